@@ -59,13 +59,14 @@ enum Command {
         palpate mesh scan.stl --unit mm --repair --vertices 5000 --output liver.obj\n  \
         palpate mesh organ.msh --unit 0.0254 --json\n\n\
         Reads OBJ, STL, PLY, glTF (.gltf and .glb), Gmsh 1, 2 and 4.1 (.msh) and VTK (.vtk, .vtp and .vtu). A volume mesh \
-        gives its outer surface. Mesh files do not state their unit, so you do: m, cm, mm, or the metres of one unit.\n\n\
+        gives its outer surface. Mesh files do not state their unit, so you do: m, cm, mm, or the metres of one unit. \
+        Places are told in it.\n\n\
         A tissue needs a surface in which each edge has one or two triangles that face the same side. --repair welds \
         vertices at one position, drops triangles without area and those that an edge has beyond two, turns triangles to \
         one side, keeps the largest surface, fills small holes and drops unused vertices. It tells what it did. Vertices \
         are numbered from 0 in the order of the file.\n\n\
-        With --json: vertices, triangles, components, holes, volume_m3, extent_m, problems with what, element and place_m, \
-        and more.\n\n\
+        With --json: vertices, triangles, components, holes, borders with edges, length_m, is_rim and place_m, volume_m3, \
+        extent_m, problems with what, element and place_m, and more.\n\n\
         Exit status: 0 when the mesh is usable, with warnings too; 1 when a file can't be written; 2 when it was refused.")]
     Mesh(mesh::MeshArguments),
     /// Make the mesh of an organ: gallbladder, liver, kidney, stomach, a segment of colon, or a patch with lumps

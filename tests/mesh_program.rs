@@ -77,3 +77,28 @@ fn a_mesh_is_mended_made_coarser_and_written() {
     assert!(json["notes"][0].as_str().unwrap().contains("welded"));
     assert!(json["done"][0].as_str().unwrap().starts_with("Vertices decimated: 6 to"));
 }
+
+#[test]
+fn holes_and_what_is_wrong_are_told_with_their_place_in_the_unit_of_the_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let open = OCTAHEDRON.replace("f 1 3 5\n", "");
+    std::fs::write(folder.path().join("organ.obj"), &open).unwrap();
+    let (status, table, _) = palpate(folder.path(), &["organ.obj", "--unit", "mm"]);
+    assert_eq!(status, 0, "{table}");
+    for row in ["holes           1", "                rim of 3 edges, 212 mm around, at (16.7, 16.7, 16.7) mm"] {
+        assert!(table.contains(row), "{row} is not in\n{table}");
+    }
+    let (_, json, _) = palpate(folder.path(), &["organ.obj", "--unit", "mm", "--json"]);
+    let border = serde_json::from_str::<Value>(&json).unwrap()["borders"][0].take();
+    assert_eq!((border["edges"].as_u64(), border["is_rim"].as_bool()), (Some(3), Some(true)), "{border}");
+    // A place that is 0 but for rounding, and a stray vertex that does not count.
+    let turned = OCTAHEDRON.replace("f 3 1 6", "f 1 3 6").replace("v 0 50 0", "v 0 50 1e-14") + "v 0 0 1e5\n";
+    std::fs::write(folder.path().join("organ.obj"), turned).unwrap();
+    let (status, table, told) = palpate(folder.path(), &["organ.obj", "--unit", "mm"]);
+    assert_eq!(status, 2, "{told}");
+    assert!(told.contains("edge 0-2 at (25, 25, 0) mm: "), "{told}");
+    assert!(
+        table.contains("100.00 × 100.00 × 100.00 mm") && table.contains("vertex 6 at (0, 0, 100000) mm"),
+        "{table}"
+    );
+}

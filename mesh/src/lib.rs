@@ -3,6 +3,7 @@
 mod curvature;
 pub mod decimate;
 pub mod delaunay;
+pub mod format;
 pub mod mesh;
 pub mod organ;
 pub mod problem;

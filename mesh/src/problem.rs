@@ -2,6 +2,9 @@
 
 use std::fmt;
 
+use crate::Unit;
+use crate::format::{length, place, rounded};
+
 /// What is wrong. Its text says what to do.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Problem {
@@ -213,19 +216,21 @@ impl fmt::Display for Problem {
             Problem::UnusedVertex => write!(f, "no triangle has this vertex: --repair drops it"),
             Problem::EdgeSpread { ratio } => write!(
                 f,
-                "the longest edge is {ratio:.0} times the shortest, which is here: short edges need short time steps; \
-                 --vertices N makes edges more even"
+                "the longest edge is {} times the shortest, which is here: short edges need short time steps; \
+                 --vertices N makes edges more even",
+                rounded(*ratio)
             ),
             Problem::AreaSpread { ratio } => write!(
                 f,
-                "the largest triangle is {ratio:.0} times the smallest, which is here: small masses need short time \
-                 steps; --vertices N makes triangles more even"
+                "the largest triangle is {} times the smallest, which is here: small masses need short time \
+                 steps; --vertices N makes triangles more even",
+                rounded(*ratio)
             ),
             Problem::Size { longest_m, instead } => {
                 write!(
                     f,
-                    "the longest side is {} m, organs are 0.005 to 5 m long: check the unit",
-                    rounded(*longest_m)
+                    "the longest side is {}, organs are 0.005 to 5 m long: check the unit",
+                    length(*longest_m, Unit::METRE)
                 )?;
                 instead.map_or(Ok(()), |instead| write!(f, " ({instead})"))
             }
@@ -238,13 +243,6 @@ impl fmt::Display for Problem {
             }
         }
     }
-}
-
-/// Three digits of a length.
-fn rounded(length: f64) -> String {
-    let text = format!("{length:.2e}");
-    let is_short = (1e-6..1e6).contains(&length.abs());
-    text.parse::<f64>().ok().filter(|_| is_short).map_or(text, |number| number.to_string())
 }
 
 /// A part of a file or of a mesh. Vertices, faces and triangles are numbered from 0, lines from 1.
@@ -301,8 +299,8 @@ impl fmt::Display for MeshError {
         write!(f, "{}: ", self.file)?;
         if self.element != Element::Whole {
             write!(f, "{}", self.element)?;
-            if let Some([x, y, z]) = self.place_m {
-                write!(f, " at ({x}, {y}, {z}) m")?;
+            if let Some(place_m) = self.place_m {
+                write!(f, " at {}", place(place_m, Unit::METRE))?;
             }
             write!(f, ": ")?;
         }

@@ -149,8 +149,7 @@ impl Work {
 
     fn weld(&mut self, weld_m: Option<f64>) {
         let vertices = &self.mesh.vertices_m;
-        let finite: Vec<DVec3> = vertices.iter().copied().filter(|at| at.is_finite()).collect();
-        let tolerance = weld_m.unwrap_or_else(|| WELD * extent(&finite).length());
+        let tolerance = weld_m.unwrap_or_else(|| WELD * extent(vertices, &self.mesh.triangles).length());
         let tolerance = if tolerance.is_finite() { tolerance.max(0.0) } else { 0.0 };
         // The cell of a position; without a tolerance the position itself. Only looked up.
         let mut cells: HashMap<[i64; 3], Vec<u32>> = HashMap::new();
@@ -332,7 +331,7 @@ impl Work {
 
     fn fill_holes(&mut self, most_edges: usize) {
         let topology = self.topology();
-        let longest = extent(&self.mesh.vertices_m).length();
+        let longest = extent(&self.mesh.vertices_m, &self.mesh.triangles).length();
         let mut uv_of: HashMap<u32, [f32; 2]> = HashMap::new();
         if let Some(uv) = &self.mesh.uv {
             for (triangle, uv) in self.mesh.triangles.iter().zip(uv) {

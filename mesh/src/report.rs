@@ -7,10 +7,11 @@ use glam::DVec3;
 use serde::Serialize;
 use serde::ser::{SerializeStruct, Serializer};
 
+use crate::format;
 use crate::read::ReadLimits;
 use crate::topology::{Topology, is_proper};
 use crate::tree::{Tree, corners, cut};
-use crate::{Element, MeshError, Problem, TriangleMesh};
+use crate::{Element, MeshError, Problem, TriangleMesh, Unit};
 
 /// Elements that are listed for each kind of problem; the others are counted.
 pub const LISTED: usize = 10;
@@ -20,6 +21,9 @@ const SPREAD: f64 = 100.0;
 
 /// The longest side of an organ, m; outside, the unit is doubted.
 const LENGTHS_M: [f64; 2] = [0.005, 5.0];
+
+/// Coordinates of places below this part of the longest side are rounding.
+const NOISE: f64 = 1e-9;
 
 /// Boxes that the check for self-intersection looks at for each triangle.
 const LOOKS: u64 = 400;
@@ -74,16 +78,49 @@ impl Serialize for Finding {
     }
 }
 
+impl Finding {
+    /// The finding in words, with its place in a unit.
+    #[must_use]
+    pub fn text(&self, unit: Unit) -> String {
+        let at = self.place_m.map(|place_m| format!(" at {}", format::place(place_m, unit))).unwrap_or_default();
+        match &self.element {
+            Element::Whole => self.problem.to_string(),
+            element => format!("{element}{at}: {}", self.problem),
+        }
+    }
+}
+
 impl fmt::Display for Finding {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if self.element != Element::Whole {
-            write!(f, "{}", self.element)?;
-            if let Some([x, y, z]) = self.place_m {
-                write!(f, " at ({x:.6}, {y:.6}, {z:.6}) m")?;
-            }
-            write!(f, ": ")?;
-        }
-        write!(f, "{}", self.problem)
+        f.write_str(&self.text(Unit::METRE))
+    }
+}
+
+/// A border of a surface: a hole, or the rim of an open one.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Border {
+    /// How many edges it has.
+    pub edges: usize,
+    /// How long it is, m.
+    pub length_m: f64,
+    /// Whether it is as long as the diagonal of the box around the mesh: rather the rim of an open surface than a hole in one.
+    pub is_rim: bool,
+    /// The middle of its vertices, m.
+    pub place_m: [f64; 3],
+}
+
+impl Border {
+    /// What it is: a hole, or a rim.
+    #[must_use]
+    pub fn name(&self) -> &'static str {
+        if self.is_rim { "rim" } else { "hole" }
+    }
+
+    /// The border in words, with its place in a unit.
+    #[must_use]
+    pub fn text(&self, unit: Unit) -> String {
+        let (length, place) = (format::length(self.length_m, unit), format::place(self.place_m, unit));
+        format!("{} of {} edges, {length} around, at {place}", self.name(), self.edges)
     }
 }
 
@@ -104,11 +141,13 @@ pub struct Report {
     pub components: usize,
     /// Borders of the surface: closed loops of edges with one triangle.
     pub holes: usize,
+    /// The borders, the longest first; at most [`LISTED`].
+    pub borders: Vec<Border>,
     /// The volume inside, m³, if the surface is closed and consistently oriented; negative if it faces inwards.
     pub volume_m3: Option<f64>,
     /// The area, m².
     pub area_m2: f64,
-    /// The sides of the bounding box, m: x, y, z.
+    /// The sides of the box around all triangles, m: x, y, z.
     pub extent_m: [f64; 3],
     /// Edge lengths, m.
     pub edge_m: Spread,
@@ -135,6 +174,8 @@ impl Report {
 struct Findings {
     list: Vec<Finding>,
     counts: BTreeMap<&'static str, usize>,
+    /// Coordinates below this are rounding, m.
+    noise_m: f64,
 }
 
 impl Findings {
@@ -142,9 +183,15 @@ impl Findings {
         let count = self.counts.entry(problem.name()).or_default();
         *count += 1;
         if *count <= LISTED {
-            self.list.push(Finding { problem, element, place_m: place.map(|place| place.to_array()) });
+            let place_m = place.map(|place| without_noise(place, self.noise_m));
+            self.list.push(Finding { problem, element, place_m });
         }
     }
+}
+
+/// A place with 0 for coordinates below some length.
+fn without_noise(place: DVec3, noise_m: f64) -> [f64; 3] {
+    place.to_array().map(|part| if part.abs() < noise_m { 0.0 } else { part })
 }
 
 /// Reports what a mesh is, with the default limits.
@@ -199,7 +246,7 @@ pub(crate) fn has_area(vertices: &[DVec3], triangle: [u32; 3]) -> bool {
 
 /// The volume that oriented triangles enclose, m³, with a sign.
 pub(crate) fn volume(vertices: &[DVec3], triangles: &[[u32; 3]]) -> f64 {
-    let middle = vertices.first().copied().unwrap_or_default();
+    let middle = triangles.first().map(|triangle| vertices[triangle[0] as usize]).unwrap_or_default();
     let of = |triangle: &[u32; 3]| {
         let [a, b, c] = corners(vertices, *triangle).map(|at| at - middle);
         a.dot(b.cross(c)) / 6.0
@@ -207,11 +254,28 @@ pub(crate) fn volume(vertices: &[DVec3], triangles: &[[u32; 3]]) -> f64 {
     triangles.iter().map(of).sum()
 }
 
-/// The sides of the box around some vertices.
-pub(crate) fn extent(vertices: &[DVec3]) -> DVec3 {
-    let least = vertices.iter().copied().reduce(DVec3::min).unwrap_or_default();
-    let most = vertices.iter().copied().reduce(DVec3::max).unwrap_or_default();
+/// The sides of the box around triangles; vertices that none has do not count.
+pub(crate) fn extent(vertices: &[DVec3], triangles: &[[u32; 3]]) -> DVec3 {
+    let used = || triangles.iter().flatten().map(|vertex| vertices[*vertex as usize]);
+    let least = used().reduce(DVec3::min).unwrap_or_default();
+    let most = used().reduce(DVec3::max).unwrap_or_default();
     most - least
+}
+
+/// The borders of a surface, the longest first.
+fn borders(vertices: &[DVec3], holes: &[Vec<u32>], extent: DVec3) -> Vec<Border> {
+    let noise_m = NOISE * extent.max_element();
+    let of = |hole: &Vec<u32>| {
+        let at = || hole.iter().map(|vertex| vertices[*vertex as usize]);
+        let length_m: f64 = at().zip(at().cycle().skip(1)).map(|(from, to)| from.distance(to)).sum();
+        let middle = at().sum::<DVec3>() / hole.len() as f64;
+        let is_rim = length_m >= extent.length();
+        Border { edges: hole.len(), length_m, is_rim, place_m: without_noise(middle, noise_m) }
+    };
+    let mut borders: Vec<Border> = holes.iter().map(of).collect();
+    borders.sort_by(|a, b| b.length_m.total_cmp(&a.length_m));
+    borders.truncate(LISTED);
+    borders
 }
 
 /// Everything about a mesh whose coordinates are finite and whose indices are in range.
@@ -222,7 +286,9 @@ fn examine(mesh: &TriangleMesh, report: &mut Report, findings: &mut Findings) {
     if vertices.len() < 4 {
         findings.add(Problem::TooFewVertices { vertices: vertices.len() }, Element::Whole, None);
     }
-    report.extent_m = extent(vertices).to_array();
+    let extent = extent(vertices, triangles);
+    report.extent_m = extent.to_array();
+    findings.noise_m = NOISE * extent.max_element();
 
     let mut areas = Vec::with_capacity(triangles.len());
     let mut smallest = None;
@@ -248,7 +314,9 @@ fn examine(mesh: &TriangleMesh, report: &mut Report, findings: &mut Findings) {
 
     let topology = Topology::new(vertices.len(), triangles);
     report.components = topology.components;
-    report.holes = topology.holes().len();
+    let holes = topology.holes();
+    report.holes = holes.len();
+    report.borders = borders(vertices, &holes, extent);
     if topology.components > 1 {
         findings.add(Problem::Components { count: topology.components }, Element::Whole, None);
     }

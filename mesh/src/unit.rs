@@ -1,8 +1,12 @@
 //! The unit of a file's lengths. Mesh files don't state it, so the user does.
 
+use std::fmt;
 use std::str::FromStr;
 
 use crate::Problem;
+
+/// Units that have a name, and their metres.
+const UNITS: [(&str, f64); 3] = [("m", 1.0), ("cm", 1e-2), ("mm", 1e-3)];
 
 /// How many metres one unit of a file is.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -21,17 +25,25 @@ impl Unit {
     }
 }
 
+impl fmt::Display for Unit {
+    /// What stands after a number: the unit's name, or what the number is multiplied with.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let known = UNITS.iter().find(|(_, metres)| *metres == self.metres);
+        match known {
+            Some((name, _)) => f.write_str(name),
+            None => write!(f, "× {} m", self.metres),
+        }
+    }
+}
+
 impl FromStr for Unit {
     type Err = Problem;
 
     /// Reads "m", "cm", "mm" or the metres of one unit, such as "0.0254".
     fn from_str(text: &str) -> Result<Self, Problem> {
-        let metres = match text.trim() {
-            "m" => 1.0,
-            "cm" => 1e-2,
-            "mm" => 1e-3,
-            other => other.parse().unwrap_or(f64::NAN),
-        };
+        let text = text.trim();
+        let known = UNITS.iter().find(|(name, _)| *name == text).map(|(_, metres)| *metres);
+        let metres = known.unwrap_or_else(|| text.parse().unwrap_or(f64::NAN));
         if metres > 0.0 && f64::is_finite(metres) {
             Ok(Self { metres })
         } else {

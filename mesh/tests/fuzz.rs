@@ -166,8 +166,9 @@ fn fuzz(extensions: &[&str]) {
     let is_own = |name: &str| extensions.iter().any(|extension| name.ends_with(extension));
     let mut corpus: Vec<(&str, Vec<u8>)> = common::samples()
         .into_iter()
-        .filter(|sample| is_own(sample.name))
         .map(|sample| (sample.name, sample.bytes))
+        .chain(common::solids().into_iter().map(|solid| (solid.name, solid.text.into_bytes())))
+        .filter(|(name, _)| is_own(name))
         .collect();
     for (name, bytes) in &corpus {
         assert!(try_all(name, bytes).is_some(), "{name}");

@@ -44,6 +44,9 @@ struct Told {
     done: Vec<String>,
     #[serde(flatten)]
     report: Report,
+    /// Of the file; places are told in it.
+    #[serde(skip)]
+    unit: Unit,
 }
 
 /// Reads at most as many bytes as a mesh file may have, and one more.
@@ -72,7 +75,7 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     let neighbours = |name: &str| bytes_of(&folder.join(name), &limits).ok();
     let found = match read(&name, &bytes, unit, &neighbours, &limits) {
         Ok(found) => found,
-        Err(error) => return refuse(arguments, &name, error),
+        Err(error) => return refuse(arguments, &name, error, unit),
     };
     drop(bytes);
     let (mut mesh, mut done) = (found.mesh, Vec::new());
@@ -88,10 +91,10 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
             done.push("Fewer would fold the surface: --repair may help.".to_owned());
         }
     }
-    let told = Told { file: name, notes: found.notes, done, report: report(&mesh) };
+    let told = Told { file: name, notes: found.notes, done, report: report(&mesh), unit };
     print(arguments, &told)?;
     if let Some(finding) = told.report.refusal() {
-        return Err(Failure::Refused(format!("{}: {finding}", told.file)));
+        return Err(Failure::Refused(format!("{}: {}", told.file, finding.text(unit))));
     }
     output.map_or(Ok(()), |(path, format)| write_mesh(path, &mesh, format))
 }
@@ -101,11 +104,11 @@ fn write_mesh(path: &Path, mesh: &TriangleMesh, format: Format) -> Result<(), Fa
 }
 
 /// Refuses a file that can't be read as a mesh; as JSON, too, if that was asked for.
-fn refuse(arguments: &MeshArguments, name: &str, error: MeshError) -> Result<(), Failure> {
+fn refuse(arguments: &MeshArguments, name: &str, error: MeshError, unit: Unit) -> Result<(), Failure> {
     let message = error.to_string();
     if arguments.json {
         let report = Report { problems: vec![Finding::from(error)], ..Report::default() };
-        print(arguments, &Told { file: name.to_owned(), notes: Vec::new(), done: Vec::new(), report })?;
+        print(arguments, &Told { file: name.to_owned(), notes: Vec::new(), done: Vec::new(), report, unit })?;
     }
     Err(Failure::Refused(message))
 }
@@ -138,6 +141,9 @@ impl Display for Told {
         row("triangles", &report.triangles)?;
         row("surfaces", &report.components)?;
         row("holes", &report.holes)?;
+        for border in &report.borders {
+            row("", &border.text(self.unit))?;
+        }
         let [x, y, z] = report.extent_m.map(|side| side * 1e3);
         row("size", &format!("{x:.2} × {y:.2} × {z:.2} mm"))?;
         row("area", &format!("{:.3} cm²", report.area_m2 * 1e4))?;
@@ -155,7 +161,7 @@ impl Display for Told {
             }
         }
         for finding in &report.problems {
-            row(if finding.problem.is_refused() { "refused" } else { "warning" }, finding)?;
+            row(if finding.problem.is_refused() { "refused" } else { "warning" }, &finding.text(self.unit))?;
         }
         for (name, count) in report.counts.iter().filter(|(_, count)| **count > LISTED) {
             row("and more", &format!("{count} of `{name}` in all"))?;

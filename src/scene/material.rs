@@ -94,7 +94,7 @@ impl Material {
 
     /// A tissue of this material, with springs of flexion whose k is the part `flexion` of that of the edge they cross.
     ///
-    /// A vertex has a third of the area of its triangles, and mass, K″ and C by that; an edge has k = E·t·(A₁ + A₂)/L² (van
+    /// A vertex has a third of the area of its triangles, and mass, K″ and C by that (one without an edge those of the mean); an edge has k = E·t·(A₁ + A₂)/L² (van
     /// Gelder 1998), times one factor for the mesh that makes its springs, those of flexion included, store what the material
     /// does when it is stretched alike to all sides (`membrane`).
     ///
@@ -105,9 +105,10 @@ impl Material {
         let Spread { of_vertices_m2, beside_edges_m2 } = Spread::of(&shape);
         let whole_m2: f64 = of_vertices_m2.iter().sum();
         #[allow(clippy::cast_precision_loss)]
-        let mean_m2 = whole_m2 / of_vertices_m2.len() as f64;
-        let none = |area_m2: &f64| !area_m2.is_finite() || *area_m2 <= mean_m2 * 1e-9;
-        if let Some(vertex) = of_vertices_m2.iter().position(none) {
+        let mean_m2 = whole_m2 / (0..of_vertices_m2.len()).filter(|vertex| shape.is_used(*vertex)).count() as f64;
+        let is_none = |area_m2: f64| !area_m2.is_finite() || area_m2 <= mean_m2 * 1e-9;
+        let lacks = |vertex: &usize| shape.is_used(*vertex) && is_none(of_vertices_m2[*vertex]);
+        if let Some(vertex) = (0..of_vertices_m2.len()).find(lacks) {
             let (name, place_m) = (shape.name(PointId::new(vertex)), shape.vertices_m()[vertex]);
             let message = format!(
                 "{name} at {place_m} m has no area, so [material] gives it no mass: `palpate mesh FILE --repair` may mend it"
@@ -122,8 +123,12 @@ impl Material {
         let crossed = |edge: &[u32; 2]| shape.edges().binary_search(edge).map_or(0.0, |at| edges[at]);
         let across: Vec<f64> = shape.crossed().iter().map(crossed).collect();
         let relative = |list: &[f64]| list.iter().map(|factor| factor / EQUAL_SIDES).collect::<Vec<f64>>();
+        let relative_mass = of_vertices_m2
+            .iter()
+            .enumerate()
+            .map(|(vertex, area_m2)| if shape.is_used(vertex) { area_m2 / mean_m2 } else { 1.0 });
         let differences = Differences {
-            relative_mass: of_vertices_m2.iter().map(|area_m2| area_m2 / mean_m2).collect(),
+            relative_mass: relative_mass.collect(),
             extra_virtual: Vec::new(),
             edges: relative(&edges),
             flexion: relative(&across),
@@ -427,6 +432,20 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn a_vertex_without_a_triangle_changes_no_other() {
+        let alone = patch(12, 0.2);
+        let with = alone.vertices_m().iter().copied().chain([DVec3::new(0.0, 0.0, 100.0)]).collect();
+        let with = MeshShape::new(with, alone.triangles().to_vec(), |_, _, _| false).unwrap();
+        let [alone, with] = [alone, with].map(|shape| SOFT.applied(0.1, Arc::new(shape)).unwrap());
+        assert_eq!(with.stiffness_n_per_m, alone.stiffness_n_per_m);
+        assert_eq!(with.virtual_stiffness_n_per_m, alone.virtual_stiffness_n_per_m);
+        assert_eq!(with.damping_n_s_per_m, alone.damping_n_s_per_m);
+        assert_eq!(with.mesh.mass_kg(), alone.mesh.mass_kg());
+        let count = alone.mesh.differences.relative_mass.len();
+        assert_eq!(with.mesh.differences.relative_mass[..count], alone.mesh.differences.relative_mass);
     }
 
     #[test]

@@ -198,12 +198,10 @@ impl Mesh {
         self.differences.extra_virtual.get(point.index()).copied().unwrap_or(0.0)
     }
 
-    /// The mass of all points, kg.
+    /// The mass of all points that have an edge, kg.
     pub fn mass_kg(&self) -> f64 {
-        let masses = &self.differences.relative_mass;
-        #[allow(clippy::cast_precision_loss)]
-        let points = if masses.is_empty() { self.shape.point_count() as f64 } else { masses.iter().sum() };
-        self.point_mass_kg * points
+        let used = (0..self.shape.vertices_m.len()).filter(|vertex| self.shape.is_used(*vertex));
+        self.point_mass_kg * used.map(|vertex| self.relative_mass(PointId::new(vertex))).sum::<f64>()
     }
 
     /// Every spring: its ends, and its k over that of reference.
@@ -547,11 +545,12 @@ impl MeshShape {
             triangle.iter().for_each(|vertex| normals[*vertex as usize] += area);
         }
         normals.iter_mut().for_each(|normal| *normal = normal.try_normalize().unwrap_or(DVec3::Z));
-        let extent = Extent::around(vertices_m.iter().copied());
         #[allow(clippy::cast_possible_truncation)]
         let is_fixed = (0..count).map(|vertex| is_fixed(on_rim[vertex], vertices_m[vertex], vertex as u32)).collect();
         let neighbours = Neighbours::new(count, &edges);
-        let cells = Cells::new(&vertices_m, extent, edge_m);
+        let used = || (0..).zip(&vertices_m).filter(|(vertex, _)| !neighbours.of(*vertex as usize).is_empty());
+        let extent = Extent::around(used().map(|(_, place_m)| *place_m));
+        let cells = Cells::new(used(), extent, edge_m);
         Ok(MeshShape {
             vertices_m,
             triangles,
@@ -609,6 +608,12 @@ impl MeshShape {
     /// The normal at each vertex.
     pub fn normals(&self) -> &[DVec3] {
         &self.normals
+    }
+
+    /// Whether a vertex has an edge. One that has none is no part of the tissue: it counts neither for its size nor for its mass, and
+    /// is the nearest to no place.
+    pub fn is_used(&self, vertex: usize) -> bool {
+        !self.neighbours.of(vertex).is_empty()
     }
 
     /// Whether a vertex is at an edge that has a single triangle.
@@ -776,9 +781,13 @@ const CELLS_PER_VERTEX: f64 = 4.0;
 
 impl Cells {
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn new(vertices_m: &[DVec3], Extent { least_m, most_m }: Extent, edge_m: f64) -> Self {
+    fn new<'v>(
+        vertices_m: impl Iterator<Item = (u32, &'v DVec3)> + Clone,
+        Extent { least_m, most_m }: Extent,
+        edge_m: f64,
+    ) -> Self {
         let size_m = most_m - least_m;
-        let most = CELLS_PER_VERTEX * vertices_m.len() as f64 + 8.0;
+        let most = CELLS_PER_VERTEX * vertices_m.clone().count() as f64 + 8.0;
         let mut side_m = edge_m;
         let cells = |side_m: f64| (size_m / side_m).floor() + 1.0;
         while cells(side_m).element_product() > most {
@@ -787,7 +796,7 @@ impl Cells {
         let counts = cells(side_m).to_array().map(|count| count as usize);
         let mut found = Cells { least_m, most_m, side_m, counts, from: Vec::new(), members: Vec::new() };
         let mut by_cell: Vec<(usize, u32)> =
-            vertices_m.iter().zip(0..).map(|(place_m, vertex)| (found.index(found.cell(*place_m)), vertex)).collect();
+            vertices_m.map(|(vertex, place_m)| (found.index(found.cell(*place_m)), vertex)).collect();
         by_cell.sort_unstable();
         found.from = vec![0; counts.iter().product::<usize>() + 1];
         by_cell.iter().for_each(|(cell, _)| found.from[cell + 1] += 1);
@@ -904,7 +913,7 @@ mod tests {
         let place =
             |dice: &mut fastrand::Rng, size: f64| DVec3::from_array([(); 3].map(|()| size * (dice.f64() - 0.5)));
         let vertices_m: Vec<DVec3> = (0..400).map(|_| place(&mut dice, 1.0) * DVec3::new(1.0, 0.3, 0.01)).collect();
-        let triangles = (0..133).map(|k| [3 * k, 3 * k + 1, 3 * k + 2]).collect();
+        let triangles = (0..133).map(|k| [3 * k, 3 * k + 1, 3 * k + 2]).chain([[397, 398, 399]]).collect();
         let shape = MeshShape::new(vertices_m.clone(), triangles, |_, _, _| false).unwrap();
         for round in 0..500 {
             let place_m = place(&mut dice, if round % 2 == 0 { 1.0 } else { 9.0 });
@@ -915,6 +924,25 @@ mod tests {
             let within: Vec<usize> = (0..400).filter(|vertex| away(vertex).sqrt() <= radius_m).collect();
             let found: Vec<usize> = shape.around(place_m, radius_m).into_iter().map(PointId::index).collect();
             assert_eq!(found, within, "{place_m} {radius_m}");
+        }
+    }
+
+    #[test]
+    fn a_vertex_without_a_triangle_changes_neither_size_nor_mass_nor_what_is_nearest() {
+        let places_m = [[0.0; 3], [0.04, 0.0, 0.0], [0.04, 0.03, 0.0], [0.0, 0.03, 0.0]].map(DVec3::from_array);
+        let triangles = vec![[0, 1, 2], [0, 2, 3]];
+        for stray_m in [DVec3::new(0.0, 0.0, 100.0), DVec3::new(0.01, 0.01, 0.0), DVec3::splat(-1e6)] {
+            let with = places_m.into_iter().chain([stray_m]).collect();
+            let [alone, with] =
+                [places_m.to_vec(), with].map(|all| MeshShape::new(all, triangles.clone(), |_, _, _| false).unwrap());
+            assert_eq!(with.extent(), alone.extent(), "{stray_m}");
+            assert_eq!(with.nearest(stray_m), alone.nearest(stray_m), "{stray_m}");
+            assert_eq!(with.around(stray_m, 0.02), alone.around(stray_m, 0.02), "{stray_m}");
+            let [alone, with] = [alone, with].map(|shape| {
+                let mesh = Mesh::uneven(0.01, 0.0, Arc::new(shape), Differences::default());
+                (mesh.mass_kg(), mesh.stiffest.bound)
+            });
+            assert_eq!(with, alone, "{stray_m}");
         }
     }
 

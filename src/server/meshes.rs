@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use palpate_mesh::repair::{Repair, repair};
-use palpate_mesh::report::{Finding, report_within};
+use palpate_mesh::report::{Border, Finding, report_within};
 use palpate_mesh::{Element, MeshError, ReadLimits, TriangleMesh, Unit};
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
@@ -153,10 +153,12 @@ impl Reading {
         go_on()?;
         let refused = found.refusal().is_some();
         // What is refused comes first.
-        let found_problems = found.problems.iter().map(problem);
-        let problems = found_problems.chain(problems).collect();
+        // The rim of an open surface is meant.
+        let holes = found.borders.iter().filter(|border| !border.is_rim).map(hole);
+        let problems = found.problems.iter().map(problem).chain(holes).chain(problems).collect();
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
-        let extent = Extent::around(mesh.vertices_m.iter().copied());
+        let used = mesh.triangles.iter().flatten().filter_map(|vertex| mesh.vertices_m.get(*vertex as usize));
+        let extent = Extent::around(used.copied());
         let report = pb::MeshReport {
             vertices: count(found.vertices),
             triangles: count(found.triangles),
@@ -195,6 +197,11 @@ fn problem(finding: &Finding) -> pb::MeshProblem {
         element: if finding.element == Element::Whole { String::new() } else { finding.element.to_string() },
         place_m: finding.place_m.and_then(|place_m| vector(place_m.into())),
     }
+}
+
+fn hole(border: &Border) -> pb::MeshProblem {
+    let what = format!("hole of {} edges", border.edges);
+    pb::MeshProblem { what, element: String::new(), place_m: vector(border.place_m.into()) }
 }
 
 /// A file that can't be read. The message names element and place.

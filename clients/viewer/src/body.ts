@@ -95,7 +95,8 @@ export class Body implements Surface {
     this.around = lists(count, triangles, (i) => Math.floor(i / 3));
     this.owned = lists(this.blocks, Array.from({ length: triangles.length / 3 }, (_, t) => triangles[3 * t]! >> BLOCK), (t) => t);
     this.touching = touching(triangles, this.blocks, BLOCK);
-    this.box.setFromArray(restM);
+    // A vertex that no triangle has may be anywhere.
+    for (const vertex of triangles) this.box.expandByPoint(this.found.fromArray(restM, 3 * vertex));
     this.sizeM = this.box.getSize(this.found).length();
     const dynamic = (values: Float32Array, size: number) => new BufferAttribute(values, size).setUsage(DynamicDrawUsage);
     this.drawn = {

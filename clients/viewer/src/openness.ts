@@ -37,9 +37,11 @@ export class Looks {
     this.across = new Float32Array(3 * count);
     const low = [Infinity, Infinity, Infinity];
     const high = [-Infinity, -Infinity, -Infinity];
-    for (let i = 0; i < position.length; i++) {
-      low[i % 3] = Math.min(low[i % 3]!, position[i]!);
-      high[i % 3] = Math.max(high[i % 3]!, position[i]!);
+    for (const vertex of triangles) {
+      for (let c = 0; c < 3; c++) {
+        low[c] = Math.min(low[c]!, position[3 * vertex + c]!);
+        high[c] = Math.max(high[c]!, position[3 * vertex + c]!);
+      }
     }
     this.middle = [0, 1, 2].map((c) => (low[c]! + high[c]!) / 2) as [number, number, number];
     const radius = Math.hypot(...[0, 1, 2].map((c) => (high[c]! - low[c]!) / 2)) || 1;

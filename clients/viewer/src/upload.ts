@@ -45,11 +45,12 @@ export function likelyUnit(longest: number): (typeof UNITS)[number]["unit"] {
   return UNITS.reduce((best, unit) => (far(unit) < far(best) ? unit : best)).unit;
 }
 
-/** A problem with where it is, in the unit of lengths of tissue. */
-function problemText({ what, element, placeM }: MeshProblem): string {
+/** A problem with where it is, in the unit of the file. */
+function problemText({ what, element, placeM }: MeshProblem, { unit, metres }: (typeof UNITS)[number]): string {
   // What the command line calls an option is a button here.
   const words = what.replace(/[;,:] --vertices N [^;]*/, "").replace(/--repair/g, "“Mend it”");
-  const at = placeM ? ` at (${[placeM.x, placeM.y, placeM.z].map((v) => Number((1000 * v).toPrecision(4))).join(", ")}) mm` : "";
+  const place = placeM && [placeM.x, placeM.y, placeM.z].map((v) => Number((v / metres).toPrecision(3))).join(", ");
+  const at = place ? ` at (${place}) ${unit}` : "";
   return element ? `${element}${at}: ${words}` : `${words}${at}`;
 }
 
@@ -134,11 +135,12 @@ export class FileOpener {
     if (file.size === 0) throw new Error("the file is empty");
     let sent = await this.send(file, "m", false, signal);
     const raw = sidesOf(sent.report);
-    const { unit } = await this.askUnit(raw, signal);
+    const chosen = await this.askUnit(raw, signal);
+    const { unit } = chosen;
     if (unit !== "m") sent = await this.send(file, unit, false, signal);
-    if ((await this.showReport(sent.report, false, signal)) === "mend") {
+    if ((await this.showReport(sent.report, chosen, false, signal)) === "mend") {
       sent = await this.send(file, unit, true, signal);
-      await this.showReport(sent.report, true, signal);
+      await this.showReport(sent.report, chosen, true, signal);
     }
     this.show("Making the tissue …");
     this.progress.hidden = false;
@@ -189,10 +191,15 @@ export class FileOpener {
   }
 
   /** Shows a report. One without a flaw needs no answer. */
-  private async showReport(report: MeshReport, isMended: boolean, signal: AbortSignal): Promise<"touch" | "mend"> {
+  private async showReport(
+    report: MeshReport,
+    unit: (typeof UNITS)[number],
+    isMended: boolean,
+    signal: AbortSignal,
+  ): Promise<"touch" | "mend"> {
     const { problems, refused } = report;
     if (!refused && problems.length === 0) return "touch";
-    const told = problems.slice(0, TOLD).map(problemText);
+    const told = problems.slice(0, TOLD).map((problem) => problemText(problem, unit));
     if (problems.length > TOLD) told.push(`and ${problems.length - TOLD} more`);
     const mendable = "It can't be used as it is. “Mend it” lets the server repair what can be repaired:";
     const beyond = "It can't be used, and the server could not mend all of it. A program that edits meshes may:";

@@ -78,7 +78,7 @@ export class Visit {
     const k = session.scene?.springs?.stiffnessNPerM ?? 0;
     const virtual = session.scene?.virtualSprings?.stiffnessNPerM ?? 0;
     if (mesh) {
-      const sizeM = boxOf(mesh.restM);
+      const sizeM = boxOf(mesh);
       const lengthM = fingerM(sizeM, mesh.edgeM);
       // Springs across carry the less of a push, the more points share it.
       const aPointN = 2 * lengthM * (virtual + 2 * k * Math.min(1, (mesh.edgeM / lengthM) ** 2));
@@ -225,14 +225,16 @@ export class Visit {
   }
 }
 
-/** The diagonal of the box around places, m. */
-function boxOf(restM: Float32Array): number {
+/** The diagonal of the box around the triangles of a mesh, m. */
+function boxOf({ restM, triangles }: MeshData): number {
   const low = [Infinity, Infinity, Infinity];
   const high = [-Infinity, -Infinity, -Infinity];
-  restM.forEach((v, i) => {
-    low[i % 3] = Math.min(low[i % 3]!, v);
-    high[i % 3] = Math.max(high[i % 3]!, v);
-  });
+  for (const vertex of triangles) {
+    for (let c = 0; c < 3; c++) {
+      low[c] = Math.min(low[c]!, restM[3 * vertex + c]!);
+      high[c] = Math.max(high[c]!, restM[3 * vertex + c]!);
+    }
+  }
   return norm([high[0]! - low[0]!, high[1]! - low[1]!, high[2]! - low[2]!]);
 }
 

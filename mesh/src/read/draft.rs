@@ -1,49 +1,23 @@
 //! A mesh while it is read: vertices, faces and volume elements in the file's unit, within the limits.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec3;
 
+use super::polygon::{Split, triangles};
+use super::volume::{Cell, Volume};
 use super::{ReadLimits, ReadMesh};
+use crate::topology::Topology;
 use crate::{Element, Group, MeshError, Problem, TriangleMesh, Unit};
 
 /// Groups of a file; what has more of them is no organ.
 const GROUPS: usize = 4096;
 
-/// In the place of the fourth corner of a triangle.
+/// In the place of the number of a vertex that is dropped.
 const NONE: u32 = u32::MAX;
 
-/// A volume element by the faces of its corners. Corners are numbered as in Gmsh and VTK, which agree here.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Cell {
-    Tetrahedron,
-    Hexahedron,
-    Prism,
-    Pyramid,
-}
-
-impl Cell {
-    /// How many corners it has.
-    pub(super) fn corners(self) -> usize {
-        match self {
-            Cell::Tetrahedron => 4,
-            Cell::Hexahedron => 8,
-            Cell::Prism => 6,
-            Cell::Pyramid => 5,
-        }
-    }
-
-    fn faces(self) -> &'static [&'static [usize]] {
-        match self {
-            Cell::Tetrahedron => &[&[0, 2, 1], &[0, 1, 3], &[1, 2, 3], &[0, 3, 2]],
-            Cell::Hexahedron => {
-                &[&[0, 3, 2, 1], &[4, 5, 6, 7], &[0, 1, 5, 4], &[1, 2, 6, 5], &[2, 3, 7, 6], &[3, 0, 4, 7]]
-            }
-            Cell::Prism => &[&[0, 2, 1], &[3, 4, 5], &[0, 1, 4, 3], &[1, 2, 5, 4], &[2, 0, 3, 5]],
-            Cell::Pyramid => &[&[0, 3, 2, 1], &[0, 1, 4], &[1, 2, 4], &[2, 3, 4], &[3, 0, 4]],
-        }
-    }
-}
+/// Comparisons that may be made to split the concave polygons of a file.
+const COMPARISONS: u64 = 1 << 26;
 
 /// A mesh while it is read.
 pub(super) struct Draft<'l> {
@@ -53,16 +27,21 @@ pub(super) struct Draft<'l> {
     pub(super) lines: usize,
     /// Whether vertices that no triangle has are dropped: the inner ones of volumes and of curved elements.
     pub(super) drops_unused: bool,
+    /// Whether triangles that repeat an earlier one are dropped.
+    pub(super) drops_repeated: bool,
     vertices: Vec<DVec3>,
     triangles: Vec<[u32; 3]>,
     uv: Vec<[[f32; 2]; 3]>,
     has_uv: bool,
     groups: Vec<Group>,
     groups_by_name: BTreeMap<String, usize>,
+    /// Polygons that were split, by how.
     split: usize,
-    cells: usize,
-    /// The faces of volume elements, seen from outside.
-    faces: Vec<[u32; 4]>,
+    concave: usize,
+    folded: usize,
+    /// Comparisons that are left.
+    comparisons: u64,
+    volume: Volume,
 }
 
 impl<'l> Draft<'l> {
@@ -72,6 +51,7 @@ impl<'l> Draft<'l> {
             notes: Vec::new(),
             lines: 0,
             drops_unused: false,
+            drops_repeated: false,
             vertices: Vec::new(),
             triangles: Vec::new(),
             uv: Vec::new(),
@@ -79,8 +59,10 @@ impl<'l> Draft<'l> {
             groups: Vec::new(),
             groups_by_name: BTreeMap::new(),
             split: 0,
-            cells: 0,
-            faces: Vec::new(),
+            concave: 0,
+            folded: 0,
+            comparisons: COMPARISONS,
+            volume: Volume::default(),
         }
     }
 
@@ -139,31 +121,57 @@ impl<'l> Draft<'l> {
         Ok(())
     }
 
-    /// Adds a polygon, split as a fan from its first vertex. `uv` has one place for each corner, or none.
+    /// Adds a polygon, split into triangles. `uv` has one place for each corner, or none.
     pub(super) fn polygon(&mut self, corners: &[i64], uv: &[[f32; 2]], groups: &[usize]) -> Result<(), Problem> {
         self.assign(corners, groups)?;
-        if corners.len() < 3 {
+        let uv = if uv.len() == corners.len() { uv } else { &[] };
+        if corners.len() == 3 {
+            return self.triangle(corners, uv, [0, 1, 2]);
+        }
+        // A corner twice in a row is one corner.
+        let is_last = |place: &usize| corners[*place] != corners[(*place + 1) % corners.len()];
+        let places: Vec<usize> = (0..corners.len()).filter(is_last).collect();
+        if places.len() < 3 {
             self.lines += 1;
             return Ok(());
         }
-        self.split += usize::from(corners.len() > 3);
-        let has_uv = uv.len() == corners.len();
-        if has_uv && !self.has_uv {
+        let at = places.iter().map(|place| Ok(self.vertices[self.index(corners[*place])? as usize]));
+        let (split, how) = triangles(&at.collect::<Result<Vec<_>, Problem>>()?, &mut self.comparisons);
+        match how {
+            Split::Fan => self.split += usize::from(split.len() > 1),
+            Split::Ears => self.concave += 1,
+            Split::Folded => self.folded += 1,
+        }
+        split.into_iter().try_for_each(|triangle| self.triangle(corners, uv, triangle.map(|place| places[place])))
+    }
+
+    /// Adds a triangle of three corners of a polygon.
+    fn triangle(&mut self, corners: &[i64], uv: &[[f32; 2]], places: [usize; 3]) -> Result<(), Problem> {
+        if self.triangles.len() >= self.limits.triangles {
+            return Err(Problem::TooLarge { what: "triangles", limit: self.limits.triangles });
+        }
+        if !uv.is_empty() && !self.has_uv {
             self.has_uv = true;
             self.uv = vec![[[0.0; 2]; 3]; self.triangles.len()];
         }
-        for second in 1..corners.len() - 1 {
-            if self.triangles.len() >= self.limits.triangles {
-                return Err(Problem::TooLarge { what: "triangles", limit: self.limits.triangles });
-            }
-            let at = [0, second, second + 1];
-            let mut triangle = [0; 3];
-            for (vertex, place) in triangle.iter_mut().zip(at) {
-                *vertex = self.index(corners[place])?;
-            }
-            self.triangles.push(triangle);
-            if self.has_uv {
-                self.uv.push(if has_uv { at.map(|place| uv[place]) } else { [[0.0; 2]; 3] });
+        let [a, b, c] = places.map(|place| self.index(corners[place]));
+        self.triangles.push([a?, b?, c?]);
+        if self.has_uv {
+            self.uv.push(if uv.is_empty() { [[0.0; 2]; 3] } else { places.map(|place| uv[place]) });
+        }
+        Ok(())
+    }
+
+    /// Adds a strip of triangles: each vertex makes one with the two before it, and every other triangle is the other way round.
+    /// Where a vertex is repeated, to go on elsewhere, there is none.
+    pub(super) fn strip(&mut self, corners: &[i64], uv: &[[f32; 2]]) -> Result<(), Problem> {
+        // Also those of triangles that are none.
+        self.assign(corners, &[])?;
+        for first in 0..corners.len().saturating_sub(2) {
+            let places = if first % 2 == 0 { [first, first + 1, first + 2] } else { [first + 1, first, first + 2] };
+            let [a, b, c] = places.map(|place| corners[place]);
+            if a != b && b != c && c != a {
+                self.triangle(corners, if uv.len() == corners.len() { uv } else { &[] }, places)?;
             }
         }
         Ok(())
@@ -171,69 +179,70 @@ impl<'l> Draft<'l> {
 
     /// Adds a volume element by its corners; further nodes of curved ones are left out.
     pub(super) fn cell(&mut self, cell: Cell, nodes: &[i64], groups: &[usize]) -> Result<(), Problem> {
-        if self.cells >= self.limits.triangles {
+        if self.volume.len() >= self.limits.triangles {
             return Err(Problem::TooLarge { what: "volume elements", limit: self.limits.triangles });
         }
         let Some(nodes) = nodes.get(..cell.corners()) else {
             return Err(Problem::Syntax { message: format!("a volume element of {} vertices", nodes.len()) });
         };
         self.assign(nodes, groups)?;
-        self.cells += 1;
         self.drops_unused = true;
-        let mut corners = [0; 8];
-        for (corner, node) in corners.iter_mut().zip(nodes) {
-            *corner = self.index(*node)?;
-        }
-        let at = |corner: usize| self.vertices[corners[corner] as usize];
-        let middle = (0..nodes.len()).map(at).sum::<DVec3>() / nodes.len() as f64;
-        for face in cell.faces() {
-            let normal = (at(face[1]) - at(face[0])).cross(at(face[2]) - at(face[0]));
-            let mut outer = [NONE; 4];
-            for (corner, place) in outer.iter_mut().zip(*face) {
-                *corner = corners[*place];
-            }
-            // Files number elements in both senses.
-            if normal.dot(at(face[0]) - middle) < 0.0 {
-                outer[..face.len()].reverse();
-            }
-            self.faces.push(outer);
-        }
+        let corners = nodes.iter().map(|node| self.index(*node)).collect::<Result<Vec<u32>, _>>()?;
+        self.volume.add(cell, &corners);
         Ok(())
     }
 
-    /// Replaces faces by the outer surface of the volume elements: the faces that one element alone has.
+    /// Whether the triangles so far are a closed surface.
+    pub(super) fn is_closed(&self) -> bool {
+        Topology::new(self.vertices.len(), &self.triangles).is_closed()
+    }
+
+    /// Replaces triangles by the surface around the volume elements.
     fn take_outer_surface(&mut self) -> Result<(), Problem> {
-        let key = |face: &[u32; 4]| {
-            let mut sorted = *face;
-            sorted.sort_unstable();
-            sorted
-        };
-        let mut sorted: Vec<([u32; 4], usize)> = self.faces.iter().map(key).zip(0..).collect();
-        sorted.sort_unstable();
-        let mut is_outer = vec![false; self.faces.len()];
-        for same in sorted.chunk_by(|a, b| a.0 == b.0) {
-            is_outer[same[0].1] = same.len() == 1;
-        }
-        drop(sorted);
+        let volume = std::mem::take(&mut self.volume);
         if !self.triangles.is_empty() {
             let number = self.triangles.len();
             self.notes
                 .push(format!("Surface triangles left out, since the outer surface of the volume is used: {number}."));
         }
-        (self.split, self.has_uv) = (0, false);
+        (self.split, self.concave, self.folded, self.has_uv) = (0, 0, 0, false);
         self.triangles.clear();
         self.uv.clear();
-        for (face, is_outer) in std::mem::take(&mut self.faces).into_iter().zip(is_outer) {
-            if is_outer {
-                let corners: Vec<i64> = face.into_iter().filter(|corner| *corner != NONE).map(i64::from).collect();
-                self.polygon(&corners, &[], &[])?;
-            }
+        let surface = volume.outer_surface(&self.vertices);
+        for face in surface.faces {
+            let corners: Vec<i64> = face.into_iter().map(i64::from).collect();
+            self.polygon(&corners, &[], &[])?;
         }
-        let (cells, triangles) = (self.cells, self.triangles.len());
+        if surface.repeated > 0 {
+            let number = surface.repeated;
+            self.notes.push(format!("Volume elements left out that have the corners of an earlier one: {number}."));
+        }
+        let (cells, triangles) = (volume.len(), self.triangles.len());
         self.notes.push(format!(
             "The mesh is the outer surface of a volume. Volume elements: {cells}; triangles: {triangles}."
         ));
         Ok(())
+    }
+
+    /// Drops the triangles that have the vertices of an earlier one, in the same sense.
+    fn drop_repeated(&mut self) {
+        let mut seen = BTreeSet::new();
+        let is_first = |triangle: &[u32; 3]| {
+            let least = (0..3).min_by_key(|corner| triangle[*corner]).unwrap_or(0);
+            let mut rotated = *triangle;
+            rotated.rotate_left(least);
+            seen.insert(rotated)
+        };
+        let is_kept: Vec<bool> = self.triangles.iter().map(is_first).collect();
+        let dropped = is_kept.iter().filter(|is| !**is).count();
+        if dropped == 0 {
+            return;
+        }
+        let mut kept = is_kept.iter();
+        self.triangles.retain(|_| *kept.next().unwrap_or(&true));
+        let mut kept = is_kept.iter();
+        self.uv.retain(|_| *kept.next().unwrap_or(&true));
+        self.notes.push(format!("Triangles left out that an earlier one repeats, as in several groups: {dropped}."));
     }
 
     /// Drops the vertices that no triangle has.
@@ -269,8 +278,11 @@ impl<'l> Draft<'l> {
     /// The mesh in metres.
     pub(super) fn finish(mut self, file: &str, unit: Unit) -> Result<ReadMesh, MeshError> {
         let fail = |element, problem| MeshError { file: file.to_owned(), element, place_m: None, problem };
-        if self.cells > 0 {
+        if self.volume.len() > 0 {
             self.take_outer_surface().map_err(|problem| fail(Element::Whole, problem))?;
+        }
+        if self.drops_repeated {
+            self.drop_repeated();
         }
         if self.drops_unused {
             self.drop_unused();
@@ -286,11 +298,15 @@ impl<'l> Draft<'l> {
             group.vertices.dedup();
         }
         self.groups.retain(|group| !group.vertices.is_empty());
-        if self.split > 0 {
-            self.notes.push(format!("Polygons split into triangles, from their first vertex: {}.", self.split));
-        }
-        if self.lines > 0 {
-            self.notes.push(format!("Points and lines left out: {}.", self.lines));
+        for (count, what) in [
+            (self.split, "Polygons split into triangles, from their first vertex"),
+            (self.concave, "Concave polygons split into triangles, by cutting off their ears"),
+            (self.folded, "Polygons that cross themselves or have no plane, split from their first vertex"),
+            (self.lines, "Points and lines left out"),
+        ] {
+            if count > 0 {
+                self.notes.push(format!("{what}: {count}."));
+            }
         }
         let has_finite_uv = self.uv.iter().flatten().flatten().all(|part| part.is_finite());
         if self.has_uv && !has_finite_uv {

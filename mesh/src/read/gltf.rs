@@ -3,175 +3,21 @@
 //! The JSON is read by `serde_json`. The crate `gltf` slices buffers without checks and panics where a file's offsets and
 //! counts are wrong.
 
+mod json;
+
 use std::borrow::Cow;
 use std::cell::Cell;
-use std::fmt;
-use std::marker::PhantomData;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::{DMat4, DQuat, DVec3};
 use serde::Deserialize;
-use serde::de::{SeqAccess, Visitor};
 
 use super::draft::Draft;
 use super::source::{Order, Scalar, named};
+use super::without_mark;
 use crate::{Element, MeshError, Problem};
-
-/// Nodes, meshes, accessors and so on of a file. They take more memory than the text that they are from.
-const MOST: usize = 1 << 16;
-
-/// A list of at most [`MOST`] entries.
-struct Few<T>(Vec<T>);
-
-impl<T> Default for Few<T> {
-    fn default() -> Self {
-        Self(Vec::new())
-    }
-}
-
-impl<'de, T: Deserialize<'de>> Deserialize<'de> for Few<T> {
-    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        struct List<T>(PhantomData<T>);
-        impl<'de, T: Deserialize<'de>> Visitor<'de> for List<T> {
-            type Value = Few<T>;
-
-            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                write!(f, "a list of at most {MOST} entries")
-            }
-
-            fn visit_seq<A: SeqAccess<'de>>(self, mut entries: A) -> Result<Few<T>, A::Error> {
-                let mut list = Vec::new();
-                while let Some(entry) = entries.next_element()? {
-                    if list.len() >= MOST {
-                        return Err(serde::de::Error::invalid_length(MOST + 1, &self));
-                    }
-                    list.push(entry);
-                }
-                Ok(Few(list))
-            }
-        }
-        deserializer.deserialize_seq(List(PhantomData))
-    }
-}
-
-#[derive(Deserialize)]
-#[serde(rename_all = "camelCase")]
-struct Root {
-    #[serde(default)]
-    scene: usize,
-    #[serde(default)]
-    scenes: Few<Scene>,
-    #[serde(default)]
-    nodes: Few<Node>,
-    #[serde(default)]
-    meshes: Few<Mesh>,
-    #[serde(default)]
-    materials: Few<Named>,
-    #[serde(default)]
-    accessors: Few<Accessor>,
-    #[serde(default)]
-    buffer_views: Few<View>,
-    #[serde(default)]
-    buffers: Few<Buffer>,
-    #[serde(default)]
-    extensions_required: Few<String>,
-}
-
-#[derive(Deserialize)]
-struct Scene {
-    #[serde(default)]
-    nodes: Few<u32>,
-}
-
-#[derive(Deserialize)]
-struct Node {
-    name: Option<String>,
-    mesh: Option<usize>,
-    #[serde(default)]
-    children: Few<u32>,
-    matrix: Option<Box<[f64; 16]>>,
-    translation: Option<[f64; 3]>,
-    rotation: Option<[f64; 4]>,
-    scale: Option<[f64; 3]>,
-}
-
-#[derive(Deserialize)]
-struct Named {
-    name: Option<String>,
-}
-
-#[derive(Deserialize)]
-struct Mesh {
-    name: Option<String>,
-    #[serde(default)]
-    primitives: Few<Primitive>,
-}
-
-#[derive(Deserialize)]
-struct Primitive {
-    attributes: Attributes,
-    indices: Option<usize>,
-    material: Option<usize>,
-    mode: Option<u32>,
-}
-
-// Required, so that no short text makes many primitives.
-#[derive(Deserialize)]
-struct Attributes {
-    #[serde(rename = "POSITION")]
-    position: usize,
-    #[serde(rename = "TEXCOORD_0")]
-    uv: Option<usize>,
-}
-
-#[derive(Deserialize)]
-#[serde(rename_all = "camelCase")]
-struct Accessor {
-    buffer_view: Option<usize>,
-    #[serde(default)]
-    byte_offset: usize,
-    component_type: u32,
-    #[serde(default)]
-    normalized: bool,
-    count: usize,
-    #[serde(rename = "type")]
-    kind: String,
-    sparse: Option<Box<Sparse>>,
-}
-
-#[derive(Deserialize)]
-struct Sparse {
-    count: usize,
-    indices: SparsePart,
-    values: SparsePart,
-}
-
-#[derive(Deserialize)]
-#[serde(rename_all = "camelCase")]
-struct SparsePart {
-    buffer_view: usize,
-    #[serde(default)]
-    byte_offset: usize,
-    component_type: Option<u32>,
-}
-
-#[derive(Deserialize)]
-#[serde(rename_all = "camelCase")]
-struct View {
-    buffer: usize,
-    #[serde(default)]
-    byte_offset: usize,
-    byte_length: usize,
-    byte_stride: Option<usize>,
-}
-
-#[derive(Deserialize)]
-#[serde(rename_all = "camelCase")]
-struct Buffer {
-    uri: Option<String>,
-    byte_length: usize,
-}
+use json::{Head, MOST, Root, other_extension, other_version};
 
 /// A file that is being read.
 struct File<'a> {
@@ -194,8 +40,9 @@ fn parts<'a>(name: &str, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]>)
         problem,
     };
     let word = |at: usize| bytes.get(at..at + 4).map(|word| Scalar::U32.integer(word, Order::Little));
-    if word(4) != Some(2) {
-        return Err(fail(4, Problem::Unsupported { message: "not version 2 of glTF: export it again".to_owned() }));
+    let version = word(4).ok_or_else(|| fail(4, Problem::Truncated { missing: "the version".to_owned() }))?;
+    if version != 2 {
+        return Err(fail(4, other_version(&format!("{version}.0"))));
     }
     let (mut json, mut binary, mut at) = (None, None, 12);
     while let Some((length, kind)) = word(at).zip(word(at + 4)) {
@@ -229,14 +76,9 @@ fn unescaped(uri: &str) -> String {
     String::from_utf8_lossy(&bytes).into_owned()
 }
 
-pub(super) fn read(
-    name: &str,
-    bytes: &[u8],
-    neighbours: &dyn Fn(&str) -> Option<Vec<u8>>,
-    draft: &mut Draft<'_>,
-) -> Result<(), MeshError> {
-    let (json, binary) = parts(name, bytes)?;
-    let root: Root = serde_json::from_slice(json).map_err(|e| MeshError {
+/// The JSON text as what is looked for in it.
+fn parsed<'a, T: Deserialize<'a>>(name: &str, json: &'a [u8]) -> Result<T, MeshError> {
+    serde_json::from_slice(json).map_err(|e| MeshError {
         file: name.to_owned(),
         element: Element::Line(e.line() as u64),
         place_m: None,
@@ -244,14 +86,36 @@ pub(super) fn read(
             serde_json::error::Category::Eof => Problem::Truncated { missing: "a part of the JSON text".to_owned() },
             _ => Problem::Syntax { message: e.to_string() },
         },
-    })?;
+    })
+}
+
+pub(super) fn read(
+    name: &str,
+    bytes: &[u8],
+    neighbours: &dyn Fn(&str) -> Option<Vec<u8>>,
+    draft: &mut Draft<'_>,
+) -> Result<(), MeshError> {
+    let (json, binary) = parts(name, bytes)?;
+    // Some programs fill it with NULs, up to a multiple of four.
+    let end = json.iter().rposition(|byte| !matches!(byte, 0 | 0x1a)).map_or(0, |last| last + 1);
+    let json = without_mark(&json[..end]);
+    let head: Head = parsed(name, json)?;
+    if let Some(problem) = head.refusal() {
+        return Err(MeshError { file: name.to_owned(), element: Element::Whole, place_m: None, problem });
+    }
+    let root: Root = parsed(name, json)?;
     let mut file = File { name, root, buffers: Vec::new(), primitives: Cell::new(0) };
     let mut buffers: Vec<Cow<'_, [u8]>> = Vec::new();
     for (number, buffer) in file.root.buffers.0.iter().enumerate() {
         let fail = |problem| file.fail("buffer", number, problem);
         let content = match &buffer.uri {
+            None if buffer.extensions.meshopt.is_some() => {
+                return Err(fail(other_extension("EXT_meshopt_compression")));
+            }
+            // The binary part of a GLB file is the first buffer.
             None => {
-                Cow::Borrowed(binary.ok_or_else(|| fail(Problem::Truncated { missing: "its content".to_owned() }))?)
+                let content = binary.filter(|_| number == 0);
+                Cow::Borrowed(content.ok_or_else(|| fail(Problem::Truncated { missing: "its content".to_owned() }))?)
             }
             Some(uri) => Cow::Owned(match uri.strip_prefix("data:").and_then(|data| data.split_once("base64,")) {
                 Some((_, text)) => {
@@ -291,15 +155,6 @@ impl File<'_> {
     /// Walks through the nodes of the scene.
     fn nodes(&self, draft: &mut Draft<'_>) -> Result<(), MeshError> {
         let root = &self.root;
-        let needed = root.extensions_required.0.iter().find(|name| !name.starts_with("KHR_materials"));
-        match needed.map(String::as_str) {
-            None | Some("KHR_mesh_quantization" | "KHR_texture_transform" | "KHR_lights_punctual") => {}
-            Some(other) => {
-                let message = format!("needs the extension {}: export it without compression", named(other.as_bytes()));
-                let problem = Problem::Unsupported { message };
-                return Err(MeshError { file: self.name.to_owned(), element: Element::Whole, place_m: None, problem });
-            }
-        }
         if root.nodes.0.is_empty() {
             for mesh in 0..root.meshes.0.len() {
                 self.mesh(mesh, None, DMat4::IDENTITY, draft)?;
@@ -324,9 +179,10 @@ impl File<'_> {
             }
             let own = node.matrix.as_ref().map_or_else(
                 || {
-                    let rotation = node.rotation.map_or(DQuat::IDENTITY, DQuat::from_array);
-                    let scale = node.scale.map_or(DVec3::ONE, DVec3::from_array);
-                    let translation = node.translation.map_or(DVec3::ZERO, DVec3::from_array);
+                    let rotation =
+                        node.rotation.as_ref().map_or(DQuat::IDENTITY, |rotation| DQuat::from_array(rotation.0));
+                    let scale = node.scale.as_ref().map_or(DVec3::ONE, |scale| DVec3::from_array(scale.0));
+                    let translation = node.translation.as_ref().map_or(DVec3::ZERO, |by| DVec3::from_array(by.0));
                     // Not by glam's function, which asserts in some builds that the rotation has unit length.
                     let axes = [DVec3::X, DVec3::Y, DVec3::Z].map(|axis| rotated(rotation, axis));
                     DMat4::from_cols(
@@ -336,7 +192,7 @@ impl File<'_> {
                         translation.extend(1.0),
                     )
                 },
-                |matrix| DMat4::from_cols_array(matrix),
+                |matrix| DMat4::from_cols_array(&matrix.0),
             );
             let whole = parent * own;
             if let Some(mesh) = node.mesh {
@@ -360,6 +216,11 @@ impl File<'_> {
                 continue;
             }
             let fail = |problem| self.fail("mesh", number, problem);
+            // Beside Draco's data there may be others, for who can't read them.
+            let position = self.root.accessors.0.get(primitive.attributes.position);
+            if primitive.extensions.draco.is_some() && position.is_some_and(|list| list.buffer_view.is_none()) {
+                return Err(fail(other_extension("KHR_draco_mesh_compression")));
+            }
             let material = primitive.material.and_then(|material| self.root.materials.0.get(material));
             let mut groups = Vec::new();
             for name in [node.or(mesh.name.as_deref()), material.and_then(|material| material.name.as_deref())] {
@@ -400,6 +261,10 @@ impl File<'_> {
                 _ => Box::new(corners.windows(2).skip(1).map(|c| [corners[0], c[0], c[1]])),
             };
             for [a, b, c] in triangles {
+                // Strips and fans go on elsewhere by a vertex twice.
+                if mode != 4 && (a == b || b == c || c == a) {
+                    continue;
+                }
                 let triangle = if is_mirrored { [a, c, b] } else { [a, b, c] };
                 if let Some(index) = triangle.into_iter().find(|index| *index >= positions.len() as i64) {
                     return Err(fail(Problem::IndexOutOfRange { index, vertices: positions.len() }));

@@ -4,8 +4,9 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-use super::draft::{Cell, Draft};
+use super::draft::Draft;
 use super::source::{Order, Scalar, Source, named, parsed, shown};
+use super::volume::Cell;
 use crate::{MeshError, Problem};
 
 /// Physical tags of an entity that count.
@@ -30,25 +31,42 @@ fn element_type(number: i64) -> Option<(usize, i64, Kind)> {
         26 => (4, 1, Kind::Line),
         27 => (5, 1, Kind::Line),
         28 => (6, 1, Kind::Line),
+        // Curved ones have more nodes, up to the fifth order.
         2 => (3, 2, Kind::Face(3)),
         9 => (6, 2, Kind::Face(3)),
         20 => (9, 2, Kind::Face(3)),
         21 => (10, 2, Kind::Face(3)),
+        22 => (12, 2, Kind::Face(3)),
+        23 => (15, 2, Kind::Face(3)),
+        24 => (15, 2, Kind::Face(3)),
+        25 => (21, 2, Kind::Face(3)),
         3 => (4, 2, Kind::Face(4)),
         10 => (9, 2, Kind::Face(4)),
         16 => (8, 2, Kind::Face(4)),
+        36 => (16, 2, Kind::Face(4)),
+        37 => (25, 2, Kind::Face(4)),
+        38 => (36, 2, Kind::Face(4)),
+        39 => (12, 2, Kind::Face(4)),
         4 => (4, 3, Kind::Cell(Tetrahedron)),
         11 => (10, 3, Kind::Cell(Tetrahedron)),
         29 => (20, 3, Kind::Cell(Tetrahedron)),
+        30 => (35, 3, Kind::Cell(Tetrahedron)),
+        31 => (56, 3, Kind::Cell(Tetrahedron)),
         5 => (8, 3, Kind::Cell(Hexahedron)),
         12 => (27, 3, Kind::Cell(Hexahedron)),
         17 => (20, 3, Kind::Cell(Hexahedron)),
+        92 => (64, 3, Kind::Cell(Hexahedron)),
+        93 => (125, 3, Kind::Cell(Hexahedron)),
         6 => (6, 3, Kind::Cell(Prism)),
         13 => (18, 3, Kind::Cell(Prism)),
         18 => (15, 3, Kind::Cell(Prism)),
+        90 => (40, 3, Kind::Cell(Prism)),
+        91 => (75, 3, Kind::Cell(Prism)),
         7 => (5, 3, Kind::Cell(Pyramid)),
         14 => (14, 3, Kind::Cell(Pyramid)),
         19 => (13, 3, Kind::Cell(Pyramid)),
+        118 => (30, 3, Kind::Cell(Pyramid)),
+        119 => (55, 3, Kind::Cell(Pyramid)),
         _ => return None,
     })
 }
@@ -79,6 +97,8 @@ pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), Mesh
         names: BTreeMap::new(),
         physical: BTreeMap::new(),
     };
+    // An element of several physical groups is there once for each of them.
+    file.draft.drops_repeated = true;
     let mut version = 1.0;
     let (mut has_nodes, mut has_elements) = (false, false);
     while let Some(word) = file.source.word() {

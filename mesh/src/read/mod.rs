@@ -5,8 +5,10 @@ mod gltf;
 mod gmsh;
 mod obj;
 mod ply;
+mod polygon;
 mod source;
 mod stl;
+mod volume;
 mod vtk;
 mod vtk_xml;
 
@@ -60,7 +62,7 @@ impl Format {
             |mark: &str| text.get(..mark.len()).is_some_and(|start| start.eq_ignore_ascii_case(mark.as_bytes()));
         if bytes.starts_with(b"glTF") || text.starts_with(b"{") {
             Some(Format::Gltf)
-        } else if bytes.starts_with(b"ply\n") || bytes.starts_with(b"ply\r") {
+        } else if starts("ply\n") || starts("ply\r") || starts("ply ") {
             Some(Format::Ply)
         } else if starts("# vtk DataFile") {
             Some(Format::Vtk)
@@ -90,6 +92,20 @@ impl Format {
     }
 }
 
+/// The bytes after a byte order mark, which says that a text is UTF-8.
+fn without_mark(bytes: &[u8]) -> &[u8] {
+    bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)
+}
+
+/// Whether a file is UTF-16: it has the byte order mark of that, or begins with Latin letters of two bytes each.
+fn is_utf16(bytes: &[u8]) -> bool {
+    let is_wide = |zero: usize| {
+        let pairs = bytes.get(..16).map(|bytes| bytes.chunks_exact(2));
+        pairs.is_some_and(|mut pairs| pairs.all(|pair| pair[zero] == 0 && matches!(pair[1 - zero], 9..=13 | 32..=126)))
+    };
+    bytes.starts_with(b"\xff\xfe") || bytes.starts_with(b"\xfe\xff") || is_wide(0) || is_wide(1)
+}
+
 /// Reads a mesh file. The content decides the format, then the extension of `name`. Vertices keep the numbers of the file,
 /// from 0, unless a note tells otherwise. `neighbours` gives the content of a file in the same folder by its bare name.
 ///
@@ -107,6 +123,13 @@ pub fn read(
     if bytes.len() > limits.bytes {
         return Err(fail(Problem::TooLarge { what: "bytes", limit: limits.bytes }));
     }
+    // A binary STL file may begin with anything.
+    let is_free = stl::is_binary(bytes);
+    if !is_free && is_utf16(bytes) {
+        let message = "the text is UTF-16, which no mesh format is: save it as ASCII or UTF-8".to_owned();
+        return Err(fail(Problem::Unsupported { message }));
+    }
+    let bytes = if is_free { bytes } else { without_mark(bytes) };
     let by_name = Format::of_extension(name);
     let format = Format::of_content(bytes).or(by_name).ok_or_else(|| fail(Problem::UnknownFormat))?;
     let mut draft = Draft::new(limits);

@@ -3,7 +3,7 @@
 //! No crate is used: they number vertices anew in each object and say no line.
 
 use super::draft::Draft;
-use super::source::{Source, named, parsed, shown};
+use super::source::{Source, named, parsed, shown, words};
 use crate::{MeshError, Problem};
 
 /// Names of one `g` line that count.
@@ -14,6 +14,19 @@ fn resolved(index: i64, count: usize) -> i64 {
     if index < 0 { index.saturating_add(i64::try_from(count).unwrap_or(i64::MAX)) } else { index - 1 }
 }
 
+/// Whether a backslash at the end of a line is its last letter, rather than that the line goes on: it may be of a path.
+fn ends_with_path(line: &[u8]) -> bool {
+    let keyword = words(line).next().unwrap_or_default();
+    keyword.starts_with(b"#")
+        || keyword.starts_with(b"$")
+        || [&b"mtllib"[..], b"maplib", b"usemtl", b"usemap", b"o"].iter().any(|text| keyword.eq_ignore_ascii_case(text))
+}
+
+/// The line without the spaces at its end and the backslash that continues it, if it goes on.
+fn continued(line: &[u8]) -> Option<&[u8]> {
+    line.trim_ascii_end().strip_suffix(b"\\").filter(|_| !ends_with_path(line))
+}
+
 pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), MeshError> {
     let mut places: Vec<[f32; 2]> = Vec::new();
     let (mut group, mut object, mut material): (Vec<usize>, Option<usize>, Option<usize>) = (Vec::new(), None, None);
@@ -22,10 +35,9 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
     let mut ignored = 0_usize;
     let mut joined: Vec<u8>;
     while let Some(mut line) = source.line() {
-        // A backslash at its end continues a line.
-        if line.ends_with(b"\\") {
+        if continued(line).is_some() {
             joined = Vec::new();
-            while let Some(part) = line.strip_suffix(b"\\") {
+            while let Some(part) = continued(line) {
                 joined.extend_from_slice(part);
                 joined.push(b' ');
                 line = source.line().unwrap_or_default();
@@ -34,28 +46,27 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
             line = &joined;
         }
         let line = line.split(|byte| *byte == b'#').next().unwrap_or_default();
-        let mut words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+        let mut words = words(line);
         let Some(keyword) = words.next() else { continue };
-        match keyword {
+        match keyword.to_ascii_lowercase().as_slice() {
             b"v" => {
                 let mut at = [0.0; 3];
                 for coordinate in &mut at {
-                    *coordinate = words
-                        .next()
-                        .and_then(parsed)
-                        .ok_or_else(|| source.syntax("a vertex needs three numbers: v x y z"))?;
+                    let word = words.next().ok_or_else(|| source.syntax("a vertex needs three numbers: v x y z"))?;
+                    *coordinate = parsed(word).ok_or_else(|| source.no_number(word, "a coordinate"))?;
                 }
                 draft.vertex(at).map_err(|problem| source.fail(problem))?;
             }
             b"vt" => {
-                let mut part = || words.next().and_then(parsed::<f32>);
-                let u = part().ok_or_else(|| source.syntax("texture coordinates are numbers: vt u v"))?;
-                places.push([u, part().unwrap_or(0.0)]);
+                let u = words.next().ok_or_else(|| source.syntax("texture coordinates are numbers: vt u v"))?;
+                let u = parsed(u).ok_or_else(|| source.no_number(u, "a texture coordinate"))?;
+                places.push([u, words.next().map_or(0.0, |v| parsed(v).unwrap_or(f32::NAN))]);
             }
-            b"f" => {
+            // `fo` is the same in old files.
+            b"f" | b"fo" => {
                 corners.clear();
                 uv.clear();
-                for word in words {
+                for word in words.take_while(|word| !word.starts_with(b"$")) {
                     let mut parts = word.split(|byte| *byte == b'/');
                     let index: i64 = parts.next().and_then(parsed).ok_or_else(|| {
                         source.syntax(format!("`{}` is no corner of a face: f 1 2 3 or f 1/1 2/2 3/3", shown(word)))
@@ -80,7 +91,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
             }
             b"g" | b"o" | b"usemtl" => {
                 let mut names = Vec::new();
-                if keyword == b"g" {
+                if keyword.eq_ignore_ascii_case(b"g") {
                     for name in words.take(NAMES) {
                         names.push(draft.group(&named(name)).map_err(|problem| source.fail(problem))?);
                     }
@@ -89,7 +100,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                     let name = named(&line[keyword.len() + line.len() - line.trim_ascii_start().len()..]);
                     let found = if name.is_empty() { None } else { Some(draft.group(&name)) };
                     let found = found.transpose().map_err(|problem| source.fail(problem))?;
-                    *if keyword == b"o" { &mut object } else { &mut material } = found;
+                    *if keyword.eq_ignore_ascii_case(b"o") { &mut object } else { &mut material } = found;
                 }
                 active = group.iter().copied().chain(object).chain(material).collect();
                 active.sort_unstable();
@@ -98,7 +109,8 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
             b"l" | b"p" => draft.lines += 1,
             b"vn" | b"vp" | b"s" | b"mtllib" | b"usemap" | b"maplib" | b"lod" | b"mg" => {}
             b"curv" | b"curv2" | b"surf" | b"bzp" | b"bsp" => ignored += 1,
-            _ if keyword.iter().all(u8::is_ascii_alphabetic) => {}
+            // Some programs begin comments with a dollar sign.
+            _ if keyword.starts_with(b"$") || keyword.iter().all(u8::is_ascii_alphabetic) => {}
             _ => return Err(source.syntax(format!("`{}` is no keyword of OBJ", shown(keyword)))),
         }
     }

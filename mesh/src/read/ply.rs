@@ -1,10 +1,11 @@
-//! PLY, text and binary of both byte orders.
+//! PLY, text and binary of both byte orders. In text, an element is a row of its own, as the format has it: columns that the
+//! header does not name are left out, and a row without enough of them is refused.
 //!
 //! `ply-rs-bw` is not used: it allocates what a header counts and panics at a count that is too long.
 
 use super::draft::Draft;
-use super::source::{Order, Scalar, Source, named, parsed, shown};
-use crate::{Element as Place, MeshError};
+use super::source::{Order, Scalar, Source, named, parsed, shown, words};
+use crate::{Element as Place, MeshError, Problem};
 
 /// How the numbers of a file are written; `None` is text.
 type Encoding = Option<Order>;
@@ -33,6 +34,8 @@ fn scalar(word: &[u8]) -> Option<Scalar> {
         b"ushort" | b"uint16" => Scalar::U16,
         b"int" | b"int32" => Scalar::I32,
         b"uint" | b"uint32" => Scalar::U32,
+        b"int64" => Scalar::I64,
+        b"uint64" => Scalar::U64,
         b"float" | b"float32" => Scalar::F32,
         b"double" | b"float64" => Scalar::F64,
         _ => return None,
@@ -44,7 +47,7 @@ fn header(source: &mut Source<'_>) -> Result<(Encoding, Vec<Element>), MeshError
     let mut elements: Vec<Element> = Vec::new();
     loop {
         let line = source.line().ok_or_else(|| source.truncated("`end_header`"))?;
-        let words: Vec<&[u8]> = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty()).collect();
+        let words: Vec<&[u8]> = words(line).collect();
         match words.as_slice() {
             [] | [b"ply" | b"comment" | b"obj_info", ..] => {}
             [b"end_header"] => break,
@@ -90,86 +93,206 @@ fn real(source: &mut Source<'_>, scalar: Scalar, encoding: Encoding, what: &str)
 #[allow(clippy::cast_possible_truncation)]
 fn integer(source: &mut Source<'_>, scalar: Scalar, encoding: Encoding, what: &str) -> Result<i64, MeshError> {
     match encoding {
-        // Some programs write indices as 3.0.
-        None => Ok(source.number::<f64>(what)? as i64),
+        None => {
+            // Some programs write indices as 3.0.
+            let number: f64 = source.number(what)?;
+            if number.fract() != 0.0 {
+                return Err(source.syntax(format!("`{number}` is no whole number: {what} is expected")));
+            }
+            Ok(number as i64)
+        }
         Some(order) => source.integer(scalar, order, what),
     }
 }
 
-#[allow(clippy::cast_possible_truncation)]
+/// What an element is for.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Role {
+    Vertex,
+    Face,
+    Strips,
+    Edge,
+    /// It is left out.
+    Other,
+}
+
+impl Element {
+    fn role(&self) -> Role {
+        match self.name.as_str() {
+            "vertex" => Role::Vertex,
+            "face" => Role::Face,
+            "tristrips" => Role::Strips,
+            "edge" => Role::Edge,
+            _ => Role::Other,
+        }
+    }
+
+    /// What its role needs and it does not have.
+    fn missing(&self) -> Option<&'static str> {
+        let lacks = |name: &&str| !self.properties.iter().any(|own| own.count.is_none() && own.name == **name);
+        match self.role() {
+            Role::Vertex => ["x", "y", "z"].into_iter().find(lacks),
+            Role::Face | Role::Strips => self.corners().is_none().then_some("vertex_indices"),
+            Role::Edge | Role::Other => None,
+        }
+    }
+
+    /// Which property lists the vertices: the one of that name, or the only list.
+    fn corners(&self) -> Option<usize> {
+        let is_named = |own: &Property| ["vertex_indices", "vertex_index"].contains(&own.name.as_str());
+        let lists = || self.properties.iter().enumerate().filter(|(_, own)| own.count.is_some());
+        let only = || lists().nth(1).is_none().then(|| lists().next()).flatten();
+        lists().find(|(_, own)| is_named(own)).or_else(only).map(|(place, _)| place)
+    }
+}
+
+/// The next row of a table in text. Comments belong into the header, but may be here.
+fn next_row<'a>(source: &mut Source<'a>) -> Option<Source<'a>> {
+    loop {
+        let row = source.row()?;
+        if !matches!(row.peek(), Some(b"comment" | b"obj_info")) {
+            return Some(row);
+        }
+    }
+}
+
+/// The numbers of one row that count here.
+#[derive(Default)]
+struct Row {
+    at: [f64; 3],
+    /// Of a vertex.
+    uv: [f32; 2],
+    corners: Vec<i64>,
+    /// Of the corners.
+    corner_uv: Vec<[f32; 2]>,
+}
+
+impl Row {
+    /// Reads the properties of an element; its lists of corners are in property number `corners`.
+    #[allow(clippy::cast_possible_truncation)]
+    fn read(
+        &mut self,
+        source: &mut Source<'_>,
+        element: &Element,
+        corners: Option<usize>,
+        encoding: Encoding,
+    ) -> Result<(), MeshError> {
+        self.corners.clear();
+        self.corner_uv.clear();
+        for (place, property) in element.properties.iter().enumerate() {
+            let Some(of_count) = property.count else {
+                let value = real(source, property.scalar, encoding, &property.name)?;
+                match property.name.as_str() {
+                    "x" => self.at[0] = value,
+                    "y" => self.at[1] = value,
+                    "z" => self.at[2] = value,
+                    "s" | "u" | "texture_u" => self.uv[0] = value as f32,
+                    "t" | "v" | "texture_v" => self.uv[1] = value as f32,
+                    _ => {}
+                }
+                continue;
+            };
+            let length = integer(source, of_count, encoding, "the length of a list")?;
+            let bytes = if encoding.is_some() { property.scalar.size() } else { 2 };
+            let length = source.count(length, bytes, "entries of a list")?;
+            let is_uv = property.name == "texcoord";
+            let mut first = 0.0;
+            for entry in 0..length {
+                if corners == Some(place) {
+                    self.corners.push(integer(source, property.scalar, encoding, "a vertex of a face")?);
+                    continue;
+                }
+                let value = real(source, property.scalar, encoding, "an entry of a list")? as f32;
+                match entry % 2 {
+                    0 => first = value,
+                    _ if is_uv => self.corner_uv.push([first, value]),
+                    _ => {}
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
 pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), MeshError> {
     let (encoding, elements) = header(&mut source)?;
     source.is_binary = encoding.is_some();
     // Texture coordinates of the vertices, if they have any.
     let mut uv_of: Vec<[f32; 2]> = Vec::new();
-    let (mut corners, mut list, mut uv) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut row, mut wider) = (Row::default(), 0_usize);
     for element in &elements {
         if element.properties.is_empty() {
             continue;
         }
-        // What a record takes at least, in text a digit and a space for each number.
+        if let Some(property) = element.missing().filter(|_| element.count != 0) {
+            return Err(source.syntax(format!("the element `{}` has no property `{property}`", element.name)));
+        }
+        // What a row takes at least, in text a digit and a space for each number.
         let least = |property: &Property| match encoding {
             None => 2,
             Some(_) => property.count.unwrap_or(property.scalar).size(),
         };
         let bytes = element.properties.iter().map(least).sum();
         let count = source.count(element.count, bytes, &element.name)?;
-        let (is_vertex, is_face) = (element.name == "vertex", element.name == "face");
-        let has_uv = is_vertex && element.properties.iter().any(|p| ["s", "u", "texture_u"].contains(&p.name.as_str()));
-        if element.name == "tristrips" {
-            draft.notes.push("Triangle strips are left out: export triangles instead.".to_owned());
-        }
-        for number in 0..count {
-            let (mut at, mut place) = ([f64::NAN; 3], [0.0_f32; 2]);
-            corners.clear();
-            uv.clear();
-            for property in &element.properties {
-                if let Some(of_count) = property.count {
-                    let length = integer(&mut source, of_count, encoding, "the length of a list")?;
-                    let bytes = if encoding.is_some() { property.scalar.size() } else { 2 };
-                    let length = source.count(length, bytes, "entries of a list")?;
-                    let is_corners = is_face && ["vertex_indices", "vertex_index"].contains(&property.name.as_str());
-                    list.clear();
-                    for _ in 0..length {
-                        if is_corners {
-                            corners.push(integer(&mut source, property.scalar, encoding, "a vertex of a face")?);
-                        } else {
-                            list.push(real(&mut source, property.scalar, encoding, "an entry of a list")? as f32);
-                        }
-                    }
-                    if is_face && property.name == "texcoord" {
-                        uv.extend(list.chunks_exact(2).map(|pair| [pair[0], pair[1]]));
-                    }
-                } else {
-                    let value = real(&mut source, property.scalar, encoding, &property.name)?;
-                    match property.name.as_str() {
-                        "x" => at[0] = value,
-                        "y" => at[1] = value,
-                        "z" => at[2] = value,
-                        "s" | "u" | "texture_u" => place[0] = value as f32,
-                        "t" | "v" | "texture_v" => place[1] = value as f32,
-                        _ => {}
-                    }
+        let (role, corners) = (element.role(), element.corners());
+        let has_uv = element.properties.iter().any(|p| ["s", "u", "texture_u"].contains(&p.name.as_str()));
+        for number in 0..count as u64 {
+            if encoding.is_some() {
+                row.read(&mut source, element, corners, encoding)?;
+            } else {
+                let mut line = next_row(&mut source)
+                    .ok_or_else(|| source.truncated(format!("row {number} of {count} of `{}`", element.name)))?;
+                row.read(&mut line, element, corners, encoding)?;
+                let is_wider = line.word().is_some();
+                // As of a row that does not begin with the length of its list.
+                if is_wider && role == Role::Face && row.corners.len() < 3 {
+                    return Err(line.syntax(format!(
+                        "a face of {} vertices in a longer row: the length of its list is wrong, or a count of the header",
+                        row.corners.len()
+                    )));
                 }
+                wider += usize::from(is_wider);
             }
-            let number = number as u64;
-            if is_vertex {
-                draft.vertex(at).map_err(|problem| source.fail(problem))?;
-                if has_uv {
-                    uv_of.push(place);
+            let of_vertex = |corner: &i64| uv_of.get(usize::try_from(*corner).ok()?).copied();
+            if row.corner_uv.len() != row.corners.len() {
+                row.corner_uv.clear();
+                row.corner_uv.extend(row.corners.iter().filter_map(of_vertex));
+            }
+            let fail = |problem| source.fail_at(Place::Face(number), problem);
+            match role {
+                Role::Vertex => {
+                    draft.vertex(row.at).map_err(|problem| source.fail(problem))?;
+                    if has_uv {
+                        uv_of.push(row.uv);
+                    }
                 }
-            } else if is_face {
-                let of_vertex = |corner: &i64| uv_of.get(usize::try_from(*corner).ok()?).copied();
-                if uv.len() != corners.len() {
-                    uv.clear();
-                    uv.extend(corners.iter().filter_map(of_vertex));
-                }
-                let fail = |problem| source.fail_at(Place::Face(number), problem);
-                draft.polygon(&corners, &uv, &[]).map_err(fail)?;
-            } else if element.name == "edge" {
-                draft.lines += 1;
+                Role::Face => draft.polygon(&row.corners, &row.corner_uv, &[]).map_err(fail)?,
+                Role::Strips => strips(&row.corners, &uv_of, draft).map_err(fail)?,
+                Role::Edge => draft.lines += 1,
+                Role::Other => {}
             }
         }
+    }
+    if encoding.is_none()
+        && let Some(line) = next_row(&mut source)
+    {
+        // Else rows of one element could have been taken for those of another.
+        let counts: Vec<String> = elements.iter().map(|own| format!("{} of `{}`", own.count, own.name)).collect();
+        return Err(line.syntax(format!("a row more than the header counts: {}", counts.join(", "))));
+    }
+    if wider > 0 {
+        draft.notes.push(format!("Rows with columns that the header does not name, which are left out: {wider}."));
+    }
+    Ok(())
+}
+
+/// Adds strips of triangles. Where the vertex is −1, a new one begins; unsigned, that is the largest number.
+fn strips(corners: &[i64], uv_of: &[[f32; 2]], draft: &mut Draft<'_>) -> Result<(), Problem> {
+    let is_end = |corner: &i64| *corner == -1 || *corner == i64::from(u32::MAX);
+    for strip in corners.split(is_end) {
+        let of_vertex = |corner: &i64| uv_of.get(usize::try_from(*corner).ok()?).copied();
+        let uv: Vec<[f32; 2]> = strip.iter().filter_map(of_vertex).collect();
+        draft.strip(strip, &uv)?;
     }
     Ok(())
 }

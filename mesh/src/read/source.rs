@@ -78,11 +78,18 @@ pub(super) struct Source<'a> {
     at: usize,
     /// Whether messages give bytes rather than lines.
     pub(super) is_binary: bool,
+    /// Whether its first line ends in a carriage return alone. A line feed after one then belongs to what follows, which may be
+    /// binary.
+    ends_by_return: bool,
+    /// Whether it is one row of a table rather than a file.
+    is_row: bool,
 }
 
 impl<'a> Source<'a> {
     pub(super) fn new(file: &'a str, bytes: &'a [u8]) -> Self {
-        Self { file, bytes, at: 0, is_binary: false }
+        let end = bytes.iter().position(is_line_end).map_or(&[][..], |end| &bytes[end..]);
+        let ends_by_return = end.starts_with(b"\r") && !end.starts_with(b"\r\n");
+        Self { file, bytes, at: 0, is_binary: false, ends_by_return, is_row: false }
     }
 
     /// The bytes that are not read yet.
@@ -95,10 +102,14 @@ impl<'a> Source<'a> {
         let element = if self.is_binary {
             Element::Byte(self.at as u64)
         } else {
-            // What was read last ends here; its line counts, not the one that begins.
-            let read = &self.bytes[..self.at];
-            let read = read.strip_suffix(b"\n").unwrap_or(read);
-            Element::Line(1 + read.iter().filter(|byte| **byte == b'\n').count() as u64)
+            // What was read last ends here; its line counts, not the one that begins. A row is the last line of its bytes.
+            let end = if self.is_row { self.bytes.len() } else { self.at };
+            let mut source = Source { bytes: &self.bytes[..end], at: 0, ..self.clone() };
+            let mut line = 0;
+            while source.line().is_some() {
+                line += 1;
+            }
+            Element::Line(line.max(1))
         };
         self.fail_at(element, problem)
     }
@@ -112,39 +123,66 @@ impl<'a> Source<'a> {
     }
 
     pub(super) fn truncated(&self, missing: impl Into<String>) -> MeshError {
-        self.fail(Problem::Truncated { missing: missing.into() })
+        let missing = missing.into();
+        if self.is_row {
+            return self.syntax(format!("the row ends early: {missing} is missing"));
+        }
+        self.fail(Problem::Truncated { missing })
     }
 
-    /// The next line without its end; `None` at the end of the file.
+    /// The next line without its end, which is a line feed, a carriage return, or both; `None` at the end of the file.
     pub(super) fn line(&mut self) -> Option<&'a [u8]> {
         let rest = self.rest();
         if rest.is_empty() {
             return None;
         }
-        let end = rest.iter().position(|byte| *byte == b'\n');
-        self.at += end.map_or(rest.len(), |end| end + 1);
-        let line = &rest[..end.unwrap_or(rest.len())];
-        Some(line.strip_suffix(b"\r").unwrap_or(line))
+        let Some(end) = rest.iter().position(is_line_end) else {
+            self.at = self.bytes.len();
+            return Some(rest);
+        };
+        let is_pair = !self.ends_by_return && rest[end..].starts_with(b"\r\n");
+        self.at += end + 1 + usize::from(is_pair);
+        Some(&rest[..end])
     }
 
-    /// The next characters up to white space; `None` at the end of the file.
+    /// The next line that has a word, as a source of its own; `None` at the end of the file.
+    pub(super) fn row(&mut self) -> Option<Source<'a>> {
+        loop {
+            let at = self.at;
+            let line = self.line()?;
+            if words(line).next().is_some() {
+                return Some(Source { bytes: &self.bytes[..at + line.len()], at, is_row: true, ..self.clone() });
+            }
+        }
+    }
+
+    /// The next characters up to a space or the end of a line; `None` at the end of the file.
     pub(super) fn word(&mut self) -> Option<&'a [u8]> {
         let rest = self.rest();
-        let start = rest.iter().position(|byte| !byte.is_ascii_whitespace());
-        let Some(start) = start else {
+        let Some(start) = rest.iter().position(|byte| !is_space(byte)) else {
             self.at = self.bytes.len();
             return None;
         };
         let word = &rest[start..];
-        let end = word.iter().position(u8::is_ascii_whitespace).unwrap_or(word.len());
+        let end = word.iter().position(is_space).unwrap_or(word.len());
         self.at += start + end;
         Some(&word[..end])
+    }
+
+    /// The word that `word` would return.
+    pub(super) fn peek(&self) -> Option<&'a [u8]> {
+        self.clone().word()
     }
 
     /// The next word, read as a number.
     pub(super) fn number<T: std::str::FromStr>(&mut self, what: &str) -> Result<T, MeshError> {
         let word = self.word().ok_or_else(|| self.truncated(what))?;
-        parsed(word).ok_or_else(|| self.syntax(format!("`{}` is no number: {what} is expected", shown(word))))
+        parsed(word).ok_or_else(|| self.no_number(word, what))
+    }
+
+    /// The error of a word in the place of a number.
+    pub(super) fn no_number(&self, word: &[u8], what: &str) -> MeshError {
+        self.fail(no_number(word, what))
     }
 
     /// The next `count` bytes.
@@ -173,6 +211,33 @@ impl<'a> Source<'a> {
         }
         Ok(count)
     }
+}
+
+fn is_line_end(byte: &u8) -> bool {
+    matches!(byte, b'\n' | b'\r')
+}
+
+/// Whether a byte separates words: white space, and the NUL and Ctrl-Z by which some programs end texts.
+fn is_space(byte: &u8) -> bool {
+    byte.is_ascii_whitespace() || matches!(byte, 0 | 0x0b | 0x1a)
+}
+
+/// The words of a line.
+pub(super) fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> {
+    line.split(is_space).filter(|word| !word.is_empty())
+}
+
+/// What is wrong with a word in the place of a number.
+pub(super) fn no_number(word: &[u8], what: &str) -> Problem {
+    let text = shown(word);
+    // 0,5 and 1.234,5: some programs write numbers as people do.
+    let parts = text.rsplit_once(',').filter(|(_, part)| part.starts_with(|digit: char| digit.is_ascii_digit()));
+    let pointed = parts.map(|(whole, part)| format!("{}.{part}", whole.replace('.', "")));
+    let message = match pointed.filter(|pointed| pointed.parse::<f64>().is_ok()) {
+        Some(pointed) => format!("`{text}` has a decimal comma: export the file with decimal points, here {pointed}"),
+        None => format!("`{text}` is no number: {what} is expected"),
+    };
+    Problem::Syntax { message }
 }
 
 /// A word as a number.

@@ -5,7 +5,7 @@
 use std::collections::HashMap;
 
 use super::draft::Draft;
-use super::source::{Order, Scalar, Source};
+use super::source::{Order, Scalar, Source, parsed, shown, words};
 use crate::{Element, MeshError, Problem};
 
 /// Bytes before the triangles of a binary file, and of each triangle.
@@ -17,6 +17,20 @@ pub(super) fn is_binary(bytes: &[u8]) -> bool {
     let Some(count) = bytes.get(80..HEADER) else { return false };
     let count = u64::try_from(Scalar::U32.integer(count, Order::Little)).unwrap_or(0);
     bytes.len() as u64 == HEADER as u64 + TRIANGLE as u64 * count
+}
+
+/// Whether a file that begins with "solid" is text. Binary ones may begin so, too, and have more or fewer bytes than they
+/// count; then no keyword follows, and the first byte of a count below 2²⁴ is 0.
+fn is_text(bytes: &[u8]) -> bool {
+    let starts =
+        |word: &[u8], text: &str| word.get(..text.len()).is_some_and(|s| s.eq_ignore_ascii_case(text.as_bytes()));
+    let mut source = Source::new("", bytes);
+    if !source.word().is_some_and(|word| starts(word, "solid")) {
+        return false;
+    }
+    source.line();
+    let next = source.word().unwrap_or_default();
+    starts(next, "facet") || starts(next, "end") || bytes.get(83) != Some(&0)
 }
 
 /// Vertices by the bits of their positions.
@@ -44,10 +58,9 @@ impl Welder<'_, '_> {
 
 pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), MeshError> {
     let bytes = source.rest();
-    let is_text = bytes.trim_ascii_start().get(..5).is_some_and(|start| start.eq_ignore_ascii_case(b"solid"));
     let mut welder = Welder { draft, numbers: HashMap::new() };
     let triangles =
-        if is_binary(bytes) || !is_text { binary(source, &mut welder)? } else { text(source, &mut welder)? };
+        if is_binary(bytes) || !is_text(bytes) { binary(source, &mut welder)? } else { text(source, &mut welder)? };
     let vertices = draft.vertices();
     draft.notes.push(format!(
         "Corners of triangles welded by their exact positions: {} became {vertices} vertices, numbered from 0 as they first \
@@ -84,14 +97,20 @@ fn text(mut source: Source<'_>, welder: &mut Welder<'_, '_>) -> Result<usize, Me
     let (mut triangles, mut is_open) = (0, true);
     while let Some(line) = source.line() {
         // By lines, since the names after `solid` and `endsolid` may be anything.
-        let mut words = line.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+        let mut words = words(line);
         let Some(keyword) = words.next() else { continue };
-        match keyword.to_ascii_lowercase().as_slice() {
+        let mut keyword = keyword.to_ascii_lowercase();
+        if keyword == b"end" {
+            // Some programs write `end solid`.
+            keyword.extend(words.next().unwrap_or_default().to_ascii_lowercase());
+        }
+        match keyword.as_slice() {
             b"vertex" => {
                 let mut at = [0.0; 3];
                 for coordinate in &mut at {
-                    let word = words.next().and_then(super::source::parsed);
-                    *coordinate = word.ok_or_else(|| source.syntax("a vertex needs three numbers: vertex x y z"))?;
+                    let missing = || source.syntax("a vertex needs three numbers: vertex x y z");
+                    let word = words.next().ok_or_else(missing)?;
+                    *coordinate = parsed(word).ok_or_else(|| source.no_number(word, "a coordinate"))?;
                 }
                 corners.push(welder.vertex(at).map_err(|problem| source.fail(problem))?);
             }
@@ -106,11 +125,13 @@ fn text(mut source: Source<'_>, welder: &mut Welder<'_, '_>) -> Result<usize, Me
             b"facet" if !corners.is_empty() => return Err(source.syntax("`endfacet` is missing before this facet")),
             b"solid" => is_open = true,
             b"endsolid" => is_open = false,
-            b"facet" | b"outer" | b"endloop" => {}
-            _ => return Err(source.syntax(format!("`{}` is no keyword of STL", super::source::shown(keyword)))),
+            b"facet" | b"outer" | b"outerloop" | b"endloop" => {}
+            _ => return Err(source.syntax(format!("`{}` is no keyword of STL", shown(&keyword)))),
         }
     }
-    if is_open || !corners.is_empty() {
+    if is_open && corners.is_empty() && welder.draft.is_closed() {
+        welder.draft.notes.push("`endsolid` is missing; the surface is closed, so that nothing else is.".to_owned());
+    } else if is_open || !corners.is_empty() {
         return Err(source.truncated("`endsolid`"));
     }
     Ok(triangles)

@@ -2,21 +2,22 @@
 //!
 //! `vtkio` is not used: it reserves what a file counts, unpacks without bound and says no element.
 
-use super::draft::{Cell, Draft};
-use super::source::{Order, Scalar, Source, shown};
+use super::draft::Draft;
+use super::source::{Order, Scalar, Source, shown, words};
+use super::volume::Cell;
 use crate::{Element, MeshError, Problem};
 
 fn scalar(word: &[u8]) -> Option<Scalar> {
     Some(match word.to_ascii_lowercase().as_slice() {
-        b"char" => Scalar::I8,
-        b"unsigned_char" => Scalar::U8,
-        b"short" => Scalar::I16,
-        b"unsigned_short" => Scalar::U16,
+        b"char" | b"signed_char" | b"vtktypeint8" => Scalar::I8,
+        b"unsigned_char" | b"vtktypeuint8" => Scalar::U8,
+        b"short" | b"vtktypeint16" => Scalar::I16,
+        b"unsigned_short" | b"vtktypeuint16" => Scalar::U16,
         // Identifiers are written as `int`, whatever they are in memory.
-        b"int" | b"vtkidtype" => Scalar::I32,
-        b"unsigned_int" => Scalar::U32,
-        b"long" | b"vtktypeint64" => Scalar::I64,
-        b"unsigned_long" | b"vtktypeuint64" => Scalar::U64,
+        b"int" | b"vtkidtype" | b"vtktypeint32" => Scalar::I32,
+        b"unsigned_int" | b"vtktypeuint32" => Scalar::U32,
+        b"long" | b"long_long" | b"vtktypeint64" => Scalar::I64,
+        b"unsigned_long" | b"unsigned_long_long" | b"vtktypeuint64" => Scalar::U64,
         b"float" => Scalar::F32,
         b"double" => Scalar::F64,
         _ => return None,
@@ -71,7 +72,7 @@ impl Faces {
         for (number, list) in self.strips.lists() {
             corners.clear();
             corners.extend(list.map_err(|problem| fail(number, problem))?.iter().map(|at| at.saturating_add(first)));
-            strip(&corners, draft).map_err(|problem| fail(number, problem))?;
+            draft.strip(&corners, &[]).map_err(|problem| fail(number, problem))?;
         }
         for ((number, list), kind) in self.grid.lists().zip(&self.types) {
             corners.clear();
@@ -84,15 +85,6 @@ impl Faces {
         }
         Ok(())
     }
-}
-
-/// Adds a strip of triangles, every other one of which is the other way round.
-fn strip(corners: &[i64], draft: &mut Draft<'_>) -> Result<(), Problem> {
-    for (number, three) in corners.windows(3).enumerate() {
-        let triangle = if number % 2 == 0 { [three[0], three[1], three[2]] } else { [three[1], three[0], three[2]] };
-        draft.polygon(&triangle, &[], &[])?;
-    }
-    Ok(())
 }
 
 /// Adds a cell of a type of VTK.
@@ -111,19 +103,21 @@ fn cell(kind: i64, corners: &mut [i64], draft: &mut Draft<'_>) -> Result<(), Pro
             corners.swap(2, 3);
             face(corners, 4)
         }
-        22 => face(corners, 3),
-        23 => face(corners, 4),
-        6 => strip(corners, draft),
-        10 | 24 => draft.cell(Cell::Tetrahedron, corners, &[]),
+        22 | 34 | 69 | 76 => face(corners, 3),
+        23 | 28 | 30 | 70 | 77 => face(corners, 4),
+        // Of a polygon with curved sides, the corners come first.
+        36 => face(corners, corners.len() / 2),
+        6 => draft.strip(corners, &[]),
+        10 | 24 | 71 | 78 => draft.cell(Cell::Tetrahedron, corners, &[]),
         11 if corners.len() == 8 => {
             corners.swap(2, 3);
             corners.swap(6, 7);
             draft.cell(Cell::Hexahedron, corners, &[])
         }
-        12 | 25 => draft.cell(Cell::Hexahedron, corners, &[]),
-        13 | 26 => draft.cell(Cell::Prism, corners, &[]),
-        14 | 27 => draft.cell(Cell::Pyramid, corners, &[]),
-        1..=4 | 21 => {
+        12 | 25 | 29 | 33 | 72 | 79 => draft.cell(Cell::Hexahedron, corners, &[]),
+        13 | 26 | 31 | 32 | 73 | 80 => draft.cell(Cell::Prism, corners, &[]),
+        14 | 27 | 37 | 74 | 81 => draft.cell(Cell::Pyramid, corners, &[]),
+        0..=4 | 21 | 35 | 68 | 75 => {
             draft.lines += 1;
             Ok(())
         }
@@ -158,14 +152,14 @@ fn begin_data(source: &mut Source<'_>, is_binary: bool) {
 }
 
 /// The lists of a section: `n size` and each list after its length, or since version 5 offsets and connectivity.
-fn cells(source: &mut Source<'_>, is_binary: bool, is_new: bool) -> Result<Cells, MeshError> {
+fn cells(source: &mut Source<'_>, is_binary: bool) -> Result<Cells, MeshError> {
     let what = "lists of vertices";
     let count: i64 = source.number("the count of cells")?;
     let size: i64 = source.number("the size of cells")?;
     let mut cells = Cells::default();
-    if is_new {
+    if is_word(source.peek(), "OFFSETS") {
         for part in ["OFFSETS", "CONNECTIVITY"] {
-            if source.word() != Some(part.as_bytes()) {
+            if !is_word(source.word(), part) {
                 return Err(source.syntax(format!("`{part}` is expected")));
             }
             let kind = source.word().and_then(scalar).ok_or_else(|| source.syntax("a type of numbers is expected"))?;
@@ -173,8 +167,10 @@ fn cells(source: &mut Source<'_>, is_binary: bool, is_new: bool) -> Result<Cells
             let is_offsets = part == "OFFSETS";
             let list = integers(source, is_binary, if is_offsets { count } else { size }, kind, what)?;
             source.is_binary = false;
-            // The first offset is 0.
             *if is_offsets { &mut cells.ends } else { &mut cells.connectivity } = list;
+        }
+        if cells.ends.first().is_some_and(|first| *first != 0) {
+            return Err(source.syntax(format!("the first offset is {} instead of 0", cells.ends[0])));
         }
         cells.ends = cells.ends.split_off(1.min(cells.ends.len()));
         return Ok(cells);
@@ -197,53 +193,112 @@ fn cells(source: &mut Source<'_>, is_binary: bool, is_new: bool) -> Result<Cells
     Ok(cells)
 }
 
+/// Whether a word is a keyword, in capitals or not.
+fn is_word(word: Option<&[u8]>, keyword: &str) -> bool {
+    word.is_some_and(|word| word.eq_ignore_ascii_case(keyword.as_bytes()))
+}
+
 /// Skips `FIELD name n` and its arrays.
 fn skip_field(source: &mut Source<'_>, is_binary: bool) -> Result<(), MeshError> {
     source.word();
     let arrays: i64 = source.number("the count of arrays")?;
     for _ in 0..source.count(arrays, 8, "arrays")? {
+        while is_word(source.peek(), "METADATA") {
+            skip_metadata(source);
+        }
         let name = source.word().ok_or_else(|| source.truncated("an array"))?;
-        if name == b"METADATA" {
-            return Err(source.syntax("METADATA within a FIELD is not read: save the file without it"));
+        if !is_word(Some(name), "NULL_ARRAY") {
+            skip_array(source, is_binary)?;
         }
-        let components: i64 = source.number("the count of components")?;
-        let tuples: i64 = source.number("the count of tuples")?;
-        let kind = source.word().unwrap_or_default();
-        let Some(kind) = scalar(kind) else {
-            return Err(source.syntax(format!("arrays of `{}` are not read", shown(kind))));
-        };
-        let count = components.checked_mul(tuples).unwrap_or(i64::MAX);
-        begin_data(source, is_binary);
-        let count = source.count(count, if is_binary { kind.size() } else { 2 }, "numbers of an array")?;
-        if is_binary {
-            source.take(count * kind.size(), "an array")?;
-        } else {
-            for _ in 0..count {
-                source.word();
-            }
-        }
-        source.is_binary = false;
     }
     Ok(())
 }
 
+/// Skips a block METADATA: it ends with an empty line.
+fn skip_metadata(source: &mut Source<'_>) {
+    source.word();
+    source.line();
+    while source.line().is_some_and(|line| words(line).next().is_some()) {}
+}
+
+/// Skips an array of a field after its name: `components tuples type`, and then the values.
+fn skip_array(source: &mut Source<'_>, is_binary: bool) -> Result<(), MeshError> {
+    let components: i64 = source.number("the count of components")?;
+    let tuples: i64 = source.number("the count of tuples")?;
+    let kind = source.word().unwrap_or_default().to_ascii_lowercase();
+    let count = components.checked_mul(tuples).unwrap_or(i64::MAX);
+    let what = "values of an array";
+    match kind.as_slice() {
+        // Each has a line, with what is no letter written as %20.
+        b"string" | b"utf8_string" | b"variant" if !is_binary || kind == b"variant" => {
+            source.line();
+            for _ in 0..source.count(count, 1, what)? {
+                source.line();
+            }
+        }
+        b"string" | b"utf8_string" => {
+            begin_data(source, is_binary);
+            for _ in 0..source.count(count, 1, what)? {
+                skip_text(source)?;
+            }
+        }
+        b"bit" if is_binary => {
+            begin_data(source, is_binary);
+            // VTK packs all values, but writes a bit for each tuple only. What it writes ends a line.
+            let packed = |count: i64| usize::try_from(count / 8 + i64::from(count % 8 != 0)).unwrap_or(usize::MAX);
+            let ends = |bytes: &usize| source.rest().get(*bytes) == Some(&b'\n');
+            let bytes = Some(packed(tuples)).filter(|bytes| !ends(&packed(count)) && ends(bytes));
+            source.take(bytes.unwrap_or(packed(count)), what)?;
+        }
+        _ => {
+            let numbers = if kind == b"bit" { Some(Scalar::U8) } else { scalar(&kind) };
+            let numbers = numbers.ok_or_else(|| source.syntax(format!("arrays of `{}` are not read", shown(&kind))))?;
+            begin_data(source, is_binary);
+            let count = source.count(count, if is_binary { numbers.size() } else { 2 }, what)?;
+            if is_binary {
+                source.take(count * numbers.size(), what)?;
+            } else {
+                for _ in 0..count {
+                    source.word();
+                }
+            }
+        }
+    }
+    source.is_binary = false;
+    Ok(())
+}
+
+/// Skips a text of a binary file. The first two bits say of how many bytes its length is, from 3, one byte, to 0, eight.
+fn skip_text(source: &mut Source<'_>) -> Result<(), MeshError> {
+    let what = "a text of an array";
+    let first = source.rest().first().copied().ok_or_else(|| source.truncated(what))?;
+    let bytes = source.take(1 << (3 - (first >> 6)), what)?;
+    let length = bytes[1..].iter().fold(i64::from(first & 0x3f), |length, byte| length << 8 | i64::from(*byte));
+    let length = source.count(length, 1, "letters")?;
+    source.take(length, what)?;
+    Ok(())
+}
+
 pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), MeshError> {
-    let header = source.line().unwrap_or_default();
-    // Version 5 and later have offsets and connectivity apart.
-    let version = header.trim_ascii_end().rsplit(u8::is_ascii_whitespace).next().and_then(super::source::parsed::<f64>);
-    let is_new = version.is_some_and(|version| version >= 5.0);
+    // The first line has the version; lists tell by themselves which one they are of.
+    source.line();
     source.line().ok_or_else(|| source.truncated("the title"))?;
     let is_binary = match source.word().ok_or_else(|| source.truncated("`ASCII` or `BINARY`"))? {
-        b"ASCII" => false,
-        b"BINARY" => true,
+        word if is_word(Some(word), "ASCII") => false,
+        word if is_word(Some(word), "BINARY") => true,
         other => return Err(source.syntax(format!("`{}` instead of ASCII or BINARY", shown(other)))),
     };
     let mut faces = Faces::default();
     let mut has_points = false;
-    while let Some(word) = source.word() {
+    while let Some(word) = source.peek() {
+        if is_word(Some(word), "METADATA") {
+            skip_metadata(&mut source);
+            continue;
+        }
+        source.word();
         match word.to_ascii_uppercase().as_slice() {
             b"DATASET" => match source.word() {
-                Some(b"POLYDATA" | b"UNSTRUCTURED_GRID") => {}
+                Some(kind) if is_word(Some(kind), "POLYDATA") || is_word(Some(kind), "UNSTRUCTURED_GRID") => {}
                 other => {
                     let other = shown(other.unwrap_or_default());
                     let message =
@@ -270,10 +325,10 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                 }
                 source.is_binary = false;
             }
-            b"POLYGONS" => faces.polygons = cells(&mut source, is_binary, is_new)?,
-            b"TRIANGLE_STRIPS" => faces.strips = cells(&mut source, is_binary, is_new)?,
-            b"CELLS" => faces.grid = cells(&mut source, is_binary, is_new)?,
-            b"VERTICES" | b"LINES" => draft.lines += cells(&mut source, is_binary, is_new)?.ends.len(),
+            b"POLYGONS" => faces.polygons = cells(&mut source, is_binary)?,
+            b"TRIANGLE_STRIPS" => faces.strips = cells(&mut source, is_binary)?,
+            b"CELLS" => faces.grid = cells(&mut source, is_binary)?,
+            b"VERTICES" | b"LINES" => draft.lines += cells(&mut source, is_binary)?.ends.len(),
             b"CELL_TYPES" => {
                 let count: i64 = source.number("the count of types")?;
                 begin_data(&mut source, is_binary);
@@ -281,11 +336,6 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                 source.is_binary = false;
             }
             b"FIELD" => skip_field(&mut source, is_binary)?,
-            b"METADATA" => {
-                // Up to an empty line.
-                source.line();
-                while source.line().is_some_and(|line| !line.trim_ascii().is_empty()) {}
-            }
             // Values at points and cells come last.
             b"POINT_DATA" | b"CELL_DATA" => break,
             _ => return Err(source.syntax(format!("`{}`: a section such as POINTS is expected", shown(word)))),

@@ -8,7 +8,7 @@ use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
 use super::draft::Draft;
-use super::source::{Order, Scalar, Source, shown};
+use super::source::{Order, Scalar, Source, no_number, parsed, shown};
 use super::vtk::{Cells, Faces};
 use crate::{Element, MeshError, Problem};
 
@@ -267,9 +267,8 @@ impl<'a> Document<'a> {
         let mut source = Source::new(self.file, &array.text);
         let mut numbers = Vec::new();
         while let Some(word) = source.word() {
-            let number = super::source::parsed(word);
-            let message = || format!("number {} of an array is `{}`", numbers.len(), shown(word));
-            numbers.push(number.ok_or_else(|| self.fail(array, Problem::Syntax { message: message() }))?);
+            let what = format!("number {} of an array", numbers.len());
+            numbers.push(parsed(word).ok_or_else(|| self.fail(array, no_number(word, &what)))?);
         }
         Ok(numbers)
     }

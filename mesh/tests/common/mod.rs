@@ -1,12 +1,16 @@
 //! The same octahedron in every format that is read, for the tests of the readers and for bent inputs.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
 
+mod others;
+
 use std::fmt::Write;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use glam::DVec3;
 use palpate_mesh::TriangleMesh;
+
+pub use others::*;
 
 /// Corners of an octahedron, mm.
 pub const VERTICES: [[f64; 3]; 6] = [
@@ -211,11 +215,15 @@ pub fn glb() -> Vec<u8> {
     while !json.len().is_multiple_of(4) {
         json.push(b' ');
     }
+    glb_of(&json)
+}
+
+fn glb_of(json: &[u8]) -> Vec<u8> {
     let buffer = gltf_buffer();
     let length = 12 + 8 + json.len() + 8 + buffer.len();
     let word = |number: usize| u32::try_from(number).unwrap().to_le_bytes();
     let parts: [&[u8]; 9] =
-        [b"glTF", &word(2), &word(length), &word(json.len()), b"JSON", &json, &word(buffer.len()), b"BIN\0", &buffer];
+        [b"glTF", &word(2), &word(length), &word(json.len()), b"JSON", json, &word(buffer.len()), b"BIN\0", &buffer];
     parts.concat()
 }
 
@@ -467,8 +475,23 @@ pub fn vtu() -> String {
 pub fn samples() -> Vec<Sample> {
     let mut obj = sample("octahedron.obj", obj());
     obj.knows_its_end = false;
+    let mut old = sample("old.obj", obj_of_old());
+    old.knows_its_end = false;
+    // The first solid by itself is a whole file.
+    let mut two = sample("two.stl", stl_of_two());
+    two.knows_its_end = false;
     vec![
         obj,
+        old,
+        two,
+        sample("more.stl", stl_with_more()),
+        sample("wide.ply", ply_wide()),
+        sample("strips.ply", ply_strips(false)),
+        sample("strips-binary.ply", ply_strips(true)),
+        sample("textures.glb", glb_with_textures()),
+        sample("fields.vtk", vtk_fields(false)),
+        sample("fields-binary.vtk", vtk_fields(true)),
+        sample("volume-pyramids.vtk", vtk_pyramids()),
         sample("text.stl", stl_text()),
         sample("binary.stl", stl_binary()),
         sample("text.ply", ply_text()),
