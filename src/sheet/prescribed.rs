@@ -4,8 +4,8 @@ use glam::DVec3;
 
 use super::model::Model;
 use super::saved::{
-    Checks, SavedGrasp, SavedGrasped, SavedPrescribed, Vector, ensure, restored_motion, restored_moves,
-    restored_velocity, saved_motion, saved_moves,
+    Checks, SavedGrasp, SavedGrasped, SavedPrescribed, Vector, ensure, restored_motion, restored_moves, saved_motion,
+    saved_moves,
 };
 use crate::refusal::Result;
 use crate::scene::check::check_free;
@@ -30,7 +30,7 @@ impl Grasp {
 
     pub(super) fn restored(saved: &SavedGrasp, checks: &Checks<'_>) -> Result<Self> {
         Ok(match saved {
-            SavedGrasp::Target(displacement_m) => Grasp::Target(checks.movement(DVec3::from(*displacement_m))?),
+            SavedGrasp::Target(displacement_m) => Grasp::Target(checks.vector(*displacement_m)?),
             SavedGrasp::Profile { point, moves } => Grasp::Profile(restored_moves(checks, *point, moves)?),
         })
     }
@@ -85,18 +85,18 @@ impl Prescribed {
     }
 
     pub(super) fn restored(saved: &SavedPrescribed, model: &Model, checks: &Checks<'_>) -> Result<Self> {
-        let rate_hz = model.scene.stepping.rate_hz;
         let mut grasped: Vec<Grasped> = Vec::new();
         for SavedGrasped { tool, index, grasp, now, held } in &saved.grasped {
             let (tool, index) = (checks.tool(*tool)?, restored_index(model, *index, checks)?);
             let is_new = grasped.iter().all(|other| other.tool != tool && other.index != index);
             ensure(is_new, "a tool that grasps twice, or a point that is grasped twice")?;
-            let (grasp, now) = (Grasp::restored(grasp, checks)?, restored_motion(checks, now, rate_hz)?);
+            let (grasp, now) = (Grasp::restored(grasp, checks)?, restored_motion(checks, now)?);
             grasped.push(Grasped { tool, index, grasp, now, held: *held });
         }
-        let released = saved.released.iter().map(|(index, velocity)| {
-            Ok((restored_index(model, *index, checks)?, restored_velocity(checks, *velocity, rate_hz)?))
-        });
+        let released = saved
+            .released
+            .iter()
+            .map(|(index, velocity)| Ok((restored_index(model, *index, checks)?, checks.vector(*velocity)?)));
         Ok(Prescribed { grasped, released: released.collect::<Result<_>>()? })
     }
 

@@ -44,8 +44,9 @@ pub(crate) struct Inner {
 
 impl Inner {
     pub(crate) fn of(session: session::Session, first: scene::Scene) -> Self {
-        let intake = Intake::new(&first, &limits()).continued_at(session.step_count(), None);
-        Inner { session, first, intake, held: BTreeSet::new(), led: BTreeMap::new(), due: Vec::new() }
+        let intake = Intake::new(&first, &limits()).continued(&session, None);
+        let led = session.led().map(|(tool, place_m, tip)| (tool, Led { place_m, tip })).collect();
+        Inner { session, first, intake, held: BTreeSet::new(), led, due: Vec::new() }
     }
 
     /// A tool does something from the next step on.
@@ -113,7 +114,7 @@ impl Session {
         Ok(Session::of(py.detach(|| Inner::of(session::Session::new(&model), model.scene.clone()))))
     }
 
-    /// Goes on from `save()`, of a session that began with `scene`. Poses have to be told again.
+    /// Goes on from `save()`, of a session that began with `scene`: also with the tools that are led.
     #[staticmethod]
     fn restore(py: Python<'_>, scene: &Bound<'_, PyAny>, snapshot: &[u8]) -> PyResult<Self> {
         let scene = match scene.cast::<Tissue>() {
