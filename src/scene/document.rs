@@ -204,8 +204,7 @@ fn value_of(value: &DeValue<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
         DeValue::String(text) => Value::Text(text.to_string()),
         DeValue::Integer(whole) => {
             let digits = whole.as_str().replace('_', "");
-            i64::from_str_radix(&digits, whole.radix())
-                .map_or_else(|_| number_of(&digits), Value::Whole)
+            i64::from_str_radix(&digits, whole.radix()).map_or_else(|_| number_of(&digits), Value::Whole)
         }
         DeValue::Float(number) => number_of(&number.as_str().replace('_', "")),
         DeValue::Boolean(flag) => Value::Flag(*flag),

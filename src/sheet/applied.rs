@@ -521,18 +521,29 @@ impl<T: Real> Applied<T> {
             checks.tool(last as u64)?;
         }
         ensure(saved.terms.len() <= MOST_TERMS * saved.slots.len(), "more forces than its tools exert")?;
+        // In the scheme's terms it is a number of this format, as far as it acts.
+        let is_sound = |poke: &Poke, forces_n: &[DVec3]| {
+            let gain = libm::exp(poke.falloff_offset) * scale;
+            let in_terms = |force_n: &DVec3| T::of(gain * force_n.length()).is_finite();
+            let acts = |force_n: &&DVec3| **force_n != DVec3::ZERO;
+            ensure(forces_n.iter().filter(acts).all(in_terms), "a force that is not finite")
+        };
         let poke = |poke: &Option<SavedPoke>| poke.as_ref().map(|poke| poke.restored(checks)).transpose();
         let slot = |slot: &SavedSlot| {
             let push = slot.push.as_ref().map(|push| Push::restored(push, checks)).transpose()?;
-            Ok(Slot { push, before: poke(&slot.before)?, compared: poke(&slot.compared)? })
+            let (before, compared) = (poke(&slot.before)?, poke(&slot.compared)?);
+            if let Some(before) = &before {
+                is_sound(before, &[before.force_n])?;
+            }
+            Ok(Slot { push, before, compared })
         };
         let slots = saved.slots.iter().map(slot).collect::<Result<_>>()?;
         let mut terms = Vec::new();
         for saved in &saved.terms {
             let wanted = Wanted { poke: saved.poke.restored(checks)?, forces_n: saved.forces_n.map(DVec3::from) };
-            let gain = libm::exp(wanted.poke.falloff_offset);
-            let is_sound = |force_n: &DVec3| T::of(gain * scale * force_n.length()).is_finite();
-            ensure(gain.is_finite() && wanted.forces_n.iter().all(is_sound), "a force that is not finite")?;
+            // One of 0 has no factor that is not finite: the sweep multiplies.
+            ensure(libm::exp(wanted.poke.falloff_offset).is_finite(), "a force that is not finite")?;
+            is_sound(&wanted.poke, &wanted.forces_n)?;
             let mut term = Term::new();
             term.place(&wanted.poke, model, layout);
             term.set(wanted, scale);

@@ -176,8 +176,7 @@ impl Model {
         scene.sleep_tolerance = state.sleep_tolerance_of_scene;
         scene.check(limits)?;
         let scene = scene.with_unsigned_zeros();
-        let sleep_tolerance =
-            number("sleep.tolerance", sleep_tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+        let sleep_tolerance = number("sleep.tolerance", sleep_tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
         let is_one = integrator != Integrator::Auto && precision != Precision::Auto && substeps > 0;
         if !is_one || expected_error.is_nan() || state.corrected.is_some_and(|plan| plan.integrator == Integrator::Auto)
         {

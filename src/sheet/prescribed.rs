@@ -84,19 +84,25 @@ impl Prescribed {
         SavedPrescribed { grasped: grasped.collect(), released: released.collect() }
     }
 
-    pub(super) fn restored(saved: &SavedPrescribed, model: &Model, checks: &Checks<'_>) -> Result<Self> {
+    /// `most_m`: no point is displaced or moves in a step by as much, in a state that the guard has let pass.
+    pub(super) fn restored(saved: &SavedPrescribed, model: &Model, most_m: f64, checks: &Checks<'_>) -> Result<Self> {
+        let step_s = model.scene.stepping.rate_hz.recip();
+        let is_within = |v: DVec3| ensure(v.abs().max_element() < most_m, "a motion that no point has");
         let mut grasped: Vec<Grasped> = Vec::new();
         for SavedGrasped { tool, index, grasp, now, held } in &saved.grasped {
             let (tool, index) = (checks.tool(*tool)?, restored_index(model, *index, checks)?);
             let is_new = grasped.iter().all(|other| other.tool != tool && other.index != index);
             ensure(is_new, "a tool that grasps twice, or a point that is grasped twice")?;
             let (grasp, now) = (Grasp::restored(grasp, checks)?, restored_motion(checks, now)?);
+            is_within(now.displacement_m)?;
+            is_within(now.velocity_m_per_s * step_s)?;
             grasped.push(Grasped { tool, index, grasp, now, held: *held });
         }
-        let released = saved
-            .released
-            .iter()
-            .map(|(index, velocity)| Ok((restored_index(model, *index, checks)?, checks.vector(*velocity)?)));
+        let released = saved.released.iter().map(|(index, velocity)| {
+            let velocity_m_per_s = checks.vector(*velocity)?;
+            is_within(velocity_m_per_s * step_s)?;
+            Ok((restored_index(model, *index, checks)?, velocity_m_per_s))
+        });
         Ok(Prescribed { grasped, released: released.collect::<Result<_>>()? })
     }
 

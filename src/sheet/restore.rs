@@ -252,7 +252,7 @@ impl<T: Real> Sheet<T> {
         let layout = sheet.tables.layout;
         let scale = sheet.plan.force_scale(&model.scene);
         sheet.applied = Applied::restored(&parts.forces, model, &layout, scale, &checks)?;
-        sheet.prescribed = Prescribed::restored(&parts.prescribed, model, &checks)?;
+        sheet.prescribed = Prescribed::restored(&parts.prescribed, model, T::LARGEST * model.unit_m, &checks)?;
         sheet.contacts = Contacts::restored(&parts.contacts, model, &checks)?;
         sheet.work = Work::restored(&parts.work)?;
         sheet.tiles.restore(&parts.tiles)?;
@@ -320,7 +320,7 @@ impl<T: Real> Sheet<T> {
             halvings: saved.halvings,
             state,
             applied: Applied::restored(&saved.forces, model, layout, scale, checks)?,
-            prescribed: Prescribed::restored(&saved.prescribed, model, checks)?,
+            prescribed: Prescribed::restored(&saved.prescribed, model, T::LARGEST * model.unit_m, checks)?,
             contacts: Contacts::restored(&saved.contacts, model, checks)?,
             work: Work::restored(&saved.work)?,
             largest: saved.largest,

@@ -357,13 +357,21 @@ impl Checks<'_> {
         ensure(value.abs() < LARGEST, "a number that is not finite or out of range").map(|()| value)
     }
 
-    /// A vector of such numbers.
+    /// A vector of lengths, speeds or forces.
     ///
     /// # Errors
     /// As for [`Checks::number`].
     pub fn vector(&self, value: Vector) -> Result<DVec3> {
         value.into_iter().try_for_each(|part| self.number(part).map(drop))?;
         Ok(DVec3::from(value))
+    }
+
+    /// A time of a script, which may be as late as it likes.
+    ///
+    /// # Errors
+    /// Refuses a number that is not finite.
+    pub fn time(&self, value: f64) -> Result<f64> {
+        ensure(value.is_finite(), "a time that is not finite").map(|()| value)
     }
 
     /// A step, or a number of steps or of anything.
@@ -493,7 +501,7 @@ impl SavedLoad {
                     SavedProfile::Constant => Profile::Constant,
                     SavedProfile::Pulse { on, off } => Profile::Pulse { on, off },
                     SavedProfile::Ramp { from_s, to_s } => {
-                        let (from_s, to_s) = (checks.number(from_s)?, checks.number(to_s)?);
+                        let (from_s, to_s) = (checks.time(from_s)?, checks.time(to_s)?);
                         ensure(from_s < to_s, "a ramp that does not rise")?;
                         Profile::Ramp { from_s, to_s }
                     }
@@ -519,7 +527,7 @@ pub(super) fn saved_moves(profile: &MotionProfile) -> SavedGrasp {
 /// A movement of a point.
 pub(super) fn restored_moves(checks: &Checks<'_>, point: u64, moves: &[(f64, f64, Vector)]) -> Result<MotionProfile> {
     let moves = moves.iter().map(|(from_s, to_s, by_m)| {
-        let (from_s, to_s) = (checks.number(*from_s)?, checks.number(*to_s)?);
+        let (from_s, to_s) = (checks.time(*from_s)?, checks.time(*to_s)?);
         // Accelerations are over its square.
         ensure(to_s - from_s > 1e-9, "a movement that takes no time")?;
         Ok(Move { from_s, to_s, by_m: checks.vector(*by_m)? })
