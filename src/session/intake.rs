@@ -93,7 +93,7 @@ impl Intake {
     /// already takes it with its tip.
     #[must_use]
     pub fn continued(self, session: &Session, changed_to: Option<Arc<Model>>) -> Self {
-        let tip_radii_m = session.led().map(|(tool, _, tip)| (tool, tip.radius_m)).collect();
+        let tip_radii_m = session.tips().map(|(tool, tip)| (tool, tip.radius_m)).collect();
         Intake { next_step: session.step_count(), changed_to, tip_radii_m, ..self }
     }
 

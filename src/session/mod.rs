@@ -210,13 +210,10 @@ impl Session {
         self.paused_commands
     }
 
-    /// The tools that are led by poses, by ascending number: where the newest one leads, m, and the tip.
+    /// The tools that are led by poses, by ascending number, and their tips.
     #[allow(clippy::cast_possible_truncation)]
-    pub fn led(&self) -> impl Iterator<Item = (u32, DVec3, Tip)> {
-        let of = |(tool, state): (usize, &Tool)| {
-            let posed = state.posed.as_ref()?;
-            Some((tool as u32, posed.path.target_m()?, posed.tip))
-        };
+    pub fn tips(&self) -> impl Iterator<Item = (u32, Tip)> {
+        let of = |(tool, state): (usize, &Tool)| Some((tool as u32, state.posed.as_ref()?.tip));
         self.tools.iter().enumerate().filter_map(of)
     }
 

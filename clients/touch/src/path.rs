@@ -218,12 +218,6 @@ impl Path {
         known.into_iter().flatten().reduce(f64::max).or(self.played.map(|played| played.0))
     }
 
-    /// Where the newest command leads, m.
-    pub fn target_m(&self) -> Option<DVec3> {
-        let heading = self.heading.map(|heading| heading.1);
-        heading.or(self.waiting.back().map(|waiting| waiting.1)).or(self.played.map(|played| played.1))
-    }
-
     fn wait(&mut self, at: usize, time_s: f64, place_m: DVec3) {
         self.waiting.insert(at, (time_s, place_m));
         if self.waiting.len() > MOST {

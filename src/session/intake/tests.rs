@@ -352,7 +352,7 @@ fn a_tool_that_is_in_the_tissue_when_a_session_goes_on_keeps_its_tip() {
     for (tool, action) in [(0, pose(0.03)), (1, Action::Release), (2, pose(0.02))] {
         session.advance(&mut vec![Due::in_time(Command::new(tool, Some(1), action))], |_| {});
     }
-    let radii_m: Vec<(u32, f64)> = session.led().map(|(tool, _, tip)| (tool, tip.radius_m)).collect();
+    let radii_m: Vec<(u32, f64)> = session.tips().map(|(tool, tip)| (tool, tip.radius_m)).collect();
     assert_eq!(radii_m, [(0, 0.03), (2, 0.02)]);
     let other = |intake: &mut Intake, tool: u32| {
         let refused = intake.submit(LEASE, vec![Command::new(tool, None, pose(0.01))], 0).unwrap_err();
