@@ -351,3 +351,50 @@ fn what_a_session_has_reached_its_snapshot_restores_with_the_same_bits() {
     }
     assert!(refused.is_empty(), "{} kinds", refused.len());
 }
+
+/// A session of a sheet that sleeps, in which a tool exerts some forces, each from its step on.
+fn pushed(precision: &str, forces: &[(u64, Poke)]) -> Session {
+    let precision = format!("stepping.precision={precision}");
+    let sets = ["sheet.points=[40, 40]", "stepping.integrator=central", "stepping.substeps=2", "sleep.tolerance=1e-3"];
+    let scene = common::scene_with(palpate::scene::PAPER, &[&sets[..], &[precision.as_str()]].concat());
+    let mut session = Session::new(&Model::compile(&scene, &limits()).unwrap());
+    for step in 0..60 {
+        let acting = forces.iter().filter(|(at, _)| *at == step);
+        let mut due = acting.map(|(_, poke)| Due::in_time(Command::new(0, Some(step), Action::Push(*poke)))).collect();
+        session.advance(&mut due, |_| {});
+    }
+    session
+}
+
+fn force_at_a_point(force_n: DVec3, falloff_per_m: f64, falloff_offset: f64) -> Poke {
+    let scene = common::scene_with(palpate::scene::PAPER, &["sheet.points=[40, 40]"]);
+    let centre_m = scene.shape().rest_m(scene.sheet().unwrap().point([20, 20]));
+    Poke { point: None, centre_m, force_n, falloff_per_m, falloff_offset }
+}
+
+#[test]
+fn a_force_of_0_does_nothing_whatever_its_factor() {
+    let push = (5, force_at_a_point(-DVec3::Z, 30.0, 0.0));
+    for precision in ["f32", "f64"] {
+        let alone = pushed(precision, &[push]);
+        assert!(alone.tissue().largest_displacement_m() > 0.01);
+        for offset in [-1000.0, 0.0, 700.0, 1000.0, f64::MAX] {
+            let after = pushed(precision, &[(1, force_at_a_point(DVec3::ZERO, 30.0, offset)), push]);
+            assert_eq!(after.tissue().state_hash(), alone.tissue().state_hash(), "{precision}, {offset}");
+        }
+    }
+}
+
+#[test]
+fn a_force_that_falls_off_at_once_acts_on_its_own_point() {
+    // e^(-c·r) is 1 at its centre, however large c is.
+    for precision in ["f32", "f64"] {
+        let course = |falloff_per_m| pushed(precision, &[(1, force_at_a_point(-DVec3::Z, falloff_per_m, 0.0))]);
+        let expected = course(1e4).tissue().state_hash();
+        for falloff_per_m in [1e20, 1e38, 1e40, 1e300, f64::MAX] {
+            let found = course(falloff_per_m);
+            assert!(found.tissue().largest_displacement_m() > 1e-3);
+            assert_eq!(found.tissue().state_hash(), expected, "{precision}, {falloff_per_m:e}");
+        }
+    }
+}

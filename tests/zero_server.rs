@@ -108,10 +108,10 @@ async fn a_session_that_was_told_negative_zeros_is_verified_and_outlives_a_kill(
         let request = [request.encode_to_vec(), within(3, &command)].concat();
         call(&before, "/palpate.v1.HapticService/SendCommands", request).await;
     }
-    before.start_until(&id, 60).await;
-    let hash = before.hash_at(&id, 60).await;
+    before.start_until(&id, 1010).await;
+    let hash = before.hash_at(&id, 1010).await;
     let waited = tokio::time::timeout(server::PATIENCE, async {
-        while before.status(&id).await.journal.unwrap().durable_step != Some(60) {
+        while before.status(&id).await.journal.unwrap().durable_step != Some(1010) {
             tokio::time::sleep(std::time::Duration::from_millis(10)).await;
         }
     });
@@ -121,8 +121,8 @@ async fn a_session_that_was_told_negative_zeros_is_verified_and_outlives_a_kill(
 
     let after = start(folder.path());
     let session = after.status(&id).await;
-    assert_eq!(session.step, 60);
-    assert_eq!(after.hash_at(&id, 60).await, hash);
+    assert_eq!(session.step, 1010);
+    assert_eq!(after.hash_at(&id, 1010).await, hash);
     let file =
         palpate::journal::file::list(folder.path()).unwrap().into_iter().find(|file| file.session_id == id).unwrap();
     let reader = palpate::journal::Reader::open(&file.path).unwrap();

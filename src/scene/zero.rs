@@ -13,7 +13,7 @@ use palpate_touch::{Coupling, Tip};
 
 use super::profile::Poke;
 use super::script::Action;
-use super::{Scene, Springs, Stepping};
+use super::{Scene, Springs};
 use crate::refusal::unsigned_zero;
 
 fn unsigned(v: DVec3) -> DVec3 {
@@ -21,27 +21,39 @@ fn unsigned(v: DVec3) -> DVec3 {
 }
 
 impl Scene {
-    /// The same scene, its zeros without a sign. What must be above 0 has none.
+    /// The same scene, its zeros without a sign: of what must be above 0, there are none. Each field is named here, so that a new one
+    /// is thought of.
     #[must_use]
     pub fn with_unsigned_zeros(self) -> Self {
-        let Springs { stiffness_n_per_m, shear_stiffness_n_per_m, flexion } = self.springs;
-        let Stepping { rate_hz, tolerance, .. } = self.stepping;
+        let Scene {
+            name,
+            body,
+            material,
+            inclusions,
+            springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m, flexion },
+            virtual_stiffness_n_per_m,
+            damping_n_s_per_m,
+            volume_stiffness_pa,
+            stepping,
+            sleep_tolerance,
+            appearance,
+        } = self;
         Scene {
+            name,
+            body,
+            material,
+            inclusions,
             springs: Springs {
                 stiffness_n_per_m: unsigned_zero(stiffness_n_per_m),
                 shear_stiffness_n_per_m: unsigned_zero(shear_stiffness_n_per_m),
                 flexion,
             },
-            virtual_stiffness_n_per_m: unsigned_zero(self.virtual_stiffness_n_per_m),
-            damping_n_s_per_m: unsigned_zero(self.damping_n_s_per_m),
-            volume_stiffness_pa: unsigned_zero(self.volume_stiffness_pa),
-            stepping: Stepping {
-                rate_hz: unsigned_zero(rate_hz),
-                tolerance: unsigned_zero(tolerance),
-                ..self.stepping
-            },
-            sleep_tolerance: self.sleep_tolerance.map(unsigned_zero),
-            ..self
+            virtual_stiffness_n_per_m: unsigned_zero(virtual_stiffness_n_per_m),
+            damping_n_s_per_m: unsigned_zero(damping_n_s_per_m),
+            volume_stiffness_pa: unsigned_zero(volume_stiffness_pa),
+            stepping,
+            sleep_tolerance: sleep_tolerance.map(unsigned_zero),
+            appearance,
         }
     }
 }
