@@ -9,14 +9,14 @@ pub fn vector(v: DVec3) -> Option<pb::Vector3> {
     Some(pb::Vector3 { x: v.x, y: v.y, z: v.z })
 }
 
-/// The vector in a message; 0 if it is absent.
+/// The vector in a message; 0 if it is absent. Zeros have no sign (`refusal::unsigned_zero`).
 pub fn from_vector(v: Option<&pb::Vector3>) -> DVec3 {
-    v.map_or(DVec3::ZERO, |v| DVec3::new(v.x, v.y, v.z))
+    v.map_or(DVec3::ZERO, |v| DVec3::new(v.x, v.y, v.z) + DVec3::ZERO)
 }
 
-/// The position in the rest plane in a message, m.
+/// The position in the rest plane in a message, m. Zeros have no sign.
 pub fn from_place(v: &pb::Vector2) -> DVec2 {
-    DVec2::new(v.x, v.y)
+    DVec2::new(v.x, v.y) + DVec2::ZERO
 }
 
 /// A mass point as a message. Indices are below the limit of points, which is below 2³².

@@ -147,7 +147,13 @@ impl fmt::Display for Refusal {
 
 impl std::error::Error for Refusal {}
 
-/// `value`, if it is finite and `holds` is true for it; `range` describes those values.
+/// A number with 0 in place of −0. They are equal in all that a number here means, but not in their bits, which hashes compare;
+/// and protobuf leaves out a field that equals 0, so that −0 comes back as 0. What enters a tissue or a session goes through this.
+pub fn unsigned_zero(value: f64) -> f64 {
+    value + 0.0
+}
+
+/// `value`, if it is finite and `holds` is true for it; `range` describes those values. −0 comes back as 0.
 ///
 /// # Errors
 /// Refuses a number that is not finite, or for which `holds` is false.
@@ -158,7 +164,7 @@ pub fn number(field: &str, value: f64, range: &str, holds: impl Fn(f64) -> bool)
     if !holds(value) {
         return Err(Refusal::new(Reason::OutOfRange, field, format!("must be {range}, but is {value}")));
     }
-    Ok(value)
+    Ok(unsigned_zero(value))
 }
 
 /// `value` if it is finite.
@@ -185,7 +191,7 @@ pub fn not_negative(field: &str, value: f64) -> Result<f64> {
     number(field, value, "0 or more", |v| v >= 0.0)
 }
 
-/// `value` if its three components are finite.
+/// `value` if its three components are finite. −0 comes back as 0.
 ///
 /// # Errors
 /// Refuses a vector with a component that is not finite.
@@ -193,7 +199,7 @@ pub fn finite_vector(field: &str, value: glam::DVec3) -> Result<glam::DVec3> {
     for component in value.to_array() {
         finite(field, component)?;
     }
-    Ok(value)
+    Ok(value + glam::DVec3::ZERO)
 }
 
 /// Checks a text for people: it is short, and on one line.

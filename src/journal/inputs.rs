@@ -111,6 +111,7 @@ mod tests {
 
     use super::*;
     use crate::scene::script::Action;
+    use crate::session::Session;
     use crate::session::command::{Command, Due};
     use crate::session::handing::Handed;
     use crate::session::intake::{Counts, Intake};
@@ -153,7 +154,9 @@ mod tests {
         assert_eq!(intake.counts(), Counts { accepted: 1, dropped: 1, ..Counts::default() });
         let pieces = encoded(&handed.waiting);
         let waiting = pieces.iter().flat_map(|piece| decoded(piece, &first, &limits).unwrap()).collect();
-        let mut other = Intake::new(&first.scene, &limits).continued_at(7, None);
+        let mut session = Session::new(&first);
+        session.skip_to(7);
+        let mut other = Intake::new(&first.scene, &limits).continued(&session, None);
         assert_eq!(other.adopt(Handed { leases: handed.leases, waiting }, 5 * MS), 0);
         assert_eq!(other.counts(), Counts { accepted: 3, waiting: 3, ..Counts::default() });
         let first_due = due(&mut other, 7);

@@ -25,13 +25,14 @@ use crate::sheet::saved::{CorrectedPlan, TissueState};
 use crate::wire::required;
 use crate::wire::scene::{from_scene, sent};
 
-/// Most tools that a journal is replayed with, whatever the limits of the server were.
+/// So many tools a journal is replayed with at least, whatever the limits of the server were.
 const MOST_TOOLS: u32 = 4096;
 
 /// The limits under which a journal is read: what a server has accepted is not refused for its force, its reach or the number of
 /// its tool, which its configuration may allow to be larger.
 pub fn limits(limits: &Limits) -> Limits {
-    Limits { point_force_n: f64::MAX, reach_in_sheets: f64::MAX, tools: MOST_TOOLS, ..limits.clone() }
+    let tools = limits.tools.max(MOST_TOOLS);
+    Limits { point_force_n: f64::MAX, reach_in_sheets: f64::MAX, tools, ..limits.clone() }
 }
 
 /// The mesh that a scene is on, as its file or its client gave it.
@@ -302,8 +303,9 @@ pub(super) fn fill_tips(inputs: &mut [pb::Input]) -> Result<()> {
 /// Refuses what no session accepts.
 pub(super) fn from_command(message: &pb::Command, rules: &Rules, points: usize) -> Result<Due> {
     use pb::command::Action as Message;
-    if message.tool >= MOST_TOOLS {
-        let text = format!("is {}, but there are at most {MOST_TOOLS} tools", message.tool);
+    let most = rules.most_tools();
+    if message.tool >= most {
+        let text = format!("is {}, but there are at most {most} tools", message.tool);
         return Err(Refusal::new(Reason::OutOfRange, "tool", text));
     }
     let point = |field: &str, number: u32| {

@@ -5,7 +5,7 @@ use palpate_touch::{Coupling, Tip};
 
 use super::profile::Poke;
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, finite, finite_vector, not_negative, number, positive};
+use crate::refusal::{Reason, Refusal, Result, finite, finite_vector, not_negative, number};
 use crate::shape::{PointId, RestShape};
 
 /// Squares and products of what a scene holds stay within single precision for values in this range.
@@ -77,8 +77,10 @@ pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
     number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= most_m)?;
     number(&format!("{field}.friction"), tip.friction, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
     if let Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } = tip.coupling {
-        positive(&format!("{field}.spring.stiffness_n_per_m"), stiffness_n_per_m)?;
-        not_negative(&format!("{field}.spring.damping_n_s_per_m"), damping_n_s_per_m)?;
+        let field = format!("{field}.spring");
+        physical(&format!("{field}.stiffness_n_per_m"), stiffness_n_per_m)?;
+        let damps = |v| (0.0..=1e12).contains(&v);
+        number(&format!("{field}.damping_n_s_per_m"), damping_n_s_per_m, "from 0 to 1e12", damps)?;
     }
     Ok(())
 }

@@ -8,7 +8,7 @@ use std::path::Path;
 use glam::{DVec2, DVec3};
 use toml::de::{DeTable, DeValue};
 
-use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, nearest};
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, nearest, unsigned_zero};
 use crate::shape::PointName;
 
 /// A parsed text.
@@ -195,15 +195,18 @@ fn table_of(table: &DeTable<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
     Value::Table(table.iter().map(entry).collect())
 }
 
+fn number_of(digits: &str) -> Value {
+    digits.parse().map_or(Value::Other, |number| Value::Number(unsigned_zero(number)))
+}
+
 fn value_of(value: &DeValue<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
     match value {
         DeValue::String(text) => Value::Text(text.to_string()),
         DeValue::Integer(whole) => {
             let digits = whole.as_str().replace('_', "");
-            i64::from_str_radix(&digits, whole.radix())
-                .map_or_else(|_| digits.parse().map_or(Value::Other, Value::Number), Value::Whole)
+            i64::from_str_radix(&digits, whole.radix()).map_or_else(|_| number_of(&digits), Value::Whole)
         }
-        DeValue::Float(number) => number.as_str().replace('_', "").parse().map_or(Value::Other, Value::Number),
+        DeValue::Float(number) => number_of(&number.as_str().replace('_', "")),
         DeValue::Boolean(flag) => Value::Flag(*flag),
         DeValue::Datetime(_) => Value::Other,
         DeValue::Array(items) => Value::List(

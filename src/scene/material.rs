@@ -8,7 +8,7 @@ use super::check::physical;
 use super::document::{Fields, Item};
 use super::membrane::settled_energy_j;
 use super::mesh::{Differences, Mesh, MeshShape, group_named};
-use crate::refusal::{Reason, Refusal, Result, finite_vector, not_negative, number, positive};
+use crate::refusal::{Reason, Refusal, Result, finite_vector, not_negative, number, positive, unsigned_zero};
 use crate::shape::{PointId, RestShape};
 
 /// k of an edge between equal triangles with equal sides, over E·t: such springs resist as a membrane with ν = 1/3.
@@ -316,7 +316,8 @@ impl Inclusion {
             *part = if *part <= 0.0 {
                 1.0
             } else {
-                let x = *part / self.edge_m;
+                // Of an edge of 0, this is infinite; of one of −0 it must not be below all.
+                let x = *part / unsigned_zero(self.edge_m);
                 if x < 1.0 { 1.0 - x * x * (3.0 - 2.0 * x) } else { 0.0 }
             };
         }

@@ -20,6 +20,7 @@ mod sheet;
 mod shown;
 mod source;
 mod volume;
+mod zero;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

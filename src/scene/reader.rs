@@ -15,7 +15,7 @@ use super::profile::{
 use super::script::Script;
 use super::{Change, Scene};
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, did_you_mean, not_negative, number, positive};
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, not_negative, number, positive, unsigned_zero};
 use crate::shape::{self, PointId};
 
 impl Script {
@@ -381,6 +381,7 @@ impl Binding<'_> {
                     .parse()
                     .ok()
                     .filter(|number: &f64| number.is_finite())
+                    .map(unsigned_zero)
                     .ok_or_else(|| refuse(line_number, format!("`{cell}` is not a finite number")))?;
             }
             let [time_s, x, y, z] = numbers;

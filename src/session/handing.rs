@@ -37,7 +37,11 @@ impl Intake {
     ///
     /// What there is no memory for is dropped; tells how many inputs.
     pub fn adopt(&mut self, handed: Handed, now_ns: u64) -> usize {
-        handed.leases.into_iter().for_each(|lease| self.leases.adopt(lease, now_ns));
+        for lease in handed.leases {
+            let tool = lease.tool;
+            self.leases.adopt(lease, now_ns);
+            self.take_tip(tool);
+        }
         let commands = handed.waiting.iter().filter(|(_, input)| matches!(input, Input::Command(_))).count();
         let has_room = self.make_room(commands).is_ok();
         let mut dropped = 0;

@@ -1,8 +1,9 @@
 //! The intake of a session: commands and changes of the tissue wait here for their step. Time is an argument.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
+use super::Session;
 use super::command::{Command, Due};
 use super::lease::{LeaseId, Leases, QueueKey, not_held};
 use super::queue::{Discarded, Queue};
@@ -47,6 +48,8 @@ pub struct Intake {
     pub(super) changed_to: Option<Arc<Model>>,
     pub(super) arrivals: u64,
     pub(super) next_step: u64,
+    /// Radii of the tips of tools that nobody holds yet and that a session which goes on has in its tissue, m.
+    tip_radii_m: BTreeMap<u32, f64>,
     /// The session rests: its steps up to this one are skipped, not computed.
     resting: Option<(Schedule, u64)>,
     /// A command or change has arrived that may take effect earlier, and the session's thread was woken for it.
@@ -71,6 +74,7 @@ impl Intake {
             changed_to: None,
             arrivals: 0,
             next_step: 0,
+            tip_radii_m: BTreeMap::new(),
             resting: None,
             changed: false,
             woken: false,
@@ -85,10 +89,12 @@ impl Intake {
         Intake { account: Some(account.clone()), ..self }
     }
 
-    /// Of a session that has done `step` steps, whose tissue is `changed_to` unless it is still the first.
+    /// Of a session that goes on, whose tissue is `changed_to` unless it is still the first. Who takes a tool that is in the tissue
+    /// already takes it with its tip.
     #[must_use]
-    pub fn continued_at(self, step: u64, changed_to: Option<Arc<Model>>) -> Self {
-        Intake { next_step: step, changed_to, ..self }
+    pub fn continued(self, session: &Session, changed_to: Option<Arc<Model>>) -> Self {
+        let tip_radii_m = session.tips().map(|(tool, tip)| (tool, tip.radius_m)).collect();
+        Intake { next_step: session.step_count(), changed_to, tip_radii_m, ..self }
     }
 
     /// Has the memory of `more` commands beside those that wait, or refuses.
@@ -119,8 +125,17 @@ impl Intake {
         self.check_open()?;
         self.lapse(now_ns);
         self.leases.acquire(tools, holder, lease_s, id, now_ns, &self.rules.limits)?;
+        tools.iter().for_each(|tool| self.take_tip(*tool));
         self.changed = true;
         Ok(())
+    }
+
+    /// A tool that was in the tissue when the session went on is held from now on.
+    pub(super) fn take_tip(&mut self, tool: u32) {
+        let radius_m = self.tip_radii_m.remove(&tool);
+        if let Some(lease) = self.leases.get_mut(tool) {
+            lease.tip_radius_m = radius_m;
+        }
     }
 
     /// Extends a lease: its holder is alive.

@@ -210,6 +210,13 @@ impl Session {
         self.paused_commands
     }
 
+    /// The tools that are led by poses, by ascending number, and their tips.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn tips(&self) -> impl Iterator<Item = (u32, Tip)> {
+        let of = |(tool, state): (usize, &Tool)| Some((tool as u32, state.posed.as_ref()?.tip));
+        self.tools.iter().enumerate().filter_map(of)
+    }
+
     /// The sum of [`Path::counts`] over all position-controlled tools.
     pub fn path_counts(&self) -> [u64; 3] {
         self.path_counts
@@ -388,7 +395,7 @@ impl Session {
         if !releases {
             self.recoveries.disturb();
         }
-        match command.action {
+        match command.action.with_unsigned_zeros() {
             Action::Push(poke) => {
                 self.tool(index).posed = None;
                 let nearest = self.model().shape().nearest(poke.centre_m);

@@ -24,6 +24,11 @@ impl Rules {
         Rules { scene: scene.clone(), limits: limits.clone() }
     }
 
+    /// Tools are numbered below this.
+    pub(crate) fn most_tools(&self) -> u32 {
+        self.limits.tools
+    }
+
     /// All of `commands`, if each keeps to the rules.
     ///
     /// # Errors

@@ -48,9 +48,6 @@ const HEADER: usize = 8 + 4 + 8 + 16;
 /// Where the checksum is.
 const CHECKSUM: std::ops::Range<usize> = 20..36;
 
-/// Longest text, bytes.
-const LONGEST_TEXT: usize = 1 << 16;
-
 /// A session at one moment.
 #[derive(Debug, Clone)]
 pub struct Saved {
@@ -185,8 +182,6 @@ impl Session {
         if let Some(last) = own.tools.len().checked_sub(1) {
             checks.tool(last as u64)?;
         }
-        let text = own.hold_reason.as_deref().unwrap_or_default();
-        ensure(text.len() <= LONGEST_TEXT, "a text that is too long")?;
         for count in own.path_counts {
             checks.count(count)?;
         }
@@ -373,11 +368,9 @@ impl SavedPath {
 
     fn restored(&self, checks: &Checks<'_>) -> Result<Path> {
         let places = self.waiting.iter().chain(&self.played).map(|place| &place.1);
-        for place_m in places.chain(&self.begins_m).chain(&self.place_m) {
-            checks.near(*place_m)?;
-        }
-        if let Some((_, place_m, _)) = self.heading {
-            checks.near(place_m)?;
+        let heads_m = self.heading.iter().map(|heading| &heading.1);
+        for place_m in places.chain(&self.begins_m).chain(&self.place_m).chain(heads_m) {
+            checks.vector(*place_m)?;
         }
         let path = Path::restored(PathState {
             at_once: self.at_once,
@@ -420,7 +413,7 @@ impl SavedRecoveries {
     fn restored(&self, now: u64, checks: &Checks<'_>) -> Result<Recoveries> {
         ensure(self.newest.len() <= MOST, "more recoveries than are kept")?;
         let newest = self.newest.iter().map(|saved| {
-            ensure(saved.step <= now && saved.reason.len() <= LONGEST_TEXT, "a recovery that has not been yet")?;
+            ensure(saved.step <= now, "a recovery that has not been yet")?;
             let recovery = Recovery {
                 step: saved.step,
                 state_of_step: saved.state_of_step,

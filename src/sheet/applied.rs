@@ -69,8 +69,9 @@ pub(super) struct Slot {
     compared: Option<Poke>,
 }
 
-/// A scheme weighs the forces of a tool at the moments of a substep by less than this in all.
-const MOST_WEIGHT: f64 = 100.0;
+/// The steepest falloff of a table, over a spacing: what is steeper reaches no second point either. In any format it is a number, so
+/// that its product with the distance 0 is 0.
+const STEEPEST: f64 = 1e30;
 
 /// Most terms that the force of one tool becomes: two at each moment at which a scheme asks for it.
 const MOST_TERMS: usize = 8;
@@ -92,7 +93,7 @@ impl ForceChange {
                 (from - centre).max(centre - to).max(0.0)
             });
             let away_m = away.map(|away| away * away).sum::<f64>().sqrt();
-            libm::exp(poke.falloff_offset - poke.falloff_per_m * away_m)
+            factor_of(poke.falloff_offset - poke.falloff_per_m * away_m)
         };
         let [p, q] = [&self.old, &self.new].map(|poke| poke.as_ref().map_or(0.0, nearest));
         let each = |poke: &Option<Poke>, factor: f64| poke.map_or(0.0, |poke| poke.force_n.length() * factor);
@@ -113,7 +114,7 @@ impl ForceChange {
 
     /// The new force at its centre, N.
     pub(super) fn peak_n(&self) -> f64 {
-        self.new.map_or(0.0, |poke| poke.force_n.length() * libm::exp(poke.falloff_offset))
+        self.new.map_or(0.0, |poke| poke.force_n.length() * factor_of(poke.falloff_offset))
     }
 }
 
@@ -152,6 +153,11 @@ pub(super) struct Term<T: Real> {
     spans: Vec<Range<usize>>,
     /// e^{−c·r} over the relative mass for those rows, each as long as a row of the sheet; 0 elsewhere.
     factors: Field<T>,
+}
+
+/// e^x, or the largest number: a force of 0 may have any factor, and 0 times what is infinite is no number.
+fn factor_of(exponent: f64) -> f64 {
+    libm::exp(exponent).min(f64::MAX)
 }
 
 /// Whether two pokes differ only in the force.
@@ -208,7 +214,7 @@ impl<T: Real> Term<T> {
         }
         let falloff = Falloff {
             centre: (poke.centre_m.truncate() / spacing_m).to_array(),
-            per_spacing: poke.falloff_per_m * spacing_m,
+            per_spacing: (poke.falloff_per_m * spacing_m).min(STEEPEST),
             rows: self.rows.clone(),
             columns: self.columns.clone(),
             stride: layout.stride,
@@ -515,22 +521,29 @@ impl<T: Real> Applied<T> {
             checks.tool(last as u64)?;
         }
         ensure(saved.terms.len() <= MOST_TERMS * saved.slots.len(), "more forces than its tools exert")?;
+        // In the scheme's terms it is a number of this format, as far as it acts.
+        let is_sound = |poke: &Poke, forces_n: &[DVec3]| {
+            let gain = libm::exp(poke.falloff_offset) * scale;
+            let in_terms = |force_n: &DVec3| T::of(gain * force_n.length()).is_finite();
+            let acts = |force_n: &&DVec3| **force_n != DVec3::ZERO;
+            ensure(forces_n.iter().filter(acts).all(in_terms), "a force that is not finite")
+        };
         let poke = |poke: &Option<SavedPoke>| poke.as_ref().map(|poke| poke.restored(checks)).transpose();
         let slot = |slot: &SavedSlot| {
             let push = slot.push.as_ref().map(|push| Push::restored(push, checks)).transpose()?;
-            Ok(Slot { push, before: poke(&slot.before)?, compared: poke(&slot.compared)? })
+            let (before, compared) = (poke(&slot.before)?, poke(&slot.compared)?);
+            if let Some(before) = &before {
+                is_sound(before, &[before.force_n])?;
+            }
+            Ok(Slot { push, before, compared })
         };
         let slots = saved.slots.iter().map(slot).collect::<Result<_>>()?;
         let mut terms = Vec::new();
         for saved in &saved.terms {
             let wanted = Wanted { poke: saved.poke.restored(checks)?, forces_n: saved.forces_n.map(DVec3::from) };
-            let gain = libm::exp(wanted.poke.falloff_offset);
-            let is_sound = |force_n: &DVec3| {
-                let force = T::of(gain * scale * force_n.length());
-                let most_n = MOST_WEIGHT * checks.limits.point_force_n;
-                force_n.is_finite() && force.is_finite() && gain * force_n.length() <= most_n
-            };
-            ensure(gain.is_finite() && wanted.forces_n.iter().all(is_sound), "a force that is not finite")?;
+            // One of 0 has no factor that is not finite: the sweep multiplies.
+            ensure(libm::exp(wanted.poke.falloff_offset).is_finite(), "a force that is not finite")?;
+            is_sound(&wanted.poke, &wanted.forces_n)?;
             let mut term = Term::new();
             term.place(&wanted.poke, model, layout);
             term.set(wanted, scale);

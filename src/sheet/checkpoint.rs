@@ -84,7 +84,7 @@ impl Input {
             SavedInput::Grasp(index, grasp) => {
                 Input::Grasp(restored_index(model, *index, checks)?, Grasp::restored(grasp, checks)?)
             }
-            SavedInput::Pose(place_m, tip) => Input::Pose(checks.near(*place_m)?, tip.restored(checks)?),
+            SavedInput::Pose(place_m, tip) => Input::Pose(checks.vector(*place_m)?, tip.restored(checks)?),
         })
     }
 }
@@ -153,7 +153,9 @@ impl Work {
     ) -> std::result::Result<(), CheckFailure> {
         let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
         let excess_j = if is_touched { self.excess_j } else { 0.0 } + energy_j - before_j - work_j;
-        if excess_j > MARGIN * (before_j + work_j.abs()) + noise * self.largest_j {
+        // What is not a number is not within it.
+        let is_within = excess_j <= MARGIN * (before_j + work_j.abs()) + noise * self.largest_j;
+        if !is_within {
             return Err(CheckFailure::Energy { energy_j, before_j, work_j });
         }
         let largest_j = self.largest_j.max(energy_j);

@@ -11,7 +11,7 @@ use super::model::{Model, Plan};
 use super::saved::{CorrectedPlan, TissueState};
 use super::tangent;
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, number};
+use crate::refusal::{Reason, Refusal, Result, number, unsigned_zero};
 use crate::scene::{Body, Change, Integrator, Named, Precision, Scene};
 
 /// What sleeping tiles may add to the error, by default, as a part of it.
@@ -47,6 +47,7 @@ impl Model {
     /// As for [`Model::compile`]; and refuses when `stop` is set.
     pub fn compile_until(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
         scene.check(limits)?;
+        let scene = &scene.clone().with_unsigned_zeros();
         let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
         // Nothing is rehearsed that no scheme could do.
@@ -102,10 +103,7 @@ impl Model {
             let chosen = scene.stepping.integrator != Integrator::Auto || scene.stepping.substeps.is_some();
             SLEEP_PART * if chosen { expected_error.min(scene.stepping.tolerance) } else { scene.stepping.tolerance }
         });
-        let mut scene = scene.clone();
-        (scene.damping_n_s_per_m, scene.virtual_stiffness_n_per_m) =
-            (sheet.damping_n_s_per_m, sheet.virtual_stiffness_n_per_m);
-        let model = Model::planned(scene, plan, precision, lanes)
+        let model = Model::planned(scene.clone(), plan, precision, lanes)
             .map_err(|fault| Refusal::new(Reason::OutOfRange, "mesh.file", fault.to_string()))?;
         let yields = tangent::yields(&model, stop).into();
         Ok(Arc::new(Model { expected_error, sleep_tolerance, warnings, rehearsed, yields, ..model }))
@@ -177,14 +175,15 @@ impl Model {
         scene.volume_stiffness_pa = state.volume_stiffness_pa;
         scene.sleep_tolerance = state.sleep_tolerance_of_scene;
         scene.check(limits)?;
-        number("sleep.tolerance", sleep_tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+        let scene = scene.with_unsigned_zeros();
+        let sleep_tolerance = number("sleep.tolerance", sleep_tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
         let is_one = integrator != Integrator::Auto && precision != Precision::Auto && substeps > 0;
         if !is_one || expected_error.is_nan() || state.corrected.is_some_and(|plan| plan.integrator == Integrator::Auto)
         {
             let message = "is of no model: it has no scheme, format, substeps or expected error";
             return Err(Refusal::new(Reason::OutOfRange, "stepping", message));
         }
-        let made = Choice { integrator, substeps, precision, expected_error };
+        let made = Choice { integrator, substeps, precision, expected_error: unsigned_zero(expected_error) };
         let model = Model::chosen(&scene, made, 0, limits, &choice::NEVER)?;
         let corrected = state.corrected.map(|plan| (plan.integrator, plan.least_substeps));
         Ok(Arc::new(Model { sleep_tolerance, corrected, ..Arc::unwrap_or_clone(model) }))

@@ -283,29 +283,21 @@ impl Tool {
         let tip = saved.tip.restored(checks)?;
         let contact_state = CONTACT_STATES.get(usize::from(saved.contact_state)).copied();
         ensure(contact_state.is_some(), "a state of contact that there is not")?;
-        let normal = checks.vector(saved.normal)?;
-        ensure((normal.length() - 1.0).abs() < 1e-6, "a normal that is not of length 1")?;
-        // What it would move a point by in a substep.
-        let moves_m_per_n = model.plan.force_scale(&model.scene) * model.unit_m;
-        let force = |force_n: [f64; 3]| {
-            let force_n = DVec3::from(force_n);
-            checks.movement(moves_m_per_n * force_n).map(|_| force_n)
-        };
         ensure(saved.side.is_none_or(|side| side.abs() == 1.0), "a side of the tissue that there is not")?;
         Ok(Tool {
             number: checks.tool(saved.number)?,
             tip,
             footprint: Footprint::restored(model, tip.radius_m, &saved.ground)?,
-            from_m: checks.near(saved.from_m)?,
-            to_m: checks.near(saved.to_m)?,
+            from_m: checks.vector(saved.from_m)?,
+            to_m: checks.vector(saved.to_m)?,
             contact_state: contact_state.unwrap_or(ContactState::Free),
-            normal,
+            normal: checks.vector(saved.normal)?,
             side: saved.side,
-            offset_m: checks.movement(DVec3::from(saved.offset_m))?,
-            gap_m: checks.movement(DVec3::from(saved.gap_m))?,
+            offset_m: checks.vector(saved.offset_m)?,
+            gap_m: checks.vector(saved.gap_m)?,
             is_new: saved.is_new,
-            force_n: force(saved.force_n)?,
-            steady_n: force(saved.steady_n)?,
+            force_n: checks.vector(saved.force_n)?,
+            steady_n: checks.vector(saved.steady_n)?,
             velocity_m_per_s: checks.vector(saved.velocity_m_per_s)?,
         })
     }

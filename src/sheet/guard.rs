@@ -55,6 +55,9 @@ impl<T: Real> Sheet<T> {
         if !calm {
             scan()?;
         }
+        if let Some(index) = self.broken_by_tools(farthest) {
+            return Err(CheckFailure::NotFinite { point: self.model.shape().name(self.model.point_at(index)) });
+        }
         if !due {
             return Ok(());
         }

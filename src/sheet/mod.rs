@@ -10,6 +10,7 @@ mod applied;
 mod around;
 pub mod audit;
 mod audit_window;
+mod bounds;
 mod change;
 mod checkpoint;
 pub mod choice;

@@ -4,8 +4,8 @@ use glam::DVec3;
 
 use super::model::Model;
 use super::saved::{
-    Checks, SavedGrasp, SavedGrasped, SavedPrescribed, Vector, ensure, restored_motion, restored_moves,
-    restored_velocity, saved_motion, saved_moves,
+    Checks, SavedGrasp, SavedGrasped, SavedPrescribed, Vector, ensure, restored_motion, restored_moves, saved_motion,
+    saved_moves,
 };
 use crate::refusal::Result;
 use crate::scene::check::check_free;
@@ -30,7 +30,7 @@ impl Grasp {
 
     pub(super) fn restored(saved: &SavedGrasp, checks: &Checks<'_>) -> Result<Self> {
         Ok(match saved {
-            SavedGrasp::Target(displacement_m) => Grasp::Target(checks.movement(DVec3::from(*displacement_m))?),
+            SavedGrasp::Target(displacement_m) => Grasp::Target(checks.vector(*displacement_m)?),
             SavedGrasp::Profile { point, moves } => Grasp::Profile(restored_moves(checks, *point, moves)?),
         })
     }
@@ -84,18 +84,24 @@ impl Prescribed {
         SavedPrescribed { grasped: grasped.collect(), released: released.collect() }
     }
 
-    pub(super) fn restored(saved: &SavedPrescribed, model: &Model, checks: &Checks<'_>) -> Result<Self> {
-        let rate_hz = model.scene.stepping.rate_hz;
+    /// `most_m`: no point is displaced or moves in a step by as much, in a state that the guard has let pass.
+    pub(super) fn restored(saved: &SavedPrescribed, model: &Model, most_m: f64, checks: &Checks<'_>) -> Result<Self> {
+        let step_s = model.scene.stepping.rate_hz.recip();
+        let is_within = |v: DVec3| ensure(v.abs().max_element() < most_m, "a motion that no point has");
         let mut grasped: Vec<Grasped> = Vec::new();
         for SavedGrasped { tool, index, grasp, now, held } in &saved.grasped {
             let (tool, index) = (checks.tool(*tool)?, restored_index(model, *index, checks)?);
             let is_new = grasped.iter().all(|other| other.tool != tool && other.index != index);
             ensure(is_new, "a tool that grasps twice, or a point that is grasped twice")?;
-            let (grasp, now) = (Grasp::restored(grasp, checks)?, restored_motion(checks, now, rate_hz)?);
+            let (grasp, now) = (Grasp::restored(grasp, checks)?, restored_motion(checks, now)?);
+            is_within(now.displacement_m)?;
+            is_within(now.velocity_m_per_s * step_s)?;
             grasped.push(Grasped { tool, index, grasp, now, held: *held });
         }
         let released = saved.released.iter().map(|(index, velocity)| {
-            Ok((restored_index(model, *index, checks)?, restored_velocity(checks, *velocity, rate_hz)?))
+            let velocity_m_per_s = checks.vector(*velocity)?;
+            is_within(velocity_m_per_s * step_s)?;
+            Ok((restored_index(model, *index, checks)?, velocity_m_per_s))
         });
         Ok(Prescribed { grasped, released: released.collect::<Result<_>>()? })
     }

@@ -45,6 +45,8 @@ pub(super) trait Real:
     const NEGLIGIBLE_EXPONENT: f64;
     /// The smallest number whose square is a normal number. Smaller values count as 0 in the state of a sheet.
     const LEAST: f64;
+    /// Sums of squares of some numbers below this, and of their differences, are numbers.
+    const LARGEST: f64;
     /// Numbers from [`Real::LEAST`] on have at least one of these bits: the two highest of the exponent.
     const LEAST_BITS: Self::Bits;
     /// The smallest |Q| of a spring that pulls; half of it is a strain. The force across the spring's direction is a
@@ -102,6 +104,7 @@ macro_rules! real {
             type Bits = $bits;
             const COMPENSATES: bool = size_of::<$t>() < 8;
             const LEAST: f64 = f64::from_bits(((1023 + (<$t>::MIN_EXP - 1) / 2) as u64) << 52);
+            const LARGEST: f64 = f64::from_bits(((1023 + (<$t>::MAX_EXP - 1) / 2 - 3) as u64) << 52);
             const LEAST_BITS: $bits = 3 << (<$bits>::BITS - 3);
             const LEAST_EXCESS: f64 = f64::from_bits(((1023 - $small[0]) as u64) << 52);
             const FAINT: f64 = f64::from_bits(((1023 - $small[1]) as u64) << 52);

@@ -11,7 +11,7 @@ use super::applied::Applied;
 use super::checkpoint::{Checkpoint, Input, Work};
 use super::contact::Contacts;
 use super::field::{Layout, State};
-use super::guard::{INTERVAL_SUBSTEPS, MOST_HALVINGS, farthest_in_spacings};
+use super::guard::{INTERVAL_SUBSTEPS, MOST_HALVINGS};
 use super::model::{Model, Plan};
 use super::motion::{Sheet, springs_of};
 use super::prescribed::Prescribed;
@@ -252,7 +252,7 @@ impl<T: Real> Sheet<T> {
         let layout = sheet.tables.layout;
         let scale = sheet.plan.force_scale(&model.scene);
         sheet.applied = Applied::restored(&parts.forces, model, &layout, scale, &checks)?;
-        sheet.prescribed = Prescribed::restored(&parts.prescribed, model, &checks)?;
+        sheet.prescribed = Prescribed::restored(&parts.prescribed, model, T::LARGEST * model.unit_m, &checks)?;
         sheet.contacts = Contacts::restored(&parts.contacts, model, &checks)?;
         sheet.work = Work::restored(&parts.work)?;
         sheet.tiles.restore(&parts.tiles)?;
@@ -261,13 +261,10 @@ impl<T: Real> Sheet<T> {
         ensure(values.len().is_multiple_of(size), "part of a value")?;
         let mut values = values.chunks_exact(size).map(T::read);
         let moved: Vec<usize> = parts.tiles.moved.iter().map(|tile| *tile as usize).collect();
-        // Squares of these are numbers in any format.
-        let farthest = farthest_in_spacings(model);
-        let mut fill = |state: &mut State<T>, has_passed: bool| -> Result<bool> {
+        // Far beyond what the guard lets a point do in an interval; what is not bearable, it finds at the next step.
+        let most = T::of(T::LARGEST);
+        let mut fill = |state: &mut State<T>| -> Result<bool> {
             let mut any = false;
-            // A state to go back to has passed the checks of the guard; another is checked in the course of an interval.
-            #[allow(clippy::cast_precision_loss)]
-            let most = T::of(if has_passed { farthest } else { INTERVAL_SUBSTEPS as f64 * farthest });
             for tile in &moved {
                 for field in state.fields_mut() {
                     for row in rows_of(&layout, *tile) {
@@ -282,14 +279,14 @@ impl<T: Real> Sheet<T> {
             Ok(any)
         };
         let mut state = State::zero(&layout, sheet.state.kept.len());
-        let is_moved = fill(&mut state, parts.checkpoint.is_none())?;
+        let is_moved = fill(&mut state)?;
         sheet.state = state;
         // What each tile adds to a volume; those asleep are not added up again.
         let tiles: Vec<usize> = (0..sheet.tiles.tile_count()).collect();
         sheet.tables.growth(&sheet.state.u, &tiles);
         let checkpoint = parts.checkpoint.as_ref().map(|saved| {
             let mut state = State::zero(&layout, sheet.state.kept.len());
-            fill(&mut state, true)?;
+            fill(&mut state)?;
             sheet.checkpoint_of(saved, state, &checks)
         });
         sheet.checkpoint = checkpoint.transpose()?.map(Arc::new);
@@ -323,7 +320,7 @@ impl<T: Real> Sheet<T> {
             halvings: saved.halvings,
             state,
             applied: Applied::restored(&saved.forces, model, layout, scale, checks)?,
-            prescribed: Prescribed::restored(&saved.prescribed, model, checks)?,
+            prescribed: Prescribed::restored(&saved.prescribed, model, T::LARGEST * model.unit_m, checks)?,
             contacts: Contacts::restored(&saved.contacts, model, checks)?,
             work: Work::restored(&saved.work)?,
             largest: saved.largest,

@@ -26,15 +26,8 @@ use crate::shape::{PointId, RestShape};
 /// A vector.
 pub(super) type Vector = [f64; 3];
 
-/// Numbers in a snapshot are below this: far beyond any that a tissue has, and their squares are numbers.
-const LARGEST: f64 = 1e30;
-
-/// Tools and points in a snapshot are moved by less than this, in longest sides of the tissue: farther than any command takes
-/// them, and the springs' forces there are numbers in any format.
-const FARTHEST_SIDES: f64 = 1e6;
-
-/// Control points in a snapshot are below this, m.
-const FARTHEST_M: f64 = 1e12;
+/// Numbers in a snapshot are below this, so that their squares are numbers. No tissue goes so far: the guard ends its motion long before.
+pub(super) const LARGEST: f64 = 1e150;
 
 /// Steps and counts in a snapshot are below this. Sums of many are numbers, and all are exact as f64.
 const MOST: u64 = 1 << 48;
@@ -358,15 +351,16 @@ pub fn ensure(holds: bool, what: &str) -> Result<()> {
 }
 
 impl Checks<'_> {
-    /// A length, time, speed or force.
+    /// A length, time, speed or force: any that a session may have come to, however unlikely it is. Whether it is bearable, the
+    /// guard finds out at the next step, as it does in the session that was saved.
     ///
     /// # Errors
-    /// Refuses a number that is not finite or too large.
+    /// Refuses a number that is not finite, or whose square is not.
     pub fn number(&self, value: f64) -> Result<f64> {
         ensure(value.abs() < LARGEST, "a number that is not finite or out of range").map(|()| value)
     }
 
-    /// A vector of such numbers.
+    /// A vector of lengths, speeds or forces.
     ///
     /// # Errors
     /// As for [`Checks::number`].
@@ -375,31 +369,12 @@ impl Checks<'_> {
         Ok(DVec3::from(value))
     }
 
-    /// A control point.
+    /// A time of a script, which may be as late as it likes.
     ///
     /// # Errors
-    /// Refuses one that is not finite or too far away.
-    pub fn place(&self, value: Vector) -> Result<DVec3> {
-        let place_m = self.vector(value)?;
-        ensure(place_m.abs().max_element() < FARTHEST_M, "a place that is too far away").map(|()| place_m)
-    }
-
-    /// How far something is moved, m.
-    ///
-    /// # Errors
-    /// Refuses what is not finite, or farther than any command leads.
-    pub fn movement(&self, value: DVec3) -> Result<DVec3> {
-        let most_m = FARTHEST_SIDES * self.shape.longest_side_m();
-        ensure(value.length() <= most_m, "a place that no command leads to").map(|()| value)
-    }
-
-    /// A place of a tool.
-    ///
-    /// # Errors
-    /// As for [`Checks::movement`], from the middle of the tissue.
-    pub fn near(&self, value: Vector) -> Result<DVec3> {
-        let place_m = DVec3::from(value);
-        self.movement(place_m - self.shape.extent().middle_m()).map(|_| place_m)
+    /// Refuses a number that is not finite.
+    pub fn time(&self, value: f64) -> Result<f64> {
+        ensure(value.is_finite(), "a time that is not finite").map(|()| value)
     }
 
     /// A step, or a number of steps or of anything.
@@ -469,7 +444,7 @@ impl SavedPoke {
         let SavedPoke { point, centre_m, force_n, falloff_per_m, falloff_offset } = *self;
         Ok(Poke {
             point: point.map(|point| checks.point(point)).transpose()?,
-            centre_m: checks.place(centre_m)?,
+            centre_m: checks.vector(centre_m)?,
             force_n: checks.force(force_n, falloff_per_m, falloff_offset)?,
             falloff_per_m,
             falloff_offset,
@@ -511,16 +486,16 @@ impl SavedLoad {
         let force = |force_n: Vector| checks.force(force_n, *falloff_per_m, *falloff_offset);
         let centre = match centre {
             SavedCentre::Hops(hops) => {
-                let hops = hops.iter().map(|hop| Ok((hop.0, checks.place(hop.1)?)));
+                let hops = hops.iter().map(|hop| Ok((hop.0, checks.vector(hop.1)?)));
                 CentreProfile::Hops(hops.collect::<Result<_>>()?)
             }
             SavedCentre::Points(hops) => {
-                let hops = hops.iter().map(|hop| Ok((hop.0, (checks.point(hop.1)?, checks.place(hop.2)?))));
+                let hops = hops.iter().map(|hop| Ok((hop.0, (checks.point(hop.1)?, checks.vector(hop.2)?))));
                 CentreProfile::Points(hops.collect::<Result<_>>()?)
             }
             SavedCentre::Path { from_m, velocity_m_per_s } => CentreProfile::Path {
-                from_m: checks.place(*from_m)?,
-                velocity_m_per_s: checks.place(*velocity_m_per_s)?,
+                from_m: checks.vector(*from_m)?,
+                velocity_m_per_s: checks.vector(*velocity_m_per_s)?,
             },
         };
         let strength = match strength {
@@ -529,7 +504,7 @@ impl SavedLoad {
                     SavedProfile::Constant => Profile::Constant,
                     SavedProfile::Pulse { on, off } => Profile::Pulse { on, off },
                     SavedProfile::Ramp { from_s, to_s } => {
-                        let (from_s, to_s) = (checks.number(from_s)?, checks.number(to_s)?);
+                        let (from_s, to_s) = (checks.time(from_s)?, checks.time(to_s)?);
                         ensure(from_s < to_s, "a ramp that does not rise")?;
                         Profile::Ramp { from_s, to_s }
                     }
@@ -555,10 +530,10 @@ pub(super) fn saved_moves(profile: &MotionProfile) -> SavedGrasp {
 /// A movement of a point.
 pub(super) fn restored_moves(checks: &Checks<'_>, point: u64, moves: &[(f64, f64, Vector)]) -> Result<MotionProfile> {
     let moves = moves.iter().map(|(from_s, to_s, by_m)| {
-        let (from_s, to_s) = (checks.number(*from_s)?, checks.number(*to_s)?);
+        let (from_s, to_s) = (checks.time(*from_s)?, checks.time(*to_s)?);
         // Accelerations are over its square.
         ensure(to_s - from_s > 1e-9, "a movement that takes no time")?;
-        Ok(Move { from_s, to_s, by_m: checks.movement(DVec3::from(*by_m))? })
+        Ok(Move { from_s, to_s, by_m: checks.vector(*by_m)? })
     });
     Ok(MotionProfile { point: checks.point(point)?, moves: moves.collect::<Result<_>>()? })
 }
@@ -568,20 +543,14 @@ pub(super) fn saved_motion(motion: &Motion) -> [Vector; 3] {
     [motion.displacement_m, motion.velocity_m_per_s, motion.acceleration_m_per_s2].map(Into::into)
 }
 
-/// A velocity, by which a point moves in each of `rate_hz` steps a second.
-pub(super) fn restored_velocity(checks: &Checks<'_>, velocity: Vector, rate_hz: f64) -> Result<DVec3> {
-    let velocity_m_per_s = DVec3::from(velocity);
-    checks.movement(velocity_m_per_s / rate_hz).map(|_| velocity_m_per_s)
-}
-
 /// A motion.
-pub(super) fn restored_motion(checks: &Checks<'_>, motion: &[Vector; 3], rate_hz: f64) -> Result<Motion> {
-    let displacement_m = checks.movement(DVec3::from(motion[0]))?;
-    let velocity_m_per_s = restored_velocity(checks, motion[1], rate_hz)?;
-    // A change of velocity within a step, times the rate of steps.
-    let acceleration_m_per_s2 = DVec3::from(motion[2]);
-    ensure(acceleration_m_per_s2.is_finite(), "an acceleration that is not finite")?;
-    Ok(Motion { displacement_m, velocity_m_per_s, acceleration_m_per_s2 })
+pub(super) fn restored_motion(checks: &Checks<'_>, motion: &[Vector; 3]) -> Result<Motion> {
+    let [displacement_m, velocity_m_per_s, acceleration_m_per_s2] = motion.map(|v| checks.vector(v));
+    Ok(Motion {
+        displacement_m: displacement_m?,
+        velocity_m_per_s: velocity_m_per_s?,
+        acceleration_m_per_s2: acceleration_m_per_s2?,
+    })
 }
 
 impl SavedTip {
@@ -605,10 +574,6 @@ impl SavedTip {
             stiffness_n_per_m,
             damping_n_s_per_m,
         });
-        if let Some((stiffness_n_per_m, damping_n_s_per_m)) = spring {
-            checks.number(stiffness_n_per_m)?;
-            checks.number(damping_n_s_per_m)?;
-        }
         let tip = Tip { radius_m, friction, grasps, coupling };
         check_tip("snapshot.tip", checks.shape, &tip)?;
         Ok(tip)

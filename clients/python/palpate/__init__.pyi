@@ -149,7 +149,7 @@ class Session:
     def __init__(self, tissue: Union[Tissue, Scene, Source]) -> None: ...
     @staticmethod
     def restore(scene: Union[Scene, Tissue, Source], snapshot: bytes) -> Session:
-        """Goes on from `save()`, of a session that began with `scene`. Poses have to be told again."""
+        """Goes on from `save()`, of a session that began with `scene`: tools stay where they are, with their tips."""
     def step(self, steps: int = 1) -> None:
         """Does so many steps. Raises Failed if the tissue can't go on. Ctrl-C ends it between two steps."""
     @property

@@ -38,14 +38,17 @@ pub(crate) struct Inner {
     first: scene::Scene,
     intake: Intake,
     held: BTreeSet<u32>,
+    /// Tips of the tools that were in the tissue when the session went on, until they are told something.
+    tips: BTreeMap<u32, palpate_touch::Tip>,
     led: BTreeMap<u32, Led>,
     due: Vec<Due>,
 }
 
 impl Inner {
     pub(crate) fn of(session: session::Session, first: scene::Scene) -> Self {
-        let intake = Intake::new(&first, &limits()).continued_at(session.step_count(), None);
-        Inner { session, first, intake, held: BTreeSet::new(), led: BTreeMap::new(), due: Vec::new() }
+        let intake = Intake::new(&first, &limits()).continued(&session, None);
+        let tips = session.tips().collect();
+        Inner { session, first, intake, held: BTreeSet::new(), tips, led: BTreeMap::new(), due: Vec::new() }
     }
 
     /// A tool does something from the next step on.
@@ -59,6 +62,7 @@ impl Inner {
         // Several commands may come for one step: their sequence is the intake's matter.
         let command = Command { sequence: None, ..run::command(tool as usize, step, action.clone()) };
         self.intake.submit(lease, vec![command], 0)?;
+        self.tips.remove(&tool);
         match action {
             Action::Pose { place_m, tip, .. } => self.led.insert(tool, Led { place_m, tip }),
             _ => self.led.remove(&tool),
@@ -113,7 +117,7 @@ impl Session {
         Ok(Session::of(py.detach(|| Inner::of(session::Session::new(&model), model.scene.clone()))))
     }
 
-    /// Goes on from `save()`, of a session that began with `scene`. Poses have to be told again.
+    /// Goes on from `save()`, of a session that began with `scene`: tools stay where they are, with their tips.
     #[staticmethod]
     fn restore(py: Python<'_>, scene: &Bound<'_, PyAny>, snapshot: &[u8]) -> PyResult<Self> {
         let scene = match scene.cast::<Tissue>() {
@@ -237,7 +241,7 @@ impl Session {
     #[pyo3(signature = (tool, place_m, tip=None))]
     fn pose(&self, py: Python<'_>, tool: u32, place_m: &Bound<'_, PyAny>, tip: Option<Tip>) -> PyResult<()> {
         let place_m = vector("place_m", place_m)?;
-        let known = self.with(py, |inner| inner.led.get(&tool).map(|led| led.tip));
+        let known = self.with(py, |inner| inner.led.get(&tool).map(|led| led.tip).or(inner.tips.get(&tool).copied()));
         let tip = tip.map(|tip| tip.0).or(known).unwrap_or_default();
         self.submit(py, tool, Action::Pose { place_m, velocity_m_per_s: None, tip })
     }

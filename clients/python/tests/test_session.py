@@ -132,6 +132,31 @@ class Sessions(unittest.TestCase):
         with self.assertRaises(palpate.Refused):
             palpate.Session.restore("liver", saved)
 
+    def test_a_session_that_goes_on_knows_the_tips_of_its_tools(self):
+        session, tip = palpate.Session("paper"), palpate.Tip(0.04)
+        for step in range(30):
+            session.pose(0, (0.25, 0.25, 0.01 - 0.001 * step), tip)
+            session.step()
+        again = palpate.Session.restore("paper", session.save())
+        with self.assertRaises(palpate.Refused) as raised:
+            palpate.Session.restore("paper", session.save()).pose(0, (0.25, 0.25, -0.02), palpate.Tip(0.02))
+        self.assertEqual((raised.exception.reason, raised.exception.field), ("OUT_OF_TURN", "pose.tip.radius_m"))
+        for one in (session, again):
+            one.step(10)
+            one.pose(0, (0.25, 0.26, -0.02))
+            one.step(20)
+        self.assertEqual(again.hash, session.hash)
+
+    def test_a_zero_has_no_sign(self):
+        hashes = []
+        for zero in (0.0, -0.0):
+            session = palpate.Session(palpate.Scene("paper", set={"damping.coefficient_n_s_per_m": zero}))
+            session.grasp(0, (7, 7), (zero, 0.001, zero))
+            session.pose(1, (0.2, 0.2, zero))
+            session.step(20)
+            hashes.append((session.hash, session.save()))
+        self.assertEqual(hashes[0], hashes[1])
+
     def test_a_change_has_the_bits_of_a_script_that_changes(self):
         script = PUSH + "[[tissue]]\nat_s = 0.01\nvirtual_stiffness_n_per_m = 50.0\n"
         session = pushed(10)

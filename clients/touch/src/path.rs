@@ -38,9 +38,8 @@ const LATE_S: f64 = 0.002;
 const CATCH_UP: f64 = 0.1;
 /// Before it catches up, something newer must have been available for this long, s.
 const WATCHED_S: f64 = 0.25;
-/// No time of a path is longer, s, and no place farther, m.
+/// No time of a path is longer, s.
 const LONGEST_S: f64 = 1e12;
-const FARTHEST_M: f64 = 1e12;
 /// Most places in the queue.
 const MOST: usize = 1024;
 
@@ -96,9 +95,7 @@ impl PathState {
     /// Whether a path may have these.
     fn is_sound(&self) -> bool {
         let is_time = |time_s: f64| time_s.abs() < LONGEST_S;
-        // The largest component of some that are not numbers may be one.
-        let is_place = |place_m: &DVec3| place_m.is_finite() && place_m.abs().max_element() < FARTHEST_M;
-        let is_passed = |(time_s, place_m): &(f64, DVec3)| is_time(*time_s) && is_place(place_m);
+        let is_passed = |(time_s, place_m): &(f64, DVec3)| is_time(*time_s) && place_m.is_finite();
         let is_heading = |(time_s, place_m, velocity): &(f64, DVec3, DVec3)| {
             is_passed(&(*time_s, *place_m)) && velocity.length() <= 2.0 * SPEED_M_PER_S
         };
@@ -106,7 +103,7 @@ impl PathState {
             && self.waiting.iter().chain(&self.played).all(is_passed)
             && self.waiting.is_sorted_by(|a, b| a.0 < b.0)
             && self.heading.iter().all(is_heading)
-            && self.begins_m.iter().chain(&self.place_m).all(is_place)
+            && self.begins_m.iter().chain(&self.place_m).all(|place_m| place_m.is_finite())
             // A tool that went to its place at once has arrived for good, and what was never measured is without end.
             && (is_time(self.arrived_s) || self.arrived_s == f64::INFINITY)
             && (is_time(self.spare_s) || self.spare_s == f64::INFINITY)

@@ -338,3 +338,44 @@ fn a_lease_is_neither_shorter_than_10_ms_nor_longer_than_the_limit() {
         assert_eq!((refused.reason, refused.field.as_str()), (Reason::OutOfRange, "lease_s"), "{lease_s} s");
     }
 }
+
+#[test]
+fn a_tool_that_is_in_the_tissue_when_a_session_goes_on_keeps_its_tip() {
+    let model = Model::paper(&["sheet.points=[9, 9]"]);
+    let limits = Limits::default();
+    let pose = |radius_m: f64| Action::Pose {
+        place_m: glam::DVec3::new(0.1, 0.1, 0.01),
+        velocity_m_per_s: None,
+        tip: Tip { radius_m, ..Tip::default() },
+    };
+    let mut session = Session::new(&model);
+    for (tool, action) in [(0, pose(0.03)), (1, Action::Release), (2, pose(0.02))] {
+        session.advance(&mut vec![Due::in_time(Command::new(tool, Some(1), action))], |_| {});
+    }
+    let radii_m: Vec<(u32, f64)> = session.tips().map(|(tool, tip)| (tool, tip.radius_m)).collect();
+    assert_eq!(radii_m, [(0, 0.03), (2, 0.02)]);
+    let other = |intake: &mut Intake, tool: u32| {
+        let refused = intake.submit(LEASE, vec![Command::new(tool, None, pose(0.01))], 0).unwrap_err();
+        (refused.reason, refused.field)
+    };
+    let refused = (Reason::OutOfTurn, "pose.tip.radius_m".to_owned());
+    // Whoever takes it, and whoever has it from another server.
+    let mut taken = Intake::new(&model.scene, &limits).continued(&session, None);
+    taken.acquire(&[0, 1], "test", 1.0, LEASE, 0).unwrap();
+    assert_eq!(other(&mut taken, 0), refused);
+    taken.submit(LEASE, vec![Command::new(0, None, pose(0.03)), Command::new(1, None, pose(0.01))], 0).unwrap();
+    let (handed, _) = taken.hand_over(Refusal::new(Reason::Elsewhere, "session_id", "another server has it"));
+    let mut adopting = Intake::new(&model.scene, &limits).continued(&session, None);
+    adopting.adopt(crate::session::handing::Handed { waiting: Vec::new(), ..handed }, 0);
+    assert_eq!(other(&mut adopting, 0), refused);
+    // Once it has let go, a new tip is as good as another; and a lease that ends takes the tip with it.
+    adopting.submit(LEASE, vec![Command::new(0, None, Action::Release), Command::new(0, None, pose(0.01))], 0).unwrap();
+    adopting.release(LEASE).unwrap();
+    adopting.acquire(&[0], "test", 1.0, LEASE, 0).unwrap();
+    adopting.submit(LEASE, vec![Command::new(0, None, pose(0.04))], 0).unwrap();
+    // All let go, as after a crash: nothing is known.
+    session.let_go();
+    let mut after = Intake::new(&model.scene, &limits).continued(&session, None);
+    after.acquire(&[2], "test", 1.0, LEASE, 0).unwrap();
+    after.submit(LEASE, vec![Command::new(2, None, pose(0.01))], 0).unwrap();
+}
