@@ -3,9 +3,13 @@
 mod curvature;
 pub mod decimate;
 pub mod delaunay;
+mod join;
 pub mod mesh;
 pub mod organ;
+mod orient;
+pub mod prepare;
 pub mod problem;
+mod ray;
 pub mod read;
 pub mod repair;
 pub mod report;
@@ -13,9 +17,11 @@ pub mod surface;
 pub mod topology;
 mod tree;
 pub mod unit;
+mod walls;
 pub mod write;
 
 pub use mesh::{Group, TriangleMesh};
+pub use prepare::{FileMesh, Prepared, prepare};
 pub use problem::{Element, MeshError, Problem};
 pub use read::{ReadLimits, ReadMesh, read};
 pub use report::{Report, report};
