@@ -16,6 +16,26 @@ pub struct TriangleMesh {
 }
 
 impl TriangleMesh {
+    /// Keeps the triangles for which `keep` is true, with their texture coordinates.
+    pub(crate) fn keep_triangles(&mut self, keep: &[bool]) {
+        let mut kept = keep.iter();
+        self.triangles.retain(|_| *kept.next().unwrap_or(&true));
+        if let Some(uv) = &mut self.uv {
+            let mut kept = keep.iter();
+            uv.retain(|_| *kept.next().unwrap_or(&true));
+        }
+    }
+
+    /// Turns the triangles for which `is_turned` is true to their other side.
+    pub(crate) fn turn_triangles(&mut self, is_turned: &[bool]) {
+        for (triangle, _) in self.triangles.iter_mut().zip(is_turned).filter(|(_, is_turned)| **is_turned) {
+            triangle.swap(1, 2);
+        }
+        for (uv, _) in self.uv.iter_mut().flatten().zip(is_turned).filter(|(_, is_turned)| **is_turned) {
+            uv.swap(1, 2);
+        }
+    }
+
     /// Writes the texture coordinates of each vertex, if the file has them; at a seam those of the first corner there.
     pub fn write_vertex_uv(&self, into: &mut [[f32; 2]]) {
         // Backwards, so that the first corner is written last.

@@ -72,6 +72,10 @@ pub enum Problem {
     Orientation,
     /// A closed surface whose triangles face inwards.
     FacesInward,
+    /// The wall of a cavity, inside of another closed surface, whose triangles face the tissue.
+    CavityFacesTissue,
+    /// An open surface whose triangles face its middle.
+    OpenFacesInward,
     /// A triangle without area.
     Degenerate,
     /// The vertices of an earlier triangle.
@@ -134,6 +138,8 @@ impl Problem {
             Problem::NonManifoldVertex { .. } => "non_manifold_vertex",
             Problem::Orientation => "orientation",
             Problem::FacesInward => "faces_inward",
+            Problem::CavityFacesTissue => "cavity_faces_tissue",
+            Problem::OpenFacesInward => "open_faces_inward",
             Problem::Degenerate => "degenerate",
             Problem::DuplicateTriangle => "duplicate_triangle",
             Problem::DuplicateVertex { .. } => "duplicate_vertex",
@@ -153,6 +159,8 @@ impl Problem {
         !matches!(
             self,
             Problem::FacesInward
+                | Problem::CavityFacesTissue
+                | Problem::OpenFacesInward
                 | Problem::Degenerate
                 | Problem::DuplicateTriangle
                 | Problem::DuplicateVertex { .. }
@@ -197,7 +205,7 @@ impl fmt::Display for Problem {
             }
             Problem::OnlyDegenerate => write!(f, "no triangle has an area: there is no surface to touch"),
             Problem::NonManifoldEdge { triangles } => {
-                write!(f, "{triangles} triangles share this edge, at most 2 can: --repair drops the others")
+                write!(f, "{triangles} triangles share this edge, at most 2 can: --repair pairs them")
             }
             Problem::NonManifoldVertex { fans } => {
                 write!(f, "{fans} surfaces touch at this vertex alone: --repair gives each its own vertex")
@@ -206,12 +214,23 @@ impl fmt::Display for Problem {
                 write!(f, "the triangles at this edge face opposite sides: --repair turns all to one side")
             }
             Problem::FacesInward => write!(f, "the closed surface faces inwards: --repair turns it outwards"),
+            Problem::CavityFacesTissue => {
+                write!(f, "the wall of a cavity faces the tissue around it: --repair turns it into the cavity")
+            }
+            Problem::OpenFacesInward => write!(
+                f,
+                "the open surface faces inwards, as the lining of a tube does: a tool outside of it touches its back; if that \
+                 is not meant, turn its triangles, or close it (--repair fills small holes)"
+            ),
             Problem::Degenerate => write!(f, "the triangle has no area: --repair drops it"),
             Problem::DuplicateTriangle => {
                 write!(f, "an earlier triangle has the same vertices: --repair drops this one")
             }
             Problem::DuplicateVertex { of } => {
-                write!(f, "at the position of vertex {of}, but not connected with it: --repair welds them")
+                write!(
+                    f,
+                    "at the position of vertex {of}, but not joined with it: no edge of their triangles is the same"
+                )
             }
             Problem::UnusedVertex => write!(f, "no triangle has this vertex: --repair drops it"),
             Problem::EdgeSpread { ratio } => write!(
@@ -239,7 +258,7 @@ impl fmt::Display for Problem {
                 write!(f, "too many triangles overlap to find which cut each other")
             }
             Problem::Components { count } => {
-                write!(f, "{count} separate surfaces: --repair keeps the largest")
+                write!(f, "{count} separate surfaces: --repair keeps the largest and what is inside of it")
             }
         }
     }
@@ -264,6 +283,21 @@ pub enum Element {
     Edge([u32; 2]),
     /// A part that the format names: accessor 3, node 5.
     Part(&'static str, u64),
+}
+
+impl Element {
+    /// Gives its vertices and triangles other numbers.
+    pub(crate) fn rename(&mut self, vertex: impl Fn(u32) -> u32, triangle: impl Fn(u32) -> u32) {
+        match self {
+            Element::Vertex(number) => *number = vertex(*number),
+            Element::Triangle(number) => *number = triangle(*number),
+            Element::Edge(both) => {
+                *both = both.map(vertex);
+                both.sort_unstable();
+            }
+            Element::Whole | Element::Line(_) | Element::Byte(_) | Element::Face(_) | Element::Part(..) => {}
+        }
+    }
 }
 
 impl fmt::Display for Element {

@@ -1,13 +1,20 @@
-//! Mending: weld, drop, split, orient, fill. Each step tells what it did, and where vertices went.
+//! Mending: weld, drop, pair, orient, fill. Each step tells what it did, and where vertices went; what came out is compared with
+//! what was asked for.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
 
 use glam::DVec3;
+use serde::Serialize;
 
 use crate::delaunay::flip_degenerate;
-use crate::report::{extent, has_area, volume};
-use crate::topology::Topology;
+use crate::join::{Odd, join, places};
+use crate::orient::{Oriented, orient};
+use crate::prepare::note;
+use crate::report::{area, extent, has_area, volume};
+use crate::topology::{Sets, Topology};
+use crate::tree::corners;
+use crate::walls::{doubled, match_diagonals};
 use crate::{Group, TriangleMesh};
 
 /// The tolerance of welding, as a part of the diagonal of the bounding box, unless it is given.
@@ -16,18 +23,26 @@ const WELD: f64 = 1e-6;
 /// Vertices of one cell that others are compared with.
 const COMPARED: usize = 8;
 
+/// How often triangles are halved at an edge that surfaces share: each has three.
+const HALVINGS: usize = 8;
+
+/// Parts of the area or of the volume that differ by more are told as lost.
+const LOST: f64 = 0.01;
+
 /// What is mended. The default is everything.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Repair {
     /// Weld vertices that are this near, m; `None`: a millionth of the diagonal; 0: the same position only.
     pub weld_m: Option<f64>,
-    /// Drop triangles without area, and those that have the vertices of an earlier one.
+    /// Drop triangles without area, those that have the vertices of an earlier one, and walls inside that are there from both
+    /// sides.
     pub degenerate: bool,
-    /// Drop the triangles that an edge has beyond two; give each surface at a shared vertex its own one.
+    /// Pair the triangles of edges that more than two have, so that each solid closes on itself; give each surface at a shared
+    /// vertex its own one.
     pub manifold: bool,
-    /// Turn triangles to one side; outwards if the surface is closed.
+    /// Turn triangles to one side; closed surfaces outwards from the tissue, so walls of cavities into these.
     pub orient: bool,
-    /// Keep the connected surface with the most triangles.
+    /// Keep the connected surface with the most triangles, with what touches it at edges and what is inside of it.
     pub largest: bool,
     /// Fill holes with at most so many edges: those with three, and those with a border shorter than the diagonal of the
     /// bounding box.
@@ -59,38 +74,77 @@ pub struct Repaired {
     pub told: Vec<String>,
     /// For each vertex of the mesh before, the vertex that it is now; `None` if it was dropped.
     pub vertex_of: Vec<Option<u32>>,
+    /// What the surface was, and what it is.
+    pub before: Measure,
+    /// What the surface is now.
+    pub after: Measure,
+    /// Why this is not what was asked for; empty if it is.
+    pub faults: Vec<String>,
+}
+
+/// How large a surface is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct Measure {
+    /// The area of all triangles, m².
+    pub area_m2: f64,
+    /// The volume inside, m³, if the surface is closed and its triangles face the same side at each edge; with several at an
+    /// edge, if as many run one way along it as the other. Before, it is measured without copies of triangles, and with those
+    /// turned that must be.
+    pub volume_m3: Option<f64>,
+}
+
+impl Measure {
+    /// Measures a surface whose coordinates are finite and whose indices are in range.
+    #[must_use]
+    pub fn of(mesh: &TriangleMesh) -> Self {
+        let (vertices, triangles) = (&mesh.vertices_m, &mesh.triangles);
+        let area_m2 = triangles.iter().map(|triangle| area(corners(vertices, *triangle)).0).sum();
+        let places = places(vertices);
+        let mut ways: Vec<([u32; 2], bool)> = Vec::with_capacity(3 * triangles.len());
+        for triangle in triangles {
+            let [a, b, c] = triangle.map(|vertex| places[vertex as usize]);
+            let sides = [[a, b], [b, c], [c, a]].into_iter().filter(|[from, to]| from != to);
+            ways.extend(sides.map(|[from, to]| ([from.min(to), from.max(to)], from < to)));
+        }
+        ways.sort_unstable();
+        let mut edges = ways.chunk_by(|a, b| a.0 == b.0);
+        let is_closed = edges.all(|edge| 2 * edge.iter().filter(|way| way.1).count() == edge.len());
+        let volume_m3 = (is_closed && !ways.is_empty()).then(|| volume(vertices, triangles).abs());
+        Self { area_m2, volume_m3 }
+    }
 }
 
 /// Mends a mesh. Triangles whose vertices don't exist or are not finite are dropped.
 #[must_use]
 pub fn repair(mesh: &TriangleMesh, how: &Repair) -> Repaired {
-    let mut work =
-        Work { mesh: mesh.clone(), told: Vec::new(), vertex_of: (0..).take(mesh.vertices_m.len()).map(Some).collect() };
+    let mut work = Work {
+        mesh: mesh.clone(),
+        told: Vec::new(),
+        vertex_of: (0..).take(mesh.vertices_m.len()).map(Some).collect(),
+        faults: Vec::new(),
+    };
     work.drop_invalid();
+    let mut before = Measure::of(&work.mesh);
     work.weld(how.weld_m);
-    if how.degenerate {
-        work.drop_degenerate();
-    }
-    if how.manifold {
-        work.split_edges();
-        work.split_vertices();
-    }
-    if how.orient {
-        work.orient();
+    let copies = if how.degenerate { work.drop_degenerate() } else { 0 };
+    let parts = work.join(how);
+    if before.volume_m3.is_none() || copies > 0 || parts.oriented.is_turned.contains(&true) {
+        before.volume_m3 = Measure::of(&work.mesh).volume_m3;
     }
     if how.largest {
-        work.keep_largest();
+        work.keep_largest(&parts);
     }
     if how.hole_edges > 0 {
         work.fill_holes(how.hole_edges);
-    }
-    if how.orient {
-        work.face_outward();
+        // What is closed now has an inside.
+        work.join(how);
     }
     if how.unused {
         work.drop_unused();
     }
-    Repaired { mesh: work.mesh, told: work.told, vertex_of: work.vertex_of }
+    let after = Measure::of(&work.mesh);
+    work.compare(&before, &after);
+    Repaired { mesh: work.mesh, told: work.told, vertex_of: work.vertex_of, before, after, faults: work.faults }
 }
 
 /// A mesh while it is mended.
@@ -98,13 +152,19 @@ struct Work {
     mesh: TriangleMesh,
     told: Vec<String>,
     vertex_of: Vec<Option<u32>>,
+    faults: Vec<String>,
+}
+
+/// Triangles that are joined at edges.
+struct Parts {
+    oriented: Oriented,
+    /// Two triangles of parts that touch at an edge.
+    touching: Vec<[u32; 2]>,
 }
 
 impl Work {
     fn tell(&mut self, count: usize, what: &str) {
-        if count > 0 {
-            self.told.push(format!("{what}: {count}."));
-        }
+        note(&mut self.told, count, what);
     }
 
     fn topology(&self) -> Topology {
@@ -114,12 +174,7 @@ impl Work {
     /// Keeps some triangles; returns how many it drops.
     fn keep(&mut self, keep: &[bool]) -> usize {
         let before = self.mesh.triangles.len();
-        let mut kept = keep.iter();
-        self.mesh.triangles.retain(|_| *kept.next().unwrap_or(&true));
-        if let Some(uv) = &mut self.mesh.uv {
-            let mut kept = keep.iter();
-            uv.retain(|_| *kept.next().unwrap_or(&true));
-        }
+        self.mesh.keep_triangles(keep);
         before - self.mesh.triangles.len()
     }
 
@@ -194,138 +249,93 @@ impl Work {
         }
     }
 
-    fn drop_degenerate(&mut self) {
+    /// Returns how many copies of triangles it drops.
+    fn drop_degenerate(&mut self) -> usize {
         let flipped = flip_degenerate(&mut self.mesh);
         self.tell(flipped, "Edges flipped beside triangles without area");
         let vertices = &self.mesh.vertices_m;
         let keep: Vec<bool> = self.mesh.triangles.iter().map(|triangle| has_area(vertices, *triangle)).collect();
         let dropped = self.keep(&keep);
         self.tell(dropped, "Triangles without area dropped");
-        let mut keep = vec![true; self.mesh.triangles.len()];
-        for triangle in self.topology().duplicates {
-            keep[triangle as usize] = false;
-        }
-        let dropped = self.keep(&keep);
-        self.tell(dropped, "Triangles dropped that have the vertices of an earlier one");
+        match_diagonals(&mut self.mesh);
+        let found = doubled(&self.mesh, &places(&self.mesh.vertices_m));
+        self.keep(&found.keep);
+        self.tell(found.copies, "Triangles dropped that have the vertices of an earlier one");
+        self.tell(found.walls, "Triangles dropped that are walls inside, there from both sides");
+        found.copies
     }
 
-    /// Drops the triangles that an edge has beyond two: the first one stays, and the next one that faces the same side.
-    fn split_edges(&mut self) {
-        let topology = self.topology();
-        let mut keep = vec![true; self.mesh.triangles.len()];
-        for edge in topology.non_manifold_edges() {
-            let open: Vec<_> =
-                topology.sides(edge).iter().filter(|side| keep[side.triangle as usize]).copied().collect();
-            if open.len() <= 2 {
-                continue;
-            }
-            let first = open[0];
-            let second = open.iter().find(|side| side.is_forward != first.is_forward).unwrap_or(&open[1]);
-            for side in &open {
-                keep[side.triangle as usize] = side.triangle == first.triangle || side.triangle == second.triangle;
-            }
-        }
-        let dropped = self.keep(&keep);
-        self.tell(dropped, "Triangles dropped at edges that more than two had");
-    }
-
-    /// Gives each fan of triangles at a vertex its own vertex; the first one keeps the old one.
-    fn split_vertices(&mut self) {
-        let topology = self.topology();
-        let mut added: HashMap<(u32, u32), u32> = HashMap::new();
-        for (triangle, fans) in self.mesh.triangles.iter_mut().zip(&topology.fan_of_corner) {
-            for (vertex, fan) in triangle.iter_mut().zip(fans).filter(|(_, fan)| **fan > 0) {
-                let old = *vertex;
-                let vertices = &mut self.mesh.vertices_m;
-                *vertex = *added.entry((old, *fan)).or_insert_with(|| {
-                    vertices.push(vertices[old as usize]);
-                    u32::try_from(vertices.len() - 1).unwrap_or(old)
-                });
-            }
-        }
-        let count = added.len();
-        if count > 0 {
-            let mut copies: Vec<(u32, u32)> = added.into_iter().map(|((old, _), new)| (old, new)).collect();
-            copies.sort_unstable();
-            for group in &mut self.mesh.groups {
-                let is_in = |copy: &&(u32, u32)| group.vertices.binary_search(&copy.0).is_ok();
-                let new: Vec<u32> = copies.iter().filter(is_in).map(|copy| copy.1).collect();
-                group.vertices.extend(new);
-                group.vertices.sort_unstable();
-            }
-        }
-        self.tell(count, "Vertices added where surfaces touched at a vertex alone");
-    }
-
-    /// Turns triangles so that neighbours face the same side as the first one of their surface.
-    fn orient(&mut self) {
-        let topology = self.topology();
-        let count = self.mesh.triangles.len();
-        // The neighbours of each triangle, and whether they face the other side.
-        let mut neighbours: Vec<Vec<(u32, bool)>> = vec![Vec::new(); count];
-        for edge in &topology.edges {
-            if let [a, b] = topology.sides(edge) {
-                let is_other = a.is_forward == b.is_forward;
-                neighbours[a.triangle as usize].push((b.triangle, is_other));
-                neighbours[b.triangle as usize].push((a.triangle, is_other));
-            }
-        }
-        let mut is_turned: Vec<Option<bool>> = vec![None; count];
-        let (mut turned, mut is_orientable) = (Vec::new(), true);
-        for start in 0..count {
-            if is_turned[start].is_some() {
-                continue;
-            }
-            is_turned[start] = Some(false);
-            let mut surface = vec![start];
-            let mut next = 0;
-            while let Some(triangle) = surface.get(next).copied() {
-                next += 1;
-                let own = is_turned[triangle].unwrap_or(false);
-                for (neighbour, is_other) in &neighbours[triangle] {
-                    let wanted = own != *is_other;
-                    match is_turned[*neighbour as usize] {
-                        None => {
-                            is_turned[*neighbour as usize] = Some(wanted);
-                            surface.push(*neighbour as usize);
-                        }
-                        Some(is) => is_orientable &= is == wanted,
-                    }
+    /// Joins triangles at edges, each with one other at most; gives surfaces that touch vertices of their own, and turns
+    /// triangles, if asked to.
+    fn join(&mut self, how: &Repair) -> Parts {
+        let odd = if how.manifold { Odd::Pair } else { Odd::Stay };
+        let joined = |mesh: &TriangleMesh| join(&mesh.vertices_m, &mesh.triangles, &places(&mesh.vertices_m), odd);
+        let mut joint = joined(&self.mesh);
+        if how.manifold {
+            self.tell(joint.paired_edges, "Edges that more than two triangles had, whose triangles were paired");
+            self.tell(joint.left_over, "Triangles that got a border of their own at such an edge");
+            let (mut added, mut halved, mut again) = (joint.split_vertices(&mut self.mesh).len(), 0, HALVINGS);
+            loop {
+                let halves = joint.halve(&mut self.mesh).len();
+                if halves == 0 || again == 0 {
+                    break;
                 }
+                (halved, again) = (halved + halves, again - 1);
+                joint = joined(&self.mesh);
+                added += joint.split_vertices(&mut self.mesh).len();
             }
-            // The side that most triangles face.
-            let is_most =
-                2 * surface.iter().filter(|triangle| is_turned[**triangle] == Some(true)).count() > surface.len();
-            turned.extend(surface.into_iter().filter(|triangle| (is_turned[*triangle] == Some(true)) != is_most));
+            self.tell(added, "Vertices added where surfaces touched at a vertex or an edge");
+            self.tell(halved, "Triangles halved where surfaces touched at an edge, both ends of which they shared");
         }
-        for triangle in &turned {
-            self.turn(*triangle);
+        let oriented = orient(&self.mesh.vertices_m, &self.mesh.triangles, &joint);
+        if how.orient {
+            self.mesh.turn_triangles(&oriented.is_turned);
+            self.told.extend(oriented.notes());
         }
-        self.tell(turned.len(), "Triangles turned to the side that the others face");
-        if !is_orientable {
-            self.told.push(
-                "The surface has one side only, like a Möbius strip: no way of turning triangles fits.".to_owned(),
-            );
-        }
+        let first = |pair: &[[u32; 2]; 2]| pair[0][0] / 3;
+        let touching = joint.touching.iter().flat_map(|of| of.windows(2).map(|two| [first(&two[0]), first(&two[1])]));
+        Parts { oriented, touching: touching.collect() }
     }
 
-    fn turn(&mut self, triangle: usize) {
-        self.mesh.triangles[triangle].swap(1, 2);
-        if let Some(uv) = &mut self.mesh.uv {
-            uv[triangle].swap(1, 2);
+    fn keep_largest(&mut self, Parts { oriented, touching }: &Parts) {
+        let parts = &oriented.parts;
+        let mut sets = Sets::new(parts.len());
+        for [a, b] in touching {
+            sets.join(oriented.part_of[*a as usize], oriented.part_of[*b as usize]);
         }
-    }
-
-    fn keep_largest(&mut self) {
-        let topology = self.topology();
-        let mut sizes = vec![0_usize; topology.components];
-        topology.component.iter().flatten().for_each(|component| sizes[*component as usize] += 1);
+        let mut sizes = vec![0_usize; parts.len()];
+        for (number, part) in (0..).zip(parts) {
+            sizes[sets.find(number) as usize] += part.triangles.len();
+        }
         // Of several as large, the first.
-        let largest = (0_u32..).zip(&sizes).min_by_key(|(_, size)| Reverse(**size)).map(|(component, _)| component);
-        if sizes.len() > 1 {
-            let keep: Vec<bool> = topology.component.iter().map(|component| *component == largest).collect();
-            let dropped = self.keep(&keep);
-            self.told.push(format!("Smaller surfaces dropped: {}, with their triangles: {dropped}.", sizes.len() - 1));
+        let largest = (0_u32..).zip(&sizes).min_by_key(|(_, size)| Reverse(**size)).map(|(number, _)| number);
+        let Some(largest) = largest else { return };
+        let is_kept: Vec<bool> = (0..)
+            .zip(parts)
+            .map(|(number, part)| {
+                let around = part.around.iter().any(|other| sets.find(*other) == largest);
+                sets.find(number) == largest || around
+            })
+            .collect();
+        let smaller = is_kept.iter().filter(|is_kept| !**is_kept).count();
+        if smaller == 0 {
+            return;
+        }
+        let keeps = |part: &u32| is_kept.get(*part as usize).copied().unwrap_or(false);
+        let keep: Vec<bool> = oriented.part_of.iter().map(keeps).collect();
+        let before = Measure::of(&self.mesh).area_m2;
+        let dropped = self.keep(&keep);
+        let lost = 1.0 - Measure::of(&self.mesh).area_m2 / before;
+        self.told.push(format!(
+            "Smaller surfaces dropped: {smaller}, with their triangles: {dropped}, and {:.2} % of the area.",
+            100.0 * lost
+        ));
+        if lost > LOST {
+            self.faults.push(format!(
+                "{:.1} % of the area was in surfaces that are separate from the largest one, and is dropped: if they \
+                 belong to it, join them in the program that made the mesh",
+                100.0 * lost
+            ));
         }
     }
 
@@ -338,7 +348,7 @@ impl Work {
                 uv_of.extend(triangle.iter().copied().zip(uv.iter().copied()));
             }
         }
-        let (mut filled, mut added) = (0, 0);
+        let (mut filled, mut added, mut tangled) = (0, 0, 0);
         for hole in topology.holes() {
             let at: Vec<DVec3> = hole.iter().map(|vertex| self.mesh.vertices_m[*vertex as usize]).collect();
             let border: f64 = (0..at.len()).map(|n| at[n].distance(at[(n + 1) % at.len()])).sum();
@@ -349,6 +359,7 @@ impl Work {
             // The rim of an open sheet is longer than the sheet. A missing triangle of a coarse mesh may be, too.
             let is_small = hole.len() <= most_edges && (hole.len() == 3 || border < longest);
             if !is_loop || !is_small {
+                tangled += usize::from(is_small);
                 continue;
             }
             let uv = |vertex: u32| uv_of.get(&vertex).copied().unwrap_or_default();
@@ -387,14 +398,23 @@ impl Work {
         }
         self.tell(filled, "Holes filled");
         self.tell(added, "Vertices added in the middle of holes");
+        if tangled > 0 {
+            self.faults.push(format!("small holes whose borders are no loops are left open: {tangled}"));
+        }
     }
 
-    fn face_outward(&mut self) {
-        let topology = self.topology();
-        let is_consistent = topology.inconsistent_edges().next().is_none();
-        if topology.is_closed() && is_consistent && volume(&self.mesh.vertices_m, &self.mesh.triangles) < 0.0 {
-            (0..self.mesh.triangles.len()).for_each(|triangle| self.turn(triangle));
-            self.told.push("All triangles were turned outwards.".to_owned());
+    /// Tells what is not as it was and should be.
+    fn compare(&mut self, before: &Measure, after: &Measure) {
+        match (before.volume_m3, after.volume_m3) {
+            (Some(was), Some(is)) if (is - was).abs() > LOST * was => self.faults.push(format!(
+                "the surface enclosed {:.3} ml, and encloses {:.3} ml now",
+                was * 1e6,
+                is * 1e6
+            )),
+            (Some(was), None) => {
+                self.faults.push(format!("the surface enclosed {:.3} ml, and is not closed now", was * 1e6));
+            }
+            _ => {}
         }
     }
 

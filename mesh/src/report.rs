@@ -8,6 +8,8 @@ use serde::Serialize;
 use serde::ser::{SerializeStruct, Serializer};
 
 use crate::format;
+use crate::join::{Odd, join, places};
+use crate::orient::orient;
 use crate::read::ReadLimits;
 use crate::topology::{Topology, is_proper};
 use crate::tree::{Tree, corners, cut};
@@ -64,6 +66,18 @@ pub struct Finding {
     pub element: Element,
     /// Where in space, m.
     pub place_m: Option<[f64; 3]>,
+}
+
+impl Finding {
+    /// Gives vertices and triangles other numbers.
+    pub(crate) fn rename(&mut self, vertex: impl Fn(u32) -> u32, triangle: impl Fn(u32) -> u32) {
+        match &mut self.problem {
+            Problem::DuplicateVertex { of } => *of = vertex(*of),
+            Problem::SelfIntersection { by } => *by = triangle(*by),
+            _ => {}
+        }
+        self.element.rename(vertex, triangle);
+    }
 }
 
 impl Serialize for Finding {
@@ -232,7 +246,7 @@ pub fn report_within(mesh: &TriangleMesh, limits: &ReadLimits) -> Report {
 }
 
 /// The area of a triangle, and whether it has one: its height is above rounding.
-fn area([a, b, c]: [DVec3; 3]) -> (f64, bool) {
+pub(crate) fn area([a, b, c]: [DVec3; 3]) -> (f64, bool) {
     let double = (b - a).cross(c - a).length();
     let longest = (b - a).length_squared().max((c - b).length_squared()).max((a - c).length_squared());
     // Twice the area over the longest side is the height.
@@ -337,10 +351,21 @@ fn examine(mesh: &TriangleMesh, report: &mut Report, findings: &mut Findings) {
         findings.add(Problem::DuplicateTriangle, Element::Triangle(*triangle), middle(*triangle));
     }
     if topology.is_closed() && is_consistent {
-        let volume = volume(vertices, triangles);
-        report.volume_m3 = Some(volume);
-        if volume < 0.0 {
-            findings.add(Problem::FacesInward, Element::Whole, None);
+        report.volume_m3 = Some(volume(vertices, triangles));
+    }
+    if is_consistent {
+        let own: Vec<u32> = (0..).take(vertices.len()).collect();
+        let parts = orient(vertices, triangles, &join(vertices, triangles, &own, Odd::Stay)).parts;
+        for part in &parts {
+            let problem = match (part.is_turned, part.is_cavity) {
+                (true, false) => Problem::FacesInward,
+                (true, true) => Problem::CavityFacesTissue,
+                (false, _) if part.faces_inward => Problem::OpenFacesInward,
+                (false, _) => continue,
+            };
+            let first = part.triangles.first().filter(|_| parts.len() > 1);
+            let (element, place) = first.map_or((Element::Whole, None), |of| (Element::Triangle(*of), middle(*of)));
+            findings.add(problem, element, place);
         }
     }
 
@@ -362,16 +387,12 @@ fn examine(mesh: &TriangleMesh, report: &mut Report, findings: &mut Findings) {
     for (vertex, _) in (0..).zip(is_used).filter(|(_, is_used)| !is_used) {
         findings.add(Problem::UnusedVertex, Element::Vertex(vertex), at(vertex));
     }
-    let mut order: Vec<u32> = (0..).take(vertices.len()).collect();
-    let key = |vertex: &u32| (vertices[*vertex as usize] + DVec3::ZERO).to_array().map(f64::to_bits);
-    order.sort_by_key(key);
-    for same in order.chunk_by(|a, b| key(a) == key(b)) {
-        for vertex in &same[1..] {
-            findings.add(Problem::DuplicateVertex { of: same[0] }, Element::Vertex(*vertex), at(*vertex));
-        }
+    let places = places(vertices);
+    for (vertex, of) in (0..).zip(&places).filter(|(vertex, of)| *vertex != **of) {
+        findings.add(Problem::DuplicateVertex { of: *of }, Element::Vertex(vertex), at(vertex));
     }
     check_size(report.extent_m, findings);
-    check_cuts(mesh, findings);
+    check_cuts(mesh, &places, findings);
 }
 
 /// Doubts the unit of a mesh that is too small or too large for an organ.
@@ -397,22 +418,23 @@ fn check_size(extent_m: [f64; 3], findings: &mut Findings) {
 }
 
 /// Looks for triangles that cut each other, within a bound of work.
-fn check_cuts(mesh: &TriangleMesh, findings: &mut Findings) {
+fn check_cuts(mesh: &TriangleMesh, places: &[u32], findings: &mut Findings) {
     let (vertices, triangles) = (&mesh.vertices_m, &mesh.triangles);
+    let at_places = |triangle: [u32; 3]| triangle.map(|vertex| places[vertex as usize]);
     let with_area = (0..).take(triangles.len()).filter(|number| has_area(vertices, triangles[*number as usize]));
     let with_area: Vec<u32> = with_area.collect();
     let tree = Tree::new(vertices, triangles, with_area.iter().copied());
     let mut left = LOOKS * with_area.len() as u64;
     for number in with_area {
-        let own = triangles[number as usize];
-        let at = corners(vertices, own);
+        let at = corners(vertices, triangles[number as usize]);
+        let own = at_places(triangles[number as usize]);
         let (least, most) = (at[0].min(at[1]).min(at[2]), at[0].max(at[1]).max(at[2]));
         let (mut looked, mut by) = (0, None);
         let boxes = tree.overlapping((vertices, triangles), [least, most], |other| {
             looked += 1;
             let triangle = triangles[other as usize];
-            // Each pair once; neighbours touch anyway.
-            if other > number && !triangle.iter().any(|vertex| own.contains(vertex)) {
+            // Each pair once; those that have a place in common touch anyway.
+            if other > number && !at_places(triangle).iter().any(|place| own.contains(place)) {
                 let is_cut = cut(at, corners(vertices, triangle));
                 by = is_cut.then_some(other);
             }

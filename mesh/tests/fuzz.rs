@@ -14,7 +14,7 @@ use palpate_mesh::delaunay::flip_to_delaunay;
 use palpate_mesh::repair::{Repair, repair};
 use palpate_mesh::report::report;
 use palpate_mesh::write::{Format, write};
-use palpate_mesh::{ReadLimits, Unit, read};
+use palpate_mesh::{ReadLimits, Unit, prepare, read};
 
 /// Inputs that were taken and are bent further.
 const CORPUS: usize = 256;
@@ -134,6 +134,17 @@ fn try_all(name: &str, bytes: &[u8]) -> Option<usize> {
         );
     }
     assert!(serde_json::to_string(&report(&mesh)).is_ok());
+    let prepared = prepare(mesh.clone());
+    let joined = prepared.mesh.vertices_m.len();
+    assert!(prepared.mesh.triangles.iter().flatten().all(|vertex| (*vertex as usize) < joined));
+    if let Some(file) = &prepared.file {
+        assert!(
+            file.mesh.vertices_m.starts_with(&mesh.vertices_m) && file.mesh.vertices_m.len() == file.vertex_of.len()
+        );
+        assert!(file.vertex_of.iter().all(|vertex| (*vertex as usize) < joined));
+        assert!(prepare(file.mesh.clone()).mesh == prepared.mesh, "prepared twice");
+    }
+    let _ = prepared.report();
     let repaired = repair(&mesh, &Repair::default());
     assert_eq!(repaired.vertex_of.len(), count);
     let after = report(&repaired.mesh);

@@ -1,0 +1,308 @@
+//! Welding along edges: triangles are joined where an edge of one lies where an edge of another does, whatever numbers its
+//! vertices have. Where more than two meet, each solid is closed on itself.
+//!
+//! A *place* is the position of vertices that have the same one. Vertices are joined with the triangles at them, and not by
+//! their places alone: two closed parts that touch at a vertex stay two.
+//!
+//! What the file joins, by two triangles that name the same edge, stays joined. All other triangles at an edge are free. Two
+//! free triangles are joined. Of more, we look along the edge, from its first place p to its second one q, at the triangles
+//! around it in the order of their angles. The normal of a triangle that runs from p to q is (q − p) × (o − p), with o its third
+//! vertex: it points to larger angles, so the solid behind such a triangle ends there, and behind one that runs from q to p it
+//! begins. Beginnings and ends are paired like parentheses around the edge. Those that are left face the same way, since some
+//! triangles of the file are turned: neighbours are joined. At most one triangle is left over; it has a border there.
+
+use std::collections::{BTreeSet, HashMap};
+
+use glam::DVec3;
+
+use crate::TriangleMesh;
+use crate::topology::{Sets, Side, is_proper};
+
+/// Angles that differ by less are the same, in quarters of a turn.
+const SAME_ANGLE: f64 = 1e-9;
+
+/// How the triangles of a mesh are joined.
+pub(crate) struct Joined {
+    /// The joined vertex of each corner of each triangle: numbers that say only which are the same.
+    corners: Vec<[u32; 3]>,
+    /// Two triangles at an edge. A side is forward where it runs from the lesser place to the larger one.
+    pub(crate) pairs: Vec<[Side; 2]>,
+    /// Triangles at an edge that no other is joined with, and the places of the edge.
+    pub(crate) borders: Vec<(u32, [u32; 2])>,
+    /// Triangles at edges that more than two name, in an odd number: all stay joined there ([`Odd::Stay`]).
+    pub(crate) crowded: Vec<u32>,
+    /// For each edge that several pairs have, these: the corners of both triangles at its lesser place and at its larger one. A
+    /// corner is three times its triangle and its place there.
+    pub(crate) touching: Vec<Vec<[[u32; 2]; 2]>>,
+    /// Edges at which more than two free triangles were paired.
+    pub(crate) paired_edges: usize,
+    /// Borders at such edges.
+    pub(crate) left_over: usize,
+}
+
+/// What becomes of an odd number of triangles, above one, that name the same edge.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Odd {
+    /// They stay joined: no surface has such an edge, and the report says so.
+    Stay,
+    /// They are paired, and one has a border.
+    Pair,
+}
+
+/// The place of each vertex: the least vertex of all at that position. Positions are finite.
+pub(crate) fn places(vertices: &[DVec3]) -> Vec<u32> {
+    let mut order: Vec<u32> = (0..).take(vertices.len()).collect();
+    // −0 is 0.
+    let key = |vertex: &u32| (vertices[*vertex as usize] + DVec3::ZERO).to_array().map(f64::to_bits);
+    order.sort_by_cached_key(key);
+    let mut places = vec![0; vertices.len()];
+    for same in order.chunk_by(|a, b| key(a) == key(b)) {
+        same.iter().for_each(|vertex| places[*vertex as usize] = same[0]);
+    }
+    places
+}
+
+/// Joins triangles, given the place of each vertex. Those with a place twice take no part; indices are in range.
+pub(crate) fn join(vertices: &[DVec3], triangles: &[[u32; 3]], places: &[u32], odd: Odd) -> Joined {
+    let place = |vertex: u32| places[vertex as usize];
+    // Of each side of each triangle: the places of its edge, then the vertices of its edge.
+    let mut halves: Vec<([u32; 2], [u32; 2], Side)> = Vec::with_capacity(3 * triangles.len());
+    for (number, triangle) in (0..).zip(triangles).filter(|(_, triangle)| is_proper(&triangle.map(place))) {
+        for corner in 0..3 {
+            let (from, to) = (triangle[corner], triangle[(corner + 1) % 3]);
+            let is_forward = place(from) < place(to);
+            let [low, high] = if is_forward { [from, to] } else { [to, from] };
+            halves.push(([place(low), place(high)], [low, high], Side { triangle: number, is_forward }));
+        }
+    }
+    halves.sort_unstable();
+    let mut joined = Joined {
+        corners: Vec::new(),
+        pairs: Vec::with_capacity(halves.len() / 2),
+        borders: Vec::new(),
+        crowded: Vec::new(),
+        touching: Vec::new(),
+        paired_edges: 0,
+        left_over: 0,
+    };
+    let mut corners = Sets::new(3 * triangles.len());
+    let corner_at = |triangle: u32, at: u32| {
+        let corner = triangles[triangle as usize].iter().position(|vertex| place(*vertex) == at).unwrap_or(0);
+        3 * triangle + u32::try_from(corner).unwrap_or(0)
+    };
+    let mut free: Vec<Side> = Vec::new();
+    for at_edge in halves.chunk_by(|a, b| a.0 == b.0) {
+        let edge = at_edge[0].0;
+        let (first_pair, first_crowded) = (joined.pairs.len(), joined.crowded.len());
+        free.clear();
+        for named in at_edge.chunk_by(|a, b| a.1 == b.1) {
+            match named {
+                [a, b] => joined.pairs.push([a.2, b.2]),
+                [_, _, _, ..] if odd == Odd::Stay && named.len() % 2 == 1 => {
+                    joined.crowded.extend(named.iter().map(|half| half.2.triangle));
+                }
+                _ => free.extend(named.iter().map(|half| half.2)),
+            }
+        }
+        match free[..] {
+            [] => {}
+            [one] => joined.borders.push((one.triangle, edge)),
+            [a, b] => joined.pairs.push([a, b]),
+            _ => {
+                let around = around(vertices, triangles, edge, &free, &place);
+                joined.paired_edges += 1;
+                let alone = pair(&around, &mut joined.pairs);
+                joined.left_over += usize::from(alone.is_some());
+                joined.borders.extend(alone.map(|side| (side.triangle, edge)));
+            }
+        }
+        let pairs = &joined.pairs[first_pair..];
+        if pairs.len() > 1 {
+            let of = |pair: &[Side; 2]| pair.map(|side| edge.map(|at| corner_at(side.triangle, at)));
+            joined.touching.push(pairs.iter().map(of).collect());
+        }
+        let crowded = joined.crowded[first_crowded..].windows(2).map(|pair| [pair[0], pair[1]]);
+        for [a, b] in pairs.iter().map(|pair| pair.map(|side| side.triangle)).chain(crowded) {
+            for at in edge {
+                corners.join(corner_at(a, at), corner_at(b, at));
+            }
+        }
+    }
+    let all = (0_u32..).take(triangles.len());
+    joined.corners = all.map(|triangle| [0, 1, 2].map(|corner| corners.find(3 * triangle + corner))).collect();
+    joined
+}
+
+impl Joined {
+    /// Gives each joined vertex vertices of its own: of several that share one the first in the order of triangles keeps it, the
+    /// others get copies behind the last. Returns of which vertex each copy is.
+    pub(crate) fn split_vertices(&self, mesh: &mut TriangleMesh) -> Vec<u32> {
+        let mut keeps = vec![u32::MAX; mesh.vertices_m.len()];
+        // Only looked up.
+        let mut copy_of: HashMap<(u32, u32), u32> = HashMap::new();
+        let mut copies = Vec::new();
+        for (vertex, joined) in mesh.triangles.iter_mut().flatten().zip(self.corners.iter().flatten()) {
+            let old = *vertex as usize;
+            if keeps[old] == u32::MAX {
+                keeps[old] = *joined;
+            }
+            if keeps[old] != *joined {
+                *vertex = *copy_of.entry((*vertex, *joined)).or_insert_with(|| {
+                    mesh.vertices_m.push(mesh.vertices_m[old]);
+                    copies.push(*vertex);
+                    u32::try_from(mesh.vertices_m.len() - 1).unwrap_or(*vertex)
+                });
+            }
+        }
+        for group in &mut mesh.groups {
+            // Copies have larger numbers, which ascend.
+            let new = (keeps.len() as u32..).zip(&copies).filter(|(_, old)| group.vertices.binary_search(old).is_ok());
+            let new: Vec<u32> = new.map(|(new, _)| new).collect();
+            group.vertices.extend(new);
+        }
+        copies
+    }
+
+    /// Where several pairs have both ends of their edge in common, halves the triangles of all but the first, at a vertex in the
+    /// middle of the edge: a surface has only one edge between two vertices. Of each triangle at most one edge; returns the
+    /// triangles that were halved, whose other halves are behind the last, in this order.
+    ///
+    /// For the mesh of [`Joined::split_vertices`].
+    pub(crate) fn halve(&self, mesh: &mut TriangleMesh) -> Vec<u32> {
+        let mut halved: BTreeSet<u32> = BTreeSet::new();
+        let mut order = Vec::new();
+        for at_edge in &self.touching {
+            let mut known = BTreeSet::new();
+            for pair in at_edge {
+                let ends = pair[0].map(|corner| self.corners[corner as usize / 3][corner as usize % 3]);
+                let triangles = pair.map(|corners| corners[0] / 3);
+                if known.insert(ends) || triangles.iter().any(|triangle| halved.contains(triangle)) {
+                    continue;
+                }
+                let mut middle_of = None;
+                for corners in pair {
+                    let triangle = corners[0] as usize / 3;
+                    let at = corners.map(|corner| corner as usize % 3);
+                    let edge = at.map(|corner| mesh.triangles[triangle][corner]);
+                    let middle = match middle_of {
+                        Some((known, middle)) if known == edge => Some(middle),
+                        _ => middle_vertex(mesh, edge),
+                    };
+                    let Some(middle) = middle else { continue };
+                    middle_of = Some((edge, middle));
+                    let mut other = mesh.triangles[triangle];
+                    (mesh.triangles[triangle][at[1]], other[at[0]]) = (middle, middle);
+                    mesh.triangles.push(other);
+                    if let Some(uv) = &mut mesh.uv {
+                        let mut other = uv[triangle];
+                        let middle = [0, 1].map(|part| 0.5 * (other[at[0]][part] + other[at[1]][part]));
+                        (uv[triangle][at[1]], other[at[0]]) = (middle, middle);
+                        uv.push(other);
+                    }
+                    halved.insert(triangle as u32);
+                    order.push(triangle as u32);
+                }
+            }
+        }
+        order
+    }
+
+    /// For each vertex, the number of the joined one that it is part of, if it is in a triangle; and for each joined one its least
+    /// vertex, which ascends. Joined vertices share none: that of [`Joined::split_vertices`] is given.
+    pub(crate) fn numbered(&self, mesh: &TriangleMesh) -> (Vec<Option<u32>>, Vec<u32>) {
+        const NONE: u32 = u32::MAX;
+        let mut set_of = vec![NONE; mesh.vertices_m.len()];
+        for (vertex, joined) in mesh.triangles.iter().flatten().zip(self.corners.iter().flatten()) {
+            set_of[*vertex as usize] = *joined;
+        }
+        let (mut number_of, mut least) = (vec![NONE; 3 * mesh.triangles.len()], Vec::new());
+        let mut vertex_of = Vec::with_capacity(set_of.len());
+        for (vertex, set) in (0..).zip(set_of) {
+            vertex_of.push((set != NONE).then(|| {
+                let number = &mut number_of[set as usize];
+                if *number == NONE {
+                    *number = least.len() as u32;
+                    least.push(vertex);
+                }
+                *number
+            }));
+        }
+        (vertex_of, least)
+    }
+}
+
+/// Adds a vertex in the middle of an edge; `None` if no number is between its ends.
+fn middle_vertex(mesh: &mut TriangleMesh, edge: [u32; 2]) -> Option<u32> {
+    let [from, to] = edge.map(|vertex| mesh.vertices_m[vertex as usize]);
+    let (place, middle) = (from.midpoint(to), u32::try_from(mesh.vertices_m.len()).ok()?);
+    if place == from || place == to || !place.is_finite() {
+        return None;
+    }
+    mesh.vertices_m.push(place);
+    for group in &mut mesh.groups {
+        if edge.iter().all(|vertex| group.vertices.binary_search(vertex).is_ok()) {
+            group.vertices.push(middle);
+        }
+    }
+    Some(middle)
+}
+
+/// The sides at an edge in the order of their angles around it; where two have the same angle, the solid that ends there comes
+/// before the one that begins.
+fn around(
+    vertices: &[DVec3],
+    triangles: &[[u32; 3]],
+    edge: [u32; 2],
+    sides: &[Side],
+    place: &impl Fn(u32) -> u32,
+) -> Vec<Side> {
+    let [from, to] = edge.map(|at| vertices[at as usize]);
+    let along = (to - from).normalize_or_zero();
+    let across = |side: &Side| {
+        let other = triangles[side.triangle as usize].into_iter().find(|vertex| !edge.contains(&place(*vertex)));
+        let off = vertices[other.unwrap_or(edge[0]) as usize] - from;
+        (off - off.dot(along) * along).normalize_or_zero()
+    };
+    let first = across(&sides[0]);
+    let second = along.cross(first);
+    // Grows with the angle as the angle does, from 0 to 4, by arithmetic that is the same on every machine.
+    let angle = |side: &Side| {
+        let off = across(side);
+        let (x, y) = (off.dot(first), off.dot(second));
+        let part = y / (x.abs() + y.abs());
+        let angle = if x < 0.0 { 2.0 - part } else { part };
+        let angle = if angle.is_nan() { 0.0 } else { angle };
+        // Just before a whole turn is where it begins.
+        if angle < -SAME_ANGLE { angle + 4.0 } else { angle }
+    };
+    let mut ordered: Vec<(f64, Side)> = sides.iter().map(|side| (angle(side), *side)).collect();
+    ordered.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    for same in ordered.chunk_by_mut(|a, b| b.0 - a.0 <= SAME_ANGLE) {
+        same.sort_by_key(|(_, side)| !side.is_forward);
+    }
+    ordered.into_iter().map(|(_, side)| side).collect()
+}
+
+/// Pairs sides in the order around their edge; returns the one that is left over, if there is one.
+fn pair(around: &[Side], pairs: &mut Vec<[Side; 2]>) -> Option<Side> {
+    let mut is_paired = vec![false; around.len()];
+    let mut begun = Vec::new();
+    // Twice around: what begins before the first angle ends after it.
+    for (turn, which) in (0..2).flat_map(|turn| (0..around.len()).map(move |which| (turn, which))) {
+        if is_paired[which] {
+            continue;
+        }
+        if !around[which].is_forward {
+            if turn == 0 {
+                begun.push(which);
+            }
+        } else if let Some(other) = begun.pop() {
+            (is_paired[which], is_paired[other]) = (true, true);
+            pairs.push([around[other], around[which]]);
+        }
+    }
+    let left: Vec<Side> = around.iter().zip(is_paired).filter(|(_, is_paired)| !is_paired).map(|(s, _)| *s).collect();
+    let (both, alone) = left.as_chunks::<2>();
+    pairs.extend(both);
+    alone.first().copied()
+}
