@@ -567,6 +567,16 @@ impl Session {
         (0..self.tools.len()).filter_map(of).collect()
     }
 
+    /// The first tool that presses where less than a quarter of its tip can move, if there is one: its force is not that of free
+    /// tissue.
+    pub fn tool_on_fixed(&self) -> Option<u32> {
+        let presses = |number: &usize| {
+            let feel = self.tissue.feel(*number);
+            feel.is_some_and(|feel| feel.is_on_fixed && (feel.place_m - feel.surface_m).dot(feel.normal) < 0.0)
+        };
+        (0..self.tools.len()).find(presses).map(|number| number as u32)
+    }
+
     /// A record of `points`, or of all points, without energies and tools.
     pub fn record(&self, points: Option<&[PointId]>) -> Record {
         let shape = self.model().shape();

@@ -220,7 +220,7 @@ impl Playing<'_> {
         let mut windows = (self.twin.is_some() && model.scene.stepping.correct).then(Windows::default);
         let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
         let (mut largest_displacement_m, mut peak_reaction_n, mut curves) = (0.0_f64, 0.0_f64, Curves::default());
-        let tip = script.first_tip();
+        let (tip, mut on_fixed) = (script.first_tip(), None);
         for step in 0..script.steps {
             player.commands(step, &mut due)?;
             // The summary's clock stops during everything other than the session's own stepping.
@@ -246,6 +246,9 @@ impl Playing<'_> {
                 if session.step_count().is_multiple_of(script.sample_every) {
                     stepping_s += clock_s() - resumed_s;
                     if written.is_ok() {
+                        if on_fixed.is_none() {
+                            on_fixed = session.tool_on_fixed().map(|tool| (tool, session.time_s()));
+                        }
                         let (energy_j, tools) = (Some(session.energy()), session.tool_records());
                         let record = Record { energy_j, tools, ..session.record(Some(&script.sample_points)) };
                         largest_displacement_m = largest_displacement_m.max(session.tissue().largest_displacement_m());
@@ -270,7 +273,13 @@ impl Playing<'_> {
         stepping_s += clock_s() - resumed_s;
         let audited_error = self.twin.as_ref().map(Twin::error);
         let (corrections, recoveries) = (self.corrections, session.recoveries().list());
-        let warnings = far_warning(largest_displacement_m, model.shape()).into_iter().collect();
+        let on_fixed = on_fixed.map(|(tool, time_s)| {
+            format!(
+                "tool {tool} pressed on fixed points, at {time_s:.3} s first: less than a quarter of its tip could move there, and its \
+                 force is not that of free tissue"
+            )
+        });
+        let warnings = far_warning(largest_displacement_m, model.shape()).into_iter().chain(on_fixed).collect();
         let summary = Summary {
             audited_error,
             corrections,

@@ -91,7 +91,8 @@ fn tool_sample(tool: &ToolSample, shape: &dyn RestShape, due_ns: u64, now_ns: u6
         paused_until_step: tool.paused_until,
         local_model: tool.local.as_ref().map(touch::local_model),
         stale: tool.stale,
-        on_fixed_point: contact.is_some_and(|contact| shape.is_fixed(contact.point)),
+        on_fixed_point: contact.is_some_and(|contact| shape.is_fixed(contact.point))
+            || tool.feel.as_ref().is_some_and(|feel| feel.is_on_fixed),
     }
 }
 

@@ -18,6 +18,14 @@ pub struct ThinMesh {
 /// The kinds, in the order of their numbers.
 pub const KINDS: [&str; 6] = ["thread", "needle", "tube", "shell", "hairpin", "slab"];
 
+/// A closed thread along z from 0.
+pub fn thread(radius_m: f64, length_m: f64, around: u32, along: u32) -> ThinMesh {
+    let mut mesh = ThinMesh { kind: "thread", places_m: Vec::new(), triangles: Vec::new(), thickness_m: radius_m };
+    let line = |part: f64| (DVec3::new(0.0, 0.0, length_m * part), DVec3::X, DVec3::Y);
+    mesh.tube(around, along, radius_m, &|_| 1.0, &line, true);
+    mesh
+}
+
 /// A random mesh of a kind.
 pub fn thin_mesh(dice: &mut fastrand::Rng, kind: usize) -> ThinMesh {
     let kind = KINDS[kind % KINDS.len()];

@@ -281,3 +281,43 @@ fn a_touch_beside_the_sheet_or_far_above_feels_nothing() {
         assert!(sheet.largest_displacement_m() < 1e-12);
     }
 }
+
+/// Of a disc that lies almost wholly on fixed points, the force was that of the few others times one over the square of their
+/// part: newtons to 1e22 N.
+#[test]
+fn a_tip_beside_what_is_fixed_feels_no_more_than_springs_and_depth_allow() {
+    let depth_m = 0.002;
+    let model = tissue("liver", &["sheet.fixed=edges"]);
+    let extent_m = model.scene.sheet().unwrap().extent_m();
+    let pressed = |place_m: DVec3, grasps: bool, radius_m: f64| {
+        let mut sheet = sheet::at_rest(&model);
+        let tip = Tip { grasps, radius_m, friction: 0.0, ..Tip::default() };
+        lead(&mut *sheet, tip, 600, |t| place_m - depth_m * smooth(t / 0.3) * DVec3::Z, |_, _| {});
+        assert_eq!(sheet.guard_events(), 0, "{place_m}");
+        sheet.feel(0).unwrap()
+    };
+    for radius_m in [0.001, 0.005] {
+        for grasps in [false, true] {
+            // A quarter of a disc moves at most four times as far as the tool, and its force counts four times.
+            let scene = &model.scene;
+            let stiffness_n_per_m = 8.0 * scene.springs.stiffness_n_per_m + scene.virtual_stiffness_n_per_m;
+            let most_n = 16.0 * stiffness_n_per_m * depth_m;
+            let mut told = 0;
+            for from_rim_m in [0.0, 1e-6, 1e-5, 1e-4, 3e-4, 1e-3, 2e-3, 4e-3] {
+                for place_m in [DVec3::new(from_rim_m, 0.4 * extent_m.y, 0.0), DVec3::new(from_rim_m, from_rim_m, 0.0)]
+                {
+                    let feel = pressed(place_m, grasps, radius_m);
+                    let force_n = feel.force_on_tool_n.length();
+                    // A quarter of a disc moves at most four times as far as the tool.
+                    assert!(
+                        force_n < 30.0 * middle_n,
+                        "{radius_m}, {place_m}: {force_n} N, {middle_n} N in the middle"
+                    );
+                    told += u32::from(feel.is_on_fixed);
+                }
+            }
+            assert!(told > 4, "{told}");
+            assert!(!pressed(middle(&model), grasps, radius_m).is_on_fixed);
+        }
+    }
+}

@@ -287,3 +287,38 @@ fn a_moving_tool_asks_only_tiles_within_its_reach() {
         assert_eq!(tissue.awake_points(), 16 * 16, "step {step}");
     }
 }
+
+/// A scheme of several sweeps pulls at the tiles beside a grasped point within the substep in which its tool moves it.
+#[test]
+fn a_grasped_point_wakes_the_tiles_beside_it_before_it_moves() {
+    for integrator in ["rk4", "central", "exponential3"] {
+        for (point, by_m) in [([16, 16], 0.05), ([15, 16], 0.05), ([31, 5], 0.05), ([16, 15], 0.0005)] {
+            let displaced = |tolerance: &str| {
+                let settings = [
+                    "sheet.points=[33, 33]",
+                    "stepping.precision=f64",
+                    &format!("stepping.integrator={integrator}"),
+                    &format!("sleep.tolerance={tolerance}"),
+                ];
+                let mut tissue = sheet(&settings);
+                let point = tissue.model().scene.sheet().unwrap().point(point);
+                let (mut held_m, mut all) = (0.0_f64, Vec::new());
+                for step in 0..600 {
+                    // There and back: at once, or at 0.5 m/s.
+                    let target_m = if step % 400 < 200 { 0.05 } else { 0.0 };
+                    held_m += (target_m - held_m).clamp(-by_m, by_m);
+                    tissue.grasp(0, point, Grasp::Target(held_m * DVec3::NEG_Z));
+                    tissue.step().unwrap();
+                    let mut displacement_m = Vec::new();
+                    tissue.whole_displacements_m(&mut displacement_m);
+                    all.push(displacement_m);
+                }
+                all
+            };
+            let (with, without) = (displaced("1e-6"), displaced("0"));
+            let apart = with.iter().flatten().zip(without.iter().flatten()).map(|(a, b)| (a - b).abs());
+            let error = apart.fold(0.0, f64::max) / 0.05;
+            assert!(error < 1e-6, "{integrator}, {point:?}, {by_m} m a step: {error:e}");
+        }
+    }
+}
