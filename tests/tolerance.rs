@@ -8,7 +8,8 @@ mod random_scenes;
 use palpate::limits::Limits;
 use palpate::refusal::Reason;
 use palpate::scene::{PAPER, Precision, Scene};
-use palpate::sheet::Model;
+use palpate::sheet::integrate::Oscillator;
+use palpate::sheet::{Model, choice, stability};
 use random_scenes::{Case, case, errors, mesh_case, play, truth};
 
 /// With the scheme that is chosen for each.
@@ -67,4 +68,39 @@ fn a_scene_that_needs_endless_substeps_is_refused() {
     ])
     .unwrap_err();
     assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "stepping.substeps"));
+}
+
+/// Stable substeps times this, where nothing keeps the tolerance; docs/accuracy.md tells it.
+fn most_substeps(model: &Model) -> u32 {
+    let (scene, plan) = (&model.scene, &model.plan);
+    choice::MOST_TIMES_STABLE
+        * stability::stable_substeps(plan.integrator, scene.stepping.rate_hz.recip(), &Oscillator::of(scene))
+}
+
+/// Bodies that float freely, that nothing damps, or both: what moves them moves them for ever.
+#[test]
+fn a_body_whose_error_nothing_bounds_takes_few_substeps_or_is_refused_at_once() {
+    let limits = Limits::default();
+    let [free, undamped] = ["material.bed_n_per_m3=0.0", "material.damping_ratio=0.0"];
+    for (seed, sets) in [
+        (0, vec![free, undamped]),
+        (1, vec![undamped]),
+        (2, vec![free]),
+        (3, vec![free, undamped, "volume.stiffness_pa=3000.0"]),
+    ] {
+        let sets: Vec<String> = sets.iter().chain(&["stepping.tolerance=1e-3"]).map(|set| (*set).to_owned()).collect();
+        let scene = random_scenes::scene(&mesh_case(seed), &sets, &limits).unwrap();
+        match Model::compile(&scene, &limits) {
+            Ok(model) => {
+                let (keeps, substeps) = (model.expected_error <= 1e-3, model.plan.substeps);
+                assert!(keeps || substeps <= most_substeps(&model), "{seed} {sets:?}: {substeps}");
+                let warning = model.warnings.iter().find(|warning| warning.starts_with("stepping.tolerance: "));
+                assert_eq!(warning.is_none(), keeps, "{seed} {sets:?}");
+                assert!(warning.is_none_or(|warning| !warning.contains("auto")), "{warning:?}");
+            }
+            Err(refusal) => {
+                assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "stepping.tolerance"));
+            }
+        }
+    }
 }

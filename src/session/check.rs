@@ -15,14 +15,16 @@ use crate::scene::{Body, Named, Stiffest};
 use crate::shape::PointId;
 use crate::sheet::choice::{self, Choice};
 use crate::sheet::integrate::Oscillator;
-use crate::sheet::{Model, Push};
+use crate::sheet::{Model, Plan, Push};
 
 /// The report on a scene.
 #[derive(Debug)]
 pub struct Report {
     model: Arc<Model>,
-    /// The choices that could keep the tolerance.
+    /// What was chosen, and what would have been of each other integrator alone.
     candidates: Vec<Choice>,
+    /// What would have been chosen if the scene gave nothing of it.
+    by_auto: Option<Choice>,
     prospect: Prospect,
     /// Least and median time of a step, s; `None` if the step failed or would take too long.
     step_s: Option<[f64; 2]>,
@@ -37,10 +39,18 @@ const WINDOW_S: f64 = 0.004;
 
 /// Reports on a scene and on a script for it, and times a step under a poke. `clock_s` returns the time.
 pub fn check(model: &Arc<Model>, script: Option<&Script>, limits: &Limits, clock_s: &dyn Fn() -> f64) -> Report {
-    let candidates = choice::candidates(&model.scene, limits);
+    let mut candidates = choice::candidates(&model.scene, limits);
+    // What was chosen did not try what would be dearer; another format of it alone is none.
+    let Plan { integrator, substeps, .. } = model.plan;
+    let chosen = Choice { integrator, substeps, precision: model.precision, expected_error: model.expected_error };
+    match candidates.iter_mut().find(|candidate| candidate.integrator == integrator) {
+        Some(same) => *same = chosen,
+        None => candidates.push(chosen),
+    }
     Report {
         model: model.clone(),
         candidates,
+        by_auto: choice::by_auto(&model.scene, limits),
         prospect: Prospect::new(model, script),
         step_s: (model.predicted_step_s() <= LONGEST_STEP_S).then(|| time(model, clock_s)).flatten(),
     }
@@ -79,6 +89,18 @@ fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
     let mut times = (0..WINDOWS).map(|_| window(steps)).collect::<Option<Vec<f64>>>()?;
     times.sort_by(f64::total_cmp);
     Some([times[0], times[WINDOWS / 2]])
+}
+
+/// An expected error, in words.
+fn error(expected: f64) -> String {
+    if expected.is_finite() { format!("{expected:.1e}") } else { "unknown".to_owned() }
+}
+
+/// A choice as a row of the table.
+fn row(f: &mut fmt::Formatter<'_>, choice: &Choice) -> fmt::Result {
+    let Choice { integrator, substeps, precision, expected_error } = choice;
+    let (integrator, precision) = (integrator.name(), precision.name());
+    writeln!(f, "  {integrator:<15} {substeps:>8}  {precision:<11}  {}", error(*expected_error))
 }
 
 impl fmt::Display for Report {
@@ -148,8 +170,9 @@ impl fmt::Display for Report {
         writeln!(f, "stability     {}", if plan.stable { "within the bound" } else { "BEYOND the bound" })?;
         writeln!(
             f,
-            "error         {:.1e} expected, {:.1e} asked for, of displacement and force relative to their largest",
-            model.expected_error, scene.stepping.tolerance
+            "error         {} expected, {:.1e} asked for, of displacement and force relative to their largest",
+            error(model.expected_error),
+            scene.stepping.tolerance
         )?;
         writeln!(f, "sleep         tiles at rest are left out, for an error of at most {:.1e}", model.sleep_tolerance)?;
         if let Some([least_s, median_s]) = self.step_s {
@@ -169,9 +192,12 @@ impl fmt::Display for Report {
             writeln!(f, "time          not measured: the guard stopped the sheet")?;
         }
         writeln!(f, "\nWhat could have been chosen:\n  integrator      substeps  precision    expected error")?;
-        for Choice { integrator, substeps, precision, expected_error } in &self.candidates {
-            let (integrator, precision) = (integrator.name(), precision.name());
-            writeln!(f, "  {integrator:<15} {substeps:>8}  {precision:<11}  {expected_error:.1e}")?;
+        for candidate in &self.candidates {
+            row(f, candidate)?;
+        }
+        if let Some(by_auto) = &self.by_auto {
+            writeln!(f, "With `auto` for integrator, substeps and precision:")?;
+            row(f, by_auto)?;
         }
         for warning in model.warnings.iter().chain(&self.prospect.warnings) {
             writeln!(f, "\nwarning: {warning}")?;
@@ -216,5 +242,28 @@ mod tests {
         // A window of 4 ms among nine points, and among as many four times.
         assert!(once.contains("(444444.44 ns a point and substep)"), "{once}");
         assert!(four.contains("(111111.11 ns a point and substep)"), "{four}");
+    }
+
+    #[test]
+    fn the_table_has_what_was_chosen_and_what_auto_would_take_where_the_scene_gives_something() {
+        let limits = Limits::default();
+        let now_s = Cell::new(0.0);
+        let clock_s = || now_s.replace(now_s.get() + WINDOW_S);
+        let of = |sets: &[&str]| Model::paper(&[&["sheet.points=[3, 3]"], sets].concat());
+        let report = |sets: &[&str]| check(&of(sets), None, &limits, &clock_s);
+        for (sets, given) in [
+            (&[][..], false),
+            (&["stepping.tolerance=1e-14"][..], false),
+            (&["stepping.integrator=lagged", "stepping.substeps=1"][..], true),
+            (&["stepping.precision=f32", "stepping.tolerance=1e-9"][..], true),
+        ] {
+            let report = report(sets);
+            let model = &report.model;
+            let chosen = (model.plan.integrator, model.plan.substeps, model.precision, model.expected_error);
+            let is_chosen = |row: &Choice| (row.integrator, row.substeps, row.precision, row.expected_error) == chosen;
+            assert_eq!(report.candidates.iter().filter(|row| is_chosen(row)).count(), 1, "{sets:?}: {report:?}");
+            assert_eq!((report.by_auto.is_some(), report.to_string().contains("`auto`")), (given, given), "{sets:?}");
+        }
+        assert_eq!([error(f64::INFINITY), error(0.00123)], ["unknown", "1.2e-3"]);
     }
 }

@@ -12,7 +12,7 @@ use super::saved::{CorrectedPlan, TissueState};
 use super::tangent;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number, unsigned_zero};
-use crate::scene::{Body, Change, Integrator, Named, Precision, Scene};
+use crate::scene::{Body, Change, Integrator, Named, Precision, Scene, Stepping};
 
 /// What sleeping tiles may add to the error, by default, as a part of it.
 const SLEEP_PART: f64 = 0.1;
@@ -30,6 +30,44 @@ fn too_many(scene: &Scene, substeps: u32, limits: &Limits) -> Refusal {
         }
     );
     Refusal::new(Reason::TooLarge, "stepping.substeps", message)
+}
+
+/// What begins the warning of an error above the tolerance.
+const TOLERANCE: &str = "stepping.tolerance: ";
+
+impl Model {
+    /// Warns of an error above the tolerance: what is known of it, and what helps. `auto` is named only where the scene does
+    /// without.
+    pub(super) fn warn_of_error(&mut self, limits: &Limits) {
+        self.warnings.retain(|warning| !warning.starts_with(TOLERANCE));
+        let (expected_error, undamped) = (self.expected_error, self.scene.damping_n_s_per_m == 0.0);
+        let Stepping { tolerance, integrator, substeps, precision, .. } = self.scene.stepping;
+        if expected_error <= tolerance {
+            return;
+        }
+        let mut parts = vec![if expected_error.is_finite() {
+            format!("an error of {expected_error:.1e} is expected, above the {tolerance:.1e} asked for")
+        } else {
+            format!("nothing is known of the error, which may be above the {tolerance:.1e} asked for")
+        }];
+        if undamped {
+            parts.push("nothing damps the tissue, and errors grow for as long as it moves".to_owned());
+        }
+        if integrator != Integrator::Auto || substeps.is_some() || precision != Precision::Auto {
+            let given = "`palpate check` tells what `auto` would take for the integrator, substeps and precision given";
+            parts.push(given.to_owned());
+        } else if expected_error.is_finite() {
+            parts.push(format!(
+                "no integrator is expected to keep it with {} times the substeps that keep it stable, or with \
+                 limits.substeps ({}): ask for a larger tolerance, or for more damping",
+                choice::MOST_TIMES_STABLE,
+                limits.substeps
+            ));
+        } else {
+            parts.push("`palpate run --audit` measures it".to_owned());
+        }
+        self.warnings.push(format!("{TOLERANCE}{}", parts.join("; ")));
+    }
 }
 
 impl Model {
@@ -82,18 +120,6 @@ impl Model {
                 plan.substep_s * omega_bound_per_s
             ));
         }
-        if expected_error > scene.stepping.tolerance {
-            let expected = if expected_error.is_finite() {
-                format!("an error of {expected_error:.1e} is expected, above")
-            } else {
-                "nothing is known of the error, which may be above".to_owned()
-            };
-            warnings.push(format!(
-                "stepping.tolerance: {expected} the {:.1e} asked for; leave integrator, substeps and precision to `auto`, \
-                 or raise the limit of substeps",
-                scene.stepping.tolerance
-            ));
-        }
         let Some(lanes) = lanes::available(scene.stepping.lanes) else {
             let message = format!("this machine's processor has no `{}`", scene.stepping.lanes.name());
             return Err(Refusal::new(Reason::NotAvailable, "stepping.lanes", message));
@@ -106,7 +132,9 @@ impl Model {
         let model = Model::planned(scene.clone(), plan, precision, lanes)
             .map_err(|fault| Refusal::new(Reason::OutOfRange, "mesh.file", fault.to_string()))?;
         let yields = tangent::yields(&model, stop).into();
-        Ok(Arc::new(Model { expected_error, sleep_tolerance, warnings, rehearsed, yields, ..model }))
+        let mut model = Model { expected_error, sleep_tolerance, warnings, rehearsed, yields, ..model };
+        model.warn_of_error(limits);
+        Ok(Arc::new(model))
     }
 
     /// The same sheet with another tissue: integrator and substeps as its tolerance asks for, in the number format that a
@@ -137,6 +165,7 @@ impl Model {
         scene.stepping.precision = self.precision;
         let mut model = self.compile_corrected(&scene, limits, stop)?;
         model.scene.stepping = asked;
+        model.warn_of_error(limits);
         Ok(Arc::new(model))
     }
 
@@ -280,6 +309,26 @@ mod tests {
         };
         assert_eq!(warns(&[]), (false, false));
         assert_eq!(warns(&["stepping.integrator=lagged", "stepping.substeps=1"]), (true, true));
+    }
+
+    #[test]
+    fn auto_is_advised_only_where_the_scene_does_without() {
+        let advises = |model: &Model| {
+            let of_error = model.warnings.iter().find(|warning| warning.starts_with(TOLERANCE));
+            of_error.map(|warning| warning.contains("auto"))
+        };
+        let small =
+            |sets: &[&str]| Model::paper(&[&["sheet.points=[5, 5]", "stepping.tolerance=1e-14"][..], sets].concat());
+        for given in ["stepping.integrator=central", "stepping.substeps=2", "stepping.precision=f32"] {
+            assert_eq!(advises(&small(&[given])), Some(true), "{given}");
+        }
+        let model = small(&[]);
+        assert_eq!(advises(&model), Some(false), "{:?}", model.warnings);
+        // Another tissue keeps the format of the state, which nobody gave.
+        let change = Change { damping_n_s_per_m: Some(0.0), ..Change::default() };
+        let changed = model.changed(&change, &model.scene, &Limits::default()).unwrap();
+        assert_eq!(advises(&changed), Some(false), "{:?}", changed.warnings);
+        assert_eq!(advises(&small(&["stepping.tolerance=1e-2"])), None);
     }
 
     #[test]

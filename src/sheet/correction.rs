@@ -90,6 +90,7 @@ impl Model {
         model.corrected = Some((correction.integrator, correction.substeps));
         // Keep the request; the plan and the format in force change.
         model.scene.stepping = self.scene.stepping.clone();
+        model.warn_of_error(limits);
         Ok(Arc::new(model))
     }
 }

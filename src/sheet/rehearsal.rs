@@ -62,6 +62,10 @@ const MOST_SUBSTEPS: u64 = 400_000;
 /// How often the truth's substep is halved before it counts as good as it gets.
 const MOST_HALVINGS: u32 = 6;
 
+/// A truth that halving its substep still changes by more than this part of the largest value is none. Neighbouring courses
+/// of such a motion part: no substep follows it.
+const MOST_UNCERTAINTY: f64 = 0.1;
+
 /// What pushes the small sheet, from its first step on.
 struct Load {
     profile: Profile,
@@ -94,6 +98,13 @@ const STEP_POINTS: u64 = 500;
 /// Displacement and reaction of the points that are looked at, step by step.
 type Course = Vec<[[DVec3; 2]; 3]>;
 
+/// How the small sheet truly moves under a load.
+struct Truth {
+    course: Course,
+    /// By how much the course may be wrong, as far as that is above the tolerance; else 0.
+    uncertainty: f64,
+}
+
 /// The small sheet, and how it truly moves.
 pub(super) struct Rehearsal<'s> {
     scene: Scene,
@@ -104,7 +115,7 @@ pub(super) struct Rehearsal<'s> {
     parts: u32,
     steps: usize,
     /// None: the motion is chaotic, or beyond every bound.
-    truth: [Option<Course>; LOADS.len()],
+    truth: [Option<Truth>; LOADS.len()],
     /// Points × substeps that may still be computed, and whether something was left out for want of them.
     left: Cell<u64>,
     is_cut: Cell<bool>,
@@ -165,21 +176,41 @@ impl<'s> Rehearsal<'s> {
     }
 
     /// Halves the substep until that changes less than the tolerance: an error of fifth order is then 32 times smaller.
-    fn true_course(&self, load: &Load, least: u32, tolerance: f64) -> Option<Course> {
+    /// Where rounding or a sensitive motion lets it never change so little, the course that changed least is the truth, and
+    /// may be wrong by that.
+    fn true_course(&self, load: &Load, least: u32, tolerance: f64) -> Option<Truth> {
         let mut substeps = least;
         let mut coarse = self.course(load, Integrator::Exponential4, substeps, Precision::F64);
+        let mut best = None::<Truth>;
         for _ in 0..MOST_HALVINGS {
             substeps = substeps.saturating_mul(2);
             if u64::from(substeps) * self.steps as u64 > MOST_SUBSTEPS {
                 break;
             }
-            let fine = self.course(load, Integrator::Exponential4, substeps, Precision::F64)?;
-            if coarse.is_some_and(|coarse| self.difference(load, &fine, &coarse) <= tolerance) {
-                return Some(fine);
+            let Some(fine) = self.course(load, Integrator::Exponential4, substeps, Precision::F64) else { break };
+            if let Some(coarse) = coarse.replace(fine.clone()) {
+                let uncertainty = self.difference(load, &fine, &coarse);
+                if uncertainty <= tolerance {
+                    return Some(Truth { course: fine, uncertainty: 0.0 });
+                }
+                if best.as_ref().is_none_or(|best| uncertainty < best.uncertainty) {
+                    best = Some(Truth { course: fine, uncertainty });
+                }
             }
-            coarse = Some(fine);
         }
-        None
+        best.filter(|truth| truth.uncertainty <= MOST_UNCERTAINTY)
+    }
+
+    /// The margin by which the true error of a script may exceed the rehearsed one.
+    fn margin(&self) -> f64 {
+        if self.scene.sheet().is_some() { MARGIN } else { MARGIN_OF_MESH }
+    }
+
+    /// No scheme can be expected to err by less: by so much the truth itself may be wrong. 0 if that is within the tolerance;
+    /// infinite if nothing can be foretold.
+    pub(super) fn least_error(&self) -> f64 {
+        let uncertainty = |truth: &Option<Truth>| truth.as_ref().map_or(f64::INFINITY, |truth| truth.uncertainty);
+        self.margin() * self.truth.iter().map(uncertainty).fold(0.0, f64::max)
     }
 
     /// What to expect of a scheme with so many substeps in a step of the scene, in a format: the error of displacement and
@@ -189,18 +220,23 @@ impl<'s> Rehearsal<'s> {
             return f64::INFINITY;
         }
         let substeps = (substeps / self.parts).max(1);
-        let error = |(load, truth): (&Load, &Option<Course>)| -> Option<f64> {
-            Some(self.difference(load, truth.as_ref()?, &self.course(load, integrator, substeps, precision)?))
+        let error = |(load, truth): (&Load, &Option<Truth>)| -> Option<f64> {
+            let Truth { course, uncertainty } = truth.as_ref()?;
+            Some(self.difference(load, course, &self.course(load, integrator, substeps, precision)?) + uncertainty)
         };
         // The first that can't be followed is enough.
         let largest = LOADS.iter().zip(&self.truth).try_fold(0.0, |largest: f64, pair| Some(largest.max(error(pair)?)));
-        let margin = if self.scene.sheet().is_some() { MARGIN } else { MARGIN_OF_MESH };
-        margin * largest.unwrap_or(f64::INFINITY)
+        self.margin() * largest.unwrap_or(f64::INFINITY)
     }
 
     /// How many substeps a scheme takes in whole rehearsed steps: no fewer than `substeps`.
     pub(super) fn whole(&self, substeps: u32) -> u32 {
         substeps.div_ceil(self.parts).saturating_mul(self.parts)
+    }
+
+    /// The same, no more than `substeps`.
+    pub(super) fn whole_within(&self, substeps: u32) -> u32 {
+        substeps / self.parts * self.parts
     }
 
     /// The course of a scheme; none if the guard finds fault with it, if it would be too much work, or if it is stopped.

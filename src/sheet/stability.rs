@@ -104,7 +104,7 @@ pub fn is_stable(scheme: &Scheme, stiffness: f64) -> bool {
 
 /// Fewest substeps of `step_s` with which any scheme is stable. Saturates for absurd scenes.
 pub fn least_substeps(step_s: f64, sheet: &Oscillator) -> u32 {
-    fewest(step_s, sheet.omega_bound_per_s(), 2.0)
+    substeps_of_turn(step_s, sheet.omega_bound_per_s(), 2.0)
 }
 
 /// Fewest substeps of `step_s` with which a scheme is stable. Saturates for absurd scenes.
@@ -130,9 +130,9 @@ pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) 
 pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
     let omega = sheet.omega_bound_per_s();
-    let turn = || fewest(step_s, omega, THETA / endurance(omega, decay_s));
+    let turn = || substeps_of_turn(step_s, omega, THETA / endurance(omega, decay_s));
     // Half the stable damping, so that light points do not ring with the substep.
-    let lag = || fewest(step_s, sheet.damping_n_s_per_m / sheet.mass_kg, 1.0);
+    let lag = || substeps_of_turn(step_s, sheet.damping_n_s_per_m / sheet.mass_kg, 1.0);
     match entry(integrator).bound {
         Bound::Stable => stable_substeps(integrator, step_s, sheet),
         Bound::Turn => turn(),
@@ -142,7 +142,7 @@ pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 
 
 /// Fewest substeps with dt·`omega_per_s` ≤ `theta`, dt = `step_s` / substeps. Saturates for absurd scenes.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-fn fewest(step_s: f64, omega_per_s: f64, theta: f64) -> u32 {
+pub fn substeps_of_turn(step_s: f64, omega_per_s: f64, theta: f64) -> u32 {
     (step_s * omega_per_s / theta).ceil().clamp(1.0, f64::from(u32::MAX)) as u32
 }
 

@@ -161,23 +161,28 @@ pub struct Played {
     pub step_s: f64,
 }
 
-/// A case with assignments over its scene, compiled.
-pub fn compile(case: &Case, assignments: &[String]) -> Result<(Arc<Model>, Script), String> {
-    // Offline, as `palpate run`: the truth takes more than a server would do.
-    let limits = Limits { rehearsal_work: 1 << 32, ..Limits::default() };
+/// A case's scene with assignments over it.
+pub fn scene(case: &Case, assignments: &[String], limits: &Limits) -> Result<Scene, String> {
     let text = |refusal: palpate::refusal::Refusal| refusal.to_string();
-    let scene = match &case.mesh {
-        None => Scene::parse("random", &case.scene, assignments, &limits),
+    match &case.mesh {
+        None => Scene::parse("random", &case.scene, assignments, limits).map_err(text),
         Some(mesh) => {
             let folder = tempfile::tempdir().map_err(|error| error.to_string())?;
             let path = folder.path().join("random.toml");
             let written =
                 std::fs::write(folder.path().join("mesh.obj"), mesh).and_then(|()| std::fs::write(&path, &case.scene));
             written.map_err(|error| error.to_string())?;
-            Scene::load(&path, assignments, &limits)
+            Scene::load(&path, assignments, limits).map_err(text)
         }
-    };
-    let scene = scene.map_err(text)?;
+    }
+}
+
+/// The same, compiled with its script.
+pub fn compile(case: &Case, assignments: &[String]) -> Result<(Arc<Model>, Script), String> {
+    // Offline, as `palpate run`: the truth takes more than a server would do.
+    let limits = Limits { rehearsal_work: 1 << 32, ..Limits::default() };
+    let text = |refusal: palpate::refusal::Refusal| refusal.to_string();
+    let scene = scene(case, assignments, &limits)?;
     let script = Script::parse("random", &case.script, Path::new("."), &scene, &limits).map_err(text)?;
     Ok((Model::compile(&scene, &limits).map_err(text)?, script))
 }
