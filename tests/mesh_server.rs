@@ -509,6 +509,28 @@ async fn a_material_and_inclusions_are_told_and_what_is_wrong_with_them_is_named
 }
 
 #[tokio::test]
+async fn a_session_tells_what_was_done_with_its_mesh() {
+    let (folder, server) = ball();
+    let scene = scene(&folder);
+    let file = std::fs::read_to_string(folder.path().join("ball.obj")).unwrap();
+    // Each triangle turned over, and a vertex that none has, far away.
+    let turned = file.lines().map(|line| match line.split_whitespace().collect::<Vec<_>>()[..] {
+        ["f", a, b, c] => format!("f {b} {a} {c}\n"),
+        _ => format!("{line}\n"),
+    });
+    let turned = turned.collect::<String>() + "v 90 0 0\n";
+    let sent = upload(&server, turned.as_bytes(), 1 << 19, "m", false).await.unwrap();
+    let report = sent.report.unwrap();
+    assert!(!report.refused && report.vertices == 162 && report.volume_m3.unwrap() > 4e-4, "{report:?}");
+    assert!(report.extent.unwrap().most_m.unwrap().x < 1.0);
+    let session = server.create(Source::Scene(on(&sent.mesh_id, &scene)), true).await.unwrap();
+    for word in ["turned outward", "no triangle has them: 1."] {
+        assert!(report.problems.iter().any(|problem| problem.what.contains(word)), "{word}: {:?}", report.problems);
+        assert!(session.warnings.iter().any(|warning| warning.contains(word)), "{word}: {:?}", session.warnings);
+    }
+}
+
+#[tokio::test]
 async fn a_mesh_that_is_none_is_refused_by_element_and_place() {
     let server = Server::start(&[]);
     let whole = ICOSPHERE.as_bytes();

@@ -3,8 +3,9 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use palpate_mesh::prepare::prepare;
 use palpate_mesh::repair::{Repair, repair};
-use palpate_mesh::report::{Border, Finding, report_within};
+use palpate_mesh::report::{Border, Finding};
 use palpate_mesh::{Element, MeshError, ReadLimits, TriangleMesh, Unit};
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
@@ -147,9 +148,13 @@ impl Reading {
             let repaired = repair(&mesh, &Repair::default());
             mesh = repaired.mesh;
             problems.extend(repaired.told.into_iter().map(note));
+            problems.extend(repaired.faults.into_iter().map(|fault| note(format!("Not as asked for: {fault}."))));
             go_on()?;
         }
-        let found = report_within(&mesh, limits);
+        // As a session prepares it, which tells that as well.
+        let prepared = prepare(mesh.clone());
+        let found = prepared.report_within(limits);
+        problems.extend(prepared.notes.into_iter().map(note));
         go_on()?;
         let refused = found.refusal().is_some();
         // What is refused comes first.
@@ -157,7 +162,8 @@ impl Reading {
         let holes = found.borders.iter().filter(|border| !border.is_rim).map(hole);
         let problems = found.problems.iter().map(problem).chain(holes).chain(problems).collect();
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
-        let used = mesh.triangles.iter().flatten().filter_map(|vertex| mesh.vertices_m.get(*vertex as usize));
+        let (places_m, triangles) = (&prepared.mesh.vertices_m, &prepared.mesh.triangles);
+        let used = triangles.iter().flatten().filter_map(|vertex| places_m.get(*vertex as usize));
         let extent = Extent::around(used.copied());
         let report = pb::MeshReport {
             vertices: count(found.vertices),
