@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use palpate_mesh::repair::{Repair, repair};
-use palpate_mesh::report::{Finding, report_within};
-use palpate_mesh::{Element, MeshError, ReadLimits, TriangleMesh, Unit};
+use palpate_mesh::report::Finding;
+use palpate_mesh::{Element, MeshError, ReadLimits, TriangleMesh, Unit, prepare};
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
 
@@ -142,19 +142,24 @@ impl Reading {
         let read = palpate_mesh::read(&self.name, &bytes, unit, &|_| None, limits).map_err(refuse)?;
         drop(bytes);
         go_on()?;
-        let (mut mesh, mut problems) = (read.mesh, read.notes.into_iter().map(note).collect::<Vec<_>>());
+        let (mut mesh, mut notes) = (read.mesh, read.notes);
         if mends {
             let repaired = repair(&mesh, &Repair::default());
             mesh = repaired.mesh;
-            problems.extend(repaired.told.into_iter().map(note));
+            notes.extend(repaired.told);
+            notes.extend(repaired.faults.into_iter().map(|fault| format!("Not as asked for: {fault}.")));
             go_on()?;
         }
-        let found = report_within(&mesh, limits);
+        // As a session prepares it; it keeps the numbers of its file.
+        let prepared = prepare(mesh);
+        let found = prepared.report_within(limits);
+        notes.extend(prepared.notes);
         go_on()?;
+        let mesh = prepared.file.map_or(prepared.mesh, |file| file.mesh);
         let refused = found.refusal().is_some();
         // What is refused comes first.
         let found_problems = found.problems.iter().map(problem);
-        let problems = found_problems.chain(problems).collect();
+        let problems = found_problems.chain(notes.into_iter().map(note)).collect();
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
         let extent = Extent::around(mesh.vertices_m.iter().copied());
         let report = pb::MeshReport {
@@ -275,7 +280,7 @@ mod tests {
 
     #[test]
     fn what_is_no_mesh_is_refused_and_forgotten() {
-        let (meshes, [one, _]) = meshes(&Limits { mesh_vertices: 4, ..Limits::default() });
+        let (meshes, [one, _]) = meshes(&Limits { mesh_vertices: 5, ..Limits::default() });
         let finish = |text: &str, mends: bool, stop: bool| {
             let id = meshes.add(&part("", 0, text.as_bytes()), &one).unwrap().mesh_id;
             let reading = meshes.read(&id, "organ.obj", &one).unwrap();
@@ -285,11 +290,11 @@ mod tests {
         let (is_kept, refused) = finish("v 0 0\nf 1 2 3\n", false, false);
         let refused = refused.unwrap_err();
         assert!(!is_kept && refused.message.contains("organ.obj: line 1"), "{refused}");
-        let (is_kept, refused) = finish(&format!("{TETRAHEDRON}v 5 5 5\n"), false, false);
+        let (is_kept, refused) = finish(&format!("{TETRAHEDRON}v 5 5 5\nv 6 6 6\n"), false, false);
         assert!(!is_kept && refused.unwrap_err().message.contains("vertices"));
         assert_eq!(finish(TETRAHEDRON, false, true).1.unwrap_err().reason, given_up().reason);
         // An edge with three triangles.
-        let leaf = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 1 4\nf 1 2 4\n";
+        let leaf = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv 0 -1 -1\nf 1 2 3\nf 2 1 4\nf 1 2 5\n";
         let (is_kept, report) = finish(leaf, false, false);
         let report = report.unwrap();
         assert!(!is_kept && report.refused && report.problems[0].place_m.is_some(), "{report:?}");
