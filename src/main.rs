@@ -61,13 +61,18 @@ enum Command {
         Reads OBJ, STL, PLY, glTF (.gltf and .glb), Gmsh 1, 2 and 4.1 (.msh) and VTK (.vtk, .vtp and .vtu). A volume mesh \
         gives its outer surface. Mesh files do not state their unit, so you do: m, cm, mm, or the metres of one unit. \
         Places are told in it.\n\n\
-        A tissue needs a surface in which each edge has one or two triangles that face the same side. --repair welds \
-        vertices at one position, drops triangles without area and those that an edge has beyond two, turns triangles to \
-        one side, keeps the largest surface, fills small holes and drops unused vertices. It tells what it did. Vertices \
-        are numbered from 0 in the order of the file.\n\n\
-        With --json: vertices, triangles, components, holes, borders with edges, length_m, is_rim and place_m, volume_m3, \
-        extent_m, problems with what, element and place_m, and more.\n\n\
-        Exit status: 0 when the mesh is usable, with warnings too; 1 when a file can't be written; 2 when it was refused.")]
+        As for a scene, vertices at one position are joined along the edges of their triangles, closed surfaces are turned \
+        outward, and triangles that are there twice are left out; it tells that. Vertices are numbered from 0 in the order \
+        of the file.\n\n\
+        A tissue needs a surface in which each edge has one or two triangles. --repair also welds vertices that are nearly \
+        at one position, drops triangles without area, pairs triangles at edges that more than two have, keeps the largest \
+        surface with what is inside of it, fills small holes and drops unused vertices. It tells what it did, and area and \
+        volume before and after.\n\n\
+        With --json: vertices, triangles, components, holes, area_m2, volume_m3, before, faults, extent_m, problems with \
+        what, element and place_m, and more.\n\n\
+        Exit status: 0 when the mesh is usable, with warnings too; 1 when a file can't be written, or what --repair or \
+        --vertices made is not what was asked for: more than 1 % of area or volume lost, a closed surface open, still \
+        refused, too many vertices; 2 when it was refused.")]
     Mesh(mesh::MeshArguments),
     /// Make the mesh of an organ: gallbladder, liver, kidney, stomach, a segment of colon, or a patch with lumps
     #[command(after_help = "Examples:\n  \

@@ -531,6 +531,122 @@ fn a_rim_of_a_closed_mesh_is_warned_of_and_so_is_a_vertex_that_is_much_too_fast(
 }
 
 #[test]
+fn a_shape_is_the_same_tissue_however_its_file_is_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let ball = sphere(9, 0.03);
+    let write = |vertices_m: &[DVec3], triangles: &[[u32; 3]], head: &str| {
+        let vertices = vertices_m.iter().map(|place| format!("v {} {} {}\n", place.x, place.y, place.z));
+        let triangles = triangles.iter().map(|[a, b, c]| format!("f {} {} {}\n", a + 1, b + 1, c + 1));
+        std::fs::write(folder.path().join("ball.obj"), vertices.chain(triangles).collect::<String>()).unwrap();
+        let text = format!(
+            "[mesh]\nfile = \"ball.obj\"\nunit = \"m\"\n{head}[material]\nyoungs_modulus_pa = 8e3\nthickness_m = 5e-4\n\
+             bed_n_per_m3 = 1.34e6\n[stepping]\nintegrator = \"exponential4\"\nsubsteps = 4\n"
+        );
+        Scene::parse_in(folder.path(), "test", &text, &[], &Limits::default()).unwrap()
+    };
+    let top = ball.vertices_m().iter().position(|place| place.z > 0.0299).unwrap();
+    // The displacement of the vertex on top under a push there, and the warnings.
+    let pressed = |scene: &Scene, vertex: u32| {
+        let model = Model::compile(scene, &Limits::default()).unwrap();
+        let point = model.shape().find("test", PointName::Vertex(vertex)).unwrap();
+        let mut tissue = at_rest(&model);
+        tissue.push(0, poke(model.shape().rest_m(point), DVec3::new(0.0, 0.0, -0.02), 200.0));
+        (0..200).for_each(|_| tissue.step().unwrap());
+        (tissue.point(point).displacement_m, model.shape().normal(point).z, model.warnings.clone())
+    };
+    let (expected_m, up, warnings) = pressed(&write(ball.vertices_m(), ball.triangles(), ""), top as u32);
+    assert!(expected_m.z < -1e-5 && up > 0.99 && warnings.is_empty(), "{expected_m} {warnings:?}");
+
+    let inward: Vec<[u32; 3]> = ball.triangles().iter().map(|[a, b, c]| [*b, *a, *c]).collect();
+    let some: Vec<[u32; 3]> = ball
+        .triangles()
+        .iter()
+        .enumerate()
+        .map(|(n, [a, b, c])| if n % 3 == 0 { [*b, *a, *c] } else { [*a, *b, *c] })
+        .collect();
+    for (triangles, word) in [(&inward, "turned outward"), (&some, "that the others face")] {
+        let (found_m, up, warnings) = pressed(&write(ball.vertices_m(), triangles, ""), top as u32);
+        assert!(found_m.distance(expected_m) < 1e-4 * expected_m.length(), "{found_m} {expected_m}");
+        assert!(up > 0.99 && warnings.iter().any(|warning| warning.contains(word)), "{warnings:?}");
+    }
+    for triangles in [ball.triangles(), &inward, &some] {
+        let soup: Vec<DVec3> = triangles.iter().flatten().map(|vertex| ball.vertices_m()[*vertex as usize]).collect();
+        let own: Vec<[u32; 3]> = (0..triangles.len() as u32).map(|n| [3 * n, 3 * n + 1, 3 * n + 2]).collect();
+        for head in ["", "vertices = 60\n"] {
+            let scene = write(&soup, &own, head);
+            let Body::Mesh(mesh) = &scene.body else { panic!("of another kind") };
+            let shown = mesh.shape.shown().unwrap();
+            assert_eq!((&shown.mesh.vertices_m, shown.places.len()), (&soup, soup.len()), "those of the file");
+            // Each corner of the file at the top is the same point, which the first of them names.
+            let of_top: Vec<u32> = (0..).zip(&soup).filter(|(_, place)| place.z > 0.0299).map(|(n, _)| n).collect();
+            let points: Vec<PointId> =
+                of_top.iter().map(|n| mesh.shape.find("test", PointName::Vertex(*n)).unwrap()).collect();
+            assert!(of_top.len() > 4 && points.iter().all(|point| *point == points[0]));
+            if head.is_empty() {
+                assert_eq!(mesh.shape.point_count(), ball.point_count());
+                assert_eq!(mesh.shape.name(points[0]), PointName::Vertex(of_top[0]));
+                let (found_m, up, warnings) = pressed(&scene, of_top[2]);
+                assert!(
+                    found_m.distance(expected_m) < 1e-4 * expected_m.length() && up > 0.99,
+                    "{found_m} {expected_m}"
+                );
+                assert!(warnings.iter().any(|warning| warning.contains("joined along the edges")), "{warnings:?}");
+            } else {
+                assert!(mesh.shape.point_count() <= 60);
+            }
+            // A client that sends it, and a journal that keeps it, make the same tissue.
+            let sent = palpate::wire::scene::sent(&scene);
+            let again = palpate::wire::scene::from_scene(&sent, Some(&shown.mesh)).unwrap();
+            let Body::Mesh(other) = &again.body else { panic!("of another kind") };
+            assert_eq!(other.shape.vertices_m(), mesh.shape.vertices_m());
+            assert_eq!(other.shape.triangles(), mesh.shape.triangles());
+            assert_eq!(other.shape.shown(), mesh.shape.shown());
+        }
+    }
+}
+
+#[test]
+fn what_remains_doubtful_about_a_mesh_is_warned_of() {
+    let folder = tempfile::tempdir().unwrap();
+    let warnings = |text: &str| {
+        std::fs::write(folder.path().join("organ.obj"), text).unwrap();
+        let scene = "[mesh]\nfile = \"organ.obj\"\nunit = \"m\"\n[material]\nyoungs_modulus_pa = 1e3\n\
+             thickness_m = 0.01\nbed_n_per_m3 = 1e5\n[stepping]\ntolerance = 1e-2\n";
+        let scene = Scene::parse_in(folder.path(), "test", scene, &[], &Limits::default());
+        Model::compile(&scene.unwrap(), &Limits::default()).unwrap().warnings.join("; ")
+    };
+    let ball = obj(&icosahedron(0.02));
+    assert_eq!(warnings(&ball), "");
+    // A stray vertex, far away: it is no tissue, and does not make it larger.
+    assert!(warnings(&format!("{ball}v 90 0 0\n")).contains("no triangle has them: 1."));
+    let (vertices, faces): (Vec<&str>, Vec<&str>) = ball.lines().partition(|line| line.starts_with('v'));
+    let other = |by: f64| {
+        let moved = vertices.iter().map(|line| {
+            let at: Vec<f64> = line.split(' ').skip(1).map(|part| part.parse().unwrap()).collect();
+            format!("v {} {} {}\n", at[0] + by, at[1] + 0.001, at[2])
+        });
+        let next = faces.iter().map(|line| {
+            let of: Vec<usize> = line.split(' ').skip(1).map(|part| part.parse().unwrap()).collect();
+            format!("f {} {} {}\n", of[0] + vertices.len(), of[1] + vertices.len(), of[2] + vertices.len())
+        });
+        format!("{ball}{}{}", moved.collect::<String>(), next.collect::<String>())
+    };
+    assert!(warnings(&other(0.1)).contains("2 separate surfaces"));
+    let cut = warnings(&other(0.015));
+    assert!(cut.contains("cuts through") && cut.contains("of this kind"), "{cut}");
+    // Open, and facing inwards.
+    let open: String = vertices
+        .iter()
+        .map(|line| format!("{line}\n"))
+        .chain(faces[3..].iter().map(|line| {
+            let of: Vec<&str> = line.split(' ').collect();
+            format!("f {} {} {}\n", of[2], of[1], of[3])
+        }))
+        .collect();
+    assert!(warnings(&open).contains("the open surface faces inwards"));
+}
+
+#[test]
 fn of_a_decimated_mesh_the_vertices_of_the_file_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let fine = sphere(13, 0.1);

@@ -50,14 +50,80 @@ fn what_is_refused_says_element_place_and_what_to_do() {
     refused(OCTAHEDRON, &["other.obj", "--unit", "mm"], &["other.obj: can't be read"]);
     refused(OCTAHEDRON, &["organ.obj", "--unit", "mm", "--output", "a.vtk"], &["--output", ".ply"]);
     refused("v 1 2\n", &["organ.obj", "--unit", "mm"], &["organ.obj: line 1:", "v x y z"]);
-    let turned = OCTAHEDRON.replace("f 3 1 6", "f 1 3 6");
-    let turned = refused(&turned, &["organ.obj", "--unit", "mm", "--json"], &["edge ", "--repair"]);
-    let problems: Value = serde_json::from_str::<Value>(&turned).unwrap()["problems"].take();
-    assert_eq!(problems[0]["what"], "orientation");
+    let fin = format!("{OCTAHEDRON}v 70 70 0\nf 1 3 7\n");
+    let fin = refused(&fin, &["organ.obj", "--unit", "mm", "--json"], &["edge ", "--repair"]);
+    let problems: Value = serde_json::from_str::<Value>(&fin).unwrap()["problems"].take();
+    assert_eq!(problems[0]["what"], "non_manifold_edge");
     assert_eq!((problems[0]["element"].as_str(), problems[0]["place_m"][2].as_f64()), (Some("edge 0-2"), Some(0.0)));
     let broken = refused("v nan 0 0\n", &["organ.obj", "--unit", "mm", "--json"], &["vertex 0"]);
     let problems: Value = serde_json::from_str::<Value>(&broken).unwrap()["problems"].take();
     assert_eq!((&problems[0]["what"], &problems[0]["element"]), (&"not_finite".into(), &"vertex 0".into()));
+}
+
+#[test]
+fn what_every_scene_does_with_a_mesh_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let told = |text: &str| {
+        std::fs::write(folder.path().join("organ.obj"), text).unwrap();
+        let (status, table, told) = palpate(folder.path(), &["organ.obj", "--unit", "mm"]);
+        assert_eq!((status, told.as_str()), (0, ""), "{table}");
+        assert!(table.contains("166.667 ml") && table.contains("vertices        6"), "{table}");
+        table
+    };
+    // One triangle turned, all of them, and each with corners of its own.
+    assert!(told(&OCTAHEDRON.replace("f 3 1 6", "f 1 3 6")).contains("that the others face: 1."));
+    let faces = || OCTAHEDRON.lines().filter(|line| line.starts_with('f'));
+    let corners: Vec<Vec<usize>> =
+        faces().map(|line| line.split(' ').skip(1).map(|corner| corner.parse().unwrap()).collect()).collect();
+    let vertices: String =
+        OCTAHEDRON.lines().filter(|line| line.starts_with('v')).map(|line| format!("{line}\n")).collect();
+    let inward: String = corners.iter().map(|of| format!("f {} {} {}\n", of[1], of[0], of[2])).collect();
+    assert!(told(&format!("{vertices}{inward}")).contains("Closed surfaces turned outward: 1"));
+    let lines: Vec<&str> = vertices.lines().collect();
+    let mut soup: String = corners.iter().flatten().map(|corner| format!("{}\n", lines[corner - 1])).collect();
+    soup.extend((0..8).map(|n| format!("f {} {} {}\n", 3 * n + 1, 3 * n + 2, 3 * n + 3)));
+    assert!(told(&soup).contains("24 became 6."));
+}
+
+#[test]
+fn repair_that_is_not_what_was_asked_for_ends_with_1() {
+    let folder = tempfile::tempdir().unwrap();
+    let ends = |text: &str, arguments: &[&str]| {
+        std::fs::write(folder.path().join("organ.obj"), text).unwrap();
+        let arguments = [&["organ.obj", "--unit", "mm", "--json"], arguments].concat();
+        let (status, json, told) = palpate(folder.path(), &arguments);
+        (status, serde_json::from_str::<Value>(&json).unwrap(), told)
+    };
+    // Another octahedron behind it, of other radius and place, mm.
+    let other = |radius: i32, x: i32| {
+        let vertices = OCTAHEDRON.lines().filter_map(|line| line.strip_prefix("v ")).map(|line| {
+            let at: Vec<i32> = line.split(' ').map(|part| part.parse::<i32>().unwrap() * radius / 50).collect();
+            format!("v {} {} {}\n", at[0] + x, at[1], at[2])
+        });
+        let faces = OCTAHEDRON.lines().filter_map(|line| line.strip_prefix("f ")).map(|line| {
+            let of: Vec<i32> = line.split(' ').map(|part| part.parse::<i32>().unwrap() + 6).collect();
+            format!("f {} {} {}\n", of[0], of[1], of[2])
+        });
+        format!("{OCTAHEDRON}{}{}", vertices.collect::<String>(), faces.collect::<String>())
+    };
+    // A hollow organ keeps its inner wall.
+    let (status, json, told) = ends(&other(20, 0), &["--repair"]);
+    assert_eq!(status, 0, "{told}");
+    let hollow = 4.0 / 3.0 * (0.05_f64.powi(3) - 0.02_f64.powi(3));
+    for volume in [&json["volume_m3"], &json["before"]["volume_m3"]] {
+        assert!((volume.as_f64().unwrap() / hollow - 1.0).abs() < 1e-9, "{json}");
+    }
+    // Another organ beside it is dropped, and that is told.
+    let (status, json, told) = ends(&other(20, 100), &["--repair"]);
+    assert_eq!((status, json["components"].as_u64()), (1, Some(1)), "{told}");
+    assert!(
+        told.contains("not as asked for") && json["faults"][0].as_str().unwrap().contains("% of the area"),
+        "{told}"
+    );
+    // So few vertices are no surface.
+    let (status, json, told) = ends(OCTAHEDRON, &["--vertices", "3"]);
+    assert_eq!(status, 1, "{told}");
+    assert!(json["before"]["area_m2"].as_f64().unwrap() > 0.0 && told.contains("more than 3"), "{told}");
 }
 
 #[test]

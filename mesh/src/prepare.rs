@@ -116,7 +116,9 @@ impl Prepared {
         let changes = match_diagonals(mesh) + self.drop_doubled(mesh, &places);
         let joined = join(&mesh.vertices_m, &mesh.triangles, &places, Odd::Stay);
         let mut oriented = orient(&mesh.vertices_m, &mesh.triangles, &joined);
-        self.notes.extend(oriented.notes());
+        // What could not be found is told once.
+        let notes: Vec<String> = oriented.notes().into_iter().filter(|note| !self.notes.contains(note)).collect();
+        self.notes.extend(notes);
         let copies = joined.split_vertices(mesh);
         note(&mut self.notes, copies.len(), "Vertices split where surfaces touch");
         self.vertex_names.extend(copies);

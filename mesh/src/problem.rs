@@ -227,10 +227,7 @@ impl fmt::Display for Problem {
                 write!(f, "an earlier triangle has the same vertices: --repair drops this one")
             }
             Problem::DuplicateVertex { of } => {
-                write!(
-                    f,
-                    "at the position of vertex {of}, but not joined with it: no edge of their triangles is the same"
-                )
+                write!(f, "at the position of vertex {of}, but not joined with it")
             }
             Problem::UnusedVertex => write!(f, "no triangle has this vertex: --repair drops it"),
             Problem::EdgeSpread { ratio } => write!(

@@ -12,8 +12,8 @@ const PLACES: usize = 16;
 /// Where on a triangle they are: nowhere that meshes of boxes have an edge.
 const AT: [f64; 3] = [0.437, 0.342, 0.221];
 
-/// Boxes and triangles that are looked at in all, for each triangle.
-const LOOKS: u64 = 60;
+/// Boxes and triangles that are looked at in all: so many, and so many for each triangle.
+const LOOKS: [u64; 2] = [1_000_000, 60];
 
 /// A ray that passes an edge or begins on a triangle by less is not sure of it, as a part of the triangle's size.
 const UNSURE: f64 = 1e-9;
@@ -38,7 +38,7 @@ impl<'m> Enclosures<'m> {
         encloses: impl Fn(u32) -> bool,
     ) -> Self {
         let of: Vec<u32> = (0..).take(triangles.len()).filter(|triangle| encloses(*triangle)).collect();
-        let looks_left = LOOKS * of.len() as u64;
+        let looks_left = LOOKS[0] + LOOKS[1] * of.len() as u64;
         let tree = Tree::new(vertices, triangles, of.into_iter());
         let end = vertices.iter().map(|at| at.x).fold(f64::NEG_INFINITY, f64::max);
         Self { vertices, triangles, part_of, tree, end, looks_left }

@@ -290,7 +290,8 @@ impl Work {
         let oriented = orient(&self.mesh.vertices_m, &self.mesh.triangles, &joint);
         if how.orient {
             self.mesh.turn_triangles(&oriented.is_turned);
-            self.told.extend(oriented.notes());
+            let notes: Vec<String> = oriented.notes().into_iter().filter(|note| !self.told.contains(note)).collect();
+            self.told.extend(notes);
         }
         let first = |pair: &[[u32; 2]; 2]| pair[0][0] / 3;
         let touching = joint.touching.iter().flat_map(|of| of.windows(2).map(|two| [first(&two[0]), first(&two[1])]));

@@ -14,6 +14,13 @@ pub struct Unit {
     metres: f64,
 }
 
+impl Default for Unit {
+    /// Metres.
+    fn default() -> Self {
+        Unit::METRE
+    }
+}
+
 impl Unit {
     /// Metres.
     pub const METRE: Unit = Unit { metres: 1.0 };

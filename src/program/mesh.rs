@@ -5,10 +5,10 @@ use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
 use palpate_mesh::decimate::decimate;
-use palpate_mesh::repair::{Repair, repair};
+use palpate_mesh::repair::{Measure, Repair, repair};
 use palpate_mesh::report::{Finding, LISTED, Report, Spread};
 use palpate_mesh::write::{Format, write};
-use palpate_mesh::{MeshError, ReadLimits, TriangleMesh, Unit, read, report};
+use palpate_mesh::{MeshError, ReadLimits, TriangleMesh, Unit, prepare, read, report};
 use serde::Serialize;
 
 use super::{Failure, write_file};
@@ -35,13 +35,17 @@ pub(crate) struct MeshArguments {
 }
 
 /// What is told of a mesh.
-#[derive(Serialize)]
+#[derive(Default, Serialize)]
 struct Told {
     file: String,
     /// What reading changed or left out.
     notes: Vec<String>,
-    /// What mending and decimation did.
+    /// What was done with it, as every scene does, and by mending and decimation.
     done: Vec<String>,
+    /// How large it was, if it was mended or made coarser.
+    before: Option<Measure>,
+    /// Why that is not what was asked for.
+    faults: Vec<String>,
     #[serde(flatten)]
     report: Report,
     /// Of the file; places are told in it.
@@ -78,25 +82,47 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
         Err(error) => return refuse(arguments, &name, error, unit),
     };
     drop(bytes);
-    let (mut mesh, mut done) = (found.mesh, Vec::new());
-    if arguments.repair {
-        let repaired = repair(&mesh, &Repair::default());
-        (mesh, done) = (repaired.mesh, repaired.told);
-    }
-    if let Some(vertices) = arguments.vertices.filter(|vertices| *vertices < mesh.vertices_m.len()) {
-        let before = mesh.vertices_m.len();
-        mesh = decimate(&mesh, vertices).mesh;
-        done.push(format!("Vertices decimated: {before} to {}.", mesh.vertices_m.len()));
-        if mesh.vertices_m.len() > vertices {
-            done.push("Fewer would fold the surface: --repair may help.".to_owned());
-        }
-    }
-    let told = Told { file: name, notes: found.notes, done, report: report(&mesh), unit };
+    let told = Told { file: name, notes: found.notes, unit, ..Told::default() };
+    let (told, mesh) = treat(arguments, found.mesh, told);
     print(arguments, &told)?;
     if let Some(finding) = told.report.refusal() {
-        return Err(Failure::Refused(format!("{}: {}", told.file, finding.text(unit))));
+        let message = format!("{}: {}", told.file, finding.text(unit));
+        return Err(if arguments.repair { Failure::Failed(message) } else { Failure::Refused(message) });
     }
-    output.map_or(Ok(()), |(path, format)| write_mesh(path, &mesh, format))
+    output.map_or(Ok(()), |(path, format)| write_mesh(path, &mesh, format))?;
+    if told.faults.is_empty() {
+        return Ok(());
+    }
+    Err(Failure::Failed(format!("{}: not as asked for: {}", told.file, told.faults.join("; "))))
+}
+
+/// Mends a mesh and makes it coarser, if asked to, and reports what comes out.
+fn treat(arguments: &MeshArguments, mesh: TriangleMesh, mut told: Told) -> (Told, TriangleMesh) {
+    let mut mesh = if arguments.repair {
+        let repaired = repair(&mesh, &Repair::default());
+        (told.done, told.faults, told.before) = (repaired.told, repaired.faults, Some(repaired.before));
+        told.report = report(&repaired.mesh);
+        repaired.mesh
+    } else {
+        let prepared = prepare(mesh);
+        told.report = prepared.report();
+        told.done = prepared.notes;
+        prepared.mesh
+    };
+    if let Some(vertices) = arguments.vertices.filter(|vertices| *vertices < mesh.vertices_m.len()) {
+        let before = mesh.vertices_m.len();
+        told.before = told.before.or_else(|| Some(Measure::of(&mesh)));
+        mesh = decimate(&mesh, vertices).mesh;
+        told.report = report(&mesh);
+        told.done.push(format!("Vertices decimated: {before} to {}.", mesh.vertices_m.len()));
+        if mesh.vertices_m.len() > vertices {
+            told.faults.push(format!(
+                "{} vertices are left, more than {vertices}: fewer would fold the surface",
+                mesh.vertices_m.len()
+            ));
+        }
+    }
+    (told, mesh)
 }
 
 fn write_mesh(path: &Path, mesh: &TriangleMesh, format: Format) -> Result<(), Failure> {
@@ -108,7 +134,7 @@ fn refuse(arguments: &MeshArguments, name: &str, error: MeshError, unit: Unit) -
     let message = error.to_string();
     if arguments.json {
         let report = Report { problems: vec![Finding::from(error)], ..Report::default() };
-        print(arguments, &Told { file: name.to_owned(), notes: Vec::new(), done: Vec::new(), report, unit })?;
+        print(arguments, &Told { file: name.to_owned(), report, unit, ..Told::default() })?;
     }
     Err(Failure::Refused(message))
 }
@@ -146,11 +172,15 @@ impl Display for Told {
         }
         let [x, y, z] = report.extent_m.map(|side| side * 1e3);
         row("size", &format!("{x:.2} × {y:.2} × {z:.2} mm"))?;
-        row("area", &format!("{:.3} cm²", report.area_m2 * 1e4))?;
-        match report.volume_m3 {
-            Some(volume) => row("volume", &format!("{:.3} ml", volume * 1e6))?,
-            None => row("volume", &"not closed: [volume] of a scene needs a mesh that is")?,
-        }
+        let was = |text: String| if self.before.is_some() { format!(", was {text}") } else { String::new() };
+        let area = |area_m2: f64| format!("{:.3} cm²", area_m2 * 1e4);
+        let volume = |volume_m3: Option<f64>, open: &str| {
+            volume_m3.map_or_else(|| open.to_owned(), |volume_m3| format!("{:.3} ml", volume_m3 * 1e6))
+        };
+        let before = self.before.unwrap_or_default();
+        row("area", &format!("{}{}", area(report.area_m2), was(area(before.area_m2))))?;
+        let now = volume(report.volume_m3, "not closed: [volume] of a scene needs a mesh that is");
+        row("volume", &format!("{now}{}", was(volume(before.volume_m3, "not closed"))))?;
         row("edges", &spread(&report.edge_m, 1e3, "mm"))?;
         row("triangle areas", &spread(&report.triangle_m2, 1e6, "mm²"))?;
         let Spread { least, median, largest } = report.valence;
@@ -159,6 +189,9 @@ impl Display for Told {
             for line in lines {
                 row(name, line)?;
             }
+        }
+        for fault in &self.faults {
+            row("not as asked", fault)?;
         }
         for finding in &report.problems {
             row(if finding.problem.is_refused() { "refused" } else { "warning" }, &finding.text(self.unit))?;

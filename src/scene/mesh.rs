@@ -5,15 +5,14 @@ use std::collections::BinaryHeap;
 use std::sync::{Arc, OnceLock};
 
 use glam::{DQuat, DVec3};
-use palpate_mesh::delaunay::flip_to_delaunay;
 use palpate_mesh::surface::Surface;
 use palpate_mesh::{Group, TriangleMesh};
 
 use super::check::physical;
 use super::document::{Fields, Item};
 use super::eigenvalue::largest_of_laplacian;
-use super::shown::{Shown, coarser};
-use super::source::Files;
+use super::shown::{Shown, Simulated};
+use super::source::{Files, SourceMesh};
 use super::volume::Volume;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, positive};
@@ -63,7 +62,7 @@ pub struct Stiffest {
     pub extra_virtual: f64,
 }
 
-/// The rest shape of a mesh: point n is vertex n of the file, unless that is decimated.
+/// The rest shape of a mesh: point n is vertex n of the file, unless another mesh is shown.
 #[derive(Debug, PartialEq)]
 pub struct MeshShape {
     vertices_m: Vec<DVec3>,
@@ -82,7 +81,7 @@ pub struct MeshShape {
     cells: Cells,
     surface: OnceLock<Surface>,
     told: Told,
-    /// The mesh of the file, if the simulated one is coarser.
+    /// The mesh of the file, if the simulated one is coarser or has joined vertices.
     shown: Option<Shown>,
 }
 
@@ -95,6 +94,8 @@ pub struct Told {
     pub uv: Option<Vec<[f32; 2]>>,
     /// Vertices with a name.
     pub groups: Vec<Group>,
+    /// What was done with the mesh of the file, and what is doubtful about it, in words.
+    pub findings: Vec<String>,
 }
 
 impl Mesh {
@@ -103,13 +104,7 @@ impl Mesh {
 
     /// Reads the section `[mesh]`; with a material, which says what a point weighs, its edges are flipped to Delaunay.
     pub(super) fn read(fields: &mut Fields<'_>, files: Files<'_>, of_material: bool, limits: &Limits) -> Result<Self> {
-        let (mesh, source) = files.mesh(fields, limits)?;
-        let report = palpate_mesh::report(&mesh);
-        if let Some(finding) = report.refusal() {
-            let hint = "`palpate mesh FILE --repair` may mend it";
-            let name = source.as_text().map_or_else(String::new, |file| format!("{file}: "));
-            return Err(source.refuse(Reason::Unreadable, format!("{name}{finding}; {hint}")));
-        }
+        let (source_mesh, source) = files.mesh(fields, limits)?;
         let point_mass_kg = match fields.item("point_mass_kg") {
             Some(mass) if of_material => {
                 return Err(mass.refuse(Reason::WrongKind, Self::WEIGHED));
@@ -127,9 +122,15 @@ impl Mesh {
             }
             None => None,
         };
-        let (mesh, shown) = simulated(mesh, vertices, of_material);
-        let fixed = fields.item("fixed").map_or(Ok(Fixed::None), |item| Fixed::read(&item, &mesh))?;
-        let made = Self::shown_as(mesh, shown, point_mass_kg, fixed);
+        let simulated = match source_mesh {
+            SourceMesh::Made(mesh) => Simulated::made(mesh, vertices, of_material),
+            SourceMesh::Read(mesh) => Simulated::of(mesh, vertices, of_material).map_err(|refusal| {
+                let name = source.as_text().map_or_else(String::new, |file| format!("{file}: "));
+                source.refuse(refusal.reason, format!("{name}{}", refusal.message))
+            })?,
+        };
+        let fixed = fields.item("fixed").map_or(Ok(Fixed::None), |item| Fixed::read(&item, &simulated.mesh))?;
+        let made = Self::simulating(simulated, point_mass_kg, fixed);
         made.map_err(|refusal| source.refuse(refusal.reason, refusal.message))
     }
 
@@ -138,14 +139,15 @@ impl Mesh {
     /// # Errors
     /// As for [`MeshShape::new`].
     pub fn of(mesh: TriangleMesh, point_mass_kg: f64, fixed: Fixed) -> Result<Self> {
-        Self::shown_as(mesh, None, point_mass_kg, fixed)
+        Self::simulating(Simulated { mesh, shown: None, findings: Vec::new() }, point_mass_kg, fixed)
     }
 
-    /// The same of a mesh that is coarser than the one that is shown ([`simulated`]).
+    /// The same of a mesh that another may be shown for.
     ///
     /// # Errors
     /// As for [`MeshShape::new`].
-    pub fn shown_as(mesh: TriangleMesh, shown: Option<Shown>, point_mass_kg: f64, fixed: Fixed) -> Result<Self> {
+    pub fn simulating(simulated: Simulated, point_mass_kg: f64, fixed: Fixed) -> Result<Self> {
+        let Simulated { mesh, shown, findings } = simulated;
         let uv = mesh.uv.as_ref().map(|_| {
             let mut of_vertex = vec![[0.0; 2]; mesh.vertices_m.len()];
             mesh.write_vertex_uv(&mut of_vertex);
@@ -157,7 +159,7 @@ impl Mesh {
             Fixed::Group(group) => group.vertices.binary_search(&vertex).is_ok(),
             Fixed::Balls(balls) => balls.iter().any(|(centre_m, radius_m)| place_m.distance(*centre_m) <= *radius_m),
         })?;
-        shape.told = Told { fixed, uv, groups: mesh.groups };
+        shape.told = Told { fixed, uv, groups: mesh.groups, findings };
         shape.shown = shown;
         Ok(Mesh::new(point_mass_kg, 0.0, Arc::new(shape)))
     }
@@ -345,8 +347,8 @@ impl Mesh {
 
     /// What a user should know of the mesh, in words.
     pub fn warnings(&self) -> Vec<String> {
-        let mut warnings = Vec::new();
         let shape = &self.shape;
+        let mut warnings = shape.told.findings.clone();
         if shape.told.fixed == Fixed::Rim && shape.is_closed() {
             warnings.push("mesh.fixed: the mesh is closed and has no rim: \"rim\" fixes nothing".to_owned());
         }
@@ -388,19 +390,6 @@ const MUCH_FASTER: f64 = 2.5;
 
 /// Vertices that a decimated mesh has at least.
 const LEAST_VERTICES: usize = 4;
-
-/// The mesh to be simulated: of at most so many vertices, with edges flipped to Delaunay if `flips`; and what is shown in its
-/// place, if it has fewer vertices.
-pub fn simulated(mut mesh: TriangleMesh, vertices: Option<usize>, flips: bool) -> (TriangleMesh, Option<Shown>) {
-    if let Some(vertices) = vertices.filter(|vertices| *vertices < mesh.vertices_m.len()) {
-        let (coarse, shown) = coarser(mesh, vertices, flips);
-        return (coarse, Some(shown));
-    }
-    if flips {
-        flip_to_delaunay(&mut mesh);
-    }
-    (mesh, None)
-}
 
 /// Which vertices never move.
 #[derive(Debug, Clone, Default, PartialEq)]

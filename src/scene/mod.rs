@@ -32,9 +32,9 @@ use check::physical;
 use document::{Document, Fields, Item};
 use kind::Kind;
 pub use material::{Inclusion, MadeOf, Material, Region};
-pub use mesh::{Differences, Fixed as FixedVertices, Mesh, MeshShape, Stiffest, Told, simulated};
+pub use mesh::{Differences, Fixed as FixedVertices, Mesh, MeshShape, Stiffest, Told};
 pub use sheet::{Fixed, LEAST_WIDTH, PointSet, Sheet};
-pub use shown::{BoundPlace, Shown};
+pub use shown::{BoundPlace, Shown, Simulated};
 use source::Files;
 pub use volume::{Swelling, Volume};
 

@@ -20,20 +20,28 @@ pub(super) enum Files<'a> {
     In(&'a Path),
 }
 
+/// A mesh, by where it is from.
+pub(super) enum SourceMesh {
+    /// It was generated, without a flaw.
+    Made(TriangleMesh),
+    /// It is that of a file.
+    Read(TriangleMesh),
+}
+
 impl Files<'_> {
     /// Reads the mesh that a section names by `organ`, or by `file` and `unit`; returns also the key, for refusals.
-    pub(super) fn mesh<'a>(self, fields: &mut Fields<'a>, limits: &Limits) -> Result<(TriangleMesh, Item<'a>)> {
+    pub(super) fn mesh<'a>(self, fields: &mut Fields<'a>, limits: &Limits) -> Result<(SourceMesh, Item<'a>)> {
         if let Some(organ) = fields.item("organ") {
             if let Some(file) = fields.item("file") {
                 return Err(file.refuse(Reason::WrongKind, "does not go with organ: a mesh is read or made"));
             }
-            return Ok((made(&organ, limits)?, organ));
+            return Ok((SourceMesh::Made(made(&organ, limits)?), organ));
         }
         let item = fields.required("unit")?;
         let unit = unit_text(&item)?.parse::<Unit>();
         let unit = unit.map_err(|_| item.wrong("\"m\", \"cm\", \"mm\" or the metres of a unit"))?;
         let file = fields.required("file")?;
-        Ok((self.read(&file, unit, limits)?, file))
+        Ok((SourceMesh::Read(self.read(&file, unit, limits)?), file))
     }
 
     /// Reads the mesh that an item names. The files that this names in turn have bare names, in the same folder.

@@ -151,19 +151,20 @@ impl Reading {
             problems.extend(repaired.faults.into_iter().map(|fault| note(format!("Not as asked for: {fault}."))));
             go_on()?;
         }
-        // As a session prepares it, which tells that as well.
-        let prepared = prepare(mesh.clone());
+        // As a session prepares it; it keeps the numbers of its file.
+        let prepared = prepare(mesh);
         let found = prepared.report_within(limits);
         problems.extend(prepared.notes.into_iter().map(note));
         go_on()?;
+        let mesh = prepared.file.map_or(prepared.mesh, |file| file.mesh);
         let refused = found.refusal().is_some();
         // What is refused comes first.
         // The rim of an open surface is meant.
         let holes = found.borders.iter().filter(|border| !border.is_rim).map(hole);
         let problems = found.problems.iter().map(problem).chain(holes).chain(problems).collect();
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
-        let (places_m, triangles) = (&prepared.mesh.vertices_m, &prepared.mesh.triangles);
-        let used = triangles.iter().flatten().filter_map(|vertex| places_m.get(*vertex as usize));
+        let places_m = &mesh.vertices_m;
+        let used = mesh.triangles.iter().flatten().filter_map(|vertex| places_m.get(*vertex as usize));
         let extent = Extent::around(used.copied());
         let report = pb::MeshReport {
             vertices: count(found.vertices),
@@ -288,7 +289,7 @@ mod tests {
 
     #[test]
     fn what_is_no_mesh_is_refused_and_forgotten() {
-        let (meshes, [one, _]) = meshes(&Limits { mesh_vertices: 4, ..Limits::default() });
+        let (meshes, [one, _]) = meshes(&Limits { mesh_vertices: 5, ..Limits::default() });
         let finish = |text: &str, mends: bool, stop: bool| {
             let id = meshes.add(&part("", 0, text.as_bytes()), &one).unwrap().mesh_id;
             let reading = meshes.read(&id, "organ.obj", &one).unwrap();
@@ -298,11 +299,11 @@ mod tests {
         let (is_kept, refused) = finish("v 0 0\nf 1 2 3\n", false, false);
         let refused = refused.unwrap_err();
         assert!(!is_kept && refused.message.contains("organ.obj: line 1"), "{refused}");
-        let (is_kept, refused) = finish(&format!("{TETRAHEDRON}v 5 5 5\n"), false, false);
+        let (is_kept, refused) = finish(&format!("{TETRAHEDRON}v 5 5 5\nv 6 6 6\n"), false, false);
         assert!(!is_kept && refused.unwrap_err().message.contains("vertices"));
         assert_eq!(finish(TETRAHEDRON, false, true).1.unwrap_err().reason, given_up().reason);
         // An edge with three triangles.
-        let leaf = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 1 4\nf 1 2 4\n";
+        let leaf = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nv 0 -1 -1\nf 1 2 3\nf 2 1 4\nf 1 2 5\n";
         let (is_kept, report) = finish(leaf, false, false);
         let report = report.unwrap();
         assert!(!is_kept && report.refused && report.problems[0].place_m.is_some(), "{report:?}");

@@ -11,7 +11,7 @@ use super::required;
 use crate::refusal::{Reason, Refusal, Result, finite, number, positive};
 use crate::scene::{
     Appearance, Body, Change, Fixed, FixedVertices, Inclusion, Integrator, Lanes, Material, Mesh, Named, PointSet,
-    Precision, Region, Scene, Sheet, Springs, Stepping, Substance, Volume, simulated,
+    Precision, Region, Scene, Sheet, Simulated, Springs, Stepping, Substance, Volume,
 };
 use crate::shape::RestShape;
 
@@ -109,11 +109,11 @@ fn from_mesh(message: &pb::Scene, of_mesh: &pb::Mesh, mesh: &TriangleMesh) -> Re
         #[allow(clippy::cast_precision_loss)]
         number("mesh.vertices", vertices as f64, "at least 4", |vertices| vertices >= 4.0)?;
     }
-    let (mesh, shown) = simulated(mesh.clone(), vertices, material.is_some());
+    let simulated = Simulated::of(mesh.clone(), vertices, material.is_some())?;
     let fixed = match &of_mesh.fixed {
         None | Some(pb::mesh::Fixed::FixedRim(false)) => FixedVertices::None,
         Some(pb::mesh::Fixed::FixedRim(true)) => FixedVertices::Rim,
-        Some(pb::mesh::Fixed::FixedGroup(name)) => FixedVertices::group("mesh.fixed_group", name, &mesh)?,
+        Some(pb::mesh::Fixed::FixedGroup(name)) => FixedVertices::group("mesh.fixed_group", name, &simulated.mesh)?,
         Some(pb::mesh::Fixed::FixedBalls(balls)) => {
             let ball = |ball: &pb::Ball| {
                 let centre_m = from_vector(required("mesh.fixed_balls.centre_m", ball.centre_m.as_ref()).map(Some)?);
@@ -125,7 +125,7 @@ fn from_mesh(message: &pb::Scene, of_mesh: &pb::Mesh, mesh: &TriangleMesh) -> Re
             FixedVertices::Balls(balls.balls.iter().map(ball).collect::<Result<_>>()?)
         }
     };
-    let made = Mesh::shown_as(mesh, shown, point_mass_kg, fixed)?;
+    let made = Mesh::simulating(simulated, point_mass_kg, fixed)?;
     let substance = match material {
         Some(material) => Substance::of_material(material, flexion, made.shape)?,
         None if flexion > 0.0 => from_coefficients(message, Body::Mesh(Mesh::new(point_mass_kg, flexion, made.shape)))?,

@@ -231,7 +231,11 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   }
   part("arriving", HTMLElement).hidden = true;
   // What tells of the session before is no longer true.
-  if (before?.sessionId !== session.sessionId) heard(session);
+  if (before?.sessionId !== session.sessionId) {
+    heard(session);
+    // What the server has to say of the scene: of a mesh what was done with it, and what is doubtful.
+    if (session.warnings.length > 0) notice(session.warnings.join(" "), 15);
+  }
   next.begin();
   if (document.hidden) next.lookAway();
   if (!former || !stage.isTextured) void dress(session.sessionId);
