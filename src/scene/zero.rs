@@ -2,11 +2,8 @@
 //!
 //! −0 and 0 are equal in all that they mean, but not in their bits, and the promise of a session is bits: its hashes, its journal and
 //! its snapshots. Protobuf leaves out a field that equals 0, so that a journal gives 0 back for −0; a program that subtracts a depth
-//! of 0 sends −0. So there is one zero on the inside: [`Model`] takes scenes and [`Session`] takes actions by these functions. (What a
+//! of 0 sends −0. So there is one zero on the inside: a model takes its scene, and a session its actions, by these functions. (What a
 //! tissue computes may be −0 for all that: no snapshot writes it as anything else.)
-//!
-//! [`Model`]: crate::sheet::Model
-//! [`Session`]: crate::session::Session
 
 use glam::DVec3;
 use palpate_touch::{Coupling, Tip};

@@ -151,12 +151,11 @@ impl Reading {
             problems.extend(repaired.faults.into_iter().map(|fault| note(format!("Not as asked for: {fault}."))));
             go_on()?;
         }
-        // As a session prepares it; it keeps the numbers of its file.
-        let prepared = prepare(mesh);
+        // As a session prepares it, which tells that as well.
+        let prepared = prepare(mesh.clone());
         let found = prepared.report_within(limits);
         problems.extend(prepared.notes.into_iter().map(note));
         go_on()?;
-        let mesh = prepared.file.map_or(prepared.mesh, |file| file.mesh);
         let refused = found.refusal().is_some();
         // What is refused comes first.
         // The rim of an open surface is meant.
