@@ -200,7 +200,7 @@ const HARD: [&[&str]; 8] = [
 #[test]
 fn the_choice_is_above_the_tolerance_only_if_every_integrator_alone_is() {
     let (limits, mut made) = (Limits::default(), 0);
-    for (sets, tolerance) in HARD.iter().flat_map(|sets| [1e-3, 1e-6, 1e-14].map(|tolerance| (sets, tolerance))) {
+    for (sets, tolerance) in HARD.iter().flat_map(|sets| [1e-3, 1e-14].map(|tolerance| (sets, tolerance))) {
         let scene = scene(&[sets, &[format!("stepping.tolerance={tolerance:e}").as_str()][..]].concat());
         let chosen = choose(&scene, &limits, &NEVER);
         let Ok((choice, work)) = chosen else {
@@ -217,7 +217,7 @@ fn the_choice_is_above_the_tolerance_only_if_every_integrator_alone_is() {
             choice.expected_error <= tolerance || choice.expected_error <= 2.0 * least && least > tolerance,
             "{case}"
         );
-        if tolerance == 1e-6 {
+        if tolerance == 1e-3 {
             assert_eq!(choose(&scene, &limits, &NEVER).unwrap(), (choice, work), "{case}");
         }
         for Choice { integrator, substeps, expected_error, .. } in alone.into_iter().chain([choice]) {
@@ -227,7 +227,7 @@ fn the_choice_is_above_the_tolerance_only_if_every_integrator_alone_is() {
             assert!(may_go_beyond || substeps <= stable * MOST_TIMES_STABLE, "{case}");
         }
     }
-    assert!(made > 2 * HARD.len(), "{made}");
+    assert!(made > HARD.len(), "{made}");
 }
 
 #[test]
