@@ -377,8 +377,8 @@ impl Tool {
         if leg.normal.is_none() {
             self.gap_m = gap_m;
         }
-        let leg = Leg { place_m, ..leg };
-        let thrust = match self.slide(model, plan, layout, state, leg, reference, felt_n) {
+        let leg = Leg { place_m, reference, ..leg };
+        let thrust = match self.slide(model, plan, layout, state, leg, felt_n) {
             Slide::Went(thrust) => return thrust,
             Slide::Stays => {
                 self.balance(&mut gap_m, self.normal, reference, self.own_movement_m(model, plan));
@@ -405,6 +405,7 @@ impl Tool {
         let mut leg = Leg {
             place_m: self.place_m(fraction),
             normal: met.then_some(self.normal),
+            reference: None,
             jump_n: DVec3::ZERO,
             spread_n: DVec3::ZERO,
         };
@@ -436,8 +437,7 @@ impl Tool {
         plan: &Plan,
         layout: &Layout,
         state: &mut State<T>,
-        Leg { place_m, normal: before, spread_n, .. }: Leg,
-        reference: Option<DVec3>,
+        Leg { place_m, normal: before, reference, spread_n, .. }: Leg,
         force_n: DVec3,
     ) -> Slide {
         let moves_m_per_n = self.moves_m_per_n(model, plan);
@@ -587,6 +587,8 @@ pub(super) struct Leg {
     place_m: DVec3,
     /// The normal of the surface where it begins, if the tool touches there.
     normal: Option<DVec3>,
+    /// What the normal was when the gap was what the tool keeps; none of a new tool.
+    reference: Option<DVec3>,
     /// What the jump of speed takes across the surface, in the first substep: it acts where the disc is then, N.
     pub(super) jump_n: DVec3,
     /// What to add to the force of the substep, so that a jump counts as spread over the step. Then whether the tool lets go or
