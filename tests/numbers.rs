@@ -82,11 +82,9 @@ fn numbers(all: &BTreeMap<String, DescriptorProto>, message: &str) -> Vec<Number
     for field in &all[message].field {
         let (name, tag) = (field.name().to_owned(), field.number() as u32);
         match field.r#type() {
-            kind @ (Type::Double | Type::Float) => {
-                // A packed list is another matter: all of it is sent, whatever its bits.
-                if field.label() != Label::Repeated {
-                    found.push(Number { name, tags: vec![tag], is_double: kind == Type::Double });
-                }
+            // A packed list is another matter: all of it is sent, whatever its bits.
+            kind @ (Type::Double | Type::Float) if field.label() != Label::Repeated => {
+                found.push(Number { name, tags: vec![tag], is_double: kind == Type::Double });
             }
             Type::Message => {
                 for Number { name: inner, tags, is_double } in numbers(all, field.type_name()) {
@@ -289,9 +287,7 @@ fn every_number_of_a_command_gives_the_same_bits_on_every_way_or_is_refused() {
     let models = ["f32", "f64"].map(|precision| Model::compile(&sheet(precision, &[]), &limits()).unwrap());
     let saved = models.each_ref().map(|model| Saved::from_bytes(&begun(model).save().to_bytes(), &limits()).unwrap());
     let (mut taken, mut refused) = (0, 0);
-    for (message, number) in
-        commands().into_iter().flat_map(|message| numbers.iter().map(move |n| (message.clone(), n)))
-    {
+    for (message, number) in commands().into_iter().flat_map(|message| numbers.iter().map(move |n| (message, n))) {
         for (value, which) in NUMBERS.into_iter().zip([0, 1].into_iter().cycle()) {
             let about = format!("{} = {value:e} in {message:?}", number.name);
             let bytes = [message.encode_to_vec(), number.set_to(value)].concat();
@@ -401,8 +397,7 @@ fn every_number_of_a_scene_gives_the_same_bits_on_every_way_or_is_refused() {
     assert!(numbers.len() > 25, "{numbers:?}");
     let mesh = octahedron();
     let (mut taken, mut refused) = (0, 0);
-    for (message, number) in scenes().into_iter().flat_map(|message| numbers.iter().map(move |n| (message.clone(), n)))
-    {
+    for (message, number) in scenes().into_iter().flat_map(|message| numbers.iter().map(move |n| (message, n))) {
         for value in NUMBERS {
             let about = format!("{} = {value:e} in {}", number.name, message.name);
             let mut sent = pb::Scene::decode(&[message.encode_to_vec(), number.set_to(value)].concat()[..]).unwrap();
