@@ -397,7 +397,8 @@ fn every_number_of_a_scene_gives_the_same_bits_on_every_way_or_is_refused() {
     assert!(numbers.len() > 25, "{numbers:?}");
     let mesh = octahedron();
     let (mut taken, mut refused) = (0, 0);
-    for (message, number) in scenes().into_iter().flat_map(|message| numbers.iter().map(move |n| (message, n))) {
+    for (message, number) in scenes().into_iter().flat_map(|message| numbers.iter().map(move |n| (message.clone(), n)))
+    {
         for value in NUMBERS {
             let about = format!("{} = {value:e} in {}", number.name, message.name);
             let mut sent = pb::Scene::decode(&[message.encode_to_vec(), number.set_to(value)].concat()[..]).unwrap();
