@@ -157,14 +157,14 @@ fn holes_and_what_is_wrong_are_told_with_their_place_in_the_unit_of_the_file() {
     let (_, json, _) = palpate(folder.path(), &["organ.obj", "--unit", "mm", "--json"]);
     let border = serde_json::from_str::<Value>(&json).unwrap()["borders"][0].take();
     assert_eq!((border["edges"].as_u64(), border["is_rim"].as_bool()), (Some(3), Some(true)), "{border}");
-    // A place that is 0 but for rounding, and a stray vertex that does not count.
-    let turned = OCTAHEDRON.replace("f 3 1 6", "f 1 3 6").replace("v 0 50 0", "v 0 50 1e-14") + "v 0 0 1e5\n";
-    std::fs::write(folder.path().join("organ.obj"), turned).unwrap();
+    // A place that is 0 but for rounding, and a stray vertex that does not count. An edge of three triangles is refused.
+    let fin = OCTAHEDRON.replace("v 0 50 0", "v 0 50 1e-14") + "v 0 0 1e5\nv 10 10 0\nf 1 3 8\n";
+    std::fs::write(folder.path().join("organ.obj"), fin).unwrap();
     let (status, table, told) = palpate(folder.path(), &["organ.obj", "--unit", "mm"]);
     assert_eq!(status, 2, "{told}");
     assert!(told.contains("edge 0-2 at (25, 25, 0) mm: "), "{told}");
     assert!(
-        table.contains("100.00 × 100.00 × 100.00 mm") && table.contains("vertex 6 at (0, 0, 100000) mm"),
+        table.contains("100.00 × 100.00 × 100.00 mm") && table.contains("because no triangle has them: 1."),
         "{table}"
     );
 }

@@ -164,6 +164,24 @@ fn opening(first: &Arc<Model>, begin_step: u64) -> Opening<'_> {
 /// Steps with what a test has them do.
 const STEPS: u64 = 24;
 
+/// Lets a session of a scene go every way, if it is not held at once. Returns whether there is one: else it was refused, with a
+/// reason.
+fn is_taken_on_every_way(scene: palpate::refusal::Result<Scene>, about: &str) -> bool {
+    match scene.and_then(|scene| Model::compile(&scene, &limits())) {
+        Err(refusal) => {
+            assert_told(&refusal, about);
+            false
+        }
+        Ok(model) => {
+            let session = begun(&model);
+            if session.hold_reason().is_none() {
+                goes_every_way(session, &model, BTreeMap::new(), about);
+            }
+            true
+        }
+    }
+}
+
 /// Goes on with a session under commands, and compares the ways: it is verified from its journal, resumed from that as after a
 /// kill, and restored from its own snapshot in the middle.
 fn goes_every_way(mut session: Session, first: &Arc<Model>, mut acting: BTreeMap<u64, Vec<Due>>, about: &str) {
@@ -413,20 +431,8 @@ fn every_number_of_a_scene_gives_the_same_bits_on_every_way_or_is_refused() {
                 let merged = [first.encode_to_vec(), second.encode_to_vec()].concat();
                 balls.balls = vec![pb::Ball::decode(&merged[..]).unwrap()];
             }
-            let scene = wire::scene::from_scene(&sent, Some(&mesh));
-            match scene.and_then(|scene| Model::compile(&scene, &limits())) {
-                Err(refusal) => {
-                    assert_told(&refusal, &about);
-                    refused += 1;
-                }
-                Ok(model) => {
-                    let session = begun(&model);
-                    if session.hold_reason().is_none() {
-                        goes_every_way(session, &model, BTreeMap::new(), &about);
-                    }
-                    taken += 1;
-                }
-            }
+            let is_taken = is_taken_on_every_way(wire::scene::from_scene(&sent, Some(&mesh)), &about);
+            *(if is_taken { &mut taken } else { &mut refused }) += 1;
         }
     }
     println!("{taken} scenes taken, {refused} refused");
@@ -558,20 +564,8 @@ fn every_number_of_a_scene_file_gives_the_same_bits_on_every_way_or_is_refused()
         for value in NUMBERS {
             for (line, text) in with_each_number(text, &format!("{value:?}").replace("NaN", "nan")) {
                 let about = format!("{value:e} in {line}");
-                let scene = Scene::parse("text", &text, &[], &limits());
-                match scene.and_then(|scene| Model::compile(&scene, &limits())) {
-                    Err(refusal) => {
-                        assert_told(&refusal, &about);
-                        refused += 1;
-                    }
-                    Ok(model) => {
-                        let session = begun(&model);
-                        if session.hold_reason().is_none() {
-                            goes_every_way(session, &model, BTreeMap::new(), &about);
-                        }
-                        taken += 1;
-                    }
-                }
+                let is_taken = is_taken_on_every_way(Scene::parse("text", &text, &[], &limits()), &about);
+                *(if is_taken { &mut taken } else { &mut refused }) += 1;
             }
         }
     }

@@ -485,9 +485,7 @@ impl Disc {
         for stage in (1..=stages).rev() {
             let reach_m = self.radius_m / f64::from(1 << stage);
             self.trace(surface, place, reach_m);
-            self.weigh(reach_m, 1.0);
-            self.incline(reach_m);
-            if !self.is_plain(surface, reach_m) {
+            if !self.draw(surface, reach_m) {
                 return self.shrink(surface, reach_m);
             }
         }
@@ -556,20 +554,23 @@ impl Disc {
         along[0].cross(along[1]).length() >= LEAST_SPAN && !(is_told && twice_m2 > MOST_OVERLAP * area_m2)
     }
 
+    /// Averages the hats over a disc of radius ρ, whatever its area. Returns whether it is plain.
+    fn draw(&mut self, surface: &Surface, rho_m: f64) -> bool {
+        self.drawn_m = rho_m;
+        self.weigh(rho_m, 1.0);
+        self.incline(rho_m);
+        self.is_plain(surface, rho_m)
+    }
+
     /// Makes the disc the largest plain one below ρ: a point, next to, if there is none.
     fn shrink(&mut self, surface: &Surface, rho_m: f64) {
         let (mut low, mut high) = (0.0, rho_m);
         for _ in 0..HALVINGS {
             let middle = 0.5 * (low + high);
-            self.weigh(middle, 1.0);
-            self.incline(middle);
-            if self.is_plain(surface, middle) { low = middle } else { high = middle }
+            if self.draw(surface, middle) { low = middle } else { high = middle }
         }
         // Half of the shortest interval is a plain disc within its triangle, as good as a point.
-        let rho_m = if low > 0.0 { low } else { high };
-        self.weigh(rho_m, 1.0);
-        self.incline(rho_m);
-        self.drawn_m = rho_m;
+        self.draw(surface, if low > 0.0 { low } else { high });
     }
 
     /// Follows all ways to a radius.

@@ -13,8 +13,8 @@ use super::saved::LARGEST;
 use palpate_touch::ContactState;
 
 fn is_sound(tool: &Tool) -> bool {
-    let Tool { from_m, to_m, normal, offset_m, force_n, steady_n, velocity_m_per_s, .. } = tool;
-    let vectors = [from_m, to_m, normal, offset_m, force_n, steady_n, velocity_m_per_s];
+    let Tool { from_m, to_m, normal, offset_m, gap_m, force_n, steady_n, velocity_m_per_s, .. } = tool;
+    let vectors = [from_m, to_m, normal, offset_m, gap_m, force_n, steady_n, velocity_m_per_s];
     // What is not a number is not below it.
     vectors.into_iter().all(|v: &DVec3| v.to_array().into_iter().all(|part| part.abs() < LARGEST))
 }

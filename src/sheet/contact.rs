@@ -342,7 +342,6 @@ impl Tool {
                 if self.tip.grasps {
                     (self.contact_state, self.offset_m) = (ContactState::Holding, gap_m);
                 } else if depth_m <= 0.0 {
-                    self.is_new = false;
                     return Thrust::default();
                 } else {
                     self.contact_state = ContactState::Sticking;
@@ -451,15 +450,15 @@ impl Tool {
         let beside_m = beside_m.clamp_length_max(self.footprint.stride_m());
         // Of a force that travels, half acts where it was, and half where it is.
         let half = plan.scheme.constant().map(|of| 0.5 * of);
-        let place_of = |footprint: &Footprint, state: &State<T>| {
-            let (surface_m, _) = footprint.surface(|point| displacement_m(model, layout, state, point));
-            surface_m - 0.5 * movement_m(model, layout, state, footprint)
+        let mean_place = |footprint: &Footprint, state: &State<T>| {
+            let (surface_m, along) = footprint.surface(|point| displacement_m(model, layout, state, point));
+            (surface_m - 0.5 * movement_m(model, layout, state, footprint), along)
         };
         push(model, plan, layout, state, &self.footprint, -self.steady_n, half);
-        let (stayed_m, ground) = (place_of(&self.footprint, state), self.footprint.saved());
+        let ((stayed_m, _), ground) = (mean_place(&self.footprint, state), self.footprint.saved());
         self.footprint.shift(model, beside_m, &along);
-        let travelled_m = place_of(&self.footprint, state) - stayed_m;
-        let (_, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        let (went_m, along) = mean_place(&self.footprint, state);
+        let travelled_m = went_m - stayed_m;
         let normal = self.side.unwrap_or(1.0) * self.footprint.outward(&along);
         // What acts over the substep is along the mean normal, and does no work along the way of the disc; a spring's force is that
         // at its end.

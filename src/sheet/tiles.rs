@@ -10,8 +10,8 @@
 //! where springs are much stiffer than the virtual ones and so pass on more of an omitted force. A tile also wakes when
 //! the tools' force on it may have changed by more than ε_w·K″ since (`rest`), or the pressure (`swelling`), when a point of it is
 //! grasped (`motion`), or one that its springs reach is moved by its tool by more than ε_w in a substep (`rest`; a scheme of several
-//! sweeps sees that within the substep), and when a position-controlled tool pushes on it (`touch`). All tiles wake when the tissue changes (`change`), after a
-//! recovery (`recovery`), and when the guard goes back to a checkpoint (`guard`).
+//! sweeps sees that within the substep), and when a position-controlled tool pushes on it (`touch`). All tiles wake when the tissue
+//! changes (`change`), after a recovery (`recovery`), and when the guard goes back to a checkpoint (`guard`).
 //!
 //! **Cost.** A step's cost follows what is awake, not the size of the sheet: sets of tiles are lists, memory that nothing has
 //! moved in is never written, a checkpoint copies what was awake since the last one, a record adds the energies that sleeping

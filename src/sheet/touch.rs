@@ -158,7 +158,7 @@ mod tests {
         Sheet::new(&Model::paper(&[&always[..], &["sheet.points=[9, 9]", "sleep.tolerance=0.0"], sets].concat()))
     }
 
-    /// Without damping and friction, all energy is work that a tip has done: also of the force that travels with its disc.
+    /// Without damping, all work that a tip has done is energy of the sheet, but for what friction takes as its disc slides.
     #[test]
     fn the_work_of_a_tip_that_slides_is_the_energy_of_the_sheet() {
         for friction in [0.0, 0.4] {
@@ -173,6 +173,7 @@ mod tests {
                 let t = t.clamp(0.0, 1.0);
                 t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
             };
+            let (mut heat_j, mut before) = (0.0, None);
             for step in 0..900 {
                 let t = f64::from(step) * 1e-3;
                 let along_m = 0.5 * smooth((t - 0.2) / 0.7);
@@ -181,9 +182,23 @@ mod tests {
                 sheet.do_step();
                 let Energy { kinetic_j, spring_j, virtual_j } = sheet.energies();
                 let (energy_j, work_j) = (kinetic_j + spring_j + virtual_j, sheet.work.done_j);
-                // The work of an impulse is counted by the speed after it, so a little too high.
-                let part = work_j / energy_j;
-                assert!(step < 200 || (1.0..1.03).contains(&part), "{friction}, {step}: {work_j} J for {energy_j} J");
+                // Friction times the way of the disc over the moved surface.
+                let tool = &sheet.contacts.tools[0];
+                let (_, [x, y]) = tool
+                    .footprint
+                    .surface(|point| displacement_m(&sheet.model, &sheet.tables.layout, &sheet.state, point));
+                let across_n = tool.force_n - tool.force_n.dot(tool.normal) * tool.normal;
+                let now = (across_n, tool.footprint.anchor_m(), [x, y]);
+                let (before_n, anchor_m, along) = before.replace(now).unwrap_or(now);
+                let way_m = now.1 - anchor_m;
+                heat_j += 0.25 * (before_n + across_n).dot(way_m.x * (along[0] + x) + way_m.y * (along[1] + y));
+                // The work of an impulse is counted by the speed after it, so a little too high; the heat is summed once a step,
+                // and the disc sticks and slips within one.
+                let part = (work_j - heat_j) / energy_j;
+                assert!(
+                    step < 200 || (0.98..1.03).contains(&part),
+                    "{friction}, {step}: {work_j} - {heat_j} J for {energy_j} J"
+                );
             }
         }
     }

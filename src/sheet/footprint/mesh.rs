@@ -15,6 +15,12 @@ use crate::sheet::saved::{SavedGround, ensure};
 /// must not hop to and fro between two.
 const NEARER: f64 = 0.1;
 
+/// The place on a mesh that a snapshot has; none of one on a sheet.
+fn place_of(saved: &SavedGround) -> Option<Place> {
+    let SavedGround::Mesh { triangle, barycentric, frame } = saved else { return None };
+    Some(Place { triangle: *triangle, barycentric: *barycentric, frame: frame.map(DVec3::from) })
+}
+
 /// A disc on a mesh, at a place.
 #[derive(Debug, Clone)]
 pub(super) struct MeshDisc {
@@ -40,8 +46,7 @@ impl MeshDisc {
 
     /// Takes the place of another.
     pub(super) fn restore(&mut self, saved: &SavedGround) -> Result<()> {
-        let SavedGround::Mesh { triangle, barycentric, frame } = saved else { return Ok(()) };
-        let place = Place { triangle: *triangle, barycentric: *barycentric, frame: frame.map(DVec3::from) };
+        let Some(place) = place_of(saved) else { return Ok(()) };
         let triangles = self.shape.triangles().len();
         ensure((place.triangle as usize) < triangles, "a tool on a triangle that the tissue has not")?;
         let hats = place.barycentric;
@@ -66,9 +71,7 @@ impl MeshDisc {
 
     /// Goes to a place where it was.
     pub(super) fn go_to(&mut self, saved: &SavedGround) {
-        if let SavedGround::Mesh { triangle, barycentric, frame } = saved {
-            self.place = Place { triangle: *triangle, barycentric: *barycentric, frame: frame.map(DVec3::from) };
-        }
+        self.place = place_of(saved).unwrap_or(self.place);
     }
 
     /// Where the place rests, m.
