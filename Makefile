@@ -38,7 +38,8 @@ help:
 	@echo 'make test-abi        libpalpate from C under valgrind and the address sanitizer; its interface beside the one kept'
 	@echo 'make test-debug      the kernel with debug assertions'
 	@echo 'make test-mutants    how many of 300 mutants of the kernel, touch and sessions the tests catch (an hour or two)'
-	@echo 'make stress          ten thousand random scenes, a million steps on 200 meshes, ten million steps (some minutes)'
+	@echo 'make stress          ten thousand random scenes, a million steps on 200 meshes, ten million steps, a thousand thin meshes,'
+	@echo '                     five thousand snapshots (an hour or two)'
 	@echo 'make fuzz            a million bent inputs for every decoder (some minutes)'
 	@echo 'make libfuzzer       one decoder under libFuzzer: TARGET=request (or scene, script, …) FUZZ_SECONDS=60'
 	@echo 'make lint            formatting, compiler and clippy warnings'
@@ -186,9 +187,11 @@ bench-rest: build
 bench-frames: need-rust
 	$(CARGO) bench --quiet --bench frames -- $(ARGUMENTS)
 
-# Ten thousand random scenes, as many that are merely legal, and a soak of ten million steps.
+# Ten thousand random scenes, as many that are merely legal, a soak of ten million steps, a thousand thin meshes under tips
+# (`PALPATE_STRESS_THIN=10000` takes hours), and five thousand snapshots that are restored.
 stress: need-rust
-	PALPATE_STRESS_SCENES=10000 PALPATE_STRESS_MESHES=200 $(CARGO) test --release --test stress --test legal --test physics -- --include-ignored --nocapture
+	PALPATE_STRESS_SCENES=10000 PALPATE_STRESS_MESHES=200 PALPATE_STRESS_THIN=1000 PALPATE_SNAPSHOTS=5000 $(CARGO) test --release \
+		--test stress --test legal --test physics --test thin --test restored -- --include-ignored --nocapture
 
 # Another processor, the same bits. The compiler and the standard library for ARM are Debian's. An emulated vector takes some
 # thousand times as long: `make test-arm ARM_TESTS="--test determinism"` for whole courses, and hours.
