@@ -665,6 +665,24 @@ impl<T: Real> Applied<T> {
         sum
     }
 
+    /// The work of the forces where something else than a sweep moves a point, in `Sheet::unit_of_work_j`. A sweep counts only
+    /// how it would have moved.
+    pub(super) fn work_along(
+        &self,
+        model: &Model,
+        plan: &Plan,
+        layout: &Layout,
+        point: [usize; 2],
+        movement: [f64; 3],
+    ) -> f64 {
+        if self.terms.is_empty() {
+            return 0.0;
+        }
+        let force = self.force_at(layout, plan.scheme.last_field(), point);
+        let product: f64 = force.iter().zip(movement).map(|(force, moved)| force * moved).sum();
+        product * model.relative_mass_at(model.index_of(point))
+    }
+
     /// Forgets the terms and their scale.
     pub(super) fn forget(&mut self) {
         self.terms.clear();

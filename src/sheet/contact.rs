@@ -35,6 +35,7 @@
 //! - A disc that lags behind its tool is pressed by no more than what the tool moves along the normal ([`Tool::balance`]), and
 //!   it moves by no more than half its radius at once.
 //! - Where the disc would come over an edge so that its way leads along its normal, it stays, and pushes along its normal alone.
+//!   Where friction would drive it against the tool's way, and farther, it stays, and friction acts: so what slid and stops is held.
 //!
 //! The force felt under a constraint is that of springs, virtual springs and damping on the disc, Σ w·f/Σ w²: F without
 //! the points' own inertia, which a hand would feel as a knock at each command.
@@ -379,9 +380,11 @@ impl Tool {
         let leg = Leg { place_m, reference, ..leg };
         let thrust = match self.slide(model, plan, layout, state, leg, felt_n) {
             Slide::Went(thrust) => return thrust,
-            Slide::Stays => {
+            Slide::Stays(across) => {
                 self.balance(&mut gap_m, self.normal, reference, self.own_movement_m(model, plan));
-                self.thrust(model, plan, layout, state, gap_m).along(self.normal)
+                let thrust = self.thrust(model, plan, layout, state, gap_m).along(self.normal);
+                let pressing_n = -(thrust.force_n() + spread_n).dot(self.normal);
+                thrust.with(self.tip.friction * pressing_n.max(0.0) * across)
             }
             Slide::Leaves => Thrust::default(),
         };
@@ -468,12 +471,16 @@ impl Tool {
         };
         let way = travelled_m.normalize_or_zero();
         let mean = (mean - mean.dot(way) * way).normalize_or_zero();
-        if mean.dot(normal) < LEAST_STRAIGHTNESS {
+        let is_straight = mean.dot(normal) >= LEAST_STRAIGHTNESS;
+        let mean = if self.tip.coupling == Coupling::Constraint { mean } else { normal };
+        let across = (across_n - across_n.dot(mean) * mean).normalize_or_zero();
+        // Friction takes energy from a disc that moves: it does not drive one against the tool's way, farther than that.
+        let is_driven = across.dot(travelled_m) < -self.own_movement_m(model, plan).length();
+        if !is_straight || is_driven {
             self.footprint.return_to(model, &ground);
             push(model, plan, layout, state, &self.footprint, self.steady_n, half);
-            return Slide::Stays;
+            return Slide::Stays(if is_straight { across_n.normalize_or_zero() } else { DVec3::ZERO });
         }
-        let mean = if self.tip.coupling == Coupling::Constraint { mean } else { normal };
         let straightness = mean.dot(normal);
         push(model, plan, layout, state, &self.footprint, self.steady_n, half);
         self.normal = normal;
@@ -489,10 +496,7 @@ impl Tool {
             push(model, plan, layout, state, &self.footprint, self.steady_n, half);
             return Slide::Leaves;
         }
-        let across = (across_n - across_n.dot(mean) * mean).normalize_or_zero();
-        // Friction takes energy from a disc that moves: it does not drive one against the tool's way, farther than that.
-        let is_driven = across.dot(travelled_m) < -self.own_movement_m(model, plan).length();
-        let friction_n = if is_driven { 0.0 } else { self.tip.friction * pressing_n } * across;
+        let friction_n = self.tip.friction * pressing_n * across;
         let along_mean = |normal_n: f64| normal_n / straightness * mean;
         let kick_n = along_mean(thrust.kick_n.dot(self.normal));
         let steady_n = along_mean((thrust.steady_n - friction_n).dot(self.normal)) + friction_n;
@@ -599,8 +603,8 @@ pub(super) struct Leg {
 enum Slide {
     /// It follows the tool.
     Went(Thrust),
-    /// It stays: its way would lead along its normal.
-    Stays,
+    /// It stays: its way would lead along its normal, or friction would drive it. Friction acts this way, with length 1 or 0.
+    Stays(DVec3),
     /// It stays, and the tool lets go: where it would come to, nothing presses.
     Leaves,
 }
@@ -621,6 +625,11 @@ impl Thrust {
     fn along(&self, normal: DVec3) -> Self {
         let along = |force_n: DVec3| force_n.dot(normal) * normal;
         Thrust { kick_n: along(self.kick_n), steady_n: along(self.steady_n), goes_on_n: along(self.goes_on_n) }
+    }
+
+    /// The same, and a steady force.
+    fn with(&self, steady_n: DVec3) -> Self {
+        Thrust { kick_n: self.kick_n, steady_n: self.steady_n + steady_n, goes_on_n: self.goes_on_n + steady_n }
     }
 
     /// Both together.

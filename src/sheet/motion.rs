@@ -178,10 +178,10 @@ impl<T: Real> Sheet<T> {
     /// Puts the grasped points at their places at `fraction` of the step, and counts the work if `counted`.
     fn hold(&mut self, step: u64, fraction: f64, counted: bool) {
         let unit_j = self.unit_of_work_j();
-        let Sheet { model, plan, tables, state, prescribed, work, .. } = self;
+        let Sheet { model, plan, tables, state, applied, prescribed, work, .. } = self;
         let spacing_m = model.unit_m;
         for (index, displacement_m, velocity_m_per_s) in prescribed.at(model, step, fraction) {
-            let mut product = 0.0;
+            let (mut product, mut moved) = (0.0, [0.0; 3]);
             for c in 0..3 {
                 let at = c * tables.layout.plane + tables.layout.offset(index);
                 let (free_u, free_d) = (state.u[at], state.d[at]);
@@ -193,9 +193,11 @@ impl<T: Real> Sheet<T> {
                     T::of(velocity_m_per_s[c] * plan.substep_s / spacing_m)
                 };
                 product += (state.d[at].wide() - free_d.wide()) * state.d[at].wide();
+                moved[c] = state.u[at].wide() - free_u.wide();
             }
             if counted {
                 work.add(product * model.relative_mass_at(index) * unit_j);
+                work.add(applied.work_along(model, plan, &tables.layout, model.point_of(index), moved) * unit_j);
             }
         }
     }
