@@ -435,6 +435,6 @@ fn a_copy_for_a_client_is_bounded_whatever_a_server_sends() {
         ["stepping.integrator=central", "stepping.substeps=1", "stepping.precision=f64", "sheet.fixed=\"corners\""];
     // Smaller than the tip; and a strip of which it covers ten thousand points.
     refused(&[&given[..], &["sheet.points=[7, 7]", "sheet.spacing_m=1e-7"]].concat(), "tip.radius_m");
-    refused(&[&given[..], &["sheet.points=[20000, 2]", "sheet.spacing_m=1e-6"]].concat(), "lengths of an edge");
+    refused(&[&given[..], &["sheet.points=[2, 20000]", "sheet.spacing_m=1e-6"]].concat(), "lengths of an edge");
     refused(&[&given[..], &["sheet.points=[400, 400]", "sheet.spacing_m=0.01"]].concat(), "points");
 }
