@@ -5,7 +5,6 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use palpate::budget;
-use palpate::printable::{printable, printable_json};
 use palpate::server::{self, Listeners, signals};
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::fmt::format::FmtSpan;
@@ -189,22 +188,15 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let detailed = filter.max_level_hint().is_none_or(|level| level >= tracing::Level::DEBUG);
     // Logging never blocks: lines that do not fit into the queue are dropped.
     let (writer, _flush) = tracing_appender::non_blocking(std::io::stderr());
-    let colours = std::io::stderr().is_terminal() && !arguments.log_json;
-    let printed: fn(&str) -> String = match (arguments.log_json, colours) {
-        (true, _) => |text: &str| printable_json(text),
-        (false, true) => log::printable_in_colour,
-        (false, false) => |text: &str| printable(text),
-    };
     let subscriber = tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(move || log::Records { writer: writer.clone(), printed })
         // At level debug, the duration of each call and sampled step is logged when it ends.
         .with_span_events(if detailed { FmtSpan::CLOSE } else { FmtSpan::NONE })
-        .with_ansi(colours);
+        .with_ansi(std::io::stderr().is_terminal());
     if arguments.log_json {
-        subscriber.json().init();
+        subscriber.json().with_writer(move || log::JsonRecords(writer.clone())).init();
     } else {
-        subscriber.init();
+        subscriber.fmt_fields(log::fields()).with_writer(writer).init();
     }
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(config.serving_threads())
