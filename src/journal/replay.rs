@@ -548,8 +548,8 @@ pub fn resume<R: Read + Seek>(reader: Reader<R>, limits: &Limits) -> Result<Resu
 /// stepped at 1 kHz. Neither steps nor tools of the session are restored, whatever they would cost.
 ///
 /// # Errors
-/// Refuses what is no snapshot of one moment, a tissue that is too large or a tip that covers too much of it, and tells that there is
-/// no memory.
+/// Refuses what is no snapshot of one moment, a tissue that is too large or a tip that covers too much of it, and tells that
+/// there is no memory.
 pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predictor>, String> {
     #[allow(clippy::cast_possible_truncation)]
     let limits = message::limits(&Limits { points: TICK_POINT_SUBSTEPS as usize, ..Limits::default() });

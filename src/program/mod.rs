@@ -26,7 +26,8 @@ use palpate::server::config::Config;
 /// program.
 macro_rules! say {
     ($($text:tt)*) => {{
-        let _ = std::io::Write::write_all(&mut std::io::stderr(), (palpate::printable::printable(format_args!($($text)*)) + "\n").as_bytes());
+        let text = palpate::printable::printable(format_args!($($text)*));
+        let _ = std::io::Write::write_all(&mut std::io::stderr(), (text + "\n").as_bytes());
     }};
 }
 pub(crate) use say;

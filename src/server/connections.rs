@@ -274,7 +274,8 @@ impl Register {
         number
     }
 
-    /// Closes the connections over which nobody has called a service of ours: they ask for the health, for reflection or for pages.
+    /// Closes the connections over which nobody has called a service of ours: they ask for the health, for reflection or for
+    /// pages.
     pub(super) fn close_strangers(&self) {
         let open = lock(&self.0);
         let strangers = open.1.values().filter(|peer| !peer.is_served.load(Ordering::Relaxed));

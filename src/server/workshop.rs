@@ -25,8 +25,8 @@ use crate::refusal::{Reason, Refusal};
 /// Number of threads of a workshop.
 const THREADS: usize = 2;
 
-/// Which of a caller's jobs comes first; those of one kind in the order of their requests. Many laws so delay no call that somebody
-/// waits for.
+/// Which of a caller's jobs comes first; those of one kind in the order of their requests. Many laws so delay no call that
+/// somebody waits for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Urgency {
     /// What a call needs.

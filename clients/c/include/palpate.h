@@ -815,9 +815,9 @@ enum palpate_result palpate_touch_arrive(const struct palpate_touch *touch,
 
 /**
  * Gives the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, by a clock that
- * goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back. It may be late,
- * early or left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of zero. One thread at a
- * time.
+ * goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back. It may be
+ * late, early or left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of zero.
+ * One thread at a time.
  */
 enum palpate_result palpate_touch_tick(const struct palpate_touch *touch,
                                        const struct palpate_reading *reading,

@@ -1,7 +1,7 @@
-//! What differs between operating systems: on Unix a write to a connection that the other end has closed sends SIGPIPE, which ends a
-//! program that does not expect it. Programs in Rust ignore it from their start; those in C do not, and their disposition is theirs. So
-//! the library blocks it in its own threads, and in the caller's while that waits for the network. And a process that is forked has none
-//! of its parent's threads.
+//! What differs between operating systems: on Unix a write to a connection that the other end has closed sends SIGPIPE, which
+//! ends a program that does not expect it. Programs in Rust ignore it from their start; those in C do not, and their disposition
+//! is theirs. So the library blocks it in its own threads, and in the caller's while that waits for the network. And a process
+//! that is forked has none of its parent's threads.
 
 use std::future::Future;
 
@@ -10,8 +10,8 @@ use tokio::task::JoinHandle;
 
 use crate::error::{Fault, PALPATE_INTERNAL};
 
-/// Threads for the network, which no closed connection ends. A child that was forked has not got them: there every use is refused, which
-/// would wait for ever.
+/// Threads for the network, which no closed connection ends. A child that was forked has not got them: there every use is
+/// refused, which would wait for ever.
 pub(crate) struct Threads {
     /// Always there, till it is dropped.
     runtime: Option<Runtime>,
@@ -33,7 +33,7 @@ impl Threads {
 
     /// The threads, if this process has them.
     pub(crate) fn here(&self) -> Result<&Runtime, Fault> {
-        let words = "the handle is of the process that this one was forked from: connect in this process, for a handle of its own";
+        let words = "the handle is of the process that this one was forked from: connect here for a handle of its own";
         let is_here = self.process == std::process::id();
         self.runtime.as_ref().filter(|_| is_here).ok_or_else(|| Fault::argument(words))
     }

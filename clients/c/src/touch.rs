@@ -202,9 +202,9 @@ pub unsafe extern "C" fn palpate_touch_arrive(
 }
 
 /// Gives the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, by a clock that
-/// goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back. It may be late,
-/// early or left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of zero. One thread at a
-/// time.
+/// goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back. It may be
+/// late, early or left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of zero.
+/// One thread at a time.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_tick(
     touch: *const palpate_touch,

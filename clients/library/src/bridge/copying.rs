@@ -18,7 +18,8 @@ type Made = Result<Box<dyn Predictor>, Error>;
 /// A snapshot of more bytes is of a tissue that no client could step in time.
 const MOST_BYTES: usize = 64 << 20;
 
-/// Makes copies for a bridge, over all its connections: one at a time, because nothing stops the thread of one until its step ends.
+/// Makes copies for a bridge, over all its connections: one at a time, because nothing stops the thread of one until its step
+/// ends.
 #[derive(Clone)]
 pub(super) struct Copier {
     copies: Copies,

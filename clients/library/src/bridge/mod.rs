@@ -118,8 +118,8 @@ pub struct Options {
     pub begun: Option<Begun>,
     /// Keep a clone to stop the forces of [`run`]; of [`begin`], [`Ticker::disable`] does it.
     pub disable: Disable,
-    /// Keeps a copy of these tissues, and renders from it as soon as it is there. A thread of its own makes and steps it, whatever
-    /// that costs: while it is late, and where it is refused, forces come from local models. `None`: from those alone.
+    /// Keeps a copy of these tissues, and renders from it as soon as it is there. A thread of its own makes and steps it,
+    /// whatever that costs: while it is late, and where it is refused, forces come from local models. `None`: from those alone.
     pub copies: Option<Copies>,
 }
 

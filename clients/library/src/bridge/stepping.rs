@@ -1,6 +1,6 @@
-//! Makes and steps a copy of the tissue on a thread of its own. A server says what the copy is, so a step of it may take long: the
-//! loop of a device waits for none. It leaves its newest place in a slot and finds in another what the tool felt at an earlier one,
-//! usually that of the last tick.
+//! Makes and steps a copy of the tissue on a thread of its own. A server says what the copy is, so a step of it may take long:
+//! the loop of a device waits for none. It leaves its newest place in a slot and finds in another what the tool felt at an
+//! earlier one, usually that of the last tick.
 
 use std::io;
 use std::sync::Arc;
@@ -105,8 +105,8 @@ fn ends() -> (Stepped, Stepper) {
     (Stepped { places, felt, is_over: is_over.clone() }, Stepper { places: to_step, felt: told, is_over })
 }
 
-/// What `make` makes, on the thread that will step it; `permit` is given back when that thread ends. If nobody waits for the answer
-/// any more, the thread ends as soon as the copy is made.
+/// What `make` makes, on the thread that will step it; `permit` is given back when that thread ends. If nobody waits for the
+/// answer any more, the thread ends as soon as the copy is made.
 pub(super) fn made_apart(
     make: impl FnOnce() -> Result<Box<dyn Predictor>, String> + Send + 'static,
     permit: OwnedSemaphorePermit,
