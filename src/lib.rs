@@ -27,3 +27,5 @@ pub mod wire;
 
 // The error of refused inputs, which is also the protocol's.
 pub use palpate_proto::refusal;
+// How text of others reaches a terminal or a log.
+pub use palpate_proto::printable;

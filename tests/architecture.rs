@@ -6,8 +6,9 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Each module of `palpate` may use those before it.
-const MODULES: [&str; 20] = [
+const MODULES: [&str; 21] = [
     "refusal",
+    "printable",
     "limits",
     "lock",
     "priority",

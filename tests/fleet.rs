@@ -199,6 +199,26 @@ async fn without_etcd_all_stands_and_then_goes_on_in_place() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_session_whose_owner_is_changed_by_hand_ends_at_its_old_server() {
+    let Some((_one, folder, etcd)) = alone().await else { return };
+    let nodes = three(folder.path(), &etcd.endpoints()).await;
+    let id = create(&nodes[0]).await.session_id;
+    let at = owner(&nodes, &id).await.unwrap();
+    let other = &nodes[(at + 1) % 3];
+    let mut touch = Touch::hold(nodes[at].there(), &id).await;
+    let value = serde_json::json!({ "node": other.name, "standby": "" }).to_string();
+    etcd.control(&["put", &format!("/palpate/default/sessions/{id}"), &value]);
+    let ended = loop {
+        if let Err(status) = touch.hear().await {
+            break status;
+        }
+    };
+    assert_eq!(elsewhere(&ended), Some(other.url.clone()), "{ended}");
+    let refused = nodes[at].session(&id).await.unwrap_err();
+    assert_eq!(elsewhere(&refused), Some(other.url.clone()), "{refused}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_moves_with_its_tools_and_the_same_bits() {
     let Some((_one, folder, etcd)) = alone().await else { return };
     let nodes = three(folder.path(), &etcd.endpoints()).await;

@@ -406,3 +406,35 @@ fn write_the_golden_file() {
     journal::seal::seal(&mut file).unwrap();
     std::fs::write(golden(journal::REPLAYS), file.into_inner()).unwrap();
 }
+
+/// The bytes of a snapshot, as a server sends them, with a tool of that radius in the tissue.
+fn snapshot_bytes(model: &Arc<Model>, radius_m: f64) -> Vec<u8> {
+    let mut session = Session::new(model);
+    let middle_m = model.shape().extent().middle_m();
+    let action = Action::Pose { place_m: middle_m, velocity_m_per_s: None, tip: Tip { radius_m, ..Tip::default() } };
+    session.advance(&mut vec![due(0, 1, action)], |_| {});
+    let mut writer = Writer::new(&Opening { begin_step: 1, ..opening(model) }, BEGUN_NS);
+    writer.snapshot(1, session.tissue().state_hash(), model, session.save().to_bytes());
+    writer.finish(pb::Why::Cut, "a snapshot", 1, BEGUN_NS)
+}
+
+#[test]
+fn a_copy_for_a_client_is_bounded_whatever_a_server_sends() {
+    let tip = Tip { radius_m: 0.005, ..Tip::default() };
+    let copy = |sets: &[&str]| {
+        let model = model(sets);
+        let radius_m = 2.0 * model.shape().edge_m();
+        palpate::journal::prediction(&snapshot_bytes(&model, radius_m), tip)
+    };
+    let refused = |sets: &[&str], why: &str| {
+        let said = copy(sets).err().unwrap();
+        assert!(said.contains(why), "{sets:?}: {said}");
+    };
+    assert!(copy(&["sheet.points=[7, 7]", "sheet.spacing_m=0.01"]).is_ok());
+    let given =
+        ["stepping.integrator=central", "stepping.substeps=1", "stepping.precision=f64", "sheet.fixed=\"corners\""];
+    // Smaller than the tip; and a strip of which it covers ten thousand points.
+    refused(&[&given[..], &["sheet.points=[7, 7]", "sheet.spacing_m=1e-7"]].concat(), "tip.radius_m");
+    refused(&[&given[..], &["sheet.points=[2, 20000]", "sheet.spacing_m=1e-6"]].concat(), "lengths of an edge");
+    refused(&[&given[..], &["sheet.points=[400, 400]", "sheet.spacing_m=0.01"]].concat(), "points");
+}

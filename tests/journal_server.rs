@@ -211,7 +211,7 @@ async fn nothing_is_kept_where_it_is_not_wanted() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_full_disk_breaks_the_journal_and_not_the_session() {
+async fn a_full_disk_breaks_the_journal_and_not_the_session_and_the_journal_begins_anew_when_there_is_room() {
     let folder = tempfile::tempdir().unwrap();
     // No file may have more than 200 KiB.
     let script = format!(
@@ -250,10 +250,24 @@ async fn a_full_disk_breaks_the_journal_and_not_the_session() {
     sequence += 1;
     touch.command(force(0, sequence, -0.2)).await;
     touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
+    // In another file there is room: the journal goes on there, from a snapshot, and then there is no fault any more.
+    let anew = async {
+        loop {
+            let journal = server.status(&id).await.journal.unwrap();
+            if journal.fault.is_empty() {
+                return journal.durable_step.unwrap();
+            }
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    };
+    let anew = tokio::time::timeout(PATIENCE, anew).await.unwrap();
+    assert!(anew > durable, "{durable} {anew}");
     drop(server);
-    verifies(&files(folder.path(), &id));
+    let files = files(folder.path(), &id);
+    assert!(files.len() >= 2, "{files:?}");
+    verifies(&files);
     let after = start(folder.path());
-    assert!(after.status(&id).await.step >= durable);
+    assert!(after.status(&id).await.step >= anew);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -583,6 +583,21 @@ async fn who_watches_the_health_is_told_first_and_not_waited_for() {
     assert!(tokio::time::timeout(PATIENCE, ended).await.unwrap().unwrap().success());
 }
 
+#[cfg(unix)]
+#[tokio::test]
+async fn who_watches_the_health_and_does_not_read_holds_up_no_shutdown() {
+    use tonic_health::pb::HealthCheckRequest;
+    use tonic_health::pb::health_client::HealthClient;
+    let mut server = Server::start(&["--shutdown-deadline-s", "3600"]);
+    // Not a byte of an answer may be sent.
+    let endpoint = tonic::transport::Channel::from_shared(server.url.clone()).unwrap().initial_stream_window_size(0);
+    let mut health = HealthClient::new(endpoint.connect().await.unwrap());
+    let _watching = health.watch(HealthCheckRequest::default()).await.unwrap();
+    assert!(Command::new("kill").arg(server.child.id().to_string()).status().unwrap().success());
+    let ended = tokio::task::spawn_blocking(move || server.child.wait().unwrap());
+    assert!(tokio::time::timeout(PATIENCE, ended).await.unwrap().unwrap().success());
+}
+
 /// Springs far too stiff for the substeps that the scene gives: no error can be expected.
 #[tokio::test]
 async fn an_expected_error_is_always_finite() {

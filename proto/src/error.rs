@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use tonic::{Code, Status};
 use tonic_types::{ErrorDetails, StatusExt};
 
+use crate::printable::printable;
 use crate::refusal::{Reason, Refusal};
 
 /// The domain of every `ErrorInfo`.
@@ -56,6 +57,7 @@ pub fn code(reason: Reason) -> Code {
 
 impl From<Refusal> for Status {
     fn from(refusal: Refusal) -> Self {
+        let refusal = refusal.without_folder();
         let mut metadata = HashMap::new();
         if !refusal.field.is_empty() {
             metadata.insert("field".to_owned(), refusal.field.clone());
@@ -74,8 +76,8 @@ impl From<Refusal> for Status {
 /// The text that a client shows for a status: its message, with the reason or, if there is none, the code.
 pub fn describe(status: &Status) -> String {
     match status.get_details_error_info() {
-        Some(info) => format!("{} ({})", status.message(), info.reason),
-        None => format!("{} ({:?})", status.message(), status.code()),
+        Some(info) => printable(format_args!("{} ({})", status.message(), info.reason)),
+        None => printable(format_args!("{} ({:?})", status.message(), status.code())),
     }
 }
 
@@ -98,5 +100,8 @@ mod tests {
         let info = status.get_details_error_info().unwrap();
         assert_eq!((info.reason.as_str(), info.domain.as_str()), ("NOT_FINITE", DOMAIN));
         assert_eq!(info.metadata["field"], "force.force_n");
+        let place = Some("/srv/secret/5e.1.mcap".to_owned());
+        let status = Status::from(Refusal { place, ..Refusal::new(Reason::Unreadable, "", "is damaged") });
+        assert_eq!(status.message(), "5e.1.mcap: is damaged");
     }
 }

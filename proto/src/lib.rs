@@ -9,6 +9,7 @@
 //! - `etcd` (feature `etcd`): messages and clients of etcd, from `etcd/*.proto`, which have what a fleet of servers uses.
 //! - [`codec`]: decodes messages, requests within bounds.
 //! - `datagram` (feature `datagrams`): what both ends of datagrams agree on.
+//! - [`printable`]: text of others on a terminal and in a log.
 //! - [`geometry`] and [`touch`]: conversion of vectors, and of the types of the crate `palpate-touch`.
 
 pub mod codec;
@@ -16,6 +17,7 @@ pub mod codec;
 pub mod datagram;
 pub mod error;
 pub mod geometry;
+pub mod printable;
 pub mod refusal;
 pub mod touch;
 

@@ -3,6 +3,8 @@
 
 use std::fmt;
 
+use crate::printable::{acts, printable};
+
 macro_rules! reasons {
     ($($(#[$doc:meta])* $variant:ident = $name:literal,)*) => {
         /// Why an input was refused: stable names, for programs.
@@ -130,18 +132,28 @@ impl Refusal {
     }
 }
 
+impl Refusal {
+    /// For others than who runs the server: of the place only the file's name, and not in which folder of this machine it is.
+    #[must_use]
+    pub fn without_folder(self) -> Self {
+        let name = |place: String| match place.rsplit_once(['/', '\\']) {
+            Some((_, name)) if self.reason != Reason::Elsewhere => name.to_owned(),
+            _ => place,
+        };
+        Refusal { place: self.place.map(name), ..self }
+    }
+}
+
 impl fmt::Display for Refusal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        // Each part may quote what others have written.
         if let Some(place) = &self.place {
-            write!(f, "{place}: ")?;
+            write!(f, "{}: ", printable(place))?;
         }
         if !self.field.is_empty() {
-            write!(f, "{}: ", self.field)?;
+            write!(f, "{}: ", printable(&self.field))?;
         }
-        // A message may quote what a client sent; that must move no cursor, and begin no line of a log. What was read from a
-        // file is shown with its lines.
-        let lines = self.place.is_some();
-        f.write_str(&self.message.replace(|c: char| c.is_control() && !(lines && c == '\n'), "?"))
+        f.write_str(&printable(&self.message))
     }
 }
 
@@ -202,13 +214,13 @@ pub fn finite_vector(field: &str, value: glam::DVec3) -> Result<glam::DVec3> {
     Ok(value + glam::DVec3::ZERO)
 }
 
-/// Checks a text for people: it is short, and on one line.
+/// Checks a text for people: it is short, on one line, and without what acts on a terminal.
 ///
 /// # Errors
 /// Refuses a text that is too long or has control characters.
 pub fn label(field: &str, label: &str) -> Result<()> {
     const MOST_BYTES: usize = 128;
-    if label.len() > MOST_BYTES || label.chars().any(char::is_control) {
+    if label.len() > MOST_BYTES || label.chars().any(acts) {
         let message = format!("must be at most {MOST_BYTES} bytes, without control characters");
         return Err(Refusal::new(Reason::OutOfRange, field, message));
     }
@@ -282,7 +294,18 @@ mod tests {
         let refusal = Refusal::new(Reason::UnknownScene, "scene_name", "there is no `a\x1b[2J\r\nINFO\u{9b}`");
         assert_eq!(refusal.to_string(), "scene_name: there is no `a?[2J??INFO?`");
         let of_file =
-            Refusal { place: Some("a.toml:1".into()), ..Refusal::new(Reason::Unreadable, "", "two\nlines\x07") };
-        assert_eq!(of_file.to_string(), "a.toml:1: two\nlines?");
+            Refusal { place: Some("a\n.toml:1".into()), ..Refusal::new(Reason::Unreadable, "b\u{202e}", "two\nlines") };
+        assert_eq!(of_file.to_string(), "a?.toml:1: b?: two?lines");
+        assert!(label("name", "a\u{202e}b").is_err());
+    }
+
+    #[test]
+    fn others_are_told_a_files_name_and_not_its_folder() {
+        let of = |reason, place: &str| Refusal { place: Some(place.to_owned()), ..Refusal::new(reason, "", "why") };
+        let told = |reason, place: &str| of(reason, place).without_folder().to_string();
+        assert_eq!(told(Reason::Unreadable, "/srv/secret/5e.1.mcap"), "5e.1.mcap: why");
+        assert_eq!(told(Reason::Unreadable, "scenes/paper.toml:5"), "paper.toml:5: why");
+        assert_eq!(told(Reason::Unreadable, "--set"), "--set: why");
+        assert_eq!(told(Reason::Elsewhere, "http://127.0.0.1:7117"), "http://127.0.0.1:7117: why");
     }
 }

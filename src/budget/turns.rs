@@ -27,8 +27,16 @@ impl<T> Turns<T> {
 
     /// Adds an item behind all others of `account`.
     pub(crate) fn push_back(&mut self, account: u64, item: T) {
+        self.push_before(account, item, |_| false);
+    }
+
+    /// Adds an item before the first of `account` that `may_wait`, or behind all.
+    pub(crate) fn push_before(&mut self, account: u64, item: T, may_wait: impl Fn(&T) -> bool) {
         match self.queue(account) {
-            Some(queue) => queue.push_back(item),
+            Some(queue) => {
+                let at = queue.iter().position(may_wait).unwrap_or(queue.len());
+                queue.insert(at, item);
+            }
             None => self.queues.push_back((account, VecDeque::from([item]))),
         }
     }

@@ -31,7 +31,7 @@ pub fn parse(name: &str) -> Option<(String, u64)> {
     (is_id && number > 0 && run == format!("{number}")).then(|| (session_id.to_owned(), number))
 }
 
-/// The journals in a folder, by session and run.
+/// The journals in a folder, by session and run: files, and not pipes or folders with such names.
 ///
 /// # Errors
 /// Returns an error if the folder can't be read.
@@ -40,7 +40,9 @@ pub fn list(folder: &Path) -> std::io::Result<Vec<JournalFile>> {
     for entry in std::fs::read_dir(folder)? {
         let path = entry?.path();
         let told = path.file_name().and_then(|name| name.to_str()).and_then(parse);
-        if let Some((session_id, run)) = told {
+        if let Some((session_id, run)) = told
+            && std::fs::metadata(&path).is_ok_and(|found| found.is_file())
+        {
             found.push(JournalFile { session_id, run, path });
         }
     }
@@ -60,5 +62,19 @@ mod tests {
         {
             assert_eq!(parse(other), None, "{other}");
         }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_pipe_is_no_journal_and_nobody_waits_for_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let pipe = folder.path().join(name("pipe", 1));
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        std::fs::create_dir(folder.path().join(name("folder", 1))).unwrap();
+        std::fs::write(folder.path().join(name("file", 1)), "").unwrap();
+        let listed = list(folder.path()).unwrap();
+        assert_eq!(listed.iter().map(|file| file.session_id.as_str()).collect::<Vec<_>>(), ["file"]);
+        let refused = crate::journal::reader::file(&pipe).unwrap_err();
+        assert!(refused.message.contains("it is no file"), "{refused}");
     }
 }

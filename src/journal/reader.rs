@@ -237,10 +237,13 @@ pub fn file(path: &Path) -> Result<BufReader<File>> {
         place: Some(place.clone()),
         ..Refusal::new(Reason::Unreadable, "", format!("can't be read: {e}"))
     };
-    let file = File::open(path).map_err(unreadable)?;
-    if file.metadata().map_err(unreadable)?.is_dir() {
-        return Err(unreadable(std::io::Error::other("it is a folder")));
+    // Before it is opened: a pipe would wait for somebody who writes into it.
+    let kind = std::fs::metadata(path).map_err(unreadable)?.file_type();
+    if !kind.is_file() {
+        let what = if kind.is_dir() { "it is a folder" } else { "it is no file" };
+        return Err(unreadable(std::io::Error::other(what)));
     }
+    let file = File::open(path).map_err(unreadable)?;
     Ok(BufReader::with_capacity(1 << 16, file))
 }
 

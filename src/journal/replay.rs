@@ -170,18 +170,8 @@ impl<R: Read + Seek> Replay<R> {
                 session
             }
             Some(at) => {
-                reader.go_to(at);
-                let Some(batch) = reader.next_batch()? else {
-                    return Err(reader.refuse("the batch of a snapshot is missing"));
-                };
-                items = self::items(&batch)?;
-                let snapshot = loop {
-                    match items.pop_front() {
-                        Some(Item::Snapshot(snapshot)) if snapshot.step == at.step => break snapshot,
-                        Some(_) => {}
-                        None => return Err(batch.refuse("a snapshot is missing".to_owned())),
-                    }
-                };
+                let (batch, snapshot, after) = snapshot(&mut reader, at)?;
+                items = after;
                 (running, until) = (snapshot.running, snapshot.until_step);
                 let session = restored(&snapshot, &first, &limits).map_err(|refusal| batch.placed(refusal))?;
                 begins_with = Some(snapshot.hash);
@@ -491,8 +481,24 @@ impl std::fmt::Display for Difference {
     }
 }
 
-/// The session in a snapshot.
-fn restored(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Result<Session> {
+/// The snapshot there: its batch, and what comes after it in that.
+fn snapshot<R: Read + Seek>(reader: &mut Reader<R>, at: &SnapshotAt) -> Result<(Batch, pb::Snapshot, VecDeque<Item>)> {
+    reader.go_to(at);
+    let Some(batch) = reader.next_batch()? else {
+        return Err(reader.refuse("the batch of a snapshot is missing"));
+    };
+    let mut items = items(&batch)?;
+    loop {
+        match items.pop_front() {
+            Some(Item::Snapshot(snapshot)) if snapshot.step == at.step => return Ok((batch, snapshot, items)),
+            Some(_) => {}
+            None => return Err(batch.refuse("a snapshot is missing".to_owned())),
+        }
+    }
+}
+
+/// What is saved in a snapshot, and the tissue of that.
+fn saved(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Result<(Saved, Arc<Model>)> {
     let saved = Saved::from_bytes(&snapshot.saved, limits)?;
     if saved.step() != snapshot.step {
         let message = format!("is of step {}, where one of step {} should be", saved.step(), snapshot.step);
@@ -501,6 +507,12 @@ fn restored(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Res
     // Most sessions have the tissue that they began with.
     let is_first = *saved.tissue() == first.tissue_state();
     let model = if is_first { first.clone() } else { Model::resumed(&first.scene, saved.tissue(), limits)? };
+    Ok((saved, model))
+}
+
+/// The session in a snapshot.
+fn restored(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Result<Session> {
+    let (saved, model) = saved(snapshot, first, limits)?;
     Session::restore(&model, &saved)
 }
 
@@ -532,19 +544,28 @@ pub fn resume<R: Read + Seek>(reader: Reader<R>, limits: &Limits) -> Result<Resu
     resume_as(reader, limits, None)
 }
 
-/// A copy of the tissue in the bytes of a snapshot, as it was then but at rest, for a client's tool with this tip: such as a loop
-/// at 1 kHz can bear, within the usual limits.
+/// A copy of the tissue in the bytes of a snapshot, as it was then but at rest, for a client's tool with this tip: such as can be
+/// stepped at 1 kHz. Neither steps nor tools of the session are restored, whatever they would cost.
 ///
 /// # Errors
-/// Tells what [`resume`] refuses, or that there is no memory.
+/// Refuses what is no snapshot of one moment, a tissue that is too large or a tip that covers too much of it, and tells that
+/// there is no memory.
 pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predictor>, String> {
-    let session = || {
+    #[allow(clippy::cast_possible_truncation)]
+    let limits = message::limits(&Limits { points: TICK_POINT_SUBSTEPS as usize, ..Limits::default() });
+    let copy = || {
         // It came from a server: what it names of the machine there is not for this one.
-        let reader = Reader::new("the snapshot", Cursor::new(bytes))?.without_files();
-        Ok(resume(reader, &Limits::default())?.session)
+        let mut reader = Reader::new("the snapshot", Cursor::new(bytes))?.without_files();
+        check_replays(reader.header())?;
+        let survey = reader.survey(&mut |_| {})?;
+        let Some(at) = survey.snapshots.last() else { return Err(reader.refuse("has no snapshot")) };
+        let first = message::model(reader.header(), &limits)?;
+        let (_, snapshot, _) = snapshot(&mut reader, at)?;
+        let (_, model) = saved(&snapshot, &first, &limits)?;
+        TissueCopy::of_stranger(&model, tip)
     };
-    let session = memory::attempt("snapshot", session).map_err(|refusal| refusal.to_string())?;
-    Ok(Box::new(TissueCopy::new(session.model(), tip).within(TICK_POINT_SUBSTEPS)))
+    let copy = memory::attempt("snapshot", copy).map_err(|refusal| refusal.to_string())?;
+    Ok(Box::new(copy))
 }
 
 /// The header of a journal, and the tissue that it begins with.

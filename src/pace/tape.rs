@@ -2,7 +2,8 @@
 //! that writes journals takes all that there are at once.
 //!
 //! A tape that nobody empties is full one day. Then it breaks: what it holds is forgotten, the reason stays, and the session
-//! goes on without a journal.
+//! goes on without a journal. When who writes journals says that there is room again, the stepping thread begins anew, with a
+//! snapshot: that is another run of the journal.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -67,10 +68,26 @@ pub struct Taken {
     pub until_step: u64,
     /// The session is at rest, or stands: nothing more comes for now.
     pub is_still: bool,
+    /// Where the events begin, if they do not go on from what was taken before.
+    pub anew: Option<Beginning>,
+    /// Nothing is kept any more.
+    pub is_broken: bool,
+}
+
+/// How a session stands where a journal of it begins.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Beginning {
+    /// Steps done.
+    pub step: u64,
+    /// Whether time goes on.
+    pub running: bool,
+    /// The step at which it pauses.
+    pub until_step: Option<u64>,
 }
 
 #[derive(Default)]
 struct Held {
+    anew: Option<Beginning>,
     events: Vec<Noted>,
     copied_bytes: u64,
     until_step: u64,
@@ -130,6 +147,8 @@ pub struct Tape {
     queue: Arc<TapeQueue>,
     /// Only what is mirrored is durable.
     needs_mirror: bool,
+    /// It is broken, and there is room again.
+    may_begin_anew: AtomicBool,
     /// One more than the durable step, so that 0 is none.
     durable: AtomicU64,
     progress: watch::Sender<Progress>,
@@ -142,6 +161,7 @@ impl Tape {
             held: Mutex::new(Held::default()),
             queue: queue.clone(),
             needs_mirror: queue.needs_mirror.load(Ordering::Relaxed),
+            may_begin_anew: AtomicBool::new(false),
             durable: AtomicU64::new(0),
             progress: watch::Sender::new(Progress::default()),
         })
@@ -161,6 +181,7 @@ impl Tape {
     pub fn is_durable(&self, step: u64, lag_s: f64) {
         self.progress.send_modify(|progress| {
             (progress.local_step, progress.lag_s) = (Some(step), lag_s);
+            progress.broken = None;
             self.tell_durable(progress);
         });
     }
@@ -209,8 +230,31 @@ impl Tape {
             }
             *held = Held { broken: Some(reason.clone()), ..Held::default() };
         }
-        tracing::error!(session = %self.about.id, %reason, "the journal of a session is broken");
-        self.progress.send_modify(|progress| progress.broken = Some(reason));
+        self.progress.send_modify(|progress| {
+            // Not at every attempt to begin anew.
+            if progress.broken.replace(reason.clone()).is_none() {
+                tracing::error!(session = %self.about.id, %reason, "the journal of a session is broken");
+            }
+        });
+    }
+
+    /// There may be room again: the stepping thread begins anew, if it is broken.
+    pub fn may_begin_anew(&self) {
+        self.may_begin_anew.store(true, Ordering::Release);
+    }
+
+    /// Begins anew, if it is broken and may. A snapshot has to follow.
+    pub(super) fn begins_anew(&self, beginning: impl FnOnce() -> Beginning) -> bool {
+        if !self.may_begin_anew.load(Ordering::Relaxed) || !self.may_begin_anew.swap(false, Ordering::AcqRel) {
+            return false;
+        }
+        let mut held = lock(&self.held);
+        let is_broken = held.broken.is_some();
+        if is_broken {
+            let beginning = beginning();
+            *held = Held { until_step: beginning.step, anew: Some(beginning), ..Held::default() };
+        }
+        is_broken
     }
 
     /// Adds what happened when `step` steps were done.
@@ -270,7 +314,13 @@ impl Tape {
         held.is_queued = false;
         held.copied_bytes = 0;
         std::mem::swap(&mut events, &mut held.events);
-        Taken { events, until_step: held.until_step, is_still: held.is_still }
+        Taken {
+            events,
+            until_step: held.until_step,
+            is_still: held.is_still,
+            anew: held.anew.take(),
+            is_broken: held.broken.is_some(),
+        }
     }
 }
 

@@ -2,8 +2,10 @@
 
 use std::sync::Arc;
 
+use super::recorder::Recorder;
 use super::running::Running;
-use super::tape::Event;
+use super::tape::{Beginning, Event};
+use crate::lock::lock;
 use crate::session::input::Input;
 use crate::sheet::Model;
 
@@ -32,8 +34,20 @@ impl Running {
         }
     }
 
+    /// Begins the journal anew, if it is broken and there is room again.
+    fn begin_anew(&mut self) {
+        let Some(recorder) = &mut self.recorder else { return };
+        let (session, running, until_step) = (&self.session, self.running, self.until);
+        let step = session.step_count();
+        if recorder.tape.begins_anew(|| Beginning { step, running, until_step }) {
+            *recorder = Recorder::new(&recorder.tape, session);
+            self.live.note_waiting(&lock(&self.live.intake));
+        }
+    }
+
     /// Tells how the tissue is after a step.
     pub(super) fn note_state(&mut self) {
+        self.begin_anew();
         let Some(recorder) = &mut self.recorder else { return };
         let (session, tape) = (&self.session, &recorder.tape);
         let step = session.step_count();
@@ -59,7 +73,8 @@ impl Running {
     }
 
     /// Tells that steps were passed over at rest.
-    pub(super) fn note_rest(&self) {
+    pub(super) fn note_rest(&mut self) {
+        self.begin_anew();
         if let Some(recorder) = &self.recorder {
             recorder.tape.is_told_until(self.session.step_count(), true);
         }

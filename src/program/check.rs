@@ -3,6 +3,7 @@
 use std::io::Write;
 use std::path::PathBuf;
 
+use palpate::printable::printable_lines;
 use palpate::scene::collection::find_script;
 use palpate::session::check;
 
@@ -25,7 +26,7 @@ pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
         say!("palpate: warning: {warning}");
     }
     let report = check::check(&model, script.as_ref(), &limits, &clock_s);
-    match write!(std::io::stdout(), "{report}") {
+    match write!(std::io::stdout(), "{}", printable_lines(report)) {
         // A reader that closed the pipe is not an error.
         Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::Failed(e.to_string())),
         _ => Ok(()),

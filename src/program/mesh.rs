@@ -4,6 +4,7 @@ use std::fmt::{self, Display};
 use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
+use palpate::printable::{printable, printable_json};
 use palpate_mesh::decimate::decimate;
 use palpate_mesh::repair::{Measure, Repair, repair};
 use palpate_mesh::report::{Finding, LISTED, Report, Spread};
@@ -141,7 +142,7 @@ fn refuse(arguments: &MeshArguments, name: &str, error: MeshError, unit: Unit) -
 
 fn print(arguments: &MeshArguments, told: &Told) -> Result<(), Failure> {
     let text = if arguments.json {
-        serde_json::to_string_pretty(told).map_err(|e| Failure::Failed(e.to_string()))? + "\n"
+        printable_json(serde_json::to_string_pretty(told).map_err(|e| Failure::Failed(e.to_string()))?) + "\n"
     } else {
         told.to_string()
     };
@@ -158,7 +159,7 @@ const NAMES: usize = 16;
 impl Display for Told {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let report = &self.report;
-        let mut row = |name: &str, value: &dyn Display| writeln!(f, "{name:NAMES$}{value}");
+        let mut row = |name: &str, value: &dyn Display| writeln!(f, "{name:NAMES$}{}", printable(value));
         let spread = |spread: &Spread, factor: f64, unit: &str| {
             let Spread { least, median, largest } = spread;
             format!("{:.3} to {:.3} {unit}, median {:.3}", least * factor, largest * factor, median * factor)

@@ -4,6 +4,7 @@ pub(crate) mod certificate;
 pub(crate) mod check;
 pub(crate) mod client;
 pub(crate) mod journal;
+mod log;
 pub(crate) mod mesh;
 pub(crate) mod organ;
 pub(crate) mod render;
@@ -21,10 +22,12 @@ use palpate::refusal::Refusal;
 use palpate::server::ServeError;
 use palpate::server::config::Config;
 
-/// Writes a line to the standard error. A closed standard error does not end the program.
+/// Writes a line to the standard error, whatever names and messages of others are in it. A closed standard error does not end the
+/// program.
 macro_rules! say {
     ($($text:tt)*) => {{
-        let _ = std::io::Write::write_all(&mut std::io::stderr(), (format!($($text)*) + "\n").as_bytes());
+        let text = palpate::printable::printable(format_args!($($text)*));
+        let _ = std::io::Write::write_all(&mut std::io::stderr(), (text + "\n").as_bytes());
     }};
 }
 pub(crate) use say;

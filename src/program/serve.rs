@@ -9,7 +9,7 @@ use palpate::server::{self, Listeners, signals};
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::fmt::format::FmtSpan;
 
-use super::{Failure, load_config};
+use super::{Failure, load_config, log};
 
 #[derive(clap::Args)]
 pub(crate) struct ServeArguments {
@@ -190,14 +190,13 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let (writer, _flush) = tracing_appender::non_blocking(std::io::stderr());
     let subscriber = tracing_subscriber::fmt()
         .with_env_filter(filter)
-        .with_writer(writer)
         // At level debug, the duration of each call and sampled step is logged when it ends.
         .with_span_events(if detailed { FmtSpan::CLOSE } else { FmtSpan::NONE })
         .with_ansi(std::io::stderr().is_terminal());
     if arguments.log_json {
-        subscriber.json().init();
+        subscriber.json().with_writer(move || log::JsonRecords(writer.clone())).init();
     } else {
-        subscriber.init();
+        subscriber.fmt_fields(log::fields()).with_writer(writer).init();
     }
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(config.serving_threads())

@@ -7,6 +7,7 @@ use serde::Serialize;
 
 use super::plot::Curves;
 use super::{Integrator, Named, Precision};
+use crate::printable::printable_json;
 use crate::refusal::{Reason, Refusal};
 use crate::shape::{PointName, RestShape};
 
@@ -300,6 +301,6 @@ pub fn output(file: Option<&Path>, plots: bool) -> Result<Box<dyn Write>, Refusa
 /// # Errors
 /// Returns the error of `output`.
 pub fn write_line(output: &mut dyn Write, line: &impl Serialize) -> std::io::Result<()> {
-    serde_json::to_writer(&mut *output, line)?;
-    output.write_all(b"\n")
+    let line = printable_json(serde_json::to_string(line)?);
+    writeln!(output, "{line}")
 }

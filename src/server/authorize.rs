@@ -2,6 +2,7 @@
 
 use std::pin::Pin;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
@@ -102,6 +103,7 @@ impl AuthorizeLayer {
                 self.traffic.called(path);
                 if let Some(peer) = peer {
                     peer.slot.mark_authenticated();
+                    peer.is_served.store(true, Ordering::Relaxed);
                 }
                 // With authentication disabled there is nothing to check again later.
                 Ok((caller, (!credentials.is_open()).then_some((presented, version))))

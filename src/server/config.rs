@@ -118,7 +118,7 @@ impl Config {
         let config: Config = toml::from_str(text).map_err(|e| {
             let line = e.span().map_or(1, |span| text[..span.start].matches('\n').count() + 1);
             let place = Some(format!("{name}:{line}"));
-            Refusal { place, ..Refusal::new(Reason::Unreadable, "", format!("{}\n{e}", e.message()).trim_end()) }
+            Refusal { place, ..Refusal::new(Reason::Unreadable, "", e.message()) }
         })?;
         config.check().map_err(|refusal| Refusal { place: Some(name.to_owned()), ..refusal })?;
         Ok(config)

@@ -250,6 +250,8 @@ pub(crate) struct Peer {
     pub(super) leases: Arc<LastingLeases>,
     /// Numbers of the accounts that have called over it.
     callers: Arc<Mutex<BTreeSet<u64>>>,
+    /// A service of ours was called over it.
+    pub(super) is_served: Arc<AtomicBool>,
 }
 
 impl Peer {
@@ -270,6 +272,14 @@ impl Register {
         let number = open.0;
         open.1.insert(number, peer.clone());
         number
+    }
+
+    /// Closes the connections over which nobody has called a service of ours: they ask for the health, for reflection or for
+    /// pages.
+    pub(super) fn close_strangers(&self) {
+        let open = lock(&self.0);
+        let strangers = open.1.values().filter(|peer| !peer.is_served.load(Ordering::Relaxed));
+        strangers.for_each(|peer| peer.gate.close());
     }
 
     /// Closes the connections over which this account has called; returns their number.
@@ -331,6 +341,7 @@ impl Entry {
             gate,
             slot,
             callers: Arc::default(),
+            is_served: Arc::default(),
         };
         Connection {
             transport,

@@ -14,7 +14,7 @@ use tonic::Status;
 use tonic_types::StatusExt;
 use tracing::{Instrument, debug};
 
-use super::workshop::Workshop;
+use super::workshop::{CancelFlag, Urgency, Workshop};
 use crate::budget::Account;
 use crate::force_law::Disc;
 use crate::pace::Live;
@@ -111,7 +111,7 @@ impl Maker {
     /// The law to begin with: at most 50 ms of work.
     async fn first(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
         let sought = self.live.law(model, disc)?;
-        Ok(self.workshop.work(&self.account, move |stop| sought.first(stop.flag())).await??)
+        Ok(self.workshop.work_as(Urgency::Law, &self.account, move |stop| sought.first(stop.flag())).await??)
     }
 
     /// The exact law. It is computed depth by depth: between two of them it is the turn of other work, also of the same
@@ -125,8 +125,8 @@ impl Maker {
                 return Ok(exact?);
             }
             let sought: Arc<SoughtLaw> = sought.clone();
-            let advance = self.workshop.work(&self.account, move |stop| sought.advance(computation, stop.flag()));
-            computation = advance.await?;
+            let advance = move |stop: &CancelFlag| sought.advance(computation, stop.flag());
+            computation = self.workshop.work_as(Urgency::BetterLaw, &self.account, advance).await?;
         }
     }
 

@@ -53,6 +53,9 @@ fn cors(origins: &[HeaderValue]) -> CorsLayer {
         .max_age(Duration::from_secs(3600))
 }
 
+/// At shutdown connections that use none of the services get so long to end.
+const STRANGERS: Duration = Duration::from_secs(1);
+
 /// When this many bytes have become free, the allocator is asked to return its free memory to the system.
 const WORTH_GIVING_BACK: u64 = 16 << 20;
 
@@ -179,8 +182,8 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
     let with_part = bytes.saturating_add(4096);
     let sessions = SessionServiceServer::new(sessions::Sessions(services.clone())).max_decoding_message_size(with_part);
     let haptics = HapticServiceServer::new(haptics::Haptics(services.clone())).max_decoding_message_size(bytes);
-    let admin =
-        AdminServiceServer::new(admin::Admin { services: services.clone(), register }).max_decoding_message_size(bytes);
+    let admin = AdminServiceServer::new(admin::Admin { services: services.clone(), register: register.clone() })
+        .max_decoding_message_size(bytes);
     let node_calls = fleet.clone().map(|fleet| {
         let sessions = sessions::Sessions(services.clone());
         NodeServiceServer::new(nodes::Nodes { sessions, fleet }).max_decoding_message_size(fleet::MOST_MESSAGE_BYTES)
@@ -224,6 +227,11 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         info!("shutting down");
         end_health(health).await;
         drain.cancel();
+        // Who only asks for the health has no work to lose, and may not read the end of its stream.
+        tokio::spawn(async move {
+            tokio::time::sleep(STRANGERS).await;
+            register.close_strangers();
+        });
         // Waits for the running steps. Every stream then reads its end from its queue.
         let last = move || {
             stopping.stop();

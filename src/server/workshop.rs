@@ -25,6 +25,18 @@ use crate::refusal::{Reason, Refusal};
 /// Number of threads of a workshop.
 const THREADS: usize = 2;
 
+/// Which of a caller's jobs comes first; those of one kind in the order of their requests. Many laws so delay no call that
+/// somebody waits for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Urgency {
+    /// What a call needs.
+    Call,
+    /// A force law that a haptic stream begins with, or that its tool is in need of.
+    Law,
+    /// A better law than the one that is in use.
+    BetterLaw,
+}
+
 /// Tells a job that its call does not wait for it any more.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct CancelFlag(Arc<AtomicBool>);
@@ -39,6 +51,7 @@ impl CancelFlag {
 struct Job {
     number: u64,
     requested_ns: u64,
+    urgency: Urgency,
     run: Box<dyn FnOnce() + Send>,
 }
 
@@ -161,6 +174,19 @@ impl Workshop {
         account: &Account,
         work: impl FnOnce(&CancelFlag) -> T + Send + 'static,
     ) -> Result<T, Status> {
+        self.work_as(Urgency::Call, account, work).await
+    }
+
+    /// The same, behind what is more urgent of this account.
+    ///
+    /// # Errors
+    /// As for [`Workshop::work`].
+    pub(crate) async fn work_as<T: Send + 'static>(
+        &self,
+        urgency: Urgency,
+        account: &Account,
+        work: impl FnOnce(&CancelFlag) -> T + Send + 'static,
+    ) -> Result<T, Status> {
         let (done, result) = oneshot::channel();
         let cancelled = CancelFlag::default();
         let flag = cancelled.clone();
@@ -169,7 +195,7 @@ impl Workshop {
                 let _ = done.send(answer);
             }
         };
-        let _waiting = self.enqueue(account.number(), cancelled, Box::new(run))?;
+        let _waiting = self.enqueue(account.number(), urgency, cancelled, Box::new(run))?;
         match tokio::time::timeout(self.0.0.deadline, result).await {
             Ok(Ok(answer)) => Ok(answer),
             Ok(Err(_)) => Err(Status::internal("internal error (worker panicked)")),
@@ -184,6 +210,7 @@ impl Workshop {
     fn enqueue(
         &self,
         account: u64,
+        urgency: Urgency,
         cancelled: CancelFlag,
         run: Box<dyn FnOnce() + Send>,
     ) -> Result<CancelOnDrop, Refusal> {
@@ -191,13 +218,13 @@ impl Workshop {
         let mut queue = lock(&shared.queue);
         let number = queue.next_number;
         queue.next_number += 1;
-        let job = Job { number, requested_ns: now_ns(), run };
+        let job = Job { number, requested_ns: now_ns(), urgency, run };
         let waiting = queue.waiting.count(account);
         if waiting >= shared.most_waiting {
             let message = format!("this caller has {waiting} jobs waiting already (limits.queued_work)");
             return Err(Refusal::new(Reason::Overloaded, "", message));
         }
-        queue.waiting.push_back(account, job);
+        queue.waiting.push_before(account, job, |other| other.urgency > urgency);
         shared.changed.notify_one();
         Ok(CancelOnDrop { shared: shared.clone(), account, number, cancelled })
     }
@@ -243,6 +270,42 @@ mod tests {
         assert_eq!(*lock(&order), (0..20).collect::<Vec<_>>());
         let load = workshop.load();
         assert!(load.waiting == 0 && !load.is_late, "{load:?}");
+    }
+
+    #[tokio::test]
+    async fn two_hundred_laws_of_a_caller_delay_its_own_call_by_the_one_that_runs() {
+        let (workshop, [one]) = (workshop(Limits::default()), accounts(["one"]));
+        let (release, gate) = mpsc::channel::<()>();
+        let order = Arc::new(Mutex::new(Vec::new()));
+        let work = |urgency: Urgency| {
+            let (workshop, one, order) = (workshop.clone(), one.clone(), order.clone());
+            async move { workshop.work_as(urgency, &one, move |_| lock(&order).push(urgency)).await }
+        };
+        let running = tokio::spawn({
+            let (workshop, one) = (workshop.clone(), one.clone());
+            async move { workshop.work_as(Urgency::Law, &one, move |_| gate.recv().is_err()).await }
+        });
+        while lock(&workshop.0.0.queue).running.is_empty() {
+            tokio::task::yield_now().await;
+        }
+        let laws: Vec<_> = (0..200)
+            .map(|law| tokio::spawn(work(if law % 2 == 0 { Urgency::BetterLaw } else { Urgency::Law })))
+            .collect();
+        while workshop.load().waiting < 200 {
+            tokio::task::yield_now().await;
+        }
+        let call = tokio::spawn(work(Urgency::Call));
+        while workshop.load().waiting < 201 {
+            tokio::task::yield_now().await;
+        }
+        drop(release);
+        call.await.unwrap().unwrap();
+        assert!(running.await.unwrap().unwrap());
+        for law in laws {
+            law.await.unwrap().unwrap();
+        }
+        let order = lock(&order);
+        assert!(order[0] == Urgency::Call && order.is_sorted(), "{order:?}");
     }
 
     #[tokio::test]

@@ -7,6 +7,8 @@ use palpate_touch::{ContactState, Predicted, Predictor, Tip};
 
 use super::Session;
 use super::command::{Command, Due};
+use crate::refusal::{Result, number};
+use crate::scene::check::check_tip;
 use crate::scene::script::Action;
 use crate::sheet::Model;
 
@@ -15,6 +17,9 @@ const TOOL: u32 = 0;
 
 /// What a copy's steps may take in a millisecond, in points times substeps: up to 1 ms with a tip on it.
 pub const TICK_POINT_SUBSTEPS: u64 = 100_000;
+
+/// The largest radius of a tip on a copy, in lengths of an edge: contact costs what the tip covers.
+const MOST_EDGES: f64 = 32.0;
 
 /// A client's usual tick, s.
 const TICK_S: f64 = 1e-3;
@@ -46,6 +51,19 @@ impl TissueCopy {
     #[must_use]
     pub fn within(self, most_point_substeps: u64) -> Self {
         TissueCopy { most_point_substeps, ..self }
+    }
+
+    /// A copy such as a client can step in time, of a tissue that a server tells of.
+    ///
+    /// # Errors
+    /// Refuses a tip that does not fit the tissue, or that covers too many of its points.
+    pub fn of_stranger(model: &Arc<Model>, tip: Tip) -> Result<Self> {
+        let shape = model.shape();
+        check_tip("tip", shape, &tip)?;
+        let most_m = MOST_EDGES * shape.edge_m();
+        let range = format!("at most {most_m} for a copy of this tissue, {MOST_EDGES} lengths of an edge");
+        number("tip.radius_m", tip.radius_m, &range, |radius_m| radius_m <= most_m)?;
+        Ok(TissueCopy::new(model, tip).within(TICK_POINT_SUBSTEPS))
     }
 
     /// Steps until `now_s`, with the tool on a straight way to `place_m`. Steps are done up to the nearest, so that ticks that

@@ -303,9 +303,9 @@ typedef struct palpate_touch_options {
    */
   void *warn_user;
   /**
-   * Of which tissues to keep a copy, which the loop simulates, so that forces come without the delay of the network; samples
-   * correct them. 0: none; 1: meshes, over whose rims, folds and lumps nothing else knows what comes next; 2: any. With a copy
-   * a tick also does the copy's step: some tenths of a millisecond are usual, and it may ask for memory. 0.
+   * Of which tissues to keep a copy, which is simulated here, so that forces come without the delay of the network; samples
+   * correct them. 0: none; 1: meshes, over whose rims, folds and lumps nothing else knows what comes next; 2: any. A thread
+   * of the library steps the copy; a tick takes what that found at the last one, and waits for nothing. 0.
    */
   uint32_t prediction;
 } palpate_touch_options;
@@ -815,10 +815,9 @@ enum palpate_result palpate_touch_arrive(const struct palpate_touch *touch,
 
 /**
  * Gives the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, by a clock that
- * goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back; but with a copy
- * of the tissue (`prediction` of its options) it does the copy's step as well, which may ask for memory. It may be late, early or
- * left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of zero. One thread at a
- * time.
+ * goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back. It may be
+ * late, early or left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of zero.
+ * One thread at a time.
  */
 enum palpate_result palpate_touch_tick(const struct palpate_touch *touch,
                                        const struct palpate_reading *reading,

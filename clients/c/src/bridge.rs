@@ -16,7 +16,6 @@ use tokio::task::JoinHandle;
 use crate::axes::{palpate_axes, palpate_vector};
 use crate::error::{Fault, PALPATE_CONNECTION, PALPATE_INTERNAL, PALPATE_OK, at, at_mut, guard, palpate_result};
 use crate::options::{options_at, palpate_limits, palpate_touch_options};
-use crate::os;
 use crate::server::{CONNECTING, Connected, palpate_session};
 use crate::touch::{palpate_reading, palpate_state, state_of};
 
@@ -213,10 +212,10 @@ pub unsafe extern "C" fn palpate_bridge_begin(
         let disable = of_run.disable.clone();
         let stop = Arc::new(Notify::new());
         let stopped = stop.clone();
-        let task = shared.runtime.spawn(async move {
+        let task = shared.threads.spawn(async move {
             let ended = run_told(called, target, of_run, async move { stopped.notified().await }).await;
             ended.map(|(_, report)| report)
-        });
+        })?;
         let bridge = palpate_bridge { shared, seen, disable, stop, task, axes: options.axes };
         let until = Instant::now() + bridge.shared.timeout.min(CONNECTING);
         while !bridge.task.is_finished() && Instant::now() < until {
@@ -235,13 +234,14 @@ impl palpate_bridge {
     /// Ends the loop, and waits for that. What it has done, and why it could not go on, if it couldn't.
     fn end(self) -> (palpate_bridge_report, Option<Fault>) {
         self.stop.notify_one();
-        let (report, fault) = match os::block_on(&self.shared.runtime, self.task) {
-            Ok(Ok(mut report)) => {
+        let (report, fault) = match self.shared.threads.block_on(self.task) {
+            Err(fault) => (None, Some(fault)),
+            Ok(Ok(Ok(mut report))) => {
                 let failure = report.failure.take();
                 (Some(report), failure.map(Fault::from))
             }
-            Ok(Err(error)) => (None, Some(error.into())),
-            Err(_) => (None, Some(Fault::new(PALPATE_INTERNAL, "the loop panicked"))),
+            Ok(Ok(Err(error))) => (None, Some(error.into())),
+            Ok(Err(_)) => (None, Some(Fault::new(PALPATE_INTERNAL, "the loop panicked"))),
         };
         let seen = seen_of(&self.seen);
         let traffic = report.as_ref().map(|report| report.traffic).unwrap_or_default();

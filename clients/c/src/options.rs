@@ -86,9 +86,9 @@ pub struct palpate_touch_options {
     pub warn: palpate_warn,
     /// Is handed to `warn`.
     pub warn_user: *mut c_void,
-    /// Of which tissues to keep a copy, which the loop simulates, so that forces come without the delay of the network; samples
-    /// correct them. 0: none; 1: meshes, over whose rims, folds and lumps nothing else knows what comes next; 2: any. With a copy
-    /// a tick also does the copy's step: some tenths of a millisecond are usual, and it may ask for memory. 0.
+    /// Of which tissues to keep a copy, which is simulated here, so that forces come without the delay of the network; samples
+    /// correct them. 0: none; 1: meshes, over whose rims, folds and lumps nothing else knows what comes next; 2: any. A thread
+    /// of the library steps the copy; a tick takes what that found at the last one, and waits for nothing. 0.
     pub prediction: u32,
 }
 

@@ -1,25 +1,66 @@
-//! What differs between operating systems: on Unix a write to a connection that the other end has closed sends SIGPIPE, which ends a
-//! program that does not expect it. Programs in Rust ignore it from their start; those in C do not, and their disposition is theirs. So
-//! the library blocks it in its own threads, and in the caller's while that waits for the network.
+//! What differs between operating systems: on Unix a write to a connection that the other end has closed sends SIGPIPE, which
+//! ends a program that does not expect it. Programs in Rust ignore it from their start; those in C do not, and their disposition
+//! is theirs. So the library blocks it in its own threads, and in the caller's while that waits for the network. And a process
+//! that is forked has none of its parent's threads.
 
 use std::future::Future;
 
 use tokio::runtime::{Builder, Runtime};
+use tokio::task::JoinHandle;
 
-/// Threads for the network, which no closed connection ends.
-pub(crate) fn runtime() -> std::io::Result<Runtime> {
-    Builder::new_multi_thread()
-        .worker_threads(2)
-        .thread_name("palpate")
-        .on_thread_start(|| _ = sigpipe::block())
-        .enable_all()
-        .build()
+use crate::error::{Fault, PALPATE_INTERNAL};
+
+/// Threads for the network, which no closed connection ends. A child that was forked has not got them: there every use is
+/// refused, which would wait for ever.
+pub(crate) struct Threads {
+    /// Always there, till it is dropped.
+    runtime: Option<Runtime>,
+    /// Who has the threads.
+    process: u32,
 }
 
-/// Waits for `future` in this thread, which no closed connection ends meanwhile.
-pub(crate) fn block_on<F: Future>(runtime: &Runtime, future: F) -> F::Output {
-    let _blocked = sigpipe::Blocked::new();
-    runtime.block_on(future)
+impl Threads {
+    pub(crate) fn start() -> Result<Self, Fault> {
+        let runtime = Builder::new_multi_thread()
+            .worker_threads(2)
+            .thread_name("palpate")
+            .on_thread_start(|| _ = sigpipe::block())
+            .enable_all()
+            .build()
+            .map_err(|error| Fault::new(PALPATE_INTERNAL, format!("threads can't be started: {error}")))?;
+        Ok(Threads { runtime: Some(runtime), process: std::process::id() })
+    }
+
+    /// The threads, if this process has them.
+    pub(crate) fn here(&self) -> Result<&Runtime, Fault> {
+        let words = "the handle is of the process that this one was forked from: connect here for a handle of its own";
+        let is_here = self.process == std::process::id();
+        self.runtime.as_ref().filter(|_| is_here).ok_or_else(|| Fault::argument(words))
+    }
+
+    /// Waits for `future` in this thread, which no closed connection ends meanwhile.
+    pub(crate) fn block_on<F: Future>(&self, future: F) -> Result<F::Output, Fault> {
+        let runtime = self.here()?;
+        let _blocked = sigpipe::Blocked::new();
+        Ok(runtime.block_on(future))
+    }
+
+    /// Does `future` on these threads.
+    pub(crate) fn spawn<F>(&self, future: F) -> Result<JoinHandle<F::Output>, Fault>
+    where
+        F: Future<Output: Send> + Send + 'static,
+    {
+        Ok(self.here()?.spawn(future))
+    }
+}
+
+impl Drop for Threads {
+    fn drop(&mut self) {
+        if self.here().is_err() {
+            // The end of a runtime waits for its threads.
+            std::mem::forget(self.runtime.take());
+        }
+    }
 }
 
 #[cfg(unix)]
@@ -131,5 +172,24 @@ mod sigpipe {
         pub(super) fn new() -> Self {
             Blocked
         }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn in_a_child_that_was_forked_the_parents_threads_are_not_waited_for() {
+        let threads = Threads::start().map_err(|_| "threads").unwrap();
+        assert_eq!(threads.block_on(async { 7 }).map_err(|_| "here"), Ok(7));
+        // As a child sees what it has of its parent.
+        let mut of_parent = Threads::start().map_err(|_| "threads").unwrap();
+        of_parent.process ^= 1;
+        let refused = of_parent.block_on(std::future::pending::<()>()).err().unwrap();
+        assert_eq!(refused.code(), crate::error::PALPATE_ARGUMENT);
+        assert!(of_parent.spawn(async {}).is_err());
+        drop(of_parent);
     }
 }

@@ -12,14 +12,11 @@ use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
 use pb::create_session_request::Source;
 use pb::session_service_client::SessionServiceClient;
-use tokio::runtime::Runtime;
 
 use crate::axes::palpate_vector;
-use crate::error::{
-    Fault, PALPATE_CONNECTION, PALPATE_INTERNAL, at, at_mut, guard, optional_text, palpate_result, text, write_text,
-};
+use crate::error::{Fault, PALPATE_CONNECTION, at, at_mut, guard, optional_text, palpate_result, text, write_text};
 use crate::options::{TouchOptions, options_at, palpate_connect_options};
-use crate::os;
+use crate::os::Threads;
 
 /// A connection to a server. Any thread, also several at once.
 pub struct palpate_server {
@@ -28,7 +25,7 @@ pub struct palpate_server {
 
 /// What a server's handle and all that was made from it share.
 pub(crate) struct Connected {
-    pub(crate) runtime: Runtime,
+    pub(crate) threads: Threads,
     pub(crate) server: Server,
     pub(crate) channel: Channel,
     pub(crate) timeout: Duration,
@@ -71,7 +68,7 @@ impl Connected {
     /// Waits for a call, for no longer than the time for calls.
     pub(crate) fn wait<T, E: Into<Fault>>(&self, call: impl Future<Output = Result<T, E>>) -> Result<T, Fault> {
         let limited = async { tokio::time::timeout(self.timeout, call).await };
-        match os::block_on(&self.runtime, limited) {
+        match self.threads.block_on(limited)? {
             Ok(answer) => answer.map_err(Into::into),
             Err(_) => {
                 let why = format!("the server has not answered within {} s", self.timeout.as_secs_f64());
@@ -151,10 +148,9 @@ pub unsafe extern "C" fn palpate_connect(
         let timeout = Duration::try_from_secs_f64(options.timeout_s).ok().filter(|time| !time.is_zero());
         let timeout = timeout.ok_or_else(|| Fault::argument("timeout_s must be above 0"))?;
         let server = Server::new(url, &credentials)?.within(timeout.min(CONNECTING));
-        let runtime = os::runtime()
-            .map_err(|error| Fault::new(PALPATE_INTERNAL, format!("threads can't be started: {error}")))?;
-        let channel = os::block_on(&runtime, server.connect())?;
-        let shared = Arc::new(Connected { runtime, server, channel, timeout });
+        let threads = Threads::start()?;
+        let channel = threads.block_on(server.connect())??;
+        let shared = Arc::new(Connected { threads, server, channel, timeout });
         *out = Box::into_raw(Box::new(palpate_server { shared }));
         Ok(())
     })

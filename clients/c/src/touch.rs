@@ -11,7 +11,6 @@ use palpate_client::{Error, Reading};
 use crate::axes::{palpate_axes, palpate_vector};
 use crate::error::{Fault, PALPATE_BUSY, at, at_mut, guard, palpate_result};
 use crate::options::{options_at, palpate_touch_options};
-use crate::os;
 use crate::server::{Connected, palpate_session};
 
 /// A tool that your loop leads.
@@ -149,7 +148,7 @@ pub unsafe extern "C" fn palpate_touch_begin(
         let (warn, copies) = (options.warn, options.copies);
         let of_run = Options { keeps_session: true, warn, copies, ..Options::default() };
         let beginning = bridge::begin(target, options.device, options.origin, of_run);
-        let (ticker, connection) = os::block_on(&shared.runtime, beginning)?;
+        let (ticker, connection) = shared.threads.block_on(beginning)??;
         let far = Far::Server { connection, shared };
         *out = Box::into_raw(Box::new(palpate_touch { ticker: Exclusive::new(ticker), axes: options.axes, far }));
         Ok(())
@@ -203,10 +202,9 @@ pub unsafe extern "C" fn palpate_touch_arrive(
 }
 
 /// Gives the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, by a clock that
-/// goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back; but with a copy
-/// of the tissue (`prediction` of its options) it does the copy's step as well, which may ask for memory. It may be late, early or
-/// left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of zero. One thread at a
-/// time.
+/// goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back. It may be
+/// late, early or left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of zero.
+/// One thread at a time.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_tick(
     touch: *const palpate_touch,
@@ -282,9 +280,16 @@ pub unsafe extern "C" fn palpate_touch_end(touch: *mut palpate_touch) {
         }
         // SAFETY: the caller's promise.
         let touch = unsafe { Box::from_raw(touch) };
-        if let Far::Server { connection, shared } = touch.far {
-            os::block_on(&shared.runtime, connection.end());
+        match touch.far {
+            Far::Server { connection, shared } if shared.threads.here().is_ok() => {
+                shared.threads.block_on(connection.end())
+            }
+            // The parent has the tool.
+            far @ Far::Server { .. } => {
+                std::mem::forget(far);
+                Ok(())
+            }
+            Far::Record(_) => Ok(()),
         }
-        Ok(())
     });
 }

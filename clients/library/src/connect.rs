@@ -5,6 +5,7 @@ use std::net::IpAddr;
 use std::time::Duration;
 
 use palpate_proto::error;
+use palpate_proto::printable::printable;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
@@ -251,7 +252,7 @@ fn broken(status: &Status) -> String {
     } else {
         ""
     };
-    format!("the connection broke: {}{hint}", in_words(&root))
+    printable(format_args!("the connection broke: {}{hint}", in_words(&root)))
 }
 
 /// The message of an error's innermost cause.

@@ -66,23 +66,25 @@ pub use device::{HapticDevice, Reading};
 pub use followed::Followed;
 pub use touch::Touch;
 
-/// An error of this library.
+use palpate_proto::printable::printable;
+
+/// An error of this library. Its text is one line that acts on no terminal, whatever a server has put into it.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// An argument is not valid. Nothing was sent.
-    #[error("{0}")]
+    #[error("{}", printable(.0))]
     Argument(String),
     /// The server can't be reached, the connection broke, or the server does not keep to the protocol.
-    #[error("{0}")]
+    #[error("{}", printable(.0))]
     Connection(String),
     /// The server refused a call, or the connection broke during it.
     #[error("{}", describe(.0))]
     Call(#[from] tonic::Status),
     /// The device can't be read or written.
-    #[error("the device: {0}")]
+    #[error("the device: {}", printable(.0))]
     Device(#[from] std::io::Error),
     /// A panic in this library or in the device's code.
-    #[error("internal error ({0})")]
+    #[error("internal error ({})", printable(.0))]
     Internal(String),
 }
 

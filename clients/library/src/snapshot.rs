@@ -10,11 +10,19 @@ const MOST_BYTES: usize = 1 << 31;
 ///
 /// # Errors
 /// Returns the server's refusal, or how the connection broke; refuses a snapshot of more than 2 GiB.
-pub async fn collect(mut parts: Streaming<pb::SaveSnapshotResponse>) -> Result<Vec<u8>, Status> {
+pub async fn collect(parts: Streaming<pb::SaveSnapshotResponse>) -> Result<Vec<u8>, Status> {
+    collect_within(parts, MOST_BYTES).await
+}
+
+/// The same, of at most `most_bytes`.
+pub(crate) async fn collect_within(
+    mut parts: Streaming<pb::SaveSnapshotResponse>,
+    most_bytes: usize,
+) -> Result<Vec<u8>, Status> {
     let mut bytes = Vec::new();
     while let Some(message) = parts.message().await? {
-        if bytes.len() + message.part.len() > MOST_BYTES {
-            return Err(Status::resource_exhausted(format!("the snapshot has more than {MOST_BYTES} bytes")));
+        if bytes.len() + message.part.len() > most_bytes {
+            return Err(Status::resource_exhausted(format!("the snapshot has more than {most_bytes} bytes")));
         }
         bytes.extend_from_slice(&message.part);
     }

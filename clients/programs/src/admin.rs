@@ -2,6 +2,7 @@
 
 use palpate_client::{Channel, fleet};
 use palpate_proto::pb;
+use palpate_proto::printable::printable;
 use pb::admin_service_client::AdminServiceClient;
 use pb::session_service_client::SessionServiceClient;
 
@@ -77,29 +78,10 @@ pub(crate) async fn admin(arguments: &Arguments) -> Result<(), Failure> {
 async fn act(act: &Act, channel: Channel) -> Result<String, tonic::Status> {
     let mut admin = AdminServiceClient::new(channel.clone());
     Ok(match act {
-        Act::Callers => {
-            let callers = admin.list_callers(pb::ListCallersRequest {}).await?.into_inner().callers;
-            let head = format!(
-                "{:40} {:>8} {:>8} {:>8} {:>6} {:>6}",
-                "caller", "MiB", "sessions", "streams", "tools", "cores"
-            );
-            let line = |caller: &pb::CallerUse| {
-                let pb::CallerUse { caller, memory_bytes, sessions, streams, tools, processor_share } = caller;
-                let mib = memory_bytes >> 20;
-                format!("{caller:40} {mib:>8} {sessions:>8} {streams:>8} {tools:>6} {processor_share:>6.3}")
-            };
-            std::iter::once(head).chain(callers.iter().map(line)).collect::<Vec<_>>().join("\n")
-        }
+        Act::Callers => callers(&admin.list_callers(pb::ListCallersRequest {}).await?.into_inner().callers),
         Act::Streams { session } => {
             let request = pb::ListStreamsRequest { session_id: session.clone() };
-            let streams = admin.list_streams(request).await?.into_inner().streams;
-            let head = format!("{:>6} {:14} {:40} {:>5} {:>9}", "number", "call", "caller", "tools", "open s");
-            let line = |stream: &pb::StreamUse| {
-                let pb::StreamUse { number, call, caller, holds_tools, age_s } = stream;
-                let tools = if *holds_tools { "holds" } else { "-" };
-                format!("{number:>6} {call:14} {caller:40} {tools:>5} {age_s:>9.1}")
-            };
-            std::iter::once(head).chain(streams.iter().map(line)).collect::<Vec<_>>().join("\n")
+            streams(&admin.list_streams(request).await?.into_inner().streams)
         }
         Act::FreeTool { session, tool } => {
             admin.free_tool(pb::FreeToolRequest { session_id: session.clone(), tool: *tool }).await?;
@@ -126,4 +108,41 @@ async fn act(act: &Act, channel: Channel) -> Result<String, tonic::Status> {
             "deleted".to_owned()
         }
     })
+}
+
+/// A line for each caller, below a header.
+fn callers(callers: &[pb::CallerUse]) -> String {
+    let head = format!("{:40} {:>8} {:>8} {:>8} {:>6} {:>6}", "caller", "MiB", "sessions", "streams", "tools", "cores");
+    let line = |caller: &pb::CallerUse| {
+        let pb::CallerUse { caller, memory_bytes, sessions, streams, tools, processor_share } = caller;
+        let mib = memory_bytes >> 20;
+        format!("{:40} {mib:>8} {sessions:>8} {streams:>8} {tools:>6} {processor_share:>6.3}", printable(caller))
+    };
+    std::iter::once(head).chain(callers.iter().map(line)).collect::<Vec<_>>().join("\n")
+}
+
+/// A line for each stream, below a header.
+fn streams(streams: &[pb::StreamUse]) -> String {
+    let head = format!("{:>6} {:14} {:40} {:>5} {:>9}", "number", "call", "caller", "tools", "open s");
+    let line = |stream: &pb::StreamUse| {
+        let pb::StreamUse { number, call, caller, holds_tools, age_s } = stream;
+        let tools = if *holds_tools { "holds" } else { "-" };
+        format!("{number:>6} {:14} {:40} {tools:>5} {age_s:>9.1}", printable(call), printable(caller))
+    };
+    std::iter::once(head).chain(streams.iter().map(line)).collect::<Vec<_>>().join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_callers_act_on_no_terminal() {
+        let name = || "a\x1b[2J\r\n\u{9b}\u{202e}z".to_owned();
+        let caller = pb::CallerUse { caller: name(), ..Default::default() };
+        let stream = pb::StreamUse { call: name(), caller: name(), ..Default::default() };
+        for table in [callers(&[caller]), streams(&[stream])] {
+            assert!(table.lines().count() == 2 && table.contains("a?[2J????z"), "{table:?}");
+        }
+    }
 }

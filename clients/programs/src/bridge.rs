@@ -6,6 +6,7 @@ use glam::DVec3;
 use palpate_client::HapticDevice;
 use palpate_client::bridge::{Options, Report, Session, Target, Tick, Traffic, Warn, run};
 use palpate_client::devices::{self, Kind, Placed};
+use palpate_proto::printable::printable_json;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{LEAD_S, Task};
 use palpate_touch::{LimitCause, RenderingState, Tip};
@@ -126,7 +127,7 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
         write_course(path, &served.course)?;
     }
     if arguments.json {
-        crate::tell!("{}", as_json(&served));
+        crate::tell!("{}", printable_json(as_json(&served)));
     } else {
         table::print(&rows(&served));
     }

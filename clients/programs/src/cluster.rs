@@ -3,13 +3,15 @@
 use std::io::{ErrorKind, IsTerminal, Write};
 use std::time::Duration;
 
-use palpate_client::{Channel, Error, Server, describe, fleet};
+use palpate_client::{Channel, Error, Server, fleet};
 use palpate_proto::pb;
+use palpate_proto::printable::{printable, printable_json};
 use pb::admin_service_client::AdminServiceClient;
 use serde_json::{Value, json};
-use tonic::{Code, Status};
+use tonic::Status;
 
 use crate::credentials::CredentialOptions;
+use crate::unanswered::Unanswered;
 use crate::{Failure, interrupted};
 
 /// Arguments of `cluster`.
@@ -74,11 +76,19 @@ pub(crate) async fn cluster(arguments: &Arguments) -> Result<(), Failure> {
     match act {
         Act::Nodes => {
             let nodes = nodes(&channel).await?;
-            print(&if *is_json { format!("{}\n", json_of(&nodes, node_json)) } else { nodes_table(&nodes) })
+            print(&if *is_json {
+                format!("{}\n", printable_json(json_of(&nodes, node_json)))
+            } else {
+                nodes_table(&nodes)
+            })
         }
         Act::Sessions => {
             let sessions = sessions(channel).await?;
-            print(&if *is_json { format!("{}\n", json_of(&sessions, session_json)) } else { sessions_table(&sessions) })
+            print(&if *is_json {
+                format!("{}\n", printable_json(json_of(&sessions, session_json)))
+            } else {
+                sessions_table(&sessions)
+            })
         }
         Act::Move { session, node } => {
             let request =
@@ -93,7 +103,7 @@ pub(crate) async fn cluster(arguments: &Arguments) -> Result<(), Failure> {
                 let moved = json!({
                     "session_id": session, "node": node, "endpoint": endpoint, "revision": revision, "gap_s": gap_s,
                 });
-                format!("{moved}\n")
+                format!("{}\n", printable_json(moved))
             } else {
                 let (node, gap_ms) = (printable(&node), 1e3 * gap_s);
                 format!("session {session} is at {node} ({}) now; no step for {gap_ms:.0} ms\n", printable(&endpoint))
@@ -150,9 +160,11 @@ async fn drain(server: &Server, channel: &Channel, node: &str, stop: bool, is_js
     while let Some(told) = moves.message().await.map_err(failed)? {
         let pb::DrainNodeResponse { session_id, node, fault, left } = &told;
         let line = match (is_json, fault.is_empty()) {
-            (true, _) => json!({ "session_id": session_id, "node": node, "fault": fault, "left": left }).to_string(),
-            (false, true) => format!("{session_id}  moved to {}; {left} left", printable(node)),
-            (false, false) => format!("{session_id}  not moved: {}; {left} left", printable(fault)),
+            (true, _) => {
+                printable_json(json!({ "session_id": session_id, "node": node, "fault": fault, "left": left }))
+            }
+            (false, true) => format!("{}  moved to {}; {left} left", printable(session_id), printable(node)),
+            (false, false) => format!("{}  not moved: {}; {left} left", printable(session_id), printable(fault)),
         };
         *(if fault.is_empty() { &mut moved } else { &mut stayed }) += 1;
         // Who reads no more still wants the server to be drained.
@@ -173,6 +185,7 @@ async fn drain(server: &Server, channel: &Channel, node: &str, stop: bool, is_js
 async fn top(channel: &Channel, once: bool, is_json: bool) -> Result<(), Failure> {
     let terminal = std::io::stdout().is_terminal() && !is_json && !once;
     let mut ticks = tokio::time::interval(EVERY);
+    let mut unanswered = Unanswered::default();
     loop {
         tokio::select! {
             _ = ticks.tick() => {}
@@ -181,15 +194,13 @@ async fn top(channel: &Channel, once: bool, is_json: bool) -> Result<(), Failure
         let nodes = match look(channel).await {
             Ok(nodes) => nodes,
             // The channel reconnects by itself.
-            Err(status) if status.code() == Code::Unavailable && !once => {
-                crate::warn(&format!("{}; trying again", describe(&status)));
-                continue;
-            }
+            Err(status) if unanswered.may_ask_again(&status) && !once => continue,
             Err(status) => return Err(failed(status)),
         };
+        unanswered = Unanswered::default();
         let table = nodes_table(&nodes);
         print(&match (is_json, terminal) {
-            (true, _) => format!("{}\n", json!({ "nodes": json_of(&nodes, node_json) })),
+            (true, _) => format!("{}\n", printable_json(json!({ "nodes": json_of(&nodes, node_json) }))),
             (false, false) => table + if once { "" } else { "\n" },
             // Overwrites the last table in place, which does not flicker.
             (false, true) => format!("\x1b[H{}\x1b[J", table.replace('\n', "\x1b[K\n")),
@@ -266,9 +277,14 @@ fn sessions_table(sessions: &[pb::FleetSession]) -> String {
     aligned(std::iter::once(head).chain(sessions.iter().map(row)))
 }
 
-/// Lines of cells, one below the other.
+/// Lines of cells, one below the other. Of a long cell only the beginning is shown: each row is as wide as the widest cells are.
 fn aligned<const N: usize>(rows: impl Iterator<Item = [String; N]>) -> String {
-    let rows: Vec<[String; N]> = rows.collect();
+    const MOST_LETTERS: usize = 128;
+    let short = |cell: String| match cell.char_indices().nth(MOST_LETTERS) {
+        Some((end, _)) => format!("{}…", &cell[..end]),
+        None => cell,
+    };
+    let rows: Vec<[String; N]> = rows.map(|row| row.map(short)).collect();
     let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let widths: [usize; N] = std::array::from_fn(width);
     let mut text = String::new();
@@ -278,11 +294,6 @@ fn aligned<const N: usize>(rows: impl Iterator<Item = [String; N]>) -> String {
         text.push('\n');
     }
     text
-}
-
-/// Replaces control characters, which would act on the terminal.
-fn printable(text: &str) -> String {
-    text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
 }
 
 #[cfg(test)]
@@ -314,5 +325,7 @@ mod tests {
     fn cells_are_one_below_the_other() {
         let rows = [["a", "long", ""], ["long", "b", "c"]].map(|row| row.map(str::to_owned));
         assert_eq!(aligned(rows.into_iter()), "a     long\nlong  b     c\n");
+        let long = ["x".repeat(1 << 20), "b".to_owned()];
+        assert_eq!(aligned([long].into_iter()).chars().count(), 128 + "…  b\n".chars().count());
     }
 }

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use palpate_client::devices::{Checked, Found, check, list, open};
 use palpate_client::{Error, HapticDevice};
+use palpate_proto::printable::{printable, printable_json};
 use palpate_touch::Device;
 use serde_json::{Value, json};
 
@@ -40,7 +41,7 @@ pub(crate) async fn devices(arguments: &Arguments) -> Result<(), Failure> {
     let Some(name) = arguments.test.clone() else {
         let found = tokio::task::spawn_blocking(move || list(library.as_deref())).await.unwrap_or_default();
         if is_json {
-            crate::tell!("{}", json!({ "devices": found.iter().map(one).collect::<Vec<_>>() }));
+            crate::tell!("{}", printable_json(json!({ "devices": found.iter().map(one).collect::<Vec<_>>() })));
         } else {
             show(&found);
         }
@@ -56,7 +57,7 @@ pub(crate) async fn devices(arguments: &Arguments) -> Result<(), Failure> {
     });
     let (device, checked) = tested.await.map_err(|error| Failure::Failed(error.to_string()))??;
     if is_json {
-        crate::tell!("{}", report(&name, &device, &checked));
+        crate::tell!("{}", printable_json(report(&name, &device, &checked)));
     } else {
         table::print(&rows(&device, &checked));
     }
@@ -74,7 +75,7 @@ fn one(found: &Found) -> Value {
 fn show(found: &[Found]) {
     let width = found.iter().map(|found| found.name.chars().count()).max().unwrap_or(0);
     for Found { name, is_there, about } in found {
-        crate::tell!("{} {name:<width$}  {}", if *is_there { "+" } else { "-" }, about.replace(char::is_control, "?"));
+        crate::tell!("{} {:<width$}  {}", if *is_there { "+" } else { "-" }, printable(name), printable(about));
     }
     crate::tell!("\n`palpate-client devices --test NAME` reads one for 5 s; `bridge --device NAME` touches with it.");
 }

@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use palpate_client::{Error, Server};
 use palpate_proto::pb::create_session_request::Source;
+use palpate_proto::printable::{printable_json, printable_lines};
 use palpate_simulated::load::{Course, Deadbands, Objective, Outcome, Plan, Progress, Second, Trial, trial};
 use palpate_simulated::scene_file::SceneFile;
 
@@ -118,9 +119,9 @@ pub(crate) async fn load(arguments: &Arguments) -> Result<(), Failure> {
     };
     let (outcome, limit) = ended.await?;
     if arguments.json {
-        crate::tell!("{}", outcome.json(limit));
+        crate::tell!("{}", printable_json(outcome.json(limit)));
     } else {
-        print!("{}", outcome.table(limit));
+        print!("{}", printable_lines(outcome.table(limit)));
     }
     if limit.is_none() && outcome.samples == 0 && arguments.clients_per_session > 0 && arguments.seconds > 0.0 {
         return Err(Failure::Failed("no sample arrived".to_owned()));
@@ -241,9 +242,9 @@ async fn by_plan(path: &Path, arguments: &Arguments) -> Result<(), Failure> {
         written.map_err(|error| Failure::Failed(format!("{}: {error}", file.display())))?;
     }
     if arguments.json {
-        crate::tell!("{}", report.json());
+        crate::tell!("{}", printable_json(report.json()));
     } else {
-        print!("{}", report.table());
+        print!("{}", printable_lines(report.table()));
     }
     report.verdict().map_or(Ok(()), |why| Err(Failure::Failed(why)))
 }

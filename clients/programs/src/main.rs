@@ -3,19 +3,21 @@
 // Clients live in real time; the rule is for what a server computes.
 #![allow(clippy::disallowed_methods)]
 
-/// Writes a line to the standard error. A closed standard error does not end the program. Control characters that a server
-/// sent do not reach the terminal.
+/// Writes a line to the standard error, whatever names and messages of others are in it. A closed standard error does not end the
+/// program.
 macro_rules! say {
     ($($text:tt)*) => {{
-        let text = format!($($text)*).replace(|c: char| c.is_control() && c != '\n', "?");
+        let text = palpate_proto::printable::printable(format_args!($($text)*));
         let _ = std::io::Write::write_all(&mut std::io::stderr(), (text + "\n").as_bytes());
     }};
 }
 
-/// Writes a line to the standard output. A closed standard output does not end the program.
+/// Writes lines to the standard output. What others have written is made printable before it, as a part of a line or as JSON. A
+/// closed standard output does not end the program.
 macro_rules! tell {
     ($($text:tt)*) => {{
-        let _ = std::io::Write::write_all(&mut std::io::stdout(), (format!($($text)*) + "\n").as_bytes());
+        let text = palpate_proto::printable::printable_lines(format_args!($($text)*));
+        let _ = std::io::Write::write_all(&mut std::io::stdout(), (text + "\n").as_bytes());
     }};
 }
 pub(crate) use {say, tell};
@@ -36,6 +38,7 @@ mod replay;
 mod simulated;
 mod table;
 mod top;
+mod unanswered;
 
 use std::process::ExitCode;
 

@@ -15,6 +15,7 @@ use palpate_client::fleet::At;
 use palpate_client::upload::upload_journal;
 use palpate_client::{Channel, Error, fleet};
 use palpate_proto::pb;
+use palpate_proto::printable::printable_json;
 use pb::create_session_request::Source;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
@@ -241,7 +242,7 @@ pub(crate) async fn play(arguments: &Arguments) -> Result<(), Failure> {
         let hash = (!hash.is_empty()).then_some(hash);
         let told = serde_json::json!({ "session_id": id, "begin_step": begin, "end_step": step, "state_hash": hash,
             "equal_hashes": compared.equal, "difference": compared.difference });
-        crate::tell!("{told}");
+        crate::tell!("{}", printable_json(told));
     } else if *live {
         table::print(&[("session", id), ("live from step", step.to_string())]);
     } else {

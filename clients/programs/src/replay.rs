@@ -16,6 +16,7 @@ use palpate::shape;
 use palpate::wire;
 use palpate_client::{Channel, Error, Touch, describe, fleet};
 use palpate_proto::pb;
+use palpate_proto::printable::printable;
 use palpate_proto::refusal::Reason;
 use palpate_simulated::scene_file::SceneFile;
 use pb::haptic_service_client::HapticServiceClient;
@@ -468,7 +469,7 @@ async fn play(
         if arguments.output.is_some() {
             crate::tell!("{}", summary.curves);
         } else {
-            crate::say!("{}", summary.curves);
+            let _ = writeln!(std::io::stderr(), "{}", summary.curves);
         }
     }
     table(arguments, &summary, &network, &measured);
@@ -506,7 +507,7 @@ fn table(arguments: &Arguments, summary: &Summary, network: &Network, measured: 
     ];
     for (name, value) in rows {
         if arguments.output.is_some() {
-            crate::tell!("{name:<28}{value}");
+            crate::tell!("{name:<28}{}", printable(value));
         } else {
             crate::say!("{name:<28}{value}");
         }

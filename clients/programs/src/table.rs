@@ -3,6 +3,7 @@
 use std::io::IsTerminal;
 
 use indicatif::{ProgressBar, ProgressStyle};
+use palpate_proto::printable::printable;
 
 /// A bar on the terminal, in indicatif's words; hidden if there is none or it is not wanted.
 pub(crate) fn progress_bar(template: &str, length: u64, quiet: bool) -> ProgressBar {
@@ -21,7 +22,7 @@ pub(crate) fn print(rows: &[(&str, String)]) {
 /// The rows as text, their values one below the other.
 fn text(rows: &[(&str, String)]) -> String {
     let width = rows.iter().map(|row| row.0.chars().count()).max().unwrap_or(0);
-    let lines: Vec<String> = rows.iter().map(|(name, value)| format!("{name:<width$}  {value}")).collect();
+    let lines: Vec<String> = rows.iter().map(|(name, value)| format!("{name:<width$}  {}", printable(value))).collect();
     lines.join("\n")
 }
 

@@ -8,11 +8,12 @@ use std::time::{Duration, Instant};
 use palpate_client::{Channel, describe};
 use palpate_proto::pb::session_service_client::SessionServiceClient;
 use palpate_proto::pb::{Audit, AuditedError, ListSessionsRequest, Session, SessionState};
+use palpate_proto::printable::{printable, printable_json};
 use serde_json::{Value, json};
-use tonic::Code;
 
 use crate::Failure;
 use crate::credentials::CredentialOptions;
+use crate::unanswered::Unanswered;
 
 /// Arguments of `top`.
 #[derive(clap::Args)]
@@ -52,7 +53,7 @@ pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
     let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server, --server names another"));
     let mut sessions = SessionServiceClient::new(server.connect().await.map_err(unreached)?);
     let terminal = std::io::stdout().is_terminal() && !arguments.json && !arguments.once;
-    let mut seen = None;
+    let (mut seen, mut unanswered) = (None, Unanswered::default());
     let mut ticks = tokio::time::interval(EVERY);
     loop {
         tokio::select! {
@@ -64,18 +65,16 @@ pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
         let (rows, now) = match looked.unwrap_or_else(silent) {
             Ok(looked) => looked,
             // The channel reconnects by itself.
-            Err(status) if status.code() == Code::Unavailable && !arguments.once => {
-                crate::warn(&format!("{}; trying again", describe(&status)));
-                continue;
-            }
+            Err(status) if unanswered.may_ask_again(&status) && !arguments.once => continue,
             Err(status) => return Err(Failure::Failed(describe(&status))),
         };
+        unanswered = Unanswered::default();
         // A rate needs two queries.
         if seen.replace(now).is_none() {
             continue;
         }
         let text = match (arguments.json, terminal) {
-            (true, _) => format!("{}\n", as_json(&rows)),
+            (true, _) => format!("{}\n", printable_json(as_json(&rows))),
             (false, false) => table(&arguments.server, &rows, usize::MAX) + if arguments.once { "" } else { "\n" },
             // Overwrites the last table in place, which does not flicker.
             (false, true) => {
@@ -200,7 +199,7 @@ fn table(server: &str, rows: &[Row], most: usize) -> String {
         let _ = writeln!(
             text,
             "{:<32}  {:<12.12} {:<7} {:>10} {:>7.0} {:>8.4} {:>15} {:>8} {:>6} {:>8} {:>7}  {}",
-            session.session_id,
+            printable(&session.session_id),
             // Clients choose names freely.
             printable(&session.scene_name),
             state(session),
@@ -221,7 +220,21 @@ fn table(server: &str, rows: &[Row], most: usize) -> String {
     text
 }
 
-/// Replaces control characters, which would act on the terminal.
-fn printable(text: &str) -> String {
-    text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
+#[cfg(test)]
+mod tests {
+    use palpate_proto::pb::HeldTool;
+
+    use super::*;
+
+    #[test]
+    fn names_that_clients_choose_act_on_no_terminal() {
+        let name = || "a\x1b[2J\r\n\u{9b}\u{202e}z".to_owned();
+        let held_tools = vec![HeldTool { holder: name(), ..Default::default() }];
+        let session = Session { session_id: name(), scene_name: name(), held_tools, ..Default::default() };
+        let rows = [Row { session, steps_per_s: 0.0, overruns_per_s: 0.0 }];
+        let table = table("here", &rows, 10);
+        assert!(table.lines().count() == 4 && table.matches("a?[2J????z").count() == 3, "{table:?}");
+        let json = printable_json(as_json(&rows));
+        assert!(json.lines().count() == 1 && !json.contains(['\x1b', '\u{9b}', '\u{202e}']), "{json:?}");
+    }
 }

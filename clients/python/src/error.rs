@@ -1,5 +1,6 @@
 //! Refusals and failures as the exceptions of `palpate._errors`.
 
+use palpate::printable::printable;
 use palpate::refusal::Refusal;
 use palpate::session::run::Failure;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyOSError};
@@ -52,7 +53,7 @@ pub(crate) fn of_status(status: Status) -> PyErr {
             let field = info.metadata.get("field").cloned().unwrap_or_default();
             // The server's text begins with the field.
             let message = status.message().strip_prefix(&format!("{field}: ")).unwrap_or(status.message());
-            raised("Refused", (info.reason, field, message, None::<String>))
+            raised("Refused", (printable(info.reason), printable(field), printable(message), None::<String>))
         }
         None => raised("Disconnected", (palpate_client::describe(&status),)),
     }

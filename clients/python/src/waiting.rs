@@ -49,12 +49,22 @@ pub(crate) fn work<T: Send>(py: Python<'_>, work: impl FnOnce(&AtomicBool) -> T 
 }
 
 /// The runtime of all connections.
+///
+/// # Errors
+/// Raises RuntimeError if its threads can't be started, and in a process that was forked after they were: it has not got them,
+/// and would wait for ever.
 pub(crate) fn runtime() -> PyResult<&'static Runtime> {
-    static RUNTIME: OnceLock<Option<Runtime>> = OnceLock::new();
-    let made = RUNTIME.get_or_init(|| {
+    static RUNTIME: OnceLock<(u32, Option<Runtime>)> = OnceLock::new();
+    let (process, made) = RUNTIME.get_or_init(|| {
         let mut threads = tokio::runtime::Builder::new_multi_thread();
-        threads.worker_threads(2).thread_name("palpate-net").enable_all().build().ok()
+        let made = threads.worker_threads(2).thread_name("palpate-net").enable_all().build().ok();
+        (std::process::id(), made)
     });
+    if *process != std::process::id() {
+        let message = "this process was forked from one that had used palpate for connections, and has none of its threads: \
+                       start it by multiprocessing.get_context(\"spawn\"), or connect in the parent only after the fork";
+        return Err(PyRuntimeError::new_err(message));
+    }
     made.as_ref().ok_or_else(|| PyRuntimeError::new_err("no threads for the network"))
 }
 

@@ -1,6 +1,7 @@
 """A real server, touched and looked at, with and without asyncio."""
 
 import asyncio
+import os
 import subprocess
 import sys
 import tempfile
@@ -52,6 +53,24 @@ asyncio.run(main(sys.argv[1]))
 """
 
 
+# A child of fork, which has none of its parent's threads.
+FORKED = """
+import os, sys
+import palpate
+
+server = palpate.connect(sys.argv[1])
+if child := os.fork():
+    sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+told = []
+for call in (lambda: palpate.connect(sys.argv[1]), server.scenes):
+    try:
+        call()
+    except RuntimeError as error:
+        told.append(str(error))
+os._exit(0 if len(told) == 2 and all("forked" in text for text in told) else 1)
+"""
+
+
 def felt(touch):
     """What came of a touch in which something was felt. A busy machine may connect only when the device's time is over."""
     for _ in range(20):
@@ -66,6 +85,11 @@ class Clients(Served, unittest.TestCase):
         for _ in range(12):
             done = subprocess.run([sys.executable, "-c", ENDING, self.url], capture_output=True, text=True, timeout=60)
             self.assertEqual(done.returncode, 0, done.stderr)
+
+    @unittest.skipUnless(hasattr(os, "fork"), "no fork here")
+    def test_a_forked_child_is_refused_and_does_not_hang(self):
+        done = subprocess.run([sys.executable, "-c", FORKED, self.url], capture_output=True, text=True, timeout=60)
+        self.assertEqual(done.returncode, 0, done.stderr)
 
     def test_a_session_runs_pauses_changes_and_ends(self):
         server = palpate.connect(self.url)

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use palpate::journal::file::{self, JournalFile};
 use palpate::journal::{Reader, Survey, pb};
+use palpate::printable::{printable, printable_json};
 use serde::Serialize;
 
 use super::super::Failure;
@@ -123,7 +124,7 @@ pub(super) fn list(arguments: &ListArguments) -> Result<(), Failure> {
     let mut text = String::new();
     if *json {
         let rows: Vec<Row> = rows.collect();
-        text = serde_json::to_string_pretty(&rows).map_err(|e| Failure::Failed(e.to_string()))? + "\n";
+        text = printable_json(serde_json::to_string_pretty(&rows).map_err(|e| Failure::Failed(e.to_string()))?) + "\n";
     } else {
         let head = ["session", "run", "state", "begun (UTC)", "from step", "durable step", "kB", "scene"];
         let [session, run, state, begun, from, durable, size, scene] = head;
@@ -131,7 +132,8 @@ pub(super) fn list(arguments: &ListArguments) -> Result<(), Failure> {
             writeln!(text, "{session:<32} {run:>4} {state:<10} {begun:<19} {from:>10} {durable:>12} {size:>9} {scene}");
         for row in rows {
             let state = serde_json::to_value(row.state).ok().and_then(|name| name.as_str().map(str::to_owned));
-            let _ = write!(text, "{:<32} {:>4} {:<10} ", row.session_id, row.run, state.unwrap_or_default());
+            let _ =
+                write!(text, "{:<32} {:>4} {:<10} ", printable(&row.session_id), row.run, state.unwrap_or_default());
             let _ = match (&row.more, &row.problem) {
                 (Some(more), _) => writeln!(
                     text,
@@ -140,9 +142,9 @@ pub(super) fn list(arguments: &ListArguments) -> Result<(), Failure> {
                     more.begin_step,
                     more.durable_step,
                     row.bytes.div_ceil(1000),
-                    more.scene
+                    printable(&more.scene)
                 ),
-                (None, problem) => writeln!(text, "{}", problem.as_deref().unwrap_or_default()),
+                (None, problem) => writeln!(text, "{}", printable(problem.as_deref().unwrap_or_default())),
             };
         }
     }

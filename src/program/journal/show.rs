@@ -6,6 +6,7 @@ use std::path::PathBuf;
 
 use palpate::journal::replay::{Item, items};
 use palpate::journal::{Reader, pb};
+use palpate::printable::{printable, printable_json};
 use serde_json::{Value, json};
 
 use super::super::Failure;
@@ -40,7 +41,11 @@ struct Shown<'a> {
 impl Shown<'_> {
     #[allow(clippy::cast_precision_loss)]
     fn line(&mut self, step: u64, text: &str) -> std::io::Result<()> {
-        writeln!(self.out, "{:>12.3} s  step {step:<10} {text}", step as f64 / self.rate_hz)
+        writeln!(self.out, "{:>12.3} s  step {step:<10} {}", step as f64 / self.rate_hz, printable(text))
+    }
+
+    fn json(&mut self, line: &Value) -> std::io::Result<()> {
+        writeln!(self.out, "{}", printable_json(line))
     }
 
     /// Ends the row of a tool.
@@ -195,9 +200,11 @@ fn write(
     if arguments.json {
         let line = json!({ "session_id": header.session_id, "run": header.run, "version": header.version, "scene": scene,
             "owner": header.owner, "rate_hz": header.rate_hz, "begin_step": header.begin_step });
-        writeln!(out, "{line}")?;
+        writeln!(out, "{}", printable_json(line))?;
     } else {
-        let pb::Header { session_id, run, version, owner, rate_hz, begin_step, .. } = &header;
+        let pb::Header { run, rate_hz, begin_step, .. } = &header;
+        let [session_id, owner, version] = [&header.session_id, &header.owner, &header.version].map(printable);
+        let scene = printable(scene);
         writeln!(out, "session {session_id}, run {run}, of {owner}: {scene}, {rate_hz} Hz, from step {begin_step}")?;
         writeln!(out, "written by Palpate {version}")?;
     }
@@ -222,13 +229,13 @@ fn write(
         };
         for item in items {
             match item {
-                Item::Input(input) if arguments.json => writeln!(shown.out, "{}", in_json(&input))?,
+                Item::Input(input) if arguments.json => shown.json(&in_json(&input))?,
                 Item::Hash(hash) if arguments.json => {
-                    writeln!(shown.out, "{}", json!({ "step": hash.step, "hash": hash.hash }))?;
+                    shown.json(&json!({ "step": hash.step, "hash": hash.hash }))?;
                 }
                 Item::Snapshot(snapshot) if arguments.json => {
                     let pb::Snapshot { step, hash, saved, .. } = snapshot;
-                    writeln!(shown.out, "{}", json!({ "step": step, "snapshot_bytes": saved.len(), "hash": hash }))?;
+                    shown.json(&json!({ "step": step, "snapshot_bytes": saved.len(), "hash": hash }))?;
                 }
                 Item::Input(input) => match &input.what {
                     Some(pb::input::What::Command(command)) => shown.command(input.step, command, arguments.all)?,
@@ -253,11 +260,7 @@ fn write(
     waiting.retain(|input| input.step >= step);
     for input in &waiting {
         if arguments.json {
-            writeln!(
-                shown.out,
-                "{}",
-                json!({ "step": input.step, "waiting": name(input), "text": self::input(input) })
-            )?;
+            shown.json(&json!({ "step": input.step, "waiting": name(input), "text": self::input(input) }))?;
         } else {
             shown.line(input.step, &format!("waits for this step at the end: {}", self::input(input)))?;
         }
@@ -273,7 +276,7 @@ fn write(
     if arguments.json {
         let line =
             json!({ "durable_step": step, "ended": ended, "torn_bytes": reader.torn_bytes(), "time": utc(unix_ns) });
-        return writeln!(shown.out, "{line}");
+        return shown.json(&line);
     }
     shown.line(step, &format!("end, {} UTC: {ended}{torn}", utc(unix_ns)))
 }

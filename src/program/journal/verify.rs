@@ -38,9 +38,11 @@ pub(super) fn verify(arguments: &VerifyArguments) -> Result<(), Failure> {
             ),
         }
     }
-    match (unread.is_empty(), differs.is_empty()) {
-        (false, _) => Err(Failure::Refused([unread, differs].concat().join("\n"))),
-        (true, false) => Err(Failure::Failed(differs.join("\n"))),
-        (true, true) => Ok(()),
+    let failure = if unread.is_empty() { Failure::Failed } else { Failure::Refused };
+    let mut problems = [unread, differs].concat();
+    let last = problems.pop();
+    for problem in problems {
+        say!("palpate: {problem}");
     }
+    last.map_or(Ok(()), |problem| Err(failure(problem)))
 }

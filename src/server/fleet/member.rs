@@ -116,6 +116,7 @@ impl Fleet {
         self.spawn(self.clone().mirror());
         self.spawn(self.clone().take_over());
         self.spawn(self.clone().settle());
+        self.spawn(self.clone().follow_owned());
         self.spawn(self.clone().tell_agones());
     }
 
@@ -225,10 +226,13 @@ impl Fleet {
                 }
                 Ok(Err(Some((value, _)))) if value.node == self.node => return false,
                 Ok(Err(found)) => {
-                    let node = found.as_ref().map_or("", |(value, _)| &value.node);
-                    info!(session = %id, node, "another server has taken over");
-                    self.tally.lost.one_more();
-                    self.lose(id, self.is_lost(found));
+                    // Unless the watch of its key has told that before.
+                    if self.revision(id).is_some() {
+                        let node = found.as_ref().map_or("", |(value, _)| &value.node);
+                        info!(session = %id, node, "another server has taken over");
+                        self.tally.lost.one_more();
+                        self.lose(id, self.is_lost(found));
+                    }
                     return true;
                 }
                 Err(refusal) => {

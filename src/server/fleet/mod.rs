@@ -1,12 +1,13 @@
 //! This server as one of a fleet. `member` keeps its lease, and with it the fence; `mirror` sends journals to the servers that
 //! stand by, `receive` takes in those of others, which `stand_by` keeps; `take_over` claims sessions whose owner is gone,
-//! `hand_over` moves those of this server, and `take_in` takes those of others. `owned` keeps the keys of this server's sessions, and
-//! `settle` puts right what etcd says of it and is not so.
+//! `hand_over` moves those of this server, and `take_in` takes those of others. `owned` keeps the keys of this server's sessions,
+//! `follow` ends those that etcd says are another's, and `settle` puts right what etcd says of it and is not so.
 //!
 //! Clients connect to the owner of a session. No call is passed on but the creation of a session.
 
 mod agones;
 mod fenced;
+mod follow;
 mod hand_over;
 mod member;
 mod mirror;

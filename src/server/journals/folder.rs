@@ -16,6 +16,9 @@ const LOCK: &str = "lock";
 const LOCK_TRIES: u32 = 150;
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
 
+/// Less than this is no room, bytes.
+const ROOM: u64 = 16 << 20;
+
 /// So many files are synced one by one; of more, the whole file system at once.
 const MOST_SINGLE: usize = 4;
 
@@ -60,6 +63,11 @@ impl Folder {
     /// Its path.
     pub(super) fn path(&self) -> &Path {
         &self.path
+    }
+
+    /// Whether some journals can grow for a while.
+    pub(super) fn has_room(&self) -> bool {
+        rustix::fs::fstatvfs(&self.directory).is_ok_and(|found| found.f_bavail.saturating_mul(found.f_frsize) >= ROOM)
     }
 
     /// Makes all that was written to `files` survive a power cut. `is_new`: some of them have just been made.

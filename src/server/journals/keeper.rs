@@ -2,9 +2,10 @@
 //! all of them at once. No session waits for it.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Weak};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use super::folder::{Folder, Grown};
@@ -14,13 +15,16 @@ use super::old;
 use crate::journal::{self, Opening, Writer, pb};
 use crate::pace::Leaving;
 use crate::pace::clock::now_ns;
-use crate::pace::tape::{About, Event, Noted, Tape, TapeQueue};
+use crate::pace::tape::{About, Beginning, Event, Noted, Tape, TapeQueue};
 
 /// A round of syncs begins so long after the one before at the earliest: what happens meanwhile goes with it.
 const ROUND: Duration = Duration::from_millis(20);
 
 /// Old journals are looked for so often.
 const SWEEP: Duration = Duration::from_secs(60);
+
+/// A disk that was full is looked at so often.
+const RETRY: Duration = Duration::from_secs(2);
 
 /// What the thread counts of itself, for the metrics.
 #[derive(Debug, Default)]
@@ -41,6 +45,8 @@ struct Entry {
     /// `None` when it is complete.
     writer: Option<Writer>,
     file: Grown,
+    /// Nothing of it is on the disk yet.
+    is_new: bool,
 }
 
 pub(super) struct Keeper {
@@ -55,6 +61,8 @@ pub(super) struct Keeper {
     entries: BTreeMap<String, Entry>,
     /// Tapes of sessions that have come back before the journal of when they left is complete.
     waiting: Vec<Arc<Tape>>,
+    /// Tapes that broke because there was no room.
+    without_room: Vec<Weak<Tape>>,
     /// Who mirrors journals is told of what was written.
     growth: Option<Arc<Growth>>,
 }
@@ -87,13 +95,14 @@ impl Keeper {
         growth: Option<Arc<Growth>>,
     ) -> Self {
         let Found { runs, left_alone } = found;
-        Keeper { folder, keep, queue, tally, runs, left_alone, entries: BTreeMap::new(), waiting: Vec::new(), growth }
+        let (entries, waiting, without_room) = (BTreeMap::new(), Vec::new(), Vec::new());
+        Keeper { folder, keep, queue, tally, runs, left_alone, entries, waiting, without_room, growth }
     }
 
     /// Works until the queue is stopped, and everything in it is written.
     pub(super) fn work(mut self) {
-        let (mut swept_ns, mut begun_ns) = (0, 0);
-        while let Some(mut tapes) = self.queue.wait(Some(SWEEP)) {
+        let (mut swept_ns, mut begun_ns, mut tried_ns) = (0, 0, 0);
+        while let Some(mut tapes) = self.queue.wait(Some(if self.without_room.is_empty() { SWEEP } else { RETRY })) {
             let now = now_ns();
             if let Some(rest) = ROUND.checked_sub(Duration::from_nanos(now.saturating_sub(begun_ns)))
                 && !self.queue.is_stopped()
@@ -103,6 +112,10 @@ impl Keeper {
             }
             begun_ns = now_ns();
             self.round(&tapes);
+            if begun_ns > tried_ns + RETRY.as_nanos() as u64 {
+                tried_ns = begun_ns;
+                self.try_again();
+            }
             if swept_ns == 0 || begun_ns > swept_ns + SWEEP.as_nanos() as u64 {
                 swept_ns = begun_ns;
                 self.sweep();
@@ -140,19 +153,18 @@ impl Keeper {
         if written.is_empty() {
             return;
         }
-        let is_first =
-            |written: &Written| self.entries.get(&written.id).is_some_and(|entry| entry.tape.local_step().is_none());
-        let is_new = written.iter().any(is_first);
+        let is_new = written.iter().any(|written| self.entries.get(&written.id).is_some_and(|entry| entry.is_new));
         let files: Vec<_> = written.iter().filter_map(|written| self.entries.get(&written.id)?.file.file()).collect();
         let synced = self.folder.sync(files.into_iter(), is_new);
         self.tally.rounds.fetch_add(1, Ordering::Relaxed);
         let now = now_ns();
         for Written { id, until_step, batches, noted_ns, is_still } in written {
             if let Err(error) = &synced {
-                self.break_off(&id, &format!("what was written can't be brought to the disk: {error}"));
+                self.break_off(&id, "what was written can't be brought to the disk", error);
                 continue;
             }
             let Some(entry) = self.entries.get_mut(&id) else { continue };
+            entry.is_new = false;
             if let Some(writer) = &mut entry.writer {
                 writer.durable(batches);
             }
@@ -172,9 +184,12 @@ impl Keeper {
     /// Writes what a tape holds. `None` if that is nothing, or can't be.
     fn write(&mut self, tape: &Arc<Tape>) -> Option<Written> {
         let taken = tape.take();
+        if taken.is_broken {
+            return None;
+        }
         let id = tape.about.id.clone();
         if !self.entries.contains_key(&id) {
-            self.begin(tape);
+            self.begin(tape, taken.anew);
         }
         let entry = self.entries.get_mut(&id)?;
         let mut writer = entry.writer.take()?;
@@ -223,16 +238,18 @@ impl Keeper {
         self.tally.bytes.fetch_add(bytes.len() as u64, Ordering::Relaxed);
         let entry = self.entries.get_mut(id)?;
         if let Err(error) = entry.file.append(bytes) {
-            self.break_off(id, &format!("the journal can't be written: {error}"));
+            self.break_off(id, "the journal can't be written", &error);
             return None;
         }
         Some(())
     }
 
-    /// Begins the journal of a session.
-    fn begin(&mut self, tape: &Arc<Tape>) {
+    /// Begins the journal of a session: where its tape began, or does so anew.
+    fn begin(&mut self, tape: &Arc<Tape>, anew: Option<Beginning>) {
         let About { id, owner, idle_timeout_s, first, begin_step, running, until_step, after_run, revision } =
             &tape.about;
+        let first_of = Beginning { step: *begin_step, running: *running, until_step: *until_step };
+        let Beginning { step: begin_step, running, until_step } = anew.unwrap_or(first_of);
         let run = self.runs.entry(id.clone()).or_default();
         *run = (*run).max(*after_run) + 1;
         let opening = Opening {
@@ -241,15 +258,18 @@ impl Keeper {
             owner,
             idle_timeout_s: *idle_timeout_s,
             first,
-            begin_step: *begin_step,
-            running: *running,
-            until_step: *until_step,
+            begin_step,
+            running,
+            until_step,
             ownership_revision: *revision,
         };
         let file = Grown::new(self.folder.path().join(journal::file::name(id, *run)));
-        let entry = Entry { tape: tape.clone(), writer: Some(Writer::new(&opening, unix_ns())), file };
+        let entry = Entry { tape: tape.clone(), writer: Some(Writer::new(&opening, unix_ns())), file, is_new: true };
         self.entries.insert(id.clone(), entry);
         tape.begins(u32::try_from(*run).unwrap_or(u32::MAX));
+        if anew.is_some() {
+            tracing::info!(session = %id, run = *run, step = begin_step, "the journal of a session begins anew");
+        }
     }
 
     /// The journal of a session that is deleted is whole.
@@ -307,10 +327,25 @@ impl Keeper {
         }
     }
 
-    fn break_off(&mut self, id: &str, reason: &str) {
+    fn break_off(&mut self, id: &str, what: &str, error: &std::io::Error) {
         self.tally.broken.fetch_add(1, Ordering::Relaxed);
-        if let Some(entry) = self.entries.remove(id) {
-            entry.tape.break_off(reason);
+        let Some(mut entry) = self.entries.remove(id) else { return };
+        // A run of which nothing is there is none.
+        if entry.file.bytes() == 0 {
+            entry.file.close();
+            old::remove(entry.file.path());
+            self.runs.get_mut(id).into_iter().for_each(|run| *run = run.saturating_sub(1));
+        }
+        entry.tape.break_off(&format!("{what}: {error}"));
+        if matches!(error.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge) {
+            self.without_room.push(Arc::downgrade(&entry.tape));
+        }
+    }
+
+    /// Journals that broke because there was no room begin anew, if there is some now.
+    fn try_again(&mut self) {
+        if !self.without_room.is_empty() && self.folder.has_room() {
+            self.without_room.drain(..).filter_map(|tape| tape.upgrade()).for_each(|tape| tape.may_begin_anew());
         }
     }
 }

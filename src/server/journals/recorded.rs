@@ -52,7 +52,9 @@ fn find(folder: &Path, session_id: &str, run: u32) -> Result<(JournalFile, Reade
 }
 
 fn open(file: &JournalFile) -> Result<Reader<Box<dyn Source>>> {
-    Reader::new(&file.path.display().to_string(), Box::new(journal::reader::file(&file.path)?))
+    let source = journal::reader::file(&file.path).map_err(Refusal::without_folder)?;
+    // Callers are told what is wrong with it, and not where it is.
+    Reader::new(&file::name(&file.session_id, file.run), Box::new(source))
 }
 
 /// A journal in a list: `reader` is it, open, or why it can't be opened.

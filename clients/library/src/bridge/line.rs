@@ -20,7 +20,7 @@ use tokio::sync::{Notify, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic_types::StatusExt;
 
-use super::copying::Copying;
+use super::copying::{Copier, Copying};
 use super::ticker::{Command, Feed};
 use super::{Copies, Session, Target};
 use crate::Error;
@@ -120,6 +120,7 @@ pub(super) async fn keep(
     mut commands: Commands,
     warn: &(impl Fn(&str) + Sync),
 ) {
+    let copier = copies.map(Copier::new);
     let mut pause = PAUSES[0];
     // Attempts in a row.
     let mut attempts = 0_u64;
@@ -129,7 +130,7 @@ pub(super) async fn keep(
     loop {
         let before = shared.inbound().traffic;
         let ended =
-            connect(&target, copies.as_ref(), &mut trail, &device, shared, &mut feed, &mut commands, warn).await;
+            connect(&target, copier.as_ref(), &mut trail, &device, shared, &mut feed, &mut commands, warn).await;
         let Err(error) = ended else { return };
         // After a move the tool is still in the tissue, and goes on by its lease; not after anything else.
         let went_on = moved_to(&error).is_none() && !std::mem::take(&mut trail.lease_id).is_empty();
@@ -272,7 +273,7 @@ fn broken(why: &str) -> Error {
 #[allow(clippy::too_many_arguments)] // One caller, which has them all.
 async fn connect(
     target: &Target,
-    copies: Option<&Copies>,
+    copier: Option<&Copier>,
     trail: &mut Trail,
     device: &Device,
     shared: &Shared,
@@ -282,7 +283,7 @@ async fn connect(
 ) -> Result<(), Error> {
     let At { server, channel, answer: session } = session(target, trail, shared).await?;
     let middle_m = middle_m(&session)?;
-    let mut copying = Copying::new(copies, &session, channel.clone(), target.tip);
+    let mut copying = Copying::new(copier, &session, channel.clone(), target.tip);
     let (outbound, messages) = mpsc::channel(COMMANDS);
     let open = pb::TouchOpen {
         session_id: session.session_id,

@@ -9,6 +9,7 @@
 mod copying;
 mod line;
 mod offline;
+mod stepping;
 mod tick;
 mod ticker;
 
@@ -17,6 +18,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use palpate_proto::printable::printable;
 use palpate_touch::{Device, Envelope, Predictor, Tip};
 use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinSet;
@@ -116,8 +118,8 @@ pub struct Options {
     pub begun: Option<Begun>,
     /// Keep a clone to stop the forces of [`run`]; of [`begin`], [`Ticker::disable`] does it.
     pub disable: Disable,
-    /// Keeps a copy of these tissues, and renders from it as soon as it is there: a tick then takes the time of the copy's step as
-    /// well. `None`: from local models alone.
+    /// Keeps a copy of these tissues, and renders from it as soon as it is there. A thread of its own makes and steps it,
+    /// whatever that costs: while it is late, and where it is refused, forces come from local models. `None`: from those alone.
     pub copies: Option<Copies>,
 }
 
@@ -247,7 +249,8 @@ fn line(
     network.spawn({
         let shared = shared.clone();
         async move {
-            let warn = |message: &str| warn.iter().for_each(|warn| warn(message));
+            // A server may have written a part of it.
+            let warn = |message: &str| warn.iter().for_each(|warn| warn(&printable(message)));
             tokio::select! {
                 () = line::keep(target, copies, device, &shared, feed, commands, &warn) => {}
                 // The loop then finds that it is over.

@@ -174,9 +174,8 @@ impl Ticker {
     /// The force to render from now on, N, for a device that reports `reading` at `time_s`, a time of any origin that goes on
     /// between ticks. Returns zero before the first connection.
     ///
-    /// It takes a bounded time: no lock, no call of the system, no memory asked for or given back. With a copy of the tissue a tick
-    /// also does the copy's step, which may ask for memory. Ticks may be late, early or left out: the envelope knows how long ago the
-    /// last one was.
+    /// It takes a bounded time: no lock, no call of the system, no memory asked for or given back. Another thread steps a copy of
+    /// the tissue. Ticks may be late, early or left out: the envelope knows how long ago the last one was.
     pub fn tick(&mut self, reading: Reading, time_s: f64) -> DVec3 {
         let now_s = self.clock.at(time_s);
         self.is_fresh |= self.newest.refresh();

@@ -1,0 +1,203 @@
+//! Makes and steps a copy of the tissue on a thread of its own. A server says what the copy is, so a step of it may take long:
+//! the loop of a device waits for none. It leaves its newest place in a slot and finds in another what the tool felt at an
+//! earlier one, usually that of the last tick.
+
+use std::io;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use glam::DVec3;
+use palpate_touch::{Predicted, Predictor};
+use tokio::sync::{OwnedSemaphorePermit, oneshot};
+
+use crate::exchange::{Listener, Teller, newest};
+
+/// What was felt longer ago than this is not rendered: local models know more, s.
+const MOST_LATE_S: f64 = 0.0045;
+
+/// How often the thread looks whether there is a new place. A tick wakes nobody, because that would be a call of the system.
+const ROUND: Duration = Duration::from_micros(200);
+
+/// After so many rounds without a new place it looks less often.
+const PATIENT_ROUNDS: u32 = 5000;
+const LONG_ROUND: Duration = Duration::from_millis(5);
+
+/// Where the tool is.
+#[derive(Clone, Copy)]
+struct Place {
+    now_s: f64,
+    place_m: DVec3,
+}
+
+/// What it felt at a place.
+#[derive(Clone, Copy)]
+struct Felt {
+    now_s: f64,
+    felt: Option<Predicted>,
+}
+
+/// A copy that another thread steps. A tick of it takes a fixed number of operations. The thread ends when this is dropped, after
+/// the step that it is in.
+struct Stepped {
+    places: Teller<Place>,
+    felt: Listener<Felt>,
+    is_over: Arc<AtomicBool>,
+}
+
+impl Predictor for Stepped {
+    fn feel(&mut self, now_s: f64, place_m: DVec3) -> Option<Predicted> {
+        self.felt.refresh();
+        let Felt { now_s: then_s, felt } = self.felt.read(|felt| *felt);
+        self.places.tell(|place| *place = Place { now_s, place_m });
+        felt.filter(|_| now_s - then_s <= MOST_LATE_S)
+    }
+}
+
+impl Drop for Stepped {
+    fn drop(&mut self) {
+        self.is_over.store(true, Ordering::Relaxed);
+    }
+}
+
+/// The other end, of the thread.
+struct Stepper {
+    places: Listener<Place>,
+    felt: Teller<Felt>,
+    is_over: Arc<AtomicBool>,
+}
+
+impl Stepper {
+    /// Steps the copy to the newest place. Returns whether there was one.
+    fn step(&mut self, copy: &mut dyn Predictor) -> bool {
+        if !self.places.refresh() {
+            return false;
+        }
+        let Place { now_s, place_m } = self.places.read(|place| *place);
+        let felt = copy.feel(now_s, place_m);
+        self.felt.tell(|newest| *newest = Felt { now_s, felt });
+        true
+    }
+
+    fn is_over(&self) -> bool {
+        self.is_over.load(Ordering::Relaxed)
+    }
+
+    /// Steps until the other end is dropped.
+    fn run(mut self, copy: &mut dyn Predictor) {
+        let mut idle = 0_u32;
+        while !self.is_over() {
+            if self.step(copy) {
+                idle = 0;
+            } else {
+                idle = idle.saturating_add(1);
+                std::thread::sleep(if idle < PATIENT_ROUNDS { ROUND } else { LONG_ROUND });
+            }
+        }
+    }
+}
+
+/// The two ends of a copy.
+fn ends() -> (Stepped, Stepper) {
+    let (places, to_step) = newest(Place { now_s: 0.0, place_m: DVec3::ZERO });
+    let (told, felt) = newest(Felt { now_s: f64::NEG_INFINITY, felt: None });
+    let is_over = Arc::new(AtomicBool::new(false));
+    (Stepped { places, felt, is_over: is_over.clone() }, Stepper { places: to_step, felt: told, is_over })
+}
+
+/// What `make` makes, on the thread that will step it; `permit` is given back when that thread ends. If nobody waits for the
+/// answer any more, the thread ends as soon as the copy is made.
+pub(super) fn made_apart(
+    make: impl FnOnce() -> Result<Box<dyn Predictor>, String> + Send + 'static,
+    permit: OwnedSemaphorePermit,
+) -> io::Result<oneshot::Receiver<Result<Box<dyn Predictor>, String>>> {
+    let (tell, made) = oneshot::channel();
+    // Not a thread of the runtime's: the end of that would wait for it.
+    std::thread::Builder::new().name("copy".to_owned()).spawn(move || {
+        let _permit = permit;
+        match make() {
+            Ok(mut copy) => {
+                let (stepped, stepper) = ends();
+                if tell.send(Ok(Box::new(stepped) as Box<dyn Predictor>)).is_ok() {
+                    stepper.run(&mut *copy);
+                }
+            }
+            Err(why) => drop(tell.send(Err(why))),
+        }
+    })?;
+    Ok(made)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use std::sync::mpsc;
+
+    use palpate_touch::ContactState;
+    use tokio::sync::Semaphore;
+
+    use super::*;
+
+    fn pressed(place_m: DVec3) -> Predicted {
+        Predicted { force_n: -400.0 * place_m, contact_state: ContactState::Sticking }
+    }
+
+    /// A spring.
+    struct Spring;
+
+    impl Predictor for Spring {
+        fn feel(&mut self, _: f64, place_m: DVec3) -> Option<Predicted> {
+            Some(pressed(place_m))
+        }
+    }
+
+    #[test]
+    fn a_tick_gets_what_was_felt_at_the_last_one_and_nothing_old() {
+        let (mut stepped, mut stepper) = ends();
+        let place_m = |tick: u32| DVec3::new(0.0, 0.0, -1e-4 * f64::from(tick));
+        for tick in 0..50 {
+            let felt = stepped.feel(f64::from(tick) * 1e-3, place_m(tick));
+            assert_eq!(felt, tick.checked_sub(1).map(|last| pressed(place_m(last))));
+            assert!(stepper.step(&mut Spring) && !stepper.step(&mut Spring));
+        }
+        // The thread is in a step that does not end.
+        let felt: Vec<bool> =
+            (50..60).map(|tick| stepped.feel(f64::from(tick) * 1e-3, place_m(tick)).is_some()).collect();
+        assert_eq!(felt, [true, true, true, true, false, false, false, false, false, false]);
+        // It goes on with the newest place.
+        assert!(stepper.step(&mut Spring));
+        assert_eq!(stepped.feel(0.060, place_m(60)), Some(pressed(place_m(59))));
+        drop(stepped);
+        assert!(stepper.is_over());
+    }
+
+    /// A copy whose steps end when the test says so.
+    struct Endless(mpsc::Receiver<()>);
+
+    impl Predictor for Endless {
+        fn feel(&mut self, _: f64, place_m: DVec3) -> Option<Predicted> {
+            let _ = self.0.recv();
+            Some(pressed(place_m))
+        }
+    }
+
+    #[test]
+    fn a_step_that_does_not_end_holds_up_no_tick_and_keeps_its_place() {
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        runtime.block_on(async {
+            let places = Arc::new(Semaphore::new(1));
+            let (end, ended) = mpsc::channel();
+            let permit = places.clone().acquire_owned().await.unwrap();
+            let made = made_apart(move || Ok(Box::new(Endless(ended))), permit).unwrap();
+            let mut copy = made.await.unwrap().unwrap();
+            // This thread comes past although no step ends.
+            assert!((0..1000).all(|tick| copy.feel(f64::from(tick) * 1e-3, DVec3::ZERO).is_none()));
+            drop(copy);
+            drop(end);
+            // Once the step has ended there is room for another copy.
+            let permit = places.acquire_owned().await.unwrap();
+            let refused = made_apart(|| Err("too large".to_owned()), permit).unwrap().await.unwrap();
+            assert_eq!(refused.err().as_deref(), Some("too large"));
+        });
+    }
+}

@@ -1,0 +1,91 @@
+//! What `palpate serve` logs: names and messages of others can neither act on a terminal nor begin a line.
+
+use std::io::{Result, Write};
+
+use palpate::printable::{printable, printable_json};
+use tracing_subscriber::field::MakeExt;
+use tracing_subscriber::fmt::format::{FormatFields, debug_fn};
+
+/// How the fields of a record are written: all that is not the log's own, colours included.
+pub(super) fn fields() -> impl for<'w> FormatFields<'w> + 'static {
+    let write = |writer: &mut tracing_subscriber::fmt::format::Writer<'_>,
+                 field: &tracing::field::Field,
+                 value: &dyn std::fmt::Debug| {
+        let value = printable(format_args!("{value:?}"));
+        if field.name() == "message" { writer.write_str(&value) } else { write!(writer, "{field}={value}") }
+    };
+    debug_fn(write).delimited(" ")
+}
+
+/// Writes records that are JSON, each of which is one call and ends in a new line of its own.
+pub(super) struct JsonRecords<W>(pub(super) W);
+
+impl<W: Write> Write for JsonRecords<W> {
+    fn write(&mut self, record: &[u8]) -> Result<usize> {
+        self.0.write_all(printable_json(String::from_utf8_lossy(record)).as_bytes())?;
+        Ok(record.len())
+    }
+
+    fn flush(&mut self) -> Result<()> {
+        self.0.flush()
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use std::sync::mpsc::{Sender, channel};
+
+    use super::*;
+
+    struct Sent(Sender<Vec<u8>>);
+
+    impl Write for Sent {
+        fn write(&mut self, bytes: &[u8]) -> Result<usize> {
+            let _ = self.0.send(bytes.to_vec());
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> Result<()> {
+            Ok(())
+        }
+    }
+
+    /// What a server logs of a hostile name: in the message, as fields, and as a field of a span.
+    fn logged(json: bool, colours: bool) -> String {
+        let (sent, received) = channel();
+        let builder = tracing_subscriber::fmt().with_ansi(colours);
+        let name = "a\x1b[2J\r\n\u{9b}2J\u{202e}\u{2066}\u{85}z";
+        let log = || {
+            let _span = tracing::info_span!("call", path = %name).entered();
+            tracing::warn!(node = name, shown = %name, "{name}: is gone");
+        };
+        if json {
+            let builder = builder.json().with_writer(move || JsonRecords(Sent(sent.clone())));
+            tracing::subscriber::with_default(builder.finish(), log);
+        } else {
+            let builder = builder.fmt_fields(fields()).with_writer(move || Sent(sent.clone()));
+            tracing::subscriber::with_default(builder.finish(), log);
+        }
+        String::from_utf8(received.into_iter().flatten().collect()).unwrap()
+    }
+
+    #[test]
+    fn a_record_is_one_line_that_acts_on_no_terminal() {
+        let acts = |text: &str| text.chars().any(|c| c.is_control() || "\u{202e}\u{2066}".contains(c));
+        for json in [false, true] {
+            let text = logged(json, false);
+            let line = text.strip_suffix('\n').unwrap();
+            assert!(!acts(line) && line.contains("is gone"), "{text:?}");
+            assert_eq!(serde_json::from_str::<serde_json::Value>(line).is_ok(), json);
+        }
+        // The colours are those of the log: each is `ESC [ digits m`.
+        let text = logged(false, true);
+        let parts: Vec<&str> = text.strip_suffix('\n').unwrap().split('\x1b').collect();
+        assert!(parts.len() > 1 && parts.iter().all(|part| !acts(part)), "{text:?}");
+        for part in &parts[1..] {
+            let end = part.find(|c: char| c != '[' && !c.is_ascii_digit());
+            assert!(end.is_some_and(|end| part[end..].starts_with('m')), "{part:?}");
+        }
+    }
+}
