@@ -3,6 +3,12 @@
 //!
 //! A thousand bent files a reader in every run of the tests; `PALPATE_FUZZ_INPUTS` says how many instead.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+#![allow(
+    clippy::cast_possible_truncation,
+    clippy::cast_possible_wrap,
+    clippy::cast_precision_loss,
+    clippy::cast_sign_loss
+)]
 
 mod common;
 #[path = "../../tests/common/counting.rs"]

@@ -20,6 +20,9 @@ const LEVELS: u32 = 16;
 /// Fields of a message, at most.
 const FIELDS: usize = 64;
 
+/// The least that a text takes, bytes.
+const LEAST_TEXT: usize = 8;
+
 /// What a field is in memory.
 enum Kind {
     /// A number or an enumeration, of so many bytes in memory. On the wire it has so many, or, if 0, as many as it needs.
@@ -133,7 +136,7 @@ impl Walk {
                 (Kind::Number(memory, wire), Some(packed)) => (packed.len() / wire, *memory),
                 (Kind::Number(memory, _), None) => (1, *memory),
                 (Kind::Text, text) => {
-                    self.measure.memory += text.map_or(0, <[u8]>::len);
+                    self.measure.memory += text.map_or(0, |text| text.len().max(LEAST_TEXT));
                     (1, size_of::<Vec<u8>>())
                 }
                 (Kind::Message(of), message) => {

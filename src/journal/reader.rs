@@ -55,7 +55,7 @@ pub struct Batch {
 const INPUTS_ROOM: usize = MOST_INPUTS * size_of::<pb::Input>();
 
 /// What a message takes beside what it refers to, in the lists in which it waits, bytes.
-const MESSAGE_BYTES: usize = 512;
+const MESSAGE_BYTES: usize = 1024;
 
 impl Batch {
     /// What it takes when all of its messages are decoded, bytes.
@@ -74,8 +74,8 @@ impl Batch {
             };
             let memory =
                 memory.map_err(|refusal| self.refuse(format!("a message {}: {}", topic.name(), refusal.message)))?;
-            // As messages, and as the list of what acts in order.
-            sum = sum.saturating_add(2 * memory + MESSAGE_BYTES);
+            // As messages, and as the list of what acts in order, whose entries are larger.
+            sum = sum.saturating_add(3 * memory + MESSAGE_BYTES);
         }
         Ok(sum as u64)
     }

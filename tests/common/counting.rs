@@ -1,5 +1,5 @@
 //! The system's allocator, which counts what a thread has of it: a test binary that has this is its own.
-#![allow(unsafe_code, dead_code, unreachable_pub)]
+#![allow(unsafe_code, dead_code, unreachable_pub, clippy::cast_possible_wrap, clippy::cast_sign_loss)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
