@@ -151,7 +151,7 @@ async fn a_server_with_few_addresses_serves_its_first_requests() {
         .spawn()
         .unwrap();
     let server = Server::of(child);
-    let mut sessions = SessionServiceClient::connect(server.url.clone()).await.unwrap();
+    let mut sessions = server.sessions().await;
     let first = create(&mut sessions, 31, false).await.unwrap();
     for _ in 0..3 {
         create(&mut sessions, 101, false).await.unwrap();
