@@ -236,7 +236,7 @@ test-mutants: need-rust need-python
 # A million inputs a decoder; FUZZ_INPUTS=… for more.
 FUZZ_INPUTS ?= 1000000
 fuzz: need-rust
-	PALPATE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(CARGO) test --release --package palpate --package palpate-mesh --test fuzz -- --nocapture
+	PALPATE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(CARGO) test --release --package palpate --package palpate-mesh --test fuzz --test allocated -- --nocapture
 
 # The same functions under libFuzzer, which looks for inputs that reach further; needs a C++ compiler, and no other Rust.
 TARGET ?= request

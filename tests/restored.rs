@@ -5,6 +5,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
 
 mod common;
+#[path = "common/moved.rs"]
+mod moved;
 #[path = "common/random_scenes.rs"]
 mod random_scenes;
 
@@ -335,6 +337,14 @@ fn what_a_session_has_reached_its_snapshot_restores_with_the_same_bits() {
             if again.save().to_bytes() != bytes {
                 refused.entry("OTHER BYTES".into()).or_default().push(format!("{about}, step {at}"));
                 continue;
+            }
+            // Another server takes it in, as it takes a session that is handed over.
+            match moved::moved(&model, &again, &limits()) {
+                Ok(there) if there.save().to_bytes() == bytes => {}
+                Ok(_) => refused.entry("OTHER BYTES THERE".into()).or_default().push(format!("{about}, step {at}")),
+                Err(refusal) => {
+                    refused.entry(format!("there: {refusal}")).or_default().push(format!("{about}, step {at}"));
+                }
             }
             for now in at..(at + COMPARED_STEPS as usize).min(course.len()) {
                 step(&mut again, &first, &inputs[now]);

@@ -24,6 +24,6 @@ pub mod write;
 pub use mesh::{Group, TriangleMesh};
 pub use prepare::{FileMesh, Prepared, prepare};
 pub use problem::{Element, MeshError, Problem};
-pub use read::{ReadLimits, ReadMesh, read};
+pub use read::{ReadLimits, ReadMesh, read, read_paid};
 pub use report::{Report, report};
 pub use unit::Unit;

@@ -1,11 +1,12 @@
-//! Decodes messages, requests with a bound on their fields: the fields are counted before decoding. A megabyte of empty
-//! parts would otherwise occupy a network thread for a tenth of a second and take many times its size in memory.
+//! Decodes messages that come, requests and answers, within bounds: they are measured before they are decoded (`measure`). A
+//! megabyte of empty parts would otherwise occupy a network thread for a tenth of a second and take many times its size in memory.
 
 use prost::{Message, Name};
 use tonic::Status;
 use tonic::codec::{BufferSettings, Codec, DecodeBuf, Decoder};
 use tonic_prost::ProstCodec;
 
+use crate::measure::{MULTIPLE, ROOM, Shape};
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Largest number of fields at a request's top level: a batch of as many commands as may wait, and some more.
@@ -14,13 +15,7 @@ const MOST_FIELDS: usize = 4096 + 256;
 /// Largest number of fields of all levels of a request together: such a batch of poses, or 20,000 fixed points.
 const MOST_FIELDS_IN_ALL: usize = 1 << 16;
 
-/// Levels that are counted: more than any request has.
-const LEVELS: u32 = 16;
-
-/// A request without levels, whose bytes are any: they may look like a message of many fields.
-const OF_ONE_LEVEL: &str = "UploadMeshRequest";
-
-/// The protobuf codec with a bound on requests. Answers have no bound: a client trusts the server that it has chosen.
+/// The protobuf codec with a bound on the memory of what comes, and on the fields of requests.
 pub struct BoundedCodec<T, U>(ProstCodec<T, U>);
 
 impl<T, U> Default for BoundedCodec<T, U> {
@@ -44,16 +39,15 @@ where
     }
 
     fn decoder(&mut self) -> Self::Decoder {
-        let levels = if U::NAME == OF_ONE_LEVEL { 0 } else { LEVELS };
-        BoundedDecoder { inner: self.0.decoder(), levels: U::NAME.ends_with("Request").then_some(levels) }
+        BoundedDecoder { inner: self.0.decoder(), shape: Shape::of::<U>(), is_request: U::NAME.ends_with("Request") }
     }
 }
 
 /// The decoder of [`BoundedCodec`].
 pub struct BoundedDecoder<D> {
     inner: D,
-    /// Levels whose fields are counted; `None` if it decodes no requests.
-    levels: Option<u32>,
+    shape: Option<&'static Shape>,
+    is_request: bool,
 }
 
 impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
@@ -62,10 +56,15 @@ impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
 
     fn decode(&mut self, buffer: &mut DecodeBuf<'_>) -> std::result::Result<Option<D::Item>, Status> {
         use bytes::Buf;
-        let Some(levels) = self.levels else { return self.inner.decode(buffer) };
         // The buffer holds the message in one chunk.
-        check(buffer.chunk(), levels)?;
-        self.inner.decode(buffer).map_err(|status| {
+        if let Some(shape) = self.shape {
+            check(buffer.chunk(), shape, self.is_request)?;
+        }
+        let decoded = self.inner.decode(buffer);
+        if !self.is_request {
+            return decoded;
+        }
+        decoded.map_err(|status| {
             let message = format!("the message can't be decoded: {}", status.message());
             Refusal::new(Reason::Unreadable, "", message).into()
         })
@@ -76,59 +75,31 @@ impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
     }
 }
 
-/// Refuses a message with more fields than any valid request has.
-fn check(message: &[u8], levels: u32) -> Result<()> {
-    let too_many = |what: &str, most: usize| {
-        Refusal::new(Reason::TooLarge, "", format!("the message has more than {most} {what}: send it in parts"))
-    };
-    let mut left = MOST_FIELDS_IN_ALL;
-    match count(message, levels, &mut left) {
-        _ if left == 0 => Err(too_many("fields in all", MOST_FIELDS_IN_ALL)),
-        Some(own) if own > MOST_FIELDS => Err(too_many("fields or entries of its own", MOST_FIELDS)),
-        // The decoder refuses malformed messages.
-        _ => Ok(()),
-    }
+/// Whether the codec decodes the bytes of a message of this type: what it refuses before.
+///
+/// # Errors
+/// Refuses a message that takes more memory than any valid one, and a request with more fields.
+pub fn accepts<M: Name>(message: &[u8]) -> Result<()> {
+    Shape::of::<M>().map_or(Ok(()), |shape| check(message, shape, M::NAME.ends_with("Request")))
 }
 
-/// Counts the fields of a message; subtracts those of all levels from `left` until it is 0. Returns `None` if the bytes are
-/// not a message. A text or byte string that could be a message counts as one.
-fn count(mut message: &[u8], levels: u32, left: &mut usize) -> Option<usize> {
-    let mut fields = 0;
-    while !message.is_empty() && *left > 0 {
-        let tag = varint(&mut message)?;
-        fields += 1;
-        *left -= 1;
-        let length = match tag & 7 {
-            0 => varint(&mut message).map(|_| 0)?,
-            1 => 8,
-            2 => usize::try_from(varint(&mut message)?).ok()?,
-            5 => 4,
-            _ => return None,
-        };
-        let (value, rest) = message.split_at_checked(length)?;
-        message = rest;
-        if tag & 7 == 2 && levels > 0 {
-            let before = *left;
-            if count(value, levels - 1, left).is_none() {
-                *left = before;
-            }
+/// Refuses a message that takes more memory than any valid one, and a request with more fields.
+fn check(message: &[u8], shape: &Shape, is_request: bool) -> Result<()> {
+    let most_memory = message.len().saturating_mul(MULTIPLE).saturating_add(ROOM);
+    let most_fields = if is_request { [MOST_FIELDS, MOST_FIELDS_IN_ALL] } else { [usize::MAX; 2] };
+    let measure = shape.measure(message, most_fields[1], most_memory);
+    for (has, most, what) in [
+        (measure.fields, most_fields[1], "fields in all"),
+        (measure.own_fields, most_fields[0], "fields or entries of its own"),
+        (measure.memory, most_memory, "bytes in memory"),
+    ] {
+        if has > most {
+            let advice = if is_request { ": send it in parts" } else { "" };
+            return Err(Refusal::new(Reason::TooLarge, "", format!("the message has more than {most} {what}{advice}")));
         }
     }
-    Some(fields)
-}
-
-/// Takes a varint from the front of `bytes`.
-fn varint(bytes: &mut &[u8]) -> Option<u64> {
-    let mut value = 0;
-    for shift in (0..64).step_by(7) {
-        let (first, rest) = bytes.split_first()?;
-        *bytes = rest;
-        value |= u64::from(first & 0x7f) << shift;
-        if first & 0x80 == 0 {
-            return Some(value);
-        }
-    }
-    None
+    // The decoder refuses malformed messages.
+    Ok(())
 }
 
 #[cfg(test)]
@@ -139,8 +110,8 @@ mod tests {
     use crate::geometry::vector;
     use crate::pb;
 
-    fn checked(message: &impl Message) -> Result<()> {
-        check(&message.encode_to_vec(), LEVELS)
+    fn checked<M: Message + Name>(message: &M) -> Result<()> {
+        accepts::<M>(&message.encode_to_vec())
     }
 
     #[test]
@@ -175,16 +146,32 @@ mod tests {
 
     #[test]
     fn the_bytes_of_a_file_are_no_fields() {
-        // Zeros would be fields, had they levels: half a million.
-        let request = pb::UploadMeshRequest { part: vec![0; 1 << 20], ..Default::default() };
-        check(&request.encode_to_vec(), 0).unwrap();
-        assert!(check(&request.encode_to_vec(), LEVELS).is_err());
+        // Zeros would be fields, half a million, and the corners of `vt 0 0` are such.
+        let part = vec![0; 1 << 20];
+        checked(&pb::UploadMeshRequest { part: part.clone(), ..Default::default() }).unwrap();
+        checked(&pb::UploadJournalRequest { part: part.clone(), ..Default::default() }).unwrap();
+        for message in [
+            pb::take_session_request::Message::Part(part.clone()),
+            pb::take_session_request::Message::Waiting(part.clone()),
+        ] {
+            checked(&pb::TakeSessionRequest { message: Some(message) }).unwrap();
+        }
+        let parts = pb::MirrorParts { parts: vec![pb::MirrorPart { bytes: part, ..Default::default() }] };
+        checked(&pb::MirrorRequest { message: Some(pb::mirror_request::Message::Parts(parts)) }).unwrap();
+    }
+
+    #[test]
+    fn answers_have_a_bound_too() {
+        let answer =
+            |sessions| pb::ListSessionsResponse { sessions: vec![Default::default(); sessions], ..Default::default() };
+        checked(&answer(1000)).unwrap();
+        assert_eq!(checked(&answer(100_000)).unwrap_err().reason, Reason::TooLarge);
     }
 
     #[test]
     fn malformed_messages_are_left_to_the_decoder() {
         for bytes in [&[0xff; 100][..], &[0x0a, 0xff, 0xff, 0xff, 0x7f], &[0x0b], &[0x80; 20], &[]] {
-            check(bytes, LEVELS).unwrap();
+            accepts::<pb::CreateSessionRequest>(bytes).unwrap();
         }
     }
 }

@@ -7,7 +7,7 @@
 //! - `agones` (feature `agones`): the calls of the SDK of Agones that servers of a fleet use, from `agones/*.proto`.
 //! - [`refusal`]: the reasons for which inputs are refused, and [`error`]: refusals as gRPC statuses.
 //! - `etcd` (feature `etcd`): messages and clients of etcd, from `etcd/*.proto`, which have what a fleet of servers uses.
-//! - [`codec`]: decodes messages, requests within bounds.
+//! - [`measure`]: how much memory a message takes, before it is decoded; [`codec`]: decodes what comes within that bound.
 //! - `datagram` (feature `datagrams`): what both ends of datagrams agree on.
 //! - [`printable`]: text of others on a terminal and in a log.
 //! - [`geometry`] and [`touch`]: conversion of vectors, and of the types of the crate `palpate-touch`.
@@ -17,6 +17,7 @@ pub mod codec;
 pub mod datagram;
 pub mod error;
 pub mod geometry;
+pub mod measure;
 pub mod printable;
 pub mod refusal;
 pub mod touch;

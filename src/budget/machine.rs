@@ -57,6 +57,24 @@ pub fn give_back_to_the_system() {
     }
 }
 
+/// Has all threads share one heap of the allocator, if the system limits the addresses of this process (`ulimit -v`): each thread
+/// would otherwise reserve 64 MiB or more of them for a heap of its own, and the first request would end the process. To be called
+/// before threads are started.
+#[allow(unsafe_code)]
+pub fn save_addresses() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    {
+        // SAFETY: it takes two numbers, and may be called by any thread at any time (mallopt(3)).
+        unsafe extern "C" {
+            safe fn mallopt(parameter: std::ffi::c_int, value: std::ffi::c_int) -> std::ffi::c_int;
+        }
+        const M_ARENA_MAX: std::ffi::c_int = -8;
+        if rustix::process::getrlimit(rustix::process::Resource::As).current.is_some() {
+            mallopt(M_ARENA_MAX, 1);
+        }
+    }
+}
+
 /// Bytes as people write them: `512MiB`, `2GiB`, `1048576`.
 ///
 /// # Errors

@@ -13,7 +13,7 @@ mod turns;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, Weak};
 
-pub use machine::{give_back_to_the_system, half_of_the_machine, parse_bytes};
+pub use machine::{give_back_to_the_system, half_of_the_machine, parse_bytes, save_addresses};
 use time::RecentTime;
 pub use time::Work;
 pub(crate) use turns::Turns;

@@ -11,11 +11,12 @@ use prost::Message;
 use super::message::{self, Tips, fill_tips, from_command, from_tissue};
 use super::reader::{Reader, Survey};
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result};
+use crate::refusal::Result;
 use crate::session::input::Input;
 use crate::session::rules::Rules;
 use crate::sheet::Model;
 use palpate_proto::journal as pb;
+use palpate_proto::measure;
 
 /// Reads the inputs of a journal.
 pub struct Inputs<R> {
@@ -98,8 +99,7 @@ pub fn encoded(inputs: &[(u64, Input)]) -> Vec<Vec<u8>> {
 pub fn decoded(bytes: &[u8], first: &Arc<Model>, given: &Limits) -> Result<Vec<(u64, Input)>> {
     let limits = message::limits(given);
     let rules = Rules::new(&first.scene, &limits);
-    let unreadable = |error: prost::DecodeError| Refusal::new(Reason::Unreadable, "waiting", error.to_string());
-    let mut messages = pb::Inputs::decode(bytes).map_err(unreadable)?.inputs;
+    let mut messages = measure::decoded::<pb::Inputs>(bytes).map_err(|refusal| refusal.within("waiting"))?.inputs;
     fill_tips(&mut messages)?;
     let read = |message: &pb::Input| Ok(input(message, &rules, first, &limits)?.map(|input| (message.step, input)));
     messages.iter().map(read).filter_map(Result::transpose).collect()

@@ -6,6 +6,8 @@
 //!
 //! A chunk's checksum finds every single bit that is other than it was written. What is outside chunks (records' lengths, indexes,
 //! the summary) decides nothing but where chunks are, and their numbers have no gap.
+//!
+//! What a batch takes in memory is known, and taken from the account of who pays, before its messages are decoded.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -13,6 +15,7 @@ use std::ops::Range;
 use std::path::Path;
 
 use palpate_proto::journal as pb;
+use palpate_proto::measure::{self, memory_of, varint};
 use prost::Message;
 
 use super::format::{MOST_BYTES, MOST_INPUTS, Topic};
@@ -20,6 +23,8 @@ use super::message::fill_tips;
 use super::records::{
     CHANNEL, CHUNK, CHUNK_HEAD, DATA_END, HEAD, HEADER, MAGIC, MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX, SCHEMA, number,
 };
+use crate::budget::Taken;
+use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// A batch, whose messages are decoded when they are asked for.
@@ -46,7 +51,35 @@ pub struct Batch {
     places: Vec<(u16, u64, u64)>,
 }
 
+/// What the inputs of a batch may take in memory whatever their length, bytes: there are no more of them than [`MOST_INPUTS`].
+const INPUTS_ROOM: usize = MOST_INPUTS * size_of::<pb::Input>();
+
+/// What a message takes beside what it refers to, in the lists in which it waits, bytes.
+const MESSAGE_BYTES: usize = 1024;
+
 impl Batch {
+    /// What it takes when all of its messages are decoded, bytes.
+    fn memory(&self) -> Result<u64> {
+        let mut sum = self.data.len() + size_of_val(self.places.as_slice());
+        for (topic, range) in &self.messages {
+            let bytes = &self.data[range.clone()];
+            let memory = match topic {
+                Topic::Header => memory_of::<pb::Header>(bytes, measure::ROOM),
+                Topic::Inputs => memory_of::<pb::Inputs>(bytes, INPUTS_ROOM),
+                Topic::Hashes => memory_of::<pb::Hash>(bytes, measure::ROOM),
+                Topic::Snapshots => memory_of::<pb::Snapshot>(bytes, measure::ROOM),
+                Topic::Felt => memory_of::<pb::Felt>(bytes, measure::ROOM),
+                Topic::Waiting => memory_of::<pb::Waiting>(bytes, measure::ROOM),
+                Topic::End => memory_of::<pb::End>(bytes, measure::ROOM),
+            };
+            let memory =
+                memory.map_err(|refusal| self.refuse(format!("a message {}: {}", topic.name(), refusal.message)))?;
+            // As messages, and as the list of what acts in order, whose entries are larger.
+            sum = sum.saturating_add(3 * memory + MESSAGE_BYTES);
+        }
+        Ok(sum as u64)
+    }
+
     /// Each message of a topic, decoded.
     fn all<M: Message + Default>(&self, topic: Topic) -> impl Iterator<Item = Result<M>> + '_ {
         let of_topic = self.messages.iter().filter(move |message| message.0 == topic);
@@ -182,6 +215,9 @@ pub struct Survey {
     pub sealed: bool,
 }
 
+/// Changes of the tissue that wait, at most: more than any session lets wait.
+const MOST_WAITING: usize = 4096;
+
 /// An index is read over, not sought over, if it has no more bytes.
 const SHORT: usize = 4096;
 
@@ -215,6 +251,11 @@ pub struct Reader<R> {
     stands: u64,
     /// The newest head of a record that was read, and where it is.
     peeked: Option<(u64, (u8, u64))>,
+    /// What is taken from who pays for its memory. `None`: it is the user's own.
+    paid: Option<Taken>,
+    /// What stays in memory beside the batch that is read, and what that takes, bytes.
+    kept_bytes: u64,
+    batch_bytes: u64,
 }
 
 impl Reader<BufReader<File>> {
@@ -253,7 +294,15 @@ impl<R: Read + Seek> Reader<R> {
     /// # Errors
     /// Refuses what is no journal, and one without a whole batch ([`Reason::Missing`]): then its session was never told to be
     /// durable.
-    pub fn new(place: &str, mut source: R) -> Result<Self> {
+    pub fn new(place: &str, source: R) -> Result<Self> {
+        Reader::paid(place, source, None)
+    }
+
+    /// The same, for somebody who pays for its memory: `paid` grows by it.
+    ///
+    /// # Errors
+    /// As for [`Reader::new`]; refuses what is beyond the part of who pays.
+    pub fn paid(place: &str, mut source: R, paid: Option<Taken>) -> Result<Self> {
         let length = source.seek(SeekFrom::End(0)).map_err(|e| unreadable(place, &e.to_string()))?;
         let mut reader = Reader {
             place: place.to_owned(),
@@ -270,6 +319,9 @@ impl<R: Read + Seek> Reader<R> {
             ended: false,
             stands: length,
             peeked: None,
+            paid,
+            kept_bytes: 0,
+            batch_bytes: 0,
         };
         let mut magic = [0; 8];
         let head = if length >= 17 { reader.read_at(0, &mut magic).and_then(|()| reader.head(8))? } else { (0, 0) };
@@ -286,6 +338,7 @@ impl<R: Read + Seek> Reader<R> {
             return Err(Refusal { place: Some(place.to_owned()), ..Refusal::new(Reason::Missing, "", message) });
         };
         reader.header = first.header()?;
+        reader.kept_bytes = first.memory()?;
         (reader.at, reader.batch, reader.input, reader.torn_bytes, reader.ended) = (begin, 0, 0, 0, false);
         Ok(reader)
     }
@@ -371,7 +424,11 @@ impl<R: Read + Seek> Reader<R> {
             let first = if survey.batches == 1 { batch.unix_ns } else { survey.unix_ns[0] };
             survey.unix_ns = [first, batch.unix_ns];
             survey.end = batch.end()?.or(survey.end);
-            survey.waiting = batch.waiting()?.map_or(survey.waiting, |waiting| waiting.inputs);
+            if let Some(mut waiting) = batch.waiting()? {
+                waiting.inputs.truncate(MOST_WAITING);
+                waiting.inputs.shrink_to_fit();
+                survey.waiting = waiting.inputs;
+            }
             survey.whole_bytes = self.at;
             progress(self.at);
         }
@@ -397,6 +454,7 @@ impl<R: Read + Seek> Reader<R> {
                     self.read_at(self.at + HEAD, &mut data)?;
                     match self.batch(data) {
                         Ok(batch) => {
+                            self.pay(batch.memory()?)?;
                             self.at += HEAD + size;
                             self.batch += 1;
                             self.input = batch.first_input + batch.input_count;
@@ -414,12 +472,50 @@ impl<R: Read + Seek> Reader<R> {
     }
 
     /// Memory for so many bytes of the file, which has them.
-    fn buffer(&self, size: u64) -> Result<Vec<u8>> {
-        let mut data: Vec<u8> = Vec::new();
-        let size = usize::try_from(size).ok().filter(|size| data.try_reserve_exact(*size).is_ok());
-        let size = size.ok_or_else(|| self.refuse("there is no memory for a batch of it"))?;
-        data.resize(size, 0);
-        Ok(data)
+    fn buffer(&mut self, size: u64) -> Result<Vec<u8>> {
+        self.pay(size)?;
+        let length = usize::try_from(size).unwrap_or(usize::MAX);
+        memory::attempt("", || Ok(memory::zeroed(length, "a batch of it")))
+            .map_err(|refusal| Refusal { place: Some(self.place.clone()), ..refusal })
+    }
+
+    /// Takes what is needed at once beside what is kept, bytes. What was taken for the batch before is used for this one.
+    fn pay(&mut self, bytes: u64) -> Result<()> {
+        memory::check(bytes, "a part of a journal")?;
+        self.batch_bytes = bytes;
+        self.take(0)
+    }
+
+    /// Takes what is made of the batch that was read, and lasts no longer than it, bytes.
+    ///
+    /// # Errors
+    /// Refuses what is beyond the part of who pays.
+    pub(super) fn pay_beside(&mut self, bytes: u64) -> Result<()> {
+        memory::check(bytes, "a part of a journal")?;
+        self.take(bytes)
+    }
+
+    fn take(&mut self, beside: u64) -> Result<()> {
+        let sum = self.kept_bytes.saturating_add(self.batch_bytes).saturating_add(beside);
+        self.paid.as_mut().map_or(Ok(()), |paid| paid.grow_to(sum, ""))
+    }
+
+    /// Takes what is made of the journal and stays as long as this reader, bytes: a tissue and its session.
+    ///
+    /// # Errors
+    /// Refuses what is beyond the part of who pays.
+    pub(super) fn keep(&mut self, bytes: u64) -> Result<()> {
+        self.pay_beside(bytes)?;
+        self.kept_bytes = self.kept_bytes.saturating_add(bytes);
+        Ok(())
+    }
+
+    /// What was made of the journal is paid for by others from now on.
+    pub(super) fn let_go(&mut self, bytes: u64) {
+        self.kept_bytes = self.kept_bytes.saturating_sub(bytes);
+        if let Some(paid) = &mut self.paid {
+            paid.shrink_to(self.kept_bytes);
+        }
     }
 
     fn read_at(&mut self, at: u64, into: &mut [u8]) -> Result<()> {
@@ -652,20 +748,6 @@ impl InputsHead {
         }
         (head.input_count <= MOST_INPUTS as u64).then_some(head)
     }
-}
-
-/// Takes a number as protobuf writes it.
-fn varint(bytes: &mut &[u8]) -> Option<u64> {
-    let mut value = 0_u64;
-    for shift in (0..64).step_by(7) {
-        let (byte, rest) = bytes.split_first()?;
-        *bytes = rest;
-        value |= u64::from(byte & 0x7F) << shift;
-        if *byte < 0x80 {
-            return Some(value);
-        }
-    }
-    None
 }
 
 /// What is in a chunk.

@@ -18,7 +18,7 @@ use crate::session::command::Due;
 use crate::session::input::Input;
 use crate::session::prediction::{TICK_POINT_SUBSTEPS, TissueCopy};
 use crate::session::rules::Rules;
-use crate::session::saved::Saved;
+use crate::session::saved::{self, Saved};
 use crate::sheet::Model;
 use crate::sheet::choice::given_up;
 
@@ -157,6 +157,7 @@ impl<R: Read + Seek> Replay<R> {
         let known = known.filter(|(header, _)| is_same_tissue(header, reader.header()));
         let first =
             known.map_or_else(|| message::model(reader.header(), &limits).map_err(placed), |known| Ok(known.1))?;
+        reader.keep(2 * first.session_bytes()).map_err(placed)?;
         let rules = Rules::new(&first.scene, &limits);
         let mut items = VecDeque::new();
         let begin_step = reader.header().begin_step;
@@ -173,6 +174,7 @@ impl<R: Read + Seek> Replay<R> {
                 let (batch, snapshot, after) = snapshot(&mut reader, at)?;
                 items = after;
                 (running, until) = (snapshot.running, snapshot.until_step);
+                reader.pay_beside(saved::memory_of(&snapshot.saved)).map_err(|refusal| batch.placed(refusal))?;
                 let session = restored(&snapshot, &first, &limits).map_err(|refusal| batch.placed(refusal))?;
                 begins_with = Some(snapshot.hash);
                 session
@@ -343,6 +345,7 @@ impl<R: Read + Seek> Replay<R> {
                 self.snapshots += 1;
                 self.compare(&snapshot.hash, "state")?;
                 if self.difference.is_none() {
+                    self.reader.pay_beside(saved::memory_of(&snapshot.saved))?;
                     let restored = restored(snapshot, &self.first, &self.limits);
                     let restored = restored.map_err(|refusal| self.reader.refuse(&refusal.to_string()))?;
                     self.compare(&message::hash(restored.tissue().state_hash()), "snapshot")?;
@@ -398,7 +401,10 @@ impl<R: Read + Seek> Replay<R> {
         self.advance(step, &mut |_| if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) })?;
         match self.difference {
             Some(difference) => Err(self.reader.refuse(&difference.to_string())),
-            None => Ok((self.session, self.first, self.reader)),
+            None => {
+                self.reader.let_go(2 * self.first.session_bytes());
+                Ok((self.session, self.first, self.reader))
+            }
         }
     }
 

@@ -186,6 +186,7 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let filter = tracing_subscriber::EnvFilter::try_new(&config.log)
         .map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
     let detailed = filter.max_level_hint().is_none_or(|level| level >= tracing::Level::DEBUG);
+    budget::save_addresses();
     // Logging never blocks: lines that do not fit into the queue are dropped.
     let (writer, _flush) = tracing_appender::non_blocking(std::io::stderr());
     let subscriber = tracing_subscriber::fmt()

@@ -22,8 +22,8 @@ use crate::wire;
 /// Triangles for each vertex that a mesh may have: a closed surface has two.
 const TRIANGLES_PER_VERTEX: usize = 4;
 
-/// Memory for reading and checking a mesh, in bytes of its file: a vertex or triangle takes at least a dozen bytes there.
-const READING: u64 = 12;
+/// Memory of mending, preparing and reporting a mesh, for each vertex and triangle, bytes.
+const PREPARING: u64 = 500;
 
 /// Groups whose names a report tells.
 const GROUPS_TOLD: usize = 1000;
@@ -139,9 +139,19 @@ impl Reading {
         let go_on = || if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) };
         let limits = &self.limits;
         let bytes = std::mem::take(&mut self.received.bytes);
-        self.received.charge(bytes.len() as u64 * READING)?;
-        let read = palpate_mesh::read(&self.name, &bytes, unit, &|_| None, limits).map_err(refuse)?;
+        // The file is kept while it is read, in a vector that has grown.
+        let kept = 2 * bytes.len() as u64;
+        let mut paid = Ok(());
+        let mut pay = |reading: u64| {
+            paid = self.received.charge(kept.saturating_add(reading));
+            paid.is_ok()
+        };
+        let read = palpate_mesh::read_paid(&self.name, &bytes, unit, &|_| None, limits, &mut pay);
+        paid?;
+        let read = read.map_err(refuse)?;
         drop(bytes);
+        let elements = (read.mesh.vertices_m.len() + read.mesh.triangles.len()) as u64;
+        self.received.charge(bytes_of(&read.mesh) * 2 + PREPARING * elements)?;
         go_on()?;
         let (mut mesh, mut problems) = (read.mesh, read.notes.into_iter().map(note).collect::<Vec<_>>());
         if mends {

@@ -31,7 +31,8 @@ use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::record::Recovery;
 use crate::sheet::saved::{
-    Checks, PlainTissue, SNAPSHOT, SavedPoke, SavedTip, SavedTissue, TissueParts, TissueState, ensure, unsound,
+    Checks, PlainTissue, SNAPSHOT, SavedPoke, SavedTip, SavedTissue, TissueParts, TissueState, ensure, tool_above,
+    unsound,
 };
 use crate::sheet::{self, Model, Tissue};
 use palpate_touch::path::{Path, PathState};
@@ -41,6 +42,19 @@ pub const MAGIC: [u8; 8] = *b"PALPSNAP";
 
 /// The version of the format, of the arithmetic too: what reads another would go on with other bits.
 pub const VERSION: u32 = 2;
+
+/// Memory of the parts for each of their bytes: the least that an entry of a list has there is three bytes, which take 24 in a
+/// vector that may have room for twice as many.
+const PARTS_MULTIPLE: u64 = 32;
+
+/// What a reader of lists reserves for those that it has begun, bytes.
+const ROOM: u64 = 4 << 20;
+
+/// Memory that a snapshot takes at most when it is read, bytes, by what its header says.
+pub fn memory_of(bytes: &[u8]) -> u64 {
+    let parts = bytes.get(12..20).map_or(0, |length| u64::from_le_bytes(array(length))).min(bytes.len() as u64);
+    bytes.len() as u64 + parts.saturating_mul(PARTS_MULTIPLE) + ROOM.min(parts << 10)
+}
 
 /// The bytes before the parts: magic, version, length, checksum.
 const HEADER: usize = 8 + 4 + 8 + 16;
@@ -88,11 +102,11 @@ struct SavedTool {
     client_time_ns: u64,
     arrival_ns: u64,
     control_point: Option<u64>,
-    around: Option<SavedPoke>,
+    around: Option<Box<SavedPoke>>,
     expires_at: Option<u64>,
     late: bool,
     expired: bool,
-    posed: Option<SavedPosed>,
+    posed: Option<Box<SavedPosed>>,
     paused_until: Option<u64>,
 }
 
@@ -262,6 +276,9 @@ impl Saved {
             Ok((parts, [])) => parts,
             _ => return Err(unsound("parts that can't be read")),
         };
+        if let Some(last) = parts.session.tools.len().checked_sub(1).filter(|last| *last >= limits.tools as usize) {
+            return Err(tool_above(last as u64, limits));
+        }
         if parts.tissue.points > limits.points as u64 {
             let message = format!("has {} points, above the limit of {}", parts.tissue.points, limits.points);
             return refuse(Reason::TooLarge, &message);
@@ -308,17 +325,19 @@ pub fn seal(bytes: &mut [u8]) {
 
 impl SavedTool {
     fn of(tool: &Tool) -> Self {
-        let posed = tool.posed.as_ref().map(|posed| SavedPosed {
-            tip: SavedTip::of(&posed.tip),
-            path: SavedPath::of(posed.path.state()),
-            client_time_s: posed.client_time_s,
+        let posed = tool.posed.as_ref().map(|posed| {
+            Box::new(SavedPosed {
+                tip: SavedTip::of(&posed.tip),
+                path: SavedPath::of(posed.path.state()),
+                client_time_s: posed.client_time_s,
+            })
         });
         SavedTool {
             acknowledged_sequence: tool.acknowledged_sequence,
             client_time_ns: tool.client_time_ns,
             arrival_ns: tool.arrival_ns,
             control_point: tool.control_point.map(|point| point.index() as u64),
-            around: tool.around.as_ref().map(SavedPoke::of),
+            around: tool.around.as_ref().map(SavedPoke::of).map(Box::new),
             expires_at: tool.expires_at,
             late: tool.late,
             expired: tool.expired,

@@ -494,9 +494,9 @@ impl<T: Real> Applied<T> {
     /// As plain data, without tables.
     pub(super) fn saved(&self) -> SavedForces {
         let slot = |Slot { push, before, compared }: &Slot| SavedSlot {
-            push: push.as_ref().map(Push::saved),
-            before: before.as_ref().map(SavedPoke::of),
-            compared: compared.as_ref().map(SavedPoke::of),
+            push: push.as_ref().map(Push::saved).map(Box::new),
+            before: before.as_ref().map(SavedPoke::of).map(Box::new),
+            compared: compared.as_ref().map(SavedPoke::of).map(Box::new),
         };
         let term = |term: &Term<T>| SavedTerm {
             poke: SavedPoke::of(&term.wanted.poke),
@@ -528,7 +528,7 @@ impl<T: Real> Applied<T> {
             let acts = |force_n: &&DVec3| **force_n != DVec3::ZERO;
             ensure(forces_n.iter().filter(acts).all(in_terms), "a force that is not finite")
         };
-        let poke = |poke: &Option<SavedPoke>| poke.as_ref().map(|poke| poke.restored(checks)).transpose();
+        let poke = |poke: &Option<Box<SavedPoke>>| poke.as_ref().map(|poke| poke.restored(checks)).transpose();
         let slot = |slot: &SavedSlot| {
             let push = slot.push.as_ref().map(|push| Push::restored(push, checks)).transpose()?;
             let (before, compared) = (poke(&slot.before)?, poke(&slot.compared)?);

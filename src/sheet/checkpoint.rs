@@ -72,7 +72,7 @@ pub(super) enum Input {
 impl Input {
     pub(super) fn saved(&self) -> SavedInput {
         match self {
-            Input::Push(push) => SavedInput::Push(push.as_ref().map(Push::saved)),
+            Input::Push(push) => SavedInput::Push(push.as_ref().map(Push::saved).map(Box::new)),
             Input::Grasp(index, grasp) => SavedInput::Grasp(*index as u64, grasp.saved()),
             Input::Pose(place_m, tip) => SavedInput::Pose((*place_m).into(), SavedTip::of(tip)),
         }

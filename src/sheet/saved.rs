@@ -8,6 +8,9 @@
 //! of a sweep) are made again from what they were made of. The large part, the values at the points, is apart from these
 //! types, as little-endian bytes: only tiles that have ever moved have any, in the order of memory. That order is the same on
 //! every machine; the padding of rows is left out.
+//!
+//! **What lists take**: who sends a snapshot says how long its lists are. What an entry may leave out is a box in it, so that no entry
+//! takes many times its bytes in memory (`session::saved::memory_of`).
 
 use std::fmt;
 use std::sync::Arc;
@@ -184,7 +187,7 @@ pub(super) struct SavedTile {
 /// An input of a tool.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) enum SavedInput {
-    Push(Option<SavedPush>),
+    Push(Option<Box<SavedPush>>),
     Grasp(u64, SavedGrasp),
     Pose(Vector, SavedTip),
 }
@@ -200,9 +203,9 @@ pub(super) struct SavedForces {
 /// The force of a tool.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct SavedSlot {
-    pub(super) push: Option<SavedPush>,
-    pub(super) before: Option<SavedPoke>,
-    pub(super) compared: Option<SavedPoke>,
+    pub(super) push: Option<Box<SavedPush>>,
+    pub(super) before: Option<Box<SavedPoke>>,
+    pub(super) compared: Option<Box<SavedPoke>>,
 }
 
 /// Forces of equal falloff.
@@ -342,6 +345,12 @@ pub fn unsound(what: &str) -> Refusal {
     Refusal::new(Reason::OutOfRange, SNAPSHOT, message)
 }
 
+/// A refusal of a tool above the limit.
+pub fn tool_above(tool: u64, limits: &Limits) -> Refusal {
+    let message = format!("has tool {tool}, but tools are numbered below {} (limits.tools)", limits.tools);
+    Refusal::new(Reason::TooLarge, SNAPSHOT, message)
+}
+
 /// Refuses unless it holds.
 ///
 /// # Errors
@@ -394,8 +403,7 @@ impl Checks<'_> {
         if tool < u64::from(self.limits.tools) {
             return Ok(tool as usize);
         }
-        let message = format!("has tool {tool}, but tools are numbered below {} (limits.tools)", self.limits.tools);
-        Err(Refusal::new(Reason::TooLarge, SNAPSHOT, message))
+        Err(tool_above(tool, self.limits))
     }
 
     /// A point.

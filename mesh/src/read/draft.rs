@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use glam::DVec3;
 
 use super::polygon::{Split, triangles};
+use super::purse::Purse;
 use super::volume::{Cell, Volume};
 use super::{ReadLimits, ReadMesh};
 use crate::topology::Topology;
@@ -19,9 +20,16 @@ const NONE: u32 = u32::MAX;
 /// Comparisons that may be made to split the concave polygons of a file.
 const COMPARISONS: u64 = 1 << 26;
 
+/// Memory of splitting a polygon, for each of its corners, bytes.
+const SPLITTING: usize = 320;
+
+/// Memory of finding out whether a surface is closed, for each of its triangles, bytes.
+const CLOSED: usize = 160;
+
 /// A mesh while it is read.
 pub(super) struct Draft<'l> {
     pub(super) limits: &'l ReadLimits,
+    pub(super) purse: Purse<'l>,
     pub(super) notes: Vec<String>,
     /// Points and lines of the file, which are no surface.
     pub(super) lines: usize,
@@ -45,9 +53,10 @@ pub(super) struct Draft<'l> {
 }
 
 impl<'l> Draft<'l> {
-    pub(super) fn new(limits: &'l ReadLimits) -> Self {
+    pub(super) fn new(limits: &'l ReadLimits, purse: Purse<'l>) -> Self {
         Self {
             limits,
+            purse,
             notes: Vec::new(),
             lines: 0,
             drops_unused: false,
@@ -76,8 +85,7 @@ impl<'l> Draft<'l> {
         if self.vertices.len() >= self.limits.vertices {
             return Err(Problem::TooLarge { what: "vertices", limit: self.limits.vertices });
         }
-        self.vertices.push(DVec3::from_array(at));
-        Ok(())
+        self.purse.push(&mut self.vertices, DVec3::from_array(at))
     }
 
     /// The group of a name.
@@ -88,6 +96,7 @@ impl<'l> Draft<'l> {
         if self.groups.len() >= GROUPS {
             return Err(Problem::TooLarge { what: "groups", limit: GROUPS });
         }
+        self.purse.take(4 * (name.len() + size_of::<Group>()))?;
         let group = self.groups.len();
         self.groups.push(Group { name: name.to_owned(), vertices: Vec::new() });
         self.groups_by_name.insert(name.to_owned(), group);
@@ -109,7 +118,7 @@ impl<'l> Draft<'l> {
             let vertex = self.index(*corner)?;
             for group in groups {
                 if let Some(group) = self.groups.get_mut(*group) {
-                    group.vertices.push(vertex);
+                    self.purse.push(&mut group.vertices, vertex)?;
                     // Many faces share a vertex. So that none takes more than twice what it needs:
                     if group.vertices.len() > 2 * self.vertices.len() + 1024 {
                         group.vertices.sort_unstable();
@@ -128,6 +137,16 @@ impl<'l> Draft<'l> {
         if corners.len() == 3 {
             return self.triangle(corners, uv, [0, 1, 2]);
         }
+        if corners.len() > self.limits.triangles.saturating_add(2) {
+            return Err(Problem::TooLarge { what: "triangles", limit: self.limits.triangles });
+        }
+        self.purse.take(SPLITTING * corners.len())?;
+        self.split(corners, uv)?;
+        self.purse.give_back(SPLITTING * corners.len());
+        Ok(())
+    }
+
+    fn split(&mut self, corners: &[i64], uv: &[[f32; 2]]) -> Result<(), Problem> {
         // A corner twice in a row is one corner.
         let is_last = |place: &usize| corners[*place] != corners[(*place + 1) % corners.len()];
         let places: Vec<usize> = (0..corners.len()).filter(is_last).collect();
@@ -152,12 +171,14 @@ impl<'l> Draft<'l> {
         }
         if !uv.is_empty() && !self.has_uv {
             self.has_uv = true;
+            self.purse.take(size_of::<[[f32; 2]; 3]>() * self.triangles.len())?;
             self.uv = vec![[[0.0; 2]; 3]; self.triangles.len()];
         }
         let [a, b, c] = places.map(|place| self.index(corners[place]));
-        self.triangles.push([a?, b?, c?]);
+        self.purse.push(&mut self.triangles, [a?, b?, c?])?;
         if self.has_uv {
-            self.uv.push(if uv.is_empty() { [[0.0; 2]; 3] } else { places.map(|place| uv[place]) });
+            let own = if uv.is_empty() { [[0.0; 2]; 3] } else { places.map(|place| uv[place]) };
+            self.purse.push(&mut self.uv, own)?;
         }
         Ok(())
     }
@@ -188,13 +209,14 @@ impl<'l> Draft<'l> {
         self.assign(nodes, groups)?;
         self.drops_unused = true;
         let corners = nodes.iter().map(|node| self.index(*node)).collect::<Result<Vec<u32>, _>>()?;
-        self.volume.add(cell, &corners);
-        Ok(())
+        self.volume.add(cell, &corners, &mut self.purse)
     }
 
     /// Whether the triangles so far are a closed surface.
-    pub(super) fn is_closed(&self) -> bool {
-        Topology::new(self.vertices.len(), &self.triangles).is_closed()
+    pub(super) fn is_closed(&mut self) -> bool {
+        // Without the memory to find out, it is not known to be.
+        let paid = self.purse.take(CLOSED * self.triangles.len());
+        paid.is_ok() && Topology::new(self.vertices.len(), &self.triangles).is_closed()
     }
 
     /// Replaces triangles by the surface around the volume elements.
@@ -208,7 +230,7 @@ impl<'l> Draft<'l> {
         (self.split, self.concave, self.folded, self.has_uv) = (0, 0, 0, false);
         self.triangles.clear();
         self.uv.clear();
-        let surface = volume.outer_surface(&self.vertices);
+        let surface = volume.outer_surface(&self.vertices, &mut self.purse)?;
         for face in surface.faces {
             let corners: Vec<i64> = face.into_iter().map(i64::from).collect();
             self.polygon(&corners, &[], &[])?;
@@ -225,7 +247,10 @@ impl<'l> Draft<'l> {
     }
 
     /// Drops the triangles that have the vertices of an earlier one, in the same sense.
-    fn drop_repeated(&mut self) {
+    fn drop_repeated(&mut self) -> Result<(), Problem> {
+        // Twice a triangle, in a tree.
+        const REPEATED: usize = 32;
+        self.purse.take(REPEATED * self.triangles.len())?;
         let mut seen = BTreeSet::new();
         let is_first = |triangle: &[u32; 3]| {
             let least = (0..3).min_by_key(|corner| triangle[*corner]).unwrap_or(0);
@@ -236,13 +261,14 @@ impl<'l> Draft<'l> {
         let is_kept: Vec<bool> = self.triangles.iter().map(is_first).collect();
         let dropped = is_kept.iter().filter(|is| !**is).count();
         if dropped == 0 {
-            return;
+            return Ok(());
         }
         let mut kept = is_kept.iter();
         self.triangles.retain(|_| *kept.next().unwrap_or(&true));
         let mut kept = is_kept.iter();
         self.uv.retain(|_| *kept.next().unwrap_or(&true));
         self.notes.push(format!("Triangles left out that an earlier one repeats, as in several groups: {dropped}."));
+        Ok(())
     }
 
     /// Drops the vertices that no triangle has.
@@ -282,7 +308,7 @@ impl<'l> Draft<'l> {
             self.take_outer_surface().map_err(|problem| fail(Element::Whole, problem))?;
         }
         if self.drops_repeated {
-            self.drop_repeated();
+            self.drop_repeated().map_err(|problem| fail(Element::Whole, problem))?;
         }
         if self.drops_unused {
             self.drop_unused();

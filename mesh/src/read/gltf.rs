@@ -19,6 +19,13 @@ use super::without_mark;
 use crate::{Element, MeshError, Problem};
 use json::{Head, MOST, Root, other_extension, other_version};
 
+/// Memory of the short entries of lists in JSON, for each byte of its text, and at most, bytes: lists are short.
+const ENTRIES_MULTIPLE: usize = 24;
+const MOST_ENTRIES: usize = 16 << 20;
+
+/// A node that waits, with its place.
+const WAITING: usize = 2 * size_of::<(usize, DMat4)>();
+
 /// A file that is being read.
 struct File<'a> {
     name: &'a str,
@@ -99,6 +106,10 @@ pub(super) fn read(
     // Some programs fill it with NULs, up to a multiple of four.
     let end = json.iter().rposition(|byte| !matches!(byte, 0 | 0x1a)).map_or(0, |last| last + 1);
     let json = without_mark(&json[..end]);
+    let fail_whole = |problem| MeshError { file: name.to_owned(), element: Element::Whole, place_m: None, problem };
+    // With texts, which are no longer in memory than in the file.
+    let entries = json.len().saturating_mul(ENTRIES_MULTIPLE).min(MOST_ENTRIES);
+    draft.purse.take(2 * json.len() + entries).map_err(fail_whole)?;
     let head: Head = parsed(name, json)?;
     if let Some(problem) = head.refusal() {
         return Err(MeshError { file: name.to_owned(), element: Element::Whole, place_m: None, problem });
@@ -133,6 +144,10 @@ pub(super) fn read(
         if used + content.len() > draft.limits.bytes {
             return Err(fail(Problem::TooLarge { what: "bytes", limit: draft.limits.bytes }));
         }
+        if matches!(content, Cow::Owned(_)) {
+            draft.purse.add_file(content.len());
+            draft.purse.take(content.len()).map_err(fail)?;
+        }
         if content.len() < buffer.byte_length {
             let missing = format!("{} of {} bytes", buffer.byte_length - content.len(), buffer.byte_length);
             return Err(fail(Problem::Truncated { missing }));
@@ -161,6 +176,8 @@ impl File<'_> {
             }
             return Ok(());
         }
+        let memory = draft.purse.take(WAITING * root.nodes.0.len());
+        memory.map_err(|problem| self.fail("node", 0, problem))?;
         let mut is_child = vec![false; root.nodes.0.len()];
         for child in root.nodes.0.iter().flat_map(|node| &node.children.0) {
             let child = *child as usize;
@@ -198,6 +215,8 @@ impl File<'_> {
             if let Some(mesh) = node.mesh {
                 self.mesh(mesh, node.name.as_deref(), whole, draft)?;
             }
+            let memory = draft.purse.take(WAITING * node.children.0.len());
+            memory.map_err(|problem| self.fail("node", number, problem))?;
             waiting.extend(node.children.0.iter().rev().map(|child| (*child as usize, whole)));
         }
         Ok(())
@@ -230,26 +249,30 @@ impl File<'_> {
             groups.dedup();
             let most = draft.limits.vertices.saturating_sub(draft.vertices());
             let positions =
-                self.numbers::<3>(primitive.attributes.position, most, "vertices", draft.limits.vertices)?;
+                self.numbers::<3>(draft, primitive.attributes.position, most, "vertices", draft.limits.vertices)?;
             let first = draft.vertices() as i64;
             for at in &positions {
                 let at = place.transform_point3(DVec3::from_array(*at));
                 draft.vertex(at.to_array()).map_err(fail)?;
             }
             let uv = primitive.attributes.uv;
-            let of_uv = |uv| self.numbers::<2>(uv, positions.len(), "texture coordinates", positions.len());
-            let uv = uv.map(of_uv).transpose()?;
+            let count = positions.len();
+            let uv = match uv {
+                Some(uv) => Some(self.numbers::<2>(draft, uv, count, "texture coordinates", count)?),
+                None => None,
+            };
             let corners: Vec<i64> = match primitive.indices {
                 #[allow(clippy::cast_possible_truncation)]
                 Some(indices) => {
                     let most = draft.limits.triangles.saturating_mul(3);
-                    let indices = self.numbers::<1>(indices, most, "indices", most)?;
+                    let indices = self.numbers::<1>(draft, indices, most, "indices", most)?;
                     indices.into_iter().map(|[index]| index as i64).collect()
                 }
                 None => (0..positions.len() as i64).collect(),
             };
             // A mirrored node turns its triangles inside out.
             let is_mirrored = place.determinant() < 0.0;
+            draft.purse.take(size_of_val(corners.as_slice())).map_err(fail)?;
             let triangles: Box<dyn Iterator<Item = [i64; 3]>> = match mode {
                 4 => Box::new(corners.chunks_exact(3).map(|c| [c[0], c[1], c[2]])),
                 5 => Box::new(
@@ -277,6 +300,8 @@ impl File<'_> {
                     .collect();
                 draft.polygon(&triangle.map(|corner| corner + first), &uv, &groups).map_err(fail)?;
             }
+            let uv = uv.as_deref().map_or(0, size_of_val);
+            draft.purse.give_back(size_of_val(positions.as_slice()) + uv + 2 * size_of_val(corners.as_slice()));
         }
         Ok(())
     }
@@ -295,6 +320,7 @@ impl File<'_> {
     /// The numbers of an accessor, `N` in each entry, at most `most` of them.
     fn numbers<const N: usize>(
         &self,
+        draft: &mut Draft<'_>,
         number: usize,
         most: usize,
         what: &'static str,
@@ -310,6 +336,8 @@ impl File<'_> {
         if accessor.count > most {
             return Err(fail(Problem::TooLarge { what, limit }));
         }
+        // Entries may be left out of the file, or overlap in it.
+        draft.purse.take(accessor.count.saturating_mul(size_of::<[f64; N]>())).map_err(fail)?;
         let known = |component: u32| scalar(component).ok_or_else(|| syntax(format!("component type {component}")));
         let component = known(accessor.component_type)?;
         let factor = if accessor.normalized { normal_factor(component) } else { 1.0 };
@@ -328,7 +356,11 @@ impl File<'_> {
                 let stride = stride.unwrap_or(width).max(1);
                 let starts = (0..accessor.count).map(|entry| entry.checked_mul(stride));
                 let entries = starts.map(|start| bytes.get(start?..)?.get(..width).map(entry));
-                entries.collect::<Option<Vec<_>>>().ok_or_else(cut)?
+                let mut values = Vec::with_capacity(accessor.count);
+                for value in entries {
+                    values.push(value.ok_or_else(cut)?);
+                }
+                values
             }
         };
         if let Some(sparse) = &accessor.sparse {

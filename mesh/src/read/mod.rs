@@ -6,6 +6,7 @@ mod gmsh;
 mod obj;
 mod ply;
 mod polygon;
+mod purse;
 mod source;
 mod stl;
 mod volume;
@@ -14,7 +15,15 @@ mod vtk_xml;
 
 use crate::{Element, MeshError, Problem, TriangleMesh, Unit};
 use draft::Draft;
+use purse::Purse;
 use source::Source;
+
+/// Reading takes so many bytes of memory for each byte of a file, and [`ROOM`] beside; what would take more is refused. Meshes of
+/// programs take less than half of it.
+pub const MULTIPLE: usize = 32;
+
+/// What reading may take whatever the length of a file, bytes.
+pub const ROOM: usize = 2 << 20;
 
 /// The upper bounds of what is read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -119,6 +128,22 @@ pub fn read(
     neighbours: &dyn Fn(&str) -> Option<Vec<u8>>,
     limits: &ReadLimits,
 ) -> Result<ReadMesh, MeshError> {
+    read_paid(name, bytes, unit, neighbours, limits, &mut |_| true)
+}
+
+/// The same, with `pay` for its memory: it is told how many bytes that is so far, before they are allocated, and returns `false` if
+/// they are too many.
+///
+/// # Errors
+/// As for [`read`], and if `pay` does not pay.
+pub fn read_paid(
+    name: &str,
+    bytes: &[u8],
+    unit: Unit,
+    neighbours: &dyn Fn(&str) -> Option<Vec<u8>>,
+    limits: &ReadLimits,
+    pay: &mut dyn FnMut(u64) -> bool,
+) -> Result<ReadMesh, MeshError> {
     let fail = |problem| MeshError { file: name.to_owned(), element: Element::Whole, place_m: None, problem };
     if bytes.len() > limits.bytes {
         return Err(fail(Problem::TooLarge { what: "bytes", limit: limits.bytes }));
@@ -132,7 +157,7 @@ pub fn read(
     let bytes = if is_free { bytes } else { without_mark(bytes) };
     let by_name = Format::of_extension(name);
     let format = Format::of_content(bytes).or(by_name).ok_or_else(|| fail(Problem::UnknownFormat))?;
-    let mut draft = Draft::new(limits);
+    let mut draft = Draft::new(limits, Purse::new(bytes.len(), pay));
     if by_name.is_some_and(|by_name| by_name != format) {
         draft.notes.push(format!("The file's content is {format:?}, whatever its extension."));
     }

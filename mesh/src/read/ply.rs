@@ -4,6 +4,7 @@
 //! `ply-rs-bw` is not used: it allocates what a header counts and panics at a count that is too long.
 
 use super::draft::Draft;
+use super::purse::Purse;
 use super::source::{Order, Scalar, Source, named, parsed, shown, words};
 use crate::{Element as Place, MeshError, Problem};
 
@@ -176,6 +177,7 @@ impl Row {
         element: &Element,
         corners: Option<usize>,
         encoding: Encoding,
+        purse: &mut Purse<'_>,
     ) -> Result<(), MeshError> {
         self.corners.clear();
         self.corner_uv.clear();
@@ -199,13 +201,17 @@ impl Row {
             let mut first = 0.0;
             for entry in 0..length {
                 if corners == Some(place) {
-                    self.corners.push(integer(source, property.scalar, encoding, "a vertex of a face")?);
+                    let corner = integer(source, property.scalar, encoding, "a vertex of a face")?;
+                    purse.push(&mut self.corners, corner).map_err(|problem| source.fail(problem))?;
                     continue;
                 }
                 let value = real(source, property.scalar, encoding, "an entry of a list")? as f32;
                 match entry % 2 {
                     0 => first = value,
-                    _ if is_uv => self.corner_uv.push([first, value]),
+                    _ if is_uv => {
+                        let place = [first, value];
+                        purse.push(&mut self.corner_uv, place).map_err(|problem| source.fail(problem))?;
+                    }
                     _ => {}
                 }
             }
@@ -238,11 +244,11 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
         let has_uv = element.properties.iter().any(|p| ["s", "u", "texture_u"].contains(&p.name.as_str()));
         for number in 0..count as u64 {
             if encoding.is_some() {
-                row.read(&mut source, element, corners, encoding)?;
+                row.read(&mut source, element, corners, encoding, &mut draft.purse)?;
             } else {
                 let mut line = next_row(&mut source)
                     .ok_or_else(|| source.truncated(format!("row {number} of {count} of `{}`", element.name)))?;
-                row.read(&mut line, element, corners, encoding)?;
+                row.read(&mut line, element, corners, encoding, &mut draft.purse)?;
                 let is_wider = line.word().is_some();
                 // As of a row that does not begin with the length of its list.
                 if is_wider && role == Role::Face && row.corners.len() < 3 {
@@ -256,14 +262,17 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
             let of_vertex = |corner: &i64| uv_of.get(usize::try_from(*corner).ok()?).copied();
             if row.corner_uv.len() != row.corners.len() {
                 row.corner_uv.clear();
-                row.corner_uv.extend(row.corners.iter().filter_map(of_vertex));
+                for place in row.corners.iter().filter_map(of_vertex) {
+                    let paid = draft.purse.push(&mut row.corner_uv, place);
+                    paid.map_err(|problem| source.fail(problem))?;
+                }
             }
             let fail = |problem| source.fail_at(Place::Face(number), problem);
             match role {
                 Role::Vertex => {
                     draft.vertex(row.at).map_err(|problem| source.fail(problem))?;
                     if has_uv {
-                        uv_of.push(row.uv);
+                        draft.purse.push(&mut uv_of, row.uv).map_err(|problem| source.fail(problem))?;
                     }
                 }
                 Role::Face => draft.polygon(&row.corners, &row.corner_uv, &[]).map_err(fail)?,

@@ -49,6 +49,8 @@ impl Welder<'_, '_> {
         if let Some(number) = self.numbers.get(&key) {
             return Ok(*number);
         }
+        // In a table that grows.
+        self.draft.purse.take(2 * size_of::<([u64; 3], i64)>() + 2)?;
         let number = self.draft.vertices() as i64;
         self.draft.vertex(at)?;
         self.numbers.insert(key, number);

@@ -5,6 +5,9 @@
 
 use glam::DVec3;
 
+use super::purse::Purse;
+use crate::Problem;
+
 /// In the place of corners that a face or element does not have.
 const NONE: u32 = u32::MAX;
 
@@ -48,6 +51,15 @@ impl Cell {
     }
 }
 
+/// A face of an element: its corners, sorted, the element, and which face of it.
+type Side = ([u32; 4], u32, u8);
+
+/// Memory of finding elements that are there twice, for each of them, bytes.
+const SORTED: usize = 48;
+
+/// Memory of a face that one element alone has, bytes.
+const OUTER: usize = 80;
+
 /// A volume element.
 struct Element {
     kind: Cell,
@@ -75,10 +87,10 @@ impl Volume {
     }
 
     /// Adds an element; `corners` are as many as its kind has.
-    pub(super) fn add(&mut self, kind: Cell, corners: &[u32]) {
+    pub(super) fn add(&mut self, kind: Cell, corners: &[u32], purse: &mut Purse<'_>) -> Result<(), Problem> {
         let mut own = [NONE; 8];
         own.iter_mut().zip(corners).for_each(|(own, corner)| *own = *corner);
-        self.elements.push(Element { kind, corners: own });
+        purse.push(&mut self.elements, Element { kind, corners: own })
     }
 
     /// Whether each element has the corners of an earlier one.
@@ -98,7 +110,9 @@ impl Volume {
     }
 
     /// The faces that one element alone has, in the order of the elements.
-    pub(super) fn outer_surface(&self, vertices: &[DVec3]) -> OuterSurface {
+    pub(super) fn outer_surface(&self, vertices: &[DVec3], purse: &mut Purse<'_>) -> Result<OuterSurface, Problem> {
+        let most_sides: usize = self.elements.iter().map(|element| element.kind.faces().len()).sum();
+        purse.take(SORTED * self.elements.len() + most_sides * size_of::<Side>())?;
         let is_repeated = self.repeated();
         let kept = || (0_u32..).zip(&self.elements).filter(|(number, _)| !is_repeated[*number as usize]);
         // An element without volume is numbered as most others of its kind, one hopes.
@@ -109,7 +123,7 @@ impl Volume {
             is_turned[number as usize] = turned;
             senses[element.kind as usize] += turned.map_or(0, |turned| if turned { -1 } else { 1 });
         }
-        let mut sides: Vec<([u32; 4], u32, u8)> = Vec::new();
+        let mut sides: Vec<Side> = Vec::with_capacity(most_sides);
         for (number, element) in kept() {
             for (place, face) in (0..).zip(element.kind.faces()) {
                 if let Some(corners) = element.face(face) {
@@ -121,8 +135,9 @@ impl Volume {
             }
         }
         sides.sort_unstable();
-        let alone = sides.chunk_by(|a, b| a.0 == b.0).filter(|same| same.len() == 1);
-        let mut outer: Vec<(u32, u8)> = alone.map(|same| (same[0].1, same[0].2)).collect();
+        let alone = || sides.chunk_by(|a, b| a.0 == b.0).filter(|same| same.len() == 1);
+        purse.take(OUTER * alone().count())?;
+        let mut outer: Vec<(u32, u8)> = alone().map(|same| (same[0].1, same[0].2)).collect();
         drop(sides);
         outer.sort_unstable();
         let face = |(number, place): (u32, u8)| {
@@ -137,7 +152,7 @@ impl Volume {
             face
         };
         let faces = outer.into_iter().map(face).collect();
-        OuterSurface { faces, repeated: is_repeated.iter().filter(|is| **is).count() }
+        Ok(OuterSurface { faces, repeated: is_repeated.iter().filter(|is| **is).count() })
     }
 }
 

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use palpate_proto::geometry::from_vector;
+use palpate_proto::measure::MULTIPLE;
 use palpate_proto::{pb, touch};
 use palpate_touch::Law;
 use pb::take_session_request::Message;
@@ -15,12 +16,13 @@ use tonic::{Status, Streaming};
 use tracing::{info, warn};
 
 use super::{Fleet, Owned};
-use crate::budget::Resource;
+use crate::budget::{Purpose, Resource, Taken};
 use crate::cluster::rules;
 use crate::force_law::Disc;
 use crate::journal::replay::{self, Known, Resumed};
 use crate::journal::{Reader, inputs};
 use crate::lock::lock;
+use crate::memory;
 use crate::pace::{Begin, Live, fenced};
 use crate::refusal::{Reason, Refusal};
 use crate::server::journals::{until_complete, until_on_disk};
@@ -55,8 +57,11 @@ fn internal(error: impl std::fmt::Display) -> Status {
     Status::internal(error.to_string())
 }
 
-/// The bytes of a state.
-async fn state(inbound: &mut Streaming<pb::TakeSessionRequest>) -> Result<Vec<u8>, Status> {
+/// The account of what other servers hand over, as long as it is not known whose it is.
+const PAYER: &str = "servers of the fleet";
+
+/// The bytes of a state. `paid` grows by them, before they are kept.
+async fn state(inbound: &mut Streaming<pb::TakeSessionRequest>, paid: &mut Taken) -> Result<Vec<u8>, Status> {
     let mut bytes = Vec::new();
     loop {
         let message = inbound.message().await?.and_then(|message| message.message);
@@ -67,13 +72,16 @@ async fn state(inbound: &mut Streaming<pb::TakeSessionRequest>) -> Result<Vec<u8
         if bytes.len() + part.len() > MOST_STATE_BYTES {
             return Err(Refusal::new(Reason::TooLarge, "part", "the state is above 1 GiB").into());
         }
+        // What a vector takes that grows.
+        paid.grow_to(2 * (bytes.len() + part.len()) as u64, "part")?;
         bytes.extend(part);
     }
 }
 
 /// What the other server has said since its last state.
-#[derive(Default)]
 struct Told {
+    /// What the pieces take.
+    paid: Taken,
     leases: Vec<pb::HeldLease>,
     laws: Vec<pb::KnownLaw>,
     /// Inputs that wait, as `inputs::decoded` reads them.
@@ -88,7 +96,9 @@ impl Told {
             match inbound.message().await.ok().flatten()?.message? {
                 Message::Waiting(piece) => {
                     self.bytes += piece.len();
-                    if self.bytes <= MOST_WAITING_BYTES {
+                    // With what they are when they are decoded.
+                    let memory = (self.bytes * (1 + MULTIPLE)) as u64;
+                    if self.bytes <= MOST_WAITING_BYTES && self.paid.grow_to(memory, "waiting").is_ok() {
                         self.pieces.push(piece);
                     }
                 }
@@ -121,10 +131,18 @@ impl Fleet {
         }
     }
 
+    /// Takes nothing yet, and grows.
+    fn paid(&self) -> crate::refusal::Result<Taken> {
+        self.account(PAYER).take(Resource::Memory(Purpose::Journals), 0, "part")
+    }
+
     async fn restored(&self, bytes: Vec<u8>, known: Option<Known>) -> Result<Resumed, Status> {
         let limits = self.config.limits.clone();
-        let restore =
-            move || replay::resume_as(Reader::new("the state of a session", Cursor::new(bytes))?, &limits, known);
+        let paid = self.paid()?;
+        let restore = move || {
+            let reader = Reader::paid("the state of a session", Cursor::new(bytes), Some(paid))?;
+            memory::attempt("part", || replay::resume_as(reader, &limits, known))
+        };
         Ok(tokio::task::spawn_blocking(restore).await.map_err(internal)??)
     }
 
@@ -135,11 +153,14 @@ impl Fleet {
     ) -> Result<(), Status> {
         let answer = || tell.send(Ok(pb::TakeSessionResponse {}));
         // Of the first state the tissue is made, which takes the longest.
-        let before = self.restored(state(inbound).await?, None).await?;
+        let mut paid = self.paid()?;
+        let before = self.restored(state(inbound, &mut paid).await?, None).await?;
+        paid.shrink_to(0);
         let _ = answer().await;
         let first = before.first.clone();
         let known = Some((before.header, before.first));
-        let resumed = self.restored(state(inbound).await?, known).await?;
+        let resumed = self.restored(state(inbound, &mut paid).await?, known).await?;
+        paid.shrink_to(0);
         let offered = resumed.header.ownership_revision;
         let id = resumed.header.session_id.clone();
         let here =
@@ -155,7 +176,7 @@ impl Fleet {
             return Err(Refusal::new(Reason::NotAvailable, "", why).into());
         }
         let _ = answer().await;
-        let mut told = Told::default();
+        let mut told = Told { paid, leases: Vec::new(), laws: Vec::new(), pieces: Vec::new(), bytes: 0 };
         let Some(revision) = self.until_certain(&id, offered, inbound, &mut told).await else {
             info!(session = %id, "a session that was being handed over does not come");
             self.withdraw(&live).await;

@@ -31,7 +31,12 @@ use crate::sheet::choice::{NEVER, given_up};
 const MOST_MOMENTS: usize = 2000;
 
 /// The journal of a run of a session, open; of its newest if `run` is 0.
-fn find(folder: &Path, session_id: &str, run: u32) -> Result<(JournalFile, Reader<Box<dyn Source>>)> {
+fn find(
+    folder: &Path,
+    session_id: &str,
+    run: u32,
+    payer: Option<&Account>,
+) -> Result<(JournalFile, Reader<Box<dyn Source>>)> {
     let unknown = |message: &str| Refusal::new(Reason::UnknownSession, "session_id", message.to_owned());
     // A name that is none would be a path.
     if file::parse(&file::name(session_id, 1)).is_none() {
@@ -42,7 +47,7 @@ fn find(folder: &Path, session_id: &str, run: u32) -> Result<(JournalFile, Reade
     })?;
     let is_it = |file: &JournalFile| file.session_id == session_id && (run == 0 || file.run == u64::from(run));
     for file in listed.into_iter().rev().filter(is_it) {
-        match open(&file) {
+        match open(&file, payer) {
             // The newest run may have been cut off before anything of it was on the disk.
             Err(refusal) if run == 0 && refusal.reason == Reason::Missing => {}
             opened => return opened.map(|reader| (file, reader)),
@@ -51,10 +56,15 @@ fn find(folder: &Path, session_id: &str, run: u32) -> Result<(JournalFile, Reade
     Err(unknown("there is no journal of this session and run; ListJournals tells which there are"))
 }
 
-fn open(file: &JournalFile) -> Result<Reader<Box<dyn Source>>> {
+fn open(file: &JournalFile, payer: Option<&Account>) -> Result<Reader<Box<dyn Source>>> {
     let source = journal::reader::file(&file.path).map_err(Refusal::without_folder)?;
     // Callers are told what is wrong with it, and not where it is.
-    Reader::new(&file::name(&file.session_id, file.run), Box::new(source))
+    Reader::paid(&file::name(&file.session_id, file.run), Box::new(source), paid_by(payer)?)
+}
+
+/// Grows by what is read, from who pays for it.
+fn paid_by(payer: Option<&Account>) -> Result<Option<Taken>> {
+    payer.map(|payer| payer.take(Resource::Memory(Purpose::Journals), 0, "")).transpose()
 }
 
 /// A journal in a list: `reader` is it, open, or why it can't be opened.
@@ -147,7 +157,8 @@ impl Recorded {
         let listed = file::list(folder.path()).map_err(|error| {
             Refusal::new(Reason::Unreadable, "journal", format!("the folder of the journals can't be read: {error}"))
         })?;
-        let info = |file: &JournalFile| info(file, open(file).as_mut().map_err(|refusal| refusal.to_string()), pacer);
+        let info =
+            |file: &JournalFile| info(file, open(file, None).as_mut().map_err(|refusal| refusal.to_string()), pacer);
         Ok(pb::ListJournalsResponse { journals: listed.iter().map(info).collect() })
     }
 
@@ -160,7 +171,7 @@ impl Recorded {
         request: &pb::GetJournalRequest,
         pacer: &Pacer,
     ) -> Result<pb::GetJournalResponse> {
-        let (file, mut reader) = find(self.folder("session_id")?, &request.session_id, request.run)?;
+        let (file, mut reader) = find(self.folder("session_id")?, &request.session_id, request.run, None)?;
         let info = info(&file, Ok(&mut reader), pacer);
         tell(reader, info, &NEVER)
     }
@@ -192,7 +203,8 @@ impl Recorded {
     ) -> Result<pb::GetJournalResponse> {
         let mut received = self.sent.take(id, account)?;
         let bytes = std::mem::take(&mut received.bytes);
-        let reader = Reader::new(SENT, Cursor::new(&bytes)).map_err(within_upload)?;
+        let paid = paid_by(Some(account))?;
+        let reader = Reader::paid(SENT, Cursor::new(&bytes), paid).map_err(within_upload)?;
         let header = reader.header();
         let known = pb::JournalInfo {
             session_id: header.session_id.clone(),
@@ -210,7 +222,7 @@ impl Recorded {
     /// The journal of a moment, and the session and run that it is of.
     fn open(&self, moment: &pb::JournalMoment, payer: &Account) -> Result<Opened> {
         if moment.upload_id.is_empty() {
-            let (file, reader) = find(self.folder("journal")?, &moment.session_id, moment.run)?;
+            let (file, reader) = find(self.folder("journal")?, &moment.session_id, moment.run, Some(payer))?;
             return Ok((reader, file.session_id, file.run));
         }
         if !moment.session_id.is_empty() || moment.run != 0 {
@@ -221,7 +233,7 @@ impl Recorded {
         // A session that plays it keeps it, also when the upload has expired.
         let taken = payer.take(Resource::Memory(Purpose::Journals), bytes.len() as u64, "upload_id")?;
         let source: Box<dyn Source> = Box::new(Cursor::new(Sent { bytes, _taken: taken }));
-        let reader = Reader::new(SENT, source)?.without_files();
+        let reader = Reader::paid(SENT, source, paid_by(Some(payer))?)?.without_files();
         let (session_id, run) = (reader.header().session_id.clone(), reader.header().run);
         Ok((reader, session_id, run))
     }

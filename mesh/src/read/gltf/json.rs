@@ -10,7 +10,7 @@ use crate::Problem;
 use crate::read::source::named;
 
 /// Nodes, meshes, accessors and so on of a file. They take more memory than the text that they are from.
-pub(super) const MOST: usize = 1 << 16;
+pub(super) const MOST: usize = 1 << 14;
 
 /// Extensions that are named in a refusal.
 const NAMED: usize = 8;
@@ -224,9 +224,9 @@ pub(super) struct Node {
     #[serde(default)]
     pub(super) children: Few<u32>,
     pub(super) matrix: Option<Box<Numbers<16>>>,
-    pub(super) translation: Option<Numbers<3>>,
-    pub(super) rotation: Option<Numbers<4>>,
-    pub(super) scale: Option<Numbers<3>>,
+    pub(super) translation: Option<Box<Numbers<3>>>,
+    pub(super) rotation: Option<Box<Numbers<4>>>,
+    pub(super) scale: Option<Box<Numbers<3>>>,
 }
 
 #[derive(Deserialize)]
