@@ -79,7 +79,7 @@ fn main() {
     report.say(
         "**Where it is measured.** Tasks stay within 1 cm of the middle of the sheet but where a table says otherwise. The force \
          law follows the tool, but near a fixed rim the force also changes along the tool's way, and the rim draws a pressed \
-         tip aside; models do not tell that, and errors are larger (docs/devices.md).",
+         tip aside; models do not tell that, and errors are larger ([at a rim](rim.md)).",
     );
     boundary(&mut report);
     stiffness(&mut report);

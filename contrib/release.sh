@@ -6,7 +6,7 @@
 #   palpate.tar      the container image of contrib/Dockerfile: needs docker; `docker load < palpate.tar`
 #   SHA256SUMS       of all of these
 #
-# `sh contrib/release.sh [FOLDER]`. What can't be made is said at the end, and the exit status is then 3.
+# `sh contrib/release.sh [FOLDER]`. If it can't make a file, it says so at the end, with exit status 3.
 # PALPATE_TARGET chooses another target, CARGO another cargo, DOCKER another docker (podman, say).
 set -eu
 
@@ -38,10 +38,10 @@ command -v "$cargo" >/dev/null || { say 'Rust is missing: install it from https:
 mkdir -p "$out"
 rm -f "$out/palpate" "$out/palpate-client" "$out/palpate.tar" "$out/SHA256SUMS"
 
-# The folder of compiled files, wherever CARGO_TARGET_DIR puts it.
+# The folder of compiled files, also with CARGO_TARGET_DIR.
 built=${CARGO_TARGET_DIR:-target}
 
-# The page is within the static program, which has no folder beside it.
+# The static program contains the page, because it has no folder beside it.
 page=clients/viewer/dist/index.html
 features=''
 if [ -f "$page" ]; then features='--features viewer'; else say "without the page: $page is missing (make viewer)"; fi

@@ -470,16 +470,18 @@ fn a_sheet_of_one_point_is_a_pendulum_and_a_line_is_a_string() {
 }
 
 #[test]
-fn the_formats_page_tells_the_truth() {
-    // Its scene and its script are read as they stand there.
-    let page = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/formats.md")).unwrap();
+fn the_pages_on_scenes_scripts_and_records_tell_the_truth() {
+    // Their scene and their scripts are read as they stand there.
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs");
+    let pages = ["scenes.md", "scripts.md", "records.md"];
+    let page = pages.map(|name| std::fs::read_to_string(folder.join(name)).unwrap()).concat();
     let blocks: Vec<&str> = page.split("```toml\n").skip(1).map(|rest| rest.split("```").next().unwrap()).collect();
     let [scene, script, people, ..] = blocks.as_slice() else { panic!("{} blocks", blocks.len()) };
     let liver = palpate::scene::BUILT_IN.iter().find(|scene| scene.0 == "liver").unwrap().1;
     assert_eq!(lines(&run(liver, people, &[])).len(), 1 + 21 + 1);
     let output = run(scene, script, &[]);
     assert_eq!(lines(&output).len(), 1 + 21 + 1);
-    // Every key of a record and of a summary is in its tables.
+    // Every key of a record and of a summary is in their tables.
     let through = lines(&output);
     let keys = |value: &Value| value.as_object().unwrap().keys().cloned().collect::<Vec<_>>();
     let point = &through[1]["points"][0];

@@ -178,7 +178,14 @@ fn the_packaged_files_start_servers_as_they_are() {
     let commands = dockerfile.split("HEALTHCHECK").nth(1).unwrap();
     let commands = commands.split_once("CMD").unwrap().1;
     assert_eq!(unknown_options(commands), [] as [&str; 0]);
-    for line in ["DynamicUser=yes", "NoNewPrivileges=yes", "ProtectSystem=strict", "MemoryMax=", "LimitNOFILE="] {
+    for line in [
+        "DynamicUser=yes",
+        "StateDirectory=",
+        "NoNewPrivileges=yes",
+        "ProtectSystem=strict",
+        "MemoryMax=",
+        "LimitNOFILE=",
+    ] {
         assert!(unit.contains(line), "the unit lacks {line}");
     }
     // Where systemd is, it says whether it understands the unit, with this build's program in the place of the installed.

@@ -1,10 +1,10 @@
 #!/bin/sh
-# Certificates for etcd.yaml, palpate.yaml and agones.yaml, for who has no authority of their own (cert-manager, say):
+# Certificates for etcd.yaml, palpate.yaml and agones.yaml, if you have no authority of your own (such as cert-manager):
 #
 #   sh certificates.sh DIR              authorities and certificates of the fleet and of etcd, for a year
 #   sh certificates.sh DIR client NAME  a client's: NAME goes into tokens.toml
 #
-# What is there stays: to renew a certificate, remove its files and run this again. Keep DIR/*-ca.key away from the cluster.
+# Existing files stay: to renew a certificate, remove its files and run this again. Keep DIR/*-ca.key away from the cluster.
 # DOMAIN: where clients outside of the cluster find the servers, such as palpate.example.org.
 set -eu
 umask 077

@@ -24,7 +24,7 @@ pub struct Config {
     pub tls_key: Option<PathBuf>,
     /// File of certificate authorities, PEM: a client must present a certificate that one of them has signed.
     pub tls_client_ca: Option<PathBuf>,
-    /// File of the roles of tokens and client certificates (docs/formats.md).
+    /// File of the roles of tokens and client certificates (docs/tokens.md).
     pub tokens: Option<PathBuf>,
     /// Serve without TLS or authentication even where other machines can reach the server.
     pub insecure: bool,

@@ -76,6 +76,26 @@ class EveryBlock(unittest.TestCase):
             self.assertEqual(ran.returncode, 0, ran.stderr)
 
 
+def anchors(path):
+    """The anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", path.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+class Links(unittest.TestCase):
+    def test_every_link_leads_to_a_file_and_a_heading(self):
+        folders = ("docs/**/*.md", "clients/*/README.md", "clients/*/*/README.md", "contrib/**/*.md")
+        pages = {*DOCUMENTS, ROOT / "ARCHITECTURE.md", *(page for folder in folders for page in ROOT.glob(folder))}
+        for page in sorted(page for page in pages if "node_modules" not in page.parts):
+            for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+                with self.subTest(f"{page.relative_to(ROOT)}: {link}"):
+                    name, _, anchor = link.partition("#")
+                    target = page.parent / name if name else page
+                    self.assertTrue(name.startswith("http") or target.exists())
+                    if anchor and target.suffix == ".md":
+                        self.assertIn(anchor, anchors(target))
+
+
 class FirstClient(unittest.TestCase):
     def test_the_python_client_presses_feels_a_force_and_sees_the_surface(self):
         # Those of the package palpate are run by clients/python/tests.

@@ -3,6 +3,7 @@
     python front_end.py http://127.0.0.1:7117 liver 10
 """
 
+import argparse
 import asyncio
 import math
 import sys
@@ -11,8 +12,6 @@ import time
 import numpy as np
 
 import palpate
-
-SHADES = " .:-=+*#%@"
 
 
 class Stroke:
@@ -26,18 +25,17 @@ class Stroke:
     def read(self):
         now_s = time.monotonic() - self.begun_s
         angle = 2 * math.pi * now_s / 4
-        height_m = max(0.004 - 0.006 * now_s, -0.002)
-        return (0.012 * math.cos(angle), 0.012 * math.sin(angle), height_m), now_s % 0.3 < 0.15
+        return (0.012 * math.cos(angle), 0.012 * math.sin(angle), max(0.004 - 0.006 * now_s, -0.002)), now_s % 0.3 < 0.15
 
     def write(self, force_n):
         self.force_n = force_n
 
 
-def draw(frame, force_n):
+def draw(frame, force_n, marks=" .:-=+*#%@"):
     depth_m = np.maximum(-frame.displacement_m[..., 2], 0)
     rows = depth_m[:: max(1, depth_m.shape[0] // 60), :: max(1, depth_m.shape[1] // 24)]
-    shades = (rows / max(rows.max(), 1e-4) * (len(SHADES) - 1)).astype(int)
-    lines = ["".join(SHADES[shade] for shade in line) for line in shades.T[::-1]]
+    shades = (rows / max(rows.max(), 1e-4) * (len(marks) - 1)).astype(int)
+    lines = ["".join(marks[shade] for shade in line) for line in shades.T[::-1]]
     strength_n = math.hypot(*force_n)
     lines.append(f"{frame.time_s:6.2f} s  {1e3 * depth_m.max():4.1f} mm  {strength_n:5.2f} N " + "=" * round(20 * strength_n))
     print("\x1b[H\x1b[2J" * sys.stdout.isatty() + "\n".join(lines), flush=True)
@@ -46,9 +44,8 @@ def draw(frame, force_n):
 async def main(url, scene, seconds):
     server = await palpate.aio.connect(url)
     async with await server.create_session(scene) as session:
-        device = Stroke()
+        frames, device = await session.frames(rate_hz=20), Stroke()
         touching = asyncio.ensure_future(session.touch(device, seconds=seconds))
-        frames = await session.frames(rate_hz=20)
         while not touching.done():
             frame = asyncio.ensure_future(frames.__anext__())
             await asyncio.wait([touching, frame], return_when=asyncio.FIRST_COMPLETED)
@@ -57,4 +54,7 @@ async def main(url, scene, seconds):
     print(f"{len(touched.time_s)} ticks, {touched.late_ticks} late; at most {np.abs(touched.force_n).max():.2f} N")
 
 
-asyncio.run(main(sys.argv[1], sys.argv[2], float(sys.argv[3])))
+parser = argparse.ArgumentParser()
+for name, kind in {"url": str, "scene": str, "seconds": float}.items():
+    parser.add_argument(name, type=kind)
+asyncio.run(main(**vars(parser.parse_args())))

@@ -4,8 +4,8 @@
     python look.py http://127.0.0.1:7117 SESSION 3       a session that others touch
 """
 
+import argparse
 import asyncio
-import sys
 import time
 
 import palpate
@@ -35,4 +35,8 @@ async def main(url: str, name: str, seconds: float) -> None:
         await look(await server.session(name), seconds)
 
 
-asyncio.run(main(sys.argv[1], sys.argv[2], float(sys.argv[3])))
+parser = argparse.ArgumentParser(description="Look at a session: how deep the tissue is dented.")
+parser.add_argument("url", help="of the server, such as http://127.0.0.1:7117")
+parser.add_argument("name", metavar="scene", help="of a new session, such as liver; or the ID of a session")
+parser.add_argument("seconds", type=float)
+asyncio.run(main(**vars(parser.parse_args())))

@@ -56,6 +56,15 @@ class Examples(Served, unittest.TestCase):
         self.assertLess(float(force_n), 3.3)
         self.assertRegex(told, r"\d mm +\d")
 
+    def test_examples_without_arguments_print_their_usage(self):
+        for example in ("look.py", "touch.py", "front_end.py"):
+            for arguments in ([], [self.url], [self.url, "liver", "long"]):
+                with self.subTest(example, arguments=arguments):
+                    command = [sys.executable, EXAMPLES / example, *arguments]
+                    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+                    self.assertEqual(done.returncode, 2, done.stderr)
+                    self.assertIn(f"usage: {example} [-h] url scene seconds", done.stderr)
+
     def test_a_study_finds_how_depth_depends_on_springs(self):
         told = ran("study.py", "24")
         found = re.search(r"24 tissues .* mm \* k\^(-[\d.]+) \* K''\^(-[\d.]+)", told, re.DOTALL)

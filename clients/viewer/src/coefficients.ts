@@ -38,7 +38,7 @@ export function sizeOf({ extent }: MeshReport): number {
  *   alone, it dents the middle by d = F/K″. For a dent d₀ under a push of 1 N altogether, K″ = 1 N·A/(2πℓ²·d₀).
  * - A dent as deep as it is wide stretches the net of springs as well, which draws each vertex back with about
  *   2k·(L/ℓ)²·d. It shall bear as much as the virtual springs: k = K″·(ℓ/L)²/2.
- * - A third of what lies beneath moves along (docs/formats.md, "Tissue"): m = ρ·H·A/3.
+ * - A third of what lies beneath moves along (docs/scenes.md, "Tissue"): m = ρ·H·A/3.
  * - C = 2ζ·√(K″·m).
  *
  * A and K″ shrink alike with more vertices, so the dent does not depend on how fine the mesh is.
