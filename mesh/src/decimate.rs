@@ -10,6 +10,7 @@ use glam::{DMat3, DVec3};
 
 use crate::topology::Topology;
 use crate::tree::{Tree, corners};
+use crate::work::spend;
 use crate::{Group, TriangleMesh};
 
 /// How much the length of an edge counts beside the error of the surface.
@@ -253,6 +254,7 @@ impl Work {
     fn collapse_down_to(&mut self, vertices: usize) {
         while self.left > vertices {
             let Some(candidate) = self.heap.pop() else { break };
+            spend(1);
             let [a, b] = candidate.vertices;
             let is_current = candidate.versions == [self.versions[a as usize], self.versions[b as usize]]
                 && self.stands_in[a as usize] == a
@@ -275,6 +277,7 @@ impl Work {
     /// Whether the surface stays a manifold, without folds and new slivers.
     fn may_collapse(&self, candidate: &Candidate) -> bool {
         let [a, b] = candidate.vertices;
+        spend(8 * (self.around[a as usize].len() + self.around[b as usize].len()));
         let shared = self.shared(candidate.vertices);
         let (of_a, of_b) = (self.neighbours(a), self.neighbours(b));
         let mut common = of_a.iter().filter(|vertex| of_b.binary_search(vertex).is_ok());
@@ -339,16 +342,12 @@ impl Work {
             mesh.vertices_m.push(*at);
         }
         let new = |vertex: u32| number_of.get(vertex as usize).copied().flatten();
+        let last = last_of(&self.stands_in);
         mesh.triangles =
             self.triangles.iter().map(|triangle| triangle.map(|vertex| new(vertex).unwrap_or(0))).collect();
         for group in &before.groups {
-            let of = |vertex: &u32| {
-                let mut at = *vertex;
-                while self.stands_in.get(at as usize).is_some_and(|next| *next != at) {
-                    at = self.stands_in[at as usize];
-                }
-                new(at)
-            };
+            spend(group.vertices.len());
+            let of = |vertex: &u32| last.get(*vertex as usize).and_then(|last| new(*last));
             let mut vertices: Vec<u32> = group.vertices.iter().filter_map(of).collect();
             vertices.sort_unstable();
             vertices.dedup();
@@ -362,4 +361,21 @@ impl Work {
         drop(tree);
         Decimated { mesh, places }
     }
+}
+
+/// The last of each chain of stand-ins, which stands for itself.
+fn last_of(stands_in: &[u32]) -> Vec<u32> {
+    let mut last = stands_in.to_vec();
+    for vertex in 0..last.len() {
+        let mut end = last[vertex];
+        while last[end as usize] != end {
+            end = last[end as usize];
+        }
+        // The next chain that comes here ends at once.
+        let mut at = vertex;
+        while last[at] != end {
+            at = std::mem::replace(&mut last[at], end) as usize;
+        }
+    }
+    last
 }

@@ -7,6 +7,7 @@ use glam::DVec3;
 use crate::TriangleMesh;
 use crate::report::has_area;
 use crate::topology::{Topology, is_proper};
+use crate::work::spend;
 
 /// Edges that are looked at, for each edge of the mesh; on curved surfaces flips need not end by themselves.
 const LOOKS: usize = 20;
@@ -69,6 +70,7 @@ fn flip(mesh: &mut TriangleMesh, wants: impl Fn(&[DVec3], &Diamond) -> bool) -> 
             break;
         }
         looks -= 1;
+        spend(4);
         let of = |edge: [u32; 2]| left.get(&edge).copied().flatten();
         let (Some(first), Some(second)) = (of([a, b]), of([b, a])) else { continue };
         let opposite = |triangle: u32| {

@@ -17,6 +17,7 @@ use glam::DVec3;
 
 use crate::TriangleMesh;
 use crate::topology::{Sets, Side, is_proper};
+use crate::work::spend;
 
 /// Angles that differ by less are the same, in quarters of a turn.
 const SAME_ANGLE: f64 = 1e-9;
@@ -51,6 +52,7 @@ pub(crate) enum Odd {
 
 /// The place of each vertex: the least vertex of all at that position. Positions are finite.
 pub(crate) fn places(vertices: &[DVec3]) -> Vec<u32> {
+    spend(4 * vertices.len());
     let mut order: Vec<u32> = (0..).take(vertices.len()).collect();
     // −0 is 0.
     let key = |vertex: &u32| (vertices[*vertex as usize] + DVec3::ZERO).to_array().map(f64::to_bits);
@@ -64,6 +66,7 @@ pub(crate) fn places(vertices: &[DVec3]) -> Vec<u32> {
 
 /// Joins triangles, given the place of each vertex. Those with a place twice take no part; indices are in range.
 pub(crate) fn join(vertices: &[DVec3], triangles: &[[u32; 3]], places: &[u32], odd: Odd) -> Joined {
+    spend(16 * triangles.len());
     let place = |vertex: u32| places[vertex as usize];
     // Of each side of each triangle: the places of its edge, then the vertices of its edge.
     let mut halves: Vec<([u32; 2], [u32; 2], Side)> = Vec::with_capacity(3 * triangles.len());
@@ -109,6 +112,7 @@ pub(crate) fn join(vertices: &[DVec3], triangles: &[[u32; 3]], places: &[u32], o
             [one] => joined.borders.push((one.triangle, edge)),
             [a, b] => joined.pairs.push([a, b]),
             _ => {
+                spend(16 * free.len());
                 let around = around(vertices, triangles, edge, &free, &place);
                 joined.paired_edges += 1;
                 let alone = pair(&around, &mut joined.pairs);
@@ -155,6 +159,7 @@ impl Joined {
             }
         }
         for group in &mut mesh.groups {
+            spend(1 + 4 * copies.len());
             // Copies have larger numbers, which ascend.
             let new = (keeps.len() as u32..).zip(&copies).filter(|(_, old)| group.vertices.binary_search(old).is_ok());
             let new: Vec<u32> = new.map(|(new, _)| new).collect();
@@ -239,6 +244,7 @@ fn middle_vertex(mesh: &mut TriangleMesh, edge: [u32; 2]) -> Option<u32> {
         return None;
     }
     mesh.vertices_m.push(place);
+    spend(4 * mesh.groups.len());
     for group in &mut mesh.groups {
         if edge.iter().all(|vertex| group.vertices.binary_search(vertex).is_ok()) {
             group.vertices.push(middle);

@@ -19,6 +19,7 @@ pub mod topology;
 mod tree;
 pub mod unit;
 mod walls;
+pub mod work;
 pub mod write;
 
 pub use mesh::{Group, TriangleMesh};

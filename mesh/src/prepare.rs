@@ -177,13 +177,19 @@ fn simulated(file: &TriangleMesh, vertex_of: &[Option<u32>], least: &[u32]) -> T
     }
 }
 
-/// The simulated vertex of each; for one that no triangle has, the nearest.
+/// Boxes that are looked at to find what is nearest to the vertices that no triangle has: so many, and so many for each triangle and
+/// vertex. Usually one takes some tens.
+const LOOKS: [u64; 2] = [1_000_000, 60];
+
+/// The simulated vertex of each; for one that no triangle has, the nearest, or one that is near ([`LOOKS`]).
 fn stand_ins(vertex_of: &[Option<u32>], file: &TriangleMesh, simulated: &TriangleMesh) -> Vec<u32> {
     let of = (&simulated.vertices_m[..], &simulated.triangles[..]);
     let mut tree = None;
+    let mut looks = LOOKS[0] + LOOKS[1] * (of.1.len() + vertex_of.len()) as u64;
     let mut nearest = |at: DVec3| {
         let tree = tree.get_or_insert_with(|| Tree::new(of.0, of.1, (0..).take(of.1.len())));
-        let triangle = tree.nearest(of, at).map(|found| of.1[found.triangle as usize]).unwrap_or_default();
+        let triangle =
+            tree.nearest_within(of, at, &mut looks).map(|found| of.1[found.triangle as usize]).unwrap_or_default();
         let away = |vertex: &u32| of.0[*vertex as usize].distance_squared(at);
         triangle.into_iter().min_by(|a, b| away(a).total_cmp(&away(b))).unwrap_or(0)
     };

@@ -58,7 +58,7 @@ impl<'m> Enclosures<'m> {
             let Some(around) = self.around_place(place, own) else { continue };
             let both = found.map_or_else(
                 || around.clone(),
-                |found| found.into_iter().filter(|part| around.contains(part)).collect(),
+                |found| found.into_iter().filter(|part| around.binary_search(part).is_ok()).collect(),
             );
             if both.is_empty() {
                 return Some(both);

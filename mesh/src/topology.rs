@@ -1,5 +1,7 @@
 //! How the triangles of a mesh are connected: edges, surfaces, holes, and where they are no manifold.
 
+use crate::work::spend;
+
 /// Ways that are compared where more than two borders meet.
 const CHOICES: usize = 8;
 
@@ -76,6 +78,7 @@ impl Topology {
     #[must_use]
     pub fn new(vertices: usize, triangles: &[[u32; 3]]) -> Self {
         let is_in = |triangle: &[u32; 3]| is_proper(triangle) && triangle.iter().all(|v| (*v as usize) < vertices);
+        spend(16 * triangles.len());
         let mut halves: Vec<([u32; 2], Side)> = Vec::with_capacity(3 * triangles.len());
         for (number, triangle) in (0..).zip(triangles).filter(|(_, triangle)| is_in(triangle)) {
             for corner in 0..3 {

@@ -2,6 +2,8 @@
 
 use glam::DVec3;
 
+use crate::work::spend;
+
 /// Triangles in a leaf.
 const LEAF: usize = 4;
 
@@ -52,6 +54,7 @@ impl Tree {
                 parent.second = Some(number);
             }
             let range = &mut tree.order[start..end];
+            spend(range.len());
             let all = range.iter().flat_map(|triangle| corners(vertices, triangles[*triangle as usize]));
             let (least, most) = all.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(l, m), at| (l.min(at), m.max(at)));
             tree.nodes.push(Node { least, most, start, end, second: None });
@@ -89,6 +92,7 @@ impl Tree {
         while let Some(number) = waiting.pop() {
             let node: &Node = &self.nodes[number];
             looked += 1;
+            spend(1);
             if node.least.cmpgt(most).any() || node.most.cmplt(least).any() {
                 continue;
             }
@@ -97,6 +101,7 @@ impl Tree {
                 waiting.push(number + 1);
                 continue;
             }
+            spend(node.end - node.start);
             for triangle in &self.order[node.start..node.end] {
                 looked += 1;
                 let at = corners(vertices, triangles[*triangle as usize]);
@@ -111,13 +116,27 @@ impl Tree {
     }
 
     /// The place nearest to a point; of several as near, that of the least triangle.
-    pub(crate) fn nearest(&self, (vertices, triangles): (&[DVec3], &[[u32; 3]]), point: DVec3) -> Option<Nearest> {
+    pub(crate) fn nearest(&self, of: (&[DVec3], &[[u32; 3]]), point: DVec3) -> Option<Nearest> {
+        let mut looks = u64::MAX;
+        self.nearest_within(of, point, &mut looks)
+    }
+
+    /// The same, or one that is near, once `looks` at boxes and triangles are used up: where very many are nearly as near, as in the
+    /// middle of a sphere, it can take a look at each to find out which is the nearest.
+    pub(crate) fn nearest_within(
+        &self,
+        (vertices, triangles): (&[DVec3], &[[u32; 3]]),
+        point: DVec3,
+        looks: &mut u64,
+    ) -> Option<Nearest> {
         let distance = |node: &Node| (point - point.clamp(node.least, node.most)).length_squared();
         let mut best: Option<Nearest> = None;
         let mut waiting = if self.nodes.is_empty() { Vec::new() } else { vec![0] };
         while let Some(number) = waiting.pop() {
             let node = &self.nodes[number];
-            if best.is_some_and(|best| distance(node) > best.squared) {
+            spend(1 + node.second.map_or(node.end - node.start, |_| 0));
+            *looks = looks.saturating_sub(1);
+            if best.is_some_and(|best| distance(node) > best.squared || *looks == 0) {
                 continue;
             }
             if let Some(second) = node.second {

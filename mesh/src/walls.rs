@@ -13,6 +13,7 @@ use std::collections::BTreeMap;
 use crate::TriangleMesh;
 use crate::ray::Enclosures;
 use crate::topology::{Sets, Topology, is_proper};
+use crate::work::spend;
 
 /// A tetrahedron is flat if six times its volume is at most this part of the cube of its longest edge.
 const FLAT: f64 = 1e-4;
@@ -176,6 +177,7 @@ pub(crate) fn match_diagonals(mesh: &mut TriangleMesh) -> usize {
     for edge in &topology.edges {
         let [a, c] = edge.vertices;
         let sides = topology.sides(edge);
+        spend(1 + sides.len() * sides.len().min(COMPARED));
         let opposite = |triangle: u32| mesh.triangles[triangle as usize].into_iter().find(|v| *v != a && *v != c);
         let mut flips = None;
         for (first, second) in sides.iter().take(COMPARED).flat_map(|one| sides.iter().map(move |other| (one, other))) {
