@@ -104,6 +104,8 @@ pub struct Limits {
     pub commands_per_step: f64,
     /// Springs times iterations that an exact force law may take; where they don't suffice, the coarse one stays.
     pub law_work: u64,
+    /// Operations, of some nanoseconds each, that a piece of heavy work may take on a mesh.
+    pub mesh_work: u64,
     /// Pieces of heavy work (a session laid out, another tissue, a force law) of one caller that wait.
     pub queued_work: usize,
     /// Such a piece has to be done within so long after it was asked for, s.
@@ -163,6 +165,7 @@ impl Default for Limits {
             keepalive_s: 10.0,
             commands_per_step: 4.0,
             law_work: 1 << 27,
+            mesh_work: 1 << 32,
             queued_work: 256,
             work_s: 30.0,
             sessions_per_minute: 600.0,

@@ -121,14 +121,14 @@ mod tests {
         assert_eq!(ended, Err(GivenUp::Stopped));
         assert!(done < 1_000_000 + 2 * BETWEEN_LOOKS, "{done}");
         for most in [0, 1, 7, 1000, 3 * BETWEEN_LOOKS + 5] {
-            let mut done = 0;
+            let done = Cell::new(0);
             let ended: Result<(), GivenUp> = within(&flag(), most, || {
                 loop {
                     spend(1);
-                    done += 1;
+                    done.set(done.get() + 1);
                 }
             });
-            assert_eq!((ended, done), (Err(GivenUp::TooMuch(most)), most));
+            assert_eq!((ended, done.get()), (Err(GivenUp::TooMuch(most)), most));
         }
     }
 

@@ -1,5 +1,7 @@
 //! The largest eigenvalue of the Laplacian of a weighted graph with masses, from above, by the method of Lanczos.
 
+use palpate_mesh::work::spend;
+
 /// Steps of Lanczos.
 const STEPS: usize = 100;
 
@@ -17,6 +19,7 @@ pub(super) fn largest_of_laplacian(around: &[Vec<(u32, f64)>], mass: impl Fn(u32
     // With √m·x in place of x it is symmetric.
     let applied = |x: &[f64], into: &mut [f64]| {
         for (point, others) in around.iter().enumerate() {
+            spend(1 + others.len());
             let pulls = others.iter().map(|(other, k)| k * x[*other as usize] / roots[*other as usize]);
             into[point] = degrees[point] * x[point] - roots[point] * pulls.sum::<f64>();
         }

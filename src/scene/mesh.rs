@@ -1,11 +1,12 @@
 //! The section `[mesh]` of a scene: tissue on the surface of a triangle mesh, and its rest shape.
 
-use std::cmp::{Ordering, Reverse};
+use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::sync::{Arc, OnceLock};
 
 use glam::{DQuat, DVec3};
 use palpate_mesh::surface::Surface;
+use palpate_mesh::work::spend;
 use palpate_mesh::{Group, TriangleMesh};
 
 use super::check::physical;
@@ -157,7 +158,10 @@ impl Mesh {
             Fixed::None => false,
             Fixed::Rim => rim,
             Fixed::Group(group) => group.vertices.binary_search(&vertex).is_ok(),
-            Fixed::Balls(balls) => balls.iter().any(|(centre_m, radius_m)| place_m.distance(*centre_m) <= *radius_m),
+            Fixed::Balls(balls) => {
+                spend(balls.len());
+                balls.iter().any(|(centre_m, radius_m)| place_m.distance(*centre_m) <= *radius_m)
+            }
         })?;
         shape.told = Told { fixed, uv, groups: mesh.groups, findings };
         shape.shown = shown;
@@ -305,17 +309,16 @@ impl Mesh {
         let mut stiffest = Stiffest { bound: 0.0, vertex: 0, usual: 0.0, extra_virtual };
         let mut bounds = Vec::new();
         for ([a, b], _) in self.springs() {
-            let [mut one, mut other] = [a, b].map(|end| around[end as usize].iter().peekable());
+            let [mut few, mut many] = [a, b].map(|end| around[end as usize].as_slice());
+            if few.len() > many.len() {
+                (few, many) = (many, few);
+            }
+            // A vertex may have very many neighbours, each of which has it as its own.
+            spend(1 + few.len());
             let mut common = 0.0;
-            while let (Some((l, of_a)), Some((m, of_b))) = (one.peek(), other.peek()) {
-                match l.cmp(m) {
-                    Ordering::Less => _ = one.next(),
-                    Ordering::Greater => _ = other.next(),
-                    Ordering::Equal => {
-                        common += of_a.min(*of_b);
-                        one.next();
-                        other.next();
-                    }
+            for (other, of_one) in few {
+                if let Ok(found) = many.binary_search_by_key(other, |(other, _)| *other) {
+                    common += of_one.min(many[found].1);
                 }
             }
             let [of_a, of_b] = [a, b].map(|end| weight[end as usize]);
@@ -487,6 +490,7 @@ impl MeshShape {
         if let Some(which) = triangles.iter().position(is_out) {
             return Err(refuse(format!("triangle {which} names a vertex beyond the last of {count}")));
         }
+        spend(32 * triangles.len());
         // Each side of each triangle, and the vertex opposite it.
         let mut sides: Vec<([u32; 2], u32)> = triangles
             .iter()
@@ -626,6 +630,7 @@ impl MeshShape {
             if std::mem::replace(&mut is_done[vertex as usize], true) {
                 continue;
             }
+            spend(16 * self.neighbours.of(vertex as usize).len());
             for next in self.neighbours.of(vertex as usize) {
                 let next_m = self.vertices_m[*next as usize].distance(self.vertices_m[member as usize]);
                 let known_m = &mut away_m[*next as usize];
@@ -866,6 +871,32 @@ impl Cells {
 mod tests {
     use super::*;
     use crate::shape;
+
+    #[test]
+    fn the_stiffest_vertex_is_found_in_as_many_operations_as_there_are_springs_whatever_they_share() {
+        // Two cones on one circle: each tip is in half of all triangles.
+        let around = 20_000_u32;
+        let mut vertices_m = vec![DVec3::new(0.0, 0.0, 0.05), DVec3::new(0.0, 0.0, -0.05)];
+        vertices_m.extend((0..around).map(|k| {
+            let angle = std::f64::consts::TAU * f64::from(k) / f64::from(around);
+            0.1 * DVec3::new(libm::cos(angle), libm::sin(angle), 0.0)
+        }));
+        let of = |k: u32| {
+            let (a, b) = (2 + k, 2 + (k + 1) % around);
+            [[0, a, b], [1, b, a]]
+        };
+        let mesh =
+            TriangleMesh { vertices_m, triangles: (0..around).flat_map(of).collect(), ..TriangleMesh::default() };
+        let most = 1000 * mesh.triangles.len() as u64;
+        let balls = vec![(DVec3::new(1.0, 1.0, 1.0), 0.1); 100];
+        let made =
+            palpate_mesh::work::within(&Arc::default(), most, || Mesh::of(mesh.clone(), 1e-3, Fixed::Balls(balls)));
+        assert_eq!(made.unwrap().unwrap().stiffest.vertex, 0);
+        // What can't be is given up.
+        let balls = vec![(DVec3::new(1.0, 1.0, 1.0), 0.1); 100_000];
+        let made = palpate_mesh::work::within(&Arc::default(), most, || Mesh::of(mesh, 1e-3, Fixed::Balls(balls)));
+        assert_eq!(made.map(|_| ()), Err(palpate_mesh::work::GivenUp::TooMuch(most)));
+    }
 
     /// A tetrahedron and, apart from it, a square of two triangles.
     fn shape() -> MeshShape {

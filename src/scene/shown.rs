@@ -7,6 +7,7 @@ use glam::DVec3;
 use palpate_mesh::decimate::{Place, decimate};
 use palpate_mesh::delaunay::flip_to_delaunay;
 use palpate_mesh::surface::nearest_place;
+use palpate_mesh::work::spend;
 use palpate_mesh::{FileMesh, TriangleMesh, prepare};
 
 use crate::refusal::{Reason, Refusal, Result};
@@ -153,6 +154,7 @@ impl Shown {
             let mut candidates: Vec<u32> = vec![place.triangle];
             if own[0] != own[1] {
                 candidates = old.iter().flat_map(|vertex| &around[*vertex as usize]).copied().collect();
+                spend(16 * candidates.len());
                 candidates.sort_unstable();
                 candidates.dedup();
             }

@@ -150,7 +150,8 @@ impl Config {
             journal_bytes journals_per_caller tools queued_commands_per_tool queued_samples queued_records
             queued_bytes sessions points_in_all point_substeps_per_step streams_per_session frame_vertices texture_side
             probe_points connections connections_per_address streams_per_connection message_bytes
-            connection_window_bytes queued_changes rehearsal_work law_work queued_work streams leases
+            connection_window_bytes queued_changes rehearsal_work law_work mesh_work queued_work streams
+            leases
         );
         if let Some((field, _)) = whole.iter().find(|limit| limit.1) {
             return Err(Refusal::new(Reason::OutOfRange, *field, "must be at least 1: 0 would refuse everything"));

@@ -5,13 +5,14 @@
 //!
 //! Jobs are bounded by counted work, not by time, so that the same request has the same result on every machine:
 //! `limits.rehearsal_work` (points × substeps of the rehearsals of a choice), `limits.law_work` (springs × iterations of a force
-//! law). A scene that needs more is refused, never chosen less accurately; offline programs allow 32 times as much.
+//! law), `limits.mesh_work` (what is done with a mesh, whose triangles a stranger may have laid). A scene that needs more is refused, never chosen less accurately; offline programs allow 32 times as much.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
+use palpate_mesh::work::{self, GivenUp};
 use tokio::sync::oneshot;
 use tonic::Status;
 
@@ -21,6 +22,7 @@ use crate::lock::lock;
 use crate::pace::clock::now_ns;
 use crate::priority::{give_way, thread};
 use crate::refusal::{Reason, Refusal};
+use crate::sheet::choice::given_up;
 
 /// Number of threads of a workshop.
 const THREADS: usize = 2;
@@ -79,6 +81,7 @@ struct Shared {
     changed: Condvar,
     deadline: Duration,
     most_waiting: usize,
+    most_operations: u64,
 }
 
 impl Shared {
@@ -152,7 +155,8 @@ impl Workshop {
     pub(crate) fn open(name: &str, limits: &Limits) -> std::io::Result<Self> {
         let deadline = Duration::from_secs_f64(limits.work_s);
         let (queue, changed) = (Mutex::default(), Condvar::new());
-        let shared = Arc::new(Shared { queue, changed, deadline, most_waiting: limits.queued_work });
+        let (most_waiting, most_operations) = (limits.queued_work, limits.mesh_work);
+        let shared = Arc::new(Shared { queue, changed, deadline, most_waiting, most_operations });
         let close = Arc::new(CloseOnDrop(shared.clone()));
         for index in 0..THREADS {
             let shared = shared.clone();
@@ -168,7 +172,8 @@ impl Workshop {
     /// if it happens while `work` runs, the flag that `work` has is set.
     ///
     /// # Errors
-    /// Returns an error if too many jobs of this account wait, if the deadline passes, or if `work` panics.
+    /// Returns an error if too many jobs of this account wait, if the deadline passes, if `work` takes too many operations, or if it
+    /// panics.
     pub(crate) async fn work<T: Send + 'static>(
         &self,
         account: &Account,
@@ -189,15 +194,21 @@ impl Workshop {
     ) -> Result<T, Status> {
         let (done, result) = oneshot::channel();
         let cancelled = CancelFlag::default();
-        let flag = cancelled.clone();
+        let (flag, most) = (cancelled.clone(), self.0.0.most_operations);
         let run = move || {
-            if let Ok(answer) = catch_unwind(AssertUnwindSafe(|| work(&flag))) {
+            if let Ok(answer) = catch_unwind(AssertUnwindSafe(|| work::within(&flag.0, most, || work(&flag)))) {
                 let _ = done.send(answer);
             }
         };
         let _waiting = self.enqueue(account.number(), urgency, cancelled, Box::new(run))?;
         match tokio::time::timeout(self.0.0.deadline, result).await {
-            Ok(Ok(answer)) => Ok(answer),
+            Ok(Ok(Ok(answer))) => Ok(answer),
+            Ok(Ok(Err(GivenUp::TooMuch(most)))) => {
+                let message = format!("would take more than {most} operations on its mesh (limits.mesh_work)");
+                Err(Refusal::new(Reason::TooLarge, "", message).into())
+            }
+            // Nobody would be told.
+            Ok(Ok(Err(GivenUp::Stopped))) => Err(given_up().into()),
             Ok(Err(_)) => Err(Status::internal("internal error (worker panicked)")),
             Err(_) => {
                 let message =
@@ -344,6 +355,35 @@ mod tests {
         assert_eq!(workshop.load().waiting, 0);
         assert_eq!(workshop.work(&greedy, |_| 7).await.unwrap(), 7);
         assert!(end.try_recv().is_err());
+    }
+
+    #[tokio::test]
+    async fn a_job_of_many_operations_ends_when_its_call_does_and_when_it_takes_too_many() {
+        let [one, other] = accounts(["one", "other"]);
+        let strict = workshop(Limits { mesh_work: 1000, ..Limits::default() });
+        let refused = strict.work(&one, |_| (0..2000).for_each(|_| work::spend(1))).await.unwrap_err();
+        assert_eq!(refused.code(), tonic::Code::InvalidArgument);
+        assert!(refused.message().contains("more than 1000 operations"), "{refused}");
+        let workshop = workshop(Limits { mesh_work: u64::MAX, ..Limits::default() });
+        let (begun, begin) = mpsc::channel();
+        let endless = move |_: &CancelFlag| {
+            let _ = begun.send(());
+            // It looks at no flag of its own.
+            loop {
+                work::spend(1);
+            }
+        };
+        let asked = tokio::spawn({
+            let (workshop, one) = (workshop.clone(), one.clone());
+            async move { workshop.work::<()>(&one, endless).await }
+        });
+        while begin.try_recv().is_err() {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(workshop.work(&other, |_| 7).await.unwrap(), 7);
+        asked.abort();
+        assert!(asked.await.unwrap_err().is_cancelled());
+        assert_eq!(workshop.work(&one, |_| 7).await.unwrap(), 7);
     }
 
     #[tokio::test]
