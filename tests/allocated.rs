@@ -217,7 +217,8 @@ fn a_journal_of_empty_entries_takes_no_more_than_its_reader_pays_for() {
             assert!(took as u64 <= paid + SLACK as u64, "{what}: {} bytes took {took}, paid {paid}", file.len());
         }
         println!("{what}: {} bytes took {took}, paid at most {paid}: {:?}", file.len(), read.err().map(|r| r.message));
-        assert!(took <= 2 * (MULTIPLE * file.len() + ROOM) + (32 << 20), "{what}: {} bytes took {took}", file.len());
+        // A batch has room for 65,536 inputs, however short they are.
+        assert!(took <= 2 * (MULTIPLE * file.len() + ROOM) + (128 << 20), "{what}: {} bytes took {took}", file.len());
     }
     // With little memory the request ends, before anything is decoded.
     let (read, took) = counted(|| read_all(&files[0].1, &account(4 << 20)));
@@ -300,6 +301,9 @@ fn every_shipped_scene_and_a_mesh_of_zeros_can_be_moved() {
     let shipped = BUILT_IN.iter().map(|(name, text)| Scene::parse(name, text, &[], &limits).unwrap());
     let message = pb::Scene {
         mesh: Some(pb::Mesh { mesh_id: "a".into(), point_mass_kg: Some(1e-4), ..Default::default() }),
+        springs: Some(pb::Springs { stiffness_n_per_m: Some(10.0), ..Default::default() }),
+        virtual_springs: Some(pb::VirtualSprings { stiffness_n_per_m: Some(1.0) }),
+        damping: Some(pb::Damping { coefficient_n_s_per_m: Some(0.01) }),
         ..Default::default()
     };
     let mesh = flat(100);

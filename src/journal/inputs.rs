@@ -110,6 +110,7 @@ mod tests {
     use palpate_touch::Tip;
 
     use super::*;
+    use crate::refusal::{Reason, Refusal};
     use crate::scene::script::Action;
     use crate::session::Session;
     use crate::session::command::{Command, Due};

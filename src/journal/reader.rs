@@ -51,8 +51,9 @@ pub struct Batch {
     places: Vec<(u16, u64, u64)>,
 }
 
-/// What the inputs of a batch may take in memory whatever their length, bytes: there are no more of them than [`MOST_INPUTS`].
-const INPUTS_ROOM: usize = MOST_INPUTS * size_of::<pb::Input>();
+/// What the inputs of a batch may take in memory whatever their length, bytes: there are no more of them than [`MOST_INPUTS`], in a
+/// vector that has grown.
+const INPUTS_ROOM: usize = 2 * MOST_INPUTS * size_of::<pb::Input>();
 
 /// What a message takes beside what it refers to, in the lists in which it waits, bytes.
 const MESSAGE_BYTES: usize = 1024;

@@ -116,9 +116,9 @@ impl Config {
     /// Returns an error with the line if the text is not TOML or has an unknown key, and the errors of [`Config::check`].
     pub fn parse(name: &str, text: &str) -> Result<Self> {
         let config: Config = toml::from_str(text).map_err(|e| {
-            let line = e.span().map_or(1, |span| text[..span.start].matches('\n').count() + 1);
-            let place = Some(format!("{name}:{line}"));
-            Refusal { place, ..Refusal::new(Reason::Unreadable, "", e.message()) }
+            let line = e.span().map_or(0, |span| text[..span.start].matches('\n').count());
+            let message = format!("{}: {}", text.lines().nth(line).unwrap_or_default().trim(), e.message());
+            Refusal { place: Some(format!("{name}:{}", line + 1)), ..Refusal::new(Reason::Unreadable, "", message) }
         })?;
         config.check().map_err(|refusal| Refusal { place: Some(name.to_owned()), ..refusal })?;
         Ok(config)

@@ -362,7 +362,7 @@ mod tests {
         let [one, other] = accounts(["one", "other"]);
         let strict = workshop(Limits { mesh_work: 1000, ..Limits::default() });
         let refused = strict.work(&one, |_| (0..2000).for_each(|_| work::spend(1))).await.unwrap_err();
-        assert_eq!(refused.code(), tonic::Code::InvalidArgument);
+        assert_eq!(refused.code(), tonic::Code::ResourceExhausted);
         assert!(refused.message().contains("more than 1000 operations"), "{refused}");
         let workshop = workshop(Limits { mesh_work: u64::MAX, ..Limits::default() });
         let (begun, begin) = mpsc::channel();
