@@ -108,8 +108,9 @@ fn a_message_takes_no_more_than_was_measured() {
         }
         let (was_decoded, took) = counted(|| shape.decodes(bytes));
         decoded += u64::from(was_decoded);
+        // A field of bytes is copied twice where it is decoded from a slice.
         assert!(
-            took <= memory + 1024,
+            took <= memory + bytes.len() + 1024,
             "{}: {} bytes took {took}, but were measured as {memory}: {:?}",
             shape.name(),
             bytes.len(),

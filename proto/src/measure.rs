@@ -163,6 +163,22 @@ fn room(entries: usize) -> usize {
     if entries == 0 { 0 } else { entries.saturating_mul(2).max(4) }
 }
 
+/// Takes a varint from the front of `bytes`.
+pub fn varint(bytes: &mut &[u8]) -> Option<u64> {
+    let mut value = 0;
+    for shift in (0..64).step_by(7) {
+        let first = *bytes.split_off_first()?;
+        value |= u64::from(first & 0x7f) << shift;
+        if first & 0x80 == 0 {
+            return Some(value);
+        }
+    }
+    None
+}
+
+/// Memory that the message in `bytes` takes when it is decoded.
+///
+/// # Errors
 /// Refuses one that would take more than [`MULTIPLE`] times its bytes and `room`.
 pub fn memory_of<M: Name>(bytes: &[u8], room: usize) -> Result<usize> {
     let Some(shape) = Shape::of::<M>() else { return Ok(0) };
@@ -208,7 +224,7 @@ mod tests {
         assert_eq!(memory, 2000 * size_of::<journal::Moment>() + 1000 * 4 * size_of::<journal::FeltTool>());
         // Packed numbers, by what each takes.
         let mesh = journal::TriangleMesh { triangles: vec![1; 4096], uv: vec![0.0; 64], ..Default::default() };
-        assert_eq!(measured(&mesh).memory, 4096 * 4 + 64 * 4);
+        assert_eq!(measured(&mesh).memory, 2 * (4096 * 4 + 64 * 4));
         let hold = journal::Hold { reason: "a".repeat(100) };
         assert_eq!(measured(&hold).memory, 100);
     }

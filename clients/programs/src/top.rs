@@ -211,7 +211,7 @@ fn table(server: &str, rows: &[Row], most: usize) -> String {
             session.late_commands,
             error,
             session.streams,
-            printable(&holders.join(", ")),
+            printable(holders.join(", ")),
         );
     }
     if rows.len() > most {
