@@ -219,7 +219,7 @@ fn a_journal_of_empty_entries_takes_no_more_than_its_reader_pays_for() {
         }
         println!("{what}: {} bytes took {took}, paid at most {paid}: {:?}", file.len(), read.err().map(|r| r.message));
         // A batch has room for 65,536 inputs, however short they are.
-        assert!(took <= 2 * (MULTIPLE * file.len() + ROOM) + (128 << 20), "{what}: {} bytes took {took}", file.len());
+        assert!(took <= 2 * (MULTIPLE * file.len() + ROOM) + (32 << 20), "{what}: {} bytes took {took}", file.len());
     }
     // With little memory the request ends, before anything is decoded.
     let (read, took) = counted(|| read_all(&files[0].1, &account(4 << 20)));

@@ -596,8 +596,9 @@ fn another_version_and_what_is_above_the_limits_is_refused() {
         (Limits { tools: 2, ..limits() }, "tool 2, but tools are numbered below 2"),
         (Limits { point_force_n: 0.01, ..limits() }, "above the limit of 0.01 N"),
     ] {
-        let saved = Saved::from_bytes(&bytes, &limits).unwrap();
-        let refusal = Session::restore(session.model(), &saved).map(drop).unwrap_err();
+        // How many tools there are is known before any of them is laid out.
+        let restored = Saved::from_bytes(&bytes, &limits).and_then(|saved| Session::restore(session.model(), &saved));
+        let refusal = restored.map(drop).unwrap_err();
         assert!(refusal.message.contains(what), "{refusal}");
     }
     assert!(refusal(b"", &limits()).message.contains("is no snapshot"));
@@ -708,4 +709,4 @@ fn the_bytes_of_a_snapshot_stay() {
     assert_eq!((VERSION, format!("{:032x}", xxhash_rust::xxh3::xxh3_128(&bytes))), (2, GOLDEN.to_owned()));
 }
 
-const GOLDEN: &str = "91ac64c3ff0e8aaf7e8fef42dcd46e7c";
+const GOLDEN: &str = "8ee702faa77d755229330c9e64198981";

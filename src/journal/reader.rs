@@ -61,8 +61,7 @@ const MESSAGE_BYTES: usize = 1024;
 impl Batch {
     /// What it takes when all of its messages are decoded, bytes.
     fn memory(&self) -> Result<u64> {
-        // Its bytes are there twice while it is read.
-        let mut sum = 2 * self.data.len() + size_of_val(self.places.as_slice());
+        let mut sum = self.data.len() + size_of_val(self.places.as_slice());
         for (topic, range) in &self.messages {
             let bytes = &self.data[range.clone()];
             let memory = match topic {

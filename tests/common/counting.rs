@@ -8,13 +8,26 @@ thread_local! {
     /// Bytes that this thread has, and the most that it has had; what other threads free for it is not known.
     static NOW: Cell<isize> = const { Cell::new(0) };
     static MOST: Cell<isize> = const { Cell::new(0) };
+    /// A large piece that was asked for last. If it goes back at once, it was a question (`palpate::memory`) and never had a page.
+    static ASKED: Cell<isize> = const { Cell::new(0) };
 }
+
+/// From this size on a piece may be a question.
+const LARGE: isize = 64 << 20;
 
 struct Counting;
 
 fn add(bytes: isize) {
+    let asked = ASKED.take();
+    if asked > 0 && bytes != -asked {
+        MOST.set(MOST.get().max(NOW.get()));
+    }
     NOW.set(NOW.get() + bytes);
-    MOST.set(MOST.get().max(NOW.get()));
+    if bytes >= LARGE {
+        ASKED.set(bytes);
+    } else {
+        MOST.set(MOST.get().max(NOW.get()));
+    }
 }
 
 // SAFETY: it only counts.
@@ -53,5 +66,6 @@ pub fn counted<T>(work: impl FnOnce() -> T) -> (T, usize) {
     let before = NOW.get();
     MOST.set(before);
     let result = work();
+    add(0);
     (result, (MOST.get() - before).max(0) as usize)
 }
