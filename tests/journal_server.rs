@@ -214,19 +214,8 @@ async fn nothing_is_kept_where_it_is_not_wanted() {
 async fn a_full_disk_breaks_the_journal_and_not_the_session_and_the_journal_begins_anew_when_there_is_room() {
     let folder = tempfile::tempdir().unwrap();
     // No file may have more than 200 KiB.
-    let script = format!(
-        "trap '' XFSZ; ulimit -f 400; exec {} serve --listen 127.0.0.1:0 --log error --journal {}",
-        env!("CARGO_BIN_EXE_palpate"),
-        folder.path().display()
-    );
-    let child = Command::new("sh")
-        .args(["-c", &script])
-        .current_dir(env!("CARGO_MANIFEST_DIR"))
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let server = Server::of(child);
+    let script = "trap '' XFSZ; ulimit -f 400; exec \"$0\" serve --listen 127.0.0.1:0 --log error --journal \"$1\"";
+    let server = Server::by_script(script, &[folder.path().as_os_str()]);
     let id = server.paper(false).await;
     let mut touch = Touch::hold(&server, &id).await;
     let mut sequence = 0;

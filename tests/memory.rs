@@ -8,7 +8,6 @@ mod cores;
 #[path = "common/server.rs"]
 mod server;
 
-use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use palpate_proto::pb;
@@ -143,14 +142,7 @@ async fn without_address_space_requests_are_refused_sessions_end_and_others_are_
 #[tokio::test]
 async fn a_server_with_few_addresses_serves_its_first_requests() {
     let script = "ulimit -v 300000 && exec \"$0\" serve --listen 127.0.0.1:0 --memory 64MiB";
-    let child = Command::new("sh")
-        .args(["-c", script, env!("CARGO_BIN_EXE_palpate")])
-        .current_dir(env!("CARGO_MANIFEST_DIR"))
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let server = Server::of(child);
+    let server = Server::by_script(script, &[]);
     let mut sessions = server.sessions().await;
     let first = create(&mut sessions, 31, false).await.unwrap();
     for _ in 0..3 {

@@ -58,12 +58,14 @@ impl<T: Real> Sheet<T> {
                 _ => DVec3::ZERO,
             };
             // Forces of other tools on these points do work along this movement as well.
-            let moved =
-                plan.scheme.kick()[0] * (leg.jump_n + thrust.kick_n) + plan.scheme.constant()[0] * thrust.steady_n;
-            let scale = plan.force_scale(&model.scene);
-            for Reached { point, mass, weight, .. } in tool.footprint.reached().iter().filter(|point| point.free) {
-                let movement = scale * weight / mass * moved;
-                work.add(applied.work_along(model, plan, layout, *point, movement.to_array()) * unit_j);
+            if !applied.terms.is_empty() {
+                let moved =
+                    plan.scheme.kick()[0] * (leg.jump_n + thrust.kick_n) + plan.scheme.constant()[0] * thrust.steady_n;
+                let scale = plan.force_scale(&model.scene);
+                for Reached { point, mass, weight, .. } in tool.footprint.reached().iter().filter(|point| point.free) {
+                    let movement = scale * weight / mass * moved;
+                    work.add(applied.work_along(model, plan, layout, *point, movement.to_array()) * unit_j);
+                }
             }
             let all_n = leg.jump_n + thrust.kick_n + thrust.steady_n;
             if is_new && !met {

@@ -90,6 +90,19 @@ impl Server {
         Server::of(child)
     }
 
+    /// A server that a script of the shell starts, such as one that sets limits: `$0` is the program, `$1` and so on `arguments`.
+    pub fn by_script(script: &str, arguments: &[&std::ffi::OsStr]) -> Self {
+        let child = Command::new("sh")
+            .args(["-c", script, env!("CARGO_BIN_EXE_palpate")])
+            .args(arguments)
+            .current_dir(env!("CARGO_MANIFEST_DIR"))
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        Server::of(child)
+    }
+
     /// A server in `child`, which prints its address first.
     pub fn of(mut child: Child) -> Self {
         let mut line = String::new();

@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec3;
 
+use super::allowance::Allowance;
 use super::polygon::{Split, triangles};
-use super::purse::Purse;
 use super::volume::{Cell, Volume};
 use super::{ReadLimits, ReadMesh};
 use crate::topology::Topology;
@@ -29,7 +29,7 @@ const CLOSED: usize = 160;
 /// A mesh while it is read.
 pub(super) struct Draft<'l> {
     pub(super) limits: &'l ReadLimits,
-    pub(super) purse: Purse<'l>,
+    pub(super) allowance: Allowance<'l>,
     pub(super) notes: Vec<String>,
     /// Points and lines of the file, which are no surface.
     pub(super) lines: usize,
@@ -53,10 +53,10 @@ pub(super) struct Draft<'l> {
 }
 
 impl<'l> Draft<'l> {
-    pub(super) fn new(limits: &'l ReadLimits, purse: Purse<'l>) -> Self {
+    pub(super) fn new(limits: &'l ReadLimits, allowance: Allowance<'l>) -> Self {
         Self {
             limits,
-            purse,
+            allowance,
             notes: Vec::new(),
             lines: 0,
             drops_unused: false,
@@ -85,7 +85,7 @@ impl<'l> Draft<'l> {
         if self.vertices.len() >= self.limits.vertices {
             return Err(Problem::TooLarge { what: "vertices", limit: self.limits.vertices });
         }
-        self.purse.push(&mut self.vertices, DVec3::from_array(at))
+        self.allowance.push(&mut self.vertices, DVec3::from_array(at))
     }
 
     /// The group of a name.
@@ -96,7 +96,7 @@ impl<'l> Draft<'l> {
         if self.groups.len() >= GROUPS {
             return Err(Problem::TooLarge { what: "groups", limit: GROUPS });
         }
-        self.purse.take(4 * (name.len() + size_of::<Group>()))?;
+        self.allowance.take(4 * (name.len() + size_of::<Group>()))?;
         let group = self.groups.len();
         self.groups.push(Group { name: name.to_owned(), vertices: Vec::new() });
         self.groups_by_name.insert(name.to_owned(), group);
@@ -118,7 +118,7 @@ impl<'l> Draft<'l> {
             let vertex = self.index(*corner)?;
             for group in groups {
                 if let Some(group) = self.groups.get_mut(*group) {
-                    self.purse.push(&mut group.vertices, vertex)?;
+                    self.allowance.push(&mut group.vertices, vertex)?;
                     // Many faces share a vertex. So that none takes more than twice what it needs:
                     if group.vertices.len() > 2 * self.vertices.len() + 1024 {
                         group.vertices.sort_unstable();
@@ -140,9 +140,9 @@ impl<'l> Draft<'l> {
         if corners.len() > self.limits.triangles.saturating_add(2) {
             return Err(Problem::TooLarge { what: "triangles", limit: self.limits.triangles });
         }
-        self.purse.take(SPLITTING * corners.len())?;
+        self.allowance.take(SPLITTING * corners.len())?;
         self.split(corners, uv)?;
-        self.purse.give_back(SPLITTING * corners.len());
+        self.allowance.give_back(SPLITTING * corners.len());
         Ok(())
     }
 
@@ -171,14 +171,14 @@ impl<'l> Draft<'l> {
         }
         if !uv.is_empty() && !self.has_uv {
             self.has_uv = true;
-            self.purse.take(size_of::<[[f32; 2]; 3]>() * self.triangles.len())?;
+            self.allowance.take(size_of::<[[f32; 2]; 3]>() * self.triangles.len())?;
             self.uv = vec![[[0.0; 2]; 3]; self.triangles.len()];
         }
         let [a, b, c] = places.map(|place| self.index(corners[place]));
-        self.purse.push(&mut self.triangles, [a?, b?, c?])?;
+        self.allowance.push(&mut self.triangles, [a?, b?, c?])?;
         if self.has_uv {
             let own = if uv.is_empty() { [[0.0; 2]; 3] } else { places.map(|place| uv[place]) };
-            self.purse.push(&mut self.uv, own)?;
+            self.allowance.push(&mut self.uv, own)?;
         }
         Ok(())
     }
@@ -209,13 +209,13 @@ impl<'l> Draft<'l> {
         self.assign(nodes, groups)?;
         self.drops_unused = true;
         let corners = nodes.iter().map(|node| self.index(*node)).collect::<Result<Vec<u32>, _>>()?;
-        self.volume.add(cell, &corners, &mut self.purse)
+        self.volume.add(cell, &corners, &mut self.allowance)
     }
 
     /// Whether the triangles so far are a closed surface.
     pub(super) fn is_closed(&mut self) -> bool {
         // Without the memory to find out, it is not known to be.
-        let paid = self.purse.take(CLOSED * self.triangles.len());
+        let paid = self.allowance.take(CLOSED * self.triangles.len());
         paid.is_ok() && Topology::new(self.vertices.len(), &self.triangles).is_closed()
     }
 
@@ -230,7 +230,7 @@ impl<'l> Draft<'l> {
         (self.split, self.concave, self.folded, self.has_uv) = (0, 0, 0, false);
         self.triangles.clear();
         self.uv.clear();
-        let surface = volume.outer_surface(&self.vertices, &mut self.purse)?;
+        let surface = volume.outer_surface(&self.vertices, &mut self.allowance)?;
         for face in surface.faces {
             let corners: Vec<i64> = face.into_iter().map(i64::from).collect();
             self.polygon(&corners, &[], &[])?;
@@ -250,7 +250,7 @@ impl<'l> Draft<'l> {
     fn drop_repeated(&mut self) -> Result<(), Problem> {
         // Twice a triangle, in a tree.
         const REPEATED: usize = 32;
-        self.purse.take(REPEATED * self.triangles.len())?;
+        self.allowance.take(REPEATED * self.triangles.len())?;
         let mut seen = BTreeSet::new();
         let is_first = |triangle: &[u32; 3]| {
             let least = (0..3).min_by_key(|corner| triangle[*corner]).unwrap_or(0);

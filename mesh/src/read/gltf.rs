@@ -109,7 +109,7 @@ pub(super) fn read(
     let fail_whole = |problem| MeshError { file: name.to_owned(), element: Element::Whole, place_m: None, problem };
     // With texts, which are no longer in memory than in the file.
     let entries = json.len().saturating_mul(ENTRIES_MULTIPLE).min(MOST_ENTRIES);
-    draft.purse.take(2 * json.len() + entries).map_err(fail_whole)?;
+    draft.allowance.take(2 * json.len() + entries).map_err(fail_whole)?;
     let head: Head = parsed(name, json)?;
     if let Some(problem) = head.refusal() {
         return Err(MeshError { file: name.to_owned(), element: Element::Whole, place_m: None, problem });
@@ -145,8 +145,8 @@ pub(super) fn read(
             return Err(fail(Problem::TooLarge { what: "bytes", limit: draft.limits.bytes }));
         }
         if matches!(content, Cow::Owned(_)) {
-            draft.purse.add_file(content.len());
-            draft.purse.take(content.len()).map_err(fail)?;
+            draft.allowance.add_file(content.len());
+            draft.allowance.take(content.len()).map_err(fail)?;
         }
         if content.len() < buffer.byte_length {
             let missing = format!("{} of {} bytes", buffer.byte_length - content.len(), buffer.byte_length);
@@ -176,7 +176,7 @@ impl File<'_> {
             }
             return Ok(());
         }
-        let memory = draft.purse.take(WAITING * root.nodes.0.len());
+        let memory = draft.allowance.take(WAITING * root.nodes.0.len());
         memory.map_err(|problem| self.fail("node", 0, problem))?;
         let mut is_child = vec![false; root.nodes.0.len()];
         for child in root.nodes.0.iter().flat_map(|node| &node.children.0) {
@@ -215,7 +215,7 @@ impl File<'_> {
             if let Some(mesh) = node.mesh {
                 self.mesh(mesh, node.name.as_deref(), whole, draft)?;
             }
-            let memory = draft.purse.take(WAITING * node.children.0.len());
+            let memory = draft.allowance.take(WAITING * node.children.0.len());
             memory.map_err(|problem| self.fail("node", number, problem))?;
             waiting.extend(node.children.0.iter().rev().map(|child| (*child as usize, whole)));
         }
@@ -272,7 +272,7 @@ impl File<'_> {
             };
             // A mirrored node turns its triangles inside out.
             let is_mirrored = place.determinant() < 0.0;
-            draft.purse.take(size_of_val(corners.as_slice())).map_err(fail)?;
+            draft.allowance.take(size_of_val(corners.as_slice())).map_err(fail)?;
             let triangles: Box<dyn Iterator<Item = [i64; 3]>> = match mode {
                 4 => Box::new(corners.chunks_exact(3).map(|c| [c[0], c[1], c[2]])),
                 5 => Box::new(
@@ -301,7 +301,7 @@ impl File<'_> {
                 draft.polygon(&triangle.map(|corner| corner + first), &uv, &groups).map_err(fail)?;
             }
             let uv = uv.as_deref().map_or(0, size_of_val);
-            draft.purse.give_back(size_of_val(positions.as_slice()) + uv + 2 * size_of_val(corners.as_slice()));
+            draft.allowance.give_back(size_of_val(positions.as_slice()) + uv + 2 * size_of_val(corners.as_slice()));
         }
         Ok(())
     }
@@ -337,7 +337,7 @@ impl File<'_> {
             return Err(fail(Problem::TooLarge { what, limit }));
         }
         // Entries may be left out of the file, or overlap in it.
-        draft.purse.take(accessor.count.saturating_mul(size_of::<[f64; N]>())).map_err(fail)?;
+        draft.allowance.take(accessor.count.saturating_mul(size_of::<[f64; N]>())).map_err(fail)?;
         let known = |component: u32| scalar(component).ok_or_else(|| syntax(format!("component type {component}")));
         let component = known(accessor.component_type)?;
         let factor = if accessor.normalized { normal_factor(component) } else { 1.0 };

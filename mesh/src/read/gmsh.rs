@@ -255,7 +255,7 @@ impl File<'_, '_, '_> {
     fn node(&mut self, tag: i64, at: [f64; 3]) -> Result<(), MeshError> {
         let number = self.draft.vertices() as i64;
         // In a table that grows.
-        self.draft.purse.take(2 * size_of::<(i64, i64)>() + 2).map_err(|problem| self.source.fail(problem))?;
+        self.draft.allowance.take(2 * size_of::<(i64, i64)>() + 2).map_err(|problem| self.source.fail(problem))?;
         if self.nodes.insert(tag, number).is_some() {
             return Err(self.source.syntax(format!("node {tag} is there twice")));
         }
@@ -292,7 +292,7 @@ impl File<'_, '_, '_> {
             let mut tags = Vec::new();
             for _ in 0..count {
                 let tag = self.tag("the tag of a node")?;
-                self.draft.purse.push(&mut tags, tag).map_err(|problem| self.source.fail(problem))?;
+                self.draft.allowance.push(&mut tags, tag).map_err(|problem| self.source.fail(problem))?;
             }
             let parameters = if is_parametric { dimension.clamp(0, 3) } else { 0 };
             for tag in tags {

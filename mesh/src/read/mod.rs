@@ -1,12 +1,12 @@
 //! Mesh files: OBJ, STL, PLY, glTF, Gmsh and VTK, read within bounds; whatever the bytes are, nothing here panics.
 
+mod allowance;
 mod draft;
 mod gltf;
 mod gmsh;
 mod obj;
 mod ply;
 mod polygon;
-mod purse;
 mod source;
 mod stl;
 mod volume;
@@ -14,8 +14,8 @@ mod vtk;
 mod vtk_xml;
 
 use crate::{Element, MeshError, Problem, TriangleMesh, Unit};
+use allowance::Allowance;
 use draft::Draft;
-use purse::Purse;
 use source::Source;
 
 /// Reading takes so many bytes of memory for each byte of a file, and [`ROOM`] beside; what would take more is refused. Meshes of
@@ -157,7 +157,7 @@ pub fn read_paid(
     let bytes = if is_free { bytes } else { without_mark(bytes) };
     let by_name = Format::of_extension(name);
     let format = Format::of_content(bytes).or(by_name).ok_or_else(|| fail(Problem::UnknownFormat))?;
-    let mut draft = Draft::new(limits, Purse::new(bytes.len(), pay));
+    let mut draft = Draft::new(limits, Allowance::new(bytes.len(), pay));
     if by_name.is_some_and(|by_name| by_name != format) {
         draft.notes.push(format!("The file's content is {format:?}, whatever its extension."));
     }

@@ -61,7 +61,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                 let u = words.next().ok_or_else(|| source.syntax("texture coordinates are numbers: vt u v"))?;
                 let u = parsed(u).ok_or_else(|| source.no_number(u, "a texture coordinate"))?;
                 let place = [u, words.next().map_or(0.0, |v| parsed(v).unwrap_or(f32::NAN))];
-                draft.purse.push(&mut places, place).map_err(|problem| source.fail(problem))?;
+                draft.allowance.push(&mut places, place).map_err(|problem| source.fail(problem))?;
             }
             // `fo` is the same in old files.
             b"f" | b"fo" => {
@@ -76,11 +76,11 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                         return Err(source.syntax("a face names vertex 0: OBJ counts vertices from 1"));
                     }
                     let corner = resolved(index, draft.vertices());
-                    draft.purse.push(&mut corners, corner).map_err(|problem| source.fail(problem))?;
+                    draft.allowance.push(&mut corners, corner).map_err(|problem| source.fail(problem))?;
                     let place = parts.next().and_then(parsed::<i64>);
                     let place = place.map(|place| resolved(place, places.len()));
                     if let Some(place) = place.and_then(|place| places.get(usize::try_from(place).ok()?)) {
-                        draft.purse.push(&mut uv, *place).map_err(|problem| source.fail(problem))?;
+                        draft.allowance.push(&mut uv, *place).map_err(|problem| source.fail(problem))?;
                     }
                 }
                 draft.polygon(&corners, &uv, &active).map_err(|problem| {

@@ -3,8 +3,8 @@
 //!
 //! `ply-rs-bw` is not used: it allocates what a header counts and panics at a count that is too long.
 
+use super::allowance::Allowance;
 use super::draft::Draft;
-use super::purse::Purse;
 use super::source::{Order, Scalar, Source, named, parsed, shown, words};
 use crate::{Element as Place, MeshError, Problem};
 
@@ -177,7 +177,7 @@ impl Row {
         element: &Element,
         corners: Option<usize>,
         encoding: Encoding,
-        purse: &mut Purse<'_>,
+        allowance: &mut Allowance<'_>,
     ) -> Result<(), MeshError> {
         self.corners.clear();
         self.corner_uv.clear();
@@ -202,7 +202,7 @@ impl Row {
             for entry in 0..length {
                 if corners == Some(place) {
                     let corner = integer(source, property.scalar, encoding, "a vertex of a face")?;
-                    purse.push(&mut self.corners, corner).map_err(|problem| source.fail(problem))?;
+                    allowance.push(&mut self.corners, corner).map_err(|problem| source.fail(problem))?;
                     continue;
                 }
                 let value = real(source, property.scalar, encoding, "an entry of a list")? as f32;
@@ -210,7 +210,7 @@ impl Row {
                     0 => first = value,
                     _ if is_uv => {
                         let place = [first, value];
-                        purse.push(&mut self.corner_uv, place).map_err(|problem| source.fail(problem))?;
+                        allowance.push(&mut self.corner_uv, place).map_err(|problem| source.fail(problem))?;
                     }
                     _ => {}
                 }
@@ -244,11 +244,11 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
         let has_uv = element.properties.iter().any(|p| ["s", "u", "texture_u"].contains(&p.name.as_str()));
         for number in 0..count as u64 {
             if encoding.is_some() {
-                row.read(&mut source, element, corners, encoding, &mut draft.purse)?;
+                row.read(&mut source, element, corners, encoding, &mut draft.allowance)?;
             } else {
                 let mut line = next_row(&mut source)
                     .ok_or_else(|| source.truncated(format!("row {number} of {count} of `{}`", element.name)))?;
-                row.read(&mut line, element, corners, encoding, &mut draft.purse)?;
+                row.read(&mut line, element, corners, encoding, &mut draft.allowance)?;
                 let is_wider = line.word().is_some();
                 // As of a row that does not begin with the length of its list.
                 if is_wider && role == Role::Face && row.corners.len() < 3 {
@@ -263,7 +263,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
             if row.corner_uv.len() != row.corners.len() {
                 row.corner_uv.clear();
                 for place in row.corners.iter().filter_map(of_vertex) {
-                    let paid = draft.purse.push(&mut row.corner_uv, place);
+                    let paid = draft.allowance.push(&mut row.corner_uv, place);
                     paid.map_err(|problem| source.fail(problem))?;
                 }
             }
@@ -272,7 +272,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                 Role::Vertex => {
                     draft.vertex(row.at).map_err(|problem| source.fail(problem))?;
                     if has_uv {
-                        draft.purse.push(&mut uv_of, row.uv).map_err(|problem| source.fail(problem))?;
+                        draft.allowance.push(&mut uv_of, row.uv).map_err(|problem| source.fail(problem))?;
                     }
                 }
                 Role::Face => draft.polygon(&row.corners, &row.corner_uv, &[]).map_err(fail)?,

@@ -50,7 +50,7 @@ impl Welder<'_, '_> {
             return Ok(*number);
         }
         // In a table that grows.
-        self.draft.purse.take(2 * size_of::<([u64; 3], i64)>() + 2)?;
+        self.draft.allowance.take(2 * size_of::<([u64; 3], i64)>() + 2)?;
         let number = self.draft.vertices() as i64;
         self.draft.vertex(at)?;
         self.numbers.insert(key, number);

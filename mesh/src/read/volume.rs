@@ -5,7 +5,7 @@
 
 use glam::DVec3;
 
-use super::purse::Purse;
+use super::allowance::Allowance;
 use crate::Problem;
 
 /// In the place of corners that a face or element does not have.
@@ -87,10 +87,10 @@ impl Volume {
     }
 
     /// Adds an element; `corners` are as many as its kind has.
-    pub(super) fn add(&mut self, kind: Cell, corners: &[u32], purse: &mut Purse<'_>) -> Result<(), Problem> {
+    pub(super) fn add(&mut self, kind: Cell, corners: &[u32], allowance: &mut Allowance<'_>) -> Result<(), Problem> {
         let mut own = [NONE; 8];
         own.iter_mut().zip(corners).for_each(|(own, corner)| *own = *corner);
-        purse.push(&mut self.elements, Element { kind, corners: own })
+        allowance.push(&mut self.elements, Element { kind, corners: own })
     }
 
     /// Whether each element has the corners of an earlier one.
@@ -110,9 +110,13 @@ impl Volume {
     }
 
     /// The faces that one element alone has, in the order of the elements.
-    pub(super) fn outer_surface(&self, vertices: &[DVec3], purse: &mut Purse<'_>) -> Result<OuterSurface, Problem> {
+    pub(super) fn outer_surface(
+        &self,
+        vertices: &[DVec3],
+        allowance: &mut Allowance<'_>,
+    ) -> Result<OuterSurface, Problem> {
         let most_sides: usize = self.elements.iter().map(|element| element.kind.faces().len()).sum();
-        purse.take(SORTED * self.elements.len() + most_sides * size_of::<Side>())?;
+        allowance.take(SORTED * self.elements.len() + most_sides * size_of::<Side>())?;
         let is_repeated = self.repeated();
         let kept = || (0_u32..).zip(&self.elements).filter(|(number, _)| !is_repeated[*number as usize]);
         // An element without volume is numbered as most others of its kind, one hopes.
@@ -136,7 +140,7 @@ impl Volume {
         }
         sides.sort_unstable();
         let alone = || sides.chunk_by(|a, b| a.0 == b.0).filter(|same| same.len() == 1);
-        purse.take(OUTER * alone().count())?;
+        allowance.take(OUTER * alone().count())?;
         let mut outer: Vec<(u32, u8)> = alone().map(|same| (same[0].1, same[0].2)).collect();
         drop(sides);
         outer.sort_unstable();

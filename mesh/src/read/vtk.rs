@@ -2,8 +2,8 @@
 //!
 //! `vtkio` is not used: it reserves what a file counts, unpacks without bound and says no element.
 
+use super::allowance::Allowance;
 use super::draft::Draft;
-use super::purse::Purse;
 use super::source::{Order, Scalar, Source, shown, words};
 use super::volume::Cell;
 use crate::{Element, MeshError, Problem};
@@ -142,10 +142,10 @@ fn integers(
     count: i64,
     scalar: Scalar,
     what: &str,
-    purse: &mut Purse<'_>,
+    allowance: &mut Allowance<'_>,
 ) -> Result<Vec<i64>, MeshError> {
     let count = source.count(count, if is_binary { scalar.size() } else { 2 }, what)?;
-    purse.take(2 * size_of::<i64>() * count).map_err(|problem| source.fail(problem))?;
+    allowance.take(2 * size_of::<i64>() * count).map_err(|problem| source.fail(problem))?;
     if is_binary {
         let bytes = source.take(count * scalar.size(), what)?;
         return Ok(bytes.chunks_exact(scalar.size()).map(|bytes| scalar.integer(bytes, Order::Big)).collect());
@@ -162,7 +162,7 @@ fn begin_data(source: &mut Source<'_>, is_binary: bool) {
 }
 
 /// The lists of a section: `n size` and each list after its length, or since version 5 offsets and connectivity.
-fn cells(source: &mut Source<'_>, is_binary: bool, purse: &mut Purse<'_>) -> Result<Cells, MeshError> {
+fn cells(source: &mut Source<'_>, is_binary: bool, allowance: &mut Allowance<'_>) -> Result<Cells, MeshError> {
     let what = "lists of vertices";
     let count: i64 = source.number("the count of cells")?;
     let size: i64 = source.number("the size of cells")?;
@@ -175,7 +175,7 @@ fn cells(source: &mut Source<'_>, is_binary: bool, purse: &mut Purse<'_>) -> Res
             let kind = source.word().and_then(scalar).ok_or_else(|| source.syntax("a type of numbers is expected"))?;
             begin_data(source, is_binary);
             let is_offsets = part == "OFFSETS";
-            let list = integers(source, is_binary, if is_offsets { count } else { size }, kind, what, purse)?;
+            let list = integers(source, is_binary, if is_offsets { count } else { size }, kind, what, allowance)?;
             source.is_binary = false;
             *if is_offsets { &mut cells.ends } else { &mut cells.connectivity } = list;
         }
@@ -186,7 +186,7 @@ fn cells(source: &mut Source<'_>, is_binary: bool, purse: &mut Purse<'_>) -> Res
         return Ok(cells);
     }
     begin_data(source, is_binary);
-    let list = integers(source, is_binary, size, Scalar::I32, what, purse)?;
+    let list = integers(source, is_binary, size, Scalar::I32, what, allowance)?;
     source.is_binary = false;
     let mut rest = list.as_slice();
     while let Some((length, after)) = rest.split_first() {
@@ -194,9 +194,9 @@ fn cells(source: &mut Source<'_>, is_binary: bool, purse: &mut Purse<'_>) -> Res
         let own =
             own.ok_or_else(|| source.syntax(format!("a list of {length} vertices does not fit into its section")))?;
         for corner in own {
-            purse.push(&mut cells.connectivity, *corner).map_err(|problem| source.fail(problem))?;
+            allowance.push(&mut cells.connectivity, *corner).map_err(|problem| source.fail(problem))?;
         }
-        purse.push(&mut cells.ends, cells.connectivity.len() as i64).map_err(|problem| source.fail(problem))?;
+        allowance.push(&mut cells.ends, cells.connectivity.len() as i64).map_err(|problem| source.fail(problem))?;
         rest = &after[own.len()..];
     }
     if cells.ends.len() as i64 != count {
@@ -337,18 +337,18 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                 }
                 source.is_binary = false;
             }
-            b"POLYGONS" => faces.polygons = cells(&mut source, is_binary, &mut draft.purse)?,
-            b"TRIANGLE_STRIPS" => faces.strips = cells(&mut source, is_binary, &mut draft.purse)?,
-            b"CELLS" => faces.grid = cells(&mut source, is_binary, &mut draft.purse)?,
+            b"POLYGONS" => faces.polygons = cells(&mut source, is_binary, &mut draft.allowance)?,
+            b"TRIANGLE_STRIPS" => faces.strips = cells(&mut source, is_binary, &mut draft.allowance)?,
+            b"CELLS" => faces.grid = cells(&mut source, is_binary, &mut draft.allowance)?,
             b"VERTICES" | b"LINES" => {
-                let lines = cells(&mut source, is_binary, &mut draft.purse)?.ends.len();
+                let lines = cells(&mut source, is_binary, &mut draft.allowance)?.ends.len();
                 draft.lines += lines;
             }
             b"CELL_TYPES" => {
                 let count: i64 = source.number("the count of types")?;
                 begin_data(&mut source, is_binary);
-                let purse = &mut draft.purse;
-                faces.types = integers(&mut source, is_binary, count, Scalar::I32, "types of cells", purse)?;
+                let allowance = &mut draft.allowance;
+                faces.types = integers(&mut source, is_binary, count, Scalar::I32, "types of cells", allowance)?;
                 source.is_binary = false;
             }
             b"FIELD" => skip_field(&mut source, is_binary)?,

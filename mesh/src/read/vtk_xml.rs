@@ -7,8 +7,8 @@ use base64::engine::general_purpose::STANDARD;
 use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
+use super::allowance::Allowance;
 use super::draft::Draft;
-use super::purse::Purse;
 use super::source::{Order, Scalar, Source, no_number, parsed, shown};
 use super::vtk::{Cells, Faces};
 use crate::{Element, MeshError, Problem};
@@ -216,8 +216,8 @@ impl<'a> Document<'a> {
         MeshError { file: self.file.to_owned(), element: Element::Byte(array.byte), place_m: None, problem }
     }
 
-    /// The bytes of a binary array, taken from `purse`. The caller gives them back.
-    fn bytes(&self, array: &Array, purse: &mut Purse<'_>) -> Result<Vec<u8>, MeshError> {
+    /// The bytes of a binary array, taken from `allowance`. The caller gives them back.
+    fn bytes(&self, array: &Array, allowance: &mut Allowance<'_>) -> Result<Vec<u8>, MeshError> {
         let fail = |problem| self.fail(array, problem);
         let text: Vec<u8> = array.text.iter().copied().filter(|byte| !byte.is_ascii_whitespace()).collect();
         let (stored, is_base64) = match array.format {
@@ -231,7 +231,7 @@ impl<'a> Document<'a> {
         if !is_compressed {
             // The length and the data are coded together.
             let length = size(&stored.peek(width).map_err(fail)?);
-            purse.take(length).map_err(fail)?;
+            allowance.take(length).map_err(fail)?;
             let mut bytes = stored.take(width + length).map_err(fail)?;
             bytes.drain(..width);
             return Ok(bytes);
@@ -244,7 +244,7 @@ impl<'a> Document<'a> {
         let packed: Vec<usize> = sizes[3 * width..].chunks_exact(width).map(size).collect();
         let all = packed.iter().try_fold(0_usize, |sum, size| sum.checked_add(*size)).unwrap_or(usize::MAX);
         let stored_bytes = length.saturating_add(all).saturating_mul(2);
-        purse.take(stored_bytes).map_err(fail)?;
+        allowance.take(stored_bytes).map_err(fail)?;
         let data = stored.take(all).map_err(fail)?;
         // What the header promises, and no more, is unpacked.
         let (block_bytes, last_bytes) = (size(&start[width..]), size(&start[2 * width..]));
@@ -252,12 +252,12 @@ impl<'a> Document<'a> {
         let promised = block_bytes.saturating_mul(blocks.saturating_sub(1)).saturating_add(last_bytes);
         let promised = if blocks == 0 { 0 } else { promised };
         // Packed volumes are files of some times their bytes.
-        purse.add_file(promised.min(all.saturating_mul(PACKED)));
-        purse.take(promised).map_err(fail)?;
+        allowance.add_file(promised.min(all.saturating_mul(PACKED)));
+        allowance.take(promised).map_err(fail)?;
         let (mut rest, mut bytes) = (data.as_slice(), Vec::with_capacity(promised));
         for (number, size) in packed.into_iter().enumerate() {
             let most = if number + 1 == blocks { last_bytes } else { block_bytes };
-            purse.take(2 * most).map_err(fail)?;
+            allowance.take(2 * most).map_err(fail)?;
             let (block, after) = rest.split_at_checked(size).unwrap_or((rest, &[]));
             let unpacked = miniz_oxide::inflate::decompress_to_vec_zlib_with_limit(block, most).map_err(|e| {
                 let is_large = e.status == miniz_oxide::inflate::TINFLStatus::HasMoreOutput;
@@ -265,40 +265,40 @@ impl<'a> Document<'a> {
                     if is_large { "a block larger than its header says" } else { "a block that zlib can't unpack" };
                 fail(Problem::Syntax { message: message.to_owned() })
             })?;
-            purse.give_back(2 * most);
+            allowance.give_back(2 * most);
             bytes.extend_from_slice(&unpacked);
             rest = after;
         }
-        purse.give_back(stored_bytes);
+        allowance.give_back(stored_bytes);
         Ok(bytes)
     }
 
-    fn text<T: std::str::FromStr>(&self, array: &Array, purse: &mut Purse<'_>) -> Result<Vec<T>, MeshError> {
+    fn text<T: std::str::FromStr>(&self, array: &Array, allowance: &mut Allowance<'_>) -> Result<Vec<T>, MeshError> {
         let mut source = Source::new(self.file, &array.text);
         let mut numbers = Vec::new();
         while let Some(word) = source.word() {
             let what = format!("number {} of an array", numbers.len());
             let number = parsed(word).ok_or_else(|| self.fail(array, no_number(word, &what)))?;
-            purse.push(&mut numbers, number).map_err(|problem| self.fail(array, problem))?;
+            allowance.push(&mut numbers, number).map_err(|problem| self.fail(array, problem))?;
         }
         Ok(numbers)
     }
 
-    /// The numbers of an array, taken from `purse`. The caller gives them back.
+    /// The numbers of an array, taken from `allowance`. The caller gives them back.
     fn numbers<T: std::str::FromStr>(
         &self,
         array: &Array,
-        purse: &mut Purse<'_>,
+        allowance: &mut Allowance<'_>,
         number: fn(Scalar, &[u8], Order) -> T,
     ) -> Result<Vec<T>, MeshError> {
         if array.format == Format::Text {
-            return self.text(array, purse);
+            return self.text(array, allowance);
         }
-        let (bytes, size) = (self.bytes(array, purse)?, array.scalar.size());
-        let memory = purse.take(bytes.len() / size * size_of::<T>());
+        let (bytes, size) = (self.bytes(array, allowance)?, array.scalar.size());
+        let memory = allowance.take(bytes.len() / size * size_of::<T>());
         memory.map_err(|problem| self.fail(array, problem))?;
         let numbers = bytes.chunks_exact(size).map(|bytes| number(array.scalar, bytes, self.coding.order)).collect();
-        purse.give_back(bytes.len());
+        allowance.give_back(bytes.len());
         Ok(numbers)
     }
 }
@@ -346,7 +346,7 @@ pub(super) fn read(file: &str, bytes: &[u8], draft: &mut Draft<'_>) -> Result<()
         let first = draft.vertices();
         let find = |role: usize| piece.iter().find(|array| array.role == role);
         if let Some(array) = find(0) {
-            let reals = document.numbers(array, &mut draft.purse, Scalar::real)?;
+            let reals = document.numbers(array, &mut draft.allowance, Scalar::real)?;
             for (number, at) in reals.chunks_exact(3).enumerate() {
                 draft.vertex([at[0], at[1], at[2]]).map_err(|problem| MeshError {
                     file: file.to_owned(),
@@ -355,18 +355,18 @@ pub(super) fn read(file: &str, bytes: &[u8], draft: &mut Draft<'_>) -> Result<()
                     problem,
                 })?;
             }
-            draft.purse.give_back(size_of_val(reals.as_slice()));
+            draft.allowance.give_back(size_of_val(reals.as_slice()));
         }
         let mut integers = |role: usize| -> Result<Vec<i64>, MeshError> {
             find(role)
-                .map_or_else(|| Ok(Vec::new()), |array| document.numbers(array, &mut draft.purse, Scalar::integer))
+                .map_or_else(|| Ok(Vec::new()), |array| document.numbers(array, &mut draft.allowance, Scalar::integer))
         };
         let polygons = Cells { connectivity: integers(1)?, ends: integers(2)? };
         let strips = Cells { connectivity: integers(3)?, ends: integers(4)? };
         let grid = Cells { connectivity: integers(5)?, ends: integers(6)? };
         let faces = Faces { polygons, strips, grid, types: integers(7)? };
         faces.add(file, first, draft)?;
-        draft.purse.give_back(faces.bytes());
+        draft.allowance.give_back(faces.bytes());
     }
     Ok(())
 }

@@ -7,18 +7,18 @@ use crate::Problem;
 const STEP: usize = 1 << 18;
 
 /// Counts what is taken.
-pub(super) struct Purse<'p> {
+pub(super) struct Allowance<'a> {
     most: usize,
     taken: usize,
     paid: usize,
     /// Pays for so many bytes in all; `false` if it can't.
-    pay: &'p mut dyn FnMut(u64) -> bool,
+    pay: &'a mut dyn FnMut(u64) -> bool,
 }
 
-impl<'p> Purse<'p> {
+impl<'a> Allowance<'a> {
     /// For a file of so many bytes.
-    pub(super) fn new(bytes: usize, pay: &'p mut dyn FnMut(u64) -> bool) -> Self {
-        Purse { most: bytes.saturating_mul(MULTIPLE).saturating_add(ROOM), taken: 0, paid: 0, pay }
+    pub(super) fn new(bytes: usize, pay: &'a mut dyn FnMut(u64) -> bool) -> Self {
+        Allowance { most: bytes.saturating_mul(MULTIPLE).saturating_add(ROOM), taken: 0, paid: 0, pay }
     }
 
     /// Another file of so many bytes belongs to it.
