@@ -31,7 +31,8 @@
 //!   thin it is not. Friction may only take.
 //! - A tool that meets the tissue presses it as deep as both have come together in this substep. If it is deeper, because its
 //!   disc has come over to another part of the tissue in which it already is, the rest stays as an offset. A new tool has no
-//!   way yet: it presses as deep as it is put.
+//!   way yet: it presses as deep as it is put. In that substep it does not ask whether the tissue pulls on it: what moves a
+//!   surface at rest and what stops it again cancel, and rounding would decide.
 //! - A disc that lags behind its tool is pressed by no more than what the tool moves along the normal ([`Tool::balance`]), and
 //!   it moves by no more than half its radius at once.
 //! - Where the disc would come over an edge so that its way leads along its normal, it stays, and pushes along its normal alone.
@@ -323,6 +324,7 @@ impl Tool {
         leg: Leg,
     ) -> Thrust {
         let Leg { mut place_m, spread_n, .. } = leg;
+        let was_free = self.contact_state == ContactState::Free;
         if self.contact_state == ContactState::Free {
             self.footprint.seek(model, place_m, |point| displacement_m(model, layout, state, point));
         }
@@ -359,6 +361,9 @@ impl Tool {
         let thrust = self.thrust(model, plan, layout, state, gap_m);
         if self.contact_state == ContactState::Holding {
             return thrust;
+        }
+        if was_free && self.is_new && self.tip.coupling == Coupling::Constraint && self.footprint.mobility() > 0.0 {
+            return thrust.along(self.normal);
         }
         let felt_n = thrust.force_n() + spread_n;
         let pressure_n = -felt_n.dot(self.normal);

@@ -117,7 +117,7 @@ impl<T: Real> Sheet<T> {
     /// Advances from `moment` to the fraction `end` of the same step.
     fn substep(&mut self, moment: Moment, end: f64) {
         let far = self.tiles.farthest_unnoticed(&self.model.scene);
-        self.tiles.wake_beside_moved(&self.state.u, far);
+        self.tiles.wake_beside_moved([&self.state.u, &self.state.d], self.plan.scheme.sweeps(), far);
         self.wake_what_is_moved(moment, end, far);
         if self.tables.pressure.is_some() {
             let growth = self.press();
@@ -156,7 +156,7 @@ impl<T: Real> Sheet<T> {
         let unit_j = self.unit_of_work_j();
         self.work.add(self.tables.take_work() * unit_j);
         self.hold(moment.step, end, true);
-        self.meet(end);
+        self.meet(end, far);
     }
 
     /// Sweep number `sweep` of a substep.

@@ -30,12 +30,12 @@ impl<T: Real> Sheet<T> {
     /// `end` of the step. The points beside a sleeping tile are compared between substeps only (`tiles`): a scheme of several
     /// sweeps would pull at it where the tool was before.
     pub(super) fn wake_what_is_moved(&mut self, moment: Moment, end: f64, far: f64) {
-        let Sheet { model, tables, state, prescribed, tiles, .. } = self;
+        let Sheet { model, plan, tables, state, prescribed, tiles, .. } = self;
         for (index, displacement_m, _) in prescribed.at(model, moment.step, end) {
             let at = tables.layout.offset(index);
             let moves = |c: usize| displacement_m[c] / model.unit_m - state.u[c * tables.layout.plane + at].wide();
             if (0..3).any(|c| moves(c).abs() > far) {
-                tiles.wake_around(model.point_of(index));
+                tiles.wake_around(model.point_of(index), plan.scheme.sweeps());
             }
         }
     }

@@ -115,6 +115,8 @@ pub(super) fn sides_of(layout: &Layout, tile: usize) -> [Range<usize>; 2] {
 #[derive(Debug, Clone, Copy)]
 struct EdgeWatch {
     tile: usize,
+    /// On which side of it, by number in [`NEIGHBOURS`].
+    side: usize,
     /// The first point, and the distance to the next.
     first: usize,
     next: usize,
@@ -378,7 +380,7 @@ impl<T: Real> SleepTiles<T> {
                 if let Some(other) = beside.filter(|other| !self.region.awake.has[*other]) {
                     let (first, next, count) = self.beyond(other, side);
                     let then = other * SNAPSHOT + side * 3 * TILE;
-                    self.watches.push(EdgeWatch { tile: other, first, next, count, then });
+                    self.watches.push(EdgeWatch { tile: other, side, first, next, count, then });
                 }
             }
         }
@@ -426,6 +428,17 @@ impl<T: Real> SleepTiles<T> {
         (i * stride + j, if x == 0 { stride } else { 1 }, count_x.max(count_y))
     }
 
+    /// The rows and columns beyond a side or corner, as many as `front`.
+    fn near(&self, tile: usize, side: usize, front: usize) -> [Range<usize>; 2] {
+        let beyond = |own: Range<usize>, way: isize, count: usize| match way {
+            -1 => own.start.saturating_sub(front)..own.start,
+            0 => own,
+            _ => own.end..(own.end + front).min(count),
+        };
+        let [x, y] = NEIGHBOURS[side];
+        [beyond(self.rows(tile), x, self.layout.rows), beyond(self.columns(tile), y, self.layout.columns)]
+    }
+
     /// Wakes the sleeping ones among `which`.
     pub(super) fn wake(&mut self, which: impl IntoIterator<Item = usize>) {
         let mut any = false;
@@ -451,15 +464,17 @@ impl<T: Real> SleepTiles<T> {
         self.wake(points.into_iter().map(|[i, j]| i / TILE * columns + j / TILE));
     }
 
-    /// Wakes the tile of a point and those that its springs reach into.
-    pub(super) fn wake_around(&mut self, point: [usize; 2]) {
+    /// Wakes the tile of a point and those that its springs reach into in so many sweeps.
+    pub(super) fn wake_around(&mut self, point: [usize; 2], sweeps: usize) {
         if let Some(graph) = self.graph.clone() {
             let tile = self.of(point);
             return self.wake(graph.beside(tile).chain([tile]));
         }
         let Layout { rows, columns, .. } = self.layout;
+        // No further than into the tiles beside it.
+        let front = (self.reach * sweeps).min(TILE);
         let [i, j] = [(point[0], rows), (point[1], columns)]
-            .map(|(at, count)| [at.saturating_sub(self.reach), (at + self.reach).min(count - 1)]);
+            .map(|(at, count)| [at.saturating_sub(front), (at + front).min(count - 1)]);
         self.wake_under([[i[0], j[0]], [i[0], j[1]], [i[1], j[0]], [i[1], j[1]]]);
     }
 
@@ -475,8 +490,9 @@ impl<T: Real> SleepTiles<T> {
         self.calm.fill(0);
     }
 
-    /// Wakes tiles whose neighbours have moved by more than `far`.
-    pub(super) fn wake_beside_moved(&mut self, u: &Field<T>, far: f64) {
+    /// Wakes tiles whose neighbours have moved by more than `far`: those next to them since they fell asleep, and of a sheet those
+    /// whose motion reaches them in the `sweeps` of a substep in the substep before.
+    pub(super) fn wake_beside_moved(&mut self, [u, d]: [&Field<T>; 2], sweeps: usize, far: f64) {
         if self.watches.is_empty() && self.watched.is_empty() {
             return;
         }
@@ -495,6 +511,14 @@ impl<T: Real> SleepTiles<T> {
             let waking: Vec<usize> = self.watched.iter().filter(moved).copied().collect();
             return self.wake(waking);
         }
+        let front = (self.reach * sweeps).min(TILE);
+        let is_near_fast = |watch: &EdgeWatch| {
+            let [rows, columns] = self.near(watch.tile, watch.side, front);
+            (0..3).any(|c| {
+                let row = |i: usize| &d[c * self.layout.plane + i * self.layout.stride..][columns.clone()];
+                rows.clone().any(|i| row(i).iter().fold(false, |any, d| any | (d.magnitude() > far)))
+            })
+        };
         let moved = |watch: &&EdgeWatch| {
             let EdgeWatch { first, next, count, then, .. } = **watch;
             (0..3).any(|c| {
@@ -506,7 +530,7 @@ impl<T: Real> SleepTiles<T> {
                 } else {
                     here.iter().step_by(next).zip(then).fold(false, any)
                 }
-            })
+            }) || front > 1 && is_near_fast(watch)
         };
         let waking: Vec<usize> = self.watches.iter().filter(moved).map(|watch| watch.tile).collect();
         self.wake(waking);

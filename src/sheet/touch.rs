@@ -13,8 +13,9 @@ use crate::memory;
 use palpate_touch::Coupling;
 
 impl<T: Real> Sheet<T> {
-    /// Makes position-controlled tools act at the end of a substep that ends at `fraction` of the step.
-    pub(super) fn meet(&mut self, fraction: f64) {
+    /// Makes position-controlled tools act at the end of a substep that ends at `fraction` of the step. One that moves points by
+    /// more than `far` spacings wakes the tiles that these pull at in the next substep.
+    pub(super) fn meet(&mut self, fraction: f64, far: f64) {
         let unit_j = self.unit_of_work_j();
         let Sheet { model, plan, tables, state, applied, contacts, tiles, work, .. } = self;
         let layout = &tables.layout;
@@ -50,6 +51,15 @@ impl<T: Real> Sheet<T> {
             // Tiles that slept were at rest in this substep, as if they had been computed.
             tiles.wake_under(tool.points());
             let change_n = thrust.steady_n - before_n;
+            // At once, or by the speed that they have now.
+            let moved_n =
+                |c: usize| plan.scheme.kick()[c] * (leg.jump_n + thrust.kick_n) + plan.scheme.constant()[c] * change_n;
+            let most = plan.force_scale(&model.scene) * moved_n(0).abs().max(moved_n(1).abs()).max_element();
+            for Reached { point, .. } in
+                tool.footprint.reached().iter().filter(|of| of.free && of.weight / of.mass * most > far)
+            {
+                tiles.wake_around(*point, plan.scheme.sweeps());
+            }
             push(model, plan, layout, state, &tool.footprint, thrust.kick_n, plan.scheme.kick());
             push(model, plan, layout, state, &tool.footprint, change_n, plan.scheme.constant());
             let surface_m = || tool.footprint.surface(|point| displacement_m(model, layout, state, point)).0;

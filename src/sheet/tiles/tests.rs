@@ -67,7 +67,7 @@ fn a_tile_wakes_when_a_point_beside_it_is_too_far_from_where_it_was_as_it_fell_a
     tiles.wake_all();
     tiles.sleep(&[(MIDDLE, 0.0)], &u, 0.0);
     assert_eq!(tiles.region.tiles(), [0, 1, 2, 3, 5, 6, 7, 8]);
-    tiles.wake_beside_moved(&u, 0.01);
+    tiles.wake_beside_moved([&u, &u], 1, 0.01);
     assert!(!tiles.region.awake.has[MIDDLE], "nothing has moved");
     // The middle tile has rows 16 to 31 and columns 16 to 31.
     let is_beside = |at: usize| at == 15 || at == 32;
@@ -78,7 +78,7 @@ fn a_tile_wakes_when_a_point_beside_it_is_too_far_from_where_it_was_as_it_fell_a
             let at = offset(c, point);
             for (far, expected) in [(0.009, false), (0.011, wakes)] {
                 u[at] += far;
-                tiles.wake_beside_moved(&u, 0.01);
+                tiles.wake_beside_moved([&u, &u], 1, 0.01);
                 assert_eq!(tiles.region.awake.has[MIDDLE], expected, "{point:?} {c} {far}");
                 u[at] -= far;
                 tiles.sleep(&[(MIDDLE, 0.0)], &u, 0.0);
