@@ -267,6 +267,9 @@ fn sleep_under_tools_errs_by_no_more_than_its_tolerance() {
             Outcome::Sensitive => sensitive += 1,
             Outcome::Beyond(text) => beyond.push(text),
         }
+        if (seed - from + 1).is_multiple_of(500) {
+            eprintln!("{} of {count}: {} beyond", seed - from + 1, beyond.len());
+        }
     }
     eprintln!("{count} scenes: {within} within, {sensitive} as sensitive, {} beyond, {left} left out", beyond.len());
     assert!(beyond.is_empty(), "{}", beyond.join("\n"));

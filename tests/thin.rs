@@ -1,8 +1,10 @@
 //! Random tips on random meshes with thin parts: everything stays finite, and no energy comes from nowhere.
 //!
-//! 12 in every test run; `make stress` does ten thousand (`PALPATE_STRESS_THIN`).
+//! 12 in every test run; `PALPATE_STRESS_THIN=10000` takes as many as that, from the seed `PALPATE_STRESS_THIN_FROM` on, and
+//! `PALPATE_STRESS_THIN_STEPS=400` runs each for longer.
 #![allow(
     clippy::cast_possible_truncation,
+    clippy::cast_precision_loss,
     clippy::unwrap_used,
     clippy::expect_used,
     clippy::panic,
@@ -12,6 +14,8 @@
 #[path = "common/thin_mesh.rs"]
 mod thin_mesh;
 
+use std::sync::Arc;
+
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::Scene;
@@ -19,21 +23,35 @@ use palpate::sheet::{self, Model, Tissue};
 use palpate_touch::{Coupling, Tip};
 use thin_mesh::{ThinMesh, thin_mesh, thread};
 
-/// A scene on a mesh, of a random material.
-fn scene(folder: &std::path::Path, mesh: &ThinMesh, dice: &mut fastrand::Rng, limits: &Limits) -> Option<Scene> {
+/// A scene on a mesh, of a random material. One in fifty chooses its own scheme, which takes longer than the steps of a test.
+fn model(folder: &std::path::Path, mesh: &ThinMesh, dice: &mut fastrand::Rng) -> Option<Arc<Model>> {
+    let limits = Limits { substeps: 20, ..Limits::default() };
     std::fs::write(folder.join("mesh.obj"), mesh.obj()).unwrap();
     let fixed = ["\"none\"", "\"rim\"", "[{ centre_m = [0, 0, 0], radius_m = 0.001 }]"][dice.usize(0..3)];
     let mut decades = |from: f64, to: f64| 10_f64.powf(from + (to - from) * dice.f64());
     let text = format!(
         "[mesh]\nfile = \"mesh.obj\"\nunit = \"m\"\nfixed = {fixed}\n[material]\nyoungs_modulus_pa = {:e}\nthickness_m = {:e}\n\
-         depth_m = {:e}\nbed_n_per_m3 = {:e}\ndamping_ratio = {:e}\n[stepping]\ntolerance = 1e-2\n",
+         depth_m = {:e}\nbed_n_per_m3 = {:e}\ndamping_ratio = {:e}\n",
         decades(3.0, 4.7),
         decades(-3.5, -2.5),
         decades(-2.0, -1.3),
         decades(5.0, 6.5),
         decades(-1.5, 0.3),
     );
-    Scene::parse_in(folder, "random", &text, &[], limits).ok()
+    let compiled = |set: &[String], limits: &Limits| {
+        let scene = Scene::parse_in(folder, "random", &text, set, limits).ok()?;
+        Model::compile(&scene, limits).ok().filter(|model| model.plan.stable)
+    };
+    let integrator = ["central", "exponential2", "exponential3", "rk4"][dice.usize(0..4)];
+    let stable = |substeps: u32| {
+        let set = [format!("stepping.integrator={integrator}"), format!("stepping.substeps={substeps}")];
+        compiled(&set, &Limits { rehearsal_work: 1, ..limits.clone() })
+    };
+    if dice.u8(0..50) == 0 {
+        compiled(&["stepping.tolerance=1e-2".into()], &limits)
+    } else {
+        [1, 2, 3, 5, 8, 13, 20].into_iter().find_map(stable)
+    }
 }
 
 /// A tip that comes, presses, goes along, jumps, and leaves.
@@ -56,24 +74,24 @@ fn energy_j(tissue: &dyn Tissue) -> f64 {
 #[derive(Debug, Default, Clone, Copy)]
 struct Course {
     blow_ups: u64,
+    guard_events: u64,
     force_n: f64,
     energy_j: f64,
     displacement_m: f64,
 }
 
-fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
+/// Plays `steps` steps; the tip does something else every `each`.
+fn play(seed: u64, steps: u64, each: u64) -> Option<(Course, &'static str)> {
     let dice = &mut fastrand::Rng::with_seed(seed);
     let folder = tempfile::tempdir().unwrap();
-    let limits = Limits { substeps: 20, ..Limits::default() };
     let mesh = thin_mesh(dice, seed as usize);
-    let scene = scene(folder.path(), &mesh, dice, &limits)?;
-    let model = Model::compile(&scene, &limits).ok()?;
+    let model = model(folder.path(), &mesh, dice)?;
     let mut tissue = sheet::at_rest(&model);
-    let shape = scene.shape();
+    let shape = model.scene.shape();
     let mut course = Course::default();
     let (mut place_m, mut way_m, mut now) = (DVec3::ZERO, DVec3::ZERO, tip(dice));
     for step in 0..steps {
-        if step % 40 == 0 {
+        if step % each == 0 {
             let point = palpate::shape::PointId::new(dice.usize(0..shape.point_count()));
             let mut random = || DVec3::from_array([(); 3].map(|()| 2.0 * dice.f64() - 1.0));
             let target_m = shape.rest_m(point) + 0.5 * now.radius_m * random();
@@ -82,12 +100,12 @@ fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
                 0 => {
                     tissue.release(0);
                     (place_m, now) = (from_m, tip(dice));
-                    way_m = (target_m - place_m) / 40.0;
+                    way_m = (target_m - place_m) / each as f64;
                 }
                 // A jump.
                 1 => (place_m, way_m) = (target_m, DVec3::ZERO),
                 2 | 3 => way_m = DVec3::ZERO,
-                _ => way_m = (target_m - place_m) / 40.0,
+                _ => way_m = (target_m - place_m) / each as f64,
             }
         }
         place_m += way_m;
@@ -103,25 +121,37 @@ fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
         course.displacement_m = course.displacement_m.max(tissue.largest_displacement_m());
         assert!(course.energy_j.is_finite() && felt_n.is_finite(), "{seed} {}, step {step}: {course:?}", mesh.kind);
     }
+    course.guard_events = tissue.guard_events();
     Some((course, mesh.kind))
 }
 
 /// Before contact was balanced, one in ten of these reached joules to megajoules, and up to kilometres.
 #[test]
 fn tips_on_thin_meshes_get_no_energy_from_nowhere() {
-    let all = std::env::var("PALPATE_STRESS_THIN").ok().map(|count| count.parse::<u64>().unwrap());
-    let (count, steps) = (all.unwrap_or(12), if all.is_some() { 400 } else { 80 });
-    let (mut played, mut blew_up) = (0, 0);
-    for seed in 0..count {
-        let Some((course, kind)) = play(seed, steps) else { continue };
+    let number = |name: &str| std::env::var(name).ok().map(|text| text.parse::<u64>().unwrap());
+    let all = number("PALPATE_STRESS_THIN");
+    let (from, count) = (number("PALPATE_STRESS_THIN_FROM").unwrap_or(0), all.unwrap_or(12));
+    let steps = number("PALPATE_STRESS_THIN_STEPS").unwrap_or(if all.is_some() { 48 } else { 80 });
+    // Of many meshes each gets less time, so faster tips.
+    let each = if steps < 80 { 12 } else { 40 };
+    let (mut played, mut blew_up, mut guarded) = (0, 0, 0);
+    let mut beyond = Vec::new();
+    for seed in from..from + count {
+        let Some((course, kind)) = play(seed, steps, each) else { continue };
         played += 1;
         blew_up += u64::from(course.blow_ups > 0);
-        // Tissue of a few millimetres, under tips that come at most 5 cm away from it.
-        let is_bounded = course.force_n < 20.0 && course.energy_j < 0.1 && course.displacement_m < 0.1;
-        assert!(is_bounded, "{seed} {kind}: {course:?}");
+        guarded += u64::from(course.guard_events > 0);
+        // Tissue of some millimetres under tips that take it at most 5 cm away: a thread that resists with 5 N stores 0.25 J.
+        if course.force_n >= 20.0 || course.energy_j >= 0.25 || course.displacement_m >= 0.1 {
+            beyond.push(format!("{seed} {kind}: {course:?}"));
+        }
+        if all.is_some() && (seed - from + 1).is_multiple_of(500) {
+            eprintln!("{} of {count}: {} beyond", seed - from + 1, beyond.len());
+        }
     }
+    eprintln!("of {played} meshes the guard acted on {guarded}, and {blew_up} had to recover");
+    assert!(beyond.is_empty(), "{}", beyond.join("\n"));
     assert!(2 * played > count, "{played} of {count} were played");
-    eprintln!("of {played} meshes {blew_up} made the guard stop at least once");
 }
 
 /// A fingertip, wider than the thread, comes down on its end, along its side and across it, and goes again. It reached 385 m and

@@ -250,7 +250,8 @@ impl Surface {
         for _ in 0..LONGEST_WAY {
             let mut leaves: Option<(usize, f64, f64)> = None;
             for k in (0..3).filter(|k| entered != Some(*k)) {
-                let [a, b, _] = side(k).map(|corner| plane[corner]);
+                let [a, b, _] = side(k);
+                let (a, b) = (plane[a], plane[b]);
                 if is_left(a) != is_left(b) {
                     let (part, at_m) = meets(a, b);
                     if leaves.is_none_or(|best| at_m > best.2) {
@@ -265,7 +266,10 @@ impl Surface {
             (out[a], out[b]) = (1.0 - part, part);
             if leaves_m >= radius_m {
                 let part = if leaves_m > distance_m { (radius_m - distance_m) / (leaves_m - distance_m) } else { 0.0 };
-                let end = std::array::from_fn(|corner| hats[corner] + part * (out[corner] - hats[corner]));
+                let mut end = hats;
+                for corner in 0..3 {
+                    end[corner] += part * (out[corner] - hats[corner]);
+                }
                 crossed(Crossing {
                     vertices: self.triangles[triangle as usize],
                     from_m: distance_m,
@@ -284,7 +288,7 @@ impl Surface {
             if next == NONE {
                 return;
             }
-            let [a_at, b_at, c_at] = side(k).map(|corner| plane[corner]);
+            let (a_at, b_at, c_at) = (plane[a], plane[b], plane[side(k)[2]]);
             let along = b_at - a_at;
             // Away from this triangle.
             let away = if along.perp_dot(c_at - a_at) > 0.0 { -turned(along) } else { turned(along) };
@@ -295,8 +299,9 @@ impl Surface {
                 _ if vertex == vertices[b] => (b_at, part),
                 _ => (apex_at, 0.0),
             };
-            let corners = self.triangles[next as usize].map(of);
-            (plane, hats) = (corners.map(|corner| corner.0), corners.map(|corner| corner.1));
+            for (corner, vertex) in self.triangles[next as usize].into_iter().enumerate() {
+                (plane[corner], hats[corner]) = of(vertex);
+            }
             // The side opposite the apex is that from the corner after it.
             entered = Some((usize::from(apex) + 1) % 3);
             (triangle, distance_m) = (next, leaves_m);
@@ -583,7 +588,8 @@ impl Disc {
         let Disc { directions, crossings, ends, covered, areas_m2, found, .. } = self;
         for direction in directions.iter() {
             surface.trace(place, *direction, reach_m, |Crossing { vertices, from_m, to_m, hats }| {
-                let covered = vertices.map(|vertex| number(vertex, surface, covered, areas_m2, found));
+                let mut number = |corner: usize| number(vertices[corner], surface, covered, areas_m2, found);
+                let covered = [number(0), number(1), number(2)];
                 crossings.push(Part { covered, from_m, to_m, hats });
             });
             ends.push(crossings.len());
