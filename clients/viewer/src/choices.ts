@@ -3,7 +3,8 @@
 import { type JournalName, lengthText, type Listed, listJournals, whenText } from "./journal";
 import { part } from "./page";
 import { entryOf, pictureOf } from "./pictures";
-import { backoffMs, PATIENCE_MS, sessions, sleep } from "./server";
+import { DEFAULT_SCENE, groupOf, GROUPS, inOrder } from "./scenes";
+import { backoffMs, isPassing, PATIENCE_MS, sessions, sleep } from "./server";
 
 /** What somebody chose. */
 export type Choice = { kind: "scene"; scene: string } | ({ kind: "live" | "recorded" } & JournalName);
@@ -17,6 +18,7 @@ const keyOf = ({ sessionId, run }: JournalName, kind: "live" | "recorded") => `$
 
 export class Choices {
   private readonly list = part("scene", HTMLSelectElement);
+  private readonly scenes = GROUPS.map(group);
   private readonly live = group("Live");
   private readonly recorded = group("Recorded");
   private readonly choices = new Map<HTMLOptionElement, Choice>();
@@ -37,15 +39,27 @@ export class Choices {
     }
   }
 
-  /** Fills the list, however long it takes the server to be there. */
+  /** The scene that the page begins with: the usual one, or the first that the server has. */
+  async first(): Promise<string> {
+    const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
+    return sceneNames.includes(DEFAULT_SCENE) ? DEFAULT_SCENE : (sceneNames[0] ?? DEFAULT_SCENE);
+  }
+
+  /** Fills the list, however long it takes the server to be there; not if it tells this caller nothing. */
   async fill(): Promise<void> {
     for (let failures = 0; ; failures++) {
       try {
         const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
-        this.list.replaceChildren(...sceneNames.map(entryOf), this.live, this.recorded);
+        this.scenes.forEach((group, index) => {
+          const within = inOrder(sceneNames.filter((scene) => groupOf(scene) === GROUPS[index]));
+          group.replaceChildren(...within.map(entryOf));
+          group.hidden = within.length === 0;
+        });
+        this.list.replaceChildren(...this.scenes, this.live, this.recorded);
         this.mark(this.marked.value, this.marked.name);
         break;
-      } catch {
+      } catch (error) {
+        if (!isPassing(error)) return;
         await sleep(backoffMs(failures));
       }
     }

@@ -7,17 +7,20 @@
 // can. Without TLS a browser speaks HTTP/1.1 with six connections: hence one stream of frames, one of samples, and one
 // acknowledgement at a time.
 
-import type { MessageInitShape } from "@bufbuild/protobuf";
+import { create, type MessageInitShape } from "@bufbuild/protobuf";
 import { norm, type Vec3 } from "palpate";
-import { type CreateSessionRequestSchema, type Session, SessionState } from "palpate/v1";
-import type { Mode } from "./hand";
+import { type CreateSessionRequestSchema, SceneSchema, type Session, SessionState } from "palpate/v1";
 import { Choices } from "./choices";
+import { Gate } from "./gate";
+import type { Mode } from "./hand";
 import { Input } from "./input";
 import type { JournalName } from "./journal";
 import { Latency } from "./latency";
+import { lumpAt, lumpsOf } from "./lumps";
 import { depthText, Overlay } from "./overlay";
 import { addressed, asked, askedNumber, holderName, part, seekAt, writeAddress, writeMoment } from "./page";
-import { keepPicture } from "./pictures";
+import { keepPicture, pictureFrom } from "./pictures";
+import type { Told } from "./samples";
 import { BACK_S, discard, type Opened, Player } from "./player";
 import { Plots, quantity } from "./plot";
 import { playScript } from "./script";
@@ -25,19 +28,26 @@ import { backoffMs, describe, type Failure, isGone, isPassing, PATIENCE_MS, reas
 import { Stage } from "./stage";
 import { Sheet } from "./sheet";
 import { Status } from "./status";
+import type { Place } from "./surface";
 import { tissueTexture } from "./texture";
 import { TissueValues } from "./tissue";
 import { FileOpener } from "./upload";
 import { Visit } from "./visit";
 
-/** The scene of a new session, if the server has it and the address names no other. */
-const DEFAULT_SCENE = "liver";
+/**
+ * A session that nobody asks for is deleted after this time: its pages are closed. Browsers let a hidden page ask once a
+ * minute.
+ */
+const IDLE_S = 180;
 
 /** So long after its texture has come a tissue's picture is taken for the list. */
 const PICTURE_MS = 1500;
 
 /** When samples are so much newer than the newest frame, nothing moves: frames come 60 times a second. */
 const STILL_S = 0.25;
+
+/** A tip that is less deep than this part of what it is set to has slipped off. */
+const SLIPPED = 0.6;
 
 /** A server of a fleet that has not answered for so long may be gone: another takes its sessions over within 4 s. */
 const GONE_MS = 3000;
@@ -51,15 +61,24 @@ const status = new Status(
   part("connection", HTMLElement),
   part("figures", HTMLElement),
   part("details", HTMLButtonElement),
+  part("try-now", HTMLButtonElement),
 );
+const gate = new Gate(() => {
+  status.say("Connecting …");
+  part("arriving", HTMLElement).hidden = false;
+  void open(refused);
+  void choices.fill();
+});
 const plots = new Plots(part("plot-displacement", HTMLCanvasElement), part("plot-force", HTMLCanvasElement));
 const tissue = new TissueValues(heard, notice);
+part("try-now", HTMLButtonElement).addEventListener("click", () => tryNow());
+addEventListener("online", () => tryNow());
 const holder = holderName();
 let visit: Visit | undefined;
 let playing: AbortController | undefined;
 
 const choices = new Choices((choice) => {
-  if (choice.kind === "scene") void open({ source: named(choice.scene) });
+  if (choice.kind === "scene") void open({ source: named(choice.scene), isNew: true });
   else if (choice.kind === "live") void open({ sessionId: choice.sessionId, isNew: true });
   else void open({ moment: choice, isNew: true });
 });
@@ -74,7 +93,8 @@ const player = new Player({
 });
 
 // What is recorded can be looked at only.
-new Input(canvas, stage, latency, () => (visit?.session.playback ? undefined : visit));
+const input = new Input(canvas, stage, latency, () => (visit?.session.playback ? undefined : visit));
+input.onPoint = (place) => overlay.point(place, visit?.reach.lengthM);
 
 let noticed: ReturnType<typeof setTimeout> | undefined;
 /** Shows a message for `seconds`; permanently if 0. */
@@ -88,12 +108,16 @@ function notice(text: string, seconds = 5): void {
 
 /** What a new session is made of: that of the last one, if somebody wants another. */
 type Source = NonNullable<MessageInitShape<typeof CreateSessionRequestSchema>["source"]>;
-let made: Source = { case: "sceneName", value: DEFAULT_SCENE };
+let made: Source | undefined;
 
-const named = (value: string | undefined): Source => ({ case: "sceneName", value: value || DEFAULT_SCENE });
+const named = (value: string): Source => ({ case: "sceneName", value });
 
 /** What to open: a session that is there, a new one, or what was recorded, from a step on. `isNew`: by a choice on this page. */
-type Target = { isNew?: boolean } & ({ sessionId: string } | { source: Source } | { moment: JournalName & { step?: number } });
+type Target = { isNew?: boolean } & ({ sessionId: string } | { source?: Source } | { moment: JournalName & { step?: number } });
+/** What was to be opened last. */
+let refused: Target = {};
+/** Ends the wait for the next attempt to open something. */
+let hurry = new AbortController();
 
 /** How often what is shown was left: who waits for something to be shown then waits in vain. */
 let left = 0;
@@ -110,7 +134,8 @@ function leave(): void {
 async function open(target: Target): Promise<void> {
   leave();
   const begun = left;
-  if ("source" in target) made = target.source;
+  if ("source" in target && target.source) made = target.source;
+  refused = target;
   const moment = "moment" in target ? target.moment : undefined;
   let sessionId = "sessionId" in target ? target.sessionId : undefined;
   for (let failures = 0; begun === left; failures++) {
@@ -123,7 +148,7 @@ async function open(target: Target): Promise<void> {
       }
       const session = sessionId
         ? (await sessions.getSession({ sessionId }, { timeoutMs: PATIENCE_MS })).session
-        : (await sessions.createSession({ source: made }, {})).session;
+        : (await sessions.createSession({ source: (made ??= named(await choices.first())), idleTimeoutS: IDLE_S }, {})).session;
       if (!session) continue;
       // Another window's playback: this one gets its own.
       if (session.playback) return await open({ moment: { ...session.playback, step: Number(session.step) } });
@@ -134,26 +159,43 @@ async function open(target: Target): Promise<void> {
       return;
     } catch (error) {
       if (begun !== left) return;
-      const refused = describe(error);
       if (isGone(error)) return over(moment ? "There is no such recording." : "This session no longer exists.");
-      if (reasonOf(error) === "UNAUTHENTICATED") {
-        return over(`The server asks who you are (${refused}). Put your token behind the address, as in #token=…`);
-      }
-      if (!isPassing(error)) return over(`${refused}.`);
+      if (gate.stops(error)) return status.end("barred", "");
+      if (!isPassing(error)) return over(`${sentence(describe(error))}.`);
       const waitMs = backoffMs(failures);
-      status.lose();
-      status.say(`Unexpected answer from the server (${refused}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
-      await sleep(waitMs);
+      status.lose(waitMs);
+      // A server that is busy says so.
+      if (reasonOf(error) !== "") notice(`${sentence(describe(error))}.`, waitMs / 1000);
+      hurry = new AbortController();
+      await sleep(waitMs, hurry.signal);
     }
   }
+}
+
+/** The beginning of a sentence. */
+function sentence(text: string): string {
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
+
+/** Asks at once whether a lost server is back. */
+function tryNow(): void {
+  hurry.abort();
+  visit?.askNow();
+}
+
+/** The server no longer lets the caller do what it did. */
+function barred(reason: string): void {
+  leave();
+  status.end("barred", "");
+  gate.show(reason);
 }
 
 /** A session has ended: the user decides what to do. */
 function over(why: string): void {
   leave();
   part("what-was-that", HTMLButtonElement).hidden = true;
-  status.lose();
-  status.say(why);
+  part("arriving", HTMLElement).hidden = true;
+  status.end("ended", "");
   notice(`${why} `, 0);
   const again = document.createElement("button");
   again.textContent = "Start a new session";
@@ -194,6 +236,7 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
     onSession: heard,
     onTrouble: (failure: Failure, waitMs: number) => visit === next && trouble(failure, waitMs),
     onWell: () => visit === next && status.found(wellText(next.session)),
+    onBarred: (reason: string) => visit === next && barred(reason),
   };
   const next = await Visit.to(session, holder, askedNumber("refinement", 0, 10), told, former);
   if (wanted !== opening) return false;
@@ -209,14 +252,16 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   part("scripts", HTMLElement).hidden ||= isPlayback;
   next.hand.mode = chosenMode();
   next.hand.strength = Number(part("strength", HTMLInputElement).value);
-  next.hand.onRefused = notice;
+  next.hand.onRefused = (message, reason) => notice(refusedText(message, reason));
   next.hand.onChange = holding;
   next.frames.onFrame = () => stage.drawFrame();
   next.samples.onSample = () => felt(next);
   const slider = part("refinement", HTMLInputElement);
   slider.max = String(next.mostRefinement);
   slider.value = String(next.refinement);
-  part("fineness", HTMLElement).hidden = next.mostRefinement === 0;
+  const isFine = next.mostRefinement > 0;
+  for (const id of ["fineness", "fineness-term", "fineness-meaning"]) part(id, HTMLElement).hidden = !isFine;
+  part("look-explained", HTMLElement).textContent = isFine ? "What are net and fineness?" : "What is the net?";
   tellControls();
   tissue.begin(session);
   const name = session.scene?.name ?? "";
@@ -227,8 +272,10 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
     if (isPlayback) player.makeRoom();
     // Shaded by its shape at once; the texture comes when it is painted.
     stage.show(next.surface, false, player.heightPx);
-    stage.setTools([], 1);
+    stage.setTools([]);
+    overlay.point();
   }
+  showLumps(session);
   part("arriving", HTMLElement).hidden = true;
   // What tells of the session before is no longer true.
   if (before?.sessionId !== session.sessionId) {
@@ -305,8 +352,7 @@ let seeking: Promise<void> | undefined;
 function trouble(failure: Failure, waitMs: number): void {
   if (failure.isGone && player.isOpen) return player.revive();
   if (failure.isGone) return over("The session has ended.");
-  status.lose();
-  status.say(`Connection lost (${failure.text}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
+  status.lose(waitMs);
   const { session, heardMs } = visit ?? {};
   if (!session?.ownership || session.playback || performance.now() - (heardMs ?? Infinity) < GONE_MS) return;
   seeking ??= seekAt(session.ownership.others, session.sessionId).finally(() => (seeking = undefined));
@@ -320,6 +366,53 @@ function heard(session: Session): void {
   tissue.show(session);
   part("what-was-that", HTMLButtonElement).hidden = session.journal?.durableStep === undefined;
   holding();
+}
+
+/** Why the hand was refused a touch, in words for the user. */
+function refusedText(message: string, reason: string): string {
+  if (reason === "ROLE_MISSING") return "Your token lets you watch, not touch.";
+  if (reason !== "TOOL_HELD") return `${sentence(message)}.`;
+  const name = visit?.session.heldTools.find(({ tool }) => tool === 0)?.holder || "Somebody else";
+  return `${name} holds the tool. You can touch as soon as ${name} lets go.`;
+}
+
+/** Shows the lumps of a session to an instructor, if there are any; and lets one put some into a mesh of one's own. */
+function showLumps(session: Session): void {
+  const lumps = lumpsOf(session.scene);
+  const isOwn = made?.case === "scene" && session.scene?.mesh !== undefined && !session.playback;
+  part("lumps-shown", HTMLElement).hidden = lumps.length === 0;
+  part("own-lumps", HTMLElement).hidden = !isOwn;
+  part("take-lumps", HTMLButtonElement).hidden = lumps.length === 0;
+  stage.setLumps(part("lumps", HTMLInputElement).checked ? lumps : []);
+}
+
+/** The next press on the tissue puts a lump there, or touches again. */
+function placeLump(on: boolean): void {
+  part("put-lump", HTMLButtonElement).setAttribute("aria-pressed", String(on));
+  input.onPlace = on ? (place) => void putLump(place) : undefined;
+  notice(on ? "Press where the lump is to be." : "", 0);
+}
+
+/** Puts a lump beneath a place of a mesh of one's own, or takes all out: another session of the same mesh. */
+async function putLump(place?: Place): Promise<void> {
+  placeLump(false);
+  const of = visit;
+  if (!of || made?.case !== "scene") return;
+  const { surface, session } = of;
+  const scene = create(SceneSchema, made.value);
+  const inclusions = place ? [...scene.inclusions, lumpAt(place, surface.sizeM, of.edgeM)] : [];
+  const source: Source = { case: "scene", value: { ...scene, inclusions } };
+  try {
+    const { session: next } = await sessions.createSession({ source, idleTimeoutS: IDLE_S }, { timeoutMs: PATIENCE_MS });
+    if (!next || visit !== of) return;
+    made = source;
+    if (place) part("lumps", HTMLInputElement).checked = true;
+    await show(next, { isNew: true, keeps: true });
+    discard(session);
+    if (place) notice("The lump is in. Take the tick from “Lumps” to hide it.", 8);
+  } catch (error) {
+    notice(`The lump is not in: ${describe(error)}.`);
+  }
 }
 
 function holding(): void {
@@ -345,9 +438,10 @@ function felt(of: Visit): void {
     // The own hand knows which side it touches.
     const isMine = tool.tool === 0 && hand.holds;
     const place = isMine && hand.outward ? { ...found, outward: sameSide(found.outward, hand.outward) } : found;
-    return [{ place, forceN: tool.forceN }];
+    const strength = isMine ? of.samples.tell(tool).allN / reach.mostN : norm(tool.forceN) / reach.pointN;
+    return [{ place, forceN: tool.forceN, part: strength }];
   });
-  stage.setTools(shown, reach.pointN);
+  stage.setTools(shown);
 }
 
 /** A direction or its opposite: that which is more like another. */
@@ -364,6 +458,7 @@ function strengthText({ hand: { mode, strength }, reach }: Visit): string {
 function tellControls(): void {
   if (!visit) return;
   const text = strengthText(visit);
+  part("strength-name", HTMLElement).textContent = visit.hand.mode === "tip" ? "Depth" : "Strength";
   part("strength-value", HTMLOutputElement).value = text;
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
   part("refinement-value", HTMLOutputElement).value = String(visit.refinement);
@@ -373,7 +468,7 @@ function tellControls(): void {
 function meaningText({ hand, reach, surface }: Visit): string {
   const range = quantity(reach.lengthM, "m");
   if (hand.mode === "tip") {
-    return `The tip is a disc of ${range} radius. Strength is its depth below the tissue at rest; what pushes back follows from that.`;
+    return `The tip is a disc of ${range} radius. Depth is how far it goes below the tissue at rest; what pushes back follows from that.`;
   }
   return surface.flank
     ? "Strength is the push in the middle of the tool. It fades out over about " +
@@ -409,6 +504,19 @@ part("refinement", HTMLInputElement).addEventListener("input", (event) => {
   tellControls();
 });
 part("what-was-that", HTMLButtonElement).addEventListener("click", () => void whatWasThat());
+part("lumps", HTMLInputElement).addEventListener("change", () => visit && showLumps(visit.session));
+part("put-lump", HTMLButtonElement).addEventListener("click", () => placeLump(input.onPlace === undefined));
+part("take-lumps", HTMLButtonElement).addEventListener("click", () => void putLump());
+part("reset-view", HTMLButtonElement).addEventListener("click", () => stage.resetView());
+const fullScreen = part("full-screen", HTMLButtonElement);
+fullScreen.hidden = !document.fullscreenEnabled;
+fullScreen.addEventListener("click", () => {
+  if (document.fullscreenElement) void document.exitFullscreen();
+  else part("view", HTMLElement).requestFullscreen().catch(() => notice("This browser has no full screen for pages."));
+});
+document.addEventListener("fullscreenchange", () => {
+  fullScreen.textContent = document.fullscreenElement ? "Leave full screen" : "Full screen";
+});
 part("share", HTMLButtonElement).addEventListener("click", () => {
   if (player.moment) writeMoment(player.moment, player.moment.step, false);
   // Browsers offer the clipboard only to pages from a secure origin or from this machine.
@@ -459,6 +567,7 @@ function warnIfFar(of: Visit): void {
 stage.onDrawn = () => {
   latency.drawn();
   overlay.drawn();
+  part("reset-view", HTMLButtonElement).hidden = stage.isAtHome;
 };
 
 // A hidden window releases its connections for visible ones.
@@ -477,7 +586,7 @@ addEventListener("pageshow", ({ persisted }) => persisted && location.reload());
 addEventListener("popstate", () => {
   const { sessionId, moment } = addressed();
   if (moment) void open({ moment });
-  else if (sessionId === undefined) void open({ source: made });
+  else if (sessionId === undefined) void open({});
   else if (sessionId !== visit?.session.sessionId) void open({ sessionId });
 });
 
@@ -489,11 +598,12 @@ setInterval(() => {
   const tool = samples.tools[0];
   const told = tool && samples.tell(tool);
   overlay.tell(told);
-  part("felt", HTMLElement).textContent = told
-    ? `${depthText(told)}, pushes back ${quantity(told.allN, "N")}`
-    : "Nothing touches the tissue.";
+  part("felt", HTMLElement).textContent = feltText(visit, told);
+  // Only of a push it is asked, and only while there is one.
+  part("why", HTMLElement).classList.toggle("none", !told || !["push", "stroke"].includes(visit.hand.mode));
 }, 100);
 setInterval(() => {
+  status.count();
   if (!visit || document.hidden) return;
   warnIfFar(visit);
   const { session, samples, frames } = visit;
@@ -519,6 +629,17 @@ setInterval(() => {
     tolerance: session.scene?.stepping?.tolerance,
   });
 }, 1000);
+
+/** What a tool feels, in words. */
+function feltText({ hand }: Visit, told: Told | undefined): string {
+  const { setM } = hand;
+  if (setM !== undefined && (told?.deepM ?? 0) < SLIPPED * setM) {
+    const now = told ? `now ${depthText(told)}, not ${quantity(setM, "m")}` : "it does not touch any more";
+    return `The tip has slipped off: ${now}. Set less depth.`;
+  }
+  if (!told) return "Nothing touches the tissue.";
+  return `${depthText(told)}, pushes back ${quantity(told.allN, "N")}`;
+}
 
 /** Fills the list of scripts with those that are made for the session's scene. */
 async function listScripts(sessionId: string): Promise<void> {
@@ -619,6 +740,12 @@ const inside = {
     const place = surface instanceof Sheet ? surface.placeAt(x, y) : stage.pickNear(x, 1 - y);
     return place && stage.placeInWindow(place);
   },
+  /** A small picture of what is shown, for the list of scenes. */
+  thumbnail(): string {
+    let picture = "";
+    stage.snap((drawn) => (picture = pictureFrom(drawn)));
+    return picture;
+  },
   pixelAfterPress: (x: number, y: number) => latency.next(x, y),
 };
 Object.assign(window, { palpate: inside });
@@ -631,8 +758,9 @@ for (const choice of document.querySelectorAll<HTMLInputElement>("input[name=mod
   if (choice.value === mode) choice.checked = true;
 }
 const first = addressed();
-choices.markScene(asked.get("scene") ?? DEFAULT_SCENE);
+const asksFor = asked.get("scene");
+choices.markScene(asksFor ?? "");
 if (first.moment) void open({ moment: first.moment });
 else if (first.sessionId) void open({ sessionId: first.sessionId });
-else void open({ source: named(asked.get("scene") ?? undefined) });
+else void open(asksFor ? { source: named(asksFor) } : {});
 void choices.fill();
