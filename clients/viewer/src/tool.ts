@@ -40,7 +40,11 @@ const LEAST = 0.25;
 /** How far the shaft leans aside, as long as there is room. */
 const LEAN = new Vector3(0.5, 0.28, 0.82).normalize();
 /** Where a shaft in a tube points to: how far beside the eye, across and ahead, of its length. There the tissue leaves room. */
-const BESIDE_EYE = [[0.25, 0], [-0.25, 0], [0, 0.25], [0, -0.25], [0.1, 0], [-0.1, 0], [0, 0.1], [0, -0.1], [0.03, 0]] as const;
+const BESIDE_EYE = [[0.25, 0], [-0.25, 0], [0, 0.25], [0, -0.25], [0.1, 0], [-0.1, 0]] as const;
+/** Other directions out of the tissue that are tried in a tube. */
+const AROUND = 16;
+/** Where the dark part of a shaft begins and ends, in radii of the tip. In a tube it ends before the wall. */
+const HANDLE = { from: 6, to: 66 };
 /** The longest arrow, of the size of the tissue, and of the room that there is. */
 const ARROW = { size: 0.26, room: 0.9 };
 const UP = new Vector3(0, 0, 1);
@@ -52,6 +56,7 @@ export class ToolMark {
   private readonly axis = new Vector3(0, 0, 1);
   private readonly probe = new Group();
   private readonly arrow = new Group();
+  private readonly handle: Mesh;
   private readonly rod: Mesh;
   private readonly head: Mesh;
   private readonly gauge: Mesh;
@@ -74,8 +79,12 @@ export class ToolMark {
     this.probe.add(
       new Mesh(new SphereGeometry(1, 28, 20), steel),
       new Mesh(new CylinderGeometry(SHAFT, SHAFT, 7, 20).rotateX(Math.PI / 2).translate(0, 0, 4), steel),
-      new Mesh(new CylinderGeometry(1.25 * SHAFT, 1.25 * SHAFT, 60, 20).rotateX(Math.PI / 2).translate(0, 0, 36), new Steel(0x40464f)),
     );
+    const long = HANDLE.to - HANDLE.from;
+    const handle = new CylinderGeometry(1.25 * SHAFT, 1.25 * SHAFT, long, 20).rotateX(Math.PI / 2).translate(0, 0, long / 2);
+    this.handle = new Mesh(handle, new Steel(0x40464f));
+    this.handle.position.z = HANDLE.from;
+    this.probe.add(this.handle);
     const above = (colour: number, opacity: number): Material =>
       new MeshBasicMaterial({ color: colour, depthTest: false, transparent: true, opacity });
     const green = above(0x35d0ba, 1);
@@ -117,6 +126,10 @@ export class ToolMark {
     this.probe.position.copy(this.tipM);
     this.probe.scale.setScalar(r);
     this.probe.quaternion.setFromUnitVectors(UP, this.axis);
+    const whole = HANDLE.to * r;
+    const free = surface.flank ? whole : whole + Math.min(0, surface.room(this.tipM, this.axis, whole, r, 0));
+    this.lengthM = Math.min(this.lengthM, free);
+    this.handle.scale.z = Math.max((ARROW.room * free) / r - HANDLE.from, 0.01) / (HANDLE.to - HANDLE.from);
     const strength = norm(tool.forceN);
     const acts = tool.part > 1e-3 && strength > 0;
     this.arrow.visible = acts;
@@ -182,11 +195,15 @@ export class ToolMark {
     let best = -Infinity;
     const [dx, dy] = [this.moved.dot(this.across), this.moved.dot(this.aside)];
     const back = Math.hypot(dx, dy) / this.radiusM;
-    for (let k = 0; k < 8 + (surface.flank ? 0 : BESIDE_EYE.length); k++) {
+    for (let k = 0; k < 8 + (surface.flank ? 0 : BESIDE_EYE.length + AROUND); k++) {
       const part = (0.3 * (k - 4)) / (this.radiusM * Math.max(back, 1));
       if (k < 5) this.along(LEAN.x * (1 - k / 4), LEAN.y * (1 - k / 4), LEAN.z * (1 - k / 4) + k / 4);
       else if (k < 8) this.along(-dx * part, -dy * part, 1);
-      else {
+      else if (k >= 8 + BESIDE_EYE.length) {
+        // A spiral on the half of the sphere that is out of the tissue.
+        const z = 1 - (k - 8 - BESIDE_EYE.length + 0.5) / AROUND;
+        this.along(Math.sqrt(1 - z * z) * Math.cos(2.4 * k), Math.sqrt(1 - z * z) * Math.sin(2.4 * k), z);
+      } else {
         const [across, ahead] = BESIDE_EYE[k - 8]!;
         this.tried.copy(eye).addScaledVector(this.across, across * this.lengthM).addScaledVector(this.aside, ahead * this.lengthM);
         this.tried.sub(this.tipM).normalize();
