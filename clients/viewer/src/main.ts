@@ -14,25 +14,24 @@ import { Choices } from "./choices";
 import { Gate } from "./gate";
 import type { Mode } from "./hand";
 import { Input } from "./input";
+import { inside } from "./inside";
 import type { JournalName } from "./journal";
 import { Latency } from "./latency";
-import { lumpAt, lumpsOf } from "./lumps";
-import { depthText, Overlay } from "./overlay";
+import { Lumps } from "./lumps";
+import { Overlay } from "./overlay";
 import { addressed, asked, askedNumber, holderName, part, seekAt, writeAddress, writeMoment } from "./page";
-import { keepPicture, pictureFrom } from "./pictures";
-import type { Told } from "./samples";
+import { keepPicture } from "./pictures";
 import { BACK_S, discard, type Opened, Player } from "./player";
-import { Plots, quantity } from "./plot";
+import { Plots } from "./plot";
 import { playScript } from "./script";
-import { backoffMs, describe, type Failure, isGone, isPassing, PATIENCE_MS, reasonOf, received, server, sessions, sleep } from "./server";
+import { backoffMs, describe, type Failure, isGone, isPassing, PATIENCE_MS, reasonOf, server, sessions, sleep } from "./server";
 import { Stage } from "./stage";
-import { Sheet } from "./sheet";
 import { Status } from "./status";
-import type { Place } from "./surface";
 import { tissueTexture } from "./texture";
 import { TissueValues } from "./tissue";
 import { FileOpener } from "./upload";
 import { Visit } from "./visit";
+import { feltText, meaningText, refusedText, sentence, strengthText, wayText, wellText } from "./words";
 
 /**
  * A session that nobody asks for is deleted after this time: its pages are closed. Browsers let a hidden page ask once a
@@ -45,9 +44,6 @@ const PICTURE_MS = 1500;
 
 /** When samples are so much newer than the newest frame, nothing moves: frames come 60 times a second. */
 const STILL_S = 0.25;
-
-/** A tip that is less deep than this part of what it is set to has slipped off. */
-const SLIPPED = 0.6;
 
 /** A server of a fleet that has not answered for so long may be gone: another takes its sessions over within 4 s. */
 const GONE_MS = 3000;
@@ -95,6 +91,21 @@ const player = new Player({
 // What is recorded can be looked at only.
 const input = new Input(canvas, stage, latency, () => (visit?.session.playback ? undefined : visit));
 input.onPoint = (place) => overlay.point(place, visit?.reach.lengthM);
+
+const lumps = new Lumps(stage, input, {
+  present: () => visit,
+  scene: () => (made?.case === "scene" && !visit?.session.playback ? create(SceneSchema, made.value) : undefined),
+  exchange: async (scene) => {
+    const of = visit;
+    const source: Source = { case: "scene", value: scene };
+    const { session } = await sessions.createSession({ source, idleTimeoutS: IDLE_S }, { timeoutMs: PATIENCE_MS });
+    if (!of || !session || visit !== of) return;
+    made = source;
+    await show(session, { isNew: true, keeps: true });
+    discard(of.session);
+  },
+  notice,
+});
 
 let noticed: ReturnType<typeof setTimeout> | undefined;
 /** Shows a message for `seconds`; permanently if 0. */
@@ -172,11 +183,6 @@ async function open(target: Target): Promise<void> {
   }
 }
 
-/** The beginning of a sentence. */
-function sentence(text: string): string {
-  return text.charAt(0).toUpperCase() + text.slice(1);
-}
-
 /** Asks at once whether a lost server is back. */
 function tryNow(): void {
   hurry.abort();
@@ -252,7 +258,7 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   part("scripts", HTMLElement).hidden ||= isPlayback;
   next.hand.mode = chosenMode();
   next.hand.strength = Number(part("strength", HTMLInputElement).value);
-  next.hand.onRefused = (message, reason) => notice(refusedText(message, reason));
+  next.hand.onRefused = (message, reason) => notice(refusedText(message, reason, next.session));
   next.hand.onChange = holding;
   next.frames.onFrame = () => stage.drawFrame();
   next.samples.onSample = () => felt(next);
@@ -275,7 +281,7 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
     stage.setTools([]);
     overlay.point();
   }
-  showLumps(session);
+  lumps.show(session);
   part("arriving", HTMLElement).hidden = true;
   // What tells of the session before is no longer true.
   if (before?.sessionId !== session.sessionId) {
@@ -328,24 +334,6 @@ function takePicture(of: Visit): void {
   choices.refresh(entry);
 }
 
-function wellText(session: Session): string {
-  const name = session.scene?.name ?? "";
-  if (session.playback) return `Connected to a recording of ${name}.`;
-  if (session.state === SessionState.HELD) return `The session is held: ${session.holdReason}`;
-  const paused = session.state === SessionState.PAUSED ? ", which is paused" : "";
-  return `Connected to ${name}${paused}.${recoveredText(session)}`;
-}
-
-/** How often the tissue recovered and why it did the last time; nothing if it never did. */
-function recoveredText({ recoveryCount, recoveries }: Session): string {
-  const newest = recoveries.at(-1);
-  if (!newest) return "";
-  const times = recoveryCount === 1n ? "once" : `${recoveryCount} times`;
-  const end = newest.pausedUntilStep;
-  const pause = end === undefined ? "" : ` Tools that acted are paused until step ${end}.`;
-  return ` The tissue recovered ${times}, the last time because after step ${newest.step} ${newest.reason}.${pause}`;
-}
-
 /** Asking whether another server of the fleet is there. */
 let seeking: Promise<void> | undefined;
 
@@ -366,53 +354,6 @@ function heard(session: Session): void {
   tissue.show(session);
   part("what-was-that", HTMLButtonElement).hidden = session.journal?.durableStep === undefined;
   holding();
-}
-
-/** Why the hand was refused a touch, in words for the user. */
-function refusedText(message: string, reason: string): string {
-  if (reason === "ROLE_MISSING") return "Your token lets you watch, not touch.";
-  if (reason !== "TOOL_HELD") return `${sentence(message)}.`;
-  const name = visit?.session.heldTools.find(({ tool }) => tool === 0)?.holder || "Somebody else";
-  return `${name} holds the tool. You can touch as soon as ${name} lets go.`;
-}
-
-/** Shows the lumps of a session to an instructor, if there are any; and lets one put some into a mesh of one's own. */
-function showLumps(session: Session): void {
-  const lumps = lumpsOf(session.scene);
-  const isOwn = made?.case === "scene" && session.scene?.mesh !== undefined && !session.playback;
-  part("lumps-shown", HTMLElement).hidden = lumps.length === 0;
-  part("own-lumps", HTMLElement).hidden = !isOwn;
-  part("take-lumps", HTMLButtonElement).hidden = lumps.length === 0;
-  stage.setLumps(part("lumps", HTMLInputElement).checked ? lumps : []);
-}
-
-/** The next press on the tissue puts a lump there, or touches again. */
-function placeLump(on: boolean): void {
-  part("put-lump", HTMLButtonElement).setAttribute("aria-pressed", String(on));
-  input.onPlace = on ? (place) => void putLump(place) : undefined;
-  notice(on ? "Press where the lump is to be." : "", 0);
-}
-
-/** Puts a lump beneath a place of a mesh of one's own, or takes all out: another session of the same mesh. */
-async function putLump(place?: Place): Promise<void> {
-  placeLump(false);
-  const of = visit;
-  if (!of || made?.case !== "scene") return;
-  const { surface, session } = of;
-  const scene = create(SceneSchema, made.value);
-  const inclusions = place ? [...scene.inclusions, lumpAt(place, surface.sizeM, of.edgeM)] : [];
-  const source: Source = { case: "scene", value: { ...scene, inclusions } };
-  try {
-    const { session: next } = await sessions.createSession({ source, idleTimeoutS: IDLE_S }, { timeoutMs: PATIENCE_MS });
-    if (!next || visit !== of) return;
-    made = source;
-    if (place) part("lumps", HTMLInputElement).checked = true;
-    await show(next, { isNew: true, keeps: true });
-    discard(session);
-    if (place) notice("The lump is in. Take the tick from “Lumps” to hide it.", 8);
-  } catch (error) {
-    notice(`The lump is not in: ${describe(error)}.`);
-  }
 }
 
 function holding(): void {
@@ -449,12 +390,6 @@ function sameSide([x, y, z]: Vec3, [ox, oy, oz]: Vec3): Vec3 {
   return x * ox + y * oy + z * oz < 0 ? [-x, -y, -z] : [x, y, z];
 }
 
-/** What the strength is of the present tool. */
-function strengthText({ hand: { mode, strength }, reach }: Visit): string {
-  if (mode === "pull") return "as you drag";
-  return mode === "tip" ? quantity(strength * reach.depthM, "m") : quantity(strength * reach.mostN, "N");
-}
-
 function tellControls(): void {
   if (!visit) return;
   const text = strengthText(visit);
@@ -463,19 +398,6 @@ function tellControls(): void {
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
   part("refinement-value", HTMLOutputElement).value = String(visit.refinement);
   part("meaning", HTMLElement).textContent = meaningText(visit);
-}
-
-function meaningText({ hand, reach, surface }: Visit): string {
-  const range = quantity(reach.lengthM, "m");
-  if (hand.mode === "tip") {
-    return `The tip is a disc of ${range} radius. Depth is how far it goes below the tissue at rest; what pushes back follows from that.`;
-  }
-  return surface.flank
-    ? "Strength is the push in the middle of the tool. It fades out over about " +
-      `${range}. What pushes back is the mean over the tissue around, weighted as the push is. The push is strongest in the ` +
-      "middle, so that mean is less than the strength while nothing moves. While the tissue moves it may be more."
-    : `Strength is the whole push of the tool. It fades out over about ${range}. What pushes back is told for all the tissue ` +
-      "that the push meets: as much as the strength while nothing moves, more or less while the tissue moves.";
 }
 
 function chosenMode(): Mode {
@@ -504,9 +426,6 @@ part("refinement", HTMLInputElement).addEventListener("input", (event) => {
   tellControls();
 });
 part("what-was-that", HTMLButtonElement).addEventListener("click", () => void whatWasThat());
-part("lumps", HTMLInputElement).addEventListener("change", () => visit && showLumps(visit.session));
-part("put-lump", HTMLButtonElement).addEventListener("click", () => placeLump(input.onPlace === undefined));
-part("take-lumps", HTMLButtonElement).addEventListener("click", () => void putLump());
 part("reset-view", HTMLButtonElement).addEventListener("click", () => stage.resetView());
 const fullScreen = part("full-screen", HTMLButtonElement);
 fullScreen.hidden = !document.fullscreenEnabled;
@@ -613,7 +532,7 @@ setInterval(() => {
     roundTripMs: visit.roundTripMs,
     networkMs: visit.hand.tool.networkMs,
     way: wayText(visit),
-    frameAgeMs: frameAgeMs(),
+    frameAgeMs: visit.frameAgeMs,
     isStill: isStill(visit),
     silentMs: performance.now() - visit.heardMs,
     framesTaken: frames.taken,
@@ -630,17 +549,6 @@ setInterval(() => {
   });
 }, 1000);
 
-/** What a tool feels, in words. */
-function feltText({ hand }: Visit, told: Told | undefined): string {
-  const { setM } = hand;
-  if (setM !== undefined && (told?.deepM ?? 0) < SLIPPED * setM) {
-    const now = told ? `now ${depthText(told)}, not ${quantity(setM, "m")}` : "it does not touch any more";
-    return `The tip has slipped off: ${now}. Set less depth.`;
-  }
-  if (!told) return "Nothing touches the tissue.";
-  return `${depthText(told)}, pushes back ${quantity(told.allN, "N")}`;
-}
-
 /** Fills the list of scripts with those that are made for the session's scene. */
 async function listScripts(sessionId: string): Promise<void> {
   for (let failures = 0; visit?.session.sessionId === sessionId; failures++) {
@@ -655,18 +563,6 @@ async function listScripts(sessionId: string): Promise<void> {
   }
 }
 
-/** Datagrams belong to a lease. */
-function wayText({ hand }: Visit): string {
-  if (!hand.holds) return "no tool is held";
-  return hand.tool.datagrams.carries ? "datagrams" : "gRPC-web";
-}
-
-/** Age of the newest frame here. */
-function frameAgeMs(): number | undefined {
-  const [now, newest] = [visit?.nowS(), visit?.frames.newest];
-  return now === undefined || !newest ? undefined : Math.max(0, (1000 * (now - newest.timeS)) / (visit?.speed ?? 1));
-}
-
 /** Whether no frame is due: the server sends none while nothing moves, and samples go on. */
 function isStill({ frames, samples, session, speed }: Visit): boolean {
   const { newest } = samples;
@@ -675,80 +571,7 @@ function isStill({ frames, samples, session, speed }: Visit): boolean {
   return newest !== undefined && frames.newest !== undefined && newest.simulationTimeS - frames.newest.timeS > STILL_S * speed;
 }
 
-/** The page's state as numbers, for tests and measurements. */
-const inside = {
-  get frames() {
-    const { taken, skipped, newest } = visit?.frames ?? { taken: 0, skipped: 0n };
-    return { taken, skipped: Number(skipped), drawn: stage.drawn, timeS: newest?.timeS ?? 0 };
-  },
-  get received() {
-    return received.bytes;
-  },
-  get ageMs() {
-    return frameAgeMs();
-  },
-  get picture() {
-    return stage.describe();
-  },
-  get largestM() {
-    return visit?.surface.largestM() ?? 0;
-  },
-  get forceN() {
-    return visit?.samples.tools.map((tool) => norm(tool.forceN)) ?? [];
-  },
-  /** Largest displacement of the control point within the length of the plots. */
-  get deepestM() {
-    return Math.max(0, ...(visit?.samples.history.map((moment) => norm(moment.displacementM)) ?? []));
-  },
-  get holds() {
-    return visit?.hand.holds ?? false;
-  },
-  /** What is played, if anything is. */
-  get recording() {
-    return player.moment;
-  },
-  /** Where the camera is. */
-  get camera() {
-    return stage.camera.matrixWorld.toArray();
-  },
-  /** Whether datagrams get through, and how many were sent and came in this session; poses and samples in them. */
-  get datagrams() {
-    const { carries, counts } = visit?.hand.tool.datagrams ?? {};
-    return { carries: carries ?? false, sent: 0, came: 0, poses: 0, samples: 0, fellBack: 0, ...counts };
-  },
-  /** The least room between a tool and the tissue as drawn, of the width of the tissue; undefined without a tool. */
-  get clear() {
-    const { clearM } = stage;
-    return clearM === undefined || !visit ? undefined : clearM / visit.widthM;
-  },
-  /** Whether the first picture of the tissue was drawn, and had a texture; and whether it has one now. */
-  get drawing() {
-    return { ...stage.began, hasTexture: stage.isTextured };
-  },
-  /** The camera's height above the table and the tissue beneath it, of the width of the tissue. */
-  get cameraHeight() {
-    return visit ? stage.heightM / visit.widthM : 0;
-  },
-  /** Width of the tissue, m. */
-  get widthM() {
-    return visit?.widthM ?? 0;
-  },
-  /** The window point of the tissue at (x, y): in fractions of a sheet; of a body near there in the picture. */
-  at(x: number, y: number): [number, number] | undefined {
-    if (!visit) return undefined;
-    const { surface } = visit;
-    const place = surface instanceof Sheet ? surface.placeAt(x, y) : stage.pickNear(x, 1 - y);
-    return place && stage.placeInWindow(place);
-  },
-  /** A small picture of what is shown, for the list of scenes. */
-  thumbnail(): string {
-    let picture = "";
-    stage.snap((drawn) => (picture = pictureFrom(drawn)));
-    return picture;
-  },
-  pixelAfterPress: (x: number, y: number) => latency.next(x, y),
-};
-Object.assign(window, { palpate: inside });
+Object.assign(window, { palpate: inside(() => visit, stage, player, latency) });
 
 const wireframe = part("wireframe", HTMLInputElement);
 wireframe.checked = asked.get("wireframe") === "1";

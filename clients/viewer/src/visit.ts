@@ -196,6 +196,12 @@ export class Visit {
     return this.clock && this.clock.timeS + this.speed * (performance.now() / 1000 - this.clock.localS);
   }
 
+  /** Age of the newest frame here, ms. */
+  get frameAgeMs(): number | undefined {
+    const [now, { newest }] = [this.nowS(), this.frames];
+    return now === undefined || !newest ? undefined : Math.max(0, (1000 * (now - newest.timeS)) / this.speed);
+  }
+
   /** Asks at once whether the server is back. */
   askNow(): void {
     this.asking.abort();
