@@ -31,7 +31,7 @@ import { tissueTexture } from "./texture";
 import { TissueValues } from "./tissue";
 import { FileOpener } from "./upload";
 import { Visit } from "./visit";
-import { feltText, meaningText, refusedText, sentence, strengthText, wayText, wellText } from "./words";
+import { feltText, isLess, meaningText, refusedText, sentence, strengthText, wayText, wellText } from "./words";
 
 /**
  * A session that nobody asks for is deleted after this time: its pages are closed. Browsers let a hidden page ask once a
@@ -518,8 +518,7 @@ setInterval(() => {
   const told = tool && samples.tell(tool);
   overlay.tell(told);
   part("felt", HTMLElement).textContent = feltText(visit, told);
-  // Only of a push it is asked, and only while there is one.
-  part("why", HTMLElement).classList.toggle("none", !told || !["push", "stroke"].includes(visit.hand.mode));
+  part("why", HTMLElement).classList.toggle("none", !isLess(visit, told));
 }, 100);
 setInterval(() => {
   status.count();

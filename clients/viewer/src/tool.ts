@@ -39,6 +39,8 @@ const NEAR = 0.9;
 const LEAST = 0.25;
 /** How far the shaft leans aside, as long as there is room. */
 const LEAN = new Vector3(0.5, 0.28, 0.82).normalize();
+/** The gauge of the depth is not drawn when one looks along it: from so much of its direction, a cosine, on. */
+const END_ON = 0.9;
 /** Where a shaft in a tube points to: how far beside the eye, across and ahead, of its length. There the tissue leaves room. */
 const BESIDE_EYE = [[0.25, 0], [-0.25, 0], [0, 0.25], [0, -0.25], [0.1, 0], [-0.1, 0]] as const;
 /** Other directions out of the tissue that are tried in a tube. */
@@ -146,7 +148,10 @@ export class ToolMark {
     }
     const out = moved.dot(this.out);
     const deep = Math.abs(out) > 0.8 * r;
-    this.gauge.visible = this.foot.visible = this.level.visible = deep;
+    this.level.visible = deep;
+    // Whoever looks along it sees nothing of its length.
+    const along = Math.abs(this.tried.copy(eye).sub(this.tipM).normalize().dot(this.out));
+    this.gauge.visible = this.foot.visible = deep && along < END_ON;
     if (deep) {
       this.level.position.set(...place.restM).add(moved).addScaledVector(this.out, -out);
       // Down to where the tip's underside is drawn: on a curved surface that is not the tissue beside it.
@@ -165,7 +170,8 @@ export class ToolMark {
     light.tips.value[this.index]!.set(this.tipM.x, this.tipM.y, this.tipM.z, r);
     const end = this.tried.copy(this.tipM).addScaledVector(this.axis, this.lengthM);
     light.shafts.value[this.index]!.set(end.x, end.y, end.z, 1.2 * SHAFT * r);
-    light.rings.value[this.index]!.copy(light.tips.value[this.index]!).setW(2.1 * r);
+    // In a dent of a body it would be several rings, where its walls meet the ball.
+    light.rings.value[this.index]!.copy(light.tips.value[this.index]!).setW(deep && !surface.flank ? 0 : 2.1 * r);
   }
 
   /** The directions of the place: a shaft that stands on it goes on leaning as it did. */

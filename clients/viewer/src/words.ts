@@ -8,6 +8,8 @@ import type { Visit } from "./visit";
 
 /** A tip that is less deep than this part of what it is set to has slipped off. */
 const SLIPPED = 0.6;
+/** A push of which less than this part is felt is less. */
+const LESS = 0.95;
 
 /** The beginning of a sentence. */
 export function sentence(text: string): string {
@@ -59,6 +61,11 @@ export function meaningText({ hand, reach, surface }: Visit): string {
       "middle, so that mean is less than the strength while nothing moves. While the tissue moves it may be more."
     : `Strength is the whole push of the tool. It fades out over about ${range}. What pushes back is told for all the tissue ` +
       "that the push meets: as much as the strength while nothing moves, more or less while the tissue moves.";
+}
+
+/** Whether a push is told as clearly less than its strength: then somebody may ask why. */
+export function isLess({ hand: { mode, strength }, reach }: Visit, told: Told | undefined): boolean {
+  return told !== undefined && ["push", "stroke"].includes(mode) && told.allN < LESS * strength * reach.mostN;
 }
 
 /** What a tool feels, in words. */

@@ -42,9 +42,13 @@ describe("the page", () => {
     const page = await open();
     assert.match(page.page.url(), /\?session=[0-9a-f]+/);
     const rest = await page.picture("rest");
+    // Only who feels less than the strength asks why.
+    const why = page.page.locator("#why");
+    await why.waitFor({ state: "hidden" });
     const [left, top] = await page.press();
     await page.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
     await page.says("felt", /pushes back/);
+    await why.waitFor({ state: "visible" });
     await page.says("holder", /^You/);
     const pressed = await page.picture("pressed");
     assert.notDeepEqual(rest, pressed);
@@ -302,16 +306,10 @@ describe("the page", () => {
     await page.page.check("#lumps");
     await page.page.waitForTimeout(300);
     assert.ok((await bluest(page, await picture())) > without + 0.2);
-    // Depth is what a tip is led by, and nobody asks why a tip's force is less than that.
-    const why = page.page.locator("#why");
+    // Depth is what a tip is led by.
     assert.equal(await page.text("strength-name"), "Strength");
-    await why.waitFor({ state: "hidden" });
-    await page.press();
-    await why.waitFor({ state: "visible" });
-    await page.page.mouse.up();
     await page.page.check("input[value=tip]", { force: true });
     assert.equal(await page.text("strength-name"), "Depth");
-    await why.waitFor({ state: "hidden" });
     assert.deepEqual(page.complaints, []);
     await close(page);
   });
