@@ -3,7 +3,7 @@
 import { type JournalName, lengthText, type Listed, listJournals, whenText } from "./journal";
 import { part } from "./page";
 import { entryOf, pictureOf } from "./pictures";
-import { DEFAULT_SCENE, groupOf, GROUPS, inOrder } from "./scenes";
+import { DEFAULT_SCENE, groupOf, GROUPS, inOrder, titleOf } from "./scenes";
 import { backoffMs, isPassing, PATIENCE_MS, sessions, sleep } from "./server";
 
 /** What somebody chose. */
@@ -102,7 +102,7 @@ export class Choices {
     const value = keyOf(journal, "recorded");
     const isOther = value !== this.marked.value;
     this.present = "";
-    this.mark(value, `${sceneName}, recorded`);
+    this.mark(value, `${titleOf(sceneName)}, recorded`);
     if (isOther && this.askedMs > 0) void this.ask();
   }
 
@@ -111,8 +111,8 @@ export class Choices {
     this.marked = { value, name };
     for (const option of [...this.list.options]) if (option.disabled) option.remove();
     this.list.value = value;
-    if (this.list.value === value) return;
-    const own = new Option(name, value);
+    if (value !== "" && this.list.value === value) return;
+    const own = new Option(name || "Choose …", value);
     own.disabled = true;
     this.list.prepend(own);
     this.list.value = value;

@@ -61,9 +61,14 @@ export class Hand {
     return this.tool.touches;
   }
 
-  /** The side of the tissue that it touches, or touched last. */
+  /** The direction out of the tissue where it touches, or touched last. A tip may slip to where there is another. */
   get outward(): Vec3 | undefined {
-    return this.place?.outward;
+    return this.mode === "tip" ? undefined : this.place?.outward;
+  }
+
+  /** Whether it touches the outer side of the tissue. It stays on its side, wherever it slips. */
+  get isOuter(): boolean | undefined {
+    return this.place && this.surface().isOuter(this.place);
   }
 
   /** The depth that the tip is set to, once it has had the time to get there; nothing if it is not led. */

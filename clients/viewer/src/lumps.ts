@@ -87,6 +87,8 @@ export class Lumps {
   private place(on: boolean): void {
     this.put.setAttribute("aria-pressed", String(on));
     this.input.onPlace = on ? (place) => void this.change(place) : undefined;
+    // On a phone the tissue is above what is in sight.
+    if (on) part("view", HTMLElement).scrollIntoView({ block: "nearest" });
     this.host.notice(on ? "Press where the lump is to be." : "", 0);
   }
 

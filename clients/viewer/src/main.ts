@@ -8,7 +8,7 @@
 // acknowledgement at a time.
 
 import { create, type MessageInitShape } from "@bufbuild/protobuf";
-import { norm, type Vec3 } from "palpate";
+import { norm } from "palpate";
 import { type CreateSessionRequestSchema, SceneSchema, type Session, SessionState } from "palpate/v1";
 import { Choices } from "./choices";
 import { Gate } from "./gate";
@@ -201,13 +201,14 @@ function over(why: string): void {
   leave();
   part("what-was-that", HTMLButtonElement).hidden = true;
   part("arriving", HTMLElement).hidden = true;
+  document.body.classList.toggle("empty", showing === 0);
   status.end("ended", "");
   notice(`${why} `, 0);
   const again = document.createElement("button");
   again.textContent = "Start a new session";
   again.addEventListener("click", () => {
     notice("", 0);
-    void open({ source: made });
+    void open({ source: made, isNew: true });
   });
   part("notice", HTMLElement).append(again);
 }
@@ -283,6 +284,7 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   }
   lumps.show(session);
   part("arriving", HTMLElement).hidden = true;
+  document.body.classList.remove("empty");
   // What tells of the session before is no longer true.
   if (before?.sessionId !== session.sessionId) {
     heard(session);
@@ -372,22 +374,15 @@ function holding(): void {
 /** Shows the tools and the forces on them. */
 function felt(of: Visit): void {
   if (of !== visit) return;
-  const { surface, hand, reach } = of;
+  const { hand, reach } = of;
   const shown = of.samples.tools.flatMap((tool) => {
-    const found = surface.ofTool(tool);
-    if (!found) return [];
-    // The own hand knows which side it touches.
+    const place = of.placeOf(tool);
+    if (!place) return [];
     const isMine = tool.tool === 0 && hand.holds;
-    const place = isMine && hand.outward ? { ...found, outward: sameSide(found.outward, hand.outward) } : found;
     const strength = isMine ? of.samples.tell(tool).allN / reach.mostN : norm(tool.forceN) / reach.pointN;
     return [{ place, forceN: tool.forceN, part: strength }];
   });
   stage.setTools(shown);
-}
-
-/** A direction or its opposite: that which is more like another. */
-function sameSide([x, y, z]: Vec3, [ox, oy, oz]: Vec3): Vec3 {
-  return x * ox + y * oy + z * oz < 0 ? [-x, -y, -z] : [x, y, z];
 }
 
 function tellControls(): void {

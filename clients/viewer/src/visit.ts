@@ -9,7 +9,7 @@ import { Hand, type Reach } from "./hand";
 import { type Felt, sampleEvery, Samples, type Sense } from "./samples";
 import { type Failure, keepOpen, PATIENCE_MS, server, sessions, sleep } from "./server";
 import { Sheet } from "./sheet";
-import type { Surface } from "./surface";
+import type { Place, Surface } from "./surface";
 
 /** Interval between two requests for the session's status. */
 const ASK_MS = 1000;
@@ -134,8 +134,14 @@ export class Visit {
   /** The side that a tool touches. Only of the own hand is known how a force is spread. */
   private sense(tool: Felt): Sense {
     const isMine = tool.tool === 0 && this.hand.holds;
-    const outward = (isMine && this.hand.outward) || this.surface.ofTool(tool)?.outward || [0, 0, 1];
+    const outward = (isMine && this.hand.outward) || this.placeOf(tool)?.outward || [0, 0, 1];
     return { outward, share: isMine ? this.hand.share : 1 };
+  }
+
+  /** Where a tool touches. The own hand knows from which side. */
+  placeOf(tool: Felt): Place | undefined {
+    const isMine = tool.tool === 0 && this.hand.holds;
+    return this.surface.ofTool(tool, isMine ? this.hand.isOuter : undefined);
   }
 
   begin(): void {
