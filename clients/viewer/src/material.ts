@@ -101,7 +101,7 @@ bool isTurned() { return closed < 0.5; }
 // On what is sharply curved the lamp would be a white dot. Curvature times the body's size: 3.5 on a ball.
 float glints(vec3 n) {
   float bend = (length(dFdx(n)) + length(dFdy(n))) / max(length(dFdx(vAt)) + length(dFdy(vAt)), 1e-9) * reach;
-  return 1.0 - smoothstep(8.0, 22.0, bend);
+  return 1.0 - smoothstep(13.0, 30.0, bend);
 }
 float within(float open) { return 1.0 - smoothstep(0.02, 0.42, open); }
 // A broad lamp, of which a smooth body shows more than a point.

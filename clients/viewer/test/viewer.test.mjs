@@ -317,13 +317,13 @@ describe("the page", () => {
   test("draws slabs and folds without white dots and black seams", async () => {
     const page = await open(`${server.url}/?scene=liver`, { viewport: { width: 1280, height: 800 } });
     await page.until(({ drawing }) => drawing.hasTexture);
-    await page.page.waitForTimeout(1000);
+    await page.page.waitForTimeout(700);
     // The corner in front, where the lamp was a dot.
     const corner = await extremes(page, await page.page.screenshot({ clip: { x: 20, y: 480, width: 300, height: 200 } }));
     assert.ok(corner.whitest < 0.85, `a pixel of ${corner.whitest}`);
     await page.page.goto(`${server.url}/?scene=colon`);
     await page.until(({ drawing }) => drawing.hasTexture);
-    await page.page.waitForTimeout(1500);
+    await page.page.waitForTimeout(900);
     // The tube from outside, which the lamp shines on.
     const outside = await extremes(page, await page.page.screenshot({ clip: { x: 200, y: 120, width: 150, height: 160 } }));
     assert.ok(outside.blackest > 0.25, `a pixel of ${outside.blackest}`);
@@ -643,8 +643,8 @@ describe("several pages on one session", () => {
     let calls = 0;
     page.page.on("request", () => (calls += 1));
     await page.page.mouse.up();
-    await page.page.waitForTimeout(4000);
-    assert.ok(calls <= 12, `${calls} calls in 4 s to a server that is away`);
+    await page.page.waitForTimeout(2000);
+    assert.ok(calls <= 12, `${calls} calls in 2 s to a server that is away`);
     // No words of the browser's, and one state at a time.
     assert.doesNotMatch(await page.page.evaluate("document.body.innerText"), /Connected|fetch/i);
     await page.picture("lost");
