@@ -11,9 +11,12 @@ export function isBarred(reason: string): boolean {
 /** What to say to whom a call was refused for a reason. */
 function words(reason: string): [string, string] {
   if (reason === "ROLE_MISSING") {
-    return ["Your token does not let you open a tissue.", "Open the link to a session that somebody else has opened, or use another token."];
+    const next = "Open the link to a session that somebody else has opened, or use another token.";
+    return ["Your token does not let you open a tissue.", next];
   }
-  if (server.token) return ["This server does not know your token.", "Copy the whole token again, or ask whoever runs the server for another."];
+  if (server.token) {
+    return ["This server does not know your token.", "Copy the whole token again, or ask whoever runs the server for another."];
+  }
   return ["This server asks for a token.", "Whoever runs the server can give you one."];
 }
 

@@ -92,7 +92,9 @@ export class Input {
   private moved(event: PointerEvent): void {
     const { hand } = this.touched() ?? {};
     const isMouse = event.pointerType !== "touch";
-    if (hand && isMouse && this.dragging === undefined) this.onPoint(event.buttons === 0 ? this.stage.pick(event.clientX, event.clientY) : undefined);
+    if (hand && isMouse && this.dragging === undefined) {
+      this.onPoint(event.buttons === 0 ? this.stage.pick(event.clientX, event.clientY) : undefined);
+    }
     if (event.pointerId !== this.dragging || !hand || !this.from) return;
     if (glides(hand)) {
       const place = this.stage.pick(event.clientX, event.clientY);

@@ -191,6 +191,8 @@ function tryNow(): void {
 
 /** The server no longer lets the caller do what it did. */
 function barred(reason: string): void {
+  // Another token leads back to the same session.
+  if (visit && !visit.session.playback) refused = { sessionId: visit.session.sessionId };
   leave();
   status.end("barred", "");
   gate.show(reason);

@@ -34,7 +34,14 @@ const SLOW = { roundTripMs: 300, dilation: 0.8, frameAgeMs: 600, drawn: 6, taken
 const LOST_MS = 4000;
 
 type Light = "wait" | "good" | "slow" | "lost" | "ended" | "barred";
-const WORDS: Record<Light, string> = { wait: "Connecting", good: "Good", slow: "Slow", lost: "Lost", ended: "Ended", barred: "No access" };
+const WORDS: Record<Light, string> = {
+  wait: "Connecting",
+  good: "Good",
+  slow: "Slow",
+  lost: "Lost",
+  ended: "Ended",
+  barred: "No access",
+};
 
 export class Status {
   /** Whether a stream failed and nothing came since, or nothing will come. */
