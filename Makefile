@@ -19,7 +19,7 @@ MODULES := clients/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
 	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
-.PHONY: help run install header test-abi bench-tick build release viewer page-if-node test test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot bench-roundtrip bench-duty \
+.PHONY: help run install header test-abi bench-tick build release viewer page-if-node test test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos
 
@@ -46,6 +46,8 @@ help:
 	@echo 'make picture         docs/poke.svg, the curve of the guide'
 	@echo 'make figures         the paper'"'"'s figures and experiments: docs/figures, shown in docs/paper.md'
 	@echo 'make screenshot      the screenshot of the README'
+	@echo 'make page-states     a picture of each state of the page, at three widths, light and dark, in target/viewer/states'
+	@echo 'make scene-pictures  the pictures of the scenes in the list of the page'
 	@echo 'make bench-roundtrip the haptic round trip beside a bare gRPC echo'
 	@echo 'make bench-duty      a minute of 1 kHz touch and 60 frames a second: time kept, commands lost'
 	@echo 'make bench-rest      a thousand sessions at rest: their share of a core, and the memory of each'
@@ -171,6 +173,13 @@ figures: need-rust
 
 screenshot: build viewer
 	cd $(VIEWER) && $(NPM) run screenshot
+
+# `make page-states STATES=first,lost WIDTHS=390`: some only.
+page-states: build viewer
+	cd $(VIEWER) && $(NPM) run states
+
+scene-pictures: build viewer
+	cd $(VIEWER) && $(NPM) run scene-pictures
 
 bench-roundtrip: build
 	@echo "Machine: $$(sed -n 's/^model name.*: //p' /proc/cpuinfo 2>/dev/null | sort | uniq -c)"

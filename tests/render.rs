@@ -82,7 +82,9 @@ fn a_texture_is_made_by_its_seed() {
 fn each_tissue_has_a_surface_of_its_own() {
     let limits = Limits::default();
     let mut means = Vec::new();
-    for (name, surface) in [("liver", "liver"), ("fibrotic", "nodular"), ("stomach", "mucosa")] {
+    for (name, surface) in
+        [("liver", "liver"), ("fibrotic", "nodular"), ("stomach", "mucosa"), ("gallbladder", "serosa")]
+    {
         let scene = Scene::load(&Path::new("scenes").join(format!("{name}.toml")), &[], &limits).unwrap();
         assert_eq!(scene.appearance.surface.name(), surface);
         let small = Appearance { texture_size: 192, ..scene.appearance };
@@ -95,6 +97,9 @@ fn each_tissue_has_a_surface_of_its_own() {
     let [liver, nodular, mucosa] = [means[0], means[1], means[2]];
     assert!(liver[0] < nodular[0] - 20.0 && nodular[0] < mucosa[0] - 15.0, "{means:?}");
     assert!(nodular[1] / nodular[2] > 1.05 * liver[1] / liver[2], "{means:?}");
+    // A gallbladder is grey-green: green before red, and far from the pink of a lining.
+    let serosa = means[3];
+    assert!(serosa[1] > serosa[0] && serosa[1] > serosa[2] && serosa[1] < 1.4 * serosa[0], "{means:?}");
     assert_eq!(Appearance::default().surface, Surface::Mucosa);
     refused(&["texture", "--surface", "spleen", "--output", "never.png"], "surface");
 }

@@ -145,11 +145,17 @@ pub enum Surface {
     Liver,
     /// A fibrotic liver: nodules in a net of scar.
     Nodular,
+    /// The outside of a gallbladder, grey-green by the bile in it.
+    Serosa,
 }
 
 impl Named for Surface {
-    const NAMES: &'static [(&'static str, Self)] =
-        &[("mucosa", Surface::Mucosa), ("liver", Surface::Liver), ("nodular", Surface::Nodular)];
+    const NAMES: &'static [(&'static str, Self)] = &[
+        ("mucosa", Surface::Mucosa),
+        ("liver", Surface::Liver),
+        ("nodular", Surface::Nodular),
+        ("serosa", Surface::Serosa),
+    ];
 }
 
 /// What of a tissue may change while it is in use. What is `None` stays.

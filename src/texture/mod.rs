@@ -7,6 +7,7 @@ mod liver;
 mod mucosa;
 mod nodular;
 mod noise;
+mod serosa;
 mod vessels;
 
 use std::io::{Cursor, Read};
@@ -52,6 +53,7 @@ pub fn painted(surface: Surface, seed: u64, size: u32, limits: &Limits) -> Resul
         Surface::Mucosa => mucosa::paint(seed, side),
         Surface::Liver => liver::paint(seed, side),
         Surface::Nodular => nodular::paint(seed, side),
+        Surface::Serosa => serosa::paint(seed, side),
     };
     Ok(Image { width: side, height: side, rgb })
 }

@@ -43,7 +43,7 @@ export class Frames {
       this.newest = { step: data.step, timeS: data.timeS };
       this.onFrame(this.newest);
     };
-    worker.onerror = (event) => onFailure({ isGone: false, text: event.message || "can't receive frames" }, 0);
+    worker.onerror = (event) => onFailure({ isGone: false, reason: "", text: event.message || "can't receive frames" }, 0);
     const vertices: [number, number] = [field.nx, field.ny];
     const { url, token } = this.server;
     worker.postMessage({ url, token, sessionId, refinement, vertices } satisfies Order);

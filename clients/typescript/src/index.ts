@@ -14,6 +14,7 @@ export {
   isGone,
   isPassing,
   isUnimplemented,
+  isUnreached,
   keepOpen,
   PATIENCE_MS,
   reasonOf,

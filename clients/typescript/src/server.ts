@@ -172,7 +172,7 @@ export function elsewhere(error: unknown): string | undefined {
 }
 
 /** Whether a call has not come to a server, or its answer not back. */
-function isUnreached(error: unknown): boolean {
+export function isUnreached(error: unknown): boolean {
   return reasonOf(error) === "" && ConnectError.from(error).code !== Code.Canceled;
 }
 
@@ -191,9 +191,15 @@ function textOf(message: MessageShape<DescMessage>, key: string): string {
   return typeof value === "string" ? value : "";
 }
 
-/** The message for an error. */
+/** What browsers say of a network that fails, each in its own words. */
+const NETWORK_FAILED = /fetch|network|load failed|input stream|connection/i;
+
+/** The message for an error, without a full stop. */
 export function describe(error: unknown): string {
-  return ConnectError.from(error).rawMessage;
+  const { rawMessage, cause, code } = ConnectError.from(error);
+  if (cause instanceof TypeError && NETWORK_FAILED.test(rawMessage)) return "the server can't be reached";
+  if (code === Code.DeadlineExceeded && reasonOf(error) === "") return "the server does not answer";
+  return rawMessage;
 }
 
 /** Whether the session is over for good. */
@@ -224,15 +230,17 @@ export function sleep(ms: number, signal?: AbortSignal): Promise<void> {
   });
 }
 
-/** The wait grows with each failure, from 0.25 s to 8 s, with some jitter so that not all clients return at once. */
+/** The wait grows with each failure, from 0.25 s to 30 s, with some jitter so that not all clients return at once. */
 export function backoffMs(failures: number): number {
-  return Math.min(8000, 250 * 2 ** Math.min(failures, 6)) * (0.75 + 0.5 * Math.random());
+  return Math.min(30_000, 250 * 2 ** Math.min(failures, 7)) * (0.75 + 0.5 * Math.random());
 }
 
 /** A stream's failure, in a form that a worker can send. */
 export interface Failure {
   /** Whether the session is over for good. */
   isGone: boolean;
+  /** The server's reason code; empty if it gave none. */
+  reason: string;
   text: string;
 }
 
@@ -253,7 +261,7 @@ export async function keepOpen(
       const waitMs = elsewhere(error) !== undefined && failures === 0 ? 0 : backoffMs(failures);
       failures += 1;
       if (waitMs === 0) continue;
-      onFailure({ isGone: isGone(error), text: describe(error) }, waitMs);
+      onFailure({ isGone: isGone(error), reason: reasonOf(error), text: describe(error) }, waitMs);
       if (isGone(error)) return;
       await sleep(waitMs, signal);
     }

@@ -7,7 +7,7 @@ import type { MessageInitShape } from "@bufbuild/protobuf";
 import { Datagrams } from "./datagrams.js";
 import type { CommandSchema, Sample } from "./gen/palpate/v1/haptic_pb.js";
 import { type Lead, poseOf } from "./poses.js";
-import { describe, isGone, PATIENCE_MS, reasonOf, type Server } from "./server.js";
+import { backoffMs, describe, isGone, isUnreached, PATIENCE_MS, reasonOf, type Server } from "./server.js";
 
 type Command = MessageInitShape<typeof CommandSchema>;
 
@@ -50,6 +50,9 @@ export class Tool {
   private underWay = 0;
   private sentMs = 0;
   private touchedMs = 0;
+  /** Batches that found no server, one after the other; and until when none is sent because of that. */
+  private unreached = 0;
+  private waitsUntilMs = 0;
   private timer: ReturnType<typeof setInterval> | undefined;
 
   /** Tool number `tool` of a session; `holder` is the name that others see. Nothing is taken yet. */
@@ -168,7 +171,7 @@ export class Tool {
     const now = performance.now();
     const wanted = this.wanted?.(now);
     if (wanted && "lead" in wanted && this.datagrams.carries) return this.leadOn(wanted.lead, now);
-    if (this.underWay >= IN_FLIGHT) return;
+    if (this.underWay >= IN_FLIGHT || now < this.waitsUntilMs) return;
     const isRest = !wanted && this.released;
     if (isRest && now - this.touchedMs > IDLE_MS) return void this.letGo();
     // At rest, send just often enough to keep the lease.
@@ -208,6 +211,7 @@ export class Tool {
     try {
       const request = { sessionId: this.sessionId, leaseId, commands };
       const { sample } = await this.server.haptics.sendCommands(request, { timeoutMs: PATIENCE_MS });
+      this.unreached = 0;
       if (sample && commands.length > 0) this.measure(sample, performance.now() - begun);
     } catch (error) {
       // Two batches may overtake each other: the newer one counts.
@@ -227,6 +231,11 @@ export class Tool {
 
   private failed(error: unknown): void {
     if (isGone(error)) this.wanted = undefined;
+    // Whoever watches the session says that the server is lost; here it is only not asked ever faster.
+    if (isUnreached(error)) {
+      this.waitsUntilMs = performance.now() + backoffMs(this.unreached++);
+      return;
+    }
     if (reasonOf(error) !== "NOT_HOLDER" && !isGone(error)) return this.onRefused(describe(error), reasonOf(error));
     // The server ended the lease because no command came for too long. A user who still presses takes the tool again.
     this.lost();

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { createServer } from "node:http";
 import { after, test } from "node:test";
 import { create, toBinary } from "@bufbuild/protobuf";
-import { elsewhere, reasonOf, Server, watchSamples } from "palpate";
+import { backoffMs, describe, elsewhere, reasonOf, Server, watchSamples } from "palpate";
 import { GetSessionResponseSchema, WatchSamplesResponseSchema } from "palpate/v1";
 
 /** @type {import("node:http").Server[]} */
@@ -117,4 +117,22 @@ test("samples of a server that had the session before are left out", async () =>
   const steps = [];
   await watchSamples(new Server(near), "s", 1, ({ step }) => steps.push(step), ended.signal, () => ended.abort());
   assert.deepEqual(steps, [1n, 2n]);
+});
+
+test("a server that is away is told of in words of ours, and asked ever more seldom", async () => {
+  // A port that nobody listens on any more.
+  const closed = createServer();
+  await /** @type {Promise<void>} */ (new Promise((done) => closed.listen(0, "127.0.0.1", done)));
+  const address = closed.address();
+  closed.close();
+  const server = new Server(`http://127.0.0.1:${typeof address === "object" && address ? address.port : 0}`);
+  const error = await server.sessions.getSession({ sessionId: "s" }).catch((/** @type {unknown} */ error) => error);
+  assert.equal(describe(error), "the server can't be reached");
+  // A refusal of the server's is told in its own words.
+  const refusing = new Server(await serve((_, answer) => refuse(answer, "TOO_MANY")));
+  assert.equal(describe(await refusing.sessions.getSession({}).catch((/** @type {unknown} */ error) => error)), "no");
+  for (const [failures, ms] of /** @type {const} */ ([[0, 250], [3, 2000], [20, 30_000]])) {
+    const waits = backoffMs(failures);
+    assert.ok(waits >= 0.75 * ms && waits <= 1.25 * ms, `${failures} failures: ${waits} ms`);
+  }
 });

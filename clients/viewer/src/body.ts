@@ -440,16 +440,16 @@ export class Body implements Surface {
     return new Vector3(...this.mix(this.restNormal, triangle, weights)).normalize();
   }
 
-  private isOuter(place: Place): boolean {
+  isOuter(place: Place): boolean {
     return this.outerAt(place).dot(new Vector3(...place.outward)) >= 0;
   }
 
-  ofTool({ vertex, appliedN: [x, y, z] }: Pick<Felt, "vertex" | "appliedN">): Place | undefined {
+  ofTool({ vertex, appliedN: [x, y, z] }: Pick<Felt, "vertex" | "appliedN">, isOuter?: boolean): Place | undefined {
     const index = vertex === undefined ? undefined : this.byFile.get(vertex);
     if (index === undefined) return undefined;
     const [nx, ny, nz] = [this.restNormal[3 * index]!, this.restNormal[3 * index + 1]!, this.restNormal[3 * index + 2]!];
     // A closed body is touched from outside; an open one from where the tool pushes.
-    return this.atVertex(index, !this.isOpen || x * nx + y * ny + z * nz <= 0);
+    return this.atVertex(index, isOuter ?? (!this.isOpen || x * nx + y * ny + z * nz <= 0));
   }
 
   displacementAt({ triangle, weights }: Place): Vector3 {

@@ -3,7 +3,8 @@
 import { type JournalName, lengthText, type Listed, listJournals, whenText } from "./journal";
 import { part } from "./page";
 import { entryOf, pictureOf } from "./pictures";
-import { backoffMs, PATIENCE_MS, sessions, sleep } from "./server";
+import { DEFAULT_SCENE, groupOf, GROUPS, inOrder, titleOf } from "./scenes";
+import { backoffMs, isPassing, PATIENCE_MS, sessions, sleep } from "./server";
 
 /** What somebody chose. */
 export type Choice = { kind: "scene"; scene: string } | ({ kind: "live" | "recorded" } & JournalName);
@@ -17,6 +18,7 @@ const keyOf = ({ sessionId, run }: JournalName, kind: "live" | "recorded") => `$
 
 export class Choices {
   private readonly list = part("scene", HTMLSelectElement);
+  private readonly scenes = GROUPS.map(group);
   private readonly live = group("Live");
   private readonly recorded = group("Recorded");
   private readonly choices = new Map<HTMLOptionElement, Choice>();
@@ -37,15 +39,27 @@ export class Choices {
     }
   }
 
-  /** Fills the list, however long it takes the server to be there. */
+  /** The scene that the page begins with: the usual one, or the first that the server has. */
+  async first(): Promise<string> {
+    const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
+    return sceneNames.includes(DEFAULT_SCENE) ? DEFAULT_SCENE : (sceneNames[0] ?? DEFAULT_SCENE);
+  }
+
+  /** Fills the list, however long it takes the server to be there; not if it tells this caller nothing. */
   async fill(): Promise<void> {
     for (let failures = 0; ; failures++) {
       try {
         const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
-        this.list.replaceChildren(...sceneNames.map(entryOf), this.live, this.recorded);
+        this.scenes.forEach((group, index) => {
+          const within = inOrder(sceneNames.filter((scene) => groupOf(scene) === GROUPS[index]));
+          group.replaceChildren(...within.map(entryOf));
+          group.hidden = within.length === 0;
+        });
+        this.list.replaceChildren(...this.scenes, this.live, this.recorded);
         this.mark(this.marked.value, this.marked.name);
         break;
-      } catch {
+      } catch (error) {
+        if (!isPassing(error)) return;
         await sleep(backoffMs(failures));
       }
     }
@@ -88,7 +102,7 @@ export class Choices {
     const value = keyOf(journal, "recorded");
     const isOther = value !== this.marked.value;
     this.present = "";
-    this.mark(value, `${sceneName}, recorded`);
+    this.mark(value, `${titleOf(sceneName)}, recorded`);
     if (isOther && this.askedMs > 0) void this.ask();
   }
 
@@ -97,8 +111,8 @@ export class Choices {
     this.marked = { value, name };
     for (const option of [...this.list.options]) if (option.disabled) option.remove();
     this.list.value = value;
-    if (this.list.value === value) return;
-    const own = new Option(name, value);
+    if (value !== "" && this.list.value === value) return;
+    const own = new Option(name || "Choose …", value);
     own.disabled = true;
     this.list.prepend(own);
     this.list.value = value;

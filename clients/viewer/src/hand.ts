@@ -13,6 +13,9 @@ export type Mode = "push" | "pull" | "stroke" | "tip";
 
 /** A tip goes down over this time from beside the tissue: so the server knows from which side it comes. */
 const SINK_MS = 250;
+/** And what it feels is known here so much later. */
+const SETTLES_MS = 400;
+
 /** The effect of strength 1 on the tissue. */
 export interface Reach {
   /** A push falls off over this length: on a sheet the spacing of its points. */
@@ -31,7 +34,7 @@ export class Hand {
   strength = 0.5;
   readonly tool: Tool;
   onChange: () => void = () => {};
-  onRefused: (message: string) => void = () => {};
+  onRefused: (message: string, reason: string) => void = () => {};
   private place: Place | undefined;
   private onSurfaceM: Vec3 = [0, 0, 0];
   private leanM: Vec3 = [0, 0, 0];
@@ -47,9 +50,7 @@ export class Hand {
     // All pages use the same tool.
     this.tool = new Tool(server, sessionId, name, sampleEverySteps);
     this.tool.onChange = () => this.onChange();
-    this.tool.onRefused = (message, reason) => {
-      this.onRefused(reason === "TOOL_HELD" ? "Somebody else holds the tool: you can only watch." : message);
-    };
+    this.tool.onRefused = (message, reason) => this.onRefused(message, reason);
   }
 
   get holds(): boolean {
@@ -60,9 +61,20 @@ export class Hand {
     return this.tool.touches;
   }
 
-  /** The side of the tissue that it touches, or touched last. */
+  /** The direction out of the tissue where it touches, or touched last. A tip may slip to where there is another. */
   get outward(): Vec3 | undefined {
-    return this.place?.outward;
+    return this.mode === "tip" ? undefined : this.place?.outward;
+  }
+
+  /** Whether it touches the outer side of the tissue. It stays on its side, wherever it slips. */
+  get isOuter(): boolean | undefined {
+    return this.place && this.surface().isOuter(this.place);
+  }
+
+  /** The depth that the tip is set to, once it has had the time to get there; nothing if it is not led. */
+  get setM(): number | undefined {
+    const hasSunk = performance.now() - this.pressedMs > SINK_MS + SETTLES_MS;
+    return this.mode === "tip" && this.tool.touches && hasSunk ? this.strength * this.reach.depthM : undefined;
   }
 
   /** What forces on the tool are told times: a push on a body is told by all of it. */

@@ -5,7 +5,7 @@ import type { Body } from "./body";
 import type { Surface } from "./surface";
 
 /** The tissue fills the picture up to these margins, pixels: the words at the top and the bottom stay free. */
-const MARGIN = { top: 14, bottom: 46, side: 12 };
+const MARGIN = { top: 48, bottom: 46, side: 12 };
 
 /** The same of a body, which is all in sight, with its tool. */
 const AROUND = { top: 26, bottom: 52, side: 24 };

@@ -23,6 +23,10 @@ function glides({ mode }: Hand): boolean {
 const TURN = 0.08;
 
 export class Input {
+  /** What becomes of the next press on the tissue, in place of a touch. */
+  onPlace: ((place: Place) => void) | undefined;
+  /** The pointer is over a place, and does not touch; or it is no longer. */
+  onPoint: (place?: Place) => void = () => {};
   private dragging: number | undefined;
   private fingers = new Set<number>();
   /** Where the drag began: the place, and where its tissue was. */
@@ -41,6 +45,7 @@ export class Input {
     for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) {
       canvas.addEventListener(end, (event) => this.up(event));
     }
+    canvas.addEventListener("pointerleave", () => this.onPoint());
     canvas.addEventListener("contextmenu", (event) => event.preventDefault());
     canvas.addEventListener("keydown", (event) => this.key(event));
     canvas.addEventListener("keyup", (event) => {
@@ -65,6 +70,8 @@ export class Input {
     // Beside the tissue a drag turns the view.
     this.stage.turnByDrag(!place);
     if (!place) return;
+    this.onPoint();
+    if (this.onPlace) return this.onPlace(place);
     this.latency.pressed(event.timeStamp);
     this.canvas.setPointerCapture(event.pointerId);
     this.dragging = event.pointerId;
@@ -84,6 +91,10 @@ export class Input {
 
   private moved(event: PointerEvent): void {
     const { hand } = this.touched() ?? {};
+    const isMouse = event.pointerType !== "touch";
+    if (hand && isMouse && this.dragging === undefined) {
+      this.onPoint(event.buttons === 0 ? this.stage.pick(event.clientX, event.clientY) : undefined);
+    }
     if (event.pointerId !== this.dragging || !hand || !this.from) return;
     if (glides(hand)) {
       const place = this.stage.pick(event.clientX, event.clientY);
@@ -138,6 +149,8 @@ export class Input {
       }
     } else if (event.key === "Escape") {
       void hand.letGo();
+    } else if (event.key === "Home") {
+      this.stage.resetView();
     } else if (event.key === "+" || event.key === "-") {
       this.stage.turn(0, 0, event.key === "+" ? 1.1 : 1 / 1.1);
     } else {

@@ -25,8 +25,9 @@ export interface Listed extends JournalName {
 export async function listJournals(): Promise<Listed[]> {
   try {
     const { journals } = await sessions.listJournals({}, { timeoutMs: PATIENCE_MS });
+    const looked = journals.some(({ live }) => live) ? await lookedAt() : new Set();
     const listed = journals
-      .filter(({ fault }) => fault === "")
+      .filter(({ fault, live, sessionId }) => fault === "" && (!live || looked.has(sessionId)))
       .map((info) => ({
         sessionId: info.sessionId,
         run: info.run,
@@ -39,6 +40,12 @@ export async function listJournals(): Promise<Listed[]> {
   } catch {
     return [];
   }
+}
+
+/** The sessions that somebody looks at: one whose pages are closed goes on for a while, and ends by itself. */
+async function lookedAt(): Promise<Set<string>> {
+  const { sessions: all } = await sessions.listSessions({}, { timeoutMs: PATIENCE_MS });
+  return new Set(all.filter(({ streams }) => streams > 0).map(({ sessionId }) => sessionId));
 }
 
 /** What a journal holds, as far as it was on disk when it was asked for. Steps are those that were done. */

@@ -7,31 +7,37 @@
 // can. Without TLS a browser speaks HTTP/1.1 with six connections: hence one stream of frames, one of samples, and one
 // acknowledgement at a time.
 
-import type { MessageInitShape } from "@bufbuild/protobuf";
-import { norm, type Vec3 } from "palpate";
-import { type CreateSessionRequestSchema, type Session, SessionState } from "palpate/v1";
-import type { Mode } from "./hand";
+import { create, type MessageInitShape } from "@bufbuild/protobuf";
+import { norm } from "palpate";
+import { type CreateSessionRequestSchema, SceneSchema, type Session, SessionState } from "palpate/v1";
 import { Choices } from "./choices";
+import { Gate } from "./gate";
+import type { Mode } from "./hand";
 import { Input } from "./input";
+import { inside } from "./inside";
 import type { JournalName } from "./journal";
 import { Latency } from "./latency";
-import { depthText, Overlay } from "./overlay";
+import { Lumps } from "./lumps";
+import { Overlay } from "./overlay";
 import { addressed, asked, askedNumber, holderName, part, seekAt, writeAddress, writeMoment } from "./page";
 import { keepPicture } from "./pictures";
 import { BACK_S, discard, type Opened, Player } from "./player";
-import { Plots, quantity } from "./plot";
+import { Plots } from "./plot";
 import { playScript } from "./script";
-import { backoffMs, describe, type Failure, isGone, isPassing, PATIENCE_MS, reasonOf, received, server, sessions, sleep } from "./server";
+import { backoffMs, describe, type Failure, isGone, isPassing, PATIENCE_MS, reasonOf, server, sessions, sleep } from "./server";
 import { Stage } from "./stage";
-import { Sheet } from "./sheet";
 import { Status } from "./status";
 import { tissueTexture } from "./texture";
 import { TissueValues } from "./tissue";
 import { FileOpener } from "./upload";
 import { Visit } from "./visit";
+import { feltText, isLess, meaningText, refusedText, sentence, strengthText, wayText, wellText } from "./words";
 
-/** The scene of a new session, if the server has it and the address names no other. */
-const DEFAULT_SCENE = "liver";
+/**
+ * A session that nobody asks for is deleted after this time: its pages are closed. Browsers let a hidden page ask once a
+ * minute.
+ */
+const IDLE_S = 180;
 
 /** So long after its texture has come a tissue's picture is taken for the list. */
 const PICTURE_MS = 1500;
@@ -51,15 +57,24 @@ const status = new Status(
   part("connection", HTMLElement),
   part("figures", HTMLElement),
   part("details", HTMLButtonElement),
+  part("try-now", HTMLButtonElement),
 );
+const gate = new Gate(() => {
+  status.say("Connecting …");
+  part("arriving", HTMLElement).hidden = false;
+  void open(refused);
+  void choices.fill();
+});
 const plots = new Plots(part("plot-displacement", HTMLCanvasElement), part("plot-force", HTMLCanvasElement));
 const tissue = new TissueValues(heard, notice);
+part("try-now", HTMLButtonElement).addEventListener("click", () => tryNow());
+addEventListener("online", () => tryNow());
 const holder = holderName();
 let visit: Visit | undefined;
 let playing: AbortController | undefined;
 
 const choices = new Choices((choice) => {
-  if (choice.kind === "scene") void open({ source: named(choice.scene) });
+  if (choice.kind === "scene") void open({ source: named(choice.scene), isNew: true });
   else if (choice.kind === "live") void open({ sessionId: choice.sessionId, isNew: true });
   else void open({ moment: choice, isNew: true });
 });
@@ -74,7 +89,23 @@ const player = new Player({
 });
 
 // What is recorded can be looked at only.
-new Input(canvas, stage, latency, () => (visit?.session.playback ? undefined : visit));
+const input = new Input(canvas, stage, latency, () => (visit?.session.playback ? undefined : visit));
+input.onPoint = (place) => overlay.point(place, visit?.reach.lengthM);
+
+const lumps = new Lumps(stage, input, {
+  present: () => visit,
+  scene: () => (made?.case === "scene" && !visit?.session.playback ? create(SceneSchema, made.value) : undefined),
+  exchange: async (scene) => {
+    const of = visit;
+    const source: Source = { case: "scene", value: scene };
+    const { session } = await sessions.createSession({ source, idleTimeoutS: IDLE_S }, { timeoutMs: PATIENCE_MS });
+    if (!of || !session || visit !== of) return;
+    made = source;
+    await show(session, { isNew: true, keeps: true });
+    discard(of.session);
+  },
+  notice,
+});
 
 let noticed: ReturnType<typeof setTimeout> | undefined;
 /** Shows a message for `seconds`; permanently if 0. */
@@ -88,12 +119,16 @@ function notice(text: string, seconds = 5): void {
 
 /** What a new session is made of: that of the last one, if somebody wants another. */
 type Source = NonNullable<MessageInitShape<typeof CreateSessionRequestSchema>["source"]>;
-let made: Source = { case: "sceneName", value: DEFAULT_SCENE };
+let made: Source | undefined;
 
-const named = (value: string | undefined): Source => ({ case: "sceneName", value: value || DEFAULT_SCENE });
+const named = (value: string): Source => ({ case: "sceneName", value });
 
 /** What to open: a session that is there, a new one, or what was recorded, from a step on. `isNew`: by a choice on this page. */
-type Target = { isNew?: boolean } & ({ sessionId: string } | { source: Source } | { moment: JournalName & { step?: number } });
+type Target = { isNew?: boolean } & ({ sessionId: string } | { source?: Source } | { moment: JournalName & { step?: number } });
+/** What was to be opened last. */
+let refused: Target = {};
+/** Ends the wait for the next attempt to open something. */
+let hurry = new AbortController();
 
 /** How often what is shown was left: who waits for something to be shown then waits in vain. */
 let left = 0;
@@ -110,7 +145,8 @@ function leave(): void {
 async function open(target: Target): Promise<void> {
   leave();
   const begun = left;
-  if ("source" in target) made = target.source;
+  if ("source" in target && target.source) made = target.source;
+  refused = target;
   const moment = "moment" in target ? target.moment : undefined;
   let sessionId = "sessionId" in target ? target.sessionId : undefined;
   for (let failures = 0; begun === left; failures++) {
@@ -123,7 +159,7 @@ async function open(target: Target): Promise<void> {
       }
       const session = sessionId
         ? (await sessions.getSession({ sessionId }, { timeoutMs: PATIENCE_MS })).session
-        : (await sessions.createSession({ source: made }, {})).session;
+        : (await sessions.createSession({ source: (made ??= named(await choices.first())), idleTimeoutS: IDLE_S }, {})).session;
       if (!session) continue;
       // Another window's playback: this one gets its own.
       if (session.playback) return await open({ moment: { ...session.playback, step: Number(session.step) } });
@@ -134,32 +170,47 @@ async function open(target: Target): Promise<void> {
       return;
     } catch (error) {
       if (begun !== left) return;
-      const refused = describe(error);
       if (isGone(error)) return over(moment ? "There is no such recording." : "This session no longer exists.");
-      if (reasonOf(error) === "UNAUTHENTICATED") {
-        return over(`The server asks who you are (${refused}). Put your token behind the address, as in #token=…`);
-      }
-      if (!isPassing(error)) return over(`${refused}.`);
+      if (gate.stops(error)) return status.end("barred", "");
+      if (!isPassing(error)) return over(`${sentence(describe(error))}.`);
       const waitMs = backoffMs(failures);
-      status.lose();
-      status.say(`Unexpected answer from the server (${refused}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
-      await sleep(waitMs);
+      status.lose(waitMs);
+      // A server that is busy says so.
+      if (reasonOf(error) !== "") notice(`${sentence(describe(error))}.`, waitMs / 1000);
+      hurry = new AbortController();
+      await sleep(waitMs, hurry.signal);
     }
   }
+}
+
+/** Asks at once whether a lost server is back. */
+function tryNow(): void {
+  hurry.abort();
+  visit?.askNow();
+}
+
+/** The server no longer lets the caller do what it did. */
+function barred(reason: string): void {
+  // Another token leads back to the same session.
+  if (visit && !visit.session.playback) refused = { sessionId: visit.session.sessionId };
+  leave();
+  status.end("barred", "");
+  gate.show(reason);
 }
 
 /** A session has ended: the user decides what to do. */
 function over(why: string): void {
   leave();
   part("what-was-that", HTMLButtonElement).hidden = true;
-  status.lose();
-  status.say(why);
+  part("arriving", HTMLElement).hidden = true;
+  document.body.classList.toggle("empty", showing === 0);
+  status.end("ended", "");
   notice(`${why} `, 0);
   const again = document.createElement("button");
   again.textContent = "Start a new session";
   again.addEventListener("click", () => {
     notice("", 0);
-    void open({ source: made });
+    void open({ source: made, isNew: true });
   });
   part("notice", HTMLElement).append(again);
 }
@@ -194,6 +245,7 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
     onSession: heard,
     onTrouble: (failure: Failure, waitMs: number) => visit === next && trouble(failure, waitMs),
     onWell: () => visit === next && status.found(wellText(next.session)),
+    onBarred: (reason: string) => visit === next && barred(reason),
   };
   const next = await Visit.to(session, holder, askedNumber("refinement", 0, 10), told, former);
   if (wanted !== opening) return false;
@@ -209,14 +261,16 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   part("scripts", HTMLElement).hidden ||= isPlayback;
   next.hand.mode = chosenMode();
   next.hand.strength = Number(part("strength", HTMLInputElement).value);
-  next.hand.onRefused = notice;
+  next.hand.onRefused = (message, reason) => notice(refusedText(message, reason, next.session));
   next.hand.onChange = holding;
   next.frames.onFrame = () => stage.drawFrame();
   next.samples.onSample = () => felt(next);
   const slider = part("refinement", HTMLInputElement);
   slider.max = String(next.mostRefinement);
   slider.value = String(next.refinement);
-  part("fineness", HTMLElement).hidden = next.mostRefinement === 0;
+  const isFine = next.mostRefinement > 0;
+  for (const id of ["fineness", "fineness-term", "fineness-meaning"]) part(id, HTMLElement).hidden = !isFine;
+  part("look-explained", HTMLElement).textContent = isFine ? "What are net and fineness?" : "What is the net?";
   tellControls();
   tissue.begin(session);
   const name = session.scene?.name ?? "";
@@ -227,9 +281,12 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
     if (isPlayback) player.makeRoom();
     // Shaded by its shape at once; the texture comes when it is painted.
     stage.show(next.surface, false, player.heightPx);
-    stage.setTools([], 1);
+    stage.setTools([]);
+    overlay.point();
   }
+  lumps.show(session);
   part("arriving", HTMLElement).hidden = true;
+  document.body.classList.remove("empty");
   // What tells of the session before is no longer true.
   if (before?.sessionId !== session.sessionId) {
     heard(session);
@@ -281,32 +338,13 @@ function takePicture(of: Visit): void {
   choices.refresh(entry);
 }
 
-function wellText(session: Session): string {
-  const name = session.scene?.name ?? "";
-  if (session.playback) return `Connected to a recording of ${name}.`;
-  if (session.state === SessionState.HELD) return `The session is held: ${session.holdReason}`;
-  const paused = session.state === SessionState.PAUSED ? ", which is paused" : "";
-  return `Connected to ${name}${paused}.${recoveredText(session)}`;
-}
-
-/** How often the tissue recovered and why it did the last time; nothing if it never did. */
-function recoveredText({ recoveryCount, recoveries }: Session): string {
-  const newest = recoveries.at(-1);
-  if (!newest) return "";
-  const times = recoveryCount === 1n ? "once" : `${recoveryCount} times`;
-  const end = newest.pausedUntilStep;
-  const pause = end === undefined ? "" : ` Tools that acted are paused until step ${end}.`;
-  return ` The tissue recovered ${times}, the last time because after step ${newest.step} ${newest.reason}.${pause}`;
-}
-
 /** Asking whether another server of the fleet is there. */
 let seeking: Promise<void> | undefined;
 
 function trouble(failure: Failure, waitMs: number): void {
   if (failure.isGone && player.isOpen) return player.revive();
   if (failure.isGone) return over("The session has ended.");
-  status.lose();
-  status.say(`Connection lost (${failure.text}). Trying again in ${(waitMs / 1000).toFixed(1)} s.`);
+  status.lose(waitMs);
   const { session, heardMs } = visit ?? {};
   if (!session?.ownership || session.playback || performance.now() - (heardMs ?? Infinity) < GONE_MS) return;
   seeking ??= seekAt(session.ownership.others, session.sessionId).finally(() => (seeking = undefined));
@@ -338,49 +376,25 @@ function holding(): void {
 /** Shows the tools and the forces on them. */
 function felt(of: Visit): void {
   if (of !== visit) return;
-  const { surface, hand, reach } = of;
+  const { hand, reach } = of;
   const shown = of.samples.tools.flatMap((tool) => {
-    const found = surface.ofTool(tool);
-    if (!found) return [];
-    // The own hand knows which side it touches.
+    const place = of.placeOf(tool);
+    if (!place) return [];
     const isMine = tool.tool === 0 && hand.holds;
-    const place = isMine && hand.outward ? { ...found, outward: sameSide(found.outward, hand.outward) } : found;
-    return [{ place, forceN: tool.forceN }];
+    const strength = isMine ? of.samples.tell(tool).allN / reach.mostN : norm(tool.forceN) / reach.pointN;
+    return [{ place, forceN: tool.forceN, part: strength }];
   });
-  stage.setTools(shown, reach.pointN);
-}
-
-/** A direction or its opposite: that which is more like another. */
-function sameSide([x, y, z]: Vec3, [ox, oy, oz]: Vec3): Vec3 {
-  return x * ox + y * oy + z * oz < 0 ? [-x, -y, -z] : [x, y, z];
-}
-
-/** What the strength is of the present tool. */
-function strengthText({ hand: { mode, strength }, reach }: Visit): string {
-  if (mode === "pull") return "as you drag";
-  return mode === "tip" ? quantity(strength * reach.depthM, "m") : quantity(strength * reach.mostN, "N");
+  stage.setTools(shown);
 }
 
 function tellControls(): void {
   if (!visit) return;
   const text = strengthText(visit);
+  part("strength-name", HTMLElement).textContent = visit.hand.mode === "tip" ? "Depth" : "Strength";
   part("strength-value", HTMLOutputElement).value = text;
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
   part("refinement-value", HTMLOutputElement).value = String(visit.refinement);
   part("meaning", HTMLElement).textContent = meaningText(visit);
-}
-
-function meaningText({ hand, reach, surface }: Visit): string {
-  const range = quantity(reach.lengthM, "m");
-  if (hand.mode === "tip") {
-    return `The tip is a disc of ${range} radius. Strength is its depth below the tissue at rest; what pushes back follows from that.`;
-  }
-  return surface.flank
-    ? "Strength is the push in the middle of the tool. It fades out over about " +
-      `${range}. What pushes back is the mean over the tissue around, weighted as the push is. The push is strongest in the ` +
-      "middle, so that mean is less than the strength while nothing moves. While the tissue moves it may be more."
-    : `Strength is the whole push of the tool. It fades out over about ${range}. What pushes back is told for all the tissue ` +
-      "that the push meets: as much as the strength while nothing moves, more or less while the tissue moves.";
 }
 
 function chosenMode(): Mode {
@@ -409,6 +423,16 @@ part("refinement", HTMLInputElement).addEventListener("input", (event) => {
   tellControls();
 });
 part("what-was-that", HTMLButtonElement).addEventListener("click", () => void whatWasThat());
+part("reset-view", HTMLButtonElement).addEventListener("click", () => stage.resetView());
+const fullScreen = part("full-screen", HTMLButtonElement);
+fullScreen.hidden = !document.fullscreenEnabled;
+fullScreen.addEventListener("click", () => {
+  if (document.fullscreenElement) void document.exitFullscreen();
+  else part("view", HTMLElement).requestFullscreen().catch(() => notice("This browser has no full screen for pages."));
+});
+document.addEventListener("fullscreenchange", () => {
+  fullScreen.textContent = document.fullscreenElement ? "Leave full screen" : "Full screen";
+});
 part("share", HTMLButtonElement).addEventListener("click", () => {
   if (player.moment) writeMoment(player.moment, player.moment.step, false);
   // Browsers offer the clipboard only to pages from a secure origin or from this machine.
@@ -459,6 +483,7 @@ function warnIfFar(of: Visit): void {
 stage.onDrawn = () => {
   latency.drawn();
   overlay.drawn();
+  part("reset-view", HTMLButtonElement).hidden = stage.isAtHome;
 };
 
 // A hidden window releases its connections for visible ones.
@@ -477,7 +502,7 @@ addEventListener("pageshow", ({ persisted }) => persisted && location.reload());
 addEventListener("popstate", () => {
   const { sessionId, moment } = addressed();
   if (moment) void open({ moment });
-  else if (sessionId === undefined) void open({ source: made });
+  else if (sessionId === undefined) void open({});
   else if (sessionId !== visit?.session.sessionId) void open({ sessionId });
 });
 
@@ -489,11 +514,11 @@ setInterval(() => {
   const tool = samples.tools[0];
   const told = tool && samples.tell(tool);
   overlay.tell(told);
-  part("felt", HTMLElement).textContent = told
-    ? `${depthText(told)}, pushes back ${quantity(told.allN, "N")}`
-    : "Nothing touches the tissue.";
+  part("felt", HTMLElement).textContent = feltText(visit, told);
+  part("why", HTMLElement).classList.toggle("none", !isLess(visit, told));
 }, 100);
 setInterval(() => {
+  status.count();
   if (!visit || document.hidden) return;
   warnIfFar(visit);
   const { session, samples, frames } = visit;
@@ -503,7 +528,7 @@ setInterval(() => {
     roundTripMs: visit.roundTripMs,
     networkMs: visit.hand.tool.networkMs,
     way: wayText(visit),
-    frameAgeMs: frameAgeMs(),
+    frameAgeMs: visit.frameAgeMs,
     isStill: isStill(visit),
     silentMs: performance.now() - visit.heardMs,
     framesTaken: frames.taken,
@@ -534,18 +559,6 @@ async function listScripts(sessionId: string): Promise<void> {
   }
 }
 
-/** Datagrams belong to a lease. */
-function wayText({ hand }: Visit): string {
-  if (!hand.holds) return "no tool is held";
-  return hand.tool.datagrams.carries ? "datagrams" : "gRPC-web";
-}
-
-/** Age of the newest frame here. */
-function frameAgeMs(): number | undefined {
-  const [now, newest] = [visit?.nowS(), visit?.frames.newest];
-  return now === undefined || !newest ? undefined : Math.max(0, (1000 * (now - newest.timeS)) / (visit?.speed ?? 1));
-}
-
 /** Whether no frame is due: the server sends none while nothing moves, and samples go on. */
 function isStill({ frames, samples, session, speed }: Visit): boolean {
   const { newest } = samples;
@@ -554,74 +567,7 @@ function isStill({ frames, samples, session, speed }: Visit): boolean {
   return newest !== undefined && frames.newest !== undefined && newest.simulationTimeS - frames.newest.timeS > STILL_S * speed;
 }
 
-/** The page's state as numbers, for tests and measurements. */
-const inside = {
-  get frames() {
-    const { taken, skipped, newest } = visit?.frames ?? { taken: 0, skipped: 0n };
-    return { taken, skipped: Number(skipped), drawn: stage.drawn, timeS: newest?.timeS ?? 0 };
-  },
-  get received() {
-    return received.bytes;
-  },
-  get ageMs() {
-    return frameAgeMs();
-  },
-  get picture() {
-    return stage.describe();
-  },
-  get largestM() {
-    return visit?.surface.largestM() ?? 0;
-  },
-  get forceN() {
-    return visit?.samples.tools.map((tool) => norm(tool.forceN)) ?? [];
-  },
-  /** Largest displacement of the control point within the length of the plots. */
-  get deepestM() {
-    return Math.max(0, ...(visit?.samples.history.map((moment) => norm(moment.displacementM)) ?? []));
-  },
-  get holds() {
-    return visit?.hand.holds ?? false;
-  },
-  /** What is played, if anything is. */
-  get recording() {
-    return player.moment;
-  },
-  /** Where the camera is. */
-  get camera() {
-    return stage.camera.matrixWorld.toArray();
-  },
-  /** Whether datagrams get through, and how many were sent and came in this session; poses and samples in them. */
-  get datagrams() {
-    const { carries, counts } = visit?.hand.tool.datagrams ?? {};
-    return { carries: carries ?? false, sent: 0, came: 0, poses: 0, samples: 0, fellBack: 0, ...counts };
-  },
-  /** The least room between a tool and the tissue as drawn, of the width of the tissue; undefined without a tool. */
-  get clear() {
-    const { clearM } = stage;
-    return clearM === undefined || !visit ? undefined : clearM / visit.widthM;
-  },
-  /** Whether the first picture of the tissue was drawn, and had a texture; and whether it has one now. */
-  get drawing() {
-    return { ...stage.began, hasTexture: stage.isTextured };
-  },
-  /** The camera's height above the table and the tissue beneath it, of the width of the tissue. */
-  get cameraHeight() {
-    return visit ? stage.heightM / visit.widthM : 0;
-  },
-  /** Width of the tissue, m. */
-  get widthM() {
-    return visit?.widthM ?? 0;
-  },
-  /** The window point of the tissue at (x, y): in fractions of a sheet; of a body near there in the picture. */
-  at(x: number, y: number): [number, number] | undefined {
-    if (!visit) return undefined;
-    const { surface } = visit;
-    const place = surface instanceof Sheet ? surface.placeAt(x, y) : stage.pickNear(x, 1 - y);
-    return place && stage.placeInWindow(place);
-  },
-  pixelAfterPress: (x: number, y: number) => latency.next(x, y),
-};
-Object.assign(window, { palpate: inside });
+Object.assign(window, { palpate: inside(() => visit, stage, player, latency) });
 
 const wireframe = part("wireframe", HTMLInputElement);
 wireframe.checked = asked.get("wireframe") === "1";
@@ -631,8 +577,9 @@ for (const choice of document.querySelectorAll<HTMLInputElement>("input[name=mod
   if (choice.value === mode) choice.checked = true;
 }
 const first = addressed();
-choices.markScene(asked.get("scene") ?? DEFAULT_SCENE);
+const asksFor = asked.get("scene");
+choices.markScene(asksFor ?? "");
 if (first.moment) void open({ moment: first.moment });
 else if (first.sessionId) void open({ sessionId: first.sessionId });
-else void open({ source: named(asked.get("scene") ?? undefined) });
+else void open(asksFor ? { source: named(asksFor) } : {});
 void choices.fill();

@@ -49,12 +49,24 @@ float contact(vec3 at) {
   return max(open, 0.0);
 }`;
 
-/** Sheets: seen from above, with an image that lies flat on them. */
+/**
+ * Sheets: seen from above, with an image that lies flat on them. Over the edge the image goes on, mirrored, and soon becomes
+ * another part of itself, so that nobody sees the mirror.
+ */
 const SHEET = `
-vec3 image() { return texture2D(map, vUv).rgb; }
-float openness() { return vOpen; }
+float beyond() {
+  vec2 past = max(abs(vUv - 0.5) - 0.5, 0.0);
+  return max(past.x, past.y);
+}
+vec3 image() {
+  vec3 other = texture2D(map, mat2(0.34, 0.94, -0.94, 0.34) * vUv + 0.37).rgb;
+  return mix(texture2D(map, vUv).rgb, other, smoothstep(0.0, 0.035, beyond()));
+}
+float openness(float facing) { return vOpen; }
 bool isTurned() { return true; }
-float within() { return 0.0; }
+// The round edge would show the lamp as a white dot.
+float glints(vec3 n) { return 1.0 - smoothstep(-0.02, 0.0, max(abs(vUv.x - 0.5), abs(vUv.y - 0.5)) - 0.5); }
+float within(float open) { return 0.0; }
 float window_(vec3 seen, vec3 lamp) { return 0.0; }`;
 
 /**
@@ -79,9 +91,19 @@ vec3 image() {
   vec3 c = texture2D(map, mat2(0.87, 0.49, -0.49, 0.87) * at.xy + 0.73).rgb;
   return a * lie.x + b * lie.y + c * lie.z;
 }
-float openness() { return gl_FrontFacing || closed > 0.5 ? vOpen : vInner; }
+// At the outline of a fold slivers of its other side come into sight: there the brighter of both sides counts.
+float openness(float facing) {
+  if (closed > 0.5) return vOpen;
+  float own = gl_FrontFacing ? vOpen : vInner;
+  return mix(max(vOpen, vInner), own, smoothstep(0.02, 0.15, abs(facing)));
+}
 bool isTurned() { return closed < 0.5; }
-float within() { return 1.0 - smoothstep(0.02, 0.42, openness()); }
+// On what is sharply curved the lamp would be a white dot. Curvature times the body's size: 3.5 on a ball.
+float glints(vec3 n) {
+  float bend = (length(dFdx(n)) + length(dFdy(n))) / max(length(dFdx(vAt)) + length(dFdy(vAt)), 1e-9) * reach;
+  return 1.0 - smoothstep(13.0, 30.0, bend);
+}
+float within(float open) { return 1.0 - smoothstep(0.02, 0.42, open); }
 // A broad lamp, of which a smooth body shows more than a point.
 float window_(vec3 seen, vec3 lamp) { return smoothstep(0.80, 0.93, dot(seen, lamp)); }`;
 
@@ -91,9 +113,6 @@ export class Skin extends ShaderMaterial {
     super({
       defines: isBody ? { BODY: "" } : {},
       side: DoubleSide,
-      polygonOffset: true,
-      polygonOffsetFactor: 1,
-      polygonOffsetUnits: 1,
       uniforms: {
         ...light,
         map: { value: null },
@@ -148,10 +167,11 @@ export class Skin extends ShaderMaterial {
         void main() {
           vec3 eye = normalize(cameraPosition - vAt);
           vec3 n = normalize(vNormal);
-          if (dot(n, eye) < 0.0 && !gl_FrontFacing && isTurned()) n = -n;
+          // By the triangle, not by the normal between vertices: at the outline of a fold that faces away, and would be black.
+          if (!gl_FrontFacing && isTurned()) n = -n;
           vec3 colour = mix(tone, image(), mapped);
-          float open = openness();
-          float inside = within();
+          float open = openness(dot(n, eye));
+          float inside = within(open);
           float share = lit(vAt);
           float near = contact(vAt);
           vec3 wrap = vec3(0.28, 0.10, 0.07);
@@ -181,7 +201,7 @@ export class Skin extends ShaderMaterial {
           float sky = (0.30 * smoothstep(0.15, 0.9, seen.z) + 0.85 * window_(seen, lamp) * share * (1.0 - inside)) * (0.25 + 2.4 * mirror);
           float inner = max(dot(n, eye), 0.0);
           glint = glint * (1.0 - inside) + 0.35 * min(scope, 1.0) * smoothstep(0.985, 0.9985, inner);
-          shown += (glint * share + 0.16 * sky * open) * near * vec3(1.0, 0.98, 0.95);
+          shown += (glint * glints(n) * share + 0.16 * sky * open) * near * vec3(1.0, 0.98, 0.95);
           for (int i = 0; i <= ${SHADOWS}; i++) if (rings[i].w > 0.0) {
             float off = abs(length(vAt - rings[i].xyz) / rings[i].w - 1.0);
             shown = mix(shown, ink, (i < ${SHADOWS} ? 0.35 : 0.9) * (1.0 - smoothstep(0.03, 0.09, off)));

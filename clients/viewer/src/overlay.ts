@@ -1,9 +1,11 @@
-// What stands over the picture: the scale bar, and beside the tool how deep it is and how hard the tissue pushes back.
+// What stands over the picture: the scale bar, beside the tool how deep it is and how hard the tissue pushes back, and a ring
+// where the pointer is, as large as what a press would move.
 
 import { part } from "./page";
 import { quantity } from "./plot";
 import type { Told } from "./samples";
 import type { Stage } from "./stage";
+import type { Place } from "./surface";
 
 /** Longest scale bar, pixels, and of the picture's width. */
 const LONGEST = { pixels: 150, part: 0.28 };
@@ -21,8 +23,10 @@ export class Overlay {
   private readonly force = part("touch-force", HTMLElement);
   private readonly bar = part("scale-bar", HTMLElement);
   private readonly length = part("scale-text", HTMLElement);
+  private readonly ring = document.getElementById("pointer-ring") as unknown as SVGPathElement;
   /** The view that the bar was measured in. */
   private measured = -1;
+  private pointed: { place: Place; radiusM: number } | undefined;
 
   constructor(private readonly stage: Stage) {}
 
@@ -41,9 +45,24 @@ export class Overlay {
     this.force.textContent = `${quantity(felt.allN, "N")} back`;
   }
 
+  /** Shows what a press would move: nothing without a place. It is no part of the picture, which need not be drawn again. */
+  point(place?: Place, radiusM = 0): void {
+    this.pointed = place && { place, radiusM };
+    this.drawRing();
+  }
+
+  private drawRing(): void {
+    const { pointed } = this;
+    if (!pointed) return this.ring.removeAttribute("d");
+    const { left, top } = this.touch.parentElement!.getBoundingClientRect();
+    const corners = this.stage.ringInWindow(pointed.place, pointed.radiusM);
+    this.ring.setAttribute("d", `M${corners.map(([x, y]) => `${(x - left).toFixed(1)} ${(y - top).toFixed(1)}`).join("L")}Z`);
+  }
+
   /** Call after each picture. */
   drawn(): void {
     this.measure();
+    if (this.pointed) this.drawRing();
     if (!this.touch.hidden) this.place();
   }
 

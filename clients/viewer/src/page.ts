@@ -55,7 +55,7 @@ export function holderName(): string {
   if (given) return given;
   let name = sessionStorage.getItem("name");
   if (!name) {
-    name = `viewer ${Math.floor(Math.random() * 9000 + 1000)}`;
+    name = `Guest ${Math.floor(Math.random() * 9000 + 1000)}`;
     sessionStorage.setItem("name", name);
   }
   return name;
@@ -65,21 +65,27 @@ export function holderName(): string {
  * Removes the token (`#token=…`) from the address, because people share addresses. It comes after `#`, so that it never
  * reaches a server or a log. Returns true if there was one.
  */
-function keepToken(): boolean {
+function takeToken(): boolean {
   const behind = new URLSearchParams(location.hash.slice(1));
   const token = behind.get("token");
   if (token === null) return false;
-  sessionStorage.setItem("token", token.trim());
+  keepToken(token.trim());
   history.replaceState(history.state, "", location.pathname + location.search);
   return true;
 }
 
-keepToken();
+/** Keeps a token for as long as this window is open, and shows it with each call from now on. */
+export function keepToken(token: string): void {
+  sessionStorage.setItem("token", token);
+  server.token = token;
+}
+
+takeToken();
 server.token = sessionStorage.getItem("token") ?? "";
 // Adding a token to the address of an open page does not reload it by itself.
-addEventListener("hashchange", () => keepToken() && location.reload());
+addEventListener("hashchange", () => takeToken() && location.reload());
 
-/** Goes to the page of another server of the fleet, with the token behind `#`, where `keepToken` takes it from. */
+/** Goes to the page of another server of the fleet, with the token behind `#`, where `takeToken` takes it from. */
 function moveTo(endpoint: string, sessionId: string): void {
   const address = new URL(endpoint);
   // A token never goes in the clear. And the page of this server would send it on without end.

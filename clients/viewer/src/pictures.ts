@@ -1,12 +1,17 @@
-// Small pictures of scenes for the list of them: taken at the first visit of each, and kept by the browser.
+// Small pictures of scenes for the list of them. Those of the shipped scenes come with the page; others are taken at the first
+// visit of each, and kept by the browser.
 
-/** Pixels of a picture. */
-const SIZE = { width: 96, height: 64 };
+import { shippedPicture, titleOf } from "./scenes";
+
+/** Pixels of a picture; it is shown at half that. */
+const SIZE = { width: 144, height: 96 };
 
 const key = (scene: string) => `picture of ${scene}`;
 
 /** The picture of a scene, if it was visited. */
 export function pictureOf(scene: string): string | undefined {
+  const shipped = shippedPicture(scene);
+  if (shipped) return shipped;
   try {
     return localStorage.getItem(key(scene)) ?? undefined;
   } catch {
@@ -15,16 +20,21 @@ export function pictureOf(scene: string): string | undefined {
   }
 }
 
-/** Keeps the middle of what was just drawn. */
-export function keepPicture(scene: string, drawn: HTMLCanvasElement): void {
+/** A small picture of the middle of what was just drawn. */
+export function pictureFrom(drawn: HTMLCanvasElement): string {
   const small = document.createElement("canvas");
   Object.assign(small, SIZE);
   const { width, height } = drawn;
   const scale = Math.min(width / SIZE.width, height / SIZE.height);
   const [w, h] = [scale * SIZE.width, scale * SIZE.height];
   small.getContext("2d")?.drawImage(drawn, (width - w) / 2, (height - h) / 2, w, h, 0, 0, SIZE.width, SIZE.height);
+  return small.toDataURL("image/jpeg", 0.8);
+}
+
+/** Keeps the picture of a scene. */
+export function keepPicture(scene: string, drawn: HTMLCanvasElement): void {
   try {
-    localStorage.setItem(key(scene), small.toDataURL("image/jpeg", 0.8));
+    localStorage.setItem(key(scene), pictureFrom(drawn));
   } catch {
     // It is full, or the browser keeps nothing.
   }
@@ -32,7 +42,7 @@ export function keepPicture(scene: string, drawn: HTMLCanvasElement): void {
 
 /** An entry of the list. Browsers that show text only in lists show the name. */
 export function entryOf(scene: string): HTMLOptionElement {
-  const entry = new Option(scene, scene);
+  const entry = new Option(titleOf(scene), scene);
   const picture = pictureOf(scene);
   if (picture) {
     const image = new Image(SIZE.width / 2, SIZE.height / 2);

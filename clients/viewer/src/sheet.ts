@@ -262,6 +262,10 @@ export class Sheet implements Surface {
     return { point: { x: Math.round(x / this.pointSpacingM), y: Math.round(y / this.pointSpacingM) } };
   }
 
+  isOuter(): boolean {
+    return true;
+  }
+
   outerAt(): Vector3 {
     return new Vector3(0, 0, 1);
   }

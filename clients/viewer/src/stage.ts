@@ -14,6 +14,7 @@ import {
   Ray,
   Raycaster,
   Scene,
+  SphereGeometry,
   SRGBColorSpace,
   type Texture,
   TOUCH,
@@ -27,7 +28,8 @@ import { Effort, isDrawnBySoftware } from "./effort";
 import { Ground } from "./ground";
 import { homeOfBody, homeOfSheet } from "./home";
 import { light, Skin, SHADOWS } from "./material";
-import type { Vec3 } from "palpate";
+import { norm, type Vec3 } from "palpate";
+import type { Lump } from "./lumps";
 import type { Place, Surface } from "./surface";
 import { type Seen, type ShownTool, ToolMark } from "./tool";
 
@@ -42,6 +44,8 @@ const CALM_TAKES_MS = 500;
 /** Movements of the tissue that nobody sees, of its size. */
 const UNSEEN = 2e-5;
 const FIELD_OF_VIEW = 28;
+/** Corners of the ring where the pointer is. */
+const RING_POINTS = 32;
 /** Least height of the camera above a sheet, of its size. */
 const LEAST_HEIGHT = 0.06;
 /** The least distance of the camera from a closed body, and of what it turns about in an open one, of its size. */
@@ -74,13 +78,16 @@ export class Stage {
   private readonly colour = { table: new Color(), background: new Color() };
   private readonly hidden = new MeshBasicMaterial({ side: DoubleSide, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 });
   private readonly wires = new LineBasicMaterial();
+  /** Lumps are seen through the tissue. */
+  private readonly ball = new SphereGeometry(1, 32, 24);
+  private readonly lumpy = new MeshBasicMaterial({ color: 0x3d8bff, depthTest: false, transparent: true, opacity: 0.45 });
+  private lumps: Mesh[] = [];
   private mesh: Mesh | undefined;
   private flank: Mesh | undefined;
   private lines: LineSegments | undefined;
   private surface: Surface | undefined;
   private readonly marks: ToolMark[] = [];
   private tools: ShownTool[] = [];
-  private mostN = 1;
   private aim: Place | undefined;
   /** Whether the camera is where the page put it. */
   private isHome = true;
@@ -185,6 +192,12 @@ export class Stage {
     this.draw();
   }
 
+  /** Puts the camera back to where the page put it first. */
+  resetView(): void {
+    this.isHome = true;
+    this.goHome();
+  }
+
   /** Puts the camera where the whole tissue fills the picture. */
   private goHome(): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
@@ -207,13 +220,26 @@ export class Stage {
     this.draw();
   }
 
-  setTools(tools: ShownTool[], mostN: number): void {
-    this.mostN = mostN;
-    const least = 2e-3 * mostN;
+  /** Shows lumps in the tissue. */
+  setLumps(lumps: readonly Lump[]): void {
+    for (const old of this.lumps) this.scene.remove(old);
+    this.lumps = lumps.map(({ centreM, radiusM }) => {
+      const lump = new Mesh(this.ball, this.lumpy);
+      lump.position.set(...centreM);
+      lump.scale.setScalar(radiusM);
+      lump.renderOrder = 1;
+      this.scene.add(lump);
+      return lump;
+    });
+    this.draw();
+  }
+
+  setTools(tools: ShownTool[]): void {
     const isSame =
       tools.length === this.tools.length &&
-      tools.every(({ place, forceN }, index) => {
+      tools.every(({ place, forceN, part }, index) => {
         const old = this.tools[index]!;
+        const least = 2e-3 * (norm(forceN) / (part || 1));
         return place.restM.every((v, c) => v === old.place.restM[c]) && forceN.every((v, c) => Math.abs(v - old.forceN[c]!) < least);
       });
     if (isSame) return;
@@ -234,7 +260,7 @@ export class Stage {
     this.seen.eye.copy(this.camera.position);
     for (let index = 0; index < this.marks.length; index++) {
       const tool = this.held ? undefined : this.tools[index];
-      if (tool && surface) this.marks[index]!.show(tool, surface, surface.sizeM, this.mostN, this.seen);
+      if (tool && surface) this.marks[index]!.show(tool, surface, surface.sizeM, this.seen);
       else this.marks[index]!.hide();
     }
     const ring = light.rings.value[SHADOWS]!;
@@ -379,6 +405,18 @@ export class Stage {
   placeInWindow(place: Place): [number, number] | undefined {
     if (!this.surface) return undefined;
     return this.inWindow(new Vector3(...place.restM).add(this.surface.displacementAt(place)).toArray());
+  }
+
+  /** A ring that lies on the tissue around a place, as points of the window. */
+  ringInWindow(place: Place, radiusM: number): [number, number][] {
+    if (!this.surface) return [];
+    const at = new Vector3(...place.restM).add(this.surface.displacementAt(place));
+    const [right, ahead] = [this.across(place, [1, 0]), this.across(place, [0, 1])];
+    return Array.from({ length: RING_POINTS }, (_, k) => {
+      const angle = (2 * Math.PI * k) / RING_POINTS;
+      const [x, y] = [radiusM * Math.cos(angle), radiusM * Math.sin(angle)];
+      return this.inWindow(this.spot.copy(at).addScaledVector(right, x).addScaledVector(ahead, y).toArray());
+    });
   }
 
   /** Requests a picture of a frame. One that moves nothing visibly is not worth drawing what stands there in full again. */

@@ -33,12 +33,21 @@ export interface Figures {
 const SLOW = { roundTripMs: 300, dilation: 0.8, frameAgeMs: 600, drawn: 6, taken: 12 };
 const LOST_MS = 4000;
 
-type Light = "wait" | "good" | "slow" | "lost";
-const WORDS: Record<Light, string> = { wait: "Connecting", good: "Good", slow: "Slow", lost: "Lost" };
+type Light = "wait" | "good" | "slow" | "lost" | "ended" | "barred";
+const WORDS: Record<Light, string> = {
+  wait: "Connecting",
+  good: "Good",
+  slow: "Slow",
+  lost: "Lost",
+  ended: "Ended",
+  barred: "No access",
+};
 
 export class Status {
-  /** Whether a stream failed and nothing came since. */
+  /** Whether a stream failed and nothing came since, or nothing will come. */
   private isLost = false;
+  /** When the server is asked again. */
+  private againMs = 0;
   /** Seconds in a row that something was slow. */
   private slowTimes = 0;
   private readonly word: HTMLElement;
@@ -50,6 +59,7 @@ export class Status {
     private readonly line: HTMLElement,
     private readonly list: HTMLElement,
     button: HTMLButtonElement,
+    private readonly again: HTMLButtonElement,
   ) {
     this.word = light.firstElementChild as HTMLElement;
     button.addEventListener("click", () => {
@@ -58,16 +68,38 @@ export class Status {
     });
   }
 
-  /** The server is lost, until it answers. */
-  lose(): void {
+  /** The server is lost, until it answers; it is asked again in `waitMs`. */
+  lose(waitMs: number): void {
     this.isLost = true;
+    this.againMs = performance.now() + waitMs;
     this.shine("lost");
+    this.again.hidden = false;
+    this.count();
+  }
+
+  /** Nothing will come any more, and why. */
+  end(light: "ended" | "barred", text: string): void {
+    this.isLost = true;
+    this.againMs = 0;
+    this.again.hidden = true;
+    this.shine(light);
+    this.say(text);
   }
 
   /** The server answers. */
   found(text: string): void {
+    if (!["good", "slow"].includes(this.light.dataset.light ?? "")) this.shine("good");
     this.isLost = false;
+    this.againMs = 0;
+    this.again.hidden = true;
     this.say(text);
+  }
+
+  /** Says when the server is asked again. Call about once a second. */
+  count(): void {
+    if (this.againMs === 0) return;
+    const seconds = Math.ceil((this.againMs - performance.now()) / 1000);
+    this.say(seconds > 0 ? `The connection is lost. Trying again in ${seconds} s.` : "The connection is lost. Trying again …");
   }
 
   /** Shows the light, and why if it is not good. What is lost is drawn without colour: nobody knows whether it still holds. */
@@ -82,7 +114,10 @@ export class Status {
   private judge(figures: Figures, taken: number, drawn: number): void {
     const { roundTripMs = 0, dilation, silentMs, frameAgeMs = 0, isStill } = figures;
     if (this.isLost) return;
-    if (silentMs > LOST_MS) return this.shine("lost", `no answer for ${(silentMs / 1000).toFixed(0)} s`);
+    if (silentMs > LOST_MS) {
+      this.say("The server does not answer.");
+      return this.shine("lost");
+    }
     const reasons = [
       roundTripMs > SLOW.roundTripMs ? `answers take ${(roundTripMs / 1000).toFixed(1)} s` : "",
       dilation < SLOW.dilation ? `the tissue's time runs at ${Math.round(100 * dilation)} %` : "",

@@ -69,8 +69,13 @@ export interface Surface {
   beside(place: Place, way: Vector3): Place;
   /** The mass point next to a place. */
   nearest(place: Place): Place;
-  /** The place of a tool's control point; undefined if it has none. Its outward side is that from which the tool acts. */
-  ofTool(tool: Pick<Felt, "point" | "vertex" | "appliedN">): Place | undefined;
+  /**
+   * The place of a tool's control point; undefined if it has none. Its outward side is that from which the tool acts: the outer one
+   * or not, if the caller knows, else by its force.
+   */
+  ofTool(tool: Pick<Felt, "point" | "vertex" | "appliedN">, isOuter?: boolean): Place | undefined;
+  /** Whether a place is touched from the tissue's outer side. */
+  isOuter(place: Place): boolean;
   /** The normal of a place at rest, on the tissue's outer side. */
   outerAt(place: Place): Vector3;
   /** Displacement of a place. The result is valid until the next call. */

@@ -21,6 +21,8 @@ export interface ShownTool {
   place: Place;
   /** Force of the tissue on the tool. */
   forceN: Vec3;
+  /** How strong that is, as a part of the strongest push. */
+  part: number;
 }
 
 /** How one looks at it: where the eye is, and what is to the right. */
@@ -37,6 +39,16 @@ const NEAR = 0.9;
 const LEAST = 0.25;
 /** How far the shaft leans aside, as long as there is room. */
 const LEAN = new Vector3(0.5, 0.28, 0.82).normalize();
+/** The gauge of the depth is not drawn when one looks along it: from so much of its direction, a cosine, on. */
+const END_ON = 0.9;
+/** Where a shaft in a tube points to: how far beside the eye, across and ahead, of its length. There the tissue leaves room. */
+const BESIDE_EYE = [[0.25, 0], [-0.25, 0], [0, 0.25], [0, -0.25], [0.1, 0], [-0.1, 0]] as const;
+/** Other directions out of the tissue that are tried in a tube. */
+const AROUND = 16;
+/** Where the dark part of a shaft begins and ends, in radii of the tip. In a tube it ends before the wall. */
+const HANDLE = { from: 6, to: 66 };
+/** The longest arrow, of the size of the tissue, and of the room that there is. */
+const ARROW = { size: 0.26, room: 0.9 };
 const UP = new Vector3(0, 0, 1);
 
 export class ToolMark {
@@ -46,6 +58,7 @@ export class ToolMark {
   private readonly axis = new Vector3(0, 0, 1);
   private readonly probe = new Group();
   private readonly arrow = new Group();
+  private readonly handle: Mesh;
   private readonly rod: Mesh;
   private readonly head: Mesh;
   private readonly gauge: Mesh;
@@ -68,8 +81,12 @@ export class ToolMark {
     this.probe.add(
       new Mesh(new SphereGeometry(1, 28, 20), steel),
       new Mesh(new CylinderGeometry(SHAFT, SHAFT, 7, 20).rotateX(Math.PI / 2).translate(0, 0, 4), steel),
-      new Mesh(new CylinderGeometry(1.25 * SHAFT, 1.25 * SHAFT, 60, 20).rotateX(Math.PI / 2).translate(0, 0, 36), new Steel(0x40464f)),
     );
+    const long = HANDLE.to - HANDLE.from;
+    const handle = new CylinderGeometry(1.25 * SHAFT, 1.25 * SHAFT, long, 20).rotateX(Math.PI / 2).translate(0, 0, long / 2);
+    this.handle = new Mesh(handle, new Steel(0x40464f));
+    this.handle.position.z = HANDLE.from;
+    this.probe.add(this.handle);
     const above = (colour: number, opacity: number): Material =>
       new MeshBasicMaterial({ color: colour, depthTest: false, transparent: true, opacity });
     const green = above(0x35d0ba, 1);
@@ -94,7 +111,7 @@ export class ToolMark {
   }
 
   /** Puts the tool on the tissue as it is drawn. `size` is the tissue's, m. */
-  show(tool: ShownTool, surface: Surface, size: number, mostN: number, { right, eye }: Seen): void {
+  show(tool: ShownTool, surface: Surface, size: number, { right, eye }: Seen): void {
     this.group.visible = true;
     const { place } = tool;
     const moved = this.moved.copy(surface.displacementAt(place));
@@ -111,23 +128,34 @@ export class ToolMark {
     this.probe.position.copy(this.tipM);
     this.probe.scale.setScalar(r);
     this.probe.quaternion.setFromUnitVectors(UP, this.axis);
+    const whole = HANDLE.to * r;
+    const free = surface.flank ? whole : whole + Math.min(0, surface.room(this.tipM, this.axis, whole, r, 0));
+    this.lengthM = Math.min(this.lengthM, free);
+    this.handle.scale.z = Math.max((ARROW.room * free) / r - HANDLE.from, 0.01) / (HANDLE.to - HANDLE.from);
     const strength = norm(tool.forceN);
-    const acts = strength > 1e-3 * mostN;
+    const acts = tool.part > 1e-3 && strength > 0;
     this.arrow.visible = acts;
     if (acts) {
       this.force.set(...tool.forceN).divideScalar(strength);
-      const long = near * Math.min(strength / mostN, 1.2) * 0.26 * size + 2.4 * r;
+      let long = near * Math.min(tool.part, 1.2) * ARROW.size * size + 2.4 * r;
+      // Within a tube it ends before the wall.
+      if (!surface.flank) long = Math.max(ARROW.room * (long + Math.min(0, surface.room(this.tipM, this.force, long, r, 0))), 3 * r);
       this.arrow.position.copy(this.tipM);
       this.arrow.quaternion.setFromUnitVectors(UP, this.force);
       this.rod.scale.set(r, r, long - 1.5 * r);
       this.head.position.z = long;
       this.head.scale.setScalar(r);
     }
-    const high = moved.dot(this.out);
-    const deep = Math.abs(high) > 0.8 * r;
-    this.gauge.visible = this.foot.visible = this.level.visible = deep;
+    const out = moved.dot(this.out);
+    const deep = Math.abs(out) > 0.8 * r;
+    this.level.visible = deep;
+    // Whoever looks along it sees nothing of its length.
+    const along = Math.abs(this.tried.copy(eye).sub(this.tipM).normalize().dot(this.out));
+    this.gauge.visible = this.foot.visible = deep && along < END_ON;
     if (deep) {
-      this.level.position.set(...place.restM).add(moved).addScaledVector(this.out, -high);
+      this.level.position.set(...place.restM).add(moved).addScaledVector(this.out, -out);
+      // Down to where the tip's underside is drawn: on a curved surface that is not the tissue beside it.
+      const high = out > 0 ? out : this.tried.copy(this.tipM).sub(this.level.position).dot(this.out) - r;
       this.level.scale.setScalar(r);
       this.level.quaternion.setFromUnitVectors(UP, this.out);
       // Beside the arrow, from the level of rest to the tissue.
@@ -142,7 +170,8 @@ export class ToolMark {
     light.tips.value[this.index]!.set(this.tipM.x, this.tipM.y, this.tipM.z, r);
     const end = this.tried.copy(this.tipM).addScaledVector(this.axis, this.lengthM);
     light.shafts.value[this.index]!.set(end.x, end.y, end.z, 1.2 * SHAFT * r);
-    light.rings.value[this.index]!.copy(light.tips.value[this.index]!).setW(2.1 * r);
+    // In a dent of a body it would be several rings, where its walls meet the ball.
+    light.rings.value[this.index]!.copy(light.tips.value[this.index]!).setW(deep && !surface.flank ? 0 : 2.1 * r);
   }
 
   /** The directions of the place: a shaft that stands on it goes on leaning as it did. */
@@ -172,12 +201,19 @@ export class ToolMark {
     let best = -Infinity;
     const [dx, dy] = [this.moved.dot(this.across), this.moved.dot(this.aside)];
     const back = Math.hypot(dx, dy) / this.radiusM;
-    for (let k = 0; k < 9; k++) {
+    for (let k = 0; k < 8 + (surface.flank ? 0 : BESIDE_EYE.length + AROUND); k++) {
       const part = (0.3 * (k - 4)) / (this.radiusM * Math.max(back, 1));
       if (k < 5) this.along(LEAN.x * (1 - k / 4), LEAN.y * (1 - k / 4), LEAN.z * (1 - k / 4) + k / 4);
       else if (k < 8) this.along(-dx * part, -dy * part, 1);
-      // Where the eye is there is room: within a tube, beside the line of sight.
-      else this.tried.copy(eye).addScaledVector(this.across, 0.25 * this.lengthM).sub(this.tipM).normalize();
+      else if (k >= 8 + BESIDE_EYE.length) {
+        // A spiral on the half of the sphere that is out of the tissue.
+        const z = 1 - (k - 8 - BESIDE_EYE.length + 0.5) / AROUND;
+        this.along(Math.sqrt(1 - z * z) * Math.cos(2.4 * k), Math.sqrt(1 - z * z) * Math.sin(2.4 * k), z);
+      } else {
+        const [across, ahead] = BESIDE_EYE[k - 8]!;
+        this.tried.copy(eye).addScaledVector(this.across, across * this.lengthM).addScaledVector(this.aside, ahead * this.lengthM);
+        this.tried.sub(this.tipM).normalize();
+      }
       const room = this.roomOf(surface, this.tried);
       if (room > best) {
         best = room;

@@ -2,13 +2,14 @@
 
 import { Body } from "./body";
 import { fingerM } from "./coefficients";
+import { isBarred } from "./gate";
 import { fetchMesh, Frames, type MeshData, norm } from "palpate";
 import type { Session } from "palpate/v1";
 import { Hand, type Reach } from "./hand";
 import { type Felt, sampleEvery, Samples, type Sense } from "./samples";
 import { type Failure, keepOpen, PATIENCE_MS, server, sessions, sleep } from "./server";
 import { Sheet } from "./sheet";
-import type { Surface } from "./surface";
+import type { Place, Surface } from "./surface";
 
 /** Interval between two requests for the session's status. */
 const ASK_MS = 1000;
@@ -23,6 +24,8 @@ export interface Told {
   onSession: (session: Session) => void;
   onTrouble: (failure: Failure, waitMs: number) => void;
   onWell: () => void;
+  /** What a caller may no longer do: the server's reason. */
+  onBarred: (reason: string) => void;
 }
 
 export class Visit {
@@ -32,6 +35,8 @@ export class Visit {
   readonly reach: Reach;
   /** Width of the tissue, m. */
   readonly widthM: number;
+  /** The usual length of an edge of a mesh, m. */
+  readonly edgeM: number;
   readonly rateHz: number;
   readonly mostRefinement: number;
   surface: Surface;
@@ -39,6 +44,9 @@ export class Visit {
   roundTripMs: number | undefined;
   /** When the server last answered, of this window's clock. */
   heardMs = performance.now();
+  /** Whether the server does not answer: then only one question after the other asks whether it is back. */
+  private isLost = false;
+  private asking = new AbortController();
   /** When its newest answer was asked for. */
   askedMs = -Infinity;
   /** Points of a sheet along its sides; vertices and 1 of a body. */
@@ -71,6 +79,7 @@ export class Visit {
     former: Visit | undefined,
   ) {
     this.mesh = mesh;
+    this.edgeM = mesh?.edgeM ?? 0;
     const sheet = session.scene?.sheet;
     const count = mesh ? mesh.restM.length / 3 : 1;
     this.points = mesh ? [count, 1] : [sheet?.pointsX ?? 1, sheet?.pointsY ?? 1];
@@ -125,8 +134,14 @@ export class Visit {
   /** The side that a tool touches. Only of the own hand is known how a force is spread. */
   private sense(tool: Felt): Sense {
     const isMine = tool.tool === 0 && this.hand.holds;
-    const outward = (isMine && this.hand.outward) || this.surface.ofTool(tool)?.outward || [0, 0, 1];
+    const outward = (isMine && this.hand.outward) || this.placeOf(tool)?.outward || [0, 0, 1];
     return { outward, share: isMine ? this.hand.share : 1 };
+  }
+
+  /** Where a tool touches. The own hand knows from which side. */
+  placeOf(tool: Felt): Place | undefined {
+    const isMine = tool.tool === 0 && this.hand.holds;
+    return this.surface.ofTool(tool, isMine ? this.hand.isOuter : undefined);
   }
 
   begin(): void {
@@ -136,11 +151,11 @@ export class Visit {
 
   /** Opens the streams. */
   look(): void {
-    if (this.ended.signal.aborted) return;
+    if (this.ended.signal.aborted || this.isLost) return;
     this.seen.abort();
     this.seen = new AbortController();
     const { signal } = this.seen;
-    void this.samples.run(this.session.sessionId, this.rateHz * this.speed, signal, this.told.onTrouble);
+    void this.samples.run(this.session.sessionId, this.rateHz * this.speed, signal, (failure, waitMs) => this.broken(failure, waitMs));
     this.watch();
   }
 
@@ -149,7 +164,12 @@ export class Visit {
     this.watching = new AbortController();
     const { signal } = this.watching;
     this.seen.signal.addEventListener("abort", () => this.watching.abort());
-    this.frames.run(this.session.sessionId, this.refinement, this.surface.field, signal, this.told.onTrouble);
+    this.frames.run(this.session.sessionId, this.refinement, this.surface.field, signal, (failure, waitMs) => this.broken(failure, waitMs));
+  }
+
+  /** A stream has failed. Whether the server is there, its status tells. */
+  private broken(failure: Failure, waitMs: number): void {
+    if (!this.isLost && !isBarred(failure.reason)) this.told.onTrouble(failure, waitMs);
   }
 
   /** Closes the streams and leaves the session unchanged. */
@@ -182,7 +202,21 @@ export class Visit {
     return this.clock && this.clock.timeS + this.speed * (performance.now() / 1000 - this.clock.localS);
   }
 
+  /** Age of the newest frame here, ms. */
+  get frameAgeMs(): number | undefined {
+    const [now, { newest }] = [this.nowS(), this.frames];
+    return now === undefined || !newest ? undefined : Math.max(0, (1000 * (now - newest.timeS)) / this.speed);
+  }
+
+  /** Asks at once whether the server is back. */
+  askNow(): void {
+    this.asking.abort();
+    if (!this.ended.signal.aborted) void this.ask();
+  }
+
   private ask(): Promise<void> {
+    this.asking = new AbortController();
+    this.ended.signal.addEventListener("abort", () => this.asking.abort());
     return keepOpen(
       async (signal, alive) => {
         while (!signal.aborted) {
@@ -197,9 +231,13 @@ export class Visit {
           await sleep(ASK_MS, signal);
         }
       },
-      this.ended.signal,
+      this.asking.signal,
       (failure, waitMs) => {
-        if (failure.isGone) this.leave();
+        if (failure.isGone || isBarred(failure.reason)) this.leave();
+        if (isBarred(failure.reason)) return this.told.onBarred(failure.reason);
+        // Each stream would ask on its own.
+        this.isLost = true;
+        this.seen.abort();
         this.told.onTrouble(failure, waitMs);
       },
     );
@@ -219,6 +257,10 @@ export class Visit {
     if (!clock || isOld || roundTripMs <= clock.roundTripMs) {
       const localS = (begunMs + endedMs) / 2000;
       this.clock = { timeS: session.simulationTimeS, localS, roundTripMs, atMs: endedMs, overruns };
+    }
+    if (this.isLost) {
+      this.isLost = false;
+      if (!document.hidden) this.look();
     }
     this.told.onSession(session);
     this.told.onWell();

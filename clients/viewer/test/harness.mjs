@@ -117,6 +117,37 @@ export async function colourAt(page, x, y) {
   return { red, green, blue };
 }
 
+/**
+ * Of a screenshot's pixels the whitest and the blackest, 0 to 1, and the largest ratio of blue to red of those that are not dark.
+ * @param {Page} page @param {Buffer} png
+ * @returns {Promise<{ whitest: number, blackest: number, bluest: number }>}
+ */
+export function extremes(page, png) {
+  return page.page.evaluate(async (data) => {
+    const image = new Image();
+    image.src = `data:image/png;base64,${data}`;
+    await image.decode();
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [image.width, image.height];
+    const pen = canvas.getContext("2d");
+    pen?.drawImage(image, 0, 0);
+    const pixels = pen?.getImageData(0, 0, image.width, image.height).data ?? [];
+    let [whitest, blackest, bluest] = [0, 1, 0];
+    for (let i = 0; i < pixels.length; i += 4) {
+      const [red = 0, green = 0, blue = 0] = [pixels[i], pixels[i + 1], pixels[i + 2]];
+      whitest = Math.max(whitest, Math.min(red, green, blue) / 255);
+      blackest = Math.min(blackest, Math.max(red, green, blue) / 255);
+      bluest = Math.max(bluest, (blue - red) / 255);
+    }
+    return { whitest, blackest, bluest };
+  }, png.toString("base64"));
+}
+
+/** How much more blue than red a screenshot's bluest pixel is. @param {Page} page @param {Buffer} png */
+export async function bluest(page, png) {
+  return (await extremes(page, png)).bluest;
+}
+
 /** `palpate serve` on a free port, or on `listen`. */
 export class Server {
   /** @param {string[]} options */
@@ -158,7 +189,7 @@ export class Server {
  *   recording: { sessionId: string, run: number, begin: number, end: number, step: number, isPlaying: boolean, isBusy: boolean, speed: number, playback: string } | undefined,
  *   camera: number[],
  *   datagrams: { carries: boolean, sent: number, came: number, poses: number, samples: number, fellBack: number },
- *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>,
+ *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>, thumbnail: () => string,
  * }} Inside What the page tells of itself (src/main.ts).
  */
 

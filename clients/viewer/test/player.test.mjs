@@ -275,7 +275,7 @@ describe("what was recorded", () => {
     await page.page.locator("#scene").hover();
     await page.page.goto(`${asking.url}/?journal=${own}`);
     assert.equal((await shown(page)).sessionId, own);
-    assert.equal(await page.page.locator("#scene optgroup option").count(), 0);
+    assert.equal(await page.page.locator("#scene optgroup:is([label=Live], [label=Recorded]) option").count(), 0);
     await page.page.goto(`${asking.url}/?journal=${own.replace(/./g, "0")}`);
     await page.says("notice", /There is no such recording/);
     await close(page);
@@ -302,12 +302,31 @@ describe("what was recorded", () => {
     assert.equal(await second.stop(), 0);
   });
 
+  test("leaves the list of live sessions when its pages are closed", async () => {
+    const [first, other] = [await open(`${server.url}/?scene=paper`), await open(`${server.url}/?scene=stomach`)];
+    const live = other.page.locator("#scene optgroup[label=Live] option");
+    /** @param {number} count */
+    const lists = async (count) => {
+      for (let tries = 0; (await live.count()) !== count; tries++) {
+        assert.ok(tries < 80, `there are ${await live.count()}, not ${count}`);
+        // A list that is old is asked for again when somebody turns to it.
+        await other.page.dispatchEvent("#scene", "pointerenter");
+        await other.page.waitForTimeout(250);
+      }
+    };
+    await lists(1);
+    await close(first);
+    await lists(0);
+    assert.deepEqual(other.complaints, []);
+    await close(other);
+  });
+
   test("is nowhere told of by a server that keeps no journals", async () => {
     const without = await Server.start();
     const page = await open(`${without.url}/?scene=paper`);
     await page.until(() => document.querySelectorAll("#scene option").length > 3);
     await page.page.waitForTimeout(1500);
-    assert.equal(await page.page.locator("#scene optgroup option").count(), 0);
+    assert.equal(await page.page.locator("#scene optgroup:is([label=Live], [label=Recorded]) option").count(), 0);
     assert.ok(await page.page.locator("#what-was-that").isHidden());
     assert.ok(await page.page.locator("#player").isHidden());
     assert.deepEqual(page.complaints, []);

@@ -5,7 +5,7 @@ import { mkdtempSync, readFileSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { after, before, describe, test } from "node:test";
-import { colourAt, cut, launch, makeOrgan, makeToken, Page, pageProcesses, ROOT, Server } from "./harness.mjs";
+import { bluest, colourAt, cut, extremes, launch, makeOrgan, makeToken, Page, pageProcesses, ROOT, Server } from "./harness.mjs";
 import { Lossy } from "./lossy.mjs";
 
 /** @type {import("playwright-core").Browser} */
@@ -42,9 +42,13 @@ describe("the page", () => {
     const page = await open();
     assert.match(page.page.url(), /\?session=[0-9a-f]+/);
     const rest = await page.picture("rest");
+    // Only who feels less than the strength asks why.
+    const why = page.page.locator("#why");
+    await why.waitFor({ state: "hidden" });
     const [left, top] = await page.press();
     await page.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
     await page.says("felt", /pushes back/);
+    await why.waitFor({ state: "visible" });
     await page.says("holder", /^You/);
     const pressed = await page.picture("pressed");
     assert.notDeepEqual(rest, pressed);
@@ -162,7 +166,7 @@ describe("the page", () => {
   });
 
   test("plays a shipped script", async () => {
-    const page = await open(server.url);
+    const page = await open(`${server.url}/?scene=liver`);
     await page.until(() => document.querySelectorAll("#script option").length > 0);
     // Only those that are made for liver.
     const names = await page.page.locator("#script option").allTextContents();
@@ -196,11 +200,28 @@ describe("the page", () => {
 
   test("shows the server a token from behind the address, and keeps it out of that", async () => {
     const tokens = join(mkdtempSync(join(tmpdir(), "palpate-")), "tokens.toml");
-    const token = makeToken(tokens, "create,touch");
+    const [token, watching] = [makeToken(tokens, "create,touch"), makeToken(tokens, "watch")];
     const asking = await Server.start(["--tokens", tokens]);
     const page = new Page(await (await browser.newContext(VIEWPORT)).newPage());
-    await page.page.goto(asking.url);
-    await page.says("notice", /asks who you are/);
+    await page.page.goto(paper(asking));
+    // One clear sentence, a field, and nothing that can't help.
+    await page.says("gate", /This server asks for a token\..*can give you one/s);
+    for (const useless of ["aside", "#arriving", "#notice", "#scene", "#open-file", "#share", "#hint", "#corner"]) {
+      assert.ok(await page.page.locator(useless).isHidden(), useless);
+    }
+    assert.doesNotMatch(await page.page.evaluate("document.body.innerText"), /fetching|lost|Bearer|authorization/i);
+    assert.deepEqual(await cut(page), []);
+    await page.page.fill("#gate-token", `${token}x`);
+    await page.page.keyboard.press("Enter");
+    await page.says("gate", /does not know your token/);
+    await page.page.fill("#gate-token", token);
+    await page.page.keyboard.press("Enter");
+    await page.shows();
+    assert.ok(await page.page.locator("#gate").isHidden());
+    assert.ok(await page.page.locator("#scene option[value=paper]").count());
+    // Behind the address it goes as well.
+    await page.page.evaluate("sessionStorage.clear()");
+    await page.page.goto("about:blank");
     await page.page.goto(`${paper(asking)}#token=${token}`);
     await page.shows();
     assert.match(page.page.url(), /\?session=[0-9a-f]+$/);
@@ -210,6 +231,11 @@ describe("the page", () => {
     await page.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
     assert.deepEqual(page.complaints, []);
     await close(page);
+    // Whoever may only watch is told so, and how to go on.
+    const watcher = new Page(await (await browser.newContext(VIEWPORT)).newPage());
+    await watcher.page.goto(`${asking.url}/#token=${watching}`);
+    await watcher.says("gate", /does not let you open a tissue/);
+    await close(watcher);
     assert.equal(await asking.stop(), 0);
   });
 
@@ -236,10 +262,17 @@ describe("the page", () => {
     }
   });
 
-  test("begins with a liver, without one word of what the server's makers call things", async () => {
+  test("begins with an organ, without one word of what the server's makers call things", async () => {
     const page = await open(server.url, { viewport: { width: 1280, height: 800 } });
-    await page.says("connection", /Connected to liver/);
-    assert.equal(await page.page.inputValue("#scene"), "liver");
+    await page.says("connection", /Connected to liver-organ/);
+    assert.equal(await page.page.inputValue("#scene"), "liver-organ");
+    // The list is grouped, and each scene has a title and a picture.
+    const groups = await page.page.locator("#scene optgroup:not([hidden])").evaluateAll((all) => all.map((group) => group.getAttribute("label")));
+    assert.deepEqual(groups.slice(0, 3), ["Organs", "Slabs of tissue", "From the paper"]);
+    const scenes = page.page.locator("#scene optgroup:is([label=Organs], [label^=Slabs], [label^=From]) option");
+    assert.equal(await scenes.count(), 7);
+    assert.equal(await scenes.locator("img").count(), 7);
+    assert.equal((await scenes.first().textContent())?.trim(), "Liver with two lumps");
     assert.deepEqual(await cut(page), []);
     const [panel, room] = await page.page.evaluate(
       "[document.querySelector('aside').scrollHeight, document.querySelector('aside').clientHeight]",
@@ -250,8 +283,56 @@ describe("the page", () => {
     await close(page);
   });
 
-  test("has a right scale bar, also after a turn of the wheel", async () => {
+  test("shows where the pointer is, goes back to the whole tissue, and shows lumps to an instructor", async () => {
     const page = await open(server.url);
+    const ring = page.page.locator("#pointer-ring");
+    const place = await page.at(0.5, 0.5);
+    await page.page.mouse.move(...place);
+    await page.page.waitForFunction("document.getElementById('pointer-ring').hasAttribute('d')");
+    const box = (await ring.boundingBox()) ?? assert.fail();
+    assert.ok(Math.abs(box.x + box.width / 2 - place[0]) < 4 && Math.abs(box.y + box.height / 2 - place[1]) < 4, JSON.stringify([box, place]));
+    assert.ok(await page.page.locator("#full-screen").isVisible());
+    // Another view, and back.
+    const home = await page.ask(({ camera }) => camera);
+    assert.ok(await page.page.locator("#reset-view").isHidden());
+    await page.page.mouse.wheel(0, -600);
+    await page.until(({ camera }, home) => camera.some((v, k) => Math.abs(v - (home[k] ?? 0)) > 1e-3), home);
+    await page.page.click("#reset-view");
+    await page.until(({ camera }, home) => camera.every((v, k) => Math.abs(v - (home[k] ?? 0)) < 1e-6), home);
+    // Lumps are seen on demand only.
+    const picture = async () => await page.page.locator("#tissue").screenshot();
+    await page.page.mouse.move(5, 300);
+    const without = await bluest(page, await picture());
+    await page.page.check("#lumps");
+    await page.page.waitForTimeout(300);
+    assert.ok((await bluest(page, await picture())) > without + 0.2);
+    // Depth is what a tip is led by.
+    assert.equal(await page.text("strength-name"), "Strength");
+    await page.page.check("input[value=tip]", { force: true });
+    assert.equal(await page.text("strength-name"), "Depth");
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
+
+  test("draws slabs and folds without white dots and black seams", async () => {
+    const page = await open(`${server.url}/?scene=liver`, { viewport: { width: 1280, height: 800 } });
+    await page.until(({ drawing }) => drawing.hasTexture);
+    await page.page.waitForTimeout(700);
+    // The corner in front, where the lamp was a dot.
+    const corner = await extremes(page, await page.page.screenshot({ clip: { x: 20, y: 480, width: 300, height: 200 } }));
+    assert.ok(corner.whitest < 0.85, `a pixel of ${corner.whitest}`);
+    await page.page.goto(`${server.url}/?scene=colon`);
+    await page.until(({ drawing }) => drawing.hasTexture);
+    await page.page.waitForTimeout(900);
+    // The tube from outside, which the lamp shines on.
+    const outside = await extremes(page, await page.page.screenshot({ clip: { x: 200, y: 120, width: 150, height: 160 } }));
+    assert.ok(outside.blackest > 0.25, `a pixel of ${outside.blackest}`);
+    assert.deepEqual(page.complaints, []);
+    await close(page);
+  });
+
+  test("has a right scale bar, also after a turn of the wheel", async () => {
+    const page = await open(`${server.url}/?scene=liver`);
     for (const turns of [0, -400]) {
       if (turns !== 0) {
         const before = await across(page, 0.2);
@@ -271,7 +352,7 @@ describe("the page", () => {
   });
 
   test("never draws the tool in the tissue, nor looks from below", async () => {
-    const page = await open(server.url);
+    const page = await open(`${server.url}/?scene=liver`);
     /** @param {string} when */
     const isClear = async (when) => {
       const clear = await page.ask((inside) => inside.clear);
@@ -327,7 +408,7 @@ describe("the page", () => {
   });
 
   test("shows one light: good, and slow when answers take long", async () => {
-    const page = await open(server.url);
+    const page = await open(`${server.url}/?scene=liver`);
     await page.says("light", /^Good$/);
     assert.equal(await page.page.locator("#figures").isVisible(), false, "figures come on demand");
     // A tissue at rest has no picture that gets older.
@@ -471,7 +552,7 @@ describe("several pages on one session", () => {
     const [left, top] = await other.at(0.3, 0.3);
     await other.page.mouse.move(left, top);
     await other.page.mouse.down();
-    await other.says("notice", /Somebody else holds the tool/);
+    await other.says("notice", /first holds the tool\. You can touch as soon as first lets go/);
     assert.equal(await other.ask(({ holds }) => holds), false);
     await other.picture("observer");
     await other.page.mouse.up();
@@ -553,13 +634,25 @@ describe("several pages on one session", () => {
   test("come back by themselves when the server does", async () => {
     const first = await Server.start();
     const page = await open(paper(first));
+    await page.press();
+    await page.until(({ largestM }) => largestM > 0.02);
     await first.stop();
-    await page.says("connection", /Connection lost.*Trying again in/);
     await page.says("light", /^Lost/);
+    await page.says("connection", /connection is lost\. Trying again/);
+    // It holds a tool, has two streams, and asks how the session is: while the server is away one call after the other is enough.
+    let calls = 0;
+    page.page.on("request", () => (calls += 1));
+    await page.page.mouse.up();
+    await page.page.waitForTimeout(2000);
+    assert.ok(calls <= 12, `${calls} calls in 2 s to a server that is away`);
+    // No words of the browser's, and one state at a time.
+    assert.doesNotMatch(await page.page.evaluate("document.body.innerText"), /Connected|fetch/i);
     await page.picture("lost");
     const second = await Server.start([], new URL(first.url).host);
     // Its session went with the first server, and the page says so and offers another.
+    await page.page.click("#try-now").catch(() => {});
     await page.says("notice", /has ended/);
+    await page.says("light", /^Ended$/);
     await page.page.click("#notice button");
     await page.says("connection", /Connected/);
     await page.press();
@@ -696,6 +789,22 @@ describe("a body of any shape", () => {
     await page.until(({ deepestM, forceN }) => deepestM > 2e-3 && deepestM < 0.03 && forceN[0] > 1e-3);
     await page.picture("own");
     await page.page.mouse.up();
+
+    // A lump of one's own: shown to whoever put it in, and stiff.
+    assert.ok(await page.page.locator("#lumps-shown").isHidden());
+    await page.page.click("#put-lump");
+    const place = await page.at(0.5, 0.5);
+    await page.page.mouse.click(...place);
+    await page.says("notice", /The lump is in/);
+    assert.ok(await page.page.locator("#lumps").isChecked());
+    const shown = await colourAt(page.page, ...place);
+    await page.page.uncheck("#lumps");
+    await page.page.mouse.move(5, 300);
+    await page.page.waitForTimeout(300);
+    const hidden = await colourAt(page.page, ...place);
+    assert.ok(shown.blue / shown.red > 1.3 * (hidden.blue / hidden.red), JSON.stringify([shown, hidden]));
+    await page.page.click("#take-lumps");
+    await page.page.locator("#lumps-shown").waitFor({ state: "hidden" });
 
     await drop("flawed.obj", flawed.join("\n"));
     await page.page.click("#own-buttons button.main");

@@ -1,0 +1,61 @@
+// The gate: what is in place of the page for whom the server does not let in. It says why, and has a field for a token.
+
+import { keepToken, part } from "./page";
+import { reasonOf, server } from "./server";
+
+/** Whether a call was refused because of who calls. */
+export function isBarred(reason: string): boolean {
+  return reason === "UNAUTHENTICATED" || reason === "ROLE_MISSING";
+}
+
+/** What to say to whom a call was refused for a reason. */
+function words(reason: string): [string, string] {
+  if (reason === "ROLE_MISSING") {
+    const next = "Open the link to a session that somebody else has opened, or use another token.";
+    return ["Your token does not let you open a tissue.", next];
+  }
+  if (server.token) {
+    return ["This server does not know your token.", "Copy the whole token again, or ask whoever runs the server for another."];
+  }
+  return ["This server asks for a token.", "Whoever runs the server can give you one."];
+}
+
+export class Gate {
+  private readonly form = part("gate", HTMLFormElement);
+  private readonly field = part("gate-token", HTMLInputElement);
+
+  /** `onToken`: somebody has entered a token. */
+  constructor(onToken: () => void) {
+    this.form.addEventListener("submit", (event) => {
+      event.preventDefault();
+      const token = this.field.value.trim();
+      if (token === "") return;
+      keepToken(token);
+      this.field.value = "";
+      this.close();
+      onToken();
+    });
+  }
+
+  /** Shows it in place of the page, if a call was refused because of who calls. Returns whether it was. */
+  stops(error: unknown): boolean {
+    const reason = reasonOf(error);
+    if (!isBarred(reason)) return false;
+    this.show(reason);
+    return true;
+  }
+
+  show(reason: string): void {
+    const [what, next] = words(reason);
+    part("gate-what", HTMLElement).textContent = what;
+    part("gate-next", HTMLElement).textContent = next;
+    this.form.hidden = false;
+    document.body.classList.add("barred");
+    this.field.focus();
+  }
+
+  private close(): void {
+    this.form.hidden = true;
+    document.body.classList.remove("barred");
+  }
+}

@@ -1,0 +1,87 @@
+// What the page tells of itself, for tests and measurements: `window.palpate`.
+
+import { norm } from "palpate";
+import type { Latency } from "./latency";
+import { pictureFrom } from "./pictures";
+import type { Player } from "./player";
+import { received } from "./server";
+import { Sheet } from "./sheet";
+import type { Stage } from "./stage";
+import type { Visit } from "./visit";
+
+/** The page's state as numbers, for tests and measurements. */
+export function inside(present: () => Visit | undefined, stage: Stage, player: Player, latency: Latency) {
+  return {
+    get frames() {
+      const { taken, skipped, newest } = present()?.frames ?? { taken: 0, skipped: 0n };
+      return { taken, skipped: Number(skipped), drawn: stage.drawn, timeS: newest?.timeS ?? 0 };
+    },
+    get received() {
+      return received.bytes;
+    },
+    get ageMs() {
+      return present()?.frameAgeMs;
+    },
+    get picture() {
+      return stage.describe();
+    },
+    get largestM() {
+      return present()?.surface.largestM() ?? 0;
+    },
+    get forceN() {
+      return present()?.samples.tools.map((tool) => norm(tool.forceN)) ?? [];
+    },
+    /** Largest displacement of the control point within the length of the plots. */
+    get deepestM() {
+      return Math.max(0, ...(present()?.samples.history.map((moment) => norm(moment.displacementM)) ?? []));
+    },
+    get holds() {
+      return present()?.hand.holds ?? false;
+    },
+    /** What is played, if anything is. */
+    get recording() {
+      return player.moment;
+    },
+    /** Where the camera is. */
+    get camera() {
+      return stage.camera.matrixWorld.toArray();
+    },
+    /** Whether datagrams get through, and how many were sent and came in this session; poses and samples in them. */
+    get datagrams() {
+      const { carries, counts } = present()?.hand.tool.datagrams ?? {};
+      return { carries: carries ?? false, sent: 0, came: 0, poses: 0, samples: 0, fellBack: 0, ...counts };
+    },
+    /** The least room between a tool and the tissue as drawn, of the width of the tissue; undefined without a tool. */
+    get clear() {
+      const [{ clearM }, visit] = [stage, present()];
+      return clearM === undefined || !visit ? undefined : clearM / visit.widthM;
+    },
+    /** Whether the first picture of the tissue was drawn, and had a texture; and whether it has one now. */
+    get drawing() {
+      return { ...stage.began, hasTexture: stage.isTextured };
+    },
+    /** The camera's height above the table and the tissue beneath it, of the width of the tissue. */
+    get cameraHeight() {
+      const visit = present();
+      return visit ? stage.heightM / visit.widthM : 0;
+    },
+    /** Width of the tissue, m. */
+    get widthM() {
+      return present()?.widthM ?? 0;
+    },
+    /** The window point of the tissue at (x, y): in fractions of a sheet; of a body near there in the picture. */
+    at(x: number, y: number): [number, number] | undefined {
+      const { surface } = present() ?? {};
+      if (!surface) return undefined;
+      const place = surface instanceof Sheet ? surface.placeAt(x, y) : stage.pickNear(x, 1 - y);
+      return place && stage.placeInWindow(place);
+    },
+    /** A small picture of what is shown, for the list of scenes. */
+    thumbnail(): string {
+      let picture = "";
+      stage.snap((drawn) => (picture = pictureFrom(drawn)));
+      return picture;
+    },
+    pixelAfterPress: (x: number, y: number) => latency.next(x, y),
+  };
+}

@@ -1,0 +1,110 @@
+// Lumps: the stiff places of a scene, shown to an instructor; and lumps that one puts into a mesh of one's own.
+
+import { create } from "@bufbuild/protobuf";
+import type { Vec3 } from "palpate";
+import { type Inclusion, InclusionSchema, type Scene, type Session } from "palpate/v1";
+import type { Input } from "./input";
+import { part } from "./page";
+import { describe } from "./server";
+import type { Stage } from "./stage";
+import type { Place } from "./surface";
+import type { Visit } from "./visit";
+
+/** A ball in the tissue. */
+export interface Lump {
+  centreM: Vec3;
+  radiusM: number;
+}
+
+/** Radius of a lump that is put in, of the size of the tissue: 9 mm in a liver; and how it lies beneath the surface, of its radius. */
+const RADIUS = 0.04;
+const BENEATH = 0.4;
+/** Over this part of its radius a lump becomes tissue. */
+const EDGE = 0.4;
+/** How much stiffer it is, and what is beneath it: as in the scene `liver-organ`. */
+const STIFFER = { springs: 1.5, support: 5 };
+
+/** The lumps of a scene. What is stiff by a group of the mesh has no shape of its own. */
+function lumpsOf(scene: Scene | undefined): Lump[] {
+  return (scene?.inclusions ?? []).flatMap(({ centreM, radiusM }) =>
+    centreM ? [{ centreM: [centreM.x, centreM.y, centreM.z] as Vec3, radiusM: radiusM ?? 0 }] : [],
+  );
+}
+
+/** A lump beneath a place of a tissue. */
+function lumpAt({ restM, outward }: Place, sizeM: number, edgeM: number): Inclusion {
+  // Some vertices have to be in it.
+  const radiusM = Math.max(RADIUS * sizeM, 1.5 * edgeM);
+  const [x, y, z] = restM.map((v, c) => v - BENEATH * radiusM * outward[c]!) as Vec3;
+  return create(InclusionSchema, {
+    centreM: { x, y, z },
+    radiusM,
+    edgeM: EDGE * radiusM,
+    stiffnessFactor: STIFFER.springs,
+    virtualStiffnessFactor: STIFFER.support,
+  });
+}
+
+/** What lumps need of the page. */
+export interface Host {
+  present: () => Visit | undefined;
+  /** The scene that the page has made of a mesh of one's own, if that is what it shows. */
+  scene: () => Scene | undefined;
+  /** Shows another scene of the same mesh in its place. */
+  exchange: (scene: Scene) => Promise<void>;
+  notice: (text: string, seconds?: number) => void;
+}
+
+export class Lumps {
+  private readonly box = part("lumps", HTMLInputElement);
+  private readonly put = part("put-lump", HTMLButtonElement);
+  private readonly take = part("take-lumps", HTMLButtonElement);
+
+  constructor(
+    private readonly stage: Stage,
+    private readonly input: Input,
+    private readonly host: Host,
+  ) {
+    this.box.addEventListener("change", () => {
+      const visit = host.present();
+      if (visit) this.show(visit.session);
+    });
+    this.put.addEventListener("click", () => this.place(this.input.onPlace === undefined));
+    this.take.addEventListener("click", () => void this.change());
+  }
+
+  /** Shows those of a session, if the instructor wants that, and what may be done about them. */
+  show({ scene }: Session): void {
+    const lumps = lumpsOf(scene);
+    part("lumps-shown", HTMLElement).hidden = lumps.length === 0;
+    part("own-lumps", HTMLElement).hidden = this.host.scene() === undefined;
+    this.take.hidden = lumps.length === 0;
+    this.stage.setLumps(this.box.checked ? lumps : []);
+    if (this.input.onPlace) this.place(false);
+  }
+
+  /** The next press on the tissue puts a lump there; or it touches again. */
+  private place(on: boolean): void {
+    this.put.setAttribute("aria-pressed", String(on));
+    this.input.onPlace = on ? (place) => void this.change(place) : undefined;
+    // On a phone the tissue is above what is in sight.
+    if (on) part("view", HTMLElement).scrollIntoView({ block: "nearest" });
+    this.host.notice(on ? "Press where the lump is to be." : "", 0);
+  }
+
+  /** Puts a lump beneath a place, or takes all out. */
+  private async change(place?: Place): Promise<void> {
+    this.place(false);
+    const [scene, visit] = [this.host.scene(), this.host.present()];
+    if (!scene || !visit) return;
+    scene.inclusions = place ? [...scene.inclusions, lumpAt(place, visit.surface.sizeM, visit.edgeM)] : [];
+    try {
+      // Whoever puts one in wants to see where it is.
+      if (place) this.box.checked = true;
+      await this.host.exchange(scene);
+      if (place) this.host.notice("The lump is in. Take the tick from “Lumps” to hide it.", 8);
+    } catch (error) {
+      this.host.notice(`The lumps are as they were: ${describe(error)}.`);
+    }
+  }
+}

@@ -1,0 +1,86 @@
+// What the page says of a session and its tools, in words for its user.
+
+import { type Session, SessionState } from "palpate/v1";
+import { depthText } from "./overlay";
+import { quantity } from "./plot";
+import type { Told } from "./samples";
+import type { Visit } from "./visit";
+
+/** A tip that is less deep than this part of what it is set to has slipped off. */
+const SLIPPED = 0.6;
+/** A push of which less than this part is felt is less. */
+const LESS = 0.95;
+
+/** The beginning of a sentence. */
+export function sentence(text: string): string {
+  return text.charAt(0).toUpperCase() + text.slice(1);
+}
+
+/** What a session is that is well. */
+export function wellText(session: Session): string {
+  const name = session.scene?.name ?? "";
+  if (session.playback) return `Connected to a recording of ${name}.`;
+  if (session.state === SessionState.HELD) return `The session is held: ${session.holdReason}`;
+  const paused = session.state === SessionState.PAUSED ? ", which is paused" : "";
+  return `Connected to ${name}${paused}.${recoveredText(session)}`;
+}
+
+/** How often the tissue recovered and why it did the last time; nothing if it never did. */
+function recoveredText({ recoveryCount, recoveries }: Session): string {
+  const newest = recoveries.at(-1);
+  if (!newest) return "";
+  const times = recoveryCount === 1n ? "once" : `${recoveryCount} times`;
+  const end = newest.pausedUntilStep;
+  const pause = end === undefined ? "" : ` Tools that acted are paused until step ${end}.`;
+  return ` The tissue recovered ${times}, the last time because after step ${newest.step} ${newest.reason}.${pause}`;
+}
+
+/** Why the hand was refused a touch, in words for the user. */
+export function refusedText(message: string, reason: string, session: Session): string {
+  if (reason === "ROLE_MISSING") return "Your token lets you watch, not touch.";
+  if (reason !== "TOOL_HELD") return `${sentence(message)}.`;
+  const name = session.heldTools.find(({ tool }) => tool === 0)?.holder || "Somebody else";
+  return `${name} holds the tool. You can touch as soon as ${name} lets go.`;
+}
+
+/** What the strength is of the present tool. */
+export function strengthText({ hand: { mode, strength }, reach }: Visit): string {
+  if (mode === "pull") return "as you drag";
+  return mode === "tip" ? quantity(strength * reach.depthM, "m") : quantity(strength * reach.mostN, "N");
+}
+
+/** What the strength means, and how that differs from what is felt. */
+export function meaningText({ hand, reach, surface }: Visit): string {
+  const range = quantity(reach.lengthM, "m");
+  if (hand.mode === "tip") {
+    return `The tip is a disc of ${range} radius. Depth is how far it goes below the tissue at rest; what pushes back follows from that.`;
+  }
+  return surface.flank
+    ? "Strength is the push in the middle of the tool. It fades out over about " +
+      `${range}. What pushes back is the mean over the tissue around, weighted as the push is. The push is strongest in the ` +
+      "middle, so that mean is less than the strength while nothing moves. While the tissue moves it may be more."
+    : `Strength is the whole push of the tool. It fades out over about ${range}. What pushes back is told for all the tissue ` +
+      "that the push meets: as much as the strength while nothing moves, more or less while the tissue moves.";
+}
+
+/** Whether a push is told as clearly less than its strength: then somebody may ask why. */
+export function isLess({ hand: { mode, strength }, reach }: Visit, told: Told | undefined): boolean {
+  return told !== undefined && ["push", "stroke"].includes(mode) && told.allN < LESS * strength * reach.mostN;
+}
+
+/** What a tool feels, in words. */
+export function feltText({ hand }: Visit, told: Told | undefined): string {
+  const { setM } = hand;
+  if (setM !== undefined && (told?.deepM ?? 0) < SLIPPED * setM) {
+    const now = told ? `now ${depthText(told)}, not ${quantity(setM, "m")}` : "it does not touch any more";
+    return `The tip has slipped off: ${now}. Set less depth.`;
+  }
+  if (!told) return "Nothing touches the tissue.";
+  return `${depthText(told)}, pushes back ${quantity(told.allN, "N")}`;
+}
+
+/** Datagrams belong to a lease. */
+export function wayText({ hand }: Visit): string {
+  if (!hand.holds) return "no tool is held";
+  return hand.tool.datagrams.carries ? "datagrams" : "gRPC-web";
+}
