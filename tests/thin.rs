@@ -80,8 +80,7 @@ struct Course {
     displacement_m: f64,
 }
 
-/// Plays `steps` steps; the tip does something else every `each`.
-fn play(seed: u64, steps: u64, each: u64) -> Option<(Course, &'static str)> {
+fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
     let dice = &mut fastrand::Rng::with_seed(seed);
     let folder = tempfile::tempdir().unwrap();
     let mesh = thin_mesh(dice, seed as usize);
@@ -91,7 +90,7 @@ fn play(seed: u64, steps: u64, each: u64) -> Option<(Course, &'static str)> {
     let mut course = Course::default();
     let (mut place_m, mut way_m, mut now) = (DVec3::ZERO, DVec3::ZERO, tip(dice));
     for step in 0..steps {
-        if step % each == 0 {
+        if step % 40 == 0 {
             let point = palpate::shape::PointId::new(dice.usize(0..shape.point_count()));
             let mut random = || DVec3::from_array([(); 3].map(|()| 2.0 * dice.f64() - 1.0));
             let target_m = shape.rest_m(point) + 0.5 * now.radius_m * random();
@@ -100,12 +99,12 @@ fn play(seed: u64, steps: u64, each: u64) -> Option<(Course, &'static str)> {
                 0 => {
                     tissue.release(0);
                     (place_m, now) = (from_m, tip(dice));
-                    way_m = (target_m - place_m) / each as f64;
+                    way_m = (target_m - place_m) / 40.0;
                 }
                 // A jump.
                 1 => (place_m, way_m) = (target_m, DVec3::ZERO),
                 2 | 3 => way_m = DVec3::ZERO,
-                _ => way_m = (target_m - place_m) / each as f64,
+                _ => way_m = (target_m - place_m) / 40.0,
             }
         }
         place_m += way_m;
@@ -131,13 +130,11 @@ fn tips_on_thin_meshes_get_no_energy_from_nowhere() {
     let number = |name: &str| std::env::var(name).ok().map(|text| text.parse::<u64>().unwrap());
     let all = number("PALPATE_STRESS_THIN");
     let (from, count) = (number("PALPATE_STRESS_THIN_FROM").unwrap_or(0), all.unwrap_or(12));
-    let steps = number("PALPATE_STRESS_THIN_STEPS").unwrap_or(if all.is_some() { 48 } else { 80 });
-    // Of many meshes each gets less time, so faster tips.
-    let each = if steps < 80 { 12 } else { 40 };
+    let steps = number("PALPATE_STRESS_THIN_STEPS").unwrap_or(80);
     let (mut played, mut blew_up, mut guarded) = (0, 0, 0);
     let mut beyond = Vec::new();
     for seed in from..from + count {
-        let Some((course, kind)) = play(seed, steps, each) else { continue };
+        let Some((course, kind)) = play(seed, steps) else { continue };
         played += 1;
         blew_up += u64::from(course.blow_ups > 0);
         guarded += u64::from(course.guard_events > 0);
