@@ -54,6 +54,9 @@ pub struct Limits {
     pub points_in_all: usize,
     /// Points times substeps of a session: what one step may cost its thread.
     pub point_substeps_per_step: u64,
+    /// Triangles that a step of a session may look up under all tips: a tip of 5 mm on a mesh whose edges are 2 mm long looks up
+    /// about 1000 in each substep.
+    pub contact_work: u64,
     /// How long a step of a session may take, predicted with all points awake, in periods of its rate.
     pub periods_per_step: f64,
     /// Points times substeps that may be computed to find out which scheme and how many substeps keep a scene's tolerance;
@@ -142,6 +145,7 @@ impl Default for Limits {
             sessions: 1024,
             points_in_all: 1 << 24,
             point_substeps_per_step: 1 << 26,
+            contact_work: 1 << 17,
             periods_per_step: 1.0,
             rehearsal_work: 1 << 27,
             streams_per_session: 256,

@@ -422,6 +422,13 @@ impl Part {
     }
 }
 
+/// The number of ways of a disc.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn ways_of(radius_m: f64, edge_m: f64) -> usize {
+    let wanted = (WAYS_PER_EDGE * radius_m / edge_m) as usize;
+    wanted.next_multiple_of(8).clamp(WAYS[0], WAYS[1])
+}
+
 /// The parts of each way that begin within a radius.
 fn ways<'c>(
     crossings: &'c [Part],
@@ -434,10 +441,9 @@ fn ways<'c>(
 
 impl Disc {
     /// A disc on a surface whose edges are about `edge_m` long.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    #[allow(clippy::cast_precision_loss)]
     pub fn new(radius_m: f64, edge_m: f64) -> Self {
-        let wanted = (WAYS_PER_EDGE * radius_m / edge_m) as usize;
-        let count = wanted.next_multiple_of(8).clamp(WAYS[0], WAYS[1]);
+        let count = ways_of(radius_m, edge_m);
         let direction = |way: usize| {
             let angle = std::f64::consts::TAU * (way as f64 + 0.5) / count as f64;
             DVec2::new(libm::cos(angle), libm::sin(angle))
@@ -454,6 +460,13 @@ impl Disc {
             found: vec![(NONE, 0); 64],
             widening: Vec::new(),
         }
+    }
+
+    /// About how many triangles the ways of a disc of `radius_m` cross, on a surface whose edges are about `edge_m` long: the work
+    /// of laying it.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub fn crossings(radius_m: f64, edge_m: f64) -> u64 {
+        ways_of(radius_m, edge_m) as u64 * (1.0 + 2.0 * radius_m / edge_m) as u64
     }
 
     /// The radius, m.

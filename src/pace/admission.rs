@@ -187,7 +187,10 @@ impl Pacer {
         let (cost, thread) = self.place(&model, !running, owner)?;
         let stepper = &self.steppers[thread];
         let changed_to = (!Arc::ptr_eq(&model, &first)).then(|| model.clone());
-        let mut intake = Intake::new(&first.scene, &self.limits).charged_to(owner).continued(&session, changed_to);
+        let mut intake = Intake::new(&first.scene, &self.limits)
+            .of_substeps(first.plan.substeps)
+            .charged_to(owner)
+            .continued(&session, changed_to);
         if let Some(reason) = session.hold_reason() {
             drop(intake.close(Refusal::new(Reason::SessionHeld, "", reason)));
         }

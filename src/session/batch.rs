@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use super::command::Command;
 use super::intake::Intake;
 use super::lease::LeaseId;
-use super::rules::{Checked, check_tip, tip_radius_m};
+use super::rules::{Checked, check_contact_work, check_tip, tip_radius_m};
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Commands that are put in the queue in one turn at the intake.
@@ -54,7 +54,13 @@ impl Intake {
             }
             command.sequence = Some(sequence);
             let tip_radius_m = tip_radius_m(command);
-            check_tip(coming.map_or(lease.tip_radius_m, |coming| coming.2), tip_radius_m)?;
+            let before_m = coming.map_or(lease.tip_radius_m, |coming| coming.2);
+            check_tip(before_m, tip_radius_m)?;
+            if let (None, Some(now_m)) = (before_m, tip_radius_m) {
+                let of = |(tool, waiting_m)| last.get(&tool).map_or(waiting_m, |coming| coming.2);
+                let others = self.leases.tips_m().filter(|(tool, _)| *tool != command.tool).filter_map(of);
+                check_contact_work(&self.rules, self.substeps(), now_m, others)?;
+            }
             let newest = before.map_or(sequence, |before| before.max(sequence));
             last.insert(command.tool, (newest, coming.map_or(0, |coming| coming.1) + 1, tip_radius_m));
         }

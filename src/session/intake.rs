@@ -52,6 +52,8 @@ pub struct Intake {
     tip_radii_m: BTreeMap<u32, f64>,
     /// The session rests: its steps up to this one are skipped, not computed.
     resting: Option<(Schedule, u64)>,
+    /// Substeps of a step of the tissue that it began with; 0 where what tips cost is nobody else's.
+    substeps: u32,
     /// A command or change has arrived that may take effect earlier, and the session's thread was woken for it.
     pub(super) changed: bool,
     woken: bool,
@@ -76,11 +78,24 @@ impl Intake {
             next_step: 0,
             tip_radii_m: BTreeMap::new(),
             resting: None,
+            substeps: 0,
             changed: false,
             woken: false,
             counts: Counts::default(),
             closed: None,
         }
+    }
+
+    /// Of a tissue that takes so many substeps in a step, on a thread of several sessions: what its tips cost follows them.
+    #[must_use]
+    pub fn of_substeps(self, substeps: u32) -> Self {
+        Intake { substeps, ..self }
+    }
+
+    /// The substeps of a step of the tissue that comes last.
+    pub(super) fn substeps(&self) -> u32 {
+        let changed = self.changed_to.as_ref().filter(|_| self.substeps > 0);
+        changed.map_or(self.substeps, |model| model.plan.substeps)
     }
 
     /// The memory of what waits is charged to `account`.

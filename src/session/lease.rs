@@ -102,6 +102,11 @@ impl Leases {
         Ok(())
     }
 
+    /// The tips that the newest commands give the tools: numbers and radii, m.
+    pub(super) fn tips_m(&self) -> impl Iterator<Item = (u32, Option<f64>)> + '_ {
+        self.held.iter().map(|(tool, lease)| (*tool, lease.tip_radius_m))
+    }
+
     /// Extends a lease: its holder is alive.
     ///
     /// # Errors

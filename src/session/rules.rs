@@ -1,11 +1,14 @@
 //! The rules that a command has to keep to, whenever it comes. So it is checked before its turn at the intake.
 
+use palpate_mesh::surface::Disc;
+
 use super::command::Command;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, positive};
 use crate::scene::Scene;
 use crate::scene::check::{self, check_free, check_poke, check_reach};
 use crate::scene::script::Action;
+use crate::shape::RestShape;
 
 /// The rules of a session.
 #[derive(Debug)]
@@ -79,6 +82,41 @@ fn check_played_by_time(command: &Command) -> Result<()> {
     let message = "goes with a pose that is played by the client's time: give client_time_ns, and no at_step";
     let is_played = command.client_time_ns != 0 && command.at_step.is_none();
     if is_played { Ok(()) } else { Err(Refusal::new(Reason::Missing, "pose.velocity_m_per_s", message)) }
+}
+
+/// How many triangles a tip makes a session look up in a step of so many substeps: its disc is laid twice in each. A disc on a
+/// sheet is bounded however large it is (`sheet::footprint`), and counts nothing.
+fn contact_work(shape: &dyn RestShape, radius_m: f64, substeps: u32) -> u64 {
+    if shape.dimensions() < 3 {
+        return 0;
+    }
+    Disc::crossings(radius_m, shape.edge_m()).saturating_mul(2 * u64::from(substeps))
+}
+
+/// Refuses tips that make a step longer than others of its thread can wait. `tips_m` are the radii of all tips of a session.
+pub(super) fn check_contact_work(
+    rules: &Rules,
+    substeps: u32,
+    now_m: f64,
+    tips_m: impl Iterator<Item = f64>,
+) -> Result<()> {
+    let shape = rules.scene.shape();
+    let most = rules.limits.contact_work;
+    let others = tips_m.fold(0_u64, |sum, radius_m| sum.saturating_add(contact_work(shape, radius_m, substeps)));
+    let all = others.saturating_add(contact_work(shape, now_m, substeps));
+    if all <= most {
+        return Ok(());
+    }
+    // Halved until it fits: the work grows with the radius.
+    let fits = std::iter::successors(Some(0.5 * now_m), |radius_m| Some(0.5 * radius_m))
+        .take(16)
+        .find(|radius_m| others.saturating_add(contact_work(shape, *radius_m, substeps)) <= most);
+    let advice = fits.map_or("release other tools first".to_owned(), |radius_m| format!("{radius_m} m fits"));
+    let message = format!(
+        "is {now_m} m: with it, a step would look up {all} triangles under the tips of this session, above {most} \
+         (limits.contact_work); {advice}"
+    );
+    Err(Refusal::new(Reason::TooLarge, "pose.tip.radius_m", message))
 }
 
 /// Radius of the tip that a command gives its tool, m.

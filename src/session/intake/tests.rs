@@ -379,3 +379,41 @@ fn a_tool_that_is_in_the_tissue_when_a_session_goes_on_keeps_its_tip() {
     after.acquire(&[2], "test", 1.0, LEASE, 0).unwrap();
     after.submit(LEASE, vec![Command::new(2, None, pose(0.01))], 0).unwrap();
 }
+
+/// 64 tips of a third of an organ on one session stopped the others of its thread for 4.5 s.
+#[test]
+fn tips_that_a_step_has_no_time_for_are_refused_with_the_radius_that_fits() {
+    let (limits, model) = (Limits::default(), Model::gallbladder(&[]));
+    let tools: Vec<u32> = (0..64).collect();
+    let pose = |tool: u32, sequence: u64, radius_m: f64| {
+        let tip = Tip { radius_m, ..Tip::default() };
+        let action = Action::Pose { place_m: glam::DVec3::ZERO, velocity_m_per_s: None, tip };
+        Command { action, ..Command::new(tool, Some(sequence), Action::Release) }
+    };
+    let edge_m = model.scene.shape().edge_m();
+    let radius_m = 8.0 * edge_m;
+    let mut intake = Intake::new(&model.scene, &limits).of_substeps(model.plan.substeps);
+    intake.acquire(&tools, "test", 1.0, LEASE, 0).unwrap();
+    let mut taken = 0;
+    let refusal = loop {
+        match intake.submit(LEASE, vec![pose(taken, 1, radius_m)], 0) {
+            Ok(()) => taken += 1,
+            Err(refusal) => break refusal,
+        }
+    };
+    assert!((2..40).contains(&taken), "{taken}");
+    assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "pose.tip.radius_m"));
+    assert!(refusal.to_string().contains("m fits"), "{refusal}");
+    // The radius that fits does fit, and who is there moves on.
+    let fits_m: f64 = refusal.to_string().rsplit("; ").next().unwrap().split(' ').next().unwrap().parse().unwrap();
+    intake.submit(LEASE, vec![pose(taken, 1, fits_m), pose(0, 2, radius_m)], 0).unwrap();
+    // In one call as well as in many: none of it is taken.
+    let many: Vec<Command> = (taken + 1..64).map(|tool| pose(tool, 1, radius_m)).collect();
+    assert_eq!(intake.submit(LEASE, many, 0).unwrap_err().reason, Reason::TooLarge);
+    // What is released makes room.
+    intake.submit(LEASE, vec![Command::new(0, Some(3), Action::Release), pose(taken + 1, 1, radius_m)], 0).unwrap();
+    // A sheet's discs are bounded, and a run of its own waits for nobody.
+    let mut alone = Intake::new(&model.scene, &limits);
+    alone.acquire(&tools, "test", 1.0, LEASE, 0).unwrap();
+    alone.submit(LEASE, tools.iter().map(|tool| pose(*tool, 1, radius_m)).collect(), 0).unwrap();
+}
