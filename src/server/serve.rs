@@ -120,7 +120,7 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         fence: fleet.is_some().then(|| pacer.fence.clone()),
     };
     let meshes = Meshes::new(&limits);
-    let recorded = Recorded::new(journals.as_deref(), &limits)?;
+    let recorded = Recorded::new(journals.as_deref(), &config)?;
     let textures = Textures::open(&config, &catalog, &pacer, &limits)?;
     let (pages, counted) = (origins.clone(), traffic.clone());
     let datagrams = datagrams::receive(socket, pages, counted, shutdown.child_token()).await;
