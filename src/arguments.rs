@@ -92,7 +92,7 @@ mod tests {
     #[test]
     fn a_negative_number_is_a_value_and_another_option_is_none() {
         assert_eq!(read_of(&["--unit", "-1"]).unwrap().unit.as_deref(), Some("-1"));
-        assert_eq!(read_of(&["--edge-mm", "-2.5e-1", "--json"]).unwrap().edge_mm, Some(-0.25));
+        assert_eq!(read_of(&["--edge-mm", "-2.5e2", "--json"]).unwrap().edge_mm, Some(-250.0));
         assert_eq!(read_of(&["-3"]).unwrap().name.as_deref(), Some("-3"));
         assert!(read_of(&["--unit", "--json"]).is_err());
     }

@@ -87,6 +87,21 @@ fn a_length_in_millimetres_is_taken_for_one() {
 }
 
 #[test]
+fn a_server_that_does_not_begin_says_no_address() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("file"), "").unwrap();
+    let usual = ["serve", "--listen", "127.0.0.1:0", "--journal"];
+    for (more, told) in [
+        (&["file"][..], "journal: file: can't be used"),
+        (&["journals", "--journal-key", "file"], "file: has no private key in PEM"),
+        (&["journals", "--journal-key", "none"], "none: can't be read"),
+    ] {
+        let (status, text) = palpate(folder.path(), &[&usual[..], more].concat());
+        assert!(status == 2 && text.contains(told) && !text.contains("listens"), "{status}: {text}");
+    }
+}
+
+#[test]
 fn an_owner_has_one_token_of_a_name() {
     let folder = tempfile::tempdir().unwrap();
     let make = |name: &str| palpate(folder.path(), &["token", "--name", name, "--role", "watch", "--tokens", "t.toml"]);

@@ -232,12 +232,15 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         let shutdown = CancellationToken::new();
         signals::outlive();
         signals::cancel_on(shutdown.clone());
-        // The standard output may be closed; that does not stop the server.
-        let _ = writeln!(std::io::stdout(), "palpate listens on {}", listeners.url());
-        if let Some(url) = listeners.metrics_url() {
-            let _ = writeln!(std::io::stdout(), "metrics are at {url}");
-        }
-        Ok(server::serve(listeners, config, shutdown).await?)
+        let (url, metrics) = (listeners.url(), listeners.metrics_url());
+        let ready = move || {
+            // The standard output may be closed; that does not stop the server.
+            let _ = writeln!(std::io::stdout(), "palpate listens on {url}");
+            if let Some(url) = metrics {
+                let _ = writeln!(std::io::stdout(), "metrics are at {url}");
+            }
+        };
+        Ok(server::serve(listeners, config, shutdown, ready).await?)
     });
     runtime.shutdown_background();
     ended

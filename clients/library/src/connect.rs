@@ -344,6 +344,7 @@ mod tests {
                 Credentials { cert_and_key: Some((junk(), junk())), ..Credentials::default() },
                 "cert: has no certificate",
             ),
+            (Credentials { cert_and_key: Some((cert, junk())), ..Credentials::default() }, "key: has no private key"),
         ] {
             let refused = Server::new("https://localhost:7117", &credentials).unwrap_err().to_string();
             assert!(refused.starts_with(told), "{refused}");
