@@ -28,8 +28,14 @@ pub fn parse<A: Parser>() -> A {
 
 fn read<A: Parser>(arguments: impl IntoIterator<Item = OsString>) -> Result<A, Error> {
     let mut command = with_negative_numbers(A::command());
-    let matches = command.try_get_matches_from_mut(arguments)?;
+    let matches = command.try_get_matches_from_mut(arguments.into_iter().map(without_exponent))?;
     A::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
+}
+
+/// `-1e-3` as `-0.001`: clap takes the former for an option.
+fn without_exponent(argument: OsString) -> OsString {
+    let number = argument.to_str().filter(|text| text.starts_with('-') && text.contains("e-"));
+    number.and_then(|text| text.parse::<f64>().ok()).map_or(argument, |number| number.to_string().into())
 }
 
 /// The same command, of which each option and argument takes a value such as `-1`: it is refused for its reason, if it is, and not
@@ -92,7 +98,7 @@ mod tests {
     #[test]
     fn a_negative_number_is_a_value_and_another_option_is_none() {
         assert_eq!(read_of(&["--unit", "-1"]).unwrap().unit.as_deref(), Some("-1"));
-        assert_eq!(read_of(&["--edge-mm", "-2.5e2", "--json"]).unwrap().edge_mm, Some(-250.0));
+        assert_eq!(read_of(&["--edge-mm", "-2.5e-1", "--json"]).unwrap().edge_mm, Some(-0.25));
         assert_eq!(read_of(&["-3"]).unwrap().name.as_deref(), Some("-3"));
         assert!(read_of(&["--unit", "--json"]).is_err());
     }

@@ -46,6 +46,7 @@ fn a_wrong_value_is_refused_for_its_reason() {
             &["organ", "liver", "--edge-mm", "-2", "--output", "x.obj"],
             &["--edge-mm: the edge length must be", "-0.002"],
         ),
+        (&["organ", "liver", "--edge-mm", "-1e-3", "--output", "x.obj"], &["--edge-mm: the edge length must be"]),
         (&["serve", "--threads", "-1"], &["--threads: must be a whole number from 0, but is `-1`"]),
         (&["certificate", "--days", "-3"], &["-3 is not in 1..=825"]),
         (&["organ", "spleen"], &["there is no organ `spleen`; there are gallbladder"]),
