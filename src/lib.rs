@@ -5,6 +5,7 @@
 //! come from the crate `libm`, not from the platform. No control register of the processor is touched. `state_hash` is XXH3-128
 //! over displacements and increments of all points; `tests/determinism.rs` keeps golden values.
 
+pub mod arguments;
 pub mod budget;
 pub mod cluster;
 pub mod force_law;

@@ -89,7 +89,7 @@ enum Command {
     #[command(after_help = "Examples:\n  \
         palpate serve\n  \
         palpate serve --listen 127.0.0.1:0 --scenes my-scenes --threads 1\n  \
-        palpate token --name ann --role create,touch --tokens tokens.toml > ann.token\n  \
+        (umask 077; palpate token --name ann --role create,touch --tokens tokens.toml > ann.token)\n  \
         palpate serve --listen 0.0.0.0:7117 --tls-cert server.pem --tls-key server.key --tokens tokens.toml\n  \
         palpate-client replay vertical-60 --server https://server:7117 --token-file ann.token\n\n\
         The server prints its address to the standard output when it is ready. Ctrl-C or SIGTERM ends it: all streams end \
@@ -114,18 +114,20 @@ enum Command {
         palpate journal render journals/SESSION.1.mcap --output film.gif\n  \
         palpate journal export journals/SESSION.1.mcap --format mcap --output foxglove.mcap\n  \
         palpate journal cut journals/SESSION.1.mcap --from 20000 --to 30000 --output case.mcap\n  \
-        palpate journal recover journals/SESSION.1.mcap\n\n\
+        palpate journal recover journals/SESSION.1.mcap\n  \
+        palpate journal key journal.key\n\n\
         A journal is an MCAP file, SESSION.RUN.mcap, one for each run of the server. It has the scene, every input with the step \
-        at which it acted, hashes, snapshots, and what the tools felt. The same inputs give the same bits, so `verify` proves \
-        that nothing in it is other than it was.\n\n\
+        at which it acted, hashes, snapshots, and what the tools felt. The same inputs give the same bits, so `verify` tells \
+        whether they still do, and for how many steps a hash proves it. That nobody has changed a file, only a signature proves: \
+        `palpate journal key` and `palpate serve --journal-key` sign, `verify --signed-by` checks.\n\n\
         Exit status: 0; 1 when a journal differs or a file can't be written; 2 when an input was refused.")]
     Journal(journal::JournalArguments),
     /// Create a token for clients of a server; prints the token once and stores only its hash
     #[command(after_help = "Examples:\n  \
-        palpate token --name ann --role create,touch --tokens tokens.toml > ann.token\n  \
+        (umask 077; palpate token --name ann --role create,touch --tokens tokens.toml > ann.token)\n  \
         palpate token --name screen --role watch\n\n\
         Roles: watch (every role includes it), touch (hold a tool, change the tissue), create (create, start, pause and \
-        delete sessions), administer (everything). To revoke a token, delete its entry; the server notices within 1 s.")]
+        delete sessions), administer (everything). `umask 077` keeps the file of a token from others who use this machine. To revoke a token, delete its entry; the server notices within 1 s.")]
     Token(token::TokenArguments),
     /// Make a certificate and its key for trials with TLS: cert.pem and key.pem
     #[command(after_help = "Examples:\n  \
@@ -159,7 +161,7 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    let ended = match Arguments::parse().command {
+    let ended = match palpate::arguments::parse::<Arguments>().command {
         Command::Run(arguments) => within_memory(|| run::run_script(&arguments)),
         Command::Check(arguments) => within_memory(|| check::check(&arguments)),
         Command::Render(arguments) => within_memory(|| render::render(&arguments)),

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Each module of `palpate` may use those before it.
-const MODULES: [&str; 21] = [
+const MODULES: [&str; 22] = [
     "refusal",
     "printable",
     "limits",
@@ -14,6 +14,7 @@ const MODULES: [&str; 21] = [
     "priority",
     "ids",
     "memory",
+    "arguments",
     "budget",
     "shape",
     "scene",
@@ -64,8 +65,9 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 9] = [
 ];
 
 /// The modules of `palpate` that a module of the programs may use. `link` simulates the far end; the others read files.
-const FOR_PROGRAMS: [(&str, &[&str]); 5] = [
+const FOR_PROGRAMS: [(&str, &[&str]); 6] = [
     ("link", &["force_law", "limits", "memory", "scene", "session", "sheet"]),
+    ("main", &["arguments"]),
     ("placement", &["scene"]),
     ("play", &["journal", "scene", "shape", "wire"]),
     ("prediction", &["journal"]),
@@ -76,7 +78,8 @@ const FOR_PROGRAMS: [(&str, &[&str]); 5] = [
 const FOR_SIMULATED: [(&str, &[&str]); 2] = [("load", &["scene"]), ("scene_file", &["limits", "scene", "wire"])];
 
 /// The modules of `palpate` that libpalpate may use: `server` reads the text of a scene, `options` makes copies of tissues.
-const FOR_LIBPALPATE: [(&str, &[&str]); 2] = [("options", &["journal"]), ("server", &["limits", "scene", "wire"])];
+const FOR_LIBPALPATE: [(&str, &[&str]); 2] =
+    [("options", &["journal"]), ("server", &["limits", "refusal", "scene", "wire"])];
 
 /// The subcommands: none uses another.
 const SUBCOMMANDS: [&str; 11] =

@@ -120,10 +120,10 @@ fn repair_that_is_not_what_was_asked_for_ends_with_1() {
         told.contains("not as asked for") && json["faults"][0].as_str().unwrap().contains("% of the area"),
         "{told}"
     );
-    // So few vertices are no surface.
-    let (status, json, told) = ends(OCTAHEDRON, &["--vertices", "3"]);
+    // Each of two surfaces has 4 vertices at least.
+    let (status, json, told) = ends(&other(20, 100), &["--vertices", "5"]);
     assert_eq!(status, 1, "{told}");
-    assert!(json["before"]["area_m2"].as_f64().unwrap() > 0.0 && told.contains("more than 3"), "{told}");
+    assert!(json["before"]["area_m2"].as_f64().unwrap() > 0.0 && told.contains("more than 5"), "{told}");
 }
 
 #[test]

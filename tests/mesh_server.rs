@@ -469,6 +469,47 @@ async fn a_mesh_that_a_client_sends_makes_the_session_that_its_file_does() {
     server.create(Source::Scene(all), true).await.unwrap();
 }
 
+async fn delete_journal(server: &Server, id: &str) -> Result<u32, Status> {
+    let request = pb::DeleteJournalRequest { session_id: id.to_owned() };
+    Ok(server.sessions().await.delete_journal(request).await?.into_inner().files)
+}
+
+#[tokio::test]
+async fn a_mesh_that_was_sent_stays_in_journals_only_as_long_as_its_owner_is_told() {
+    let folder = folder();
+    let scene = scene(&folder);
+    let file = std::fs::read(folder.path().join("ball.obj")).unwrap();
+    let (journals, config) = (folder.path().join("journals"), folder.path().join("patient.conf"));
+    std::fs::write(&config, "[limits]\nwork_s = 600.0\n").unwrap();
+    let start = |more: &[&str]| {
+        let usual = ["--journal", journals.to_str().unwrap(), "--config", config.to_str().unwrap()];
+        Server::start(&[&usual[..], more].concat())
+    };
+    let kept = || palpate::journal::file::list(&journals).unwrap().len();
+    let server = start(&[]);
+    let sent = upload(&server, &file, 100_000, "m", false).await.unwrap();
+    assert!(sent.kept.contains("30 days") && sent.kept.contains("DeleteJournal"), "{}", sent.kept);
+    let id = server.create(Source::Scene(on(&sent.mesh_id, &scene)), true).await.unwrap().session_id;
+    assert_eq!(kept(), 1);
+    let refused = delete_journal(&server, &id).await.unwrap_err();
+    assert!(refused.message().contains("goes on: delete it first"), "{refused:?}");
+    server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id: id.clone() }).await.unwrap();
+    assert_eq!((kept(), delete_journal(&server, &id).await.unwrap(), kept()), (1, 1, 0));
+    for unknown in [id.as_str(), "../patient", ""] {
+        assert_eq!(delete_journal(&server, unknown).await.unwrap_err().code(), Code::NotFound, "{unknown}");
+    }
+    drop(server);
+
+    // Kept out of journals: a session on it has none, and the others have theirs.
+    let server = start(&["--journal-meshes", "false"]);
+    let sent = upload(&server, &file, 100_000, "m", false).await.unwrap();
+    assert_eq!(sent.kept, "");
+    let session = server.create(Source::Scene(on(&sent.mesh_id, &scene)), true).await.unwrap();
+    assert_eq!((session.journal, kept()), (None, 0));
+    server.paper(true).await;
+    assert_eq!(kept(), 1);
+}
+
 #[tokio::test]
 async fn a_material_and_inclusions_are_told_and_what_is_wrong_with_them_is_named() {
     let (folder, server) = ball();

@@ -2,6 +2,7 @@
 // libpalpate.so (Windows: palpate.dll) where your program finds native libraries. C# 7, .NET Standard 2.0, Mono, Unity.
 // The rules of palpate.h hold: which thread may call what, and what waits.
 using System;
+using System.Globalization;
 using System.Runtime.InteropServices;
 using System.Text;
 
@@ -185,6 +186,8 @@ namespace Palpate
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_scenes(IntPtr server, byte[] names, UIntPtr capacity, out UIntPtr needed);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_create(IntPtr server, byte[] scene, out IntPtr session);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_create_from_text(IntPtr server, byte[] scene, out IntPtr session);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_create_from_file(IntPtr server, byte[] path, out IntPtr session);
+        [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_create_from_mesh(IntPtr server, byte[] scene, byte[] name, byte[] bytes, UIntPtr count, out IntPtr session);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_join(IntPtr server, byte[] id, out IntPtr session);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_id(IntPtr session, byte[] id, UIntPtr capacity, out UIntPtr needed);
         [DllImport(Library, CallingConvention = C)] internal static extern Code palpate_session_extent(IntPtr session, out Extent extent);
@@ -289,12 +292,54 @@ namespace Palpate
             return new Session(session);
         }
 
-        /// <summary>Makes a session of the text of a scene. Waits for the server.</summary>
+        /// <summary>Makes a session of the text of a scene that names no file. Waits for the server.</summary>
         public Session CreateFromText(string scene)
         {
             IntPtr session;
             Native.Check(Native.palpate_session_create_from_text(Pointer, Native.Utf8(scene), out session));
             return new Session(session);
+        }
+
+        /// <summary>Makes a session of a scene file of yours, and sends its mesh. Waits for the server.</summary>
+        public Session CreateFromFile(string path)
+        {
+            IntPtr session;
+            Native.Check(Native.palpate_session_create_from_file(Pointer, Native.Utf8(path), out session));
+            return new Session(session);
+        }
+
+        /// <summary>Makes a session of the text of a scene and the bytes of a mesh file, which [mesh] of the text calls `name`. `Obj` makes
+        /// such bytes of an engine's mesh. Waits for the server.</summary>
+        public Session CreateFromMesh(string scene, string name, byte[] bytes)
+        {
+            IntPtr session;
+            var count = (UIntPtr)(ulong)bytes.Length;
+            Native.Check(Native.palpate_session_create_from_mesh(Pointer, Native.Utf8(scene), Native.Utf8(name), bytes, count, out session));
+            return new Session(session);
+        }
+
+        /// <summary>A mesh in these axes as a file (OBJ) in Palpate's own: three coordinates for each vertex, three vertices for each
+        /// triangle.</summary>
+        public static byte[] Obj(float[] positions, int[] triangles, Axes axes)
+        {
+            var text = new StringBuilder();
+            // Unity has y and z exchanged; Unreal x and y, and centimetres.
+            int[] at = axes == Axes.Unity ? new[] { 0, 2, 1 } : axes == Axes.Unreal ? new[] { 1, 0, 2 } : new[] { 0, 1, 2 };
+            double metres = axes == Axes.Unreal ? 0.01 : 1.0;
+            for (int k = 0; k + 2 < positions.Length; k += 3)
+            {
+                text.Append('v');
+                foreach (int axis in at) text.Append(' ').Append((metres * positions[k + axis]).ToString("R", CultureInfo.InvariantCulture));
+                text.Append('\n');
+            }
+            // Unity's triangles are clockwise from outside.
+            bool isTurned = axes == Axes.Unity;
+            for (int k = 0; k + 2 < triangles.Length; k += 3)
+            {
+                int b = triangles[k + (isTurned ? 2 : 1)] + 1, c = triangles[k + (isTurned ? 1 : 2)] + 1;
+                text.Append("f ").Append(triangles[k] + 1).Append(' ').Append(b).Append(' ').Append(c).Append('\n');
+            }
+            return Encoding.UTF8.GetBytes(text.ToString());
         }
 
         /// <summary>Joins a session by its id. Waits for the server.</summary>

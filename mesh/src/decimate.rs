@@ -28,6 +28,9 @@ const QUALITY: f64 = 0.2;
 /// Triangles around a vertex, above which it stays as it is: the work for a collapse grows with them.
 const MOST_AROUND: usize = 256;
 
+/// A closed surface has so many at least.
+pub const LEAST_VERTICES: usize = 4;
+
 /// A place on a mesh.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Place {

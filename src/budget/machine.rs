@@ -7,9 +7,24 @@ const UNKNOWN: u64 = 1 << 30;
 
 /// Bytes: half of what the machine has, or of what the control groups of this process leave it, if that is less.
 pub fn half_of_the_machine() -> u64 {
-    let machine = std::fs::read_to_string("/proc/meminfo").ok().and_then(|text| total(&text));
+    let machine =
+        std::fs::read_to_string("/proc/meminfo").ok().and_then(|text| total(&text)).or_else(told_by_the_system);
     let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
-    groups_of(&groups).into_iter().filter_map(|file| number(&file)).chain(machine).min().unwrap_or(UNKNOWN) / 2
+    let limits = groups_of(&groups).into_iter().filter_map(|file| limit(&std::fs::read_to_string(file).ok()?));
+    limits.chain(machine).min().unwrap_or(UNKNOWN) / 2
+}
+
+/// What the machine has, where /proc does not tell it (`ProcSubset=pid` of a systemd unit).
+fn told_by_the_system() -> Option<u64> {
+    #[cfg(target_os = "linux")]
+    {
+        let told = rustix::system::sysinfo();
+        #[allow(clippy::useless_conversion)]
+        let total = u64::from(told.totalram).checked_mul(u64::from(told.mem_unit))?;
+        (total > 0).then_some(total)
+    }
+    #[cfg(not(target_os = "linux"))]
+    None
 }
 
 /// `MemTotal:  16324520 kB`.
@@ -38,9 +53,10 @@ fn groups_of(text: &str) -> Vec<PathBuf> {
     files
 }
 
-/// `max` is no number.
-fn number(file: &Path) -> Option<u64> {
-    std::fs::read_to_string(file).ok()?.trim().parse().ok()
+/// What the file of a group says. A group without a limit says `max`, or the largest number of whole pages, 9.2e18 bytes.
+fn limit(text: &str) -> Option<u64> {
+    const NO_MACHINE_HAS: u64 = 1 << 56;
+    text.trim().parse().ok().filter(|bytes| *bytes < NO_MACHINE_HAS)
 }
 
 /// What has been freed and lies about in the allocator goes back to the system. Some milliseconds: not for a thread that
@@ -110,6 +126,13 @@ mod tests {
     #[test]
     fn the_machine_has_memory_and_groups_are_found() {
         assert!(half_of_the_machine() > 1 << 20);
+        assert_eq!(limit("4294967296\n"), Some(4 << 30));
+        assert_eq!((limit("max\n"), limit("9223372036854771712\n")), (None, None));
+        #[cfg(target_os = "linux")]
+        {
+            let by_proc = total(&std::fs::read_to_string("/proc/meminfo").unwrap()).unwrap();
+            assert_eq!(told_by_the_system(), Some(by_proc));
+        }
         assert_eq!(total("MemFree: 1 kB\nMemTotal:       2048 kB\n"), Some(2 << 20));
         let files = groups_of("12:cpu,cpuacct:/x\n3:memory:/a\n0::/b/c\n");
         let told: Vec<_> = files.iter().map(|file| file.to_str().unwrap()).collect();

@@ -37,12 +37,22 @@ pub enum Topic {
     End = 6,
     /// `Waiting`.
     Waiting = 7,
+    /// `Signature`.
+    Signatures = 8,
 }
 
 impl Topic {
     /// All of them.
-    pub const ALL: [Topic; 7] =
-        [Topic::Header, Topic::Inputs, Topic::Hashes, Topic::Snapshots, Topic::Felt, Topic::End, Topic::Waiting];
+    pub const ALL: [Topic; 8] = [
+        Topic::Header,
+        Topic::Inputs,
+        Topic::Hashes,
+        Topic::Snapshots,
+        Topic::Felt,
+        Topic::End,
+        Topic::Waiting,
+        Topic::Signatures,
+    ];
 
     /// The topic of its channel.
     pub fn name(self) -> &'static str {
@@ -54,6 +64,7 @@ impl Topic {
             Topic::Felt => "/felt",
             Topic::End => "/end",
             Topic::Waiting => "/waiting",
+            Topic::Signatures => "/signatures",
         }
     }
 
@@ -67,6 +78,7 @@ impl Topic {
             Topic::Felt => "Felt",
             Topic::End => "End",
             Topic::Waiting => "Waiting",
+            Topic::Signatures => "Signature",
         }
     }
 
@@ -118,9 +130,9 @@ pub fn schema_of(file: &str) -> Vec<u8> {
     Files { file: kept }.encode_to_vec()
 }
 
-/// The schemas and channels of all topics, as records.
-pub(super) fn channels(out: &mut Vec<u8>) {
-    for topic in Topic::ALL {
+/// The schemas and channels of all topics, as records; that of signatures only if there are some.
+pub(super) fn channels(out: &mut Vec<u8>, signed: bool) {
+    for topic in Topic::ALL.into_iter().filter(|topic| signed || *topic != Topic::Signatures) {
         records::record(out, SCHEMA, |body| {
             body.extend(topic.channel().to_le_bytes());
             records::string(body, &format!("palpate.journal.v1.{}", topic.message()));

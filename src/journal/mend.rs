@@ -23,7 +23,8 @@ fn unwritten(e: &io::Error) -> Refusal {
 /// summary. Tells what the journal had.
 ///
 /// # Errors
-/// Refuses a journal that is damaged in the middle, and an output that can't be written.
+/// Refuses a journal that is damaged in the middle, unless it is read [up to that](Reader::up_to_damage), and an output that can't
+/// be written.
 pub fn recover<R: Read + Seek>(
     mut reader: Reader<R>,
     output: &mut (impl Read + Write + Seek),
@@ -40,9 +41,10 @@ pub fn recover<R: Read + Seek>(
     }
     if survey.end.is_none() {
         let writer = Writer::after(survey.batches, survey.inputs, survey.until_step);
-        let message = match survey.torn_bytes {
-            0 => "the server had no time to finish it".to_owned(),
-            bytes => format!("{bytes} bytes at its end belonged to no whole batch"),
+        let message = match (&survey.damage, survey.torn_bytes) {
+            (Some(damage), bytes) => format!("{damage}; the {bytes} bytes from there on are left out"),
+            (None, 0) => "the server had no time to finish it".to_owned(),
+            (None, bytes) => format!("{bytes} bytes at its end belonged to no whole batch"),
         };
         written(output.write_all(&writer.finish(pb::Why::Recovered, &message, survey.until_step, survey.unix_ns[1])))?;
     }
@@ -63,7 +65,8 @@ pub fn cut<R: Read + Seek>(
     let survey = reader.survey(&mut |_| {})?;
     let end = survey.until_step;
     if to <= from || to > end {
-        let message = format!("must be above --from and at most {end}, which the journal has, but is {to}");
+        let damage = survey.damage.map_or(String::new(), |damage| format!("; the journal is {damage}"));
+        let message = format!("must be above --from and at most {end}, which the journal has, but is {to}{damage}");
         return Err(Refusal::new(Reason::OutOfRange, "to", message));
     }
     let (session, _, mut reader) = Replay::near(reader, survey, limits, from)?.reach(from, &NEVER)?;

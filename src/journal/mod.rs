@@ -13,6 +13,9 @@
 //! whole batch. Each batch says how many before it were on the disk for certain: damage among those is an error that names
 //! the place ([`reader`]).
 //!
+//! **Proof.** Hashes show that the same inputs still give the same bits, not who wrote them: who can change an input can change the
+//! hashes too. A server with a key signs its journals ([`signature`]).
+//!
 //! **Use.** Who records makes a [`Writer`] with an [`Opening`], tells it what happens ([`crate::session::input::Input`]), and
 //! appends what each [`Writer::flush`] gives; after each sync it tells [`Writer::durable`]. Who goes on after a restart calls
 //! [`resume`].
@@ -30,6 +33,7 @@ pub mod reader;
 pub mod records;
 pub mod replay;
 pub mod seal;
+pub mod signature;
 pub mod writer;
 
 pub use format::{REPLAYS, Topic};

@@ -72,6 +72,7 @@ impl Batch {
                 Topic::Felt => memory_of::<pb::Felt>(bytes, measure::ROOM),
                 Topic::Waiting => memory_of::<pb::Waiting>(bytes, measure::ROOM),
                 Topic::End => memory_of::<pb::End>(bytes, measure::ROOM),
+                Topic::Signatures => memory_of::<pb::Signature>(bytes, measure::ROOM),
             };
             let memory =
                 memory.map_err(|refusal| self.refuse(format!("a message {}: {}", topic.name(), refusal.message)))?;
@@ -88,6 +89,11 @@ impl Batch {
             M::decode(&self.data[range.clone()])
                 .map_err(|e| self.refuse(format!("a message {} can't be decoded: {e}", topic.name())))
         })
+    }
+
+    /// Each of its messages that is known here, as it was written, in order.
+    pub(super) fn messages(&self) -> impl Iterator<Item = (Topic, &[u8])> {
+        self.messages.iter().map(|(topic, range)| (*topic, &self.data[range.clone()]))
     }
 
     /// The content of its chunk.
@@ -214,6 +220,8 @@ pub struct Survey {
     pub torn_bytes: u64,
     /// Whether the file has a summary, so that every tool opens it.
     pub sealed: bool,
+    /// Why reading ended before the end, if the file is damaged there and is read [up to that](Reader::up_to_damage).
+    pub damage: Option<String>,
 }
 
 /// Changes of the tissue that wait, at most: more than any session lets wait.
@@ -248,6 +256,9 @@ pub struct Reader<R> {
     torn_bytes: u64,
     sealed: bool,
     ended: bool,
+    /// Damage ends the journal in place of being an error.
+    stops_at_damage: bool,
+    damage: Option<String>,
     /// Where the source stands: to seek empties its buffer.
     stands: u64,
     /// The newest head of a record that was read, and where it is.
@@ -318,6 +329,8 @@ impl<R: Read + Seek> Reader<R> {
             torn_bytes: 0,
             sealed: false,
             ended: false,
+            stops_at_damage: false,
+            damage: None,
             stands: length,
             peeked: None,
             paid,
@@ -358,6 +371,18 @@ impl<R: Read + Seek> Reader<R> {
         self
     }
 
+    /// For a user who wants what is whole: a journal that is damaged in the middle ends there, and [`Reader::damage`] tells why. Who
+    /// goes on with a session wants an error.
+    #[must_use]
+    pub fn up_to_damage(self) -> Self {
+        Reader { stops_at_damage: true, ..self }
+    }
+
+    /// Why the last batch is not that of the journal, if it is damaged behind it; known after that batch.
+    pub fn damage(&self) -> Option<&str> {
+        self.damage.as_deref()
+    }
+
     /// What refusals call the file.
     pub fn place(&self) -> &str {
         &self.place
@@ -386,12 +411,13 @@ impl<R: Read + Seek> Reader<R> {
     /// Where a batch is that holds a snapshot: the next batch will be that one.
     pub fn go_to(&mut self, snapshot: &SnapshotAt) {
         (self.at, self.batch, self.ended, self.torn_bytes) = (snapshot.offset, snapshot.batch, false, 0);
-        self.input = u64::MAX;
+        (self.input, self.damage) = (u64::MAX, None);
     }
 
     /// Goes back to the first batch.
     pub fn rewind(&mut self) {
         (self.at, self.batch, self.input, self.ended, self.torn_bytes) = (self.begin, 0, 0, false, 0);
+        self.damage = None;
     }
 
     /// The bytes before the first batch.
@@ -407,7 +433,7 @@ impl<R: Read + Seek> Reader<R> {
     /// One pass over the file, from its beginning, which is where it is afterwards. `progress` gets the bytes that are read.
     ///
     /// # Errors
-    /// Refuses a file that is damaged in the middle.
+    /// Refuses a file that is damaged in the middle, unless it is read [up to that](Reader::up_to_damage).
     pub fn survey(&mut self, progress: &mut dyn FnMut(u64)) -> Result<Survey> {
         self.rewind();
         let mut survey = Survey { whole_bytes: self.begin, ..Survey::default() };
@@ -434,6 +460,7 @@ impl<R: Read + Seek> Reader<R> {
             progress(self.at);
         }
         (survey.torn_bytes, survey.sealed) = (self.torn_bytes, self.sealed);
+        survey.damage.clone_from(&self.damage);
         self.rewind();
         Ok(survey)
     }
@@ -441,7 +468,7 @@ impl<R: Read + Seek> Reader<R> {
     /// The next batch; `None` after the last whole one.
     ///
     /// # Errors
-    /// Refuses a file that is damaged before its end.
+    /// Refuses a file that is damaged before its end, unless it is read [up to that](Reader::up_to_damage).
     pub fn next_batch(&mut self) -> Result<Option<Batch>> {
         while !self.ended {
             let wrong = match self.next_record()? {
@@ -627,7 +654,10 @@ impl<R: Read + Seek> Reader<R> {
                 "damaged at byte {at}, in batch {batch}: {what}; batch {} at byte {} says that it had been on the disk",
                 found.0, found.1
             );
-            return Err(self.refuse(&message));
+            if !self.stops_at_damage {
+                return Err(self.refuse(&message));
+            }
+            self.damage = Some(message);
         }
         self.torn_bytes = self.length - at;
         Ok(())

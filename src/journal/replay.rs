@@ -133,8 +133,9 @@ impl<R: Read + Seek> Replay<R> {
     fn near_with(reader: Reader<R>, survey: Survey, limits: &Limits, step: u64, known: Option<Known>) -> Result<Self> {
         let begin = reader.header().begin_step;
         if !(begin..=survey.until_step).contains(&step) {
+            let damage = survey.damage.map_or(String::new(), |damage| format!("; the journal is {damage}"));
             let message =
-                format!("must be from {begin} to {}, which the journal has, but is {step}", survey.until_step);
+                format!("must be from {begin} to {}, which the journal has, but is {step}{damage}", survey.until_step);
             let refusal = Refusal::new(Reason::OutOfRange, "step", message);
             return Err(Refusal { place: Some(reader.place().to_owned()), ..refusal });
         }
@@ -423,7 +424,8 @@ impl<R: Read + Seek> Replay<R> {
             }
             Ok(())
         })?;
-        Ok(Verdict { steps: [begin, end], compared: self.compared(), difference: self.difference })
+        let proved_until = self.equal_until.unwrap_or(begin).max(begin);
+        Ok(Verdict { steps: [begin, end], proved_until, compared: self.compared(), difference: self.difference })
     }
 
     /// Goes on to the end of the journal, for a server that goes on with the session: commands for the step after its end
@@ -611,6 +613,9 @@ pub fn session_at<R: Read + Seek>(
 pub struct Verdict {
     /// Steps done at the beginning and at the end.
     pub steps: [u64; 2],
+    /// The last step whose hash is in the journal and was equal: nothing is known of the steps after it. That of the beginning if no
+    /// hash was compared.
+    pub proved_until: u64,
     /// Hashes and snapshots that were compared.
     pub compared: [u64; 2],
     /// The first difference.

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use super::format::{self, MOST_INPUTS, REPLAYS, Topic, VERSION};
 use super::message::{self, Tips};
 use super::records::{self, Chunk};
+use super::signature::{Key, Signer};
 use crate::session::input::{Felt, Input};
 use crate::sheet::Model;
 
@@ -80,6 +81,9 @@ pub struct Writer {
     bytes: usize,
     /// Chunks that are full before their flush.
     full: Vec<u8>,
+    signer: Option<Signer>,
+    /// Nothing comes after the batch that is written.
+    ends: bool,
 }
 
 impl Writer {
@@ -107,7 +111,15 @@ impl Writer {
             bytes: bytes.len(),
             messages: vec![(Topic::Header, bytes)],
             full: Vec::new(),
+            signer: None,
+            ends: false,
         }
+    }
+
+    /// The same, which signs what it writes.
+    #[must_use]
+    pub fn signed(self, key: Option<&Key>) -> Self {
+        Writer { signer: key.map(|key| Signer::new(key.clone())), ..self }
     }
 
     /// For what is appended to a journal that has so many batches and inputs, up to a step.
@@ -229,6 +241,7 @@ impl Writer {
     pub fn finish(mut self, why: pb::Why, message: &str, until_step: u64, unix_ns: u64) -> Vec<u8> {
         let end = pb::End { why: why.into(), message: message.to_owned() };
         self.message(Topic::End, end.encode_to_vec());
+        self.ends = true;
         self.flush(until_step, unix_ns)
     }
 
@@ -238,7 +251,7 @@ impl Writer {
         let mut channels = Vec::new();
         if self.batches == 0 {
             self.full = records::beginning(&format!("palpate {VERSION}"));
-            format::channels(&mut channels);
+            format::channels(&mut channels, self.signer.is_some());
         }
         let mut chunk = Chunk::new(self.unix_ns, self.batches as u32, &channels);
         let inputs = std::mem::take(&mut self.inputs);
@@ -252,13 +265,22 @@ impl Writer {
         };
         let messages = std::mem::take(&mut self.messages);
         let (first, others) = messages.split_at(messages.iter().filter(|message| message.0 == Topic::Header).count());
-        first.iter().for_each(|(topic, bytes)| chunk.add(topic.channel(), bytes));
-        chunk.add(Topic::Inputs.channel(), &inputs.encode_to_vec());
+        let mut add = |topic: Topic, bytes: &[u8]| {
+            chunk.add(topic.channel(), bytes);
+            if let Some(signer) = &mut self.signer {
+                signer.add(topic, self.unix_ns, bytes);
+            }
+        };
+        first.iter().for_each(|(topic, bytes)| add(*topic, bytes));
+        add(Topic::Inputs, &inputs.encode_to_vec());
         if !self.moments.is_empty() {
             let moments = std::mem::take(&mut self.moments);
-            chunk.add(Topic::Felt.channel(), &pb::Felt { moments }.encode_to_vec());
+            add(Topic::Felt, &pb::Felt { moments }.encode_to_vec());
         }
-        others.iter().for_each(|(topic, bytes)| chunk.add(topic.channel(), bytes));
+        others.iter().for_each(|(topic, bytes)| add(*topic, bytes));
+        if let Some(signature) = self.signer.as_mut().and_then(|signer| signer.sign(self.unix_ns, self.ends)) {
+            chunk.add(Topic::Signatures.channel(), &signature);
+        }
         self.full.extend(chunk.finish());
         self.batches += 1;
         self.inputs_before += count;

@@ -52,6 +52,8 @@ pub struct Begin {
     pub waiting: Vec<(u64, Input)>,
     /// It begins frozen, and is not served till [`Live::arrive`].
     pub frozen: bool,
+    /// Its tape is told what happens to it, if the server keeps tapes.
+    pub recorded: bool,
 }
 
 /// The name of a new session.
@@ -61,6 +63,8 @@ pub struct Birth {
     pub id: String,
     /// The revision at which this server became its owner; 0 without a fleet.
     pub revision: u64,
+    /// Its tape is told what happens to it, if the server keeps tapes.
+    pub recorded: bool,
 }
 
 impl Birth {
@@ -69,7 +73,7 @@ impl Birth {
     /// # Errors
     /// Refuses if the system has no random numbers.
     pub fn new() -> Result<Self> {
-        Ok(Birth { id: random_id()?, revision: 0 })
+        Ok(Birth { id: random_id()?, revision: 0, recorded: true })
     }
 }
 
@@ -96,7 +100,7 @@ impl Pacer {
     /// As for [`Pacer::create`].
     pub fn create_as(
         &self,
-        Birth { id, revision }: Birth,
+        Birth { id, revision, recorded }: Birth,
         scene: &Scene,
         (paused, idle_timeout_s): (bool, f64),
         owner: &Account,
@@ -119,6 +123,7 @@ impl Pacer {
             revision,
             waiting: Vec::new(),
             frozen: false,
+            recorded,
         };
         self.admit(begin, owner, slot, || Ok(Session::new(&model)), stop)
     }
@@ -149,7 +154,19 @@ impl Pacer {
         session: impl FnOnce() -> Result<Session>,
         stop: &AtomicBool,
     ) -> Result<Arc<Live>> {
-        let Begin { id, first, running, until, idle_timeout_s, playback, after_run, revision, waiting, frozen } = begin;
+        let Begin {
+            id,
+            first,
+            running,
+            until,
+            idle_timeout_s,
+            playback,
+            after_run,
+            revision,
+            waiting,
+            frozen,
+            recorded,
+        } = begin;
         let speed = playback.as_ref().map_or(1.0, |playback| playback.speed);
         check_work(&first, &self.limits)?;
         let skin = memory::attempt("sheet.points", || Ok(Skin::of(&first)))?;
@@ -211,7 +228,7 @@ impl Pacer {
             revision,
         };
         // What is played is recorded already.
-        let tape = self.tapes.get().filter(|_| playback.is_none()).map(|queue| Tape::new(queue, about()));
+        let tape = self.tapes.get().filter(|_| recorded && playback.is_none()).map(|queue| Tape::new(queue, about()));
         let live = Arc::new(Live {
             id: id.clone(),
             intake: Mutex::new(intake),

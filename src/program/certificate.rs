@@ -74,7 +74,7 @@ fn is_name(name: &str) -> bool {
 }
 
 /// Writes the key so that only its owner can read it, also over a file that others could read.
-fn write_key(path: &Path, pem: &str) -> Result<(), Failure> {
+pub(crate) fn write_key(path: &Path, pem: &str) -> Result<(), Failure> {
     let failed = |e: std::io::Error| Failure::Failed(format!("{}: can't be written: {e}", path.display()));
     match std::fs::remove_file(path) {
         Err(e) if e.kind() != std::io::ErrorKind::NotFound => return Err(failed(e)),
@@ -103,7 +103,7 @@ fn next(names: &[String], days: u16, cert: &Path, key: &Path) -> String {
         // Others can reach such a server, so that it asks for tokens.
         Some(_) => (
             "0.0.0.0:7117",
-            "A token for the client:\n  palpate token --name me --role create,touch --tokens tokens.toml > me.token\n\n"
+            "A token for the client:\n  (umask 077; palpate token --name me --role create,touch --tokens tokens.toml > me.token)\n\n"
                 .to_owned(),
             " --tokens tokens.toml",
             " --token-file me.token",

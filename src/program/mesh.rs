@@ -5,7 +5,7 @@ use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 
 use palpate::printable::{printable, printable_json};
-use palpate_mesh::decimate::decimate;
+use palpate_mesh::decimate::{LEAST_VERTICES, decimate};
 use palpate_mesh::repair::{Measure, Repair, repair};
 use palpate_mesh::report::{Finding, LISTED, Report, Spread};
 use palpate_mesh::write::{Format, write};
@@ -27,7 +27,7 @@ pub(crate) struct MeshArguments {
     /// Mend what can be mended, and tell what was done
     #[arg(long)]
     repair: bool,
-    /// Make it coarser: at most so many vertices
+    /// Make it coarser: at most so many vertices, 4 or more
     #[arg(long, value_name = "N")]
     vertices: Option<usize>,
     /// Write the mesh to a file that ends in .obj, .stl or .ply; its lengths are metres
@@ -69,6 +69,10 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
         return Err(Failure::Refused(format!("{name}: {message}")));
     };
     let unit: Unit = unit.parse().map_err(|problem| Failure::Refused(format!("--unit: {problem}")))?;
+    if let Some(vertices) = arguments.vertices.filter(|vertices| *vertices < LEAST_VERTICES) {
+        let message = format!("--vertices: must be at least {LEAST_VERTICES}, but is {vertices}");
+        return Err(Failure::Refused(message));
+    }
     let output = arguments.output.as_ref().map(|path| Ok((path, Format::of(&path.display().to_string())?)));
     let output = output
         .transpose()

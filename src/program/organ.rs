@@ -20,7 +20,7 @@ pub(crate) struct OrganArguments {
     #[arg(long, value_name = "N", default_value_t = 1)]
     seed: u64,
     /// The file to write, in metres: .obj, .stl or .ply
-    #[arg(short, long, value_name = "FILE", required_unless_present = "list")]
+    #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// List the organs
     #[arg(long, exclusive = true)]
@@ -29,11 +29,14 @@ pub(crate) struct OrganArguments {
 
 /// Makes an organ, or lists them.
 pub(crate) fn organ(arguments: &OrganArguments) -> Result<(), Failure> {
-    let (Some(name), Some(output)) = (&arguments.name, &arguments.output) else { return list() };
-    let format = Format::of(&output.display().to_string());
-    let format = format.map_err(|problem| Failure::Refused(format!("--output: {problem}")))?;
+    let Some(name) = &arguments.name else { return list() };
     let refused = |argument: &str, error: OrganError| Failure::Refused(format!("{argument}: {error}"));
     let organ: Organ = name.parse().map_err(|error| refused("NAME", error))?;
+    let Some(output) = &arguments.output else {
+        return Err(Failure::Refused(format!("--output: is missing: give the file to write, such as {organ}.obj")));
+    };
+    let format = Format::of(&output.display().to_string());
+    let format = format.map_err(|problem| Failure::Refused(format!("--output: {problem}")))?;
     let mesh = organ::generate(organ, arguments.edge_mm * 1e-3, arguments.seed).map_err(|error| {
         let argument = if matches!(error, OrganError::NotAManifold { .. }) { "--seed" } else { "--edge-mm" };
         refused(argument, error)

@@ -22,6 +22,9 @@ pub(crate) struct RenderArguments {
     /// The moment to draw, s, rounded to a step [default: the sample time with the largest displacement]
     #[arg(long, value_name = "SECONDS")]
     at_s: Option<f64>,
+    /// The moment to draw, steps done
+    #[arg(long, value_name = "STEP", conflicts_with = "at_s")]
+    at: Option<u64>,
     /// Show the mesh instead of the texture
     #[arg(long)]
     wireframe: bool,
@@ -69,9 +72,16 @@ pub(crate) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
         let message = format!("must be from 0 to {lasts_s}, the script's duration, but is {at_s}");
         if holds { Ok(step as u64) } else { Err(refused("at-s", message)) }
     });
-    let at_step = at_step.transpose()?;
+    let in_steps = arguments.at.map(|step| {
+        let message = format!("must be from 0 to {}, the script's duration in steps, but is {step}", script.steps);
+        if step <= script.steps { Ok(step) } else { Err(refused("at", message)) }
+    });
+    let at_step = at_step.or(in_steps).transpose()?;
     if moves && at_step.is_some() {
-        return Err(refused("at-s", "applies to a .png only: a .gif shows the whole script".to_owned()));
+        return Err(refused(
+            if arguments.at.is_some() { "at" } else { "at-s" },
+            "applies to a .png only: a .gif shows the whole script".to_owned(),
+        ));
     }
     let camera = arguments.camera.parse()?;
     let cells = (model.shape().longest_side_m() / model.shape().edge_m()).round().max(1.0) as u32;

@@ -27,9 +27,14 @@ pub(crate) struct SceneArguments {
 
 /// Compiles the scene that the arguments name; returns it with the limits in force.
 pub(super) fn compile(arguments: &SceneArguments) -> Result<(Arc<Model>, Limits), Failure> {
+    compile_with(arguments, &[])
+}
+
+/// The same with further keys overridden, `KEY=VALUE` each.
+pub(super) fn compile_with(arguments: &SceneArguments, further: &[String]) -> Result<(Arc<Model>, Limits), Failure> {
     let limits = load_config(arguments.config.as_deref())?.limits.offline();
     let path = &arguments.scene;
-    let scene = find_scene(path, &arguments.scenes, &arguments.set, &limits)?;
+    let scene = find_scene(path, &arguments.scenes, &[&arguments.set, further].concat(), &limits)?;
     // An error of compilation belongs to no single line.
     let in_scene = |refusal: Refusal| Refusal { place: Some(path.display().to_string()), ..refusal };
     Ok((Model::compile(&scene, &limits).map_err(in_scene)?, limits))

@@ -69,6 +69,14 @@ pub(crate) struct ServeArguments {
     /// these are removed: 30d, 12h, 10GiB, both, or 0 to keep none [default: 30d,10GiB]
     #[arg(long, value_name = "AGE,BYTES", requires = "journal")]
     journal_keep: Option<palpate::server::Keep>,
+    /// Whether sessions have journals if a client has sent their mesh: a journal contains it. Without one, such a session ends with
+    /// the server [default: true]
+    #[arg(long, value_name = "true|false", requires = "journal", action = clap::ArgAction::Set)]
+    journal_meshes: Option<bool>,
+    /// Sign the journals with this key (PEM), which `palpate journal key` makes: `verify --signed-by` then tells whether somebody has
+    /// changed one
+    #[arg(long, value_name = "FILE")]
+    journal_key: Option<PathBuf>,
     /// Be one of a fleet: URLs of the members of etcd, such as http://etcd:2379. Needs --journal and --advertise
     #[arg(long, value_name = "URL", value_delimiter = ',', requires = "advertise")]
     cluster: Vec<String>,
@@ -140,6 +148,10 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         if !folder.is_dir() {
             return Err(Failure::Refused(format!("{option} {}: is not a folder", folder.display())));
         }
+        if option == "--viewer" && !folder.join("index.html").is_file() {
+            let message = "has no index.html; `npm run build` in clients/viewer makes the page in clients/viewer/dist";
+            return Err(Failure::Refused(format!("{option} {}: {message}", folder.display())));
+        }
         key.clone_from(folder);
     }
     if let Some(threads) = arguments.threads {
@@ -153,6 +165,12 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     }
     if arguments.journal.is_some() {
         config.journal.clone_from(&arguments.journal);
+    }
+    if let Some(meshes) = arguments.journal_meshes {
+        config.journal_meshes = meshes;
+    }
+    if arguments.journal_key.is_some() {
+        config.journal_key.clone_from(&arguments.journal_key);
     }
     if let Some(keep) = arguments.journal_keep {
         config.journal_keep = keep;
@@ -214,12 +232,15 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         let shutdown = CancellationToken::new();
         signals::outlive();
         signals::cancel_on(shutdown.clone());
-        // The standard output may be closed; that does not stop the server.
-        let _ = writeln!(std::io::stdout(), "palpate listens on {}", listeners.url());
-        if let Some(url) = listeners.metrics_url() {
-            let _ = writeln!(std::io::stdout(), "metrics are at {url}");
-        }
-        Ok(server::serve(listeners, config, shutdown).await?)
+        let (url, metrics) = (listeners.url(), listeners.metrics_url());
+        let ready = move || {
+            // The standard output may be closed; that does not stop the server.
+            let _ = writeln!(std::io::stdout(), "palpate listens on {url}");
+            if let Some(url) = metrics {
+                let _ = writeln!(std::io::stdout(), "metrics are at {url}");
+            }
+        };
+        Ok(server::serve(listeners, config, shutdown, ready).await?)
     });
     runtime.shutdown_background();
     ended

@@ -33,6 +33,12 @@ pub(crate) fn token(arguments: &TokenArguments) -> Result<(), Failure> {
         );
         return printed.map_err(|e| Failure::Failed(e.to_string()));
     };
+    match std::fs::read_to_string(path) {
+        // The file with the entry has to be one that a server takes: another of that name is refused here, with its reason.
+        Ok(text) => drop(identity::Credentials::parse(path, &format!("{text}\n{entry}"))?),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {}
+        Err(e) => return Err(Failure::Refused(format!("{}: can't be read: {e}", path.display()))),
+    }
     let refuse = |e: std::io::Error| Failure::Refused(format!("{}: can't be written: {e}", path.display()));
     let mut options = std::fs::OpenOptions::new();
     options.append(true).create(true);

@@ -43,8 +43,18 @@ pub fn check_poke(poke: &Poke, shape: &dyn RestShape, limits: &Limits) -> Result
 /// Refuses one beyond the limit.
 pub fn check_reach(field: &str, shape: &dyn RestShape, displacement_m: f64, limits: &Limits) -> Result<()> {
     let limit_m = shape.longest_side_m() * limits.reach_in_sheets;
-    number(field, displacement_m, &format!("at most {limit_m} m from the rest position"), |v| v <= limit_m)?;
+    let range = format!("at most {limit_m} m from the rest position");
+    number(field, displacement_m, &range, |v| v <= limit_m).map_err(in_millimetres(displacement_m, limit_m))?;
     Ok(())
+}
+
+/// Asks, behind the refusal of a length, whether it is in millimetres: it would be right if it were.
+fn in_millimetres(length_m: f64, limit_m: f64) -> impl Fn(Refusal) -> Refusal {
+    let might_be = length_m > limit_m && length_m * 1e-3 <= limit_m;
+    move |refusal| {
+        let hint = if might_be { " m; millimetres? All lengths are in metres" } else { "" };
+        Refusal { message: refusal.message + hint, ..refusal }
+    }
 }
 
 /// Checks whether a point can be grasped.
@@ -74,7 +84,8 @@ pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
         _ => (longest_m, "the longest side of the tissue"),
     };
     let range = format!("above 0 and at most {most_m}, {what}");
-    number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= most_m)?;
+    number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= most_m)
+        .map_err(in_millimetres(tip.radius_m, most_m))?;
     number(&format!("{field}.friction"), tip.friction, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
     if let Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } = tip.coupling {
         let field = format!("{field}.spring");

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::document::read_text;
+use super::document::{Document, read_text};
 use super::kind::{Kind, ORDER};
 use super::reader::made_for;
 use super::script::{self, Script};
@@ -80,6 +80,10 @@ impl Collection {
             let file = format!("{name}.toml");
             let text = read_text(&path, limits.file_bytes)
                 .map_err(|refusal| Refusal { place: Some(file.clone()), ..refusal })?;
+            if Document::parse(&file, &text).is_ok_and(|document| self.kind.check(&document).is_err()) {
+                let refusal = Refusal::new(Reason::WrongKind, "", self.kind.misplaced());
+                return Err(Refusal { place: Some(file), ..refusal });
+            }
             return Ok((file, text));
         }
         let built_in = self.built_in.iter().find(|text| text.0 == name);

@@ -314,6 +314,22 @@ impl<'a> Fields<'a> {
     }
 }
 
+/// What serde says of a name that it does not know, with the nearest of those that it knows in place of all of them, if one is near.
+pub fn nearest_name(message: &str) -> String {
+    // As in "unknown field `lissen`, expected one of `listen`, `tls_cert`".
+    let mut names = message.split('`').skip(1).step_by(2);
+    match (message.starts_with("unknown field"), names.next()) {
+        // Or one that has all of another, as `max_sessions`.
+        (true, Some(given)) => match meant(given, names.clone()).or_else(|| {
+            names.clone().filter(|name| name.len() > 4 && given.contains(name)).max_by_key(|name| name.len())
+        }) {
+            Some(name) => format!("unknown key; did you mean `{name}`?"),
+            None => format!("unknown key; known here: {}", names.collect::<Vec<_>>().join(", ")),
+        },
+        _ => message.to_owned(),
+    }
+}
+
 /// The key that `there` is without its unit, or misspelt.
 fn meant<'k>(there: &str, keys: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
     let keys: Vec<&str> = keys.into_iter().collect();

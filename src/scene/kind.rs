@@ -41,6 +41,12 @@ impl Kind {
         }
     }
 
+    /// The refusal of a text of the other kind in a folder of this kind, where nobody has mixed up the order of arguments.
+    pub(super) fn misplaced(self) -> String {
+        let other = self.other().name();
+        format!("is a {other} in the folder of {}s: move it to the folder of {other}s", self.name())
+    }
+
     /// Refuses a document that has keys of the other kind and none of this one.
     pub(super) fn check(self, document: &Document) -> Result<()> {
         let has_keys_of = |kind: Kind| kind.keys().iter().any(|key| document.has(key));

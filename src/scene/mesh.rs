@@ -5,6 +5,7 @@ use std::collections::BinaryHeap;
 use std::sync::{Arc, OnceLock};
 
 use glam::{DQuat, DVec3};
+use palpate_mesh::decimate::LEAST_VERTICES;
 use palpate_mesh::surface::Surface;
 use palpate_mesh::work::spend;
 use palpate_mesh::{Group, TriangleMesh};
@@ -358,19 +359,28 @@ impl Mesh {
         if shape.told.fixed != Fixed::None && shape.is_fixed.iter().all(|fixed| *fixed) {
             warnings.push("mesh.fixed: every vertex is fixed: nothing moves".to_owned());
         }
-        let Stiffest { bound, usual, vertex, .. } = self.stiffest;
-        let faster = (bound / usual).sqrt();
-        if faster > MUCH_FASTER {
-            let point = PointId::new(vertex as usize);
+        if self.has_fast_vertex() {
+            let point = PointId::new(self.stiffest.vertex as usize);
             warnings.push(format!(
-                "mesh: {} at {:.4} m, with its short edges or small triangles, vibrates {faster:.1} times as fast as half of \
-                 the mesh: without such vertices a step would take as many fewer substeps (`palpate mesh FILE --repair`, or \
-                 mesh.vertices)",
+                "mesh: {} at {:.4} m, with its short edges or small triangles, vibrates {:.1} times as fast as half of the mesh: \
+                 without such vertices a step would take fewer substeps; `palpate check` finds out which mesh.vertices leaves \
+                 them out",
                 shape.name(point),
                 shape.rest_m(point),
+                self.fastest_ratio(),
             ));
         }
         warnings
+    }
+
+    /// How many times as fast the fastest vibration is as those of half of the mesh.
+    fn fastest_ratio(&self) -> f64 {
+        (self.stiffest.bound / self.stiffest.usual).sqrt()
+    }
+
+    /// Whether a few vertices vibrate so fast that they alone make the substeps many.
+    pub fn has_fast_vertex(&self) -> bool {
+        self.fastest_ratio() > MUCH_FASTER
     }
 
     pub(super) fn check(&self, limits: &Limits) -> Result<()> {
@@ -390,9 +400,6 @@ const APPROACH_M: f64 = 0.002;
 
 /// A vertex that vibrates so much faster than half of a mesh is warned of.
 const MUCH_FASTER: f64 = 2.5;
-
-/// Vertices that a decimated mesh has at least.
-const LEAST_VERTICES: usize = 4;
 
 /// Which vertices never move.
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -335,6 +335,15 @@ impl Scene {
         Self::parse_with(name, text, assignments, Files::None, limits)
     }
 
+    /// Reads a scene whose `[mesh]` names one file, `mesh_name`, of which the bytes are given; it names no other files, except for
+    /// images.
+    ///
+    /// # Errors
+    /// As for [`Scene::parse`]; refuses a mesh that can't be read, and a scene that names another.
+    pub fn parse_given(name: &str, text: &str, (mesh_name, mesh): (&str, &[u8]), limits: &Limits) -> Result<Self> {
+        Self::parse_with(name, text, &[], Files::Given(mesh_name, mesh), limits)
+    }
+
     fn parse_with(name: &str, text: &str, assignments: &[String], files: Files<'_>, limits: &Limits) -> Result<Self> {
         let mut document = Document::parse(name, text)?;
         Kind::Scene.check(&document)?;

@@ -2,6 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
+use palpate_mesh::TriangleMesh;
+use palpate_mesh::write::{Format, write};
+
+use super::Mesh;
 use super::document::{Document, Fields, read_text};
 use super::source::unit_text;
 use crate::limits::Limits;
@@ -24,12 +28,22 @@ pub struct MeshFile {
 /// Refuses a file that can't be read.
 pub fn mesh_file(scene: &Path, limits: &Limits) -> Result<Option<MeshFile>> {
     let text = read_text(scene, limits.file_bytes)?;
-    let document = Document::parse(&scene.display().to_string(), &text)?;
+    let folder = scene.parent().unwrap_or(Path::new(""));
+    Ok(said(&scene.display().to_string(), &text)?
+        .map(|said| MeshFile { path: said.path.map(|path| folder.join(path)), ..said }))
+}
+
+/// The same of the text of a scene, whose files are named as it does.
+///
+/// # Errors
+/// Refuses a text that is not TOML.
+pub fn said(name: &str, text: &str) -> Result<Option<MeshFile>> {
+    let document = Document::parse(name, text)?;
     let mut found = None;
     let read = |fields: &mut Fields<'_>| {
         let unit = fields.item("unit").and_then(|item| unit_text(&item).ok());
         found = Some(MeshFile {
-            path: fields.text("file")?.map(|file| scene.parent().unwrap_or(Path::new("")).join(file)),
+            path: fields.text("file")?.map(PathBuf::from),
             unit: unit.unwrap_or_default(),
             vertices: fields.item("vertices").map(|item| item.whole()).transpose()?,
         });
@@ -38,6 +52,24 @@ pub fn mesh_file(scene: &Path, limits: &Limits) -> Result<Option<MeshFile>> {
     // Other keys are no matter of this: who reads the scene checks them.
     let _ = document.read(|fields| fields.item("mesh").map_or(Ok(()), |item| item.table(read)));
     Ok(found)
+}
+
+/// The mesh of a scene, before it was made coarser.
+pub fn written(mesh: &Mesh) -> TriangleMesh {
+    if let Some(shown) = mesh.shape.shown() {
+        return shown.mesh.clone();
+    }
+    TriangleMesh {
+        vertices_m: mesh.shape.vertices_m().to_vec(),
+        triangles: mesh.shape.triangles().to_vec(),
+        uv: None,
+        groups: mesh.shape.told().groups.clone(),
+    }
+}
+
+/// The same as a file, to be sent: its name, its bytes and its unit.
+pub fn file(mesh: &Mesh) -> (&'static str, Vec<u8>, &'static str) {
+    ("mesh.obj", write(&written(mesh), Format::Obj), "m")
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use palpate_mesh::{ReadLimits, TriangleMesh, Unit};
 use super::document::{Fields, Item, read_bytes};
 use crate::limits::Limits;
 use crate::lock::lock;
-use crate::refusal::{Reason, Result};
+use crate::refusal::{Reason, Result, excerpt};
 
 /// What files a scene may name.
 #[derive(Debug, Clone, Copy)]
@@ -18,6 +18,8 @@ pub(super) enum Files<'a> {
     None,
     /// Those in a folder.
     In(&'a Path),
+    /// One mesh, by its name and its bytes.
+    Given(&'a str, &'a [u8]),
 }
 
 /// A mesh, by where it is from.
@@ -46,16 +48,27 @@ impl Files<'_> {
 
     /// Reads the mesh that an item names. The files that this names in turn have bare names, in the same folder.
     fn read(self, item: &Item<'_>, unit: Unit, limits: &Limits) -> Result<TriangleMesh> {
-        let Files::In(folder) = self else {
-            let message = "names a file: a scene that a client sends can't";
-            return Err(item.refuse(Reason::WrongKind, message));
-        };
         // Refusals name it as the scene does: clients do not learn where the server's files are.
         let name = item.text()?;
-        let path = folder.join(&name);
-        let bytes = read_bytes(&path, limits.mesh_bytes)
-            .map_err(|refusal| item.refuse(refusal.reason, format!("{name}: {}", refusal.message)))?;
-        let beside = |name: &str| read_bytes(&path.parent()?.join(name), limits.mesh_bytes).ok();
+        let refuse = |message: String| Err(item.refuse(Reason::WrongKind, message));
+        let (bytes, path) = match self {
+            Files::None => return refuse("names a file: a scene that a client sends can't".to_owned()),
+            Files::Given(given, _) if given != name => {
+                return refuse(format!(
+                    "names `{}`, but the mesh that was given is `{}`",
+                    excerpt(&name),
+                    excerpt(given)
+                ));
+            }
+            Files::Given(_, bytes) => (bytes.to_owned(), None),
+            Files::In(folder) => {
+                let path = folder.join(&name);
+                let bytes = read_bytes(&path, limits.mesh_bytes)
+                    .map_err(|refusal| item.refuse(refusal.reason, format!("{name}: {}", refusal.message)))?;
+                (bytes, Some(path))
+            }
+        };
+        let beside = |name: &str| read_bytes(&path.as_ref()?.parent()?.join(name), limits.mesh_bytes).ok();
         let most = usize::try_from(limits.mesh_bytes).unwrap_or(usize::MAX);
         let within = ReadLimits { bytes: most, vertices: limits.points, triangles: limits.points.saturating_mul(4) };
         let found = palpate_mesh::read(&name, &bytes, unit, &beside, &within);

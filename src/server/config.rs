@@ -9,7 +9,7 @@ use super::cluster_config::{Beside, ClusterConfig};
 use super::journals::keep::Keep;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number, positive};
-use crate::scene::document::read_text;
+use crate::scene::document::{nearest_name, read_text};
 
 /// Everything that you can configure. Absent keys keep their defaults.
 #[derive(Debug, Clone, Deserialize)]
@@ -62,6 +62,10 @@ pub struct Config {
     /// How long the journals of sessions that have ended are kept, and how many bytes all journals may take before the oldest
     /// of these are removed: `30d`, `10GiB`, `30d,10GiB`, or `0` to keep none.
     pub journal_keep: Keep,
+    /// Sessions whose mesh a client has sent have journals too, which contain it; else they have none, and end with the server.
+    pub journal_meshes: bool,
+    /// File of the private key that signs the journals, PEM. `None`: they are not signed.
+    pub journal_key: Option<PathBuf>,
     /// The fleet that the server is of.
     pub cluster: ClusterConfig,
     /// The log filter: `info`, `debug`, `palpate=debug,tonic=warn`, …
@@ -94,6 +98,8 @@ impl Default for Config {
             idle_session_s: 900.0,
             journal: None,
             journal_keep: Keep::default(),
+            journal_meshes: true,
+            journal_key: None,
             cluster: ClusterConfig::default(),
             log: "info".to_owned(),
             limits: Limits::default(),
@@ -117,7 +123,8 @@ impl Config {
     pub fn parse(name: &str, text: &str) -> Result<Self> {
         let config: Config = toml::from_str(text).map_err(|e| {
             let line = e.span().map_or(0, |span| text[..span.start].matches('\n').count());
-            let message = format!("{}: {}", text.lines().nth(line).unwrap_or_default().trim(), e.message());
+            let message =
+                format!("{}: {}", text.lines().nth(line).unwrap_or_default().trim(), nearest_name(e.message()));
             Refusal { place: Some(format!("{name}:{}", line + 1)), ..Refusal::new(Reason::Unreadable, "", message) }
         })?;
         config.check().map_err(|refusal| Refusal { place: Some(name.to_owned()), ..refusal })?;
@@ -163,6 +170,7 @@ impl Config {
         let (cert, key) = (self.tls_cert.is_some(), self.tls_key.is_some());
         together("tls_cert", cert, "tls_key", key)?;
         together("tls_key", key, "tls_cert", cert)?;
+        together("journal_key", self.journal_key.is_some(), "journal", self.journal.is_some())?;
         together("tls_client_ca", self.tls_client_ca.is_some(), "tls_cert", cert)?;
         for (index, origin) in self.origins.iter().enumerate() {
             let uri = origin.parse::<http::Uri>().ok().filter(|uri| uri.scheme().is_some() && uri.host().is_some());
@@ -195,6 +203,10 @@ impl Config {
         number("shutdown_deadline_s", self.shutdown_deadline_s, "above 0 and at most a day", within(day_s))?;
         number("audit_share", self.audit_share, "from 0 to 1", |share| (0.0..=1.0).contains(&share))?;
         self.cluster.check(Beside { journal: self.journal.is_some(), tls: cert, insecure: self.insecure })?;
+        if self.cluster.is_on() && !self.journal_meshes {
+            let message = "can't be false in a fleet: its servers take sessions over by their journals";
+            return Err(Refusal::new(Reason::OutOfRange, "journal_meshes", message));
+        }
         number("idle_session_s", self.idle_session_s, "above 0", |value| value > 0.0)?;
         Ok(())
     }

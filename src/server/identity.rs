@@ -16,6 +16,7 @@ use subtle::ConstantTimeEq;
 
 use crate::ids::random_bits;
 use crate::refusal::{Reason, Refusal, Result, label};
+use crate::scene::document::nearest_name;
 
 /// What a caller may do. Every role includes `Watch`, and `Administer` includes every role but `Node`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -97,6 +98,7 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.NodeService/Mirror", Access::Role(Role::Node)),
     ("/palpate.v1.NodeService/TakeSession", Access::Role(Role::Node)),
     ("/palpate.v1.SessionService/CreateSession", Access::Role(Role::Create)),
+    ("/palpate.v1.SessionService/DeleteJournal", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/DeleteSession", Access::Role(Role::Create)),
     ("/palpate.v1.SessionService/GetJournal", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/GetScript", Access::Role(Role::Watch)),
@@ -170,12 +172,24 @@ pub fn new_token() -> Result<String> {
     Ok(format!("{PREFIX}{:032x}{:032x}", random_bits()?, random_bits()?))
 }
 
+/// Checks the name of a token's owner, or of a certificate.
+fn owner(field: &str, name: &str) -> Result<()> {
+    if name.trim().is_empty() {
+        return Err(Refusal::new(
+            Reason::Missing,
+            field,
+            "is empty: logs, limits and `palpate-client admin` know a caller by it",
+        ));
+    }
+    label(field, name)
+}
+
 /// The entry of a token for the token file. It holds the token's hash, not the token.
 ///
 /// # Errors
 /// Returns an error if the name is not fit for a log.
 pub fn entry(name: &str, roles: &[Role], token: &str) -> Result<String> {
-    label("name", name)?;
+    owner("name", name)?;
     let roles: Vec<_> = roles.iter().map(|role| format!("\"{}\"", role.name())).collect();
     let hash: String = hash(token).iter().map(|byte| format!("{byte:02x}")).collect();
     let name = toml::Value::from(name);
@@ -247,12 +261,19 @@ impl Credentials {
         let file: File = toml::from_str(text).map_err(|e| {
             let line = e.span().map_or(1, |span| text[..span.start].matches('\n').count() + 1);
             // TOML's message may quote a token from the wrong place; a token must not appear in a log.
-            let message = if e.message().contains(PREFIX) { "unexpected value" } else { e.message() };
+            let message =
+                if e.message().contains(PREFIX) { "unexpected value".to_owned() } else { nearest_name(e.message()) };
             let place = Some(format!("{}:{line}", path.display()));
             Refusal { place, ..Refusal::new(Reason::Unreadable, "", message) }
         })?;
-        let caller = |field: &str, name: &str, roles: Vec<Role>| {
-            label(field, name)?;
+        let caller = |field: &str, name: &str, is_taken: bool, roles: Vec<Role>| {
+            let field_of_name = format!("{field}.name");
+            owner(&field_of_name, name)?;
+            if is_taken {
+                let message =
+                    format!("`{name}` is the name of another entry in this file: a caller is known by its name");
+                return Err(Refusal::new(Reason::OutOfRange, field_of_name, message));
+            }
             if roles.is_empty() {
                 let why = "is empty: give at least one of watch, touch, create, administer";
                 return Err(Refusal::new(Reason::Missing, format!("{field}.roles"), why));
@@ -271,10 +292,13 @@ impl Credentials {
                 let message = "duplicates that of another token in this file";
                 return Err(Refusal::new(Reason::OutOfRange, format!("{field}.sha256"), message));
             }
-            known.tokens.push((hash, caller(&field, &name, roles)?));
+            let is_taken = known.tokens.iter().any(|token| *token.1.name == name);
+            let caller = caller(&field, &name, is_taken, roles)?;
+            known.tokens.push((hash, caller));
         }
         for (index, CertificateEntry { name, roles }) in file.certificate.into_iter().enumerate() {
-            let caller = caller(&format!("certificate[{index}]"), &name, roles)?;
+            let is_taken = known.certificates.iter().any(|certificate| certificate.0 == name);
+            let caller = caller(&format!("certificate[{index}]"), &name, is_taken, roles)?;
             known.certificates.push((name, caller));
         }
         Ok(known)

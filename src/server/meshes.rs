@@ -73,7 +73,7 @@ impl Meshes {
         let pb::UploadMeshRequest { mesh_id, offset, part, last, .. } = request;
         let part = Part { id: mesh_id, offset: *offset, bytes: part, last: *last };
         let (mesh_id, received_bytes) = self.uploads.add(&part, account)?;
-        Ok(pb::UploadMeshResponse { mesh_id, received_bytes, report: None })
+        Ok(pb::UploadMeshResponse { mesh_id, received_bytes, ..Default::default() })
     }
 
     /// Takes a file that has come in full, to read it. If what this returns is dropped, the file is gone. Refusals call it

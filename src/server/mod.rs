@@ -17,6 +17,7 @@ mod force_law;
 mod haptics;
 mod health;
 pub mod identity;
+pub mod journal_key;
 mod journals;
 mod leases;
 mod listeners;

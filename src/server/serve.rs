@@ -60,11 +60,17 @@ const STRANGERS: Duration = Duration::from_secs(1);
 const WORTH_GIVING_BACK: u64 = 16 << 20;
 
 /// Serves at `listeners` until `shutdown` is cancelled. Then ends all streams, and returns at the latest after the configured
-/// deadline. The caller must end its runtime without waiting (`shutdown_background`).
+/// deadline. `ready` is called when all that can be refused at the beginning is there: the journals, the sessions of the server
+/// before this one, the fleet. The caller must end its runtime without waiting (`shutdown_background`).
 ///
 /// # Errors
-/// Returns an error if a thread can't be started, or if the transport fails.
-pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationToken) -> Result<(), ServeError> {
+/// Returns an error if a thread can't be started, if the journals or the fleet can't be used, or if the transport fails.
+pub async fn serve(
+    listeners: Listeners,
+    config: Config,
+    shutdown: CancellationToken,
+    ready: impl FnOnce(),
+) -> Result<(), ServeError> {
     let Listeners { listener, metrics, datagrams: socket, protection } = listeners;
     let budget = Budget::new(&config.limits, config.stepping_threads(), config.serving_threads());
     info!(bytes = budget.bytes(), "memory that callers share");
@@ -120,7 +126,7 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         fence: fleet.is_some().then(|| pacer.fence.clone()),
     };
     let meshes = Meshes::new(&limits);
-    let recorded = Recorded::new(journals.as_deref(), &limits)?;
+    let recorded = Recorded::new(journals.as_deref(), &config)?;
     let textures = Textures::open(&config, &catalog, &pacer, &limits)?;
     let (pages, counted) = (origins.clone(), traffic.clone());
     let datagrams = datagrams::receive(socket, pages, counted, shutdown.child_token()).await;
@@ -247,6 +253,7 @@ pub async fn serve(listeners: Listeners, config: Config, shutdown: CancellationT
         shutdown.cancelled().await;
         tokio::time::sleep(deadline).await;
     };
+    ready();
     tokio::select! {
         (served, ()) = async { tokio::join!(serving, stop) } => served?,
         () = sweeping => {}

@@ -60,6 +60,7 @@ impl Sessions {
             Some(fleet) => fleet.birth().await?,
             None => Birth::new()?,
         };
+        let birth = Birth { recorded: config.journal_meshes || mesh.is_none(), ..birth };
         let named = birth.clone();
         let create = move |cancel: &CancelFlag| {
             let scene = match &source {
@@ -149,6 +150,7 @@ impl SessionService for Sessions {
             "mesh received"
         );
         answer.report = Some(report);
+        answer.kept = self.0.recorded.told_of_meshes();
         Ok(Response::new(answer))
     }
 
@@ -238,6 +240,18 @@ impl SessionService for Sessions {
             fleet.until_deleted(id).await?;
         }
         Ok(Response::new(pb::DeleteSessionResponse { journal_fault }))
+    }
+
+    async fn delete_journal(
+        &self,
+        request: Request<pb::DeleteJournalRequest>,
+    ) -> Result<Response<pb::DeleteJournalResponse>, Status> {
+        let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
+        let id = request.into_inner().session_id;
+        let (recorded, pacer) = (self.0.recorded.clone(), self.0.pacer.clone());
+        let remove = move |_: &CancelFlag| recorded.remove(&id, &pacer);
+        let files = self.0.workshop.work(&account, remove).await??;
+        Ok(Response::new(pb::DeleteJournalResponse { files }))
     }
 
     async fn start_session(

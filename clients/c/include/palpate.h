@@ -696,8 +696,27 @@ enum palpate_result palpate_session_create(const struct palpate_server *server,
                                            struct palpate_session **session);
 
 /**
- * The same of a scene of your own: the text of a scene file (TOML) of a sheet. A scene that names files, or that is of a mesh, has
- * to be one of the server's. Any thread; waits for the server.
+ * The same of a scene file of your own (TOML), by its path. The file of its mesh, if it names one, is read where the scene file
+ * says, and sent to the server. Any thread; waits for the server.
+ */
+enum palpate_result palpate_session_create_from_file(const struct palpate_server *server,
+                                                     const char *scene_file,
+                                                     struct palpate_session **session);
+
+/**
+ * The same of the text of a scene file and of a mesh in memory: the `byte_count` bytes of a file (OBJ, STL, PLY, glTF, Gmsh or
+ * VTK) that `[mesh]` of the text calls `mesh_name`. The mesh is sent to the server. Any thread; waits for the server.
+ */
+enum palpate_result palpate_session_create_from_mesh(const struct palpate_server *server,
+                                                     const char *scene_text,
+                                                     const char *mesh_name,
+                                                     const uint8_t *mesh_bytes,
+                                                     size_t byte_count,
+                                                     struct palpate_session **session);
+
+/**
+ * The same of the text of a scene file that names no other file: of a sheet, or of an organ that is generated. Any thread; waits
+ * for the server.
  */
 enum palpate_result palpate_session_create_from_text(const struct palpate_server *server,
                                                      const char *scene_text,

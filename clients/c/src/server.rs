@@ -1,12 +1,16 @@
 //! Servers and sessions: connect, list scenes, create, join, change, delete.
 
 use std::ffi::c_char;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use palpate::limits::Limits;
+use palpate::refusal::Refusal;
+use palpate::scene::sent::{self, MeshFile, mesh_file};
 use palpate::scene::{Body, Scene};
 use palpate_client::bridge::{Session, Target};
+use palpate_client::upload::upload_mesh;
 use palpate_client::{Channel, Credentials, Server, Token, fleet};
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
@@ -67,11 +71,17 @@ pub struct palpate_change {
 impl Connected {
     /// Waits for a call, for no longer than the time for calls.
     pub(crate) fn wait<T, E: Into<Fault>>(&self, call: impl Future<Output = Result<T, E>>) -> Result<T, Fault> {
-        let limited = async { tokio::time::timeout(self.timeout, call).await };
+        self.wait_for(1, call)
+    }
+
+    /// The same for so many calls, one after the other.
+    fn wait_for<T, E: Into<Fault>>(&self, calls: u32, call: impl Future<Output = Result<T, E>>) -> Result<T, Fault> {
+        let timeout = self.timeout.saturating_mul(calls);
+        let limited = async { tokio::time::timeout(timeout, call).await };
         match self.threads.block_on(limited)? {
             Ok(answer) => answer.map_err(Into::into),
             Err(_) => {
-                let why = format!("the server has not answered within {} s", self.timeout.as_secs_f64());
+                let why = format!("the server has not answered within {} s", timeout.as_secs_f64());
                 Err(Fault::new(PALPATE_CONNECTION, why))
             }
         }
@@ -231,8 +241,92 @@ pub unsafe extern "C" fn palpate_session_create(
     })
 }
 
-/// The same of a scene of your own: the text of a scene file (TOML) of a sheet. A scene that names files, or that is of a mesh, has
-/// to be one of the server's. Any thread; waits for the server.
+/// Parts of a file are not smaller, bytes.
+const PART_BYTES: usize = 256 << 10;
+
+/// A session of a scene that was read here; its mesh is sent first. `said` is what its text says of that.
+fn create_own(shared: &Arc<Connected>, scene: &Scene, said: Option<MeshFile>) -> Result<*mut palpate_session, Fault> {
+    let mut message = palpate::wire::scene::sent(scene);
+    if let (Body::Mesh(mesh), Some(of_scene)) = (&scene.body, &mut message.mesh) {
+        // As many vertices as were asked for, of which there may be some fewer here.
+        let vertices = said.and_then(|said| said.vertices);
+        of_scene.vertices = vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
+        let (name, bytes, unit) = sent::file(mesh);
+        let calls = u32::try_from(bytes.len() / PART_BYTES).unwrap_or(u32::MAX).saturating_add(1);
+        let answer = shared.wait_for(calls, upload_mesh(shared.channel.clone(), name, &bytes, unit, false))?;
+        if let Some(report) = answer.report.filter(|report| report.refused) {
+            let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
+            return Err(Fault::argument(format!("the mesh can't be used: {}", what.unwrap_or_default())));
+        }
+        of_scene.mesh_id = answer.mesh_id;
+    }
+    create(shared, Source::Scene(message))
+}
+
+fn refused(refusal: Refusal) -> Fault {
+    Fault::argument(refusal.to_string())
+}
+
+/// The same of a scene file of your own (TOML), by its path. The file of its mesh, if it names one, is read where the scene file
+/// says, and sent to the server. Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_create_from_file(
+    server: *const palpate_server,
+    scene_file: *const c_char,
+    session: *mut *mut palpate_session,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (shared, path, out) = unsafe {
+            (
+                &at(server, "server is null")?.shared,
+                Path::new(text(scene_file, "scene_file")?),
+                at_mut(session, "session is null")?,
+            )
+        };
+        *out = std::ptr::null_mut();
+        let limits = Limits::default();
+        let scene = Scene::load(path, &[], &limits).map_err(refused)?;
+        *out = create_own(shared, &scene, mesh_file(path, &limits).map_err(refused)?)?;
+        Ok(())
+    })
+}
+
+/// The same of the text of a scene file and of a mesh in memory: the `byte_count` bytes of a file (OBJ, STL, PLY, glTF, Gmsh or
+/// VTK) that `[mesh]` of the text calls `mesh_name`. The mesh is sent to the server. Any thread; waits for the server.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn palpate_session_create_from_mesh(
+    server: *const palpate_server,
+    scene_text: *const c_char,
+    mesh_name: *const c_char,
+    mesh_bytes: *const u8,
+    byte_count: usize,
+    session: *mut *mut palpate_session,
+) -> palpate_result {
+    guard(|| {
+        // SAFETY: the caller's promises.
+        let (shared, scene, mesh_name, out) = unsafe {
+            (
+                &at(server, "server is null")?.shared,
+                text(scene_text, "scene_text")?,
+                text(mesh_name, "mesh_name")?,
+                at_mut(session, "session is null")?,
+            )
+        };
+        *out = std::ptr::null_mut();
+        if mesh_bytes.is_null() {
+            return Err(Fault::argument("mesh_bytes is null"));
+        }
+        // SAFETY: the caller's promise, that there are so many.
+        let bytes = unsafe { std::slice::from_raw_parts(mesh_bytes, byte_count) };
+        let made = Scene::parse_given("scene_text", scene, (mesh_name, bytes), &Limits::default()).map_err(refused)?;
+        *out = create_own(shared, &made, sent::said("scene_text", scene).map_err(refused)?)?;
+        Ok(())
+    })
+}
+
+/// The same of the text of a scene file that names no other file: of a sheet, or of an organ that is generated. Any thread; waits
+/// for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_create_from_text(
     server: *const palpate_server,
@@ -249,14 +343,8 @@ pub unsafe extern "C" fn palpate_session_create_from_text(
             )
         };
         *out = std::ptr::null_mut();
-        let scene = Scene::parse("scene_text", scene, &[], &Limits::default());
-        let scene = scene.map_err(|refusal| Fault::argument(refusal.to_string()))?;
-        if matches!(scene.body, Body::Mesh(_)) {
-            return Err(Fault::argument(
-                "scene_text is of a mesh: give the scene to the server, and create it by name",
-            ));
-        }
-        *out = create(shared, Source::Scene(palpate::wire::scene::sent(&scene)))?;
+        let made = Scene::parse("scene_text", scene, &[], &Limits::default()).map_err(refused)?;
+        *out = create_own(shared, &made, sent::said("scene_text", scene).map_err(refused)?)?;
         Ok(())
     })
 }

@@ -1,5 +1,5 @@
 /* What is wrong is an error with words, and never more than that: `errors URL`. */
-#define _POSIX_C_SOURCE 200112L
+#define _POSIX_C_SOURCE 200809L
 #include <math.h>
 #include <palpate.h>
 #include <stdio.h>
@@ -131,6 +131,36 @@ int main(int count, char **arguments) {
     EXPECT(palpate_session_join(server, "00000000000000000000000000000000", &session), PALPATE_REFUSED, NULL);
     EXPECT(palpate_session_create_from_text(server, "sheet = 7", &session), PALPATE_ARGUMENT, "scene_text:1");
     EXPECT(palpate_session_create_from_text(server, "", &session), PALPATE_ARGUMENT, NULL);
+    /* Scenes of your own on a mesh: generated, in memory, in a file. */
+    const char *of_mesh = "[mesh]\nfile = \"ball.obj\"\nunit = \"mm\"\npoint_mass_kg = 0.01\n[springs]\nstiffness_n_per_m = 100.0\n"
+                          "[virtual_springs]\nstiffness_n_per_m = 5.0\n[damping]\ncoefficient_n_s_per_m = 1.0\n";
+    const char *ball = "v 50 0 0\nv -50 0 0\nv 0 50 0\nv 0 -50 0\nv 0 0 50\nv 0 0 -50\n"
+                       "f 1 3 5\nf 3 2 5\nf 2 4 5\nf 4 1 5\nf 3 1 6\nf 2 3 6\nf 4 2 6\nf 1 4 6\n";
+    const unsigned char *bytes = (const unsigned char *)ball;
+    palpate_extent box;
+    EXPECT(palpate_session_create_from_text(server, of_mesh, &session), PALPATE_ARGUMENT, "names a file");
+    EXPECT(palpate_session_create_from_mesh(server, of_mesh, "ball.obj", NULL, 3, &session), PALPATE_ARGUMENT, "mesh_bytes");
+    EXPECT(palpate_session_create_from_mesh(server, of_mesh, "cube.obj", bytes, strlen(ball), &session), PALPATE_ARGUMENT, "cube.obj");
+    EXPECT(palpate_session_create_from_mesh(server, of_mesh, "ball.obj", bytes, 30, &session), PALPATE_ARGUMENT, NULL);
+    if (session) failures++;
+    EXPECT(palpate_session_create_from_mesh(server, of_mesh, "ball.obj", bytes, strlen(ball), &session), PALPATE_OK, NULL);
+    EXPECT(palpate_session_extent(session, &box), PALPATE_OK, NULL);
+    if (fabs(box.most_m.x - 0.05) > 1e-9) failures++, fprintf(stderr, "the ball reaches to %g m\n", box.most_m.x);
+    EXPECT(palpate_session_delete(session), PALPATE_OK, NULL);
+    palpate_session_free(session), session = NULL;
+    EXPECT(palpate_session_create_from_file(server, "nowhere.toml", &session), PALPATE_ARGUMENT, "nowhere.toml");
+    char folder[] = "/tmp/palpate-XXXXXX", path[64];
+    if (!mkdtemp(folder)) return 2;
+    const char *const written[2][2] = {{"ball.obj", ball}, {"ball.toml", of_mesh}};
+    for (int k = 0; k < 2; k++) {
+        snprintf(path, sizeof path, "%s/%s", folder, written[k][0]);
+        FILE *file = fopen(path, "w");
+        if (!file || fputs(written[k][1], file) < 0 || fclose(file)) return 2;
+    }
+    EXPECT(palpate_session_create_from_file(server, path, &session), PALPATE_OK, NULL);
+    EXPECT(palpate_session_delete(session), PALPATE_OK, NULL);
+    palpate_session_free(session), session = NULL;
+
     EXPECT(palpate_session_create(server, "liver", &session), PALPATE_OK, NULL);
     EXPECT(palpate_session_id(session, text, sizeof text, &needed), PALPATE_OK, NULL);
     palpate_session *same = NULL;

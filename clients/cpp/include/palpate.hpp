@@ -297,9 +297,21 @@ public:
     }
     /// Makes a session of a scene that the server has. Waits for the server.
     Result<Session> create(const std::string& scene) const { return made(palpate_session_create, scene); }
-    /// Makes a session of the text of a scene. Waits for the server.
+    /// Makes a session of the text of a scene that names no file. Waits for the server.
     Result<Session> create_from_text(const std::string& text) const {
         return made(palpate_session_create_from_text, text);
+    }
+    /// Makes a session of a scene file of yours, and sends its mesh. Waits for the server.
+    Result<Session> create_from_file(const std::string& path) const {
+        return made(palpate_session_create_from_file, path);
+    }
+    /// Makes a session of the text of a scene and the bytes of a mesh file, which `[mesh]` calls `mesh_name`. Waits for the server.
+    Result<Session> create_from_mesh(const std::string& text, const std::string& mesh_name, const std::string& bytes) const {
+        palpate_session* session = nullptr;
+        auto data = reinterpret_cast<const unsigned char*>(bytes.data());
+        auto code = palpate_session_create_from_mesh(server_.get(), text.c_str(), mesh_name.c_str(), data, bytes.size(), &session);
+        if (code) return detail::error(code);
+        return Session(session);
     }
     /// Joins a session by its id. Waits for the server.
     Result<Session> join(const std::string& id) const { return made(palpate_session_join, id); }

@@ -30,6 +30,27 @@ pub struct Credentials {
     pub cert_and_key: Option<(String, String)>,
 }
 
+impl Credentials {
+    /// Checks that what should be certificates or a key is some.
+    ///
+    /// # Errors
+    /// Returns an error that begins with what is wrong: `ca`, `cert` or `key`.
+    pub fn check(&self) -> Result<(), Error> {
+        let (cert, key) = self.cert_and_key.as_ref().map(|(cert, key)| (cert, key)).unzip();
+        let of = |name, what, begin, text: Option<&String>| match text {
+            Some(text) if !text.contains(begin) => {
+                Err(Error::Argument(format!("{name}: has no {what} in PEM (-----BEGIN {begin})")))
+            }
+            _ => Ok(()),
+        };
+        of("ca", "certificate", "CERTIFICATE-----", self.ca.as_ref())?;
+        of("cert", "certificate", "CERTIFICATE-----", cert)?;
+        // There are several kinds: `RSA PRIVATE KEY` and others.
+        of("key", "private key", "PRIVATE KEY-----", key)?;
+        Ok(())
+    }
+}
+
 /// A token. It is not shown by `Debug`.
 #[derive(Clone)]
 pub struct Token(MetadataValue<Ascii>);
@@ -112,6 +133,7 @@ impl Server {
     /// Returns an error if the URL is not valid, if a token would be sent in the clear, or if the credentials are not those
     /// of a connection with TLS or can't be read.
     pub fn new(url: &str, credentials: &Credentials) -> Result<Self, Error> {
+        credentials.check()?;
         let refuse = |why: &str| Error::Argument(format!("{url}: {why}"));
         let url_text = if url.contains("://") { url.to_owned() } else { format!("http://{url}") };
         let uri = url_text.parse::<Uri>().map_err(|e| refuse(&e.to_string()))?;
@@ -310,6 +332,24 @@ fn tls(credentials: &Credentials) -> ClientTlsConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_file_without_a_certificate_or_key_is_refused_by_its_name() {
+        let junk = || "v 0 0 0\n".to_owned();
+        let cert = "-----BEGIN CERTIFICATE-----\n*\n-----END CERTIFICATE-----\n".to_owned();
+        for (credentials, told) in [
+            (Credentials { ca: Some(junk()), ..Credentials::default() }, "ca: has no certificate in PEM"),
+            (Credentials { ca: Some(String::new()), ..Credentials::default() }, "ca: has no certificate in PEM"),
+            (
+                Credentials { cert_and_key: Some((junk(), junk())), ..Credentials::default() },
+                "cert: has no certificate",
+            ),
+            (Credentials { cert_and_key: Some((cert, junk())), ..Credentials::default() }, "key: has no private key"),
+        ] {
+            let refused = Server::new("https://localhost:7117", &credentials).unwrap_err().to_string();
+            assert!(refused.starts_with(told), "{refused}");
+        }
+    }
 
     #[test]
     fn another_server_is_called_with_the_same_credentials_but_never_in_the_clear() {

@@ -57,6 +57,11 @@ enum Act {
         /// As `palpate-client top` shows it
         session: String,
     },
+    /// Remove the journals of a session that has ended, and with them its mesh and all that was done to it
+    DeleteJournal {
+        /// As `palpate journal list` shows it
+        session: String,
+    },
     /// Delete a session and end all its streams
     Delete {
         /// As `palpate-client top` shows it
@@ -101,6 +106,12 @@ async fn act(act: &Act, channel: Channel) -> Result<String, tonic::Status> {
             let request = pb::ReviveSessionRequest { session_id: session.clone() };
             let step = admin.revive_session(request).await?.into_inner().step;
             format!("paused at step {step}")
+        }
+        Act::DeleteJournal { session } => {
+            let mut sessions = SessionServiceClient::new(channel);
+            let request = pb::DeleteJournalRequest { session_id: session.clone() };
+            let files = sessions.delete_journal(request).await?.into_inner().files;
+            format!("{files} {} removed", if files == 1 { "file" } else { "files" })
         }
         Act::Delete { session } => {
             let mut sessions = SessionServiceClient::new(channel);

@@ -141,7 +141,8 @@ fn as_json(served: &Report) -> serde_json::Value {
         "connections": traffic.connections, "samples": traffic.samples, "commands_refused": traffic.refused,
         "failed_attempts": traffic.failed, "poses": traffic.poses, "datagrams_up": traffic.carried.sent,
         "datagrams_down": traffic.carried.came, "fell_back": traffic.carried.fell_back, "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
-        "predicted_ticks": served.predicted_ticks,
+        "predicted_ticks": served.predicted_ticks, "largest_force_n": served.most_force_n,
+        "largest_displacement_m": traffic.deepest_m,
     });
     if let Some(envelope) = &served.envelope {
         report["energy_j"] = json!(envelope.energy_j());
@@ -155,7 +156,7 @@ fn as_json(served: &Report) -> serde_json::Value {
 
 /// The results for people.
 fn rows(served: &Report) -> Vec<(&'static str, String)> {
-    let Traffic { connections, samples, bytes, refused, failed, poses, carried } = served.traffic;
+    let Traffic { connections, samples, bytes, refused, failed, poses, carried, deepest_m } = served.traffic;
     #[allow(clippy::cast_precision_loss)]
     let kilobytes = bytes as f64 / 1e3;
     let mut rows = vec![
@@ -168,6 +169,8 @@ fn rows(served: &Report) -> Vec<(&'static str, String)> {
         ),
         ("commands refused", refused.to_string()),
         ("late ticks", format!("{} (skipped: {})", served.late_ticks, served.missed_ticks)),
+        ("largest force", table::with_unit(served.most_force_n, "N")),
+        ("tissue moved at most", format!("{:.1} mm", 1e3 * deepest_m)),
         ("from a copy of the tissue", format!("{} ticks", served.predicted_ticks)),
     ];
     if let Some(envelope) = &served.envelope {
@@ -183,7 +186,7 @@ fn rows(served: &Report) -> Vec<(&'static str, String)> {
 fn write_course(path: &std::path::Path, course: &[Tick]) -> Result<(), Failure> {
     let mut text = "time_s,x_m,y_m,z_m,force_x_n,force_y_n,force_z_n,state\n".to_owned();
     for Tick { time_s, place_m, force_n, state } in course {
-        let state = state.map_or("none".to_owned(), |state| format!("{state:?}").to_lowercase());
+        let state = state.map_or("waiting".to_owned(), |state| format!("{state:?}").to_lowercase());
         let [place, force] = [place_m, force_n].map(|v| format!("{:.7},{:.7},{:.7}", v.x, v.y, v.z));
         text += &format!("{time_s:.9},{place},{force},{state}\n");
     }

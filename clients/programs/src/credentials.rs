@@ -27,6 +27,24 @@ pub(crate) struct CredentialOptions {
     key: Option<PathBuf>,
 }
 
+/// The server: as `--server`, like everywhere, or as the only argument.
+#[derive(clap::Args, Debug, Clone)]
+pub(crate) struct ServerOption {
+    /// The server, as --server
+    #[arg(value_name = "URL", conflicts_with = "server")]
+    url: Option<String>,
+    /// The server
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
+    server: String,
+}
+
+impl ServerOption {
+    /// Its URL.
+    pub(crate) fn url(&self) -> &str {
+        self.url.as_deref().unwrap_or(&self.server)
+    }
+}
+
 impl CredentialOptions {
     /// The server at `url`, with these credentials.
     ///
@@ -42,6 +60,7 @@ impl CredentialOptions {
                 _ => None,
             },
         };
+        credentials.check().map_err(|error| Failure::Refused(format!("--{error}")))?;
         Server::new(url, &credentials).map_err(|error| Failure::Refused(format!("--server {error}")))
     }
 

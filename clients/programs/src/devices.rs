@@ -99,7 +99,7 @@ fn rows(device: &Device, checked: &Checked) -> Vec<(&'static str, String)> {
         format!("{:.1} to {:.1}, {:.1} to {:.1}, {:.1} to {:.1} mm", least.x, most.x, least.y, most.y, least.z, most.z)
     });
     let pressed: Vec<String> =
-        (0..u32::BITS).filter(|bit| checked.buttons >> bit & 1 != 0).map(|bit| bit.to_string()).collect();
+        (0..u32::BITS).filter(|bit| checked.buttons >> bit & 1 != 0).map(|bit| format!("number {bit}")).collect();
     vec![
         ("model", device.name.to_owned()),
         ("largest force", format!("{} N, {} N for long", device.force_n, device.continuous_n)),
@@ -108,7 +108,7 @@ fn rows(device: &Device, checked: &Checked) -> Vec<(&'static str, String)> {
         ("ticks", format!("{}, {:.0} a second", checked.ticks, checked.rate_hz)),
         ("positions that changed", format!("{:.0} a second", checked.changes_hz)),
         ("x, y and z", place.unwrap_or_else(|| "none".to_owned())),
-        ("buttons pressed", if pressed.is_empty() { "none".to_owned() } else { pressed.join(", ") }),
+        ("buttons pressed, from 0", if pressed.is_empty() { "none".to_owned() } else { pressed.join(", ") }),
         ("                        p50 / p99 / max", String::new()),
         ("between ticks", micros(checked.period_s)),
         ("in the device's calls", micros(checked.call_s)),

@@ -8,14 +8,13 @@ use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
 
 use crate::Failure;
-use crate::credentials::CredentialOptions;
+use crate::credentials::{CredentialOptions, ServerOption};
 
 /// Arguments of `health`.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
-    /// The server
-    #[arg(value_name = "URL", default_value = "http://127.0.0.1:7117")]
-    server: String,
+    #[command(flatten)]
+    server: ServerOption,
     #[command(flatten)]
     credentials: CredentialOptions,
 }
@@ -25,9 +24,10 @@ const PATIENCE: Duration = Duration::from_secs(2);
 
 /// Fails unless the server reports that it is serving.
 pub(crate) async fn health(arguments: &Arguments) -> Result<(), Failure> {
-    let server = arguments.credentials.server(&arguments.server)?.within(PATIENCE);
+    let server = arguments.credentials.server(arguments.server.url())?.within(PATIENCE);
     let asked = async {
-        let mut health = HealthClient::new(server.connect().await.map_err(|error| error.to_string())?);
+        let mut health =
+            HealthClient::new(server.connect().await.map_err(|error| format!("{error}; --server names another"))?);
         health.check(HealthCheckRequest::default()).await.map_err(|status| describe(&status))
     };
     let answer = tokio::time::timeout(PATIENCE, asked).await.map_err(|_| Failure::Failed("no answer".into()))?;

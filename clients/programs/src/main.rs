@@ -135,13 +135,13 @@ enum Command {
     /// Check that a server is serving; for scripts and containers
     #[command(after_help = "Examples:\n  \
         palpate-client health\n  \
-        palpate-client health https://localhost:7117 --ca /etc/palpate/ca.pem\n\n\
+        palpate-client health --server https://localhost:7117 --ca /etc/palpate/ca.pem\n\n\
         Needs no token. Exit status: 0 if the server is serving; 1 if not; 2 when an input was refused.")]
     Health(health::Arguments),
     /// Show the sessions of a server once a second: state, step rate, dilation, awake points, holders of tools
     #[command(after_help = "Examples:\n  \
         palpate-client top\n  \
-        palpate-client top https://server:7117 --token-file admin.token\n  \
+        palpate-client top --server https://server:7117 --token-file admin.token\n  \
         palpate-client top --once --json | jq '.sessions[] | select(.time_dilation < 0.999)'\n\n\
         If the server authenticates clients, your token needs the role `administer`.\n\n\
         Exit status: 0; 1 when the server can't be reached or refuses; 2 when an input was refused.")]
@@ -213,7 +213,7 @@ pub(crate) async fn interrupted() {
 // Two threads for the network; a device runs on its own thread.
 #[tokio::main(worker_threads = 2)]
 async fn main() -> ExitCode {
-    let ended = match Arguments::parse().command {
+    let ended = match palpate::arguments::parse::<Arguments>().command {
         Command::Replay(arguments) => replay::replay(&arguments).await,
         Command::Play(arguments) => play::play(&arguments).await,
         Command::Link(arguments) => link::link(&arguments).await,

@@ -12,15 +12,14 @@ use palpate_proto::printable::{printable, printable_json};
 use serde_json::{Value, json};
 
 use crate::Failure;
-use crate::credentials::CredentialOptions;
+use crate::credentials::{CredentialOptions, ServerOption};
 use crate::unanswered::Unanswered;
 
 /// Arguments of `top`.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
-    /// The server
-    #[arg(value_name = "URL", default_value = "http://127.0.0.1:7117")]
-    server: String,
+    #[command(flatten)]
+    server: ServerOption,
     /// Print one table, after a second, and exit
     #[arg(long)]
     once: bool,
@@ -49,7 +48,7 @@ struct Seen {
 
 /// Shows a server's sessions until it is interrupted or its output is closed.
 pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
-    let server = arguments.credentials.server(&arguments.server)?;
+    let server = arguments.credentials.server(arguments.server.url())?;
     let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server, --server names another"));
     let mut sessions = SessionServiceClient::new(server.connect().await.map_err(unreached)?);
     let terminal = std::io::stdout().is_terminal() && !arguments.json && !arguments.once;
@@ -75,11 +74,11 @@ pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
         }
         let text = match (arguments.json, terminal) {
             (true, _) => format!("{}\n", printable_json(as_json(&rows))),
-            (false, false) => table(&arguments.server, &rows, usize::MAX) + if arguments.once { "" } else { "\n" },
+            (false, false) => table(arguments.server.url(), &rows, usize::MAX) + if arguments.once { "" } else { "\n" },
             // Overwrites the last table in place, which does not flicker.
             (false, true) => {
                 let height = usize::from(console::Term::stdout().size().0);
-                let table = table(&arguments.server, &rows, height.saturating_sub(4));
+                let table = table(arguments.server.url(), &rows, height.saturating_sub(4));
                 format!("\x1b[H{}\x1b[J", table.replace('\n', "\x1b[K\n"))
             }
         };

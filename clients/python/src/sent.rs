@@ -4,13 +4,11 @@ use std::path::Path;
 
 use palpate::refusal::{Reason, Refusal};
 use palpate::scene::Body;
-use palpate::scene::sent::mesh_file;
+use palpate::scene::sent::{self, mesh_file};
 use palpate::wire;
 use palpate_client::Channel;
 use palpate_client::upload::upload_mesh;
-use palpate_mesh::write::{Format, write};
 use palpate_proto::pb;
-use palpate_simulated::scene_file::written;
 use pb::create_session_request::Source;
 use pyo3::PyResult;
 
@@ -41,7 +39,7 @@ impl Sent {
         {
             told.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
         }
-        Ok(Sent::Scene { scene: message, mesh: Some(write(&written(mesh), Format::Obj)) })
+        Ok(Sent::Scene { scene: message, mesh: Some(sent::file(mesh).1) })
     }
 
     /// What a session is to be made of; sends the mesh, if there is one.
@@ -51,12 +49,12 @@ impl Sent {
             Sent::Scene { scene, mesh } => (scene, mesh),
         };
         if let (Some(file), Some(of_scene)) = (mesh, &mut scene.mesh) {
-            let sent = upload_mesh(channel, "mesh.obj", &file, "m", false).await.map_err(of_status)?;
-            if let Some(report) = sent.report.filter(|report| report.refused) {
+            let answer = upload_mesh(channel, "mesh.obj", &file, "m", false).await.map_err(of_status)?;
+            if let Some(report) = answer.report.filter(|report| report.refused) {
                 let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
                 return Err(refused(Refusal::new(Reason::OutOfRange, "scene", what.unwrap_or_default())));
             }
-            of_scene.mesh_id = sent.mesh_id;
+            of_scene.mesh_id = answer.mesh_id;
         }
         Ok(Source::Scene(*scene))
     }

@@ -4,12 +4,11 @@ use std::path::Path;
 
 use glam::DVec3;
 use palpate::limits::Limits;
-use palpate::scene::sent::mesh_file;
-use palpate::scene::{Body, Mesh, Scene};
+use palpate::scene::sent::{self, mesh_file};
+use palpate::scene::{Body, Scene};
 use palpate::wire;
 use palpate_client::upload::upload_mesh;
 use palpate_client::{Channel, Error};
-use palpate_mesh::write::{Format, write};
 use palpate_mesh::{Group, TriangleMesh};
 use palpate_proto::pb;
 use palpate_proto::refusal::{Reason, Refusal};
@@ -64,11 +63,10 @@ impl SceneFile {
                         let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
                         MeshToSend { name: name.unwrap_or_default(), bytes, unit: said.unit }
                     }
-                    None => MeshToSend {
-                        name: "mesh.obj".to_owned(),
-                        bytes: write(&written(mesh), Format::Obj),
-                        unit: "m".to_owned(),
-                    },
+                    None => {
+                        let (name, bytes, unit) = sent::file(mesh);
+                        MeshToSend { name: name.to_owned(), bytes, unit: unit.to_owned() }
+                    }
                 })
             }
         };
@@ -114,19 +112,6 @@ impl SceneFile {
                 wire::scene::from_scene(&even, Some(&mesh)).map_err(wrong)
             }
         }
-    }
-}
-
-/// The mesh of a scene, before it was made coarser.
-pub fn written(mesh: &Mesh) -> TriangleMesh {
-    if let Some(shown) = mesh.shape.shown() {
-        return shown.mesh.clone();
-    }
-    TriangleMesh {
-        vertices_m: mesh.shape.vertices_m().to_vec(),
-        triangles: mesh.shape.triangles().to_vec(),
-        uv: None,
-        groups: mesh.shape.told().groups.clone(),
     }
 }
 

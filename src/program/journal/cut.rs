@@ -35,5 +35,9 @@ pub(super) fn cut(arguments: &CutArguments) -> Result<(), Failure> {
         let _ = std::fs::remove_file(output);
         return Err(refusal.into());
     }
-    file.sync_all().map_err(|e| unwritten(output, &e))
+    file.sync_all().map_err(|e| unwritten(output, &e))?;
+    // It had all steps that were wanted.
+    let mut reader = source.open()?;
+    let survey = reader.survey(&mut |_| {})?;
+    source.tell_damage(survey.damage.as_deref(), survey.until_step, Some(*to))
 }

@@ -121,7 +121,9 @@ pub(super) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     go_to(&mut replay, begin)?;
     if !moves {
         let image = still(replay.session(), shown.as_ref()).picture(&model, &view);
-        return write_file(output, &image.png()?);
+        write_file(output, &image.png()?)?;
+        let survey = replay.survey();
+        return source.tell_damage(survey.damage.as_deref(), survey.until_step, *at);
     }
     let last = to.unwrap_or(u64::MAX).min(replay.survey().until_step);
     let mut file = Vec::new();
@@ -139,5 +141,7 @@ pub(super) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
         Ok(())
     })?;
     drop(film);
-    write_file(output, &file)
+    write_file(output, &file)?;
+    let survey = replay.survey();
+    source.tell_damage(survey.damage.as_deref(), survey.until_step, *to)
 }

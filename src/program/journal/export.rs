@@ -60,19 +60,24 @@ pub(super) fn export(arguments: &ExportArguments) -> Result<(), Failure> {
         ),
         Format::Jsonl | Format::Mcap => Ok(()),
     };
-    let result = with_progress("byte", length, file.is_none(), |progress| -> Result<std::io::Result<()>, Failure> {
+    type Written = (std::io::Result<()>, u64);
+    let exported = with_progress("byte", length, file.is_none(), |progress| -> Result<Written, Failure> {
         let mut result = result;
+        let mut until_step = reader.header().begin_step;
         while let Some(batch) = reader.next_batch()?.filter(|_| result.is_ok()) {
             for moment in batch.felt()? {
                 let rows = &mut moment.tools.iter();
                 result =
                     result.and_then(|()| rows.try_for_each(|tool| row(&mut *out, *format, moment.step, rate_hz, tool)));
             }
+            until_step = batch.until_step;
             progress(reader.position());
         }
-        Ok(result)
-    })?;
-    written(result.and_then(|()| out.flush()))
+        Ok((result, until_step))
+    });
+    let (result, until_step) = exported?;
+    written(result.and_then(|()| out.flush()))?;
+    source.tell_damage(reader.damage(), until_step, None)
 }
 
 #[allow(clippy::cast_precision_loss)]

@@ -42,6 +42,6 @@ pub(super) fn export(source: &Source, path: &Path) -> Result<(), Failure> {
     file.sync_all().map_err(|e| unwritten(path, &e))?;
     match replay.difference() {
         Some(difference) => Err(Failure::Failed(format!("{}: {difference}", source.file.display()))),
-        None => Ok(()),
+        None => source.tell_damage(replay.survey().damage.as_deref(), last, None),
     }
 }

@@ -87,7 +87,8 @@ fn state(survey: &Survey) -> State {
 
 fn row(JournalFile { session_id, run, path }: JournalFile) -> Row {
     let bytes = std::fs::metadata(&path).map_or(0, |metadata| metadata.len());
-    let read = Reader::open(&path).and_then(|mut reader| {
+    let read = Reader::open(&path).and_then(|reader| {
+        let mut reader = reader.up_to_damage();
         let survey = reader.survey(&mut |_| {})?;
         let header = reader.header();
         let more = More {
@@ -105,10 +106,11 @@ fn row(JournalFile { session_id, run, path }: JournalFile) -> Row {
             torn_bytes: survey.torn_bytes,
             sealed: survey.sealed,
         };
-        Ok((state(&survey), more))
+        Ok((state(&survey), survey.damage, more))
     });
     let (state, problem, more) = match read {
-        Ok((state, more)) => (state, None, Some(more)),
+        Ok((_, Some(damage), more)) => (State::Damaged, Some(damage), Some(more)),
+        Ok((state, None, more)) => (state, None, Some(more)),
         Err(refusal) => (State::Damaged, Some(refusal.message), None),
     };
     Row { session_id, run, file: path, bytes, state, problem, more }

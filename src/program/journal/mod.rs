@@ -4,6 +4,7 @@ mod cut;
 mod draw;
 mod export;
 mod foxglove;
+mod key;
 mod list;
 mod output;
 mod records;
@@ -18,7 +19,7 @@ use std::path::{Path, PathBuf};
 use palpate::journal::{Reader, Replay};
 use palpate::limits::Limits;
 
-use super::{Failure, load_config, with_progress};
+use super::{Failure, load_config, say, with_progress};
 
 #[derive(clap::Args)]
 pub(crate) struct JournalArguments {
@@ -32,10 +33,12 @@ enum Command {
     List(list::ListArguments),
     /// Show what happened in a session, as lines
     Show(show::ShowArguments),
-    /// Simulate journals again and compare every hash; name the first step that differs
+    /// Simulate journals again and compare every hash; name the first step that differs, and how many steps were proved
     #[command(
-        after_help = "Exit status: 0 when all hashes are equal; 1 when one differs; 2 when a journal can't be read, or was \
-        written by a version whose bits are others."
+        after_help = "A step is proved if a hash at it or after it is equal: the inputs in the file give these bits. Who can change a \
+        file can change its hashes as well; against that, --signed-by checks the signatures of the server that wrote it.\n\n\
+        Exit status: 0 when all hashes are equal, also when there are none; 1 when one differs, or a signature is missing or \
+        wrong; 2 when a journal can't be read, is damaged, or was written by a version whose bits are others."
     )]
     Verify(verify::VerifyArguments),
     /// Simulate a journal again, and write records as `palpate run` does; or play it on a server
@@ -46,8 +49,10 @@ enum Command {
     Export(export::ExportArguments),
     /// Write a part of a journal: a journal that verifies alone
     Cut(cut::CutArguments),
-    /// Finish a journal whose server was killed, up to its last whole batch; tell what was lost
+    /// Finish a journal whose server was killed, or that is damaged, up to its last whole batch; tell what was lost
     Recover(recover::RecoverArguments),
+    /// Make a key with which a server signs its journals
+    Key(key::KeyArguments),
 }
 
 /// A journal that is simulated.
@@ -65,8 +70,20 @@ impl Source {
         limits(self.config.as_deref())
     }
 
+    /// The journal, up to where it is damaged, if it is.
     fn open(&self) -> Result<Reader<BufReader<File>>, Failure> {
-        Ok(Reader::open(&self.file)?)
+        Ok(Reader::open(&self.file)?.up_to_damage())
+    }
+
+    /// Tells, after all that is whole was written, what is not. It is an error if more was wanted: steps after `until`.
+    fn tell_damage(&self, damage: Option<&str>, until: u64, wanted: Option<u64>) -> Result<(), Failure> {
+        let Some(damage) = damage else { return Ok(()) };
+        let message = format!("{}: {damage}; it is whole up to step {until}", self.file.display());
+        if wanted.is_some_and(|wanted| wanted <= until) {
+            say!("palpate: warning: {message}");
+            return Ok(());
+        }
+        Err(Failure::Refused(format!("{message}, and what is written ends there")))
     }
 
     /// A replay from the beginning, or from the newest snapshot before a step.
@@ -97,5 +114,6 @@ pub(crate) fn journal(arguments: &JournalArguments) -> Result<(), Failure> {
         Command::Export(arguments) => export::export(arguments),
         Command::Cut(arguments) => cut::cut(arguments),
         Command::Recover(arguments) => recover::recover(arguments),
+        Command::Key(arguments) => key::key(arguments),
     }
 }

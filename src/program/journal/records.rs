@@ -150,7 +150,8 @@ pub(super) fn replay(arguments: &ReplayArguments) -> Result<(), Failure> {
             if !quiet && arguments.output.is_some() {
                 say!("steps {from} to {to}, final hash {}", summary.final_hash);
             }
-            Ok(())
+            let survey = replay.survey();
+            source.tell_damage(survey.damage.as_deref(), survey.until_step, arguments.to)
         }
     }
 }

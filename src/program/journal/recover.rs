@@ -1,4 +1,4 @@
-//! `palpate journal recover`: finishes a journal whose server was killed.
+//! `palpate journal recover`: finishes a journal whose server was killed, or that is damaged.
 
 use std::path::{Path, PathBuf};
 
@@ -11,7 +11,7 @@ use super::output::{new_file, unwritten};
 pub(super) struct RecoverArguments {
     /// The journal
     file: PathBuf,
-    /// The finished journal [default: it takes the place of FILE]
+    /// The finished journal [default: it takes the place of FILE; one that is damaged stays beside it as FILE.damaged]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
 }
@@ -21,7 +21,7 @@ pub(super) fn recover(arguments: &RecoverArguments) -> Result<(), Failure> {
     let RecoverArguments { file, output } = arguments;
     let beside = file.with_extension("mcap.part");
     let target = output.as_deref().unwrap_or(&beside);
-    let reader = Reader::open(file)?;
+    let reader = Reader::open(file)?.up_to_damage();
     let length = reader.length();
     let mut new = new_file(target)?;
     let recovered = with_progress("byte", length, false, |progress| mend::recover(reader, &mut new, progress));
@@ -34,6 +34,12 @@ pub(super) fn recover(arguments: &RecoverArguments) -> Result<(), Failure> {
     };
     new.sync_all().map_err(|e| unwritten(target, &e))?;
     if output.is_none() {
+        if survey.damage.is_some() {
+            // What is behind the damage may be worth something to somebody.
+            let damaged = file.with_extension("mcap.damaged");
+            std::fs::rename(file, &damaged).map_err(|e| unwritten(&damaged, &e))?;
+            say!("{}: the file as it was is {}", file.display(), damaged.display());
+        }
         std::fs::rename(target, file).map_err(|e| unwritten(file, &e))?;
     }
     tell(output.as_deref().unwrap_or(file), &survey);
@@ -41,7 +47,10 @@ pub(super) fn recover(arguments: &RecoverArguments) -> Result<(), Failure> {
 }
 
 fn tell(path: &Path, survey: &Survey) {
-    let Survey { until_step, torn_bytes, end, sealed, .. } = survey;
+    let Survey { until_step, torn_bytes, end, sealed, damage, .. } = survey;
+    if let Some(damage) = damage {
+        return say!("{}: complete up to step {until_step}; {damage}; {torn_bytes} bytes are lost", path.display());
+    }
     let was = match (end, torn_bytes) {
         (Some(_), _) if *sealed => "it was finished already".to_owned(),
         (Some(_), _) => "its end was there; it has a summary now".to_owned(),

@@ -253,7 +253,8 @@ impl Fleet {
             || Refusal::new(Reason::UnknownSession, "session_id", format!("there is no session `{}`", excerpt(id)));
         let (value, revision) = self.session_value(id).await?.ok_or_else(unknown)?;
         if !self.is_there(&value.node) {
-            return Err(between_owners());
+            let standby = Some(value.standby.as_str()).filter(|node| self.is_there(node));
+            return Err(between_owners(standby));
         }
         Ok(self.ownership(&value, revision))
     }
@@ -261,7 +262,7 @@ impl Fleet {
     /// Why this server does not serve a session that is `unknown` here.
     pub(super) async fn refuse(&self, id: &str, unknown: Refusal) -> Refusal {
         match self.locate(id).await {
-            Ok(ownership) if ownership.node == self.node => between_owners(),
+            Ok(ownership) if ownership.node == self.node => between_owners(Some(&self.node)),
             Ok(ownership) => elsewhere(&ownership.node, ownership.endpoint),
             Err(refusal) if refusal.reason == Reason::UnknownSession => unknown,
             Err(refusal) => refusal,
@@ -346,9 +347,15 @@ impl Fleet {
     }
 }
 
-/// The refusal of a session whose owner is gone, and that nobody has taken over yet.
-fn between_owners() -> Refusal {
-    let message = "the server of this session is gone, and another is about to take over; try again in a second";
+/// The refusal of a session that no server has now; `standby` is the one that may claim it, if it is there.
+fn between_owners(standby: Option<&str>) -> Refusal {
+    let message = match standby {
+        Some(node) => {
+            format!("the server of this session is gone, and `{node}` is about to take over; try again in a second")
+        }
+        None => "the server of this session is gone, and none stood by: the session goes on when that server is back"
+            .to_owned(),
+    };
     Refusal::new(Reason::Fenced, "session_id", message)
 }
 

@@ -135,7 +135,7 @@ impl Fleet {
         let made = self.transact(rules::create(&self.keys, &id, &self.node), &id, |found| found.is_some()).await?;
         let revision = made.map_err(|_| crate::pace::fenced())?;
         lock(&self.owned).insert(id.clone(), Owned::since(revision));
-        Ok(Birth { id, revision })
+        Ok(Birth { id, revision, recorded: true })
     }
 
     /// The session of a birth is there; or, if `is_there` is false, will not come.

@@ -271,6 +271,7 @@ impl Fleet {
             // They come with the commands that wait.
             waiting: Vec::new(),
             frozen: true,
+            recorded: true,
         };
         let (owner, pacer) = (self.account(&resumed.header.owner), self.pacer.clone());
         let session = resumed.session;

@@ -66,6 +66,24 @@ impl TryFrom<String> for Keep {
     }
 }
 
+impl Keep {
+    /// For people: how long the journals of a session stay when it has ended.
+    pub(super) fn in_words(self) -> String {
+        let age = match self.age.as_secs() {
+            _ if self.age == Duration::MAX => None,
+            s if s % DAY_S == 0 => Some(format!("{} days", s / DAY_S)),
+            s => Some(format!("{:.1} hours", Duration::from_secs(s).as_secs_f64() / 3600.0)),
+        };
+        let size = (self.bytes != u64::MAX).then(|| format!("all journals take more than {} MiB", self.bytes >> 20));
+        match (age, size) {
+            (None, None) => "until somebody removes them".to_owned(),
+            (None, Some(size)) => format!("after the session's end until {size}"),
+            (Some(age), None) => format!("{age} after the session's end"),
+            (Some(age), Some(size)) => format!("{age} after the session's end, or until {size}"),
+        }
+    }
+}
+
 fn age_of(text: &str) -> Option<Duration> {
     let unit_s = match text.chars().last()? {
         'd' => DAY_S,
@@ -81,6 +99,17 @@ fn age_of(text: &str) -> Option<Duration> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn in_words_it_is_what_people_say() {
+        let words = |text: &str| text.parse::<Keep>().unwrap().in_words();
+        assert_eq!(
+            Keep::default().in_words(),
+            "30 days after the session's end, or until all journals take more than 10240 MiB"
+        );
+        assert_eq!(words("12h"), "12.0 hours after the session's end");
+        assert_eq!(words("500MiB"), "after the session's end until all journals take more than 500 MiB");
+    }
 
     #[test]
     fn an_age_a_size_or_both() {

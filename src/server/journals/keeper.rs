@@ -12,6 +12,7 @@ use super::folder::{Folder, Grown};
 use super::growth::Growth;
 use super::keep::Keep;
 use super::old;
+use crate::journal::signature::Key;
 use crate::journal::{self, Opening, Writer, pb};
 use crate::pace::Leaving;
 use crate::pace::clock::now_ns;
@@ -52,6 +53,8 @@ struct Entry {
 pub(super) struct Keeper {
     folder: Arc<Folder>,
     keep: Keep,
+    /// Signs what is written.
+    key: Option<Key>,
     queue: Arc<TapeQueue>,
     tally: Arc<KeeperTally>,
     /// The newest run of each session that was found in the folder, or has begun.
@@ -88,7 +91,7 @@ struct Written {
 impl Keeper {
     pub(super) fn new(
         folder: Arc<Folder>,
-        keep: Keep,
+        (keep, key): (Keep, Option<Key>),
         queue: Arc<TapeQueue>,
         tally: Arc<KeeperTally>,
         found: Found,
@@ -96,7 +99,7 @@ impl Keeper {
     ) -> Self {
         let Found { runs, left_alone } = found;
         let (entries, waiting, without_room) = (BTreeMap::new(), Vec::new(), Vec::new());
-        Keeper { folder, keep, queue, tally, runs, left_alone, entries, waiting, without_room, growth }
+        Keeper { folder, keep, key, queue, tally, runs, left_alone, entries, waiting, without_room, growth }
     }
 
     /// Works until the queue is stopped, and everything in it is written.
@@ -264,7 +267,8 @@ impl Keeper {
             ownership_revision: *revision,
         };
         let file = Grown::new(self.folder.path().join(journal::file::name(id, *run)));
-        let entry = Entry { tape: tape.clone(), writer: Some(Writer::new(&opening, unix_ns())), file, is_new: true };
+        let writer = Writer::new(&opening, unix_ns()).signed(self.key.as_ref());
+        let entry = Entry { tape: tape.clone(), writer: Some(writer), file, is_new: true };
         self.entries.insert(id.clone(), entry);
         tape.begins(u32::try_from(*run).unwrap_or(u32::MAX));
         if anew.is_some() {

@@ -18,6 +18,8 @@ use std::time::Duration;
 pub use keep::Keep;
 
 use super::config::Config;
+use super::{journal_key, reload};
+use crate::journal::signature::Key;
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::pace::tape::{Progress, TapeQueue};
@@ -58,12 +60,14 @@ impl Journals {
     ) -> Result<Option<Arc<Self>>> {
         let Some(path) = &config.journal else { return Ok(None) };
         let (own, growth) = fleet.unzip();
+        let key = config.journal_key.as_deref().map(signing_key).transpose()?;
         let folder = Arc::new(Folder::open(path)?);
         let (queue, tally) = (pacer.keep_tapes(), Arc::new(KeeperTally::default()));
         let found = resume::all(folder.path(), own.as_ref(), pacer, &config.limits)?;
         let name = |path: &PathBuf| crate::journal::file::parse(path.file_name()?.to_str()?);
         let left_alone = found.left_alone.iter().filter_map(|path| Some(name(path)?.0)).collect();
-        let keeper = Keeper::new(folder.clone(), config.journal_keep, queue.clone(), tally.clone(), found, growth);
+        let keeper =
+            Keeper::new(folder.clone(), (config.journal_keep, key), queue.clone(), tally.clone(), found, growth);
         let work = move || {
             give_way_a_little();
             keeper.work();
@@ -121,6 +125,19 @@ impl Journals {
             let _ = thread.join();
         }
     }
+}
+
+/// The key in a file, for signatures.
+fn signing_key(path: &Path) -> Result<Key> {
+    let refuse = |why: String| {
+        let refusal = Refusal::new(Reason::Unreadable, "", why);
+        Refusal { place: Some(path.display().to_string()), ..refusal }
+    };
+    let text = std::fs::read_to_string(path).map_err(|e| refuse(format!("can't be read: {e}")))?;
+    reload::warn_if_readable(path, "the key of the journals");
+    let key = journal_key::private(&text).map_err(|refusal| refuse(refusal.message))?;
+    tracing::info!(public_key = %key.public(), "journals are signed");
+    Ok(key)
 }
 
 /// Waits until a session is on the disk; if that takes too long, tells why.

@@ -10,11 +10,12 @@ use std::time::UNIX_EPOCH;
 
 use palpate_proto::pb;
 
+use super::super::config::Config;
 use super::super::uploads::{Kind, Part, Uploads};
-use super::Journals;
 use super::folder::Folder;
 use super::keeper::unix_ns;
 use super::player::{Player, Source, read_ahead};
+use super::{Journals, Keep};
 use crate::budget::{Account, Purpose, Resource, Taken};
 use crate::journal::file::{self, JournalFile};
 use crate::journal::inputs::Inputs;
@@ -98,6 +99,10 @@ fn info(
 pub(in crate::server) struct Recorded {
     /// `None` if no journals are kept.
     folder: Option<Arc<Folder>>,
+    /// How long they stay.
+    keep: Keep,
+    /// Sessions whose mesh a client has sent have journals too.
+    with_meshes: bool,
     sent: Uploads<Vec<u8>>,
     player: Arc<Player>,
     thread: Mutex<Option<JoinHandle<()>>>,
@@ -108,7 +113,8 @@ impl Recorded {
     ///
     /// # Errors
     /// Refuses if no thread can be started.
-    pub(in crate::server) fn new(journals: Option<&Journals>, limits: &Limits) -> Result<Arc<Self>> {
+    pub(in crate::server) fn new(journals: Option<&Journals>, config: &Config) -> Result<Arc<Self>> {
+        let limits = &config.limits;
         let player = Arc::new(Player::default());
         let reader = player.clone();
         let playing = thread("player").spawn(move || reader.work()).map_err(|error| {
@@ -124,7 +130,8 @@ impl Recorded {
             kept_s: limits.journal_s,
         });
         let folder = journals.map(|journals| journals.folder.clone());
-        Ok(Arc::new(Recorded { folder, sent, player, thread: Some(playing).into() }))
+        let (keep, with_meshes) = (config.journal_keep, config.journal_meshes);
+        Ok(Arc::new(Recorded { folder, keep, with_meshes, sent, player, thread: Some(playing).into() }))
     }
 
     /// Ends. The stepping threads have ended before.
@@ -146,6 +153,54 @@ impl Recorded {
             Refusal::new(Reason::NotAvailable, field, message)
         };
         self.folder.as_ref().map(|folder| folder.path()).ok_or_else(none)
+    }
+
+    /// What the server keeps of a mesh that a client sends, for people; empty if nothing.
+    pub(in crate::server) fn told_of_meshes(&self) -> String {
+        match (&self.folder, self.with_meshes && !self.keep.age.is_zero()) {
+            (Some(_), true) => format!(
+                "the journals of sessions on this mesh contain it, and stay {}; DeleteJournal removes them earlier",
+                self.keep.in_words()
+            ),
+            _ => String::new(),
+        }
+    }
+
+    /// Removes the journals of a session that is not here any more, all runs. Tells how many.
+    ///
+    /// # Errors
+    /// Refuses a session that goes on or of which there is no journal, and tells which file can't be removed.
+    pub(in crate::server) fn remove(&self, session_id: &str, pacer: &Pacer) -> Result<u32> {
+        let folder = self.folder("session_id")?;
+        if pacer.has(session_id) {
+            let message = "is that of a session that goes on: delete it first (DeleteSession)";
+            return Err(Refusal::new(Reason::OutOfTurn, "session_id", message));
+        }
+        let unreadable = |name: &str, error: std::io::Error| {
+            let refusal = Refusal::new(Reason::Unreadable, "session_id", format!("can't be removed: {error}"));
+            Refusal { place: Some(name.to_owned()), ..refusal }
+        };
+        let listed = file::list(folder).map_err(|error| unreadable("the folder of the journals", error))?;
+        let mut removed = 0;
+        for file in listed.into_iter().filter(|file| file.session_id == session_id) {
+            match std::fs::remove_file(&file.path) {
+                Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+                removal => {
+                    removal.map_err(|error| unreadable(&file::name(session_id, file.run), error))?;
+                    tracing::info!(
+                        session = session_id,
+                        run = file.run,
+                        "journal removed, because a client asked for it"
+                    );
+                    removed += 1;
+                }
+            }
+        }
+        if removed == 0 {
+            let message = "there is no journal of this session";
+            return Err(Refusal::new(Reason::UnknownSession, "session_id", message));
+        }
+        Ok(removed)
     }
 
     /// All journals of the folder, by session and run; none if there is no folder.
@@ -246,7 +301,7 @@ impl Recorded {
     pub(in crate::server) fn begin(
         &self,
         moment: &pb::JournalMoment,
-        Birth { id, revision }: Birth,
+        Birth { id, revision, .. }: Birth,
         (paused, idle_timeout_s): (bool, f64),
         (payer, pacer): (&Account, &Pacer),
         limits: &Limits,
@@ -256,6 +311,7 @@ impl Recorded {
         number("journal.speed", speed, "from 0.1 to 8", |speed| (0.1..=8.0).contains(&speed))?;
         let within = |refusal: Refusal| refusal.within("journal");
         let (mut reader, session_id, run) = self.open(moment, payer).map_err(within)?;
+        let has_mesh = reader.header().mesh.is_some();
         let survey = reader.survey(&mut |_| {}).map_err(within)?;
         let step = moment.step.unwrap_or(survey.until_step);
         let steps = [reader.header().begin_step, survey.until_step];
@@ -272,6 +328,8 @@ impl Recorded {
             revision,
             waiting: Vec::new(),
             frozen: false,
+            // What the server has a journal of is not kept out of them.
+            recorded: self.with_meshes || moment.upload_id.is_empty() || !has_mesh,
         };
         if !moment.plays {
             // With the memory that is taken for a journal which was sent.

@@ -153,6 +153,7 @@ fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) 
         revision,
         waiting: std::mem::take(&mut resumed.waiting),
         frozen: false,
+        recorded: true,
     };
     let owner = pacer.budget.account(&resumed.header.owner);
     let (step, torn_bytes) = (resumed.session.step_count(), resumed.survey.torn_bytes);

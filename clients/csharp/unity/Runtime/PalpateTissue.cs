@@ -9,11 +9,16 @@ namespace Palpate
     public sealed class PalpateTissue : MonoBehaviour
     {
         public string url = "http://127.0.0.1:7117";
-        public string scene = "liver";
-        [Range(0, 10)] public int refinement = 1;
+        [Tooltip("A scene of the server, if there is no text of one of your own.")] public string scene = "liver";
+        [Tooltip("The text of a scene (TOML) of your own. Its [mesh] says file = \"mesh.obj\" and unit = \"m\".")] public
+        TextAsset sceneText; [Tooltip("With that text: the mesh to touch, which has to be readable. It is sent to the server.")]
+        public Mesh ownMesh; [Range(0, 10)] public int refinement = 1;
 
         /// <summary>The session; null while there is none.</summary>
         public Session Session { get; private set; }
+
+        /// <summary>The surface at rest, for rays.</summary>
+        public MeshCollider Rest { get; private set; }
 
         Server server;
         Surface surface;
@@ -23,7 +28,7 @@ namespace Palpate
         void Awake()
         {
             server = new Server(url);
-            Session = server.Create(scene);
+            Session = Create();
             surface = Session.Surface(Axes.Unity, refinement);
             int vertices = surface.Positions.Length / 3;
             positions = new Vector3[vertices];
@@ -39,6 +44,23 @@ namespace Palpate
                 mesh.SetUVs(0, uv);
             }
             GetComponent<MeshFilter>().sharedMesh = mesh;
+            // The tissue at rest: what a ray meets, whatever the tool has done to it.
+            var atRest = new Mesh { name = scene + " at rest", indexFormat = UnityEngine.Rendering.IndexFormat.UInt32 };
+            atRest.SetVertices(positions);
+            atRest.triangles = surface.Indices;
+            Rest = gameObject.AddComponent<MeshCollider>();
+            Rest.sharedMesh = atRest;
+        }
+
+        Session Create()
+        {
+            if (sceneText == null) return server.Create(scene);
+            if (ownMesh == null) return server.CreateFromText(sceneText.text);
+            var corners = ownMesh.vertices;
+            var places = new float[3 * corners.Length];
+            for (int k = 0; k < corners.Length; k++)
+                for (int axis = 0; axis < 3; axis++) places[3 * k + axis] = corners[k][axis];
+            return server.CreateFromMesh(sceneText.text, "mesh.obj", Server.Obj(places, ownMesh.triangles, Axes.Unity));
         }
 
         // Never waits for the server.

@@ -5,11 +5,13 @@ using UnityEngine;
 
 namespace Palpate
 {
-    /// <summary>Leads a tool where this object is, on a thread of its own at 1 kHz, and tells the force. The object follows the mouse.</summary>
+    /// <summary>Leads a tool where this object is, on a thread of its own at 1 kHz, and tells the force. The object follows the
+    /// mouse over the tissue.</summary>
     public sealed class PalpateTool : MonoBehaviour
     {
         public PalpateTissue tissue;
         [Tooltip("How far the tool goes in while the left button is down, m.")] public float press = 0.004f;
+        [Tooltip("How far it is off the surface else, m.")] public float hover = 0.002f;
 
         /// <summary>The force on the tool, N, in the coordinates of the tissue.</summary>
         public Vector3 Force { get; private set; }
@@ -37,11 +39,12 @@ namespace Palpate
         void Update()
         {
             var ray = Camera.main.ScreenPointToRay(Input.mousePosition);
-            var plane = new Plane(tissue.transform.up, tissue.transform.position);
-            float along;
-            if (!plane.Raycast(ray, out along)) return;
-            var place = tissue.transform.InverseTransformPoint(ray.GetPoint(along));
-            place.y = Input.GetMouseButton(0) ? -press : 0.002f;
+            // Along the normal of the surface at rest, of a sheet or of a mesh, where the mouse is over it.
+            RaycastHit hit;
+            if (!tissue.Rest.Raycast(ray, out hit, Camera.main.farClipPlane)) return;
+            var normal = tissue.transform.InverseTransformDirection(hit.normal);
+            var depth = Input.GetMouseButton(0) ? press : -hover;
+            var place = tissue.transform.InverseTransformPoint(hit.point) - depth * normal;
             transform.position = tissue.transform.TransformPoint(place);
             lock (exchange)
             {

@@ -51,7 +51,7 @@ pub(super) struct Inbound {
 }
 
 /// What went over the network, in all.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Traffic {
     /// Connections that were opened.
     pub connections: u64,
@@ -67,6 +67,8 @@ pub struct Traffic {
     pub poses: u64,
     /// What went by datagram, and how often the stream took over again.
     pub carried: Carried,
+    /// How far the tissue under the tip was moved at most, m, as samples told it.
+    pub deepest_m: f64,
 }
 
 impl Shared {
@@ -326,6 +328,10 @@ async fn connect(
             let mut inbound = shared.inbound();
             inbound.traffic.samples += 1;
             inbound.traffic.bytes += touch::wire_bytes(sample);
+            for displacement_m in sample.tools.iter().filter_map(|tool| tool.displacement_m) {
+                let deep_m = DVec3::new(displacement_m.x, displacement_m.y, displacement_m.z).length();
+                inbound.traffic.deepest_m = inbound.traffic.deepest_m.max(deep_m);
+            }
             inbound.traffic.carried = Carried {
                 sent: before.sent + now.sent,
                 came: before.came + now.came,

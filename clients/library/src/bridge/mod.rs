@@ -149,6 +149,8 @@ pub struct Report {
     pub missed_ticks: u64,
     /// Number of ticks that were rendered from a copy of the tissue.
     pub predicted_ticks: u64,
+    /// The largest force that was rendered, N.
+    pub most_force_n: f64,
     /// With which priority the loop ran.
     pub priority: Priority,
     /// What went over the network.
@@ -205,7 +207,8 @@ pub async fn run_told<D: HapticDevice + 'static>(
     let (device, served, priority) =
         ended.await.map_err(|_| Error::Internal("the device's loop panicked".to_owned()))?;
     line.close().await;
-    let tick::Served { course, envelope, late_ticks, missed_ticks, predicted_ticks, ages_s, failure } = served;
+    let tick::Served { course, envelope, late_ticks, missed_ticks, predicted_ticks, most_force_n, ages_s, failure } =
+        served;
     let failure = failure.map(Error::Device);
     let mut inbound = line.shared.inbound();
     let (traffic, lost) = (inbound.traffic, inbound.failure.take());
@@ -219,6 +222,7 @@ pub async fn run_told<D: HapticDevice + 'static>(
         late_ticks,
         missed_ticks,
         predicted_ticks,
+        most_force_n,
         priority,
         traffic,
         lost,

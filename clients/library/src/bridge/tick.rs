@@ -45,6 +45,8 @@ pub(super) struct Served {
     pub(super) missed_ticks: u64,
     /// Number of ticks that were rendered from a copy of the tissue.
     pub(super) predicted_ticks: u64,
+    /// The largest force that was rendered, N.
+    pub(super) most_force_n: f64,
     /// Age of the local model at each tick, s; empty unless the loop was to remember.
     pub(super) ages_s: Vec<f64>,
     /// How the device failed, if it has.
@@ -84,7 +86,7 @@ fn tick(
     remember: bool,
     served: &mut Served,
 ) -> std::io::Result<()> {
-    let Served { course, late_ticks, missed_ticks, ages_s, .. } = served;
+    let Served { course, late_ticks, missed_ticks, ages_s, most_force_n, .. } = served;
     let start = Instant::now();
     let mut due = start;
     // If it is much too late, the beat begins anew.
@@ -113,6 +115,7 @@ fn tick(
         }
         let force_n = ticker.tick(reading, time_s);
         device.write(force_n)?;
+        *most_force_n = most_force_n.max(force_n.length());
         if ticker.has_spoken() {
             news.notify_one();
         }

@@ -1,7 +1,7 @@
 //! A SpaceMouse or a gamepad, by the events of Linux: position by rate, force by rumble, so that anybody can try touch.
 //!
 //! A deflection moves the position at a speed, within a ball of the workspace's radius. Nothing pushes the position back: the
-//! force is felt as rumble, if the device has that. Events are read from a path as they are, so a pipe with recorded events
+//! force is felt as rumble, if the device has that. So the position stops by itself where the force comes near the largest one. Events are read from a path as they are, so a pipe with recorded events
 //! does as well.
 
 use std::fs::{File, OpenOptions};
@@ -43,6 +43,18 @@ const RESTS: Duration = Duration::from_millis(100);
 
 /// Longest time that the position moves between two readings, s.
 const MOST_S: f64 = 0.02;
+
+/// Parts of the largest force between which a movement against it becomes slower, until it stops.
+const STOPS: [f64; 2] = [0.6, 0.9];
+
+/// A movement, without what would make a force much larger that is near the largest one already.
+fn stopped(moved_m: DVec3, force_n: DVec3) -> DVec3 {
+    let along = force_n.normalize_or_zero();
+    let against_m = moved_m.dot(along).min(0.0);
+    let part = force_n.length() / UNDECLARED.most_n();
+    let left = ((STOPS[1] - part) / (STOPS[1] - STOPS[0])).clamp(0.0, 1.0);
+    moved_m - (1.0 - left) * against_m * along
+}
 
 /// How often the rumble changes at most, and how long it lasts if it is not said anew.
 const RUMBLE_EVERY: Duration = Duration::from_millis(20);
@@ -248,6 +260,8 @@ pub(super) struct Input {
     has_told: bool,
     told: Told,
     rumble: Option<Rumble>,
+    /// That was written last.
+    force_n: DVec3,
     place_m: DVec3,
     moved: Option<Instant>,
 }
@@ -288,7 +302,8 @@ impl Input {
             return Err(io::Error::new(ErrorKind::InvalidInput, message));
         }
         let told = Told::new(map, ranges);
-        Ok(Input { path, events, part: Vec::new(), has_told: false, told, rumble, place_m: DVec3::ZERO, moved: None })
+        let (part, place_m, force_n) = (Vec::new(), DVec3::ZERO, DVec3::ZERO);
+        Ok(Input { path, events, part, has_told: false, told, rumble, force_n, place_m, moved: None })
     }
 
     /// Reads what has come, without waiting.
@@ -331,13 +346,14 @@ impl HapticDevice for Input {
         self.take(now)?;
         let passed_s =
             self.moved.replace(now).map_or(0.0, |before| now.duration_since(before).as_secs_f64().min(MOST_S));
-        let moved_m = SPEED_M_PER_S * passed_s * self.told.velocity(now);
+        let moved_m = stopped(SPEED_M_PER_S * passed_s * self.told.velocity(now), self.force_n);
         // Within the workspace: beyond it the envelope would take the force away.
         self.place_m = (self.place_m + moved_m).clamp_length_max(0.95 * UNDECLARED.workspace_m);
         Ok(Reading { place_m: self.place_m, enable: self.told.buttons & 1 != 0 })
     }
 
     fn write(&mut self, force_n: DVec3) -> io::Result<()> {
+        self.force_n = force_n;
         if let Some(rumble) = &mut self.rumble {
             rumble.play(force_n.length() / UNDECLARED.most_n());
         }
@@ -428,6 +444,20 @@ mod tests {
         let mut pad = Told::new(Map::Gamepad, Map::Gamepad.ranges());
         pad.take(&event(EV_ABS, 5, 255), now).unwrap();
         assert_eq!(pad.velocity(now), -DVec3::Z);
+    }
+
+    #[test]
+    fn nothing_goes_deeper_where_the_force_is_near_the_largest_one() {
+        let most_n = UNDECLARED.most_n();
+        let moved_m = DVec3::new(1e-5, 0.0, -2e-5);
+        assert_eq!(stopped(moved_m, DVec3::ZERO), moved_m);
+        assert_eq!(stopped(moved_m, DVec3::Z * 0.5 * most_n), moved_m);
+        // Half way it is half as fast, then it only slides, and it can always come out.
+        let half_m = stopped(moved_m, DVec3::Z * 0.75 * most_n);
+        assert!((half_m - DVec3::new(1e-5, 0.0, -1e-5)).length() < 1e-12, "{half_m}");
+        let slides_m = stopped(moved_m, DVec3::Z * 0.95 * most_n);
+        assert!((slides_m - DVec3::X * 1e-5).length() < 1e-12, "{slides_m}");
+        assert_eq!(stopped(-moved_m, DVec3::Z * most_n), -moved_m);
     }
 
     #[test]

@@ -75,6 +75,12 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     if let Some(error) = &served.lost {
         warn(&error.to_string());
     }
+    #[allow(clippy::cast_precision_loss)]
+    if let Some(told) =
+        too_late([served.late_ticks, served.missed_ticks].map(|ticks| ticks as f64), duration_s / TICK_S)
+    {
+        warn(&told);
+    }
     let mut totals = Totals::default();
     with_tissue(|| {
         let mut twin = Tissue::new(setup)?;
@@ -105,6 +111,22 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     Ok(outcome)
 }
 
+/// Parts of the ticks that may be late or skipped: above that, the figures are those of this machine.
+const MOST_LATE: f64 = 0.01;
+
+/// What to say of a run in which too many ticks were late or skipped.
+fn too_late([late, missed]: [f64; 2], ticks: f64) -> Option<String> {
+    (late + missed > MOST_LATE * ticks).then(|| {
+        let percent = |count: f64| 100.0 * count / ticks;
+        format!(
+            "this machine was too late to judge server and network: {:.1} % of the ticks began more than 1 ms late, {:.1} % were \
+             skipped; the figures below are no measure of the link",
+            percent(late),
+            percent(missed)
+        )
+    })
+}
+
 /// A course resampled at each whole tick: the place, interpolated linearly, and the force that the device held.
 fn steps(course: &[Part]) -> impl Iterator<Item = Part> {
     let (mut at, mut tick) = (1, 0_u32);
@@ -123,6 +145,13 @@ fn steps(course: &[Part]) -> impl Iterator<Item = Part> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_machine_that_was_late_is_told_of() {
+        assert_eq!(too_late([50.0, 40.0], 1e4), None);
+        let told = too_late([200.0, 1000.0], 1e4).unwrap();
+        assert!(told.contains("2.0 % of the ticks") && told.contains("10.0 % were skipped"), "{told}");
+    }
 
     #[test]
     fn a_course_with_a_stall_is_resampled_by_the_time_that_passed() {

@@ -1,0 +1,36 @@
+//! The keys that sign journals, as files have them: PEM.
+
+use tokio_rustls::rustls::pki_types::pem::PemObject;
+use tokio_rustls::rustls::pki_types::{PrivatePkcs8KeyDer, SubjectPublicKeyInfoDer};
+
+use crate::journal::signature::{Key, PublicKey};
+use crate::refusal::{Reason, Refusal, Result};
+
+fn refuse(why: &str) -> Refusal {
+    Refusal::new(Reason::Unreadable, "", why)
+}
+
+/// A refusal of a key that is not Ed25519.
+fn other_kind() -> Refusal {
+    refuse("is a key of another kind: signatures of journals are Ed25519")
+}
+
+/// The private key in a text (`PRIVATE KEY`, PKCS#8).
+///
+/// # Errors
+/// Refuses any other text, and a key of another kind. The message does not quote it.
+pub fn private(text: &str) -> Result<Key> {
+    let key = PrivatePkcs8KeyDer::from_pem_slice(text.as_bytes())
+        .map_err(|_| refuse("has no private key in PEM (-----BEGIN PRIVATE KEY-----)"))?;
+    Key::of(key.secret_pkcs8_der()).ok_or_else(other_kind)
+}
+
+/// The public key in a text (`PUBLIC KEY`).
+///
+/// # Errors
+/// Refuses any other text, and a key of another kind.
+pub fn public(text: &str) -> Result<PublicKey> {
+    let key = SubjectPublicKeyInfoDer::from_pem_slice(text.as_bytes())
+        .map_err(|_| refuse("has no public key in PEM (-----BEGIN PUBLIC KEY-----)"))?;
+    PublicKey::of(key.as_ref()).ok_or_else(other_kind)
+}

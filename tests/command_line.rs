@@ -1,0 +1,137 @@
+//! What people mistype: each program says what is wrong and what would be right.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, missing_docs)]
+
+use std::path::Path;
+use std::process::Command;
+
+use palpate_mesh::write::{Format, write};
+use palpate_mesh::{TriangleMesh, organ};
+
+/// Exit status, and both outputs.
+fn palpate(folder: &Path, arguments: &[&str]) -> (i32, String) {
+    let output = Command::new(env!("CARGO_BIN_EXE_palpate")).args(arguments).current_dir(folder).output().unwrap();
+    let text = [output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).concat();
+    (output.status.code().unwrap(), text)
+}
+
+fn says((status, text): (i32, String), expected: i32, parts: &[&str]) {
+    assert_eq!(status, expected, "{text}");
+    parts.iter().for_each(|part| assert!(text.contains(part), "`{part}` is not in {text}"));
+}
+
+/// A liver of 1,500 vertices or so.
+fn liver() -> TriangleMesh {
+    organ::generate("liver".parse().unwrap(), 0.007, 1).unwrap()
+}
+
+#[test]
+fn a_wrong_value_is_refused_for_its_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    std::fs::write(at("liver.obj"), write(&liver(), Format::of("x.obj").unwrap())).unwrap();
+    std::fs::create_dir(at("empty")).unwrap();
+    std::fs::create_dir(at("mine")).unwrap();
+    std::fs::write(at("mine/poke.toml"), "scenes = [\"paper\"]\nduration_s = 1.0\n").unwrap();
+    for (name, text) in [
+        ("a.toml", "lissen = \"127.0.0.1:0\"\n"),
+        ("b.toml", "[limits]\nmax_sessions = 3\n"),
+        ("c.toml", "[limit]\nsessions = 3\n"),
+        ("d.toml", "colour = 3\n"),
+    ] {
+        std::fs::write(at(name), text).unwrap();
+    }
+    for (arguments, parts) in [
+        (&["mesh", "liver.obj", "--unit", "-1"][..], &["--unit: `-1` is no unit"][..]),
+        (
+            &["organ", "liver", "--edge-mm", "-2", "--output", "x.obj"],
+            &["--edge-mm: the edge length must be", "-0.002"],
+        ),
+        (&["organ", "liver", "--edge-mm", "-1e-3", "--output", "x.obj"], &["--edge-mm: the edge length must be"]),
+        (&["serve", "--threads", "-1"], &["--threads: must be a whole number from 0, but is `-1`"]),
+        (&["certificate", "--days", "-3"], &["-3 is not in 1..=825"]),
+        (&["organ", "spleen"], &["there is no organ `spleen`; there are gallbladder"]),
+        (&["organ", "liver"], &["--output: is missing", "liver.obj"]),
+        (&["mesh", "liver.obj", "--unit", "m", "--vertices", "2"], &["--vertices: must be at least 4, but is 2"]),
+        (
+            &["serve", "--viewer", "empty", "--listen", "127.0.0.1:0"],
+            &["--viewer empty: has no index.html", "npm run build"],
+        ),
+        (&["serve", "--config", "a.toml"], &["a.toml:1", "unknown key; did you mean `listen`?"]),
+        (&["serve", "--config", "b.toml"], &["b.toml:2", "unknown key; did you mean `sessions`?"]),
+        (&["serve", "--config", "c.toml"], &["c.toml:1", "unknown key; did you mean `limits`?"]),
+        (&["serve", "--config", "d.toml"], &["d.toml:1", "unknown key; known here: listen, tls_cert"]),
+        (&["serve", "--journal-key", "a.key"], &["journal: is missing, but journal_key requires it"]),
+        (&["check", "poke", "--scenes", "mine"], &["poke.toml: is a script in the folder of scenes: move it"]),
+        (&["render", "paper", "vertical-60", "--at", "9999", "--output", "p.png"], &["--at: must be from 0 to 1000"]),
+        (&["token", "--name", "", "--role", "watch"], &["name: is empty"]),
+        (&["token", "--name", " ", "--role", "watch"], &["name: is empty"]),
+    ] {
+        says(palpate(folder.path(), arguments), 2, parts);
+    }
+    let picture = ["render", "paper", "vertical-60", "--at", "300", "--size", "32x32", "--output", "p.png"];
+    says(palpate(folder.path(), &picture), 0, &[]);
+}
+
+#[test]
+fn a_length_in_millimetres_is_taken_for_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let refused = |radius_m: &str, place_m: &str, parts: &[&str]| {
+        let text = format!(
+            "duration_s = 0.1\nsample_every_s = 0.05\n[[tool]]\ntip = {{ radius_m = {radius_m}, friction = 0.2 }}\n\
+             poses = [{{ at_s = 0.0, place_m = {place_m} }}]\n"
+        );
+        std::fs::write(folder.path().join("s.toml"), text).unwrap();
+        says(palpate(folder.path(), &["run", "liver", "s.toml"]), 2, parts);
+    };
+    refused("0.005", "[37.5, 37.5, 53.0]", &["must be at most", "millimetres? All lengths are in metres"]);
+    refused("5.0", "[0.0375, 0.0375, 0.002]", &["radius_m: must be above 0", "millimetres? All lengths are in metres"]);
+}
+
+#[test]
+fn a_server_that_does_not_begin_says_no_address() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("file"), "").unwrap();
+    let usual = ["serve", "--listen", "127.0.0.1:0", "--journal"];
+    for (more, told) in [
+        (&["file"][..], "journal: file: can't be used"),
+        (&["journals", "--journal-key", "file"], "file: has no private key in PEM"),
+        (&["journals", "--journal-key", "none"], "none: can't be read"),
+    ] {
+        let (status, text) = palpate(folder.path(), &[&usual[..], more].concat());
+        assert!(status == 2 && text.contains(told) && !text.contains("listens"), "{status}: {text}");
+    }
+}
+
+#[test]
+fn an_owner_has_one_token_of_a_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let make = |name: &str| palpate(folder.path(), &["token", "--name", name, "--role", "watch", "--tokens", "t.toml"]);
+    says(make("ann"), 0, &["palpate_"]);
+    says(make("ann"), 2, &["`ann` is the name of another entry in this file"]);
+    says(make("bob"), 0, &["palpate_"]);
+    let text = std::fs::read_to_string(folder.path().join("t.toml")).unwrap();
+    assert_eq!(text.matches("[[token]]").count(), 2, "{text}");
+}
+
+#[test]
+fn check_tells_what_helps_against_a_fast_vertex_as_tried() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut mesh = liver();
+    let [a, b, _] = mesh.triangles[700].map(|vertex| vertex as usize);
+    mesh.vertices_m[a] = mesh.vertices_m[a].lerp(mesh.vertices_m[b], 0.97);
+    std::fs::write(folder.path().join("bad.obj"), write(&mesh, Format::of("x.obj").unwrap())).unwrap();
+    let scene = "[mesh]\nfile = \"bad.obj\"\nunit = \"m\"\nfixed = { group = \"bare-area\" }\n[material]\n\
+        youngs_modulus_pa = 8000.0\nthickness_m = 0.0005\nbed_n_per_m3 = 1.34e6\ndamping_ratio = 0.5\n";
+    std::fs::write(folder.path().join("bad.toml"), scene).unwrap();
+    let (status, text) = palpate(folder.path(), &["check", "bad.toml"]);
+    assert!(status == 0 && text.contains("times as fast as half of the mesh") && !text.contains("--repair"), "{text}");
+    let fewer = mesh.vertices_m.len() - 1;
+    assert!(text.contains(&format!("advice: vertices = {fewer} in [mesh] takes ")), "{text}");
+    let advice = text.lines().find(|line| line.starts_with("advice")).unwrap();
+    let numbers: Vec<u32> = advice.split(' ').filter_map(|word| word.trim_end_matches(',').parse().ok()).collect();
+    assert!(numbers[1] < numbers[2], "{advice}");
+    let (_, text) = palpate(folder.path(), &["check", "bad.toml", "--set", &format!("mesh.vertices={fewer}")]);
+    assert!(!text.contains("advice"), "{text}");
+    let substeps = format!(", {} times a step", numbers[1]);
+    assert!(text.contains(&substeps) || numbers[1] == 1 && text.contains("once a step"), "{advice}\n{text}");
+}
