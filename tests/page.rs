@@ -142,7 +142,11 @@ fn nothing_leads_out_of_the_pages_folder() {
 #[test]
 fn without_a_page_it_says_how_to_get_one_and_serves_all_the_same() {
     let empty = tempfile::tempdir().unwrap();
+    // A page that is gone once the server runs: without one, `--viewer` is refused.
+    let index = empty.path().join("index.html");
+    std::fs::write(&index, "<title>tissue</title>").unwrap();
     let server = Server::start(&["--viewer", empty.path().to_str().unwrap()]);
+    std::fs::remove_file(index).unwrap();
     let (head, body) = get(&server, "/", "");
     assert!(head.starts_with("http/1.1 404") && head.contains("text/html"), "{head}");
     assert!(body.contains("make viewer") && body.contains("Node.js"), "{body}");

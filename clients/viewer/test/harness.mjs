@@ -67,7 +67,7 @@ const PROGRAM = process.env.SERVER_PROGRAM ?? join(ROOT, "target/release/palpate
 
 /** A new token, added to a file. @param {string} file @param {string} roles */
 export function makeToken(file, roles) {
-  const made = spawnSync(PROGRAM, ["token", "--name", "page", "--role", roles, "--tokens", file], { encoding: "utf8" });
+  const made = spawnSync(PROGRAM, ["token", "--name", `page ${roles}`, "--role", roles, "--tokens", file], { encoding: "utf8" });
   if (made.status !== 0) throw new Error(made.stderr);
   return made.stdout.trim();
 }
