@@ -158,7 +158,7 @@ fn a_bridge_renders_from_a_copy_of_a_mesh_and_of_a_sheet_only_when_asked_to() {
         serde_json::from_slice::<Value>(&output.stdout).unwrap()["predicted_ticks"].as_u64().unwrap()
     };
     assert_eq!(predicted("paper", "", 1), 0);
-    assert_eq!(predicted("gallbladder", "--prediction never", 1), 0);
+    assert_eq!(predicted("gallbladder", "--prediction never", 4), 0);
     // A copy is there when it is made: on a busy machine that may take more than a few seconds.
     for (scene, more) in [("paper", "--prediction always"), ("gallbladder", "")] {
         assert!([3, 30].iter().any(|seconds| predicted(scene, more, *seconds) > 0), "{scene}");
