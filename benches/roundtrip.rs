@@ -13,7 +13,7 @@
 #[path = "../tests/common/server.rs"]
 mod server;
 
-use std::process::{Command, Stdio};
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
@@ -144,7 +144,7 @@ fn serve_echo() {
 /// Starts the echo server in a process of its own.
 fn spawn_echo() -> Server {
     let mut echo = Command::new(std::env::current_exe().unwrap());
-    Server::of(echo.arg("--echo").stdout(Stdio::piped()).spawn().unwrap())
+    Server::spawn(echo.arg("--echo"))
 }
 
 /// A haptic stream that sends a command and waits for its acknowledgement.

@@ -79,7 +79,7 @@ mod tests {
     use super::*;
 
     #[derive(Parser, Debug)]
-    struct Arguments {
+    struct TestArguments {
         #[arg(long)]
         unit: Option<String>,
         #[arg(long)]
@@ -91,7 +91,7 @@ mod tests {
         name: Option<String>,
     }
 
-    fn read_of(arguments: &[&str]) -> Result<Arguments, Error> {
+    fn read_of(arguments: &[&str]) -> Result<TestArguments, Error> {
         read(std::iter::once("program").chain(arguments.iter().copied()).map(OsString::from))
     }
 

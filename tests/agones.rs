@@ -199,18 +199,15 @@ async fn an_sdk_that_hangs_is_asked_again() {
 
 /// A server of a fleet of one, under Agones.
 fn under_agones(etcd: &Etcd, port: u16, folder: &std::path::Path) -> Server {
-    let child = Command::new(env!("CARGO_BIN_EXE_palpate"))
+    let mut command = Command::new(env!("CARGO_BIN_EXE_palpate"));
+    command
         .args(["serve", "--listen", "127.0.0.1:0", "--agones", "--node", "a", "--advertise", "http://localhost:7117"])
         .arg(format!("--cluster={}", etcd.endpoints().join(",")))
         .arg("--journal")
         .arg(folder)
         .env("AGONES_SDK_GRPC_PORT", port.to_string())
-        .current_dir(env!("CARGO_MANIFEST_DIR"))
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    Server::of(child)
+        .stderr(Stdio::piped());
+    Server::spawn(&mut command)
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -26,13 +26,7 @@ fn limited(limits: &str, arguments: &[&str]) -> Server {
 /// A server as a shell starts it: $0 is the program, $1 where it is to listen.
 #[cfg(unix)]
 fn serve(command: &str, address: &str) -> Server {
-    let child = std::process::Command::new("sh")
-        .args(["-c", &format!("{command} \"$1\""), env!("CARGO_BIN_EXE_palpate"), address])
-        .stdout(std::process::Stdio::piped())
-        .stderr(std::process::Stdio::piped())
-        .spawn()
-        .unwrap();
-    Server::of(child)
+    Server::by_script(&format!("{command} \"$1\""), &[address.as_ref()])
 }
 
 fn connect(server: &Server) -> TcpStream {

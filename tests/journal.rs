@@ -1,11 +1,15 @@
 //! Journals: what is written is read again, whatever happens to the file, and gives the same bits.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_possible_truncation)]
 
+#[path = "common/opening.rs"]
+mod opening;
+
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use glam::DVec3;
+use opening::opening;
 use palpate::journal::replay::{Item, items};
 use palpate::journal::{self, Opening, Reader, Seen, Writer, mend, pb};
 use palpate::limits::Limits;
@@ -38,20 +42,6 @@ fn pose(model: &Model, sequence: u64) -> Action {
     let deep_m = 0.2 * model.shape().edge_m() * (1.0 - libm::cos(sequence as f64 * 0.01));
     let place_m = middle_m + DVec3::new(1e-5 * sequence as f64, 0.0, -deep_m);
     Action::Pose { place_m, velocity_m_per_s: None, tip: Tip { radius_m: model.shape().edge_m(), ..Tip::default() } }
-}
-
-fn opening(first: &Arc<Model>) -> Opening<'_> {
-    Opening {
-        session_id: "0123456789abcdef",
-        run: 1,
-        owner: "ann",
-        idle_timeout_s: 60.0,
-        first,
-        begin_step: 0,
-        running: true,
-        until_step: None,
-        ownership_revision: 0,
-    }
 }
 
 /// Steps of a session in each batch, and in all.

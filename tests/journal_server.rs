@@ -2,6 +2,8 @@
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/opening.rs"]
+mod opening;
 #[path = "common/server.rs"]
 mod server;
 
@@ -10,6 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
+use opening::opening;
 use palpate::limits::Limits;
 use palpate::sheet::choice::NEVER;
 use palpate_proto::pb;
@@ -510,17 +513,7 @@ async fn what_a_server_plays_is_compared_with_the_journal_and_written() {
     let mut reader = palpate::journal::Reader::open(&file).unwrap();
     let survey = reader.survey(&mut |_| {}).unwrap();
     let first = palpate::journal::Replay::new(reader, survey, &Limits::default()).unwrap().first().clone();
-    let opening = palpate::journal::Opening {
-        session_id: &id,
-        run: 1,
-        owner: "ann",
-        idle_timeout_s: 60.0,
-        first: &first,
-        begin_step: 0,
-        running: true,
-        until_step: None,
-        ownership_revision: 0,
-    };
+    let opening = palpate::journal::Opening { session_id: &id, ..opening(&first) };
     let mut writer = palpate::journal::Writer::new(&opening, 1);
     writer.hash(100, 7);
     let wrong = folder.path().join("wrong.mcap");

@@ -2,9 +2,13 @@
 //! is found.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, missing_docs)]
 
+#[path = "common/opening.rs"]
+mod opening;
+
 use std::path::Path;
 use std::process::Command;
 
+use opening::opening;
 use palpate::journal::signature::{Key, Signatures};
 use palpate::journal::{Opening, Reader, Writer, pb};
 use palpate::limits::Limits;
@@ -29,17 +33,7 @@ fn journal(key: Option<&Key>, ends: bool) -> Vec<u8> {
     let limits = Limits::default();
     let scene = Scene::parse("paper", PAPER, &["sheet.points=[7, 7]".to_owned()], &limits).unwrap();
     let first = Model::compile(&scene, &limits).unwrap();
-    let opening = Opening {
-        session_id: "0123456789abcdef",
-        run: 1,
-        owner: "ann of the test",
-        idle_timeout_s: 60.0,
-        first: &first,
-        begin_step: 0,
-        running: true,
-        until_step: None,
-        ownership_revision: 0,
-    };
+    let opening = Opening { owner: "ann of the test", ..opening(&first) };
     let (mut session, mut file) = (Session::new(&first), Vec::new());
     let mut writer = Writer::new(&opening, BEGUN_NS).signed(key);
     writer.snapshot(0, session.tissue().state_hash(), session.model(), session.save().to_bytes());

@@ -5,6 +5,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod common;
+#[path = "common/opening.rs"]
+mod opening;
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -148,17 +150,7 @@ fn snapshot(writer: &mut Writer, session: &Session) {
 }
 
 fn opening(first: &Arc<Model>, begin_step: u64) -> Opening<'_> {
-    Opening {
-        session_id: "0123456789abcdef",
-        run: 1,
-        owner: "",
-        idle_timeout_s: 60.0,
-        first,
-        begin_step,
-        running: true,
-        until_step: None,
-        ownership_revision: 0,
-    }
+    Opening { owner: "", begin_step, ..opening::opening(first) }
 }
 
 /// Steps with what a test has them do.

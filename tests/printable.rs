@@ -1,10 +1,14 @@
 //! Names and messages of others in what `palpate` prints: they act on no terminal and begin no line.
 #![allow(clippy::unwrap_used)]
 
+#[path = "common/opening.rs"]
+mod opening;
+
 use std::path::Path;
 use std::process::Command;
 use std::sync::Arc;
 
+use opening::opening;
 use palpate::journal::{Opening, Writer, pb};
 use palpate::limits::Limits;
 use palpate::scene::{PAPER, Scene};
@@ -38,17 +42,7 @@ fn journal() -> Vec<u8> {
     let mut first: Arc<Model> = Model::compile(&scene, &limits).unwrap();
     // No server would take such a name.
     Arc::get_mut(&mut first).unwrap().scene.name = HOSTILE.to_owned();
-    let opening = Opening {
-        session_id: HOSTILE,
-        run: 1,
-        owner: HOSTILE,
-        idle_timeout_s: 60.0,
-        first: &first,
-        begin_step: 0,
-        running: true,
-        until_step: None,
-        ownership_revision: 0,
-    };
+    let opening = Opening { session_id: HOSTILE, owner: HOSTILE, ..opening(&first) };
     let mut writer = Writer::new(&opening, 1);
     writer.input(3, &Input::Hold(HOSTILE.to_owned()));
     writer.finish(pb::Why::Drained, HOSTILE, 10, 2)

@@ -54,19 +54,16 @@ fn server(keys: &Keys, kind: Option<&Kind>) -> Server {
     let limit = kind.and_then(|kind| kind.descriptors).map_or(String::new(), |most| format!("ulimit -n {most}; "));
     let config = keys.beside("palpate.toml", CONFIGURATION);
     let arguments = ["serve", "--listen", "127.0.0.1:0", "--threads", "1", "--log", "error", "--config", &config];
-    let child = kept_to(true, || {
-        Command::new("sh")
+    kept_to(true, || {
+        let mut command = Command::new("sh");
+        command
             .args(["-c", &format!("{limit}exec \"$0\" \"$@\""), env!("CARGO_BIN_EXE_palpate")])
             .args(arguments)
             .args(["--tokens", keys.file()])
-            .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .stdout(Stdio::piped())
             // A log that nobody reads would hold the server up.
-            .stderr(Stdio::null())
-            .spawn()
-            .unwrap()
-    });
-    Server::of(child)
+            .stderr(Stdio::null());
+        Server::spawn(&mut command)
+    })
 }
 
 /// Watches for so long; the most that was resident.

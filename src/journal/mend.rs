@@ -52,7 +52,8 @@ pub fn recover<R: Read + Seek>(
     Ok(survey)
 }
 
-/// Writes the part of a journal from step `from` to step `to` to `output`, which is empty: a journal that verifies alone.
+/// Writes the part of a journal from step `from` to step `to` to `output`, which is empty: a journal that verifies alone. Tells
+/// what the whole journal had.
 ///
 /// # Errors
 /// Refuses steps that the journal has not, a journal that can't be simulated, and an output that can't be written.
@@ -61,11 +62,12 @@ pub fn cut<R: Read + Seek>(
     [from, to]: [u64; 2],
     limits: &Limits,
     output: &mut (impl Read + Write + Seek),
-) -> Result<()> {
+) -> Result<Survey> {
     let survey = reader.survey(&mut |_| {})?;
+    let had = survey.clone();
     let end = survey.until_step;
     if to <= from || to > end {
-        let damage = survey.damage.map_or(String::new(), |damage| format!("; the journal is {damage}"));
+        let damage = survey.and_damage();
         let message = format!("must be above --from and at most {end}, which the journal has, but is {to}{damage}");
         return Err(Refusal::new(Reason::OutOfRange, "to", message));
     }
@@ -121,7 +123,8 @@ pub fn cut<R: Read + Seek>(
     let writer = kept.unwrap_or_else(|| begin(running, until_step, &header, unix_ns));
     let message = format!("steps {from} to {to} of a journal up to step {end}");
     let bytes = writer.finish(pb::Why::Cut, &message, to, unix_ns);
-    output.write_all(&bytes).and_then(|()| seal(output)).map_err(|e| unwritten(&e))
+    output.write_all(&bytes).and_then(|()| seal(output)).map_err(|e| unwritten(&e))?;
+    Ok(had)
 }
 
 fn save(session: &Session) -> Vec<u8> {

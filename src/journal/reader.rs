@@ -224,6 +224,13 @@ pub struct Survey {
     pub damage: Option<String>,
 }
 
+impl Survey {
+    /// The damage, to follow the words on what the journal has; empty without.
+    pub(super) fn and_damage(&self) -> String {
+        self.damage.as_ref().map_or(String::new(), |damage| format!("; the journal is {damage}"))
+    }
+}
+
 /// Changes of the tissue that wait, at most: more than any session lets wait.
 const MOST_WAITING: usize = 4096;
 

@@ -133,7 +133,7 @@ impl<R: Read + Seek> Replay<R> {
     fn near_with(reader: Reader<R>, survey: Survey, limits: &Limits, step: u64, known: Option<Known>) -> Result<Self> {
         let begin = reader.header().begin_step;
         if !(begin..=survey.until_step).contains(&step) {
-            let damage = survey.damage.map_or(String::new(), |damage| format!("; the journal is {damage}"));
+            let damage = survey.and_damage();
             let message =
                 format!("must be from {begin} to {}, which the journal has, but is {step}{damage}", survey.until_step);
             let refusal = Refusal::new(Reason::OutOfRange, "step", message);

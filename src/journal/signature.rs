@@ -55,11 +55,11 @@ impl Key {
 
 /// Sums up messages in their order.
 #[derive(Clone)]
-struct Sum(Context);
+struct MessageDigest(Context);
 
-impl Sum {
+impl MessageDigest {
     fn new() -> Self {
-        Sum(Context::new(&SHA256))
+        MessageDigest(Context::new(&SHA256))
     }
 
     fn add(&mut self, topic: Topic, unix_ns: u64, bytes: &[u8]) {
@@ -78,7 +78,7 @@ impl Sum {
 /// Signs a journal while it is written.
 pub(super) struct Signer {
     key: Key,
-    sum: Sum,
+    sum: MessageDigest,
     /// Whether there are messages after the last signature.
     is_behind: bool,
     /// When it signed last.
@@ -90,7 +90,7 @@ const EVERY_NS: u64 = 1_000_000_000;
 
 impl Signer {
     pub(super) fn new(key: Key) -> Self {
-        Signer { key, sum: Sum::new(), is_behind: false, unix_ns: None }
+        Signer { key, sum: MessageDigest::new(), is_behind: false, unix_ns: None }
     }
 
     /// A message was written.
@@ -121,7 +121,7 @@ impl std::fmt::Debug for Signer {
 /// Checks the signatures of a journal, batch by batch.
 pub struct Signatures {
     key: PublicKey,
-    sum: Sum,
+    sum: MessageDigest,
     /// The step up to which the last batch is complete that was signed, and its number.
     signed: Option<(u64, u64)>,
     /// Messages after the last signature.
@@ -143,7 +143,7 @@ pub struct Signed {
 impl Signatures {
     /// Those of the server with this key.
     pub fn of(key: PublicKey) -> Self {
-        Signatures { key, sum: Sum::new(), signed: None, behind: 0, ended: false }
+        Signatures { key, sum: MessageDigest::new(), signed: None, behind: 0, ended: false }
     }
 
     /// Checks the next batch. All are to be given in order, from the first.

@@ -247,7 +247,7 @@ impl<T: Real> Sheet<T> {
         let unit = plan.scheme.spring_scale() * scale;
         let springs = tables.springs.gather(&tables.layout, &state.u, self.growth(), model.point_of(index));
         let [i, j] = model.point_of(index);
-        let (mass, extra) = (model.relative_mass_at(index), model.extra_virtual_at(index));
+        let mass = model.relative_mass_at(index);
         let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
         // Without all forces of the present a two-step scheme would tell a velocity of a point that rests under a tip.
         let tips_n = if plan.scheme.takes_means() { self.contacts.steady_on(model, index) } else { DVec3::ZERO };
@@ -263,12 +263,7 @@ impl<T: Real> Sheet<T> {
             let (u, w) = with_arithmetic!(&plan.scheme, f64, |scheme| scheme.observe(u, d, n, &kept, Some(force)));
             found[0][c] = u.value() * spacing_m;
             found[1][c] = if still { 0.0 } else { w.value() * spacing_m / plan.substep_s };
-            found[2][c] = n.value() / unit;
-            if model.graph.is_some() {
-                // What pulls beyond the K″ of reference is none of the springs.
-                let pulled_n = model.scene.virtual_stiffness_n_per_m * extra * state.u[at].wide() * spacing_m;
-                found[2][c] = mass * (found[2][c] + pulled_n);
-            }
+            found[2][c] = spring_force_n(model, plan, index, n.value(), state.u[at].wide());
         }
         found
     }
@@ -295,6 +290,17 @@ impl<T: Real> Sheet<T> {
             }
         }
     }
+}
+
+/// The force of the springs on a point along an axis, N, of what they are in the tables and how far the point is, spacings.
+pub(super) fn spring_force_n(model: &Model, plan: &Plan, index: usize, gathered: f64, u: f64) -> f64 {
+    let force_n = gathered / (plan.scheme.spring_scale() * plan.force_scale(&model.scene));
+    if model.graph.is_none() {
+        return force_n;
+    }
+    // What pulls beyond the K″ of reference is none of the springs.
+    let pulled_n = model.scene.virtual_stiffness_n_per_m * model.extra_virtual_at(index) * u * model.unit_m;
+    model.relative_mass_at(index) * (force_n + pulled_n)
 }
 
 /// The springs of a model, in the terms of a plan.

@@ -9,8 +9,9 @@
 //! them is more than ε_w from there. (A comparison with the step before would miss a slow creep.) ε_w is ε, or less
 //! where springs are much stiffer than the virtual ones and so pass on more of an omitted force. A tile also wakes when
 //! the tools' force on it may have changed by more than ε_w·K″ since (`rest`), or the pressure (`swelling`), when a point of it is
-//! grasped (`motion`), or one that its springs reach is moved by its tool by more than ε_w in a substep (`rest`; a scheme of several
-//! sweeps sees that within the substep), and when a position-controlled tool pushes on it (`touch`). All tiles wake when the tissue
+//! grasped (`motion`), and when a position-controlled tool pushes on it (`touch`). What moves by more than ε_w in one substep would
+//! get past that comparison where springs reach two rows, or a scheme has several sweeps: so it wakes all tiles that it reaches in the
+//! sweeps of a substep, be it led by a tool (`rest`, `touch`) or moving by itself. All tiles wake when the tissue
 //! changes (`change`), after a recovery (`recovery`), and when the guard goes back to a checkpoint (`guard`).
 //!
 //! **Cost.** A step's cost follows what is awake, not the size of the sheet: sets of tiles are lists, memory that nothing has
@@ -121,8 +122,13 @@ struct EdgeWatch {
     first: usize,
     next: usize,
     count: usize,
-    /// Their earlier positions: the offset in the snapshots.
-    then: usize,
+}
+
+impl EdgeWatch {
+    /// Where the snapshots have the earlier positions of its points.
+    fn then(&self) -> usize {
+        self.tile * SNAPSHOT + self.side * 3 * TILE
+    }
 }
 
 /// Which tiles of a sheet sleep, and the values kept for waking them.
@@ -379,8 +385,7 @@ impl<T: Real> SleepTiles<T> {
                 let beside = self.neighbour(tile, opposite);
                 if let Some(other) = beside.filter(|other| !self.region.awake.has[*other]) {
                     let (first, next, count) = self.beyond(other, side);
-                    let then = other * SNAPSHOT + side * 3 * TILE;
-                    self.watches.push(EdgeWatch { tile: other, side, first, next, count, then });
+                    self.watches.push(EdgeWatch { tile: other, side, first, next, count });
                 }
             }
         }
@@ -428,6 +433,11 @@ impl<T: Real> SleepTiles<T> {
         (i * stride + j, if x == 0 { stride } else { 1 }, count_x.max(count_y))
     }
 
+    /// How many rows on motion comes in so many sweeps; no further than into the tiles beside it.
+    fn front(&self, sweeps: usize) -> usize {
+        (self.reach * sweeps).min(TILE)
+    }
+
     /// The rows and columns beyond a side or corner, as many as `front`.
     fn near(&self, tile: usize, side: usize, front: usize) -> [Range<usize>; 2] {
         let beyond = |own: Range<usize>, way: isize, count: usize| match way {
@@ -471,8 +481,7 @@ impl<T: Real> SleepTiles<T> {
             return self.wake(graph.beside(tile).chain([tile]));
         }
         let Layout { rows, columns, .. } = self.layout;
-        // No further than into the tiles beside it.
-        let front = (self.reach * sweeps).min(TILE);
+        let front = self.front(sweeps);
         let [i, j] = [(point[0], rows), (point[1], columns)]
             .map(|(at, count)| [at.saturating_sub(front), (at + front).min(count - 1)]);
         self.wake_under([[i[0], j[0]], [i[0], j[1]], [i[1], j[0]], [i[1], j[1]]]);
@@ -511,7 +520,7 @@ impl<T: Real> SleepTiles<T> {
             let waking: Vec<usize> = self.watched.iter().filter(moved).copied().collect();
             return self.wake(waking);
         }
-        let front = (self.reach * sweeps).min(TILE);
+        let front = self.front(sweeps);
         let is_near_fast = |watch: &EdgeWatch| {
             let [rows, columns] = self.near(watch.tile, watch.side, front);
             (0..3).any(|c| {
@@ -520,7 +529,7 @@ impl<T: Real> SleepTiles<T> {
             })
         };
         let moved = |watch: &&EdgeWatch| {
-            let EdgeWatch { first, next, count, then, .. } = **watch;
+            let (EdgeWatch { first, next, count, .. }, then) = (**watch, watch.then());
             (0..3).any(|c| {
                 let (here, then) = (&u[c * self.layout.plane + first..], &self.snapshots[then + c * TILE..][..count]);
                 // Compares all of them without an early exit, so that it compiles to a few vectors.

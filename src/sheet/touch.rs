@@ -8,7 +8,7 @@ use super::contact::{Feel, Surroundings, Thrust, Tool, displacement_m, movement_
 use super::field::{Field, State};
 use super::footprint::Reached;
 use super::model::{Model, Plan};
-use super::motion::Sheet;
+use super::motion::{Sheet, spring_force_n};
 use super::real::Real;
 use super::tables::SweepTables;
 use super::tangent::Window;
@@ -198,19 +198,15 @@ fn states<T: Real>(
     growth: f64,
     tool: &Tool,
 ) -> Vec<UnderTip> {
-    let unit = plan.scheme.spring_scale() * plan.force_scale(&model.scene);
     let of = |Reached { point, mass, .. }: Reached| {
         let index = model.index_of(point);
         let at = |c: usize| c * tables.layout.plane + tables.layout.offset(index);
         let vector = |field: &Field<T>| DVec3::from_array([0, 1, 2].map(|c| field[at(c)].wide()));
-        let u_m = model.unit_m * vector(&state.u);
-        let springs = tables.springs.gather(&tables.layout, &state.u, growth, point);
-        let spring_n = DVec3::from_array(springs.map(Real::wide)) / unit;
+        let (u, springs) = (vector(&state.u), tables.springs.gather(&tables.layout, &state.u, growth, point));
+        let spring_n = [0, 1, 2].map(|c| spring_force_n(model, plan, index, springs[c].wide(), u[c]));
         let place_n_per_m = model.scene.virtual_stiffness_n_per_m * model.relative_virtual_stiffness_at(index);
-        // On a mesh, what pulls beyond the K″ of reference is among the springs, and all of them by mass.
-        let extra_n_per_m = model.scene.virtual_stiffness_n_per_m * model.extra_virtual_at(index);
-        let spring_n = if model.graph.is_some() { mass * (spring_n + extra_n_per_m * u_m) } else { spring_n };
-        UnderTip { mass, u_m, d: vector(&state.d), pull_n: spring_n - place_n_per_m * u_m }
+        let u_m = model.unit_m * u;
+        UnderTip { mass, u_m, d: vector(&state.d), pull_n: DVec3::from_array(spring_n) - place_n_per_m * u_m }
     };
     tool.footprint.reached().iter().copied().filter(|point| point.free).map(of).collect()
 }

@@ -1,6 +1,9 @@
 //! A session as one server hands it to another, or a client sends it: as a journal of one snapshot, in requests.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
 
+#[path = "opening.rs"]
+mod opening;
+
 use std::io::Cursor;
 use std::sync::Arc;
 
@@ -20,17 +23,7 @@ const PART_BYTES: usize = 256 << 10;
 /// The journal of one moment of a session that began with the tissue of `first`.
 pub fn journal(first: &Arc<Model>, session: &Session) -> Vec<u8> {
     let step = session.step_count();
-    let opening = Opening {
-        session_id: "0123456789abcdef",
-        run: 1,
-        owner: "test",
-        idle_timeout_s: 60.0,
-        first,
-        begin_step: step,
-        running: true,
-        until_step: None,
-        ownership_revision: 1,
-    };
+    let opening = Opening { owner: "test", begin_step: step, ownership_revision: 1, ..opening::opening(first) };
     let mut writer = Writer::new(&opening, 1);
     writer.snapshot(step, session.tissue().state_hash(), session.model(), session.save().to_bytes());
     writer.finish(kept::Why::Cut, "a snapshot", step, 1)

@@ -79,32 +79,24 @@ impl Server {
 
     /// The same, at that address.
     pub fn start_at(listen: &str, arguments: &[&str]) -> Self {
-        let child = Command::new(env!("CARGO_BIN_EXE_palpate"))
-            .args(["serve", "--listen", listen])
-            .args(arguments)
-            .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .stdout(Stdio::piped())
-            .stderr(if std::env::var_os("PALPATE_SHOW_LOGS").is_some() { Stdio::inherit() } else { Stdio::piped() })
-            .spawn()
-            .unwrap();
-        Server::of(child)
+        let mut command = Command::new(env!("CARGO_BIN_EXE_palpate"));
+        command.args(["serve", "--listen", listen]).args(arguments);
+        if std::env::var_os("PALPATE_SHOW_LOGS").is_some() {
+            return Server::spawn(command.stderr(Stdio::inherit()));
+        }
+        Server::spawn(command.stderr(Stdio::piped()))
     }
 
     /// A server that a script of the shell starts, such as one that sets limits: `$0` is the program, `$1` and so on `arguments`.
     pub fn by_script(script: &str, arguments: &[&std::ffi::OsStr]) -> Self {
-        let child = Command::new("sh")
-            .args(["-c", script, env!("CARGO_BIN_EXE_palpate")])
-            .args(arguments)
-            .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap();
-        Server::of(child)
+        let mut command = Command::new("sh");
+        command.args(["-c", script, env!("CARGO_BIN_EXE_palpate")]).args(arguments);
+        Server::spawn(command.stderr(Stdio::piped()))
     }
 
-    /// A server in `child`, which prints its address first.
-    pub fn of(mut child: Child) -> Self {
+    /// A server that a command starts, which prints its address first.
+    pub fn spawn(command: &mut Command) -> Self {
+        let mut child = command.current_dir(env!("CARGO_MANIFEST_DIR")).stdout(Stdio::piped()).spawn().unwrap();
         let mut line = String::new();
         let mut out = BufReader::new(child.stdout.take().unwrap());
         out.read_line(&mut line).unwrap();

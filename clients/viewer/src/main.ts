@@ -11,15 +11,15 @@ import { create, type MessageInitShape } from "@bufbuild/protobuf";
 import { norm } from "palpate";
 import { type CreateSessionRequestSchema, SceneSchema, type Session, SessionState } from "palpate/v1";
 import { Choices } from "./choices";
-import { Gate } from "./gate";
 import type { Mode } from "./hand";
 import { Input } from "./input";
-import { inside } from "./inside";
 import type { JournalName } from "./journal";
 import { Latency } from "./latency";
 import { Lumps } from "./lumps";
+import { feltText, isLess, meaningText, refusedText, sentence, strengthText, wayText, wellText } from "./messages";
 import { Overlay } from "./overlay";
 import { addressed, asked, askedNumber, holderName, part, seekAt, writeAddress, writeMoment } from "./page";
+import { pageState } from "./page-state";
 import { keepPicture } from "./pictures";
 import { BACK_S, discard, type Opened, Player } from "./player";
 import { Plots } from "./plot";
@@ -29,9 +29,9 @@ import { Stage } from "./stage";
 import { Status } from "./status";
 import { tissueTexture } from "./texture";
 import { TissueValues } from "./tissue";
+import { TokenForm } from "./token-form";
 import { FileOpener } from "./upload";
 import { Visit } from "./visit";
-import { feltText, isLess, meaningText, refusedText, sentence, strengthText, wayText, wellText } from "./words";
 
 /**
  * A session that nobody asks for is deleted after this time: its pages are closed. Browsers let a hidden page ask once a
@@ -59,7 +59,7 @@ const status = new Status(
   part("details", HTMLButtonElement),
   part("try-now", HTMLButtonElement),
 );
-const gate = new Gate(() => {
+const tokenForm = new TokenForm(() => {
   status.say("Connecting …");
   part("arriving", HTMLElement).hidden = false;
   void open(refused);
@@ -171,7 +171,7 @@ async function open(target: Target): Promise<void> {
     } catch (error) {
       if (begun !== left) return;
       if (isGone(error)) return over(moment ? "There is no such recording." : "This session no longer exists.");
-      if (gate.stops(error)) return status.end("barred", "");
+      if (tokenForm.stops(error)) return status.end("barred", "");
       if (!isPassing(error)) return over(`${sentence(describe(error))}.`);
       const waitMs = backoffMs(failures);
       status.lose(waitMs);
@@ -195,7 +195,7 @@ function barred(reason: string): void {
   if (visit && !visit.session.playback) refused = { sessionId: visit.session.sessionId };
   leave();
   status.end("barred", "");
-  gate.show(reason);
+  tokenForm.show(reason);
 }
 
 /** A session has ended: the user decides what to do. */
@@ -567,7 +567,7 @@ function isStill({ frames, samples, session, speed }: Visit): boolean {
   return newest !== undefined && frames.newest !== undefined && newest.simulationTimeS - frames.newest.timeS > STILL_S * speed;
 }
 
-Object.assign(window, { palpate: inside(() => visit, stage, player, latency) });
+Object.assign(window, { palpate: pageState(() => visit, stage, player, latency) });
 
 const wireframe = part("wireframe", HTMLInputElement);
 wireframe.checked = asked.get("wireframe") === "1";

@@ -2,7 +2,7 @@
 
 import { Body } from "./body";
 import { fingerM } from "./coefficients";
-import { isBarred } from "./gate";
+import { isBarred } from "./token-form";
 import { fetchMesh, Frames, type MeshData, norm } from "palpate";
 import type { Session } from "palpate/v1";
 import { Hand, type Reach } from "./hand";

@@ -205,19 +205,19 @@ describe("the page", () => {
     const page = new Page(await (await browser.newContext(VIEWPORT)).newPage());
     await page.page.goto(paper(asking));
     // One clear sentence, a field, and nothing that can't help.
-    await page.says("gate", /This server asks for a token\..*can give you one/s);
+    await page.says("token-form", /This server asks for a token\..*can give you one/s);
     for (const useless of ["aside", "#arriving", "#notice", "#scene", "#open-file", "#share", "#hint", "#corner"]) {
       assert.ok(await page.page.locator(useless).isHidden(), useless);
     }
     assert.doesNotMatch(await page.page.evaluate("document.body.innerText"), /fetching|lost|Bearer|authorization/i);
     assert.deepEqual(await cut(page), []);
-    await page.page.fill("#gate-token", `${token}x`);
+    await page.page.fill("#token-form-token", `${token}x`);
     await page.page.keyboard.press("Enter");
-    await page.says("gate", /does not know your token/);
-    await page.page.fill("#gate-token", token);
+    await page.says("token-form", /does not know your token/);
+    await page.page.fill("#token-form-token", token);
     await page.page.keyboard.press("Enter");
     await page.shows();
-    assert.ok(await page.page.locator("#gate").isHidden());
+    assert.ok(await page.page.locator("#token-form").isHidden());
     assert.ok(await page.page.locator("#scene option[value=paper]").count());
     // Behind the address it goes as well.
     await page.page.evaluate("sessionStorage.clear()");
@@ -234,7 +234,7 @@ describe("the page", () => {
     // Whoever may only watch is told so, and how to go on.
     const watcher = new Page(await (await browser.newContext(VIEWPORT)).newPage());
     await watcher.page.goto(`${asking.url}/#token=${watching}`);
-    await watcher.says("gate", /does not let you open a tissue/);
+    await watcher.says("token-form", /does not let you open a tissue/);
     await close(watcher);
     assert.equal(await asking.stop(), 0);
   });

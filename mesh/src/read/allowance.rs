@@ -7,7 +7,7 @@ use crate::Problem;
 const STEP: usize = 1 << 18;
 
 /// Counts what is taken.
-pub(super) struct Allowance<'a> {
+pub(super) struct MemoryAllowance<'a> {
     most: usize,
     taken: usize,
     paid: usize,
@@ -15,10 +15,10 @@ pub(super) struct Allowance<'a> {
     pay: &'a mut dyn FnMut(u64) -> bool,
 }
 
-impl<'a> Allowance<'a> {
+impl<'a> MemoryAllowance<'a> {
     /// For a file of so many bytes.
     pub(super) fn new(bytes: usize, pay: &'a mut dyn FnMut(u64) -> bool) -> Self {
-        Allowance { most: bytes.saturating_mul(MULTIPLE).saturating_add(ROOM), taken: 0, paid: 0, pay }
+        MemoryAllowance { most: bytes.saturating_mul(MULTIPLE).saturating_add(ROOM), taken: 0, paid: 0, pay }
     }
 
     /// Another file of so many bytes belongs to it.

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec3;
 
-use super::allowance::Allowance;
+use super::allowance::MemoryAllowance;
 use super::polygon::{Split, triangles};
 use super::volume::{Cell, Volume};
 use super::{ReadLimits, ReadMesh};
@@ -29,7 +29,7 @@ const CLOSED: usize = 160;
 /// A mesh while it is read.
 pub(super) struct Draft<'l> {
     pub(super) limits: &'l ReadLimits,
-    pub(super) allowance: Allowance<'l>,
+    pub(super) allowance: MemoryAllowance<'l>,
     pub(super) notes: Vec<String>,
     /// Points and lines of the file, which are no surface.
     pub(super) lines: usize,
@@ -53,7 +53,7 @@ pub(super) struct Draft<'l> {
 }
 
 impl<'l> Draft<'l> {
-    pub(super) fn new(limits: &'l ReadLimits, allowance: Allowance<'l>) -> Self {
+    pub(super) fn new(limits: &'l ReadLimits, allowance: MemoryAllowance<'l>) -> Self {
         Self {
             limits,
             allowance,

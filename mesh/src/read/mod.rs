@@ -14,7 +14,7 @@ mod vtk;
 mod vtk_xml;
 
 use crate::{Element, MeshError, Problem, TriangleMesh, Unit};
-use allowance::Allowance;
+use allowance::MemoryAllowance;
 use draft::Draft;
 use source::Source;
 
@@ -157,7 +157,7 @@ pub fn read_paid(
     let bytes = if is_free { bytes } else { without_mark(bytes) };
     let by_name = Format::of_extension(name);
     let format = Format::of_content(bytes).or(by_name).ok_or_else(|| fail(Problem::UnknownFormat))?;
-    let mut draft = Draft::new(limits, Allowance::new(bytes.len(), pay));
+    let mut draft = Draft::new(limits, MemoryAllowance::new(bytes.len(), pay));
     if by_name.is_some_and(|by_name| by_name != format) {
         draft.notes.push(format!("The file's content is {format:?}, whatever its extension."));
     }

@@ -3,7 +3,7 @@
 //!
 //! `ply-rs-bw` is not used: it allocates what a header counts and panics at a count that is too long.
 
-use super::allowance::Allowance;
+use super::allowance::MemoryAllowance;
 use super::draft::Draft;
 use super::source::{Order, Scalar, Source, named, parsed, shown, words};
 use crate::{Element as Place, MeshError, Problem};
@@ -177,7 +177,7 @@ impl Row {
         element: &Element,
         corners: Option<usize>,
         encoding: Encoding,
-        allowance: &mut Allowance<'_>,
+        allowance: &mut MemoryAllowance<'_>,
     ) -> Result<(), MeshError> {
         self.corners.clear();
         self.corner_uv.clear();

@@ -5,7 +5,7 @@
 
 use glam::DVec3;
 
-use super::allowance::Allowance;
+use super::allowance::MemoryAllowance;
 use crate::Problem;
 
 /// In the place of corners that a face or element does not have.
@@ -87,7 +87,12 @@ impl Volume {
     }
 
     /// Adds an element; `corners` are as many as its kind has.
-    pub(super) fn add(&mut self, kind: Cell, corners: &[u32], allowance: &mut Allowance<'_>) -> Result<(), Problem> {
+    pub(super) fn add(
+        &mut self,
+        kind: Cell,
+        corners: &[u32],
+        allowance: &mut MemoryAllowance<'_>,
+    ) -> Result<(), Problem> {
         let mut own = [NONE; 8];
         own.iter_mut().zip(corners).for_each(|(own, corner)| *own = *corner);
         allowance.push(&mut self.elements, Element { kind, corners: own })
@@ -113,7 +118,7 @@ impl Volume {
     pub(super) fn outer_surface(
         &self,
         vertices: &[DVec3],
-        allowance: &mut Allowance<'_>,
+        allowance: &mut MemoryAllowance<'_>,
     ) -> Result<OuterSurface, Problem> {
         let most_sides: usize = self.elements.iter().map(|element| element.kind.faces().len()).sum();
         allowance.take(SORTED * self.elements.len() + most_sides * size_of::<Side>())?;

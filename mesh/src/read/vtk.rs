@@ -2,7 +2,7 @@
 //!
 //! `vtkio` is not used: it reserves what a file counts, unpacks without bound and says no element.
 
-use super::allowance::Allowance;
+use super::allowance::MemoryAllowance;
 use super::draft::Draft;
 use super::source::{Order, Scalar, Source, shown, words};
 use super::volume::Cell;
@@ -142,7 +142,7 @@ fn integers(
     count: i64,
     scalar: Scalar,
     what: &str,
-    allowance: &mut Allowance<'_>,
+    allowance: &mut MemoryAllowance<'_>,
 ) -> Result<Vec<i64>, MeshError> {
     let count = source.count(count, if is_binary { scalar.size() } else { 2 }, what)?;
     allowance.take(2 * size_of::<i64>() * count).map_err(|problem| source.fail(problem))?;
@@ -162,7 +162,7 @@ fn begin_data(source: &mut Source<'_>, is_binary: bool) {
 }
 
 /// The lists of a section: `n size` and each list after its length, or since version 5 offsets and connectivity.
-fn cells(source: &mut Source<'_>, is_binary: bool, allowance: &mut Allowance<'_>) -> Result<Cells, MeshError> {
+fn cells(source: &mut Source<'_>, is_binary: bool, allowance: &mut MemoryAllowance<'_>) -> Result<Cells, MeshError> {
     let what = "lists of vertices";
     let count: i64 = source.number("the count of cells")?;
     let size: i64 = source.number("the size of cells")?;

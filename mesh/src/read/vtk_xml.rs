@@ -7,7 +7,7 @@ use base64::engine::general_purpose::STANDARD;
 use quick_xml::Reader;
 use quick_xml::events::{BytesStart, Event};
 
-use super::allowance::Allowance;
+use super::allowance::MemoryAllowance;
 use super::draft::Draft;
 use super::source::{Order, Scalar, Source, no_number, parsed, shown};
 use super::vtk::{Cells, Faces};
@@ -217,7 +217,7 @@ impl<'a> Document<'a> {
     }
 
     /// The bytes of a binary array, taken from `allowance`. The caller gives them back.
-    fn bytes(&self, array: &Array, allowance: &mut Allowance<'_>) -> Result<Vec<u8>, MeshError> {
+    fn bytes(&self, array: &Array, allowance: &mut MemoryAllowance<'_>) -> Result<Vec<u8>, MeshError> {
         let fail = |problem| self.fail(array, problem);
         let text: Vec<u8> = array.text.iter().copied().filter(|byte| !byte.is_ascii_whitespace()).collect();
         let (stored, is_base64) = match array.format {
@@ -273,7 +273,11 @@ impl<'a> Document<'a> {
         Ok(bytes)
     }
 
-    fn text<T: std::str::FromStr>(&self, array: &Array, allowance: &mut Allowance<'_>) -> Result<Vec<T>, MeshError> {
+    fn text<T: std::str::FromStr>(
+        &self,
+        array: &Array,
+        allowance: &mut MemoryAllowance<'_>,
+    ) -> Result<Vec<T>, MeshError> {
         let mut source = Source::new(self.file, &array.text);
         let mut numbers = Vec::new();
         while let Some(word) = source.word() {
@@ -288,7 +292,7 @@ impl<'a> Document<'a> {
     fn numbers<T: std::str::FromStr>(
         &self,
         array: &Array,
-        allowance: &mut Allowance<'_>,
+        allowance: &mut MemoryAllowance<'_>,
         number: fn(Scalar, &[u8], Order) -> T,
     ) -> Result<Vec<T>, MeshError> {
         if array.format == Format::Text {

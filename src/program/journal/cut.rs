@@ -29,15 +29,11 @@ pub(super) fn cut(arguments: &CutArguments) -> Result<(), Failure> {
     let limits = source.limits()?;
     let reader = source.open()?;
     let mut file = new_file(output)?;
-    let cut = mend::cut(reader, [*from, *to], &limits, &mut file);
-    if let Err(refusal) = cut {
+    let survey = mend::cut(reader, [*from, *to], &limits, &mut file).inspect_err(|_| {
         // What is half of a journal helps nobody.
         let _ = std::fs::remove_file(output);
-        return Err(refusal.into());
-    }
+    })?;
     file.sync_all().map_err(|e| unwritten(output, &e))?;
     // It had all steps that were wanted.
-    let mut reader = source.open()?;
-    let survey = reader.survey(&mut |_| {})?;
     source.tell_damage(survey.damage.as_deref(), survey.until_step, Some(*to))
 }

@@ -61,7 +61,7 @@ pub(super) fn export(arguments: &ExportArguments) -> Result<(), Failure> {
         Format::Jsonl | Format::Mcap => Ok(()),
     };
     type Written = (std::io::Result<()>, u64);
-    let exported = with_progress("byte", length, file.is_none(), |progress| -> Result<Written, Failure> {
+    let (result, until_step) = with_progress("byte", length, file.is_none(), |progress| -> Result<Written, Failure> {
         let mut result = result;
         let mut until_step = reader.header().begin_step;
         while let Some(batch) = reader.next_batch()?.filter(|_| result.is_ok()) {
@@ -74,8 +74,7 @@ pub(super) fn export(arguments: &ExportArguments) -> Result<(), Failure> {
             progress(reader.position());
         }
         Ok((result, until_step))
-    });
-    let (result, until_step) = exported?;
+    })?;
     written(result.and_then(|()| out.flush()))?;
     source.tell_damage(reader.damage(), until_step, None)
 }

@@ -82,16 +82,13 @@ fn public_key(path: &Path) -> Result<PublicKey, Failure> {
 fn signed(reader: &mut Reader<BufReader<File>>, key: PublicKey) -> Result<Option<Signed>, Refusal> {
     let mut signatures = Signatures::of(key);
     reader.rewind();
-    let checked = loop {
-        match reader.next_batch() {
-            Ok(Some(batch)) => match signatures.check(&batch) {
-                Ok(()) => {}
-                Err(refusal) => break Err(refusal),
-            },
-            Ok(None) => break Ok(signatures.signed()),
-            Err(refusal) => break Err(refusal),
+    let mut check = || {
+        while let Some(batch) = reader.next_batch()? {
+            signatures.check(&batch)?;
         }
+        Ok(signatures.signed())
     };
+    let checked = check();
     reader.rewind();
     checked
 }

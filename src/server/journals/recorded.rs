@@ -31,6 +31,13 @@ use crate::sheet::choice::{NEVER, given_up};
 /// Moments of a curve of forces.
 const MOST_MOMENTS: usize = 2000;
 
+/// The journals of a folder.
+fn listed(folder: &Path) -> Result<Vec<JournalFile>> {
+    file::list(folder).map_err(|error| {
+        Refusal::new(Reason::Unreadable, "journal", format!("the folder of the journals can't be read: {error}"))
+    })
+}
+
 /// The journal of a run of a session, open; of its newest if `run` is 0.
 fn find(
     folder: &Path,
@@ -43,9 +50,7 @@ fn find(
     if file::parse(&file::name(session_id, 1)).is_none() {
         return Err(unknown("is no ID of a session"));
     }
-    let listed = file::list(folder).map_err(|error| {
-        Refusal::new(Reason::Unreadable, "journal", format!("the folder of the journals can't be read: {error}"))
-    })?;
+    let listed = listed(folder)?;
     let is_it = |file: &JournalFile| file.session_id == session_id && (run == 0 || file.run == u64::from(run));
     for file in listed.into_iter().rev().filter(is_it) {
         match open(&file, payer) {
@@ -209,9 +214,7 @@ impl Recorded {
     /// Refuses if the folder can't be read.
     pub(in crate::server) fn list(&self, pacer: &Pacer) -> Result<pb::ListJournalsResponse> {
         let Some(folder) = &self.folder else { return Ok(pb::ListJournalsResponse::default()) };
-        let listed = file::list(folder.path()).map_err(|error| {
-            Refusal::new(Reason::Unreadable, "journal", format!("the folder of the journals can't be read: {error}"))
-        })?;
+        let listed = listed(folder.path())?;
         let info =
             |file: &JournalFile| info(file, open(file, None).as_mut().map_err(|refusal| refusal.to_string()), pacer);
         Ok(pb::ListJournalsResponse { journals: listed.iter().map(info).collect() })

@@ -1,8 +1,8 @@
 //! A SpaceMouse or a gamepad, by the events of Linux: position by rate, force by rumble, so that anybody can try touch.
 //!
 //! A deflection moves the position at a speed, within a ball of the workspace's radius. Nothing pushes the position back: the
-//! force is felt as rumble, if the device has that. So the position stops by itself where the force comes near the largest one. Events are read from a path as they are, so a pipe with recorded events
-//! does as well.
+//! force is felt as rumble, if the device has that. So the position stops by itself where the force comes near the largest one.
+//! Events are read from a path as they are, so a pipe with recorded events does as well.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read};

@@ -10,7 +10,7 @@ import type { Stage } from "./stage";
 import type { Visit } from "./visit";
 
 /** The page's state as numbers, for tests and measurements. */
-export function inside(present: () => Visit | undefined, stage: Stage, player: Player, latency: Latency) {
+export function pageState(present: () => Visit | undefined, stage: Stage, player: Player, latency: Latency) {
   return {
     get frames() {
       const { taken, skipped, newest } = present()?.frames ?? { taken: 0, skipped: 0n };

@@ -1,4 +1,4 @@
-// The gate: what is in place of the page for whom the server does not let in. It says why, and has a field for a token.
+// The form for a token, in place of the page where the server refuses who calls. It says why.
 
 import { keepToken, part } from "./page";
 import { reasonOf, server } from "./server";
@@ -20,9 +20,9 @@ function words(reason: string): [string, string] {
   return ["This server asks for a token.", "Whoever runs the server can give you one."];
 }
 
-export class Gate {
-  private readonly form = part("gate", HTMLFormElement);
-  private readonly field = part("gate-token", HTMLInputElement);
+export class TokenForm {
+  private readonly form = part("token-form", HTMLFormElement);
+  private readonly field = part("token-form-token", HTMLInputElement);
 
   /** `onToken`: somebody has entered a token. */
   constructor(onToken: () => void) {
@@ -47,8 +47,8 @@ export class Gate {
 
   show(reason: string): void {
     const [what, next] = words(reason);
-    part("gate-what", HTMLElement).textContent = what;
-    part("gate-next", HTMLElement).textContent = next;
+    part("token-form-what", HTMLElement).textContent = what;
+    part("token-form-next", HTMLElement).textContent = next;
     this.form.hidden = false;
     document.body.classList.add("barred");
     this.field.focus();
