@@ -54,7 +54,7 @@ fn a_wrong_value_is_refused_for_its_reason() {
         (&["mesh", "liver.obj", "--unit", "m", "--vertices", "2"], &["--vertices: must be at least 4, but is 2"]),
         (
             &["serve", "--viewer", "empty", "--listen", "127.0.0.1:0"],
-            &["--viewer empty: has no index.html", "npm run build"],
+            &["--viewer empty: has no .html file", "npm run build"],
         ),
         (&["serve", "--config", "a.toml"], &["a.toml:1", "unknown key; did you mean `listen`?"]),
         (&["serve", "--config", "b.toml"], &["b.toml:2", "unknown key; did you mean `sessions`?"]),

@@ -1,7 +1,7 @@
 //! `palpate serve`: serves tissue over gRPC and to browsers.
 
 use std::io::{IsTerminal, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use palpate::budget;
@@ -113,6 +113,12 @@ pub(crate) struct ServeArguments {
     log_json: bool,
 }
 
+/// Whether one of a folder's own files is a page. The client library's examples have no index.html.
+fn has_page(folder: &Path) -> bool {
+    let mut files = folder.read_dir().into_iter().flatten().flatten();
+    files.any(|file| file.path().extension().is_some_and(|extension| extension == "html"))
+}
+
 /// Serves until it is told to stop.
 pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let mut config = load_config(arguments.config.as_deref())?;
@@ -148,8 +154,8 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         if !folder.is_dir() {
             return Err(Failure::Refused(format!("{option} {}: is not a folder", folder.display())));
         }
-        if option == "--viewer" && !folder.join("index.html").is_file() {
-            let message = "has no index.html; `npm run build` in clients/viewer makes the page in clients/viewer/dist";
+        if option == "--viewer" && !has_page(folder) {
+            let message = "has no .html file; `npm run build` in clients/viewer makes the page in clients/viewer/dist";
             return Err(Failure::Refused(format!("{option} {}: {message}", folder.display())));
         }
         key.clone_from(folder);
