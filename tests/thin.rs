@@ -1,6 +1,6 @@
 //! Random tips on random meshes with thin parts: everything stays finite, and no energy comes from nowhere.
 //!
-//! 12 in every test run; `PALPATE_STRESS_THIN=10000` takes as many as that, from the seed `PALPATE_STRESS_THIN_FROM` on, and
+//! 18 in every test run; `PALPATE_STRESS_THIN=10000` takes as many as that, from the seed `PALPATE_STRESS_THIN_FROM` on, and
 //! `PALPATE_STRESS_THIN_STEPS=400` runs each for longer.
 #![allow(
     clippy::cast_possible_truncation,
@@ -70,6 +70,44 @@ fn energy_j(tissue: &dyn Tissue) -> f64 {
     energy.kinetic_j + energy.spring_j + energy.virtual_j
 }
 
+/// Energies below this are not compared, J.
+const LEAST_J: f64 = 1e-6;
+
+/// An account of work from outside: by what is felt, and not by what the tissue counts itself.
+#[derive(Debug, Clone, Copy)]
+struct Account {
+    mass_kg: f64,
+    step_s: f64,
+    place_m: DVec3,
+    way_m: DVec3,
+    felt_n: f64,
+    /// The most that the tool can have done.
+    work_j: f64,
+}
+
+impl Account {
+    fn begin(model: &Model, place_m: DVec3) -> Account {
+        let (mass_kg, step_s) = (model.scene.mass_kg(), 1.0 / model.scene.stepping.rate_hz);
+        Account { mass_kg, step_s, place_m, way_m: DVec3::ZERO, felt_n: 0.0, work_j: 0.0 }
+    }
+
+    /// Adds a step's work: the larger of the forces at its ends along its whole way. What a tool sets in motion at once is not felt,
+    /// but goes at most twice as fast as the tool.
+    fn step(&mut self, place_m: DVec3, felt_n: f64, is_put: bool, displacement_m: f64) {
+        let way_m = place_m - self.place_m;
+        let meets = self.felt_n == 0.0 && (is_put || felt_n > 0.0);
+        let (way, sudden) = if meets {
+            let way = way_m.length().max(displacement_m);
+            (way, way)
+        } else {
+            (way_m.length(), (way_m - self.way_m).length())
+        };
+        let speed_m_per_s = 2.0 * sudden / self.step_s;
+        self.work_j += way * felt_n.max(self.felt_n) + 0.5 * self.mass_kg * speed_m_per_s * speed_m_per_s;
+        (self.place_m, self.way_m, self.felt_n) = (place_m, way_m, felt_n);
+    }
+}
+
 /// The most of a run.
 #[derive(Debug, Default, Clone, Copy)]
 struct Course {
@@ -78,6 +116,8 @@ struct Course {
     force_n: f64,
     energy_j: f64,
     displacement_m: f64,
+    /// The largest part that an energy was of the work until then.
+    part: f64,
 }
 
 fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
@@ -89,8 +129,10 @@ fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
     let shape = model.scene.shape();
     let mut course = Course::default();
     let (mut place_m, mut way_m, mut now) = (DVec3::ZERO, DVec3::ZERO, tip(dice));
+    let mut account = None;
     for step in 0..steps {
-        if step % 40 == 0 {
+        let is_put = step % 40 == 0;
+        if is_put {
             let point = palpate::shape::PointId::new(dice.usize(0..shape.point_count()));
             let mut random = || DVec3::from_array([(); 3].map(|()| 2.0 * dice.f64() - 1.0));
             let target_m = shape.rest_m(point) + 0.5 * now.radius_m * random();
@@ -109,20 +151,28 @@ fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
         }
         place_m += way_m;
         tissue.pose(0, place_m, now);
+        let account = account.get_or_insert_with(|| Account::begin(&model, place_m));
         if let Err(blow_up) = tissue.step() {
             course.blow_ups += 1;
             tissue.recover(blow_up.step, false);
+            (account.place_m, account.felt_n) = (place_m, 0.0);
             continue;
         }
         let felt_n = tissue.feel(0).unwrap().force_on_tool_n.length();
         course.force_n = course.force_n.max(felt_n);
-        course.energy_j = course.energy_j.max(energy_j(&*tissue));
+        account.step(place_m, felt_n, is_put, tissue.largest_displacement_m());
+        let energy_j = energy_j(&*tissue);
+        course.energy_j = course.energy_j.max(energy_j);
+        course.part = course.part.max((energy_j - LEAST_J) / (account.work_j + LEAST_J));
         course.displacement_m = course.displacement_m.max(tissue.largest_displacement_m());
         assert!(course.energy_j.is_finite() && felt_n.is_finite(), "{seed} {}, step {step}: {course:?}", mesh.kind);
     }
     course.guard_events = tissue.guard_events();
     Some((course, mesh.kind))
 }
+
+/// Runs in which a disc that stopped sliding was drawn to its tool at once, or kept the normal of a place that it had left.
+const FOUND: [u64; 6] = [34, 435, 470, 481, 482, 511];
 
 /// Before contact was balanced, one in ten of these reached joules to megajoules, and up to kilometres.
 #[test]
@@ -133,13 +183,13 @@ fn tips_on_thin_meshes_get_no_energy_from_nowhere() {
     let steps = number("PALPATE_STRESS_THIN_STEPS").unwrap_or(80);
     let (mut played, mut blew_up, mut guarded) = (0, 0, 0);
     let mut beyond = Vec::new();
-    for seed in from..from + count {
+    let found = if all.is_some() { &[][..] } else { &FOUND };
+    for seed in (from..from + count).chain(found.iter().copied()) {
         let Some((course, kind)) = play(seed, steps) else { continue };
         played += 1;
         blew_up += u64::from(course.blow_ups > 0);
         guarded += u64::from(course.guard_events > 0);
-        // Tissue of some millimetres under tips that take it at most 5 cm away: a thread that resists with 5 N stores 0.25 J.
-        if course.force_n >= 20.0 || course.energy_j >= 0.25 || course.displacement_m >= 0.1 {
+        if course.part > 1.0 {
             beyond.push(format!("{seed} {kind}: {course:?}"));
         }
         if all.is_some() && (seed - from + 1).is_multiple_of(500) {

@@ -35,6 +35,8 @@
 //!   surface at rest and what stops it again cancel, and rounding would decide.
 //! - A disc that lags behind its tool is pressed by no more than what the tool moves along the normal ([`Tool::balance`]), and
 //!   it moves by no more than half its radius at once.
+//! - A disc that lags behind and stops sliding sticks where it is: the impulses that would draw it to its tool and stop it there cancel,
+//!   so that the tool would do no work.
 //! - Where the disc would come over an edge so that its way leads along its normal, it stays, and pushes along its normal alone.
 //!   Where friction would drive it against the tool's way, and farther, it stays, and friction acts: so what slid and stops is held.
 //!
@@ -59,6 +61,9 @@ const LEAST_DETERMINANT: f64 = 1e-6;
 
 /// The offset of a disc that slides vanishes by this part of the tool's way.
 const RELAXATION: f64 = 1.0 / 64.0;
+
+/// What a disc lags behind its tool counts from this part of its radius on. On a smooth surface none does.
+const LEAST_LAG: f64 = 1.0 / 64.0;
 
 /// A disc slides on while its mean normal, taken perpendicular to its way, has at least this part along the normal where it is.
 const LEAST_STRAIGHTNESS: f64 = 0.9;
@@ -324,7 +329,7 @@ impl Tool {
         leg: Leg,
     ) -> Thrust {
         let Leg { mut place_m, spread_n, .. } = leg;
-        let was_free = self.contact_state == ContactState::Free;
+        let before = self.contact_state;
         if self.contact_state == ContactState::Free {
             self.footprint.seek(model, place_m, |point| displacement_m(model, layout, state, point));
         }
@@ -356,13 +361,23 @@ impl Tool {
             }
             ContactState::Holding | ContactState::Sticking | ContactState::Sliding => {}
         }
+        let lag_m = match before {
+            ContactState::Free => self.lag_m(gap_m),
+            ContactState::Sliding => self.lag_m(self.gap_m),
+            ContactState::Holding | ContactState::Sticking => DVec3::ZERO,
+        };
         gap_m -= self.offset_m;
         place_m -= self.offset_m;
-        let thrust = self.thrust(model, plan, layout, state, gap_m);
+        // What sticks goes with the tool from where it is.
+        let thrust = self.thrust(model, plan, layout, state, gap_m - lag_m);
         if self.contact_state == ContactState::Holding {
             return thrust;
         }
-        if was_free && self.is_new && self.tip.coupling == Coupling::Constraint && self.footprint.mobility() > 0.0 {
+        if before == ContactState::Free
+            && self.is_new
+            && self.tip.coupling == Coupling::Constraint
+            && self.footprint.mobility() > 0.0
+        {
             return thrust.along(self.normal);
         }
         let felt_n = thrust.force_n() + spread_n;
@@ -374,7 +389,16 @@ impl Tool {
         let (inside, felt_n) = within_cone(felt_n, self.normal, self.tip.friction);
         if inside {
             self.contact_state = ContactState::Sticking;
+            self.offset_m += lag_m;
             return thrust;
+        }
+        if before == ContactState::Sticking {
+            // What it lagged behind when it began to stick, it lags behind again.
+            let lag_m = self.lag_m(self.offset_m);
+            self.offset_m -= lag_m;
+            self.gap_m += lag_m;
+            gap_m += lag_m;
+            place_m += lag_m;
         }
         self.contact_state = ContactState::Sliding;
         // What its normal was when the gap was what it is kept as.
@@ -398,6 +422,13 @@ impl Tool {
             return Thrust::default();
         }
         thrust
+    }
+
+    /// What of a gap is across the normal, if a constraint would close it and it is too much for a disc that follows its tool, m.
+    fn lag_m(&self, gap_m: DVec3) -> DVec3 {
+        let across_m = gap_m - gap_m.dot(self.normal) * self.normal;
+        let lags = across_m.length() > LEAST_LAG * self.footprint.radius_m();
+        if lags && self.tip.coupling == Coupling::Constraint && !self.tip.grasps { across_m } else { DVec3::ZERO }
     }
 
     /// The movement of the tool in a substep, m.
@@ -488,6 +519,7 @@ impl Tool {
         }
         let straightness = mean.dot(normal);
         push(model, plan, layout, state, &self.footprint, self.steady_n, half);
+        let stays = (self.normal, self.offset_m);
         self.normal = normal;
         let (surface_m, _) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
         let mut gap_m = place_m - surface_m;
@@ -498,6 +530,7 @@ impl Tool {
             // There is nothing to press where it would come to. What acts in this substep is all where it was.
             push(model, plan, layout, state, &self.footprint, -self.steady_n, half);
             self.footprint.return_to(model, &ground);
+            (self.normal, self.offset_m) = stays;
             push(model, plan, layout, state, &self.footprint, self.steady_n, half);
             return Slide::Leaves;
         }
