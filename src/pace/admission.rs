@@ -1,7 +1,7 @@
 //! Admission: sessions are created, started and changed if their thread has time for their steps.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 use tokio::sync::watch;
@@ -22,7 +22,7 @@ use crate::ids::random_id;
 use crate::lock::lock;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, number};
-use crate::scene::{Change, Scene};
+use crate::scene::{Body, Change, Scene};
 use crate::session::Session;
 use crate::session::input::Input;
 use crate::session::intake::Intake;
@@ -170,6 +170,10 @@ impl Pacer {
         let speed = playback.as_ref().map_or(1.0, |playback| playback.speed);
         check_work(&first, &self.limits)?;
         let skin = memory::attempt("sheet.points", || Ok(Skin::of(&first)))?;
+        if let Body::Mesh(mesh) = &first.scene.body {
+            // Who touches it first does so in a step, which must not wait for this.
+            mesh.shape.surface();
+        }
         let bytes = first.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes());
         let memory = owner.take(Resource::Memory(Purpose::Session), bytes, "sheet.points")?;
         // Laid out before the lock is taken, on which all calls wait.
@@ -248,7 +252,7 @@ impl Pacer {
             model: first,
             skin,
             cost,
-            thread,
+            thread: AtomicUsize::new(thread),
             inbox: stepper.inbox.clone(),
             tape,
             playback,
@@ -289,17 +293,22 @@ impl Pacer {
     /// The thread with the most time to spare for a further session of `owner`, and what that will take.
     fn place(&self, model: &Model, paused: bool, owner: &Account) -> Result<(Cost, usize)> {
         let sessions = lock(&self.sessions);
-        let cost = Cost::guess(model, sessions.values().map(|live| &live.cost));
+        // What steps take that are too long for others tells nothing of a new one.
+        let known = sessions.values().filter(|live| live.thread() < self.steppers.len());
+        let cost = Cost::guess(model, known.map(|live| &live.cost));
         let mut taken = vec![(0.0, 0_usize); self.steppers.len()];
         for live in sessions.values() {
-            taken[live.thread].0 += live.cost.share();
-            taken[live.thread].1 += 1;
+            // Those apart take nothing of these.
+            if let Some(taken) = taken.get_mut(live.thread()) {
+                taken.0 += live.cost.share();
+                taken.1 += 1;
+            }
         }
         let spare =
             |a: &(usize, &(f64, usize)), b: &(usize, &(f64, usize))| a.1.0.total_cmp(&b.1.0).then(a.1.1.cmp(&b.1.1));
         let thread = taken.iter().enumerate().min_by(spare).map_or(0, |(thread, _)| thread);
         if !paused {
-            let beside = self.taken_beside(sessions.values().filter(|live| live.thread == thread), owner);
+            let beside = self.taken_beside(sessions.values().filter(|live| live.thread() == thread), owner);
             self.check_share(beside, cost.awake_share())?;
         }
         Ok((cost, thread))
@@ -321,7 +330,12 @@ impl Pacer {
 
     /// Of the thread of a session, what the others that are awake take.
     fn taken_by_others(&self, live: &Live) -> f64 {
-        let others = |other: &&Arc<Live>| other.thread == live.thread && other.number != live.number;
+        let thread = live.thread();
+        // Those apart may be late.
+        if thread == self.steppers.len() {
+            return 0.0;
+        }
+        let others = |other: &&Arc<Live>| other.thread() == thread && other.number != live.number;
         self.taken_beside(lock(&self.sessions).values().filter(others), &live.owner)
     }
 

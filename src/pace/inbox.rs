@@ -65,6 +65,9 @@ pub(super) enum Request {
     },
     /// The session leaves this server: it is deleted, or has another owner.
     Leave(Refusal, Leaving),
+    /// It goes over to the thread that gives way.
+    #[cfg(test)]
+    GoApart,
     /// A fault of the program, to see what comes of it.
     #[cfg(test)]
     Panic,

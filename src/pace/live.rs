@@ -1,6 +1,6 @@
 //! A session as the server sees it: requests to its stepping thread, and its intake.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
 use tokio::sync::{oneshot, watch};
@@ -67,9 +67,9 @@ pub struct Live {
     pub(super) tissue: watch::Sender<(u64, Arc<Model>)>,
     pub(super) cost: Cost,
     pub(super) audited: Mutex<Audited>,
-    /// Index of its stepping thread.
-    pub(super) thread: usize,
-    /// The inbox of that thread.
+    /// Index of its stepping thread; that of the one that gives way comes after the last.
+    pub(super) thread: AtomicUsize,
+    /// The inbox of the thread that it began on, which passes on what it is asked.
     pub(super) inbox: Arc<Inbox>,
     /// What it plays, if it plays what was recorded.
     pub playback: Option<Playback>,
@@ -94,6 +94,11 @@ impl Live {
             (status.resting, status.step, status.awake_points) = (true, step, 0);
         }
         status
+    }
+
+    /// Index of its stepping thread.
+    pub(super) fn thread(&self) -> usize {
+        self.thread.load(Ordering::Relaxed)
     }
 
     /// How fast time goes on: other than 1 only of what is played.

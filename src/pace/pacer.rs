@@ -15,7 +15,7 @@ use super::live::{Live, deleted};
 use super::reading::{Piece, Reading};
 use super::tally::Tally;
 use super::tape::TapeQueue;
-use super::thread::{self, Stepper};
+use super::thread::{self, Apart, Stepper};
 use crate::budget::Budget;
 use crate::limits::Limits;
 use crate::lock::lock;
@@ -33,6 +33,8 @@ pub struct Pacer {
     pub budget: Arc<Budget>,
     /// One for each stepping thread: where it is asked, and where new sessions wait for it.
     pub(super) steppers: Vec<Arc<Stepper>>,
+    /// The one that gives way to them, for sessions whose steps take too long.
+    apart: Arc<Stepper>,
     encoder: Arc<Encoder>,
     reading: Arc<Reading>,
     threads: Mutex<Vec<JoinHandle<()>>>,
@@ -46,7 +48,8 @@ pub struct Pacer {
 }
 
 impl Pacer {
-    /// Starts `threads` stepping threads (named `step-0` and so on), and one thread each that computes the stiffness under
+    /// Starts `threads` stepping threads (named `step-0` and so on), and one thread each that has the sessions whose steps take too long
+    /// for others (`step-apart`), computes the stiffness under
     /// tools (`stiffness`), encodes frames (`frames`), reads large sheets (`records`), and measures errors with `audit_share`
     /// of a core (`audit`; none if that is 0).
     ///
@@ -55,7 +58,7 @@ impl Pacer {
     pub fn start(threads: usize, audit_share: f64, limits: &Limits, budget: Arc<Budget>) -> std::io::Result<Arc<Self>> {
         let (encoder, reading) = (Arc::new(Encoder::default()), Arc::new(Reading::default()));
         let (mut handles, fence) = (Vec::new(), Arc::new(Fence::default()));
-        let mut steppers = Vec::new();
+        let (mut steppers, apart) = (Vec::new(), Arc::new(Stepper::default()));
         // It ends when the stepping threads have ended, and nobody sends any more.
         let (refiner, refinements) = std::sync::mpsc::sync_channel::<StiffnessJob>(WAITING_REFINEMENTS);
         let worker = move || {
@@ -63,13 +66,23 @@ impl Pacer {
             refinements.into_iter().for_each(StiffnessJob::work);
         };
         handles.push(priority::thread("stiffness").spawn(worker)?);
-        for index in 0..threads.max(1) {
+        let threads = threads.max(1);
+        for index in 0..threads {
             let stepper = Arc::new(Stepper::default());
             steppers.push(stepper.clone());
             let (encoder, refiner, reading) = (encoder.clone(), refiner.clone(), reading.clone());
             let (builder, fence) = (priority::thread(format!("step-{index}")), fence.clone());
-            handles.push(builder.spawn(move || thread::work(&stepper, &fence, &encoder, &refiner, &reading))?);
+            let apart = Apart { stepper: apart.clone(), index: threads };
+            let work = move || thread::work(&stepper, Some(&apart), &fence, &encoder, &refiner, &reading);
+            handles.push(builder.spawn(work)?);
         }
+        let (stepper, fence_of_apart, its_encoder, its_reading) =
+            (apart.clone(), fence.clone(), encoder.clone(), reading.clone());
+        let worker = move || {
+            give_way();
+            thread::work(&stepper, None, &fence_of_apart, &its_encoder, &refiner, &its_reading);
+        };
+        handles.push(priority::thread("step-apart").spawn(worker)?);
         let (worker, shared) = (encoder.clone(), budget.clone());
         handles.push(priority::thread("frames").spawn(move || worker.work(&shared))?);
         let reader = reading.clone();
@@ -91,6 +104,7 @@ impl Pacer {
             limits: limits.clone(),
             budget,
             steppers,
+            apart,
             encoder,
             reading,
             threads: Mutex::new(handles),
@@ -143,7 +157,7 @@ impl Pacer {
 
     /// What each stepping thread counts of itself.
     pub fn tallies(&self) -> impl Iterator<Item = &Tally> {
-        self.steppers.iter().map(|stepper| &stepper.inbox.tally)
+        self.steppers.iter().chain([&self.apart]).map(|stepper| &stepper.inbox.tally)
     }
 
     /// What the auditor counts.
@@ -233,7 +247,7 @@ impl Pacer {
         for live in lock(&self.sessions).values() {
             drop(lock(&live.intake).close(why.clone()));
         }
-        self.steppers.iter().for_each(|stepper| stepper.inbox.stop(why.clone()));
+        self.steppers.iter().chain([&self.apart]).for_each(|stepper| stepper.inbox.stop(why.clone()));
         self.encoder.stop();
         self.reading.stop();
         self.auditor.stop();

@@ -12,6 +12,10 @@
 //! those. So between two steps of a session that is too heavy all others get theirs, and it gets what they leave. A step
 //! can't be interrupted: the longest recent one may have made every session late, and each catches that up however many
 //! steps it is.
+//!
+//! **Apart.** A step that takes longer than its period, and than [`MOST_STEP_NS`], makes all others of the thread late, however the
+//! rest is divided: a scene may be light and its tools not. A session that has such steps beside others goes over to a thread that
+//! gives way, and stays there. So who is late is late alone.
 
 /// Steps that a session may be behind before the rest is dropped.
 const CATCH_UP_STEPS: f64 = 2.0;
@@ -35,6 +39,38 @@ impl Backlog {
 /// session's caller has `siblings` of them, itself included.
 pub(super) fn parts(callers: usize, siblings: usize) -> usize {
     callers * siblings
+}
+
+/// A step may take so long, ns, whatever its period is.
+const MOST_STEP_NS: u64 = 2_000_000;
+
+/// After a step that took too long, the processor time of so many is measured: it took too long if that says so as well.
+const MEASURED_STEPS: u32 = 64;
+
+/// Watches whether the steps of a session take too long for others beside it. A step may also have waited for the processor, which is no
+/// fault of its own; to measure that each time would take a part of each step.
+#[derive(Debug, Default)]
+pub(super) struct StepWatch {
+    to_measure: u32,
+}
+
+impl StepWatch {
+    /// Whether the processor time of the coming step is to be measured.
+    pub(super) fn measures(&self) -> bool {
+        self.to_measure > 0
+    }
+
+    /// Notes a step that took `took_ns`, of which the processor was busy for `worked_ns` if that was measured. Tells whether such
+    /// steps take too long.
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn is_too_long(&mut self, took_ns: u64, worked_ns: Option<u64>, period_ns: f64) -> bool {
+        let is_long = |ns: u64| ns > MOST_STEP_NS && ns as f64 > period_ns;
+        self.to_measure = self.to_measure.saturating_sub(1);
+        if is_long(took_ns) {
+            self.to_measure = MEASURED_STEPS;
+        }
+        worked_ns.is_some_and(is_long)
+    }
 }
 
 /// A session that looks for its place among the others of its thread, after a step.
@@ -136,6 +172,24 @@ mod tests {
         // 40 sessions of one caller take 2 ms of each millisecond together; one session of another keeps its time.
         let (many, one) = (turn(0.05, parts(2, 40)), turn(0.05, parts(2, 1)));
         assert_eq!((many.not_before_ns(10 * MS), one.not_before_ns(10 * MS)), (10 * MS, 0));
+    }
+
+    #[test]
+    fn a_session_whose_steps_keep_the_processor_busy_for_too_long_goes_apart() {
+        let period_ns = MS as f64;
+        let mut watch = StepWatch::default();
+        // Within 2 ms, or within its period, or not running.
+        assert!(!watch.is_too_long(2 * MS, None, period_ns) && !watch.measures());
+        assert!(!watch.is_too_long(20 * MS, None, 20.0 * period_ns) && !watch.measures());
+        assert!(!watch.is_too_long(4500 * MS, None, period_ns) && watch.measures());
+        for _ in 0..MEASURED_STEPS {
+            assert!(watch.measures() && !watch.is_too_long(MS, Some(MS), period_ns));
+        }
+        assert!(!watch.measures());
+        // The second such step tells.
+        assert!(!watch.is_too_long(3 * MS, None, period_ns) && watch.measures());
+        assert!(!watch.is_too_long(9 * MS, Some(MS / 2), period_ns) && watch.measures());
+        assert!(watch.is_too_long(3 * MS, Some(3 * MS), period_ns));
     }
 
     #[test]

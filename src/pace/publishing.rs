@@ -107,7 +107,7 @@ impl Running {
 
     pub(super) fn publish_status(&self) {
         let mut status = lock(&self.live.status);
-        let (before, tally) = (&*status, &self.live.inbox.tally);
+        let (before, tally) = (&*status, &self.inbox.tally);
         let path_counts = self.session.path_counts();
         let guard_events = self.session.tissue().guard_events();
         let is_held = self.session.hold_reason().is_some();

@@ -60,6 +60,7 @@ impl Rota {
     /// Ends all sessions.
     pub(super) fn end(&mut self, why: &Refusal) {
         for running in self.sessions.values_mut() {
+            running.guarded(Running::finish_step);
             running.note_the_end();
             running.end(why);
         }

@@ -6,6 +6,7 @@
 //! whose rota is empty sleeps until it is asked something. What comes in meanwhile is placed where it would be had the
 //! session been stepped ([`Intake::rest`](crate::session::intake::Intake::rest)), and wakes the thread.
 
+use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::mpsc::SyncSender;
@@ -14,10 +15,10 @@ use super::clock::{Dilation, now_ns};
 use super::feed::Next;
 use super::fence::Fence;
 use super::frames::Encoder;
-use super::inbox::{Leaving, Request};
+use super::inbox::{Inbox, Leaving, Request};
 use super::live::Live;
 use super::paced::Present;
-use super::policy::{Backlog, Longest, Turn};
+use super::policy::{Backlog, Longest, StepWatch, Turn};
 use super::queue::Wakes;
 use super::reading::{Copies, Hashed, Reading};
 use super::recorder::Recorder;
@@ -40,6 +41,9 @@ const BEAT_NS: u64 = 1_000_000;
 
 /// Every so many steps of a session one is a span of the log, at level debug.
 const STEPS_PER_SPAN: u64 = 1024;
+
+/// What the guard repeats for one step may take many times as long as the step. After so long, ns, others of the thread have their turn.
+const MOST_REPETITION_NS: u64 = if cfg!(test) { 0 } else { 500_000 };
 
 /// How often the stiffness under tools is computed anew, Hz.
 const REFINED_HZ: f64 = 50.0;
@@ -77,7 +81,14 @@ pub(super) struct Running {
     pub(super) recorder: Option<Recorder>,
     /// It is handed over: no step, until that has failed.
     pub(super) frozen: bool,
+    pub(super) watch: StepWatch,
+    /// The inbox of the thread that has it, which counts what it does.
+    pub(super) inbox: Arc<Inbox>,
+    /// It goes over to another thread.
+    pub(super) goes_apart: bool,
     left: bool,
+    /// What it is asked while a step is not done: each caller waits for an answer.
+    waiting: VecDeque<Request>,
 }
 
 /// What all sessions of a thread use.
@@ -122,14 +133,18 @@ impl Running {
             taps: Taps::default(),
             audit: None,
             frozen: false,
+            watch: StepWatch::default(),
+            inbox: live.inbox.clone(),
+            goes_apart: false,
             left: false,
+            waiting: VecDeque::new(),
             live,
         }
     }
 
     /// When its next step is due, if time goes on and one is wanted.
     pub(super) fn due_ns(&self) -> Option<u64> {
-        let due_ns = (self.running && !self.frozen && self.next_step < u64::MAX)
+        let due_ns = (self.running && !self.frozen && !self.goes_apart && self.next_step < u64::MAX)
             .then(|| self.schedule.due_ns(self.next_step))?;
         Some(due_ns.max(self.not_before_ns))
     }
@@ -154,9 +169,9 @@ impl Running {
         self.live.owner.number()
     }
 
-    /// Whether it has left the server, and is to leave the thread.
+    /// Whether it is to leave the thread: it has left the server, or goes over to another thread.
     pub(super) fn has_left(&self) -> bool {
-        self.left
+        self.left || self.goes_apart
     }
 
     /// Does something with it. A panic ends this session, and no other; so does memory that can't be had.
@@ -180,6 +195,9 @@ impl Running {
 
     /// Decides which step comes next: the very next one, or at rest the next one that somebody waits for.
     pub(super) fn plan(&mut self) {
+        if self.session.is_within_step() {
+            return;
+        }
         let step = self.session.step_count();
         let wanted = || {
             let wanted = self.taps.next_wanted(step, self.still_since, self.live.model.scene.stepping.rate_hz);
@@ -212,6 +230,10 @@ impl Running {
     }
 
     pub(super) fn serve(&mut self, request: Request, context: &mut ThreadContext<'_>) {
+        if self.session.is_within_step() {
+            self.waiting.push_back(request);
+            return;
+        }
         self.catch_up(context.fence);
         let step = self.session.step_count();
         // Also while time stands, when no step does it.
@@ -286,6 +308,8 @@ impl Running {
                 self.end(&why);
                 self.left = true;
             }
+            #[cfg(test)]
+            Request::GoApart => self.goes_apart = true,
             #[cfg(test)]
             #[allow(clippy::panic)]
             Request::Panic => panic!("a test"),
@@ -374,8 +398,39 @@ impl Running {
         }
     }
 
-    /// The next step, at its time or after it.
+    /// Does what was asked for while a step was not done.
+    pub(super) fn serve_waiting(&mut self, context: &mut ThreadContext<'_>) {
+        while !self.session.is_within_step()
+            && let Some(request) = self.waiting.pop_front()
+        {
+            self.serve(request, context);
+        }
+    }
+
+    /// Ends a step that is not done, before all ends.
+    pub(super) fn finish_step(&mut self) {
+        if self.session.is_within_step() {
+            self.session.advance(&mut self.due, |_| {});
+            self.note_state();
+        }
+    }
+
+    /// The next step, at its time or after it: all of it, or a part of what the guard repeats for it.
     pub(super) fn step(&mut self, begun_ns: u64, context: &mut ThreadContext<'_>) {
+        if !self.session.is_within_step() && !self.begin_step(begun_ns, context) {
+            return;
+        }
+        let (Running { session, taps, due, copies, .. }, wakes, reading) =
+            (&mut *self, &mut context.wakes, context.reading);
+        copies.forget();
+        let mut may_go_on = || now_ns() < begun_ns + MOST_REPETITION_NS;
+        if session.advance_while(due, &mut may_go_on, |session| taps.record(session, copies, reading, wakes)) {
+            self.end_step(begun_ns, context);
+        }
+    }
+
+    /// Whether the next step can be done: what acts in it is known.
+    fn begin_step(&mut self, begun_ns: u64, context: &mut ThreadContext<'_>) -> bool {
         let sampled = self.next_step.is_multiple_of(STEPS_PER_SPAN);
         let span = sampled.then(|| tracing::debug_span!("step", session = %self.live.id, step = self.next_step));
         let _span = span.map(tracing::Span::entered);
@@ -388,17 +443,20 @@ impl Running {
             self.skip_to(self.next_step);
         }
         let step = self.session.step_count();
-        let Some(change) = self.take_inputs(step, begun_ns) else { return self.wait_for_record(context) };
+        let Some(change) = self.take_inputs(step, begun_ns) else {
+            self.wait_for_record(context);
+            return false;
+        };
         self.note_inputs(change.as_ref());
         if let Some(model) = change {
             self.session.change(&model);
             self.live.tissue.send_replace((step, model));
         }
+        true
+    }
 
-        let (Running { session, taps, due, copies, .. }, wakes, reading) =
-            (&mut *self, &mut context.wakes, context.reading);
-        copies.forget();
-        session.advance(due, |session| taps.record(session, copies, reading, wakes));
+    /// Tells what has come of a step.
+    fn end_step(&mut self, begun_ns: u64, context: &mut ThreadContext<'_>) {
         self.tell_auditor();
         self.log_recovery();
         self.note_state();

@@ -1,12 +1,18 @@
 //! Tests of the threads that step, and of who may have a session.
 #![allow(clippy::unwrap_used)]
 
+use glam::DVec3;
+
 use super::inbox::Request;
 use super::*;
 use crate::budget::{Account, Budget};
 use crate::limits::Limits;
 use crate::refusal::Reason;
+use crate::scene::profile::Poke;
+use crate::scene::script::Action;
 use crate::scene::{PAPER, Scene};
+use crate::session::Session;
+use crate::session::command::{Command, Due};
 use crate::session::sampling::Sampling;
 use crate::sheet::choice::NEVER;
 
@@ -37,6 +43,73 @@ async fn a_fault_in_one_session_ends_that_one_alone() {
     // On the same thread.
     let step = sound.status().step;
     assert_eq!(sound.hash_at(Some(step + 20), &Account::alone()).await.unwrap().0, step + 20);
+    pacer.stop();
+}
+
+#[tokio::test]
+async fn a_session_that_goes_apart_does_what_it_is_asked_and_leaves_its_thread_to_others() {
+    let limits = Limits::default();
+    let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+    let pacer = Pacer::start(1, 0.0, &limits, Budget::new(&limits, 1, 1)).unwrap();
+    let account = Account::alone();
+    let [heavy, light] = [(); 2].map(|()| pacer.create(&scene, false, 60.0, &account, &NEVER).unwrap());
+    let (laws, touch_stiffness) = (None, false);
+    let mut samples = heavy.samples(
+        Sampling { every: 1, only: None, deadband: None, heartbeat_s: 0.01, laws, touch_stiffness, wanted: None },
+        None,
+    );
+    samples.pop().await.unwrap();
+    heavy.inbox.send(heavy.number, Request::GoApart);
+    // Asked in this order, and done in this order, on the other thread.
+    heavy.pause().await.unwrap();
+    assert_eq!((heavy.thread(), light.thread()), (1, 0));
+    let step = heavy.status().step;
+    assert_eq!(heavy.hash_at(None, &account).await.unwrap().0, step);
+    // What it takes there is nobody's concern here.
+    (0..1000).for_each(|_| heavy.cost.observe(100_000_000));
+    assert_eq!(pacer.start_session(&heavy, None).await.unwrap(), step);
+    assert_eq!(heavy.hash_at(Some(step + 20), &account).await.unwrap().0, step + 20);
+    samples.pop().await.unwrap();
+    let (third, step) = (pacer.create(&scene, false, 60.0, &account, &NEVER).unwrap(), light.status().step);
+    assert_eq!((third.thread(), light.hash_at(Some(step + 20), &account).await.unwrap().0), (0, step + 20));
+    pacer.delete(&heavy.id).unwrap();
+    while samples.pop().await.is_ok() {}
+    pacer.stop();
+}
+
+#[tokio::test]
+async fn what_a_session_is_asked_while_the_guard_repeats_is_done_after_that_step() {
+    let limits = Limits::default();
+    let sets = ["sheet.points=[9, 9]", "stepping.integrator=central", "stepping.substeps=1"].map(str::to_owned);
+    let stiff = [&sets[..], &["springs.stiffness_n_per_m=100000".to_owned()]].concat();
+    let scene = Scene::parse("paper", PAPER, &stiff, &limits).unwrap();
+    let pacer = Pacer::start(1, 0.0, &limits, Budget::new(&limits, 1, 1)).unwrap();
+    let account = Account::alone();
+    let live = pacer.create(&scene, true, 60.0, &account, &NEVER).unwrap();
+    let push = Poke {
+        point: None,
+        centre_m: DVec3::new(0.13, 0.13, 0.0),
+        force_n: DVec3::NEG_Z,
+        falloff_per_m: 100.0,
+        falloff_offset: 0.0,
+    };
+    live.at_intake(|intake, now| {
+        intake.acquire(&[0], "", 60.0, 1, now)?;
+        intake.submit(1, vec![Command::new(0, Some(1), Action::Push(push))], now)
+    })
+    .unwrap();
+    let mut alone = Session::new(&live.model);
+    alone.advance(&mut vec![Due::in_time(Command::new(0, Some(1), Action::Push(push)))], |_| {});
+    pacer.start_session(&live, Some(400)).await.unwrap();
+    for step in 2..=400 {
+        alone.advance(&mut Vec::new(), |_| {});
+        if step % 16 == 0 {
+            let (at, hash) = live.hash_at(Some(step), &account).await.unwrap();
+            assert_eq!((at, hash), (step, alone.tissue().state_hash()), "{step}");
+        }
+    }
+    assert!(alone.recoveries().count() > 0 || alone.tissue().guard_events() > 0);
+    pacer.delete(&live.id).unwrap();
     pacer.stop();
 }
 

@@ -3,12 +3,16 @@
 //! One beat: sessions begin at a whole millisecond, so those of one rate are due together. The thread wakes once for all of
 //! them, and wakes their readers together at the end of the round, after 32 of them, or after 0.2 ms (`queue::Wakes`). So the
 //! samples of a round leave in few turns of the network threads.
+//!
+//! A session whose steps take too long for the others goes over to a thread that gives way (`step-apart`), by the rule of `policy`. The
+//! thread that it began on stays the one that is asked, and passes on what that is: so nothing overtakes anything.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeSet, VecDeque};
+use std::sync::atomic::Ordering;
 use std::sync::mpsc::SyncSender;
 use std::sync::{Arc, Mutex};
 
-use super::clock::now_ns;
+use super::clock::{now_ns, thread_time_ns};
 use super::fence::Fence;
 use super::frames::Encoder;
 use super::inbox::{Inbox, Request};
@@ -35,6 +39,23 @@ impl Stepper {
     }
 }
 
+/// The thread that gives way.
+pub(super) struct Apart {
+    pub(super) stepper: Arc<Stepper>,
+    /// What sessions call it.
+    pub(super) index: usize,
+}
+
+impl Apart {
+    /// Takes over a session.
+    fn adopt(&self, number: u64, mut running: Box<Running>) {
+        tracing::info!(session = %running.live.id, "steps take too long for other sessions: on a thread that gives way");
+        (running.goes_apart, running.inbox) = (false, self.stepper.inbox.clone());
+        running.live.thread.store(self.index, Ordering::Relaxed);
+        self.stepper.adopt(number, running);
+    }
+}
+
 /// So many readers wait at most, and so long, ns, for the end of a round of steps before they are woken.
 const MOST_WAKES: usize = 32;
 const MOST_ROUND_NS: u64 = 200_000;
@@ -45,6 +66,7 @@ const FENCED_NS: u64 = 5_000_000;
 /// The thread's work.
 pub(super) fn work(
     stepper: &Stepper,
+    apart: Option<&Apart>,
     fence: &Fence,
     encoder: &Encoder,
     refiner: &SyncSender<StiffnessJob>,
@@ -58,7 +80,18 @@ pub(super) fn work(
     let mut requests = VecDeque::new();
     let (wakes, longest) = (Wakes::default(), Longest::default());
     let mut context = ThreadContext { fence, encoder, refiner, reading, wakes, longest };
-    let mut begun_round_ns = 0;
+    let (mut begun_round_ns, mut gone) = (0, BTreeSet::new());
+    let part_with = |number, running: Box<Running>, gone: &mut BTreeSet<u64>| match apart {
+        Some(apart) if running.goes_apart => {
+            gone.insert(number);
+            apart.adopt(number, running);
+        }
+        _ => {
+            // To free what a session has takes longer than a step may wait.
+            let owner = running.live.owner.clone();
+            reading.post(&owner, Piece::Remains(running));
+        }
+    };
     loop {
         let now = now_ns();
         // Behind the fence no session is stepped, however late it is.
@@ -78,12 +111,15 @@ pub(super) fn work(
             if matches!(request, Request::Adopt) {
                 let newcomers = std::mem::take(&mut *lock(&stepper.newcomers));
                 newcomers.into_iter().for_each(|(number, running)| rota.adopt(number, running));
+            } else if let Some(apart) = apart.filter(|_| gone.contains(&number)) {
+                if matches!(request, Request::Leave(..)) {
+                    gone.remove(&number);
+                }
+                apart.stepper.inbox.send(number, request);
             } else {
                 let left = rota.with(number, |running| running.guarded(|running| running.serve(request, &mut context)));
                 if let Some(running) = left {
-                    // To free what a session has takes longer than a step may wait.
-                    let owner = running.live.owner.clone();
-                    reading.post(&owner, Piece::Remains(running));
+                    part_with(number, running, &mut gone);
                 }
             }
             if next_ns.is_some_and(|next_ns| next_ns <= now_ns()) {
@@ -99,16 +135,24 @@ pub(super) fn work(
                 begun_round_ns = begun_ns;
             }
             let (parts, is_alone) = (rota.parts(number), rota.is_alone());
-            rota.with(number, |running| {
+            let left = rota.with(number, |running| {
                 let late_ns = running.late_ns(begun_ns);
+                let worked_ns = running.watch.measures().then(thread_time_ns);
                 running.guarded(|running| running.step(begun_ns, &mut context));
+                running.guarded(|running| running.serve_waiting(&mut context));
+                let worked_ns = worked_ns.map(|before_ns| thread_time_ns().saturating_sub(before_ns));
                 let ended_ns = now_ns();
                 let taken_ns = ended_ns.saturating_sub(begun_ns);
                 context.longest.observe(ended_ns, taken_ns);
                 inbox.tally.lateness.add(late_ns);
                 inbox.tally.step_time.add(taken_ns);
                 running.queue_again(begun_ns, ended_ns, parts, is_alone);
+                let is_too_long = running.watch.is_too_long(taken_ns, worked_ns, running.schedule.period_ns());
+                running.goes_apart = is_too_long && !is_alone && apart.is_some();
             });
+            if let Some(running) = left {
+                part_with(number, running, &mut gone);
+            }
         }
     }
 }

@@ -153,6 +153,8 @@ pub struct Session {
     path_counts: [u64; 3],
     recoveries: Recoveries,
     hold_reason: Option<String>,
+    /// The present step is not done: the guard repeats others for it.
+    is_within_step: bool,
 }
 
 impl Session {
@@ -166,6 +168,7 @@ impl Session {
             path_counts: [0; 3],
             recoveries: Recoveries::default(),
             hold_reason: None,
+            is_within_step: false,
         }
     }
 
@@ -259,10 +262,47 @@ impl Session {
     /// called at its end unless the guard has ended the session, and before the first step also at t = 0⁺, when the
     /// commands act and nothing has moved.
     pub fn advance(&mut self, due: &mut Vec<Due>, mut observe: impl FnMut(&Session)) {
+        while !self.advance_while(due, &mut || true, &mut observe) {}
+    }
+
+    /// The same, but stops in what the guard repeats for the step where it may not go on. Then the result is false, and only this may be
+    /// called, again. What comes of it does not depend on where it stops.
+    pub fn advance_while(
+        &mut self,
+        due: &mut Vec<Due>,
+        may_go_on: &mut dyn FnMut() -> bool,
+        mut observe: impl FnMut(&Session),
+    ) -> bool {
         if self.hold_reason.is_some() {
+            self.is_within_step = false;
             due.clear();
-            return;
+            return true;
         }
+        if !self.is_within_step {
+            self.begin_step(due, &mut observe);
+        }
+        let stepped = self.tissue.step_while(may_go_on);
+        self.is_within_step = matches!(stepped, Ok(false));
+        if self.is_within_step {
+            return false;
+        }
+        if let Err(blow_up) = stepped
+            && !self.recover(blow_up)
+        {
+            return true;
+        }
+        self.recoveries.accept_until(self.tissue.checkpoint_step());
+        observe(self);
+        true
+    }
+
+    /// Whether a step is not done yet, because [`Session::advance_while`] has stopped.
+    pub fn is_within_step(&self) -> bool {
+        self.is_within_step && self.hold_reason.is_none()
+    }
+
+    /// What happens before a step.
+    fn begin_step(&mut self, due: &mut Vec<Due>, observe: &mut impl FnMut(&Session)) {
         // The network decides the order of arrival between tools, so it must not affect the result.
         due.sort_by_key(|due| due.command.tool);
         for due in due.drain(..) {
@@ -273,13 +313,6 @@ impl Session {
         if self.step_count() == 0 {
             observe(self);
         }
-        if let Err(blow_up) = self.tissue.step()
-            && !self.recover(blow_up)
-        {
-            return;
-        }
-        self.recoveries.accept_until(self.tissue.checkpoint_step());
-        observe(self);
     }
 
     /// The recoveries so far.

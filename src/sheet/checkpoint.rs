@@ -105,6 +105,25 @@ pub(super) struct Checkpoint<T: Real> {
     pub(super) passed_checks: bool,
 }
 
+/// Steps that the guard repeats from its checkpoint.
+#[derive(Debug)]
+pub(super) struct Repetition {
+    /// Where a check failed, steps.
+    pub(super) target: u64,
+    /// Of these steps, from the checkpoint on.
+    pub(super) inputs: Vec<(u64, usize, Input)>,
+    pub(super) next_input: usize,
+    pub(super) halvings: u32,
+}
+
+/// By how much an energy may rise without a cause.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Noise {
+    /// Part of the largest energy so far.
+    pub(super) part: f64,
+    pub(super) energy_j: f64,
+}
+
 /// Work of the tools, J, and energies at the last survey.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Work {
@@ -141,20 +160,20 @@ impl Work {
         Work { done_j: present_j, energy_j, largest_j: energy_j, excess_j: 0.0 }
     }
 
-    /// Checks an energy; a rise by `noise` of the largest does not count. `present_j` is subtracted from the work so
+    /// Checks an energy; a rise by `noise` does not count. `present_j` is subtracted from the work so
     /// far and belongs to the next interval. The account begins anew, but for what was too much while tools touch or hold
     /// (`is_touched`): what gains a little in every interval must not go on for ever.
     pub(super) fn survey(
         &mut self,
         energy_j: f64,
         present_j: f64,
-        noise: f64,
+        noise: Noise,
         is_touched: bool,
     ) -> std::result::Result<(), CheckFailure> {
         let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
         let excess_j = if is_touched { self.excess_j } else { 0.0 } + energy_j - before_j - work_j;
         // What is not a number is not within it.
-        let is_within = excess_j <= MARGIN * (before_j + work_j.abs()) + noise * self.largest_j;
+        let is_within = excess_j <= MARGIN * (before_j + work_j.abs()) + noise.part * self.largest_j + noise.energy_j;
         if !is_within {
             return Err(CheckFailure::Energy { energy_j, before_j, work_j });
         }
@@ -170,25 +189,30 @@ mod tests {
 
     #[test]
     fn energy_comes_from_work_alone() {
+        const EXACT: Noise = Noise { part: 0.0, energy_j: 0.0 };
         let begun = Work::begun(1.0, 0.0);
         // Up to the margin.
-        assert_eq!({ begun }.survey(1.04, 0.0, 0.0, false), Ok(()));
+        assert_eq!({ begun }.survey(1.04, 0.0, EXACT, false), Ok(()));
         let found = CheckFailure::Energy { energy_j: 1.2, before_j: 1.0, work_j: 0.0 };
-        assert_eq!({ begun }.survey(1.2, 0.0, 0.0, false), Err(found));
+        assert_eq!({ begun }.survey(1.2, 0.0, EXACT, false), Err(found));
         let mut worked = begun;
         worked.add(0.25);
         // Work that belongs to the next interval does not count in this one.
-        assert!({ worked }.survey(1.25, 0.2, 0.0, false).is_err());
-        assert_eq!(worked.survey(1.2, 0.05, 0.0, false), Ok(()));
+        assert!({ worked }.survey(1.25, 0.2, EXACT, false).is_err());
+        assert_eq!(worked.survey(1.2, 0.05, EXACT, false), Ok(()));
         assert_eq!(worked, Work { done_j: 0.05, energy_j: 1.2, largest_j: 1.2, excess_j: 0.0 });
         // A gain within the margin counts against the next while a tool touches, until it is lost again.
         let mut touched = begun;
-        assert_eq!(touched.survey(1.04, 0.0, 0.0, true), Ok(()));
-        assert!({ touched }.survey(1.06, 0.0, 0.0, true).is_err());
-        assert_eq!({ touched }.survey(1.06, 0.0, 0.0, false), Ok(()));
-        assert_eq!(touched.survey(1.0, 0.0, 0.0, true), Ok(()));
-        assert_eq!(touched.survey(1.04, 0.0, 0.0, true), Ok(()));
+        assert_eq!(touched.survey(1.04, 0.0, EXACT, true), Ok(()));
+        assert!({ touched }.survey(1.06, 0.0, EXACT, true).is_err());
+        assert_eq!({ touched }.survey(1.06, 0.0, EXACT, false), Ok(()));
+        assert_eq!(touched.survey(1.0, 0.0, EXACT, true), Ok(()));
+        assert_eq!(touched.survey(1.04, 0.0, EXACT, true), Ok(()));
+        // What is nothing but rounding is no energy.
+        let rounding = Noise { energy_j: 1e-27, ..EXACT };
+        assert_eq!(Work::default().survey(1e-30, 0.0, rounding, true), Ok(()));
+        assert!(Work::default().survey(1e-24, 0.0, rounding, true).is_err());
         // It goes as it likes.
-        assert_eq!(worked.survey(0.01, 0.0, 0.0, false), Ok(()));
+        assert_eq!(worked.survey(0.01, 0.0, EXACT, false), Ok(()));
     }
 }

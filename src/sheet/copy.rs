@@ -38,6 +38,7 @@ impl<T: Real> Sheet<T> {
             work: Work::default(),
             checkpoint: None,
             inputs: Vec::new(),
+            repetition: None,
             audit_window: AuditWindow::Off,
             is_marked: false,
             tiles: tiles.for_copy(),

@@ -14,7 +14,7 @@ use std::sync::Arc;
 
 use super::applied::Applied;
 pub use super::checkpoint::{CheckFailure, MARGIN};
-use super::checkpoint::{Checkpoint, Input, Work};
+use super::checkpoint::{Checkpoint, Input, Noise, Repetition, Work};
 use super::field::{Field, Layout, State};
 use super::model::{Model, Plan};
 use super::motion::{Sheet, springs_of};
@@ -39,6 +39,10 @@ pub(super) const MOST_INPUTS: usize = 1024;
 /// A rise of energy below this fraction of the largest so far is rounding noise in a sheet that has come to rest. So is
 /// a rise below the square of ten times the error that sleeping tiles may have.
 const NOISE: f64 = 1e-10;
+
+/// Tools that hold what can't move, or rest on what is at rest, move points by less than this part of a spacing: where it is computed
+/// how far they are apart, numbers of the size of the tissue cancel.
+const ROUNDING: f64 = 1e-12;
 
 impl<T: Real> Sheet<T> {
     /// Returns the cause of a failure, if there is one. Checks in every step that all is finite; the full check is
@@ -70,7 +74,10 @@ impl<T: Real> Sheet<T> {
             return Err(CheckFailure::Prediction { part: survey.prediction_error / survey.largest });
         }
         let present_j = self.present_work_j(&survey);
-        let noise = NOISE.max((10.0 * self.model.sleep_tolerance).powi(2));
+        let noise = Noise {
+            part: NOISE.max((10.0 * self.model.sleep_tolerance).powi(2)),
+            energy_j: ROUNDING * ROUNDING * self.unit_of_work_j(),
+        };
         self.work.survey(energy_j + self.coupling_j(), present_j, noise, !self.contacts.is_empty())?;
         self.take_checkpoint();
         Ok(())
@@ -161,38 +168,52 @@ impl<T: Real> Sheet<T> {
         self.tell(tool, input);
     }
 
-    /// Repeats from the checkpoint to `steps` with shorter substeps, until the checks pass or the substep is the
-    /// shortest.
-    pub(super) fn mend(&mut self, steps: u64, mut cause: CheckFailure) -> Result<(), BlowUp> {
-        let inputs = std::mem::take(&mut self.inputs);
-        let blow_up = |cause| BlowUp { step: steps, cause };
-        for halvings in self.halvings + 1..=MOST_HALVINGS {
-            self.go_back(halvings);
-            // A repetition that went well for a while has left a later checkpoint.
-            let from = self.steps;
-            let mut waiting = inputs.iter().filter(|(step, ..)| *step >= from).peekable();
-            let repeated = loop {
-                if self.steps == steps {
-                    break Ok(());
-                }
-                while let Some((_, tool, input)) = waiting.next_if(|(step, ..)| *step == self.steps) {
-                    self.input(*tool, input.clone());
-                }
-                self.do_step();
-                if let Err(cause) = self.check() {
-                    break Err(cause);
-                }
-            };
-            match repeated {
-                Ok(()) => {
-                    self.guard_events += 1;
-                    return Ok(());
-                }
-                Err(found) => cause = found,
+    /// Begins to repeat from the checkpoint to the present step, after a check has failed, with half the substep.
+    pub(super) fn begin_repetition(&mut self, cause: CheckFailure) -> Result<(), BlowUp> {
+        let (target, inputs) = (self.steps, std::mem::take(&mut self.inputs));
+        let mut repetition = Repetition { target, inputs, next_input: 0, halvings: self.halvings };
+        self.repeat_shorter(&mut repetition, cause)?;
+        self.repetition = Some(repetition);
+        Ok(())
+    }
+
+    /// Begins anew with half the substep; fails if that is the shortest.
+    fn repeat_shorter(&mut self, repetition: &mut Repetition, cause: CheckFailure) -> Result<(), BlowUp> {
+        if repetition.halvings >= MOST_HALVINGS {
+            self.go_back(self.halvings);
+            return Err(BlowUp { step: repetition.target, cause });
+        }
+        repetition.halvings += 1;
+        self.go_back(repetition.halvings);
+        // A repetition that went well for a while has left a later checkpoint.
+        repetition.next_input = repetition.inputs.partition_point(|(step, ..)| *step < self.steps);
+        Ok(())
+    }
+
+    /// Goes on with a repetition, if there is one, while it `may_go_on`, by one step at least. It ends when the checks pass up to where
+    /// it began, or fail with the shortest substep. Tells whether it has ended.
+    pub(super) fn go_on_repeating(&mut self, may_go_on: &mut dyn FnMut() -> bool) -> Result<bool, BlowUp> {
+        let Some(mut repetition) = self.repetition.take() else { return Ok(true) };
+        loop {
+            if self.steps == repetition.target {
+                self.guard_events += 1;
+                return Ok(true);
+            }
+            let inputs = &repetition.inputs[repetition.next_input..];
+            let now = inputs.partition_point(|(step, ..)| *step == self.steps);
+            for (_, tool, input) in &inputs[..now] {
+                self.input(*tool, input.clone());
+            }
+            repetition.next_input += now;
+            self.do_step();
+            if let Err(cause) = self.check() {
+                self.repeat_shorter(&mut repetition, cause)?;
+            }
+            if self.steps != repetition.target && !may_go_on() {
+                self.repetition = Some(repetition);
+                return Ok(false);
             }
         }
-        self.go_back(self.halvings);
-        Err(blow_up(cause))
     }
 }
 
@@ -253,6 +274,7 @@ mod tests {
     use crate::shape::PointId;
     use crate::sheet::integrate::Scheme;
     use crate::sheet::{Push, Tissue};
+    use palpate_touch::{Coupling, Tip};
 
     /// The names of all schemes.
     fn schemes() -> impl Iterator<Item = &'static str> {
@@ -326,6 +348,24 @@ mod tests {
     }
 
     #[test]
+    fn grasps_that_hold_still_beside_each_other_do_nothing() {
+        for integrator in schemes() {
+            let model = Model::paper(&[&format!("stepping.integrator={integrator}"), "stepping.substeps=7"]);
+            let mut sheet = crate::sheet::at_rest(&model);
+            let tip = Tip { radius_m: 0.005, friction: 0.2, grasps: true, coupling: Coupling::Constraint };
+            for tool in 0..16 {
+                let (y_m, x_m) = (0.1 * f64::from(tool)).sin_cos();
+                sheet.pose(tool as usize, DVec3::new(0.07 + 0.01 * x_m, 0.07 + 0.01 * y_m, -0.004), tip);
+            }
+            (0..400).for_each(|step| assert!(sheet.step().is_ok(), "{integrator}, {step}"));
+            assert_eq!(sheet.guard_events(), 0, "{integrator}");
+            let energy = sheet.energy();
+            let energy_j = energy.kinetic_j + energy.spring_j + energy.virtual_j;
+            assert!(energy_j < 1e-27, "{integrator}: {energy_j} J");
+        }
+    }
+
+    #[test]
     fn what_the_tools_do_is_what_the_sheet_has() {
         // Without damping `lagged` is `central`.
         for integrator in schemes() {
@@ -342,6 +382,34 @@ mod tests {
             (0..20).for_each(|_| sheet.step().unwrap());
             assert_eq!(sheet.guard_events(), 0);
         }
+    }
+
+    #[test]
+    fn a_repetition_that_stops_at_each_step_fails_and_mends_as_one_that_does_not() {
+        let sets = ["stepping.substeps=1", "springs.stiffness_n_per_m=100000"];
+        let model = Model::paper(&[&["sheet.points=[9, 9]", "stepping.integrator=central"][..], &sets].concat());
+        let (mut whole, mut parts) = (Sheet::<f32>::new(&model), Sheet::<f32>::new(&model));
+        let mut stops = 0;
+        for step in 0..300 {
+            let place_m = DVec3::new(0.13, 0.13, 0.01 - 1e-3 * f64::from(step));
+            for sheet in [&mut whole, &mut parts] {
+                sheet.pose(0, place_m, Tip { radius_m: 0.03, ..Default::default() });
+            }
+            let done = whole.step();
+            let done_in_parts = loop {
+                match parts.step_while(&mut || false) {
+                    Ok(false) => stops += 1,
+                    done => break done.map(drop),
+                }
+            };
+            assert_eq!(done, done_in_parts, "{step}");
+            assert_eq!((whole.steps, whole.guard_events), (parts.steps, parts.guard_events), "{step}");
+            assert_eq!(whole.state_hash(), parts.state_hash(), "{step}");
+            if let Err(blow_up) = done {
+                [&mut whole, &mut parts].into_iter().for_each(|sheet| drop(sheet.recover(blow_up.step, false)));
+            }
+        }
+        assert!(stops > 20 && whole.guard_events > 0, "{stops} stops, {} events", whole.guard_events);
     }
 
     #[test]

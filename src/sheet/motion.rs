@@ -9,7 +9,7 @@ use xxhash_rust::xxh3::Xxh3;
 
 use super::applied::{Applied, Push};
 use super::audit_window::{AuditWindow, Inputs, Mark};
-use super::checkpoint::{Checkpoint, Input, Work};
+use super::checkpoint::{Checkpoint, Input, Repetition, Work};
 use super::contact::{Contacts, Feel, Surroundings};
 use super::field::{BLOCK, Layout, State};
 use super::integrate::arithmetic::{Arithmetic, MAX_KEPT};
@@ -54,6 +54,8 @@ pub(super) struct Sheet<T: Real> {
     pub(super) checkpoint: Option<Arc<Checkpoint<T>>>,
     /// The inputs of the tools since the checkpoint: step they precede, tool, input.
     pub(super) inputs: Vec<(u64, usize, Input)>,
+    /// What the guard repeats: the present step is not done before.
+    pub(super) repetition: Option<Repetition>,
     pub(super) audit_window: AuditWindow,
     /// Whether the beginning of the window is still to be reported.
     pub(super) is_marked: bool,
@@ -82,6 +84,7 @@ impl<T: Real> Sheet<T> {
             prescribed: Prescribed::new(),
             contacts: Contacts::default(),
             inputs: Vec::new(),
+            repetition: None,
             audit_window: AuditWindow::Off,
             is_marked: false,
             tiles: SleepTiles::new(layout, model),
@@ -397,16 +400,23 @@ impl<T: Real> Tissue for Sheet<T> {
         self.substeps_done += steps * u64::from(self.plan.substeps);
     }
 
-    fn step(&mut self) -> Result<(), BlowUp> {
-        self.do_step();
-        if self.checkpoint.is_some() || !self.is_still() {
-            self.check().or_else(|cause| self.mend(self.steps, cause))?;
+    fn step_while(&mut self, may_go_on: &mut dyn FnMut() -> bool) -> Result<bool, BlowUp> {
+        if self.repetition.is_none() {
+            self.do_step();
+            if (self.checkpoint.is_some() || !self.is_still())
+                && let Err(cause) = self.check()
+            {
+                self.begin_repetition(cause)?;
+            }
+        }
+        if !self.go_on_repeating(may_go_on)? {
+            return Ok(false);
         }
         if self.checkpoint.is_some() && self.is_still() {
             self.forget_checkpoint();
         }
         self.known_growth.set(None);
-        Ok(())
+        Ok(true)
     }
 
     fn recover(&mut self, step: u64, to_rest: bool) -> Released {

@@ -122,7 +122,16 @@ pub trait Tissue: Send {
     /// # Errors
     /// Returns a blow-up that the guard could not repair. The state is then that of the last checkpoint, which is
     /// finite.
-    fn step(&mut self) -> Result<(), BlowUp>;
+    fn step(&mut self) -> Result<(), BlowUp> {
+        while !self.step_while(&mut || true)? {}
+        Ok(())
+    }
+    /// Advances one step, but stops in what the guard repeats for it where it may not go on: then the result is false, the state is that
+    /// of no step, and only this may be called, again. What comes of it does not depend on where it stops.
+    ///
+    /// # Errors
+    /// As `step`.
+    fn step_while(&mut self, may_go_on: &mut dyn FnMut() -> bool) -> Result<bool, BlowUp>;
     /// After a blow-up: continues at step `step` (of the blow-up) from the state of the last checkpoint, or at rest if
     /// `to_rest` or if that state has passed no check, with all tools released and the model's own substep.
     fn recover(&mut self, step: u64, to_rest: bool) -> Released;
