@@ -360,13 +360,13 @@ async fn who_does_not_read_loses_samples_and_delays_nobody() {
     }
 }
 
-/// What no machine does so often on one core, while all of it moves.
-fn heavy() -> Source {
+/// A sheet of so many points, 10,000 times a second.
+fn frequent(points_x: u32, points_y: u32) -> Source {
     let limits = palpate::limits::Limits::default();
     let paper = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[], &limits).unwrap();
     let mut scene = palpate::wire::scene::scene(&paper);
     let sheet = scene.sheet.as_mut().unwrap();
-    (sheet.points_x, sheet.points_y) = (Some(800), Some(500));
+    (sheet.points_x, sheet.points_y) = (Some(points_x), Some(points_y));
     scene.stepping.as_mut().unwrap().rate_hz = Some(10_000.0);
     Source::Scene(scene)
 }
@@ -380,19 +380,28 @@ fn everywhere(sequence: u64) -> pb::Command {
 }
 
 #[tokio::test]
-async fn a_heavy_session_slows_itself_and_lets_no_further_one_in() {
+async fn heavy_sessions_slow_themselves_and_let_no_further_one_in() {
     let server = limited("periods_per_step = 20.0", &["--threads", "1"]);
-    let heavy = server.create(heavy(), false).await.unwrap().session_id;
-    // At rest it takes nothing: others are let in.
+    // What no machine does so often on one core, while all of them move.
+    let mut heavy = Vec::new();
+    for _ in 0..4 {
+        heavy.push(server.create(frequent(300, 200), false).await.unwrap().session_id);
+    }
+    // At rest they take nothing: others are let in.
     let light = server.paper(false).await;
-    let (slow, mut quick) = (Touch::hold(&server, &heavy).await, Touch::hold(&server, &light).await);
-    slow.command(everywhere(1)).await;
+    let mut quick = Touch::hold(&server, &light).await;
+    let mut slow = Vec::new();
+    for session in &heavy {
+        let hold = Touch::hold(&server, session).await;
+        hold.command(everywhere(1)).await;
+        slow.push(hold);
+    }
     for sequence in 1..=500 {
         quick.command(force(0, sequence, -1.0 - 0.001 * sequence as f64)).await;
         quick.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
     }
-    // Steps of the heavy one were dropped, commands of the light one were not. Who goes first: `pace::thread`.
-    let (heavy_now, light_now) = (server.status(&heavy).await, server.status(&light).await);
+    // Steps of the heavy ones were dropped, commands of the light one were not. Who goes first: `pace::thread`.
+    let (heavy_now, light_now) = (server.status(&heavy[0]).await, server.status(&light).await);
     assert!(heavy_now.overrun_count > 0, "{heavy_now:?}");
     let commands = light_now.commands.unwrap();
     assert_eq!((commands.applied, commands.superseded, commands.dropped), (500, 0, 0), "{commands:?}");
@@ -403,9 +412,33 @@ async fn a_heavy_session_slows_itself_and_lets_no_further_one_in() {
     let start = || pb::StartSessionRequest { session_id: standing.clone(), until_step: None };
     let refused = server.sessions().await.start_session(start()).await.unwrap_err();
     assert_eq!(told(&refused).1, "OVERLOADED");
-    server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id: heavy }).await.unwrap();
+    for session_id in heavy {
+        server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id }).await.unwrap();
+    }
     server.paper(false).await;
     server.sessions().await.start_session(start()).await.unwrap();
+}
+
+#[tokio::test]
+async fn a_session_whose_steps_are_too_long_for_others_leaves_the_thread_to_them() {
+    let server = limited("periods_per_step = 200.0", &["--threads", "1"]);
+    // Steps of some milliseconds on any machine.
+    let heavy = server.create(frequent(2000, 500), false).await.unwrap().session_id;
+    let light = server.paper(false).await;
+    let (slow, mut quick) = (Touch::hold(&server, &heavy).await, Touch::hold(&server, &light).await);
+    slow.command(everywhere(1)).await;
+    for sequence in 1..=200 {
+        quick.command(force(0, sequence, -1.0 - 0.001 * sequence as f64)).await;
+        quick.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
+    }
+    // It is late, and nobody else: another session is let in, after some of its steps.
+    while server.status(&heavy).await.overrun_count == 0
+        || server.create(Source::SceneName("paper".into()), false).await.is_err()
+    {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    let commands = server.status(&light).await.commands.unwrap();
+    assert_eq!((commands.applied, commands.superseded, commands.dropped), (200, 0, 0), "{commands:?}");
 }
 
 #[cfg(unix)]

@@ -13,6 +13,9 @@
 //! can't be interrupted: the longest recent one may have made every session late, and each catches that up however many
 //! steps it is.
 //!
+//! **Turns.** What was not late before is stepped when it is due, also if it is one of four hundred that a caller has woken at once. After
+//! [`MOST_TURN_NS`] of steps of one caller, a session of another that is due comes first.
+//!
 //! **Apart.** A step that takes longer than its period, and than [`MOST_STEP_NS`], makes all others of the thread late, however the
 //! rest is divided: a scene may be light and its tools not. A session that has such steps beside others goes over to a thread that
 //! gives way, and stays there. So who is late is late alone.
@@ -39,6 +42,30 @@ impl Backlog {
 /// session's caller has `siblings` of them, itself included.
 pub(super) fn parts(callers: usize, siblings: usize) -> usize {
     callers * siblings
+}
+
+/// Steps of one caller may follow each other for so long, ns, while a session of another is due.
+const MOST_TURN_NS: u64 = 500_000;
+
+/// Whose steps a thread does at present, one after the other.
+#[derive(Debug, Default)]
+pub(super) struct CallerTurn {
+    caller: u64,
+    begun_ns: u64,
+}
+
+impl CallerTurn {
+    /// Notes that a step of a caller begins. If that is the one whose turn was over, no other had one that was due.
+    pub(super) fn step(&mut self, caller: u64, begun_ns: u64) {
+        if caller != self.caller || self.is_over_for(begun_ns).is_some() {
+            *self = CallerTurn { caller, begun_ns };
+        }
+    }
+
+    /// The caller for whom others have waited long enough.
+    pub(super) fn is_over_for(&self, now_ns: u64) -> Option<u64> {
+        (now_ns > self.begun_ns + MOST_TURN_NS).then_some(self.caller)
+    }
 }
 
 /// A step may take so long, ns, whatever its period is.
@@ -172,6 +199,19 @@ mod tests {
         // 40 sessions of one caller take 2 ms of each millisecond together; one session of another keeps its time.
         let (many, one) = (turn(0.05, parts(2, 40)), turn(0.05, parts(2, 1)));
         assert_eq!((many.not_before_ns(10 * MS), one.not_before_ns(10 * MS)), (10 * MS, 0));
+    }
+
+    #[test]
+    fn the_turn_of_a_caller_is_over_after_half_a_millisecond_of_its_steps() {
+        let mut turn = CallerTurn::default();
+        turn.step(7, MS);
+        turn.step(7, MS + MS / 4);
+        assert_eq!((turn.is_over_for(MS + MS / 2), turn.is_over_for(MS + MS / 2 + 1)), (None, Some(7)));
+        turn.step(7, 2 * MS);
+        assert_eq!(turn.is_over_for(2 * MS + 1), None);
+        turn.step(8, 2 * MS);
+        turn.step(7, 2 * MS + 1);
+        assert_eq!(turn.is_over_for(2 * MS + 2), None);
     }
 
     #[test]

@@ -48,8 +48,20 @@ impl Rota {
 
     /// The number of equal parts of the thread of which one belongs to session `number` ([`policy::parts`]).
     pub(super) fn parts(&self, number: u64) -> usize {
-        let owner = self.sessions.get(&number).map(|running| running.owner());
+        let owner = self.owner(number);
         policy::parts(self.awake.len(), owner.and_then(|owner| self.awake.get(&owner)).copied().unwrap_or(1))
+    }
+
+    /// The session to be stepped now: that which is due first, of other callers than `weary` if one of theirs is due.
+    pub(super) fn next(&self, now_ns: u64, weary: Option<u64>) -> Option<u64> {
+        let due = || self.due.iter().take_while(|(due_ns, _)| *due_ns <= now_ns).map(|(_, number)| *number);
+        let is_others = |number: &u64| self.owner(*number) != weary;
+        weary.and_then(|_| due().find(is_others)).or_else(|| due().next())
+    }
+
+    /// Who has made a session.
+    pub(super) fn owner(&self, number: u64) -> Option<u64> {
+        self.sessions.get(&number).map(|running| running.owner())
     }
 
     /// Whether only one session is due some time.
@@ -75,7 +87,7 @@ impl Rota {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::Budget;
+    use crate::budget::{Account, Budget};
     use crate::limits::Limits;
     use crate::pace::Pacer;
     use crate::scene::{PAPER, Scene};
@@ -103,6 +115,10 @@ mod tests {
             rota.with(index, |running| running.running = true);
         }
         assert_eq!((rota.parts(0), rota.parts(40), rota.awake.len()), (80, 2, 2));
+        // All are due at once: first those of the caller with many, and that of the other after their turn.
+        let next = |weary: Option<&Account>| rota.next(10_000_000, weary.map(Account::number));
+        assert_eq!((next(None), next(Some(&many)), next(Some(&one))), (Some(0), Some(40), Some(0)));
+        assert_eq!((rota.next(1_000_000, None), rota.next(1_000_000, Some(many.number()))), (None, None));
         // All are late; those of the caller with more than its half go behind, the other does not.
         let (now_ns, due) = (10_000_000, 2_000_000);
         for (number, expected) in [(0, now_ns), (40, due)] {

@@ -16,6 +16,7 @@ use super::clock::{now_ns, thread_time_ns};
 use super::fence::Fence;
 use super::frames::Encoder;
 use super::inbox::{Inbox, Request};
+use super::policy::CallerTurn;
 use super::policy::Longest;
 use super::queue::Wakes;
 use super::reading::{Piece, Reading};
@@ -80,7 +81,7 @@ pub(super) fn work(
     let mut requests = VecDeque::new();
     let (wakes, longest) = (Wakes::default(), Longest::default());
     let mut context = ThreadContext { fence, encoder, refiner, reading, wakes, longest };
-    let (mut begun_round_ns, mut gone) = (0, BTreeSet::new());
+    let (mut begun_round_ns, mut gone, mut turn) = (0, BTreeSet::new(), CallerTurn::default());
     let part_with = |number, running: Box<Running>, gone: &mut BTreeSet<u64>| match apart {
         Some(apart) if running.goes_apart => {
             gone.insert(number);
@@ -127,10 +128,10 @@ pub(super) fn work(
             }
         }
         let begun_ns = now_ns();
-        if let Some((due_ns, number)) = rota.first()
-            && due_ns <= begun_ns
+        if let Some(number) = rota.next(begun_ns, turn.is_over_for(begun_ns))
             && fence.may_act()
         {
+            turn.step(rota.owner(number).unwrap_or_default(), begun_ns);
             if context.wakes.is_empty() {
                 begun_round_ns = begun_ns;
             }

@@ -361,9 +361,11 @@ impl Tool {
             }
             ContactState::Holding | ContactState::Sticking | ContactState::Sliding => {}
         }
+        // A lag is across the normal that the surface had when the tool was there: that it has turned since moves nothing.
+        let normal_before = leg.normal.unwrap_or(self.normal);
         let lag_m = match before {
-            ContactState::Free => self.lag_m(gap_m),
-            ContactState::Sliding => self.lag_m(self.gap_m),
+            ContactState::Free => self.lag_m(gap_m, normal_before),
+            ContactState::Sliding => self.lag_m(self.gap_m, normal_before),
             ContactState::Holding | ContactState::Sticking => DVec3::ZERO,
         };
         gap_m -= self.offset_m;
@@ -394,7 +396,7 @@ impl Tool {
         }
         if before == ContactState::Sticking {
             // What it lagged behind when it began to stick, it lags behind again.
-            let lag_m = self.lag_m(self.offset_m);
+            let lag_m = self.lag_m(self.offset_m, normal_before);
             self.offset_m -= lag_m;
             self.gap_m += lag_m;
             gap_m += lag_m;
@@ -424,9 +426,9 @@ impl Tool {
         thrust
     }
 
-    /// What of a gap is across the normal, if a constraint would close it and it is too much for a disc that follows its tool, m.
-    fn lag_m(&self, gap_m: DVec3) -> DVec3 {
-        let across_m = gap_m - gap_m.dot(self.normal) * self.normal;
+    /// What of a gap is across a normal, if a constraint would close it and it is too much for a disc that follows its tool, m.
+    fn lag_m(&self, gap_m: DVec3, normal: DVec3) -> DVec3 {
+        let across_m = gap_m - gap_m.dot(normal) * normal;
         let lags = across_m.length() > LEAST_LAG * self.footprint.radius_m();
         if lags && self.tip.coupling == Coupling::Constraint && !self.tip.grasps { across_m } else { DVec3::ZERO }
     }

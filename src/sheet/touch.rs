@@ -34,8 +34,7 @@ impl<T: Real> Sheet<T> {
                 push(model, plan, layout, state, &tool.footprint, leg.jump_n, plan.scheme.kick());
             }
             let thrust = tool.meet(model, plan, layout, state, leg);
-            // Whether it touches or not, it has been compared with the surface, unless it is beside that.
-            tool.is_new &= tool.side.is_none();
+            tool.is_new = false;
             tool.force_n = thrust.force_n();
             tool.steady_n = if met { thrust.goes_on_n } else { DVec3::ZERO };
             if tool.contact_state == ContactState::Free {
