@@ -27,7 +27,7 @@ enum Command {
         Exit status: 0; 1 when the run failed; 2 when an input was refused.")]
     Run(run::RunArguments),
     /// Report what a scene needs and what to expect of it: size, mass, stiffness under a fingertip, time to rest, integrator,
-    /// expected error, time per step, sessions per core; warns of what can't be meant
+    /// expected error, time per step, sessions per core; warns of what is unlikely
     #[command(after_help = "Examples:\n  \
         palpate check paper\n  \
         palpate check my-scene.toml my-script.toml\n  \

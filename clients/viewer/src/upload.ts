@@ -30,6 +30,8 @@ type Scene = MessageInitShape<typeof SceneSchema>;
 interface Sent {
   meshId: string;
   report: MeshReport;
+  /** What the server keeps of it for longer than the session, in words; empty if nothing. */
+  kept: string;
 }
 
 /** The sides of a box in words. */
@@ -135,7 +137,7 @@ export class FileOpener {
     if (file.size === 0) throw new Error("the file is empty");
     let sent = await this.send(file, "m", false, signal);
     const raw = sidesOf(sent.report);
-    const chosen = await this.askUnit(raw, signal);
+    const chosen = await this.askUnit(raw, sent.kept, signal);
     const { unit } = chosen;
     if (unit !== "m") sent = await this.send(file, unit, false, signal);
     if ((await this.showReport(sent.report, chosen, false, signal)) === "mend") {
@@ -166,13 +168,13 @@ export class FileOpener {
       this.progress.value = Math.min(1, (offset + bytes.length) / file.size);
       if (!last) continue;
       if (!answer.report) throw new Error("the server has not reported on the mesh");
-      return { meshId, report: answer.report };
+      return { meshId, report: answer.report, kept: answer.kept };
     }
   }
 
-  /** Asks what a length of 1 is, and says what size results for each unit. */
-  private async askUnit(raw: number[], signal: AbortSignal): Promise<(typeof UNITS)[number]> {
-    this.show("Mesh files do not say in which unit they are. How large is it?");
+  /** Asks what a length of 1 is, and says what size results for each unit. The file is kept only if one goes on, so tells that first. */
+  private async askUnit(raw: number[], kept: string, signal: AbortSignal): Promise<(typeof UNITS)[number]> {
+    this.show("Mesh files do not say in which unit they are. How large is it?", kept ? [kept] : []);
     const likely = likelyUnit(Math.max(...raw));
     const choices = UNITS.map(({ unit, name, metres }) => {
       const label = document.createElement("label");

@@ -689,7 +689,7 @@ describe("a body of any shape", () => {
       makeOrgan(organ, edgeMm, join(folder, `${organ}.obj`));
       writeFileSync(join(folder, `${organ}.toml`), onMesh(organ));
     }
-    organs = await Server.start(["--scenes", folder]);
+    organs = await Server.start(["--scenes", folder, "--journal", mkdtempSync(join(tmpdir(), "palpate-"))]);
   });
   after(async () => assert.equal(await organs?.stop(), 0));
 
@@ -778,6 +778,7 @@ describe("a body of any shape", () => {
     // A piece of 100 mm is likelier than one of 100 m.
     await page.says("own-units", /100 × 1?[0-9.]+ × .* mm in millimetres/);
     assert.equal(await page.page.locator("#own-units input:checked").inputValue(), "mm");
+    await page.says("own-problems", /journals of sessions on this mesh contain it, and stay 30 days/);
     await page.page.click("#own-buttons button.main");
     // A mesh without a flaw waits for no further answer.
     await page.says("connection", /Connected to own/);
