@@ -290,6 +290,19 @@ async fn a_journal_that_is_damaged_in_its_middle_is_left_alone_and_told() {
     let log = after.log();
     assert!(log.contains(path.to_str().unwrap()) && log.contains("step"), "{log}");
     assert_eq!(std::fs::read(&path).unwrap(), bytes);
+    // It is played, and gone on from, up to there.
+    let request = pb::GetJournalRequest { session_id: broken.clone(), run: 0 };
+    let told = after.sessions().await.get_journal(request).await.unwrap().into_inner();
+    let fault = told.info.unwrap().fault;
+    assert!(fault.starts_with("damaged at byte") && told.end_step > told.begin_step, "{fault}, {}", told.end_step);
+    let moment = |plays| {
+        let step = Some(told.end_step);
+        let moment = pb::JournalMoment { session_id: broken.clone(), step, plays, ..Default::default() };
+        pb::create_session_request::Source::Journal(moment)
+    };
+    for plays in [true, false] {
+        assert_eq!(after.create(moment(plays), true).await.unwrap().step, told.end_step);
+    }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -61,6 +61,8 @@ export class Recording implements JournalName {
   readonly forces: ForceMoment[];
   /** Steps from which playing begins at once. */
   readonly snapshots: number[];
+  /** Where it is damaged: it ends before that. Empty if it is whole. */
+  readonly fault: string;
 
   static async of({ sessionId, run }: JournalName): Promise<Recording> {
     return new Recording(await sessions.getJournal({ sessionId, run }, { timeoutMs: PATIENCE_MS }));
@@ -77,6 +79,7 @@ export class Recording implements JournalName {
     this.end = Math.max(Number(endStep), this.begin);
     this.forces = forces;
     this.snapshots = snapshotSteps.map(Number);
+    this.fault = info?.fault ?? "";
   }
 
   /** Time since its beginning, s. */

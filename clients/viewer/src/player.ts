@@ -126,6 +126,7 @@ export class Player {
     this.bar.hidden = false;
     this.timeline.show(recording);
     this.tell();
+    if (recording.fault) this.host.notice(`The recording is shown up to where its file is ${recording.fault}.`);
     if (recording.isLive) void this.grow();
   }
 

@@ -65,7 +65,7 @@ fn find(
 fn open(file: &JournalFile, payer: Option<&Account>) -> Result<Reader<Box<dyn Source>>> {
     let source = journal::reader::file(&file.path).map_err(Refusal::without_folder)?;
     // Callers are told what is wrong with it, and not where it is.
-    Reader::paid(&file::name(&file.session_id, file.run), Box::new(source), paid_by(payer)?)
+    Ok(Reader::paid(&file::name(&file.session_id, file.run), Box::new(source), paid_by(payer)?)?.up_to_damage())
 }
 
 /// Grows by what is read, from who pays for it.
@@ -262,7 +262,7 @@ impl Recorded {
         let mut received = self.sent.take(id, account)?;
         let bytes = std::mem::take(&mut received.bytes);
         let paid = paid_by(Some(account))?;
-        let reader = Reader::paid(SENT, Cursor::new(&bytes), paid).map_err(within_upload)?;
+        let reader = Reader::paid(SENT, Cursor::new(&bytes), paid).map_err(within_upload)?.up_to_damage();
         let header = reader.header();
         let known = pb::JournalInfo {
             session_id: header.session_id.clone(),
@@ -291,7 +291,7 @@ impl Recorded {
         // A session that plays it keeps it, also when the upload has expired.
         let taken = payer.take(Resource::Memory(Purpose::Journals), bytes.len() as u64, "upload_id")?;
         let source: Box<dyn Source> = Box::new(Cursor::new(Sent { bytes, _taken: taken }));
-        let reader = Reader::paid(SENT, source, paid_by(Some(payer))?)?.without_files();
+        let reader = Reader::paid(SENT, source, paid_by(Some(payer))?)?.without_files().up_to_damage();
         let (session_id, run) = (reader.header().session_id.clone(), reader.header().run);
         Ok((reader, session_id, run))
     }
@@ -380,7 +380,7 @@ impl AsRef<[u8]> for Sent {
     }
 }
 
-/// What is in a journal, of which `info` is known.
+/// What is in a journal, of which `info` is known. One that is damaged is told up to there.
 fn tell<R: Read + Seek>(
     mut reader: Reader<R>,
     info: pb::JournalInfo,
@@ -401,7 +401,7 @@ fn tell<R: Read + Seek>(
         }
     }
     Ok(pb::GetJournalResponse {
-        info: Some(info),
+        info: Some(pb::JournalInfo { fault: survey.damage.unwrap_or_default(), ..info }),
         rate_hz: reader.header().rate_hz,
         begin_step: reader.header().begin_step,
         end_step: survey.until_step,
