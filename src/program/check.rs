@@ -16,7 +16,7 @@ use super::{Failure, clock_s, say};
 pub(crate) struct CheckArguments {
     #[command(flatten)]
     scene: SceneArguments,
-    /// A script to check with it: a file, or the name of a script in ./scripts
+    /// A script to check with it: a file, or the name of one that is in ./scripts or built in: `press`, `stroke`, …
     script: Option<PathBuf>,
 }
 

@@ -14,7 +14,7 @@ use super::{Failure, say, with_progress, write_file};
 pub(crate) struct RenderArguments {
     #[command(flatten)]
     scene: SceneArguments,
-    /// A script file, or the name of a script in ./scripts
+    /// A script file, or the name of one that is in ./scripts or built in: `press`, `stroke`, …
     script: PathBuf,
     /// The file to write: a .png of one moment, or a .gif of the whole script
     #[arg(short, long, value_name = "FILE")]

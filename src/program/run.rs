@@ -14,7 +14,7 @@ use super::{Failure, clock_s, say, with_progress};
 pub(crate) struct RunArguments {
     #[command(flatten)]
     scene: SceneArguments,
-    /// A script file, or the name of a script in ./scripts
+    /// A script file, or the name of one that is in ./scripts or built in: `press`, `stroke`, …
     script: PathBuf,
     /// Write the records here instead of to the standard output
     #[arg(short, long, value_name = "FILE")]

@@ -12,7 +12,7 @@ use super::{Failure, load_config};
 
 #[derive(clap::Args)]
 pub(crate) struct SceneArguments {
-    /// A scene file, or the name of a scene in --scenes; `paper` is built in
+    /// A scene file, or the name of one that is in --scenes or built in: `liver`, `liver-organ`, `paper`, …
     scene: PathBuf,
     /// Folder of the scenes that you can give by name
     #[arg(long, value_name = "DIR", default_value = "scenes")]

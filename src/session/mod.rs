@@ -11,6 +11,7 @@
 //! **Order.** Commands that are due at one step act in the order of their tools' numbers, not of arrival: two clients that
 //! stamp their commands get the same bits whichever network was faster. A second tool that grasps a point takes it over.
 
+mod approach;
 pub mod audit;
 pub mod batch;
 pub mod check;

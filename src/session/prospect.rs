@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 use glam::DVec3;
 use palpate_touch::{Coupling, Law, Tip};
 
-use super::dent;
+use super::{approach, dent};
 use crate::force_law::{self, Disc};
 use crate::scene::Body;
 use crate::scene::profile::{LoadProfile, Poke, PoseProfile, StrengthProfile, weights};
@@ -91,20 +91,24 @@ enum Meeting {
     Held { moved_m: f64 },
 }
 
-/// The force laws of a tissue under discs in the middle; each is computed once.
+/// The force laws of a tissue under discs; each is computed once.
 struct Laws<'m> {
     model: &'m Model,
-    known: Vec<(f64, Option<Law>)>,
+    known: Vec<(Disc, Option<Law>)>,
 }
 
 impl Laws<'_> {
-    /// The first law under a disc, coarse where the exact one takes too much work.
+    /// The first law under a disc in the middle.
     fn of(&mut self, radius_m: f64) -> Option<&Law> {
-        let known = self.known.iter().position(|known| known.0 == radius_m);
+        self.under(Disc::in_middle(self.model, radius_m))
+    }
+
+    /// The first law under a disc, coarse where the exact one takes too much work.
+    fn under(&mut self, disc: Disc) -> Option<&Law> {
+        let known = self.known.iter().position(|known| known.0 == disc);
         let place = known.unwrap_or_else(|| {
-            let law = force_law::first(self.model, Disc::in_middle(self.model, radius_m), &AtomicBool::new(false))
-                .filter(Law::is_sound);
-            self.known.push((radius_m, law));
+            let law = force_law::first(self.model, disc, &AtomicBool::new(false)).filter(Law::is_sound);
+            self.known.push((disc, law));
             self.known.len() - 1
         });
         self.known[place].1.as_ref()
@@ -261,7 +265,8 @@ fn tips(shape: &dyn RestShape, script: &Script, laws: &mut Laws<'_>) -> Vec<TipU
     (first..).zip(&script.poses).map(of).collect()
 }
 
-/// How a tool meets the tissue at rest until `end_s`. The force is by the law under a disc of its radius in the middle.
+/// How a tool meets the tissue at rest until `end_s`. The force is by the law under a disc of its radius: of a sheet in the middle, of a
+/// mesh where it goes deepest.
 fn meeting(shape: &dyn RestShape, profile: &PoseProfile, end_s: f64, laws: &mut Laws<'_>) -> Meeting {
     let end_s = end_s.min(profile.until_s);
     let endless = PoseProfile { until_s: f64::INFINITY, ..profile.clone() };
@@ -280,13 +285,18 @@ fn meeting(shape: &dyn RestShape, profile: &PoseProfile, end_s: f64, laws: &mut 
         let moved_m = way[begin + 1..].iter().map(|place_m| place_m.distance(held_m)).fold(0.0, f64::max);
         return Meeting::Held { moved_m };
     }
-    let lowest_m = parts.map(|place_m| place_m.z).fold(f64::INFINITY, f64::min);
-    // The surface at rest is at the upper side of the extent.
-    let depth_m = most_m.z - lowest_m;
+    let (depth_m, disc) = if let Body::Mesh(mesh) = &laws.model.scene.body {
+        let Some(found) = approach::deepest(mesh.shape.surface(), &way, tip.radius_m) else { return Meeting::Beside };
+        let disc = Disc::in_middle(laws.model, tip.radius_m);
+        (found.depth_m, disc.follow(laws.model, found.rest_m))
+    } else {
+        let lowest_m = parts.map(|place_m| place_m.z).fold(f64::INFINITY, f64::min);
+        (most_m.z - lowest_m, Disc::in_middle(laws.model, tip.radius_m))
+    };
     if depth_m <= 0.0 {
         return Meeting::Above { gap_m: -depth_m };
     }
-    let by_law_n = laws.of(tip.radius_m).map(|law| law.at_depth(depth_m).force_n);
+    let by_law_n = laws.under(disc).map(|law| law.at_depth(depth_m).force_n);
     match tip.coupling {
         Coupling::Constraint => Meeting::Pressed { depth_m, force_n: by_law_n, is_bound: false },
         Coupling::Spring { stiffness_n_per_m, .. } => {
@@ -359,7 +369,7 @@ impl fmt::Display for Meeting {
             Meeting::Unused => write!(f, "is not used: its first pose is later than the end of the script"),
             Meeting::Beside => write!(f, "never meets the tissue: it is beside it all the time"),
             Meeting::Above { gap_m } => {
-                write!(f, "never meets the tissue: its lowest place is {} above it", length(gap_m))
+                write!(f, "never meets the tissue: it stays {} away", length(gap_m))
             }
             Meeting::Pressed { depth_m, force_n, is_bound } => {
                 let (most, about) = if is_bound { ("at most ", "at most") } else { ("", "about") };
@@ -554,7 +564,7 @@ mod tests {
         let script = tools(&model, &[&wrong[0], &wrong[1], &wrong[2], &wrong[3], PRESS]);
         let found = Prospect::new(&model, Some(&script));
         let expected = [
-            "tool 0 never meets the tissue: its lowest place is 3 mm above it",
+            "tool 0 never meets the tissue: it stays 3 mm away",
             "tool 1 never meets the tissue: it is beside it all the time",
             "tool 2 is not used: its first pose is later than the end of the script",
             "tool 3 goes 60 mm deep, more than the tissue's longest side: it goes through",

@@ -51,7 +51,7 @@ const PATIENCE: Duration = Duration::from_secs(120);
 
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
-    /// A script file, or the name of a script in ./scripts
+    /// A script file, or the name of one that is in ./scripts or built in: `press`, `stroke`, …
     script: PathBuf,
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]

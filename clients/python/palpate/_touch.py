@@ -31,13 +31,15 @@ class Course:
 
 def press(depth_m=0.003, *, seconds=2.0, hover_m=0.005, at_m=(0.0, 0.0), limits="omega3"):
     """A course that comes down from `hover_m` above the tissue, presses `depth_m` deep, holds, and goes up again: smooth, a third of
-    `seconds` each. `at_m` is beside the middle of the tissue."""
+    `seconds` each. `at_m` is beside the middle of the tissue. On an organ that is the middle of the box around it, inside: give the
+    height of its surface there as a third number, such as `at_m=(0.0, 0.0, 0.035)`, or the tip touches nothing."""
     moments = np.arange(max(1, round(1000 * seconds))) / max(1, round(1000 * seconds))
     down = np.clip(3 * moments, 0, 1) - np.clip(3 * moments - 2, 0, 1)
     smooth = down * down * (3 - 2 * down)
     heights = hover_m - (hover_m + depth_m) * smooth
-    x, y = at_m
-    return Course(np.column_stack([np.full_like(heights, x), np.full_like(heights, y), heights]), limits)
+    x, y, surface_m = (*at_m, 0.0)[:3]
+    places = [np.full_like(heights, x), np.full_like(heights, y), surface_m + heights]
+    return Course(np.column_stack(places), limits)
 
 
 @dataclasses.dataclass(eq=False)

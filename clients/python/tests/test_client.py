@@ -142,6 +142,11 @@ class Clients(Served, unittest.TestCase):
             self.assertEqual(first.displacement_m.shape[:2], mesh["grid"])
             self.assertLess(mesh["triangles"].max(), mesh["rest_m"].shape[0])
 
+    def test_a_press_begins_above_the_surface_at_the_height_that_is_given(self):
+        flat, organ = palpate.press(0.003, hover_m=0.005), palpate.press(0.003, hover_m=0.005, at_m=(0.01, 0.0, 0.035))
+        self.assertTrue(np.allclose(organ.places_m - flat.places_m, (0.01, 0.0, 0.035)))
+        self.assertAlmostEqual(organ.places_m[:, 2].min(), 0.032)
+
     def test_a_copy_of_the_tissue_is_made_when_it_is_asked_for(self):
         with palpate.connect(self.url).create_session("liver") as session:
             press = palpate.press(depth_m=0.003, seconds=2.0)

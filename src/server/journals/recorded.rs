@@ -63,9 +63,9 @@ fn find(
 }
 
 fn open(file: &JournalFile, payer: Option<&Account>) -> Result<Reader<Box<dyn Source>>> {
-    let source = journal::reader::file(&file.path).map_err(Refusal::without_folder)?;
+    let source: Box<dyn Source> = Box::new(journal::reader::file(&file.path).map_err(Refusal::without_folder)?);
     // Callers are told what is wrong with it, and not where it is.
-    Ok(Reader::paid(&file::name(&file.session_id, file.run), Box::new(source), paid_by(payer)?)?.up_to_damage())
+    Ok(Reader::paid(&file::name(&file.session_id, file.run), source, paid_by(payer)?)?.up_to_damage())
 }
 
 /// Grows by what is read, from who pays for it.
