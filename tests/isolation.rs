@@ -384,8 +384,8 @@ async fn heavy_sessions_slow_themselves_and_let_no_further_one_in() {
     let server = limited("periods_per_step = 20.0", &["--threads", "1"]);
     // What no machine does so often on one core, while all of them move.
     let mut heavy = Vec::new();
-    for _ in 0..4 {
-        heavy.push(server.create(frequent(300, 200), false).await.unwrap().session_id);
+    for _ in 0..12 {
+        heavy.push(server.create(frequent(200, 100), false).await.unwrap().session_id);
     }
     // At rest they take nothing: others are let in.
     let light = server.paper(false).await;
