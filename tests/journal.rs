@@ -1,15 +1,15 @@
 //! Journals: what is written is read again, whatever happens to the file, and gives the same bits.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_possible_truncation)]
 
-#[path = "common/opening.rs"]
-mod opening;
+#[path = "common/journal_opening.rs"]
+mod journal_opening;
 
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use glam::DVec3;
-use opening::opening;
+use journal_opening::opening;
 use palpate::journal::replay::{Item, items};
 use palpate::journal::{self, Opening, Reader, Seen, Writer, mend, pb};
 use palpate::limits::Limits;

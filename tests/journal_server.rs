@@ -2,8 +2,8 @@
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-#[path = "common/opening.rs"]
-mod opening;
+#[path = "common/journal_opening.rs"]
+mod journal_opening;
 #[path = "common/server.rs"]
 mod server;
 
@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use opening::opening;
+use journal_opening::opening;
 use palpate::limits::Limits;
 use palpate::sheet::choice::NEVER;
 use palpate_proto::pb;

@@ -2,13 +2,13 @@
 //! is found.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, missing_docs)]
 
-#[path = "common/opening.rs"]
-mod opening;
+#[path = "common/journal_opening.rs"]
+mod journal_opening;
 
 use std::path::Path;
 use std::process::Command;
 
-use opening::opening;
+use journal_opening::opening;
 use palpate::journal::signature::{Key, Signatures};
 use palpate::journal::{Opening, Reader, Writer, pb};
 use palpate::limits::Limits;

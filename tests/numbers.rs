@@ -5,8 +5,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod common;
-#[path = "common/opening.rs"]
-mod opening;
+#[path = "common/journal_opening.rs"]
+mod journal_opening;
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -150,7 +150,7 @@ fn snapshot(writer: &mut Writer, session: &Session) {
 }
 
 fn opening(first: &Arc<Model>, begin_step: u64) -> Opening<'_> {
-    Opening { owner: "", begin_step, ..opening::opening(first) }
+    Opening { owner: "", begin_step, ..journal_opening::opening(first) }
 }
 
 /// Steps with what a test has them do.

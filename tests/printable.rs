@@ -1,14 +1,14 @@
 //! Names and messages of others in what `palpate` prints: they act on no terminal and begin no line.
 #![allow(clippy::unwrap_used)]
 
-#[path = "common/opening.rs"]
-mod opening;
+#[path = "common/journal_opening.rs"]
+mod journal_opening;
 
 use std::path::Path;
 use std::process::Command;
 use std::sync::Arc;
 
-use opening::opening;
+use journal_opening::opening;
 use palpate::journal::{Opening, Writer, pb};
 use palpate::limits::Limits;
 use palpate::scene::{PAPER, Scene};

@@ -76,9 +76,9 @@ const LEAST_J: f64 = 1e-6;
 /// An energy may be so many times the work, because between the ends of a step a force may have been larger than there.
 const MOST_PART: f64 = 1.25;
 
-/// An account of work from outside: by what is felt, and not by what the tissue counts itself.
+/// The most that a tool can have done, from outside: by what is felt, and not by what the tissue counts itself.
 #[derive(Debug, Clone, Copy)]
-struct Account {
+struct WorkBound {
     mass_kg: f64,
     step_s: f64,
     place_m: DVec3,
@@ -88,10 +88,10 @@ struct Account {
     work_j: f64,
 }
 
-impl Account {
-    fn begin(model: &Model, place_m: DVec3) -> Account {
+impl WorkBound {
+    fn begin(model: &Model, place_m: DVec3) -> WorkBound {
         let (mass_kg, step_s) = (model.scene.mass_kg(), 1.0 / model.scene.stepping.rate_hz);
-        Account { mass_kg, step_s, place_m, way_m: DVec3::ZERO, felt_n: 0.0, work_j: 0.0 }
+        WorkBound { mass_kg, step_s, place_m, way_m: DVec3::ZERO, felt_n: 0.0, work_j: 0.0 }
     }
 
     /// Adds a step's work: the larger of the forces at its ends along its whole way. What a tool sets in motion at once is not felt,
@@ -132,7 +132,7 @@ fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
     let shape = model.scene.shape();
     let mut course = Course::default();
     let (mut place_m, mut way_m, mut now) = (DVec3::ZERO, DVec3::ZERO, tip(dice));
-    let (mut account, mut has_recovered) = (None, false);
+    let (mut bound, mut has_recovered) = (None, false);
     for step in 0..steps {
         let is_put = step % 40 == 0 || std::mem::take(&mut has_recovered);
         if step % 40 == 0 {
@@ -154,20 +154,20 @@ fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
         }
         place_m += way_m;
         tissue.pose(0, place_m, now);
-        let account = account.get_or_insert_with(|| Account::begin(&model, place_m));
+        let bound = bound.get_or_insert_with(|| WorkBound::begin(&model, place_m));
         if let Err(blow_up) = tissue.step() {
             course.blow_ups += 1;
             tissue.recover(blow_up.step, false);
             // All tools were released: what comes next is put.
-            (account.place_m, account.felt_n, has_recovered) = (place_m, 0.0, true);
+            (bound.place_m, bound.felt_n, has_recovered) = (place_m, 0.0, true);
             continue;
         }
         let felt_n = tissue.feel(0).unwrap().force_on_tool_n.length();
         course.force_n = course.force_n.max(felt_n);
-        account.step(place_m, felt_n, is_put, tissue.largest_displacement_m());
+        bound.step(place_m, felt_n, is_put, tissue.largest_displacement_m());
         let energy_j = energy_j(&*tissue);
         course.energy_j = course.energy_j.max(energy_j);
-        course.part = course.part.max((energy_j - LEAST_J) / (account.work_j + LEAST_J));
+        course.part = course.part.max((energy_j - LEAST_J) / (bound.work_j + LEAST_J));
         course.displacement_m = course.displacement_m.max(tissue.largest_displacement_m());
         assert!(course.energy_j.is_finite() && felt_n.is_finite(), "{seed} {}, step {step}: {course:?}", mesh.kind);
     }

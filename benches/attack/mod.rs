@@ -7,8 +7,9 @@ mod crowd;
 mod datagrams;
 mod hoard;
 mod legal;
-mod tissue;
+mod meshes;
 mod toil;
+mod tools;
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -213,29 +214,27 @@ pub const KINDS: &[Kind] = &[
     kind("create-and-drop", "sessions made and dropped without end", |g| Box::pin(toil::create_and_drop(g))),
     kind("legal-calls", "random legal calls to sessions of its own", |g| Box::pin(legal::calls(g))),
     // What tools and meshes cost.
-    kind("tip-strip", "64 tips of half of a sheet of 2000 × 1, again and again", |g| Box::pin(tissue::strip(g, 2000))),
-    kind("tip-strip-60000", "the same on 60,000 × 1", |g| Box::pin(tissue::strip(g, 60_000))),
+    kind("tip-strip", "64 tips of half of a sheet of 2000 × 1, again and again", |g| Box::pin(tools::strip(g, 2000))),
+    kind("tip-strip-60000", "the same on 60,000 × 1", |g| Box::pin(tools::strip(g, 60_000))),
     kind("tips-organ", "64 tips of 25 mm that press a gallbladder and go", |g| {
-        Box::pin(tissue::organ(g, "gallbladder", 0.025, false))
+        Box::pin(tools::organ(g, "gallbladder", 0.025, false))
     }),
-    kind("tips-organ-small", "64 tips of 5 mm that do so", |g| Box::pin(tissue::organ(g, "gallbladder", 0.005, false))),
-    kind("grasps-organ", "64 grasps of 5 mm that pull a liver", |g| Box::pin(tissue::organ(g, "liver", 0.005, true))),
-    kind("grasps-sheet", "64 grasps of 10 mm that pull at the same points of 60²", |g| {
-        Box::pin(tissue::grasps(g, 60))
-    }),
+    kind("tips-organ-small", "64 tips of 5 mm that do so", |g| Box::pin(tools::organ(g, "gallbladder", 0.005, false))),
+    kind("grasps-organ", "64 grasps of 5 mm that pull a liver", |g| Box::pin(tools::organ(g, "liver", 0.005, true))),
+    kind("grasps-sheet", "64 grasps of 10 mm that pull at the same points of 60²", |g| Box::pin(tools::grasps(g, 60))),
     kind("touch-again", "64 tools that let go of a sheet and touch it again with another tip", |g| {
-        Box::pin(tissue::touch_again(g))
+        Box::pin(tools::touch_again(g))
     }),
-    kind("wide-pushes", "64 forces on all points of 100²", |g| Box::pin(tissue::wide_pushes(g))),
+    kind("wide-pushes", "64 forces on all points of 100²", |g| Box::pin(tools::wide_pushes(g))),
     kind("mesh-hub", "meshes with two vertices that have 100,000 edges each, by two callers", |g| {
-        Box::pin(tissue::hub(g, None))
+        Box::pin(meshes::hub(g, None))
     }),
-    kind("mesh-hub-coarse", "the same with mesh.vertices = 500", |g| Box::pin(tissue::hub(g, Some(500)))),
-    kind("mesh-nested", "4000 tetrahedra, each within the next", |g| Box::pin(tissue::nested(g, true))),
-    kind("mesh-overlaid", "4000 tetrahedra in one place", |g| Box::pin(tissue::nested(g, false))),
-    kind("mesh-unused", "20,000 vertices that no triangle has", |g| Box::pin(tissue::unused_vertices(g))),
+    kind("mesh-hub-coarse", "the same with mesh.vertices = 500", |g| Box::pin(meshes::hub(g, Some(500)))),
+    kind("mesh-nested", "4000 tetrahedra, each within the next", |g| Box::pin(meshes::nested(g, true))),
+    kind("mesh-overlaid", "4000 tetrahedra in one place", |g| Box::pin(meshes::nested(g, false))),
+    kind("mesh-unused", "20,000 vertices that no triangle has", |g| Box::pin(meshes::unused_vertices(g))),
     kind("mesh-empty-accessor", "a glTF file of 300 bytes with 10,000,000 vertices", |g| {
-        Box::pin(tissue::empty_accessor(g))
+        Box::pin(meshes::empty_accessor(g))
     }),
     // Who is locked out.
     kind("watchers", "256 streams of samples of the honest client's session", |g| Box::pin(crowd::watchers(g))),

@@ -48,10 +48,9 @@ pub struct Pacer {
 }
 
 impl Pacer {
-    /// Starts `threads` stepping threads (named `step-0` and so on), and one thread each that has the sessions whose steps take too long
-    /// for others (`step-apart`), computes the stiffness under
-    /// tools (`stiffness`), encodes frames (`frames`), reads large sheets (`records`), and measures errors with `audit_share`
-    /// of a core (`audit`; none if that is 0).
+    /// Starts `threads` stepping threads (named `step-0` and so on), and one thread each that steps the sessions whose steps take
+    /// too long for others (`step-apart`), computes the stiffness under tools (`stiffness`), encodes frames (`frames`), reads
+    /// large sheets (`records`), and measures errors with `audit_share` of a core (`audit`; none if that is 0).
     ///
     /// # Errors
     /// Returns an error if a thread can't be started.
@@ -67,22 +66,23 @@ impl Pacer {
         };
         handles.push(priority::thread("stiffness").spawn(worker)?);
         let threads = threads.max(1);
+        // The one without another to which its sessions may go gives way.
+        let spawn = |name: String, stepper: Arc<Stepper>, apart: Option<Apart>| {
+            let (encoder, refiner, reading, fence) = (encoder.clone(), refiner.clone(), reading.clone(), fence.clone());
+            priority::thread(name).spawn(move || {
+                if apart.is_none() {
+                    give_way();
+                }
+                thread::work(&stepper, apart.as_ref(), &fence, &encoder, &refiner, &reading);
+            })
+        };
         for index in 0..threads {
             let stepper = Arc::new(Stepper::default());
             steppers.push(stepper.clone());
-            let (encoder, refiner, reading) = (encoder.clone(), refiner.clone(), reading.clone());
-            let (builder, fence) = (priority::thread(format!("step-{index}")), fence.clone());
             let apart = Apart { stepper: apart.clone(), index: threads };
-            let work = move || thread::work(&stepper, Some(&apart), &fence, &encoder, &refiner, &reading);
-            handles.push(builder.spawn(work)?);
+            handles.push(spawn(format!("step-{index}"), stepper, Some(apart))?);
         }
-        let (stepper, fence_of_apart, its_encoder, its_reading) =
-            (apart.clone(), fence.clone(), encoder.clone(), reading.clone());
-        let worker = move || {
-            give_way();
-            thread::work(&stepper, None, &fence_of_apart, &its_encoder, &refiner, &its_reading);
-        };
-        handles.push(priority::thread("step-apart").spawn(worker)?);
+        handles.push(spawn("step-apart".to_owned(), apart.clone(), None)?);
         let (worker, shared) = (encoder.clone(), budget.clone());
         handles.push(priority::thread("frames").spawn(move || worker.work(&shared))?);
         let reader = reading.clone();

@@ -4,6 +4,7 @@
 use glam::DVec3;
 
 use super::inbox::Request;
+use super::queue::Reader;
 use super::*;
 use crate::budget::{Account, Budget};
 use crate::limits::Limits;
@@ -16,17 +17,21 @@ use crate::session::command::{Command, Due};
 use crate::session::sampling::Sampling;
 use crate::sheet::choice::NEVER;
 
+/// A stream of a sample each step.
+fn all_samples(live: &Live) -> Reader<PacedSample> {
+    let (laws, touch_stiffness) = (None, false);
+    let sampling =
+        Sampling { every: 1, only: None, deadband: None, heartbeat_s: 0.01, laws, touch_stiffness, wanted: None };
+    live.samples(sampling, None)
+}
+
 #[tokio::test]
 async fn a_fault_in_one_session_ends_that_one_alone() {
     let limits = Limits::default();
     let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
     let pacer = Pacer::start(1, 0.02, &limits, Budget::new(&limits, 1, 1)).unwrap();
     let [faulty, sound] = [(); 2].map(|()| pacer.create(&scene, false, 60.0, &Account::alone(), &NEVER).unwrap());
-    let (laws, touch_stiffness) = (None, false);
-    let mut samples = faulty.samples(
-        Sampling { every: 1, only: None, deadband: None, heartbeat_s: 0.01, laws, touch_stiffness, wanted: None },
-        None,
-    );
+    let mut samples = all_samples(&faulty);
     samples.pop().await.unwrap();
     faulty.inbox.send(faulty.number, Request::Panic);
     let told = faulty.hash_at(Some(1_000_000), &Account::alone()).await.unwrap_err();
@@ -53,11 +58,7 @@ async fn a_session_that_goes_apart_does_what_it_is_asked_and_leaves_its_thread_t
     let pacer = Pacer::start(1, 0.0, &limits, Budget::new(&limits, 1, 1)).unwrap();
     let account = Account::alone();
     let [heavy, light] = [(); 2].map(|()| pacer.create(&scene, false, 60.0, &account, &NEVER).unwrap());
-    let (laws, touch_stiffness) = (None, false);
-    let mut samples = heavy.samples(
-        Sampling { every: 1, only: None, deadband: None, heartbeat_s: 0.01, laws, touch_stiffness, wanted: None },
-        None,
-    );
+    let mut samples = all_samples(&heavy);
     samples.pop().await.unwrap();
     heavy.inbox.send(heavy.number, Request::GoApart);
     // Asked in this order, and done in this order, on the other thread.

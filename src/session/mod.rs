@@ -11,7 +11,6 @@
 //! **Order.** Commands that are due at one step act in the order of their tools' numbers, not of arrival: two clients that
 //! stamp their commands get the same bits whichever network was faster. A second tool that grasps a point takes it over.
 
-mod approach;
 pub mod audit;
 pub mod batch;
 pub mod check;
@@ -32,6 +31,7 @@ pub mod run;
 pub mod sampling;
 pub mod saved;
 pub mod schedule;
+mod tool_depth;
 
 use std::sync::Arc;
 
@@ -154,8 +154,6 @@ pub struct Session {
     path_counts: [u64; 3],
     recoveries: Recoveries,
     hold_reason: Option<String>,
-    /// The present step is not done: the guard repeats others for it.
-    is_within_step: bool,
 }
 
 impl Session {
@@ -169,7 +167,6 @@ impl Session {
             path_counts: [0; 3],
             recoveries: Recoveries::default(),
             hold_reason: None,
-            is_within_step: false,
         }
     }
 
@@ -275,22 +272,20 @@ impl Session {
         mut observe: impl FnMut(&Session),
     ) -> bool {
         if self.hold_reason.is_some() {
-            self.is_within_step = false;
             due.clear();
             return true;
         }
-        if !self.is_within_step {
+        if !self.is_within_step() {
             self.begin_step(due, &mut observe);
         }
-        let stepped = self.tissue.step_while(may_go_on);
-        self.is_within_step = matches!(stepped, Ok(false));
-        if self.is_within_step {
-            return false;
-        }
-        if let Err(blow_up) = stepped
-            && !self.recover(blow_up)
-        {
-            return true;
+        match self.tissue.step_while(may_go_on) {
+            Ok(true) => {}
+            Ok(false) => return false,
+            Err(blow_up) => {
+                if !self.recover(blow_up) {
+                    return true;
+                }
+            }
         }
         self.recoveries.accept_until(self.tissue.checkpoint_step());
         observe(self);
@@ -299,7 +294,7 @@ impl Session {
 
     /// Whether a step is not done yet, because [`Session::advance_while`] has stopped.
     pub fn is_within_step(&self) -> bool {
-        self.is_within_step && self.hold_reason.is_none()
+        self.tissue.is_within_step() && self.hold_reason.is_none()
     }
 
     /// What happens before a step.

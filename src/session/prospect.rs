@@ -7,7 +7,7 @@ use std::sync::atomic::AtomicBool;
 use glam::DVec3;
 use palpate_touch::{Coupling, Law, Tip};
 
-use super::{approach, dent};
+use super::{dent, tool_depth};
 use crate::force_law::{self, Disc};
 use crate::scene::Body;
 use crate::scene::profile::{LoadProfile, Poke, PoseProfile, StrengthProfile, weights};
@@ -285,13 +285,13 @@ fn meeting(shape: &dyn RestShape, profile: &PoseProfile, end_s: f64, laws: &mut 
         let moved_m = way[begin + 1..].iter().map(|place_m| place_m.distance(held_m)).fold(0.0, f64::max);
         return Meeting::Held { moved_m };
     }
+    let middle = Disc::in_middle(laws.model, tip.radius_m);
     let (depth_m, disc) = if let Body::Mesh(mesh) = &laws.model.scene.body {
-        let Some(found) = approach::deepest(mesh.shape.surface(), &way, tip.radius_m) else { return Meeting::Beside };
-        let disc = Disc::in_middle(laws.model, tip.radius_m);
-        (found.depth_m, disc.follow(laws.model, found.rest_m))
+        let Some(found) = tool_depth::deepest(mesh.shape.surface(), &way, tip.radius_m) else { return Meeting::Beside };
+        (found.depth_m, middle.follow(laws.model, found.rest_m))
     } else {
         let lowest_m = parts.map(|place_m| place_m.z).fold(f64::INFINITY, f64::min);
-        (most_m.z - lowest_m, Disc::in_middle(laws.model, tip.radius_m))
+        (most_m.z - lowest_m, middle)
     };
     if depth_m <= 0.0 {
         return Meeting::Above { gap_m: -depth_m };

@@ -207,7 +207,6 @@ impl Session {
             path_counts: own.path_counts,
             recoveries: own.recoveries.restored(step, &checks)?,
             hold_reason: own.hold_reason.clone(),
-            is_within_step: false,
         })
     }
 

@@ -117,7 +117,7 @@ pub(super) struct Repetition {
 }
 
 /// By how much an energy may rise without a cause.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 pub(super) struct Noise {
     /// Part of the largest energy so far.
     pub(super) part: f64,

@@ -419,6 +419,10 @@ impl<T: Real> Tissue for Sheet<T> {
         Ok(true)
     }
 
+    fn is_within_step(&self) -> bool {
+        self.repetition.is_some()
+    }
+
     fn recover(&mut self, step: u64, to_rest: bool) -> Released {
         self.known_growth.set(None);
         let released = Sheet::recover(self, step, to_rest);

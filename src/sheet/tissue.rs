@@ -132,6 +132,8 @@ pub trait Tissue: Send {
     /// # Errors
     /// As `step`.
     fn step_while(&mut self, may_go_on: &mut dyn FnMut() -> bool) -> Result<bool, BlowUp>;
+    /// Whether a step is not done yet, because `step_while` has stopped.
+    fn is_within_step(&self) -> bool;
     /// After a blow-up: continues at step `step` (of the blow-up) from the state of the last checkpoint, or at rest if
     /// `to_rest` or if that state has passed no check, with all tools released and the model's own substep.
     fn recover(&mut self, step: u64, to_rest: bool) -> Released;

@@ -1,8 +1,8 @@
 //! A session as one server hands it to another, or a client sends it: as a journal of one snapshot, in requests.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
 
-#[path = "opening.rs"]
-mod opening;
+#[path = "journal_opening.rs"]
+mod journal_opening;
 
 use std::io::Cursor;
 use std::sync::Arc;
@@ -23,7 +23,7 @@ const PART_BYTES: usize = 256 << 10;
 /// The journal of one moment of a session that began with the tissue of `first`.
 pub fn journal(first: &Arc<Model>, session: &Session) -> Vec<u8> {
     let step = session.step_count();
-    let opening = Opening { owner: "test", begin_step: step, ownership_revision: 1, ..opening::opening(first) };
+    let opening = Opening { owner: "test", begin_step: step, ownership_revision: 1, ..journal_opening::opening(first) };
     let mut writer = Writer::new(&opening, 1);
     writer.snapshot(step, session.tissue().state_hash(), session.model(), session.save().to_bytes());
     writer.finish(kept::Why::Cut, "a snapshot", step, 1)
