@@ -2,8 +2,10 @@
 //! functions as under libFuzzer (`fuzz/`); here without instrumentation, and the same inputs in every run.
 //!
 //! Twenty thousand for each decoder in every run of the tests; `make fuzz` tries a million (`PALPATE_FUZZ_INPUTS`).
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
 
+#[path = "common/counting.rs"]
+mod counting;
 #[path = "../fuzz/src/lib.rs"]
 #[allow(dead_code, clippy::cast_possible_truncation)]
 mod targets;
@@ -11,7 +13,9 @@ mod targets;
 use std::collections::BTreeSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
+use counting::counted;
 use fastrand::Rng;
+use palpate_proto::measure::{MULTIPLE, ROOM};
 use palpate_proto::pb;
 use prost::Message;
 use targets::{REQUESTS, TARGETS, Taker, Target, requests};
@@ -21,6 +25,9 @@ const CORPUS: usize = 512;
 
 /// Longest input, bytes.
 const LONGEST: usize = 1 << 14;
+
+/// What an input may take beside, bytes: that of a message, and of a small tissue that is compiled and rehearsed.
+const MOST_ROOM: usize = 3 * ROOM;
 
 /// Pieces of text and of protobuf at which readers stumble.
 fn pieces() -> Vec<Vec<u8>> {
@@ -108,17 +115,27 @@ fn fuzz(target: &Target, inputs: u64) {
         assert!((target.run)(seed), "{} does not take its own seed {:?}", target.name, String::from_utf8_lossy(seed));
     }
     let seeds = corpus.len();
-    let mut taken = 0;
+    let (mut taken, mut most_bytes, mut most_multiple) = (0, 0, 0.0_f64);
     for _ in 0..inputs {
         let mut bytes = corpus[random.usize(0..corpus.len())].clone();
         for _ in 0..=random.u8(0..6) {
             let other = random.usize(0..corpus.len());
             bytes = bend(&mut random, bytes, &corpus[other], &pieces);
         }
-        let ran = catch_unwind(AssertUnwindSafe(|| (target.run)(&bytes)));
+        let (ran, took) = counted(|| catch_unwind(AssertUnwindSafe(|| (target.run)(&bytes))));
         let Ok(was_taken) = ran else {
             panic!("{} panics at {:?}\nas text: {}", target.name, bytes, String::from_utf8_lossy(&bytes));
         };
+        assert!(
+            took <= MULTIPLE * bytes.len() + MOST_ROOM,
+            "{}: {} bytes take {took} of memory: {:?}\nas text: {}",
+            target.name,
+            bytes.len(),
+            bytes,
+            String::from_utf8_lossy(&bytes)
+        );
+        most_bytes = most_bytes.max(took);
+        most_multiple = most_multiple.max(took as f64 / bytes.len().max(64) as f64);
         if was_taken {
             taken += 1;
             // The seeds stay.
@@ -129,7 +146,11 @@ fn fuzz(target: &Target, inputs: u64) {
             }
         }
     }
-    println!("{}: {inputs} inputs, {taken} of them taken", target.name);
+    println!(
+        "{}: {inputs} inputs, {taken} of them taken; memory at most {:.0} KiB, {most_multiple:.0} times the bytes of an input (of 64 at least)",
+        target.name,
+        most_bytes as f64 / 1024.0
+    );
     // Else the readers were hardly tried.
     assert!(taken > inputs / 1000 && taken < inputs, "{}: {taken} of {inputs} taken", target.name);
 }

@@ -1,5 +1,9 @@
 //! Decodes messages that come, requests and answers, within bounds: they are measured before they are decoded (`measure`). A
 //! megabyte of empty parts would otherwise occupy a network thread for a tenth of a second and take many times its size in memory.
+//! What a larger request takes is taken from its caller's budget first ([`paid_by`]).
+
+use std::cell::RefCell;
+use std::sync::Arc;
 
 use prost::{Message, Name};
 use tonic::Status;
@@ -14,6 +18,38 @@ const MOST_FIELDS: usize = 4096 + 256;
 
 /// Largest number of fields of all levels of a request together: such a batch of poses, or 20,000 fixed points.
 const MOST_FIELDS_IN_ALL: usize = 1 << 16;
+
+/// A request that takes less memory than this is not paid for, bytes: a caller has few calls at once, and thousands a second.
+const SMALL: usize = 16 << 10;
+
+/// Pays for the memory of requests, before they are decoded.
+pub trait Payer: Send + Sync {
+    /// A request is decoded that takes so many bytes.
+    ///
+    /// # Errors
+    /// Refuses what the caller has no memory for.
+    fn pay(&self, bytes: u64) -> Result<()>;
+}
+
+thread_local! {
+    /// Who pays for what this thread decodes.
+    static PAYER: RefCell<Option<Arc<dyn Payer>>> = const { RefCell::new(None) };
+}
+
+/// Puts back who paid before.
+struct Before(Option<Arc<dyn Payer>>);
+
+impl Drop for Before {
+    fn drop(&mut self) {
+        PAYER.set(self.0.take());
+    }
+}
+
+/// Does something, and has `payer` pay for the requests that this thread decodes meanwhile.
+pub fn paid_by<T>(payer: &Arc<dyn Payer>, act: impl FnOnce() -> T) -> T {
+    let _before = Before(PAYER.replace(Some(payer.clone())));
+    act()
+}
 
 /// The protobuf codec with a bound on the memory of what comes, and on the fields of requests.
 pub struct BoundedCodec<T, U>(ProstCodec<T, U>);
@@ -97,6 +133,10 @@ fn check(message: &[u8], shape: &Shape, is_request: bool) -> Result<()> {
             let advice = if is_request { ": send it in parts" } else { "" };
             return Err(Refusal::new(Reason::TooLarge, "", format!("the message has more than {most} {what}{advice}")));
         }
+    }
+    if is_request && measure.memory > SMALL {
+        let payer = PAYER.with_borrow(Clone::clone);
+        payer.map_or(Ok(()), |payer| payer.pay(measure.memory as u64))?;
     }
     // The decoder refuses malformed messages.
     Ok(())

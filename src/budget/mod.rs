@@ -46,11 +46,13 @@ pub enum Purpose {
     Meshes,
     /// Journals that clients have sent.
     Journals,
+    /// Requests that are being answered, decoded.
+    Requests,
 }
 
 impl Purpose {
     /// All of them.
-    pub const ALL: [Purpose; 10] = [
+    pub const ALL: [Purpose; 11] = [
         Purpose::Session,
         Purpose::Change,
         Purpose::Frames,
@@ -61,6 +63,7 @@ impl Purpose {
         Purpose::Laws,
         Purpose::Meshes,
         Purpose::Journals,
+        Purpose::Requests,
     ];
 
     /// The name that metrics give it.
@@ -76,6 +79,7 @@ impl Purpose {
             Purpose::Laws => "laws",
             Purpose::Meshes => "meshes",
             Purpose::Journals => "journals",
+            Purpose::Requests => "requests",
         }
     }
 }

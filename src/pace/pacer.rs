@@ -19,7 +19,7 @@ use super::thread::{self, Apart, Stepper};
 use crate::budget::Budget;
 use crate::limits::Limits;
 use crate::lock::lock;
-use crate::priority::{self, give_way};
+use crate::priority::{self, give_way, give_way_a_little};
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 use crate::session::local::StiffnessJob;
 
@@ -83,8 +83,13 @@ impl Pacer {
             handles.push(spawn(format!("step-{index}"), stepper, Some(apart))?);
         }
         handles.push(spawn("step-apart".to_owned(), apart.clone(), None)?);
-        let (worker, shared) = (encoder.clone(), budget.clone());
-        handles.push(priority::thread("frames").spawn(move || worker.work(&shared))?);
+        let (frames, shared) = (encoder.clone(), budget.clone());
+        // A late frame is seen, a late step is felt.
+        let worker = move || {
+            give_way_a_little();
+            frames.work(&shared);
+        };
+        handles.push(priority::thread("frames").spawn(worker)?);
         let reader = reading.clone();
         let worker = move || {
             give_way();

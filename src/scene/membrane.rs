@@ -8,6 +8,7 @@
 //! shape; points on a border are held.
 
 use glam::{DMat3, DVec3};
+use palpate_mesh::work::spend;
 
 /// Steps of the conjugate gradients at most, and the part of the first residual at which they end. (What is left is then some
 /// ten thousandths of the energy.)
@@ -87,6 +88,7 @@ pub(super) fn settled_energy_j(
         if left <= enough {
             break;
         }
+        spend(2 * springs.len());
         let mut product = zero();
         springs.iter().for_each(|spring| spring.add(spring.stiffness * spring.gained(&direction), &mut product));
         let curvature = dot(&direction, &product);

@@ -18,7 +18,7 @@ use super::fleet::FencedBody;
 use super::identity::{Access, Caller, Credentials, PresentedCredentials, access};
 use super::price::Price;
 use super::reload::Reloaded;
-use super::request::{RequestBody, TimeLimit};
+use super::request::{RequestBody, TimeLimit, paid_for};
 use super::revocation::Calls;
 use super::traffic::Traffic;
 use crate::budget::Budget;
@@ -208,7 +208,7 @@ where
                     _ => TimeLimit::WholeBody(self.layer.message_timeout),
                 };
                 let price = Price::of(request.uri().path(), &account);
-                let charged_caller = ChargedCaller::new(account, &request);
+                let charged_caller = ChargedCaller::new(account.clone(), &request);
                 request.extensions_mut().insert(charged_caller);
                 let call = presented.map(|(presented, version)| self.layer.calls.begin(presented, from, version));
                 if let Some(call) = &call {
@@ -221,7 +221,7 @@ where
                 let path = request.uri().path();
                 let is_of_sessions = path.starts_with(OWN) && !OF_THE_FLEET.iter().any(|of| path.starts_with(of));
                 let fence = self.layer.fence.clone().filter(|_| is_of_sessions);
-                let answer = self.inner.call(request).instrument(span);
+                let answer = paid_for(account, self.inner.call(request).instrument(span));
                 let traffic = self.layer.traffic.clone();
                 Box::pin(async move {
                     let answer = match price {

@@ -1,20 +1,24 @@
 //! The body of a request. It must arrive in time, its caller's credentials must still be valid, and each part that is read
-//! lets the connection receive more.
+//! lets the connection receive more. What a large message takes in memory is its caller's, from before it is decoded until the
+//! call is answered.
 
 use std::pin::Pin;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll};
 use std::time::Duration;
 
 use bytes::Bytes;
 use http_body::Frame;
+use palpate_proto::codec::{Payer, paid_by};
 use tokio::time::{Instant, Sleep};
 use tonic::Status;
 use tonic::body::Body;
 
 use super::revocation::Call;
 use super::transport::Gate;
-use crate::refusal::{Reason, Refusal};
+use crate::budget::{Account, Purpose, Resource, Taken};
+use crate::lock::lock;
+use crate::refusal::{Reason, Refusal, Result};
 
 /// How long the messages of a call may take to arrive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -64,7 +68,10 @@ impl http_body::Body for RequestBody {
     type Data = Bytes;
     type Error = Status;
 
-    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+    fn poll_frame(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+    ) -> Poll<Option<std::result::Result<Frame<Bytes>, Status>>> {
         let this = &mut *self;
         if let Some(Err(refusal)) = this.call.as_ref().map(|call| call.may_say(context)) {
             return Poll::Ready(Some(Err(refusal.into())));
@@ -89,5 +96,68 @@ impl http_body::Body for RequestBody {
 
     fn size_hint(&self) -> http_body::SizeHint {
         self.body.size_hint()
+    }
+}
+
+/// The memory of a call's message. Of a call with many messages it is that of the last: who reads them pays for what it keeps.
+struct MessageMemory {
+    account: Account,
+    taken: Mutex<Option<Taken>>,
+}
+
+impl Payer for MessageMemory {
+    fn pay(&self, bytes: u64) -> Result<()> {
+        let mut taken = lock(&self.taken);
+        *taken = None;
+        *taken = Some(self.account.take(Resource::Memory(Purpose::Requests), bytes, "")?);
+        Ok(())
+    }
+}
+
+/// Runs a call whose message is paid for by `account`.
+pub(super) async fn paid_for<F: Future>(account: Account, call: F) -> F::Output {
+    let payer: Arc<dyn Payer> = Arc::new(MessageMemory { account, taken: Mutex::default() });
+    let mut call = std::pin::pin!(call);
+    std::future::poll_fn(|context| paid_by(&payer, || call.as_mut().poll(context))).await
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use palpate_proto::codec::accepts;
+    use palpate_proto::pb;
+    use prost::Message;
+
+    use super::*;
+    use crate::budget::Budget;
+    use crate::limits::Limits;
+
+    #[tokio::test]
+    async fn a_large_message_is_its_callers_until_the_call_is_answered() {
+        let account = |memory_bytes| Budget::new(&Limits { memory_bytes, ..Limits::default() }, 1, 1).account("test");
+        let has = |account: &Account| account.has(Resource::Memory(Purpose::Requests));
+        let request = |commands| pb::SendCommandsRequest {
+            commands: vec![pb::Command::default(); commands],
+            ..Default::default()
+        };
+        let (small, large) = (request(2).encode_to_vec(), request(4096).encode_to_vec());
+        let rich = account(1 << 30);
+        paid_for(rich.clone(), async {
+            accepts::<pb::SendCommandsRequest>(&small).unwrap();
+            assert_eq!(has(&rich), 0, "a command is not worth the bookkeeping");
+            accepts::<pb::SendCommandsRequest>(&large).unwrap();
+            let one = has(&rich);
+            assert!(one as usize >= 4096 * size_of::<pb::Command>(), "{one}");
+            tokio::task::yield_now().await;
+            accepts::<pb::SendCommandsRequest>(&large).unwrap();
+            assert_eq!(has(&rich), one, "the message before has been read");
+        })
+        .await;
+        assert_eq!(has(&rich), 0);
+        let poor = account(100_000);
+        let refused = paid_for(poor, async { accepts::<pb::SendCommandsRequest>(&large) }).await.unwrap_err();
+        assert_eq!(refused.reason, Reason::TooLarge, "{refused}");
+        // What no call decodes is nobody's.
+        accepts::<pb::SendCommandsRequest>(&large).unwrap();
     }
 }

@@ -7,6 +7,8 @@
 
 use std::cmp::Reverse;
 
+use palpate_mesh::work::spend;
+
 use super::graph::MeshGraph;
 use crate::memory;
 use crate::sheet::field::BLOCK;
@@ -145,7 +147,9 @@ impl<'a> Walks<'a> {
                 self.came.push((*point, last.1 + 1));
             }
             last = self.came[next];
-            for &(other, _) in self.adjacency.of_point(last.0) {
+            let around = self.adjacency.of_point(last.0);
+            spend(1 + around.len());
+            for &(other, _) in around {
                 if self.set[other as usize] == set && self.walk[other as usize] != walk {
                     self.walk[other as usize] = walk;
                     self.came.push((other, last.1 + 1));

@@ -11,6 +11,8 @@
 //!   of the block would leave many lanes of the last rows empty. So the springs beyond the *plain* rows are *packed*:
 //!   each lane of such a row has a spring of any point of the block, and its force is moved to that point's lane.
 
+use palpate_mesh::work::spend;
+
 use super::order::TABLES;
 use super::slots::{HALO, HalfSpring, MeshSlots, part};
 use crate::memory;
@@ -156,6 +158,7 @@ impl<T: Real> Rows<T> {
         let mut places: Vec<u32> = memory::zeroed(rows * lanes, TABLES);
         let mut coefficients = Field::of_length(rows * lanes * COEFFICIENTS);
         for (vector, rows) in firsts.windows(2).enumerate() {
+            spend(1 + lanes * (rows[1] - rows[0]) as usize);
             for (k, row) in (rows[0] as usize..rows[1] as usize).enumerate() {
                 let into = &mut coefficients[row * lanes * COEFFICIENTS..][..lanes * COEFFICIENTS];
                 for lane in 0..lanes {
@@ -199,6 +202,7 @@ impl<T: Real> Halo<T> {
         for block in 0..slots.blocks() {
             packing.halo.firsts.push(packing.halo.parts.len() as u32);
             let outside = slots.outside(block);
+            spend(64 + 8 * outside.len());
             let mut later: [&[HalfSpring]; BLOCK] = std::array::from_fn(|lane| slots.springs(block * BLOCK + lane));
             for number in 0..outside.len().div_ceil(HALO).max(1) {
                 let springs: [&[HalfSpring]; BLOCK] = std::array::from_fn(|lane| {
