@@ -508,7 +508,7 @@ fn what_goes_wrong_with_haplys_service_ends_the_bridge_within_the_envelope() {
 async fn a_knob_or_stick_that_fails_while_it_is_pressed_is_left_without_a_force() {
     let server = Server::start(&[]);
     for (name, kind) in [("spacemouse", REL), ("gamepad", ABS)] {
-        for (last, says) in [(&[][..], "it was unplugged"), (&[0xa5; 480], "no event of an input device")] {
+        for (last, says) in [(&[][..], "it was unplugged"), (&[0xa5; 480], "not an event of an input device")] {
             let folder = tempfile::tempdir().unwrap();
             let path = pipe(folder.path());
             let device = open(&format!("{name}:{}", path.display()), None).unwrap();
@@ -561,7 +561,7 @@ fn what_goes_wrong_with_events_ends_the_bridge() {
             let _ = OpenOptions::new().write(true).open(path).unwrap().write_all(&[0xa5; 480]);
         }
     });
-    ends(&server, &Case { device, library: None, status: 1, says: &["no event of an input device"] });
+    ends(&server, &Case { device, library: None, status: 1, says: &["not an event of an input device"] });
     garbage.join().unwrap();
     for (device, says) in [
         (format!("gamepad:{}/none", folder.path().display()), &["No such file"][..]),
