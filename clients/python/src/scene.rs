@@ -443,7 +443,7 @@ impl Tissue {
 }
 
 fn names(kind: Kind, folder: &Path) -> Vec<String> {
-    Collection::new(kind, folder).names()
+    Collection::new(kind, folder).names(&limits())
 }
 
 /// The names of the scenes that are shipped, and of the files in a folder.
