@@ -153,10 +153,10 @@ class Clients(Served, unittest.TestCase):
             self.assertEqual(status["top_m"][:2], status["middle_m"][:2])
             self.assertEqual(status["top_m"], palpate.Tissue("liver-organ").top_m)
             self.assertGreater(status["top_m"][2], status["middle_m"][2] + 0.01)
-            touched = felt(lambda: session.touch(palpate.press(depth_m=0.003, seconds=2.0)))
-            np.testing.assert_allclose(touched.place_m[-1], np.add(status["top_m"], (0.0, 0.0, 0.005)), atol=1e-4)
             with self.assertWarnsRegex(RuntimeWarning, "never touched the tissue"):
                 session.touch(palpate.press(depth_m=-0.004, seconds=0.5))
+            touched = felt(lambda: session.touch(palpate.press(depth_m=0.003, seconds=2.0)))
+            np.testing.assert_allclose(touched.place_m[-1], np.add(status["top_m"], (0.0, 0.0, 0.005)), atol=1e-4)
 
     def test_a_tool_that_is_held_is_refused_at_once(self):
         server = palpate.connect(self.url)
