@@ -27,7 +27,7 @@ enum Command {
         Exit status: 0; 1 when the run failed; 2 when an input was refused.")]
     Run(run::RunArguments),
     /// Report what a scene needs and what to expect of it: size, mass, stiffness under a fingertip, time to rest, integrator,
-    /// expected error, time per step, sessions per core; warns of what is unlikely
+    /// expected error, time per step, sessions per core; warn about unlikely values
     #[command(after_help = "Examples:\n  \
         palpate check paper\n  \
         palpate check my-scene.toml my-script.toml\n  \
@@ -53,19 +53,19 @@ enum Command {
         Exit status: 0; 1 when the file can't be written; 2 when an input was refused.")]
     Texture(texture::TextureArguments),
     /// Check a mesh of an organ: size, holes, volume, how even it is, and what is wrong with it; mend it, make it coarser,
-    /// write it anew
+    /// write it to another file
     #[command(after_help = "Examples:\n  \
         palpate mesh liver.obj --unit mm\n  \
         palpate mesh scan.stl --unit mm --repair --vertices 5000 --output liver.obj\n  \
         palpate mesh organ.msh --unit 0.0254 --json\n\n\
         Reads OBJ, STL, PLY, glTF (.gltf and .glb), Gmsh 1, 2 and 4.1 (.msh) and VTK (.vtk, .vtp and .vtu). A volume mesh \
         gives its outer surface. Mesh files do not state their unit, so you do: m, cm, mm, or the metres of one unit. \
-        Places are told in it.\n\n\
+        The report gives places in that unit.\n\n\
         As for a scene, vertices at one position are joined along the edges of their triangles, closed surfaces are turned \
-        outward, and triangles that are there twice are left out; it tells that. Vertices are numbered from 0 in the order \
+        outward, and duplicate triangles are removed; the report says so. Vertices are numbered from 0 in the order \
         of the file.\n\n\
         A tissue needs a surface in which each edge has one or two triangles. --repair also welds vertices that are nearly \
-        at one position, drops triangles without area, pairs triangles at edges that more than two have, keeps the largest \
+        at one position, drops triangles without area, pairs triangles at edges of more than two, keeps the largest \
         surface with what is inside of it, fills small holes and drops unused vertices. It tells what it did, and area and \
         volume before and after.\n\n\
         With --json: vertices, triangles, components, holes, area_m2, volume_m3, before, faults, extent_m, problems with \
@@ -118,8 +118,7 @@ enum Command {
         palpate journal key journal.key\n\n\
         A journal is an MCAP file, SESSION.RUN.mcap, one for each run of the server. It has the scene, every input with the step \
         at which it acted, hashes, snapshots, and what the tools felt. The same inputs give the same bits, so `verify` tells \
-        whether they still do, and for how many steps a hash proves it. That nobody has changed a file, only a signature proves: \
-        `palpate journal key` and `palpate serve --journal-key` sign, `verify --signed-by` checks.\n\n\
+        whether they still do, and for how many steps a hash proves it. Only a signature proves that nobody has changed a file: `palpate journal key` and `palpate serve --journal-key` sign, `verify --signed-by` checks.\n\n\
         Exit status: 0; 1 when a journal differs or a file can't be written; 2 when an input was refused.")]
     Journal(journal::JournalArguments),
     /// Create a token for clients of a server; prints the token once and stores only its hash

@@ -7,7 +7,7 @@ use std::str::FromStr;
 use glam::DVec3;
 use serde::Serialize;
 
-use crate::refusal::{Reason, Refusal, Result, finite};
+use crate::refusal::{Reason, Refusal, Result, finite, legible};
 
 /// A mass point of a tissue. Which one it is, its shape tells.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -85,9 +85,7 @@ impl Extent {
 
 impl fmt::Display for Extent {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // Ten digits: the last ones are those of a product of spacing and number.
-        let rounded = |size_m: f64| format!("{size_m:.9e}").parse().unwrap_or(size_m);
-        let [x, y, z] = self.size_m().to_array().map(rounded);
+        let [x, y, z] = self.size_m().to_array().map(legible);
         if z > 0.0 { write!(f, "{x} m × {y} m × {z} m") } else { write!(f, "{x} m × {y} m") }
     }
 }
@@ -121,6 +119,12 @@ pub trait RestShape: fmt::Debug + Send + Sync {
     fn extent(&self) -> Extent;
     /// The usual distance between neighbours, m.
     fn edge_m(&self) -> f64;
+
+    /// The highest place of the surface in line with the middle of the box, m: devices have their origin there, so that a tip
+    /// that comes down meets the tissue.
+    fn top_m(&self) -> DVec3 {
+        self.extent().middle_m()
+    }
 
     /// Where a tool with a tip of `radius_m` begins that comes new and is to be at a place, if not above that: outside the
     /// tissue or within it, but not in the surface, which it meets as a hand does.
@@ -157,7 +161,7 @@ pub trait RestShape: fmt::Debug + Send + Sync {
         if self.is_near(place_m) {
             return Ok(());
         }
-        let (DVec3 { x, y, z }, extent) = (place_m, self.extent());
+        let ([x, y, z], extent) = (place_m.to_array().map(legible), self.extent());
         let message =
             format!("({x}, {y}, {z}) m is off the tissue, which is {extent}, by more than a tenth of its longest side");
         Err(Refusal::new(Reason::OffSheet, field, message))

@@ -41,7 +41,7 @@ fn a_wrong_value_is_refused_for_its_reason() {
         std::fs::write(at(name), text).unwrap();
     }
     for (arguments, parts) in [
-        (&["mesh", "liver.obj", "--unit", "-1"][..], &["--unit: `-1` is no unit"][..]),
+        (&["mesh", "liver.obj", "--unit", "-1"][..], &["--unit: `-1` is not a unit"][..]),
         (
             &["organ", "liver", "--edge-mm", "-2", "--output", "x.obj"],
             &["--edge-mm: the edge length must be", "-0.002"],

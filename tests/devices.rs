@@ -478,12 +478,12 @@ fn what_goes_wrong_with_haplys_service_ends_the_bridge_within_the_envelope() {
         (Some("3.0.7"), Wrong::Nothing, false, &["version 3.0.7", "knows 3.1 up to 3.x"]),
         (Some("4.0.0"), Wrong::Nothing, false, &["version 4.0.0"]),
         (Some("3.5.0"), Wrong::NoDevice, false, &["no Inverse3", "plugged in"]),
-        (Some("3.5.0"), Wrong::GarbageAtFirst, false, &["sent what is no state", "hello"]),
+        (Some("3.5.0"), Wrong::GarbageAtFirst, false, &["sent something other than a state", "hello"]),
         (Some("3.5.0"), Wrong::Unplugged, true, &["does not tell where the Inverse3 is any more"]),
         (Some("3.5.0"), Wrong::Placeless, true, &["does not tell where the Inverse3 is any more"]),
         (Some("3.1.0"), Wrong::Killed, true, &["Haply's Inverse Service is gone"]),
         (Some("3.5.0"), Wrong::Silent, true, &["does not answer any more"]),
-        (Some("3.5.0"), Wrong::Garbage, true, &["sent what is no state", "{{{"]),
+        (Some("3.5.0"), Wrong::Garbage, true, &["sent something other than a state", "{{{"]),
     ];
     for (version, wrong, is_touched, says) in table {
         let service = InverseService::start(version, wrong);
@@ -508,7 +508,7 @@ fn what_goes_wrong_with_haplys_service_ends_the_bridge_within_the_envelope() {
 async fn a_knob_or_stick_that_fails_while_it_is_pressed_is_left_without_a_force() {
     let server = Server::start(&[]);
     for (name, kind) in [("spacemouse", REL), ("gamepad", ABS)] {
-        for (last, says) in [(&[][..], "it was unplugged"), (&[0xa5; 480], "no event of an input device")] {
+        for (last, says) in [(&[][..], "it was unplugged"), (&[0xa5; 480], "not an event of an input device")] {
             let folder = tempfile::tempdir().unwrap();
             let path = pipe(folder.path());
             let device = open(&format!("{name}:{}", path.display()), None).unwrap();
@@ -561,7 +561,7 @@ fn what_goes_wrong_with_events_ends_the_bridge() {
             let _ = OpenOptions::new().write(true).open(path).unwrap().write_all(&[0xa5; 480]);
         }
     });
-    ends(&server, &Case { device, library: None, status: 1, says: &["no event of an input device"] });
+    ends(&server, &Case { device, library: None, status: 1, says: &["not an event of an input device"] });
     garbage.join().unwrap();
     for (device, says) in [
         (format!("gamepad:{}/none", folder.path().display()), &["No such file"][..]),

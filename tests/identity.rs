@@ -92,6 +92,24 @@ fn every_call_asks_for_a_role_or_says_that_it_is_open() {
 }
 
 #[tokio::test]
+async fn a_client_without_a_token_is_told_how_to_give_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("tokens.toml");
+    token(&file, "ann", "watch");
+    let server = Server::start(&["--tokens", file.to_str().unwrap()]);
+    for arguments in
+        [&["top", "--once"][..], &["bridge", "--seconds", "1"], &["admin", "callers"], &["replay", "press"]]
+    {
+        let mut command = Command::new(server::client_program());
+        command.args(arguments).args(["--server", &server.url]).env_remove("PALPATE_TOKEN");
+        let ran = command.current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap();
+        let said = String::from_utf8_lossy(&ran.stderr);
+        assert!(!ran.status.success() && said.contains("UNAUTHENTICATED"), "{arguments:?}: {said}");
+        assert!(said.contains("--token-file FILE") && said.contains("PALPATE_TOKEN"), "{arguments:?}: {said}");
+    }
+}
+
+#[tokio::test]
 async fn every_call_is_refused_without_a_token_with_a_wrong_one_and_with_too_weak_a_one() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("tokens.toml");

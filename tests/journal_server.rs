@@ -343,7 +343,7 @@ async fn what_was_recorded_is_played_with_the_same_bits_and_gone_on_from() {
         waited.await.unwrap();
         assert_eq!(server.status(&played).await.step, 200);
         let held = Touch::open(&server, server::open(&played, &[0])).await;
-        assert!(held.err().unwrap().message().contains("plays what was recorded"));
+        assert!(held.err().unwrap().message().contains("plays a recording"));
     }
     // Gone on from: a live session, at whose beginning the tissue is as it was, and nothing presses any more.
     let live = server.create(moment(Some(120), false, None), true).await.unwrap();

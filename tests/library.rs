@@ -133,6 +133,55 @@ async fn a_device_in_the_middle_of_its_workspace_touches_the_middle_of_the_sheet
     assert!(report.envelope.is_some());
 }
 
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_device_over_an_organ_comes_down_onto_the_top_of_its_surface() {
+    let server = Server::start(&[]);
+    let session_id = create(at(&server).connect().await.unwrap(), "liver-organ").await;
+    let extent = server.status(&session_id).await.extent.unwrap();
+    let [top_m, middle_m, most_m] =
+        [&extent.top_m, &extent.middle_m, &extent.most_m].map(|place_m| from_vector(place_m.as_ref()));
+    assert!(top_m.truncate() == middle_m.truncate() && top_m.z > middle_m.z + 0.01, "{top_m} {middle_m}");
+    assert!(top_m.z <= most_m.z, "{top_m} {most_m}");
+    let (device, felt) = pressing();
+    let options = Options { remembers: true, ..Options::default() };
+    let serving =
+        run(device, target(&server, Session::Existing(session_id)), options, async move { felt.notified().await });
+    let (_, report) = tokio::time::timeout(PATIENCE, serving).await.expect("no force").unwrap();
+    let last = report.course.last().unwrap();
+    assert!((last.place_m - top_m).truncate().length() < 1e-9 && (last.place_m - top_m).z.abs() < 0.006, "{last:?}");
+    assert_eq!((report.unfelt(), report.made), (None, None));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_tool_that_somebody_holds_ends_the_bridge_with_its_number_and_holder() {
+    let server = Server::start(&[]);
+    let channel = at(&server).connect().await.unwrap();
+    let session_id = create(channel.clone(), "paper").await;
+    let (_say, messages) = mpsc::channel(8);
+    let _held = Touch::open(channel, open(&session_id, &[0]), ReceiverStream::new(messages)).await.unwrap();
+    let (device, _felt) = pressing();
+    let serving =
+        run(device, target(&server, Session::Existing(session_id)), Options::default(), std::future::pending());
+    let error = tokio::time::timeout(PATIENCE, serving).await.expect("it waits").err().unwrap().to_string();
+    assert!(error.contains("tool 0 is held by `") && error.contains("TOOL_HELD"), "{error}");
+}
+
+#[cfg(unix)]
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_bridge_that_touched_nothing_says_so_and_tells_the_session_that_it_keeps() {
+    let server = Server::start(&[]);
+    // 3 cm above the tissue.
+    let options = ["--server", &server.url, "--scene", "paper", "--offset-m", "0,0,0.03", "--seconds", "1.5"];
+    let mut bridge = std::process::Command::new(server::client_program());
+    let ran = bridge.arg("bridge").args(options).args(["--keep-session", "--json"]).output().unwrap();
+    let told = String::from_utf8_lossy(&ran.stderr);
+    assert!(ran.status.success() && told.contains("warning: the tool never touched the tissue"), "{told}");
+    let report: serde_json::Value = serde_json::from_slice(&ran.stdout).unwrap();
+    let session_id = report["session_id"].as_str().unwrap();
+    assert!(told.contains(&format!("palpate-client admin delete {session_id} --server {}", server.url)), "{told}");
+    assert_eq!(server.status(session_id).await.scene_name, "paper");
+}
+
 #[tokio::test]
 async fn what_a_server_refuses_at_first_ends_the_bridge() {
     let server = Server::start(&[]);

@@ -483,7 +483,7 @@ fn what_a_scene_says_of_a_mesh_and_its_material_is_refused_by_key() {
         ),
         (format!("[sheet]\npoints = [3, 3]\n{material}"), "material", "is for a mesh"),
         (inclusion("stiffness_factor = 2.0"), "inclusion[0].centre_m", "or else `group`"),
-        (inclusion("group = \"lump\""), "inclusion[0].group", "is no group"),
+        (inclusion("group = \"lump\""), "inclusion[0].group", "the mesh has no group"),
         (inclusion("group = \"lump\"\ncentre_m = [0, 0, 0]"), "inclusion[0].group", "a ball or a group"),
         (inclusion("group = \"lump\"\nradius_m = 0.01"), "inclusion[0].radius_m", "a ball or a group"),
         (inclusion("centre_m = [0, 0, 0]\nradius = 0.01"), "inclusion[0].radius", "the unit belongs to the name"),

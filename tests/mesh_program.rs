@@ -36,6 +36,25 @@ fn a_sound_mesh_is_reported() {
 }
 
 #[test]
+fn groups_are_listed_with_their_vertices() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = OCTAHEDRON.replace("f 1 3 5", "g top\nf 1 3 5").replace("f 3 1 6", "g bottom\nf 3 1 6");
+    std::fs::write(folder.path().join("organ.obj"), text).unwrap();
+    let (status, table, told) = palpate(folder.path(), &["organ.obj", "--unit", "mm"]);
+    assert_eq!((status, told.as_str()), (0, ""));
+    for row in ["groups          ", "top: 5 vertices\n", "bottom: 5 vertices\n"] {
+        assert!(table.contains(row), "{row} is not in\n{table}");
+    }
+    let (_, json, _) = palpate(folder.path(), &["organ.obj", "--unit", "mm", "--json"]);
+    let groups = &serde_json::from_str::<Value>(&json).unwrap()["groups"];
+    assert!(groups.as_array().unwrap().contains(&serde_json::json!({ "name": "top", "vertices": 5 })), "{groups}");
+    let many: String = (0..30).map(|group| format!("g part{group}\nf 1 3 5\n")).collect();
+    std::fs::write(folder.path().join("many.obj"), OCTAHEDRON.replace("f 1 3 5\n", &many)).unwrap();
+    let (_, table, told) = palpate(folder.path(), &["many.obj", "--unit", "mm", "--repair"]);
+    assert!(table.contains("and 10 more; --json lists all"), "{table}{told}");
+}
+
+#[test]
 fn what_is_refused_says_element_place_and_what_to_do() {
     let folder = tempfile::tempdir().unwrap();
     let refused = |text: &str, arguments: &[&str], says: &[&str]| {
@@ -46,7 +65,7 @@ fn what_is_refused_says_element_place_and_what_to_do() {
         output
     };
     refused(OCTAHEDRON, &["organ.obj"], &["no unit", "--unit mm"]);
-    refused(OCTAHEDRON, &["organ.obj", "--unit", "inch"], &["`inch` is no unit", "0.0254"]);
+    refused(OCTAHEDRON, &["organ.obj", "--unit", "inch"], &["`inch` is not a unit", "0.0254"]);
     refused(OCTAHEDRON, &["other.obj", "--unit", "mm"], &["other.obj: can't be read"]);
     refused(OCTAHEDRON, &["organ.obj", "--unit", "mm", "--output", "a.vtk"], &["--output", ".ply"]);
     refused("v 1 2\n", &["organ.obj", "--unit", "mm"], &["organ.obj: line 1:", "v x y z"]);

@@ -601,7 +601,7 @@ fn another_version_and_what_is_above_the_limits_is_refused() {
         let refusal = restored.map(drop).unwrap_err();
         assert!(refusal.message.contains(what), "{refusal}");
     }
-    assert!(refusal(b"", &limits()).message.contains("is no snapshot"));
+    assert!(refusal(b"", &limits()).message.contains("is not a snapshot"));
 }
 
 #[test]

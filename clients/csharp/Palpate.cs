@@ -31,7 +31,7 @@ namespace Palpate
 
     /// <summary>The box around a tissue at rest, in Palpate's own axes, m.</summary>
     [StructLayout(LayoutKind.Sequential)]
-    public struct Extent { public Vector Least, Most, Middle; }
+    public struct Extent { public Vector Least, Most, Middle, Top; }
 
     /// <summary>What a device reports.</summary>
     [StructLayout(LayoutKind.Sequential)]

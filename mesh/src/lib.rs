@@ -15,6 +15,7 @@ pub mod read;
 pub mod repair;
 pub mod report;
 pub mod surface;
+pub mod top;
 pub mod topology;
 mod tree;
 pub mod unit;

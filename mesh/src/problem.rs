@@ -180,7 +180,7 @@ impl fmt::Display for Problem {
         match self {
             Problem::Unit { text } => write!(
                 f,
-                "`{text}` is no unit: give m, cm, mm, or the metres of one unit as a number above 0 (for inches: 0.0254)"
+                "`{text}` is not a unit: give m, cm, mm, or the metres of one unit as a number above 0 (for inches: 0.0254)"
             ),
             Problem::UnknownFormat => write!(
                 f,
@@ -232,13 +232,13 @@ impl fmt::Display for Problem {
             Problem::UnusedVertex => write!(f, "no triangle has this vertex: --repair drops it"),
             Problem::EdgeSpread { ratio } => write!(
                 f,
-                "the longest edge is {} times the shortest, which is here: short edges need short time steps; \
+                "the longest edge is {} times the shortest, here: short edges need short time steps; \
                  --vertices N makes edges more even",
                 rounded(*ratio)
             ),
             Problem::AreaSpread { ratio } => write!(
                 f,
-                "the largest triangle is {} times the smallest, which is here: small masses need short time \
+                "the largest triangle is {} times the smallest, here: small masses need short time \
                  steps; --vertices N makes triangles more even",
                 rounded(*ratio)
             ),

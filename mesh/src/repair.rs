@@ -400,7 +400,7 @@ impl Work {
         self.tell(filled, "Holes filled");
         self.tell(added, "Vertices added in the middle of holes");
         if tangled > 0 {
-            self.faults.push(format!("small holes whose borders are no loops are left open: {tangled}"));
+            self.faults.push(format!("small holes whose borders are not loops are left open: {tangled}"));
         }
     }
 

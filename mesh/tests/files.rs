@@ -152,7 +152,7 @@ fn every_text_may_end_lines_and_itself_as_any_system_does_and_begin_with_a_mark(
     assert!(comma.contains("decimal comma"), "{comma}");
     // Lists of numbers with commas between them have none.
     let list = refusal("a.obj", obj().replace("v 40 30 0", "v 40, 30, 0"));
-    assert!(list.contains("`40,` is no number"), "{list}");
+    assert!(list.contains("`40,` is not a number"), "{list}");
     // Lines are counted as editors count them.
     for end in ["\n", "\r\n", "\r"] {
         let refusal = refusal("a.obj", obj().replace("f 1 6 5", "f 1 6 x").replace('\n', end));
@@ -208,8 +208,12 @@ fn a_row_of_ply_is_a_line() {
             ply_of(CORNERS, &triangles(|[a, b, c]| format!("{a} {b} {c}\n")), list),
             "line 18: a face of 0 vertices in a longer row",
         ),
-        ("half a vertex", ply_of(CORNERS, &faces.replace("3 0 1 5", "3 0 1.5 5"), list), "line 22: `1.5` is no whole"),
-        ("a word", ply_of(CORNERS, &faces.replace("3 0 1 5", "3 0 one 5"), list), "line 22: `one` is no number"),
+        (
+            "half a vertex",
+            ply_of(CORNERS, &faces.replace("3 0 1 5", "3 0 1.5 5"), list),
+            "line 22: `1.5` is not a whole",
+        ),
+        ("a word", ply_of(CORNERS, &faces.replace("3 0 1 5", "3 0 one 5"), list), "line 22: `one` is not a number"),
         (
             "a vertex too many",
             ply_of(&format!("{CORNERS}1 1 1\n"), &faces, list),

@@ -165,6 +165,11 @@ pub fn unsigned_zero(value: f64) -> f64 {
     value + 0.0
 }
 
+/// The value with at most ten digits, to show to people: what was computed, or was a f32, has up to 17, and most are rounding.
+pub fn legible(value: f64) -> f64 {
+    format!("{value:.9e}").parse().unwrap_or(value)
+}
+
 /// `value`, if it is finite and `holds` is true for it; `range` describes those values. −0 comes back as 0.
 ///
 /// # Errors
@@ -174,6 +179,8 @@ pub fn number(field: &str, value: f64, range: &str, holds: impl Fn(f64) -> bool)
         return Err(Refusal::new(Reason::NotFinite, field, format!("must be a finite number, but is {value}")));
     }
     if !holds(value) {
+        // All digits where fewer would seem to be in range.
+        let value = Some(legible(value)).filter(|value| !holds(*value)).unwrap_or(value);
         return Err(Refusal::new(Reason::OutOfRange, field, format!("must be {range}, but is {value}")));
     }
     Ok(unsigned_zero(value))
@@ -267,6 +274,16 @@ pub fn excerpt(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn numbers_that_are_told_have_ten_digits_unless_they_would_seem_to_be_in_range() {
+        let told = |value: f64| number("x", value, "below 0.3", |v| v < 0.3).unwrap_err().to_string();
+        assert_eq!(told(0.75), "x: must be below 0.3, but is 0.75");
+        assert_eq!(told(f64::from(0.7_f32)), "x: must be below 0.3, but is 0.6999999881");
+        let below = number("x", 0.1 + 0.2, "at most 0.3", |v| v <= 0.3).unwrap_err().to_string();
+        assert_eq!(below, "x: must be at most 0.3, but is 0.30000000000000004");
+        assert_eq!(legible(f64::INFINITY), f64::INFINITY);
+    }
 
     #[test]
     fn a_name_is_meant_that_begins_so_or_differs_by_a_letter_or_two() {

@@ -145,7 +145,7 @@ async fn tell_standing(channel: Channel, seen: impl Fn() -> Seen) {
                 sdk.is_away = false;
             }
             Err(status) if !sdk.is_away => {
-                warn!("Agones can't be told how this server stands; it is tried again: {}", status.message());
+                warn!("Agones can't be reached to report this server's state; trying again: {}", status.message());
                 sdk.is_away = true;
             }
             Ok(()) | Err(_) => {}

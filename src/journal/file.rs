@@ -75,6 +75,6 @@ mod tests {
         let listed = list(folder.path()).unwrap();
         assert_eq!(listed.iter().map(|file| file.session_id.as_str()).collect::<Vec<_>>(), ["file"]);
         let refused = crate::journal::reader::file(&pipe).unwrap_err();
-        assert!(refused.message.contains("it is no file"), "{refused}");
+        assert!(refused.message.contains("it is not a file"), "{refused}");
     }
 }

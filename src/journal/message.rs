@@ -309,7 +309,7 @@ pub(super) fn from_command(message: &pb::Command, rules: &Rules, points: usize) 
         return Err(Refusal::new(Reason::OutOfRange, "tool", text));
     }
     let point = |field: &str, number: u32| {
-        let message = || Refusal::new(Reason::OffSheet, field, format!("{number} is no point of the tissue"));
+        let message = || Refusal::new(Reason::OffSheet, field, format!("the tissue has no point {number}"));
         ((number as usize) < points).then(|| PointId::new(number as usize)).ok_or_else(message)
     };
     let action = match required("action", message.action.as_ref())? {

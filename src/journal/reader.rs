@@ -300,7 +300,7 @@ pub fn file(path: &Path) -> Result<BufReader<File>> {
     // Before it is opened: a pipe would wait for somebody who writes into it.
     let kind = std::fs::metadata(path).map_err(unreadable)?.file_type();
     if !kind.is_file() {
-        let what = if kind.is_dir() { "it is a folder" } else { "it is no file" };
+        let what = if kind.is_dir() { "it is a folder" } else { "it is not a file" };
         return Err(unreadable(std::io::Error::other(what)));
     }
     let file = File::open(path).map_err(unreadable)?;

@@ -216,8 +216,7 @@ impl Pacer {
             drop(intake.close(Refusal::new(Reason::SessionHeld, "", reason)));
         }
         if playback.is_some() {
-            let message =
-                "this session plays what was recorded; to touch the tissue, go on from a moment of it (CreateSession)";
+            let message = "this session plays a recording; to touch the tissue, begin a session at one of its moments (CreateSession)";
             drop(intake.close(Refusal::new(Reason::NotAvailable, "session_id", message)));
         }
         let about = || About {

@@ -9,7 +9,7 @@ use palpate_mesh::decimate::{LEAST_VERTICES, decimate};
 use palpate_mesh::repair::{Measure, Repair, repair};
 use palpate_mesh::report::{Finding, LISTED, Report, Spread};
 use palpate_mesh::write::{Format, write};
-use palpate_mesh::{MeshError, ReadLimits, TriangleMesh, Unit, prepare, read, report};
+use palpate_mesh::{Group, MeshError, ReadLimits, TriangleMesh, Unit, prepare, read, report};
 use serde::Serialize;
 
 use super::{Failure, write_file};
@@ -24,7 +24,7 @@ pub(crate) struct MeshArguments {
     /// Write the report as JSON
     #[arg(long)]
     json: bool,
-    /// Mend what can be mended, and tell what was done
+    /// Repair what can be repaired, and report what was done
     #[arg(long)]
     repair: bool,
     /// Make it coarser: at most so many vertices, 4 or more
@@ -49,9 +49,18 @@ struct Told {
     faults: Vec<String>,
     #[serde(flatten)]
     report: Report,
+    /// Vertices with a name, which `fixed` of a scene may give.
+    groups: Vec<ToldGroup>,
     /// Of the file; places are told in it.
     #[serde(skip)]
     unit: Unit,
+}
+
+/// Vertices with a name.
+#[derive(Serialize)]
+struct ToldGroup {
+    name: String,
+    vertices: usize,
 }
 
 /// Reads at most as many bytes as a mesh file may have, and one more.
@@ -88,7 +97,9 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     };
     drop(bytes);
     let told = Told { file: name, notes: found.notes, unit, ..Told::default() };
-    let (told, mesh) = treat(arguments, found.mesh, told);
+    let (mut told, mesh) = treat(arguments, found.mesh, told);
+    let group = |group: &Group| ToldGroup { name: group.name.clone(), vertices: group.vertices.len() };
+    told.groups = mesh.groups.iter().map(group).collect();
     print(arguments, &told)?;
     if let Some(finding) = told.report.refusal() {
         let message = format!("{}: {}", told.file, finding.text(unit));
@@ -157,6 +168,9 @@ fn print(arguments: &MeshArguments, told: &Told) -> Result<(), Failure> {
     }
 }
 
+/// So many groups are listed in the table.
+const GROUPS_TOLD: usize = 20;
+
 /// The width of the names in the table.
 const NAMES: usize = 16;
 
@@ -190,6 +204,13 @@ impl Display for Told {
         row("triangle areas", &spread(&report.triangle_m2, 1e6, "mm²"))?;
         let Spread { least, median, largest } = report.valence;
         row("edges a vertex", &format!("{least:.0} to {largest:.0}, median {median:.0}"))?;
+        for (number, ToldGroup { name, vertices }) in self.groups.iter().take(GROUPS_TOLD).enumerate() {
+            row(if number == 0 { "groups" } else { "" }, &format!("{name}: {vertices} vertices"))?;
+        }
+        match self.groups.len().saturating_sub(GROUPS_TOLD) {
+            0 => {}
+            more => row("", &format!("and {more} more; --json lists all"))?,
+        }
         for (name, lines) in [("read", &self.notes), ("done", &self.done)] {
             for line in lines {
                 row(name, line)?;

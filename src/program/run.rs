@@ -27,8 +27,8 @@ pub(crate) struct RunArguments {
     /// relative to its largest. With [stepping] correct = true, the run is corrected where an error exceeds the tolerance
     #[arg(long)]
     audit: bool,
-    /// Plot displacement and force of the first tool with a tip, or of the first point, in the terminal; without --output
-    /// the records are then not written to a terminal
+    /// Plot displacement and force of the first tool with a tip, or of the first point, in the terminal: on a sheet along z,
+    /// on a mesh their magnitudes; without --output the records are then not written to a terminal
     #[arg(long)]
     plot: bool,
     /// Show no progress and no summary

@@ -34,11 +34,10 @@ pub(crate) struct ServeArguments {
     /// Origin of another site whose pages may call, such as https://example.org; may be repeated
     #[arg(long, value_name = "ORIGIN")]
     origin: Vec<String>,
-    /// No touch by datagram (WebTransport over UDP); else it is served on the UDP port of the same number
+    /// Disable touch by datagram (WebTransport over UDP), which otherwise uses the UDP port of the same number
     #[arg(long)]
     no_datagrams: bool,
-    /// Tell clients this address for datagrams, if they reach the UDP port under another than the server's own: behind a proxy,
-    /// in a container
+    /// Address for datagrams to give to clients, if it differs from the server's own: behind a proxy or in a container
     #[arg(long, value_name = "HOST:PORT", conflicts_with = "no_datagrams")]
     datagrams_advertise: Option<String>,
     /// Serve Prometheus metrics at http://ADDRESS:PORT/metrics [default: off]
@@ -77,7 +76,7 @@ pub(crate) struct ServeArguments {
     /// changed one
     #[arg(long, value_name = "FILE")]
     journal_key: Option<PathBuf>,
-    /// Be one of a fleet: URLs of the members of etcd, such as http://etcd:2379. Needs --journal and --advertise
+    /// Join a fleet: URLs of the members of etcd, such as http://etcd:2379. Needs --journal and --advertise
     #[arg(long, value_name = "URL", value_delimiter = ',', requires = "advertise")]
     cluster: Vec<String>,
     /// URL under which clients and the other servers of the fleet reach this one
@@ -92,10 +91,10 @@ pub(crate) struct ServeArguments {
     /// Certificate authorities (PEM) of the servers of the fleet, which show each other --tls-cert; other clients need none
     #[arg(long, value_name = "FILE")]
     cluster_ca: Option<PathBuf>,
-    /// What `durable_step` means in a fleet: on the disk of the server, or also on that of the one that stands by [default: one]
+    /// What `durable_step` means in a fleet: on the disk of the server, or also on its standby's [default: one]
     #[arg(long, value_name = "SERVERS")]
     durable: Option<palpate::server::Durable>,
-    /// Tell Agones how the server stands: ready, its sessions, drained. For a server of a fleet in a pod of Agones
+    /// Report the server's state to Agones: ready, its sessions, drained. For a server of a fleet in a pod of Agones
     #[arg(long)]
     agones: bool,
     /// Time that streams get to end at shutdown before they are cut, s [default: 5]

@@ -5,7 +5,7 @@ use palpate_touch::{Coupling, Tip};
 
 use super::profile::Poke;
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, finite, finite_vector, not_negative, number};
+use crate::refusal::{Reason, Refusal, Result, finite, finite_vector, legible, not_negative, number};
 use crate::shape::{PointId, RestShape};
 
 /// Squares and products of what a scene holds stay within single precision for values in this range.
@@ -43,7 +43,7 @@ pub fn check_poke(poke: &Poke, shape: &dyn RestShape, limits: &Limits) -> Result
 /// Refuses one beyond the limit.
 pub fn check_reach(field: &str, shape: &dyn RestShape, displacement_m: f64, limits: &Limits) -> Result<()> {
     let limit_m = shape.longest_side_m() * limits.reach_in_sheets;
-    let range = format!("at most {limit_m} m from the rest position");
+    let range = format!("at most {} m from the rest position", legible(limit_m));
     number(field, displacement_m, &range, |v| v <= limit_m).map_err(in_millimetres(displacement_m, limit_m))?;
     Ok(())
 }
@@ -83,7 +83,7 @@ pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
         edges_m if shape.dimensions() > 2 && edges_m < longest_m => (edges_m, "32 lengths of an edge"),
         _ => (longest_m, "the longest side of the tissue"),
     };
-    let range = format!("above 0 and at most {most_m}, {what}");
+    let range = format!("above 0 and at most {}, {what}", legible(most_m));
     number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= most_m)
         .map_err(in_millimetres(tip.radius_m, most_m))?;
     number(&format!("{field}.friction"), tip.friction, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;

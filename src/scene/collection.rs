@@ -42,8 +42,31 @@ impl Collection {
         &self.folder
     }
 
-    /// Every name, sorted.
-    pub fn names(&self) -> Vec<String> {
+    /// Every name, sorted, but for those of files that belong into the folder of the other kind.
+    pub fn names(&self, limits: &Limits) -> Vec<String> {
+        self.files_and_built_in().into_iter().filter(|name| self.misplaced(name, limits).is_none()).collect()
+    }
+
+    /// The refusals of files that belong into the folder of the other kind, by their names.
+    pub fn all_misplaced(&self, limits: &Limits) -> Vec<Refusal> {
+        self.files_and_built_in().iter().filter_map(|name| self.misplaced(name, limits)).collect()
+    }
+
+    fn misplaced(&self, name: &str, limits: &Limits) -> Option<Refusal> {
+        let text = read_text(&self.file(name)?, limits.file_bytes).ok()?;
+        self.refuse_other_kind(&format!("{name}.toml"), &text).err()
+    }
+
+    /// Refuses the text of a file of the folder that is of the other kind.
+    fn refuse_other_kind(&self, file: &str, text: &str) -> Result<()> {
+        if Document::parse(file, text).is_ok_and(|document| self.kind.check(&document).is_err()) {
+            let refusal = Refusal::new(Reason::WrongKind, "", self.kind.misplaced());
+            return Err(Refusal { place: Some(file.to_owned()), ..refusal });
+        }
+        Ok(())
+    }
+
+    fn files_and_built_in(&self) -> Vec<String> {
         let mut names: Vec<String> = self.built_in.iter().map(|text| text.0.to_owned()).collect();
         for entry in std::fs::read_dir(&self.folder).into_iter().flatten().flatten() {
             let path = entry.path();
@@ -80,18 +103,17 @@ impl Collection {
             let file = format!("{name}.toml");
             let text = read_text(&path, limits.file_bytes)
                 .map_err(|refusal| Refusal { place: Some(file.clone()), ..refusal })?;
-            if Document::parse(&file, &text).is_ok_and(|document| self.kind.check(&document).is_err()) {
-                let refusal = Refusal::new(Reason::WrongKind, "", self.kind.misplaced());
-                return Err(Refusal { place: Some(file), ..refusal });
-            }
+            self.refuse_other_kind(&file, &text)?;
             return Ok((file, text));
         }
         let built_in = self.built_in.iter().find(|text| text.0 == name);
-        built_in.map(|(name, text)| ((*name).to_owned(), (*text).to_owned())).ok_or_else(|| self.unknown(name, others))
+        built_in
+            .map(|(name, text)| ((*name).to_owned(), (*text).to_owned()))
+            .ok_or_else(|| self.unknown(name, others, limits))
     }
 
-    fn unknown(&self, name: &str, others: &Collection) -> Refusal {
-        let (kind, names) = (self.kind.name(), self.names());
+    fn unknown(&self, name: &str, others: &Collection, limits: &Limits) -> Refusal {
+        let (kind, names) = (self.kind.name(), self.names(limits));
         let file = format!("{name}.toml");
         let hint = if self.names_files && is_name(name) && Path::new(&file).is_file() {
             format!("; did you mean the file `{file}`?")
@@ -173,6 +195,22 @@ pub fn scenes_of(path: &Path, limits: &Limits) -> Result<Vec<String>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_file_of_the_other_kind_has_no_name_and_is_told() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("poke.toml"), "duration_s = 1.0\n").unwrap();
+        std::fs::write(folder.path().join("mine.toml"), "[sheet]\n").unwrap();
+        let [scenes, scripts] = [Kind::Scene, Kind::Script].map(|kind| Collection::new(kind, folder.path()));
+        let limits = Limits::default();
+        let [of_scenes, of_scripts] = [scenes.names(&limits), scripts.names(&limits)];
+        let has = |names: &[String], name: &str| names.iter().any(|other| other == name);
+        assert!(has(&of_scenes, "mine") && !has(&of_scenes, "poke"), "{of_scenes:?}");
+        assert!(has(&of_scripts, "poke") && !has(&of_scripts, "mine"), "{of_scripts:?}");
+        let told = |all: &Collection| all.all_misplaced(&limits).iter().map(ToString::to_string).collect::<Vec<_>>();
+        assert_eq!(told(&scenes), ["poke.toml: is a script in the folder of scenes: move it to the folder of scripts"]);
+        assert_eq!(told(&scripts), ["mine.toml: is a scene in the folder of scripts: move it to the folder of scenes"]);
+    }
 
     #[test]
     fn an_unknown_name_is_refused_with_all_names_and_the_nearest() {

@@ -111,7 +111,7 @@ impl Material {
         if let Some(vertex) = (0..of_vertices_m2.len()).find(lacks) {
             let (name, place_m) = (shape.name(PointId::new(vertex)), shape.vertices_m()[vertex]);
             let message = format!(
-                "{name} at {place_m} m has no area, so [material] gives it no mass: `palpate mesh FILE --repair` may mend it"
+                "{name} at {place_m:.6} m has no area, so [material] gives it no mass: `palpate mesh FILE --repair` may mend it"
             );
             return Err(Refusal::new(Reason::Unreadable, "material", message));
         }
@@ -299,7 +299,7 @@ impl Inclusion {
                 let away_m = nearest_m.distance(*centre_m);
                 if away_m > radius_m + self.edge_m {
                     let message = format!(
-                        "no vertex is within the ball: the nearest is at {nearest_m} m, {away_m:.4} m from its centre"
+                        "no vertex is within the ball: the nearest is at {nearest_m:.4} m, {away_m:.4} m from its centre"
                     );
                     return Err(Refusal::new(Reason::OutOfRange, named("radius_m"), message));
                 }

@@ -80,6 +80,7 @@ pub struct MeshShape {
     on_rim: Vec<bool>,
     edge_m: f64,
     extent: Extent,
+    top_m: DVec3,
     cells: Cells,
     surface: OnceLock<Surface>,
     told: Told,
@@ -149,7 +150,9 @@ impl Mesh {
     /// # Errors
     /// As for [`MeshShape::new`].
     pub fn simulating(simulated: Simulated, point_mass_kg: f64, fixed: Fixed) -> Result<Self> {
-        let Simulated { mesh, shown, findings } = simulated;
+        let Simulated { mesh, shown, mut findings } = simulated;
+        let balls = if let Fixed::Balls(balls) = &fixed { balls.as_slice() } else { &[] };
+        let mut is_empty = vec![true; balls.len()];
         let uv = mesh.uv.as_ref().map(|_| {
             let mut of_vertex = vec![[0.0; 2]; mesh.vertices_m.len()];
             mesh.write_vertex_uv(&mut of_vertex);
@@ -161,9 +164,21 @@ impl Mesh {
             Fixed::Group(group) => group.vertices.binary_search(&vertex).is_ok(),
             Fixed::Balls(balls) => {
                 spend(balls.len());
-                balls.iter().any(|(centre_m, radius_m)| place_m.distance(*centre_m) <= *radius_m)
+                let mut is_within = false;
+                for ((centre_m, radius_m), is_empty) in balls.iter().zip(&mut is_empty) {
+                    let holds = place_m.distance(*centre_m) <= *radius_m;
+                    *is_empty &= !holds;
+                    is_within |= holds;
+                }
+                is_within
             }
         })?;
+        let empty = (0..).zip(balls).zip(is_empty).filter(|(_, is_empty)| *is_empty).map(|(ball, _)| ball);
+        findings.extend(empty.clone().take(EMPTY_BALLS_TOLD).map(|(number, ball)| shape.empty_ball(number, *ball)));
+        match empty.count().saturating_sub(EMPTY_BALLS_TOLD) {
+            0 => {}
+            more => findings.push(format!("mesh.fixed: {more} more balls hold no vertex")),
+        }
         shape.told = Told { fixed, uv, groups: mesh.groups, findings };
         shape.shown = shown;
         Ok(Mesh::new(point_mass_kg, 0.0, Arc::new(shape)))
@@ -398,6 +413,9 @@ impl Mesh {
 /// A new tool begins at least this far off the surface at rest, m.
 const APPROACH_M: f64 = 0.002;
 
+/// So many balls of `mesh.fixed` that hold no vertex are told one by one.
+const EMPTY_BALLS_TOLD: usize = 4;
+
 /// A vertex that vibrates so much faster than half of a mesh is warned of.
 const MUCH_FASTER: f64 = 2.5;
 
@@ -458,7 +476,7 @@ pub(super) fn group_named<'g>(field: &str, name: &str, groups: &'g [Group]) -> R
         let meant = did_you_mean(name, groups.iter().map(|group| group.name.as_str()));
         let names: Vec<&str> = groups.iter().map(|group| group.name.as_str()).take(8).collect();
         let all = if names.is_empty() { "it has none".to_owned() } else { format!("it has {}", names.join(", ")) };
-        let message = format!("`{}` is no group of the mesh{meant}; {all}", excerpt(name));
+        let message = format!("the mesh has no group `{}`{meant}; {all}", excerpt(name));
         Refusal::new(Reason::WrongKind, field, message)
     })
 }
@@ -473,7 +491,7 @@ impl MeshShape {
     pub fn new(
         vertices_m: Vec<DVec3>,
         triangles: Vec<[u32; 3]>,
-        is_fixed: impl Fn(bool, DVec3, u32) -> bool,
+        is_fixed: impl FnMut(bool, DVec3, u32) -> bool,
     ) -> Result<Self> {
         Self::braced(vertices_m, triangles, &[], is_fixed)
     }
@@ -486,7 +504,7 @@ impl MeshShape {
         vertices_m: Vec<DVec3>,
         triangles: Vec<[u32; 3]>,
         braces: &[[u32; 2]],
-        is_fixed: impl Fn(bool, DVec3, u32) -> bool,
+        mut is_fixed: impl FnMut(bool, DVec3, u32) -> bool,
     ) -> Result<Self> {
         let refuse = |message: String| Refusal::new(Reason::Unreadable, "mesh", message);
         if let Some(vertex) = vertices_m.iter().position(|place_m| !place_m.is_finite()) {
@@ -511,14 +529,14 @@ impl MeshShape {
             let [from_m, to_m] = edge.map(|vertex| vertices_m[vertex as usize]);
             let length_m = from_m.distance(to_m);
             if length_m == 0.0 {
-                return Err(refuse(format!("the edge between vertices {a} and {b} at {from_m} m has no length")));
+                return Err(refuse(format!("the edge between vertices {a} and {b} at {from_m:.6} m has no length")));
             }
             match of_edge {
                 [_] => edge.iter().for_each(|vertex| on_rim[*vertex as usize] = true),
                 [(_, c), (_, d)] => opposite.push(([*c.min(d), *c.max(d)], edge)),
                 more => {
                     let message =
-                        format!("the edge between vertices {a} and {b} at {from_m} m has {} triangles", more.len());
+                        format!("the edge between vertices {a} and {b} at {from_m:.6} m has {} triangles", more.len());
                     return Err(refuse(message));
                 }
             }
@@ -551,6 +569,7 @@ impl MeshShape {
         let used = || (0..).zip(&vertices_m).filter(|(vertex, _)| !neighbours.of(*vertex as usize).is_empty());
         let extent = Extent::around(used().map(|(_, place_m)| *place_m));
         let cells = Cells::new(used(), extent, edge_m);
+        let top_m = palpate_mesh::top::top_m(&vertices_m, &triangles, &normals, extent.middle_m());
         Ok(MeshShape {
             vertices_m,
             triangles,
@@ -563,11 +582,23 @@ impl MeshShape {
             on_rim,
             edge_m,
             extent,
+            top_m,
             cells,
             surface: OnceLock::new(),
             told: Told::default(),
             shown: None,
         })
+    }
+
+    /// That a ball of `mesh.fixed` fixes nothing, in words.
+    fn empty_ball(&self, number: usize, (centre_m, radius_m): (DVec3, f64)) -> String {
+        let nearest = self.nearest(centre_m);
+        let off_m = self.rest_m(nearest).distance(centre_m);
+        format!(
+            "mesh.fixed[{number}]: no vertex is within {radius_m} m of {centre_m:.4} m, so this ball fixes nothing; the nearest, {}, \
+             is {off_m:.4} m off",
+            self.name(nearest)
+        )
     }
 
     /// What clients are told of it.
@@ -738,6 +769,10 @@ impl RestShape for MeshShape {
 
     fn edge_m(&self) -> f64 {
         self.edge_m
+    }
+
+    fn top_m(&self) -> DVec3 {
+        self.top_m
     }
 }
 
@@ -955,6 +990,25 @@ mod tests {
     }
 
     #[test]
+    fn a_ball_that_fixes_no_vertex_is_told_with_the_nearest_one() {
+        let vertices_m =
+            [[0.0; 3], [0.04, 0.0, 0.0], [0.04, 0.03, 0.0], [0.0, 0.03, 0.0]].map(DVec3::from_array).to_vec();
+        let mesh = TriangleMesh { vertices_m, triangles: vec![[0, 1, 2], [0, 2, 3]], ..TriangleMesh::default() };
+        let (held, empty) = ((DVec3::ZERO, 0.001), (DVec3::new(0.04, 0.03, 0.005), 0.004));
+        let told =
+            |balls: &[(DVec3, f64)]| Mesh::of(mesh.clone(), 1e-3, Fixed::Balls(balls.to_vec())).unwrap().warnings();
+        assert_eq!(told(&[held]), [""; 0]);
+        assert_eq!(
+            told(&[held, empty]),
+            [
+                "mesh.fixed[1]: no vertex is within 0.004 m of [0.0400, 0.0300, 0.0050] m, so this ball fixes nothing; the nearest, \
+              vertex 2, is 0.0050 m off"
+            ]
+        );
+        assert_eq!(told(&[empty; 7]).last().unwrap(), "mesh.fixed: 3 more balls hold no vertex");
+    }
+
+    #[test]
     fn a_vertex_without_a_triangle_changes_neither_size_nor_mass_nor_what_is_nearest() {
         let places_m = [[0.0; 3], [0.04, 0.0, 0.0], [0.04, 0.03, 0.0], [0.0, 0.03, 0.0]].map(DVec3::from_array);
         let triangles = vec![[0, 1, 2], [0, 2, 3]];
@@ -1063,7 +1117,11 @@ mod tests {
             (square(), vec![], "has no triangle"),
             (square(), vec![[0, 1, 5]], "triangle 0 names a vertex beyond the last of 5"),
             (square(), vec![[0, 1, 1]], "the edge between vertices 1 and 1"),
-            (square(), vec![[0, 1, 2], [1, 0, 3], [0, 1, 4]], "the edge between vertices 0 and 1 at [0, 0, 0] m has 3"),
+            (
+                square(),
+                vec![[0, 1, 2], [1, 0, 3], [0, 1, 4]],
+                "the edge between vertices 0 and 1 at [0.000000, 0.000000, 0.000000] m has 3",
+            ),
             (vec![DVec3::NAN; 3], vec![[0, 1, 2]], "vertex 0 is not finite"),
         ] {
             let refused = MeshShape::new(vertices_m, triangles, |_, _, _| false).unwrap_err();

@@ -2,14 +2,19 @@
 
 use std::fmt;
 
+use glam::DVec3;
 use textplots::{Chart, LabelBuilder, LabelFormat, Plot, Shape};
+
+use crate::shape::RestShape;
 
 /// The number of values from which on every second one is left out. A terminal shows 140 dots side by side.
 const MOST_KEPT: usize = 4096;
 
-/// Displacement and force along z of one tool or point over time. The memory does not grow with the length of a run.
+/// Displacement and force of one tool or point over time: of a sheet along z, as in the paper's figures; of a mesh, which is
+/// pressed from any side, their lengths. The memory does not grow with the length of a run.
 #[derive(Debug, Clone, Default)]
 pub struct Curves {
+    of_lengths: bool,
     /// Time, s, and displacement, m.
     displacement: Vec<(f32, f32)>,
     /// Time, s, and force of the tissue, N.
@@ -21,9 +26,14 @@ pub struct Curves {
 }
 
 impl Curves {
-    /// Adds the displacement, m, and the force of the tissue, N, along z at a time, s. Times ascend.
+    /// Of a tissue of this shape.
+    pub fn of(shape: &dyn RestShape) -> Self {
+        Curves { of_lengths: shape.dimensions() > 2, ..Curves::default() }
+    }
+
+    /// Adds the displacement, m, and the force of the tissue, N, at a time, s. Times ascend.
     #[allow(clippy::cast_possible_truncation)]
-    pub fn add(&mut self, time_s: f64, displacement_m: f64, force_n: f64) {
+    pub fn add(&mut self, time_s: f64, displacement_m: DVec3, force_n: DVec3) {
         if self.displacement.len() == MOST_KEPT {
             for curve in [&mut self.displacement, &mut self.force] {
                 let mut is_kept = false;
@@ -35,8 +45,9 @@ impl Curves {
             self.halvings += 1;
         }
         if self.added.trailing_zeros() >= self.halvings {
-            self.displacement.push((time_s as f32, displacement_m as f32));
-            self.force.push((time_s as f32, force_n as f32));
+            let value = |v: DVec3| (time_s as f32, if self.of_lengths { v.length() } else { v.z } as f32);
+            self.displacement.push(value(displacement_m));
+            self.force.push(value(force_n));
         }
         self.added += 1;
     }
@@ -44,8 +55,16 @@ impl Curves {
 
 impl fmt::Display for Curves {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        writeln!(f, "{}", draw("Displacement of the control point along z, m", &self.displacement))?;
-        write!(f, "{}", draw("Force of the tissue on the tool along z, N", &self.force))
+        let titles = if self.of_lengths {
+            [
+                "Magnitude of the displacement of the control point, m",
+                "Magnitude of the force of the tissue on the tool, N",
+            ]
+        } else {
+            ["Displacement of the control point along z, m", "Force of the tissue on the tool along z, N"]
+        };
+        writeln!(f, "{}", draw(titles[0], &self.displacement))?;
+        write!(f, "{}", draw(titles[1], &self.force))
     }
 }
 
@@ -77,7 +96,7 @@ mod tests {
     fn long_runs_keep_evenly_spaced_values_and_little_memory() {
         let mut curves = Curves::default();
         for index in 0..100_000_u32 {
-            curves.add(f64::from(index), 0.0, f64::from(index));
+            curves.add(f64::from(index), DVec3::X, f64::from(index) * DVec3::Z);
             assert!(curves.force.len() <= MOST_KEPT);
         }
         // 100,000 values fit in after five halvings.
@@ -85,5 +104,20 @@ mod tests {
         assert_eq!(times, (0..3125_u16).map(|k| 32.0 * f32::from(k)).collect::<Vec<_>>());
         assert!(curves.to_string().contains("Force of the tissue on the tool along z, N\n"), "{curves}");
         assert!(curves.to_string().contains("along z, m: 0 throughout\n"), "{curves}");
+    }
+
+    #[test]
+    fn curves_of_a_mesh_are_of_lengths() {
+        // Pressed from the side.
+        let mut curves = Curves { of_lengths: true, ..Curves::default() };
+        curves.add(0.0, DVec3::ZERO, DVec3::ZERO);
+        curves.add(1.0, DVec3::new(0.003, 0.004, 0.0), DVec3::new(-2.0, 0.0, 0.0));
+        assert_eq!([curves.displacement[1].1, curves.force[1].1], [0.005, 2.0]);
+        for title in [
+            "Magnitude of the displacement of the control point, m\n",
+            "Magnitude of the force of the tissue on the tool, N\n",
+        ] {
+            assert!(curves.to_string().contains(title), "{curves}");
+        }
     }
 }

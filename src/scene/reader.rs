@@ -15,7 +15,7 @@ use super::profile::{
 use super::script::Script;
 use super::{Change, Scene};
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, did_you_mean, not_negative, number, positive, unsigned_zero};
+use crate::refusal::{Reason, Refusal, Result, did_you_mean, legible, not_negative, number, positive, unsigned_zero};
 use crate::shape::{self, PointId};
 
 impl Script {
@@ -459,9 +459,9 @@ impl Binding<'_> {
                 let extent = shape.extent();
                 let beside_m = (extent.least_m - place_m).max(place_m - extent.most_m).max(DVec3::ZERO).truncate();
                 if shape.dimensions() == 2 && beside_m != DVec2::ZERO {
-                    let off_m = beside_m.length();
+                    let off_m = legible(beside_m.length());
                     self.warnings.push(format!(
-                        "{field}: is {off_m} m beside the tissue: a tip that touches goes on with the edge, and drags it along"
+                        "{field}: is {off_m} m beside the tissue: a tip that touches drags the edge along"
                     ));
                 }
                 let touches = tip.grasps || place_m.z <= 0.0;

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use crate::limits::Limits;
 use crate::lock::lock;
-use crate::refusal::Result;
+use crate::refusal::{Refusal, Result};
 use crate::scene::collection::Collection;
 use crate::scene::kind::Kind;
 use crate::scene::reader::fits;
@@ -32,8 +32,13 @@ impl Catalog {
     }
 
     /// The names of all scenes, sorted.
-    pub fn names(&self) -> Vec<String> {
-        self.scenes.names()
+    pub fn names(&self, limits: &Limits) -> Vec<String> {
+        self.scenes.names(limits)
+    }
+
+    /// The refusals of scripts in the folder of scenes and of scenes in that of scripts, which have no name here.
+    pub fn misplaced(&self, limits: &Limits) -> Vec<Refusal> {
+        [&self.scenes, &self.scripts].into_iter().flat_map(|all| all.all_misplaced(limits)).collect()
     }
 
     /// The names of the scenes that are not built in word for word: nobody has looked yet whether they are valid.
@@ -41,12 +46,12 @@ impl Catalog {
         let is_foreign = |name: &String| {
             self.scenes.text(name, &self.scripts, limits).map_or(true, |(_, text)| !is_built_in(name, &text))
         };
-        self.names().into_iter().filter(is_foreign).collect()
+        self.names(limits).into_iter().filter(is_foreign).collect()
     }
 
     /// The names of all scripts, sorted.
-    pub fn script_names(&self) -> Vec<String> {
-        self.scripts.names()
+    pub fn script_names(&self, limits: &Limits) -> Vec<String> {
+        self.scripts.names(limits)
     }
 
     /// The names of the scripts that are made for the scene of that name, sorted.
@@ -55,7 +60,7 @@ impl Catalog {
             let text = self.scripts.text(name, &self.scenes, limits);
             text.map_or(true, |(_, text)| fits(&text, scene))
         };
-        self.script_names().into_iter().filter(fits).collect()
+        self.script_names(limits).into_iter().filter(fits).collect()
     }
 
     /// Loads the scene of that name; `--set` assignments override its keys.

@@ -11,7 +11,7 @@ use crate::refusal::{Reason, Refusal, Result};
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ClusterConfig {
-    /// URLs of the members of etcd. Empty: the server is of no fleet.
+    /// URLs of the members of etcd. Empty: the server belongs to no fleet.
     pub etcd: Vec<String>,
     /// Name of the fleet: servers of one name share their sessions.
     pub name: String,
@@ -54,7 +54,7 @@ pub enum Durable {
     /// On the disk of the server.
     #[default]
     One,
-    /// Also on that of the server that stands by.
+    /// Also on the disk of its standby.
     Two,
 }
 
@@ -105,7 +105,7 @@ impl ClusterConfig {
     pub(super) fn check(&self, beside: Beside) -> Result<()> {
         if !self.is_on() {
             if self.advertise.is_some() || !self.node.is_empty() || self.agones {
-                let message = "is missing: without the URLs of etcd the server is of no fleet";
+                let message = "is missing: without the URLs of etcd the server belongs to no fleet";
                 return Err(Refusal::new(Reason::Missing, "cluster.etcd", message));
             }
             return Ok(());

@@ -46,7 +46,7 @@ fn unavailable(field: &str, error: &std::io::Error) -> String {
         ),
         std::io::ErrorKind::AddrNotAvailable => {
             format!(
-                "it is no address of this machine ({error}); give another --{field}, such as 0.0.0.0:7117 for all of them"
+                "the address does not belong to this machine ({error}); give another --{field}, such as 0.0.0.0:7117 for all of them"
             )
         }
         std::io::ErrorKind::PermissionDenied => {

@@ -46,7 +46,7 @@ pub(super) fn registry(
     registry.register("connected", "Connections so far", traffic.connected.clone());
     let failed = "Connections that were cut off before they were secure";
     registry.register("tls_handshakes_failed", failed, traffic.handshakes_failed.clone());
-    let silent = "Connections that did not say in time what they want";
+    let silent = "Connections that sent no request in time";
     registry.register("silent_connections", silent, traffic.silent.clone());
     let cuts = "Connections that a transport has cut: whose, and why (RFC 9113)";
     registry.register("transport_cuts", cuts, traffic.cuts.clone());
@@ -96,7 +96,7 @@ impl<F: Fn() -> Standing + Send + Sync + 'static> Collector for InFleet<F> {
             ("sessions_without_standby", "Of those, the ones for which no server stands by", None, {
                 now.without_standby as f64
             }),
-            ("unmirrored", "Of its journals, what is on no second disk", Some(&Unit::Bytes), {
+            ("unmirrored", "Bytes of its journals that are on no second disk", Some(&Unit::Bytes), {
                 now.unmirrored_bytes as f64
             }),
         ] {
@@ -128,7 +128,7 @@ impl Collector for Kept {
         let KeeperTally { bytes, rounds, broken, lag_ns } = &*self.0;
         for (name, help, unit, count) in [
             ("journal_written", "What was written to journals", Some(&Unit::Bytes), bytes),
-            ("journal_rounds", "How often what was written was brought to the disk", None, rounds),
+            ("journal_rounds", "How often written data was flushed to the disk", None, rounds),
             ("journal_broken", "Sessions whose journal can't be written any more", None, broken),
         ] {
             let counter = ConstCounter::new(count.load(Ordering::Relaxed));

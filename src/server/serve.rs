@@ -82,6 +82,9 @@ pub async fn serve(
             warn!(%refusal, "this scene is invalid: no session can be created from it");
         }
     }
+    for refusal in catalog.misplaced(&config.limits) {
+        warn!(%refusal, "this file is left out of the list");
+    }
     let mut limits = config.limits.clone();
     let traffic = Arc::new(Traffic::default());
     descriptors::raise();

@@ -60,7 +60,7 @@ impl Services {
     /// Refuses if it is of none.
     pub(super) fn fleet(&self) -> Result<&Arc<Fleet>> {
         self.fleet.as_ref().ok_or_else(|| {
-            Refusal::new(Reason::NotAvailable, "", "this server is of no fleet (`palpate serve --cluster`)")
+            Refusal::new(Reason::NotAvailable, "", "this server belongs to no fleet (`palpate serve --cluster`)")
         })
     }
 }

@@ -104,7 +104,7 @@ impl SessionService for Sessions {
     type GetScriptStream = Pin<Box<dyn Stream<Item = Result<pb::GetScriptResponse, Status>> + Send>>;
 
     async fn list_scenes(&self, _: Request<pb::ListScenesRequest>) -> Result<Response<pb::ListScenesResponse>, Status> {
-        Ok(Response::new(pb::ListScenesResponse { scene_names: self.0.catalog.names() }))
+        Ok(Response::new(pb::ListScenesResponse { scene_names: self.0.catalog.names(&self.0.config.limits) }))
     }
 
     async fn create_session(
@@ -329,7 +329,7 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::ListScriptsResponse>, Status> {
         let pb::ListScriptsRequest { session_id } = request.into_inner();
         let script_names = if session_id.is_empty() {
-            self.0.catalog.script_names()
+            self.0.catalog.script_names(&self.0.config.limits)
         } else {
             let live = self.0.session(&session_id).await?;
             self.0.catalog.script_names_for(&live.model.scene.name, &self.0.config.limits)

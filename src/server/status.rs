@@ -8,6 +8,7 @@ use crate::scene::record::AuditedError;
 use crate::sheet::Model;
 use crate::sheet::audit::Origin;
 use crate::wire;
+use palpate_proto::geometry::vector;
 use palpate_proto::pb;
 
 /// The current state of a session as a message.
@@ -56,7 +57,7 @@ pub(super) fn session(live: &Live) -> pb::Session {
         streams: count(live.streams()),
         scene_name: model.scene.name.clone(),
         points: count(model.len()),
-        extent: Some(wire::extent(&model.shape().extent())),
+        extent: Some(pb::Extent { top_m: vector(model.shape().top_m()), ..wire::extent(&model.shape().extent()) }),
         audit: audit(live),
         journal: live.tape.as_deref().map(journal),
         playback: live.playback.as_ref().map(playback),

@@ -56,7 +56,7 @@ impl Traffic {
 
     /// A connection had to be closed that did not say what it wants.
     pub(super) fn stayed_silent(&self, client: SocketAddr) {
-        info!(%client, "connection closed: it did not say what it wants");
+        info!(%client, "connection closed: it sent no request in time");
         self.silent.inc();
     }
 

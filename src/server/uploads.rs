@@ -180,7 +180,7 @@ impl<T> Uploads<T> {
 fn unknown(kind: &Kind) -> Refusal {
     let name = kind.names[0];
     let message = format!(
-        "is of no {name} that this caller has sent, or it has expired: send the {name} again, from its first part"
+        "names no {name} that this caller has sent, or it has expired: send the {name} again, from its first part"
     );
     Refusal::new(kind.unknown, kind.id, message)
 }

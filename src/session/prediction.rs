@@ -7,7 +7,7 @@ use palpate_touch::{ContactState, Predicted, Predictor, Tip};
 
 use super::Session;
 use super::command::{Command, Due};
-use crate::refusal::{Result, number};
+use crate::refusal::{Result, legible, number};
 use crate::scene::check::check_tip;
 use crate::scene::script::Action;
 use crate::sheet::Model;
@@ -61,7 +61,7 @@ impl TissueCopy {
         let shape = model.shape();
         check_tip("tip", shape, &tip)?;
         let most_m = MOST_EDGES * shape.edge_m();
-        let range = format!("at most {most_m} for a copy of this tissue, {MOST_EDGES} lengths of an edge");
+        let range = format!("at most {} for a copy of this tissue, {MOST_EDGES} lengths of an edge", legible(most_m));
         number("tip.radius_m", tip.radius_m, &range, |radius_m| radius_m <= most_m)?;
         Ok(TissueCopy::new(model, tip).within(TICK_POINT_SUBSTEPS))
     }

@@ -1,5 +1,5 @@
 //! What a user should know of a tissue before anybody touches it: its size and mass, how a fingertip meets it, when it comes
-//! to rest, and what of a scene or a script can't be meant.
+//! to rest, and which values of a scene or a script are unlikely.
 
 use std::fmt;
 use std::sync::atomic::AtomicBool;
@@ -46,7 +46,7 @@ pub(super) struct Prospect {
     rest_s: Result<f64, &'static str>,
     forces: Vec<Force>,
     tips: Vec<TipUse>,
-    /// What can't be meant, in words.
+    /// Unlikely values, in words.
     pub(super) warnings: Vec<String>,
 }
 

@@ -4,7 +4,7 @@ use palpate_mesh::surface::Disc;
 
 use super::command::Command;
 use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, positive};
+use crate::refusal::{Reason, Refusal, Result, legible, positive};
 use crate::scene::Scene;
 use crate::scene::check::{self, check_free, check_poke, check_reach};
 use crate::scene::script::Action;
@@ -111,10 +111,12 @@ pub(super) fn check_contact_work(
     let fits = std::iter::successors(Some(0.5 * now_m), |radius_m| Some(0.5 * radius_m))
         .take(16)
         .find(|radius_m| others.saturating_add(contact_work(shape, *radius_m, substeps)) <= most);
-    let advice = fits.map_or("release other tools first".to_owned(), |radius_m| format!("{radius_m} m fits"));
+    let advice =
+        fits.map_or("release other tools first".to_owned(), |radius_m| format!("{} m fits", legible(radius_m)));
     let message = format!(
-        "is {now_m} m: with it, a step would look up {all} triangles under the tips of this session, above {most} \
-         (limits.contact_work); {advice}"
+        "is {} m: with it, a step would look up {all} triangles under the tips of this session, above {most} \
+         (limits.contact_work); {advice}",
+        legible(now_m)
     );
     Err(Refusal::new(Reason::TooLarge, "pose.tip.radius_m", message))
 }
@@ -129,6 +131,7 @@ pub(super) fn tip_radius_m(command: &Command) -> Option<f64> {
 pub(super) fn check_tip(before_m: Option<f64>, now_m: Option<f64>) -> Result<()> {
     match (before_m, now_m) {
         (Some(before_m), Some(now_m)) if before_m.to_bits() != now_m.to_bits() => {
+            let [before_m, now_m] = [before_m, now_m].map(legible);
             let message = format!("is {now_m} m, but the tool is led with a tip of {before_m} m: release it first");
             Err(Refusal::new(Reason::OutOfTurn, "pose.tip.radius_m", message))
         }

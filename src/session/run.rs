@@ -219,7 +219,8 @@ impl Playing<'_> {
         let mut written: std::io::Result<()> = Ok(());
         let mut windows = (self.twin.is_some() && model.scene.stepping.correct).then(Windows::default);
         let (mut stepping_s, mut resumed_s) = (0.0, clock_s());
-        let (mut largest_displacement_m, mut peak_reaction_n, mut curves) = (0.0_f64, 0.0_f64, Curves::default());
+        let (mut largest_displacement_m, mut peak_reaction_n, mut curves) =
+            (0.0_f64, 0.0_f64, Curves::of(model.shape()));
         let (tip, mut on_fixed) = (script.first_tip(), None);
         for step in 0..script.steps {
             player.commands(step, &mut due)?;
@@ -254,7 +255,7 @@ impl Playing<'_> {
                         largest_displacement_m = largest_displacement_m.max(session.tissue().largest_displacement_m());
                         peak_reaction_n = peak_reaction_n.max(record.peak_n(tip.is_some()));
                         if let Some((displacement_m, force_n)) = record.first(tip) {
-                            curves.add(record.time_s, displacement_m[2], force_n[2]);
+                            curves.add(record.time_s, displacement_m.into(), force_n.into());
                         }
                         self.twin.iter_mut().for_each(|twin| twin.compare(&record));
                         written = tell(Told::Record(record));

@@ -255,7 +255,7 @@ impl Saved {
         let refuse = |reason, message: &str| Err(Refusal::new(reason, SNAPSHOT, message));
         let Some((header, content)) = bytes.split_at_checked(HEADER).filter(|(header, _)| header.starts_with(&MAGIC))
         else {
-            return refuse(Reason::Unreadable, "is no snapshot of Palpate, or cut off");
+            return refuse(Reason::Unreadable, "is not a snapshot of Palpate, or was cut off");
         };
         let version = u32::from_le_bytes(array(&header[8..12]));
         if version != VERSION {

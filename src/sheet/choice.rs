@@ -46,7 +46,7 @@ pub static NEVER: AtomicBool = AtomicBool::new(false);
 
 /// The refusal of work whose caller's flag is set.
 pub fn given_up() -> Refusal {
-    Refusal::new(Reason::TimedOut, "", "was given up: nobody waits for it any more")
+    Refusal::new(Reason::TimedOut, "", "was given up, because nobody waits for it")
 }
 
 /// Rehearsals of one integrator in one format at most.

@@ -209,7 +209,7 @@ impl Model {
         let is_one = integrator != Integrator::Auto && precision != Precision::Auto && substeps > 0;
         if !is_one || expected_error.is_nan() || state.corrected.is_some_and(|plan| plan.integrator == Integrator::Auto)
         {
-            let message = "is of no model: it has no scheme, format, substeps or expected error";
+            let message = "does not belong to a model: it has no scheme, format, substeps or expected error";
             return Err(Refusal::new(Reason::OutOfRange, "stepping", message));
         }
         let made = Choice { integrator, substeps, precision, expected_error: unsigned_zero(expected_error) };

@@ -207,7 +207,7 @@ impl<'s> Rehearsal<'s> {
     }
 
     /// No scheme can be expected to err by less: by so much the truth itself may be wrong. 0 if that is within the tolerance;
-    /// infinite if nothing can be foretold.
+    /// infinite if nothing can be estimated.
     pub(super) fn least_error(&self) -> f64 {
         let uncertainty = |truth: &Option<Truth>| truth.as_ref().map_or(f64::INFINITY, |truth| truth.uncertainty);
         self.margin() * self.truth.iter().map(uncertainty).fold(0.0, f64::max)

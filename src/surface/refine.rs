@@ -55,7 +55,7 @@ impl Refinement {
             return Err(Refusal::new(Reason::OutOfRange, "refinement", message));
         }
         if n > 0 && scene.sheet().is_none() {
-            let message = format!("must be 0 on a mesh, which is shown by its own vertices, but is {n}");
+            let message = format!("must be 0 on a mesh, whose own vertices are shown, but is {n}");
             return Err(Refusal::new(Reason::OutOfRange, "refinement", message));
         }
         let (points, point_spacing_m) = grid(scene);

@@ -107,7 +107,7 @@ fn read(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
 impl Image {
     /// Reads a PNG file of any colour type. Transparency is ignored.
     fn decode(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Self> {
-        let wrong = |e: png::DecodingError| refuse(path, Reason::Unreadable, format!("is no PNG image: {e}"));
+        let wrong = |e: png::DecodingError| refuse(path, Reason::Unreadable, format!("is not a PNG image: {e}"));
         let mut decoder = png::Decoder::new(Cursor::new(bytes));
         decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::STRIP_16);
         let mut reader = decoder.read_info().map_err(wrong)?;

@@ -84,8 +84,9 @@ pub fn probed(names: impl Iterator<Item = PointName>) -> pb::probe_request::Wher
     }
 }
 
-/// Where a tissue rests, as a message.
+/// The box around a tissue or a mesh, as a message. Its `top_m` is absent.
 pub fn extent(extent: &Extent) -> pb::Extent {
     let vector = geometry::vector;
-    pb::Extent { least_m: vector(extent.least_m), most_m: vector(extent.most_m), middle_m: vector(extent.middle_m()) }
+    let [least_m, most_m, middle_m] = [extent.least_m, extent.most_m, extent.middle_m()].map(vector);
+    pb::Extent { least_m, most_m, middle_m, top_m: None }
 }

@@ -253,7 +253,7 @@ typedef struct palpate_touch_options {
    */
   uint32_t axes;
   /**
-   * What positions mean. 0: they are in the device's frame, whose origin lies on the middle of the tissue. 1: they are in the
+   * What positions mean. 0: they are in the device's frame, whose origin lies on the top of the tissue. 1: they are in the
    * tissue's frame, as positions of its surface are.
    */
   uint32_t in_tissue_frame;
@@ -450,6 +450,10 @@ typedef struct palpate_extent {
    * Its middle.
    */
   struct palpate_vector middle_m;
+  /**
+   * The highest place of the surface in line with its middle: positions of devices begin there.
+   */
+  struct palpate_vector top_m;
 } palpate_extent;
 
 /**
@@ -817,8 +821,8 @@ enum palpate_result palpate_touch_begin(const struct palpate_session *session,
 
 /**
  * A loop over what was recorded, without a server: the same messages, positions and times give the same forces, bit by bit.
- * It has no copy of the tissue, whatever `prediction` says. `options` may be null; `middle_m` is the middle of the tissue, in
- * Palpate's own axes. Writes a handle for `palpate_touch_end`. Any thread.
+ * It has no copy of the tissue, whatever `prediction` says. `options` may be null; `middle_m` is where the middle of the
+ * workspace is laid in the tissue (`palpate_extent.top_m`), in Palpate's own axes. Writes a handle for `palpate_touch_end`. Any thread.
  */
 enum palpate_result palpate_touch_begin_offline(const struct palpate_touch_options *options,
                                                 struct palpate_vector middle_m,

@@ -180,7 +180,7 @@ pub unsafe extern "C" fn palpate_bridge_begin(
         *out = std::ptr::null_mut();
         if options.origin != Origin::Workspace {
             return Err(Fault::argument(
-                "in_tissue_frame is not for devices: their origin lies on the middle of the tissue",
+                "in_tissue_frame is not for devices: their origin lies on the top of the tissue",
             ));
         }
         let (Some(descriptor), Some(_), Some(_)) = (device.descriptor, device.read, device.write) else {

@@ -60,7 +60,7 @@ pub struct palpate_touch_options {
     pub tool: u32,
     /// One of `palpate_axes`: of positions and forces.
     pub axes: u32,
-    /// What positions mean. 0: they are in the device's frame, whose origin lies on the middle of the tissue. 1: they are in the
+    /// What positions mean. 0: they are in the device's frame, whose origin lies on the top of the tissue. 1: they are in the
     /// tissue's frame, as positions of its surface are.
     pub in_tissue_frame: u32,
     /// The tip holds the tissue, pulling as well as pushing; 0: it touches.

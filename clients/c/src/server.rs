@@ -52,6 +52,8 @@ pub struct palpate_extent {
     pub most_m: palpate_vector,
     /// Its middle.
     pub middle_m: palpate_vector,
+    /// The highest place of the surface in line with its middle: positions of devices begin there.
+    pub top_m: palpate_vector,
 }
 
 /// A change of the tissue under way. Not a number: it stays as it is.
@@ -206,8 +208,9 @@ fn handle(shared: &Arc<Connected>, session: Option<pb::Session>) -> Result<*mut 
     let session = session.ok_or_else(|| Fault::new(PALPATE_CONNECTION, "the server sent no session"))?;
     let extent = session.extent.unwrap_or_default();
     let place = |place: Option<pb::Vector3>| palpate_vector::own(from_vector(place.as_ref()));
-    let [least_m, most_m, middle_m] = [extent.least_m, extent.most_m, extent.middle_m].map(place);
-    let extent = palpate_extent { least_m, most_m, middle_m };
+    let top_m = extent.top_m.or(extent.middle_m);
+    let [least_m, most_m, middle_m, top_m] = [extent.least_m, extent.most_m, extent.middle_m, top_m].map(place);
+    let extent = palpate_extent { least_m, most_m, middle_m, top_m };
     let handle = palpate_session { shared: shared.clone(), session_id: session.session_id, extent };
     Ok(Box::into_raw(Box::new(handle)))
 }

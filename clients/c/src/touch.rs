@@ -156,8 +156,8 @@ pub unsafe extern "C" fn palpate_touch_begin(
 }
 
 /// A loop over what was recorded, without a server: the same messages, positions and times give the same forces, bit by bit.
-/// It has no copy of the tissue, whatever `prediction` says. `options` may be null; `middle_m` is the middle of the tissue, in
-/// Palpate's own axes. Writes a handle for `palpate_touch_end`. Any thread.
+/// It has no copy of the tissue, whatever `prediction` says. `options` may be null; `middle_m` is where the middle of the
+/// workspace is laid in the tissue (`palpate_extent.top_m`), in Palpate's own axes. Writes a handle for `palpate_touch_end`. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_begin_offline(
     options: *const palpate_touch_options,

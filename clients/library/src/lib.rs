@@ -3,7 +3,7 @@
 //! - [`connect`]: connections, plain or TLS, with the caller's credentials, deadlines, and errors in words.
 //! - [`fleet`]: which server of a fleet has a session, and calls that go there; [`followed`]: one session, from server to server.
 //! - [`touch`]: the haptic stream, for programs that send commands and render forces themselves.
-//! - [`datagrams`]: the datagrams of such a stream, which no lost packet holds up.
+//! - [`datagrams`]: the datagrams of such a stream, where one lost packet does not delay the next.
 //! - [`device`] and [`bridge`]: the trait of haptic devices, and the loop that connects one to a server at 1 kHz.
 //! - [`devices`]: devices of makers, loaded at run time, and where their workspace is laid over the tissue.
 //! - [`snapshot`]: snapshots of sessions, as servers send them.

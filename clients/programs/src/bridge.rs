@@ -51,8 +51,8 @@ pub(crate) struct Arguments {
     /// Send a pose only when the server would be wrong about the tool by more than this fraction of the force; 0: one per tick
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
     up_deadband: f64,
-    /// Of which tissues to keep a copy, which the device's loop simulates: forces then come without the delay of the network, and
-    /// samples correct them
+    /// When to keep a copy of the tissue, which the device's loop simulates: forces then come without the delay of the network,
+    /// and samples correct them
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     prediction: When,
     /// Touch by the stream alone, also where the server has datagrams
@@ -64,7 +64,7 @@ pub(crate) struct Arguments {
     /// Seed of the simulated hand's movements
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Keep the session that it made, for others: the server deletes it when nobody has used it for long
+    /// Keep the session that it made, and print its ID: the server deletes it when nobody has used it for long
     #[arg(long)]
     keep_session: bool,
     /// Print one JSON object instead of a table
@@ -126,23 +126,30 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
     if let Some(path) = &arguments.course {
         write_course(path, &served.course)?;
     }
+    let session_id = arguments.session.as_deref().or(served.made.as_deref());
     if arguments.json {
-        crate::tell!("{}", printable_json(as_json(&served)));
+        crate::tell!("{}", printable_json(as_json(&served, session_id)));
     } else {
         table::print(&rows(&served));
+    }
+    if let Some(id) = served.made.as_ref().filter(|_| arguments.keep_session) {
+        let url = &arguments.server;
+        crate::say!("palpate-client: session {id} is kept; the server deletes it when nobody has used it for long");
+        crate::say!("palpate-client: touch it again with `palpate-client bridge --server {url} --session {id}`");
+        crate::say!("palpate-client: end it with `palpate-client admin delete {id} --server {url}`");
     }
     served.lost.map_or(Ok(()), |error| Err(error.into()))
 }
 
 /// The results for programs.
-fn as_json(served: &Report) -> serde_json::Value {
+fn as_json(served: &Report, session_id: Option<&str>) -> serde_json::Value {
     let traffic = served.traffic;
     let mut report = json!({
         "connections": traffic.connections, "samples": traffic.samples, "commands_refused": traffic.refused,
         "failed_attempts": traffic.failed, "poses": traffic.poses, "datagrams_up": traffic.carried.sent,
         "datagrams_down": traffic.carried.came, "fell_back": traffic.carried.fell_back, "late_ticks": served.late_ticks, "missed_ticks": served.missed_ticks,
         "predicted_ticks": served.predicted_ticks, "largest_force_n": served.most_force_n,
-        "largest_displacement_m": traffic.deepest_m,
+        "largest_displacement_m": traffic.deepest_m, "session_id": session_id,
     });
     if let Some(envelope) = &served.envelope {
         report["energy_j"] = json!(envelope.energy_j());
@@ -176,7 +183,7 @@ fn rows(served: &Report) -> Vec<(&'static str, String)> {
     if let Some(envelope) = &served.envelope {
         let is_on = envelope.state() == RenderingState::Enabled;
         rows.push(("energy into the device", table::with_unit(envelope.energy_j(), "J")));
-        rows.push(("forces at the end", if is_on { "on" } else { "off" }.to_owned()));
+        rows.push(("forces were on at the end", if is_on { "yes" } else { "no" }.to_owned()));
         let counts = LimitCause::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0));
         rows.push(("limits that acted", table::acted(counts)));
     }

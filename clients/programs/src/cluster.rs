@@ -33,9 +33,9 @@ pub(crate) struct Arguments {
 enum Act {
     /// Show the servers: name, URL, release, threads, load, sessions, whether they take new sessions
     Nodes,
-    /// Show the sessions: which server has each, since which revision, and which one stands by
+    /// Show the sessions: which server has each, since which revision, and which is its standby
     Sessions,
-    /// Move a session to another server while it goes on; prints where it is then, and for how long no step was done
+    /// Move a session to another server while it goes on; prints its new server, and for how long it did no step
     Move {
         /// As `sessions` shows it
         session: String,

@@ -14,7 +14,7 @@ use crate::{Failure, table, within};
 /// Arguments of `devices`.
 #[derive(clap::Args)]
 pub(crate) struct Arguments {
-    /// Read this device for some seconds, set no force, and tell how well it keeps time
+    /// Read this device for some seconds, set no force, and report how well it keeps time
     #[arg(long, value_name = "NAME")]
     test: Option<String>,
     /// The maker's library, if it is not where the system looks for libraries

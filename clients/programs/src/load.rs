@@ -42,8 +42,8 @@ pub(crate) struct Arguments {
     /// Frames per second of each viewer
     #[arg(long, value_name = "HZ", default_value_t = 60.0, value_parser = rate)]
     frame_rate_hz: f64,
-    /// Clients lead tools with a tip and render forces, as devices do, in place of pushing. Of a round trip, the wait for the step
-    /// of the sample does not count: that is what a deadband is for. Sheets only, such as --scene liver
+    /// Clients lead tools with a tip and render forces, as devices do, in place of pushing. The round trip then excludes the wait
+    /// for the step of the sample, because a deadband makes samples wait. Sheets only, such as --scene liver
     #[arg(long)]
     touch: bool,
     /// With --touch: clients get a sample only when the rendered force would be off by more than this fraction

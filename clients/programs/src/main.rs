@@ -44,7 +44,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use palpate_client::Error;
-use palpate_proto::refusal::Refusal;
+use palpate_proto::refusal::{Reason, Refusal};
 
 /// Programs that talk to a Palpate server.
 #[derive(Parser)]
@@ -68,9 +68,9 @@ enum Command {
     #[command(after_help = "Examples:\n  \
         palpate-client play 3f0c….1.mcap --speed 2\n  \
         palpate-client play training.mcap --live --from 12000\n\n\
-        Viewers see the session as any other (its id is told at the beginning). Nobody can hold a tool of a session that \
-        plays; a live one is there for everybody, and stays. Each hash that the journal has is compared with that of what is \
-        played. `palpate journal replay` without a server writes records as fast as it goes.\n\n\
+        Viewers see the session like any other; its ID is printed at the beginning. Nobody can hold a tool of a session that \
+        plays. Anybody may touch a live one, and it stays after the end. Each hash of the journal is compared with the \
+        session's. `palpate journal replay` without a server writes records as fast as it goes.\n\n\
         Exit status: 0; 1 when a hash differs, the connection broke or the session was held; 2 when an input was refused.")]
     Play(play::Arguments),
     /// Simulate hand, device, network and tissue in one loop in virtual time; report how accurate and safe the touch is
@@ -95,14 +95,14 @@ enum Command {
         palpate-client bridge --scene fibrotic --device touch --deadband 0.1\n  \
         palpate-client bridge --device force-dimension --scale 0.5 --rotation-deg 0,0,90\n  \
         palpate-client bridge --device gamepad --placement my-desk.toml\n\n\
-        A name may say which one: force-dimension:1, openhaptics:'Left Device', haply:ws://localhost:10001, \
+        A name may select one of several: force-dimension:1, openhaptics:'Left Device', haply:ws://localhost:10001, \
         gamepad:/dev/input/event5. It reconnects by itself when the connection breaks; forces return when the operator asks \
         for them, by the device's first button. It deletes the session that it made when it ends. For another device, \
         implement `HapticDevice` of the crate palpate-client (clients/library).\n\n\
         Exit status: 0; 1 when the device is missing or fails, when no connection succeeded or none stood at the end; 2 when \
         an input was refused.")]
     Bridge(Box<bridge::Arguments>),
-    /// Tell which haptic devices are there; read one for some seconds, and tell how well it keeps time
+    /// List haptic devices; read one for some seconds, and report how well it keeps time
     #[command(after_help = "Examples:\n  \
         palpate-client devices\n  \
         palpate-client devices --test force-dimension\n  \
@@ -116,8 +116,8 @@ enum Command {
         palpate-client proxy 127.0.0.1:7200 127.0.0.1:7117 --delay-ms 25 --loss 0.01\n  \
         palpate-client proxy 127.0.0.1:7200 127.0.0.1:7117 --udp --jitter-ms 10 --seed 7\n\n\
         Start the server with --datagrams-advertise 127.0.0.1:7200, so that clients send their datagrams through the proxy \
-        as well. What is lost on TCP is sent again by the rule of RFC 6298, which holds up all that follows it. It ends at \
-        Ctrl-C, and tells then what went through.\n\n\
+        as well. Lost TCP packets are sent again by the rule of RFC 6298, which delays everything behind them. Ctrl-C ends the \
+        proxy, which then prints what went through.\n\n\
         Exit status: 0; 1 when it can't listen; 2 when an input was refused.")]
     Proxy(proxy::Arguments),
     /// Load a server with many sessions, haptic clients and viewers; report delays, losses and dilation
@@ -125,10 +125,12 @@ enum Command {
         palpate-client load --sessions 50 --seconds 10\n  \
         palpate-client load --sessions 20 --clients-per-session 2 --viewers 3 --scene liver --json\n  \
         palpate-client load --find-limit 'p99<2ms,dilation>0.999'\n\n\
-        Each client strokes the tissue with a command every tick of its own clock, whatever comes back: nothing rests, and a \
-        late answer delays no later command. The round trip lasts from a command to the first sample that acknowledges it \
-        and includes the wait for the step. Lost are commands that nothing acknowledged within 2 s of the end, and samples \
-        that the server dropped. The age of a frame is measured against the sample of the same step. On the server's \
+        Each client strokes the tissue with a command every tick of its own clock, without waiting for answers: no tissue \
+        rests, and a late answer delays no later command. The round trip lasts from a command to the first sample that \
+        acknowledges it \
+        and includes the wait for the step. A command that nothing acknowledged within 2 s of the end counts as lost, and so \
+        does a sample that the server dropped. The age of a frame is measured against the sample of the same step. On the \
+        server's \
         machine the generator takes processor time from it; the report says how much.\n\n\
         Exit status: 0; 1 when streams broke or the server could not be reached; 2 when an input was refused.")]
     Load(load::Arguments),
@@ -200,7 +202,7 @@ pub(crate) fn warn(message: &str) {
 
 /// An option's number, within a range.
 pub(crate) fn within(text: &str, range: std::ops::RangeInclusive<f64>) -> Result<f64, String> {
-    let value: f64 = text.parse().map_err(|_| "is no number".to_owned())?;
+    let value: f64 = text.parse().map_err(|_| "is not a number".to_owned())?;
     let wrong = || format!("must be from {} to {}", range.start(), range.end());
     if range.contains(&value) { Ok(value) } else { Err(wrong()) }
 }
@@ -232,6 +234,11 @@ async fn main() -> ExitCode {
         Err(Failure::Refused(message)) => (2, message),
     };
     crate::say!("palpate-client: {message}");
+    if message.contains(Reason::Unauthenticated.as_str()) {
+        crate::say!(
+            "palpate-client: give your token by --token-file FILE, or set the environment variable PALPATE_TOKEN to it"
+        );
+    }
     ExitCode::from(status)
 }
 

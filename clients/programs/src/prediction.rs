@@ -8,11 +8,11 @@ use palpate_client::bridge::Copies;
 /// Of which tissues a device's loop keeps a copy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum When {
-    /// Of meshes: over a rim, a fold or a lump a local model does not know what comes next
+    /// For meshes: a local model does not know the rim, fold or lump that comes next
     Auto,
-    /// Of any tissue
+    /// For every tissue
     Always,
-    /// Of none: forces come from local models alone, which take the least time and no memory
+    /// For none: forces come from local models alone, which take the least time and no memory
     Never,
 }
 

@@ -112,7 +112,11 @@ class Tissue:
         """The triangles of the surface, each the rows of its three points, counter-clockwise from outside."""
     @property
     def middle_m(self) -> tuple[float, float, float]:
-        """The middle of the tissue at rest. Devices have their origin there."""
+        """The middle of the box around the tissue at rest."""
+    @property
+    def top_m(self) -> tuple[float, float, float]:
+        """The highest place of the surface at rest in line with the middle: of a sheet, its middle. Devices have their origin
+        there."""
     def index(self, point: Point) -> int:
         """The row of a point: (i, j) of a sheet, the number of a vertex of a mesh."""
     def point(self, index: int) -> Union[tuple[int, int], int]:
@@ -235,8 +239,8 @@ class Journal:
 class Offline:
     """A touch loop without a network: the same messages, places and times give the same forces, bit by bit, as in every other language.
 
-    `limits` are those of a device, as of a Course. Places are from the middle of the device's workspace, which is laid on `middle_m`, the
-    middle of the tissue; or, `in_tissue_frame`, in the tissue's own frame.
+    `limits` are those of a device, as of a Course. Places are from the middle of the device's workspace, which is laid on `middle_m` of
+    the tissue (give its `top_m`, as a server does); or, `in_tissue_frame`, in the tissue's own frame.
     """
 
     def __init__(
@@ -266,7 +270,18 @@ class Offline:
         """How old the newest news of the tissue is; None before the first."""
 
 class Samples(Iterator[dict[str, Any]]):
-    """The samples of a session, one after the other: what tools feel."""
+    """The samples of a session, one after the other: what tools feel. Each is a dictionary:
+
+    - `step`: steps done; `time_s`: simulated time.
+    - `awake_points`: points that the step computed; `asleep`: nothing moves; `held`: the guard has ended the session.
+    - `overruns`: steps that were due and dropped; `time_dilation`: simulated over real time; `late_commands`: commands that came
+      too late for their step; `dropped_samples`: samples that this reader was too slow for. Counts are since the session began.
+    - `tools`: by its number, each tool that does something, as a dictionary. `displacement_m`: how far the tissue under the tool is from
+      where it rests, under a tip the mean over its disc; `surface_displacement_m`: the same of the surface just under its centre;
+      `velocity_m_per_s`; `force_on_tool_n`: the force of the tissue on the tool; `applied_force_n`: the force of all tools on the tissue
+      there; all in the tissue's frame. `late`: its newest command came too late; `expired`: what it did has ended by itself; `stale`:
+      no pose came for 50 ms.
+    """
 
     def take(self, count: int) -> Sampled:
         """The next samples, as arrays."""
@@ -337,6 +352,8 @@ class RemoteSession:
         `device` is a Course, or an object with `read()`, which returns ((x, y, z), enable), and `write(force_n)`, and perhaps
         `limits`, as a Course has them. A change of enable from False to True asks for forces. `prediction` says of which tissues
         the loop simulates a copy, so that forces come without the delay of the network: "auto", of meshes; "always"; "never".
+        Warns (RuntimeWarning) if no force was felt at all. Raises Refused, reason TOOL_HELD, if somebody holds the tool, this
+        session object included.
         """
     def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None:
         """Brings a tool with a tip here by the end of the next step, and takes the tool first if that is needed. It stays here until it

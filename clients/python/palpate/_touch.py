@@ -19,7 +19,7 @@ class ToolState:
 
 @dataclasses.dataclass(eq=False)
 class Course:
-    """A device that is led along `places_m`, a row for each millisecond, from the middle of the tissue, z out of it.
+    """A device that is led along `places_m`, a row for each millisecond, from the top of the tissue (`Tissue.top_m`), z up.
 
     `limits` is the name of a device (`palpate.devices()`), or a dict with force_n, continuous_n, stiffness_n_per_m,
     damping_n_s_per_m, workspace_m.
@@ -31,8 +31,8 @@ class Course:
 
 def press(depth_m=0.003, *, seconds=2.0, hover_m=0.005, at_m=(0.0, 0.0), limits="omega3"):
     """A course that comes down from `hover_m` above the tissue, presses `depth_m` deep, holds, and goes up again: smooth, a third of
-    `seconds` each. `at_m` is beside the middle of the tissue. On an organ that is the middle of the box around it, inside: give the
-    height of its surface there as a third number, such as `at_m=(0.0, 0.0, 0.035)`, or the tip touches nothing."""
+    `seconds` each. `at_m` is measured from the top of the tissue: of a sheet its middle, of an organ the highest place of its surface
+    over the middle. Where the surface of an organ lies lower, give its height as a third number, such as `at_m=(0.03, 0.0, -0.008)`."""
     moments = np.arange(max(1, round(1000 * seconds))) / max(1, round(1000 * seconds))
     down = np.clip(3 * moments, 0, 1) - np.clip(3 * moments - 2, 0, 1)
     smooth = down * down * (3 - 2 * down)
@@ -44,7 +44,13 @@ def press(depth_m=0.003, *, seconds=2.0, hover_m=0.005, at_m=(0.0, 0.0), limits=
 
 @dataclasses.dataclass(eq=False)
 class Touched:
-    """What came of a touch: time, place and force of each tick of the device's loop, and counts."""
+    """What came of a touch: a row for each tick of the device's loop, and counts.
+
+    `place_m` is where the tool was, in the tissue's frame: a device that reads (0, 0, 0) is at `status()["top_m"]`. `force_n` is what the
+    device was told, on the hand, z up. `time_s` is counted from the first tick; `enabled` says whether forces were on. `ages_s` is how
+    old the newest news of the tissue was, of ticks since the first. `limits` counts the ticks in which each limit of the safety envelope
+    acted, `energy_j` is the energy that the device gave to the hand, and `lost` says why there was no connection at the end.
+    """
 
     time_s: np.ndarray
     place_m: np.ndarray

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use glam::DVec3;
 use palpate::journal;
+use palpate::refusal::{Reason, Refusal};
 use palpate::scene;
 use palpate::shape::PointName;
 use palpate_client::bridge::{self, Copies, Options, Target};
@@ -381,7 +382,8 @@ impl RemoteSession {
     /// `device` is a Course, or an object with `read()`, which returns ((x, y, z), enable), and `write(force_n)`, and
     /// perhaps `limits`, as a Course has them. A change of enable from False to True asks for forces. `prediction` says of which
     /// tissues the loop simulates a copy, so that forces come without the delay of the network: "auto", of meshes; "always";
-    /// "never".
+    /// "never". Warns (RuntimeWarning) if no force was felt at all. Raises Refused, reason TOOL_HELD, if somebody holds the
+    /// tool, this session object included.
     #[pyo3(signature = (device, *, seconds=None, tool=0, tip=None, deadband=0.0, up_deadband=0.0, datagrams=true,
         prediction="auto", holder="python", remember=true))]
     #[allow(clippy::too_many_arguments)]
@@ -423,11 +425,19 @@ impl RemoteSession {
         };
         let options = Options { lasts, remembers: remember, keeps_session: true, copies, ..Options::default() };
         let (end, ended) = oneshot::channel();
+        let held = self.held.clone();
         answer_in_order(py, self.awaited, Some(end), async move {
             let stop = async {
                 // Dropped when nobody waits any more.
                 let _ = ended.await;
             };
+            if held.holds(tool).await {
+                let message = format!(
+                    "tool {tool} is held by this session object, which took it for pose, push or grasp: call release({tool}) \
+                     first, or touch with another tool"
+                );
+                return Err(refused(Refusal::new(Reason::ToolHeld, "tool", message)));
+            }
             let (_, report) = bridge::run(device, target, options, stop).await.map_err(of_client)?;
             Ok(Touched(report))
         })

@@ -37,7 +37,7 @@ pub(crate) fn descriptor(value: Option<Bound<'_, PyAny>>) -> PyResult<Device> {
                 "workspace_m" => device.workspace_m = number,
                 _ => {
                     let keys = ["force_n", "continuous_n", "stiffness_n_per_m", "damping_n_s_per_m", "workspace_m"];
-                    let message = format!("`{key}` is none of {}{}", keys.join(", "), did_you_mean(&key, keys));
+                    let message = format!("`{key}` is not one of {}{}", keys.join(", "), did_you_mean(&key, keys));
                     return Err(wrong("limits", message));
                 }
             }

@@ -99,6 +99,11 @@ impl Held {
         send(&session, &lease_id, vec![command]).await
     }
 
+    /// Whether this object has taken a tool, and not given it back.
+    pub(crate) async fn holds(&self, tool: u32) -> bool {
+        self.leases.lock().await.contains_key(&tool)
+    }
+
     /// Gives a tool back, which ends what it did.
     pub(crate) async fn release(self: Arc<Self>, session: Arc<Followed>, tool: u32) -> Result<(), Error> {
         let Some(lease_id) = self.leases.lock().await.remove(&tool) else { return Ok(()) };

@@ -17,7 +17,7 @@ use crate::error::{of_client, refused};
 /// other language.
 ///
 /// `limits` are those of a device, as of a Course. Places are from the middle of the device's workspace, which is laid
-/// on `middle_m`, the middle of the tissue; or, `in_tissue_frame`, in the tissue's own frame.
+/// on `middle_m` of the tissue (give its `top_m`, as a server does); or, `in_tissue_frame`, in the tissue's own frame.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Offline {
     inner: Mutex<bridge::Offline>,

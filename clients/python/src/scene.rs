@@ -417,11 +417,18 @@ impl Tissue {
         Ok(self.model.shape().nearest(place_m).index())
     }
 
-    /// The middle of the tissue at rest. Devices have their origin there.
+    /// The middle of the box around the tissue at rest.
     #[getter]
     fn middle_m(&self) -> (f64, f64, f64) {
         let middle_m = self.model.shape().extent().middle_m();
-        (middle_m.x, middle_m.y, middle_m.z)
+        middle_m.into()
+    }
+
+    /// The highest place of the surface at rest in line with the middle: of a sheet, its middle. Devices have their origin
+    /// there.
+    #[getter]
+    fn top_m(&self) -> (f64, f64, f64) {
+        self.model.shape().top_m().into()
     }
 
     fn __repr__(&self) -> String {
@@ -436,7 +443,7 @@ impl Tissue {
 }
 
 fn names(kind: Kind, folder: &Path) -> Vec<String> {
-    Collection::new(kind, folder).names()
+    Collection::new(kind, folder).names(&limits())
 }
 
 /// The names of the scenes that are shipped, and of the files in a folder.

@@ -101,7 +101,17 @@ fn at_end(awaited: bool) -> PyErr {
     if awaited { PyStopAsyncIteration::new_err(()) } else { PyStopIteration::new_err(()) }
 }
 
-/// The samples of a session, one after the other: what tools feel.
+/// The samples of a session, one after the other: what tools feel. Each is a dictionary:
+///
+/// - `step`: steps done; `time_s`: simulated time.
+/// - `awake_points`: points that the step computed; `asleep`: nothing moves; `held`: the guard has ended the session.
+/// - `overruns`: steps that were due and dropped; `time_dilation`: simulated over real time; `late_commands`: commands that came
+///   too late for their step; `dropped_samples`: samples that this reader was too slow for. Counts are since the session began.
+/// - `tools`: by its number, each tool that does something, as a dictionary. `displacement_m`: how far the tissue under the tool is from
+///   where it rests, under a tip the mean over its disc; `surface_displacement_m`: the same of the surface just under its centre;
+///   `velocity_m_per_s`; `force_on_tool_n`: the force of the tissue on the tool; `applied_force_n`: the force of all tools on the tissue
+///   there; all in the tissue's frame. `late`: its newest command came too late; `expired`: what it did has ended by itself; `stale`:
+///   no pose came for 50 ms.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Samples {
     pub(crate) stream: Arc<Mutex<Following<watch::Samples, pb::WatchSamplesRequest>>>,

@@ -4,6 +4,7 @@ use palpate_client::bridge::Report;
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
 use palpate_touch::{LimitCause, RenderingState};
+use pyo3::exceptions::PyRuntimeWarning;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
@@ -30,6 +31,7 @@ pub(crate) struct Status {
     hold_reason: String,
     held_tools: Vec<(u32, String)>,
     middle_m: (f64, f64, f64),
+    top_m: (f64, f64, f64),
     warnings: Vec<String>,
 }
 
@@ -41,7 +43,9 @@ impl Status {
             pb::SessionState::Held => "held",
             pb::SessionState::Unspecified => "unknown",
         };
-        let middle_m = from_vector(session.extent.as_ref().and_then(|extent| extent.middle_m.as_ref()));
+        let extent = session.extent.unwrap_or_default();
+        let [middle_m, top_m] =
+            [extent.middle_m.as_ref(), extent.top_m.as_ref().or(extent.middle_m.as_ref())].map(from_vector);
         Status {
             session_id: session.session_id,
             scene: session.scene_name,
@@ -60,7 +64,8 @@ impl Status {
             resting: session.resting,
             hold_reason: session.hold_reason,
             held_tools: session.held_tools.into_iter().map(|held| (held.tool, held.holder)).collect(),
-            middle_m: (middle_m.x, middle_m.y, middle_m.z),
+            middle_m: middle_m.into(),
+            top_m: top_m.into(),
             warnings: session.warnings,
         }
     }
@@ -114,6 +119,10 @@ impl<'py> IntoPyObject<'py> for Touched {
     type Error = PyErr;
 
     fn into_pyobject(self, py: Python<'py>) -> PyResult<Self::Output> {
+        if let Some(why) = self.0.unfelt() {
+            let text = std::ffi::CString::new(why)?;
+            PyErr::warn(py, &py.get_type::<PyRuntimeWarning>(), &text, 1)?;
+        }
         let Report { course, ages_s, envelope, late_ticks, missed_ticks, predicted_ticks, traffic, lost, .. } = self.0;
         let found = PyDict::new(py);
         let place_m = course.iter().flat_map(|tick| tick.place_m.to_array()).collect();

@@ -147,6 +147,32 @@ class Clients(Served, unittest.TestCase):
         self.assertTrue(np.allclose(organ.places_m - flat.places_m, (0.01, 0.0, 0.035)))
         self.assertAlmostEqual(organ.places_m[:, 2].min(), 0.032)
 
+    def test_a_press_touches_an_organ_and_one_beside_it_is_warned_of(self):
+        with palpate.connect(self.url).create_session("liver-organ") as session:
+            status = session.status()
+            self.assertEqual(status["top_m"][:2], status["middle_m"][:2])
+            self.assertEqual(status["top_m"], palpate.Tissue("liver-organ").top_m)
+            self.assertGreater(status["top_m"][2], status["middle_m"][2] + 0.01)
+            with self.assertWarnsRegex(RuntimeWarning, "never touched the tissue"):
+                session.touch(palpate.press(depth_m=-0.004, seconds=0.5))
+            touched = felt(lambda: session.touch(palpate.press(depth_m=0.003, seconds=2.0)))
+            np.testing.assert_allclose(touched.place_m[-1], np.add(status["top_m"], (0.0, 0.0, 0.005)), atol=1e-4)
+
+    def test_a_tool_that_is_held_is_refused_at_once(self):
+        server = palpate.connect(self.url)
+        with server.create_session("paper") as session:
+            session.pose(0, (0.05, 0.05, 0.01))
+            with self.assertRaises(palpate.Refused) as own:
+                session.touch(palpate.press(0.003, seconds=0.5))
+            self.assertEqual((own.exception.reason, own.exception.field), ("TOOL_HELD", "tool"))
+            self.assertIn("tool 0 is held by this session object", own.exception.message)
+            with self.assertRaises(palpate.Refused) as other:
+                server.session(session.id).touch(palpate.press(0.003, seconds=0.5))
+            self.assertEqual(other.exception.reason, "TOOL_HELD")
+            self.assertIn("tool 0 is held by `python`", other.exception.message)
+            session.release(0)
+            session.touch(palpate.press(-0.004, seconds=0.2), tool=1)
+
     def test_a_copy_of_the_tissue_is_made_when_it_is_asked_for(self):
         with palpate.connect(self.url).create_session("liver") as session:
             press = palpate.press(depth_m=0.003, seconds=2.0)

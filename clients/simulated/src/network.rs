@@ -19,7 +19,7 @@ use crate::random::Random;
 /// How messages travel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Transport {
-    /// A gRPC stream over TCP: a lost packet holds up all that follow it.
+    /// A gRPC stream over TCP: a lost packet delays all later ones.
     #[default]
     Stream,
     /// Datagrams over UDP: a lost packet is lost alone.

@@ -323,7 +323,7 @@ async function whatWasThat(): Promise<void> {
     await showOpened(opened, { keeps: true, isNew: true });
     player.focus();
   } catch (error) {
-    notice(`What was cannot be shown: ${describe(error)}.`);
+    notice(`The last ten seconds can't be shown: ${describe(error)}.`);
   } finally {
     button.disabled = false;
   }

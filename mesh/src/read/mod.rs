@@ -159,7 +159,7 @@ pub fn read_paid(
     let format = Format::of_content(bytes).or(by_name).ok_or_else(|| fail(Problem::UnknownFormat))?;
     let mut draft = Draft::new(limits, MemoryAllowance::new(bytes.len(), pay));
     if by_name.is_some_and(|by_name| by_name != format) {
-        draft.notes.push(format!("The file's content is {format:?}, whatever its extension."));
+        draft.notes.push(format!("The file's content is {format:?}, not what its extension says."));
     }
     let source = Source::new(name, bytes);
     match format {

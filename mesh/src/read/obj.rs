@@ -70,7 +70,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                 for word in words.take_while(|word| !word.starts_with(b"$")) {
                     let mut parts = word.split(|byte| *byte == b'/');
                     let index: i64 = parts.next().and_then(parsed).ok_or_else(|| {
-                        source.syntax(format!("`{}` is no corner of a face: f 1 2 3 or f 1/1 2/2 3/3", shown(word)))
+                        source.syntax(format!("`{}` is not a corner of a face: f 1 2 3 or f 1/1 2/2 3/3", shown(word)))
                     })?;
                     if index == 0 {
                         return Err(source.syntax("a face names vertex 0: OBJ counts vertices from 1"));
@@ -115,7 +115,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
             b"curv" | b"curv2" | b"surf" | b"bzp" | b"bsp" => ignored += 1,
             // Some programs begin comments with a dollar sign.
             _ if keyword.starts_with(b"$") || keyword.iter().all(u8::is_ascii_alphabetic) => {}
-            _ => return Err(source.syntax(format!("`{}` is no keyword of OBJ", shown(keyword)))),
+            _ => return Err(source.syntax(format!("`{}` is not a keyword of OBJ", shown(keyword)))),
         }
     }
     if ignored > 0 {

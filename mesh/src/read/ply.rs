@@ -57,11 +57,11 @@ fn header(source: &mut Source<'_>) -> Result<(Encoding, Vec<Element>), MeshError
                     b"ascii" => None,
                     b"binary_little_endian" => Some(Order::Little),
                     b"binary_big_endian" => Some(Order::Big),
-                    _ => return Err(source.syntax(format!("`{}` is no format of PLY", shown(name)))),
+                    _ => return Err(source.syntax(format!("`{}` is not a format of PLY", shown(name)))),
                 });
             }
             [b"element", name, count] if elements.len() < MOST => {
-                let count = parsed(count).ok_or_else(|| source.syntax("the count of an element is no number"))?;
+                let count = parsed(count).ok_or_else(|| source.syntax("the count of an element is not a number"))?;
                 elements.push(Element { name: named(name), count, properties: Vec::new() });
             }
             [b"property", rest @ ..] => {
@@ -98,7 +98,7 @@ fn integer(source: &mut Source<'_>, scalar: Scalar, encoding: Encoding, what: &s
             // Some programs write indices as 3.0.
             let number: f64 = source.number(what)?;
             if number.fract() != 0.0 {
-                return Err(source.syntax(format!("`{number}` is no whole number: {what} is expected")));
+                return Err(source.syntax(format!("`{number}` is not a whole number: {what} is expected")));
             }
             Ok(number as i64)
         }

@@ -205,7 +205,7 @@ impl<'a> Source<'a> {
     /// A count that the file states, if that many records of at least `bytes` bytes can still follow. So nothing is
     /// allocated or counted for what is not there.
     pub(super) fn count(&self, count: i64, bytes: usize, what: &str) -> Result<usize, MeshError> {
-        let count = usize::try_from(count).map_err(|_| self.syntax(format!("{count} is no count of {what}")))?;
+        let count = usize::try_from(count).map_err(|_| self.syntax(format!("{count} is not a count of {what}")))?;
         if count.checked_mul(bytes.max(1)).is_none_or(|bytes| bytes > self.rest().len() + 1) {
             return Err(self.truncated(format!("a part of {count} {what}")));
         }
@@ -235,7 +235,7 @@ pub(super) fn no_number(word: &[u8], what: &str) -> Problem {
     let pointed = parts.map(|(whole, part)| format!("{}.{part}", whole.replace('.', "")));
     let message = match pointed.filter(|pointed| pointed.parse::<f64>().is_ok()) {
         Some(pointed) => format!("`{text}` has a decimal comma: export the file with decimal points, here {pointed}"),
-        None => format!("`{text}` is no number: {what} is expected"),
+        None => format!("`{text}` is not a number: {what} is expected"),
     };
     Problem::Syntax { message }
 }

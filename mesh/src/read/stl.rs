@@ -128,7 +128,7 @@ fn text(mut source: Source<'_>, welder: &mut Welder<'_, '_>) -> Result<usize, Me
             b"solid" => is_open = true,
             b"endsolid" => is_open = false,
             b"facet" | b"outer" | b"outerloop" | b"endloop" => {}
-            _ => return Err(source.syntax(format!("`{}` is no keyword of STL", shown(&keyword)))),
+            _ => return Err(source.syntax(format!("`{}` is not a keyword of STL", shown(&keyword)))),
         }
     }
     if is_open && corners.is_empty() && welder.draft.is_closed() {

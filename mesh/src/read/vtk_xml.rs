@@ -201,12 +201,12 @@ impl<'a> Document<'a> {
         let syntax = |message: String| Problem::Syntax { message };
         let kind = attribute(element, "type").unwrap_or_default();
         let scalar =
-            scalar(&kind).ok_or_else(|| syntax(format!("`{}` is no type of an array", shown(kind.as_bytes()))))?;
+            scalar(&kind).ok_or_else(|| syntax(format!("`{}` is not a type of an array", shown(kind.as_bytes()))))?;
         let format = match attribute(element, "format").as_deref() {
             None | Some("ascii") => Format::Text,
             Some("binary") => Format::Base64,
             Some("appended") => Format::Appended,
-            Some(other) => return Err(syntax(format!("`{}` is no format of an array", shown(other.as_bytes())))),
+            Some(other) => return Err(syntax(format!("`{}` is not a format of an array", shown(other.as_bytes())))),
         };
         let offset = attribute(element, "offset").and_then(|offset| offset.parse().ok()).unwrap_or(0);
         Ok(Some(Array { role, scalar, format, offset, text: Vec::new(), byte }))
@@ -320,7 +320,7 @@ impl Stored<'_> {
         let taken = if self.is_base64 { count.div_ceil(3).checked_mul(4) } else { Some(count) };
         let stored = taken.and_then(|taken| self.bytes.get(..taken)).ok_or_else(missing)?;
         let mut bytes = if self.is_base64 {
-            STANDARD.decode(stored).map_err(|e| Problem::Syntax { message: format!("an array is no base64: {e}") })?
+            STANDARD.decode(stored).map_err(|e| Problem::Syntax { message: format!("an array is not base64: {e}") })?
         } else {
             stored.to_vec()
         };

@@ -40,7 +40,7 @@ impl Login {
         let request = AuthenticateRequest { name: user.clone(), password };
         let given = AuthClient::new(channel.clone()).authenticate(request).await?.into_inner().token;
         let Ok(mut value) = MetadataValue::try_from(given) else {
-            return Err(Status::invalid_argument("etcd has given a token that is no text"));
+            return Err(Status::invalid_argument("etcd has given a token that is not text"));
         };
         value.set_sensitive(true);
         let number = kept.as_ref().map_or(0, |token| token.number + 1);

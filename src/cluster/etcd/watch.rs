@@ -44,7 +44,7 @@ pub enum WatchEvent {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum WatchError {
     /// etcd no longer has the changes since the last one seen: list the keys, and watch from the revision after that list's.
-    #[error("etcd no longer has the changes since revision {since}: list the keys anew")]
+    #[error("etcd no longer has the changes since revision {since}: list the keys again")]
     Compacted {
         /// The first revision that was missed.
         since: u64,
@@ -55,7 +55,7 @@ pub enum WatchError {
 }
 
 /// Changes of the keys that begin with a prefix. It works only while [`Watch::next`] is waited for, and takes no more from etcd
-/// than fits the connection's window. It has a connection of its own, so that what waits there holds up nobody else.
+/// than fits the connection's window. It has a connection of its own, so that what waits there delays nothing else.
 pub struct Watch {
     calls: Arc<Calls>,
     /// The member that it was last open at; `usize::MAX` before the first.

@@ -35,10 +35,11 @@ enum Command {
     Show(show::ShowArguments),
     /// Simulate journals again and compare every hash; name the first step that differs, and how many steps were proved
     #[command(
-        after_help = "A step is proved if a hash at it or after it is equal: the inputs in the file give these bits. Who can change a \
-        file can change its hashes as well; against that, --signed-by checks the signatures of the server that wrote it.\n\n\
+        after_help = "A step is proved if a hash at it or after it is equal: the inputs in the file give these bits. Somebody \
+        who can change a file can change its hashes too. --signed-by checks the signatures of the server that wrote the \
+        file.\n\n\
         Exit status: 0 when all hashes are equal, also when there are none; 1 when one differs, or a signature is missing or \
-        wrong; 2 when a journal can't be read, is damaged, or was written by a version whose bits are others."
+        wrong; 2 when a journal can't be read, is damaged, or was written by a version that computes other bits."
     )]
     Verify(verify::VerifyArguments),
     /// Simulate a journal again, and write records as `palpate run` does; or play it on a server
@@ -49,7 +50,7 @@ enum Command {
     Export(export::ExportArguments),
     /// Write a part of a journal: a journal that verifies alone
     Cut(cut::CutArguments),
-    /// Finish a journal whose server was killed, or that is damaged, up to its last whole batch; tell what was lost
+    /// Finish a journal whose server was killed, or that is damaged, up to its last whole batch; report what was lost
     Recover(recover::RecoverArguments),
     /// Make a key with which a server signs its journals
     Key(key::KeyArguments),
@@ -83,7 +84,7 @@ impl Source {
             say!("palpate: warning: {message}");
             return Ok(());
         }
-        Err(Failure::Refused(format!("{message}, and what is written ends there")))
+        Err(Failure::Refused(format!("{message}; the output ends there")))
     }
 
     /// A replay from the beginning, or from the newest snapshot before a step.

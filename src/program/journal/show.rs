@@ -16,7 +16,7 @@ use super::output::{output, utc, written};
 pub(super) struct ShowArguments {
     /// The journal
     file: PathBuf,
-    /// Show each command; else those of one kind in a row to one tool are one line
+    /// Show each command [default: one line for successive commands of one kind to one tool]
     #[arg(long)]
     all: bool,
     /// Write JSON Lines, with each command

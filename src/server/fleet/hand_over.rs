@@ -144,7 +144,7 @@ impl Fleet {
                 let message = if node.is_empty() {
                     "no other server of the fleet takes sessions of this release".to_owned()
                 } else {
-                    format!("`{}` is none of the other servers of the fleet that give the same bits", excerpt(node))
+                    format!("the fleet has no other server `{}` that computes the same bits", excerpt(node))
                 };
                 return Err(Refusal::new(Reason::OutOfRange, "node", message));
             };
@@ -154,7 +154,7 @@ impl Fleet {
             return Err(Refusal::new(
                 Reason::NotAvailable,
                 "session_id",
-                "a session that plays what was recorded can't be moved",
+                "a session that plays a recording can't be moved",
             ));
         }
         let _moving = self.begins_to_move(&live.id)?;

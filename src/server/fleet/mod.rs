@@ -353,8 +353,10 @@ fn between_owners(standby: Option<&str>) -> Refusal {
         Some(node) => {
             format!("the server of this session is gone, and `{node}` is about to take over; try again in a second")
         }
-        None => "the server of this session is gone, and none stood by: the session goes on when that server is back"
-            .to_owned(),
+        None => {
+            "the server of this session is gone, and it had no standby: the session continues when that server is back"
+                .to_owned()
+        }
     };
     Refusal::new(Reason::Fenced, "session_id", message)
 }

@@ -150,7 +150,7 @@ impl StandBy {
         for pb::MirrorPart { session_id, run, offset, bytes } in parts {
             let name = journal::file::name(session_id, u64::from(*run));
             if journal::file::parse(&name).is_none() {
-                return Err(Refusal::new(Reason::OutOfRange, "session_id", "is no ID of a session"));
+                return Err(Refusal::new(Reason::OutOfRange, "session_id", "is not the ID of a session"));
             }
             let path = self.path(session_id, *run);
             let known = lock(&self.kept).get(session_id).map(|kept| (kept.run, kept.bytes));

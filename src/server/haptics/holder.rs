@@ -35,9 +35,8 @@ pub(super) struct Holder {
 /// A command, unless its pose is outside the declared workspace.
 fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Result<Command> {
     if let (Action::Pose { place_m, .. }, Some(device)) = (&command.action, device) {
-        let middle_m = live.model.shape().extent().middle_m();
-        let away_m = (*place_m - middle_m).length();
-        let range = format!("within {} m of the middle of the sheet, the device's workspace", device.workspace_m);
+        let away_m = (*place_m - live.model.shape().top_m()).length();
+        let range = format!("within {} m of the top of the tissue, the device's workspace", device.workspace_m);
         number("pose.position_m", away_m, &range, |away_m| away_m <= device.workspace_m)?;
     }
     Ok(command)

@@ -11,6 +11,6 @@ pub(super) fn charges(account: &Account, tools: usize) -> Result<Vec<Taken>, Ref
 
 /// The lease that a text names.
 pub(super) fn lease_id(text: &str) -> Result<LeaseId, Refusal> {
-    let wrong = |_| Refusal::new(Reason::NotHolder, "lease_id", "is none that this server gave");
+    let wrong = |_| Refusal::new(Reason::NotHolder, "lease_id", "is not a lease of this server");
     LeaseId::from_str_radix(text, 16).map_err(wrong)
 }

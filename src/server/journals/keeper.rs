@@ -163,7 +163,7 @@ impl Keeper {
         let now = now_ns();
         for Written { id, until_step, batches, noted_ns, is_still } in written {
             if let Err(error) = &synced {
-                self.break_off(&id, "what was written can't be brought to the disk", error);
+                self.break_off(&id, "written data can't be flushed to the disk", error);
                 continue;
             }
             let Some(entry) = self.entries.get_mut(&id) else { continue };

@@ -69,7 +69,7 @@ impl Player {
             played.retain_mut(|Played { live, feed, inputs }| {
                 let Some(live) = live.upgrade() else { return false };
                 if let Err(refusal) = read_ahead(feed, inputs, live.status().step) {
-                    tracing::error!(session = %live.id, %refusal, "what was recorded can't be played any further");
+                    tracing::error!(session = %live.id, %refusal, "the recording can't be played any further");
                     feed.complete();
                 }
                 feed.wants_more(0).is_some()

@@ -48,7 +48,7 @@ fn find(
     let unknown = |message: &str| Refusal::new(Reason::UnknownSession, "session_id", message.to_owned());
     // A name that is none would be a path.
     if file::parse(&file::name(session_id, 1)).is_none() {
-        return Err(unknown("is no ID of a session"));
+        return Err(unknown("is not the ID of a session"));
     }
     let listed = listed(folder)?;
     let is_it = |file: &JournalFile| file.session_id == session_id && (run == 0 || file.run == u64::from(run));
@@ -178,7 +178,7 @@ impl Recorded {
     pub(in crate::server) fn remove(&self, session_id: &str, pacer: &Pacer) -> Result<u32> {
         let folder = self.folder("session_id")?;
         if pacer.has(session_id) {
-            let message = "is that of a session that goes on: delete it first (DeleteSession)";
+            let message = "belongs to a session that still runs: delete that first (DeleteSession)";
             return Err(Refusal::new(Reason::OutOfTurn, "session_id", message));
         }
         let unreadable = |name: &str, error: std::io::Error| {

@@ -109,6 +109,10 @@ const MOST_MOVES: u32 = 8;
 /// A connection on which the server is silent for longer than this is given up.
 const SILENCE: Duration = Duration::from_secs(2);
 
+/// A stream is opened within this time, or given up. The server computes the first force law meanwhile: on a busy machine that takes
+/// seconds, and whoever gives up earlier begins it anew each time.
+const OPENING: Duration = Duration::from_secs(8);
+
 /// Largest number of commands that wait for the stream.
 const COMMANDS: usize = 64;
 
@@ -156,8 +160,9 @@ pub(super) async fn keep(
             inbound.traffic.failed += 1;
             inbound.traffic
         };
-        // Another attempt would be refused too.
-        if traffic.connections == 0 && (error.is_refusal() || error.is_denied()) {
+        // Another attempt would be refused too, or would wait for somebody who may hold the tool for hours.
+        let is_final = error.is_refusal() || error.is_denied() || is_of(&error, Reason::ToolHeld);
+        if traffic.connections == 0 && is_final {
             shared.inbound().failure = Some(error);
             return;
         }
@@ -261,10 +266,10 @@ async fn session(target: &Target, trail: &mut Trail, shared: &Shared) -> Result<
     Ok(known)
 }
 
-/// The middle of a session's tissue at rest, m.
-fn middle_m(session: &pb::Session) -> Result<DVec3, Error> {
+/// Where a device has its origin in a session's tissue, m: the top of its surface. A server that does not tell that has the middle.
+fn origin_m(session: &pb::Session) -> Result<DVec3, Error> {
     let extent = session.extent.as_ref().ok_or_else(|| broken("the server does not tell where the tissue is"))?;
-    Ok(from_vector(extent.middle_m.as_ref()))
+    Ok(from_vector(extent.top_m.as_ref().or(extent.middle_m.as_ref())))
 }
 
 fn broken(why: &str) -> Error {
@@ -284,7 +289,7 @@ async fn connect(
     warn: &(impl Fn(&str) + Sync),
 ) -> Result<(), Error> {
     let At { server, channel, answer: session } = session(target, trail, shared).await?;
-    let middle_m = middle_m(&session)?;
+    let origin_m = origin_m(&session)?;
     let mut copying = Copying::new(copier, &session, channel.clone(), target.tip);
     let (outbound, messages) = mpsc::channel(COMMANDS);
     let open = pb::TouchOpen {
@@ -304,11 +309,11 @@ async fn connect(
     };
     let silent = |_| broken("the server is silent");
     let opening = Touch::open(channel, open, ReceiverStream::new(messages));
-    let mut stream = tokio::time::timeout(SILENCE, opening).await.map_err(silent)??;
+    let mut stream = tokio::time::timeout(OPENING, opening).await.map_err(silent)??;
     trail.lease_id.clone_from(&stream.opened().lease_id);
     stream.opened().warnings.iter().for_each(|warning| warn(warning));
     let first = stream.opened().law.as_ref().ok_or_else(|| broken("the server sent no force law"))?;
-    feed.begin(first, middle_m)?;
+    feed.begin(first, origin_m)?;
     // The stream tells of every change of the tissue from now on.
     copying.begin();
     {

@@ -112,7 +112,7 @@ pub struct Options {
     pub real_time: bool,
     /// Keeps the session that was made for the target, for others; the server deletes it when nobody has used it for long.
     pub keeps_session: bool,
-    /// Called when the connection breaks, and with the server's warnings.
+    /// Called when the connection breaks, with the server's warnings, and at the end of [`run`] if no force was felt.
     pub warn: Option<Warn>,
     /// Called by the loop of [`run`] before its first tick, with its priority.
     pub begun: Option<Begun>,
@@ -155,10 +155,32 @@ pub struct Report {
     pub priority: Priority,
     /// What went over the network.
     pub traffic: Traffic,
+    /// The ID of the session that was made for the target, if one was.
+    pub made: Option<String>,
     /// Why there was no connection any more at the end.
     pub lost: Option<Error>,
     /// How the device failed, which has ended the loop; of [`run_told`] alone.
     pub failure: Option<Error>,
+}
+
+/// No hand feels a smaller force, N.
+const LEAST_FELT_N: f64 = 1e-3;
+
+/// A tool that moved the tissue by less has not touched it, m: what an earlier touch has left still moves.
+const LEAST_MOVED_M: f64 = 1e-5;
+
+impl Report {
+    /// Why no force was felt at all, in words; `None` if one was.
+    pub fn unfelt(&self) -> Option<&'static str> {
+        if self.most_force_n >= LEAST_FELT_N {
+            return None;
+        }
+        Some(if self.traffic.deepest_m >= LEAST_MOVED_M {
+            "the tool moved the tissue, but no force was rendered: ask for forces while the tool is out of the tissue"
+        } else {
+            "the tool never touched the tissue: the device has its origin on the top of the surface, with z up"
+        })
+    }
 }
 
 /// Connects a device until its time is over or `stop` completes. Returns the device and the results. The last force written
@@ -191,11 +213,11 @@ pub async fn run_told<D: HapticDevice + 'static>(
     let descriptor = device.descriptor();
     let warn = Arc::new(warn);
     let (ticker, mut line) = line(target, copies, descriptor, Origin::Workspace, keeps_session, warn.clone(), stop);
-    let news = line.news.clone();
+    let (news, of_loop) = (line.news.clone(), warn.clone());
     let (tell, ended) = oneshot::channel();
     std::thread::Builder::new().name("device".to_owned()).spawn(move || {
         let priority = if real_time { os::take_real_time_priority() } else { Priority::Usual };
-        if let (Priority::Refused(why), Some(warn)) = (&priority, &*warn) {
+        if let (Priority::Refused(why), Some(warn)) = (&priority, &*of_loop) {
             warn(&format!("the loop has no real-time priority, so other programs may delay it: {why}"));
         }
         if let Some(begun) = begun {
@@ -206,6 +228,7 @@ pub async fn run_told<D: HapticDevice + 'static>(
     })?;
     let (device, served, priority) =
         ended.await.map_err(|_| Error::Internal("the device's loop panicked".to_owned()))?;
+    let made = line.shared.inbound().made.clone();
     line.close().await;
     let tick::Served { course, envelope, late_ticks, missed_ticks, predicted_ticks, most_force_n, ages_s, failure } =
         served;
@@ -225,9 +248,13 @@ pub async fn run_told<D: HapticDevice + 'static>(
         most_force_n,
         priority,
         traffic,
+        made,
         lost,
         failure,
     };
+    if let (Some(why), Some(warn)) = (report.unfelt(), &*warn) {
+        warn(why);
+    }
     Ok((device, report))
 }
 

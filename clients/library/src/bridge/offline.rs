@@ -23,21 +23,21 @@ pub struct Offline {
 pub struct Record {
     feed: Feed,
     commands: Reader<Command>,
-    middle_m: DVec3,
+    origin_m: DVec3,
 }
 
 impl std::fmt::Debug for Record {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Record").field("middle_m", &self.middle_m).finish_non_exhaustive()
+        f.debug_struct("Record").field("origin_m", &self.origin_m).finish_non_exhaustive()
     }
 }
 
 impl Offline {
-    /// A loop of a device whose forces stay within its limits, over a tissue with its middle at `middle_m`. `up_deadband` as in
-    /// [`super::Target`]: it changes no force.
-    pub fn new(device: Device, origin: Origin, middle_m: DVec3, up_deadband: f64) -> Self {
+    /// A loop of a device whose forces stay within its limits, with the middle of its workspace on `origin_m` of the tissue.
+    /// `up_deadband` as in [`super::Target`]: it changes no force.
+    pub fn new(device: Device, origin: Origin, origin_m: DVec3, up_deadband: f64) -> Self {
         let (ticker, feed, commands) = ticker::ticker(device, origin, up_deadband);
-        Offline { ticker, record: Record { feed, commands, middle_m } }
+        Offline { ticker, record: Record { feed, commands, origin_m } }
     }
 }
 
@@ -59,7 +59,7 @@ impl Record {
         match response.message {
             Some(Heard::Opened(opened)) => {
                 let law = opened.law.ok_or_else(|| Error::Argument("`opened` has no force law".to_owned()))?;
-                self.feed.begin(&law, self.middle_m)
+                self.feed.begin(&law, self.origin_m)
             }
             Some(Heard::ForceLaw(update)) => update.law.iter().try_for_each(|law| self.feed.learn(law)),
             Some(Heard::Sample(sample)) => {

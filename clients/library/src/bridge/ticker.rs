@@ -28,8 +28,8 @@ pub(super) struct Command {
 
 /// What a tick learns, in order.
 enum Told {
-    /// A new connection, its first law and the middle of the tissue, m.
-    Begin { connection: u64, law: Law, middle_m: DVec3 },
+    /// A new connection, its first law and where the middle of the device's workspace is laid, m.
+    Begin { connection: u64, law: Law, origin_m: DVec3 },
     /// A further law of this connection, which is sound, and its number.
     Learn { number: u32, law: Law },
     /// A copy of this connection's tissue; none if that has become another.
@@ -65,7 +65,8 @@ const MOST_AHEAD_S: f64 = 3600.0;
 /// What positions of a device mean.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Origin {
-    /// They are in the device's frame, whose origin is the middle of its workspace. That is laid on the middle of the tissue.
+    /// They are in the device's frame, whose origin is the middle of its workspace. That is laid on the top of the tissue: of a sheet, on
+    /// its middle.
     #[default]
     Workspace,
     /// They are in the tissue's frame.
@@ -86,7 +87,7 @@ pub struct Ticker {
     up_deadband: f64,
     /// Of [`Told::Begin`]; 0 before the first.
     connection: u64,
-    middle_m: DVec3,
+    origin_m: DVec3,
     renderer: Renderer,
     was_asked: bool,
     news: News,
@@ -123,7 +124,7 @@ pub(super) fn ticker(device: Device, origin: Origin, up_deadband: f64) -> (Ticke
         origin,
         up_deadband,
         connection: 0,
-        middle_m: DVec3::ZERO,
+        origin_m: DVec3::ZERO,
         // Until the first connection this law is not used.
         renderer: Renderer::new(Law::linear(0.0, 0.0), Envelope::new(device, DVec3::ZERO)),
         was_asked: false,
@@ -182,7 +183,7 @@ impl Ticker {
         self.learn();
         self.has_spoken = false;
         self.place_m = match self.origin {
-            Origin::Workspace => reading.place_m + self.middle_m,
+            Origin::Workspace => reading.place_m + self.origin_m,
             Origin::Tissue => reading.place_m,
         };
         let (was_asked, place_m) = (std::mem::replace(&mut self.was_asked, reading.enable), self.place_m);
@@ -230,15 +231,15 @@ impl Ticker {
             // There is room.
             let mut give_back = |value: Used| drop(used.push(value));
             match told {
-                Told::Begin { connection, law, middle_m } => {
+                Told::Begin { connection, law, origin_m } => {
                     self.renderer.begin_with(law, |law| give_back(Used::Law(law)));
                     self.renderer.predict(None).into_iter().for_each(|copy| give_back(Used::Copy(copy)));
                     if self.connection == 0 {
-                        self.renderer.envelope = Envelope::new(self.device, middle_m);
+                        self.renderer.envelope = Envelope::new(self.device, origin_m);
                     }
                     // The envelope of an earlier connection stays: what was paused stays paused, and a rendered force falls
                     // at the slew limit.
-                    (self.connection, self.middle_m) = (connection, middle_m);
+                    (self.connection, self.origin_m) = (connection, origin_m);
                 }
                 Told::Learn { number, law } => {
                     self.renderer.learn_with(number, law, |law| give_back(Used::Law(law)));
@@ -311,17 +312,17 @@ fn law(message: &pb::ForceLaw) -> Result<Law, Error> {
 }
 
 impl Feed {
-    /// A new connection to a tissue with its middle at `middle_m`.
+    /// A new connection to a tissue; the middle of the device's workspace is laid on `origin_m`.
     ///
     /// # Errors
     /// Returns an error if the law can't be used.
-    pub(super) fn begin(&mut self, message: &pb::ForceLaw, middle_m: DVec3) -> Result<(), Error> {
+    pub(super) fn begin(&mut self, message: &pb::ForceLaw, origin_m: DVec3) -> Result<(), Error> {
         let law = law(message)?;
         self.connection += 1;
         (self.model, self.wanted_s) = (None, 0.0);
         // What a tick has not learned of the connection before.
         self.waiting.clear();
-        self.waiting.push_back(Told::Begin { connection: self.connection, law, middle_m });
+        self.waiting.push_back(Told::Begin { connection: self.connection, law, origin_m });
         self.pass_on();
         Ok(())
     }

@@ -175,7 +175,10 @@ fn state(message: &Message) -> io::Result<Option<Value>> {
 
 fn garbage(text: &str) -> io::Error {
     let shown: String = text.chars().take(60).collect();
-    io::Error::new(ErrorKind::InvalidData, format!("Haply's Inverse Service sent what is no state: `{shown}`"))
+    io::Error::new(
+        ErrorKind::InvalidData,
+        format!("Haply's Inverse Service sent something other than a state: `{shown}`"),
+    )
 }
 
 fn broken(error: &tungstenite::Error) -> io::Error {

@@ -195,7 +195,7 @@ impl Told {
             }
             0..=EV_MAX => {}
             _ => {
-                let message = format!("what comes is no event of an input device (type {kind})");
+                let message = format!("what comes is not an event of an input device (type {kind})");
                 return Err(io::Error::new(ErrorKind::InvalidData, message));
             }
         }

@@ -1,6 +1,6 @@
 //! Where a device's workspace is laid over the tissue, and the clutch.
 //!
-//! A position p of the device, from the middle of its workspace, becomes `offset + scale·R·p` from the middle of the tissue. A
+//! A position p of the device, from the middle of its workspace, becomes `offset + scale·R·p` from the top of the tissue. A
 //! force f of the tissue goes back as `force_scale·R⁻¹·f`. So the work at the device is `force_scale/scale` of the work at the
 //! tissue: what the envelope keeps passive there is passive here, whatever the scale. A spring of the tissue is felt
 //! `scale·force_scale` times as stiff, and the device's limits are declared to the server divided by that. As `force_scale` is at
@@ -9,7 +9,7 @@
 use std::time::Instant;
 
 use glam::{DQuat, DVec3, EulerRot};
-use palpate_proto::refusal::{Reason, Refusal, Result, finite_vector, number};
+use palpate_proto::refusal::{Reason, Refusal, Result, finite_vector, legible, number};
 use palpate_touch::Device;
 
 use crate::bridge::Tick;
@@ -42,7 +42,7 @@ pub enum Enables {
 /// Where a device is laid over the tissue.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Placement {
-    /// The middle of the workspace, from the middle of the tissue, m.
+    /// The middle of the workspace, from the top of the tissue, m.
     pub offset_m: DVec3,
     /// The device is turned about the tissue's x, then y, then z axis by so much, degrees.
     pub rotation_deg: DVec3,
@@ -78,8 +78,8 @@ impl Placement {
         let Placement { offset_m, rotation_deg, scale, force_scale, enable, clutch_button } = *self;
         finite_vector("offset_m", offset_m)?;
         if offset_m.length() > OFFSET_M {
-            let message =
-                format!("must be within {OFFSET_M} m of the middle of the tissue, but is {} m off", offset_m.length());
+            let off_m = legible(offset_m.length());
+            let message = format!("must be within {OFFSET_M} m of the top of the tissue, but is {off_m} m off");
             return Err(Refusal::new(Reason::OutOfRange, "offset_m", message));
         }
         finite_vector("rotation_deg", rotation_deg)?;

@@ -29,20 +29,20 @@ const LEAD_S: f64 = 3.0;
 struct Laid {
     device: Simulated,
     spot: Spot,
-    /// Where a bridge lays that middle, m: the middle of the tissue.
-    middle_m: DVec3,
+    /// Where a bridge lays that middle, m: the top of the tissue.
+    top_m: DVec3,
 }
 
 impl HapticDevice for Laid {
     fn descriptor(&self) -> Device {
         let device = self.device.descriptor();
-        // A bridge measures the workspace from the middle of the tissue.
-        Device { workspace_m: device.workspace_m + self.spot.at_m.distance(self.middle_m), ..device }
+        // A bridge measures the workspace from the top of the tissue.
+        Device { workspace_m: device.workspace_m + self.spot.at_m.distance(self.top_m), ..device }
     }
 
     fn read(&mut self) -> std::io::Result<Reading> {
         let reading = self.device.read()?;
-        Ok(Reading { place_m: self.spot.of_tissue(self.spot.at_m + reading.place_m) - self.middle_m, ..reading })
+        Ok(Reading { place_m: self.spot.of_tissue(self.spot.at_m + reading.place_m) - self.top_m, ..reading })
     }
 
     fn write(&mut self, force_n: DVec3) -> std::io::Result<()> {
@@ -56,7 +56,7 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     let direct = with_tissue(|| Direct::new(setup, LEAD_S))?;
     let task = Task::new(DVec3::ZERO, LEAD_S, *duration_s, direct.scale, &mut Random::new(*seed, 0));
     let device = Simulated::new(*device, *hand, task, true);
-    let laid = Laid { device, spot: *spot, middle_m: model.shape().extent().middle_m() };
+    let laid = Laid { device, spot: *spot, top_m: model.shape().top_m() };
     let target = Target {
         server,
         session: Session::New { scene: model.scene.name.clone() },

@@ -64,7 +64,8 @@ pub(crate) struct Arguments {
     /// Fraction of the packets that are lost. A stream sends them again, which delays all later ones
     #[arg(long, value_name = "FRACTION", conflicts_with = "profile")]
     loss: Option<f64>,
-    /// How samples and poses travel: stream (TCP: a lost packet holds up all that follow it) or datagram (UDP: it is lost alone)
+    /// How samples and poses travel: stream (TCP: a lost packet delays all later ones) or datagram (UDP: a lost packet delays no
+    /// other)
     #[arg(long, default_value = "stream", conflicts_with_all = ["random", "boundary"])]
     transport: Transport,
     /// Mean number of packets that are lost in a row; 1: each by itself
@@ -79,7 +80,7 @@ pub(crate) struct Arguments {
     /// With --bandwidth-kbit: a datagram that would wait longer than this for the link is dropped, ms
     #[arg(long, value_name = "MS", default_value_t = 100.0, requires = "bandwidth_kbit")]
     queue_ms: f64,
-    /// A second tool, which moves by a seed of its own, presses so far from the place of the task, mm
+    /// A second tool with its own seed presses at this distance from the place of the task, mm
     #[arg(long, value_name = "MM", default_value_t = 0.0, conflicts_with_all = ["random", "boundary"])]
     second_tool_mm: f64,
     /// The tissue changes at this time, s
@@ -91,7 +92,7 @@ pub(crate) struct Arguments {
     /// Stall the client once a second, at a random moment, for this long, ms; the device holds its last force
     #[arg(long, value_name = "MS", default_value_t = 0.0, conflicts_with = "random")]
     stall_ms: f64,
-    /// A network by name, instead of the three options above
+    /// A network by name, instead of --rtt-ms, --jitter-ms and --loss
     #[arg(long)]
     profile: Option<Profile>,
     /// How the client renders samples [default: prediction on a mesh, model on a sheet, as `bridge` does]

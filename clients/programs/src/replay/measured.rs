@@ -51,7 +51,7 @@ impl<'s> Measured<'s> {
             peak_reaction_n: 0.0,
             first: None,
             last: (0, 0),
-            curves: Curves::default(),
+            curves: Curves::of(&*script.shape),
         })
     }
 
@@ -74,9 +74,9 @@ impl<'s> Measured<'s> {
             let displacement_m = from_vector(tool.displacement_m.as_ref());
             let reaction_n = from_vector(tool.force_on_tool_n.as_ref());
             self.largest_displacement_m = self.largest_displacement_m.max(displacement_m.length());
-            if tool.tool as usize == plotted && is_there && tool.point.is_some() {
-                // The vertical component, as in the paper's figures.
-                self.curves.add(sample.simulation_time_s, displacement_m.z, reaction_n.z);
+            let has_touched = tool.point.is_some() || tool.vertex.is_some();
+            if tool.tool as usize == plotted && is_there && has_touched {
+                self.curves.add(sample.simulation_time_s, displacement_m, reaction_n);
             }
         }
     }

@@ -205,7 +205,7 @@ impl Report {
             }
         }
         if whole.broken > 0 {
-            whys.push(format!("{} streams broke, the first because {}", whole.broken, first("of what is not known")));
+            whys.push(format!("{} streams broke, the first because {}", whole.broken, first("of an unknown cause")));
         }
         (!whys.is_empty()).then(|| whys.join("; "))
     }
