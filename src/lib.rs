@@ -8,6 +8,7 @@
 pub mod arguments;
 pub mod budget;
 pub mod cluster;
+pub mod files;
 pub mod force_law;
 mod ids;
 pub mod journal;

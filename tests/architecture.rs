@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// Each module of `palpate` may use those before it.
-const MODULES: [&str; 22] = [
+const MODULES: [&str; 23] = [
     "refusal",
     "printable",
     "limits",
@@ -14,6 +14,7 @@ const MODULES: [&str; 22] = [
     "priority",
     "ids",
     "memory",
+    "files",
     "arguments",
     "budget",
     "shape",
@@ -65,17 +66,19 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 9] = [
 ];
 
 /// The modules of `palpate` that a module of the programs may use. `link` simulates the far end; the others read files.
-const FOR_PROGRAMS: [(&str, &[&str]); 6] = [
+const FOR_PROGRAMS: [(&str, &[&str]); 7] = [
+    ("credentials", &["files"]),
     ("link", &["force_law", "limits", "memory", "scene", "session", "sheet"]),
     ("main", &["arguments"]),
-    ("placement", &["scene"]),
-    ("play", &["journal", "scene", "shape", "wire"]),
+    ("placement", &["files", "scene"]),
+    ("play", &["files", "journal", "scene", "shape", "wire"]),
     ("prediction", &["journal"]),
     ("replay", &["limits", "scene", "shape", "wire"]),
 ];
 
 /// The same of simulated users: both read files.
-const FOR_SIMULATED: [(&str, &[&str]); 2] = [("load", &["scene"]), ("scene_file", &["limits", "scene", "wire"])];
+const FOR_SIMULATED: [(&str, &[&str]); 2] =
+    [("load", &["files", "scene"]), ("scene_file", &["files", "limits", "scene", "wire"])];
 
 /// The modules of `palpate` that libpalpate may use: `server` reads the text of a scene, `options` makes copies of tissues.
 const FOR_LIBPALPATE: [(&str, &[&str]); 2] =

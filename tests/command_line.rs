@@ -95,7 +95,9 @@ fn a_server_that_does_not_begin_says_no_address() {
     for (more, told) in [
         (&["file"][..], "journal: file: can't be used"),
         (&["journals", "--journal-key", "file"], "file: has no private key in PEM"),
-        (&["journals", "--journal-key", "none"], "none: can't be read"),
+        (&["journals", "--journal-key", "none"], "none: can't be opened"),
+        // Which is read to its end.
+        (&["journals", "--journal-key", "/dev/zero"], "/dev/zero: is larger than the limit of 1048576 bytes"),
     ] {
         let (status, text) = palpate(folder.path(), &[&usual[..], more].concat());
         assert!(status == 2 && text.contains(told) && !text.contains("listens"), "{status}: {text}");

@@ -333,9 +333,12 @@ async fn servers_know_each_other_by_certificates_and_clients_by_tokens() {
     let made = server::palpate(&["token", "--name", "ann", "--role", roles, "--tokens", &tokens]);
     let token = String::from_utf8(made.stdout).unwrap().trim().to_owned();
     let urls = [(); 2].map(|()| format!("https://127.0.0.1:{}", fleet::port()));
+    let certify = |at: usize, name: &str| {
+        let (cert, key) = authority.sign_node(&format!("{name}-{at}"));
+        (write(&format!("{at}.pem"), &cert), write(&format!("{at}.key"), &key))
+    };
     let serve = |at: usize| {
-        let (cert, key) = authority.sign_node(&format!("node-{at}"));
-        let (cert, key) = (write(&format!("{at}.pem"), &cert), write(&format!("{at}.key"), &key));
+        let (cert, key) = certify(at, "node");
         let journal = folder.path().join(format!("journal-{at}")).display().to_string();
         let of_the_fleet =
             ["--cluster", &etcd.endpoints()[0], "--advertise", &urls[at], "--cluster-ca", &ca, "--journal", &journal];
@@ -398,4 +401,16 @@ async fn servers_know_each_other_by_certificates_and_clients_by_tokens() {
         let mut calls = pb::node_service_client::NodeServiceClient::new(channel);
         assert!(calls.create_here(create_here()).await.is_err());
     }
+    // Both get another certificate while they run, and the names of the first have no role any more: what they show each other from
+    // then on are the new ones.
+    (0..2).for_each(|at| drop(certify(at, "renewed")));
+    std::fs::write(&tokens, std::fs::read_to_string(&tokens).unwrap().replace("\"node-", "\"renewed-")).unwrap();
+    let source = pb::create_session_request::Source::SceneName("paper".into());
+    let request = pb::CreateSessionRequest { source: Some(source), ..pb::CreateSessionRequest::default() };
+    let session = sessions.create_session(request).await.unwrap().into_inner().session.unwrap();
+    until("a session of servers with other certificates has a standby", async || {
+        let request = pb::LocateSessionRequest { session_id: session.session_id.clone() };
+        !sessions.locate_session(request).await.unwrap().into_inner().ownership.unwrap().standby.is_empty()
+    })
+    .await;
 }

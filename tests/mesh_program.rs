@@ -66,7 +66,7 @@ fn what_is_refused_says_element_place_and_what_to_do() {
     };
     refused(OCTAHEDRON, &["organ.obj"], &["no unit", "--unit mm"]);
     refused(OCTAHEDRON, &["organ.obj", "--unit", "inch"], &["`inch` is not a unit", "0.0254"]);
-    refused(OCTAHEDRON, &["other.obj", "--unit", "mm"], &["other.obj: can't be read"]);
+    refused(OCTAHEDRON, &["other.obj", "--unit", "mm"], &["other.obj: can't be opened"]);
     refused(OCTAHEDRON, &["organ.obj", "--unit", "mm", "--output", "a.vtk"], &["--output", ".ply"]);
     refused("v 1 2\n", &["organ.obj", "--unit", "mm"], &["organ.obj: line 1:", "v x y z"]);
     let fin = format!("{OCTAHEDRON}v 70 70 0\nf 1 3 7\n");

@@ -1,9 +1,10 @@
 //! `palpate mesh`: reads a mesh file, reports what it is and what is wrong with it, mends it and writes it.
 
 use std::fmt::{self, Display};
-use std::io::{ErrorKind, Read, Write};
+use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
+use palpate::files;
 use palpate::printable::{printable, printable_json};
 use palpate_mesh::decimate::{LEAST_VERTICES, decimate};
 use palpate_mesh::repair::{Measure, Repair, repair};
@@ -63,13 +64,6 @@ struct ToldGroup {
     vertices: usize,
 }
 
-/// Reads at most as many bytes as a mesh file may have, and one more.
-fn bytes_of(path: &Path, limits: &ReadLimits) -> std::io::Result<Vec<u8>> {
-    let mut bytes = Vec::new();
-    std::fs::File::open(path)?.take(limits.bytes as u64 + 1).read_to_end(&mut bytes)?;
-    Ok(bytes)
-}
-
 /// Checks a mesh; mends and writes it if asked to.
 pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     let name = arguments.file.display().to_string();
@@ -87,10 +81,9 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
         .transpose()
         .map_err(|problem: palpate_mesh::Problem| Failure::Refused(format!("--output: {problem}")))?;
     let limits = ReadLimits::default();
-    let bytes = bytes_of(&arguments.file, &limits)
-        .map_err(|e| Failure::Refused(format!("{name}: can't be read: {e}; give an existing mesh file")))?;
+    let bytes = files::read(&arguments.file, limits.bytes as u64)?;
     let folder = arguments.file.parent().unwrap_or(Path::new(""));
-    let neighbours = |name: &str| bytes_of(&folder.join(name), &limits).ok();
+    let neighbours = |name: &str| files::read_regular(&folder.join(name), limits.bytes as u64).ok();
     let found = match read(&name, &bytes, unit, &neighbours, &limits) {
         Ok(found) => found,
         Err(error) => return refuse(arguments, &name, error, unit),

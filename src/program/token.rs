@@ -3,6 +3,7 @@
 use std::io::Write;
 use std::path::PathBuf;
 
+use palpate::files;
 use palpate::server::identity::{self, Role};
 
 use super::Failure;
@@ -33,11 +34,10 @@ pub(crate) fn token(arguments: &TokenArguments) -> Result<(), Failure> {
         );
         return printed.map_err(|e| Failure::Failed(e.to_string()));
     };
-    match std::fs::read_to_string(path) {
-        // The file with the entry has to be one that a server takes: another of that name is refused here, with its reason.
-        Ok(text) => drop(identity::Credentials::parse(path, &format!("{text}\n{entry}"))?),
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {}
-        Err(e) => return Err(Failure::Refused(format!("{}: can't be read: {e}", path.display()))),
+    // The file with the entry has to be one that a server takes: another of that name is refused here, with its reason.
+    if path.symlink_metadata().is_ok() {
+        let text = files::read_regular_text(path, files::MOST_SECRET_BYTES)?;
+        identity::Credentials::parse(path, &format!("{text}\n{entry}"))?;
     }
     let refuse = |e: std::io::Error| Failure::Refused(format!("{}: can't be written: {e}", path.display()));
     let mut options = std::fs::OpenOptions::new();

@@ -2,11 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use super::document::{Document, read_text};
+use super::document::Document;
 use super::kind::{Kind, ORDER};
 use super::reader::made_for;
 use super::script::{self, Script};
 use super::{BUILT_IN, Scene};
+use crate::files;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt};
 
@@ -82,10 +83,10 @@ impl Collection {
         names
     }
 
-    /// The file of that name in the folder.
+    /// The file of that name in the folder, whatever it is: who reads it tells what is wrong with it.
     fn file(&self, name: &str) -> Option<PathBuf> {
         let path = self.folder.join(format!("{name}.toml"));
-        (is_name(name) && path.is_file()).then_some(path)
+        (is_name(name) && path.symlink_metadata().is_ok()).then_some(path)
     }
 
     fn has(&self, name: &str) -> bool {
@@ -101,7 +102,7 @@ impl Collection {
     pub fn text(&self, name: &str, others: &Collection, limits: &Limits) -> Result<(String, String)> {
         if let Some(path) = self.file(name) {
             let file = format!("{name}.toml");
-            let text = read_text(&path, limits.file_bytes)
+            let text = files::read_regular_text(&path, limits.file_bytes)
                 .map_err(|refusal| Refusal { place: Some(file.clone()), ..refusal })?;
             self.refuse_other_kind(&file, &text)?;
             return Ok((file, text));
@@ -164,7 +165,7 @@ pub fn find_scene(path: &Path, folder: &Path, assignments: &[String], limits: &L
 fn script_text(path: &Path, limits: &Limits) -> Result<(String, String, PathBuf)> {
     let of_file = |path: &Path| {
         let folder = path.parent().unwrap_or(Path::new("")).to_owned();
-        Ok((path.display().to_string(), read_text(path, limits.file_bytes)?, folder))
+        Ok((path.display().to_string(), files::read_text(path, limits.file_bytes)?, folder))
     };
     let Some(name) = name_in(path) else { return of_file(path) };
     let scripts = Collection::new(Kind::Script, Path::new(SCRIPTS)).for_user();
@@ -231,5 +232,29 @@ mod tests {
         assert!(swapped.message.contains("`vertical-60` is a script: give the scene first"), "{swapped}");
         assert!(scenes.text("../paper", &scripts, &limits).is_err());
         assert!(scripts.text("vertical-60", &scenes, &limits).is_ok());
+    }
+    /// Opening a pipe waits for somebody who writes into it: such a file, or one that a scene names, would hold a server's start.
+    #[cfg(unix)]
+    #[test]
+    fn what_is_no_file_is_told_as_that_and_nobody_waits_for_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        for pipe in ["pipe.toml", "pipe.obj"] {
+            assert!(std::process::Command::new("mkfifo").arg(path(pipe)).status().unwrap().success());
+        }
+        std::os::unix::fs::symlink("nowhere", path("dangling.toml")).unwrap();
+        std::os::unix::fs::symlink("/dev/zero", path("zero.toml")).unwrap();
+        std::fs::create_dir(path("folder.toml")).unwrap();
+        std::fs::write(path("mesh.toml"), "[mesh]\nfile = \"pipe.obj\"\nunit = \"m\"\npoint_mass_kg = 1e-3\n").unwrap();
+        for (name, told) in [
+            ("pipe", "pipe.toml: is not a regular file"),
+            ("dangling", "dangling.toml: can't be opened"),
+            ("zero", "zero.toml: is not a regular file"),
+            ("folder", "folder.toml: is a folder"),
+            ("mesh", "mesh.file: pipe.obj: is not a regular file"),
+        ] {
+            let refused = find_scene(Path::new(name), folder.path(), &[], &Limits::default()).unwrap_err().to_string();
+            assert!(refused.contains(told), "{refused}");
+        }
     }
 }

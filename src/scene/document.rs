@@ -2,8 +2,6 @@
 //! key. `--set` overrides values before they are read.
 
 use std::collections::BTreeMap;
-use std::io::Read;
-use std::path::Path;
 
 use glam::{DVec2, DVec3};
 use toml::de::{DeTable, DeValue};
@@ -48,39 +46,6 @@ impl Value {
             Value::Other => "a date",
         }
     }
-}
-
-/// Reads at most `limit` bytes of UTF-8, also from a pipe or device.
-///
-/// # Errors
-/// Refuses a path that can't be read, a longer text, and text that is not UTF-8.
-pub fn read_text(path: &Path, limit: u64) -> Result<String> {
-    String::from_utf8(read_bytes(path, limit)?).map_err(|e| Refusal {
-        place: Some(path.display().to_string()),
-        ..Refusal::new(Reason::Unreadable, "", format!("is not UTF-8 text: {e}"))
-    })
-}
-
-/// Reads at most `limit` bytes, also from a pipe or device.
-///
-/// # Errors
-/// Refuses a path that can't be read, and a longer file.
-pub fn read_bytes(path: &Path, limit: u64) -> Result<Vec<u8>> {
-    let place = path.display().to_string();
-    let refuse = |reason, message: String| Refusal { place: Some(place.clone()), ..Refusal::new(reason, "", message) };
-    let file = std::fs::File::open(path).map_err(|e| refuse(Reason::Unreadable, format!("can't be opened: {e}")))?;
-    let too_large = || refuse(Reason::TooLarge, format!("is larger than the limit of {limit} bytes"));
-    if file.metadata().is_ok_and(|meta| meta.len() > limit) {
-        return Err(too_large());
-    }
-    let mut bytes = Vec::new();
-    file.take(limit + 1)
-        .read_to_end(&mut bytes)
-        .map_err(|e| refuse(Reason::Unreadable, format!("can't be read: {e}")))?;
-    if bytes.len() as u64 > limit {
-        return Err(too_large());
-    }
-    Ok(bytes)
 }
 
 impl Document {

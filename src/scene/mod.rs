@@ -25,6 +25,7 @@ mod zero;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use crate::files;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
 use crate::shape::{PointId, RestShape};
@@ -313,7 +314,7 @@ impl Scene {
     /// # Errors
     /// Refuses a file that can't be read, and as [`Scene::parse`] does.
     pub fn load(path: &Path, assignments: &[String], limits: &Limits) -> Result<Self> {
-        let text = document::read_text(path, limits.file_bytes)?;
+        let text = files::read_text(path, limits.file_bytes)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         Self::parse_in(folder, &path.display().to_string(), &text, assignments, limits)
     }

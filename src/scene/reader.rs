@@ -7,13 +7,14 @@ use glam::{DVec2, DVec3};
 use palpate_touch::{Coupling, Tip};
 
 use super::check::{check_force, check_free, check_reach, check_tip};
-use super::document::{self, Document, Fields, Item};
+use super::document::{Document, Fields, Item};
 use super::kind::Kind;
 use super::profile::{
     CentreProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile, weights,
 };
 use super::script::Script;
 use super::{Change, Scene};
+use crate::files;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, did_you_mean, legible, not_negative, number, positive, unsigned_zero};
 use crate::shape::{self, PointId};
@@ -24,7 +25,7 @@ impl Script {
     /// # Errors
     /// Refuses a script that can't be read, parsed or bound to the scene.
     pub fn load(path: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
-        let text = document::read_text(path, limits.file_bytes)?;
+        let text = files::read_text(path, limits.file_bytes)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         Self::parse(&path.display().to_string(), &text, folder, scene, limits)
     }
@@ -355,7 +356,7 @@ impl Binding<'_> {
     }
 
     fn trace(&mut self, item: &Item<'_>, path: &Path) -> Result<Vec<(u64, DVec3)>> {
-        let text = document::read_text(path, self.limits.trace_bytes)
+        let text = files::read_regular_text(path, self.limits.trace_bytes)
             .map_err(|refusal| item.refuse(refusal.reason, format!("{} {}", path.display(), refusal.message)))?;
         let refuse = |line: usize, message: String| {
             let place = format!("{}:{line}", path.display());

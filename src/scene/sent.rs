@@ -6,8 +6,9 @@ use palpate_mesh::TriangleMesh;
 use palpate_mesh::write::{Format, write};
 
 use super::Mesh;
-use super::document::{Document, Fields, read_text};
+use super::document::{Document, Fields};
 use super::source::unit_text;
+use crate::files;
 use crate::limits::Limits;
 use crate::refusal::Result;
 
@@ -27,7 +28,7 @@ pub struct MeshFile {
 /// # Errors
 /// Refuses a file that can't be read.
 pub fn mesh_file(scene: &Path, limits: &Limits) -> Result<Option<MeshFile>> {
-    let text = read_text(scene, limits.file_bytes)?;
+    let text = files::read_text(scene, limits.file_bytes)?;
     let folder = scene.parent().unwrap_or(Path::new(""));
     Ok(said(&scene.display().to_string(), &text)?
         .map(|said| MeshFile { path: said.path.map(|path| folder.join(path)), ..said }))

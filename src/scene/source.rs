@@ -6,7 +6,8 @@ use std::sync::{Arc, Mutex};
 use palpate_mesh::organ::{self, Organ, OrganError};
 use palpate_mesh::{ReadLimits, TriangleMesh, Unit};
 
-use super::document::{Fields, Item, read_bytes};
+use super::document::{Fields, Item};
+use crate::files;
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::refusal::{Reason, Result, excerpt};
@@ -63,12 +64,12 @@ impl Files<'_> {
             Files::Given(_, bytes) => (bytes.to_owned(), None),
             Files::In(folder) => {
                 let path = folder.join(&name);
-                let bytes = read_bytes(&path, limits.mesh_bytes)
+                let bytes = files::read_regular(&path, limits.mesh_bytes)
                     .map_err(|refusal| item.refuse(refusal.reason, format!("{name}: {}", refusal.message)))?;
                 (bytes, Some(path))
             }
         };
-        let beside = |name: &str| read_bytes(&path.as_ref()?.parent()?.join(name), limits.mesh_bytes).ok();
+        let beside = |name: &str| files::read_regular(&path.as_ref()?.parent()?.join(name), limits.mesh_bytes).ok();
         let most = usize::try_from(limits.mesh_bytes).unwrap_or(usize::MAX);
         let within = ReadLimits { bytes: most, vertices: limits.points, triangles: limits.points.saturating_mul(4) };
         let found = palpate_mesh::read(&name, &bytes, unit, &beside, &within);

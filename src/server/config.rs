@@ -7,9 +7,10 @@ use serde::Deserialize;
 use super::address::host_and_port;
 use super::cluster_config::{Beside, ClusterConfig};
 use super::journals::keep::Keep;
+use crate::files;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number, positive};
-use crate::scene::document::{nearest_name, read_text};
+use crate::scene::document::nearest_name;
 
 /// Everything that you can configure. Absent keys keep their defaults.
 #[derive(Debug, Clone, Deserialize)]
@@ -113,7 +114,7 @@ impl Config {
     /// # Errors
     /// Returns an error if the file can't be read, or if the configuration is invalid.
     pub fn load(path: &Path) -> Result<Self> {
-        Config::parse(&path.display().to_string(), &read_text(path, Limits::default().file_bytes)?)
+        Config::parse(&path.display().to_string(), &files::read_text(path, Limits::default().file_bytes)?)
     }
 
     /// Parses a configuration; refusals call it `name`.

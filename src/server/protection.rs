@@ -11,7 +11,10 @@ use super::tls::{self, Tls};
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Time between two checks of when certificates expire.
-const DAY: Duration = Duration::from_secs(86_400);
+const MINUTE: Duration = Duration::from_secs(60);
+
+/// What will expire soon is told again after so many.
+const MINUTES_OF_DAY: u32 = 24 * 60;
 
 /// The protection of one server.
 pub(super) struct Protection {
@@ -70,13 +73,10 @@ impl Protection {
     pub(super) async fn watch(&self) {
         let tls = async {
             let Some(tls) = &self.tls else { return std::future::pending().await };
-            let mut days = tokio::time::interval(DAY);
-            // The first tick is at once; loading has checked the certificates already.
-            days.tick().await;
             let warning = async {
-                loop {
-                    days.tick().await;
-                    tls.get().warn_of_expiry();
+                for minute in 1u32.. {
+                    tokio::time::sleep(MINUTE).await;
+                    tls.get().warn_of_expiry(minute % MINUTES_OF_DAY == 0);
                 }
             };
             tokio::join!(tls.clone().watch(), warning);

@@ -1,6 +1,5 @@
 //! Values made from files, and made again when the files change: certificates, keys, tokens.
 
-use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -10,6 +9,7 @@ use tokio::time::MissedTickBehavior;
 use tracing::{info, warn};
 use xxhash_rust::xxh3::xxh3_128;
 
+use crate::files;
 use crate::lock::lock;
 use crate::pace::clock::now_ns;
 use crate::refusal::{Reason, Refusal, Result};
@@ -19,9 +19,6 @@ const INTERVAL: Duration = Duration::from_millis(500);
 
 /// A check that takes longer is reported: the files may be on a disk that does not answer.
 const PATIENCE: Duration = Duration::from_secs(5);
-
-/// Largest size of one file, bytes.
-const MOST_BYTES: u64 = 1 << 20;
 
 /// For this long an empty file counts as one that is being written; then it takes effect as an empty file.
 const EMPTY_NS: u64 = 60_000_000_000;
@@ -174,33 +171,7 @@ impl<T: Send + Sync + 'static> Reloaded<T> {
 }
 
 fn read(paths: &[PathBuf]) -> Result<Vec<String>> {
-    paths.iter().map(|path| read_file(path).map_err(|message| of_file(path)(unreadable(message)))).collect()
-}
-
-fn unreadable(message: impl Into<String>) -> Refusal {
-    Refusal::new(Reason::Unreadable, "", message)
-}
-
-/// Reads a file as text. It opens the file without blocking, which an open of a pipe without a writer would do.
-fn read_file(path: &Path) -> std::result::Result<String, String> {
-    let mut options = std::fs::OpenOptions::new();
-    options.read(true);
-    #[cfg(unix)]
-    {
-        let flags = rustix::fs::OFlags::NONBLOCK.bits().cast_signed();
-        std::os::unix::fs::OpenOptionsExt::custom_flags(&mut options, flags);
-    }
-    let file = options.open(path).map_err(|e| format!("can't be opened: {e}"))?;
-    let meta = file.metadata().map_err(|e| format!("can't be read: {e}"))?;
-    if !meta.is_file() {
-        return Err("is not a regular file".to_owned());
-    }
-    let mut bytes = Vec::new();
-    file.take(MOST_BYTES + 1).read_to_end(&mut bytes).map_err(|e| format!("can't be read: {e}"))?;
-    if bytes.len() as u64 > MOST_BYTES {
-        return Err(format!("is larger than the limit of {MOST_BYTES} bytes"));
-    }
-    String::from_utf8(bytes).map_err(|e| format!("is not UTF-8 text: {e}"))
+    paths.iter().map(|path| files::read_regular_text(path, files::MOST_SECRET_BYTES)).collect()
 }
 
 fn digest(texts: &[String]) -> u128 {

@@ -1,7 +1,7 @@
 //! TLS and mutual TLS: the server's certificate, and the authorities of the client certificates that it accepts.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::pki_types::pem::PemObject;
@@ -11,32 +11,61 @@ use tokio_rustls::rustls::{RootCertStore, ServerConfig};
 use tracing::warn;
 
 use super::reload::{Reloaded, of_file, warn_if_readable};
-use super::validity;
+use super::validity::{self, DAY_S};
+use crate::lock::lock;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// The TLS configuration of new connections.
 pub(super) struct Tls {
     pub(super) config: Arc<ServerConfig>,
-    /// The file of each certificate, and when it expires, s since 1970.
-    expiries: Vec<(PathBuf, i64)>,
+    expiries: Mutex<Vec<Expiry>>,
 }
 
-/// The log warns of a certificate this long before it expires, s.
-const NEAR_S: i64 = 14 * validity::DAY_S;
+/// When a certificate expires.
+struct Expiry {
+    path: PathBuf,
+    /// s since 1970.
+    at_s: i64,
+    /// How urgent that was when it was last looked at.
+    urgency: usize,
+}
+
+/// It becomes more urgent when a certificate expires within so many seconds.
+const URGENT_S: [i64; 4] = [14 * DAY_S, DAY_S, 3600, 0];
+
+impl Expiry {
+    /// What to warn of, if that has become more urgent.
+    fn news(&mut self, now_s: i64) -> Option<String> {
+        let left_s = self.at_s.saturating_sub(now_s);
+        let urgency = URGENT_S.iter().filter(|urgent_s| left_s <= **urgent_s).count();
+        let was = std::mem::replace(&mut self.urgency, urgency);
+        let left = match left_s {
+            ..=0 => return (urgency > was).then(|| "has expired: clients and other servers refuse it".to_owned()),
+            ..3600 => format!("{} min", (left_s + 59) / 60),
+            ..DAY_S => format!("{} h", left_s / 3600),
+            _ => format!("{} days", left_s / DAY_S),
+        };
+        (urgency > was).then(|| format!("expires in {left}"))
+    }
+}
+
+/// The time of day, s since 1970: certificates expire by it.
+#[allow(clippy::disallowed_methods)]
+fn unix_s() -> i64 {
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
+    i64::try_from(now.as_secs()).unwrap_or(i64::MAX)
+}
 
 impl Tls {
-    /// Logs a warning for each certificate that has expired or will soon.
-    #[allow(clippy::disallowed_methods)]
-    pub(super) fn warn_of_expiry(&self) {
-        // Certificates expire by the wall clock.
-        let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
-        let now_s = i64::try_from(now.as_secs()).unwrap_or(i64::MAX);
-        for (path, expires_s) in &self.expiries {
-            let left_s = expires_s.saturating_sub(now_s);
-            if left_s <= 0 {
-                warn!("{}: the certificate has expired: clients refuse it", path.display());
-            } else if left_s < NEAR_S {
-                warn!("{}: the certificate expires in {} days", path.display(), left_s / validity::DAY_S);
+    /// Logs a warning for each certificate that has expired or will soon: when that becomes more urgent, and if `again`, anyway.
+    pub(super) fn warn_of_expiry(&self, again: bool) {
+        let now_s = unix_s();
+        for expiry in lock(&self.expiries).iter_mut() {
+            if again {
+                expiry.urgency = 0;
+            }
+            if let Some(news) = expiry.news(now_s) {
+                warn!("{}: the certificate {news}", expiry.path.display());
             }
         }
     }
@@ -56,7 +85,10 @@ pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>, node_ca: O
 fn configure(paths: &[PathBuf], texts: &[String], everyone: bool) -> Result<Tls> {
     let unreadable = |what: &str| Refusal::new(Reason::Unreadable, "", what.to_owned());
     let chain = certificates(&paths[0], &texts[0])?;
-    let mut expiries: Vec<_> = chain.iter().filter_map(|c| Some((paths[0].clone(), validity::expires_s(c)?))).collect();
+    let expiry = |path: &PathBuf, certificate: &CertificateDer<'_>| {
+        Some(Expiry { path: path.clone(), at_s: validity::expires_s(certificate)?, urgency: 0 })
+    };
+    let mut expiries: Vec<_> = chain.iter().filter_map(|certificate| expiry(&paths[0], certificate)).collect();
     // The parser's error is dropped: no part of a key may appear in a log.
     let key = PrivateKeyDer::from_pem_slice(texts[1].as_bytes())
         .map_err(|_| of_file(&paths[1])(unreadable("is not a private key in PEM")))?;
@@ -67,7 +99,7 @@ fn configure(paths: &[PathBuf], texts: &[String], everyone: bool) -> Result<Tls>
     let mut roots = RootCertStore::empty();
     for (path, text) in paths.iter().zip(texts).skip(2) {
         for certificate in certificates(path, text)? {
-            expiries.extend(validity::expires_s(&certificate).map(|expires_s| (path.clone(), expires_s)));
+            expiries.extend(expiry(path, &certificate));
             roots.add(certificate).map_err(|e| of_file(path)(unreadable(&e.to_string())))?;
         }
     }
@@ -83,8 +115,8 @@ fn configure(paths: &[PathBuf], texts: &[String], everyone: bool) -> Result<Tls>
         of_file(&paths[0])(unreadable(&both))
     })?;
     config.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
-    let tls = Tls { config: Arc::new(config), expiries };
-    tls.warn_of_expiry();
+    let tls = Tls { config: Arc::new(config), expiries: Mutex::new(expiries) };
+    tls.warn_of_expiry(true);
     Ok(tls)
 }
 
@@ -101,4 +133,26 @@ pub(super) fn names(chain: &[CertificateDer<'_>]) -> Vec<String> {
         return Vec::new();
     };
     certificate.valid_dns_names().chain(certificate.valid_uri_names()).map(str::to_owned).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_certificate_is_warned_of_when_it_becomes_more_urgent() {
+        let mut expiry = Expiry { path: PathBuf::new(), at_s: 100 * DAY_S, urgency: 0 };
+        let mut told = Vec::new();
+        // Every minute, as the server looks.
+        for minute in 0..101 * 24 * 60 {
+            told.extend(expiry.news(60 * minute));
+        }
+        let expired = "has expired: clients and other servers refuse it";
+        assert_eq!(told, ["expires in 14 days", "expires in 1 days", "expires in 1 h", expired].map(str::to_owned));
+        // A clock that is set back and goes on.
+        assert_eq!(expiry.news(0), None);
+        assert_eq!(expiry.news(99 * DAY_S + 3600 * 23 + 60 * 30), Some("expires in 30 min".to_owned()));
+        assert_eq!(expiry.news(200 * DAY_S), Some(expired.to_owned()));
+        assert_eq!(expiry.news(201 * DAY_S), None);
+    }
 }

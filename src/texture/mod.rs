@@ -10,11 +10,12 @@ mod noise;
 mod serosa;
 mod vessels;
 
-use std::io::{Cursor, Read};
+use std::io::Cursor;
 use std::path::Path;
 
 use bytes::Bytes;
 
+use crate::files;
 use crate::limits::Limits;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, number};
@@ -92,16 +93,7 @@ fn refuse(path: &Path, reason: Reason, message: String) -> Refusal {
 }
 
 fn read(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
-    let file =
-        std::fs::File::open(path).map_err(|e| refuse(path, Reason::Unreadable, format!("can't be opened: {e}")))?;
-    let mut bytes = Vec::new();
-    file.take(limits.file_bytes + 1)
-        .read_to_end(&mut bytes)
-        .map_err(|e| refuse(path, Reason::Unreadable, format!("can't be read: {e}")))?;
-    if bytes.len() as u64 > limits.file_bytes {
-        return Err(refuse(path, Reason::TooLarge, format!("is larger than the limit of {} bytes", limits.file_bytes)));
-    }
-    Ok(bytes)
+    files::read_regular(path, limits.file_bytes).map_err(|found| refuse(path, found.reason, found.message))
 }
 
 impl Image {

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use palpate::files;
 use palpate_client::{Credentials, Server, Token};
 
 use crate::Failure;
@@ -11,19 +12,19 @@ use crate::Failure;
 #[command(next_help_heading = "Credentials, if the server wants any")]
 pub(crate) struct CredentialOptions {
     /// File with your token [or set the environment variable PALPATE_TOKEN to the token itself]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", global = true)]
     token_file: Option<PathBuf>,
     /// Certificates (PEM) to trust for https URLs instead of the system's
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", global = true)]
     ca: Option<PathBuf>,
     /// Name that the server's certificate must carry, if it differs from the URL's host
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", global = true)]
     tls_name: Option<String>,
     /// Your client certificate (PEM), if the server requires one
-    #[arg(long, value_name = "FILE", requires = "key")]
+    #[arg(long, value_name = "FILE", requires = "key", global = true)]
     cert: Option<PathBuf>,
     /// Private key of the client certificate (PEM)
-    #[arg(long, value_name = "FILE", requires = "cert")]
+    #[arg(long, value_name = "FILE", requires = "cert", global = true)]
     key: Option<PathBuf>,
 }
 
@@ -94,6 +95,5 @@ fn warn_if_readable(path: &Path) {
 }
 
 fn read(option: &str, path: &Path) -> Result<String, Failure> {
-    std::fs::read_to_string(path)
-        .map_err(|e| Failure::Refused(format!("{option} {}: can't be read: {e}", path.display())))
+    files::read_text(path, files::MOST_SECRET_BYTES).map_err(|refusal| Failure::Refused(format!("{option} {refusal}")))
 }

@@ -3,7 +3,8 @@
 use std::path::PathBuf;
 
 use glam::DVec3;
-use palpate::scene::document::{Document, Fields, read_text};
+use palpate::files::read_text;
+use palpate::scene::document::{Document, Fields};
 use palpate_client::devices::{Enables, Placement};
 use palpate_proto::refusal::{Reason, Result};
 

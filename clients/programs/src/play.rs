@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use indicatif::ProgressBar;
+use palpate::files;
 use palpate::scene::record::{Line, Record, Run, output, write_line};
 use palpate::shape::PointName;
 use palpate::wire;
@@ -25,6 +26,9 @@ use crate::credentials::CredentialOptions;
 use crate::table::progress_bar;
 use crate::{Failure, interrupted, table};
 use recorded::Compared;
+
+/// Bytes of a journal, at most: no server takes more.
+const MOST_BYTES: u64 = 1 << 32;
 
 /// Arguments of `play`.
 #[derive(clap::Args)]
@@ -149,7 +153,7 @@ fn unwritten(error: std::io::Error) -> Failure {
 /// Returns an error if the file can't be read, the server refuses it, the connection breaks, or a hash differs from the journal's.
 pub(crate) async fn play(arguments: &Arguments) -> Result<(), Failure> {
     let Arguments { file, from, to, speed, live, quiet, .. } = arguments;
-    let bytes = std::fs::read(file).map_err(|e| Failure::Refused(format!("{}: {e}", file.display())))?;
+    let bytes = files::read_regular(file, MOST_BYTES)?;
     let mut recorded = recorded::hashes(&file.display().to_string(), &bytes)?;
     let server = arguments.credentials.server(&arguments.server)?;
     let channel = server.connect().await?;

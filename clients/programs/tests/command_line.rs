@@ -25,6 +25,22 @@ fn clients_name_their_server_alike() {
         says(client(&[program, nobody, "--server", nobody]), 2, "cannot be used with");
     }
     says(client(&["admin", "callers", "--server", nobody]), 1, "can't reach http://127.0.0.1:1");
+    // Credentials stand where the server does, before or after what is asked.
+    let named = ["--server", "https://127.0.0.1:1", "--tls-name", "name"];
+    for asked in [["admin", "callers"], ["cluster", "nodes"]] {
+        says(client(&[&asked[..], &named].concat()), 1, "can't reach https://127.0.0.1:1");
+        says(client(&[&asked[..1], &named, &asked[1..]].concat()), 1, "can't reach https://127.0.0.1:1");
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn what_has_no_end_is_no_file_of_a_token() {
+    let server = ["health", "--server", "http://127.0.0.1:1"];
+    for option in ["--token-file", "--ca"] {
+        says(client(&[&server[..], &[option, "/dev/zero"]].concat()), 2, "/dev/zero: is larger than the limit");
+    }
+    says(client(&["play", "/dev/zero"]), 2, "/dev/zero: is not a regular file");
 }
 
 #[test]

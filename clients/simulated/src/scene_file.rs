@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use glam::DVec3;
+use palpate::files;
 use palpate::limits::Limits;
 use palpate::scene::sent::{self, mesh_file};
 use palpate::scene::{Body, Scene};
@@ -11,7 +12,7 @@ use palpate_client::upload::upload_mesh;
 use palpate_client::{Channel, Error};
 use palpate_mesh::{Group, TriangleMesh};
 use palpate_proto::pb;
-use palpate_proto::refusal::{Reason, Refusal};
+use palpate_proto::refusal::Refusal;
 use pb::create_session_request::Source;
 use pb::view_service_client::ViewServiceClient;
 use tonic::Status;
@@ -55,11 +56,7 @@ impl SceneFile {
                 let whole = said.path.filter(|path| path.extension().is_none_or(|extension| extension != "gltf"));
                 Some(match whole {
                     Some(path) => {
-                        let unread = |e| Refusal {
-                            place: Some(path.display().to_string()),
-                            ..Refusal::new(Reason::Unreadable, "", format!("can't be read: {e}"))
-                        };
-                        let bytes = std::fs::read(&path).map_err(unread)?;
+                        let bytes = files::read_regular(&path, limits.mesh_bytes)?;
                         let name = path.file_name().map(|name| name.to_string_lossy().into_owned());
                         MeshToSend { name: name.unwrap_or_default(), bytes, unit: said.unit }
                     }

@@ -11,6 +11,12 @@ export interface Rectangle {
   b1: number;
 }
 
+/** No surface moves farther, m. */
+const FARTHEST_M = 1e6;
+
+/** Vertices of a surface, at most. */
+export const MOST_VERTICES = 1 << 24;
+
 /** Whether an encoding writes integers, with origin and scale, or floats. */
 function hasIntegers(encoding: Encoding): boolean {
   switch (encoding) {
@@ -35,6 +41,8 @@ export class Field {
     readonly nx: number,
     readonly ny: number,
   ) {
+    const isWhole = [nx, ny].every((count) => Number.isInteger(count) && count >= 0);
+    if (!isWhole || nx * ny > MOST_VERTICES) throw new RangeError(`a surface of ${nx} × ${ny} vertices can't be shown`);
     this.displacementM = new Float32Array(3 * nx * ny);
   }
 
@@ -53,6 +61,10 @@ export class Field {
     const [o, s] = [part.originM, part.scaleM];
     const [ox, oy, oz] = [o?.x ?? 0, o?.y ?? 0, o?.z ?? 0];
     const [sx, sy, sz] = isWhole ? [s?.x ?? 0, s?.y ?? 0, s?.z ?? 0] : [1, 1, 1];
+    const isNear = (value: number) => Math.abs(value) <= FARTHEST_M;
+    if (![ox, oy, oz, sx, sy, sz].every(isNear) || !(isWhole || q.every(isNear))) {
+      throw new RangeError("a patch has displacements that are none");
+    }
     const d = this.displacementM;
     for (let a = firstX, k = 0; a < firstX + countX; a++) {
       for (let b = 0, i = 3 * (a * this.ny + firstY); b < countY; b++, i += 3, k += 3) {

@@ -45,7 +45,13 @@ export function meshOf(parts: Part[]): MeshData {
   const triangles = joined(parts.map((part) => part.triangles), whole);
   const named = joined(parts.map((part) => part.fileVertex), whole);
   const first = parts[0];
-  if (!first || triangles.some((vertex) => vertex >= count)) throw new RangeError("the server's mesh is not whole");
+  const isWhole = Number.isInteger(count) && triangles.length % 3 === 0 && triangles.every((vertex) => vertex < count);
+  if (!first || !isWhole || !restM.every(Number.isFinite)) throw new RangeError("the server's mesh is not whole");
+  // The last places of a frame may stand for no vertex: less than a row.
+  const places = first.verticesX * first.verticesY;
+  if (places < count || places >= count + Math.max(first.verticesX, first.verticesY)) {
+    throw new RangeError(`a mesh of ${count} vertices has no frames of ${first.verticesX} × ${first.verticesY}`);
+  }
   return {
     places: [first.verticesX, first.verticesY],
     restM,
@@ -56,9 +62,18 @@ export function meshOf(parts: Part[]): MeshData {
   };
 }
 
+/** Numbers of a mesh, at most: of one and a half million vertices. Above that browsers get slow on any machine. */
+const MOST_NUMBERS = 12 * 1_500_000;
+
 /** Asks for the mesh of a session. */
 export async function fetchMesh(server: Server, sessionId: string): Promise<MeshData> {
   const parts: GetMeshResponse[] = [];
-  for await (const part of server.views.getMesh({ sessionId }, { timeoutMs: PATIENCE_MS })) parts.push(part);
+  let numbers = 0;
+  for await (const part of server.views.getMesh({ sessionId }, { timeoutMs: PATIENCE_MS })) {
+    numbers += part.restPositionM.length + part.textureCoordinates.length + part.triangles.length + part.fileVertex.length + 1;
+    if (numbers > MOST_NUMBERS) throw new RangeError("the server's mesh has no end");
+    parts.push(part);
+    if (part.last) break;
+  }
   return meshOf(parts);
 }

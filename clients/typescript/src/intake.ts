@@ -8,6 +8,10 @@ import { type Failure, keepOpen, PATIENCE_MS, Server } from "./server.js";
 /** Frames in flight: a round trip of 60 ms at 60 frames a second. */
 const IN_FLIGHT = 4;
 
+/** A part of a frame, and a patch of it, cost as much as so many values; a frame has at most so many parts and patches. */
+const PART_VALUES = 64;
+const MOST_PARTS = 1 << 16;
+
 /** The stream to receive: the page's first message. Each later message returns the buffer. */
 export interface Order {
   url: string;
@@ -70,13 +74,17 @@ class Intake {
     const credit = new Credit(this.server, signal);
     this.skipped.before = this.skipped.now;
     let parts: WatchFramesResponse[] = [];
+    let values = 0;
     for await (const part of this.server.views.watchFrames(request, { signal })) {
       alive();
       parts.push(part);
+      // A frame has each vertex once.
+      values += PART_VALUES + part.patches.reduce((sum, patch) => sum + PART_VALUES + patch.displacement.byteLength / 2, 0);
+      if (values > 2 * this.field.displacementM.length + MOST_PARTS * PART_VALUES) throw new RangeError("a frame has no end");
       if (!part.last) continue;
       // Apply all parts at once, so that half a frame is never visible.
       for (const each of parts) each.patches.forEach((patch) => this.field.write(each, patch));
-      parts = [];
+      [parts, values] = [[], 0];
       credit.giveBack(part.viewerId, part.frameId);
       this.taken += 1;
       this.skipped.now = this.skipped.before + part.skippedFrames;

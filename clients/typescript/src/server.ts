@@ -11,6 +11,33 @@ import { ViewService } from "./gen/palpate/v1/view_pb.js";
 /** A call is sent on this often, one server after the other. */
 const MOST_HOPS = 8;
 
+/** Bytes of a message, at most: no honest server sends a longer one. */
+const MOST_MESSAGE_BYTES = 4 << 20;
+
+/** The lengths of the messages in a body, each after a byte of flags. They are kept until they are whole. */
+class Lengths {
+  private readonly head = new DataView(new ArrayBuffer(5));
+  private filled = 0;
+  private left = 0;
+
+  /** Throws where a message begins that is too long. */
+  pass(chunk: Uint8Array): void {
+    for (let at = 0; at < chunk.length; ) {
+      if (this.left > 0) {
+        const passed = Math.min(this.left, chunk.length - at);
+        this.left -= passed;
+        at += passed;
+        continue;
+      }
+      this.head.setUint8(this.filled++, chunk[at++]!);
+      if (this.filled < 5) continue;
+      this.filled = 0;
+      this.left = this.head.getUint32(1);
+      if (this.left > MOST_MESSAGE_BYTES) throw new RangeError(`the server sends a message of ${this.left} bytes`);
+    }
+  }
+}
+
 /** Where the calls for a session go. */
 interface Way {
   url: string;
@@ -144,9 +171,11 @@ export class Server {
     const answer = await fetch(input, this.isLeft ? { ...init, keepalive: true } : init);
     if (!answer.body) return answer;
     const { received } = this;
+    const lengths = answer.headers.get("content-type")?.startsWith("application/grpc-web") ? new Lengths() : undefined;
     const count = new TransformStream<Uint8Array, Uint8Array>({
       transform(chunk, out) {
         received.bytes += chunk.byteLength;
+        lengths?.pass(chunk);
         out.enqueue(chunk);
       },
     });

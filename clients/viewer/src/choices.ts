@@ -5,10 +5,13 @@ import { part } from "./page";
 import { entryOf, pictureOf } from "./pictures";
 import { DEFAULT_SCENE, groupOf, GROUPS, inOrder, titleOf } from "./scenes";
 import { backoffMs, isPassing, PATIENCE_MS, sessions, sleep } from "./server";
+import { excerpt } from "./text";
 
 /** What somebody chose. */
 export type Choice = { kind: "scene"; scene: string } | ({ kind: "live" | "recorded" } & JournalName);
 
+/** So many scenes are listed. */
+const MOST_SCENES = 1000;
 /** So many of each group are listed, the newest. */
 const MOST_LISTED = 40;
 /** A list this old is asked for again when somebody turns to it. */
@@ -51,7 +54,7 @@ export class Choices {
       try {
         const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
         this.scenes.forEach((group, index) => {
-          const within = inOrder(sceneNames.filter((scene) => groupOf(scene) === GROUPS[index]));
+          const within = inOrder(sceneNames.slice(0, MOST_SCENES).filter((scene) => groupOf(scene) === GROUPS[index]));
           group.replaceChildren(...within.map(entryOf));
           group.hidden = within.length === 0;
         });
@@ -84,7 +87,7 @@ export class Choices {
 
   private entry(journal: Listed, kind: "live" | "recorded"): HTMLOptionElement {
     const { sceneName, begun, lengthS, sessionId, run } = journal;
-    const entry = new Option(`${sceneName}, ${whenText(begun)}, ${lengthText(lengthS)}`, keyOf(journal, kind));
+    const entry = new Option(`${excerpt(sceneName)}, ${whenText(begun)}, ${lengthText(lengthS)}`, keyOf(journal, kind));
     this.choices.set(entry, { kind, sessionId, run });
     return entry;
   }
@@ -112,7 +115,7 @@ export class Choices {
     for (const option of [...this.list.options]) if (option.disabled) option.remove();
     this.list.value = value;
     if (value !== "" && this.list.value === value) return;
-    const own = new Option(name || "Choose …", value);
+    const own = new Option(excerpt(name) || "Choose …", value);
     own.disabled = true;
     this.list.prepend(own);
     this.list.value = value;

@@ -27,6 +27,7 @@ import { playScript } from "./script";
 import { backoffMs, describe, type Failure, isGone, isPassing, PATIENCE_MS, reasonOf, server, sessions, sleep } from "./server";
 import { Stage } from "./stage";
 import { Status } from "./status";
+import { excerpt } from "./text";
 import { tissueTexture } from "./texture";
 import { TissueValues } from "./tissue";
 import { TokenForm } from "./token-form";
@@ -44,6 +45,12 @@ const PICTURE_MS = 1500;
 
 /** When samples are so much newer than the newest frame, nothing moves: frames come 60 times a second. */
 const STILL_S = 0.25;
+
+/** So many scripts are listed. */
+const MOST_SCRIPTS = 1000;
+
+/** Of warnings and of holders of tools, so many are told. */
+const MOST_TOLD = 16;
 
 /** A server of a fleet that has not answered for so long may be gone: another takes its sessions over within 4 s. */
 const GONE_MS = 3000;
@@ -112,7 +119,7 @@ let noticed: ReturnType<typeof setTimeout> | undefined;
 function notice(text: string, seconds = 5): void {
   const line = part("notice", HTMLElement);
   clearTimeout(noticed);
-  line.textContent = text;
+  line.textContent = excerpt(text);
   line.hidden = text === "";
   if (seconds > 0) noticed = setTimeout(() => (line.hidden = true), 1000 * seconds);
 }
@@ -160,7 +167,7 @@ async function open(target: Target): Promise<void> {
       const session = sessionId
         ? (await sessions.getSession({ sessionId }, { timeoutMs: PATIENCE_MS })).session
         : (await sessions.createSession({ source: (made ??= named(await choices.first())), idleTimeoutS: IDLE_S }, {})).session;
-      if (!session) continue;
+      if (!session) throw new RangeError("it tells of no session");
       // Another window's playback: this one gets its own.
       if (session.playback) return await open({ moment: { ...session.playback, step: Number(session.step) } });
       const isNew = target.isNew ?? sessionId === undefined;
@@ -172,6 +179,7 @@ async function open(target: Target): Promise<void> {
       if (begun !== left) return;
       if (isGone(error)) return over(moment ? "There is no such recording." : "This session no longer exists.");
       if (tokenForm.stops(error)) return status.end("barred", "");
+      if (error instanceof RangeError) return over(`What the server says can't be shown: ${error.message}.`);
       if (!isPassing(error)) return over(`${sentence(describe(error))}.`);
       const waitMs = backoffMs(failures);
       status.lose(waitMs);
@@ -291,7 +299,7 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   if (before?.sessionId !== session.sessionId) {
     heard(session);
     // What the server has to say of the scene: of a mesh what was done with it, and what is doubtful.
-    if (session.warnings.length > 0) notice(session.warnings.join(" "), 15);
+    if (session.warnings.length > 0) notice(session.warnings.slice(0, MOST_TOLD).join(" "), 15);
   }
   next.begin();
   if (document.hidden) next.lookAway();
@@ -368,8 +376,9 @@ function holding(): void {
   }
   const mine = visit.hand.holds;
   const others = visit.session.heldTools.filter((tool) => !mine || tool.tool !== 0);
-  const names = others.map((tool) => `${tool.holder || "Somebody"} holds ${tool.tool === 0 ? "the tool" : `tool ${tool.tool}`}`);
-  part("holder", HTMLElement).textContent = mine ? `You (${holder}) hold the tool` : names.join(", ") || "Nobody touches: press to begin";
+  const names = others.slice(0, MOST_TOLD).map((tool) => `${tool.holder || "Somebody"} holds ${tool.tool === 0 ? "the tool" : `tool ${tool.tool}`}`);
+  const whose = excerpt(names.join(", "));
+  part("holder", HTMLElement).textContent = mine ? `You (${holder}) hold the tool` : whose || "Nobody touches: press to begin";
   part("release", HTMLButtonElement).disabled = !mine;
 }
 
@@ -550,7 +559,7 @@ async function listScripts(sessionId: string): Promise<void> {
   for (let failures = 0; visit?.session.sessionId === sessionId; failures++) {
     try {
       const { scriptNames } = await sessions.listScripts({ sessionId }, { timeoutMs: PATIENCE_MS });
-      part("script", HTMLSelectElement).replaceChildren(...scriptNames.map((name) => new Option(name)));
+      part("script", HTMLSelectElement).replaceChildren(...scriptNames.slice(0, MOST_SCRIPTS).map((name) => new Option(excerpt(name), name)));
       part("scripts", HTMLElement).hidden = scriptNames.length === 0;
       return;
     } catch {

@@ -2,6 +2,7 @@
 // visit of each, and kept by the browser.
 
 import { shippedPicture, titleOf } from "./scenes";
+import { excerpt } from "./text";
 
 /** Pixels of a picture; it is shown at half that. */
 const SIZE = { width: 144, height: 96 };
@@ -42,7 +43,7 @@ export function keepPicture(scene: string, drawn: HTMLCanvasElement): void {
 
 /** An entry of the list. Browsers that show text only in lists show the name. */
 export function entryOf(scene: string): HTMLOptionElement {
-  const entry = new Option(titleOf(scene), scene);
+  const entry = new Option(excerpt(titleOf(scene)), scene);
   const picture = pictureOf(scene);
   if (picture) {
     const image = new Image(SIZE.width / 2, SIZE.height / 2);

@@ -5,6 +5,7 @@ import { type Session, SessionState } from "palpate/v1";
 import { clockText, type JournalName, Recording, whenText } from "./journal";
 import { part } from "./page";
 import { backoffMs, describe, isGone, isPassing, PATIENCE_MS, sessions, sleep } from "./server";
+import { excerpt } from "./text";
 import { Timeline } from "./timeline";
 import type { Visit } from "./visit";
 
@@ -389,7 +390,7 @@ export class Player {
   private tell(): void {
     const { recording } = this.opened ?? {};
     if (!recording) return;
-    this.title.textContent = `${recording.sceneName}, ${whenText(recording.begun)}`;
+    this.title.textContent = `${excerpt(recording.sceneName)}, ${whenText(recording.begun)}`;
     this.back.hidden = !recording.isLive;
     this.tick();
   }

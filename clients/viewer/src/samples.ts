@@ -49,6 +49,10 @@ export function sampleEvery(stepRateHz: number): number {
 /** Length of the plots, s. */
 export const HISTORY_S = 6;
 
+/** Moments of the plots, and tools of a sample, at most. */
+const MOST_MOMENTS = 8 * HISTORY_S * RATE_HZ;
+const MOST_TOOLS = 256;
+
 /** A tool counts as touching above this fraction of the strongest push. */
 const FELT = 0.01;
 
@@ -104,9 +108,10 @@ export class Samples {
 
   /** Takes a sample, unless a newer one came the other way. */
   private take(sample: Sample, tools: ToolSample[]): void {
-    if (this.newest && sample.step < this.newest.step) return;
+    if (!Number.isFinite(sample.simulationTimeS) || (this.newest && sample.step < this.newest.step)) return;
     this.newest = sample;
     const felt = tools
+      .slice(0, MOST_TOOLS)
       .filter((tool) => tool.point !== undefined || tool.vertex !== undefined)
       .map((tool) => ({
         tool: tool.tool,
@@ -125,7 +130,8 @@ export class Samples {
     if (this.history.at(-1)?.timeS === timeS) this.history.pop();
     if (first) this.history.push({ timeS, displacementM: first.displacementM, ...this.tell(first) });
     // A gap of a second or more stays visible. Older samples are dropped.
-    while (this.history.length > 0 && this.history[0]!.timeS < timeS - HISTORY_S) this.history.shift();
+    const isOld = ({ timeS: thenS }: Moment) => !(thenS > timeS - HISTORY_S && thenS <= timeS);
+    while (this.history.length > MOST_MOMENTS || (this.history[0] && isOld(this.history[0]))) this.history.shift();
     this.onSample(sample);
   }
 }

@@ -1,6 +1,7 @@
 // The status line: a light (good, slow, lost), what the session says, and on demand the figures behind it.
 
 import { received } from "./server";
+import { excerpt } from "./text";
 
 /** The figures, in display order. An absent one is unknown. */
 export interface Figures {
@@ -132,7 +133,8 @@ export class Status {
 
   /** Screen readers announce it, so only changes are written. */
   say(text: string): void {
-    if (this.line.textContent !== text) this.line.textContent = text;
+    const said = excerpt(text);
+    if (this.line.textContent !== said) this.line.textContent = said;
   }
 
   /** Updates the figures. Call about once a second. */

@@ -8,6 +8,7 @@ import { MOST_VERTICES, sceneOf } from "./coefficients";
 import type { MeshProblem, MeshReport, SceneSchema, Session } from "palpate/v1";
 import { part } from "./page";
 import { describe, PATIENCE_MS, sessions } from "./server";
+import { excerpt } from "./text";
 
 /** Bytes of a part. */
 const PART_BYTES = 1 << 20;
@@ -71,6 +72,9 @@ function reportText(report: MeshReport): string {
 
 /** The user has closed the dialog. */
 class Ended extends Error {}
+
+/** Problems of a mesh that are told. */
+const MOST_PROBLEMS = 100;
 
 export class FileOpener {
   private readonly dialog = part("own", HTMLDialogElement);
@@ -227,13 +231,13 @@ export class FileOpener {
   }
 
   private show(text: string, problems: string[] = []): void {
-    this.said.textContent = text;
+    this.said.textContent = excerpt(text);
     this.progress.hidden = true;
     this.units.hidden = true;
     this.problems.replaceChildren(
-      ...problems.map((problem) => {
+      ...problems.slice(0, MOST_PROBLEMS).map((problem) => {
         const line = document.createElement("li");
-        line.textContent = problem;
+        line.textContent = excerpt(problem);
         return line;
       }),
     );

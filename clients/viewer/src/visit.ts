@@ -19,6 +19,9 @@ const CHOSEN_VERTICES = 40_000;
 /** Above this browsers get slow on any machine. */
 const MOST_VERTICES = 1_500_000;
 
+/** Points of a sheet, at most. */
+const MOST_POINTS = 1 << 23;
+
 /** Callbacks of a visit. */
 export interface Told {
   onSession: (session: Session) => void;
@@ -66,6 +69,7 @@ export class Visit {
     told: Told,
     former?: Visit,
   ): Promise<Visit> {
+    check(session);
     const mesh = former ? former.mesh : session.scene?.mesh && (await fetchMesh(server, session.sessionId));
     return new Visit(session, holder, refinement, told, mesh, former);
   }
@@ -264,6 +268,20 @@ export class Visit {
     }
     this.told.onSession(session);
     this.told.onWell();
+  }
+}
+
+/** Throws if a session can't be shown, whatever its server says. */
+function check({ scene }: Session): void {
+  const isPositive = (value = 1) => Number.isFinite(value) && value > 0;
+  const { sheet, stepping, springs, virtualSprings } = scene ?? {};
+  const isNumber = (value = 0) => Number.isFinite(value);
+  if (!isPositive(stepping?.rateHz)) throw new RangeError(`it has ${stepping?.rateHz} steps a second`);
+  if (!isNumber(springs?.stiffnessNPerM) || !isNumber(virtualSprings?.stiffnessNPerM)) throw new RangeError("its springs are no numbers");
+  if (!sheet) return;
+  const { pointsX = 1, pointsY = 1, spacingM } = sheet;
+  if (pointsX < 1 || pointsY < 1 || pointsX * pointsY > MOST_POINTS || !isPositive(spacingM)) {
+    throw new RangeError(`it is a sheet of ${pointsX} × ${pointsY} points, ${spacingM} m apart`);
   }
 }
 

@@ -79,7 +79,7 @@ pub(super) fn text(status: &Status) -> String {
 }
 
 /// The first cause of an error.
-pub(super) fn root(error: &(dyn Error + 'static)) -> String {
+pub(crate) fn root(error: &(dyn Error + 'static)) -> String {
     std::iter::successors(Some(error), |&cause| cause.source()).last().map(ToString::to_string).unwrap_or_default()
 }
 

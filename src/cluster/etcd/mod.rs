@@ -34,6 +34,7 @@ use tokio::time::timeout;
 use tonic::{Code, Response};
 
 use calls::{Calls, Repeat, Way};
+pub(crate) use error::root;
 pub use error::{EtcdError, Result};
 pub use lease::Lease;
 use lease::Pulse;

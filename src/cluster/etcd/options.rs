@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use tonic::transport::{Certificate, ClientTlsConfig, Identity, Uri};
 
 use super::error::{EtcdError, Result};
+use crate::files;
 
 /// Most members that are named: etcd itself advises seven at most.
 const MOST_ENDPOINTS: usize = 16;
@@ -110,7 +111,7 @@ pub(super) fn is_secure(uri: &Uri) -> bool {
 }
 
 fn read(path: &Path) -> std::result::Result<Vec<u8>, String> {
-    std::fs::read(path).map_err(|e| format!("{}: can't be read: {e}", path.display()))
+    files::read_regular(path, files::MOST_SECRET_BYTES).map_err(|refusal| refusal.to_string())
 }
 
 #[cfg(test)]
@@ -139,6 +140,6 @@ mod tests {
             EtcdOptions { password_file: Some("nowhere".into()), user: Some("me".into()), ..at("http://etcd:2379") };
         assert!(refused(&clear).contains("in the clear"));
         let missing = EtcdOptions { endpoints: vec!["http://127.0.0.1:2379".into()], ..clear };
-        assert!(refused(&missing).contains("nowhere: can't be read"));
+        assert!(refused(&missing).contains("nowhere: can't be opened"));
     }
 }

@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
+use palpate::files;
 use palpate::journal::signature::{PublicKey, Signatures, Signed};
 use palpate::journal::{Reader, Replay, Verdict};
 use palpate::refusal::Refusal;
@@ -74,7 +75,7 @@ pub(super) fn verify(arguments: &VerifyArguments) -> Result<(), Failure> {
 /// The key in a file.
 fn public_key(path: &Path) -> Result<PublicKey, Failure> {
     let refuse = |why: String| Failure::Refused(format!("--signed-by {}: {why}", path.display()));
-    let text = std::fs::read_to_string(path).map_err(|e| refuse(format!("can't be read: {e}")))?;
+    let text = files::read_text(path, files::MOST_SECRET_BYTES).map_err(|refusal| refuse(refusal.message))?;
     journal_key::public(&text).map_err(|refusal| refuse(refusal.message))
 }
 

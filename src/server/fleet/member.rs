@@ -111,6 +111,7 @@ impl Fleet {
         });
         self.pacer.fence.set(self.confirmed_ns.load(Ordering::Acquire));
         self.spawn(self.clone().watch_fence());
+        self.spawn(self.peers.watch());
         self.spawn(self.clone().watch_nodes());
         self.spawn(self.clone().tell());
         self.spawn(self.clone().mirror());

@@ -17,6 +17,7 @@ use tokio::time::sleep;
 use tokio_stream::wrappers::ReceiverStream;
 use tracing::{info, warn};
 
+use super::peers::why;
 use super::{Fleet, Standby};
 use crate::cluster::{placement, rules};
 use crate::lock::lock;
@@ -131,7 +132,7 @@ impl Fleet {
 
     /// Sends over one stream, until that breaks.
     async fn mirror_once(self: &Arc<Self>, name: &str, endpoint: &str) -> Result<(), String> {
-        let told = |status: tonic::Status| status.message().to_owned();
+        let told = |status: tonic::Status| why(&status);
         let mut peer = self.peers.at(endpoint).map_err(|refusal| refusal.to_string())?;
         let (say, said) = mpsc::channel(WAITING);
         let open = pb::MirrorOpen { node: self.node.clone() };

@@ -1,14 +1,18 @@
 //! Connections to the other servers of the fleet.
 
 use std::collections::BTreeMap;
-use std::path::Path;
-use std::sync::Mutex;
+use std::error::Error;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use palpate_proto::pb::node_service_client::NodeServiceClient;
+use tonic::Status;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 
 use super::super::config::Config;
+use super::super::reload::Reloaded;
+use crate::cluster::etcd::root;
 use crate::lock::lock;
 use crate::refusal::{Reason, Refusal, Result};
 
@@ -17,30 +21,55 @@ const SILENCE: Duration = Duration::from_secs(1);
 
 /// How to reach the other servers.
 pub(super) struct Peers {
-    tls: Option<ClientTlsConfig>,
-    channels: Mutex<BTreeMap<String, Channel>>,
+    /// This server's certificate and the authorities of theirs, as the files are now.
+    tls: Option<Arc<Reloaded<ClientTlsConfig>>>,
+    /// Each with the version of these files by which it was made.
+    channels: Mutex<BTreeMap<String, (u64, Channel)>>,
 }
 
-fn read(field: &str, path: &Path) -> Result<Vec<u8>> {
-    std::fs::read(path)
-        .map_err(|error| Refusal::new(Reason::Unreadable, field, format!("{}: can't be read: {error}", path.display())))
+/// Of the authorities, and this server's certificate and key if it has one.
+fn configure(texts: &[String]) -> Result<ClientTlsConfig> {
+    let mut tls = ClientTlsConfig::new();
+    let mut texts = texts.iter();
+    if let Some(ca) = texts.next() {
+        tls = tls.ca_certificate(Certificate::from_pem(ca));
+    }
+    if let (Some(cert), Some(key)) = (texts.next(), texts.next()) {
+        tls = tls.identity(Identity::from_pem(cert, key));
+    }
+    // The library reads them only now. Its error quotes no key.
+    let tried = Endpoint::from_static("https://localhost").tls_config(tls.clone());
+    tried.map_err(|error| Refusal::new(Reason::Unreadable, "cluster.ca", root(&error)))?;
+    Ok(tls)
+}
+
+/// What a call of another server has failed of: of a connection, the first cause.
+pub(super) fn why(status: &Status) -> String {
+    status.source().map_or_else(|| status.message().to_owned(), root)
 }
 
 impl Peers {
     /// With this server's certificate, if it has one.
     ///
     /// # Errors
-    /// Refuses files that can't be read.
+    /// Refuses files that can't be read or used.
     pub(super) fn new(config: &Config) -> Result<Self> {
-        let mut tls = None;
-        if let Some(ca) = &config.cluster.ca {
-            let mut with = ClientTlsConfig::new().ca_certificate(Certificate::from_pem(read("cluster.ca", ca)?));
-            if let (Some(cert), Some(key)) = (&config.tls_cert, &config.tls_key) {
-                with = with.identity(Identity::from_pem(read("tls_cert", cert)?, read("tls_key", key)?));
-            }
-            tls = Some(with);
-        }
+        let load = |ca: &PathBuf| {
+            let paths = [Some(ca), config.tls_cert.as_ref(), config.tls_key.as_ref()];
+            Reloaded::load("TLS of the fleet", paths.into_iter().flatten().cloned().collect(), configure)
+        };
+        let tls = config.cluster.ca.as_ref().map(load).transpose()?.map(Arc::new);
         Ok(Peers { tls, channels: Mutex::default() })
+    }
+
+    /// Follows the files of certificates, for ever: connections that are made from then on show the new ones.
+    pub(super) fn watch(&self) -> impl Future<Output = ()> + Send + 'static + use<> {
+        let tls = self.tls.clone();
+        async move {
+            if let Some(tls) = tls {
+                tls.watch().await;
+            }
+        }
     }
 
     /// The server at that URL, which is connected to when it is called.
@@ -48,8 +77,9 @@ impl Peers {
     /// # Errors
     /// Refuses what is no URL.
     pub(super) fn at(&self, endpoint: &str) -> Result<NodeServiceClient<Channel>> {
+        let version = self.tls.as_ref().map_or(0, |tls| tls.version());
         let mut channels = lock(&self.channels);
-        if let Some(channel) = channels.get(endpoint) {
+        if let Some((_, channel)) = channels.get(endpoint).filter(|made| made.0 == version) {
             return Ok(client(channel.clone()));
         }
         let wrong = |error: tonic::transport::Error| {
@@ -69,10 +99,10 @@ impl Peers {
         if endpoint.starts_with("https://")
             && let Some(tls) = &self.tls
         {
-            to = to.tls_config(tls.clone()).map_err(wrong)?;
+            to = to.tls_config(tls.get().as_ref().clone()).map_err(wrong)?;
         }
         let channel = to.connect_lazy();
-        channels.insert(endpoint.to_owned(), channel.clone());
+        channels.insert(endpoint.to_owned(), (version, channel.clone()));
         Ok(client(channel))
     }
 

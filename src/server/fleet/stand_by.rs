@@ -9,6 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use palpate_proto::pb;
 
+use crate::files;
 use crate::ids::random_id;
 use crate::journal;
 use crate::lock::lock;
@@ -31,15 +32,12 @@ fn unusable(path: &Path, error: &std::io::Error) -> Refusal {
 /// Refuses a folder that can't be used.
 pub(super) fn instance(folder: &Path) -> Result<String> {
     let path = folder.join(INSTANCE);
-    match std::fs::read_to_string(&path) {
-        Ok(text) => Ok(text.trim().to_owned()),
-        Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
-            let id = random_id()?;
-            std::fs::write(&path, &id).map_err(|error| unusable(&path, &error))?;
-            Ok(id)
-        }
-        Err(error) => Err(unusable(&path, &error)),
+    if path.symlink_metadata().is_ok() {
+        return Ok(files::read_regular_text(&path, files::MOST_SECRET_BYTES)?.trim().to_owned());
     }
+    let id = random_id()?;
+    std::fs::write(&path, &id).map_err(|error| unusable(&path, &error))?;
+    Ok(id)
 }
 
 /// A journal for which this server stands by.

@@ -68,6 +68,8 @@ pub(super) struct Keeper {
     without_room: Vec<Weak<Tape>>,
     /// Who mirrors journals is told of what was written.
     growth: Option<Arc<Growth>>,
+    /// Whether files tell how old they are.
+    ages: old::Ages,
 }
 
 /// What a folder held at the beginning.
@@ -99,7 +101,8 @@ impl Keeper {
     ) -> Self {
         let Found { runs, left_alone } = found;
         let (entries, waiting, without_room) = (BTreeMap::new(), Vec::new(), Vec::new());
-        Keeper { folder, keep, key, queue, tally, runs, left_alone, entries, waiting, without_room, growth }
+        let ages = old::Ages::default();
+        Keeper { folder, keep, key, queue, tally, runs, left_alone, entries, waiting, without_room, growth, ages }
     }
 
     /// Works until the queue is stopped, and everything in it is written.
@@ -303,7 +306,9 @@ impl Keeper {
     fn sweep(&mut self) {
         self.entries.retain(|_, entry| entry.tape.progress().borrow().broken.is_none());
         let current = |path: &Path| self.entries.values().any(|entry| entry.file.path() == path);
-        old::sweep(self.folder.path(), self.keep, |path| current(path) || self.left_alone.contains(path));
+        old::sweep(self.folder.path(), self.keep, &mut self.ages, |path| {
+            current(path) || self.left_alone.contains(path)
+        });
     }
 
     /// The server ends: says so at the end of every journal.

@@ -19,6 +19,7 @@ pub use keep::Keep;
 
 use super::config::Config;
 use super::{journal_key, reload};
+use crate::files;
 use crate::journal::signature::Key;
 use crate::limits::Limits;
 use crate::lock::lock;
@@ -133,7 +134,7 @@ fn signing_key(path: &Path) -> Result<Key> {
         let refusal = Refusal::new(Reason::Unreadable, "", why);
         Refusal { place: Some(path.display().to_string()), ..refusal }
     };
-    let text = std::fs::read_to_string(path).map_err(|e| refuse(format!("can't be read: {e}")))?;
+    let text = files::read_text(path, files::MOST_SECRET_BYTES)?;
     reload::warn_if_readable(path, "the key of the journals");
     let key = journal_key::private(&text).map_err(|refusal| refuse(refusal.message))?;
     tracing::info!(public_key = %key.public(), "journals are signed");

@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use palpate::scene::document::{Document, Fields, Item, read_text};
+use palpate::files::read_text;
+use palpate::scene::document::{Document, Fields, Item};
 use palpate_proto::refusal::{Reason, Refusal, Result, number};
 use palpate_touch::Device;
 use palpate_touch::device::{DEVICES, UNDECLARED};
