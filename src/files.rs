@@ -123,6 +123,7 @@ fn await_bytes(_: &Path, _: &File, _: Duration) -> Result<()> {
 
 #[cfg(all(test, unix))]
 mod tests {
+    #![allow(clippy::unwrap_used)]
     use std::io::Write;
 
     use super::*;

@@ -83,7 +83,7 @@ fn scene(seed: u64) -> (String, Option<String>) {
     let odds = [0.03, 0.1, 0.3][dice.usize(0..3)];
     let mut text = String::new();
     let mesh = dice.bool().then(|| closed_mesh(dice));
-    let edge_m = mesh.as_ref().map_or(0.01, |mesh| mesh.edge_m());
+    let edge_m = mesh.as_ref().map_or(0.01, closed_mesh::ClosedMesh::edge_m);
     let mut with_material = false;
     if mesh.is_some() {
         text += "[mesh]\nfile = \"mesh.obj\"\n";

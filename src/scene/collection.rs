@@ -54,7 +54,7 @@ impl Collection {
     }
 
     fn misplaced(&self, name: &str, limits: &Limits) -> Option<Refusal> {
-        let text = read_text(&self.file(name)?, limits.file_bytes).ok()?;
+        let text = files::read_regular_text(&self.file(name)?, limits.file_bytes).ok()?;
         self.refuse_other_kind(&format!("{name}.toml"), &text).err()
     }
 

@@ -39,13 +39,13 @@ impl Expiry {
         let left_s = self.at_s.saturating_sub(now_s);
         let urgency = URGENT_S.iter().filter(|urgent_s| left_s <= **urgent_s).count();
         let was = std::mem::replace(&mut self.urgency, urgency);
-        let left = match left_s {
-            ..=0 => return (urgency > was).then(|| "has expired: clients and other servers refuse it".to_owned()),
-            ..3600 => format!("{} min", (left_s + 59) / 60),
-            ..DAY_S => format!("{} h", left_s / 3600),
-            _ => format!("{} days", left_s / DAY_S),
+        let news = match left_s {
+            ..=0 => "has expired: clients and other servers refuse it".to_owned(),
+            1..3600 => format!("expires in {} min", (left_s + 59) / 60),
+            3600..DAY_S => format!("expires in {} h", left_s / 3600),
+            DAY_S.. => format!("expires in {} days", left_s / DAY_S),
         };
-        (urgency > was).then(|| format!("expires in {left}"))
+        (urgency > was).then_some(news)
     }
 }
 
