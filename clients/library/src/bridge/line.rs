@@ -67,7 +67,7 @@ pub struct Traffic {
     pub poses: u64,
     /// What went by datagram, and how often the stream took over again.
     pub carried: Carried,
-    /// How far the tissue under the tip was moved at most, m, as samples told it.
+    /// How far the tissue under the middle of the tip was moved at most, m, as samples told it.
     pub deepest_m: f64,
 }
 
@@ -333,8 +333,9 @@ async fn connect(
             let mut inbound = shared.inbound();
             inbound.traffic.samples += 1;
             inbound.traffic.bytes += touch::wire_bytes(sample);
-            for displacement_m in sample.tools.iter().filter_map(|tool| tool.displacement_m) {
-                let deep_m = DVec3::new(displacement_m.x, displacement_m.y, displacement_m.z).length();
+            // The mean over a tip, `displacement_m`, is beside the surface where that is curved, also at rest.
+            for moved_m in sample.tools.iter().filter_map(|tool| tool.surface_displacement_m) {
+                let deep_m = DVec3::new(moved_m.x, moved_m.y, moved_m.z).length();
                 inbound.traffic.deepest_m = inbound.traffic.deepest_m.max(deep_m);
             }
             inbound.traffic.carried = Carried {
