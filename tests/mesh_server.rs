@@ -492,7 +492,7 @@ async fn a_mesh_that_was_sent_stays_in_journals_only_as_long_as_its_owner_is_tol
     let id = server.create(Source::Scene(on(&sent.mesh_id, &scene)), true).await.unwrap().session_id;
     assert_eq!(kept(), 1);
     let refused = delete_journal(&server, &id).await.unwrap_err();
-    assert!(refused.message().contains("goes on: delete it first"), "{refused:?}");
+    assert!(refused.message().contains("still runs: delete that first"), "{refused:?}");
     server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id: id.clone() }).await.unwrap();
     assert_eq!((kept(), delete_journal(&server, &id).await.unwrap(), kept()), (1, 1, 0));
     for unknown in [id.as_str(), "../patient", ""] {
