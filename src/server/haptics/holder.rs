@@ -35,8 +35,11 @@ pub(super) struct Holder {
 /// A command, unless its pose is outside the declared workspace.
 fn within_reach(command: Command, live: &Live, device: Option<&Device>) -> Result<Command> {
     if let (Action::Pose { place_m, .. }, Some(device)) = (&command.action, device) {
-        let away_m = (*place_m - live.model.shape().top_m()).length();
-        let range = format!("within {} m of the top of the tissue, the device's workspace", device.workspace_m);
+        // A device has its origin on the top; other clients may have it in the middle.
+        let shape = live.model.shape();
+        let away_m = place_m.distance(shape.top_m()).min(place_m.distance(shape.extent().middle_m()));
+        let range =
+            format!("within {} m of the top or the middle of the tissue, the device's workspace", device.workspace_m);
         number("pose.position_m", away_m, &range, |away_m| away_m <= device.workspace_m)?;
     }
     Ok(command)
