@@ -37,9 +37,9 @@ thread_local! {
 }
 
 /// Puts back who paid before.
-struct Before(Option<Arc<dyn Payer>>);
+struct PreviousPayer(Option<Arc<dyn Payer>>);
 
-impl Drop for Before {
+impl Drop for PreviousPayer {
     fn drop(&mut self) {
         PAYER.set(self.0.take());
     }
@@ -47,7 +47,7 @@ impl Drop for Before {
 
 /// Does something, and has `payer` pay for the requests that this thread decodes meanwhile.
 pub fn paid_by<T>(payer: &Arc<dyn Payer>, act: impl FnOnce() -> T) -> T {
-    let _before = Before(PAYER.replace(Some(payer.clone())));
+    let _previous = PreviousPayer(PAYER.replace(Some(payer.clone())));
     act()
 }
 
@@ -135,8 +135,7 @@ fn check(message: &[u8], shape: &Shape, is_request: bool) -> Result<()> {
         }
     }
     if is_request && measure.memory > SMALL {
-        let payer = PAYER.with_borrow(Clone::clone);
-        payer.map_or(Ok(()), |payer| payer.pay(measure.memory as u64))?;
+        PAYER.with_borrow(|payer| payer.as_ref().map_or(Ok(()), |payer| payer.pay(measure.memory as u64)))?;
     }
     // The decoder refuses malformed messages.
     Ok(())

@@ -48,6 +48,21 @@ impl Collection {
         self.files_and_built_in().into_iter().filter(|name| self.misplaced(name, limits).is_none()).collect()
     }
 
+    /// Of these the ones whose text is wanted, by name and text, and those that can't be read. Each file is read once.
+    pub fn names_where(
+        &self,
+        others: &Collection,
+        limits: &Limits,
+        is_wanted: impl Fn(&str, &str) -> bool,
+    ) -> Vec<String> {
+        let stays = |name: &String| match self.text(name, others, limits) {
+            Ok((_, text)) => is_wanted(name, &text),
+            // Of the other kind.
+            Err(refusal) => refusal.reason != Reason::WrongKind,
+        };
+        self.files_and_built_in().into_iter().filter(stays).collect()
+    }
+
     /// The refusals of files that belong into the folder of the other kind, by their names.
     pub fn all_misplaced(&self, limits: &Limits) -> Vec<Refusal> {
         self.files_and_built_in().iter().filter_map(|name| self.misplaced(name, limits)).collect()

@@ -43,10 +43,7 @@ impl Catalog {
 
     /// The names of the scenes that are not built in word for word: nobody has looked yet whether they are valid.
     pub fn foreign_names(&self, limits: &Limits) -> Vec<String> {
-        let is_foreign = |name: &String| {
-            self.scenes.text(name, &self.scripts, limits).map_or(true, |(_, text)| !is_built_in(name, &text))
-        };
-        self.names(limits).into_iter().filter(is_foreign).collect()
+        self.scenes.names_where(&self.scripts, limits, |name, text| !is_built_in(name, text))
     }
 
     /// The names of all scripts, sorted.
@@ -56,11 +53,7 @@ impl Catalog {
 
     /// The names of the scripts that are made for the scene of that name, sorted.
     pub fn script_names_for(&self, scene: &str, limits: &Limits) -> Vec<String> {
-        let fits = |name: &String| {
-            let text = self.scripts.text(name, &self.scenes, limits);
-            text.map_or(true, |(_, text)| fits(&text, scene))
-        };
-        self.script_names(limits).into_iter().filter(fits).collect()
+        self.scripts.names_where(&self.scenes, limits, |_, text| fits(text, scene))
     }
 
     /// Loads the scene of that name; `--set` assignments override its keys.

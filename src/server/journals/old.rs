@@ -109,6 +109,7 @@ mod tests {
         sweep(folder.path(), Keep { age: Duration::MAX, bytes: 0 }, &mut Ages::default(), needed);
         assert_eq!(left(), ["s3"]);
     }
+
     #[test]
     fn a_clock_that_is_set_forward_makes_no_journal_old() {
         const HOUR_NS: u64 = 3_600_000_000_000;
