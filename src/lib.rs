@@ -16,7 +16,7 @@ pub mod limits;
 mod lock;
 pub mod memory;
 pub mod pace;
-mod priority;
+pub mod priority;
 pub mod render;
 pub mod scene;
 pub mod server;

@@ -20,6 +20,11 @@ impl<T> Turns<T> {
         self.queues.iter_mut().find(|queue| queue.0 == account).map(|queue| &mut queue.1)
     }
 
+    /// Who has items that wait.
+    pub(crate) fn accounts(&self) -> impl Iterator<Item = u64> {
+        self.queues.iter().map(|queue| queue.0)
+    }
+
     /// How many items of `account` wait.
     pub(crate) fn count(&self, account: u64) -> usize {
         self.queues.iter().find(|queue| queue.0 == account).map_or(0, |queue| queue.1.len())

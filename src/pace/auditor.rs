@@ -10,6 +10,7 @@
 //! scene says `correct`, a more accurate model enters as another tissue does: through the intake, at a step that is told.
 
 use std::collections::BTreeMap;
+use std::ops::Bound;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -66,17 +67,11 @@ impl Auditor {
     /// The thread's work, with `share` of a core.
     pub(super) fn work(&self, sessions: &Sessions, share: f64) {
         let mut duty = Duty { auditor: self, share, since_ns: thread_time_ns() };
-        let mut last = 0;
+        let mut last = String::new();
         loop {
-            let next = {
-                let sessions = lock(sessions);
-                let awake = || sessions.values().filter(|live| live.cost.share() > 0.0);
-                let after = awake().filter(|live| live.number > last).min_by_key(|live| live.number);
-                after.or_else(|| awake().min_by_key(|live| live.number)).cloned()
-            };
-            let goes_on = match next {
+            let goes_on = match next_awake(sessions, &last) {
                 Some(live) => {
-                    last = live.number;
+                    last.clone_from(&live.id);
                     // A fault in one audit must not end the others.
                     let audited = catch_unwind(AssertUnwindSafe(|| audit(&live, sessions, &mut duty, &self.tally)));
                     if let Err(panic) = audited {
@@ -95,6 +90,19 @@ impl Auditor {
             }
         }
     }
+}
+
+/// The next session after the one with the id `last` that is awake, in the order of ids, the first after the last. This thread
+/// gives way, and may be stopped for long while it holds the lock that every call needs: so it holds it for one session at a time.
+fn next_awake(sessions: &Sessions, last: &str) -> Option<Arc<Live>> {
+    let after = |id: &str| {
+        let sessions = lock(sessions);
+        sessions.range::<str, _>((Bound::Excluded(id), Bound::Unbounded)).next().map(|(_, live)| live.clone())
+    };
+    let is_awake = |live: &Arc<Live>| live.cost.share() > 0.0;
+    let rest = std::iter::successors(after(last), |live| after(&live.id));
+    let beginning = std::iter::successors(after(""), |live| after(&live.id)).take_while(|live| *live.id <= *last);
+    rest.chain(beginning).find(is_awake)
 }
 
 /// Keeps the thread to its share of a core.

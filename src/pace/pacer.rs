@@ -19,7 +19,7 @@ use super::thread::{self, Apart, Stepper};
 use crate::budget::Budget;
 use crate::limits::Limits;
 use crate::lock::lock;
-use crate::priority::{self, give_way, give_way_a_little};
+use crate::priority::{self, STEPPING_TURN, give_way, give_way_a_little, take_short_turns};
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 use crate::session::local::StiffnessJob;
 
@@ -70,7 +70,9 @@ impl Pacer {
         let spawn = |name: String, stepper: Arc<Stepper>, apart: Option<Apart>| {
             let (encoder, refiner, reading, fence) = (encoder.clone(), refiner.clone(), reading.clone(), fence.clone());
             priority::thread(name).spawn(move || {
-                if apart.is_none() {
+                if apart.is_some() {
+                    take_short_turns(STEPPING_TURN);
+                } else {
                     give_way();
                 }
                 thread::work(&stepper, apart.as_ref(), &fence, &encoder, &refiner, &reading);

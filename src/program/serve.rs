@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use palpate::budget;
+use palpate::priority::{NETWORK_TURN, take_short_turns};
 use palpate::server::{self, Listeners, signals};
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::fmt::format::FmtSpan;
@@ -229,6 +230,7 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         // idle thread in turn before it ends, so that none ever would.
         .max_blocking_threads(16)
         .thread_keep_alive(Duration::from_secs(1))
+        .on_thread_start(|| take_short_turns(NETWORK_TURN))
         .enable_all()
         .build()
         .map_err(|e| Failure::Failed(format!("can't start the network threads: {e}")))?;

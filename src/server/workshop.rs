@@ -67,12 +67,21 @@ struct Queue {
 }
 
 impl Queue {
+    fn is_running(&self, account: u64) -> bool {
+        self.running.iter().any(|running| running.0 == account)
+    }
+
     /// Starts the first job of the next account without a running job, and returns both.
     fn start_next(&mut self) -> Option<(u64, Job)> {
-        let is_idle = |account: u64| !self.running.iter().any(|running| running.0 == account);
-        let (account, job) = self.waiting.next(is_idle)?;
+        let (account, job) = self.waiting.next(|account| !self.running.iter().any(|running| running.0 == account))?;
         self.running.push((account, job.requested_ns));
         Some((account, job))
+    }
+
+    fn end(&mut self, account: u64) {
+        if let Some(done) = self.running.iter().position(|running| running.0 == account) {
+            self.running.swap_remove(done);
+        }
     }
 }
 
@@ -87,23 +96,34 @@ struct Shared {
 impl Shared {
     /// Runs jobs until the workshop is closed and no job is left to start.
     fn work(&self) {
-        let mut queue = lock(&self.queue);
-        loop {
-            if let Some((account, job)) = queue.start_next() {
-                drop(queue);
-                (job.run)();
-                queue = lock(&self.queue);
-                if let Some(done) = queue.running.iter().position(|running| running.0 == account) {
-                    queue.running.swap_remove(done);
-                }
-                // Any thread may start the account's next job.
-                self.changed.notify_all();
-            } else if queue.is_closed {
-                return;
-            } else {
-                queue = self.changed.wait(queue).unwrap_or_else(PoisonError::into_inner);
-            }
+        let mut done = None;
+        while let Some((account, job)) = self.next(done) {
+            (job.run)();
+            done = Some(account);
         }
+    }
+
+    /// Ends the job of the account `done`, waits for the next that may start, and starts it. A thread that gives way may be
+    /// stopped for tens of milliseconds wherever it is, also where it holds the lock that calls wait for. So it holds it once a
+    /// job, for as short as can be, and wakes others without it.
+    fn next(&self, done: Option<u64>) -> Option<(u64, Job)> {
+        let mut queue = lock(&self.queue);
+        done.into_iter().for_each(|account| queue.end(account));
+        let next = loop {
+            if let Some(next) = queue.start_next() {
+                break next;
+            }
+            if queue.is_closed {
+                return None;
+            }
+            queue = self.changed.wait(queue).unwrap_or_else(PoisonError::into_inner);
+        };
+        let is_more = queue.waiting.accounts().any(|account| !queue.is_running(account));
+        drop(queue);
+        if is_more {
+            self.changed.notify_one();
+        }
+        Some(next)
     }
 }
 
@@ -123,12 +143,16 @@ struct CancelOnDrop {
     account: u64,
     number: u64,
     cancelled: CancelFlag,
+    /// The job is not in the queue any more.
+    is_started: Arc<AtomicBool>,
 }
 
 impl Drop for CancelOnDrop {
     fn drop(&mut self) {
         self.cancelled.0.store(true, Ordering::Relaxed);
-        lock(&self.shared.queue).waiting.retain(self.account, |job| job.number != self.number);
+        if !self.is_started.load(Ordering::Relaxed) {
+            lock(&self.shared.queue).waiting.retain(self.account, |job| job.number != self.number);
+        }
     }
 }
 
@@ -195,12 +219,15 @@ impl Workshop {
         let (done, result) = oneshot::channel();
         let cancelled = CancelFlag::default();
         let (flag, most) = (cancelled.clone(), self.0.0.most_operations);
+        let is_started = Arc::new(AtomicBool::new(false));
+        let starts = is_started.clone();
         let run = move || {
+            starts.store(true, Ordering::Relaxed);
             if let Ok(answer) = catch_unwind(AssertUnwindSafe(|| work::within(&flag.0, most, || work(&flag)))) {
                 let _ = done.send(answer);
             }
         };
-        let _waiting = self.enqueue(account.number(), urgency, cancelled, Box::new(run))?;
+        let _waiting = self.enqueue(account.number(), urgency, cancelled, is_started, Box::new(run))?;
         match tokio::time::timeout(self.0.0.deadline, result).await {
             Ok(Ok(Ok(answer))) => Ok(answer),
             Ok(Ok(Err(GivenUp::TooMuch(most)))) => {
@@ -223,6 +250,7 @@ impl Workshop {
         account: u64,
         urgency: Urgency,
         cancelled: CancelFlag,
+        is_started: Arc<AtomicBool>,
         run: Box<dyn FnOnce() + Send>,
     ) -> Result<CancelOnDrop, Refusal> {
         let shared = &self.0.0;
@@ -236,8 +264,9 @@ impl Workshop {
             return Err(Refusal::new(Reason::Overloaded, "", message));
         }
         queue.waiting.push_before(account, job, |other| other.urgency > urgency);
+        drop(queue);
         shared.changed.notify_one();
-        Ok(CancelOnDrop { shared: shared.clone(), account, number, cancelled })
+        Ok(CancelOnDrop { shared: shared.clone(), account, number, cancelled, is_started })
     }
 
     /// How busy the workshop is.
