@@ -19,7 +19,7 @@ MODULES := clients/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
 	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
-.PHONY: help run install header test-abi bench-tick build release viewer page-if-node test test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run programs install header test-abi bench-tick build release viewer page-if-node test test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos
 
@@ -42,7 +42,7 @@ help:
 	@echo '                     five thousand snapshots (an hour or two)'
 	@echo 'make fuzz            a million bent inputs for every decoder (some minutes)'
 	@echo 'make libfuzzer       one decoder under libFuzzer: TARGET=request (or scene, script, …) FUZZ_SECONDS=60'
-	@echo 'make lint            formatting, compiler and clippy warnings'
+	@echo 'make lint            formatting, compiler and clippy warnings, and the counts of tests/counts.py'
 	@echo 'make picture         docs/poke.svg, the curve of the guide'
 	@echo 'make figures         the paper'"'"'s figures and experiments: docs/figures, shown in docs/paper.md'
 	@echo 'make screenshot      the screenshot of the README'
@@ -92,6 +92,10 @@ need-node:
 build: need-rust
 	$(CARGO) build --release --workspace
 
+# The two programs alone: all that a poke needs. The libraries for C and Python take as long again.
+programs: need-rust
+	$(CARGO) build --release --package palpate --package palpate-programs
+
 # Below PREFIX: include, lib (with pkg-config and CMake), bin. As a package: DESTDIR=….
 PREFIX ?= /usr/local
 BUILT := $(or $(CARGO_TARGET_DIR),target)/release
@@ -120,7 +124,7 @@ page-if-node:
 # The server runs until Ctrl-C, which reaches it as well as this shell. The page is built beside the programs: each has
 # parts that keep one core busy alone.
 run:
-	@$(MAKE) --no-print-directory -j2 build page-if-node
+	@$(MAKE) --no-print-directory -j2 programs page-if-node
 	@rm -f target/serving.txt; \
 	./target/release/palpate serve --listen $(LISTEN) --log warn > target/serving.txt & server=$$!; \
 	trap 'kill $$server 2>/dev/null; wait $$server; exit 0' INT TERM; \
@@ -160,6 +164,7 @@ test-python: build $(VENV)/ready
 
 lint: need-rust $(MODULES)
 	$(CARGO) fmt --all --check
+	$(PYTHON) tests/counts.py
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
 	cd $(TYPESCRIPT) && $(NPM) run lint
 	cd $(VIEWER) && $(NPM) run lint
@@ -221,7 +226,7 @@ test-arm: need-arm
 test-asan: need-rust
 	CARGO_PROFILE_RELEASE_OPT_LEVEL=1 CARGO_PROFILE_RELEASE_CODEGEN_UNITS=16 CARGO_PROFILE_RELEASE_DEBUG=false \
 		RUSTC_BOOTSTRAP=1 RUSTFLAGS=-Zsanitizer=address $(CARGO) test --release --target $(shell uname -m)-unknown-linux-gnu \
-		--target-dir target/asan --lib --test determinism -- sheet:: bits hash
+		--target-dir target/asan --lib --test determinism -- tissue:: bits hash
 
 # Memcheck does not know AVX-512: `auto` becomes AVX2.
 test-valgrind: need-rust

@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use palpate_proto::pb;
 use pb::touch_response::Message as Heard;
-use server::{Server, Touch, force};
+use server::{TestServer, TestTouch, force};
 
 fn runtime() -> tokio::runtime::Runtime {
     tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap()
@@ -20,7 +20,7 @@ fn runtime() -> tokio::runtime::Runtime {
 
 fn main() {
     let seconds: u64 = std::env::var("DUTY_S").ok().and_then(|text| text.parse().ok()).unwrap_or(60);
-    let server = Arc::new(Server::start(&["--log", "warn"]));
+    let server = Arc::new(TestServer::start(&["--log", "warn"]));
     let session = runtime().block_on(server.paper(true));
     let steps = seconds * 1000;
 
@@ -51,7 +51,7 @@ fn main() {
     });
 
     let (first, last, sent, rejected, samples) = runtime().block_on(async {
-        let mut touch = Touch::hold(&server, &session).await;
+        let mut touch = TestTouch::hold(&server, &session).await;
         let (mut sent, mut rejected, mut samples, mut first) = (0, 0, 0_u64, None);
         server.start_until(&session, steps).await;
         loop {

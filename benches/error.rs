@@ -1,5 +1,5 @@
 //! The cost of accuracy: every scheme, number format and step on seven sheets and two organs, run time against error. Writes
-//! docs/benchmarks/error.{md,json,svg}; `-- --quick` tries fewer steps and measures each once.
+//! docs/benchmarks/error.{md,svg}; `-- --quick` tries fewer steps and measures each once.
 
 #![allow(
     clippy::unwrap_used,
@@ -18,14 +18,14 @@ mod subject;
 use std::path::Path;
 use std::sync::Arc;
 
-use frontier::{Curve, Trial, cheapest, is_best, on_any_frontier};
+use frontier::{Curve, SchemeTrial, cheapest, is_best, on_any_frontier};
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::script::Script;
 use palpate::session::Session;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use report::chart::{Look, Panel, Series};
-use report::{Report, cells, digits, least, quick, rough, seconds};
+use report::{BenchReport, cells, digits, least, quick, rough, seconds};
 use scenes::{CASES, Case};
 use serde_json::json;
 use subject::{INTEGRATOR, PRECISION, PRECISIONS, integrators, known, set};
@@ -46,19 +46,19 @@ struct Trace {
 }
 
 /// A scene with its settings, ready to run.
-struct Run {
+struct SceneRun {
     model: Arc<Model>,
     script: Script,
 }
 
-impl Run {
+impl SceneRun {
     /// `None` where the settings are refused, or are known to be unstable.
     fn new(case: &Case, assignments: &[String]) -> Option<Self> {
         let model = subject::model_of(case.scene, &case.with(assignments)).ok()?;
         let script =
             Script::parse(case.name, &case.script(), Path::new("."), &model.scene, &Limits::default()).unwrap();
         assert!(script.warnings.is_empty(), "{}: {:?}", case.name, script.warnings);
-        model.plan.stable.then_some(Run { model, script })
+        model.plan.stable.then_some(SceneRun { model, script })
     }
 
     fn session(&self) -> Session {
@@ -127,7 +127,7 @@ fn truth(case: &Case, knows_rk4: bool) -> (Trace, [f64; 2], &'static str) {
     let substeps = 2 * (64.0 * fastest_per_s / 1000.0).ceil().max(32.0) as u32;
     let trace = |integrator: &str, substeps: u32| {
         let settings = [set(INTEGRATOR, integrator), set(PRECISION, "f64"), set("stepping.substeps", substeps)];
-        Run::new(case, &settings).unwrap().trace().unwrap()
+        SceneRun::new(case, &settings).unwrap().trace().unwrap()
     };
     let extrapolated = |coarse: &Trace, fine: &Trace| {
         let values = |coarse: &[DVec3], fine: &[DVec3]| {
@@ -156,18 +156,18 @@ fn curve(
     precision: &'static str,
     truth: &Trace,
     effort: &Effort,
-) -> Vec<(Run, Trial)> {
-    let mut trials: Vec<(Run, Trial)> = Vec::new();
+) -> Vec<(SceneRun, SchemeTrial)> {
+    let mut trials: Vec<(SceneRun, SchemeTrial)> = Vec::new();
     let mut best = f64::INFINITY;
     let mut in_vain = 0;
     for halvings in 0..16 {
         let (step_s, mut settings) = step_of(halvings);
         settings.extend([set(INTEGRATOR, integrator), set(PRECISION, precision)]);
-        let Some(run) = Run::new(case, &settings) else { continue };
+        let Some(run) = SceneRun::new(case, &settings) else { continue };
         let (run_s, trace) = seconds(|| run.trace());
         let Some(trace) = trace else { continue };
         let [displacement, force] = errors(&trace, truth);
-        let trial = Trial { integrator, precision, step_s, displacement, force, cost: f64::NAN };
+        let trial = SchemeTrial { integrator, precision, step_s, displacement, force, cost: f64::NAN };
         // At some step, rounding stops the gain.
         in_vain = if trial.error() < 0.8 * best { 0 } else { in_vain + 1 };
         best = best.min(trial.error());
@@ -189,10 +189,10 @@ fn measure(case: &Case, truth: &Trace, schemes: &[&'static str], effort: &Effort
         }
     }
     eprintln!("  timing");
-    let runs: Vec<&Run> = curves.iter().flatten().map(|(run, _)| run).collect();
+    let runs: Vec<&SceneRun> = curves.iter().flatten().map(|(run, _)| run).collect();
     let mut costs = least(effort.rounds, &runs, |run| run.cost()).into_iter();
-    let timed = |trials: &Vec<(Run, Trial)>| {
-        let timed = trials.iter().map(|(_, trial)| Trial { cost: costs.next().unwrap(), ..trial.clone() });
+    let timed = |trials: &Vec<(SceneRun, SchemeTrial)>| {
+        let timed = trials.iter().map(|(_, trial)| SchemeTrial { cost: costs.next().unwrap(), ..trial.clone() });
         timed.collect::<Curve>()
     };
     curves.iter().map(timed).filter(|curve| !curve.is_empty()).collect()
@@ -201,7 +201,7 @@ fn measure(case: &Case, truth: &Trace, schemes: &[&'static str], effort: &Effort
 fn panel(case: &Case, curves: &[Curve]) -> Panel {
     let mut best: Vec<_> = curves.iter().flatten().filter(|trial| is_best(trial, curves)).collect();
     best.sort_by(|a, b| a.cost.total_cmp(&b.cost));
-    let line = |trials: &[&Trial]| trials.iter().map(|trial| (trial.error(), trial.cost)).collect();
+    let line = |trials: &[&SchemeTrial]| trials.iter().map(|trial| (trial.error(), trial.cost)).collect();
     let mut series =
         vec![Series { name: "cheapest".into(), hue: integrators().len(), look: Look::Broad, points: line(&best) }];
     series.extend(curves.iter().map(|curve| Series {
@@ -218,11 +218,11 @@ fn panel(case: &Case, curves: &[Curve]) -> Panel {
     }
 }
 
-fn tell_case(report: &mut Report, case: &Case, curves: &[Curve], truth: &str) {
+fn tell_case(report: &mut BenchReport, case: &Case, curves: &[Curve], truth: &str) {
     report.heading(case.name);
     report.say(&format!("{}. {truth}", case.about));
     let header = ["scheme", "format", "step, µs", "error of displacement", "of force", "s a simulated second", "best"];
-    let row = |trial: &Trial| {
+    let row = |trial: &SchemeTrial| {
         cells([
             trial.integrator,
             trial.precision,
@@ -237,7 +237,7 @@ fn tell_case(report: &mut Report, case: &Case, curves: &[Curve], truth: &str) {
 }
 
 /// Ratios at equal error: the cost of the reference scheme over that of the best.
-fn tell_ratios(report: &mut Report, reference: &str, at: &[f64], results: &[(&Case, Vec<Curve>)]) {
+fn tell_ratios(report: &mut BenchReport, reference: &str, at: &[f64], results: &[(&Case, Vec<Curve>)]) {
     let mut header = vec!["scene".to_owned()];
     header.extend(at.iter().map(|error| format!("at {error:.0e}")));
     let mut rows = Vec::new();
@@ -245,7 +245,7 @@ fn tell_ratios(report: &mut Report, reference: &str, at: &[f64], results: &[(&Ca
     for (case, curves) in results {
         let mut row = vec![case.name.to_owned()];
         for &error in at {
-            let of = |trial: &Trial| trial.integrator == reference;
+            let of = |trial: &SchemeTrial| trial.integrator == reference;
             // Extrapolation is possible only for a scheme of first order.
             let reference = cheapest(curves, error, of, reference == "lagged");
             let best = cheapest(curves, error, |_| true, false);
@@ -291,10 +291,10 @@ fn main() {
         results.push((case, measure(case, &truth, &schemes, &effort)));
     }
 
-    let mut report = Report::new("error", "Run time against error", "make bench-error");
+    let mut report = BenchReport::new("error", "Run time against error", "make bench-error");
     report.say(
         "Errors are the largest over all sample times and points, relative to the largest value: of the displacement, \
-         and of the force on a tool there (springs, virtual spring and damping). `error` is the larger of the two. The \
+         and of the force on a tool there (springs, anchor spring and damping). `error` is the larger of the two. The \
          truth is central differences in f64 at two small steps, extrapolated to none. Time is that of the stepping \
          alone on one thread, the least of some runs in turn. ● marks what no other run beats: none takes less time for an error as small, or within 2 % of it.",
     );

@@ -1,18 +1,18 @@
-//! What a fleet costs beside one server, how it spreads sessions, and what etcd bears of it. Writes
-//! docs/benchmarks/fleet.{md,json,svg}; `-- calls`, `-- spread`, `-- steps` and `-- etcd` print one part alone, `-- --quick` does all
+//! What a fleet costs beside one server, how it spreads sessions, and what etcd etcd_capacity of it. Writes
+//! docs/benchmarks/fleet.{md,svg}; `-- calls`, `-- spread`, `-- steps` and `-- etcd` print one part alone, `-- --quick` does all
 //! with small numbers. Linux only: times are read from /proc. Needs etcd.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 #![allow(unreachable_pub)]
 
-#[path = "fleet/bears.rs"]
-mod bears;
 #[path = "fleet/calls.rs"]
 mod calls;
 #[path = "../tests/common/cores.rs"]
 mod cores;
 #[path = "../tests/common/etcd.rs"]
 mod etcd;
+#[path = "fleet/etcd_capacity.rs"]
+mod etcd_capacity;
 #[path = "../tests/common/fleet.rs"]
 mod fleet;
 mod report;
@@ -25,8 +25,8 @@ mod steps;
 
 use std::path::{Path, PathBuf};
 
-use etcd::Etcd;
-use report::Report;
+use etcd::EtcdMembers;
+use report::BenchReport;
 use report::chart::Panel;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
@@ -41,9 +41,9 @@ fn generous(folder: &Path) -> PathBuf {
 
 /// Times of one kind.
 #[derive(Default)]
-struct Times(Vec<f64>);
+struct FleetTimes(Vec<f64>);
 
-impl Times {
+impl FleetTimes {
     /// Not a number if there are none.
     fn quantile(&self, quantile: f64) -> f64 {
         let mut sorted = self.0.clone();
@@ -59,23 +59,27 @@ impl Times {
 }
 
 /// One part of the page.
-type Part = (&'static str, fn(&mut Report) -> Option<Panel>);
+type PageSection = (&'static str, fn(&mut BenchReport) -> Option<Panel>);
 
-const PARTS: [Part; 4] =
-    [("calls", calls::measure), ("spread", spread::measure), ("steps", steps::measure), ("etcd", bears::measure)];
+const PARTS: [PageSection; 4] = [
+    ("calls", calls::measure),
+    ("spread", spread::measure),
+    ("steps", steps::measure),
+    ("etcd", etcd_capacity::measure),
+];
 
 fn main() {
     if !Path::new("/proc/self/stat").exists() {
         return println!("left out: there is no /proc on this system");
     }
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     // A thousand nodes have a connection each.
     let most = getrlimit(Resource::Nofile).maximum;
     let _ = setrlimit(Resource::Nofile, Rlimit { current: most, maximum: most });
-    let mut report = Report::new("fleet", "A fleet on etcd", "make bench-fleet");
-    let wanted = |part: &&Part| std::env::args().skip(1).any(|argument| argument == part.0);
+    let mut report = BenchReport::new("fleet", "A fleet on etcd", "make bench-fleet");
+    let wanted = |part: &&PageSection| std::env::args().skip(1).any(|argument| argument == part.0);
     if let Some(part) = PARTS.iter().find(wanted) {
         part.1(&mut report);
         return report.print();

@@ -1,7 +1,7 @@
 //! Compares refining and encoding a frame with a plain copy of its bytes: both on one core, in turn, the least time of
 //! many turns. The frame is written into the buffers of the one before, as in the server; the copy goes into a buffer
 //! that has been written before. Also measures the bytes of a poke sent as frames of changes. Writes
-//! docs/benchmarks/frames.{md,json,svg}.
+//! docs/benchmarks/frames.{md,svg}.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
@@ -14,13 +14,13 @@ use std::time::{Duration, Instant};
 
 use glam::DVec3;
 use palpate::limits::Limits;
-use palpate::pace::frames::Delivery;
+use palpate::realtime::frames::Delivery;
 use palpate::scene::profile::Poke;
 use palpate::scene::{PAPER, Scene};
-use palpate::sheet::{Push, at_rest};
 use palpate::surface::{Encoding, Frame, FrameTiles, Refinement, Snapshot, encode, encode_over};
+use palpate::tissue::{Push, at_rest};
 use report::chart::Panel;
-use report::{Report, cells, digits, quick, seconds};
+use report::{BenchReport, cells, digits, quick, seconds};
 use serde_json::json;
 
 const SIDES: [usize; 2] = [31, 331];
@@ -28,12 +28,12 @@ const REFINEMENTS: [u32; 4] = [0, 1, 3, 10];
 
 /// How long each case is measured, and the least number of times.
 const DURATION: Duration = Duration::from_millis(1000);
-const LEAST_TURNS: u32 = 25;
+const MIN_TURNS: u32 = 25;
 
 /// The goal: a frame of 331 × 331 points takes at most as long as this many copies.
 const GOAL: f64 = 3.0;
 
-struct Case {
+struct FrameCase {
     side: usize,
     refinement: u32,
     encoding: Encoding,
@@ -45,7 +45,7 @@ struct Case {
     copy_s: f64,
 }
 
-impl Case {
+impl FrameCase {
     fn ratio(&self) -> f64 {
         self.frame_s / self.copy_s
     }
@@ -74,7 +74,7 @@ fn copy(frame: &Frame, mut to: &mut [u8]) {
     }
 }
 
-fn measure(side: usize, refinement: u32, encoding: Encoding) -> Case {
+fn measure(side: usize, refinement: u32, encoding: Encoding) -> FrameCase {
     let limits = Limits { frame_vertices: usize::MAX, ..Limits::default() };
     let sets = [format!("sheet.points=[{side}, {side}]")];
     let scene = Scene::parse("frames", PAPER, &sets, &limits).unwrap();
@@ -88,7 +88,7 @@ fn measure(side: usize, refinement: u32, encoding: Encoding) -> Case {
     let mut least_s = [f64::INFINITY; 3];
     let (begin, mut turns) = (Instant::now(), 0);
     let duration = if quick() { DURATION / 10 } else { DURATION };
-    while turns < LEAST_TURNS || begin.elapsed() < duration {
+    while turns < MIN_TURNS || begin.elapsed() < duration {
         let (frame_s, next) = seconds(|| black_box(encode_over(black_box(&snapshot), frame)));
         frame = next;
         let (copy_s, ()) = seconds(|| copy(black_box(&frame), black_box(&mut copied)));
@@ -100,10 +100,10 @@ fn measure(side: usize, refinement: u32, encoding: Encoding) -> Case {
         turns += 1;
     }
     let [frame_s, copy_s, box_s] = least_s;
-    Case { side, refinement, encoding, vertices, bytes, frame_s, box_s, copy_s }
+    FrameCase { side, refinement, encoding, vertices, bytes, frame_s, box_s, copy_s }
 }
 
-fn table(report: &mut Report, cases: &[Case]) {
+fn table(report: &mut BenchReport, cases: &[FrameCase]) {
     let header =
         ["sheet", "n", "encoding", "ms a frame", "ns a vertex", "GB/s", "copy, ms", "frame / copy", "with box"];
     let rows = cases.iter().map(|case| {
@@ -123,10 +123,10 @@ fn table(report: &mut Report, cases: &[Case]) {
 }
 
 /// The ratio of each case by sheet, refinement and encoding; yellow is the goal.
-fn map(cases: &[Case]) -> Panel {
-    let shown = |case: &Case| (digits(case.ratio()), 0.5 * case.ratio() / GOAL);
+fn map(cases: &[FrameCase]) -> Panel {
+    let shown = |case: &FrameCase| (digits(case.ratio()), 0.5 * case.ratio() / GOAL);
     let column = |side: usize| cases.iter().filter(move |case| case.side == side);
-    let name = |case: &Case| format!("n={} {:?}", case.refinement, case.encoding);
+    let name = |case: &FrameCase| format!("n={} {:?}", case.refinement, case.encoding);
     Panel::Cells {
         title: "Time of a frame / time of a copy of its bytes".to_owned(),
         x: ("points", SIDES.map(|side| format!("{side}²")).into()),
@@ -144,7 +144,7 @@ const RATE_HZ: u64 = 60;
 const PHASES: [(&str, u64); 4] = [("poked", 1000), ("let go", 2000), ("coming to rest", 7000), ("still", 12_000)];
 
 /// The frames of changes sent in one phase.
-struct Sent {
+struct SentFrames {
     bytes: usize,
     frames: u64,
     /// Largest distance of a vertex from its true place, in quanta.
@@ -152,7 +152,7 @@ struct Sent {
 }
 
 /// The frames that a viewer gets of a poke: for each phase, and in total.
-fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec<String>>) {
+fn poke(force_n: DVec3, refinement: u32, report: &mut BenchReport, rows: &mut Vec<Vec<String>>) {
     let side = 331;
     let model = subject::model(&[subject::set("sheet.points", format!("[{side}, {side}]"))]).unwrap();
     let mut tissue = at_rest(&model);
@@ -164,10 +164,10 @@ fn poke(force_n: DVec3, refinement: u32, report: &mut Report, rows: &mut Vec<Vec
     let [_, columns] = grid.vertices();
     let full_bytes = grid.vertex_count() * Encoding::I16.bytes_per_vertex();
     let (mut tiles, mut seen, mut shown) = (None::<FrameTiles>, None, vec![[0.0; 3]; full_bytes / 6]);
-    let mut sent: Vec<Sent> = Vec::new();
+    let mut sent: Vec<SentFrames> = Vec::new();
     let mut frames = 0;
     for (phase, (name, end)) in PHASES.into_iter().enumerate() {
-        sent.push(Sent { bytes: 0, frames: 0, error: 0.0 });
+        sent.push(SentFrames { bytes: 0, frames: 0, error: 0.0 });
         let sent = &mut sent[phase];
         let begin = tissue.step_count();
         while tissue.step_count() < end {
@@ -260,7 +260,7 @@ fn error(truth: &Frame, frame: &Frame, columns: usize, shown: &[[f64; 3]]) -> f6
 }
 
 fn main() {
-    let mut report = Report::new("frames", "Frames", "make bench-frames");
+    let mut report = BenchReport::new("frames", "Frames", "make bench-frames");
     let mut cases = Vec::new();
     for side in SIDES {
         for refinement in REFINEMENTS {

@@ -1,5 +1,5 @@
 //! The time of a step for every width of the kernel, number format and size, compared with the limits of the machine
-//! and with implementations in NumPy, numba or Taichi. Writes docs/benchmarks/kernel.{md,json,svg}. The peers run if
+//! and with implementations in NumPy, numba or Taichi. Writes docs/benchmarks/kernel.{md,svg}. The peers run if
 //! PEERS names a Python that has them, as `make bench-kernel` ensures. `-- --quick` measures two sizes once.
 
 #![allow(
@@ -21,16 +21,16 @@ use std::process::Command;
 
 use glam::DVec3;
 use palpate::scene::profile::Poke;
-use palpate::sheet::{Push, Tissue, at_rest};
+use palpate::tissue::{Push, Tissue, at_rest};
 use report::chart::{Look, Panel, Series};
-use report::{Report, digits, quick, seconds};
+use report::{BenchReport, digits, quick, seconds};
 use serde_json::{Value, json};
 use subject::{INTEGRATOR, LANE_NAMES, LANES, PRECISION, PRECISIONS, known, set};
 
 /// Additions, multiplications and fused multiply-adds of 16 lanes per point, the operations of the measured chain.
 /// Comparisons, masks and shifts of lanes are not counted: some processors have other units for them. For each of its 4
 /// springs: 3 for the difference, ½ along the spring, 4 for the square, 7 for a polynomial of degree 5, 3 for the
-/// force, 5¼ to add it to both ends. For each of its 3 components: 4 for virtual spring, damping, the sum, and the
+/// force, 5¼ to add it to both ends. For each of its 3 components: 4 for anchor spring, damping, the sum, and the
 /// check of all.
 const OPERATIONS_PER_POINT: f64 = (4.0 * 22.75 + 3.0 * 4.0) / 16.0;
 
@@ -179,7 +179,7 @@ fn main() {
     let memory_ns = |side: usize| best(&|limit| limit["traffic_ns_per_point"][side.to_string()].as_f64());
     let clock_ghz = limits.iter().filter_map(|limit| limit["clock_ghz"].as_f64()).reduce(f64::max);
 
-    let mut report = Report::new("kernel", "The time of a step", "make bench-kernel");
+    let mut report = BenchReport::new("kernel", "The time of a step", "make bench-kernel");
     report.say(
         "ns a point and substep, one substep a step, one thread, with all that a step does (applied force, checks, \
          checkpoints): the least of many windows of about 3 ms in several rounds, and in brackets their median. The \

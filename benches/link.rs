@@ -15,9 +15,9 @@ mod server;
 use links::{by_seed, link, links, number};
 use palpate::limits::Limits;
 use palpate::scene::{BUILT_IN, Scene};
-use palpate::sheet::{Model, tangent};
+use palpate::tissue::{Model, tangent};
 use report::chart::{Look, Panel, Series};
-use report::{Report, cells, digits, quick, rough};
+use report::{BenchReport, cells, digits, quick, rough};
 use serde_json::{Value, json};
 
 const SCHEMES: [&str; 3] = ["model", "hold", "raw"];
@@ -67,7 +67,7 @@ fn header(label: &[&str]) -> Vec<String> {
 
 fn main() {
     let seeds: u64 = if quick() { 1 } else { 3 };
-    let mut report = Report::new("link", "Touch over a network", "make bench-link");
+    let mut report = BenchReport::new("link", "Touch over a network", "make bench-link");
     report.say(
         "Simulated hands, devices and networks, in virtual time (`palpate-client link --help`); runs of 20 s, means over \
          the seeds 1 to 3, of energies, jumps, peaks and ages the worst. `raw` renders the newest force as it came, `hold` \
@@ -94,7 +94,7 @@ fn main() {
     report.write(3, &panels);
 }
 
-fn boundary(report: &mut Report) {
+fn boundary(report: &mut BenchReport) {
     let found = link("--boundary");
     let rows = found.as_array().unwrap();
     let apart = |row: &Value| (number(&row["predicted_ms"]) - number(&row["observed_ms"])).abs();
@@ -119,7 +119,7 @@ fn boundary(report: &mut Report) {
     report.figure("boundary", found);
 }
 
-fn stiffness(report: &mut Report) {
+fn stiffness(report: &mut BenchReport) {
     report.heading("Stiffness under a disc, by spacing");
     report.say(
         "A slow press by a disc of 5 mm radius, force over depth, N/m; the same tissue on finer grids, the disc at three \
@@ -139,7 +139,7 @@ fn stiffness(report: &mut Report) {
             scene.sheet_mut().unwrap().points = [points; 2];
             scene.sheet_mut().unwrap().spacing_m = spacing_m;
             scene.sheet_mut().unwrap().point_mass_kg *= share;
-            scene.virtual_stiffness_n_per_m *= share;
+            scene.anchor_stiffness_n_per_m *= share;
             scene.damping_n_s_per_m *= share;
             let model = Model::compile(&scene, &Limits::default()).unwrap();
             let places = [0.0, 0.25, 0.5].map(|part| {
@@ -160,7 +160,7 @@ fn stiffness(report: &mut Report) {
 }
 
 /// The main table: error by delay.
-fn delays(report: &mut Report, seeds: u64) -> Vec<Panel> {
+fn delays(report: &mut BenchReport, seeds: u64) -> Vec<Panel> {
     report.heading("By delay: medium hand, omega3");
     let scenes = ["liver", "fibrotic", "stomach"];
     let mut runs = Vec::new();
@@ -198,8 +198,8 @@ fn delays(report: &mut Report, seeds: u64) -> Vec<Panel> {
     panels
 }
 
-fn others(report: &mut Report, seeds: u64) {
-    let table = |report: &mut Report, name: &str, labels: &[&str], runs: Vec<(Vec<String>, String)>| {
+fn others(report: &mut BenchReport, seeds: u64) {
+    let table = |report: &mut BenchReport, name: &str, labels: &[&str], runs: Vec<(Vec<String>, String)>| {
         let all: Vec<_> = runs.iter().flat_map(|(_, run)| by_seed(run, seeds)).collect();
         let found = links(&all);
         let rows: Vec<_> =
@@ -253,7 +253,7 @@ fn others(report: &mut Report, seeds: u64) {
 }
 
 /// The same hand and task in real time, over gRPC with a delay, to validate virtual time.
-fn live(report: &mut Report) {
+fn live(report: &mut BenchReport) {
     report.heading("In real time: medium hand, omega3");
     report.say(
         "`palpate-client link --server URL` through a proxy that delays by half the round trip each way, beside the same \
@@ -261,7 +261,7 @@ fn live(report: &mut Report) {
          the hand goes on by time, whoever is late, and the device holds its last force.",
     );
     let runtime = tokio::runtime::Runtime::new().unwrap();
-    let server = server::Server::start(&["--log", "warn"]);
+    let server = server::TestServer::start(&["--log", "warn"]);
     let seconds = if quick() { 8 } else { 20 };
     let (mut rows, mut figures) = (Vec::new(), Vec::new());
     for scene in ["liver", "fibrotic"] {
@@ -302,7 +302,7 @@ const BOTH: [(&str, &str); 11] = [
 ];
 
 /// A table of runs over a stream beside the same over datagrams, of liver and fibrotic tissue: by label and arguments.
-fn beside(report: &mut Report, name: &str, label: &str, runs: &[(String, String)], seeds: u64) {
+fn beside(report: &mut BenchReport, name: &str, label: &str, runs: &[(String, String)], seeds: u64) {
     let transports = ["stream", "datagram"];
     let tissues = ["liver", "fibrotic"];
     let mut all = Vec::new();
@@ -339,7 +339,7 @@ fn beside(report: &mut Report, name: &str, label: &str, runs: &[(String, String)
 }
 
 /// Loss, jitter and outages.
-fn lossy(report: &mut Report, seeds: u64) {
+fn lossy(report: &mut BenchReport, seeds: u64) {
     report.heading("Stream beside datagrams: 50 ms, medium hand, omega3");
     report.say(
         "Over a stream a lost packet holds up all that follow it. Over datagrams it is lost alone; each repeats up to eight \
@@ -376,7 +376,7 @@ fn lossy(report: &mut Report, seeds: u64) {
 }
 
 /// Places of a sheet of 75 mm, a second tool, and a tissue that changes.
-fn places(report: &mut Report, seeds: u64) {
+fn places(report: &mut BenchReport, seeds: u64) {
     report.heading("Elsewhere, and not alone: 50 ms, medium hand, omega3");
     report.say(
         "*Half-way* is between the middle and the rim, *at the rim* one radius of the tip (5 mm) from it; the rim is fixed. The \
@@ -394,7 +394,7 @@ fn places(report: &mut Report, seeds: u64) {
 }
 
 /// Organs, whose surfaces are curved.
-fn organs(report: &mut Report, seeds: u64) {
+fn organs(report: &mut BenchReport, seeds: u64) {
     report.heading("Organs: 50 ms, medium hand, omega3, datagrams");
     report.say(
         "A model tells the surface under the tip with its curvature; a tip that strokes over a rim, a fold or a lump meets another \
@@ -438,7 +438,7 @@ const ORGANS: [(&str, &str); 5] = [
     ("least energy, J", "energy_min_j"),
 ];
 
-fn random(report: &mut Report) {
+fn random(report: &mut BenchReport) {
     let runs = if quick() { 20 } else { 1000 };
     report.heading("Random combinations");
     let found = link(&format!("--random {runs} --seconds 5"));

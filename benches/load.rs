@@ -1,7 +1,7 @@
 //! How many sessions does a core bear, each with a haptic client at 1 kHz or none, what does each cost beside the kernel
 //! alone? The server is kept to one core, the generator (`palpate-client load`) to the others. Writes
-//! docs/benchmarks/load.{md,json,svg}. `-- --quick` tries few numbers for a short time; `-- profile` prints that part alone.
-//! `-- attacks` shows what one honest client notices of clients that attack, and writes docs/benchmarks/attacks.{md,json,svg};
+//! docs/benchmarks/load.{md,svg}. `-- --quick` tries few numbers for a short time; `-- profile` prints that part alone.
+//! `-- attacks` shows what one honest client notices of clients that attack, and writes docs/benchmarks/attacks.{md,svg};
 //! `-- attacks NAME` prints one attack's row alone. Linux only: times are read from /proc.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
@@ -27,7 +27,7 @@ use std::process::{Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use attack::Kind;
+use attack::AttackKind;
 use cores::{kept_to, thread_times};
 use glam::DVec3;
 use palpate::limits::Limits;
@@ -36,17 +36,17 @@ use palpate::scene::script::Action;
 use palpate::scene::{PAPER, Scene};
 use palpate::session::Session;
 use palpate::session::command::{Command as Order, Due};
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use report::chart::{Look, Panel, Series};
-use report::{Report, cells, digits, quick};
-use rows::Row;
+use report::{BenchReport, cells, digits, quick};
+use rows::AttackRow;
 use serde_json::{Value, json};
-use server::{Server, client_program};
+use server::{TestServer, client_program};
 
 const OBJECTIVE: &str = "p99<2ms,dilation>0.999";
 
 /// One run of the generator.
-struct Load {
+struct GeneratorRun {
     told: Value,
     /// Cores that the server took: stepping and network, each in user mode and in the system.
     stepping: [f64; 2],
@@ -54,7 +54,7 @@ struct Load {
     resident_mib: f64,
 }
 
-impl Load {
+impl GeneratorRun {
     fn number(&self, path: &str) -> f64 {
         self.told.pointer(path).and_then(Value::as_f64).unwrap_or(f64::NAN)
     }
@@ -64,7 +64,7 @@ impl Load {
     }
 }
 
-fn load(server: &Server, seconds: f64, arguments: &[&str]) -> Load {
+fn load(server: &TestServer, seconds: f64, arguments: &[&str]) -> GeneratorRun {
     let mut child = kept_to(false, || {
         Command::new(client_program())
             .args(["load", "--server", &server.url, "--seconds", &seconds.to_string(), "--json"])
@@ -93,10 +93,10 @@ fn load(server: &Server, seconds: f64, arguments: &[&str]) -> Load {
         let (before, after) = (of(&before, name), of(&after, name));
         [0, 1].map(|mode| (after[mode] - before[mode]) / elapsed_s)
     };
-    Load { told, stepping: cores("step"), network: cores("network"), resident_mib }
+    GeneratorRun { told, stepping: cores("step"), network: cores("network"), resident_mib }
 }
 
-fn resident_mib(server: &Server) -> f64 {
+fn resident_mib(server: &TestServer) -> f64 {
     let status = std::fs::read_to_string(format!("/proc/{}/status", server.child.id())).unwrap();
     let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
     line.split_whitespace().nth(1).unwrap().parse::<f64>().unwrap() / 1024.0
@@ -139,9 +139,9 @@ fn kernel_alone_s(count: usize, rounds: u64) -> f64 {
     begun.elapsed().as_secs_f64() / (rounds as f64 * count as f64)
 }
 
-fn start(arguments: &[&str]) -> Arc<Server> {
+fn start(arguments: &[&str]) -> Arc<TestServer> {
     let common = ["--threads", "1", "--log", "error"];
-    kept_to(true, || Arc::new(Server::start(&[&common[..], arguments].concat())))
+    kept_to(true, || Arc::new(TestServer::start(&[&common[..], arguments].concat())))
 }
 
 /// How many sessions take a core for themselves, by what one takes among so many (µs a step of 1 ms): the more there are,
@@ -161,7 +161,7 @@ fn most_by(line: &[(f64, f64)]) -> f64 {
 }
 
 /// How many sessions there may be, with clients and without, and what each costs.
-fn crowds(report: &mut Report, figures: &mut Vec<Value>, seconds: f64) -> Vec<Series> {
+fn crowds(report: &mut BenchReport, figures: &mut Vec<Value>, seconds: f64) -> Vec<Series> {
     let counts: &[usize] = if quick() { &[1, 25, 100] } else { &[1, 10, 25, 50, 75, 100, 150, 200, 300] };
     // Also those that a server would not let in.
     let folder = tempfile::tempdir().unwrap();
@@ -251,7 +251,7 @@ fn crowds(report: &mut Report, figures: &mut Vec<Value>, seconds: f64) -> Vec<Se
 const PROFILED: usize = 50;
 
 /// Where the time goes beside the kernel.
-fn profile(report: &mut Report) {
+fn profile(report: &mut BenchReport) {
     report.heading("Where it goes");
     eprintln!("a profile of {PROFILED} sessions");
     let server = start(&[]);
@@ -272,7 +272,7 @@ fn profile(report: &mut Report) {
          machines their cores do it.",
         digits(each_us)
     ));
-    let row = |((thread, doing), part): &(profile::Place, f64)| {
+    let row = |((thread, doing), part): &(profile::Activity, f64)| {
         cells([(*thread).to_owned(), (*doing).to_owned(), digits(part * each_us), format!("{:.1}", 100.0 * part)])
     };
     let shown: Vec<_> = parts.iter().filter(|entry| entry.1 >= 0.002).map(row).collect();
@@ -302,7 +302,7 @@ fn runs() -> usize {
 }
 
 /// What an honest client notices of clients that are not: of the attack of that name, or of all of them.
-fn attacks(report: &mut Report, name: Option<&str>) -> Panel {
+fn attacks(report: &mut BenchReport, name: Option<&str>) -> Panel {
     let runs = runs().max(1);
     report.say(&format!(
         "One client at 1 kHz in a session of its own, on a server that is kept to one core (one stepping thread, one of the \
@@ -312,28 +312,28 @@ fn attacks(report: &mut Report, name: Option<&str>) -> Panel {
          leave; a newcomer that waits for 5 s gives up. Lost commands were never answered. Memory is resident: before, at \
          most, and 10 s after, when all have left. Each attack is run {runs} times; the row is the run with the median p99."
     ));
-    let kinds: Vec<Option<&'static Kind>> = match name {
+    let kinds: Vec<Option<&'static AttackKind>> = match name {
         Some(name) => vec![Some(attack::named(name).unwrap_or_else(|| unknown_attack(name)))],
         // Quiet before and after: the two tell how far one row can be trusted.
         None => std::iter::once(None).chain(attack::KINDS.iter().map(Some)).chain([None]).collect(),
     };
     let (mut table, mut figures, mut pictured) = (Vec::new(), Vec::new(), Vec::new());
     for kind in kinds {
-        let mut rows: Vec<Row> = (0..runs)
+        let mut rows: Vec<AttackRow> = (0..runs)
             .map(|_| {
                 let row = rows::run(kind);
                 eprintln!("| {} |", row.cells().join(" | "));
                 row
             })
             .collect();
-        figures.extend(rows.iter().map(Row::figures));
+        figures.extend(rows.iter().map(AttackRow::figures));
         let each: Vec<_> = rows.iter().map(|row| digits(row.times_quiet())).collect();
         rows.sort_by(|a, b| a.times_quiet().total_cmp(&b.times_quiet()));
         let row = rows.swap_remove(runs / 2);
         table.push([row.cells(), vec![each.join(", ")]].concat());
         pictured.push(row);
     }
-    report.table(&[Row::header(), cells(["p99 × quiet, each run"])].concat(), &table);
+    report.table(&[AttackRow::header(), cells(["p99 × quiet, each run"])].concat(), &table);
     report.figure("runs", figures.into());
     // From the bottom up.
     pictured.reverse();
@@ -341,7 +341,7 @@ fn attacks(report: &mut Report, name: Option<&str>) -> Panel {
         title: "What one honest client notices".to_owned(),
         x: ("", cells(["p99 × quiet", "commands lost", "most memory, MiB"])),
         y: ("", pictured.iter().map(|row| row.name().to_owned()).collect()),
-        rows: pictured.iter().map(Row::pictured).collect(),
+        rows: pictured.iter().map(AttackRow::pictured).collect(),
     }
 }
 
@@ -361,7 +361,7 @@ fn main() {
     match arguments.next().as_deref() {
         Some("attacks") => {
             let name = arguments.next().filter(|name| name != "all" && !name.starts_with('-'));
-            let mut report = Report::new("attacks", "Under attack", "make bench-load ATTACK=all");
+            let mut report = BenchReport::new("attacks", "Under attack", "make bench-load ATTACK=all");
             let panel = attacks(&mut report, name.as_deref());
             if name.is_none() {
                 return report.write(1, &[panel]);
@@ -369,12 +369,12 @@ fn main() {
             report.print();
         }
         Some(_) => {
-            let mut report = Report::new("load", "Many sessions on one core", "make bench-load");
+            let mut report = BenchReport::new("load", "Many sessions on one core", "make bench-load");
             profile(&mut report);
             report.print();
         }
         None => {
-            let mut report = Report::new("load", "Many sessions on one core", "make bench-load");
+            let mut report = BenchReport::new("load", "Many sessions on one core", "make bench-load");
             report.say(
                 "Sessions of the paper's 31 × 31 points at 1 kHz, all of them awake: each is stroked without rest. The server \
                  (one stepping thread, one of the network) is kept to one core; `palpate-client load` has the others, and \

@@ -1,6 +1,6 @@
 //! The time of a step on triangle meshes: `central` in f32, all awake, at every width, on spheres of even and of uneven
 //! triangles; beside it a plain loop, implementations in numba and Taichi, and a sheet of as many points. Writes
-//! docs/benchmarks/mesh.{md,json,svg}. The peers run if PEERS names a Python that has them, as `make bench-mesh` ensures.
+//! docs/benchmarks/mesh.{md,svg}. The peers run if PEERS names a Python that has them, as `make bench-mesh` ensures.
 //! `-- --quick` measures the two smaller sizes, with fewer rounds.
 
 #![allow(
@@ -23,17 +23,17 @@ use std::path::Path;
 use glam::DVec3;
 use palpate::scene::profile::Poke;
 use palpate::scene::{Lanes, Named};
-use palpate::sheet::mesh::{MeshGraph, MeshSpring, Trial};
-use palpate::sheet::{Push, Tissue, at_rest};
+use palpate::tissue::mesh::{MeshGraph, MeshSpring, MeshTrial};
+use palpate::tissue::{Push, Tissue, at_rest};
 use report::chart::{Look, Panel, Series};
-use report::{Report, digits, least, quick, seconds};
+use report::{BenchReport, digits, least, quick, seconds};
 use serde_json::json;
 use subject::{INTEGRATOR, LANE_NAMES, LANES, PRECISION, known, set};
 
 /// Steps of one timing: the first of them bring the mesh into the caches.
 const STEPS: usize = 6;
 
-/// The phase per step of a point's virtual spring alone, rad, and (k/m)·dt²: of all that is measured on a mesh
+/// The phase per step of a point's anchor spring alone, rad, and (k/m)·dt²: of all that is measured on a mesh
 /// (benches/peers/common.py has the squares).
 const TURN: f64 = 0.1;
 const PULL: f64 = 0.03;
@@ -243,7 +243,7 @@ fn sheet(points: usize) -> Box<dyn Tissue> {
 // There are three of them.
 #[allow(clippy::large_enum_variant)]
 enum Subject {
-    Kernel(Trial),
+    Kernel(MeshTrial),
     Plain(PlainLoop),
     Sheet(Box<dyn Tissue>),
 }
@@ -287,7 +287,7 @@ fn measure(kind: &'static str, graph: &MeshGraph, widths: &[&str], rounds: usize
     let mut subjects: Vec<(String, RefCell<Subject>)> = widths
         .iter()
         .map(|name| {
-            let mut trial = Trial::new(graph, TURN, PULL, lanes_of(name)).unwrap();
+            let mut trial = MeshTrial::new(graph, TURN, PULL, lanes_of(name)).unwrap();
             trial.displace(|vertex| displaced(graph, vertex));
             ((*name).to_owned(), RefCell::new(Subject::Kernel(trial)))
         })
@@ -333,7 +333,7 @@ fn main() {
     names.push(PLAIN);
     names.extend(PEERS.map(|(name, _)| name).into_iter().filter(|name| measured[0].ns.contains_key(*name)));
 
-    let mut report = Report::new("mesh", "The time of a step on a mesh", "make bench-mesh");
+    let mut report = BenchReport::new("mesh", "The time of a step on a mesh", "make bench-mesh");
     report.say(
         "ns a vertex and step of `central` in f32, one thread, all awake, without the checks of a session: the least of \
          many timings in which the widths take turns. Spheres with three springs a vertex: regular (divided \

@@ -1,5 +1,5 @@
 //! Organs: the time of a step, what a poke on a resting organ costs beside it all awake, what
-//! a tip costs, and how even touch is over a mesh. Writes docs/benchmarks/organ.{md,json,svg}. `-- --quick` measures less.
+//! a tip costs, and how even touch is over a mesh. Writes docs/benchmarks/organ.{md,svg}. `-- --quick` measures less.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
@@ -12,10 +12,10 @@ use palpate::limits::Limits;
 use palpate::scene::profile::Poke;
 use palpate::scene::{BUILT_IN, Named, Scene};
 use palpate::shape::points;
-use palpate::sheet::{Model, Push, Tissue, at_rest, tangent};
+use palpate::tissue::{Model, Push, Tissue, at_rest, tangent};
 use palpate_touch::{Coupling, Tip};
 use report::chart::{Look, Panel, Series};
-use report::{Report, cells, digits, least, quick, seconds};
+use report::{BenchReport, cells, digits, least, quick, seconds};
 use serde_json::json;
 
 /// Steps of one timing.
@@ -55,7 +55,7 @@ fn step_s(rounds: usize, tissues: &[std::cell::RefCell<Box<dyn Tissue>>]) -> Vec
 
 fn main() {
     let rounds = if quick() { 10 } else { 100 };
-    let mut report = Report::new("organ", "Organs", "make bench-organ");
+    let mut report = BenchReport::new("organ", "Organs", "make bench-organ");
     report.say("Release build, one thread; times are the least of many, in which the rows of a table take turns.");
     speed(&mut report, rounds);
     let model = organ("liver-organ", 0.002, &[]);
@@ -65,7 +65,7 @@ fn main() {
     report.write(2, &[across, map]);
 }
 
-fn speed(report: &mut Report, rounds: usize) {
+fn speed(report: &mut BenchReport, rounds: usize) {
     report.heading("Time of a step");
     report.say(
         "`liver-organ` at its default tolerance and 1 kHz. All awake: a force reaches every vertex. A poke: a force of 0.3 N that \
@@ -132,7 +132,7 @@ const LUMPS_M: [(DVec3, f64); 2] =
 const NEAR_M: f64 = 0.005;
 
 /// Stiffness of a slow press of 2 mm along a line over the larger lump.
-fn across_a_lump(report: &mut Report, model: &Arc<Model>) -> Panel {
+fn across_a_lump(report: &mut BenchReport, model: &Arc<Model>) -> Panel {
     report.heading("A lump is felt where it is");
     report.say("Force of a slow press of `liver-organ`, 1 and 2 mm deep, along a line across its larger lump.");
     let lump_m = LUMPS_M[0].0;
@@ -167,7 +167,7 @@ fn across_a_lump(report: &mut Report, model: &Arc<Model>) -> Panel {
 }
 
 /// Stiffness of a slow press of 1 mm all over the organ, seen from above. Places are `apart_m` or more from each other.
-fn map(report: &mut Report, model: &Arc<Model>) -> Panel {
+fn map(report: &mut BenchReport, model: &Arc<Model>) -> Panel {
     report.heading("And nowhere else");
     let apart_m: f64 = if quick() { 0.012 } else { 0.004 };
     let shape = model.shape();
@@ -255,10 +255,10 @@ fn flat(edge_m: f64) -> Arc<Model> {
         youngs_modulus_pa = 8000.0
         thickness_m = 0.01
         depth_m = 0.03
-        bed_n_per_m3 = 1.34e6
+        foundation_n_per_m3 = 1.34e6
         damping_ratio = 0.5
         [springs]
-        flexion = 0.1
+        bending = 0.1
     "#;
     let path = folder.path().join("flat.toml");
     std::fs::write(&path, scene).unwrap();
@@ -273,7 +273,7 @@ fn spread(values: &[f64]) -> (f64, f64) {
 }
 
 /// The same press at many places between the vertices, and a tip that slides.
-fn evenness(report: &mut Report) {
+fn evenness(report: &mut BenchReport) {
     report.heading("The same wherever it lies between the vertices");
     report.say(
         "Flat tissue of the liver's material on a mesh whose vertices are moved by up to a quarter of an edge. A disc of 5 mm \
@@ -304,7 +304,7 @@ fn evenness(report: &mut Report) {
         for step in 1..=steps {
             tissue.pose(0, from_m + f64::from(step) / f64::from(steps) * way_m, TIP);
             tissue.step().unwrap();
-            let force_n = tissue.feel(0).unwrap().force_on_tool_n.z;
+            let force_n = tissue.tool_contact(0).unwrap().force_on_tool_n.z;
             if step > 200 {
                 jump = slid.last().map_or(0.0, |last: &f64| (force_n / last - 1.0).abs()).max(jump);
                 slid.push(force_n);

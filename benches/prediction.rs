@@ -18,11 +18,11 @@ use links::{by_seed, link, links, number};
 use palpate::limits::Limits;
 use palpate::scene::{BUILT_IN, Scene};
 use palpate::session::prediction::TissueCopy;
-use palpate::sheet::{Footprint, Model};
+use palpate::tissue::{Footprint, Model};
 use palpate_proto::pb;
 use palpate_touch::{Predictor, Tip};
 use report::chart::{Look, Panel, Series};
-use report::{Report, cells, digits, quick};
+use report::{BenchReport, cells, digits, quick};
 use serde_json::{Value, json};
 
 /// Round trip, ms.
@@ -76,7 +76,8 @@ fn row(label: &[&str], runs: &[Value]) -> Vec<String> {
 }
 
 fn main() {
-    let mut report = Report::new("prediction", "Touch on organs from a copy of the tissue", "make bench-prediction");
+    let mut report =
+        BenchReport::new("prediction", "Touch on organs from a copy of the tissue", "make bench-prediction");
     report.say(
         "`model` renders the local model along the tool's own way. `prediction` renders from a copy of the tissue that the client \
          simulates, corrected by samples, or from the local model while that has been nearer to them. Medium hand, omega3, runs of \
@@ -99,7 +100,7 @@ fn main() {
 }
 
 /// A table of what was run by each scheme.
-fn table(report: &mut Report, label: &str, name: &'static str, runs: &[(&str, String)], seeds: u64) {
+fn table(report: &mut BenchReport, label: &str, name: &'static str, runs: &[(&str, String)], seeds: u64) {
     let each = || runs.iter().flat_map(|(title, run)| SCHEMES.map(|scheme| (*title, run, scheme)));
     let all: Vec<_> = each().flat_map(|(_, run, scheme)| by_seed(&format!("{run} --scheme {scheme}"), seeds)).collect();
     let found = links(&all);
@@ -108,7 +109,7 @@ fn table(report: &mut Report, label: &str, name: &'static str, runs: &[(&str, St
     report.figure(name, Value::Array(found));
 }
 
-fn places(report: &mut Report, seeds: u64) {
+fn places(report: &mut BenchReport, seeds: u64) {
     report.heading("A constant delay of 50 ms, datagrams");
     let run = |(title, scene, place): &(&'static str, &str, &str)| {
         (*title, format!("--scene {scene} {place} --transport datagram --rtt-ms {ROUND_TRIP_MS}"))
@@ -117,7 +118,7 @@ fn places(report: &mut Report, seeds: u64) {
 }
 
 /// What makes the copy another tissue than the server's.
-fn disturbed(report: &mut Report, seeds: u64) {
+fn disturbed(report: &mut BenchReport, seeds: u64) {
     report.heading("Where the copy is not the whole truth: liver-organ");
     report.say(
         "A second tool presses by a task of its own. The tissue changes after 10 s to springs of half as much stiffness again; its \
@@ -172,14 +173,14 @@ fn panel(title: &str, scene: &str, place: &str) -> Panel {
     }
 }
 
-fn live(report: &mut Report) {
+fn live(report: &mut BenchReport) {
     report.heading("In real time, 50 ms");
     report.say(
         "The same hand and task over gRPC to a real server through a proxy that delays by 25 ms each way. The copy is made of a \
          snapshot that the server sends. Ticks and steps are late now and then, each by the clock of its own end.",
     );
     let runtime = tokio::runtime::Runtime::new().unwrap();
-    let server = server::Server::start(&["--log", "warn"]);
+    let server = server::TestServer::start(&["--log", "warn"]);
     let seconds = if quick() { 8 } else { 20 };
     let (mut rows, mut figures) = (Vec::new(), Vec::new());
     for (title, scene, place) in PLACES.iter().filter(|place| place.1 != "gallbladder") {
@@ -202,14 +203,14 @@ fn live(report: &mut Report) {
 }
 
 /// What a copy takes of a tick, in memory, and to be made.
-fn cost(report: &mut Report) {
+fn cost(report: &mut BenchReport) {
     report.heading("What a copy costs");
     report.say(
         "A tip of 5 mm strokes over the tissue, 3 mm deep, at 1 kHz: the time of a tick's step of the copy, one thread. The snapshot is \
          what the server sends; to make a copy of it takes the time of the last column, beside the loop.",
     );
     let runtime = tokio::runtime::Runtime::new().unwrap();
-    let server = server::Server::start(&["--log", "warn"]);
+    let server = server::TestServer::start(&["--log", "warn"]);
     let (mut rows, mut figures) = (Vec::new(), Vec::new());
     for name in ["liver-organ", "gallbladder", "colon", "liver"] {
         let text = BUILT_IN.iter().find(|scene| scene.0 == name).unwrap().1;
@@ -257,7 +258,7 @@ fn times_us(model: &Arc<Model>) -> Vec<f64> {
     times.skip(200).collect()
 }
 
-async fn snapshot(server: &server::Server, scene: &str) -> Vec<u8> {
+async fn snapshot(server: &server::TestServer, scene: &str) -> Vec<u8> {
     let source = pb::create_session_request::Source::SceneName(scene.to_owned());
     let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
     let session = server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap();

@@ -13,14 +13,14 @@ use palpate_proto::pb;
 use pb::create_session_request::Source;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
-use server::{Server, force};
+use server::{TestServer, force};
 use tonic::transport::Channel;
 
 /// Limit for all sessions together, per cent of one core.
-const MOST_PERCENT: f64 = 1.0;
+const MAX_PERCENT: f64 = 1.0;
 
 /// Limit for one session of 31 × 31 points.
-const MOST_KIB: f64 = 128.0;
+const MAX_KIB: f64 = 128.0;
 
 /// Sessions poked at a time: fewer than a core can step.
 const BATCH: usize = 50;
@@ -30,14 +30,14 @@ fn environment(name: &str, otherwise: f64) -> f64 {
 }
 
 /// Resident memory, KiB.
-fn memory_kib(server: &Server) -> f64 {
+fn memory_kib(server: &TestServer) -> f64 {
     let status = std::fs::read_to_string(format!("/proc/{}/status", server.child.id())).unwrap();
     let line = status.lines().find(|line| line.starts_with("VmRSS:")).unwrap();
     line.split_whitespace().nth(1).unwrap().parse().unwrap()
 }
 
 /// Processor time of all threads so far, s. Linux counts it in ticks of 10 ms.
-fn cpu_s(server: &Server) -> f64 {
+fn cpu_s(server: &TestServer) -> f64 {
     let stat = std::fs::read_to_string(format!("/proc/{}/stat", server.child.id())).unwrap();
     let after_name = &stat[stat.rfind(')').unwrap() + 2..];
     let ticks = after_name.split_whitespace().skip(11).take(2).map(|field| field.parse::<f64>().unwrap());
@@ -45,7 +45,7 @@ fn cpu_s(server: &Server) -> f64 {
 }
 
 /// Per cent of a core, over some seconds without requests.
-fn share_percent(server: &Server) -> f64 {
+fn share_percent(server: &TestServer) -> f64 {
     let (begun, before_s) = (Instant::now(), cpu_s(server));
     std::thread::sleep(Duration::from_secs_f64(environment("REST_S", 10.0)));
     100.0 * (cpu_s(server) - before_s) / begun.elapsed().as_secs_f64()
@@ -91,7 +91,7 @@ fn main() {
     }
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     let count = environment("REST_SESSIONS", 1000.0) as usize;
-    let server = Server::start(&["--log", "warn"]);
+    let server = TestServer::start(&["--log", "warn"]);
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     let channel = runtime.block_on(server.channel());
     let (mut sessions, mut haptics) = (SessionServiceClient::new(channel.clone()), HapticServiceClient::new(channel));
@@ -102,7 +102,7 @@ fn main() {
     let mut report = |what: &str| {
         let (each_kib, percent) = ((memory_kib(&server) - before_kib) / count as f64, share_percent(&server));
         println!("| {what} | {percent:.2} % | {each_kib:.1} KiB |");
-        missed |= percent >= MOST_PERCENT || each_kib > MOST_KIB;
+        missed |= percent >= MAX_PERCENT || each_kib > MAX_KIB;
     };
     println!("| {count} sessions of 31 × 31 points | of a core, all together | memory of each |\n|---|---|---|");
     let ids: Vec<String> = runtime.block_on(async {
@@ -133,7 +133,7 @@ fn main() {
         missed = true;
     }
     if missed {
-        println!("\nabove the bounds of {MOST_PERCENT} % and {MOST_KIB} KiB");
+        println!("\nabove the bounds of {MAX_PERCENT} % and {MAX_KIB} KiB");
         // Stops the server; an exit would not run the destructor.
         drop(server);
         std::process::exit(1);

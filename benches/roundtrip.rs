@@ -21,12 +21,12 @@ use palpate_proto::pb;
 use pb::haptic_service_server::{HapticService, HapticServiceServer};
 use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;
-use server::{Server, Touch, force};
+use server::{TestServer, TestTouch, force};
 use tokio_stream::wrappers::TcpListenerStream;
 use tokio_stream::{Stream, StreamExt};
 use tonic::{Request, Response, Status, Streaming};
 
-type Out<T> = std::pin::Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+type OutStream<T> = std::pin::Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 /// Answers each command with a sample of the usual size: at once, or after a millisecond in a session named "wait".
 struct Echo;
@@ -68,9 +68,9 @@ fn echoed(request: &pb::TouchRequest, server_hold_ns: u64) -> pb::TouchResponse 
 
 #[tonic::async_trait]
 impl HapticService for Echo {
-    type TouchStream = Out<pb::TouchResponse>;
-    type WatchSamplesStream = Out<pb::WatchSamplesResponse>;
-    type ProbeStream = Out<pb::ProbeResponse>;
+    type TouchStream = OutStream<pb::TouchResponse>;
+    type WatchSamplesStream = OutStream<pb::WatchSamplesResponse>;
+    type ProbeStream = OutStream<pb::ProbeResponse>;
     async fn touch(
         &self,
         request: Request<Streaming<pb::TouchRequest>>,
@@ -142,21 +142,21 @@ fn serve_echo() {
 }
 
 /// Starts the echo server in a process of its own.
-fn spawn_echo() -> Server {
+fn spawn_echo() -> TestServer {
     let mut echo = Command::new(std::env::current_exe().unwrap());
-    Server::spawn(echo.arg("--echo"))
+    TestServer::spawn(echo.arg("--echo"))
 }
 
 /// A haptic stream that sends a command and waits for its acknowledgement.
 struct Asker {
-    touch: Touch,
+    touch: TestTouch,
     sequence: u64,
     clock: Instant,
 }
 
 impl Asker {
-    async fn open(server: &Server, session_id: &str) -> Self {
-        Asker { touch: Touch::hold(server, session_id).await, sequence: 0, clock: Instant::now() }
+    async fn open(server: &TestServer, session_id: &str) -> Self {
+        Asker { touch: TestTouch::hold(server, session_id).await, sequence: 0, clock: Instant::now() }
     }
 
     fn now_ns(&self) -> u64 {
@@ -186,7 +186,7 @@ fn main() {
     if std::env::args().any(|argument| argument == "--echo") {
         return serve_echo();
     }
-    let palpate = Server::start(&["--log", "warn"]);
+    let palpate = TestServer::start(&["--log", "warn"]);
     let echo = spawn_echo();
     let rounds: usize = std::env::var("ROUNDS").ok().and_then(|text| text.parse().ok()).unwrap_or(10);
     tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap().block_on(async {

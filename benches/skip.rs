@@ -1,5 +1,5 @@
 //! How much time sleep saves, and how much accuracy it costs. Sizes, springs and kinds of poke against the tolerance of
-//! `[sleep]`; the truth is the same run with everything awake. Writes docs/benchmarks/skip.{md,json,svg}. `-- --quick`
+//! `[sleep]`; the truth is the same run with everything awake. Writes docs/benchmarks/skip.{md,svg}. `-- --quick`
 //! measures the small sheets.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
@@ -9,9 +9,9 @@ mod subject;
 
 use glam::DVec3;
 use palpate::scene::profile::{CentreProfile, LoadProfile, Profile, StrengthProfile};
-use palpate::sheet::{Push, at_rest};
+use palpate::tissue::{Push, at_rest};
 use report::chart::{Look, Panel, Series};
-use report::{Report, cells, digits, quick, rough, seconds};
+use report::{BenchReport, cells, digits, quick, rough, seconds};
 use serde_json::json;
 use subject::set;
 
@@ -21,7 +21,7 @@ const STEPS: u64 = 2000;
 const LOOK_STEPS: u64 = 50;
 
 /// The forces on a sheet of side `length_m`, at 1 kHz.
-struct Kind {
+struct LoadCase {
     name: &'static str,
     about: &'static str,
     pushes: fn(length_m: f64) -> Vec<LoadProfile>,
@@ -42,13 +42,13 @@ fn poke(centre_m: DVec3, force_n: DVec3) -> LoadProfile {
     }
 }
 
-const KINDS: [Kind; 4] = [
-    Kind {
+const KINDS: [LoadCase; 4] = [
+    LoadCase {
         name: "local",
         about: "3 N straight down at the centre for 1 s, then let go",
         pushes: |length_m| vec![poke(at(length_m, 0.5), DVec3::new(0.0, 0.0, -3.0))],
     },
-    Kind {
+    LoadCase {
         name: "stroke",
         about: "1 N at a slant that moves along y at 0.2 m/s, all the time",
         pushes: |length_m| {
@@ -63,7 +63,7 @@ const KINDS: [Kind; 4] = [
             }]
         },
     },
-    Kind {
+    LoadCase {
         name: "two tools",
         about: "3 N at a third and at two thirds of the diagonal for 1 s, at a slant and straight down",
         pushes: |length_m| {
@@ -73,7 +73,7 @@ const KINDS: [Kind; 4] = [
             ]
         },
     },
-    Kind {
+    LoadCase {
         name: "everything",
         about: "a force on all points that swings at 3 Hz, all the time",
         pushes: |length_m| {
@@ -88,13 +88,13 @@ const KINDS: [Kind; 4] = [
 ];
 
 /// A run: the mean time of a step, the computed fraction, and the recorded fields.
-struct Run {
+struct SkipRun {
     step_s: f64,
     computed: f64,
     fields: Vec<[Vec<f32>; 3]>,
 }
 
-fn run(settings: &[String], kind: &Kind, rounds: usize) -> Run {
+fn run(settings: &[String], kind: &LoadCase, rounds: usize) -> SkipRun {
     let model = subject::model(settings).unwrap();
     let length_m = model.shape().longest_side_m();
     let (mut least_s, mut fields, mut computed) = (f64::INFINITY, Vec::new(), 0.0);
@@ -114,7 +114,7 @@ fn run(settings: &[String], kind: &Kind, rounds: usize) -> Run {
         least_s = least_s.min(stepping_s);
         computed = tissue.computed_fraction();
     }
-    Run { step_s: least_s / STEPS as f64, computed, fields }
+    SkipRun { step_s: least_s / STEPS as f64, computed, fields }
 }
 
 /// Bound for the time of a step with a part of the points awake: 1.1 times the cost of those points in a step with all
@@ -124,7 +124,7 @@ fn bound_s(all_awake_s: f64, computed: f64) -> f64 {
 }
 
 /// The largest component anywhere at any time, and the largest difference.
-fn compare(truth: &Run, other: &Run) -> [f64; 2] {
+fn compare(truth: &SkipRun, other: &SkipRun) -> [f64; 2] {
     let mut most = [0.0_f64; 2];
     for (truth, other) in truth.fields.iter().flatten().zip(other.fields.iter().flatten()) {
         for (a, b) in truth.iter().zip(other) {
@@ -136,7 +136,7 @@ fn compare(truth: &Run, other: &Run) -> [f64; 2] {
 
 fn main() {
     let sides: &[usize] = if quick() { &[31, 121] } else { &[31, 121, 331, 1001] };
-    let mut report = Report::new("skip", "What it saves to leave out what is at rest", "make bench-skip");
+    let mut report = BenchReport::new("skip", "What it saves to leave out what is at rest", "make bench-skip");
     report.say(
         "Two seconds at 1 kHz of the paper's tissue (K″ = 5 N/m) with more points and stiffer springs. How many times \
          faster the steps are than with everything awake, and the error: the largest difference from that run of any \

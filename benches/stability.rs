@@ -1,5 +1,5 @@
 //! The largest stable step: the predicted and the observed limit for every scheme, by stiffness and damping; and the
-//! effect of a large force near it; and the same limit of organs. Writes docs/benchmarks/stability.{md,json,svg}.
+//! effect of a large force near it; and the same limit of organs. Writes docs/benchmarks/stability.{md,svg}.
 
 #![allow(
     clippy::unwrap_used,
@@ -21,9 +21,9 @@ use palpate::scene::profile::{CentreProfile, LoadProfile, Poke, Profile, Strengt
 use palpate::scene::{Body, Integrator, Mesh, Named, Scene};
 use palpate::session::Session;
 use palpate::shape::PointId;
-use palpate::sheet::{Model, Push, at_rest};
+use palpate::tissue::{Model, Push, at_rest};
 use report::chart::Panel;
-use report::{Report, cells, digits};
+use report::{BenchReport, cells, digits};
 use serde_json::{Value, json};
 use subject::{INTEGRATOR, integrators, known, set};
 
@@ -42,18 +42,18 @@ const FATES: [(&str, f64); 4] = [("stable", 0.0), ("mended", 0.4), ("astray", 0.
 
 /// A scheme and its conditions.
 #[derive(Clone, Copy)]
-struct Tissue {
+struct SchemeCase {
     integrator: &'static str,
     spring_n_per_m: f64,
     damping_n_s_per_m: f64,
 }
 
-impl Tissue {
+impl SchemeCase {
     fn model(self, step_s: f64) -> palpate::refusal::Result<Arc<Model>> {
         let varied = [
             set(INTEGRATOR, self.integrator),
             set("springs.stiffness_n_per_m", self.spring_n_per_m),
-            set("virtual_springs.stiffness_n_per_m", VIRTUAL_N_PER_M),
+            set("anchor_springs.stiffness_n_per_m", VIRTUAL_N_PER_M),
             set("damping.coefficient_n_s_per_m", self.damping_n_s_per_m),
             set("stepping.rate_hz", 1.0 / step_s),
         ];
@@ -67,7 +67,7 @@ impl Tissue {
         let spring_n_per_m = (omega_per_s * omega_per_s * mass_kg - VIRTUAL_N_PER_M) / 12.0;
         // A remainder from rounding is not a spring.
         let spring_n_per_m = if spring_n_per_m < 1e-9 { 0.0 } else { spring_n_per_m };
-        let bounded = Tissue { spring_n_per_m, ..self };
+        let bounded = SchemeCase { spring_n_per_m, ..self };
         largest_s(1.0 / omega_per_s, |step_s| bounded.model(step_s).unwrap().plan.stable)
     }
 
@@ -169,7 +169,7 @@ fn largest_s(about_s: f64, holds: impl Fn(f64) -> bool) -> Option<f64> {
     Some(low)
 }
 
-/// The fastest vibration of a sheet without fixed points or flexion at rest, rad/s: the largest eigenvalue of its
+/// The fastest vibration of a sheet without fixed points or bending at rest, rad/s: the largest eigenvalue of its
 /// stiffness by the power method. At rest a spring resists only along itself, so everything is in the plane.
 fn fastest_per_s(model: &Model) -> f64 {
     let scene = &model.scene;
@@ -177,7 +177,7 @@ fn fastest_per_s(model: &Model) -> f64 {
     let (k, shear) = (scene.springs.stiffness_n_per_m, scene.springs.shear_stiffness_n_per_m);
     let springs = [((0, 1), k), ((1, 0), k), ((1, 1), shear), ((1, -1), shear)];
     let stiffness_of = |u: &[DVec2]| {
-        let mut force: Vec<DVec2> = u.iter().map(|u| scene.virtual_stiffness_n_per_m * *u).collect();
+        let mut force: Vec<DVec2> = u.iter().map(|u| scene.anchor_stiffness_n_per_m * *u).collect();
         for ((di, dj), stiffness_n_per_m) in springs {
             let along = DVec2::new(di as f64, dj as f64).normalize();
             for i in 0..nx - di {
@@ -242,7 +242,7 @@ fn textbook(integrator: &str, omega_per_s: f64, damping_per_s: f64) -> Option<f6
 
 /// dt·ω at the limit.
 struct Limit {
-    tissue: Tissue,
+    tissue: SchemeCase,
     omega_per_s: f64,
     predicted: Option<f64>,
     observed: Option<f64>,
@@ -252,7 +252,7 @@ struct Limit {
 }
 
 impl Limit {
-    fn find(tissue: Tissue) -> Self {
+    fn find(tissue: SchemeCase) -> Self {
         let model = tissue.model(1e-3).unwrap();
         let mass_kg = model.scene.sheet().unwrap().point_mass_kg;
         let omega_per_s = fastest_per_s(&model);
@@ -292,7 +292,7 @@ impl Limit {
     fn figures(&self) -> Value {
         json!({
             "integrator": self.tissue.integrator, "damping_n_s_per_m": self.tissue.damping_n_s_per_m,
-            "spring_n_per_m": self.tissue.spring_n_per_m, "virtual_n_per_m": VIRTUAL_N_PER_M,
+            "spring_n_per_m": self.tissue.spring_n_per_m, "anchor_n_per_m": VIRTUAL_N_PER_M,
             "omega_per_s": self.omega_per_s, "textbook_turn": self.textbook, "predicted_turn": self.predicted,
             "observed_turn": self.observed, "difference_percent": self.difference(), "beyond": self.beyond,
         })
@@ -348,7 +348,7 @@ impl Organ {
     }
 }
 
-/// The fastest vibration of a mesh at rest, rad/s: of its springs along themselves and its virtual springs, by the power method.
+/// The fastest vibration of a mesh at rest, rad/s: of its springs along themselves and its anchor springs, by the power method.
 fn fastest_of_mesh_per_s(scene: &Scene, mesh: &Mesh) -> f64 {
     let shape = scene.shape();
     let mass_kg = |vertex: usize| mesh.point_mass_kg * mesh.relative_mass(PointId::new(vertex));
@@ -360,7 +360,7 @@ fn fastest_of_mesh_per_s(scene: &Scene, mesh: &Mesh) -> f64 {
         })
         .collect();
     let held_per_s2 = |vertex: usize| {
-        scene.virtual_stiffness_n_per_m / mesh.point_mass_kg * (1.0 + mesh.extra_virtual(PointId::new(vertex)))
+        scene.anchor_stiffness_n_per_m / mesh.point_mass_kg * (1.0 + mesh.extra_anchor(PointId::new(vertex)))
     };
     let accelerations = |u: &[DVec3]| {
         let mut forces_n = vec![DVec3::ZERO; u.len()];
@@ -443,7 +443,7 @@ fn limit_panel(integrator: &str, limits: &[Limit]) -> Panel {
 
 /// The effect of a large force, over steps and forces, and whether everything within the predicted limit went well.
 fn force_panel(integrator: &'static str) -> (Panel, Vec<Value>) {
-    let tissue = Tissue { integrator, spring_n_per_m: 10.0, damping_n_s_per_m: 0.5 };
+    let tissue = SchemeCase { integrator, spring_n_per_m: 10.0, damping_n_s_per_m: 0.5 };
     let omega_per_s = tissue.model(1e-3).unwrap().omega_bound_per_s;
     let turns = [0.125, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0, 4.0];
     let forces_n = [0.01, 0.1, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0];
@@ -480,7 +480,7 @@ fn main() {
         eprintln!("{integrator}: limits");
         for damping_n_s_per_m in DAMPINGS_N_S_PER_M {
             for spring_n_per_m in SPRINGS_N_PER_M {
-                limits.push(Limit::find(Tissue { integrator, spring_n_per_m, damping_n_s_per_m }));
+                limits.push(Limit::find(SchemeCase { integrator, spring_n_per_m, damping_n_s_per_m }));
             }
         }
         panels.push(limit_panel(integrator, &limits));
@@ -499,7 +499,7 @@ fn main() {
         }
     }
 
-    let mut report = Report::new("stability", "The largest stable step", "make bench-stability");
+    let mut report = BenchReport::new("stability", "The largest stable step", "make bench-stability");
     report.say(&format!(
         "The sheet: 9 × 9 points of 10 g, K″ = {VIRTUAL_N_PER_M} N/m, f64, one substep a step. ω is its fastest vibration at \
          rest: the largest eigenvalue of its stiffness, by the power method. *Predicted* is the largest dt·ω that the \

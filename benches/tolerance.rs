@@ -1,5 +1,5 @@
 //! Whether the chosen scheme keeps a scene's tolerance, and by how much. Random scenes with random scripts against f64
-//! at 1e-10. Writes docs/benchmarks/tolerance.{md,json,svg}. `-- --scenes 1000 --seed 1 --tolerances 1e-3,1e-5`; exit
+//! at 1e-10. Writes docs/benchmarks/tolerance.{md,svg}. `-- --scenes 1000 --seed 1 --tolerances 1e-3,1e-5`; exit
 //! status 1 if a tolerance was broken. `--audit` also compares an audit's result with the true error, which takes ten
 //! times as long.
 
@@ -17,11 +17,11 @@ use std::time::Instant;
 use palpate::scene::{Named, Precision};
 use random_scenes::{audited_errors, case, errors, play, truth};
 use report::chart::{Look, Panel, Series};
-use report::{Report, quick, rough};
+use report::{BenchReport, quick, rough};
 use serde_json::json;
 
 /// One scene at one tolerance.
-struct Row {
+struct ToleranceRow {
     /// The larger error of displacement and force, over the tolerance.
     part: f64,
     /// The expected error over the true one.
@@ -59,7 +59,7 @@ fn main() -> ExitCode {
     let audit = std::env::args().any(|argument| argument == "--audit");
     let begun = Instant::now();
     let clock_s = || begun.elapsed().as_secs_f64();
-    let mut rows: BTreeMap<&str, Vec<Row>> = BTreeMap::new();
+    let mut rows: BTreeMap<&str, Vec<ToleranceRow>> = BTreeMap::new();
     let mut refused = Vec::new();
     for n in 0..scenes {
         let case = case(seed * 1_000_000 + n);
@@ -84,7 +84,7 @@ fn main() -> ExitCode {
                     });
                     let (model, error) = (&played.model, displacement.max(force));
                     let (integrator, substeps) = (model.plan.integrator.name(), model.plan.substeps);
-                    rows.entry(tolerance).or_default().push(Row {
+                    rows.entry(tolerance).or_default().push(ToleranceRow {
                         part: error / asked,
                         expected: model.expected_error / error,
                         dear: substeps > 1 || model.precision == Precision::F64,
@@ -103,7 +103,7 @@ fn main() -> ExitCode {
         }
     }
 
-    let mut report = Report::new("tolerance", "Is the tolerance kept?", "make bench-tolerance");
+    let mut report = BenchReport::new("tolerance", "Is the tolerance kept?", "make bench-tolerance");
     report.say(&format!(
         "{scenes} random scenes with random scripts (seed {seed}; tests/common/random_scenes.rs says which), each against itself in \
          f64 at 1e-10. The error is the largest difference of any component of displacement or force at any watched point \
@@ -149,7 +149,7 @@ fn main() -> ExitCode {
     }
     report.table(&header.map(str::to_owned), &table);
     for (tolerance, rows) in &rows {
-        let mut beyond: Vec<&Row> = rows.iter().filter(|row| row.part > 1.0).collect();
+        let mut beyond: Vec<&ToleranceRow> = rows.iter().filter(|row| row.part > 1.0).collect();
         beyond.sort_by(|a, b| b.part.total_cmp(&a.part));
         for row in beyond.iter().take(10) {
             report.say(&format!("Beyond {tolerance} by {:.2} times: {} ({})", row.part, row.about, row.chosen));

@@ -16,9 +16,9 @@ use palpate::render::{Camera, Film, View};
 use palpate::scene::script::Script;
 use palpate::scene::{BUILT_IN, PAPER, Scene};
 use palpate::session::{Session, run};
-use palpate::sheet::{Model, tangent};
 use palpate::surface::Refinement;
 use palpate::texture;
+use palpate::tissue::{Model, tangent};
 
 const SIZE: [usize; 2] = [560, 420];
 
@@ -159,7 +159,7 @@ fn lumps() {
 /// Keys of a scene and their labels in a picture.
 const K: (&str, &str) = ("springs.stiffness_n_per_m", "k");
 const C: (&str, &str) = ("damping.coefficient_n_s_per_m", "C");
-const VIRTUAL: (&str, &str) = ("virtual_springs.stiffness_n_per_m", "K″");
+const VIRTUAL: (&str, &str) = ("anchor_springs.stiffness_n_per_m", "K″");
 
 fn main() {
     // The last step before the force is released.
@@ -179,7 +179,7 @@ fn main() {
     let one = |title, what, values: &[f64], up| [curves(title, what, values, up, &[])];
     sweep("sweep-k.svg", &one("springs k, N/m", K, &[1.0, 10.0, 30.0, 100.0], -20.0..200.0));
     sweep("sweep-c.svg", &one("damping C, N·s/m", C, &[0.1, 0.25, 0.5, 1.0], -40.0..120.0));
-    sweep("sweep-virtual.svg", &one("virtual springs K″, N/m", VIRTUAL, &[2.0, 5.0, 10.0, 20.0], -20.0..120.0));
+    sweep("sweep-virtual.svg", &one("anchor springs K″, N/m", VIRTUAL, &[2.0, 5.0, 10.0, 20.0], -20.0..120.0));
 
     let (values, up) = ([10.0, 36.0, 38.0, 40.0], || -20.0..100.0);
     let paper = ["stepping.integrator=lagged", "stepping.substeps=1", "stepping.rate_hz=100"];

@@ -133,7 +133,7 @@ fn shapes(files: &[FileDescriptorProto]) -> Result<String, Box<dyn Error>> {
         writeln!(table, "Shape {{ name: \"{name}\", bytes: size_of::<{path}>(), decode: {decode}, fields: &[")?;
         for field in *fields {
             let (number, is_list, kind) = (field.number(), field.label() == Label::Repeated, kind(field)?);
-            writeln!(table, "Field {{ number: {number}, is_list: {is_list}, kind: Kind::{kind} }},")?;
+            writeln!(table, "Field {{ number: {number}, is_list: {is_list}, kind: FieldKind::{kind} }},")?;
         }
         table.push_str("] },\n");
     }

@@ -8,17 +8,17 @@ use std::time::Duration;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Who writes into a pipe may be silent for so long.
-const PATIENCE: Duration = Duration::from_secs(30);
+const PIPE_TIMEOUT: Duration = Duration::from_secs(30);
 
 /// Bytes of a key, a certificate, a password or a file of tokens, at most.
-pub const MOST_SECRET_BYTES: u64 = 1 << 20;
+pub const MAX_SECRET_BYTES: u64 = 1 << 20;
 
 /// At most `most` bytes of what a user names on a command line: a file, a device, or a pipe such as `<(…)` makes.
 ///
 /// # Errors
 /// Refuses a path that can't be read, what has more bytes, and a pipe into which nobody writes for 30 s.
 pub fn read(path: &Path, most: u64) -> Result<Vec<u8>> {
-    read_within(path, most, PATIENCE)
+    read_within(path, most, PIPE_TIMEOUT)
 }
 
 /// The same as text.
@@ -152,7 +152,7 @@ mod tests {
                 // Who reads may have had enough.
                 drop(written);
             });
-            match read_within(&path, most, PATIENCE) {
+            match read_within(&path, most, PIPE_TIMEOUT) {
                 Ok(bytes) => assert!(bytes.len() == sent && sent as u64 <= most),
                 Err(refusal) => assert!(refusal.reason == Reason::TooLarge && sent as u64 > most, "{refusal}"),
             }

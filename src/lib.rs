@@ -15,16 +15,16 @@ pub mod journal;
 pub mod limits;
 mod lock;
 pub mod memory;
-pub mod pace;
 pub mod priority;
+pub mod realtime;
 pub mod render;
 pub mod scene;
 pub mod server;
 pub mod session;
 pub mod shape;
-pub mod sheet;
 pub mod surface;
 pub mod texture;
+pub mod tissue;
 pub mod wire;
 
 // The error of refused inputs, which is also the protocol's.

@@ -12,13 +12,13 @@ use program::{
 /// A server for touching soft tissue over a network.
 #[derive(Parser)]
 #[command(version, about, max_term_width = 100)]
-struct Arguments {
+struct ServerArguments {
     #[command(subcommand)]
-    command: Command,
+    command: ServerCommand,
 }
 
 #[derive(Subcommand)]
-enum Command {
+enum ServerCommand {
     /// Play a script on a scene, offline and as fast as possible; write the records as JSON Lines
     #[command(after_help = "Examples:\n  \
         palpate run paper vertical-60\n  \
@@ -160,20 +160,20 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    let ended = match palpate::arguments::parse::<Arguments>().command {
-        Command::Run(arguments) => within_memory(|| run::run_script(&arguments)),
-        Command::Check(arguments) => within_memory(|| check::check(&arguments)),
-        Command::Render(arguments) => within_memory(|| render::render(&arguments)),
-        Command::Texture(arguments) => within_memory(|| texture::make_texture(&arguments)),
-        Command::Mesh(arguments) => within_memory(|| mesh::mesh(&arguments)),
-        Command::Organ(arguments) => within_memory(|| organ::organ(&arguments)),
-        Command::Serve(arguments) => serve::serve(&arguments),
-        Command::Journal(arguments) => within_memory(|| journal::journal(&arguments)),
-        Command::Token(arguments) => token::token(&arguments),
-        Command::Certificate(arguments) => certificate::certificate(&arguments),
-        Command::Top { arguments } => client::client("top", &arguments),
-        Command::Admin { arguments } => client::client("admin", &arguments),
-        Command::Cluster { arguments } => client::client("cluster", &arguments),
+    let ended = match palpate::arguments::parse::<ServerArguments>().command {
+        ServerCommand::Run(arguments) => within_memory(|| run::run_script(&arguments)),
+        ServerCommand::Check(arguments) => within_memory(|| check::check(&arguments)),
+        ServerCommand::Render(arguments) => within_memory(|| render::render(&arguments)),
+        ServerCommand::Texture(arguments) => within_memory(|| texture::make_texture(&arguments)),
+        ServerCommand::Mesh(arguments) => within_memory(|| mesh::mesh(&arguments)),
+        ServerCommand::Organ(arguments) => within_memory(|| organ::organ(&arguments)),
+        ServerCommand::Serve(arguments) => serve::serve(&arguments),
+        ServerCommand::Journal(arguments) => within_memory(|| journal::journal(&arguments)),
+        ServerCommand::Token(arguments) => token::token(&arguments),
+        ServerCommand::Certificate(arguments) => certificate::certificate(&arguments),
+        ServerCommand::Top { arguments } => client::client("top", &arguments),
+        ServerCommand::Admin { arguments } => client::client("admin", &arguments),
+        ServerCommand::Cluster { arguments } => client::client("cluster", &arguments),
     };
     let (status, message) = match ended {
         Ok(()) => return ExitCode::SUCCESS,
@@ -192,7 +192,7 @@ mod tests {
     /// What is wider than `width` columns, other than single words and the names of options.
     fn too_wide(width: usize) -> Vec<String> {
         let mut found = Vec::new();
-        for subcommand in super::Arguments::command().get_subcommands() {
+        for subcommand in super::ServerArguments::command().get_subcommands() {
             let help = subcommand.clone().term_width(width).render_long_help().to_string();
             // clap does not wrap the line of usage.
             let kept = |line: &str| line.starts_with("Usage:") || line.trim().starts_with('-');
@@ -205,7 +205,7 @@ mod tests {
 
     #[test]
     fn help_fits_into_a_terminal_of_any_width() {
-        super::Arguments::command().debug_assert();
+        super::ServerArguments::command().debug_assert();
         for width in [40, 80, 100, 160] {
             assert_eq!(too_wide(width), [""; 0], "{width} columns");
         }
@@ -213,7 +213,7 @@ mod tests {
 
     #[test]
     fn paragraphs_of_help_are_wrapped_by_the_terminal_alone() {
-        for subcommand in super::Arguments::command().get_subcommands() {
+        for subcommand in super::ServerArguments::command().get_subcommands() {
             let text = subcommand.get_after_help().map(ToString::to_string).unwrap_or_default();
             let lines: Vec<&str> = text.lines().collect();
             for pair in lines.windows(2) {

@@ -164,7 +164,7 @@ pub trait RestShape: fmt::Debug + Send + Sync {
         let ([x, y, z], extent) = (place_m.to_array().map(legible), self.extent());
         let message =
             format!("({x}, {y}, {z}) m is off the tissue, which is {extent}, by more than a tenth of its longest side");
-        Err(Refusal::new(Reason::OffSheet, field, message))
+        Err(Refusal::new(Reason::OffTissue, field, message))
     }
 }
 

@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use palpate::cluster::agones::{self, Seen};
+use palpate::cluster::agones::{self, ServerStatus};
 use palpate_proto::agones::Empty;
 use palpate_proto::agones::beta::sdk_server::{Sdk as Counters, SdkServer as CountersServer};
 use palpate_proto::agones::beta::{Counter, GetCounterRequest, UpdateCounterRequest};
@@ -23,8 +23,8 @@ use tokio::task::JoinHandle;
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::{Request, Response, Status, Streaming};
 
-use etcd::Etcd;
-use server::{PATIENCE, Server};
+use etcd::EtcdMembers;
+use server::{TEST_TIMEOUT, TestServer};
 
 /// How far the counter goes.
 const CAPACITY: i64 = 70;
@@ -64,7 +64,7 @@ impl Imitation {
     async fn until(&self, expected: &[&str]) {
         let begun = std::time::Instant::now();
         while *self.calls.lock().unwrap() != expected {
-            assert!(begun.elapsed() < PATIENCE, "{:?} instead of {expected:?}", self.calls.lock().unwrap());
+            assert!(begun.elapsed() < TEST_TIMEOUT, "{:?} instead of {expected:?}", self.calls.lock().unwrap());
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     }
@@ -72,7 +72,7 @@ impl Imitation {
     async fn until_beats(&self, least: usize) {
         let begun = std::time::Instant::now();
         while self.beats.load(Ordering::SeqCst) < least {
-            assert!(begun.elapsed() < PATIENCE, "the server does not say that it is well");
+            assert!(begun.elapsed() < TEST_TIMEOUT, "the server does not say that it is well");
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     }
@@ -125,42 +125,42 @@ async fn listen(port: u16) -> TcpListener {
 }
 
 /// Tells an SDK at `port` how a server stands, which may be changed.
-fn tell(port: u16, seen: Seen) -> (Arc<Mutex<Seen>>, JoinHandle<()>) {
+fn tell(port: u16, seen: ServerStatus) -> (Arc<Mutex<ServerStatus>>, JoinHandle<()>) {
     let standing = Arc::new(Mutex::new(seen));
     let told = standing.clone();
     (standing, tokio::spawn(agones::tell(port, move || *told.lock().unwrap())))
 }
 
-const EMPTY: Seen = Seen { acts: true, sessions: 0, draining: false };
+const EMPTY: ServerStatus = ServerStatus { acts: true, sessions: 0, draining: false };
 
 #[tokio::test]
 async fn agones_hears_everything_in_its_order() {
     let (listener, sdk) = (listen(0).await, Imitation::default());
     let port = listener.local_addr().unwrap().port();
     sdk.serve(listener);
-    let (standing, telling) = tell(port, Seen { acts: false, ..EMPTY });
+    let (standing, telling) = tell(port, ServerStatus { acts: false, ..EMPTY });
     // It is well before it takes sessions.
     sdk.until_beats(2).await;
     sdk.until(&[]).await;
     let mut calls = Vec::new();
     for (seen, more) in [
         (EMPTY, &["ready", "get sessions", "sessions 0"][..]),
-        (Seen { sessions: 1, ..EMPTY }, &["allocate", "sessions 1"]),
-        (Seen { sessions: 7, ..EMPTY }, &["sessions 7"]),
+        (ServerStatus { sessions: 1, ..EMPTY }, &["allocate", "sessions 1"]),
+        (ServerStatus { sessions: 7, ..EMPTY }, &["sessions 7"]),
         // More than Agones reckons with.
-        (Seen { sessions: 100, ..EMPTY }, &["sessions 70"]),
+        (ServerStatus { sessions: 100, ..EMPTY }, &["sessions 70"]),
         (EMPTY, &["ready", "sessions 0"]),
-        (Seen { sessions: 2, ..EMPTY }, &["allocate", "sessions 2"]),
+        (ServerStatus { sessions: 2, ..EMPTY }, &["allocate", "sessions 2"]),
         // While it is drained it is still in use.
-        (Seen { sessions: 1, draining: true, ..EMPTY }, &["sessions 1"]),
-        (Seen { draining: true, ..EMPTY }, &["shutdown"]),
+        (ServerStatus { sessions: 1, draining: true, ..EMPTY }, &["sessions 1"]),
+        (ServerStatus { draining: true, ..EMPTY }, &["shutdown"]),
     ] {
         *standing.lock().unwrap() = seen;
         calls.extend(more);
         sdk.until(&calls).await;
     }
     // Nothing after that, but that it is well.
-    *standing.lock().unwrap() = Seen { sessions: 3, ..EMPTY };
+    *standing.lock().unwrap() = ServerStatus { sessions: 3, ..EMPTY };
     let beats = sdk.beats.load(Ordering::SeqCst);
     sdk.until_beats(beats + 2).await;
     sdk.until(&calls).await;
@@ -178,7 +178,7 @@ async fn an_sdk_that_comes_late_is_told_all_the_same() {
     let sdk = Imitation::default();
     sdk.serve(listen(port).await);
     sdk.until(&["ready", "get sessions", "sessions 0"]).await;
-    *standing.lock().unwrap() = Seen { sessions: 1, ..EMPTY };
+    *standing.lock().unwrap() = ServerStatus { sessions: 1, ..EMPTY };
     sdk.until(&["ready", "get sessions", "sessions 0", "allocate", "sessions 1"]).await;
     sdk.until_beats(1).await;
     assert!(!telling.is_finished());
@@ -198,7 +198,7 @@ async fn an_sdk_that_hangs_is_asked_again() {
 }
 
 /// A server of a fleet of one, under Agones.
-fn under_agones(etcd: &Etcd, port: u16, folder: &std::path::Path) -> Server {
+fn under_agones(etcd: &EtcdMembers, port: u16, folder: &std::path::Path) -> TestServer {
     let mut command = Command::new(env!("CARGO_BIN_EXE_palpate"));
     command
         .args(["serve", "--listen", "127.0.0.1:0", "--agones", "--node", "a", "--advertise", "http://localhost:7117"])
@@ -207,18 +207,18 @@ fn under_agones(etcd: &Etcd, port: u16, folder: &std::path::Path) -> Server {
         .arg(folder)
         .env("AGONES_SDK_GRPC_PORT", port.to_string())
         .stderr(Stdio::piped());
-    Server::spawn(&mut command)
+    TestServer::spawn(&mut command)
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_server_under_agones_tells_of_its_sessions_and_of_its_drain() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     let (listener, sdk) = (listen(0).await, Imitation::default());
     let port = listener.local_addr().unwrap().port();
     sdk.serve(listener);
-    let (etcd, folder) = (Etcd::start(1), tempfile::tempdir().unwrap());
+    let (etcd, folder) = (EtcdMembers::start(1), tempfile::tempdir().unwrap());
     let server = under_agones(&etcd, port, folder.path());
     let mut calls = vec!["ready", "get sessions", "sessions 0"];
     sdk.until(&calls).await;
@@ -238,13 +238,13 @@ async fn a_server_under_agones_tells_of_its_sessions_and_of_its_drain() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_server_serves_while_agones_hangs_or_is_not_there() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     // Connections are taken, and nothing is said.
     let listener = listen(0).await;
     let port = listener.local_addr().unwrap().port();
-    let (etcd, folder) = (Etcd::start(1), tempfile::tempdir().unwrap());
+    let (etcd, folder) = (EtcdMembers::start(1), tempfile::tempdir().unwrap());
     let server = under_agones(&etcd, port, folder.path());
     let begun = std::time::Instant::now();
     loop {
@@ -252,7 +252,7 @@ async fn a_server_serves_while_agones_hangs_or_is_not_there() {
         let source = pb::create_session_request::Source::SceneName("paper".into());
         match server.create(source, false).await {
             Ok(_) => break,
-            Err(status) => assert!(begun.elapsed() < PATIENCE, "{status}"),
+            Err(status) => assert!(begun.elapsed() < TEST_TIMEOUT, "{status}"),
         }
         tokio::time::sleep(Duration::from_millis(50)).await;
     }

@@ -24,13 +24,13 @@ use counting::counted;
 use fastrand::Rng;
 use palpate::budget::{Account, Budget, Purpose, Resource};
 use palpate::journal::records::{self, Chunk};
-use palpate::journal::{REPLAYS, Reader, Topic, message, pb as kept};
+use palpate::journal::{JournalReader, REPLAYS, Topic, message, pb as kept};
 use palpate::limits::Limits;
 use palpate::refusal::{Reason, Result};
 use palpate::scene::{BUILT_IN, PAPER, Scene};
 use palpate::session::Session;
 use palpate::session::saved::{self, Saved};
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate::wire;
 use palpate_mesh::TriangleMesh;
 use palpate_proto::measure::{MULTIPLE, ROOM, Shape};
@@ -182,7 +182,7 @@ fn header() -> kept::Header {
 /// Reads all of a journal.
 fn read_all(file: &[u8], account: &Account) -> Result<()> {
     let paid = account.take(Resource::Memory(Purpose::Journals), 0, "")?;
-    let mut reader = Reader::paid("test", Cursor::new(file), Some(paid))?;
+    let mut reader = JournalReader::paid("test", Cursor::new(file), Some(paid))?;
     let _survey = reader.survey(&mut |_| {})?;
     while let Some(batch) = reader.next_batch()? {
         let _items = palpate::journal::replay::items(&batch)?;
@@ -303,7 +303,7 @@ fn every_shipped_scene_and_a_mesh_of_zeros_can_be_moved() {
     let message = pb::Scene {
         mesh: Some(pb::Mesh { mesh_id: "a".into(), point_mass_kg: Some(1e-4), ..Default::default() }),
         springs: Some(pb::Springs { stiffness_n_per_m: Some(10.0), ..Default::default() }),
-        virtual_springs: Some(pb::VirtualSprings { stiffness_n_per_m: Some(1.0) }),
+        anchor_springs: Some(pb::AnchorSprings { stiffness_n_per_m: Some(1.0) }),
         damping: Some(pb::Damping { coefficient_n_s_per_m: Some(0.01) }),
         ..Default::default()
     };

@@ -20,11 +20,11 @@ const MODULES: [&str; 23] = [
     "shape",
     "scene",
     "texture",
-    "sheet",
+    "tissue",
     "force_law",
     "surface",
     "session",
-    "pace",
+    "realtime",
     "wire",
     "journal",
     "cluster",
@@ -68,7 +68,7 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 9] = [
 /// The modules of `palpate` that a module of the programs may use. `link` simulates the far end; the others read files.
 const FOR_PROGRAMS: [(&str, &[&str]); 7] = [
     ("credentials", &["files"]),
-    ("link", &["force_law", "limits", "memory", "scene", "session", "sheet"]),
+    ("link", &["force_law", "limits", "memory", "scene", "session", "tissue"]),
     ("main", &["arguments"]),
     ("placement", &["files", "scene"]),
     ("play", &["files", "journal", "scene", "shape", "wire"]),
@@ -127,7 +127,7 @@ fn imports_go_one_way_only() {
             let used_place = MODULES.iter().position(|other| *other == used);
             let used_place = used_place.unwrap_or_else(|| panic!("{}: unknown module `{used}`", inside.display()));
             // Pictures are for who has no server.
-            let drawn = module == "render" && ["pace", "wire", "server"].contains(&used);
+            let drawn = module == "render" && ["realtime", "wire", "server"].contains(&used);
             assert!(used_place <= place && !drawn, "{} uses `{used}`, which comes after `{module}`", inside.display());
         }
     }
@@ -148,8 +148,8 @@ fn module_of(inside: &Path) -> Module {
 
 /// The files of vectors and of the number format count as one: each names the other's trait.
 fn merged(module: Module) -> Module {
-    let is_vector = module.starts_with(&["sheet".into(), "lanes".into()]) || module == ["sheet", "real"];
-    if is_vector { vec!["sheet".into(), "lanes".into()] } else { module }
+    let is_vector = module.starts_with(&["tissue".into(), "lanes".into()]) || module == ["tissue", "real"];
+    if is_vector { vec!["tissue".into(), "lanes".into()] } else { module }
 }
 
 /// The paths that a file uses, without those of its tests and of modules within it.
@@ -284,6 +284,85 @@ fn what_a_crate_must_not_have_is_not_in_its_tree() {
     }
 }
 
+/// Whether an SPDX expression can be met by licences that are `allowed`. `AND` binds closer than `OR`, for which some write `/`.
+fn is_met(expression: &str, allowed: &dyn Fn(&str) -> bool) -> bool {
+    let (mut depth, mut ends, mut begin) = (0, Vec::new(), 0);
+    let text = expression.replace('/', " OR ");
+    let mut split = |by: &str| {
+        ends.clear();
+        (depth, begin) = (0, 0);
+        for (at, letter) in text.char_indices() {
+            depth += i32::from(letter == '(') - i32::from(letter == ')');
+            if depth == 0 && at >= begin && text[at..].starts_with(by) {
+                ends.push(text[begin..at].trim().to_owned());
+                begin = at + by.len();
+            }
+        }
+        ends.push(text[begin..].trim().to_owned());
+        ends.clone()
+    };
+    let (alternatives, all) = (split(" OR "), split(" AND "));
+    match () {
+        () if alternatives.len() > 1 => alternatives.iter().any(|part| is_met(part, allowed)),
+        () if all.len() > 1 => all.iter().all(|part| is_met(part, allowed)),
+        () => match text.trim().strip_prefix('(').and_then(|inner| inner.strip_suffix(')')) {
+            Some(inner) => is_met(inner, allowed),
+            None => allowed(text.trim()),
+        },
+    }
+}
+
+#[test]
+fn an_expression_of_licences_is_met_by_one_alternative_and_by_all_of_its_parts() {
+    let allowed = |licence: &str| ["MIT", "ISC"].contains(&licence);
+    for met in
+        ["MIT", "GPL-3.0 OR MIT", "MIT AND ISC", "GPL-3.0/MIT", "(GPL-3.0 OR MIT) AND ISC", "GPL-3.0 AND X OR ISC"]
+    {
+        assert!(is_met(met, &allowed), "{met}");
+    }
+    for unmet in ["GPL-3.0", "MIT AND GPL-3.0", "(GPL-3.0 OR X) AND ISC", ""] {
+        assert!(!is_met(unmet, &allowed), "{unmet}");
+    }
+}
+
+#[test]
+fn dependencies_are_those_that_deny_toml_allows() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let rules: toml::Table = std::fs::read_to_string(root.join("deny.toml")).unwrap().parse().unwrap();
+    let texts = |list: &toml::Value| -> Vec<String> {
+        list.as_array().unwrap().iter().map(|text| text.as_str().unwrap().to_owned()).collect()
+    };
+    let allowed = texts(&rules["licenses"]["allow"]);
+    let exceptions: BTreeMap<String, Vec<String>> = rules["licenses"]["exceptions"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|one| (one["crate"].as_str().unwrap().to_owned(), texts(&one["allow"])))
+        .collect();
+    let banned: Vec<&str> =
+        rules["bans"]["deny"].as_array().unwrap().iter().map(|one| one["crate"].as_str().unwrap()).collect();
+    let tree = Command::new(env!("CARGO"))
+        .args(["tree", "--locked", "--offline", "--workspace", "--edges", "normal,build,dev", "--prefix", "none"])
+        .args(["--format", "{p}|{l}|{r}"])
+        .current_dir(root)
+        .output()
+        .unwrap();
+    assert!(tree.status.success(), "{}", String::from_utf8_lossy(&tree.stderr));
+    let tree = String::from_utf8(tree.stdout).unwrap();
+    let packages: BTreeSet<&str> =
+        tree.lines().filter(|line| !line.is_empty() && !line.starts_with("palpate")).collect();
+    assert!(packages.len() > 100, "the tree of dependencies was not read");
+    for package in packages {
+        let (name, licence) = package.split_once('|').unwrap();
+        let licence = licence.split('|').next().unwrap().trim_end_matches(" (*)");
+        let name = name.split_whitespace().next().unwrap();
+        assert!(!banned.contains(&name), "{name} is banned by deny.toml");
+        let is_allowed =
+            |one: &str| allowed.iter().chain(exceptions.get(name).into_iter().flatten()).any(|allowed| allowed == one);
+        assert!(is_met(licence, &is_allowed), "{name}: deny.toml does not allow {licence:?}");
+    }
+}
+
 #[test]
 fn the_protocol_enters_at_the_wire() {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
@@ -338,7 +417,7 @@ fn above_the_sheet_a_tissue_is_its_rest_shape() {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     for path in rust_files(&source) {
         let inside = path.strip_prefix(&source).unwrap().to_str().unwrap();
-        let above = ["force_law", "session", "pace", "wire", "server", "render"].contains(&module(&source, &path));
+        let above = ["force_law", "session", "realtime", "wire", "server", "render"].contains(&module(&source, &path));
         // What scripts say of a tissue, too.
         let files = ["action", "check", "profile", "reader", "record", "script"];
         let above = above || files.iter().any(|file| inside == format!("scene/{file}.rs"));
@@ -356,7 +435,7 @@ fn above_the_sheet_a_tissue_is_its_rest_shape() {
 const IMPURE: [&str; 7] = ["Instant", "SystemTime", "tokio", "std::thread", "std::net", "getrandom", "HashMap"];
 
 #[test]
-fn only_pace_reads_the_clock_and_only_the_server_opens_sockets() {
+fn only_realtime_reads_the_clock_and_only_the_server_opens_sockets() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     for path in rust_files(&root.join("clients/touch/src")) {
         let text = std::fs::read_to_string(&path).unwrap();
@@ -366,7 +445,7 @@ fn only_pace_reads_the_clock_and_only_the_server_opens_sockets() {
     for path in rust_files(&source) {
         let inside = path.strip_prefix(&source).unwrap().to_str().unwrap().to_owned();
         let text = std::fs::read_to_string(&path).unwrap();
-        let core = ["scene", "render", "sheet", "force_law", "surface", "session", "journal"]
+        let core = ["scene", "render", "tissue", "force_law", "surface", "session", "journal"]
             .iter()
             .any(|module| inside.starts_with(module));
         if core {
@@ -389,20 +468,20 @@ fn unsafe_code_is_where_vectors_are() {
             // Functions of the system, which any thread may call at any time.
             "budget/machine.rs",
             "priority.rs",
-            "sheet/lanes/mod.rs",
-            "sheet/lanes/neon.rs",
-            "sheet/lanes/x86.rs",
-            "sheet/mesh/sweep.rs",
-            "sheet/mesh/trial.rs",
-            "sheet/pressure.rs",
-            "sheet/grid.rs",
-            "sheet/sweep.rs",
-            "sheet/stage.rs",
-            "sheet/tables.rs",
-            "sheet/advance.rs",
-            "sheet/edge.rs",
-            "sheet/survey.rs",
-            "sheet/applied.rs",
+            "tissue/lanes/mod.rs",
+            "tissue/lanes/neon.rs",
+            "tissue/lanes/x86.rs",
+            "tissue/mesh/sweep.rs",
+            "tissue/mesh/mesh_calibration.rs",
+            "tissue/pressure.rs",
+            "tissue/grid.rs",
+            "tissue/sweep.rs",
+            "tissue/stage.rs",
+            "tissue/tables.rs",
+            "tissue/advance.rs",
+            "tissue/edge.rs",
+            "tissue/survey.rs",
+            "tissue/applied.rs",
             "surface/wide.rs",
         ];
         let text = std::fs::read_to_string(&path).unwrap();

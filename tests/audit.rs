@@ -19,13 +19,13 @@ use palpate::session::Session;
 use palpate::session::audit::Windows;
 use palpate::session::command::Due;
 use palpate::session::run::{self, command};
-use palpate::sheet::Model;
-use palpate::sheet::audit::{Extent, FINER, Finding, Inputs, Mark, Origin};
+use palpate::tissue::Model;
+use palpate::tissue::audit::{AuditFinding, ErrorExtent, FINER, Mark, Origin, WindowInputs};
 use palpate_proto::pb;
 use palpate_touch::Tip;
 use pb::create_session_request::Source;
 use serde_json::Value;
-use server::{PATIENCE, Server, Touch, force};
+use server::{TEST_TIMEOUT, TestServer, TestTouch, force};
 
 /// A force that comes and goes, beside the middle.
 const PULSE: &str = "duration_s = 1.0\nsample_every_s = 0.02\nsample_points = [[3, 2], [1, 1], [5, 3]]\n[[force]]\n\
@@ -113,7 +113,7 @@ fn an_audit_of_a_good_scene_is_within_its_tolerance() {
 }
 
 /// The actions that a client commands at a step.
-type Told = fn(u64) -> Vec<(usize, Action)>;
+type StepActions = fn(u64) -> Vec<(usize, Action)>;
 
 /// A touch that presses, slides and releases; with `grasps`, a grasp that holds.
 fn touching(grasps: bool, step: u64) -> Vec<(usize, Action)> {
@@ -140,7 +140,7 @@ fn grasping(step: u64) -> Vec<(usize, Action)> {
 }
 
 /// Runs a session with commands; `look` is called after each step.
-fn commanded(scene: &Scene, told: Told, steps: u64, mut look: impl FnMut(&mut Session)) -> Session {
+fn commanded(scene: &Scene, told: StepActions, steps: u64, mut look: impl FnMut(&mut Session)) -> Session {
     let mut session = Session::new(&model(scene));
     for step in 0..steps {
         let due = |(tool, action)| Due {
@@ -157,21 +157,21 @@ fn commanded(scene: &Scene, told: Told, steps: u64, mut look: impl FnMut(&mut Se
 }
 
 /// The findings of all windows of such a session, each repeated with `finer` times the substeps.
-fn findings(scene: &Scene, told: Told, steps: u64, finer: u32) -> Vec<Finding> {
+fn findings(scene: &Scene, told: StepActions, steps: u64, finer: u32) -> Vec<AuditFinding> {
     let (mut opening, mut found, mut asked) = (None, Vec::new(), false);
     commanded(scene, told, steps, |session| {
         match session.take_mark() {
             Some(Mark::Begin(look)) => opening = Some(look.open()),
             Some(Mark::End(look, inputs)) => {
                 let audit = opening.take().unwrap().close(look, inputs);
-                found.push(audit.work(finer, Extent::default(), &mut || true).unwrap());
+                found.push(audit.work(finer, ErrorExtent::default(), &mut || true).unwrap());
                 asked = false;
             }
             Some(Mark::Dropped) => panic!("a window was dropped"),
             None => {}
         }
         if !std::mem::replace(&mut asked, true) {
-            session.request_audit(Inputs::default());
+            session.request_audit(WindowInputs::default());
         }
     });
     found
@@ -182,7 +182,7 @@ fn a_window_agrees_with_one_of_a_much_shorter_substep() {
     // The error of a tool that meets the sheet falls more slowly with the substep than the scheme's: contact begins and
     // ends within a substep, and a tip that sticks or slips a substep earlier ends elsewhere. So a quarter of the
     // substep reveals less of that error, and in some windows much less.
-    let tools: [(&str, f64, f64, Told); 4] = [
+    let tools: [(&str, f64, f64, StepActions); 4] = [
         ("push", 2.0, 1.0, pushing),
         ("grasp of a point", 2.0, 1.0, grasping),
         ("touch", 5.0, 0.9, |step| touching(false, step)),
@@ -242,7 +242,7 @@ fn a_tip_keeps_to_the_tolerance_of_liver() {
 
 #[test]
 fn the_audit_changes_no_bit() {
-    let tools: [Told; 3] = [pushing, grasping, |step| touching(false, step)];
+    let tools: [StepActions; 3] = [pushing, grasping, |step| touching(false, step)];
     for told in tools {
         for precision in ["f32", "compensated", "f64"] {
             let precision = format!("stepping.precision={precision}");
@@ -347,8 +347,8 @@ fn coarse(correct: bool) -> Source {
 }
 
 /// Pushes up and down until the status is as `wanted`.
-async fn push_until(server: &Server, session_id: &str, wanted: impl Fn(&pb::Session) -> bool) -> pb::Session {
-    let touch = Touch::hold(server, session_id).await;
+async fn push_until(server: &TestServer, session_id: &str, wanted: impl Fn(&pb::Session) -> bool) -> pb::Session {
+    let touch = TestTouch::hold(server, session_id).await;
     let begun = Instant::now();
     for sequence in 1.. {
         touch.command(force(0, sequence, if sequence % 2 == 0 { -1.0 } else { -2.0 })).await;
@@ -357,14 +357,14 @@ async fn push_until(server: &Server, session_id: &str, wanted: impl Fn(&pb::Sess
         if wanted(&status) {
             return status;
         }
-        assert!(begun.elapsed() < PATIENCE, "{status:?}");
+        assert!(begun.elapsed() < TEST_TIMEOUT, "{status:?}");
     }
     unreachable!()
 }
 
 #[tokio::test]
 async fn a_live_session_tells_its_audited_error_and_why() {
-    let mut server = Server::start(&["--audit-share", "0.5", "--metrics", "127.0.0.1:0"]);
+    let mut server = TestServer::start(&["--audit-share", "0.5", "--metrics", "127.0.0.1:0"]);
     let session = server.create(coarse(false), false).await.unwrap();
     assert_eq!(session.audit, None);
     let status = push_until(&server, &session.session_id, |status| status.audit.is_some()).await;
@@ -390,7 +390,7 @@ async fn a_live_session_tells_its_audited_error_and_why() {
 
 #[tokio::test]
 async fn a_live_session_is_corrected_if_its_scene_says_so() {
-    let server = Server::start(&["--audit-share", "0.5"]);
+    let server = TestServer::start(&["--audit-share", "0.5"]);
     let session = server.create(coarse(true), false).await.unwrap();
     assert!(session.scene.as_ref().unwrap().stepping.as_ref().unwrap().correct);
     let acted = |status: &pb::Session| {
@@ -417,7 +417,7 @@ async fn a_correction_that_would_take_longer_than_a_scene_may_is_refused_and_tol
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, format!("[limits]\nperiods_per_step = {periods}\nrehearsal_work = 1\n")).unwrap();
-    let server = Server::start(&["--audit-share", "0.5", "--config", config.to_str().unwrap()]);
+    let server = TestServer::start(&["--audit-share", "0.5", "--config", config.to_str().unwrap()]);
     let session = server.create(coarse(true), false).await.unwrap();
     let told = |status: &pb::Session| status.audit.as_ref().is_some_and(|audit| !audit.refused_correction.is_empty());
     let status = push_until(&server, &session.session_id, told).await;
@@ -432,7 +432,7 @@ async fn a_correction_that_would_take_longer_than_a_scene_may_is_refused_and_tol
 
 #[tokio::test]
 async fn without_a_share_nothing_is_audited() {
-    let server = Server::start(&["--audit-share", "0"]);
+    let server = TestServer::start(&["--audit-share", "0"]);
     let session = server.create(coarse(false), false).await.unwrap();
     // Long enough for several windows of a quarter of a second of simulated time.
     let status = push_until(&server, &session.session_id, |status| status.step > 2000).await;

@@ -24,7 +24,7 @@ use palpate::scene::script::{Action, Script};
 use palpate::session::command::Command;
 use palpate::session::intake::Intake;
 use palpate::session::{Session, check};
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate_touch::{Coupling, Tip};
 
 const LEASE: u128 = 1;
@@ -109,7 +109,7 @@ fn scene(seed: u64) -> (String, Option<String>) {
     }
     if with_material {
         text += "[material]\n";
-        for (key, usual) in [("youngs_modulus_pa", 8000.0), ("thickness_m", 1e-3), ("bed_n_per_m3", 1e6)] {
+        for (key, usual) in [("youngs_modulus_pa", 8000.0), ("thickness_m", 1e-3), ("foundation_n_per_m3", 1e6)] {
             let _ = writeln!(text, "{key} = {:e}", number(dice, usual, odds));
         }
         for (key, usual) in [("density_kg_per_m3", 1060.0), ("depth_m", 0.03), ("damping_ratio", 0.5)] {
@@ -117,12 +117,12 @@ fn scene(seed: u64) -> (String, Option<String>) {
         }
         text += "[springs]\n";
     } else {
-        let _ = writeln!(text, "[virtual_springs]\nstiffness_n_per_m = {:e}", number(dice, 5.0, odds));
+        let _ = writeln!(text, "[anchor_springs]\nstiffness_n_per_m = {:e}", number(dice, 5.0, odds));
         let _ = writeln!(text, "[damping]\ncoefficient_n_s_per_m = {:e}", number(dice, 0.1, odds));
         let _ = writeln!(text, "[springs]\nstiffness_n_per_m = {:e}", number(dice, 10.0, odds));
     }
     if mesh.is_some() {
-        maybe(&mut text, dice, "flexion", 0.2, odds);
+        maybe(&mut text, dice, "bending", 0.2, odds);
         if dice.f64() < 0.3 {
             let _ = writeln!(text, "[volume]\nstiffness_pa = {:e}", number(dice, 3000.0, odds));
         }
@@ -133,13 +133,13 @@ fn scene(seed: u64) -> (String, Option<String>) {
                 "[[inclusion]]\ncentre_m = [{:e}, 0.0, 0.0]\nradius_m = {radius_m:e}",
                 number(dice, edge_m, odds)
             );
-            for (key, usual) in [("stiffness_factor", 3.0), ("virtual_stiffness_factor", 4.0), ("edge_m", edge_m)] {
+            for (key, usual) in [("stiffness_factor", 3.0), ("anchor_stiffness_factor", 4.0), ("edge_m", edge_m)] {
                 maybe(&mut text, dice, key, usual, odds);
             }
         }
     } else {
         maybe(&mut text, dice, "shear_stiffness_n_per_m", 5.0, odds);
-        let _ = writeln!(text, "flexion = {}", dice.bool());
+        let _ = writeln!(text, "bending = {}", dice.bool());
     }
     text += "[stepping]\n";
     maybe(&mut text, dice, "rate_hz", 1000.0, odds);

@@ -11,16 +11,16 @@ mod server;
 use std::time::Duration;
 
 use palpate_proto::pb;
-use server::{PATIENCE, Server, sheet, told};
+use server::{TEST_TIMEOUT, TestServer, sheet, told};
 use tonic::Code;
 
 /// A server with so much memory, and where its metrics are. It refuses nothing because its machine is slow.
-fn small(memory: &str) -> (Server, String) {
+fn small(memory: &str) -> (TestServer, String) {
     let config = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(&config, "[limits]\nperiods_per_step = 1000.0\n").unwrap();
     let path = config.path().to_str().unwrap();
     let mut server =
-        Server::start(&["--config", path, "--memory", memory, "--metrics", "127.0.0.1:0", "--log", "error"]);
+        TestServer::start(&["--config", path, "--memory", memory, "--metrics", "127.0.0.1:0", "--log", "error"]);
     let metrics = metrics::url(&mut server.out);
     (server, metrics)
 }
@@ -32,7 +32,7 @@ fn metric(url: &str, name: &str) -> f64 {
 
 /// Waits until it is true.
 async fn until(what: &str, mut holds: impl FnMut() -> bool) {
-    let waited = tokio::time::timeout(PATIENCE, async {
+    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
         while !holds() {
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
@@ -41,7 +41,7 @@ async fn until(what: &str, mut holds: impl FnMut() -> bool) {
 }
 
 /// Bytes that the process has in memory.
-fn resident(server: &Server) -> u64 {
+fn resident(server: &TestServer) -> u64 {
     cores::resident(server.child.id())
 }
 
@@ -51,7 +51,7 @@ const TAKEN: &str = "palpate_memory_taken_bytes";
 async fn sessions_above_the_budget_are_refused_and_what_went_makes_room() {
     let (server, metrics) = small("64MiB");
     let other = server.paper(false).await;
-    let mut touch = server::Touch::hold(&server, &other).await;
+    let mut touch = server::TestTouch::hold(&server, &other).await;
     let mut kept = Vec::new();
     let refused = loop {
         match server.create(sheet(128, 128), true).await {
@@ -113,7 +113,7 @@ async fn force_laws_are_charged_and_go_with_their_session() {
     let device = palpate_touch::Device::named("omega3").unwrap();
     let device = Some(palpate_proto::touch::device(&device));
     let touch =
-        server::Touch::open(&server, pb::TouchOpen { device, ..server::open(&session_id, &[0]) }).await.unwrap();
+        server::TestTouch::open(&server, pb::TouchOpen { device, ..server::open(&session_id, &[0]) }).await.unwrap();
     assert!(laws() > 0.0);
     drop(touch);
     let request = pb::DeleteSessionRequest { session_id };
@@ -126,7 +126,7 @@ async fn few_changes_of_the_tissue_wait() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, "[limits]\nqueued_changes = 3\n").unwrap();
-    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let server = TestServer::start(&["--config", config.to_str().unwrap()]);
     let session = server.paper(true).await;
     let mut sessions = server.sessions().await;
     let mut taken = 0;
@@ -163,7 +163,7 @@ async fn memory_goes_back_to_the_system_with_the_sessions() {
     for _ in 0..3 {
         let session_id = server.create(sheet(512, 512), false).await.unwrap().session_id;
         // Something moves, so that its memory is there.
-        let mut touch = server::Touch::hold(&server, &session_id).await;
+        let mut touch = server::TestTouch::hold(&server, &session_id).await;
         touch.command(server::force(0, 1, -1.0)).await;
         touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
         let request = pb::GetStateHashRequest { session_id: session_id.clone(), at_step: None };
@@ -185,13 +185,13 @@ async fn memory_goes_back_to_the_system_with_the_sessions() {
 }
 
 /// The tool of a session that is held.
-async fn held(server: &Server, session: &str) -> usize {
+async fn held(server: &TestServer, session: &str) -> usize {
     server.status(session).await.held_tools.len()
 }
 
 #[tokio::test]
 async fn a_lease_ends_with_its_connection_unless_asked_otherwise() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
     let request = |tool, outlives_connection| pb::AcquireToolRequest {
         session_id: session.clone(),
@@ -205,7 +205,7 @@ async fn a_lease_ends_with_its_connection_unless_asked_otherwise() {
     haptics.acquire_tool(request(1, true)).await.unwrap();
     assert_eq!(held(&server, &session).await, 2);
     drop(haptics);
-    let waited = tokio::time::timeout(PATIENCE, async {
+    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
         while held(&server, &session).await > 1 {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
@@ -218,7 +218,7 @@ async fn a_lease_ends_with_its_connection_unless_asked_otherwise() {
 async fn who_administers_frees_tools_and_cuts_streams_and_callers() {
     // Built before anything is held: a connection that does not answer meanwhile is closed.
     tokio::task::spawn_blocking(server::client_program).await.unwrap();
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     let session = server.paper(false).await;
     let admin = |arguments: &[&str]| {
         let mut command = std::process::Command::new(server::client_program());
@@ -226,14 +226,14 @@ async fn who_administers_frees_tools_and_cuts_streams_and_callers() {
         command.output().unwrap()
     };
     let text = |output: &std::process::Output| String::from_utf8(output.stdout.clone()).unwrap();
-    let mut touch = server::Touch::hold(&server, &session).await;
+    let mut touch = server::TestTouch::hold(&server, &session).await;
     let shown = text(&admin(&["streams", &session]));
     assert!(shown.contains("Touch") && shown.contains("holds") && shown.contains("address:127.0.0.1"), "{shown}");
     assert!(text(&admin(&["callers"])).contains("address:127.0.0.1"));
     let number = shown.lines().nth(1).unwrap().split_whitespace().next().unwrap();
     assert!(admin(&["cut-stream", &session, number]).status.success());
     let ended = loop {
-        match tokio::time::timeout(PATIENCE, touch.hear()).await.expect("a stream that was cut goes on") {
+        match tokio::time::timeout(TEST_TIMEOUT, touch.hear()).await.expect("a stream that was cut goes on") {
             Ok(Some(_)) => {}
             Ok(None) => panic!("it ends without a reason"),
             Err(status) => break status,
@@ -258,7 +258,7 @@ async fn who_administers_frees_tools_and_cuts_streams_and_callers() {
 
 #[tokio::test]
 async fn watchers_leave_room_for_who_holds_a_tool() {
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     let session = server.paper(true).await;
     let mut haptics = server.haptics().await;
     let mut watchers = Vec::new();
@@ -270,5 +270,5 @@ async fn watchers_leave_room_for_who_holds_a_tool() {
         }
     };
     assert_eq!(told(&refused), (Code::ResourceExhausted, "TOO_MANY".into(), String::new()));
-    server::Touch::hold(&server, &session).await;
+    server::TestTouch::hold(&server, &session).await;
 }

@@ -123,7 +123,7 @@ fn check_tells_what_helps_against_a_fast_vertex_as_tried() {
     mesh.vertices_m[a] = mesh.vertices_m[a].lerp(mesh.vertices_m[b], 0.97);
     std::fs::write(folder.path().join("bad.obj"), write(&mesh, Format::of("x.obj").unwrap())).unwrap();
     let scene = "[mesh]\nfile = \"bad.obj\"\nunit = \"m\"\nfixed = { group = \"bare-area\" }\n[material]\n\
-        youngs_modulus_pa = 8000.0\nthickness_m = 0.0005\nbed_n_per_m3 = 1.34e6\ndamping_ratio = 0.5\n";
+        youngs_modulus_pa = 8000.0\nthickness_m = 0.0005\nfoundation_n_per_m3 = 1.34e6\ndamping_ratio = 0.5\n";
     std::fs::write(folder.path().join("bad.toml"), scene).unwrap();
     let (status, text) = palpate(folder.path(), &["check", "bad.toml"]);
     assert!(status == 0 && text.contains("times as fast as half of the mesh") && !text.contains("--repair"), "{text}");

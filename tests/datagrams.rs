@@ -16,7 +16,7 @@ use palpate::scene::script::Action;
 use palpate::scene::{BUILT_IN, Scene};
 use palpate::session::Session;
 use palpate::session::command::{Command, Due};
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate_client::Credentials;
 use palpate_client::datagrams::Datagrams;
 use palpate_proto::{datagram, pb, touch};
@@ -24,7 +24,7 @@ use palpate_touch::{Device, Tip};
 use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;
 use prost::Message;
-use server::{PATIENCE, Server, Touch, open, palpate};
+use server::{TEST_TIMEOUT, TestServer, TestTouch, open, palpate};
 use tokio::net::UdpSocket;
 use wtransport::endpoint::ConnectOptions;
 use wtransport::error::ConnectingError;
@@ -71,10 +71,10 @@ impl Wire {
     }
 
     /// A server whose datagrams go by a wire.
-    async fn before_server(arguments: &[&str]) -> (Self, Server) {
+    async fn before_server(arguments: &[&str]) -> (Self, TestServer) {
         let (wire, aim) = Wire::start().await;
         let advertised = wire.address.to_string();
-        let server = Server::start(&[&["--datagrams-advertise", &advertised], arguments].concat());
+        let server = TestServer::start(&[&["--datagrams-advertise", &advertised], arguments].concat());
         aim.send(address(&server)).unwrap();
         (wire, server)
     }
@@ -84,11 +84,11 @@ impl Wire {
     }
 }
 
-fn address(server: &Server) -> SocketAddr {
+fn address(server: &TestServer) -> SocketAddr {
     server.url.trim_start_matches("http://").parse().unwrap()
 }
 
-async fn liver(server: &Server) -> String {
+async fn liver(server: &TestServer) -> String {
     let source = pb::create_session_request::Source::SceneName("liver".into());
     server.create(source, false).await.unwrap().session_id
 }
@@ -112,8 +112,8 @@ fn pose(tool: u32, sequence: u64) -> pb::Command {
 }
 
 /// A touch that goes on, one pose a millisecond.
-struct Client {
-    touch: Touch,
+struct DatagramClient {
+    touch: TestTouch,
     datagrams: Datagrams,
     sequence: u64,
     /// Poses that went by datagram, and samples that came by it and by the stream.
@@ -124,15 +124,15 @@ struct Client {
     asked: u64,
 }
 
-impl Client {
-    async fn open(server: &Server) -> Self {
+impl DatagramClient {
+    async fn open(server: &TestServer) -> Self {
         let session = liver(server).await;
-        let mut touch = Touch::open(server, by_datagram(&session, &[0])).await.unwrap();
+        let mut touch = TestTouch::open(server, by_datagram(&session, &[0])).await.unwrap();
         let offer = touch.opened.take().unwrap().datagrams;
         assert!(offer.is_some());
         let at = palpate_client::Server::new(&server.url, &Credentials::default()).unwrap();
         let datagrams = Datagrams::dial(offer.as_ref(), &at);
-        Client { touch, datagrams, sequence: 0, poses: 0, samples: [0; 2], newest: None, asked: 0 }
+        DatagramClient { touch, datagrams, sequence: 0, poses: 0, samples: [0; 2], newest: None, asked: 0 }
     }
 
     /// Touches until `enough`.
@@ -170,7 +170,7 @@ impl Client {
                 }
             }
         };
-        assert!(tokio::time::timeout(PATIENCE, touching).await.is_ok(), "{what}");
+        assert!(tokio::time::timeout(TEST_TIMEOUT, touching).await.is_ok(), "{what}");
     }
 
     fn acknowledged(&self) -> u64 {
@@ -186,7 +186,7 @@ impl Client {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn touch_goes_by_datagram_while_it_gets_through_and_by_the_stream_else() {
     let (wire, server) = Wire::before_server(&[]).await;
-    let mut client = Client::open(&server).await;
+    let mut client = DatagramClient::open(&server).await;
     client
         .until("datagrams carry", |client| client.samples[0] > 100 && client.poses > 100 && client.is_pressed())
         .await;
@@ -213,7 +213,7 @@ async fn touch_goes_by_datagram_while_it_gets_through_and_by_the_stream_else() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_session_that_the_network_has_ended_is_opened_anew() {
     let (wire, server) = Wire::before_server(&[]).await;
-    let mut client = Client::open(&server).await;
+    let mut client = DatagramClient::open(&server).await;
     client.until("datagrams carry", |client| client.samples[0] > 100 && client.poses > 100).await;
     [0, 1].iter().for_each(|way| wire.cut(*way, true));
     client.until("the session is over", |client| client.asked > 0).await;
@@ -231,25 +231,25 @@ async fn a_session_that_the_network_has_ended_is_opened_anew() {
 async fn where_udp_is_blocked_touch_goes_by_the_stream() {
     let (wire, server) = Wire::before_server(&[]).await;
     wire.cut(0, true);
-    let mut client = Client::open(&server).await;
+    let mut client = DatagramClient::open(&server).await;
     client.until("pressed", |client| client.is_pressed() && client.acknowledged() > 300).await;
     assert_eq!((client.poses, client.samples[0], client.datagrams.carried().came), (0, 0, 0));
 }
 
 #[tokio::test]
 async fn nothing_is_offered_where_there_is_nothing() {
-    let server = Server::start(&["--no-datagrams"]);
+    let server = TestServer::start(&["--no-datagrams"]);
     let session = liver(&server).await;
-    let touch = Touch::open(&server, by_datagram(&session, &[0])).await.unwrap();
+    let touch = TestTouch::open(&server, by_datagram(&session, &[0])).await.unwrap();
     assert!(touch.opened.unwrap().datagrams.is_none());
     let lease_id = lease(&server, &session, 1).await;
     let request = pb::OpenDatagramsRequest { session_id: session.clone(), lease_id, ..Default::default() };
     let refused = server.haptics().await.open_datagrams(request).await.unwrap_err();
     assert!(refused.message().contains("no datagrams"), "{refused}");
     // A stream that did not ask gets none either.
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = liver(&server).await;
-    let touch = Touch::open(&server, open(&session, &[0])).await.unwrap();
+    let touch = TestTouch::open(&server, open(&session, &[0])).await.unwrap();
     assert!(touch.opened.unwrap().datagrams.is_none());
     let wrong = palpate(&["serve", "--datagrams-advertise", "nowhere"]);
     assert_eq!(wrong.status.code(), Some(2));
@@ -257,7 +257,7 @@ async fn nothing_is_offered_where_there_is_nothing() {
 }
 
 /// A lease of a tool that no stream holds.
-async fn lease(server: &Server, session: &str, tool: u32) -> String {
+async fn lease(server: &TestServer, session: &str, tool: u32) -> String {
     let request = pb::AcquireToolRequest {
         session_id: session.to_owned(),
         tool,
@@ -283,15 +283,15 @@ fn hex(ticket: &[u8]) -> String {
 }
 
 async fn in_time<T>(what: impl Future<Output = T>) -> T {
-    tokio::time::timeout(PATIENCE, what).await.expect("in time")
+    tokio::time::timeout(TEST_TIMEOUT, what).await.expect("in time")
 }
 
 #[tokio::test]
 async fn a_session_needs_a_ticket_that_is_good_and_a_page_that_may_call_and_ends_with_its_stream() {
-    let server = Server::start(&["--origin", "https://good.example"]);
+    let server = TestServer::start(&["--origin", "https://good.example"]);
     let (to, session) = (address(&server), liver(&server).await);
     let open = || async {
-        let mut touch = Touch::open(&server, by_datagram(&session, &[0])).await.unwrap();
+        let mut touch = TestTouch::open(&server, by_datagram(&session, &[0])).await.unwrap();
         let offer = touch.opened.take().unwrap().datagrams.unwrap();
         assert_eq!((offer.host.as_str(), offer.port, offer.ticket.len()), ("", u32::from(to.port()), 16));
         (touch, offer.certificate_sha256, hex(&offer.ticket))
@@ -332,10 +332,10 @@ fn poses(number: u64, tool: u32, sequence: u64) -> Vec<u8> {
 
 #[tokio::test]
 async fn a_session_leads_the_tools_of_its_own_stream_alone_and_bears_nonsense() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = liver(&server).await;
-    let mut touch = Touch::open(&server, by_datagram(&session, &[0])).await.unwrap();
-    let other = Touch::open(&server, by_datagram(&session, &[1])).await.unwrap();
+    let mut touch = TestTouch::open(&server, by_datagram(&session, &[0])).await.unwrap();
+    let other = TestTouch::open(&server, by_datagram(&session, &[1])).await.unwrap();
     let offer = touch.opened.take().unwrap().datagrams.unwrap();
     let connection =
         in_time(dial(address(&server), &offer.certificate_sha256, &hex(&offer.ticket), None)).await.unwrap();
@@ -375,7 +375,7 @@ async fn a_session_leads_the_tools_of_its_own_stream_alone_and_bears_nonsense() 
 async fn the_server_answers_an_address_that_was_not_confirmed_by_less_than_it_was_sent() {
     let (wire, server) = Wire::before_server(&[]).await;
     let session = liver(&server).await;
-    let mut touch = Touch::open(&server, by_datagram(&session, &[0])).await.unwrap();
+    let mut touch = TestTouch::open(&server, by_datagram(&session, &[0])).await.unwrap();
     let offer = touch.opened.take().unwrap().datagrams.unwrap();
     // No answer gets through, so nothing shows that the client is where it says.
     wire.cut(1, true);
@@ -388,7 +388,7 @@ async fn the_server_answers_an_address_that_was_not_confirmed_by_less_than_it_wa
 
 #[tokio::test]
 async fn a_client_that_cant_open_a_stream_has_datagrams_for_its_lease() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = liver(&server).await;
     let mut haptics = server.haptics().await;
     let lease_id = lease(&server, &session, 0).await;
@@ -496,7 +496,7 @@ fn a_pose_that_was_overtaken_by_a_release_begins_no_touch() {
 }
 
 /// What a stream answers when it is asked for another session, which is once a second at most.
-async fn another_offer(touch: &mut Touch) -> pb::DatagramOffer {
+async fn another_offer(touch: &mut TestTouch) -> pb::DatagramOffer {
     loop {
         touch.say(Say::Renew(pb::Renew { client_time_ns: 1, datagrams: true })).await;
         loop {
@@ -512,9 +512,9 @@ async fn another_offer(touch: &mut Touch) -> pb::DatagramOffer {
 
 #[tokio::test]
 async fn another_session_takes_the_place_of_the_one_before() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let (to, session) = (address(&server), liver(&server).await);
-    let mut touch = Touch::open(&server, by_datagram(&session, &[0])).await.unwrap();
+    let mut touch = TestTouch::open(&server, by_datagram(&session, &[0])).await.unwrap();
     let offer = touch.opened.take().unwrap().datagrams.unwrap();
     let first = in_time(dial(to, &offer.certificate_sha256, &hex(&offer.ticket), None)).await.unwrap();
     let offer = in_time(another_offer(&mut touch)).await;
@@ -538,7 +538,7 @@ async fn another_session_takes_the_place_of_the_one_before() {
     })
     .await;
     // A stream that did not ask for datagrams gets none later.
-    let mut touch = Touch::open(&server, open(&session, &[1])).await.unwrap();
+    let mut touch = TestTouch::open(&server, open(&session, &[1])).await.unwrap();
     touch.say(Say::Renew(pb::Renew { client_time_ns: 5, datagrams: true })).await;
     let renewed = in_time(async {
         loop {
@@ -553,7 +553,7 @@ async fn another_session_takes_the_place_of_the_one_before() {
 
 #[tokio::test]
 async fn an_offer_that_nobody_takes_gives_its_place_among_the_streams_back() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = liver(&server).await;
     let mut haptics = server.haptics().await;
     let lease_id = lease(&server, &session, 0).await;

@@ -9,7 +9,7 @@ use common::{playing, scene_with, script};
 use palpate::limits::Limits;
 use palpate::scene::{PAPER, Scene};
 use palpate::session::run::run;
-use palpate::sheet::{self, Grasp, Model};
+use palpate::tissue::{self, Grasp, Model};
 
 const ALL_LAWS: &str = r#"
 duration_s = 0.3
@@ -49,7 +49,7 @@ fn the_golden_hash_of_a_fixed_scene_stays() {
     // These change only when the arithmetic changes. If they do, say so in CHANGELOG.md.
     for (sets, golden) in [
         (vec!["stepping.precision=f32"], GOLDEN_F32),
-        (vec!["stepping.precision=f64", "springs.flexion=true", "stepping.substeps=3"], GOLDEN_F64),
+        (vec!["stepping.precision=f64", "springs.bending=true", "stepping.substeps=3"], GOLDEN_F64),
     ] {
         let scene = scene_with(PAPER, &sets);
         assert_eq!(hash(&scene, false), golden, "{sets:?}");
@@ -77,7 +77,7 @@ fn every_width_of_vectors_gives_the_same_bits() {
         let mut sets = sets.to_vec();
         sets.extend([points.as_str(), lanes.as_str()]);
         let scene = scene_with(PAPER, &sets);
-        let mut tissue = sheet::at_rest(&common::model(&scene));
+        let mut tissue = tissue::at_rest(&common::model(&scene));
         // Strong enough to strain springs beyond the polynomial's range, and for rounding to matter.
         tissue.push(0, Some(common::push_on(&scene, [0, 0], [0.7, 0.2, -0.9])));
         let middle = [scene.sheet().unwrap().points[0] / 2, scene.sheet().unwrap().points[1] / 2];
@@ -103,8 +103,8 @@ fn every_width_of_vectors_gives_the_same_bits() {
             let format = ["f32", "f64", if compensates { "compensated" } else { "f32" }][(index + points[1]) % 3];
             let precision = format!("stepping.precision={format}");
             let others = [
-                ["springs.flexion=true", "sheet.fixed=edges"],
-                ["springs.flexion=false", "damping.coefficient_n_s_per_m=0.1"],
+                ["springs.bending=true", "sheet.fixed=edges"],
+                ["springs.bending=false", "damping.coefficient_n_s_per_m=0.1"],
             ];
             let mut sets = vec![scheme.as_str(), precision.as_str(), "stepping.substeps=2"];
             sets.extend(others[(index + points[0]) % 2]);

@@ -19,12 +19,12 @@ use std::time::Duration;
 
 use glam::DVec3;
 use inverse_service::{InverseService, Wrong};
-use palpate_client::bridge::{Options, Report, Session, Target, run};
+use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, run};
 use palpate_client::devices::{Enables, Placed, Placement, open};
 use palpate_client::{Credentials, HapticDevice, Reading};
 use palpate_touch::device::SAFE_FORCE_N;
 use palpate_touch::{Device, RenderingState, Tip};
-use server::{PATIENCE, Server, client_program};
+use server::{TEST_TIMEOUT, TestServer, client_program};
 
 /// The middle of the scene `liver`.
 const MIDDLE_M: DVec3 = DVec3::new(0.0375, 0.0375, 0.0);
@@ -76,10 +76,10 @@ impl Log {
     }
 }
 
-fn target(server: &Server) -> Target {
+fn target(server: &TestServer) -> Target {
     Target {
         server: palpate_client::Server::new(&server.url, &Credentials::default()).unwrap(),
-        session: Session::New { scene: "liver".to_owned() },
+        session: SessionChoice::New { scene: "liver".to_owned() },
         tool: 0,
         tip: Tip::default(),
         deadband: 0.0,
@@ -92,9 +92,9 @@ fn target(server: &Server) -> Target {
 /// Runs the bridge of the library until the device has felt a press for some ticks.
 async fn touch(
     device: impl HapticDevice + 'static,
-    server: &Server,
+    server: &TestServer,
     felt: impl Fn() -> bool + Send + 'static,
-) -> Report {
+) -> BridgeReport {
     let options = Options { remembers: true, ..Options::default() };
     let stop = async move {
         while !felt() {
@@ -102,7 +102,7 @@ async fn touch(
         }
     };
     let serving = run(device, target(server), options, stop);
-    let (device, report) = tokio::time::timeout(PATIENCE, serving).await.expect("no force").unwrap();
+    let (device, report) = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("no force").unwrap();
     drop(device);
     report
 }
@@ -139,7 +139,7 @@ fn is_felt(forces: &[DVec3]) -> bool {
 fn until(what: &str, is_so: impl Fn() -> bool) {
     let begun = std::time::Instant::now();
     while !is_so() {
-        assert!(begun.elapsed() < PATIENCE, "{what}: it does not come");
+        assert!(begun.elapsed() < TEST_TIMEOUT, "{what}: it does not come");
         std::thread::sleep(Duration::from_millis(5));
     }
 }
@@ -150,7 +150,7 @@ fn near(a: DVec3, b: DVec3) -> bool {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_force_dimension_device_gets_each_force_of_the_bridge_in_its_own_axes() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     // Returns of 1 and 2 are no errors.
     for wrong in [&[][..], &["SATURATED"]] {
         let imitation = Imitation::build("dhd", wrong);
@@ -196,7 +196,7 @@ async fn a_force_dimension_device_gets_each_force_of_the_bridge_in_its_own_axes(
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_touch_gets_millimetres_right_and_its_own_limits() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     for wrong in [&[][..], &["SATURATED"]] {
         let imitation = Imitation::build("hd", wrong);
         let device = open("openhaptics:Left Device", Some(&imitation.library)).unwrap();
@@ -244,7 +244,7 @@ fn a_loop_of_ours_that_stands_still_leaves_a_touch_without_a_force() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn an_inverse3_is_spoken_to_in_the_words_of_its_services_version() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     for (version, field) in [(Some("3.5.2"), "vector"), (Some("3.1.1"), "values"), (None, "vector")] {
         let service = InverseService::start(version, Wrong::Nothing);
         let device = open(&format!("haply:{}", service.url), None).unwrap();
@@ -331,7 +331,7 @@ fn down_and_up(z_m: impl Fn() -> f64 + Send + 'static) -> impl Fn(u32) -> bool +
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn recorded_events_of_a_knob_and_of_a_stick_touch_the_tissue() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     for (name, kind) in [("spacemouse", REL), ("gamepad", ABS)] {
         let folder = tempfile::tempdir().unwrap();
         let path = pipe(folder.path());
@@ -361,7 +361,7 @@ fn client(arguments: &[&str]) -> Output {
 }
 
 /// What goes wrong with a device, how the bridge ends, and what it says.
-struct Case {
+struct DeviceFaultCase {
     device: String,
     library: Option<PathBuf>,
     status: i32,
@@ -369,7 +369,7 @@ struct Case {
 }
 
 /// Runs `palpate-client bridge`, which must end by itself as the case says.
-fn ends(server: &Server, case: &Case) {
+fn ends(server: &TestServer, case: &DeviceFaultCase) {
     let library = case.library.as_ref().map(|library| library.display().to_string());
     // It ends earlier, if it ends as it should.
     let mut arguments = vec!["bridge", "--server", &server.url, "--device", &case.device, "--seconds", "300"];
@@ -395,7 +395,7 @@ fn is_safe(forces: &[DVec3]) {
 
 #[test]
 fn what_goes_wrong_with_a_loaded_library_ends_the_bridge_without_a_force() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     // Device, what is wrong, exit status, whether it was touched, what is said.
     type Row = (&'static str, &'static [&'static str], i32, bool, &'static [&'static str]);
     let table: [Row; 11] = [
@@ -413,7 +413,10 @@ fn what_goes_wrong_with_a_loaded_library_ends_the_bridge_without_a_force() {
     ];
     for (device, wrong, status, is_touched, says) in table {
         let imitation = Imitation::build(if device.starts_with('f') { "dhd" } else { "hd" }, wrong);
-        ends(&server, &Case { device: device.to_owned(), library: Some(imitation.library.clone()), status, says });
+        ends(
+            &server,
+            &DeviceFaultCase { device: device.to_owned(), library: Some(imitation.library.clone()), status, says },
+        );
         let forces = imitation.log.vectors("force");
         assert_eq!(is_felt(&forces), is_touched, "{device} {wrong:?}");
         match wrong {
@@ -432,7 +435,7 @@ fn what_goes_wrong_with_a_loaded_library_ends_the_bridge_without_a_force() {
     ] {
         let root = Path::new(env!("CARGO_MANIFEST_DIR"));
         let library = library.map(|library| root.join(library));
-        ends(&server, &Case { device: device.to_owned(), library, status, says });
+        ends(&server, &DeviceFaultCase { device: device.to_owned(), library, status, says });
     }
 }
 
@@ -444,8 +447,8 @@ fn is_let_go(forces: &[DVec3]) -> bool {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn positions_that_no_arm_has_give_no_force_and_do_not_end_the_touch() {
-    let server = Server::start(&[]);
-    let is_wrong = |report: &Report| {
+    let server = TestServer::start(&[]);
+    let is_wrong = |report: &BridgeReport| {
         let last = report.course.last().unwrap();
         assert!(
             (last.place_m.is_nan() || last.place_m.length() >= 1e3) && last.state == Some(RenderingState::Fault),
@@ -473,7 +476,7 @@ async fn positions_that_no_arm_has_give_no_force_and_do_not_end_the_touch() {
 
 #[test]
 fn what_goes_wrong_with_haplys_service_ends_the_bridge_within_the_envelope() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let table: [(Option<&str>, Wrong, bool, &[&str]); 9] = [
         (Some("3.0.7"), Wrong::Nothing, false, &["version 3.0.7", "knows 3.1 up to 3.x"]),
         (Some("4.0.0"), Wrong::Nothing, false, &["version 4.0.0"]),
@@ -488,7 +491,7 @@ fn what_goes_wrong_with_haplys_service_ends_the_bridge_within_the_envelope() {
     for (version, wrong, is_touched, says) in table {
         let service = InverseService::start(version, wrong);
         let device = format!("haply:{}", service.url);
-        ends(&server, &Case { device, library: None, status: 1, says });
+        ends(&server, &DeviceFaultCase { device, library: None, status: 1, says });
         let forces = service.heard().forces_n();
         assert_eq!(is_felt(&forces), is_touched, "{wrong:?}");
         assert!(forces.iter().all(|force_n| force_n.length() <= SAFE_FORCE_N), "{wrong:?}");
@@ -499,14 +502,14 @@ fn what_goes_wrong_with_haplys_service_ends_the_bridge_within_the_envelope() {
     }
     let nobody = "ws://127.0.0.1:9";
     let says = &["does not answer at 127.0.0.1:9", "Haply Hub"][..];
-    ends(&server, &Case { device: format!("haply:{nobody}"), library: None, status: 1, says });
+    ends(&server, &DeviceFaultCase { device: format!("haply:{nobody}"), library: None, status: 1, says });
     let says = &["an address is like ws://localhost:10001"][..];
-    ends(&server, &Case { device: "haply:here".to_owned(), library: None, status: 1, says });
+    ends(&server, &DeviceFaultCase { device: "haply:here".to_owned(), library: None, status: 1, says });
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_knob_or_stick_that_fails_while_it_is_pressed_is_left_without_a_force() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     for (name, kind) in [("spacemouse", REL), ("gamepad", ABS)] {
         for (last, says) in [(&[][..], "it was unplugged"), (&[0xa5; 480], "not an event of an input device")] {
             let folder = tempfile::tempdir().unwrap();
@@ -525,7 +528,7 @@ async fn a_knob_or_stick_that_fails_while_it_is_pressed_is_left_without_a_force(
                 drop(stop);
             });
             let serving = run(Noting { device, noted: noted.clone() }, target(&server), Options::default(), pending());
-            let failed = tokio::time::timeout(PATIENCE, serving).await.expect("it goes on").err().unwrap();
+            let failed = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it goes on").err().unwrap();
             assert!(failed.to_string().contains(says), "{name}: {failed}");
             ending.join().unwrap();
             playing.join().unwrap();
@@ -538,7 +541,7 @@ async fn a_knob_or_stick_that_fails_while_it_is_pressed_is_left_without_a_force(
 
 #[test]
 fn what_goes_wrong_with_events_ends_the_bridge() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let folder = tempfile::tempdir().unwrap();
     let path = pipe(folder.path());
     let device = format!("gamepad:{}", path.display());
@@ -551,7 +554,12 @@ fn what_goes_wrong_with_events_ends_the_bridge() {
     });
     ends(
         &server,
-        &Case { device: device.clone(), library: None, status: 1, says: &["no more events: it was unplugged"] },
+        &DeviceFaultCase {
+            device: device.clone(),
+            library: None,
+            status: 1,
+            says: &["no more events: it was unplugged"],
+        },
     );
     playing.join().unwrap();
     ending.join().unwrap();
@@ -561,13 +569,13 @@ fn what_goes_wrong_with_events_ends_the_bridge() {
             let _ = OpenOptions::new().write(true).open(path).unwrap().write_all(&[0xa5; 480]);
         }
     });
-    ends(&server, &Case { device, library: None, status: 1, says: &["not an event of an input device"] });
+    ends(&server, &DeviceFaultCase { device, library: None, status: 1, says: &["not an event of an input device"] });
     garbage.join().unwrap();
     for (device, says) in [
         (format!("gamepad:{}/none", folder.path().display()), &["No such file"][..]),
         (format!("spacemouse:{}", folder.path().display()), &["neither an input device nor a pipe"]),
     ] {
-        ends(&server, &Case { device, library: None, status: 1, says });
+        ends(&server, &DeviceFaultCase { device, library: None, status: 1, says });
     }
 }
 
@@ -603,7 +611,7 @@ fn devices_are_listed_and_tested_without_a_force() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_device_without_a_button_gets_forces_by_itself() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let service = InverseService::start(Some("3.5.0"), Wrong::NoGrip);
     let device = open(&format!("haply:{}", service.url), None).unwrap();
     let placement = Placement { enable: Enables::Always, ..Placement::default() };

@@ -11,27 +11,27 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use etcd::{Certificates, Etcd, SHORT_TIMES};
+use etcd::{Certificates, EtcdMembers, SHORT_TIMES};
 use palpate::cluster::etcd::{
-    Compare, Etcd as Client, EtcdError, EtcdOptions, Op, Outcome, Txn, Watch, WatchError, WatchEvent,
+    Compare, Etcd as Client, EtcdError, EtcdOptions, Op, TransactionOutcome, Txn, Watch, WatchError, WatchEvent,
 };
 use rcgen::{BasicConstraints, CertificateParams, DistinguishedName, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair};
 
 /// Long enough for any machine.
-const PATIENCE: Duration = Duration::from_secs(60);
+const ETCD_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// So long may an attempt take where members die: longer than on a busy machine, shorter than a test's patience.
 const LIMIT: Duration = Duration::from_secs(1);
 
-fn started(members: usize) -> Etcd {
-    Etcd::start_with(members, SHORT_TIMES, &[], |_| None)
+fn started(members: usize) -> EtcdMembers {
+    EtcdMembers::start_with(members, SHORT_TIMES, &[], |_| None)
 }
 
-fn options(etcd: &Etcd) -> EtcdOptions {
+fn options(etcd: &EtcdMembers) -> EtcdOptions {
     EtcdOptions { endpoints: etcd.endpoints(), ..Default::default() }
 }
 
-fn client(etcd: &Etcd) -> Client {
+fn client(etcd: &EtcdMembers) -> Client {
     Client::open_within(&options(etcd), LIMIT).unwrap()
 }
 
@@ -50,7 +50,7 @@ async fn at_last<T, A: Future<Output = Result<T, EtcdError>>>(call: impl Fn() ->
         match call().await {
             Ok(done) => return done,
             Err(EtcdError::Refused(why)) => panic!("{why}"),
-            Err(error) => assert!(begun.elapsed() < PATIENCE, "{error}"),
+            Err(error) => assert!(begun.elapsed() < ETCD_TIMEOUT, "{error}"),
         }
     }
 }
@@ -67,12 +67,12 @@ async fn make(client: &Client, key: &str) -> u64 {
 }
 
 async fn next(watch: &mut Watch) -> Result<Vec<WatchEvent>, WatchError> {
-    tokio::time::timeout(PATIENCE, watch.next()).await.expect("the watch says nothing")
+    tokio::time::timeout(ETCD_TIMEOUT, watch.next()).await.expect("the watch says nothing")
 }
 
 #[tokio::test]
 async fn each_call() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     let mut etcd = started(1);
@@ -128,7 +128,7 @@ async fn compares(client: &Client, revision: u64) {
         (Compare::ModRevision("a".into(), revision), true),
         (Compare::ModRevision("a".into(), revision + 1), false),
     ] {
-        let Outcome { succeeded, got, .. } = does(compare.clone()).await;
+        let TransactionOutcome { succeeded, got, .. } = does(compare.clone()).await;
         assert_eq!(succeeded, holds, "{compare:?}");
         let got: Vec<_> = got.iter().map(|one| one.as_ref().map(|kv| kv.mod_revision)).collect();
         assert_eq!(got, if holds { vec![] } else { vec![Some(revision), None] });
@@ -177,7 +177,7 @@ async fn leases(client: &Client) {
 
 #[tokio::test]
 async fn a_lease_that_is_not_kept_alive_ends_with_its_keys() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     let etcd = started(1);
@@ -196,7 +196,7 @@ async fn a_lease_that_is_not_kept_alive_ends_with_its_keys() {
 
 #[tokio::test]
 async fn a_watch_begins_where_it_is_told_to_and_says_what_is_lost() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     let etcd = started(1);
@@ -243,7 +243,7 @@ async fn a_watch_begins_where_it_is_told_to_and_says_what_is_lost() {
 
 #[tokio::test]
 async fn a_watch_outlives_the_death_and_the_frost_of_its_member() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     const KEYS: usize = 60;
@@ -284,7 +284,7 @@ async fn a_watch_outlives_the_death_and_the_frost_of_its_member() {
 
 #[tokio::test]
 async fn calls_go_on_when_the_leader_dies_or_freezes() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     let mut etcd = started(3);
@@ -320,7 +320,7 @@ async fn calls_go_on_when_the_leader_dies_or_freezes() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_thousand_transactions_at_once_are_done_once_each_though_members_die() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     const TASKS: usize = 1000;
@@ -349,7 +349,7 @@ async fn a_thousand_transactions_at_once_are_done_once_each_though_members_die()
     let begun = Instant::now();
     while let Some(ended) = tasks.join_next().await {
         ended.unwrap();
-        assert!(begun.elapsed() < 2 * PATIENCE);
+        assert!(begun.elapsed() < 2 * ETCD_TIMEOUT);
     }
     let counters = at_last(|| client.list("counter/")).await.0;
     let sum: usize = counters.iter().map(|kv| String::from_utf8_lossy(&kv.value).parse::<usize>().unwrap()).sum();
@@ -364,7 +364,7 @@ async fn increment(client: &Client, counter: &str, mark: &str, unknown: &AtomicU
     loop {
         match client.transact(txn.clone()).await {
             Ok(outcome) if outcome.got.is_empty() => return,
-            Ok(Outcome { got, .. }) => {
+            Ok(TransactionOutcome { got, .. }) => {
                 let [counted, marked] = &got[..] else { panic!("{got:?}") };
                 if marked.is_some() {
                     return;
@@ -412,12 +412,12 @@ fn certify(folder: &Path, addresses: &[SocketAddr]) -> Certificates {
 
 #[tokio::test]
 async fn certificates_and_passwords() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     const PASSWORD: &str = "correct-horse";
     let folder = tempfile::tempdir().unwrap();
-    let mut etcd = Etcd::start_with(1, SHORT_TIMES, &[], |addresses| Some(certify(folder.path(), addresses)));
+    let mut etcd = EtcdMembers::start_with(1, SHORT_TIMES, &[], |addresses| Some(certify(folder.path(), addresses)));
     let files = etcd.certificates().unwrap().clone();
     let bare = EtcdOptions { ca: Some(files.ca), ..options(&etcd) };
     let known = EtcdOptions { certificate: Some(files.cert), key: Some(files.key), ..bare.clone() };

@@ -20,13 +20,13 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use authority::Authority;
-use etcd::Etcd;
+use etcd::EtcdMembers;
 use fleet::{create, goes_on, owner, three, until, until_stood_by, verify};
 use palpate::journal::file;
 use palpate_proto::error::elsewhere;
 use palpate_proto::pb;
 use pb::touch_response::Message as Heard;
-use server::{Server, Touch, force, waiting};
+use server::{TestServer, TestTouch, force, waiting};
 use tempfile::TempDir;
 use tokio::sync::MutexGuard;
 use tonic::Code;
@@ -35,11 +35,11 @@ use tonic::Code;
 static ONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
 
 /// A folder and an etcd, while no other test runs. `None` where etcd is not installed.
-async fn alone() -> Option<(MutexGuard<'static, ()>, TempDir, Etcd)> {
-    if !Etcd::is_there() {
+async fn alone() -> Option<(MutexGuard<'static, ()>, TempDir, EtcdMembers)> {
+    if !EtcdMembers::is_there() {
         return None;
     }
-    Some((ONE.lock().await, tempfile::tempdir().unwrap(), Etcd::start(1)))
+    Some((ONE.lock().await, tempfile::tempdir().unwrap(), EtcdMembers::start(1)))
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -88,7 +88,7 @@ async fn any_server_creates_sessions_and_tells_where_they_are() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_server_of_no_fleet_says_so() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let request = pb::LocateSessionRequest { session_id: "0".repeat(32) };
     let refused = server.sessions().await.locate_session(request).await.unwrap_err();
     assert_eq!(refused.code(), Code::FailedPrecondition);
@@ -120,7 +120,7 @@ async fn a_frozen_server_says_nothing_for_its_sessions_when_it_thaws() {
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (at, session) = until_stood_by(&nodes, &id).await;
-    let mut touch = Touch::hold(nodes[at].there(), &id).await;
+    let mut touch = TestTouch::hold(nodes[at].there(), &id).await;
     touch.command(force(0, 1, -0.1)).await;
     let newest = touch.sample().await;
     assert_eq!(newest.ownership_revision, session.ownership.as_ref().unwrap().revision);
@@ -167,7 +167,7 @@ async fn without_etcd_all_stands_and_then_goes_on_in_place() {
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let (at, before) = until_stood_by(&nodes, &id).await;
-    let mut touch = Touch::hold(nodes[at].there(), &id).await;
+    let mut touch = TestTouch::hold(nodes[at].there(), &id).await;
     touch.command(force(0, 1, -0.1)).await;
     etcd.stop_all();
     let refused = loop {
@@ -187,7 +187,7 @@ async fn without_etcd_all_stands_and_then_goes_on_in_place() {
         nodes[at].session(&id).await.is_ok_and(|session| session.held_tools.is_empty())
     })
     .await;
-    let mut again = Touch::hold(nodes[at].there(), &id).await;
+    let mut again = TestTouch::hold(nodes[at].there(), &id).await;
     again.command(force(0, 1, -0.1)).await;
     let step = again.sample().await.step;
     again.sample_with(|sample| sample.step > step).await;
@@ -205,7 +205,7 @@ async fn a_session_whose_owner_is_changed_by_hand_ends_at_its_old_server() {
     let id = create(&nodes[0]).await.session_id;
     let at = owner(&nodes, &id).await.unwrap();
     let other = &nodes[(at + 1) % 3];
-    let mut touch = Touch::hold(nodes[at].there(), &id).await;
+    let mut touch = TestTouch::hold(nodes[at].there(), &id).await;
     let value = serde_json::json!({ "node": other.name, "standby": "" }).to_string();
     etcd.control(&["put", &format!("/palpate/default/sessions/{id}"), &value]);
     let ended = loop {
@@ -224,7 +224,7 @@ async fn a_session_moves_with_its_tools_and_the_same_bits() {
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
     let mut at = owner(&nodes, &id).await.unwrap();
-    let mut touch = Touch::hold(nodes[at].there(), &id).await;
+    let mut touch = TestTouch::hold(nodes[at].there(), &id).await;
     touch.command(force(0, 1, -0.1)).await;
     let pressed =
         touch.sample_with(|sample| sample.tools.first().is_some_and(|tool| tool.acknowledged_sequence == 1)).await;
@@ -256,7 +256,7 @@ async fn a_session_moves_with_its_tools_and_the_same_bits() {
         assert_eq!(elsewhere(&ended), Some(nodes[to].url.clone()), "{ended}");
         // The tool is still in the tissue, and whoever held it goes on.
         let open = pb::TouchOpen { lease_id, ..server::open(&id, &[0]) };
-        touch = Touch::open(nodes[to].there(), open).await.unwrap();
+        touch = TestTouch::open(nodes[to].there(), open).await.unwrap();
         let sample = touch.sample_with(|sample| !sample.tools.is_empty()).await;
         assert!((force_n(&sample) - newest_n).abs() < 0.1, "{newest_n} {sample:?}");
         goes_on(&nodes, &id, &nodes[to], false).await;
@@ -271,7 +271,7 @@ async fn a_session_moves_with_its_tools_and_the_same_bits() {
     .await;
     // A lease that is none, and an unknown server.
     let open = pb::TouchOpen { lease_id: "0".repeat(32), ..server::open(&id, &[0]) };
-    assert_eq!(Touch::open(nodes[at].there(), open).await.err().unwrap().code(), Code::PermissionDenied);
+    assert_eq!(TestTouch::open(nodes[at].there(), open).await.err().unwrap().code(), Code::PermissionDenied);
     let request = pb::MoveSessionRequest { session_id: id.clone(), node: "nowhere".into() };
     assert_eq!(nodes[at].admin().await.move_session(request).await.unwrap_err().code(), Code::InvalidArgument);
     // Upgrades by day: nothing is left.
@@ -343,7 +343,7 @@ async fn servers_know_each_other_by_certificates_and_clients_by_tokens() {
         let of_the_fleet =
             ["--cluster", &etcd.endpoints()[0], "--advertise", &urls[at], "--cluster-ca", &ca, "--journal", &journal];
         let of_tls = ["--tls-cert", &cert, "--tls-key", &key, "--tokens", &tokens, "--threads", "1"];
-        Server::start_at(urls[at].trim_start_matches("https://"), &[&of_the_fleet[..], &of_tls].concat())
+        TestServer::start_at(urls[at].trim_start_matches("https://"), &[&of_the_fleet[..], &of_tls].concat())
     };
     let _servers = [serve(0), serve(1)];
     let bearer = format!("Bearer {token}");

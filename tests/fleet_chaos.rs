@@ -35,14 +35,14 @@ use std::io::Write;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use etcd::Etcd;
+use etcd::EtcdMembers;
 use fleet::{Node, create, goes_on, three, until, verify};
-use follower::{Doors, Follower, Viewer};
+use follower::{Doors, Follower, FollowingViewer};
 use palpate_client::fleet::is_fenced;
 use palpate_proto::pb;
 use proxy::Proxy;
-use random::Random;
-use server::{Touch, force};
+use random::TestRandom;
+use server::{TestTouch, force};
 
 /// One test at a time: each has several processes.
 static ONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
@@ -150,12 +150,12 @@ impl Ward {
     }
 
     /// Ends all; the journals are those of offline runs, and whatever a client was told was told by one server at a time.
-    async fn close(mut self) -> Vec<follower::Seen> {
+    async fn close(mut self) -> Vec<follower::FollowerObservation> {
         let mut seen = Vec::new();
         for follower in self.followers.drain(..) {
             seen.push(follower.end().await);
         }
-        seen.iter().for_each(follower::Seen::check);
+        seen.iter().for_each(follower::FollowerObservation::check);
         self.nodes.iter_mut().for_each(Node::kill);
         let journals = self.nodes.iter().flat_map(|node| self.ids.iter().flat_map(|id| node.runs(id)));
         let compared: u64 = journals.map(|journal| verify(&journal.path)).sum();
@@ -166,7 +166,7 @@ impl Ward {
 
 /// What becomes of a server.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
-enum Fault {
+enum ServerFault {
     Killed,
     Frozen,
     /// Its connections to etcd break.
@@ -192,14 +192,14 @@ fn check_runs(nodes: &[Node], id: &str) -> u64 {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn rounds() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     let _one = ONE.lock().await;
-    let (rounds, mut random) = (number("PALPATE_FLEET_ROUNDS", 4), Random(number("PALPATE_FLEET_SEED", 1)));
+    let (rounds, mut random) = (number("PALPATE_FLEET_ROUNDS", 4), TestRandom(number("PALPATE_FLEET_SEED", 1)));
     let (sessions, resting) = (number("PALPATE_FLEET_SESSIONS", 3), number("PALPATE_FLEET_RESTING", 3));
     let frozen = Duration::from_secs(number("PALPATE_FLEET_FROZEN_S", 4));
-    let etcd = Etcd::start(1);
+    let etcd = EtcdMembers::start(1);
     // Each server reaches etcd by a wire of its own, which can be cut.
     let mut wires = Vec::new();
     for _ in 0..3 {
@@ -207,8 +207,8 @@ async fn rounds() {
     }
     let ways: Vec<Vec<String>> = wires.iter().map(|wire| vec![wire.url()]).collect();
     let mut ward = Ward::open(&ways, sessions, 4, resting).await;
-    let viewers: Vec<Viewer> =
-        ward.followers.iter().take(2).map(|follower| Viewer::start(&ward.doors, &follower.id)).collect();
+    let viewers: Vec<FollowingViewer> =
+        ward.followers.iter().take(2).map(|follower| FollowingViewer::start(&ward.doors, &follower.id)).collect();
     let (mut touched, mut rested, mut done) = (Figures::default(), Figures::default(), BTreeMap::new());
     let (mut compared, mut others) = (0, 0);
     for round in 1..=rounds {
@@ -220,7 +220,7 @@ async fn rounds() {
         if round > 4 && random.below(4) == 0 {
             at = usize::try_from(random.below(3)).unwrap();
         }
-        let kinds = [Fault::Killed, Fault::Frozen, Fault::Cut, Fault::Silenced];
+        let kinds = [ServerFault::Killed, ServerFault::Frozen, ServerFault::Cut, ServerFault::Silenced];
         // The first rounds have one of each.
         let kind = if round <= 4 { round - 1 } else { random.below(4) };
         let fault = kinds[usize::try_from(kind).unwrap()];
@@ -233,20 +233,20 @@ async fn rounds() {
             ward.followers.iter().map(|f| (f.id.clone(), f.seen().durable_step)).collect();
         let begun = Instant::now();
         match fault {
-            Fault::Killed => ward.nodes[at].kill(),
-            Fault::Frozen => ward.nodes[at].freeze(),
-            Fault::Cut => wires[at].cut(),
-            Fault::Silenced => wires[at].silence(),
+            ServerFault::Killed => ward.nodes[at].kill(),
+            ServerFault::Frozen => ward.nodes[at].freeze(),
+            ServerFault::Cut => wires[at].cut(),
+            ServerFault::Silenced => wires[at].silence(),
         }
         *done.entry(fault).or_insert(0) += 1;
         let (back_touched, back_rested) = until_back(&ward, at, &its, begun, &before).await;
-        if fault == Fault::Frozen {
+        if fault == ServerFault::Frozen {
             tokio::time::sleep(frozen.saturating_sub(begun.elapsed())).await;
         }
         match fault {
-            Fault::Killed => ward.nodes[at].begin(),
-            Fault::Frozen => ward.nodes[at].thaw(),
-            Fault::Cut | Fault::Silenced => wires[at].mend(),
+            ServerFault::Killed => ward.nodes[at].begin(),
+            ServerFault::Frozen => ward.nodes[at].thaw(),
+            ServerFault::Cut | ServerFault::Silenced => wires[at].mend(),
         }
         ward.nodes[at].until_nodes(3).await;
         let owners = ward.until_well().await;
@@ -336,12 +336,12 @@ async fn until_back(
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 3)]
 async fn etcds_leader_is_killed() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     let _one = ONE.lock().await;
     let (leaders, sessions) = (number("PALPATE_FLEET_LEADERS", 2), number("PALPATE_FLEET_SESSIONS", 3));
-    let mut etcd = Etcd::start(3);
+    let mut etcd = EtcdMembers::start(3);
     let ward = Ward::open(&vec![etcd.endpoints(); 3], sessions, 4, 0).await;
     let before = ward.until_well().await;
     ward.followers.iter().for_each(Follower::forget_silence);
@@ -375,7 +375,7 @@ async fn etcds_leader_is_killed() {
     let longest = seen.iter().map(|seen| seen.longest_silence.as_secs_f64()).fold(0.0, f64::max);
     let interrupted: usize = seen.iter().map(|seen| seen.returns.len()).sum();
     tell(&format!(
-        "Etcd's leader: killed {leaders} times, {sessions} sessions; none has moved, no revision has changed; {interrupted} streams \
+        "EtcdMembers's leader: killed {leaders} times, {sessions} sessions; none has moved, no revision has changed; {interrupted} streams \
          were interrupted, the longest silence of a client was {longest:.3} s"
     ));
 }
@@ -383,18 +383,18 @@ async fn etcds_leader_is_killed() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 3)]
 #[ignore = "takes a minute: make chaos"]
 async fn etcd_is_gone() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     let _one = ONE.lock().await;
     let (gone_s, sessions) = (number("PALPATE_FLEET_GONE_S", 60), number("PALPATE_FLEET_SESSIONS", 3));
-    let mut etcd = Etcd::start(3);
+    let mut etcd = EtcdMembers::start(3);
     let ward = Ward::open(&vec![etcd.endpoints(); 3], sessions, 1, 3).await;
     let before = ward.until_well().await;
     // Holds a tool, and does not come back by itself.
     let held = ward.ids.last().unwrap();
     let holder = ward.nodes.iter().find(|node| node.name == before[held].node).unwrap();
-    let mut touch = Touch::hold(holder.there(), held).await;
+    let mut touch = TestTouch::hold(holder.there(), held).await;
     touch.command(force(0, 1, -0.1)).await;
     touch.sample_with(|sample| sample.tools.first().is_some_and(|tool| tool.acknowledged_sequence == 1)).await;
     etcd.stop_all();
@@ -457,7 +457,7 @@ async fn etcd_is_gone() {
         }
     }
     tell(&format!(
-        "Etcd gone for {gone_s} s: {} sessions; the last step was {latest_s:.2} s after it stopped, all calls were refused as FENCED \
+        "EtcdMembers gone for {gone_s} s: {} sessions; the last step was {latest_s:.2} s after it stopped, all calls were refused as FENCED \
          after {refused_s:.2} s; started again, etcd had a leader after {led_s:.2} s; all went on in place, their clients touched again \
          {:.2} s (median), {:.2} s (worst) after the start",
         before.len(),
@@ -468,13 +468,13 @@ async fn etcd_is_gone() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn moves_under_a_tool() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     let _one = ONE.lock().await;
     let moves = number("PALPATE_FLEET_MOVES", 12);
-    let mut random = Random(number("PALPATE_FLEET_SEED", 1));
-    let etcd = Etcd::start(1);
+    let mut random = TestRandom(number("PALPATE_FLEET_SEED", 1));
+    let etcd = EtcdMembers::start(1);
     let folder = tempfile::tempdir().unwrap();
     let nodes = three(folder.path(), &etcd.endpoints()).await;
     let doors = Doors::of(&nodes);

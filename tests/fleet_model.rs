@@ -29,7 +29,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 use broken::Broken;
-use faults::{Counts, simulate};
+use faults::{FaultCounts, simulate};
 
 /// Time, ns.
 type Ns = u64;
@@ -59,7 +59,7 @@ fn explain(seed: u64, on_two: bool, world: &world::World) -> Option<String> {
 fn histories_of_many_seeds_keep_what_the_fleet_promises() {
     let wanted: u64 = std::env::var("PALPATE_FLEET_SECONDS").ok().and_then(|text| text.parse().ok()).unwrap_or(20_000);
     let first: u64 = std::env::var("PALPATE_FLEET_SEED").ok().and_then(|text| text.parse().ok()).unwrap_or(1);
-    let (next, done, begun) = (AtomicU64::new(first), Mutex::new((Counts::default(), 0)), Instant::now());
+    let (next, done, begun) = (AtomicU64::new(first), Mutex::new((FaultCounts::default(), 0)), Instant::now());
     let work = || {
         loop {
             let seed = next.fetch_add(1, Ordering::Relaxed);
@@ -83,7 +83,7 @@ fn histories_of_many_seeds_keep_what_the_fleet_promises() {
         let threads: Vec<_> = (0..2).map(|_| scope.spawn(work)).collect();
         threads.into_iter().for_each(|thread| thread.join().unwrap());
     });
-    let Counts { longest, .. } = done.lock().unwrap().0;
+    let FaultCounts { longest, .. } = done.lock().unwrap().0;
     println!(
         "{:?}; {:.1} s; longest without an owner {:.2} s",
         done.lock().unwrap().0,

@@ -14,13 +14,13 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicI64, Ordering};
 use std::sync::{Arc, Mutex};
 
-use etcd::Etcd;
+use etcd::EtcdMembers;
 use fleet::{Node, until, until_stood_by};
 use glam::DVec3;
-use palpate::journal::{Reader, file};
+use palpate::journal::{JournalReader, file};
 use palpate::limits::Limits;
 use palpate::scene::collection::find_scene;
-use palpate_client::bridge::{Options, Report, Session, Target, Tick, run};
+use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, run};
 use palpate_client::{Credentials, HapticDevice, Reading};
 use palpate_proto::pb;
 use palpate_touch::envelope::{PAUSE_S, SLEW_N_PER_S};
@@ -40,13 +40,13 @@ const IN_UM: i64 = -3000;
 
 /// Where a hand is to go, and what it has felt.
 #[derive(Default)]
-struct Course {
+struct HandPath {
     ticks: Mutex<Vec<Tick>>,
     goal_um: AtomicI64,
     asks: AtomicBool,
 }
 
-impl Course {
+impl HandPath {
     fn go(&self, goal_um: i64) {
         self.goal_um.store(goal_um, Ordering::Relaxed);
     }
@@ -98,12 +98,12 @@ impl Course {
 }
 
 /// A hand that goes where it is told by 20 mm/s.
-struct Hand {
-    course: Arc<Course>,
+struct SlowHand {
+    course: Arc<HandPath>,
     z_m: f64,
 }
 
-impl HapticDevice for Hand {
+impl HapticDevice for SlowHand {
     fn descriptor(&self) -> Device {
         Device::named("omega3").unwrap()
     }
@@ -126,19 +126,19 @@ impl HapticDevice for Hand {
 
 /// A bridge that touches a session of a fleet.
 struct Bridge {
-    course: Arc<Course>,
+    course: Arc<HandPath>,
     stop: oneshot::Sender<()>,
-    serving: JoinHandle<Result<(Hand, Report), palpate_client::Error>>,
+    serving: JoinHandle<Result<(SlowHand, BridgeReport), palpate_client::Error>>,
 }
 
 impl Bridge {
     /// It is told of one server only.
     fn begin(node: &Node, session_id: &str) -> Self {
-        let course = Arc::new(Course { goal_um: AtomicI64::new(OUT_UM), ..Course::default() });
-        let hand = Hand { course: course.clone(), z_m: 0.004 };
+        let course = Arc::new(HandPath { goal_um: AtomicI64::new(OUT_UM), ..HandPath::default() });
+        let hand = SlowHand { course: course.clone(), z_m: 0.004 };
         let target = Target {
             server: palpate_client::Server::new(&node.url, &Credentials::default()).unwrap(),
-            session: Session::Existing(session_id.to_owned()),
+            session: SessionChoice::Existing(session_id.to_owned()),
             tool: 0,
             tip: Tip::default(),
             deadband: 0.0,
@@ -152,9 +152,9 @@ impl Bridge {
         Bridge { course, stop, serving }
     }
 
-    async fn end(self) -> Report {
+    async fn end(self) -> BridgeReport {
         drop(self.stop);
-        tokio::time::timeout(server::PATIENCE, self.serving).await.expect("it goes on").unwrap().unwrap().1
+        tokio::time::timeout(server::TEST_TIMEOUT, self.serving).await.expect("it goes on").unwrap().unwrap().1
     }
 }
 
@@ -201,7 +201,7 @@ async fn until_led(node: &Node, id: &str, more: u64) {
 fn ended_leases(node: &Node, id: &str) -> usize {
     let newest = file::list(&node.journals).unwrap().into_iter().filter(|file| file.session_id == id);
     let newest = newest.max_by_key(|file| file.run).expect("it has a journal");
-    let (mut reader, mut ended) = (Reader::open(&newest.path).unwrap(), 0);
+    let (mut reader, mut ended) = (JournalReader::open(&newest.path).unwrap(), 0);
     while let Some(batch) = reader.next_batch().unwrap() {
         for input in batch.inputs().unwrap() {
             if let Some(palpate::journal::pb::input::What::Command(command)) = input.what {
@@ -216,13 +216,13 @@ fn ended_leases(node: &Node, id: &str) -> usize {
 async fn a_hand_goes_on_with_a_session_that_moves_and_feels_no_jump() {
     const MOVES: u32 = 4;
     /// A busy machine may be silent for longer than a hand goes on by itself.
-    const MOST_MOVES: u32 = 16;
-    if !Etcd::is_there() {
+    const MAX_MOVES: u32 = 16;
+    if !EtcdMembers::is_there() {
         return;
     }
     let _one = ONE.lock().await;
     let folder = tempfile::tempdir().unwrap();
-    let etcd = Etcd::start(1);
+    let etcd = EtcdMembers::start(1);
     let nodes = two(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await;
     let mut at = fleet::owner(&nodes, &id).await.unwrap();
@@ -231,7 +231,7 @@ async fn a_hand_goes_on_with_a_session_that_moves_and_feels_no_jump() {
     until_led(&nodes[at], &id, 100).await;
     let course = bridge.course.clone();
     let (mut moves, mut went_on) = (0, 0);
-    while moves < MOVES || went_on == 0 && moves < MOST_MOVES {
+    while moves < MOVES || went_on == 0 && moves < MAX_MOVES {
         if course.state() != Some(RenderingState::Enabled) || course.force_n() < 0.05 {
             course.press().await;
         }
@@ -272,12 +272,12 @@ async fn a_hand_goes_on_with_a_session_that_moves_and_feels_no_jump() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_hand_whose_server_dies_rests_until_it_asks_for_forces() {
-    if !Etcd::is_there() {
+    if !EtcdMembers::is_there() {
         return;
     }
     let _one = ONE.lock().await;
     let folder = tempfile::tempdir().unwrap();
-    let etcd = Etcd::start(1);
+    let etcd = EtcdMembers::start(1);
     let mut nodes = two(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await;
     let (at, _) = until_stood_by(&nodes, &id).await;

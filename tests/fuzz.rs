@@ -18,7 +18,7 @@ use fastrand::Rng;
 use palpate_proto::measure::{MULTIPLE, ROOM};
 use palpate_proto::pb;
 use prost::Message;
-use targets::{REQUESTS, TARGETS, Taker, Target, requests};
+use targets::{FuzzTarget, REQUESTS, TARGETS, Taker, requests};
 
 /// Inputs that were taken and are bent further.
 const CORPUS: usize = 512;
@@ -27,7 +27,7 @@ const CORPUS: usize = 512;
 const LONGEST: usize = 1 << 14;
 
 /// What an input may take beside, bytes: that of a message, and of a small tissue that is compiled and rehearsed.
-const MOST_ROOM: usize = 3 * ROOM;
+const MAX_ROOM: usize = 3 * ROOM;
 
 /// Pieces of text and of protobuf at which readers stumble.
 fn pieces() -> Vec<Vec<u8>> {
@@ -107,7 +107,7 @@ fn bend(random: &mut Rng, mut bytes: Vec<u8>, other: &[u8], pieces: &[Vec<u8>]) 
     bytes
 }
 
-fn fuzz(target: &Target, inputs: u64) {
+fn fuzz(target: &FuzzTarget, inputs: u64) {
     let pieces = pieces();
     let mut random = Rng::with_seed(0x7011_ca7e);
     let mut corpus = (target.seeds)();
@@ -127,7 +127,7 @@ fn fuzz(target: &Target, inputs: u64) {
             panic!("{} panics at {:?}\nas text: {}", target.name, bytes, String::from_utf8_lossy(&bytes));
         };
         assert!(
-            took <= MULTIPLE * bytes.len() + MOST_ROOM,
+            took <= MULTIPLE * bytes.len() + MAX_ROOM,
             "{}: {} bytes take {took} of memory: {:?}\nas text: {}",
             target.name,
             bytes.len(),

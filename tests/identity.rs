@@ -17,7 +17,7 @@ use palpate::server::identity::{self, Access, CALLS, Role, access};
 use palpate_proto::pb;
 use prost::Message;
 use rcgen::{CertificateParams, KeyPair};
-use server::{PATIENCE, Server, force, palpate, told};
+use server::{TEST_TIMEOUT, TestServer, force, palpate, told};
 use tokio::io::AsyncReadExt;
 use tokio_rustls::TlsConnector;
 use tokio_rustls::rustls::crypto::ring;
@@ -52,7 +52,7 @@ async fn call(channel: &Channel, path: &str, authorization: Option<&str>) -> Res
     }
     let codec = tonic_prost::ProstCodec::<(), ()>::default();
     let answer = grpc.streaming(request, path.parse().unwrap(), codec);
-    let mut answer = tokio::time::timeout(PATIENCE, answer).await.unwrap()?.into_inner();
+    let mut answer = tokio::time::timeout(TEST_TIMEOUT, answer).await.unwrap()?.into_inner();
     // Streams that are let in may have nothing to say.
     tokio::select! {
         biased;
@@ -96,7 +96,7 @@ async fn a_client_without_a_token_is_told_how_to_give_one() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("tokens.toml");
     token(&file, "ann", "watch");
-    let server = Server::start(&["--tokens", file.to_str().unwrap()]);
+    let server = TestServer::start(&["--tokens", file.to_str().unwrap()]);
     for arguments in
         [&["top", "--once"][..], &["bridge", "--seconds", "1"], &["admin", "callers"], &["replay", "press"]]
     {
@@ -114,7 +114,7 @@ async fn every_call_is_refused_without_a_token_with_a_wrong_one_and_with_too_wea
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("tokens.toml");
     let tokens: Vec<_> = Role::ALL.iter().map(|role| (*role, token(&file, role.name(), role.name()))).collect();
-    let server = Server::start(&["--tokens", file.to_str().unwrap()]);
+    let server = TestServer::start(&["--tokens", file.to_str().unwrap()]);
     let channel = server.channel().await;
     let reason = |status: &Status| status.get_details_error_info().map(|info| info.reason).unwrap_or_default();
     for path in served() {
@@ -164,7 +164,7 @@ async fn a_lease_is_of_no_use_to_whom_it_was_not_given() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("tokens.toml");
     let (owner, thief) = (token(&file, "owner", "create,touch"), token(&file, "thief", "touch"));
-    let server = Server::start(&["--tokens", file.to_str().unwrap()]);
+    let server = TestServer::start(&["--tokens", file.to_str().unwrap()]);
     let (mut sessions, mut haptics) = (server.sessions().await, server.haptics().await);
     let source = Some(pb::create_session_request::Source::SceneName("paper".into()));
     let create = pb::CreateSessionRequest { source, paused: true, idle_timeout_s: None };
@@ -230,7 +230,7 @@ struct Two {
     before: String,
     stays: String,
     goes: String,
-    server: Server,
+    server: TestServer,
     log: Log,
     session: String,
 }
@@ -266,7 +266,7 @@ async fn who_loses_a_token_loses_the_streams_and_tools_that_it_opened() {
     std::fs::write(&file, &before).unwrap();
     log.wait_for("new files are in use");
     let ended = loop {
-        if let Err(status) = tokio::time::timeout(PATIENCE, lost.message()).await.unwrap().map(Option::unwrap) {
+        if let Err(status) = tokio::time::timeout(TEST_TIMEOUT, lost.message()).await.unwrap().map(Option::unwrap) {
             break status;
         }
     };
@@ -278,7 +278,7 @@ async fn who_loses_a_token_loses_the_streams_and_tools_that_it_opened() {
         let request = pb::AcquireToolRequest { session_id: session.clone(), tool: 0, ..Default::default() };
         match haptics.acquire_tool(with_token(request, &stays)).await {
             Ok(_) => break,
-            Err(status) => assert!(begun.elapsed() < PATIENCE, "{status}"),
+            Err(status) => assert!(begun.elapsed() < TEST_TIMEOUT, "{status}"),
         }
     }
     for _ in 0..3 {
@@ -316,7 +316,7 @@ async fn who_loses_a_token_loses_the_tools_that_outlive_its_calls() {
 
 /// A haptic stream of whom a token was given, over a connection whose transport lets so many bytes of answers in.
 async fn touch_with(
-    server: &Server,
+    server: &TestServer,
     token: &str,
     session: &str,
     window_bytes: u32,
@@ -345,7 +345,7 @@ async fn who_loses_a_token_and_does_not_read_commands_nothing_more() {
     let mut sequence = 0;
     let command = async |sequence: u64| {
         let message = Some(pb::touch_request::Message::Command(force(0, sequence, -1.0)));
-        tokio::time::timeout(PATIENCE, sender.send(pb::TouchRequest { message })).await.unwrap().is_ok()
+        tokio::time::timeout(TEST_TIMEOUT, sender.send(pb::TouchRequest { message })).await.unwrap().is_ok()
     };
     while status().await.commands.unwrap().applied < 20 {
         sequence += 1;
@@ -386,7 +386,7 @@ async fn tokens_that_can_not_be_read_are_told_of_and_the_old_ones_hold() {
     // Between two changes of the file the server may see a third state, and tells that too.
     let mut tells = async |status: ServingStatus, when: &str| {
         let told = async { while watching.message().await.unwrap().unwrap().status != status as i32 {} };
-        tokio::time::timeout(PATIENCE, told).await.unwrap_or_else(|_| panic!("{status:?} is not told {when}"));
+        tokio::time::timeout(TEST_TIMEOUT, told).await.unwrap_or_else(|_| panic!("{status:?} is not told {when}"));
     };
     tells(Serving, "at first").await;
     let list = "/palpate.v1.SessionService/ListScenes";
@@ -412,7 +412,7 @@ async fn tokens_that_can_not_be_read_are_told_of_and_the_old_ones_hold() {
     }
     // What can be read and has no token in it lets nobody in.
     std::fs::write(&file, "# nobody\n").unwrap();
-    let waited = tokio::time::timeout(PATIENCE, async { while is_known().await {} });
+    let waited = tokio::time::timeout(TEST_TIMEOUT, async { while is_known().await {} });
     waited.await.expect("a token that is not in the file is known");
 }
 
@@ -429,7 +429,7 @@ fn signals_that_mean_nothing_to_a_server_do_not_end_it_and_a_hangup_has_it_look(
     // A hangup just after the start comes before anything waits for it: the files have only just been read.
     let begun = std::time::Instant::now();
     while !log.tells("SIGHUP: checking the files", std::time::Duration::from_secs(1)) {
-        assert!(begun.elapsed() < PATIENCE, "a hangup is not heard");
+        assert!(begun.elapsed() < TEST_TIMEOUT, "a hangup is not heard");
         send("-HUP");
     }
     assert_eq!(server.child.try_wait().unwrap(), None);
@@ -466,12 +466,12 @@ impl Log {
     }
 
     fn wait_for(&self, text: &str) {
-        while !self.0.recv_timeout(PATIENCE).unwrap_or_else(|_| panic!("the log lacks `{text}`")).contains(text) {}
+        while !self.0.recv_timeout(TEST_TIMEOUT).unwrap_or_else(|_| panic!("the log lacks `{text}`")).contains(text) {}
     }
 }
 
-fn start_logged(arguments: &[&str]) -> (Server, Log) {
-    let mut server = Server::start(arguments);
+fn start_logged(arguments: &[&str]) -> (TestServer, Log) {
+    let mut server = TestServer::start(arguments);
     let (lines, log) = mpsc::channel();
     let stderr = BufReader::new(server.child.stderr.take().unwrap());
     std::thread::spawn(move || stderr.lines().map_while(Result::ok).try_for_each(|line| lines.send(line)));
@@ -508,7 +508,7 @@ async fn a_client_certificate_that_is_missing_or_of_somebody_else_is_refused() {
         Identity::from_pem(cert, key)
     };
     // Without a file of roles a certificate is enough.
-    let server = Server::start(&mutual);
+    let server = TestServer::start(&mutual);
     assert!(server.url.starts_with("https://"));
     let channel = connect(&server.url, authority.trust().identity(identity(&authority, "anybody"))).await.unwrap();
     call(&channel, SESSIONS, None).await.unwrap();
@@ -525,7 +525,7 @@ async fn a_client_certificate_that_is_missing_or_of_somebody_else_is_refused() {
     }
     drop(server);
     // With one, it is the names in it that count.
-    let server = Server::start(&[&mutual[..], &["--tokens", &tokens]].concat());
+    let server = TestServer::start(&[&mutual[..], &["--tokens", &tokens]].concat());
     let channel = connect(&server.url, authority.trust().identity(identity(&authority, "bench-3"))).await.unwrap();
     call(&channel, SCENES, None).await.unwrap();
     assert_eq!(told(&call(&channel, SESSIONS, None).await.unwrap_err()).1, "ROLE_MISSING");
@@ -561,7 +561,7 @@ async fn a_connection_through_tls_that_says_nothing_is_closed_before_its_handsha
     let (cert, key) = authority.sign(None);
     let config = "[limits]\nhandshake_s = 1.0\n";
     let [cert, key, config] = write(folder.path(), [("cert.pem", &*cert), ("key.pem", &key), ("palpate.toml", config)]);
-    let server = Server::start(&["--config", &config, "--tls-cert", &cert, "--tls-key", &key]);
+    let server = TestServer::start(&["--config", &config, "--tls-cert", &cert, "--tls-key", &key]);
     let address = server.url.trim_start_matches("https://").to_owned();
     let mut roots = RootCertStore::empty();
     roots.add(CertificateDer::from_pem_slice(authority.pem.as_bytes()).unwrap()).unwrap();
@@ -585,7 +585,7 @@ async fn a_connection_through_tls_that_says_nothing_is_closed_before_its_handsha
         // By an end or a reset.
         let _ = secured.read_to_end(&mut heard).await;
     };
-    tokio::time::timeout(PATIENCE, ended).await.expect("what says nothing is kept");
+    tokio::time::timeout(TEST_TIMEOUT, ended).await.expect("what says nothing is kept");
 }
 
 #[test]
@@ -685,7 +685,7 @@ async fn no_secret_gets_into_the_log_however_much_is_logged() {
     let file = folder.path().join("tokens.toml");
     let (good, wrong) = (token(&file, "good", "administer"), identity::new_token().unwrap());
     let arguments = ["--tls-cert", &cert, "--tls-key", &key_path, "--tokens", file.to_str().unwrap(), "--log", "trace"];
-    let mut server = Server::start(&arguments);
+    let mut server = TestServer::start(&arguments);
     let mut stderr = server.child.stderr.take().unwrap();
     let reading = std::thread::spawn(move || {
         let mut log = String::new();
@@ -719,7 +719,7 @@ async fn no_secret_gets_into_the_log_however_much_is_logged() {
 /// What a server answers to a request in HTTP/1.1.
 fn ask(url: &str, head: &str) -> String {
     let mut stream = std::net::TcpStream::connect(url.trim_start_matches("http://")).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.set_read_timeout(Some(TEST_TIMEOUT)).unwrap();
     write!(stream, "{head}\r\nHost: tissue\r\nContent-Length: 0\r\nConnection: close\r\n\r\n").unwrap();
     let mut answer = String::new();
     stream.read_to_string(&mut answer).unwrap();
@@ -735,7 +735,7 @@ fn pages_of_other_sites_may_call_only_if_the_configuration_says_so() {
         )
     };
     let post = |origin: &str| format!("POST {SCENES} HTTP/1.1\r\nOrigin: {origin}\r\nContent-Type: application/grpc");
-    let server = Server::start(&["--origin", "https://viewer.example", "--origin", "http://other.example:8080"]);
+    let server = TestServer::start(&["--origin", "https://viewer.example", "--origin", "http://other.example:8080"]);
     for origin in ["https://viewer.example", "http://other.example:8080"] {
         let answer = ask(&server.url, &preflight(origin));
         assert!(answer.contains(&format!("access-control-allow-origin: {origin}\r\n")), "{answer}");
@@ -750,7 +750,7 @@ fn pages_of_other_sites_may_call_only_if_the_configuration_says_so() {
     assert!(answer.contains("grpc-status: 7") && answer.contains("configuration"), "{answer}");
     let answer = ask(&server.url, &post(&server.url));
     assert!(!answer.contains("grpc-status: 7"), "{answer}");
-    let plain = Server::start(&[]);
+    let plain = TestServer::start(&[]);
     assert!(!ask(&plain.url, &preflight("https://viewer.example")).contains("access-control-allow-origin"));
 }
 
@@ -775,7 +775,7 @@ fn the_clients_programs_show_their_token_and_check_the_server() {
         path
     });
     let arguments = ["--tls-cert", &cert, "--tls-key", &key, "--tls-client-ca", &ca];
-    let server = Server::start(&[&arguments[..], &["--tokens", file.to_str().unwrap()]].concat());
+    let server = TestServer::start(&[&arguments[..], &["--tokens", file.to_str().unwrap()]].concat());
     let replay = |more: &[&str], environment: Option<&str>| {
         let mut command = Command::new(server::client_program());
         command.args(["replay", "scripts/vertical-60.toml", "--quiet"]).args(more);
@@ -832,7 +832,7 @@ fn a_certificate_for_trials_serves_and_the_wrong_scheme_is_named() {
         let ended = Command::new(server::client_program()).arg("health").args(arguments).output().unwrap();
         (ended.status.code(), String::from_utf8(ended.stderr).unwrap())
     };
-    let secure = Server::start(&["--tls-cert", &cert, "--tls-key", &key]);
+    let secure = TestServer::start(&["--tls-cert", &cert, "--tls-key", &key]);
     let address = secure.url.strip_prefix("https://").unwrap();
     for name in ["localhost", "127.0.0.1"] {
         let url = format!("https://{}", address.replace("127.0.0.1", name));
@@ -842,7 +842,7 @@ fn a_certificate_for_trials_serves_and_the_wrong_scheme_is_named() {
     let (status, said) = health(&[&format!("http://{address}")]);
     assert_eq!(status, Some(1));
     assert!(said.contains(&format!("the server at {address} speaks TLS: use https://{address}")), "{said}");
-    let plain = Server::start(&[]);
+    let plain = TestServer::start(&[]);
     let address = plain.url.strip_prefix("http://").unwrap();
     let (status, said) = health(&[&format!("https://{address}"), "--ca", &cert]);
     assert_eq!(status, Some(1));
@@ -851,7 +851,7 @@ fn a_certificate_for_trials_serves_and_the_wrong_scheme_is_named() {
 
 #[test]
 fn an_address_that_is_in_use_is_told_with_what_to_do() {
-    let taken = Server::start(&[]);
+    let taken = TestServer::start(&[]);
     let address = taken.url.strip_prefix("http://").unwrap();
     let ended = palpate(&["serve", "--listen", address]);
     let said = String::from_utf8(ended.stderr).unwrap();

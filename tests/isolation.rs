@@ -12,26 +12,26 @@ use palpate_proto::pb;
 use pb::create_session_request::Source;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::touch_response::Message as Heard;
-use server::{PATIENCE, Server, Touch, force, told};
+use server::{TEST_TIMEOUT, TestServer, TestTouch, force, told};
 use tonic::Code;
 
 /// A server with these keys of `[limits]`.
-fn limited(limits: &str, arguments: &[&str]) -> Server {
+fn limited(limits: &str, arguments: &[&str]) -> TestServer {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, format!("[limits]\n{limits}\n")).unwrap();
-    Server::start(&[&["--config", config.to_str().unwrap()], arguments].concat())
+    TestServer::start(&[&["--config", config.to_str().unwrap()], arguments].concat())
 }
 
 /// A server as a shell starts it: $0 is the program, $1 where it is to listen.
 #[cfg(unix)]
-fn serve(command: &str, address: &str) -> Server {
-    Server::by_script(&format!("{command} \"$1\""), &[address.as_ref()])
+fn serve(command: &str, address: &str) -> TestServer {
+    TestServer::by_script(&format!("{command} \"$1\""), &[address.as_ref()])
 }
 
-fn connect(server: &Server) -> TcpStream {
+fn connect(server: &TestServer) -> TcpStream {
     let socket = TcpStream::connect(server.url.strip_prefix("http://").unwrap()).unwrap();
-    socket.set_read_timeout(Some(PATIENCE)).unwrap();
+    socket.set_read_timeout(Some(TEST_TIMEOUT)).unwrap();
     socket
 }
 
@@ -48,8 +48,8 @@ fn is_closed(mut socket: TcpStream) -> bool {
 }
 
 /// So many commands are taken and act, each of them.
-async fn all_act(server: &Server, session: &str, count: u64) {
-    let mut touch = Touch::hold(server, session).await;
+async fn all_act(server: &TestServer, session: &str, count: u64) {
+    let mut touch = TestTouch::hold(server, session).await;
     for sequence in 1..=count {
         touch.command(force(0, sequence, -1.0 - 0.001 * sequence as f64)).await;
         touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
@@ -58,7 +58,7 @@ async fn all_act(server: &Server, session: &str, count: u64) {
     assert_eq!((commands.accepted, commands.applied, commands.refused), (count, count, 0));
 }
 
-fn handles(server: &Server) -> usize {
+fn handles(server: &TestServer) -> usize {
     std::fs::read_dir(format!("/proc/{}/fd", server.child.id())).map_or(0, Iterator::count)
 }
 
@@ -75,7 +75,7 @@ async fn a_thousand_connections_that_say_nothing_disturb_nobody_and_are_closed()
     all_act(&server, &session, 50).await;
     tokio::task::spawn_blocking(move || assert!(silent.into_iter().all(is_closed))).await.unwrap();
     // Only what the test itself has open still.
-    let waited = tokio::time::timeout(PATIENCE, async {
+    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
         while handles(&server) > before + 8 {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
@@ -90,7 +90,7 @@ async fn connections_above_the_limit_are_closed_and_let_in_later() {
     let fifth = connect(&server);
     assert!(tokio::task::spawn_blocking(move || is_closed(fifth)).await.unwrap());
     drop(held);
-    let waited = tokio::time::timeout(PATIENCE, async {
+    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             let endpoint = tonic::transport::Channel::from_shared(server.url.clone()).unwrap();
             if let Ok(channel) = endpoint.connect().await {
@@ -110,7 +110,7 @@ async fn connections_above_the_limit_are_closed_and_let_in_later() {
 async fn a_server_without_file_descriptors_waits_for_some() {
     let server = serve("ulimit -n 64 && exec \"$0\" serve --log error --listen", "127.0.0.1:0");
     let session = server.paper(false).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     let held: Vec<TcpStream> = (0..100).map(|_| connect(&server)).collect();
     // Who is there already is served on.
     for sequence in 1..=50 {
@@ -118,7 +118,10 @@ async fn a_server_without_file_descriptors_waits_for_some() {
         touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
     }
     drop(held);
-    assert_eq!(tokio::time::timeout(PATIENCE, server.status(&session)).await.unwrap().commands.unwrap().applied, 50);
+    assert_eq!(
+        tokio::time::timeout(TEST_TIMEOUT, server.status(&session)).await.unwrap().commands.unwrap().applied,
+        50
+    );
 }
 
 #[tokio::test]
@@ -126,7 +129,7 @@ async fn a_stream_that_never_opens_is_ended() {
     let server = limited("open_s = 0.2", &[]);
     let silent = tokio_stream::pending::<pb::TouchRequest>();
     let mut inbound = server.haptics().await.touch(silent).await.unwrap().into_inner();
-    let ended = tokio::time::timeout(PATIENCE, inbound.message()).await.unwrap().unwrap_err();
+    let ended = tokio::time::timeout(TEST_TIMEOUT, inbound.message()).await.unwrap().unwrap_err();
     assert_eq!(told(&ended), (Code::DeadlineExceeded, "TIMED_OUT".into(), "open".into()));
 }
 
@@ -140,7 +143,7 @@ async fn a_call_whose_message_does_not_come_is_ended() {
         grpc.ready().await.unwrap();
         let codec = tonic_prost::ProstCodec::<(), ()>::default();
         let silent = tonic::Request::new(tokio_stream::pending());
-        let ended = tokio::time::timeout(PATIENCE, async {
+        let ended = tokio::time::timeout(TEST_TIMEOUT, async {
             let mut answer = grpc.streaming(silent, path.parse().unwrap(), codec).await?.into_inner();
             answer.message().await
         });
@@ -162,7 +165,7 @@ async fn a_call_whose_message_does_not_come_is_ended() {
 
 #[tokio::test]
 async fn what_is_no_message_and_no_call_is_refused_in_words() {
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     // A field of a length that is not there.
     let mut head = "POST /palpate.v1.SessionService/GetSession HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\
                     Content-Type: application/grpc-web+proto\r\nContent-Length: 7\r\n\r\n"
@@ -199,7 +202,7 @@ async fn connections_that_show_no_token_leave_room_for_who_does() {
         let mut request = tonic::Request::new(pb::ListScenesRequest {});
         request.metadata_mut().insert("authorization", token.parse().unwrap());
         let mut sessions = pb::session_service_client::SessionServiceClient::new(channel);
-        tokio::time::timeout(PATIENCE, sessions.list_scenes(request)).await.unwrap()
+        tokio::time::timeout(TEST_TIMEOUT, sessions.list_scenes(request)).await.unwrap()
     };
     let known = server.channel().await;
     list(known.clone()).await.unwrap();
@@ -250,7 +253,7 @@ async fn a_message_that_is_too_large_is_refused_and_the_connection_goes_on() {
 async fn a_flood_is_refused_with_a_reason_accounted_for_and_no_harm_to_others() {
     let server = limited("queued_commands_per_tool = 500", &["--log", "error"]);
     let (flooded, other) = (server.paper(false).await, server.paper(false).await);
-    let flood = Touch::hold(&server, &flooded).await;
+    let flood = TestTouch::hold(&server, &flooded).await;
     let flooding = tokio::spawn(async move {
         let mut flood = flood;
         let (mut sent, mut rejected) = (0, 0);
@@ -276,7 +279,7 @@ async fn a_flood_is_refused_with_a_reason_accounted_for_and_no_harm_to_others() 
         }
     });
     all_act(&server, &other, 200).await;
-    let (ended, sent, rejected) = tokio::time::timeout(PATIENCE, flooding).await.unwrap().unwrap();
+    let (ended, sent, rejected) = tokio::time::timeout(TEST_TIMEOUT, flooding).await.unwrap().unwrap();
     assert_eq!((ended.0, ended.1.as_str()), (Code::ResourceExhausted, "RATE_LIMITED"));
     assert!(rejected > 0);
     let status = server.status(&flooded).await;
@@ -351,7 +354,8 @@ async fn who_does_not_read_loses_samples_and_delays_nobody() {
     all_act(&server, &session, 1000).await;
     let mut last = 0;
     loop {
-        let sample = tokio::time::timeout(PATIENCE, stalled.message()).await.unwrap().unwrap().unwrap().sample.unwrap();
+        let sample =
+            tokio::time::timeout(TEST_TIMEOUT, stalled.message()).await.unwrap().unwrap().unwrap().sample.unwrap();
         assert!(sample.step > last);
         last = sample.step;
         if sample.dropped_samples > 0 {
@@ -389,10 +393,10 @@ async fn heavy_sessions_slow_themselves_and_let_no_further_one_in() {
     }
     // At rest they take nothing: others are let in.
     let light = server.paper(false).await;
-    let mut quick = Touch::hold(&server, &light).await;
+    let mut quick = TestTouch::hold(&server, &light).await;
     let mut slow = Vec::new();
     for session in &heavy {
-        let hold = Touch::hold(&server, session).await;
+        let hold = TestTouch::hold(&server, session).await;
         hold.command(everywhere(1)).await;
         slow.push(hold);
     }
@@ -400,7 +404,7 @@ async fn heavy_sessions_slow_themselves_and_let_no_further_one_in() {
         quick.command(force(0, sequence, -1.0 - 0.001 * sequence as f64)).await;
         quick.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
     }
-    // Steps of the heavy ones were dropped, commands of the light one were not. Who goes first: `pace::thread`.
+    // Steps of the heavy ones were dropped, commands of the light one were not. Who goes first: `realtime::thread`.
     let (heavy_now, light_now) = (server.status(&heavy[0]).await, server.status(&light).await);
     assert!(heavy_now.overrun_count > 0, "{heavy_now:?}");
     let commands = light_now.commands.unwrap();
@@ -425,7 +429,7 @@ async fn a_session_whose_steps_are_too_long_for_others_leaves_the_thread_to_them
     // Steps of some milliseconds on any machine.
     let heavy = server.create(frequent(2000, 500), false).await.unwrap().session_id;
     let light = server.paper(false).await;
-    let (slow, mut quick) = (Touch::hold(&server, &heavy).await, Touch::hold(&server, &light).await);
+    let (slow, mut quick) = (TestTouch::hold(&server, &heavy).await, TestTouch::hold(&server, &light).await);
     slow.command(everywhere(1)).await;
     for sequence in 1..=200 {
         quick.command(force(0, sequence, -1.0 - 0.001 * sequence as f64)).await;
@@ -444,7 +448,7 @@ async fn a_session_whose_steps_are_too_long_for_others_leaves_the_thread_to_them
 #[cfg(unix)]
 #[tokio::test(flavor = "multi_thread")]
 async fn a_bridge_comes_back_to_a_server_that_was_killed() {
-    let mut server = Server::start(&[]);
+    let mut server = TestServer::start(&[]);
     let address = server.url.strip_prefix("http://").unwrap().to_owned();
     let mut bridge = std::process::Command::new(server::client_program())
         .args(["bridge", "--server", &server.url, "--scene", "liver"])
@@ -465,7 +469,7 @@ async fn a_bridge_comes_back_to_a_server_that_was_killed() {
 #[cfg(unix)]
 #[tokio::test]
 async fn a_second_signal_ends_the_server_at_once() {
-    let mut server = Server::start(&["--shutdown-deadline-s", "3600"]);
+    let mut server = TestServer::start(&["--shutdown-deadline-s", "3600"]);
     let session = server.paper(false).await;
     // Nothing of it is read: it would not end before the deadline.
     let request = pb::WatchFramesRequest {
@@ -476,12 +480,12 @@ async fn a_second_signal_ends_the_server_at_once() {
         ..Default::default()
     };
     let _stalled = server.views().await.watch_frames(request).await.unwrap();
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     touch.command(force(0, 1, -1.0)).await;
     touch.sample_with(|sample| sample.step >= 300).await;
     let id = server.child.id().to_string();
     let signal = || assert!(std::process::Command::new("kill").arg(&id).status().unwrap().success());
-    let ended = tokio::time::timeout(PATIENCE, async {
+    let ended = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             signal();
             tokio::time::sleep(Duration::from_millis(100)).await;

@@ -10,8 +10,8 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use journal_opening::opening;
-use palpate::journal::replay::{Item, items};
-use palpate::journal::{self, Opening, Reader, Seen, Writer, mend, pb};
+use palpate::journal::replay::{JournalItem, items};
+use palpate::journal::{self, JournalReader, JournalWriter, Opening, ReplayEvent, pb, recover};
 use palpate::limits::Limits;
 use palpate::refusal::Reason;
 use palpate::scene::script::Action;
@@ -19,8 +19,8 @@ use palpate::scene::{Change, PAPER, Scene};
 use palpate::session::Session;
 use palpate::session::command::{Command, Due};
 use palpate::session::input::Input;
-use palpate::sheet::Model;
-use palpate::sheet::choice::NEVER;
+use palpate::tissue::Model;
+use palpate::tissue::scheme_selection::NEVER;
 use palpate_touch::Tip;
 
 /// 2026-01-01.
@@ -50,10 +50,10 @@ const BATCH_STEPS: u64 = 20;
 /// A session that is written as it goes: a tool that strokes, another tissue, a release. Each batch is durable when the next one is
 /// written. Tells the file, and where each batch ends.
 fn written(first: &Arc<Model>, steps: u64, ends: bool) -> (Vec<u8>, Vec<(u64, u64)>) {
-    let mut writer = Writer::new(&opening(first), BEGUN_NS);
+    let mut writer = JournalWriter::new(&opening(first), BEGUN_NS);
     let mut session = Session::new(first);
     let (mut file, mut ends_at) = (Vec::new(), Vec::new());
-    let snapshot = |writer: &mut Writer, session: &Session| {
+    let snapshot = |writer: &mut JournalWriter, session: &Session| {
         let (hash, saved) = (session.tissue().state_hash(), session.save().to_bytes());
         writer.snapshot(session.step_count(), hash, session.model(), saved);
     };
@@ -104,7 +104,7 @@ fn small() -> Arc<Model> {
 }
 
 fn survey(bytes: &[u8]) -> palpate::refusal::Result<palpate::journal::Survey> {
-    Reader::new("test", Cursor::new(bytes))?.survey(&mut |_| {})
+    JournalReader::new("test", Cursor::new(bytes))?.survey(&mut |_| {})
 }
 
 #[test]
@@ -112,8 +112,8 @@ fn a_journal_of_a_stranger_names_no_file_of_this_machine() {
     let mut scene = Scene::parse("paper", PAPER, &["sheet.points=[7, 7]".to_owned()], &Limits::default()).unwrap();
     scene.appearance.texture = Some("/etc/passwd".into());
     let (file, _) = written(&Model::compile(&scene, &Limits::default()).unwrap(), 40, true);
-    let texture = |reader: Reader<Cursor<&[u8]>>| reader.header().appearance.clone().unwrap().texture;
-    let open = || Reader::new("a journal", Cursor::new(&file[..])).unwrap();
+    let texture = |reader: JournalReader<Cursor<&[u8]>>| reader.header().appearance.clone().unwrap().texture;
+    let open = || JournalReader::new("a journal", Cursor::new(&file[..])).unwrap();
     assert_eq!(texture(open()), "/etc/passwd");
     assert_eq!(texture(open().without_files()), "");
 }
@@ -126,7 +126,7 @@ fn what_is_written_is_read_again() {
     assert_eq!((found.until_step, found.batches, found.torn_bytes, found.sealed), (400, ends.len() as u64, 0, false));
     assert_eq!((found.hashes, found.whole_bytes), (9, file.len() as u64));
     assert_eq!(found.end.unwrap().why(), pb::Why::Drained);
-    let mut reader = Reader::new("test", Cursor::new(&file)).unwrap();
+    let mut reader = JournalReader::new("test", Cursor::new(&file)).unwrap();
     assert_eq!((reader.header().session_id.as_str(), reader.header().run), ("0123456789abcdef", 1));
     let (mut inputs, mut moments) = (Vec::new(), 0);
     while let Some(batch) = reader.next_batch().unwrap() {
@@ -175,7 +175,7 @@ fn a_bit_that_is_other_is_found_or_harmless() {
     let (file, _) = written(&first, 200, true);
     let whole = survey(&file).unwrap();
     let inputs = |bytes: &[u8]| {
-        let mut reader = Reader::new("test", Cursor::new(bytes)).unwrap();
+        let mut reader = JournalReader::new("test", Cursor::new(bytes)).unwrap();
         let mut all = Vec::new();
         while let Some(batch) = reader.next_batch().unwrap() {
             all.extend(batch.inputs().unwrap());
@@ -234,8 +234,8 @@ fn a_sealed_file_opens_with_the_reader_of_mcap() {
     let path = folder.path().join(palpate::journal::file::name("abc", 3));
     std::fs::write(&path, &file).unwrap();
     assert_eq!(palpate::journal::file::list(folder.path()).unwrap()[0].run, 3);
-    assert!(Reader::open(&path).is_ok());
-    assert!(Reader::open(Path::new("nowhere.1.mcap")).is_err());
+    assert!(JournalReader::open(&path).is_ok());
+    assert!(JournalReader::open(Path::new("nowhere.1.mcap")).is_err());
 }
 
 /// Ten minutes with PALPATE_LONG, and then it tells how long that took: of a journal with more hashes and snapshots than a
@@ -252,8 +252,8 @@ fn a_long_touch_verifies() {
     println!("{steps} steps, {} bytes: verified in {seconds:.2} s", file.len());
 }
 
-fn reader(bytes: &[u8]) -> Reader<Cursor<&[u8]>> {
-    Reader::new("test", Cursor::new(bytes)).unwrap()
+fn reader(bytes: &[u8]) -> JournalReader<Cursor<&[u8]>> {
+    JournalReader::new("test", Cursor::new(bytes)).unwrap()
 }
 
 #[test]
@@ -270,7 +270,7 @@ fn a_journal_gives_the_same_bits_again_and_a_difference_is_named() {
     let sets = ["sheet.points=[7, 7]", "stepping.integrator=central", "stepping.substeps=2", "stepping.precision=f32"];
     let first = model(&sets);
     let other = model(&[&sets[..], &["damping.coefficient_n_s_per_m=0.06"]].concat());
-    let mut writer = Writer::new(&opening(&other), BEGUN_NS);
+    let mut writer = JournalWriter::new(&opening(&other), BEGUN_NS);
     let mut inputs = Vec::new();
     let (file, _) = written(&first, 200, true);
     let mut read = reader(&file);
@@ -279,8 +279,8 @@ fn a_journal_gives_the_same_bits_again_and_a_difference_is_named() {
     }
     for item in inputs {
         match item {
-            Item::Hash(hash) => writer.hash(hash.step, u128::from_str_radix(&hash.hash, 16).unwrap()),
-            Item::Input(pb::Input { step, what: Some(pb::input::What::Command(command)) }) => {
+            JournalItem::Hash(hash) => writer.hash(hash.step, u128::from_str_radix(&hash.hash, 16).unwrap()),
+            JournalItem::Input(pb::Input { step, what: Some(pb::input::What::Command(command)) }) => {
                 let Some(pb::command::Action::Pose(_)) = command.action else { continue };
                 writer.input(step, &Input::Command(due(0, step + 1, pose(&first, step + 1))));
             }
@@ -319,7 +319,7 @@ fn a_part_of_a_journal_and_a_recovered_one_verify_alone() {
     let limits = Limits::default();
     for [from, to] in [[0, 700], [90, 91], [333, 512], [699, 700]] {
         let mut part = Cursor::new(Vec::new());
-        mend::cut(reader(&file), [from, to], &limits, &mut part).unwrap();
+        recover::cut(reader(&file), [from, to], &limits, &mut part).unwrap();
         let part = part.into_inner();
         let verdict = journal::verify(reader(&part), &limits, &mut |_, _| {}).unwrap();
         assert_eq!((verdict.steps, verdict.difference), ([from, to], None));
@@ -329,11 +329,11 @@ fn a_part_of_a_journal_and_a_recovered_one_verify_alone() {
             |bytes: &[u8]| journal::session_at(reader(bytes), &limits, to, &NEVER).unwrap().0.tissue().state_hash();
         assert_eq!(at(&part), at(&file));
     }
-    assert!(mend::cut(reader(&file), [5, 5], &limits, &mut Cursor::new(Vec::new())).is_err());
+    assert!(recover::cut(reader(&file), [5, 5], &limits, &mut Cursor::new(Vec::new())).is_err());
     let torn = &file[..ends[20].0 as usize - 1];
     let mut whole = Cursor::new(Vec::new());
     // The last index is cut off, and no message with it.
-    let lost = mend::recover(reader(torn), &mut whole, &mut |_| {}).unwrap();
+    let lost = recover::recover(reader(torn), &mut whole, &mut |_| {}).unwrap();
     let whole = whole.into_inner();
     let found = survey(&whole).unwrap();
     assert_eq!((found.until_step, found.torn_bytes, lost.until_step), (ends[20].1, 0, ends[20].1));
@@ -346,7 +346,7 @@ fn a_part_of_a_journal_and_a_recovered_one_verify_alone() {
 #[test]
 fn steps_at_rest_are_skipped_and_seen_where_somebody_wants_to() {
     let first = small();
-    let mut writer = Writer::new(&opening(&first), BEGUN_NS);
+    let mut writer = JournalWriter::new(&opening(&first), BEGUN_NS);
     writer.input(1000, &Input::Pause);
     writer.input(1000, &Input::Start { until: Some(100_000) });
     let file = writer.finish(pb::Why::Drained, "", 5000, BEGUN_NS);
@@ -354,8 +354,8 @@ fn steps_at_rest_are_skipped_and_seen_where_somebody_wants_to() {
     let survey = read.survey(&mut |_| {}).unwrap();
     let mut seen = Vec::new();
     let mut replay = journal::Replay::new(read, survey, &Limits::default()).unwrap().stopping_every(1500);
-    let see: &mut dyn FnMut(Seen<'_>) -> palpate::refusal::Result<()> = &mut |what| {
-        if let Seen::Step(session) = what {
+    let see: &mut dyn FnMut(ReplayEvent<'_>) -> palpate::refusal::Result<()> = &mut |what| {
+        if let ReplayEvent::Step(session) = what {
             seen.push(session.step_count());
         }
         Ok(())
@@ -375,7 +375,7 @@ fn golden(replays: u32) -> PathBuf {
 #[test]
 fn the_journal_of_an_older_version_gives_the_same_bits_or_is_refused_with_both_versions() {
     for replays in 1..=journal::REPLAYS {
-        let mut read = Reader::open(&golden(replays)).unwrap();
+        let mut read = JournalReader::open(&golden(replays)).unwrap();
         let survey = read.survey(&mut |_| {}).unwrap();
         assert_eq!((survey.until_step, survey.snapshots.len(), survey.sealed), (1000, 3, true), "{replays}");
         let verified = journal::verify(read, &Limits::default(), &mut |_, _| {});
@@ -403,7 +403,7 @@ fn snapshot_bytes(model: &Arc<Model>, radius_m: f64) -> Vec<u8> {
     let middle_m = model.shape().extent().middle_m();
     let action = Action::Pose { place_m: middle_m, velocity_m_per_s: None, tip: Tip { radius_m, ..Tip::default() } };
     session.advance(&mut vec![due(0, 1, action)], |_| {});
-    let mut writer = Writer::new(&Opening { begin_step: 1, ..opening(model) }, BEGUN_NS);
+    let mut writer = JournalWriter::new(&Opening { begin_step: 1, ..opening(model) }, BEGUN_NS);
     writer.snapshot(1, session.tissue().state_hash(), model, session.save().to_bytes());
     writer.finish(pb::Why::Cut, "a snapshot", 1, BEGUN_NS)
 }

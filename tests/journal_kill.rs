@@ -18,26 +18,30 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use palpate::journal::file::JournalFile;
-use palpate::journal::{Reader, file, pb as kept, replay};
+use palpate::journal::{JournalReader, file, pb as kept, replay};
 use palpate::limits::Limits;
 use palpate_proto::pb;
 use pb::touch_response::Message as Heard;
-use random::Random;
-use server::{Server, Touch, force};
+use random::TestRandom;
+use server::{TestServer, TestTouch, force};
 
 /// What a client was told of a session.
 #[derive(Debug, Clone, Copy, Default)]
-struct Told {
+struct ClientHistoryBeforeKill {
     durable_step: u64,
     /// The newest command that acted before that step.
     durable_sequence: u64,
 }
 
 /// Presses a session at 1 kHz until its server is gone. Tells when its first command had acted.
-async fn press(server: Arc<Server>, id: String, told: Arc<Mutex<BTreeMap<String, Told>>>) -> Option<Instant> {
+async fn press(
+    server: Arc<TestServer>,
+    id: String,
+    told: Arc<Mutex<BTreeMap<String, ClientHistoryBeforeKill>>>,
+) -> Option<Instant> {
     let mut open = server::open(&id, &[0]);
     open.sample_every_steps = Some(1);
-    let mut touch = Touch::open(&server, open).await.ok()?;
+    let mut touch = TestTouch::open(&server, open).await.ok()?;
     let mut ticks = tokio::time::interval(Duration::from_millis(1));
     let (mut sequence, mut first) = (0_u16, None);
     // Steps and the newest commands that had acted at them, until they are durable.
@@ -74,7 +78,7 @@ async fn press(server: Arc<Server>, id: String, told: Arc<Mutex<BTreeMap<String,
 }
 
 fn sequences(path: &Path) -> Vec<u64> {
-    let mut reader = Reader::open(path).unwrap();
+    let mut reader = JournalReader::open(path).unwrap();
     let mut sequences = Vec::new();
     while let Some(batch) = reader.next_batch().unwrap() {
         for input in batch.inputs().unwrap() {
@@ -88,13 +92,13 @@ fn sequences(path: &Path) -> Vec<u64> {
 
 /// The run goes on from the one before with the bits of an offline run of its inputs.
 fn goes_on(before: &JournalFile, after: &JournalFile) {
-    let resumed = replay::resume(Reader::open(&before.path).unwrap(), &Limits::default()).unwrap();
+    let resumed = replay::resume(JournalReader::open(&before.path).unwrap(), &Limits::default()).unwrap();
     let mut session = resumed.session;
     if let Some(model) = &resumed.pending {
         session.change(model);
     }
     session.let_go();
-    let mut reader = Reader::open(&after.path).unwrap();
+    let mut reader = JournalReader::open(&after.path).unwrap();
     assert_eq!(reader.header().begin_step, resumed.survey.until_step);
     let first = reader.next_batch().unwrap().unwrap().snapshots().unwrap().remove(0);
     assert_eq!(first.hash, format!("{:032x}", session.tissue().state_hash()), "{}", after.path.display());
@@ -104,7 +108,7 @@ fn goes_on(before: &JournalFile, after: &JournalFile) {
 async fn whatever_was_told_to_be_durable_survives_a_kill_at_any_moment() {
     let of = |name: &str, otherwise: u64| std::env::var(name).map_or(otherwise, |text| text.parse().unwrap());
     let (kills, count) = (of("PALPATE_JOURNAL_KILLS", 2), of("PALPATE_JOURNAL_SESSIONS", 3));
-    let mut random = Random(of("PALPATE_SEED", 1));
+    let mut random = TestRandom(of("PALPATE_SEED", 1));
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, "[limits]\nthread_share = 1000.0\n").unwrap();
@@ -112,7 +116,7 @@ async fn whatever_was_told_to_be_durable_survives_a_kill_at_any_moment() {
     let start = || {
         let arguments =
             ["--log", "error", "--config", config.to_str().unwrap(), "--journal", journals.to_str().unwrap()];
-        Arc::new(Server::start(&arguments))
+        Arc::new(TestServer::start(&arguments))
     };
     let mut server = start();
     let mut ids = Vec::new();

@@ -14,12 +14,12 @@ use std::time::Duration;
 
 use journal_opening::opening;
 use palpate::limits::Limits;
-use palpate::sheet::choice::NEVER;
+use palpate::tissue::scheme_selection::NEVER;
 use palpate_proto::pb;
-use server::{PATIENCE, Server, Touch, force, waiting};
+use server::{TEST_TIMEOUT, TestServer, TestTouch, force, waiting};
 
-fn start(folder: &Path) -> Server {
-    Server::start(&["--log", "info", "--journal", folder.to_str().unwrap()])
+fn start(folder: &Path) -> TestServer {
+    TestServer::start(&["--log", "info", "--journal", folder.to_str().unwrap()])
 }
 
 /// The journals of a session, by run.
@@ -30,14 +30,14 @@ fn files(folder: &Path, session_id: &str) -> Vec<PathBuf> {
 
 fn verifies(files: &[PathBuf]) {
     for path in files {
-        let reader = palpate::journal::Reader::open(path).unwrap();
+        let reader = palpate::journal::JournalReader::open(path).unwrap();
         let verdict = palpate::journal::replay::verify(reader, &Limits::default(), &mut |_, _| {}).unwrap();
         assert_eq!(verdict.difference, None, "{}", path.display());
     }
 }
 
-async fn durable_at(server: &Server, session_id: &str, step: u64) -> u64 {
-    let waited = tokio::time::timeout(PATIENCE, async {
+async fn durable_at(server: &TestServer, session_id: &str, step: u64) -> u64 {
+    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             let journal = server.status(session_id).await.journal.unwrap();
             assert_eq!(journal.fault, "");
@@ -50,7 +50,7 @@ async fn durable_at(server: &Server, session_id: &str, step: u64) -> u64 {
     waited.await.unwrap()
 }
 
-async fn pause(server: &Server, session_id: &str) -> pb::Session {
+async fn pause(server: &TestServer, session_id: &str) -> pb::Session {
     let request = pb::PauseSessionRequest { session_id: session_id.into() };
     server.sessions().await.pause_session(request).await.unwrap();
     server.status(session_id).await
@@ -63,7 +63,7 @@ async fn a_killed_server_goes_on_with_its_sessions_from_their_durable_step() {
     let (pressed, stopped) = (before.paper(false).await, before.paper(true).await);
     before.start_until(&stopped, 120).await;
     let hash_at_120 = before.hash_at(&stopped, 120).await;
-    let mut touch = Touch::hold(&before, &pressed).await;
+    let mut touch = TestTouch::hold(&before, &pressed).await;
     let mut told = 0;
     for sequence in 1..=200_u16 {
         touch.command(force(0, u64::from(sequence), -1e-3 * f64::from(sequence))).await;
@@ -94,7 +94,7 @@ async fn a_killed_server_goes_on_with_its_sessions_from_their_durable_step() {
     assert_eq!((session.step, session.state()), (120, pb::SessionState::Paused));
     assert_eq!(after.hash_at(&stopped, 120).await, hash_at_120);
     // Leases are void, sequence numbers begin anew.
-    let mut touch = Touch::hold(&after, &pressed).await;
+    let mut touch = TestTouch::hold(&after, &pressed).await;
     touch.command(force(0, 1, -0.1)).await;
     touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
     drop(touch);
@@ -106,7 +106,7 @@ async fn a_killed_server_goes_on_with_its_sessions_from_their_durable_step() {
 /// Waits until the journal of a run has changes of the tissue that wait for these steps.
 async fn until_waits(folder: &Path, session_id: &str, run: usize, steps: &[u64]) {
     let waits = |path: &PathBuf| waiting(path).as_deref() == Some(steps);
-    let waited = tokio::time::timeout(PATIENCE, async {
+    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
         while !files(folder, session_id).get(run - 1).is_some_and(waits) {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
@@ -143,7 +143,7 @@ async fn changes_of_the_tissue_that_wait_for_their_step_outlive_a_kill() {
     let kept = files(folder.path(), &id);
     let mut acted = Vec::new();
     for path in &kept {
-        let mut reader = palpate::journal::Reader::open(path).unwrap();
+        let mut reader = palpate::journal::JournalReader::open(path).unwrap();
         while let Some(batch) = reader.next_batch().unwrap() {
             let is_tissue = |what: &Option<_>| matches!(what, Some(palpate::journal::pb::input::What::Tissue(_)));
             acted.extend(batch.inputs().unwrap().iter().filter(|input| is_tissue(&input.what)).map(|input| input.step));
@@ -158,7 +158,7 @@ async fn a_server_that_is_told_to_end_hands_its_sessions_over() {
     let folder = tempfile::tempdir().unwrap();
     let mut before = start(folder.path());
     let id = before.paper(false).await;
-    let touch = Touch::hold(&before, &id).await;
+    let touch = TestTouch::hold(&before, &id).await;
     touch.command(force(0, 1, -0.2)).await;
     before.until_applied("paper", 0).await;
     let pid = rustix::process::Pid::from_child(&before.child);
@@ -191,7 +191,7 @@ async fn a_server_that_is_told_to_end_hands_its_sessions_over() {
 async fn nothing_is_kept_where_it_is_not_wanted() {
     let folder = tempfile::tempdir().unwrap();
     let server =
-        Server::start(&["--log", "error", "--journal", folder.path().to_str().unwrap(), "--journal-keep", "0"]);
+        TestServer::start(&["--log", "error", "--journal", folder.path().to_str().unwrap(), "--journal-keep", "0"]);
     let id = server.paper(false).await;
     assert_eq!(files(folder.path(), &id).len(), 1);
     server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id: id.clone() }).await.unwrap();
@@ -208,7 +208,7 @@ async fn nothing_is_kept_where_it_is_not_wanted() {
     assert_eq!(second.wait().unwrap().code(), Some(2), "{said}");
     assert!(said.contains("another server keeps its journals here"), "{said}");
     // Without a journal nothing is told of one.
-    let without = Server::start(&["--log", "error"]);
+    let without = TestServer::start(&["--log", "error"]);
     let id = without.paper(false).await;
     assert_eq!(without.status(&id).await.journal, None);
 }
@@ -218,11 +218,11 @@ async fn a_full_disk_breaks_the_journal_and_not_the_session_and_the_journal_begi
     let folder = tempfile::tempdir().unwrap();
     // No file may have more than 200 KiB.
     let script = "trap '' XFSZ; ulimit -f 400; exec \"$0\" serve --listen 127.0.0.1:0 --log error --journal \"$1\"";
-    let server = Server::by_script(script, &[folder.path().as_os_str()]);
+    let server = TestServer::by_script(script, &[folder.path().as_os_str()]);
     let id = server.paper(false).await;
-    let mut touch = Touch::hold(&server, &id).await;
+    let mut touch = TestTouch::hold(&server, &id).await;
     let mut sequence = 0;
-    let fault = tokio::time::timeout(PATIENCE, async {
+    let fault = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             for _ in 0..100 {
                 sequence += 1;
@@ -252,7 +252,7 @@ async fn a_full_disk_breaks_the_journal_and_not_the_session_and_the_journal_begi
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
     };
-    let anew = tokio::time::timeout(PATIENCE, anew).await.unwrap();
+    let anew = tokio::time::timeout(TEST_TIMEOUT, anew).await.unwrap();
     assert!(anew > durable, "{durable} {anew}");
     drop(server);
     let files = files(folder.path(), &id);
@@ -268,7 +268,7 @@ async fn a_journal_that_is_damaged_in_its_middle_is_left_alone_and_told() {
     let mut before = start(folder.path());
     let (broken, whole) = (before.paper(false).await, before.paper(false).await);
     for id in [&broken, &whole] {
-        let mut touch = Touch::hold(&before, id).await;
+        let mut touch = TestTouch::hold(&before, id).await;
         for sequence in 1..=300 {
             touch.command(force(0, sequence, -0.1)).await;
             touch.sample().await;
@@ -312,7 +312,7 @@ async fn what_was_recorded_is_played_with_the_same_bits_and_gone_on_from() {
     let folder = tempfile::tempdir().unwrap();
     let server = start(folder.path());
     let id = server.paper(true).await;
-    let mut touch = Touch::hold(&server, &id).await;
+    let mut touch = TestTouch::hold(&server, &id).await;
     let mut hashes = Vec::new();
     for (sequence, step) in (1..).zip([40, 80, 120, 160, 200]) {
         touch.command(force(0, sequence, -0.05 * step as f64)).await;
@@ -335,21 +335,21 @@ async fn what_was_recorded_is_played_with_the_same_bits_and_gone_on_from() {
             assert_eq!(server.hash_at(&played, *step).await, *hash, "step {step} of what is played from {from}");
         }
         server.start_until(&played, 1000).await;
-        let waited = tokio::time::timeout(PATIENCE, async {
+        let waited = tokio::time::timeout(TEST_TIMEOUT, async {
             while server.status(&played).await.state() != pb::SessionState::Paused {
                 tokio::time::sleep(Duration::from_millis(5)).await;
             }
         });
         waited.await.unwrap();
         assert_eq!(server.status(&played).await.step, 200);
-        let held = Touch::open(&server, server::open(&played, &[0])).await;
+        let held = TestTouch::open(&server, server::open(&played, &[0])).await;
         assert!(held.err().unwrap().message().contains("plays a recording"));
     }
     // Gone on from: a live session, at whose beginning the tissue is as it was, and nothing presses any more.
     let live = server.create(moment(Some(120), false, None), true).await.unwrap();
     assert!(live.playback.is_none() && live.journal.is_some() && live.step == 120);
     assert_eq!(server.hash_at(&live.session_id, 120).await, hashes[2].1);
-    let mut other = Touch::hold(&server, &live.session_id).await;
+    let mut other = TestTouch::hold(&server, &live.session_id).await;
     other.command(force(0, 1, -0.2)).await;
     other.settle().await;
     server.start_until(&live.session_id, 160).await;
@@ -374,7 +374,7 @@ async fn what_was_recorded_is_played_with_the_same_bits_and_gone_on_from() {
 }
 
 /// What a client sends in parts; the answer to the last one.
-async fn send(server: &Server, bytes: &[u8]) -> Result<pb::UploadJournalResponse, tonic::Status> {
+async fn send(server: &TestServer, bytes: &[u8]) -> Result<pb::UploadJournalResponse, tonic::Status> {
     let at = palpate_client::Server::new(&server.url, &palpate_client::Credentials::default()).unwrap();
     let (channel, mut sent) = (at.connect().await.unwrap(), 0);
     let answer = palpate_client::upload::upload_journal(channel, bytes, |bytes| sent = bytes).await?;
@@ -385,9 +385,9 @@ async fn send(server: &Server, bytes: &[u8]) -> Result<pb::UploadJournalResponse
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_snapshot_is_a_journal_of_one_moment_and_goes_on_at_another_server() {
     use pb::create_session_request::Source;
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     let id = server.paper(true).await;
-    let mut touch = Touch::hold(&server, &id).await;
+    let mut touch = TestTouch::hold(&server, &id).await;
     touch.command(force(0, 1, -0.3)).await;
     touch.settle().await;
     server.start_until(&id, 77).await;
@@ -395,11 +395,11 @@ async fn a_snapshot_is_a_journal_of_one_moment_and_goes_on_at_another_server() {
     let request = pb::SaveSnapshotRequest { session_id: id.clone() };
     let parts = server.sessions().await.save_snapshot(request).await.unwrap().into_inner();
     let bytes = palpate_client::snapshot::collect(parts).await.unwrap();
-    let reader = palpate::journal::Reader::new("snapshot", std::io::Cursor::new(&bytes)).unwrap();
+    let reader = palpate::journal::JournalReader::new("snapshot", std::io::Cursor::new(&bytes)).unwrap();
     let (session, _) = palpate::journal::session_at(reader, &Limits::default(), 77, &NEVER).unwrap();
     assert_eq!(format!("{:032x}", session.tissue().state_hash()), hash);
 
-    let other = Server::start(&["--log", "error"]);
+    let other = TestServer::start(&["--log", "error"]);
     let answer = send(&other, &bytes).await.unwrap();
     let told = answer.journal.unwrap();
     assert_eq!((told.begin_step, told.end_step, told.info.unwrap().session_id), (77, 77, id.clone()));
@@ -434,7 +434,7 @@ async fn a_journal_is_replayed_through_a_server_that_keeps_none() {
     let (id, hash, file) = {
         let server = start(folder.path());
         let id = server.paper(true).await;
-        let mut touch = Touch::hold(&server, &id).await;
+        let mut touch = TestTouch::hold(&server, &id).await;
         touch.command(force(0, 1, -0.3)).await;
         touch.settle().await;
         server.start_until(&id, 150).await;
@@ -443,7 +443,7 @@ async fn a_journal_is_replayed_through_a_server_that_keeps_none() {
         let file = files(folder.path(), &id).remove(0);
         (id, hash, file)
     };
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     let run = |program: PathBuf, arguments: &[&str]| {
         let ran = Command::new(program).args(arguments).arg(&file).args(["--server", &server.url]).output().unwrap();
         (
@@ -481,7 +481,7 @@ async fn what_a_server_plays_is_compared_with_the_journal_and_written() {
     let (id, file) = {
         let server = start(folder.path());
         let id = server.paper(true).await;
-        let mut touch = Touch::hold(&server, &id).await;
+        let mut touch = TestTouch::hold(&server, &id).await;
         // It does not come to rest before a second is over, when its hash is written.
         for (sequence, step) in (1..).zip([450, 900, 1200]) {
             touch.command(force(0, sequence, -3e-4 * step as f64)).await;
@@ -493,7 +493,7 @@ async fn what_a_server_plays_is_compared_with_the_journal_and_written() {
         (id.clone(), files(folder.path(), &id).remove(0))
     };
     server::client_program();
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     let replay = |file: &Path, arguments: &[&str]| {
         let ran = server::palpate(&[&["journal", "replay", file.to_str().unwrap()], arguments].concat());
         let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
@@ -524,11 +524,11 @@ async fn what_a_server_plays_is_compared_with_the_journal_and_written() {
     let (status, _, err) = replay(&file, &[&on_server[..], &["--point", "1,1"]].concat());
     assert!(status == Some(2) && err.contains("--output"), "{err}");
     // A journal that has another hash than its inputs give.
-    let mut reader = palpate::journal::Reader::open(&file).unwrap();
+    let mut reader = palpate::journal::JournalReader::open(&file).unwrap();
     let survey = reader.survey(&mut |_| {}).unwrap();
     let first = palpate::journal::Replay::new(reader, survey, &Limits::default()).unwrap().first().clone();
     let opening = palpate::journal::Opening { session_id: &id, ..opening(&first) };
-    let mut writer = palpate::journal::Writer::new(&opening, 1);
+    let mut writer = palpate::journal::JournalWriter::new(&opening, 1);
     writer.hash(100, 7);
     let wrong = folder.path().join("wrong.mcap");
     std::fs::write(&wrong, writer.finish(palpate::journal::pb::Why::Deleted, "", 200, 2)).unwrap();
@@ -588,7 +588,13 @@ fn run(program: &str, arguments: &[&Path]) -> bool {
 
 /// Presses for so long, each command after the one before has acted. Tells the steps that were done and those that were dropped.
 #[cfg(target_os = "linux")]
-async fn pressed(server: &Server, id: &str, touch: &mut Touch, sequence: &mut u64, longest: Duration) -> [u64; 2] {
+async fn pressed(
+    server: &TestServer,
+    id: &str,
+    touch: &mut TestTouch,
+    sequence: &mut u64,
+    longest: Duration,
+) -> [u64; 2] {
     let (before, begun) = (server.status(id).await, std::time::Instant::now());
     while begun.elapsed() < longest {
         *sequence += 1;
@@ -613,7 +619,7 @@ async fn no_step_waits_for_a_disk_that_stalls() {
     let journals = disk.0.join("journals");
     let server = start(&journals);
     let id = server.paper(false).await;
-    let (mut touch, mut sequence, stall) = (Touch::hold(&server, &id).await, 0, Duration::from_secs(5));
+    let (mut touch, mut sequence, stall) = (TestTouch::hold(&server, &id).await, 0, Duration::from_secs(5));
     let usual = pressed(&server, &id, &mut touch, &mut sequence, stall).await;
     durable_at(&server, &id, usual[0]).await;
     let frozen = disk.freeze();

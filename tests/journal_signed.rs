@@ -10,12 +10,12 @@ use std::process::Command;
 
 use journal_opening::opening;
 use palpate::journal::signature::{Key, Signatures};
-use palpate::journal::{Opening, Reader, Writer, pb};
+use palpate::journal::{JournalReader, JournalWriter, Opening, pb};
 use palpate::limits::Limits;
 use palpate::scene::{PAPER, Scene};
 use palpate::server::journal_key;
 use palpate::session::Session;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 
 /// 2026-01-01.
 const BEGUN_NS: u64 = 1_767_225_600_000_000_000;
@@ -35,7 +35,7 @@ fn journal(key: Option<&Key>, ends: bool) -> Vec<u8> {
     let first = Model::compile(&scene, &limits).unwrap();
     let opening = Opening { owner: "ann of the test", ..opening(&first) };
     let (mut session, mut file) = (Session::new(&first), Vec::new());
-    let mut writer = Writer::new(&opening, BEGUN_NS).signed(key);
+    let mut writer = JournalWriter::new(&opening, BEGUN_NS).signed(key);
     writer.snapshot(0, session.tissue().state_hash(), session.model(), session.save().to_bytes());
     for step in (40..=400).step_by(40) {
         session.skip_to(step);
@@ -54,7 +54,7 @@ fn journal(key: Option<&Key>, ends: bool) -> Vec<u8> {
 
 /// Where each batch begins.
 fn batches(file: &[u8]) -> Vec<usize> {
-    let mut reader = Reader::new("test", std::io::Cursor::new(file)).unwrap();
+    let mut reader = JournalReader::new("test", std::io::Cursor::new(file)).unwrap();
     std::iter::from_fn(|| reader.next_batch().unwrap()).map(|batch| usize::try_from(batch.offset).unwrap()).collect()
 }
 
@@ -166,7 +166,7 @@ fn every_bit_that_decides_something_is_signed() {
     let whole = journal(Some(&key), true);
     let signed = |bytes: &[u8]| {
         let (mut reader, mut signatures) =
-            (Reader::new("test", std::io::Cursor::new(bytes))?, Signatures::of(key.public()));
+            (JournalReader::new("test", std::io::Cursor::new(bytes))?, Signatures::of(key.public()));
         while let Some(batch) = reader.next_batch()? {
             signatures.check(&batch)?;
         }
@@ -190,7 +190,7 @@ fn every_bit_that_decides_something_is_signed() {
         {
             // Schemas, names of channels nobody has, numbers and times of publication: they decide nothing.
             let read = |bytes: &[u8]| {
-                let mut reader = Reader::new("test", std::io::Cursor::new(bytes)).unwrap();
+                let mut reader = JournalReader::new("test", std::io::Cursor::new(bytes)).unwrap();
                 let header = reader.header().clone();
                 let batches: Vec<_> = std::iter::from_fn(|| reader.next_batch().unwrap())
                     .map(|batch| (batch.inputs().unwrap(), batch.hashes().unwrap(), batch.until_step, batch.unix_ns))

@@ -19,11 +19,11 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use course::Course;
+use course::DeviceTrace;
 use palpate_proto::pb;
 use proxy::Proxy;
-use random::Random;
-use server::{PATIENCE, Server, client_program};
+use random::TestRandom;
+use server::{TEST_TIMEOUT, TestServer, client_program};
 
 /// Sessions of a load, each with a client that holds its tool 0.
 const SESSIONS: usize = 4;
@@ -32,9 +32,9 @@ const SESSIONS: usize = 4;
 const TOUCHES: u64 = 1000;
 
 /// A server that lets everybody in: on a busy machine steps take long, and a session more would make others late.
-fn start(config: &Path) -> Server {
+fn start(config: &Path) -> TestServer {
     std::fs::write(config, "[limits]\nthread_share = 1000.0\n").unwrap();
-    Server::start(&["--log", "error", "--config", config.to_str().unwrap()])
+    TestServer::start(&["--log", "error", "--config", config.to_str().unwrap()])
 }
 
 /// A program that is killed with whoever started it.
@@ -47,7 +47,7 @@ impl Drop for Program {
     }
 }
 
-fn load(server: &Server) -> Program {
+fn load(server: &TestServer) -> Program {
     let sessions = SESSIONS.to_string();
     let arguments = ["load", "--server", &server.url, "--sessions", &sessions, "--seconds", "600", "--ramp-s", "0.1"];
     let child = Command::new(client_program()).args(arguments).stdout(Stdio::null()).stderr(Stdio::piped()).spawn();
@@ -55,20 +55,20 @@ fn load(server: &Server) -> Program {
 }
 
 /// Sessions of the paper's scene (the device's has another) of which a tool is held.
-async fn held(server: &Server) -> Vec<String> {
+async fn held(server: &TestServer) -> Vec<String> {
     let listed = server.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner();
     let held = listed.sessions.into_iter().filter(|one| one.scene_name == "paper" && !one.held_tools.is_empty());
     held.map(|session| session.session_id).collect()
 }
 
-async fn held_at_last(server: &Server, clients: &mut Program, wanted: usize) -> Vec<String> {
+async fn held_at_last(server: &TestServer, clients: &mut Program, wanted: usize) -> Vec<String> {
     let begun = Instant::now();
     loop {
         let held = held(server).await;
         if held.len() == wanted {
             return held;
         }
-        if begun.elapsed() > PATIENCE {
+        if begun.elapsed() > TEST_TIMEOUT {
             let _ = clients.0.kill();
             let mut said = String::new();
             clients.0.stderr.take().unwrap().read_to_string(&mut said).unwrap();
@@ -82,10 +82,10 @@ async fn held_at_last(server: &Server, clients: &mut Program, wanted: usize) -> 
 async fn who_is_killed_holds_nothing_and_who_is_left_comes_back() {
     let of = |name: &str, otherwise: u64| std::env::var(name).map_or(otherwise, |text| text.parse().unwrap());
     let (kills, seed) = (of("PALPATE_KILLS", 2), of("PALPATE_SEED", 1));
-    let mut random = Random(seed);
+    let mut random = TestRandom(seed);
     // Commands of a load before a kill, and ms without a server.
     let mut moment = move || random.below(1500);
-    let address = |server: &Server| server.url.trim_start_matches("http://").to_owned();
+    let address = |server: &TestServer| server.url.trim_start_matches("http://").to_owned();
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     let mut server = start(&config);
@@ -131,7 +131,7 @@ async fn who_is_killed_holds_nothing_and_who_is_left_comes_back() {
     }
     let told = Command::new("kill").args(["-INT", &bridge.0.id().to_string()]).status().unwrap();
     assert!(told.success() && bridge.0.wait().unwrap().success());
-    let course = Course::take(&file);
+    let course = DeviceTrace::take(&file);
     let pauses = course.keeps_to_the_envelope();
     assert!(pauses.len() >= kills as usize, "killed {kills} times, paused at {pauses:?} s");
     assert!(course.comes_back_after(pauses[pauses.len() - 1]), "it never came back");

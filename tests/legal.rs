@@ -11,11 +11,13 @@ use std::sync::Arc;
 
 use palpate::budget::Budget;
 use palpate::limits::Limits;
-use palpate::pace::Pacer;
+use palpate::realtime::Pacer;
 use palpate::refusal::Reason;
-use palpate::scene::{Body, Fixed, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping};
-use palpate::sheet;
-use palpate::sheet::choice::NEVER;
+use palpate::scene::{
+    Body, FixedPoints, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping,
+};
+use palpate::tissue;
+use palpate::tissue::scheme_selection::NEVER;
 
 fn name<T: Named>(random: &mut fastrand::Rng) -> T {
     T::NAMES[random.usize(..T::NAMES.len())].1
@@ -33,10 +35,10 @@ fn legal(seed: u64, limits: &Limits) -> Scene {
     let points = [[nx, ny], [ny, nx]][random.usize(..2)];
     let place = |random: &mut fastrand::Rng| points.map(|side| random.usize(..side));
     let fixed = match random.u8(..4) {
-        0 => Fixed::Edges,
-        1 => Fixed::Corners,
-        2 => Fixed::Points((0..random.usize(..100)).map(|_| place(&mut random)).collect()),
-        _ => Fixed::Points(PointSet::default()),
+        0 => FixedPoints::Edges,
+        1 => FixedPoints::Corners,
+        2 => FixedPoints::Points((0..random.usize(..100)).map(|_| place(&mut random)).collect()),
+        _ => FixedPoints::Points(PointSet::default()),
     };
     let stiffness_n_per_m = or_zero(&mut random);
     let shear_stiffness_n_per_m = if random.bool() { stiffness_n_per_m } else { or_zero(&mut random) };
@@ -45,8 +47,8 @@ fn legal(seed: u64, limits: &Limits) -> Scene {
         body: Body::Sheet(Sheet { points, spacing_m: any(&mut random), point_mass_kg: any(&mut random), fixed }),
         material: None,
         inclusions: Arc::default(),
-        springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m, flexion: random.bool() },
-        virtual_stiffness_n_per_m: or_zero(&mut random),
+        springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m, bending: random.bool() },
+        anchor_stiffness_n_per_m: or_zero(&mut random),
         damping_n_s_per_m: or_zero(&mut random),
         volume_stiffness_pa: 0.0,
         stepping: Stepping {
@@ -100,7 +102,7 @@ fn every_legal_scene_is_bounded_work_or_refused() {
                 // What a course repeats after the guard stopped it is bounded by the course.
                 assert!(model.rehearsed <= limits.rehearsal_work, "{seed}: {}", model.rehearsed);
                 assert!(model.predicted_step_s() * scene.stepping.rate_hz <= limits.periods_per_step, "{seed}");
-                let mut tissue = sheet::at_rest(model);
+                let mut tissue = tissue::at_rest(model);
                 (0..STEPS).for_each(|_| tissue.step().unwrap());
                 assert_eq!(tissue.substeps_done(), STEPS * u64::from(model.plan.substeps), "{seed}");
                 pacer.delete(&live.id).unwrap();
@@ -125,13 +127,13 @@ fn scene(text: &str, sets: &[&str]) -> Scene {
 
 /// Four points that vibrate 10¹² times a second, stepped once a second.
 const STIFF: &str = "[sheet]\npoints = [2, 2]\nspacing_m = 0.01\npoint_mass_kg = 1e-12\n\
-                     [springs]\nstiffness_n_per_m = 1e12\n[virtual_springs]\nstiffness_n_per_m = 1.0\n\
+                     [springs]\nstiffness_n_per_m = 1e12\n[anchor_springs]\nstiffness_n_per_m = 1.0\n\
                      [damping]\ncoefficient_n_s_per_m = 0.0\n[stepping]\nrate_hz = 1.0\n";
 
 #[test]
 fn what_no_number_of_substeps_can_do_is_refused_at_once_with_the_figure() {
     let limits = Limits::default();
-    let compile = |sets: &[&str]| sheet::Model::compile(&scene(STIFF, sets), &limits);
+    let compile = |sets: &[&str]| tissue::Model::compile(&scene(STIFF, sets), &limits);
     let refusal = compile(&[]).unwrap_err();
     assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "stepping.substeps"));
     assert!(refusal.message.contains("above the limit of 100000"), "{refusal}");

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use glam::DVec3;
-use palpate_client::bridge::{Options, Session, Target, Tick, run};
+use palpate_client::bridge::{Options, SessionChoice, Target, Tick, run};
 use palpate_client::devices::{Enables, Placed, Placement};
 use palpate_client::view::Frames;
 use palpate_client::watch::Samples;
@@ -22,11 +22,11 @@ use pb::create_session_request::Source;
 use pb::session_service_client::SessionServiceClient;
 use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;
-use server::{PATIENCE, Server, force, open};
+use server::{TEST_TIMEOUT, TestServer, force, open};
 use tokio::sync::{Notify, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 
-fn at(server: &Server) -> palpate_client::Server {
+fn at(server: &TestServer) -> palpate_client::Server {
     palpate_client::Server::new(&server.url, &Credentials::default()).unwrap()
 }
 
@@ -38,7 +38,7 @@ async fn create(channel: Channel, scene: &str) -> String {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_force_is_felt_watched_and_seen() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let channel = at(&server).connect().await.unwrap();
     let session_id = create(channel.clone(), "paper").await;
     let request = pb::WatchSamplesRequest { session_id: session_id.clone(), ..Default::default() };
@@ -51,7 +51,7 @@ async fn a_force_is_felt_watched_and_seen() {
     say.send(Say::Command(force(0, 1, -0.1))).await.unwrap();
     let pressed =
         |sample: &pb::Sample| sample.tools.iter().any(|tool| from_vector(tool.displacement_m.as_ref()).z < -1e-5);
-    let done = tokio::time::timeout(PATIENCE, async {
+    let done = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             match touch.next().await.unwrap().expect("the stream goes on") {
                 Heard::Sample(sample) if pressed(&sample) => break,
@@ -104,7 +104,7 @@ fn pressing() -> (Pressing, Arc<Notify>) {
     (Pressing { ticks: 0, force_n: DVec3::ZERO, felt: felt.clone() }, felt)
 }
 
-fn target(server: &Server, session: Session) -> Target {
+fn target(server: &TestServer, session: SessionChoice) -> Target {
     let holder = "test".to_owned();
     Target {
         server: at(server),
@@ -120,12 +120,12 @@ fn target(server: &Server, session: Session) -> Target {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_device_in_the_middle_of_its_workspace_touches_the_middle_of_the_sheet() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let (device, felt) = pressing();
     let options = Options { remembers: true, ..Options::default() };
-    let target = target(&server, Session::New { scene: "liver".to_owned() });
+    let target = target(&server, SessionChoice::New { scene: "liver".to_owned() });
     let serving = run(device, target, options, async move { felt.notified().await });
-    let (device, report) = tokio::time::timeout(PATIENCE, serving).await.expect("no force").unwrap();
+    let (device, report) = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("no force").unwrap();
     assert_eq!(device.force_n, DVec3::ZERO, "a device is left without a force");
     assert_eq!((report.traffic.connections, report.traffic.refused), (1, 0));
     let last = report.course.last().unwrap();
@@ -135,7 +135,7 @@ async fn a_device_in_the_middle_of_its_workspace_touches_the_middle_of_the_sheet
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_device_over_an_organ_comes_down_onto_the_top_of_its_surface() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session_id = create(at(&server).connect().await.unwrap(), "liver-organ").await;
     let extent = server.status(&session_id).await.extent.unwrap();
     let [top_m, middle_m, most_m] =
@@ -145,8 +145,13 @@ async fn a_device_over_an_organ_comes_down_onto_the_top_of_its_surface() {
     let (device, felt) = pressing();
     let options = Options { remembers: true, ..Options::default() };
     let serving =
-        run(device, target(&server, Session::Existing(session_id)), options, async move { felt.notified().await });
-    let (_, report) = tokio::time::timeout(PATIENCE, serving).await.expect("no force").unwrap();
+        run(
+            device,
+            target(&server, SessionChoice::Existing(session_id)),
+            options,
+            async move { felt.notified().await },
+        );
+    let (_, report) = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("no force").unwrap();
     let last = report.course.last().unwrap();
     assert!((last.place_m - top_m).truncate().length() < 1e-9 && (last.place_m - top_m).z.abs() < 0.006, "{last:?}");
     assert_eq!((report.unfelt(), report.made), (None, None));
@@ -154,22 +159,22 @@ async fn a_device_over_an_organ_comes_down_onto_the_top_of_its_surface() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_tool_that_somebody_holds_ends_the_bridge_with_its_number_and_holder() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let channel = at(&server).connect().await.unwrap();
     let session_id = create(channel.clone(), "paper").await;
     let (_say, messages) = mpsc::channel(8);
     let _held = Touch::open(channel, open(&session_id, &[0]), ReceiverStream::new(messages)).await.unwrap();
     let (device, _felt) = pressing();
     let serving =
-        run(device, target(&server, Session::Existing(session_id)), Options::default(), std::future::pending());
-    let error = tokio::time::timeout(PATIENCE, serving).await.expect("it waits").err().unwrap().to_string();
+        run(device, target(&server, SessionChoice::Existing(session_id)), Options::default(), std::future::pending());
+    let error = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it waits").err().unwrap().to_string();
     assert!(error.contains("tool 0 is held by `") && error.contains("TOOL_HELD"), "{error}");
 }
 
 #[cfg(unix)]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_bridge_that_touched_nothing_says_so_and_tells_the_session_that_it_keeps() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     // 3 cm above the tissue.
     let options = ["--server", &server.url, "--scene", "paper", "--offset-m", "0,0,0.03", "--seconds", "1.5"];
     let mut bridge = std::process::Command::new(server::client_program());
@@ -184,11 +189,11 @@ async fn a_bridge_that_touched_nothing_says_so_and_tells_the_session_that_it_kee
 
 #[tokio::test]
 async fn what_a_server_refuses_at_first_ends_the_bridge() {
-    let server = Server::start(&[]);
-    for session in [Session::New { scene: "nowhere".to_owned() }, Session::Existing("0".repeat(32))] {
+    let server = TestServer::start(&[]);
+    for session in [SessionChoice::New { scene: "nowhere".to_owned() }, SessionChoice::Existing("0".repeat(32))] {
         let (device, _felt) = pressing();
         let serving = run(device, target(&server, session), Options::default(), std::future::pending());
-        let error = tokio::time::timeout(PATIENCE, serving).await.expect("it goes on").err().unwrap();
+        let error = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it goes on").err().unwrap();
         assert!(error.is_refusal() && matches!(&error, Error::Call(_)), "{error}");
     }
 }
@@ -215,7 +220,7 @@ impl Orders {
     }
 
     async fn until(&self, what: &str, holds: impl Fn(&Tick, DVec3) -> bool) -> Tick {
-        let waited = tokio::time::timeout(PATIENCE, async {
+        let waited = tokio::time::timeout(TEST_TIMEOUT, async {
             loop {
                 let (newest, force_n) = (*self.newest.lock().unwrap(), *self.force_n.lock().unwrap());
                 if let Some(tick) = newest.filter(|tick| tick.state.is_some() && holds(tick, force_n)) {
@@ -261,7 +266,7 @@ impl HapticDevice for Clutched {
 async fn a_clutch_leaves_the_tool_in_the_tissue_and_takes_the_force_off_the_hand() {
     const ENABLE: u32 = 1;
     const CLUTCH: u32 = 2;
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session_id = create(at(&server).connect().await.unwrap(), "liver").await;
     let orders = Arc::new(Orders::default());
     let (out_m, in_m) = (0.004 * DVec3::Z, -0.003 * DVec3::Z);
@@ -270,7 +275,7 @@ async fn a_clutch_leaves_the_tool_in_the_tissue_and_takes_the_force_off_the_hand
     let placement = Placement { enable: Enables::Button(0), ..Placement::default() };
     let placed = Placed::new(hand, placement).unwrap();
     let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
-    let target = target(&server, Session::Existing(session_id.clone()));
+    let target = target(&server, SessionChoice::Existing(session_id.clone()));
     let serving = tokio::spawn(run(placed, target, Options::default(), async { drop(stopped.await) }));
     orders.until("it is connected", |tick, _| tick.place_m.z > 0.0039).await;
     orders.buttons.store(ENABLE, Ordering::Relaxed);
@@ -301,7 +306,7 @@ async fn a_clutch_leaves_the_tool_in_the_tissue_and_takes_the_force_off_the_hand
     orders.go(DVec3::new(0.005, 0.0, 0.004));
     orders.until("it is felt again", |tick, force_n| tick.place_m.z < 0.0 && force_n.z > 0.05).await;
     drop(stop);
-    let (placed, report) = tokio::time::timeout(PATIENCE, serving).await.expect("it goes on").unwrap().unwrap();
+    let (placed, report) = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it goes on").unwrap().unwrap();
     assert_eq!(*placed.device().orders.force_n.lock().unwrap(), DVec3::ZERO);
     assert_eq!(report.lost.map(|error| error.to_string()), None);
 }

@@ -11,11 +11,11 @@ mod server;
 use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
-use course::Course;
+use course::DeviceTrace;
 use palpate_touch::envelope::PAUSE_S;
 use proxy::Proxy;
 use serde_json::Value;
-use server::{Server, client_program};
+use server::{TestServer, client_program};
 
 fn client(arguments: &str) -> Output {
     Command::new(client_program()).args(arguments.split_whitespace()).output().unwrap()
@@ -150,7 +150,7 @@ fn a_copy_that_is_not_the_whole_truth_does_no_harm() {
 /// With a real server's snapshot.
 #[test]
 fn a_bridge_renders_from_a_copy_of_a_mesh_and_of_a_sheet_only_when_asked_to() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let predicted = |scene: &str, more: &str, seconds: u32| {
         let url = &server.url;
         let output = client(&format!("bridge --json --server {url} --scene {scene} --seconds {seconds} {more}"));
@@ -309,7 +309,7 @@ fn a_wrong_argument_is_refused_and_named() {
 
 #[tokio::test]
 async fn a_bridge_to_what_the_server_does_not_have_ends() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let output = client(&format!("bridge --server {} --scene nowhere", server.url));
     let told = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(2), "{told}");
@@ -337,7 +337,7 @@ fn a_bridge_to_nobody_fails_and_says_how_often_it_tried() {
 async fn a_bridge_deletes_the_session_that_it_made_and_no_other() {
     let scene = || palpate_proto::pb::create_session_request::Source::SceneName("liver".to_owned());
     for (keeps, given, left) in [(false, false, 0), (true, false, 1), (false, true, 1)] {
-        let server = Server::start(&[]);
+        let server = TestServer::start(&[]);
         let mut more = if keeps { vec!["--keep-session"] } else { Vec::new() };
         let session = if given { server.create(scene(), false).await.unwrap().session_id } else { String::new() };
         if given {
@@ -393,7 +393,7 @@ async fn interrupted(bridge: Child) -> Output {
     output
 }
 
-fn address(server: &Server) -> String {
+fn address(server: &TestServer) -> String {
     server.url.trim_start_matches("http://").to_owned()
 }
 
@@ -401,7 +401,7 @@ fn address(server: &Server) -> String {
 #[cfg(unix)]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_bridge_outlives_a_cut() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let proxy = Proxy::start(address(&server), Duration::from_millis(5)).await;
     let bridge = bridge(&proxy.url(), &["--json"]);
     server.until_applied("liver", TOUCHES).await;
@@ -423,7 +423,7 @@ async fn a_bridge_outlives_a_cut() {
 #[cfg(unix)]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn forces_stay_within_the_envelope_whatever_breaks() {
-    let first = Server::start(&[]);
+    let first = TestServer::start(&[]);
     let proxy = Proxy::start(address(&first), Duration::from_millis(5)).await;
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("course.csv");
@@ -432,7 +432,7 @@ async fn forces_stay_within_the_envelope_whatever_breaks() {
     drop(first);
     // Long enough without a server that forces pause, however soon the next one is there.
     tokio::time::sleep(Duration::from_secs_f64(2.0 * PAUSE_S)).await;
-    let second = Server::start(&[]);
+    let second = TestServer::start(&[]);
     proxy.aim(address(&second));
     second.until_applied("liver", TOUCHES).await;
     signal(&bridge, "-STOP");
@@ -440,7 +440,7 @@ async fn forces_stay_within_the_envelope_whatever_breaks() {
     signal(&bridge, "-CONT");
     second.until_applied("liver", TOUCHES).await;
     interrupted(bridge).await;
-    let course = Course::take(&file);
+    let course = DeviceTrace::take(&file);
     let pauses = course.keeps_to_the_envelope();
     // One for the server, one for the freeze.
     assert!(pauses.len() >= 2, "{pauses:?}");

@@ -9,15 +9,15 @@ use std::time::Duration;
 
 use palpate_proto::pb;
 use serde_json::Value;
-use server::{PATIENCE, Server, client_program};
+use server::{TEST_TIMEOUT, TestServer, client_program};
 
-fn load(server: &Server, arguments: &str) -> Output {
+fn load(server: &TestServer, arguments: &str) -> Output {
     let server = if arguments.contains("--server") { String::new() } else { format!("--server {}", server.url) };
     let all = format!("load {server} --quiet {arguments}");
     Command::new(client_program()).args(all.split_whitespace()).output().unwrap()
 }
 
-fn told(server: &Server, arguments: &str) -> Value {
+fn told(server: &TestServer, arguments: &str) -> Value {
     let output = load(server, &format!("--json {arguments}"));
     assert!(output.status.success(), "{arguments}: {}", String::from_utf8_lossy(&output.stderr));
     serde_json::from_slice(&output.stdout).unwrap()
@@ -27,13 +27,13 @@ fn number(told: &Value, path: &str) -> f64 {
     told.pointer(path).and_then(Value::as_f64).unwrap_or_else(|| panic!("{path} is missing in {told}"))
 }
 
-async fn sessions(server: &Server) -> Vec<pb::Session> {
+async fn sessions(server: &TestServer) -> Vec<pb::Session> {
     server.sessions().await.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn every_command_of_a_load_is_accounted_for_and_no_session_stays() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let told = told(&server, "--sessions 3 --clients-per-session 2 --viewers 1 --seconds 2 --rate-hz 500");
     assert_eq!((number(&told, "/sessions"), number(&told, "/lost"), number(&told, "/rejected")), (3.0, 0.0, 0.0));
     assert!(number(&told, "/commands") > 0.0, "{told}");
@@ -55,7 +55,7 @@ async fn the_dilation_of_sessions_that_are_too_heavy_is_told() {
     let paper = palpate::scene::PAPER.replace("points = [31, 31]", "points = [800, 500]");
     std::fs::write(&scene, paper + "[stepping]\nrate_hz = 10000.0\n[sleep]\ntolerance = 0.0\n").unwrap();
     std::fs::write(&config, "[limits]\nthread_share = 1000.0\nperiods_per_step = 20.0\n").unwrap();
-    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let server = TestServer::start(&["--config", config.to_str().unwrap()]);
     for clients in [0, 1] {
         let scene = scene.to_str().unwrap();
         let told = told(&server, &format!("--scene {scene} --sessions 1 --clients-per-session {clients} --seconds 2"));
@@ -66,7 +66,7 @@ async fn the_dilation_of_sessions_that_are_too_heavy_is_told() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn sessions_without_clients_are_kept_awake() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let told = told(&server, "--sessions 2 --clients-per-session 0 --seconds 3");
     assert_eq!((number(&told, "/samples"), number(&told, "/broken_streams")), (0.0, 0.0));
     assert!(number(&told, "/dilation_min") > 0.0 && told["round_trip_us"]["p50"].is_null(), "{told}");
@@ -78,7 +78,7 @@ fn the_limit_is_the_largest_number_that_meets_the_objective() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, "[limits]\nsessions = 6\n").unwrap();
-    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let server = TestServer::start(&["--config", config.to_str().unwrap()]);
     let told = told(&server, "--sessions 2 --seconds 0.2 --rate-hz 100 --find-limit lost<1");
     assert_eq!((number(&told, "/limit_sessions"), number(&told, "/sessions")), (6.0, 6.0));
     // What nothing meets.
@@ -88,7 +88,7 @@ fn the_limit_is_the_largest_number_that_meets_the_objective() {
 
 #[test]
 fn what_makes_no_sense_is_refused() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     for (arguments, expected) in [
         ("--find-limit p99<2", "not a valid bound of p99"),
         ("--find-limit p98<2ms", "unknown quantity `p98`"),
@@ -108,13 +108,13 @@ fn what_makes_no_sense_is_refused() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn clients_that_are_killed_leave_no_tool_held_and_no_session() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let mut child = Command::new(client_program())
         .args(["load", "--server", &server.url, "--sessions", "3", "--seconds", "1000", "--quiet"])
         .stdout(Stdio::null())
         .spawn()
         .unwrap();
-    let waited = tokio::time::timeout(PATIENCE, async {
+    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             let sessions = sessions(&server).await;
             if sessions.len() == 3 && sessions.iter().all(|session| session.commands.unwrap().applied > 10) {
@@ -126,7 +126,7 @@ async fn clients_that_are_killed_leave_no_tool_held_and_no_session() {
     waited.await.expect("the load does not begin");
     child.kill().unwrap();
     child.wait().unwrap();
-    let waited = tokio::time::timeout(PATIENCE, async {
+    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             let sessions = sessions(&server).await;
             for commands in sessions.iter().map(|session| session.commands.unwrap()) {
@@ -191,7 +191,7 @@ name = "after"
 seconds = 1
 "#;
 
-fn planned(server: &Server, folder: &std::path::Path, plan: &str, more: &[&str]) -> Output {
+fn planned(server: &TestServer, folder: &std::path::Path, plan: &str, more: &[&str]) -> Output {
     let path = folder.join("plan.toml");
     std::fs::write(&path, plan).unwrap();
     let mut program = Command::new(client_program());
@@ -202,7 +202,7 @@ fn planned(server: &Server, folder: &std::path::Path, plan: &str, more: &[&str])
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_plan_is_played_by_its_users_and_told_by_second_phase_and_page() {
-    let (server, folder) = (Server::start(&[]), tempfile::tempdir().unwrap());
+    let (server, folder) = (TestServer::start(&[]), tempfile::tempdir().unwrap());
     let page = folder.path().join("load.html");
     let output = planned(&server, folder.path(), PLAN, &["--json", "--report", page.to_str().unwrap()]);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -241,7 +241,7 @@ async fn a_plan_is_played_by_its_users_and_told_by_second_phase_and_page() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_plan_that_misses_an_objective_or_is_wrong_says_so_by_its_status() {
-    let (server, folder) = (Server::start(&[]), tempfile::tempdir().unwrap());
+    let (server, folder) = (TestServer::start(&[]), tempfile::tempdir().unwrap());
     let short = "[[phase]]\nname = \"brief\"\nseconds = 1.5\narrivals = \"spike\"\nusers = 1\n";
     let missed = planned(&server, folder.path(), &format!("{short}objective = \"p50<1us\"\n"), &[]);
     let said = String::from_utf8_lossy(&missed.stderr);

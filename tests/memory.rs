@@ -13,12 +13,12 @@ use std::time::Duration;
 use palpate_proto::pb;
 use pb::session_service_client::SessionServiceClient;
 use rustix::process::{Pid, Resource, Rlimit, prlimit};
-use server::{PATIENCE, Server, Touch, force, sheet, told};
+use server::{TEST_TIMEOUT, TestServer, TestTouch, force, sheet, told};
 use tonic::transport::Channel;
 use tonic::{Code, Status};
 
 /// From now on the server may have so many bytes of address space more than it has.
-fn leave(server: &Server, bytes: u64) {
+fn leave(server: &TestServer, bytes: u64) {
     let limit = Some(cores::address_space(server.child.id()) + bytes);
     prlimit(Some(Pid::from_child(&server.child)), Resource::As, Rlimit { current: limit, maximum: None }).unwrap();
 }
@@ -36,9 +36,9 @@ fn assert_no_memory(refused: &Status, field: &str) {
 }
 
 /// Who reads a session that is held, or commands it, is told so.
-async fn assert_is_held(server: &Server, session: &str, mut touch: Touch) {
+async fn assert_is_held(server: &TestServer, session: &str, mut touch: TestTouch) {
     let ended = loop {
-        match tokio::time::timeout(PATIENCE, touch.hear()).await.expect("the stream goes on") {
+        match tokio::time::timeout(TEST_TIMEOUT, touch.hear()).await.expect("the stream goes on") {
             Ok(Some(_)) => {}
             Ok(None) => panic!("it ends without a reason"),
             Err(status) => break status,
@@ -70,12 +70,12 @@ async fn without_address_space_requests_are_refused_sessions_end_and_others_are_
     )
     .unwrap();
     // The budget is no bound here.
-    let server = Server::start(&["--config", config.to_str().unwrap(), "--memory", "1024GiB", "--log", "error"]);
+    let server = TestServer::start(&["--config", config.to_str().unwrap(), "--memory", "1024GiB", "--log", "error"]);
     let mut sessions = server.sessions().await;
     let small = server.paper(false).await;
-    let mut touch = Touch::hold(&server, &small).await;
+    let mut touch = TestTouch::hold(&server, &small).await;
     let doomed = create(&mut sessions, 512, false).await.unwrap();
-    let doomed_touch = Touch::hold(&server, &doomed).await;
+    let doomed_touch = TestTouch::hold(&server, &doomed).await;
     leave(&server, 512 << 20);
 
     // Large sessions until one is refused, then smaller ones: after that there is room for small things alone.
@@ -105,7 +105,7 @@ async fn without_address_space_requests_are_refused_sessions_end_and_others_are_
 
     // A session that needs more to go on is held with the reason.
     doomed_touch.command(force(0, 1, -1.0)).await;
-    let waited = tokio::time::timeout(PATIENCE, async {
+    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             let status = server.status(&doomed).await;
             if status.state() == pb::SessionState::Held {
@@ -129,7 +129,7 @@ async fn without_address_space_requests_are_refused_sessions_end_and_others_are_
     for session_id in kept {
         sessions.delete_session(pb::DeleteSessionRequest { session_id }).await.unwrap();
     }
-    let again = tokio::time::timeout(PATIENCE, async {
+    let again = tokio::time::timeout(TEST_TIMEOUT, async {
         while let Err(refused) = create(&mut sessions, 512, true).await {
             assert_no_memory(&refused, "sheet.points");
             tokio::time::sleep(Duration::from_millis(50)).await;
@@ -142,7 +142,7 @@ async fn without_address_space_requests_are_refused_sessions_end_and_others_are_
 #[tokio::test]
 async fn a_server_with_few_addresses_serves_its_first_requests() {
     let script = "ulimit -v 300000 && exec \"$0\" serve --listen 127.0.0.1:0 --memory 64MiB";
-    let server = Server::by_script(script, &[]);
+    let server = TestServer::by_script(script, &[]);
     let mut sessions = server.sessions().await;
     let first = create(&mut sessions, 31, false).await.unwrap();
     for _ in 0..3 {

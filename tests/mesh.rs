@@ -10,9 +10,9 @@ use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::collection::find_scene;
 use palpate::scene::profile::Poke;
-use palpate::scene::{Body, Differences, Inclusion, Material, Mesh, MeshShape, Region, Scene};
+use palpate::scene::{Body, Inclusion, Material, Mesh, MeshShape, PerNodeFactors, Region, Scene};
 use palpate::shape::{PointId, PointName, RestShape};
-use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
+use palpate::tissue::{Grasp, Model, Push, Tissue, at_rest};
 
 /// The paper's scene with another body, and with some values set.
 fn scene(body: Option<Body>, sets: &[&str]) -> Scene {
@@ -64,22 +64,22 @@ fn sphere(rings: u32, radius_m: f64) -> MeshShape {
     MeshShape::new(vertices_m, triangles, |_, _, _| false).unwrap()
 }
 
-fn body(shape: MeshShape, point_mass_kg: f64, flexion: f64) -> Option<Body> {
-    Some(Body::Mesh(Mesh::new(point_mass_kg, flexion, Arc::new(shape))))
+fn body(shape: MeshShape, point_mass_kg: f64, bending: f64) -> Option<Body> {
+    Some(Body::Mesh(Mesh::new(point_mass_kg, bending, Arc::new(shape))))
 }
 
-/// The same where masses, springs and virtual springs differ from vertex to vertex.
-fn uneven_body(shape: MeshShape, point_mass_kg: f64, flexion: f64) -> Option<Body> {
+/// The same where masses, springs and anchor springs differ from vertex to vertex.
+fn uneven_body(shape: MeshShape, point_mass_kg: f64, bending: f64) -> Option<Body> {
     let mut dice = fastrand::Rng::with_seed(8);
     let mut list = |count: usize, least: f64| (0..count).map(|_| least + dice.f64()).collect::<Vec<f64>>();
     let count = shape.vertices_m().len();
-    let differences = Differences {
+    let differences = PerNodeFactors {
         relative_mass: list(count, 0.4),
-        extra_virtual: list(count, -0.3),
+        extra_anchor: list(count, -0.3),
         edges: list(shape.edges().len(), 0.5),
-        flexion: list(shape.opposite().len(), 0.5),
+        bending: list(shape.opposite().len(), 0.5),
     };
-    Some(Body::Mesh(Mesh::uneven(point_mass_kg, flexion, Arc::new(shape), differences)))
+    Some(Body::Mesh(Mesh::uneven(point_mass_kg, bending, Arc::new(shape), differences)))
 }
 
 fn poke(centre_m: DVec3, force_n: DVec3, falloff_per_m: f64) -> Option<Push> {
@@ -161,12 +161,12 @@ fn shape_of(shape: &MeshShape) -> MeshShape {
 
 #[test]
 fn without_damping_energy_is_kept_and_springs_change_no_momentum() {
-    for (flexion, is_uneven) in [(0.0, false), (0.4, false), (0.4, true)] {
-        let sets = ["damping.coefficient_n_s_per_m=0", "virtual_springs.stiffness_n_per_m=0", "stepping.precision=f64"];
+    for (bending, is_uneven) in [(0.0, false), (0.4, false), (0.4, true)] {
+        let sets = ["damping.coefficient_n_s_per_m=0", "anchor_springs.stiffness_n_per_m=0", "stepping.precision=f64"];
         let sets =
             [&sets[..], &["sleep.tolerance=0", "stepping.integrator=exponential4", "stepping.substeps=4"]].concat();
         let of = if is_uneven { uneven_body } else { body };
-        let scene = scene(of(sphere(9, 0.1), 0.01, flexion), &sets);
+        let scene = scene(of(sphere(9, 0.1), 0.01, bending), &sets);
         let mut tissue = tissue(&scene);
         let points: Vec<PointId> = tissue.model().points().collect();
         tissue.push(0, poke(DVec3::new(0.0, 0.1, 0.0), DVec3::new(0.1, -0.6, 0.2), 15.0));
@@ -186,7 +186,7 @@ fn without_damping_energy_is_kept_and_springs_change_no_momentum() {
         };
         let total = |tissue: &dyn Tissue| {
             let energy = tissue.energy();
-            energy.kinetic_j + energy.spring_j + energy.virtual_j
+            energy.kinetic_j + energy.spring_j + energy.anchor_j
         };
         let (begun_j, begun, begun_turn) = (total(&*tissue), momentum(&*tissue), turn(&*tissue));
         for _ in 0..500 {
@@ -238,7 +238,7 @@ fn a_mesh_sleeps_where_nothing_moves_and_wakes_where_something_does() {
 }
 
 fn sleeps_and_wakes(of: fn(MeshShape, f64, f64) -> Option<Body>) {
-    let sets = ["damping.coefficient_n_s_per_m=0.3", "virtual_springs.stiffness_n_per_m=20"];
+    let sets = ["damping.coefficient_n_s_per_m=0.3", "anchor_springs.stiffness_n_per_m=20"];
     let with_sleep = |sleep: &str| scene(of(sphere(45, 0.1), 0.01, 0.0), &[&sets[..], &[sleep]].concat());
     let (mut sleeper, mut awake) =
         (tissue(&with_sleep("sleep.tolerance=1e-4")), tissue(&with_sleep("sleep.tolerance=0")));
@@ -280,7 +280,7 @@ fn a_scene_on_a_mesh_is_found_by_its_name_with_the_file_beside_it() {
     std::fs::write(folder.path().join("organ.obj"), "v 0 0 0\nv 50 0 0\nv 0 50 0\nv 50 50 0\nf 1 2 3\nf 2 4 3\n")
         .unwrap();
     let text = "[mesh]\nfile = \"organ.obj\"\nunit = \"mm\"\npoint_mass_kg = 0.01\n\
-                [springs]\nstiffness_n_per_m = 10.0\n[virtual_springs]\nstiffness_n_per_m = 5.0\n\
+                [springs]\nstiffness_n_per_m = 10.0\n[anchor_springs]\nstiffness_n_per_m = 5.0\n\
                 [damping]\ncoefficient_n_s_per_m = 0.05\n";
     std::fs::write(folder.path().join("organ.toml"), text).unwrap();
     let limits = Limits::default();
@@ -296,7 +296,7 @@ fn a_scene_on_a_mesh_is_found_by_its_name_with_the_file_beside_it() {
 fn forces_move_each_vertex_by_its_own_mass() {
     for integrator in ["central", "exponential4", "rk4"] {
         let sets =
-            ["damping.coefficient_n_s_per_m=0.03", "virtual_springs.stiffness_n_per_m=9", "stepping.precision=f64"];
+            ["damping.coefficient_n_s_per_m=0.03", "anchor_springs.stiffness_n_per_m=9", "stepping.precision=f64"];
         let [integrator, rate] = [format!("stepping.integrator={integrator}"), "stepping.rate_hz=20000".to_owned()];
         let sets = [&sets[..], &["sleep.tolerance=0", &integrator, &rate, "stepping.substeps=1"]].concat();
         let scene = scene(uneven_body(sphere(7, 0.1), 0.01, 0.4), &sets);
@@ -317,9 +317,9 @@ fn forces_move_each_vertex_by_its_own_mass() {
             let after = velocities(&*tissue);
             let (mut largest, mut apart) = (0.0_f64, 0.0_f64);
             for (point, state) in model.points().zip(&now) {
-                let virtual_n = -model.virtual_stiffness_n_per_m(point) * state.displacement_m;
+                let anchor_n = -model.anchor_stiffness_n_per_m(point) * state.displacement_m;
                 let damping_n = -model.damping_n_s_per_m(point) * state.velocity_m_per_s;
-                assert!(state.virtual_n.distance(virtual_n) < 1e-12 && state.damping_n.distance(damping_n) < 1e-12);
+                assert!(state.anchor_n.distance(anchor_n) < 1e-12 && state.damping_n.distance(damping_n) < 1e-12);
                 if point == held {
                     continue;
                 }
@@ -335,14 +335,14 @@ fn forces_move_each_vertex_by_its_own_mass() {
             .points()
             .map(|point| 0.5 * mass_kg(point) * tissue.point(point).velocity_m_per_s.length_squared())
             .sum();
-        let virtual_j: f64 = model
+        let anchor_j: f64 = model
             .points()
             .map(|point| {
-                0.5 * model.virtual_stiffness_n_per_m(point) * tissue.point(point).displacement_m.length_squared()
+                0.5 * model.anchor_stiffness_n_per_m(point) * tissue.point(point).displacement_m.length_squared()
             })
             .sum();
         assert!((energy.kinetic_j - kinetic_j).abs() < 1e-9 * kinetic_j, "{integrator}: {energy:?} {kinetic_j}");
-        assert!((energy.virtual_j - virtual_j).abs() < 1e-9 * virtual_j, "{integrator}: {energy:?} {virtual_j}");
+        assert!((energy.anchor_j - anchor_j).abs() < 1e-9 * anchor_j, "{integrator}: {energy:?} {anchor_j}");
         assert_eq!(tissue.guard_events(), 0);
     }
 }
@@ -372,7 +372,7 @@ const MATERIAL: Material = Material {
     thickness_m: 0.004,
     density_kg_per_m3: 1060.0,
     depth_m: 0.03,
-    bed_n_per_m3: 4e5,
+    foundation_n_per_m3: 4e5,
     damping_ratio: 0.5,
 };
 
@@ -383,14 +383,14 @@ fn where_all_vertices_are_alike_a_material_is_the_coefficients_of_the_paper() {
     let with = |mesh: Mesh| {
         let mut scene = scene(Some(Body::Mesh(mesh)), &sets);
         scene.springs.stiffness_n_per_m = made.stiffness_n_per_m;
-        scene.virtual_stiffness_n_per_m = made.virtual_stiffness_n_per_m;
+        scene.anchor_stiffness_n_per_m = made.anchor_stiffness_n_per_m;
         scene.damping_n_s_per_m = made.damping_n_s_per_m;
         scene
     };
     let even = Mesh::new(made.mesh.point_mass_kg, 0.0, made.mesh.shape.clone());
     assert!((made.mesh.stiffest.bound / even.stiffest.bound - 1.0).abs() < 1e-9);
     let area_m2 = 20.0 * 3.0_f64.sqrt() / 4.0 * made.mesh.shape.edge_m().powi(2);
-    assert!((made.virtual_stiffness_n_per_m / (4e5 * area_m2 / 12.0) - 1.0).abs() < 1e-12);
+    assert!((made.anchor_stiffness_n_per_m / (4e5 * area_m2 / 12.0) - 1.0).abs() < 1e-12);
     assert!((made.mesh.mass_kg() / (1060.0 * 0.03 / 3.0 * area_m2) - 1.0).abs() < 1e-12);
     // Nothing gives way where all is alike.
     assert!((made.stiffness_n_per_m / (3.0_f64.sqrt() / 2.0 * 32.0) - 1.0).abs() < 1e-9, "{}", made.stiffness_n_per_m);
@@ -413,13 +413,13 @@ fn where_all_vertices_are_alike_a_material_is_the_coefficients_of_the_paper() {
 #[test]
 fn an_inclusion_makes_a_mesh_stiffer_where_it_is_and_nowhere_else() {
     let sets =
-        ["damping.coefficient_n_s_per_m=0.4", "virtual_springs.stiffness_n_per_m=20", "springs.stiffness_n_per_m=10"];
+        ["damping.coefficient_n_s_per_m=0.4", "anchor_springs.stiffness_n_per_m=20", "springs.stiffness_n_per_m=10"];
     let shape = Arc::new(sphere(13, 0.1));
     let plain = Mesh::new(0.01, 0.2, shape.clone());
     let lump = Inclusion {
         region: Region::Ball { centre_m: DVec3::new(0.09, 0.0, 0.0), radius_m: 0.03 },
         stiffness_factor: 4.0,
-        virtual_stiffness_factor: 3.0,
+        anchor_stiffness_factor: 3.0,
         edge_m: 0.01,
     };
     let with = Inclusion::put_into(&[lump], "inclusion", &plain).unwrap();
@@ -454,7 +454,7 @@ fn what_a_scene_says_of_a_mesh_and_its_material_is_refused_by_key() {
     let limits = Limits { points: 20_000, ..Limits::default() };
     let parsed = |text: &str| Scene::parse_in(folder.path(), "test", text, &[], &limits);
     let (file, organ) = ("file = \"ball.obj\"\nunit = \"m\"\n", "organ = { name = \"liver\", edge_m = 0.0001 }\n");
-    let material = "[material]\nyoungs_modulus_pa = 1e4\nthickness_m = 0.01\nbed_n_per_m3 = 1e6\n";
+    let material = "[material]\nyoungs_modulus_pa = 1e4\nthickness_m = 0.01\nfoundation_n_per_m3 = 1e6\n";
     let good = parsed(&format!("[mesh]\n{file}{material}")).unwrap();
     assert!(good.springs.stiffness_n_per_m > 50.0 && good.damping_n_s_per_m > 0.0 && good.point_mass_kg() > 0.0);
     let inclusion = |keys: &str| format!("[mesh]\n{file}{material}[[inclusion]]\n{keys}\n");
@@ -518,7 +518,7 @@ fn a_rim_of_a_closed_mesh_is_warned_of_and_so_is_a_vertex_that_is_much_too_fast(
     let warnings = |file: &str| {
         let text = format!(
             "[mesh]\nfile = \"{file}\"\nunit = \"m\"\nfixed = \"rim\"\n[material]\nyoungs_modulus_pa = 1e3\n\
-             thickness_m = 0.01\nbed_n_per_m3 = 1e5\n[stepping]\ntolerance = 1e-2\n"
+             thickness_m = 0.01\nfoundation_n_per_m3 = 1e5\n[stepping]\ntolerance = 1e-2\n"
         );
         let scene = Scene::parse_in(folder.path(), "test", &text, &[], &Limits::default()).unwrap();
         let Body::Mesh(mesh) = scene.body else { panic!("of another kind") };
@@ -540,7 +540,7 @@ fn a_shape_is_the_same_tissue_however_its_file_is_written() {
         std::fs::write(folder.path().join("ball.obj"), vertices.chain(triangles).collect::<String>()).unwrap();
         let text = format!(
             "[mesh]\nfile = \"ball.obj\"\nunit = \"m\"\n{head}[material]\nyoungs_modulus_pa = 8e3\nthickness_m = 5e-4\n\
-             bed_n_per_m3 = 1.34e6\n[stepping]\nintegrator = \"exponential4\"\nsubsteps = 4\n"
+             foundation_n_per_m3 = 1.34e6\n[stepping]\nintegrator = \"exponential4\"\nsubsteps = 4\n"
         );
         Scene::parse_in(folder.path(), "test", &text, &[], &Limits::default()).unwrap()
     };
@@ -611,7 +611,7 @@ fn what_remains_doubtful_about_a_mesh_is_warned_of() {
     let warnings = |text: &str| {
         std::fs::write(folder.path().join("organ.obj"), text).unwrap();
         let scene = "[mesh]\nfile = \"organ.obj\"\nunit = \"m\"\n[material]\nyoungs_modulus_pa = 1e3\n\
-             thickness_m = 0.01\nbed_n_per_m3 = 1e5\n[stepping]\ntolerance = 1e-2\n";
+             thickness_m = 0.01\nfoundation_n_per_m3 = 1e5\n[stepping]\ntolerance = 1e-2\n";
         let scene = Scene::parse_in(folder.path(), "test", scene, &[], &Limits::default());
         Model::compile(&scene.unwrap(), &Limits::default()).unwrap().warnings.join("; ")
     };
@@ -652,7 +652,7 @@ fn of_a_decimated_mesh_the_vertices_of_the_file_are_named() {
     let fine = sphere(13, 0.1);
     std::fs::write(folder.path().join("ball.obj"), obj(&fine)).unwrap();
     let text = "[mesh]\nfile = \"ball.obj\"\nunit = \"m\"\nvertices = 100\n[material]\nyoungs_modulus_pa = 1e4\n\
-                thickness_m = 0.01\nbed_n_per_m3 = 1e6\n";
+                thickness_m = 0.01\nfoundation_n_per_m3 = 1e6\n";
     let scene = Scene::parse_in(folder.path(), "test", text, &[], &Limits::default()).unwrap();
     let Body::Mesh(mesh) = &scene.body else { panic!("of another kind") };
     let (shape, count) = (&mesh.shape, fine.vertices_m().len());

@@ -15,8 +15,8 @@ use palpate::limits::Limits;
 use palpate::scene::profile::Poke;
 use palpate::scene::{Body, Scene};
 use palpate::shape::{PointId, PointName, RestShape};
-use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
-use palpate_client::view::Surface;
+use palpate::tissue::{Grasp, Model, Push, Tissue, at_rest};
+use palpate_client::view::SurfaceState;
 use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::{pb, touch};
 use palpate_touch::Tip;
@@ -24,7 +24,7 @@ use palpate_touch::device::Device;
 use pb::create_session_request::Source;
 use pb::force::Centre;
 use pb::touch_response::Message as Heard;
-use server::{Server, Touch, client_program, open, palpate, told};
+use server::{TestServer, TestTouch, client_program, open, palpate, told};
 use tempfile::TempDir;
 use tonic::{Code, Status};
 
@@ -41,17 +41,17 @@ fixed = [{ centre_m = [0.0, 0.0, 0.05], radius_m = 0.02 }]
 youngs_modulus_pa = 2000.0
 thickness_m = 0.005
 depth_m = 0.02
-bed_n_per_m3 = 5e4
+foundation_n_per_m3 = 5e4
 [springs]
-flexion = 0.1
+bending = 0.1
 [[inclusion]]
 centre_m = [0.0, -0.05, 0.0]
 radius_m = 0.02
 stiffness_factor = 3.0
-virtual_stiffness_factor = 2.0
+anchor_stiffness_factor = 2.0
 [[inclusion]]
 group = "lump"
-virtual_stiffness_factor = 4.0
+anchor_stiffness_factor = 4.0
 edge_m = 0.01
 [stepping]
 integrator = "central"
@@ -69,8 +69,8 @@ point_mass_kg = 0.01
 fixed = [{ centre_m = [0.0, 0.0, 0.05], radius_m = 0.02 }]
 [springs]
 stiffness_n_per_m = 10.0
-flexion = 0.3
-[virtual_springs]
+bending = 0.3
+[anchor_springs]
 stiffness_n_per_m = 5.0
 [damping]
 coefficient_n_s_per_m = 0.1
@@ -81,13 +81,13 @@ precision = "f32"
 "#;
 
 /// A folder with the ball and its scene, and a server that has it.
-fn ball() -> (TempDir, Server) {
+fn ball() -> (TempDir, TestServer) {
     let folder = folder();
     // A server that was not optimized takes long to lay out a session.
     let config = folder.path().join("patient.conf");
     std::fs::write(&config, "[limits]\nwork_s = 600.0\n").unwrap();
     let [scenes, config] = [folder.path(), &config].map(|path| path.to_str().unwrap());
-    let server = Server::start(&["--scenes", scenes, "--config", config]);
+    let server = TestServer::start(&["--scenes", scenes, "--config", config]);
     (folder, server)
 }
 
@@ -156,7 +156,7 @@ const MOVE_M: DVec3 = DVec3::new(0.0, 0.002, 0.001);
 
 /// All of what a session shows at rest.
 #[derive(Default)]
-struct Shown {
+struct RestingMesh {
     rest_m: Vec<DVec3>,
     file_vertex: Vec<u32>,
     triangles: Vec<u32>,
@@ -165,10 +165,10 @@ struct Shown {
     edge_m: f64,
 }
 
-async fn shown(server: &Server, session_id: &str) -> Shown {
+async fn shown(server: &TestServer, session_id: &str) -> RestingMesh {
     let request = pb::GetMeshRequest { session_id: session_id.into(), refinement: 0 };
     let mut parts = server.views().await.get_mesh(request).await.unwrap().into_inner();
-    let mut all = Shown::default();
+    let mut all = RestingMesh::default();
     while let Some(part) = parts.message().await.unwrap() {
         let place = |place: &[f32]| DVec3::from_array([0, 1, 2].map(|c| f64::from(place[c])));
         all.rest_m.extend(part.rest_position_m.chunks(3).map(place));
@@ -182,11 +182,11 @@ async fn shown(server: &Server, session_id: &str) -> Shown {
 }
 
 /// The first frame, which is full.
-async fn surface(server: &Server, session_id: &str, encoding: pb::Encoding) -> Surface {
+async fn surface(server: &TestServer, session_id: &str, encoding: pb::Encoding) -> SurfaceState {
     let request =
         pb::WatchFramesRequest { session_id: session_id.to_owned(), encoding: encoding.into(), ..Default::default() };
     let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
-    let mut surface = Surface::default();
+    let mut surface = SurfaceState::default();
     loop {
         let part = frames.message().await.unwrap().unwrap();
         surface.write(&part).unwrap();
@@ -207,13 +207,13 @@ async fn a_session_on_a_mesh_is_told_pushed_grasped_sampled_probed_and_shown() {
     assert!(told_scene.sheet.is_none() && mesh.mesh_id.is_empty() && mesh.point_mass_kg == Some(0.01));
     assert!(matches!(mesh.fixed, Some(pb::mesh::Fixed::FixedBalls(balls)) if balls.balls[0].radius_m == 0.02));
     let springs = told_scene.springs.unwrap();
-    assert_eq!((springs.shear_stiffness_n_per_m, springs.flexion_factor), (None, Some(0.3)));
+    assert_eq!((springs.shear_stiffness_n_per_m, springs.bending_factor), (None, Some(0.3)));
     assert_eq!(session.points, 162);
     let extent = session.extent.unwrap();
     assert!(from_vector(extent.most_m.as_ref()).distance(scene.shape().extent().most_m) < 1e-12);
 
     let id = &session.session_id;
-    let mut touch = Touch::open(&server, open(id, &[0, 1])).await.unwrap();
+    let mut touch = TestTouch::open(&server, open(id, &[0, 1])).await.unwrap();
     touch.command(push(0, 1, Centre::Vertex(7), FORCE_N)).await;
     touch.command(grasp(1, 1, 40, MOVE_M)).await;
     touch.settle().await;
@@ -288,7 +288,7 @@ async fn frames_of_a_coarser_tissue_show_the_mesh_of_its_file() {
     let id = &session.session_id;
     assert_eq!(session.points as usize, shape.point_count());
     assert_eq!(session.scene.unwrap().mesh.unwrap().vertices, Some(session.points));
-    let mut touch = Touch::hold(&server, id).await;
+    let mut touch = TestTouch::hold(&server, id).await;
     // Any vertex of the file has a name.
     touch.command(push(0, 1, Centre::Vertex(161), FORCE_N)).await;
     touch.settle().await;
@@ -329,19 +329,19 @@ async fn what_does_not_fit_the_tissue_is_refused_with_what_does() {
     let (_folder, server) = ball();
     let mesh = server.create(by_name(), true).await.unwrap().session_id;
     let sheet = server.create(small_sheet(), true).await.unwrap().session_id;
-    let mut on_mesh = Touch::hold(&server, &mesh).await;
-    let mut on_sheet = Touch::hold(&server, &sheet).await;
+    let mut on_mesh = TestTouch::hold(&server, &mesh).await;
+    let mut on_sheet = TestTouch::hold(&server, &sheet).await;
     let place = |x, y, z| Centre::AtM(pb::Vector3 { x, y, z });
     let point = Centre::Point(pb::GridPoint { x: 1, y: 1 });
     let plane = Centre::CentreM(pb::Vector2 { x: 0.0, y: 0.0 });
     for (is_mesh, centre, field, reason, words) in [
         (true, point, "force.point", "WRONG_KIND", "the number of a vertex"),
         (true, plane, "force.centre_m", "WRONG_KIND", "`at_m`"),
-        (true, Centre::Vertex(162), "force.vertex", "OFF_SHEET", "from 0 to 161"),
-        (true, place(0.0, 0.0, 0.07), "force.at_m", "OFF_SHEET", "a tenth"),
+        (true, Centre::Vertex(162), "force.vertex", "OFF_TISSUE", "from 0 to 161"),
+        (true, place(0.0, 0.0, 0.07), "force.at_m", "OFF_TISSUE", "a tenth"),
         (true, place(0.0, f64::NAN, 0.0), "force.at_m", "NOT_FINITE", ""),
         (false, Centre::Vertex(3), "force.vertex", "WRONG_KIND", "5 × 5"),
-        (false, place(0.2, 0.2, 0.2), "force.at_m", "OFF_SHEET", ""),
+        (false, place(0.2, 0.2, 0.2), "force.at_m", "OFF_TISSUE", ""),
     ] {
         let touch = if is_mesh { &mut on_mesh } else { &mut on_sheet };
         touch.command(push(0, 1, centre, FORCE_N)).await;
@@ -384,7 +384,7 @@ async fn what_does_not_fit_the_tissue_is_refused_with_what_does() {
 
 /// Sends a file in parts of that size.
 async fn upload(
-    server: &Server,
+    server: &TestServer,
     file: &[u8],
     part: usize,
     unit: &str,
@@ -429,7 +429,7 @@ async fn a_mesh_that_a_client_sends_makes_the_session_that_its_file_does() {
     let session = server.create(Source::Scene(on(&sent.mesh_id, &scene)), true).await.unwrap();
     assert_eq!(session.scene.unwrap().mesh.unwrap().mesh_id, "");
     let id = session.session_id;
-    let touch = Touch::open(&server, open(&id, &[0, 1])).await;
+    let touch = TestTouch::open(&server, open(&id, &[0, 1])).await;
     let mut touch = touch.unwrap();
     touch.command(push(0, 1, Centre::Vertex(7), FORCE_N)).await;
     touch.command(grasp(1, 1, 40, MOVE_M)).await;
@@ -469,7 +469,7 @@ async fn a_mesh_that_a_client_sends_makes_the_session_that_its_file_does() {
     server.create(Source::Scene(all), true).await.unwrap();
 }
 
-async fn delete_journal(server: &Server, id: &str) -> Result<u32, Status> {
+async fn delete_journal(server: &TestServer, id: &str) -> Result<u32, Status> {
     let request = pb::DeleteJournalRequest { session_id: id.to_owned() };
     Ok(server.sessions().await.delete_journal(request).await?.into_inner().files)
 }
@@ -483,7 +483,7 @@ async fn a_mesh_that_was_sent_stays_in_journals_only_as_long_as_its_owner_is_tol
     std::fs::write(&config, "[limits]\nwork_s = 600.0\n").unwrap();
     let start = |more: &[&str]| {
         let usual = ["--journal", journals.to_str().unwrap(), "--config", config.to_str().unwrap()];
-        Server::start(&[&usual[..], more].concat())
+        TestServer::start(&[&usual[..], more].concat())
     };
     let kept = || palpate::journal::file::list(&journals).unwrap().len();
     let server = start(&[]);
@@ -573,7 +573,7 @@ async fn a_session_tells_what_was_done_with_its_mesh() {
 
 #[tokio::test]
 async fn a_mesh_that_is_none_is_refused_by_element_and_place() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let whole = ICOSPHERE.as_bytes();
     // Cut in the middle of a vertex: one of its coordinates is missing.
     let cut = ICOSPHERE.find("\nf ").unwrap() - 20;
@@ -604,7 +604,7 @@ async fn a_mesh_above_the_limits_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, "[limits]\nmesh_bytes = 14000\nmesh_vertices = 161\n").unwrap();
-    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let server = TestServer::start(&["--config", config.to_str().unwrap()]);
     let long = [ICOSPHERE.as_bytes(), &[b'\n'; 1000]].concat();
     let refused = upload(&server, &long, 1000, "m", false).await.unwrap_err();
     assert_eq!(told(&refused), (Code::ResourceExhausted, "TOO_LARGE".into(), "part".into()));
@@ -692,7 +692,7 @@ async fn a_tip_touches_a_mesh_by_the_law_of_the_place_where_it_is() {
     let device = touch::device(&Device::named("omega3").unwrap());
     let tip_message = pb::Tip { radius_m: tip.radius_m, friction: Some(0.0), ..Default::default() };
     let wanted = pb::TouchOpen { device: Some(device), tip: Some(tip_message), ..open(&session, &[0]) };
-    let mut stream = Touch::open(&server, wanted).await.unwrap();
+    let mut stream = TestTouch::open(&server, wanted).await.unwrap();
     let first = touch::from_law(&stream.opened.take().unwrap().law.unwrap()).unwrap();
     let mut laws = vec![first];
     // Below, and then from the side.

@@ -8,10 +8,10 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::{Body, Mesh, MeshShape, Scene};
-use palpate::sheet::{Feel, Model, Tissue, at_rest, tangent};
+use palpate::tissue::{Model, Tissue, ToolContact, at_rest, tangent};
 use palpate_touch::{ContactState, Tip};
 
-/// Membrane and bed of a liver: N/m along an edge, N/m³ beneath, kg/m², and the damping ratio of a point on the bed.
+/// Membrane and foundation of a liver: N/m along an edge, N/m³ beneath, kg/m², and the damping ratio of a point on the foundation.
 const EDGE_N_PER_M: f64 = 80.0;
 const BED_N_PER_M3: f64 = 4e5;
 const KG_PER_M2: f64 = 2.0;
@@ -19,11 +19,11 @@ const KG_PER_M2: f64 = 2.0;
 /// A scene on a mesh whose vertices have `area_m2` each in the mean.
 fn scene(shape: MeshShape, area_m2: f64, sets: &[&str]) -> Scene {
     let mass_kg = KG_PER_M2 * area_m2;
-    let virtual_n_per_m = BED_N_PER_M3 * area_m2;
-    let damping = 2.0 * 0.7 * (mass_kg * virtual_n_per_m).sqrt();
+    let anchor_n_per_m = BED_N_PER_M3 * area_m2;
+    let damping = 2.0 * 0.7 * (mass_kg * anchor_n_per_m).sqrt();
     let mut all = vec![
         format!("springs.stiffness_n_per_m={EDGE_N_PER_M}"),
-        format!("virtual_springs.stiffness_n_per_m={virtual_n_per_m:.17}"),
+        format!("anchor_springs.stiffness_n_per_m={anchor_n_per_m:.17}"),
         format!("damping.coefficient_n_s_per_m={damping:.17}"),
         "stepping.tolerance=1e-4".to_owned(),
     ];
@@ -113,12 +113,12 @@ fn sphere(times: u32, radius_m: f64) -> (MeshShape, f64) {
 const TIP: Tip = Tip { radius_m: 0.005, friction: 0.0, grasps: false, coupling: palpate_touch::Coupling::Constraint };
 
 /// Moves a tool straight from one place to another in so many steps, and leaves it there for `rest` more.
-fn lead(tissue: &mut dyn Tissue, from_m: DVec3, to_m: DVec3, steps: u32, rest: u32, tip: Tip) -> Feel {
+fn lead(tissue: &mut dyn Tissue, from_m: DVec3, to_m: DVec3, steps: u32, rest: u32, tip: Tip) -> ToolContact {
     for step in 1..=steps + rest {
         tissue.pose(0, from_m.lerp(to_m, f64::from(step.min(steps)) / f64::from(steps)), tip);
         tissue.step().unwrap();
     }
-    tissue.feel(0).unwrap()
+    tissue.tool_contact(0).unwrap()
 }
 
 /// Mean, and standard deviation over the mean.
@@ -203,11 +203,11 @@ fn a_tool_slides_over_edges_and_vertices_without_a_ripple() {
     // Slowly: 20 mm in 2 s.
     let mut forces = Vec::new();
     let way_m = DVec3::new(0.016, 0.012, 0.0);
-    let mut before_n = tissue.feel(0).unwrap().force_on_tool_n.z;
+    let mut before_n = tissue.tool_contact(0).unwrap().force_on_tool_n.z;
     for step in 1..=2000 {
         tissue.pose(0, from_m + f64::from(step) / 2000.0 * way_m, TIP);
         tissue.step().unwrap();
-        let feel = tissue.feel(0).unwrap();
+        let feel = tissue.tool_contact(0).unwrap();
         assert_eq!(feel.contact_state, ContactState::Sliding);
         let force_n = feel.force_on_tool_n.z;
         assert!((force_n / before_n - 1.0).abs() < 0.02, "step {step}: {before_n} to {force_n}");

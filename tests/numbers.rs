@@ -14,7 +14,7 @@ use std::sync::Arc;
 
 use common::scene_with;
 use glam::DVec3;
-use palpate::journal::{self, Opening, Reader, Writer};
+use palpate::journal::{self, JournalReader, JournalWriter, Opening};
 use palpate::limits::Limits;
 use palpate::refusal::Refusal;
 use palpate::scene::profile::Poke;
@@ -25,7 +25,7 @@ use palpate::session::command::{Command, Due};
 use palpate::session::input::Input;
 use palpate::session::intake::Intake;
 use palpate::session::saved::Saved;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate::wire;
 use palpate_mesh::{Group, TriangleMesh};
 use palpate_proto::pb;
@@ -144,7 +144,7 @@ fn told(session: &Session) -> (u128, String) {
     (session.tissue().state_hash(), format!("{tools:?} {:?} {:?}", session.energy(), session.recoveries().list()))
 }
 
-fn snapshot(writer: &mut Writer, session: &Session) {
+fn snapshot(writer: &mut JournalWriter, session: &Session) {
     let (hash, saved) = (session.tissue().state_hash(), session.save().to_bytes());
     writer.snapshot(session.step_count(), hash, session.model(), saved);
 }
@@ -178,7 +178,7 @@ fn is_taken_on_every_way(scene: palpate::refusal::Result<Scene>, about: &str) ->
 /// kill, and restored from its own snapshot in the middle.
 fn goes_every_way(mut session: Session, first: &Arc<Model>, mut acting: BTreeMap<u64, Vec<Due>>, about: &str) {
     let begin = session.step_count();
-    let mut writer = Writer::new(&opening(first, begin), 1);
+    let mut writer = JournalWriter::new(&opening(first, begin), 1);
     snapshot(&mut writer, &session);
     let (middle, mut restored) = (begin + STEPS / 2, None);
     for step in begin..begin + STEPS {
@@ -204,7 +204,7 @@ fn goes_every_way(mut session: Session, first: &Arc<Model>, mut acting: BTreeMap
     assert_eq!(told(&restored.unwrap()), told(&session), "{about}: from its snapshot");
     let until = session.step_count();
     let file = writer.finish(journal::pb::Why::Drained, "", until, 2);
-    let reader = || Reader::new("journal", Cursor::new(file.clone())).unwrap();
+    let reader = || JournalReader::new("journal", Cursor::new(file.clone())).unwrap();
     let verdict = journal::verify(reader(), &Limits::default(), &mut |_, _| {});
     let verdict = verdict.unwrap_or_else(|refusal| panic!("{about}: {refusal}"));
     assert_eq!(verdict.difference, None, "{about}");
@@ -372,18 +372,18 @@ fn scenes() -> Vec<pb::Scene> {
             thickness_m: Some(0.002),
             density_kg_per_m3: Some(1000.0),
             depth_m: Some(0.02),
-            bed_n_per_m3: Some(4e5),
+            foundation_n_per_m3: Some(4e5),
             damping_ratio: Some(0.5),
         }),
         inclusions: vec![pb::Inclusion {
             centre_m: Some(pb::Vector3 { x: 0.0, y: 0.0, z: 0.03 }),
             radius_m: Some(0.01),
             stiffness_factor: Some(2.0),
-            virtual_stiffness_factor: Some(2.0),
+            anchor_stiffness_factor: Some(2.0),
             edge_m: Some(0.002),
             ..Default::default()
         }],
-        springs: Some(pb::Springs { flexion_factor: Some(0.2), ..Default::default() }),
+        springs: Some(pb::Springs { bending_factor: Some(0.2), ..Default::default() }),
         volume: Some(pb::Volume { stiffness_pa: Some(300.0) }),
         stepping,
         sleep,
@@ -392,8 +392,8 @@ fn scenes() -> Vec<pb::Scene> {
     let of_coefficients = pb::Scene {
         mesh: Some(pb::Mesh { point_mass_kg: Some(1e-3), ..of_mesh.mesh.clone().unwrap() }),
         material: None,
-        springs: Some(pb::Springs { stiffness_n_per_m: Some(20.0), flexion_factor: Some(0.2), ..Default::default() }),
-        virtual_springs: Some(pb::VirtualSprings { stiffness_n_per_m: Some(5.0) }),
+        springs: Some(pb::Springs { stiffness_n_per_m: Some(20.0), bending_factor: Some(0.2), ..Default::default() }),
+        anchor_springs: Some(pb::AnchorSprings { stiffness_n_per_m: Some(5.0) }),
         damping: Some(pb::Damping { coefficient_n_s_per_m: Some(0.1) }),
         ..of_mesh.clone()
     };
@@ -461,7 +461,7 @@ fn a_zero_has_no_sign_in_any_number_of_a_journal() {
     let descriptors = messages(journal::pb::DESCRIPTORS);
     let first = Model::compile(&sheet("f64", &["damping.coefficient_n_s_per_m=0.0"]), &limits()).unwrap();
     // Of the tissue: the same model, or none.
-    let change = palpate::scene::Change { virtual_stiffness_n_per_m: Some(0.0), ..Default::default() };
+    let change = palpate::scene::Change { anchor_stiffness_n_per_m: Some(0.0), ..Default::default() };
     let changed = first.changed(&change, &first.scene, &limits()).unwrap();
     let tissue = |more: &[u8]| -> Result<Arc<Model>, Refusal> {
         match with_more(&descriptors, &Input::Tissue(changed.clone()), more, &first)? {
@@ -539,14 +539,14 @@ fn with_each_number(text: &str, value: &str) -> Vec<(String, String)> {
 }
 
 const SHEET: &str = "name = \"zeros\"\n[sheet]\npoints = [9, 7]\nspacing_m = @0.05@\npoint_mass_kg = @0.02@\n[springs]\n\
-    stiffness_n_per_m = @30.0@\nshear_stiffness_n_per_m = @15.0@\n[virtual_springs]\nstiffness_n_per_m = @5.0@\n[damping]\n\
+    stiffness_n_per_m = @30.0@\nshear_stiffness_n_per_m = @15.0@\n[anchor_springs]\nstiffness_n_per_m = @5.0@\n[damping]\n\
     coefficient_n_s_per_m = @0.2@\n[stepping]\nrate_hz = @1000.0@\ntolerance = @1e-3@\nintegrator = \"exponential3\"\n\
     substeps = 4\n[sleep]\ntolerance = @1e-3@\n";
 
 const MESH: &str = "name = \"zeros\"\n[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.007 }\n[material]\n\
-    youngs_modulus_pa = @2e4@\nthickness_m = @0.003@\ndensity_kg_per_m3 = @1000.0@\ndepth_m = @0.02@\nbed_n_per_m3 = @5e6@\n\
-    damping_ratio = @0.5@\n[springs]\nflexion = @0.1@\n[[inclusion]]\ncentre_m = [@0.0@, @0.0@, @-0.05@]\nradius_m = @0.03@\n\
-    stiffness_factor = @2.0@\nvirtual_stiffness_factor = @2.0@\nedge_m = @0.004@\n[stepping]\nintegrator = \"exponential3\"\n\
+    youngs_modulus_pa = @2e4@\nthickness_m = @0.003@\ndensity_kg_per_m3 = @1000.0@\ndepth_m = @0.02@\nfoundation_n_per_m3 = @5e6@\n\
+    damping_ratio = @0.5@\n[springs]\nbending = @0.1@\n[[inclusion]]\ncentre_m = [@0.0@, @0.0@, @-0.05@]\nradius_m = @0.03@\n\
+    stiffness_factor = @2.0@\nanchor_stiffness_factor = @2.0@\nedge_m = @0.004@\n[stepping]\nintegrator = \"exponential3\"\n\
     substeps = 12\n[sleep]\ntolerance = @1e-3@\n";
 
 #[test]

@@ -17,13 +17,13 @@ use palpate::server::identity::{self, Role};
 use palpate::wire;
 use palpate_proto::pb;
 use prost::Message;
-use server::{PATIENCE, Server, told};
+use server::{TEST_TIMEOUT, TestServer, told};
 
 /// Head, in small letters, and body of an answer.
-fn ask(server: &Server, method: &str, path: &str, headers: &str, body: &[u8]) -> (String, Vec<u8>) {
+fn ask(server: &TestServer, method: &str, path: &str, headers: &str, body: &[u8]) -> (String, Vec<u8>) {
     let address = server.url.trim_start_matches("http://");
     let mut stream = TcpStream::connect(address).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.set_read_timeout(Some(TEST_TIMEOUT)).unwrap();
     let length = body.len();
     let head = format!(
         "{method} {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\nContent-Length: {length}\r\n{headers}\r\n"
@@ -36,18 +36,18 @@ fn ask(server: &Server, method: &str, path: &str, headers: &str, body: &[u8]) ->
     (String::from_utf8(answer[..end].to_vec()).unwrap().to_lowercase(), answer[end + 4..].to_vec())
 }
 
-fn get(server: &Server, path: &str, headers: &str) -> (String, String) {
+fn get(server: &TestServer, path: &str, headers: &str) -> (String, String) {
     let (head, body) = ask(server, "GET", path, headers, b"");
     (head, String::from_utf8_lossy(&body).into_owned())
 }
 
 /// A server whose page is a folder of our own.
-fn with_page() -> (Server, tempfile::TempDir) {
+fn with_page() -> (TestServer, tempfile::TempDir) {
     with_page_and(|_| Vec::new())
 }
 
 /// The same, with options that may name files of the folder.
-fn with_page_and(options: impl Fn(&Path) -> Vec<String>) -> (Server, tempfile::TempDir) {
+fn with_page_and(options: impl Fn(&Path) -> Vec<String>) -> (TestServer, tempfile::TempDir) {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("secret.txt"), "not for you").unwrap();
     let page = folder.path().join("page");
@@ -56,7 +56,7 @@ fn with_page_and(options: impl Fn(&Path) -> Vec<String>) -> (Server, tempfile::T
     std::fs::write(page.join("assets/index-1a2b.js"), "export {}").unwrap();
     let options = [vec!["--viewer".to_owned(), page.to_str().unwrap().to_owned()], options(folder.path())].concat();
     let options: Vec<&str> = options.iter().map(String::as_str).collect();
-    (Server::start(&options), folder)
+    (TestServer::start(&options), folder)
 }
 
 #[test]
@@ -79,10 +79,10 @@ fn a_page_has_its_type_its_policy_and_a_tag() {
 }
 
 /// A connection over which one file is asked for so many times at once.
-fn pipelined(server: &Server, path: &str, times: usize) -> TcpStream {
+fn pipelined(server: &TestServer, path: &str, times: usize) -> TcpStream {
     let address = server.url.trim_start_matches("http://");
     let mut stream = TcpStream::connect(address).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.set_read_timeout(Some(TEST_TIMEOUT)).unwrap();
     let request = format!("GET {path} HTTP/1.1\r\nHost: {address}\r\n\r\n");
     stream.write_all(request.repeat(times).as_bytes()).unwrap();
     stream
@@ -145,7 +145,7 @@ fn without_a_page_it_says_how_to_get_one_and_serves_all_the_same() {
     // A page that is gone once the server runs: without one, `--viewer` is refused.
     let index = empty.path().join("index.html");
     std::fs::write(&index, "<title>tissue</title>").unwrap();
-    let server = Server::start(&["--viewer", empty.path().to_str().unwrap()]);
+    let server = TestServer::start(&["--viewer", empty.path().to_str().unwrap()]);
     std::fs::remove_file(index).unwrap();
     let (head, body) = get(&server, "/", "");
     assert!(head.starts_with("http/1.1 404") && head.contains("text/html"), "{head}");
@@ -198,11 +198,11 @@ fn a_page_is_for_everybody_and_its_calls_for_those_with_a_token() {
     scenes_over_grpc_web_as(&server, &known);
 }
 
-fn scenes_over_grpc_web(server: &Server) {
+fn scenes_over_grpc_web(server: &TestServer) {
     scenes_over_grpc_web_as(server, "");
 }
 
-fn scenes_over_grpc_web_as(server: &Server, authorization: &str) {
+fn scenes_over_grpc_web_as(server: &TestServer, authorization: &str) {
     let headers = format!("Content-Type: application/grpc-web+proto\r\n{authorization}");
     let (head, body) = ask(server, "POST", "/palpate.v1.SessionService/ListScenes", &headers, &[0; 5]);
     assert!(head.starts_with("http/1.1 200") && head.contains("application/grpc-web+proto"), "{head}");
@@ -212,7 +212,7 @@ fn scenes_over_grpc_web_as(server: &Server, authorization: &str) {
 
 #[tokio::test]
 async fn a_script_of_the_server_is_the_commands_that_a_replay_sends() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session_id = server.paper(true).await;
     let mut sessions = server.sessions().await;
     let listed = sessions.list_scripts(pb::ListScriptsRequest::default()).await.unwrap().into_inner().script_names;
@@ -245,7 +245,7 @@ async fn a_script_of_the_server_is_the_commands_that_a_replay_sends() {
 }
 
 /// Takes a tool by a call over HTTP/1.1; how long it is held without a command, s.
-fn acquire(server: &Server, session_id: &str, tool: u32, outlives_connection: bool) -> f64 {
+fn acquire(server: &TestServer, session_id: &str, tool: u32, outlives_connection: bool) -> f64 {
     let lease_s = Some(600.0);
     let request = pb::AcquireToolRequest {
         session_id: session_id.to_owned(),
@@ -270,7 +270,7 @@ fn acquire(server: &Server, session_id: &str, tool: u32, outlives_connection: bo
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_tool_taken_over_grpc_web_is_not_held_for_long_by_who_says_nothing() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
     assert_eq!(acquire(&server, &session, 0, false), 10.0);
     assert_eq!(acquire(&server, &session, 1, true), 600.0);
@@ -279,11 +279,11 @@ async fn a_tool_taken_over_grpc_web_is_not_held_for_long_by_who_says_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, "[limits]\nbrowser_lease_s = 0.2\n").unwrap();
-    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let server = TestServer::start(&["--config", config.to_str().unwrap()]);
     let session = server.paper(false).await;
     assert_eq!(acquire(&server, &session, 0, false), 0.2);
     assert_eq!(acquire(&server, &session, 1, true), 600.0);
-    let lapsed = tokio::time::timeout(PATIENCE, async {
+    let lapsed = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             let status = server.status(&session).await;
             if status.lapsed_leases == 1 {

@@ -9,11 +9,11 @@ use std::process::Command;
 use std::sync::Arc;
 
 use journal_opening::opening;
-use palpate::journal::{Opening, Writer, pb};
+use palpate::journal::{JournalWriter, Opening, pb};
 use palpate::limits::Limits;
 use palpate::scene::{PAPER, Scene};
 use palpate::session::input::Input;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 
 /// ESC, CR, LF, BEL, DEL, controls C1, controls of direction, a separator of lines.
 const HOSTILE: &str = "a\x1b[2J\r\nFORGED\x07\x7f\u{9b}2J\u{85}\u{202e}\u{2066}\u{200f}\u{2028}z";
@@ -43,7 +43,7 @@ fn journal() -> Vec<u8> {
     // No server would take such a name.
     Arc::get_mut(&mut first).unwrap().scene.name = HOSTILE.to_owned();
     let opening = Opening { session_id: HOSTILE, owner: HOSTILE, ..opening(&first) };
-    let mut writer = Writer::new(&opening, 1);
+    let mut writer = JournalWriter::new(&opening, 1);
     writer.input(3, &Input::Hold(HOSTILE.to_owned()));
     writer.finish(pb::Why::Drained, HOSTILE, 10, 2)
 }

@@ -11,21 +11,21 @@ use palpate::scene::{Change, PAPER, Scene};
 use palpate::session::Session;
 use palpate::session::command::Command;
 use palpate::session::intake::Intake;
-use palpate::session::recovery::{MOST, WINDOW_STEPS};
-use palpate::sheet::Model;
+use palpate::session::recovery::{MAX_RECOVERIES, WINDOW_STEPS};
+use palpate::tissue::Model;
 
 /// What the holder of tools 0 and 1 sends, and when.
 type Order = (u64, u32, Action);
 
 /// The course of a session.
-struct Course {
+struct SessionRun {
     session: Session,
     /// The state's hash at the end of each step.
     hashes: Vec<u128>,
 }
 
 /// Plays `orders`, by ascending step, through an intake as a server does.
-fn play(model: &Arc<Model>, orders: &[Order], steps: u64) -> Course {
+fn play(model: &Arc<Model>, orders: &[Order], steps: u64) -> SessionRun {
     let limits = Limits { lease_s: 1e4, ..Limits::default() };
     let (mut session, mut intake) = (Session::new(model), Intake::new(&model.scene, &limits));
     intake.acquire(&[0, 1], "test", 1e4, 1, 0).unwrap();
@@ -58,7 +58,7 @@ fn play(model: &Arc<Model>, orders: &[Order], steps: u64) -> Course {
         let point = session.tissue().point(index);
         assert!(point.displacement_m.is_finite() && point.velocity_m_per_s.is_finite(), "{point:?}");
     }
-    Course { session, hashes }
+    SessionRun { session, hashes }
 }
 
 /// Springs far too stiff for the substeps that the scene gives: each force makes the tissue blow up.
@@ -84,7 +84,7 @@ fn push(model: &Model, point: [usize; 2], z_n: f64) -> Action {
 fn a_blow_up_undoes_what_led_to_it_and_time_goes_on() {
     let model = stiff();
     let orders = [(20, 0, push(&model, [15, 15], -1.0)), (20, 1, push(&model, [3, 4], -1.0))];
-    let Course { session, hashes } = play(&model, &orders, 100);
+    let SessionRun { session, hashes } = play(&model, &orders, 100);
     assert_eq!((session.hold_reason(), session.step_count()), (None, 100));
     let recoveries = session.recoveries().list();
     let [recovery] = &recoveries[..] else { panic!("{recoveries:?}") };
@@ -131,13 +131,16 @@ fn too_many_recoveries_in_a_short_time_pause_the_tool_that_caused_them() {
     assert_eq!((sample.tools[0].acknowledged_sequence, sample.tools[0].paused_until.is_some()), (8, true));
     assert_eq!(sample.tools[1].paused_until, None);
     let other = play(&model, &[pushed(0, &few), pushed(1, &[420])].concat(), 500).session;
-    assert_eq!((other.hold_reason(), other.recoveries().count(), other.paused_commands()), (None, MOST as u64 + 1, 0));
+    assert_eq!(
+        (other.hold_reason(), other.recoveries().count(), other.paused_commands()),
+        (None, MAX_RECOVERIES as u64 + 1, 0)
+    );
     // The same commands give the same bits.
     let repeated = play(&model, &pushed(0, &[&few[..], &late[..]].concat()), end + 100);
     assert_eq!(again.hashes, repeated.hashes);
     // As many, and the last when the first is long over.
     let kept = play(&model, &pushed(0, &[20, 120, 220, WINDOW_STEPS + 70]), WINDOW_STEPS + 200).session;
-    assert_eq!((kept.hold_reason(), kept.recoveries().count()), (None, MOST as u64));
+    assert_eq!((kept.hold_reason(), kept.recoveries().count()), (None, MAX_RECOVERIES as u64));
     assert!(kept.recoveries().list().iter().all(|recovery| recovery.paused_until_step.is_none()));
 }
 

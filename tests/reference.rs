@@ -46,10 +46,10 @@ fn scene_text(scene: &Value) -> String {
         let [nx, ny, spacing] = ["nx", "ny", "spacing"].map(|key| &scene[key]);
         format!("[sheet]\npoints = [{nx}, {ny}]\nspacing_m = {spacing}\npoint_mass_kg = {mass}\n")
     };
-    let flexion = scene.get("flexion").and_then(Value::as_bool).unwrap_or(false);
+    let bending = scene.get("bending").and_then(Value::as_bool).unwrap_or(false);
     let volume = scene.get("kappa").map_or(String::new(), |kappa| format!("[volume]\nstiffness_pa = {kappa}\n"));
     format!(
-        "{body}{volume}[springs]\nstiffness_n_per_m = {}\nflexion = {flexion}\n[virtual_springs]\nstiffness_n_per_m = {}\n\
+        "{body}{volume}[springs]\nstiffness_n_per_m = {}\nbending = {bending}\n[anchor_springs]\nstiffness_n_per_m = {}\n\
          [damping]\ncoefficient_n_s_per_m = {}\n",
         scene["k"], scene["K"], scene["C"]
     )
@@ -134,7 +134,7 @@ fn errors(name: &str, assignments: &[&str]) -> Errors {
             let reaction = part("reaction") + part("damping");
             let mut pairs = vec![
                 (state.spring_n, part("spring")),
-                (state.virtual_n, part("virtual")),
+                (state.anchor_n, part("virtual")),
                 (state.damping_n, part("damping")),
                 (state.applied_n, part("surgical")),
                 (state.reaction_n(), reaction),
@@ -148,7 +148,7 @@ fn errors(name: &str, assignments: &[&str]) -> Errors {
             largest.force = largest.force.max(reaction.length());
         }
         let (energy, expected) = (session.tissue().energy(), &frame["energy"]);
-        for (value, name) in [(energy.kinetic_j, "kinetic"), (energy.spring_j, "spring"), (energy.virtual_j, "virtual")]
+        for (value, name) in [(energy.kinetic_j, "kinetic"), (energy.spring_j, "spring"), (energy.anchor_j, "virtual")]
         {
             error.energy = error.energy.max((value - number(&expected[name])).abs());
             largest.energy = largest.energy.max(number(&expected[name]));
@@ -194,7 +194,7 @@ fn each_scheme_has_its_order() {
             Integrator::Rk4 => 2000.0,
             _ => 1000.0,
         };
-        let order = palpate::sheet::order(*scheme);
+        let order = palpate::tissue::order(*scheme);
         for name in SCENES {
             for gain in gains(name, integrator, rate_hz) {
                 println!("{integrator} {name}: {:.2}", gain.log2() / 2.0);

@@ -6,7 +6,7 @@ use std::process::{Command, Output};
 
 use palpate::limits::Limits;
 use palpate::refusal::Reason;
-use palpate::scene::{Appearance, Named, PAPER, Scene, Surface};
+use palpate::scene::{Appearance, Named, PAPER, PaintedSurface, Scene};
 use palpate::texture::{Image, image, painted, texture};
 
 fn palpate(arguments: &[&str]) -> Output {
@@ -62,7 +62,7 @@ fn a_texture_is_made_by_its_seed() {
     let small = decoded(&first);
     assert_eq!((small.width, small.height), (96, 96));
     // The lining of a stomach: red, and neither flat nor noise. Only colour differs, not light.
-    let large = painted(Surface::Mucosa, 5, 384, &Limits::default()).unwrap();
+    let large = painted(PaintedSurface::Mucosa, 5, 384, &Limits::default()).unwrap();
     let mut spread = 0.0_f64;
     for part in (0..64).map(|k| [k % 8, k / 8]) {
         let [a, b] = [mean(&small, 8, part), mean(&large, 8, part)];
@@ -100,7 +100,7 @@ fn each_tissue_has_a_surface_of_its_own() {
     // A gallbladder is grey-green: green before red, and far from the pink of a lining.
     let serosa = means[3];
     assert!(serosa[1] > serosa[0] && serosa[1] > serosa[2] && serosa[1] < 1.4 * serosa[0], "{means:?}");
-    assert_eq!(Appearance::default().surface, Surface::Mucosa);
+    assert_eq!(Appearance::default().surface, PaintedSurface::Mucosa);
     refused(&["texture", "--surface", "spleen", "--output", "never.png"], "surface");
 }
 

@@ -12,11 +12,11 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use palpate_proto::pb;
 use serde_json::Value;
-use server::{PATIENCE, Server, Touch, client_program, force, open};
+use server::{TEST_TIMEOUT, TestServer, TestTouch, client_program, force, open};
 
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
-fn replay(server: &Server, script: &Path, more: &[&str]) -> Output {
+fn replay(server: &TestServer, script: &Path, more: &[&str]) -> Output {
     Command::new(client_program())
         .args(["replay", script.to_str().unwrap(), "--server", &server.url])
         .args(more)
@@ -56,7 +56,7 @@ fn shipped_scripts() -> Vec<(String, PathBuf)> {
 }
 
 /// Replays and compares every record, and the hash, with the run offline.
-fn assert_same(server: &Server, scene: &str, script: &Path) {
+fn assert_same(server: &TestServer, scene: &str, script: &Path) {
     let output = replay(server, script, &["--scene", scene]);
     let errors = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.success(), "{errors}");
@@ -78,7 +78,7 @@ fn assert_same(server: &Server, scene: &str, script: &Path) {
 
 #[test]
 fn every_shipped_script_gives_the_hash_of_the_run_offline() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     for (scene, script) in shipped_scripts() {
         assert_same(&server, &scene, &script);
     }
@@ -102,7 +102,7 @@ until_s = 0.08
 
 #[test]
 fn a_replay_plots_the_first_tool_with_a_tip_as_a_run_does() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let folder = tempfile::tempdir().unwrap();
     let (scene, script) = (folder.path().join("stiff.toml"), folder.path().join("hovering.toml"));
     std::fs::write(&scene, STIFF).unwrap();
@@ -137,11 +137,11 @@ fn hammer(url: String) -> Hammer {
         // Borrows the real server's address; it is not this one's to end.
         let mut child = Command::new("true").stdout(Stdio::piped()).spawn().unwrap();
         let out = BufReader::new(child.stdout.take().unwrap());
-        let server = std::mem::ManuallyDrop::new(Server { child, url, out });
+        let server = std::mem::ManuallyDrop::new(TestServer { child, url, out });
         runtime.block_on(async {
             while !stopped.load(Ordering::Relaxed) {
                 let session = server.paper(false).await;
-                let mut touch = Touch::open(&server, open(&session, &[0])).await.unwrap();
+                let mut touch = TestTouch::open(&server, open(&session, &[0])).await.unwrap();
                 for sequence in 1..400 {
                     let strength_n = if sequence % 2 == 0 { -3.0 } else { f64::NAN };
                     touch.command(force(0, sequence, strength_n)).await;
@@ -158,7 +158,7 @@ fn hammer(url: String) -> Hammer {
 fn a_replay_is_exact_while_another_client_hammers_another_session() {
     // Built before anybody hammers.
     server::client_program();
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     let hammer = hammer(server.url.clone());
     for (scene, script) in shipped_scripts() {
         assert_same(&server, &scene, &script);
@@ -205,7 +205,7 @@ stiffness_n_per_m = 55.0
 [[tissue]]
 at_s = 0.2
 damping_n_s_per_m = 0.6
-virtual_stiffness_n_per_m = 11.0
+anchor_stiffness_n_per_m = 11.0
 "#;
 
 const STIFF: &str = r#"
@@ -218,8 +218,8 @@ fixed = "corners"
 [springs]
 stiffness_n_per_m = 400.0
 shear_stiffness_n_per_m = 200.0
-flexion = true
-[virtual_springs]
+bending = true
+[anchor_springs]
 stiffness_n_per_m = 5.0
 [damping]
 coefficient_n_s_per_m = 0.3
@@ -236,7 +236,7 @@ fn every_kind_of_force_and_tool_comes_through_exactly() {
     let rows: Vec<String> =
         (0..60).map(|k| format!("{},0.0,{},-0.2", 0.01 * f64::from(k), 0.01 * f64::from(k % 9))).collect();
     std::fs::write(folder.path().join("trace.csv"), format!("time_s,fx_n,fy_n,fz_n\n{}\n", rows.join("\n"))).unwrap();
-    let server = Server::start(&["--scenes", folder.path().to_str().unwrap()]);
+    let server = TestServer::start(&["--scenes", folder.path().to_str().unwrap()]);
     assert_same(&server, scene.to_str().unwrap(), &script);
     // By the name under which the server has it, too.
     let output = replay(&server, &script, &["--scene", "stiff"]);
@@ -265,7 +265,7 @@ falloff_offset = 0.0
 profile = { type = "pulse", on_s = 1.1, off_s = 1.15 }
 [[tissue]]
 at_s = 0.3
-virtual_stiffness_n_per_m = 7.0
+anchor_stiffness_n_per_m = 7.0
 [[tissue]]
 at_s = 0.55
 stiffness_n_per_m = 30.0
@@ -279,7 +279,7 @@ fn a_session_that_rests_gives_the_hash_of_the_run_offline_on_any_number_of_threa
     std::fs::write(&script, PAUSES).unwrap();
     let offline = run_held("paper", &script);
     for threads in ["1", "3"] {
-        let server = Server::start(&["--threads", threads]);
+        let server = TestServer::start(&["--threads", threads]);
         assert_same(&server, "paper", &script);
         for sampling in [
             &["--every", "20"][..],
@@ -316,9 +316,9 @@ profile = { type = "sine", frequency_hz = 5.0 }
 
 /// Asks for the only session until it satisfies `wanted`.
 #[cfg(unix)]
-async fn session_that(server: &Server, wanted: impl Fn(&pb::Session) -> bool) -> pb::Session {
+async fn session_that(server: &TestServer, wanted: impl Fn(&pb::Session) -> bool) -> pb::Session {
     let mut sessions = server.sessions().await;
-    let waited = tokio::time::timeout(PATIENCE, async {
+    let waited = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
             if let Some(session) = listed.into_iter().find(&wanted) {
@@ -333,7 +333,7 @@ async fn session_that(server: &Server, wanted: impl Fn(&pb::Session) -> bool) ->
 #[cfg(unix)]
 #[tokio::test]
 async fn time_waits_for_a_replay_that_stands_still() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let folder = tempfile::tempdir().unwrap();
     let script = folder.path().join("restless.toml");
     std::fs::write(&script, RESTLESS).unwrap();
@@ -361,7 +361,7 @@ async fn time_waits_for_a_replay_that_stands_still() {
 
 #[test]
 fn a_server_that_stops_in_mid_replay_is_told() {
-    let mut server = Server::start(&[]);
+    let mut server = TestServer::start(&[]);
     let folder = tempfile::tempdir().unwrap();
     let script = folder.path().join("long.toml");
     let text = std::fs::read_to_string(Path::new(ROOT).join("scripts/vertical-60.toml")).unwrap();
@@ -387,7 +387,7 @@ fn a_server_that_stops_in_mid_replay_is_told() {
 #[cfg(unix)]
 #[test]
 fn a_server_that_falls_silent_in_mid_replay_is_told() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let folder = tempfile::tempdir().unwrap();
     let script = folder.path().join("long.toml");
     std::fs::write(&script, "duration_s = 600.0\nsample_every_s = 0.001\nsample_points = [[0, 0]]\n").unwrap();
@@ -410,7 +410,7 @@ fn a_server_that_falls_silent_in_mid_replay_is_told() {
 
 #[test]
 fn what_a_replay_can_not_play_is_refused() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let script = Path::new(ROOT).join("scripts/vertical-60.toml");
     let refused = |output: Output, status: i32, expected: &str| {
         let message = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -449,7 +449,7 @@ fn what_a_replay_can_not_play_is_refused() {
 
 #[tokio::test]
 async fn a_replay_leaves_no_session_behind() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let folder = tempfile::tempdir().unwrap();
     let script = folder.path().join("short.toml");
     std::fs::write(&script, "duration_s = 0.05\nsample_every_s = 0.05\n").unwrap();
@@ -483,7 +483,7 @@ fn a_recovery_is_the_same_in_a_replay_and_offline_and_neither_calls_that_the_scr
     // The scene's error is not known, and looking for it would take long.
     let config = write("palpate.toml", "[limits]\nrehearsal_work = 1\n".to_owned());
     let config = ["--config", config.to_str().unwrap()];
-    let server = Server::start(&config);
+    let server = TestServer::start(&config);
     let through = replay(&server, &script, &["--scene", scene.to_str().unwrap()]);
     let offline = Command::new(env!("CARGO_BIN_EXE_palpate"))
         .args(["run", scene.to_str().unwrap(), script.to_str().unwrap(), "--held"])

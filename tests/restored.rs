@@ -24,7 +24,7 @@ use palpate::session::command::{Command, Due};
 use palpate::session::intake::Intake;
 use palpate::session::saved::Saved;
 use palpate::shape::PointId;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate_touch::{Coupling, Tip};
 
 /// Steps for which a restored session is compared with the one that was saved.
@@ -48,7 +48,7 @@ fn wanted() -> usize {
 
 /// What acts before a step.
 #[derive(Debug, Clone, Default)]
-struct Inputs {
+struct StepInputs {
     change: Option<Change>,
     due: Vec<Due>,
 }
@@ -145,7 +145,7 @@ fn tip(scene: &Scene, random: &mut Rng) -> Tip {
 }
 
 /// Whoever holds a tool: what it does now, and where.
-struct Hand {
+struct RandomHand {
     tool: u32,
     place_m: DVec3,
     velocity_m: DVec3,
@@ -154,11 +154,11 @@ struct Hand {
     point: PointId,
 }
 
-impl Hand {
+impl RandomHand {
     fn new(tool: u32, scene: &Scene, random: &mut Rng) -> Self {
         let shape = scene.shape();
         let point = any_point(shape, random);
-        let mut hand = Hand {
+        let mut hand = RandomHand {
             tool,
             place_m: shape.rest_m(point),
             velocity_m: DVec3::ZERO,
@@ -191,7 +191,7 @@ impl Hand {
             self.turn(scene, random);
         }
         if random.u8(0..40) == 0 {
-            *self = Hand::new(self.tool, scene, random);
+            *self = RandomHand::new(self.tool, scene, random);
             return Some(Command::new(self.tool, None, Action::Release));
         }
         self.place_m += self.velocity_m;
@@ -235,12 +235,12 @@ fn change(scene: &Scene, random: &mut Rng) -> Option<Change> {
     Some(Change {
         stiffness_n_per_m: random.bool().then_some(scene.springs.stiffness_n_per_m * factor),
         damping_n_s_per_m: random.bool().then_some(scene.damping_n_s_per_m * factor),
-        virtual_stiffness_n_per_m: random.bool().then_some(scene.virtual_stiffness_n_per_m * factor),
+        anchor_stiffness_n_per_m: random.bool().then_some(scene.anchor_stiffness_n_per_m * factor),
         volume_stiffness_pa: None,
     })
 }
 
-fn step(session: &mut Session, first: &Scene, inputs: &Inputs) {
+fn step(session: &mut Session, first: &Scene, inputs: &StepInputs) {
     if let Some(change) = &inputs.change
         && let Ok(model) = session.model().changed(change, first, &limits())
     {
@@ -260,23 +260,23 @@ fn told(session: &Session) -> (u128, String) {
 }
 
 /// A random session: what acted at each of its steps, and the bytes at some of them.
-struct Course {
+struct RandomSession {
     about: String,
     first: Scene,
     model: Arc<Model>,
-    inputs: Vec<Inputs>,
+    inputs: Vec<StepInputs>,
     saved: Vec<(u64, Vec<u8>)>,
     told: Vec<(u128, String)>,
 }
 
-fn course(seed: u64) -> Course {
+fn course(seed: u64) -> RandomSession {
     let mut random = Rng::with_seed(seed);
     let first = scene(&mut random);
     let model = Model::compile(&first, &limits()).unwrap();
     let mut session = Session::new(&model);
     let mut intake = Intake::new(&first, &limits());
     intake.acquire(&TOOLS, "test", 60.0, LEASE, 0).unwrap();
-    let mut hands: Vec<Hand> = TOOLS.iter().map(|tool| Hand::new(*tool, &first, &mut random)).collect();
+    let mut hands: Vec<RandomHand> = TOOLS.iter().map(|tool| RandomHand::new(*tool, &first, &mut random)).collect();
     let about = format!(
         "seed {seed}: {} {:?} {} substeps {}, sleep {:?}",
         first.name,
@@ -294,7 +294,7 @@ fn course(seed: u64) -> Course {
         if stops.contains(&now) {
             saved.push((now, session.save().to_bytes()));
         }
-        let mut inputs = Inputs { change: change(&first, &mut random), due: Vec::new() };
+        let mut inputs = StepInputs { change: change(&first, &mut random), due: Vec::new() };
         for hand in hands.iter_mut().filter(|_| (begin..end).contains(&now)) {
             if let Some(command) = hand.command(&first, now, &mut random) {
                 // What a server refuses, it refuses.
@@ -309,7 +309,7 @@ fn course(seed: u64) -> Course {
         all.push(inputs);
         course.push(told(&session));
     }
-    Course { about, first, model, inputs: all, saved, told: course }
+    RandomSession { about, first, model, inputs: all, saved, told: course }
 }
 
 #[test]
@@ -318,7 +318,7 @@ fn what_a_session_has_reached_its_snapshot_restores_with_the_same_bits() {
     let mut refused: BTreeMap<String, Vec<String>> = BTreeMap::new();
     let mut seed = 0;
     while tried < wanted {
-        let Course { about, first, model, inputs, saved, told: course } = course(seed);
+        let RandomSession { about, first, model, inputs, saved, told: course } = course(seed);
         seed += 1;
         for (at, bytes) in saved {
             tried += 1;

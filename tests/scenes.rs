@@ -16,7 +16,7 @@ point_mass_kg = 0.01
 [springs]
 stiffness_n_per_m = 20.0
 
-[virtual_springs]
+[anchor_springs]
 stiffness_n_per_m = 5.0
 
 [damping]
@@ -87,7 +87,7 @@ fn a_run_writes_a_header_records_and_a_summary() {
         let [pushed, grasped] = record["points"].as_array().unwrap().as_slice() else { panic!() };
         assert_eq!((&pushed["point"], &grasped["point"]), (&serde_json::json!([4, 3]), &serde_json::json!([1, 1])));
         for key in
-            ["displacement_m", "velocity_m_per_s", "spring_n", "virtual_n", "damping_n", "applied_n", "reaction_n"]
+            ["displacement_m", "velocity_m_per_s", "spring_n", "anchor_n", "damping_n", "applied_n", "reaction_n"]
         {
             assert_eq!(pushed[key].as_array().unwrap().len(), 3);
         }
@@ -145,7 +145,7 @@ fn a_bad_scene_is_refused_with_file_line_and_key() {
         ("points = [9, 7]", "points = [9.5, 7]", "scene.toml:4: sheet.points[0]: must be a whole number, but is 9.5"),
         ("points = [9, 7]", "points = [61.0, 7]", "sheet.points[0]: must be a whole number, but is 61.0: write 61"),
         ("spacing_m = 0.05", "spacing_m = \"0.05\"", "must be a number, but is a string: write 0.05 without"),
-        ("[virtual_springs]", "[virtual]", "virtual: unknown key; did you mean `virtual_springs`?"),
+        ("[anchor_springs]", "[anchor]", "anchor: unknown key; did you mean `anchor_springs`?"),
         ("[springs]", "[spring]", "scene.toml:8: spring: unknown key; did you mean `springs`?"),
         ("[springs]", "fixed = \"edge\"\n[springs]", "but is `edge`; did you mean `edges`?"),
         ("[damping]", "[stepping]\nintegrator = \"centrl\"\n[damping]", "but is `centrl`; did you mean `central`?"),
@@ -463,7 +463,7 @@ fn a_sheet_of_one_point_is_a_pendulum_and_a_line_is_a_string() {
     for points in ["[1, 1]", "[1, 9]", "[9, 1]", "[2, 2]"] {
         let scene = SCENE.replace("[9, 7]", points);
         let script = SCRIPT.replace("[4, 3]", "[0, 0]");
-        let sets = ["--set", "springs.flexion=true"];
+        let sets = ["--set", "springs.bending=true"];
         let lines = lines(&run(&scene, &script, &sets));
         assert!(lines[3]["points"][0]["displacement_m"][2].as_f64().unwrap() < -0.01, "{points}");
     }

@@ -16,7 +16,7 @@ use palpate::scene::{self, Scene, reader};
 use palpate::session::Session;
 use palpate::session::command::Command;
 use palpate::session::run;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 
 fn built_in(scene: &str, sets: &[&str]) -> Scene {
     let (_, text) = scene::BUILT_IN.iter().find(|(name, _)| *name == scene).unwrap();
@@ -192,13 +192,13 @@ fn a_force_in_all_is_that_force_wherever_the_points_are() {
     }
 }
 
-/// Liver with points twice as close: mass, virtual springs and damping are those of an area.
+/// Liver with points twice as close: mass, anchor springs and damping are those of an area.
 fn finer(scene: &Scene) -> Scene {
     let mut finer = scene.clone();
     finer.sheet_mut().unwrap().points = scene.sheet().unwrap().points.map(|points| 2 * points - 1);
     finer.sheet_mut().unwrap().spacing_m /= 2.0;
     finer.sheet_mut().unwrap().point_mass_kg /= 4.0;
-    finer.virtual_stiffness_n_per_m /= 4.0;
+    finer.anchor_stiffness_n_per_m /= 4.0;
     finer.damping_n_s_per_m /= 4.0;
     finer
 }

@@ -8,7 +8,7 @@ use std::process::Command;
 
 use palpate_proto::pb;
 use pb::create_session_request::Source;
-use server::{PATIENCE, Server, Touch, force, open, palpate, told};
+use server::{TEST_TIMEOUT, TestServer, TestTouch, force, open, palpate, told};
 use tonic::Code;
 
 fn paper() -> pb::Scene {
@@ -19,7 +19,7 @@ fn paper() -> pb::Scene {
 
 #[tokio::test]
 async fn sessions_are_made_listed_and_deleted() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let mut sessions = server.sessions().await;
     let names = sessions.list_scenes(pb::ListScenesRequest {}).await.unwrap().into_inner().scene_names;
     assert!(names.contains(&"paper".to_owned()), "{names:?}");
@@ -35,7 +35,7 @@ async fn sessions_are_made_listed_and_deleted() {
     let ids: Vec<_> = listed.iter().map(|session| session.session_id.clone()).collect();
     assert_eq!(ids, [by_name.session_id.clone(), own.session_id.clone()]);
     // Deleting tells every stream.
-    let mut touch = Touch::hold(&server, &own.session_id).await;
+    let mut touch = TestTouch::hold(&server, &own.session_id).await;
     let request = pb::DeleteSessionRequest { session_id: own.session_id.clone() };
     sessions.delete_session(request.clone()).await.unwrap();
     let ended = loop {
@@ -51,7 +51,7 @@ async fn sessions_are_made_listed_and_deleted() {
 
 #[tokio::test]
 async fn bad_scenes_are_refused_with_the_field() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     type Change = fn(&mut pb::Scene);
     let cases: [(Change, Code, &str, &str); 13] = [
         (|s| s.sheet.as_mut().unwrap().points_x = Some(0), Code::InvalidArgument, "OUT_OF_RANGE", "sheet.points"),
@@ -116,7 +116,7 @@ async fn bad_scenes_are_refused_with_the_field() {
                 s.sheet.as_mut().unwrap().fixed = Some(pb::sheet::Fixed::FixedPoints(pb::GridPoints { points }));
             },
             Code::InvalidArgument,
-            "OFF_SHEET",
+            "OFF_TISSUE",
             "sheet.fixed[0]",
         ),
         (
@@ -146,7 +146,7 @@ async fn bad_scenes_are_refused_with_the_field() {
 
 #[tokio::test]
 async fn a_paused_session_stands_and_a_started_one_goes_as_far_as_it_should() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
     server.start_until(&session, 25).await;
     let hash = server.hash_at(&session, 25).await;
@@ -175,13 +175,13 @@ async fn a_paused_session_stands_and_a_started_one_goes_as_far_as_it_should() {
 async fn the_same_scene_and_commands_give_the_same_hash_on_any_number_of_threads() {
     let mut hashes = Vec::new();
     for threads in ["1", "3"] {
-        let server = Server::start(&["--threads", threads]);
+        let server = TestServer::start(&["--threads", threads]);
         // Other sessions make other schedules.
         for _ in 0..5 {
             server.paper(false).await;
         }
         let session = server.paper(true).await;
-        let mut touch = Touch::hold(&server, &session).await;
+        let mut touch = TestTouch::hold(&server, &session).await;
         for step in 0..200 {
             let command = force(0, step + 1, -1.0 - 0.001 * step as f64);
             touch.command(pb::Command { at_step: Some(step), ..command }).await;
@@ -199,7 +199,7 @@ async fn a_session_too_heavy_for_its_rate_slows_its_own_time_and_says_so() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, "[limits]\nperiods_per_step = 20.0\n").unwrap();
-    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let server = TestServer::start(&["--config", config.to_str().unwrap()]);
     let mut heavy = paper();
     let sheet = heavy.sheet.as_mut().unwrap();
     // No machine does 400,000 points 10,000 times a second on one core.
@@ -209,14 +209,15 @@ async fn a_session_too_heavy_for_its_rate_slows_its_own_time_and_says_so() {
     let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
     let mut samples = server.haptics().await.watch_samples(request).await.unwrap().into_inner();
     // The same force everywhere: all of it moves. At rest it would cost nothing.
-    let touch = Touch::hold(&server, &session).await;
+    let touch = TestTouch::hold(&server, &session).await;
     let mut everywhere = force(0, 1, -1.0);
     let Some(pb::command::Action::Force(force)) = &mut everywhere.action else { unreachable!() };
     force.falloff_per_m = Some(0.0);
     touch.command(everywhere).await;
     let mut last: Option<pb::Sample> = None;
     loop {
-        let sample = tokio::time::timeout(PATIENCE, samples.message()).await.unwrap().unwrap().unwrap().sample.unwrap();
+        let sample =
+            tokio::time::timeout(TEST_TIMEOUT, samples.message()).await.unwrap().unwrap().unwrap().sample.unwrap();
         if let Some(last) = last {
             // No step is longer than another, and none is left out: time is what gives way.
             assert!((sample.simulation_time_s - sample.step as f64 * 1e-4).abs() < 1e-12);
@@ -232,8 +233,8 @@ async fn a_session_too_heavy_for_its_rate_slows_its_own_time_and_says_so() {
 }
 
 /// Asks until the session rests.
-async fn rested(server: &Server, session: &str) -> pb::Session {
-    let until = std::time::Instant::now() + PATIENCE;
+async fn rested(server: &TestServer, session: &str) -> pb::Session {
+    let until = std::time::Instant::now() + TEST_TIMEOUT;
     loop {
         let status = server.status(session).await;
         if status.resting {
@@ -246,7 +247,7 @@ async fn rested(server: &Server, session: &str) -> pb::Session {
 
 #[tokio::test]
 async fn time_goes_on_at_rest_without_steps_and_without_overruns() {
-    let server = Server::start(&["--threads", "1"]);
+    let server = TestServer::start(&["--threads", "1"]);
     let session = server.paper(false).await;
     let first = rested(&server, &session).await;
     let later = loop {
@@ -290,7 +291,7 @@ async fn time_goes_on_at_rest_without_steps_and_without_overruns() {
 
 #[tokio::test]
 async fn the_state_after_rest_is_that_of_a_session_that_was_stepped_all_the_time() {
-    let server = Server::start(&["--threads", "1"]);
+    let server = TestServer::start(&["--threads", "1"]);
     let mut hashes = Vec::new();
     for probed in [false, true] {
         let session = server.paper(true).await;
@@ -300,7 +301,7 @@ async fn the_state_after_rest_is_that_of_a_session_that_was_stepped_all_the_time
         let probe = pb::ProbeRequest { session_id: session.clone(), r#where, ..Default::default() };
         let mut haptics = server.haptics().await;
         let records = if probed { Some(haptics.probe(probe).await.unwrap()) } else { None };
-        let mut touch = Touch::hold(&server, &session).await;
+        let mut touch = TestTouch::hold(&server, &session).await;
         touch.command(pb::Command { at_step: Some(400), ..force(0, 1, -1.0) }).await;
         touch.settle().await;
         server.start_until(&session, 450).await;
@@ -315,9 +316,9 @@ async fn the_state_after_rest_is_that_of_a_session_that_was_stepped_all_the_time
 
 #[tokio::test]
 async fn a_command_wakes_a_session_at_the_step_that_is_next() {
-    let server = Server::start(&["--threads", "1"]);
+    let server = TestServer::start(&["--threads", "1"]);
     let session = server.paper(false).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     let mut sequence = 0;
     for at_step in [None, Some(0)] {
         let before = rested(&server, &session).await;
@@ -339,9 +340,10 @@ async fn a_command_wakes_a_session_at_the_step_that_is_next() {
 
 #[tokio::test]
 async fn a_lease_lapses_at_rest_at_its_step() {
-    let server = Server::start(&["--threads", "1"]);
+    let server = TestServer::start(&["--threads", "1"]);
     let session = server.paper(false).await;
-    let mut touch = Touch::open(&server, pb::TouchOpen { lease_s: Some(0.1), ..open(&session, &[0]) }).await.unwrap();
+    let mut touch =
+        TestTouch::open(&server, pb::TouchOpen { lease_s: Some(0.1), ..open(&session, &[0]) }).await.unwrap();
     let opened = touch.opened.take().unwrap();
     // Nobody asks for anything. Of the step, not of the time at which a busy machine does it.
     let expired = touch.sample_with(|sample| sample.tools[0].expired).await;
@@ -352,7 +354,7 @@ async fn a_lease_lapses_at_rest_at_its_step() {
 #[cfg(target_os = "linux")]
 #[tokio::test]
 async fn with_nothing_awake_the_stepping_threads_sleep() {
-    let server = Server::start(&["--threads", "2"]);
+    let server = TestServer::start(&["--threads", "2"]);
     for _ in 0..20 {
         let session = server.paper(false).await;
         rested(&server, &session).await;
@@ -367,7 +369,7 @@ async fn with_nothing_awake_the_stepping_threads_sleep() {
         };
         steps.filter(|status| status.starts_with("Name:\tstep-")).map(|status| of(&status)).collect::<Vec<_>>()
     };
-    let until = std::time::Instant::now() + PATIENCE;
+    let until = std::time::Instant::now() + TEST_TIMEOUT;
     loop {
         // The last of them may be on its way to sleep.
         let before = sleeps();
@@ -386,18 +388,18 @@ async fn sessions_and_streams_have_a_limit() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, "threads = 1\n[limits]\nsessions = 2\nstreams_per_session = 1\n").unwrap();
-    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let server = TestServer::start(&["--config", config.to_str().unwrap()]);
     let session = server.paper(true).await;
     server.paper(true).await;
     let status = server.create(Source::SceneName("paper".into()), true).await.unwrap_err();
     assert_eq!(told(&status), (Code::ResourceExhausted, "TOO_MANY".into(), String::new()));
-    let touch = Touch::hold(&server, &session).await;
-    let refused = Touch::open(&server, open(&session, &[1])).await.err().unwrap();
+    let touch = TestTouch::hold(&server, &session).await;
+    let refused = TestTouch::open(&server, open(&session, &[1])).await.err().unwrap();
     assert_eq!(told(&refused).1, "TOO_MANY");
     // Room again when a stream has ended.
     drop(touch);
-    let until = std::time::Instant::now() + PATIENCE;
-    while Touch::open(&server, open(&session, &[1])).await.is_err() {
+    let until = std::time::Instant::now() + TEST_TIMEOUT;
+    while TestTouch::open(&server, open(&session, &[1])).await.is_err() {
         assert!(std::time::Instant::now() < until);
         tokio::time::sleep(std::time::Duration::from_millis(10)).await;
     }
@@ -405,7 +407,7 @@ async fn sessions_and_streams_have_a_limit() {
 
 #[tokio::test]
 async fn a_session_that_nobody_uses_is_deleted_and_one_in_use_stays() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let make = |idle_timeout_s: f64| pb::CreateSessionRequest {
         source: Some(Source::SceneName("paper".into())),
         idle_timeout_s: Some(idle_timeout_s),
@@ -417,8 +419,8 @@ async fn a_session_that_nobody_uses_is_deleted_and_one_in_use_stays() {
     }
     let unused = sessions.create_session(make(0.2)).await.unwrap().into_inner().session.unwrap();
     let used = sessions.create_session(make(0.2)).await.unwrap().into_inner().session.unwrap();
-    let mut touch = Touch::hold(&server, &used.session_id).await;
-    let until = std::time::Instant::now() + PATIENCE;
+    let mut touch = TestTouch::hold(&server, &used.session_id).await;
+    let until = std::time::Instant::now() + TEST_TIMEOUT;
     loop {
         let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
         assert!(listed.iter().any(|session| session.session_id == used.session_id));
@@ -433,7 +435,7 @@ async fn a_session_that_nobody_uses_is_deleted_and_one_in_use_stays() {
 
 #[tokio::test]
 async fn a_session_beyond_the_limits_of_the_server_is_refused() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let mut scene = paper();
     let sheet = scene.sheet.as_mut().unwrap();
     (sheet.points_x, sheet.points_y) = (Some(1000), Some(1000));
@@ -448,7 +450,7 @@ async fn a_session_beyond_the_limits_of_the_server_is_refused() {
 
 #[tokio::test]
 async fn health_is_served() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let mut health = tonic_health::pb::health_client::HealthClient::new(server.channel().await);
     for service in ["", "palpate.v1.SessionService", "palpate.v1.HapticService", "palpate.v1.ViewService"] {
         let request = tonic_health::pb::HealthCheckRequest { service: service.into() };
@@ -460,9 +462,9 @@ async fn health_is_served() {
 #[tokio::test]
 async fn shutdown_tells_open_streams_and_ends_before_the_deadline() {
     // Who waits for the deadline waits for longer than anybody here.
-    let mut server = Server::start(&["--shutdown-deadline-s", "3600"]);
+    let mut server = TestServer::start(&["--shutdown-deadline-s", "3600"]);
     let session = server.paper(false).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     touch.command(force(0, 1, -1.0)).await;
     touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
     let killed = Command::new("kill").arg(server.child.id().to_string()).status().unwrap();
@@ -482,13 +484,13 @@ async fn shutdown_tells_open_streams_and_ends_before_the_deadline() {
             tokio::time::sleep(std::time::Duration::from_millis(10)).await;
         }
     };
-    assert!(tokio::time::timeout(PATIENCE, waited).await.expect("it does not end").success());
+    assert!(tokio::time::timeout(TEST_TIMEOUT, waited).await.expect("it does not end").success());
 }
 
 #[cfg(unix)]
 #[tokio::test]
 async fn a_stream_that_will_not_end_is_cut_at_the_deadline() {
-    let mut server = Server::start(&["--shutdown-deadline-s", "0.3"]);
+    let mut server = TestServer::start(&["--shutdown-deadline-s", "0.3"]);
     let session = server.paper(true).await;
     // A connection that holds a stream open and reads nothing of it.
     let request = pb::WatchFramesRequest {
@@ -501,14 +503,14 @@ async fn a_stream_that_will_not_end_is_cut_at_the_deadline() {
     let stalled = server.views().await.watch_frames(request).await.unwrap();
     Command::new("kill").arg(server.child.id().to_string()).status().unwrap();
     let waited = tokio::task::spawn_blocking(move || server.child.wait().unwrap());
-    let status = tokio::time::timeout(PATIENCE, waited).await.unwrap().unwrap();
+    let status = tokio::time::timeout(TEST_TIMEOUT, waited).await.unwrap().unwrap();
     assert!(status.success());
     drop(stalled);
 }
 
 #[tokio::test]
 async fn a_port_in_use_is_told() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let address = server.url.strip_prefix("http://").unwrap();
     let second = palpate(&["serve", "--listen", address]);
     let message = String::from_utf8_lossy(&second.stderr).into_owned();
@@ -573,7 +575,7 @@ async fn who_watches_the_health_is_told_first_and_not_waited_for() {
     use tonic_health::pb::HealthCheckRequest;
     use tonic_health::pb::health_client::HealthClient;
     // A deadline that the test would not outlive.
-    let mut server = Server::start(&["--shutdown-deadline-s", "3600"]);
+    let mut server = TestServer::start(&["--shutdown-deadline-s", "3600"]);
     let mut health = HealthClient::new(server.channel().await);
     let mut watching = health.watch(HealthCheckRequest::default()).await.unwrap().into_inner();
     assert_eq!(watching.message().await.unwrap().unwrap().status, Serving as i32);
@@ -581,7 +583,7 @@ async fn who_watches_the_health_is_told_first_and_not_waited_for() {
     assert_eq!(watching.message().await.unwrap().unwrap().status, NotServing as i32);
     assert!(watching.message().await.unwrap().is_none());
     let ended = tokio::task::spawn_blocking(move || server.child.wait().unwrap());
-    assert!(tokio::time::timeout(PATIENCE, ended).await.unwrap().unwrap().success());
+    assert!(tokio::time::timeout(TEST_TIMEOUT, ended).await.unwrap().unwrap().success());
 }
 
 #[cfg(unix)]
@@ -589,14 +591,14 @@ async fn who_watches_the_health_is_told_first_and_not_waited_for() {
 async fn who_watches_the_health_and_does_not_read_holds_up_no_shutdown() {
     use tonic_health::pb::HealthCheckRequest;
     use tonic_health::pb::health_client::HealthClient;
-    let mut server = Server::start(&["--shutdown-deadline-s", "3600"]);
+    let mut server = TestServer::start(&["--shutdown-deadline-s", "3600"]);
     // Not a byte of an answer may be sent.
     let endpoint = tonic::transport::Channel::from_shared(server.url.clone()).unwrap().initial_stream_window_size(0);
     let mut health = HealthClient::new(endpoint.connect().await.unwrap());
     let _watching = health.watch(HealthCheckRequest::default()).await.unwrap();
     assert!(Command::new("kill").arg(server.child.id().to_string()).status().unwrap().success());
     let ended = tokio::task::spawn_blocking(move || server.child.wait().unwrap());
-    assert!(tokio::time::timeout(PATIENCE, ended).await.unwrap().unwrap().success());
+    assert!(tokio::time::timeout(TEST_TIMEOUT, ended).await.unwrap().unwrap().success());
 }
 
 /// Springs far too stiff for the substeps that the scene gives: no error can be expected.
@@ -606,7 +608,7 @@ async fn an_expected_error_is_always_finite() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, "[limits]\nrehearsal_work = 1\n").unwrap();
-    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let server = TestServer::start(&["--config", config.to_str().unwrap()]);
     let mut unknown = paper();
     unknown.springs.as_mut().unwrap().stiffness_n_per_m = Some(1e9);
     unknown.springs.as_mut().unwrap().shear_stiffness_n_per_m = None;
@@ -627,14 +629,14 @@ async fn an_expected_error_is_always_finite() {
         );
     }
     // Of a scene whose tolerance is kept it is what is expected.
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let known = server.create(Source::SceneName("paper".into()), true).await.unwrap();
     assert!(known.expected_error > 0.0 && known.expected_error < 1e-2, "{}", known.expected_error);
 }
 
 #[tokio::test]
 async fn a_session_tells_where_its_tissue_rests() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.create(Source::SceneName("liver".into()), false).await.unwrap();
     let extent = session.extent.unwrap();
     let place = |place: Option<pb::Vector3>| place.map(|place| [place.x, place.y, place.z]);

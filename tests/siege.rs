@@ -26,13 +26,13 @@ mod server;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use attack::{Attack, Ground, Kind, Toll};
-use caller::{Caller, Keys};
+use attack::{Attack, AttackKind, Ground, Toll};
+use caller::{TestCaller, TokenFile};
 use cores::{descriptors, kept_to, peak, resident, threads};
 use fastrand::Rng;
-use honest::{Account, Honest, Newcomers};
+use honest::{ClientLedger, Honest, Newcomers};
 use palpate::server::identity::Role;
-use server::{PATIENCE, Server};
+use server::{TEST_TIMEOUT, TestServer};
 
 const ATTACKERS: u64 = 8;
 const HONEST: u64 = 4;
@@ -53,13 +53,13 @@ fn environment(name: &str) -> Option<u64> {
 }
 
 /// The attacks that eight may do at once, at random, again and again.
-fn mixable() -> Vec<&'static Kind> {
+fn mixable() -> Vec<&'static AttackKind> {
     attack::KINDS.iter().filter(|kind| !kind.name.starts_with("stall-")).collect()
 }
 
 struct Besieged {
-    server: Server,
-    keys: Arc<Keys>,
+    server: TestServer,
+    keys: Arc<TokenFile>,
     /// Where the metrics are.
     metrics: String,
     /// Descriptors and threads of a server that has nothing to do.
@@ -67,7 +67,7 @@ struct Besieged {
 }
 
 impl Besieged {
-    fn start(keys: Keys) -> Self {
+    fn start(keys: TokenFile) -> Self {
         // What nobody uses any more goes soon.
         let config = keys.beside("palpate.toml", "idle_session_s = 2.0\n");
         let mut arguments = vec!["--tokens", keys.file(), "--metrics", "127.0.0.1:0", "--threads", "1"];
@@ -75,7 +75,7 @@ impl Besieged {
         let budget = BUDGET.to_string();
         arguments.extend(["--memory", &budget]);
         // Attackers do not take the server's core from it, but only its time.
-        let mut server = kept_to(true, || Server::start(&arguments));
+        let mut server = kept_to(true, || TestServer::start(&arguments));
         // A log that nobody reads would hold the server up.
         let mut log = server.child.stderr.take().unwrap();
         std::thread::spawn(move || std::io::copy(&mut log, &mut std::io::stderr()));
@@ -103,7 +103,7 @@ impl Besieged {
     /// Waits until `is`, for as long as any machine may need.
     fn until(&self, is: impl Fn(&Self) -> bool) -> bool {
         let begun = Instant::now();
-        while begun.elapsed() < PATIENCE {
+        while begun.elapsed() < TEST_TIMEOUT {
             if is(self) {
                 return true;
             }
@@ -128,7 +128,7 @@ fn attacker(besieged: &Besieged, number: u64, seed: u64, token: &str, shared: &s
         // Half of the time what is merely legal.
         let kind =
             if random.bool() { attack::named("legal-calls").unwrap() } else { kinds[random.usize(..kinds.len())] };
-        let caller = Caller::new(&besieged.server.url, token);
+        let caller = TestCaller::new(&besieged.server.url, token);
         let mut ground = Ground::new(caller, shared, besieged.process(), &besieged.keys);
         // A machine without optimization does a twentieth of the work in the same time.
         ground.scale = if cfg!(debug_assertions) { 0.01 } else { 0.25 };
@@ -153,7 +153,7 @@ fn weather(besieged: &Besieged, seed: u64, shared: &str, until: Instant) -> u64 
     while Instant::now() < until {
         std::thread::sleep(Duration::from_millis(random.u64(4000..9000)));
         let kind = attack::named(WEATHER[random.usize(..WEATHER.len())]).unwrap();
-        let caller = Caller::new(&besieged.server.url, "nobody");
+        let caller = TestCaller::new(&besieged.server.url, "nobody");
         let attack = Attack::start(kind.run, Ground::new(caller, shared, besieged.process(), &besieged.keys));
         std::thread::sleep(Duration::from_millis(1200));
         stalls += attack.end().strikes;
@@ -165,7 +165,7 @@ fn weather(besieged: &Besieged, seed: u64, shared: &str, until: Instant) -> u64 
 fn honest_clients_outlive_a_siege_and_all_is_given_back() {
     let (seconds, seed) =
         (environment("PALPATE_SIEGE_S").unwrap_or(30), environment("PALPATE_SIEGE_SEED").unwrap_or(16));
-    let keys = Keys::new();
+    let keys = TokenFile::new();
     let admit = |name: &str, number: u64| keys.admit(&format!("{name}-{number}"), &[Role::Create, Role::Touch]);
     let honest: Vec<String> = (0..HONEST).map(|number| admit("honest", number)).collect();
     let attackers: Vec<String> = (0..ATTACKERS).map(|number| admit("attacker", number)).collect();
@@ -173,15 +173,15 @@ fn honest_clients_outlive_a_siege_and_all_is_given_back() {
     let mut besieged = Besieged::start(keys);
     let url = besieged.server.url.clone();
     let (clients, newcomers) = kept_to(false, || {
-        let clients: Vec<Honest> = honest.iter().map(|token| Honest::start(Caller::new(&url, token), 1)).collect();
+        let clients: Vec<Honest> = honest.iter().map(|token| Honest::start(TestCaller::new(&url, token), 1)).collect();
         let shared = clients[0].session_id.clone();
-        let newcomers = Newcomers::start(Caller::new(&url, &newcomer), shared, PATIENCE);
+        let newcomers = Newcomers::start(TestCaller::new(&url, &newcomer), shared, TEST_TIMEOUT);
         (clients, newcomers)
     });
     let shared = clients[0].session_id.clone();
     let begun = Instant::now();
     let until = begun + Duration::from_secs(seconds);
-    let mut accounts: Vec<Account> = clients.iter().map(|_| Account::default()).collect();
+    let mut accounts: Vec<ClientLedger> = clients.iter().map(|_| ClientLedger::default()).collect();
     let (tolls, stalls) = std::thread::scope(|scope| {
         let attackers: Vec<_> = (0..)
             .zip(&attackers)
@@ -203,7 +203,7 @@ fn honest_clients_outlive_a_siege_and_all_is_given_back() {
                 continue;
             }
             last = Instant::now();
-            let mut all = Account::default();
+            let mut all = ClientLedger::default();
             for (client, account) in clients.iter().zip(&mut accounts) {
                 let part = client.take();
                 account.add(&part);
@@ -252,11 +252,11 @@ fn honest_clients_outlive_a_siege_and_all_is_given_back() {
         welcome.reasons
     );
     let silent = welcome.reasons.get("DeadlineExceeded: no answer").copied().unwrap_or(0);
-    must(silent == 0, format!("{silent} newcomers had no answer in {PATIENCE:?}"));
+    must(silent == 0, format!("{silent} newcomers had no answer in {TEST_TIMEOUT:?}"));
     // What attackers have left goes; then there is room.
     let given_back = besieged.until(|besieged| besieged.gauge("palpate_sessions") == Some(HONEST as f64));
     must(given_back, format!("{:?} sessions stay, of {HONEST} that are in use", besieged.gauge("palpate_sessions")));
-    let late = Newcomers::start(Caller::new(&url, &newcomer), clients[1].session_id.clone(), PATIENCE).end();
+    let late = Newcomers::start(TestCaller::new(&url, &newcomer), clients[1].session_id.clone(), TEST_TIMEOUT).end();
     must(late.served == 1, format!("when it is over, a newcomer is not served: {:?}", late.reasons));
     for (number, (client, account)) in clients.into_iter().zip(&mut accounts).enumerate() {
         let verdict = client.end();

@@ -14,7 +14,7 @@ use std::task::{Context, Poll, Waker};
 
 use glam::DVec3;
 use palpate::limits::Limits;
-use palpate::pace::queue::{Reader, Writer, queue};
+use palpate::realtime::queue::{Reader, Writer, queue};
 use palpate::refusal::Reason;
 use palpate::scene::profile::Poke;
 use palpate::scene::script::Action;
@@ -23,7 +23,7 @@ use palpate::session::intake::Intake;
 use palpate::session::lease::LeaseId;
 use palpate::session::schedule::Schedule;
 use palpate::session::{Sample, Session};
-use random::Random;
+use random::TestRandom;
 
 const MS: u64 = 1_000_000;
 const STEPS: u64 = 1500;
@@ -46,7 +46,7 @@ enum Said {
 type Message = (u64, usize, u64, usize, Said);
 
 #[derive(Default)]
-struct Client {
+struct SimulatedClient {
     /// Tool and lease that it believes to hold.
     held: Option<(u32, LeaseId)>,
     sequence: u64,
@@ -62,7 +62,7 @@ struct Client {
 }
 
 #[derive(Debug, Default, PartialEq)]
-struct Course {
+struct ClientHistory {
     hash: u128,
     accepted: u64,
     refused: BTreeMap<&'static str, u64>,
@@ -79,16 +79,16 @@ fn poll<T>(reader: &mut Reader<T>) -> Option<(T, u64)> {
     }
 }
 
-fn course(seed: u64) -> Course {
-    let mut random = Random(seed);
+fn course(seed: u64) -> ClientHistory {
+    let mut random = TestRandom(seed);
     let limits = Limits { queued_commands_per_tool: 16, ..Limits::default() };
     let scene = common::scene(common::SMALL);
     let (mut session, mut intake) = (Session::new(&common::model(&scene)), Intake::new(&scene, &limits));
-    let mut clients: Vec<Client> = (0..CLIENTS).map(|_| Client::default()).collect();
+    let mut clients: Vec<SimulatedClient> = (0..CLIENTS).map(|_| SimulatedClient::default()).collect();
     // By when it arrives, earliest first; of the same moment one client's before another's, and another time after it.
     let mut network: BinaryHeap<Reverse<Message>> = BinaryHeap::new();
     let mut serial = 0;
-    let mut found = Course::default();
+    let mut found = ClientHistory::default();
     let (mut submitted, mut refused, mut due, mut leases) = (0, 0, Vec::new(), 0_u128);
     // Of each tool, the last word of its holder that was taken in.
     let mut last_word: BTreeMap<u32, u64> = BTreeMap::new();
@@ -102,7 +102,7 @@ fn course(seed: u64) -> Course {
             match random.below(1000) {
                 0..=2 => {
                     // All it knew is gone, and what it had under way still arrives.
-                    *client = Client { crashed_until: step + random.below(200), ..Client::default() };
+                    *client = SimulatedClient { crashed_until: step + random.below(200), ..SimulatedClient::default() };
                     client.last_arrival = step;
                     continue;
                 }
@@ -232,7 +232,7 @@ fn course(seed: u64) -> Course {
 
 #[test]
 fn whatever_the_network_does_all_is_accounted_for_and_no_tool_stays_held() {
-    let mut all = Course::default();
+    let mut all = ClientHistory::default();
     for seed in 0..60 {
         let found = course(seed);
         all.accepted += found.accepted;

@@ -20,7 +20,7 @@ use palpate::limits::Limits;
 use palpate::scene::Scene;
 use palpate::scene::profile::Poke;
 use palpate::shape::PointId;
-use palpate::sheet::{self, Grasp, Model, Push, Tissue};
+use palpate::tissue::{self, Grasp, Model, Push, Tissue};
 use palpate_touch::Tip;
 use thin_mesh::thread;
 
@@ -48,7 +48,7 @@ fn scene(folder: &std::path::Path, dice: &mut fastrand::Rng, sleep_tolerance: f6
         let of_place = stiffness / ratio;
         format!(
             "[sheet]\npoints = [{nx}, {ny}]\nspacing_m = {spacing_m}\npoint_mass_kg = {mass}\nfixed = {}\n[springs]\n\
-             stiffness_n_per_m = {stiffness:e}\nflexion = {}\n[virtual_springs]\nstiffness_n_per_m = {of_place:e}\n[damping]\n\
+             stiffness_n_per_m = {stiffness:e}\nbending = {}\n[anchor_springs]\nstiffness_n_per_m = {of_place:e}\n[damping]\n\
              coefficient_n_s_per_m = {:e}\n{rest}",
             ["[]", "\"edges\"", "\"corners\""][dice.usize(0..3)],
             dice.bool(),
@@ -57,11 +57,11 @@ fn scene(folder: &std::path::Path, dice: &mut fastrand::Rng, sleep_tolerance: f6
     } else {
         let mesh = thread(0.02, 0.08, dice.u32(16..33), dice.u32(16..41));
         std::fs::write(folder.join("mesh.obj"), mesh.obj()).unwrap();
-        let bed = 10.0 * (turn / 1e-3).powi(2) / (10.0 * ratio + 1.0);
-        let youngs_modulus_pa = ratio * bed * 0.004 * 0.004 / 1e-3;
+        let foundation = 10.0 * (turn / 1e-3).powi(2) / (10.0 * ratio + 1.0);
+        let youngs_modulus_pa = ratio * foundation * 0.004 * 0.004 / 1e-3;
         format!(
             "[mesh]\nfile = \"mesh.obj\"\nunit = \"m\"\n[material]\nyoungs_modulus_pa = {youngs_modulus_pa:e}\nthickness_m = 1e-3\n\
-             depth_m = 0.03\nbed_n_per_m3 = {bed:e}\ndamping_ratio = {zeta:e}\n{rest}"
+             depth_m = 0.03\nfoundation_n_per_m3 = {foundation:e}\ndamping_ratio = {zeta:e}\n{rest}"
         )
     };
     let limits = Limits { substeps: 40, ..Limits::default() };
@@ -73,7 +73,7 @@ fn scene(folder: &std::path::Path, dice: &mut fastrand::Rng, sleep_tolerance: f6
 }
 
 /// What a tool does from a step on.
-enum Act {
+enum ToolChange {
     /// Holds a point and takes it along at a speed, m/s, after a jump, m.
     Grasp(PointId, DVec3, DVec3),
     /// Leads a tip from a place at a speed.
@@ -82,19 +82,19 @@ enum Act {
     Release,
 }
 
-impl Act {
+impl ToolChange {
     /// Where it acts, m.
     fn place_m(&self, model: &Model) -> Option<DVec3> {
         match self {
-            Act::Grasp(point, ..) => Some(model.scene.shape().rest_m(*point)),
-            Act::Pose(place_m, ..) => Some(*place_m),
-            Act::Push(push) => Some(push.centre_m),
-            Act::Release => None,
+            ToolChange::Grasp(point, ..) => Some(model.scene.shape().rest_m(*point)),
+            ToolChange::Pose(place_m, ..) => Some(*place_m),
+            ToolChange::Push(push) => Some(push.centre_m),
+            ToolChange::Release => None,
         }
     }
 }
 
-fn random_act(model: &Model, dice: &mut fastrand::Rng) -> Act {
+fn random_act(model: &Model, dice: &mut fastrand::Rng) -> ToolChange {
     let shape = model.scene.shape();
     let point = loop {
         let point = PointId::new(dice.usize(0..shape.point_count()));
@@ -107,7 +107,7 @@ fn random_act(model: &Model, dice: &mut fastrand::Rng) -> Act {
     let (jump_m, way) = (edge_m * random(), random());
     let speed = [0.0, 0.05, 0.5][dice.usize(0..3)];
     match dice.u8(0..6) {
-        0 | 1 => Act::Grasp(point, [0.0, 1.0][dice.usize(0..2)] * jump_m, speed * way),
+        0 | 1 => ToolChange::Grasp(point, [0.0, 1.0][dice.usize(0..2)] * jump_m, speed * way),
         2 | 3 => {
             let tip = Tip {
                 radius_m: edge_m * (0.5 + 3.0 * dice.f64()),
@@ -116,11 +116,11 @@ fn random_act(model: &Model, dice: &mut fastrand::Rng) -> Act {
                 ..Tip::default()
             };
             let place_m = shape.rest_m(point) - 0.5 * edge_m * dice.f64() * shape.normal(point);
-            Act::Pose(place_m, 0.1 * speed * way, tip)
+            ToolChange::Pose(place_m, 0.1 * speed * way, tip)
         }
         4 => {
-            let stiffness = model.scene.virtual_stiffness_n_per_m + 0.3 * model.scene.springs.stiffness_n_per_m;
-            Act::Push(Poke {
+            let stiffness = model.scene.anchor_stiffness_n_per_m + 0.3 * model.scene.springs.stiffness_n_per_m;
+            ToolChange::Push(Poke {
                 point: Some(point),
                 centre_m: shape.rest_m(point),
                 force_n: 0.5 * edge_m * stiffness * way,
@@ -128,13 +128,13 @@ fn random_act(model: &Model, dice: &mut fastrand::Rng) -> Act {
                 falloff_offset: 0.0,
             })
         }
-        _ => Act::Release,
+        _ => ToolChange::Release,
     }
 }
 
 /// What acts on both of a pair of tissues.
 struct Hands {
-    acts: Vec<(u64, usize, Act)>,
+    acts: Vec<(u64, usize, ToolChange)>,
 }
 
 impl Hands {
@@ -146,12 +146,12 @@ impl Hands {
             }
             let since_s = (step - from) as f64 * 1e-3;
             match act {
-                Act::Grasp(point, jump_m, way) => {
+                ToolChange::Grasp(point, jump_m, way) => {
                     tissue.grasp(*tool, *point, Grasp::Target(*jump_m + (since_s.min(0.05)) * *way));
                 }
-                Act::Pose(place_m, way, tip) => tissue.pose(*tool, *place_m + since_s.min(0.2) * *way, *tip),
-                Act::Push(poke) if *from == step => tissue.push(*tool, Some(Push::Constant(*poke))),
-                Act::Release if *from == step => tissue.release(*tool),
+                ToolChange::Pose(place_m, way, tip) => tissue.pose(*tool, *place_m + since_s.min(0.2) * *way, *tip),
+                ToolChange::Push(poke) if *from == step => tissue.push(*tool, Some(Push::Constant(*poke))),
+                ToolChange::Release if *from == step => tissue.release(*tool),
                 _ => {}
             }
         }
@@ -166,7 +166,7 @@ fn compared(
     other: &Arc<Model>,
     disturb: impl Fn(&mut dyn Tissue, u64),
 ) -> Option<(f64, f64)> {
-    let [mut awake, mut tissue] = [model, other].map(sheet::at_rest);
+    let [mut awake, mut tissue] = [model, other].map(tissue::at_rest);
     let (mut largest_m, mut difference_m) = (0.0_f64, 0.0_f64);
     let (mut of_awake, mut of_other) = (Vec::new(), Vec::new());
     for step in 0..STEPS {
@@ -191,7 +191,7 @@ fn compared(
 }
 
 /// What came of a seed.
-enum Outcome {
+enum SeedOutcome {
     /// The scene needs too many substeps, or the guard acted.
     Left,
     Within,
@@ -200,11 +200,11 @@ enum Outcome {
     Beyond(String),
 }
 
-fn play(seed: u64) -> Outcome {
+fn play(seed: u64) -> SeedOutcome {
     let dice = &mut fastrand::Rng::with_seed(seed);
     let folder = tempfile::tempdir().unwrap();
     let tolerance = 10_f64.powf(-6.0 + 3.0 * dice.f64());
-    let [Ok(sleeping), Ok(awake)] = scene(folder.path(), dice, tolerance) else { return Outcome::Left };
+    let [Ok(sleeping), Ok(awake)] = scene(folder.path(), dice, tolerance) else { return SeedOutcome::Left };
     let mut acts = Vec::new();
     for _ in 0..dice.usize(2..9) {
         acts.push((dice.u64(0..STEPS * 3 / 4), dice.usize(0..3), random_act(&awake, dice)));
@@ -212,9 +212,11 @@ fn play(seed: u64) -> Outcome {
     acts.sort_by_key(|(step, tool, _)| (*step, *tool));
     acts.dedup_by_key(|(step, tool, _)| (*step, *tool));
     let hands = Hands { acts };
-    let Some((largest_m, difference_m)) = compared(&hands, &awake, &sleeping, |_, _| {}) else { return Outcome::Left };
+    let Some((largest_m, difference_m)) = compared(&hands, &awake, &sleeping, |_, _| {}) else {
+        return SeedOutcome::Left;
+    };
     if difference_m <= tolerance * largest_m {
-        return Outcome::Within;
+        return SeedOutcome::Within;
     }
     // Forces for good that move the points where tools act, and one more, by no more than the tolerance. A tip that is put just
     // between two places of its disc may take either, so the forces go three ways.
@@ -228,7 +230,7 @@ fn play(seed: u64) -> Outcome {
             .map(|place_m| Poke {
                 point: None,
                 centre_m: *place_m,
-                force_n: tolerance * largest_m * awake.scene.virtual_stiffness_n_per_m / places_m.len() as f64
+                force_n: tolerance * largest_m * awake.scene.anchor_stiffness_n_per_m / places_m.len() as f64
                     * DVec3::from_array([(); 3].map(|()| 2.0 * dice.f64() - 1.0)).normalize_or(DVec3::Z),
                 falloff_per_m: 0.1 / shape.edge_m(),
                 falloff_offset: 0.0,
@@ -239,13 +241,13 @@ fn play(seed: u64) -> Outcome {
                 tissue.push(FIRST_DISTURBING + tool, Some(Push::Constant(*push)));
             }
         };
-        let Some((_, other_m)) = compared(&hands, &awake, &awake, disturb) else { return Outcome::Sensitive };
+        let Some((_, other_m)) = compared(&hands, &awake, &awake, disturb) else { return SeedOutcome::Sensitive };
         disturbed_m = disturbed_m.max(other_m);
         if disturbed_m >= AS_SENSITIVE * difference_m {
-            return Outcome::Sensitive;
+            return SeedOutcome::Sensitive;
         }
     }
-    Outcome::Beyond(format!(
+    SeedOutcome::Beyond(format!(
         "seed {seed}: {:.3e} of the largest displacement, {tolerance:.3e} asked for; disturbances of that: {:.3e}; {} points, {:?}",
         difference_m / largest_m,
         disturbed_m / largest_m,
@@ -262,10 +264,10 @@ fn sleep_under_tools_errs_by_no_more_than_its_tolerance() {
     let mut beyond = Vec::new();
     for seed in from..from + count {
         match play(seed) {
-            Outcome::Left => left += 1,
-            Outcome::Within => within += 1,
-            Outcome::Sensitive => sensitive += 1,
-            Outcome::Beyond(text) => beyond.push(text),
+            SeedOutcome::Left => left += 1,
+            SeedOutcome::Within => within += 1,
+            SeedOutcome::Sensitive => sensitive += 1,
+            SeedOutcome::Beyond(text) => beyond.push(text),
         }
         if (seed - from + 1).is_multiple_of(500) {
             eprintln!("{} of {count}: {} beyond", seed - from + 1, beyond.len());

@@ -16,8 +16,8 @@ use palpate::scene::{Change, Integrator, Lanes, Named, PAPER, Precision, Scene};
 use palpate::session::Session;
 use palpate::session::command::{Command, Due};
 use palpate::session::saved::{Saved, VERSION, seal};
-use palpate::sheet::Model;
-use palpate::sheet::saved::TissueState;
+use palpate::tissue::Model;
+use palpate::tissue::saved::TissueState;
 use palpate_touch::{ContactState, Coupling, Tip};
 
 /// Little is rehearsed: most scenes give the number of substeps.
@@ -26,23 +26,23 @@ fn limits() -> Limits {
 }
 
 const GALLBLADDER: &str = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\n[material]\nyoungs_modulus_pa = 2e4\n\
-                           thickness_m = 0.003\nbed_n_per_m3 = 5e6\n";
+                           thickness_m = 0.003\nfoundation_n_per_m3 = 5e6\n";
 
 /// What happens to a session before a step.
 #[derive(Debug, Clone)]
-enum Event {
+enum SessionEvent {
     Command(Box<Due>),
     Change(Change),
     Correct(Correction),
 }
 
 /// A session's scene and all its inputs.
-struct Case {
+struct SnapshotCase {
     about: String,
     first: Scene,
     forces: Vec<LoadProfile>,
     moves: Vec<MotionProfile>,
-    events: BTreeMap<u64, Vec<Event>>,
+    events: BTreeMap<u64, Vec<SessionEvent>>,
     steps: u64,
 }
 
@@ -51,12 +51,12 @@ const TOLD_EVERY: u64 = 5;
 
 /// What is told of a session after a step.
 #[derive(PartialEq, Debug)]
-struct Told {
+struct StepOutput {
     hash: u128,
     rest: String,
 }
 
-fn told(session: &Session) -> Told {
+fn told(session: &Session) -> StepOutput {
     let tissue = session.tissue();
     let counts = (session.late_commands(), session.paused_commands(), session.path_counts());
     let guard = (tissue.guard_events(), tissue.substeps_done(), tissue.plan().substeps, tissue.checkpoint_step());
@@ -68,10 +68,10 @@ fn told(session: &Session) -> Told {
         session.hold_reason(),
         tissue.computed_fraction()
     );
-    Told { hash: tissue.state_hash(), rest }
+    StepOutput { hash: tissue.state_hash(), rest }
 }
 
-impl Case {
+impl SnapshotCase {
     fn model(&self) -> Arc<Model> {
         Model::compile(&self.first, &limits()).unwrap()
     }
@@ -92,14 +92,14 @@ impl Case {
         let mut due = Vec::new();
         for event in self.events.get(&session.step_count()).into_iter().flatten() {
             match event {
-                Event::Command(command) => due.push(Due::clone(command)),
-                Event::Change(change) => {
+                SessionEvent::Command(command) => due.push(Due::clone(command)),
+                SessionEvent::Change(change) => {
                     // After a correction, another tissue may need more rehearsals than are allowed here.
                     if let Ok(model) = session.model().changed(change, &self.first, &limits()) {
                         session.change(&model);
                     }
                 }
-                Event::Correct(correction) => {
+                SessionEvent::Correct(correction) => {
                     let model = session.model().corrected(correction, &limits()).unwrap();
                     session.change(&model);
                 }
@@ -135,7 +135,7 @@ fn command(tool: u32, sequence: u64, action: Action) -> Due {
 }
 
 /// A random session.
-fn case(seed: u64) -> Case {
+fn case(seed: u64) -> SnapshotCase {
     let mut random = Rng::with_seed(seed);
     let schemes: Vec<&str> = common::schemes().collect();
     let scheme = schemes[seed as usize % schemes.len()];
@@ -154,9 +154,9 @@ fn case(seed: u64) -> Case {
         // Now and then too stiff for the substeps: the guard halves them, or takes the tissue back.
         let stiffness = [10.0, 10.0, 10.0, 3.0, 100.0, 3e4, 1e5, 1e9][random.usize(0..8)];
         sets.push(format!("springs.stiffness_n_per_m={stiffness:?}"));
-        sets.push(format!("virtual_springs.stiffness_n_per_m={}", [5, 5, 50, 0][random.usize(0..4)]));
+        sets.push(format!("anchor_springs.stiffness_n_per_m={}", [5, 5, 50, 0][random.usize(0..4)]));
         sets.push(format!("damping.coefficient_n_s_per_m={}", [0.5, 0.5, 2.0, 0.05][random.usize(0..4)]));
-        sets.push(format!("springs.flexion={}", random.bool()));
+        sets.push(format!("springs.bending={}", random.bool()));
         sets.push(format!("sheet.fixed={}", ["edges", "corners", "[]"][random.usize(0..3)]));
     }
     if random.u8(0..4) > 0 {
@@ -172,7 +172,7 @@ fn case(seed: u64) -> Case {
     } else {
         Scene::parse("random", PAPER, &sets, &limits()).unwrap()
     };
-    let mut case = Case {
+    let mut case = SnapshotCase {
         about: format!("seed {seed}, {sets:?}"),
         first,
         forces: Vec::new(),
@@ -190,7 +190,7 @@ fn case(seed: u64) -> Case {
 }
 
 /// A point that may be grasped.
-fn free(case: &Case, random: &mut Rng) -> palpate::shape::PointId {
+fn free(case: &SnapshotCase, random: &mut Rng) -> palpate::shape::PointId {
     let shape = case.first.shape();
     loop {
         let point = palpate::shape::PointId::new(random.usize(0..shape.point_count()));
@@ -200,10 +200,10 @@ fn free(case: &Case, random: &mut Rng) -> palpate::shape::PointId {
     }
 }
 
-fn poke(case: &Case, random: &mut Rng) -> Poke {
+fn poke(case: &SnapshotCase, random: &mut Rng) -> Poke {
     let shape = case.first.shape();
     let (point, edge_m) = (free(case, random), shape.edge_m());
-    let stiffness = case.first.virtual_stiffness_n_per_m + 0.3 * case.first.springs.stiffness_n_per_m.min(1000.0);
+    let stiffness = case.first.anchor_stiffness_n_per_m + 0.3 * case.first.springs.stiffness_n_per_m.min(1000.0);
     let centre_m = if random.bool() { shape.rest_m(point) } else { shape.rest_m(point) + vector(random, 0.2 * edge_m) };
     let centre_m = if shape.dimensions() == 2 { centre_m.truncate().extend(0.0) } else { centre_m };
     Poke {
@@ -216,7 +216,7 @@ fn poke(case: &Case, random: &mut Rng) -> Poke {
 }
 
 /// Forces and movements as functions of time.
-fn profiles(case: &mut Case, random: &mut Rng) {
+fn profiles(case: &mut SnapshotCase, random: &mut Rng) {
     for _ in 0..random.usize(0..3) {
         let Poke { centre_m, force_n, falloff_per_m, falloff_offset, .. } = poke(case, random);
         let edge_m = case.first.shape().edge_m();
@@ -246,11 +246,11 @@ fn profiles(case: &mut Case, random: &mut Rng) {
 }
 
 /// The commands to a tool: periods of pushing, grasping or leading it by poses, and of nothing.
-fn hand(case: &mut Case, random: &mut Rng, tool: u32) {
+fn hand(case: &mut SnapshotCase, random: &mut Rng, tool: u32) {
     let edge_m = case.first.shape().edge_m();
     let (mut step, mut sequence) = (random.u64(0..60), 0);
-    let put = |events: &mut BTreeMap<u64, Vec<Event>>, step: u64, due: Due| {
-        events.entry(step).or_default().push(Event::Command(Box::new(due)));
+    let put = |events: &mut BTreeMap<u64, Vec<SessionEvent>>, step: u64, due: Due| {
+        events.entry(step).or_default().push(SessionEvent::Command(Box::new(due)));
     };
     while step < case.steps {
         let until = step + random.u64(20..250);
@@ -293,7 +293,7 @@ fn hand(case: &mut Case, random: &mut Rng, tool: u32) {
 
 /// Leads a tool onto the tissue and along it, by poses of a thousandth of a second that come in bursts. Returns the step after
 /// the last.
-fn pose(case: &mut Case, random: &mut Rng, tool: u32, [from, until]: [u64; 2], sequence: &mut u64) -> u64 {
+fn pose(case: &mut SnapshotCase, random: &mut Rng, tool: u32, [from, until]: [u64; 2], sequence: &mut u64) -> u64 {
     let shape = case.first.shape();
     let edge_m = shape.edge_m();
     let point = free(case, random);
@@ -308,7 +308,7 @@ fn pose(case: &mut Case, random: &mut Rng, tool: u32, [from, until]: [u64; 2], s
         coupling: if random.bool() { Coupling::Constraint } else { spring },
     };
     let (kind, burst) = (random.u8(0..4), random.u64(1..12));
-    let mut events: Vec<(u64, Event)> = Vec::new();
+    let mut events: Vec<(u64, SessionEvent)> = Vec::new();
     for step in from..until {
         let passed = (step - from) as f64;
         let depth_m = (0.006 - 0.0003 * passed).max(-0.3 * edge_m);
@@ -335,7 +335,7 @@ fn pose(case: &mut Case, random: &mut Rng, tool: u32, [from, until]: [u64; 2], s
         if kind == 0 {
             arrives = step;
         }
-        events.push((arrives, Event::Command(Box::new(due))));
+        events.push((arrives, SessionEvent::Command(Box::new(due))));
     }
     for (step, event) in events {
         case.events.entry(step).or_default().push(event);
@@ -344,17 +344,17 @@ fn pose(case: &mut Case, random: &mut Rng, tool: u32, [from, until]: [u64; 2], s
 }
 
 /// Other tissues, and corrections.
-fn tissues(case: &mut Case, random: &mut Rng, on_mesh: bool) {
+fn tissues(case: &mut SnapshotCase, random: &mut Rng, on_mesh: bool) {
     for _ in 0..random.usize(0..3) {
         let factor = [0.5, 1.5, 2.0][random.usize(0..3)];
         let first = &case.first;
         let change = Change {
             stiffness_n_per_m: random.bool().then_some(first.springs.stiffness_n_per_m * factor),
             damping_n_s_per_m: random.bool().then_some(first.damping_n_s_per_m * factor),
-            virtual_stiffness_n_per_m: Some(first.virtual_stiffness_n_per_m * factor),
+            anchor_stiffness_n_per_m: Some(first.anchor_stiffness_n_per_m * factor),
             volume_stiffness_pa: None,
         };
-        case.events.entry(random.u64(0..case.steps)).or_default().push(Event::Change(change));
+        case.events.entry(random.u64(0..case.steps)).or_default().push(SessionEvent::Change(change));
     }
     for _ in 0..random.usize(0..2) {
         let integrator = Integrator::NAMES[1..][random.usize(0..Integrator::NAMES.len() - 1)].1;
@@ -380,17 +380,17 @@ fn tissues(case: &mut Case, random: &mut Rng, on_mesh: bool) {
         // A scheme that does not compensate, in a format that does, is refused.
         let is_possible = own.corrected(&correction, &limits()).is_ok();
         if is_possible {
-            case.events.entry(step).or_default().push(Event::Correct(correction));
+            case.events.entry(step).or_default().push(SessionEvent::Correct(correction));
         }
     }
 }
 
 /// What a snapshot had in it, over all cases: so that none of it goes untried.
 #[derive(Default)]
-struct Seen(BTreeMap<&'static str, u32>);
+struct Coverage(BTreeMap<&'static str, u32>);
 
-impl Seen {
-    fn note(&mut self, session: &Session, case: &Case) {
+impl Coverage {
+    fn note(&mut self, session: &Session, case: &SnapshotCase) {
         let tissue = session.tissue();
         let mut add = |name: &'static str, holds: bool| *self.0.entry(name).or_default() += u32::from(holds);
         let awake = tissue.awake_points();
@@ -431,7 +431,7 @@ fn bytes_of(session: &Session) -> Vec<u8> {
 
 #[test]
 fn a_hundred_random_sessions_go_on_with_the_same_bits() {
-    let (mut seen, widths, mut tried) = (Seen::default(), widths(), 0_u32);
+    let (mut seen, widths, mut tried) = (Coverage::default(), widths(), 0_u32);
     for seed in 0..100 {
         let case = case(seed);
         let mut random = Rng::with_seed(!seed);

@@ -12,22 +12,22 @@ use std::time::{Duration, Instant};
 
 use palpate_proto::pb;
 use pb::touch_response::Message as Heard;
-use random::Random;
-use server::{PATIENCE, Server, Touch, force, position};
+use random::TestRandom;
+use server::{TEST_TIMEOUT, TestServer, TestTouch, force, position};
 
 /// What one client has sent and heard.
 #[derive(Default)]
-struct Account {
+struct ClientLedger {
     sent: u64,
     refused: u64,
     seen: u64,
 }
 
 /// A session of its own for a while, with a client, a viewer or both, that ends well or badly.
-async fn life(server: &Server, random: &mut Random) -> Account {
-    let mut account = Account::default();
+async fn life(server: &TestServer, random: &mut TestRandom) -> ClientLedger {
+    let mut account = ClientLedger::default();
     let session = server.paper(false).await;
-    let mut touch = Touch::hold(server, &session).await;
+    let mut touch = TestTouch::hold(server, &session).await;
     let mut frames = None;
     if random.below(2) == 0 {
         let request = pb::WatchFramesRequest { session_id: session.clone(), ..Default::default() };
@@ -72,7 +72,7 @@ async fn life(server: &Server, random: &mut Random) -> Account {
     let settled = pb::touch_request::Message::Renew(pb::Renew { client_time_ns: 1, datagrams: false });
     touch.say(settled).await;
     loop {
-        match tokio::time::timeout(PATIENCE, touch.hear()).await.unwrap().unwrap().unwrap() {
+        match tokio::time::timeout(TEST_TIMEOUT, touch.hear()).await.unwrap().unwrap().unwrap() {
             Heard::Renewed(_) => break,
             Heard::Rejection(_) => account.refused += 1,
             _ => {}
@@ -92,7 +92,7 @@ async fn life(server: &Server, random: &mut Random) -> Account {
 }
 
 /// Resident memory (KiB), handles and threads.
-fn weight(server: &Server) -> [usize; 3] {
+fn weight(server: &TestServer) -> [usize; 3] {
     let of = |what: &str| format!("/proc/{}/{what}", server.child.id());
     let status = std::fs::read_to_string(of("status")).unwrap();
     let line = |name: &str| {
@@ -107,17 +107,17 @@ fn weight(server: &Server) -> [usize; 3] {
 #[ignore = "long: `make soak`"]
 fn nothing_grows_and_no_command_is_lost() {
     let seconds: u64 = std::env::var("PALPATE_SOAK_S").ok().and_then(|text| text.parse().ok()).unwrap_or(60);
-    let server = Arc::new(Server::start(&["--log", "error"]));
+    let server = Arc::new(TestServer::start(&["--log", "error"]));
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
     let begun = Instant::now();
     let lives = |round: u64, length: Duration| {
         let clients: Vec<_> = (0..12)
             .map(|number| {
                 let server = server.clone();
-                let mut random = Random(round * 1000 + number);
+                let mut random = TestRandom(round * 1000 + number);
                 let until = Instant::now() + length;
                 runtime.spawn(async move {
-                    let (mut lives, mut account) = (0_u64, Account::default());
+                    let (mut lives, mut account) = (0_u64, ClientLedger::default());
                     while Instant::now() < until {
                         let one = life(&server, &mut random).await;
                         account.sent += one.sent;
@@ -136,7 +136,7 @@ fn nothing_grows_and_no_command_is_lost() {
         }
         // What ended last is put away.
         let quiet = Instant::now();
-        while weight(&server)[1] > 40 && quiet.elapsed() < PATIENCE {
+        while weight(&server)[1] > 40 && quiet.elapsed() < TEST_TIMEOUT {
             std::thread::sleep(Duration::from_millis(50));
         }
         sum

@@ -23,7 +23,7 @@ use pb::haptic_service_client::HapticServiceClient;
 use pb::touch_request::Message as Say;
 use pb::touch_response::Message as Heard;
 use proxy::Proxy;
-use server::{PATIENCE, Server, open};
+use server::{TEST_TIMEOUT, TestServer, open};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Streaming;
@@ -41,13 +41,13 @@ const STALL: Duration = Duration::from_secs(5);
 /// What an unoptimized server steps in time.
 fn small() -> Source {
     let text = "name = \"small\"\n[sheet]\npoints = [9, 9]\nspacing_m = 0.01\npoint_mass_kg = 0.002\n\
-                [springs]\nstiffness_n_per_m = 30.0\n[virtual_springs]\nstiffness_n_per_m = 5.0\n\
+                [springs]\nstiffness_n_per_m = 30.0\n[anchor_springs]\nstiffness_n_per_m = 5.0\n\
                 [damping]\ncoefficient_n_s_per_m = 0.2\n\
                 [stepping]\nintegrator = \"central\"\nsubsteps = 4\nprecision = \"f32\"\n";
     Source::Scene(wire::scene::scene(&Scene::parse("small", text, &[], &Limits::default()).unwrap()))
 }
 
-fn signal(server: &Server, name: &str) {
+fn signal(server: &TestServer, name: &str) {
     let pid = server.child.id().to_string();
     assert!(std::process::Command::new("kill").args([name, &pid]).status().unwrap().success());
 }
@@ -99,7 +99,7 @@ impl Led {
     async fn acknowledged(&mut self) -> HashMap<String, u64> {
         let mut refused = HashMap::new();
         loop {
-            let heard = tokio::time::timeout(PATIENCE, self.inbound.message()).await.expect("the server is silent");
+            let heard = tokio::time::timeout(TEST_TIMEOUT, self.inbound.message()).await.expect("the server is silent");
             match heard.unwrap_or_else(|status| panic!("the stream was cut: {status:?}")).unwrap().message {
                 Some(Heard::Rejection(rejection)) => *refused.entry(rejection.reason).or_default() += 1,
                 Some(Heard::Sample(sample))
@@ -116,7 +116,7 @@ impl Led {
     async fn refused(&mut self) -> HashMap<String, u64> {
         let mut refused = HashMap::new();
         loop {
-            let heard = tokio::time::timeout(PATIENCE, self.inbound.message()).await.expect("the server is silent");
+            let heard = tokio::time::timeout(TEST_TIMEOUT, self.inbound.message()).await.expect("the server is silent");
             if let Some(Heard::Rejection(rejection)) = heard.unwrap().unwrap().message {
                 *refused.entry(rejection.reason).or_default() += 1;
                 if rejection.sequence == self.sequence {
@@ -128,7 +128,7 @@ impl Led {
 }
 
 /// Every command was taken in or refused.
-async fn all_are_told(server: &Server, session: &str, led: &Led) {
+async fn all_are_told(server: &TestServer, session: &str, led: &Led) {
     let status = server.status(session).await;
     let commands = status.commands.unwrap();
     assert_eq!(commands.accepted + commands.refused, led.sequence * u64::from(led.tools), "{commands:?}");
@@ -140,7 +140,7 @@ async fn all_are_told(server: &Server, session: &str, led: &Led) {
 }
 
 /// The server stands still while `tools` are led.
-async fn the_server_stands_still(url: String, server: &Server, tools: u32, stall: Duration) {
+async fn the_server_stands_still(url: String, server: &TestServer, tools: u32, stall: Duration) {
     let session = server.create(small(), false).await.unwrap().session_id;
     let channel = Channel::from_shared(url).unwrap().connect().await.unwrap();
     let mut led = Led::open(channel, &session, tools, 60.0).await;
@@ -157,19 +157,19 @@ async fn the_server_stands_still(url: String, server: &Server, tools: u32, stall
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_tool_outlives_a_server_that_stands_still() {
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     the_server_stands_still(server.url.clone(), &server, 1, STALL).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn sixteen_tools_outlive_a_server_that_stands_still() {
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     the_server_stands_still(server.url.clone(), &server, 16, Duration::from_secs(1)).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_tool_far_away_outlives_a_server_that_stands_still() {
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     let address = server.url.strip_prefix("http://").unwrap().to_owned();
     let proxy = Proxy::start(address, Duration::from_millis(25)).await;
     the_server_stands_still(proxy.url(), &server, 1, STALL).await;
@@ -200,7 +200,7 @@ fn a_client_that_stands_still(url: String, session: String, lease_s: f64) -> std
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_client_that_stands_still_keeps_its_stream_and_its_tool_lets_go() {
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     let mut clients = Vec::new();
     for lease_s in [60.0, 2.0] {
         let session = server.create(small(), false).await.unwrap().session_id;
@@ -209,7 +209,7 @@ async fn a_client_that_stands_still_keeps_its_stream_and_its_tool_lets_go() {
         clients.push(a_client_that_stands_still(server.url.clone(), session, lease_s));
         // Held, then let go, in this order.
         for wanted in [(|tool| tool.stale && !tool.expired) as fn(&pb::ToolSample) -> bool, |tool| tool.expired] {
-            let seen = tokio::time::timeout(PATIENCE, async {
+            let seen = tokio::time::timeout(TEST_TIMEOUT, async {
                 loop {
                     let sample = watching.message().await.unwrap().unwrap().sample.unwrap();
                     if sample.tools.iter().any(wanted) {
@@ -225,7 +225,7 @@ async fn a_client_that_stands_still_keeps_its_stream_and_its_tool_lets_go() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn commands_before_a_stream_is_open_are_taken_in_or_refused() {
-    let server = Server::start(&["--log", "error"]);
+    let server = TestServer::start(&["--log", "error"]);
     let session = server.create(small(), false).await.unwrap().session_id;
     let (outbound, messages) = mpsc::channel(1 << 20);
     let say = |message: Say| outbound.try_send(pb::TouchRequest { message: Some(message) }).unwrap();
@@ -239,7 +239,7 @@ async fn commands_before_a_stream_is_open_are_taken_in_or_refused() {
     let channel = server.channel().await;
     let mut inbound =
         HapticServiceClient::new(channel).touch(ReceiverStream::new(messages)).await.unwrap().into_inner();
-    let commands = tokio::time::timeout(PATIENCE, async {
+    let commands = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
             let ended = inbound.message().await.map(|message| message.expect("the stream is over")).err();
             let commands = server.status(&session).await.commands.unwrap();
@@ -292,7 +292,7 @@ fn no_program_waits_for_who_says_nothing() {
 
 #[tokio::test]
 async fn a_cut_by_the_transport_is_logged_and_counted() {
-    let mut server = Server::start(&["--metrics", "127.0.0.1:0"]);
+    let mut server = TestServer::start(&["--metrics", "127.0.0.1:0"]);
     let mut line = String::new();
     server.out.read_line(&mut line).unwrap();
     let metrics = line.split_whitespace().last().unwrap().strip_prefix("http://").unwrap().to_owned();

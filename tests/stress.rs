@@ -15,8 +15,8 @@ use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::profile::Poke;
 use palpate::scene::{Integrator, Named, Scene};
-use palpate::sheet::guard::INTERVAL_SUBSTEPS;
-use palpate::sheet::{self, Grasp, Model, Push, Tissue};
+use palpate::tissue::guard::INTERVAL_SUBSTEPS;
+use palpate::tissue::{self, Grasp, Model, Push, Tissue};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 
@@ -40,11 +40,11 @@ fn any_scene() -> impl Strategy<Value = String> {
     let fixed = prop_oneof![3 => Just("[]"), 1 => Just("\"edges\""), 1 => Just("\"corners\"")];
     let tolerance = decades(-7.0, -2.0);
     (shape, elastic, fixed, integrator, tolerance).prop_map(
-        |((nx, ny, h, m), (k, virtual_k, c, flexion), fixed, integrator, tolerance)| {
+        |((nx, ny, h, m), (k, anchor_k, c, bending), fixed, integrator, tolerance)| {
             format!(
                 "[sheet]\npoints = [{nx}, {ny}]\nspacing_m = {h:e}\npoint_mass_kg = {m:e}\nfixed = {fixed}\n\
-                 [springs]\nstiffness_n_per_m = {k:e}\nflexion = {flexion}\n\
-                 [virtual_springs]\nstiffness_n_per_m = {virtual_k:e}\n[damping]\ncoefficient_n_s_per_m = {c:e}\n\
+                 [springs]\nstiffness_n_per_m = {k:e}\nbending = {bending}\n\
+                 [anchor_springs]\nstiffness_n_per_m = {anchor_k:e}\n[damping]\ncoefficient_n_s_per_m = {c:e}\n\
                  [stepping]\nintegrator = \"{integrator}\"\ntolerance = {tolerance:e}\n"
             )
         },
@@ -53,7 +53,7 @@ fn any_scene() -> impl Strategy<Value = String> {
 
 /// The action of a tool before a step: its strength (relative to the scene), place and kind.
 #[derive(Debug, Clone, Copy)]
-struct Act {
+struct RandomAction {
     step: u64,
     tool: usize,
     place: [f64; 2],
@@ -61,12 +61,12 @@ struct Act {
     manner: u8,
 }
 
-fn any_act() -> impl Strategy<Value = Act> {
+fn any_act() -> impl Strategy<Value = RandomAction> {
     (0..200_u64, 0..3_usize, [0.0..1.0_f64, 0.0..1.0_f64], [-1.0..1.0_f64, -1.0..1.0, -1.0..1.0], 0..8_u8)
-        .prop_map(|(step, tool, place, towards, manner)| Act { step, tool, place, towards, manner })
+        .prop_map(|(step, tool, place, towards, manner)| RandomAction { step, tool, place, towards, manner })
 }
 
-fn act(tissue: &mut dyn Tissue, Act { tool, place, towards, manner, .. }: Act) {
+fn act(tissue: &mut dyn Tissue, RandomAction { tool, place, towards, manner, .. }: RandomAction) {
     let scene = tissue.model().scene.clone();
     let [nx, ny] = scene.sheet().unwrap().points;
     let point = [(place[0] * nx as f64) as usize, (place[1] * ny as f64) as usize];
@@ -80,7 +80,7 @@ fn act(tissue: &mut dyn Tissue, Act { tool, place, towards, manner, .. }: Act) {
         return tissue.grasp(tool, index, Grasp::Target(2.5 * spacing_m * towards));
     }
     // A force that moves a point by up to some spacings.
-    let stiffness = scene.virtual_stiffness_n_per_m + scene.springs.stiffness_n_per_m.min(1e3);
+    let stiffness = scene.anchor_stiffness_n_per_m + scene.springs.stiffness_n_per_m.min(1e3);
     tissue.push(
         tool,
         Some(Push::Constant(Poke {
@@ -103,17 +103,17 @@ fn all_finite(tissue: &dyn Tissue) -> bool {
 
 fn energy_j(tissue: &dyn Tissue) -> f64 {
     let energy = tissue.energy();
-    energy.kinetic_j + energy.spring_j + energy.virtual_j
+    energy.kinetic_j + energy.spring_j + energy.anchor_j
 }
 
 /// Plays the acts for 256 steps, then releases and waits. Everything must be finite, and without tools no energy may
 /// appear.
-fn play(text: &str, acts: &[Act]) -> Result<(), TestCaseError> {
+fn play(text: &str, acts: &[RandomAction]) -> Result<(), TestCaseError> {
     let limits = Limits { substeps: 400, ..Limits::default() };
     let scene = Scene::parse("random", text, &[], &limits).unwrap();
     // A scene that needs more substeps is refused, which is a valid result.
     let Ok(model) = Model::compile(&scene, &limits) else { return Ok(()) };
-    let mut tissue = sheet::at_rest(&model);
+    let mut tissue = tissue::at_rest(&model);
     let mut acts = acts.to_vec();
     acts.sort_by_key(|act| act.step);
     let mut waiting = acts.into_iter().peekable();
@@ -184,13 +184,14 @@ fn random_scenes_stay_finite_and_take_no_energy_from_nowhere() {
 #[test]
 fn energy_that_appears_between_two_looks_of_the_guard_does_not_outlast_the_second() {
     let scene = "[sheet]\npoints = [7, 3]\nspacing_m = 1.0\npoint_mass_kg = 3.2794546670559865e-2\nfixed = []\n\
-                 [springs]\nstiffness_n_per_m = 1.559932287026399e4\nflexion = true\n\
-                 [virtual_springs]\nstiffness_n_per_m = 1.317469143691047e2\n\
+                 [springs]\nstiffness_n_per_m = 1.559932287026399e4\nbending = true\n\
+                 [anchor_springs]\nstiffness_n_per_m = 1.317469143691047e2\n\
                  [damping]\ncoefficient_n_s_per_m = 1.648929095254097e-3\n\
                  [stepping]\nintegrator = \"central\"\ntolerance = 1e-2\n";
     let towards = [0.5477845957859616, 0.7475874882048965, 0.16899049618750936];
-    let push = Act { step: 19, tool: 0, place: [0.39974532906274307, 0.0], towards, manner: 3 };
-    let grasp = Act { step: 139, tool: 0, place: [0.0; 2], towards: [0.0, 0.0, -0.5568062780921599], manner: 1 };
+    let push = RandomAction { step: 19, tool: 0, place: [0.39974532906274307, 0.0], towards, manner: 3 };
+    let grasp =
+        RandomAction { step: 139, tool: 0, place: [0.0; 2], towards: [0.0, 0.0, -0.5568062780921599], manner: 1 };
     play(scene, &[push, grasp]).unwrap();
 }
 
@@ -206,8 +207,8 @@ fn closed_meshes_of_any_material_stay_finite() {
         let mut decades = |from: f64, to: f64| 10_f64.powf(from + (to - from) * dice.f64());
         let text = format!(
             "[mesh]\nfile = \"mesh.obj\"\nunit = \"m\"\n[material]\nyoungs_modulus_pa = {:e}\nthickness_m = {:e}\n\
-             bed_n_per_m3 = {:e}\ndamping_ratio = {:e}\n[springs]\nflexion = {}\n[[inclusion]]\ncentre_m = [0, 0, 0]\n\
-             radius_m = 1.0\nstiffness_factor = {:e}\nvirtual_stiffness_factor = {:e}\n[stepping]\ntolerance = 1e-2\n",
+             foundation_n_per_m3 = {:e}\ndamping_ratio = {:e}\n[springs]\nbending = {}\n[[inclusion]]\ncentre_m = [0, 0, 0]\n\
+             radius_m = 1.0\nstiffness_factor = {:e}\nanchor_stiffness_factor = {:e}\n[stepping]\ntolerance = 1e-2\n",
             decades(2.0, 5.0),
             decades(-3.0, -2.0),
             decades(3.0, 6.5),
@@ -218,9 +219,9 @@ fn closed_meshes_of_any_material_stay_finite() {
         );
         let scene = Scene::parse_in(folder.path(), "random", &text, &[], &limits).unwrap();
         let Ok(model) = Model::compile(&scene, &limits) else { continue };
-        let mut tissue = sheet::at_rest(&model);
+        let mut tissue = tissue::at_rest(&model);
         let (shape, edge_m) = (scene.shape(), scene.shape().edge_m());
-        let stiffness = scene.virtual_stiffness_n_per_m + 0.3 * scene.springs.stiffness_n_per_m;
+        let stiffness = scene.anchor_stiffness_n_per_m + 0.3 * scene.springs.stiffness_n_per_m;
         played += 1;
         for step in 0..steps {
             if step % 25 == 0 {
@@ -257,13 +258,13 @@ fn closed_meshes_of_any_material_stay_finite() {
 /// Scenes where only the damping is fast, dt·C/m from 0.7 to 90: `rk4` was stable by its vibrations alone, and grew.
 #[test]
 fn strong_damping_alone_lets_no_scheme_grow() {
-    let held = Act { step: 0, tool: 0, place: [0.0; 2], towards: [0.0, 0.0, 0.77], manner: 1 };
+    let held = RandomAction { step: 0, tool: 0, place: [0.0; 2], towards: [0.0, 0.0, 0.77], manner: 1 };
     for (integrator, _) in Integrator::NAMES {
         for damping in [0.2, 0.7, 0.75, 1.4, 6.0, 25.0] {
             let text = format!(
                 "[sheet]\npoints = [3, 7]\nspacing_m = 1.0\npoint_mass_kg = 2.5e-4\nfixed = []\n\
-                 [springs]\nstiffness_n_per_m = 0.015\nflexion = false\n\
-                 [virtual_springs]\nstiffness_n_per_m = 1.0\n[damping]\ncoefficient_n_s_per_m = {damping}\n\
+                 [springs]\nstiffness_n_per_m = 0.015\nbending = false\n\
+                 [anchor_springs]\nstiffness_n_per_m = 1.0\n[damping]\ncoefficient_n_s_per_m = {damping}\n\
                  [stepping]\nintegrator = \"{integrator}\"\ntolerance = 1e-2\n"
             );
             play(&text, &[held]).unwrap_or_else(|failure| panic!("{integrator}, C = {damping}: {failure}"));
@@ -277,7 +278,7 @@ fn adversarial_commands_leave_the_tissue_finite() {
     for worst in 0..4 {
         let scene = scene_with(SMALL, &["stepping.precision=f32"]);
         let model = model(&scene);
-        let mut tissue = sheet::at_rest(&model);
+        let mut tissue = tissue::at_rest(&model);
         // The sign changes at the frequency of the fastest vibration at rest.
         let half_period = (std::f64::consts::PI / model.omega_bound_per_s * scene.stepping.rate_hz).max(1.0) as u64;
         for step in 0..2000_u64 {
@@ -305,7 +306,7 @@ fn adversarial_commands_leave_the_tissue_finite() {
 fn a_sheet_that_wrinkles_stays_bounded() {
     let sets = ["springs.stiffness_n_per_m=1e4", "sheet.points=[15, 15]", "sheet.point_mass_kg=0.01"];
     let scene = scene_with(SMALL, &sets);
-    let mut tissue = sheet::at_rest(&model(&scene));
+    let mut tissue = tissue::at_rest(&model(&scene));
     // Both sides pressed towards the middle, and a little out of the plane.
     tissue.push(0, Some(common::push_on(&scene, [0, 7], [400.0, 0.0, 0.5])));
     tissue.push(1, Some(common::push_on(&scene, [14, 7], [-400.0, 0.0, -0.3])));
@@ -320,7 +321,7 @@ fn a_sheet_that_wrinkles_stays_bounded() {
 fn ten_million_steps_end_where_they_should() {
     // Every step must be computed: nothing may sleep.
     let scene = scene_with(SMALL, &["stepping.precision=auto", "sleep.tolerance=0"]);
-    let mut tissue = sheet::at_rest(&model(&scene));
+    let mut tissue = tissue::at_rest(&model(&scene));
     tissue.push(0, Some(common::push_on(&scene, [3, 2], [0.1, 0.0, -0.3])));
     let mut settled = None;
     for million in 0..10 {

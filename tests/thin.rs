@@ -19,7 +19,7 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::Scene;
-use palpate::sheet::{self, Model, Tissue};
+use palpate::tissue::{self, Model, Tissue};
 use palpate_touch::{Coupling, Tip};
 use thin_mesh::{ThinMesh, thin_mesh, thread};
 
@@ -31,7 +31,7 @@ fn model(folder: &std::path::Path, mesh: &ThinMesh, dice: &mut fastrand::Rng) ->
     let mut decades = |from: f64, to: f64| 10_f64.powf(from + (to - from) * dice.f64());
     let text = format!(
         "[mesh]\nfile = \"mesh.obj\"\nunit = \"m\"\nfixed = {fixed}\n[material]\nyoungs_modulus_pa = {:e}\nthickness_m = {:e}\n\
-         depth_m = {:e}\nbed_n_per_m3 = {:e}\ndamping_ratio = {:e}\n",
+         depth_m = {:e}\nfoundation_n_per_m3 = {:e}\ndamping_ratio = {:e}\n",
         decades(3.0, 4.7),
         decades(-3.5, -2.5),
         decades(-2.0, -1.3),
@@ -67,14 +67,14 @@ fn tip(dice: &mut fastrand::Rng) -> Tip {
 
 fn energy_j(tissue: &dyn Tissue) -> f64 {
     let energy = tissue.energy();
-    energy.kinetic_j + energy.spring_j + energy.virtual_j
+    energy.kinetic_j + energy.spring_j + energy.anchor_j
 }
 
 /// Energies below this are not compared, J.
-const LEAST_J: f64 = 1e-6;
+const MIN_J: f64 = 1e-6;
 
 /// An energy may be so many times the work, because between the ends of a step a force may have been larger than there.
-const MOST_PART: f64 = 1.25;
+const MAX_PART: f64 = 1.25;
 
 /// The most that a tool can have done, from outside: by what is felt, and not by what the tissue counts itself.
 #[derive(Debug, Clone, Copy)]
@@ -113,7 +113,7 @@ impl WorkBound {
 
 /// The most of a run.
 #[derive(Debug, Default, Clone, Copy)]
-struct Course {
+struct Extremes {
     blow_ups: u64,
     guard_events: u64,
     force_n: f64,
@@ -123,14 +123,14 @@ struct Course {
     part: f64,
 }
 
-fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
+fn play(seed: u64, steps: u64) -> Option<(Extremes, &'static str)> {
     let dice = &mut fastrand::Rng::with_seed(seed);
     let folder = tempfile::tempdir().unwrap();
     let mesh = thin_mesh(dice, seed as usize);
     let model = model(folder.path(), &mesh, dice)?;
-    let mut tissue = sheet::at_rest(&model);
+    let mut tissue = tissue::at_rest(&model);
     let shape = model.scene.shape();
-    let mut course = Course::default();
+    let mut course = Extremes::default();
     let (mut place_m, mut way_m, mut now) = (DVec3::ZERO, DVec3::ZERO, tip(dice));
     let (mut bound, mut has_recovered) = (None, false);
     for step in 0..steps {
@@ -162,12 +162,12 @@ fn play(seed: u64, steps: u64) -> Option<(Course, &'static str)> {
             (bound.place_m, bound.felt_n, has_recovered) = (place_m, 0.0, true);
             continue;
         }
-        let felt_n = tissue.feel(0).unwrap().force_on_tool_n.length();
+        let felt_n = tissue.tool_contact(0).unwrap().force_on_tool_n.length();
         course.force_n = course.force_n.max(felt_n);
         bound.step(place_m, felt_n, is_put, tissue.largest_displacement_m());
         let energy_j = energy_j(&*tissue);
         course.energy_j = course.energy_j.max(energy_j);
-        course.part = course.part.max((energy_j - LEAST_J) / (bound.work_j + LEAST_J));
+        course.part = course.part.max((energy_j - MIN_J) / (bound.work_j + MIN_J));
         course.displacement_m = course.displacement_m.max(tissue.largest_displacement_m());
         assert!(course.energy_j.is_finite() && felt_n.is_finite(), "{seed} {}, step {step}: {course:?}", mesh.kind);
     }
@@ -194,7 +194,7 @@ fn tips_on_thin_meshes_get_no_energy_from_nowhere() {
         played += 1;
         blew_up += u64::from(course.blow_ups > 0);
         guarded += u64::from(course.guard_events > 0);
-        if course.part > MOST_PART {
+        if course.part > MAX_PART {
             let found = format!("{seed} {kind}: {course:?}");
             eprintln!("{found}");
             beyond.push(found);
@@ -215,7 +215,7 @@ fn a_fingertip_on_a_thread_does_what_its_work_allows() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("mesh.obj"), thread(0.001, 0.03, 12, 30).obj()).unwrap();
     let text = "[mesh]\nfile = \"mesh.obj\"\nunit = \"m\"\n[material]\nyoungs_modulus_pa = 8000\nthickness_m = 0.0005\n\
-                depth_m = 0.04\nbed_n_per_m3 = 1.34e6\ndamping_ratio = 0.5\n[stepping]\ntolerance = 1e-3\n";
+                depth_m = 0.04\nfoundation_n_per_m3 = 1.34e6\ndamping_ratio = 0.5\n[stepping]\ntolerance = 1e-3\n";
     let limits = Limits::default();
     let scene = Scene::parse_in(folder.path(), "thread", text, &[], &limits).unwrap();
     let model = Model::compile(&scene, &limits).unwrap();
@@ -223,7 +223,7 @@ fn a_fingertip_on_a_thread_does_what_its_work_allows() {
     for (from_m, to_m) in
         [(end, DVec3::new(0.0, 0.0, 0.027)), (side, DVec3::new(-0.003, 0.0, 0.015)), (off, DVec3::ZERO)]
     {
-        let mut tissue = sheet::at_rest(&model);
+        let mut tissue = tissue::at_rest(&model);
         let tip = Tip { radius_m: 0.005, friction: 0.2, ..Tip::default() };
         let (mut force_n, mut energy) = (0.0_f64, 0.0_f64);
         for step in 0..1500_u32 {
@@ -231,7 +231,7 @@ fn a_fingertip_on_a_thread_does_what_its_work_allows() {
             let part = (t / 0.5).min(1.0) - ((t - 0.9) / 0.5).clamp(0.0, 1.0);
             tissue.pose(0, from_m.lerp(to_m, part), tip);
             tissue.step().unwrap();
-            force_n = force_n.max(tissue.feel(0).unwrap().force_on_tool_n.length());
+            force_n = force_n.max(tissue.tool_contact(0).unwrap().force_on_tool_n.length());
             energy = energy.max(energy_j(&*tissue));
         }
         assert_eq!(tissue.guard_events(), 0, "{from_m}");

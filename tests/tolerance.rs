@@ -8,12 +8,12 @@ mod random_scenes;
 use palpate::limits::Limits;
 use palpate::refusal::Reason;
 use palpate::scene::{PAPER, Precision, Scene};
-use palpate::sheet::integrate::Oscillator;
-use palpate::sheet::{Model, choice, stability};
-use random_scenes::{Case, case, errors, mesh_case, play, truth};
+use palpate::tissue::integrate::Oscillator;
+use palpate::tissue::{Model, scheme_selection, stability};
+use random_scenes::{RandomScene, case, errors, mesh_case, play, truth};
 
 /// With the scheme that is chosen for each.
-fn keeps_every_tolerance(case: &Case) {
+fn keeps_every_tolerance(case: &RandomScene) {
     let truth = truth(case).unwrap().course;
     for tolerance in [1e-2, 1e-3, 1e-4, 1e-5, 1e-6] {
         let played = play(case, &[format!("stepping.tolerance={tolerance:e}")], &|| 0.0).unwrap();
@@ -49,7 +49,7 @@ fn paper_with(assignments: &[&str]) -> palpate::refusal::Result<std::sync::Arc<M
 
 /// The force of a stiff, lightly tied sheet is a small difference of large displacements: f32 rounds it away.
 #[test]
-fn a_stiff_sheet_on_soft_virtual_springs_gets_f64() {
+fn a_stiff_sheet_on_soft_anchor_springs_gets_f64() {
     let stiff = ["springs.stiffness_n_per_m=1000", "damping.coefficient_n_s_per_m=0.05"];
     assert_eq!(paper_with(&stiff).unwrap().precision, Precision::F64);
     assert_eq!(paper_with(&[]).unwrap().precision, Precision::F32);
@@ -62,7 +62,7 @@ fn a_scene_that_needs_endless_substeps_is_refused() {
         "sheet.points=[2, 2]",
         "sheet.point_mass_kg=1e-12",
         "springs.stiffness_n_per_m=1e12",
-        "virtual_springs.stiffness_n_per_m=1",
+        "anchor_springs.stiffness_n_per_m=1",
         "damping.coefficient_n_s_per_m=0",
         "stepping.rate_hz=1",
     ])
@@ -73,7 +73,7 @@ fn a_scene_that_needs_endless_substeps_is_refused() {
 /// Stable substeps times this, where nothing keeps the tolerance; docs/accuracy.md tells it.
 fn most_substeps(model: &Model) -> u32 {
     let (scene, plan) = (&model.scene, &model.plan);
-    choice::MOST_TIMES_STABLE
+    scheme_selection::MAX_TIMES_STABLE
         * stability::stable_substeps(plan.integrator, scene.stepping.rate_hz.recip(), &Oscillator::of(scene))
 }
 
@@ -81,7 +81,7 @@ fn most_substeps(model: &Model) -> u32 {
 #[test]
 fn a_body_whose_error_nothing_bounds_takes_few_substeps_or_is_refused_at_once() {
     let limits = Limits::default();
-    let [free, undamped] = ["material.bed_n_per_m3=0.0", "material.damping_ratio=0.0"];
+    let [free, undamped] = ["material.foundation_n_per_m3=0.0", "material.damping_ratio=0.0"];
     for (seed, sets) in [
         (0, vec![free, undamped]),
         (1, vec![undamped]),

@@ -5,7 +5,7 @@
 mod server;
 
 use palpate_proto::pb;
-use server::{PATIENCE, Server, Touch, force, told};
+use server::{TEST_TIMEOUT, TestServer, TestTouch, force, told};
 use tonic::{Code, Streaming};
 
 fn watch(session_id: &str, refinement: u32, encoding: pb::Encoding) -> pb::WatchFramesRequest {
@@ -40,7 +40,7 @@ async fn show(
 ) -> (pb::WatchFramesResponse, usize) {
     let (mut id, mut count) = (None, 0);
     loop {
-        let part = tokio::time::timeout(PATIENCE, stream.message()).await.expect("no frame").unwrap().unwrap();
+        let part = tokio::time::timeout(TEST_TIMEOUT, stream.message()).await.expect("no frame").unwrap().unwrap();
         vertices.resize((part.vertices_x * part.vertices_y) as usize, None);
         assert_eq!(*id.get_or_insert(part.frame_id), part.frame_id, "a frame began before the last one was whole");
         let (origin, scale) = (part.origin_m.unwrap(), part.scale_m.unwrap());
@@ -69,7 +69,7 @@ async fn show(
 }
 
 /// What is shown is the tissue as it stands, within the quantum.
-async fn check(server: &Server, session: &str, last: &pb::WatchFramesResponse, vertices: &Vertices) {
+async fn check(server: &TestServer, session: &str, last: &pb::WatchFramesResponse, vertices: &Vertices) {
     let request = watch(session, last.refinement, pb::Encoding::F32);
     let (now, exact) = frame(&mut server.views().await.watch_frames(request).await.unwrap().into_inner()).await;
     assert_eq!(last.step, now.step);
@@ -84,8 +84,8 @@ async fn check(server: &Server, session: &str, last: &pb::WatchFramesResponse, v
 }
 
 /// Something that moves for so many steps: of what is still no frames are due.
-async fn stir(server: &Server, session: &str, steps: u64) -> Touch {
-    let mut touch = Touch::hold(server, session).await;
+async fn stir(server: &TestServer, session: &str, steps: u64) -> TestTouch {
+    let mut touch = TestTouch::hold(server, session).await;
     for step in (0..steps).step_by(5) {
         let strength_n = if step % 10 == 0 { -1.0 } else { 1.0 };
         touch.command(pb::Command { at_step: Some(step), ..force(0, step + 1, strength_n) }).await;
@@ -96,9 +96,9 @@ async fn stir(server: &Server, session: &str, steps: u64) -> Touch {
 
 #[tokio::test]
 async fn every_refinement_and_encoding_shows_the_same_tissue() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     touch.command(force(0, 1, -1.0)).await;
     touch.settle().await;
     server.start_until(&session, 200).await;
@@ -124,7 +124,7 @@ async fn every_refinement_and_encoding_shows_the_same_tissue() {
 
 #[tokio::test]
 async fn a_texture_is_sent_once() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session_id = server.paper(true).await;
     let mut views = server.views().await;
     let mut sent = async |session_id: &str, known_etag: &str| {
@@ -150,7 +150,7 @@ async fn a_texture_is_sent_once() {
 
 #[tokio::test]
 async fn the_mesh_and_a_frame_fit_together() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
     for refinement in [0, 3, 10] {
         let request = pb::GetMeshRequest { session_id: session.clone(), refinement };
@@ -186,7 +186,7 @@ async fn the_mesh_and_a_frame_fit_together() {
 
 #[tokio::test]
 async fn a_viewer_without_credit_gets_no_more_frames_until_it_acknowledges() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
     let request = pb::WatchFramesRequest {
         max_frames_in_flight: Some(2),
@@ -215,9 +215,9 @@ async fn a_viewer_without_credit_gets_no_more_frames_until_it_acknowledges() {
 
 #[tokio::test]
 async fn frames_of_changes_make_the_same_picture_as_full_ones() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     let mut streams = Vec::new();
     for (refinement, encoding) in [(0, pb::Encoding::I16), (3, pb::Encoding::I16), (2, pb::Encoding::F32)] {
         // One that is always ready, one without credit for most of the time.
@@ -278,9 +278,9 @@ fn at_a_corner(sequence: u64, z_n: f64) -> pb::Command {
 
 #[tokio::test]
 async fn a_still_tissue_sends_nothing_and_five_seconds_of_change_a_full_frame() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     let request = pb::WatchFramesRequest { rate_hz: Some(100.0), ..changes(&session, 0, pb::Encoding::I16) };
     let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
     let mut vertices = Vec::new();
@@ -316,7 +316,7 @@ async fn a_still_tissue_sends_nothing_and_five_seconds_of_change_a_full_frame() 
 
 #[tokio::test]
 async fn a_viewer_chooses_its_rate() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
     let mut streams = Vec::new();
     for rate_hz in [20.0, 50.0] {
@@ -343,7 +343,7 @@ async fn a_viewer_chooses_its_rate() {
 
 #[tokio::test]
 async fn a_viewer_that_reads_nothing_delays_nobody() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
     // Whole frames as often as they go, never read.
     let mut stalled = Vec::new();
@@ -370,7 +370,7 @@ async fn a_viewer_that_reads_nothing_delays_nobody() {
 
 #[tokio::test]
 async fn a_greedy_session_leaves_frames_for_others() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let greedy = server.paper(false).await;
     let request = pb::WatchFramesRequest { rate_hz: Some(1000.0), ..watch(&greedy, 10, pb::Encoding::F32) };
     let mut flood = server.views().await.watch_frames(request).await.unwrap().into_inner();
@@ -380,7 +380,7 @@ async fn a_greedy_session_leaves_frames_for_others() {
     let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
     let _touch = stir(&server, &session, 1000).await;
     server.start_until(&session, 1000).await;
-    // How many come in time is for a bench; that whose turn it is gets it, for `pace::frames`.
+    // How many come in time is for a bench; that whose turn it is gets it, for `realtime::frames`.
     while frame(&mut frames).await.0.step < 1000 {}
     assert!(!reading.is_finished(), "the flood has ended");
     reading.abort();
@@ -388,7 +388,7 @@ async fn a_greedy_session_leaves_frames_for_others() {
 
 #[tokio::test]
 async fn bad_views_are_refused() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
     let good = watch(&session, 1, pb::Encoding::F32);
     let mut views = server.views().await;

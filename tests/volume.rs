@@ -13,13 +13,13 @@ use palpate::refusal::Reason;
 use palpate::scene::profile::Poke;
 use palpate::scene::{Body, Change, Scene};
 use palpate::shape::{PointId, RestShape};
-use palpate::sheet::{Model, Push, Tissue, at_rest, tangent};
+use palpate::tissue::{Model, Push, Tissue, at_rest, tangent};
 use palpate_touch::{Coupling, Tip};
 
 /// A ball of 162 vertices and 0.1 m.
 fn ball(sets: &[&str]) -> Scene {
     let text = "[mesh]\nfile = \"icosphere.obj\"\nunit = \"m\"\npoint_mass_kg = 0.01\n[springs]\nstiffness_n_per_m = 10.0\n\
-                [virtual_springs]\nstiffness_n_per_m = 5.0\n[damping]\ncoefficient_n_s_per_m = 0.1\n\
+                [anchor_springs]\nstiffness_n_per_m = 5.0\n[damping]\ncoefficient_n_s_per_m = 0.1\n\
                 [volume]\nstiffness_pa = 2e4\n";
     let folder = format!("{}/tests/reference", env!("CARGO_MANIFEST_DIR"));
     let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
@@ -29,7 +29,7 @@ fn ball(sets: &[&str]) -> Scene {
 /// A gallbladder of several tiles, its points heavy and light, part of it fixed.
 fn gallbladder(sets: &[&str]) -> Scene {
     let text = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0025 }\nfixed = { group = \"bed\" }\n[material]\n\
-                youngs_modulus_pa = 15e3\nthickness_m = 0.001\nbed_n_per_m3 = 2e6\n[volume]\nstiffness_pa = 2e4\n\
+                youngs_modulus_pa = 15e3\nthickness_m = 0.001\nfoundation_n_per_m3 = 2e6\n[volume]\nstiffness_pa = 2e4\n\
                 [stepping]\ntolerance = 1e-4\n";
     scene_with(text, sets)
 }
@@ -100,7 +100,7 @@ fn what_nothing_damps_keeps_its_energy_and_what_nothing_holds_its_momentum() {
         [("central", 3e-3), ("rk4", 1e-5), ("exponential2", 3e-3), ("exponential3", 1e-4), ("exponential4", 1e-5)]
     {
         let integrator = format!("stepping.integrator={integrator}");
-        let free = ["damping.coefficient_n_s_per_m=0", "virtual_springs.stiffness_n_per_m=0", "sleep.tolerance=0"];
+        let free = ["damping.coefficient_n_s_per_m=0", "anchor_springs.stiffness_n_per_m=0", "sleep.tolerance=0"];
         let finely = ["stepping.precision=f64", "stepping.substeps=4", &integrator];
         let mut tissue = at_rest(&model(&ball(&[&free[..], &finely].concat())));
         tissue.push(0, poke(DVec3::new(0.05, 0.0, 0.0), DVec3::new(-0.3, 0.0, 0.1), 40.0));
@@ -110,7 +110,7 @@ fn what_nothing_damps_keeps_its_energy_and_what_nothing_holds_its_momentum() {
         let state = |tissue: &dyn Tissue| {
             let energy = tissue.energy();
             let momentum: DVec3 = points(tissue).iter().map(|point| tissue.point(*point).velocity_m_per_s).sum();
-            (energy.kinetic_j + energy.spring_j + energy.virtual_j, momentum)
+            (energy.kinetic_j + energy.spring_j + energy.anchor_j, momentum)
         };
         let (before_j, momentum) = state(&*tissue);
         for _ in 0..4 {
@@ -146,7 +146,7 @@ fn the_stiffer_its_volume_the_better_a_pressed_ball_keeps_it_and_the_more_its_ot
         let far = tissue.model().shape().nearest(DVec3::new(0.0, 0.0, -0.05));
         let lost = -growth_m3(&*tissue) / tissue.model().scene.volume().unwrap().volume_m3;
         let bulges_m = -tissue.point(far).displacement_m.z;
-        let force_n = tissue.feel(0).unwrap().force_on_tool_n.z;
+        let force_n = tissue.tool_contact(0).unwrap().force_on_tool_n.z;
         println!(
             "{stiffness_pa} Pa: {lost:.2e} lost, {:.2e} truly; {bulges_m:.2e} m, {force_n:.3} N",
             -true_growth(&*tissue)
@@ -165,9 +165,9 @@ fn the_stiffer_its_volume_the_better_a_pressed_ball_keeps_it_and_the_more_its_ot
 #[test]
 fn a_force_is_felt_as_the_tangent_and_the_force_law_say_also_where_only_a_part_is_looked_at() {
     // All points notice the disc, or a part of them.
-    for bed in ["material.bed_n_per_m3=5e5", "material.bed_n_per_m3=8e6"] {
+    for foundation in ["material.foundation_n_per_m3=5e5", "material.foundation_n_per_m3=8e6"] {
         let [with, without] = ["volume.stiffness_pa=1e5", "volume.stiffness_pa=1e-6"]
-            .map(|stiffness| model(&gallbladder(&["stepping.tolerance=1e-3", bed, stiffness])));
+            .map(|stiffness| model(&gallbladder(&["stepping.tolerance=1e-3", foundation, stiffness])));
         let shape = with.shape();
         let top = shape.nearest(DVec3::new(0.02, 0.0, -0.05));
         let (at_m, outward) = (shape.rest_m(top), shape.normal(top));
@@ -186,12 +186,12 @@ fn a_force_is_felt_as_the_tangent_and_the_force_law_say_also_where_only_a_part_i
                 tissue.pose(0, at_m + (0.001 - part * 0.004) * outward, tip);
                 tissue.step().unwrap();
             }
-            let feel = tissue.feel(0).unwrap();
+            let feel = tissue.tool_contact(0).unwrap();
             assert!((feel.surface_m.distance(at_m) - 0.003).abs() < 1e-6);
             [feel.force_on_tool_n.dot(outward), law[6].force_n]
         };
         let [with, without] = [felt_and_told_n(&with), felt_and_told_n(&without)];
-        println!("{bed}: felt and by the law {with:?} N, without a volume {without:?} N");
+        println!("{foundation}: felt and by the law {with:?} N, without a volume {without:?} N");
         // A law presses straight along the mean normal of the disc: what a volume adds is what is compared.
         let [felt, told] = [0, 1].map(|which| with[which] / without[which] - 1.0);
         assert!(felt > 0.005 && (told / felt - 1.0).abs() < 0.1, "{felt} {told}");
@@ -331,7 +331,7 @@ fn a_scene_that_encloses_nothing_or_says_it_wrongly_is_refused_with_its_line() {
         let folder = format!("{}/tests/reference", env!("CARGO_MANIFEST_DIR"));
         Scene::parse_in(Path::new(&folder), "ball", &text, &[], &Limits::default()).unwrap_err().to_string()
     };
-    let coefficients = "[springs]\nstiffness_n_per_m = 10.0\n[virtual_springs]\nstiffness_n_per_m = 5.0\n[damping]\n\
+    let coefficients = "[springs]\nstiffness_n_per_m = 10.0\n[anchor_springs]\nstiffness_n_per_m = 5.0\n[damping]\n\
                         coefficient_n_s_per_m = 0.1\n";
     let mesh = "[mesh]\nfile = \"icosphere.obj\"\nunit = \"m\"\npoint_mass_kg = 0.01\n";
     let colon = "[mesh]\norgan = { name = \"colon\", edge_m = 0.005 }\npoint_mass_kg = 0.01\n";

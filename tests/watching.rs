@@ -13,14 +13,14 @@ use std::process::{Command, Output, Stdio};
 use metrics::scrape;
 use palpate_proto::pb;
 use serde_json::Value;
-use server::{Server, Touch, client_program, force};
+use server::{TestServer, TestTouch, client_program, force};
 
 #[tokio::test]
 async fn metrics_tell_what_was_done_and_name_no_session() {
-    let mut server = Server::start(&["--metrics", "127.0.0.1:0"]);
+    let mut server = TestServer::start(&["--metrics", "127.0.0.1:0"]);
     let url = metrics::url(&mut server.out);
     let (running, paused) = (server.paper(false).await, server.paper(true).await);
-    let mut touch = Touch::hold(&server, &running).await;
+    let mut touch = TestTouch::hold(&server, &running).await;
     for sequence in 1..=3 {
         touch.command(force(0, sequence, -1.0)).await;
     }
@@ -59,7 +59,7 @@ async fn metrics_tell_what_was_done_and_name_no_session() {
 fn the_dashboard_shows_what_is_there_and_asks_for_nothing_else() {
     let folder = tempfile::tempdir().unwrap();
     let journals = folder.path().to_str().unwrap();
-    let mut server = Server::start(&["--metrics", "127.0.0.1:0", "--journal", journals]);
+    let mut server = TestServer::start(&["--metrics", "127.0.0.1:0", "--journal", journals]);
     let url = metrics::url(&mut server.out);
     let told = scrape(&url);
     let names: BTreeSet<&str> = told.keys().map(|name| name.split('{').next().unwrap()).collect();
@@ -104,9 +104,9 @@ fn top(arguments: &[&str]) -> Output {
 async fn top_shows_sessions_as_a_table_and_as_json() {
     // While it is built a tissue would come to rest.
     client_program();
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let (running, paused) = (server.paper(false).await, server.paper(true).await);
-    let mut touch = Touch::hold(&server, &running).await;
+    let mut touch = TestTouch::hold(&server, &running).await;
     // Now more and now less, all the while: it would come to rest.
     tokio::spawn(async move {
         for sequence in 1.. {
@@ -152,7 +152,7 @@ async fn top_shows_sessions_as_a_table_and_as_json() {
 
 #[test]
 fn a_server_says_that_it_is_well_and_one_that_is_gone_does_not() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let health = |url: &str| Command::new(client_program()).args(["health", url]).output().unwrap().status.code();
     assert_eq!(health(&server.url), Some(0));
     let url = server.url.clone();

@@ -10,7 +10,7 @@ use std::path::Path;
 use palpate::limits::Limits;
 use palpate_proto::pb;
 use prost::Message;
-use server::Server;
+use server::TestServer;
 use tonic::Status;
 use tonic::codec::{Codec, DecodeBuf, Decoder, EncodeBuf, Encoder};
 
@@ -54,7 +54,7 @@ impl Decoder for Bytes {
 }
 
 /// Calls a method of a service with bytes.
-async fn call(server: &Server, method: &'static str, request: Vec<u8>) -> Vec<u8> {
+async fn call(server: &TestServer, method: &'static str, request: Vec<u8>) -> Vec<u8> {
     let mut client = tonic::client::Grpc::new(server.channel().await);
     client.ready().await.unwrap();
     let path = http::uri::PathAndQuery::from_static(method);
@@ -72,8 +72,8 @@ fn vector(v: [f64; 3]) -> Vec<u8> {
     (1..).zip(v).flat_map(component).collect()
 }
 
-fn start(folder: &Path) -> Server {
-    Server::start(&["--log", "info", "--journal", folder.to_str().unwrap()])
+fn start(folder: &Path) -> TestServer {
+    TestServer::start(&["--log", "info", "--journal", folder.to_str().unwrap()])
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -110,7 +110,7 @@ async fn a_session_that_was_told_negative_zeros_is_verified_and_outlives_a_kill(
     }
     before.start_until(&id, 1010).await;
     let hash = before.hash_at(&id, 1010).await;
-    let waited = tokio::time::timeout(server::PATIENCE, async {
+    let waited = tokio::time::timeout(server::TEST_TIMEOUT, async {
         while before.status(&id).await.journal.unwrap().durable_step != Some(1010) {
             tokio::time::sleep(std::time::Duration::from_millis(10)).await;
         }
@@ -125,7 +125,7 @@ async fn a_session_that_was_told_negative_zeros_is_verified_and_outlives_a_kill(
     assert_eq!(after.hash_at(&id, 1010).await, hash);
     let file =
         palpate::journal::file::list(folder.path()).unwrap().into_iter().find(|file| file.session_id == id).unwrap();
-    let reader = palpate::journal::Reader::open(&file.path).unwrap();
+    let reader = palpate::journal::JournalReader::open(&file.path).unwrap();
     let verdict = palpate::journal::verify(reader, &Limits::default(), &mut |_, _| {}).unwrap();
     assert!(verdict.difference.is_none() && verdict.compared[0] > 0, "{verdict:?}");
 }

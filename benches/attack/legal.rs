@@ -8,7 +8,7 @@ use pb::touch_request::Message as Say;
 use tonic::{Status, Streaming};
 
 use super::Ground;
-use super::hoard::{lease, send};
+use super::memory::{lease, send};
 use crate::caller::{Door, create, haptics, push, push_all, sessions, sheet, views};
 
 /// Sessions and streams of one attacker at a time.
@@ -16,10 +16,10 @@ const SESSIONS: usize = 6;
 const STREAMS: usize = 24;
 
 /// No call is waited for any longer.
-const PATIENCE: Duration = Duration::from_secs(3);
+const CALL_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// What is open, and perhaps read.
-enum Stream {
+enum OpenStream {
     Samples(Streaming<pb::WatchSamplesResponse>),
     Records(Streaming<pb::ProbeResponse>),
     Frames(Streaming<pb::WatchFramesResponse>),
@@ -29,20 +29,20 @@ enum Stream {
     Touch(Streaming<pb::TouchResponse>, tokio::sync::mpsc::Sender<pb::TouchRequest>),
 }
 
-impl Stream {
+impl OpenStream {
     /// Reads one message; the viewer of a frame is told.
     async fn read(&mut self) -> Result<Option<pb::AcknowledgeFramesRequest>, Status> {
         match self {
-            Stream::Samples(stream) => stream.message().await.map(|_| None),
-            Stream::Records(stream) => stream.message().await.map(|_| None),
-            Stream::Frames(stream) => {
+            OpenStream::Samples(stream) => stream.message().await.map(|_| None),
+            OpenStream::Records(stream) => stream.message().await.map(|_| None),
+            OpenStream::Frames(stream) => {
                 let frame = stream.message().await?;
                 Ok(frame.map(|f| pb::AcknowledgeFramesRequest { viewer_id: f.viewer_id, frame_id: f.frame_id }))
             }
-            Stream::Mesh(stream) => stream.message().await.map(|_| None),
-            Stream::Texture(stream) => stream.message().await.map(|_| None),
-            Stream::Script(stream) => stream.message().await.map(|_| None),
-            Stream::Touch(stream, _) => stream.message().await.map(|_| None),
+            OpenStream::Mesh(stream) => stream.message().await.map(|_| None),
+            OpenStream::Texture(stream) => stream.message().await.map(|_| None),
+            OpenStream::Script(stream) => stream.message().await.map(|_| None),
+            OpenStream::Touch(stream, _) => stream.message().await.map(|_| None),
         }
     }
 }
@@ -58,7 +58,7 @@ fn scene(ground: &Ground, random: &mut Rng) -> pb::Scene {
     let mut side = || decades(random, 2.0, most.max(4.0)) as u32;
     let mut scene = sheet(side(), side());
     scene.springs.get_or_insert_default().stiffness_n_per_m = Some(decades(random, 0.1, 1000.0));
-    scene.virtual_springs.get_or_insert_default().stiffness_n_per_m = Some(decades(random, 0.01, 100.0));
+    scene.anchor_springs.get_or_insert_default().stiffness_n_per_m = Some(decades(random, 0.01, 100.0));
     scene.damping.get_or_insert_default().coefficient_n_s_per_m = Some(decades(random, 0.01, 10.0));
     scene.stepping.get_or_insert_default().rate_hz = Some([50.0, 250.0, 1000.0, 2000.0][random.usize(..4)]);
     scene
@@ -91,7 +91,7 @@ pub async fn calls(ground: &Ground) -> Result<(), Status> {
     loop {
         sequence += 1;
         let called = call(ground, &door, &mut random, &mut mine, &mut streams, sequence);
-        let called = tokio::time::timeout(PATIENCE, called).await;
+        let called = tokio::time::timeout(CALL_TIMEOUT, called).await;
         let called = called.unwrap_or_else(|_| Err(Status::deadline_exceeded("no answer")));
         // Who has lost its connection makes another.
         if called.as_ref().is_err_and(|status| status.code() == tonic::Code::Unavailable) {
@@ -109,7 +109,7 @@ async fn call(
     door: &Door,
     random: &mut Rng,
     mine: &mut Vec<String>,
-    streams: &mut Vec<Stream>,
+    streams: &mut Vec<OpenStream>,
     sequence: u64,
 ) -> Result<(), Status> {
     if mine.is_empty() || mine.len() < SESSIONS && random.u8(..8) == 0 {
@@ -145,12 +145,12 @@ async fn call(
         8 => {
             let script_name = "vertical-60".to_owned();
             let script = sessions(door).get_script(pb::GetScriptRequest { session_id, script_name }).await?;
-            streams.push(Stream::Script(script.into_inner()));
+            streams.push(OpenStream::Script(script.into_inner()));
             Ok(())
         }
         9 => {
             let request = pb::WatchSamplesRequest { session_id, ..Default::default() };
-            streams.push(Stream::Samples(haptics(door).watch_samples(request).await?.into_inner()));
+            streams.push(OpenStream::Samples(haptics(door).watch_samples(request).await?.into_inner()));
             Ok(())
         }
         10 => {
@@ -158,23 +158,23 @@ async fn call(
             let every_steps = Some(random.u32(1..20));
             let request =
                 pb::ProbeRequest { session_id, r#where, every_steps, energy: random.bool(), tools: random.bool() };
-            streams.push(Stream::Records(haptics(door).probe(request).await?.into_inner()));
+            streams.push(OpenStream::Records(haptics(door).probe(request).await?.into_inner()));
             Ok(())
         }
         11 => {
             let request =
                 pb::WatchFramesRequest { session_id, refinement, always_full: random.bool(), ..Default::default() };
-            streams.push(Stream::Frames(views(door).watch_frames(request).await?.into_inner()));
+            streams.push(OpenStream::Frames(views(door).watch_frames(request).await?.into_inner()));
             Ok(())
         }
         12 => {
             let mesh = views(door).get_mesh(pb::GetMeshRequest { session_id, refinement }).await?;
-            streams.push(Stream::Mesh(mesh.into_inner()));
+            streams.push(OpenStream::Mesh(mesh.into_inner()));
             Ok(())
         }
         13 => {
             let texture = views(door).get_texture(pb::GetTextureRequest { session_id, ..Default::default() }).await?;
-            streams.push(Stream::Texture(texture.into_inner()));
+            streams.push(OpenStream::Texture(texture.into_inner()));
             Ok(())
         }
         14 => {
@@ -193,7 +193,7 @@ async fn call(
                 let _ = say.try_send(pb::TouchRequest { message });
             }
             let messages = tokio_stream::wrappers::ReceiverStream::new(messages);
-            streams.push(Stream::Touch(haptics(door).touch(messages).await?.into_inner(), say));
+            streams.push(OpenStream::Touch(haptics(door).touch(messages).await?.into_inner(), say));
             Ok(())
         }
         _ if streams.is_empty() => Ok(()),

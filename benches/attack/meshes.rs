@@ -32,7 +32,7 @@ async fn mesh(ground: &Ground, door: &Door, name: &str, file: &[u8], vertices: O
     let material = pb::Material {
         youngs_modulus_pa: Some(8000.0),
         thickness_m: Some(0.001),
-        bed_n_per_m3: Some(1e6),
+        foundation_n_per_m3: Some(1e6),
         ..Default::default()
     };
     let scene = pb::Scene { mesh: Some(source), material: Some(material), ..Default::default() };

@@ -3,12 +3,12 @@
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::panic, clippy::disallowed_methods)]
 
 mod bytes;
-mod crowd;
+mod cpu;
 mod datagrams;
-mod hoard;
 mod legal;
+mod memory;
 mod meshes;
-mod toil;
+mod slots;
 mod tools;
 
 use std::collections::BTreeMap;
@@ -21,19 +21,19 @@ use futures_util::future::BoxFuture;
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-use crate::caller::{Caller, Keys, SIDE, why};
+use crate::caller::{SIDE, TestCaller, TokenFile, why};
 use crate::honest::Freezer;
 
 /// Where an attack takes place.
 pub struct Ground {
     /// Who attacks.
-    pub caller: Caller,
+    pub caller: TestCaller,
     /// A session of an honest client, whose id got about. It holds tool 0 there.
     pub shared: String,
     /// The server's process.
     pub process: u32,
     /// The file of tokens, which changes under attacks that need it to.
-    pub keys: Arc<Keys>,
+    pub keys: Arc<TokenFile>,
     /// The honest client itself, where an attack has it stand still.
     pub freezer: Option<Freezer>,
     /// How much of everything: 1 is all that the attack is known for.
@@ -44,7 +44,7 @@ pub struct Ground {
 }
 
 impl Ground {
-    pub fn new(caller: Caller, shared: &str, process: u32, keys: &Arc<Keys>) -> Self {
+    pub fn new(caller: TestCaller, shared: &str, process: u32, keys: &Arc<TokenFile>) -> Self {
         Ground {
             caller,
             shared: shared.to_owned(),
@@ -83,15 +83,15 @@ impl Ground {
 }
 
 /// Does it for as long as it is let; fails if the server does not play.
-type Run = for<'g> fn(&'g Ground) -> BoxFuture<'g, Result<(), Status>>;
+type AttackFunction = for<'g> fn(&'g Ground) -> BoxFuture<'g, Result<(), Status>>;
 
 /// An attack.
 #[derive(Clone, Copy)]
-pub struct Kind {
+pub struct AttackKind {
     pub name: &'static str,
     /// In one line.
     pub about: &'static str,
-    pub run: Run,
+    pub run: AttackFunction,
     /// Tools of the honest client beside it.
     pub tools: u32,
     /// Of the honest client's way to the server and back, ms.
@@ -102,92 +102,92 @@ pub struct Kind {
     pub descriptors: Option<u32>,
 }
 
-const fn kind(name: &'static str, about: &'static str, run: Run) -> Kind {
-    Kind { name, about, run, tools: 1, round_trip_ms: 0, same_caller: false, descriptors: None }
+const fn kind(name: &'static str, about: &'static str, run: AttackFunction) -> AttackKind {
+    AttackKind { name, about, run, tools: 1, round_trip_ms: 0, same_caller: false, descriptors: None }
 }
 
 /// All that is known, in the order of the points of what a server has to bear.
-pub const KINDS: &[Kind] = &[
+pub const KINDS: &[AttackKind] = &[
     // Work without end.
     kind("endless-scene", "scenes of four points that ask for 1 substep and need 2³²", |g| {
-        Box::pin(toil::endless_scene(g))
+        Box::pin(cpu::endless_scene(g))
     }),
-    kind("big-law", "force laws of a sheet of 331² that hardly anything holds back", |g| Box::pin(toil::big_law(g))),
+    kind("big-law", "force laws of a sheet of 331² that hardly anything holds back", |g| Box::pin(cpu::big_law(g))),
     // Somebody stands still.
     kind("stall-server", "the server stands still for 5 s", |g| Box::pin(bytes::stall_server(g, 5.0))),
-    Kind {
+    AttackKind {
         round_trip_ms: 50,
         ..kind("stall-server-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_server(g, 5.0)))
     },
-    Kind {
+    AttackKind {
         tools: 16,
         ..kind("stall-server-16", "the server stands still for 1 s, under 16 tools", |g| {
             Box::pin(bytes::stall_server(g, 1.0))
         })
     },
-    Kind {
+    AttackKind {
         tools: 16,
         round_trip_ms: 50,
         ..kind("stall-server-16-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_server(g, 1.0)))
     },
     kind("stall-client", "the honest client stands still for 5 s", |g| Box::pin(bytes::stall_client(g, 5.0))),
-    Kind {
+    AttackKind {
         round_trip_ms: 50,
         ..kind("stall-client-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_client(g, 5.0)))
     },
-    Kind {
+    AttackKind {
         tools: 16,
         ..kind("stall-client-16", "the honest client stands still for 1 s, with 16 tools", |g| {
             Box::pin(bytes::stall_client(g, 1.0))
         })
     },
-    Kind {
+    AttackKind {
         tools: 16,
         round_trip_ms: 50,
         ..kind("stall-client-16-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_client(g, 1.0)))
     },
     // What one call makes the server do.
     kind("fixed-positions", "4096 positions a call to a sheet with 500,000 fixed points", |g| {
-        Box::pin(toil::fixed_positions(g))
+        Box::pin(cpu::fixed_positions(g))
     }),
-    kind("empty-commands", "500,000 empty commands a call", |g| Box::pin(toil::empty_commands(g))),
+    kind("empty-commands", "500,000 empty commands a call", |g| Box::pin(cpu::empty_commands(g))),
     // A token that is not one any more.
     kind(
         "revoked-unread",
         "commands by a token that was struck out, reading nothing (counted: taken 2 s after)",
-        |g| Box::pin(crowd::revoked_unread(g)),
+        |g| Box::pin(slots::revoked_unread(g)),
     ),
     // Memory.
     kind(
         "tissue-changes",
         "changes of a tissue with 500,000 fixed points, that wait for a step that never comes",
-        |g| Box::pin(hoard::tissue_changes(g)),
+        |g| Box::pin(memory::tissue_changes(g)),
     ),
-    kind("fixed-sessions", "sessions with 500,000 fixed points each", |g| Box::pin(hoard::fixed_sessions(g))),
+    kind("fixed-sessions", "sessions with 500,000 fixed points each", |g| Box::pin(memory::fixed_sessions(g))),
     kind("unread-viewers", "139 viewers of 186² at refinement 10 that read nothing", |g| {
-        Box::pin(hoard::unread_viewers(g))
+        Box::pin(memory::unread_viewers(g))
     }),
     kind("waiting-commands", "64 tools with 4096 commands each that wait, in one session after the other", |g| {
-        Box::pin(hoard::waiting_commands(g))
+        Box::pin(memory::waiting_commands(g))
     }),
-    kind("thin-sheet", "a sheet of 4,194,304 × 1, all of it awake", |g| Box::pin(hoard::thin_sheet(g))),
+    kind("thin-sheet", "a sheet of 4,194,304 × 1, all of it awake", |g| Box::pin(memory::thin_sheet(g))),
     // What a request costs.
-    kind("unread-probes", "20 probes of all points that nobody reads", |g| Box::pin(toil::unread_probes(g, 20, SIDE))),
-    Kind {
+    kind("unread-probes", "20 probes of all points that nobody reads", |g| Box::pin(cpu::unread_probes(g, 20, SIDE))),
+    AttackKind {
         same_caller: true,
         ..kind("unread-probes-same", "the same by the honest client's own token", |g| {
-            Box::pin(toil::unread_probes(g, 20, SIDE))
+            Box::pin(cpu::unread_probes(g, 20, SIDE))
         })
     },
-    kind("unread-probes-250", "250 such probes", |g| Box::pin(toil::unread_probes(g, 250, SIDE))),
-    kind("probe-2048", "a probe of all points of 2048²", |g| Box::pin(toil::unread_probes(g, 1, g.side(2048)))),
+    kind("unread-probes-250", "250 such probes", |g| Box::pin(cpu::unread_probes(g, 250, SIDE))),
+    kind("probe-2048", "a probe of all points of 2048²", |g| Box::pin(cpu::unread_probes(g, 1, g.side(2048)))),
     kind("heavy-poked", "a sheet of 2000², made at rest and then pushed everywhere", |g| {
-        Box::pin(toil::heavy_poked(g))
+        Box::pin(cpu::heavy_poked(g))
     }),
-    kind("stiff-change", "a tissue that is changed to k = 10⁹ N/m and pushed", |g| Box::pin(toil::stiff_change(g))),
-    kind("woken-together", "400 resting sessions pushed at once", |g| Box::pin(toil::woken_together(g))),
-    kind("polling", "GetSession again and again while 262,144 commands wait", |g| Box::pin(toil::polling(g))),
-    kind("hash-1024", "the hash of a sheet of 1024², eight times a second", |g| Box::pin(toil::hashes(g))),
+    kind("stiff-change", "a tissue that is changed to k = 10⁹ N/m and pushed", |g| Box::pin(cpu::stiff_change(g))),
+    kind("woken-together", "400 resting sessions pushed at once", |g| Box::pin(cpu::woken_together(g))),
+    kind("polling", "GetSession again and again while 262,144 commands wait", |g| Box::pin(cpu::polling(g))),
+    kind("hash-1024", "the hash of a sheet of 1024², eight times a second", |g| Box::pin(cpu::hashes(g))),
     kind("page-gets", "GETs of the page without waiting for answers", |g| Box::pin(bytes::page_gets(g))),
     kind("flood-window-update", "WINDOW_UPDATE frames as fast as they go", |g| {
         Box::pin(bytes::frames(g, &bytes::WINDOW_UPDATE))
@@ -208,10 +208,10 @@ pub const KINDS: &[Kind] = &[
         Box::pin(datagrams::chatter(g))
     }),
     kind("stalled-viewer", "a viewer that asks for 1000 full frames a second and reads none", |g| {
-        Box::pin(hoard::stalled_viewer(g))
+        Box::pin(memory::stalled_viewer(g))
     }),
-    kind("command-flood", "a client that sends 100 times as many commands", |g| Box::pin(toil::command_flood(g))),
-    kind("create-and-drop", "sessions made and dropped without end", |g| Box::pin(toil::create_and_drop(g))),
+    kind("command-flood", "a client that sends 100 times as many commands", |g| Box::pin(cpu::command_flood(g))),
+    kind("create-and-drop", "sessions made and dropped without end", |g| Box::pin(cpu::create_and_drop(g))),
     kind("legal-calls", "random legal calls to sessions of its own", |g| Box::pin(legal::calls(g))),
     // What tools and meshes cost.
     kind("tip-strip", "64 tips of half of a sheet of 2000 × 1, again and again", |g| Box::pin(tools::strip(g, 2000))),
@@ -237,22 +237,22 @@ pub const KINDS: &[Kind] = &[
         Box::pin(meshes::empty_accessor(g))
     }),
     // Who is locked out.
-    kind("watchers", "256 streams of samples of the honest client's session", |g| Box::pin(crowd::watchers(g))),
+    kind("watchers", "256 streams of samples of the honest client's session", |g| Box::pin(slots::watchers(g))),
     kind("kept-leases", "every other tool of the honest client's session taken for 600 s, then hung up", |g| {
-        Box::pin(crowd::kept_leases(g))
+        Box::pin(slots::kept_leases(g))
     }),
-    kind("all-slots", "as many sessions as there may be", |g| Box::pin(crowd::all_slots(g))),
-    Kind {
+    kind("all-slots", "as many sessions as there may be", |g| Box::pin(slots::all_slots(g))),
+    AttackKind {
         descriptors: Some(1024),
         ..kind("descriptors", "1500 connections without a token, to a server that may open 1024 files", |g| {
-            Box::pin(crowd::connections(g, bytes::GREETING))
+            Box::pin(slots::connections(g, bytes::GREETING))
         })
     },
-    kind("half-open", "1000 connections that say nothing", |g| Box::pin(crowd::connections(g, b""))),
+    kind("half-open", "1000 connections that say nothing", |g| Box::pin(slots::connections(g, b""))),
 ];
 
 /// The attack of that name.
-pub fn named(name: &str) -> Option<&'static Kind> {
+pub fn named(name: &str) -> Option<&'static AttackKind> {
     KINDS.iter().find(|kind| kind.name == name)
 }
 
@@ -273,7 +273,7 @@ pub struct Attack {
 }
 
 impl Attack {
-    pub fn start(run: Run, ground: Ground) -> Self {
+    pub fn start(run: AttackFunction, ground: Ground) -> Self {
         let over = CancellationToken::new();
         let thread = std::thread::spawn({
             let over = over.clone();

@@ -10,7 +10,7 @@ use pb::create_session_request::Source;
 use tonic::Status;
 
 use super::Ground;
-use super::hoard::{lease, send};
+use super::memory::{lease, send};
 use crate::caller::{Door, SIDE, create, push_all, sessions, sheet};
 
 const TOOLS: u32 = 64;

@@ -8,31 +8,31 @@ use pb::session_service_client::SessionServiceClient;
 use serde_json::json;
 use tonic::transport::Channel;
 
-use crate::etcd::Etcd;
+use crate::etcd::EtcdMembers;
 use crate::fleet::Node;
 use crate::report::chart::Panel;
-use crate::report::{Report, cells, digits, quick};
-use crate::server::Server;
-use crate::{Times, generous};
+use crate::report::{BenchReport, cells, digits, quick};
+use crate::server::TestServer;
+use crate::{FleetTimes, generous};
 
-type Sessions = SessionServiceClient<Channel>;
+type SessionClients = SessionServiceClient<Channel>;
 
-async fn create(sessions: &mut Sessions) -> pb::Session {
+async fn create(sessions: &mut SessionClients) -> pb::Session {
     let request = pb::CreateSessionRequest { source: Some(Source::SceneName("paper".into())), ..Default::default() };
     sessions.create_session(request).await.unwrap().into_inner().session.unwrap()
 }
 
-async fn get(sessions: &mut Sessions, session_id: &str) {
+async fn get(sessions: &mut SessionClients, session_id: &str) {
     let request = pb::GetSessionRequest { session_id: session_id.to_owned() };
     sessions.get_session(request).await.unwrap();
 }
 
-async fn delete(sessions: &mut Sessions, session_id: String) {
+async fn delete(sessions: &mut SessionClients, session_id: String) {
     sessions.delete_session(pb::DeleteSessionRequest { session_id }).await.unwrap();
 }
 
 /// The time of a call, ms.
-async fn timed<T>(times: &mut Times, call: impl Future<Output = T>) -> T {
+async fn timed<T>(times: &mut FleetTimes, call: impl Future<Output = T>) -> T {
     let begun = Instant::now();
     let answer = call.await;
     times.0.push(1e3 * begun.elapsed().as_secs_f64());
@@ -40,20 +40,20 @@ async fn timed<T>(times: &mut Times, call: impl Future<Output = T>) -> T {
 }
 
 /// Each call through three servers in turn, and in between to one without a fleet.
-pub fn measure(report: &mut Report) -> Option<Panel> {
+pub fn measure(report: &mut BenchReport) -> Option<Panel> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
     runtime.block_on(measured(report));
     None
 }
 
-async fn measured(report: &mut Report) {
+async fn measured(report: &mut BenchReport) {
     let rounds = if quick() { 30 } else { 2000 };
     let folder = tempfile::tempdir().unwrap();
     let config = generous(folder.path());
     let more = ["--log", "error", "--config", config.to_str().unwrap()];
-    let etcd = Etcd::start(1);
+    let etcd = EtcdMembers::start(1);
     let alone = folder.path().join("alone");
-    let alone = Server::start(&[&["--threads", "1", "--journal", alone.to_str().unwrap()], &more[..]].concat());
+    let alone = TestServer::start(&[&["--threads", "1", "--journal", alone.to_str().unwrap()], &more[..]].concat());
     let nodes: Vec<Node> =
         (0..3).map(|at| Node::start(folder.path(), &format!("n{at}"), &etcd.endpoints(), &more)).collect();
     nodes[0].until_nodes(3).await;
@@ -66,7 +66,7 @@ async fn measured(report: &mut Report) {
         let endpoint = &session.ownership.as_ref().unwrap().endpoint;
         nodes.iter().position(|node| node.url == *endpoint).unwrap()
     };
-    let mut times: [Times; 5] = Default::default();
+    let mut times: [FleetTimes; 5] = Default::default();
     let [create_alone, create_here, get_alone, get_here, locate] = &mut times;
     for round in 0..rounds {
         if round % 500 == 0 {
@@ -103,7 +103,7 @@ async fn measured(report: &mut Report) {
         ("GetSession", [&times[2], &times[3]]),
         ("LocateSession", [&times[2], &times[4]]),
     ] {
-        let of = |times: &Times| [0.5, 0.99].map(|quantile| times.quantile(quantile));
+        let of = |times: &FleetTimes| [0.5, 0.99].map(|quantile| times.quantile(quantile));
         let (alone, here) = (of(alone), of(here));
         let row = [alone[0], alone[1], here[0], here[1], here[0] / alone[0], here[1] / alone[1]];
         rows.push([vec![name.to_owned()], row.map(digits).to_vec()].concat());

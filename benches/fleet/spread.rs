@@ -9,27 +9,27 @@ use pb::create_session_request::Source;
 use serde_json::json;
 
 use crate::cores::resident;
-use crate::etcd::Etcd;
+use crate::etcd::EtcdMembers;
 use crate::fleet::Node;
 use crate::generous;
 use crate::report::chart::Panel;
-use crate::report::{Report, cells, digits, quick};
+use crate::report::{BenchReport, cells, digits, quick};
 
 /// Clients that create sessions at once, as many at each server.
 const AT_ONCE: usize = 6;
 
 /// Sessions at rest, created through three servers.
-pub fn measure(report: &mut Report) -> Option<Panel> {
+pub fn measure(report: &mut BenchReport) -> Option<Panel> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
     runtime.block_on(measured(report));
     None
 }
 
-async fn measured(report: &mut Report) {
+async fn measured(report: &mut BenchReport) {
     let count: usize = if quick() { 60 } else { 10_000 };
     let folder = tempfile::tempdir().unwrap();
     let config = generous(folder.path());
-    let etcd = Etcd::start(1);
+    let etcd = EtcdMembers::start(1);
     let more = ["--log", "error", "--config", config.to_str().unwrap()];
     let nodes: Vec<Node> =
         (0..3).map(|at| Node::start(folder.path(), &format!("n{at}"), &etcd.endpoints(), &more)).collect();

@@ -10,12 +10,12 @@ use pb::touch_response::Message as Heard;
 use serde_json::json;
 
 use crate::cores::{kept_to, processor_s, thread_times};
-use crate::etcd::Etcd;
+use crate::etcd::EtcdMembers;
 use crate::fleet::{Node, until};
 use crate::report::chart::{Look, Panel, Series};
-use crate::report::{Report, cells, digits, quick};
-use crate::server::{Server, Touch, force, open};
-use crate::{Times, generous};
+use crate::report::{BenchReport, cells, digits, quick};
+use crate::server::{TestServer, TestTouch, force, open};
+use crate::{FleetTimes, generous};
 
 /// What is compared: a name, and whether it is of a fleet, and with what else.
 const WAYS: [(&str, Option<&[&str]>); 3] = [
@@ -25,7 +25,7 @@ const WAYS: [(&str, Option<&[&str]>); 3] = [
 ];
 
 /// One run of one way.
-struct Run {
+struct WayRun {
     /// Time of stepping threads for a step, and of all threads, µs.
     step_us: f64,
     all_us: f64,
@@ -38,9 +38,9 @@ struct Run {
 }
 
 /// The steps under touch: each way several times, in turn.
-pub fn measure(report: &mut Report) -> Option<Panel> {
+pub fn measure(report: &mut BenchReport) -> Option<Panel> {
     let (clients, seconds, rounds) = if quick() { (2, 2.0, 1) } else { (20, 10.0, 7) };
-    let mut runs: [Vec<Run>; 3] = Default::default();
+    let mut runs: [Vec<WayRun>; 3] = Default::default();
     for round in 1..=rounds {
         for (way, runs) in WAYS.iter().zip(&mut runs) {
             eprintln!("steps, {}: {round} of {rounds}", way.0);
@@ -53,7 +53,7 @@ pub fn measure(report: &mut Report) -> Option<Panel> {
          the clients, etcd and the server that stands by are on the others. The median of {rounds} runs of {seconds} s, the ways in \
          turn."
     ));
-    let median = |runs: &[Run], of: fn(&Run) -> f64| Times(runs.iter().map(of).collect()).median();
+    let median = |runs: &[WayRun], of: fn(&WayRun) -> f64| FleetTimes(runs.iter().map(of).collect()).median();
     let header = cells([
         "",
         "stepping, µs a step",
@@ -90,27 +90,27 @@ pub fn measure(report: &mut Report) -> Option<Panel> {
     Some(Panel::Curves { title, x, y, up: 0.0..1.2 * most, series })
 }
 
-fn run(fleet: Option<&[&str]>, clients: usize, seconds: f64) -> Run {
+fn run(fleet: Option<&[&str]>, clients: usize, seconds: f64) -> WayRun {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
     // The threads of the runtime have been started outside the server's core.
     kept_to(false, || runtime.block_on(ran(fleet, clients, seconds)))
 }
 
-async fn ran(fleet: Option<&[&str]>, clients: usize, seconds: f64) -> Run {
+async fn ran(fleet: Option<&[&str]>, clients: usize, seconds: f64) -> WayRun {
     let folder = tempfile::tempdir().unwrap();
     let config = generous(folder.path());
     let common = ["--log", "error", "--config", config.to_str().unwrap()];
     let Some(more) = fleet else {
         let journals = folder.path().join("alone");
         let own = ["--threads", "1", "--journal", journals.to_str().unwrap()];
-        let server = kept_to(true, || Server::start(&[&own[..], &common].concat()));
+        let server = kept_to(true, || TestServer::start(&[&own[..], &common].concat()));
         let mut ids = Vec::new();
         for _ in 0..clients {
             ids.push(server.paper(false).await);
         }
         return measured(&server, &ids, seconds, [None, None]).await;
     };
-    let etcd = Etcd::start(1);
+    let etcd = EtcdMembers::start(1);
     let more = [&common[..], more].concat();
     let there = kept_to(true, || Node::start(folder.path(), "n0", &etcd.endpoints(), &more));
     let standby = Node::start(folder.path(), "n1", &etcd.endpoints(), &more);
@@ -134,12 +134,13 @@ async fn ran(fleet: Option<&[&str]>, clients: usize, seconds: f64) -> Run {
 }
 
 /// Measures a server with a client in each of its sessions, and what two other processes take.
-async fn measured(server: &Server, ids: &[String], seconds: f64, others: [Option<u32>; 2]) -> Run {
+async fn measured(server: &TestServer, ids: &[String], seconds: f64, others: [Option<u32>; 2]) -> WayRun {
     let over = Arc::new(AtomicBool::new(false));
     let begins = Arc::new(AtomicBool::new(false));
     let mut presses = Vec::new();
     for id in ids {
-        let touch = Touch::open(server, pb::TouchOpen { sample_every_steps: Some(1), ..open(id, &[0]) }).await.unwrap();
+        let touch =
+            TestTouch::open(server, pb::TouchOpen { sample_every_steps: Some(1), ..open(id, &[0]) }).await.unwrap();
         presses.push(tokio::spawn(press(touch, begins.clone(), over.clone())));
     }
     // All are under way.
@@ -152,7 +153,7 @@ async fn measured(server: &Server, ids: &[String], seconds: f64, others: [Option
     let (elapsed_s, after, others_after_s) = (begun.elapsed().as_secs_f64(), thread_times(process), cores());
     let done = (self::steps(server, ids).await - steps) as f64;
     over.store(true, Ordering::Relaxed);
-    let mut round_trips = Times::default();
+    let mut round_trips = FleetTimes::default();
     for press in presses {
         round_trips.0.extend(press.await.unwrap().0);
     }
@@ -162,7 +163,7 @@ async fn measured(server: &Server, ids: &[String], seconds: f64, others: [Option
     };
     let each_us = |name: &str| 1e6 * (of(&after, name) - of(&times, name)) / done;
     let [standby_cores, etcd_cores] = [0, 1].map(|at| (others_after_s[at] - others_s[at]) / elapsed_s);
-    Run {
+    WayRun {
         step_us: each_us("step"),
         all_us: each_us(""),
         p50_ms: round_trips.quantile(0.5),
@@ -173,7 +174,7 @@ async fn measured(server: &Server, ids: &[String], seconds: f64, others: [Option
 }
 
 /// Steps that were done, of all sessions.
-async fn steps(server: &Server, ids: &[String]) -> u64 {
+async fn steps(server: &TestServer, ids: &[String]) -> u64 {
     let mut sum = 0;
     for id in ids {
         let session = server.status(id).await;
@@ -183,10 +184,10 @@ async fn steps(server: &Server, ids: &[String]) -> u64 {
 }
 
 /// A command each millisecond, until it is over. The times until they were acknowledged, ms.
-async fn press(mut touch: Touch, begins: Arc<AtomicBool>, over: Arc<AtomicBool>) -> Times {
+async fn press(mut touch: TestTouch, begins: Arc<AtomicBool>, over: Arc<AtomicBool>) -> FleetTimes {
     let mut ticks = tokio::time::interval(Duration::from_millis(1));
     ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Skip);
-    let (mut sequence, mut waiting, mut times) = (0, VecDeque::new(), Times::default());
+    let (mut sequence, mut waiting, mut times) = (0, VecDeque::new(), FleetTimes::default());
     while !over.load(Ordering::Relaxed) {
         tokio::select! {
             biased;

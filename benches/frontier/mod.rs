@@ -7,7 +7,7 @@ use crate::scenes::Case;
 
 /// One scheme at one step on one scene.
 #[derive(Clone)]
-pub struct Trial {
+pub struct SchemeTrial {
     pub integrator: &'static str,
     pub precision: &'static str,
     /// Length of a substep, s.
@@ -21,9 +21,9 @@ pub struct Trial {
 }
 
 /// The trials of one scheme and number format, largest step first.
-pub type Curve = Vec<Trial>;
+pub type Curve = Vec<SchemeTrial>;
 
-impl Trial {
+impl SchemeTrial {
     /// The larger error.
     pub fn error(&self) -> f64 {
         self.displacement.max(self.force)
@@ -40,7 +40,7 @@ impl Trial {
 
 /// Whether no other trial takes less time for an error that is smaller, or larger by at most a 50th: f32 and f64 at one
 /// step differ by less, which is not worth a cost.
-pub fn is_best(trial: &Trial, curves: &[Curve]) -> bool {
+pub fn is_best(trial: &SchemeTrial, curves: &[Curve]) -> bool {
     !curves.iter().flatten().any(|other| other.error() < 1.02 * trial.error() && other.cost < trial.cost)
 }
 
@@ -64,7 +64,7 @@ pub struct Offer {
 
 /// The least cost at which the trials accepted by `of` reach `error`. If none does and `extrapolate` is true, the f64
 /// curves are extrapolated at first order; rounding would stop those in f32.
-pub fn cheapest(curves: &[Curve], error: f64, of: impl Fn(&Trial) -> bool, extrapolate: bool) -> Option<Offer> {
+pub fn cheapest(curves: &[Curve], error: f64, of: impl Fn(&SchemeTrial) -> bool, extrapolate: bool) -> Option<Offer> {
     let offers = |extrapolated: bool| {
         let curves = curves.iter().filter(|curve| of(&curve[0]) && (!extrapolated || curve[0].precision == "f64"));
         let offer = move |curve: &Curve| {

@@ -1,6 +1,6 @@
 """Shared by the peers: the paper's tissue in numbers, the forces on it, and the timing of a window.
 
-The physics, at every point: structural and shear springs to 8 neighbours, each k (1 - L0/L)(x_b - x_a); a virtual
+The physics, at every point: structural and shear springs to 8 neighbours, each k (1 - L0/L)(x_b - x_a); a anchor
 spring -K u to the rest position; damping -C v; a constant applied force. Central differences with implicit damping:
 d <- p d + q F(u), u <- u + d, u from rest, d the increment of the last step. f32, one thread.
 

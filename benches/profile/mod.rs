@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 const RATE_HZ: u32 = 1999;
 
 /// Thread and activity.
-pub type Place = (&'static str, &'static str);
+pub type Activity = (&'static str, &'static str);
 
 /// Matched against each frame of the stack, leaf first; the first match counts. System calls come before their causes.
 const SYSTEM: [(&str, &str); 8] = [
@@ -24,12 +24,12 @@ const SYSTEM: [(&str, &str); 8] = [
 
 /// Matched against the leaf, outside the system; the first match counts.
 const PROGRAM: [(&str, &str); 17] = [
-    ("palpate::sheet::lanes", "the sweep over the springs"),
-    ("palpate::sheet", "the sheet beside the sweep: forces, samples, checks"),
+    ("palpate::tissue::lanes", "the sweep over the springs"),
+    ("palpate::tissue", "the sheet beside the sweep: forces, samples, checks"),
     ("libm", "the sheet beside the sweep: forces, samples, checks"),
     ("fma", "the sheet beside the sweep: forces, samples, checks"),
     ("palpate::session", "session and schedule"),
-    ("palpate::pace", "session and schedule"),
+    ("palpate::realtime", "session and schedule"),
     ("palpate", "wire and services"),
     ("tonic", "gRPC and protobuf"),
     ("prost", "gRPC and protobuf"),
@@ -43,7 +43,7 @@ const PROGRAM: [(&str, &str); 17] = [
     ("tsc", "the clock"),
 ];
 
-fn place(thread: &str, stack: &[&str]) -> Place {
+fn place(thread: &str, stack: &[&str]) -> Activity {
     let thread = ["network", "step"].into_iter().find(|name| thread.starts_with(name)).unwrap_or("other threads");
     let find = |table: &[(&str, &'static str)], frame: &str| {
         table.iter().find(|entry| frame.contains(entry.0)).map(|entry| entry.1)
@@ -59,7 +59,7 @@ fn place(thread: &str, stack: &[&str]) -> Place {
 
 /// The fraction of time that process `id` spends in each place, over `seconds` from now, largest first. `None` if there
 /// is no `perf` with permission to sample.
-pub fn parts(id: u32, seconds: u32) -> Option<Vec<(Place, f64)>> {
+pub fn parts(id: u32, seconds: u32) -> Option<Vec<(Activity, f64)>> {
     let folder = tempfile::tempdir().unwrap();
     let data = folder.path().join("perf.data");
     let mut record = Command::new("perf");
@@ -70,7 +70,7 @@ pub fn parts(id: u32, seconds: u32) -> Option<Vec<(Place, f64)>> {
     }
     let script = Command::new("perf").args(["script", "-F", "comm,ip,sym", "-i"]).arg(&data).output().ok()?;
     let text = String::from_utf8_lossy(&script.stdout).into_owned();
-    let mut counts: BTreeMap<Place, f64> = BTreeMap::new();
+    let mut counts: BTreeMap<Activity, f64> = BTreeMap::new();
     // A sample is a line with the thread's name, a line for each frame, and an empty one.
     for sample in text.split("\n\n") {
         let mut lines = sample.lines().filter(|line| !line.is_empty());

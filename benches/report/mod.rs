@@ -1,4 +1,4 @@
-//! The output of a benchmark: tables, figures and charts in docs/benchmarks; and its clock.
+//! The output of a benchmark: tables and charts in docs/benchmarks, figures for programs in target/benchmarks; and its clock.
 // Each benchmark uses only a part of this module.
 #![allow(dead_code, unreachable_pub)]
 
@@ -11,25 +11,25 @@ use chart::Panel;
 use serde_json::{Map, Value, json};
 
 /// The results of a benchmark as they come in.
-pub struct Report {
+pub struct BenchReport {
     name: &'static str,
     text: String,
     figures: Map<String, Value>,
 }
 
-impl Report {
+impl BenchReport {
     /// A report that the command `command` reproduces.
     pub fn new(name: &'static str, title: &str, command: &str) -> Self {
         let machine = machine();
         let command = if quick() { format!("{command} ARGUMENTS=--quick") } else { command.to_owned() };
         let text = format!(
-            "# {title}\n\n`{command}` wrote this page, [{name}.json]({name}.json) and the picture, on {machine}.\n\n\
+            "# {title}\n\n`{command}` wrote this page and the picture, on {machine}.\n\n\
              ![{title}]({name}.svg)\n"
         );
         let mut figures = Map::new();
         figures.insert("machine".to_owned(), json!(machine));
         figures.insert("command".to_owned(), json!(command));
-        Report { name, text, figures }
+        BenchReport { name, text, figures }
     }
 
     /// Adds a heading.
@@ -60,14 +60,16 @@ impl Report {
         print!("{}", self.text);
     }
 
-    /// Writes the page, the figures and the picture to docs/benchmarks, and the page to standard output.
+    /// Writes the page and the picture to docs/benchmarks, the figures to target/benchmarks, and the page to standard output.
     pub fn write(self, columns: usize, panels: &[Panel]) {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/benchmarks");
-        std::fs::create_dir_all(&folder).unwrap();
-        let file = |extension: &str| folder.join(self.name).with_extension(extension);
-        std::fs::write(file("md"), &self.text).unwrap();
-        std::fs::write(file("json"), serde_json::to_string_pretty(&self.figures).unwrap() + "\n").unwrap();
-        std::fs::write(file("svg"), chart::svg(columns, panels)).unwrap();
+        let write = |folder: &str, extension: &str, text: String| {
+            let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);
+            std::fs::create_dir_all(&folder).unwrap();
+            std::fs::write(folder.join(self.name).with_extension(extension), text).unwrap();
+        };
+        write("docs/benchmarks", "md", self.text.clone());
+        write("docs/benchmarks", "svg", chart::svg(columns, panels));
+        write("target/benchmarks", "json", serde_json::to_string_pretty(&self.figures).unwrap() + "\n");
         self.print();
     }
 }

@@ -10,16 +10,16 @@ use palpate::server::identity::Role;
 use serde_json::{Value, json};
 use tokio::runtime::Runtime;
 
-use crate::attack::{Attack, Ground, Kind, Toll};
-use crate::caller::{Caller, Keys};
+use crate::attack::{Attack, AttackKind, Ground, Toll};
+use crate::caller::{TestCaller, TokenFile};
 use crate::cores::{kept_to, processor_s, resident};
-use crate::honest::{Account, Honest, Newcomers, Welcome};
+use crate::honest::{ClientLedger, Honest, Newcomers, Welcome};
 use crate::proxy::Proxy;
 use crate::report::{cells, digits, quick};
-use crate::server::Server;
+use crate::server::TestServer;
 
 /// A newcomer gives up.
-const PATIENCE: Duration = Duration::from_secs(5);
+const NEWCOMER_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// A session that nobody uses is deleted soon.
 const CONFIGURATION: &str = "idle_session_s = 4.0\n";
@@ -28,17 +28,17 @@ const CONFIGURATION: &str = "idle_session_s = 4.0\n";
 const SCALE: f64 = if cfg!(debug_assertions) { 0.01 } else { 1.0 };
 
 /// The attack is called off here, whatever the server: a machine that swaps measures nothing.
-const MOST_RESIDENT: u64 = 6 << 30;
+const MAX_RESIDENT: u64 = 6 << 30;
 
 /// One row.
-pub struct Row {
+pub struct AttackRow {
     name: &'static str,
     about: &'static str,
-    quiet: Account,
-    besieged: Account,
-    after: Account,
+    quiet: ClientLedger,
+    besieged: ClientLedger,
+    after: ClientLedger,
     /// All of what was lost or broke, to the end.
-    whole: Account,
+    whole: ClientLedger,
     welcome: Welcome,
     /// Once the attack was over.
     late: Welcome,
@@ -50,7 +50,7 @@ pub struct Row {
     resident: [u64; 3],
 }
 
-fn server(keys: &Keys, kind: Option<&Kind>) -> Server {
+fn server(keys: &TokenFile, kind: Option<&AttackKind>) -> TestServer {
     let limit = kind.and_then(|kind| kind.descriptors).map_or(String::new(), |most| format!("ulimit -n {most}; "));
     let config = keys.beside("palpate.toml", CONFIGURATION);
     let arguments = ["serve", "--listen", "127.0.0.1:0", "--threads", "1", "--log", "error", "--config", &config];
@@ -62,14 +62,14 @@ fn server(keys: &Keys, kind: Option<&Kind>) -> Server {
             .args(["--tokens", keys.file()])
             // A log that nobody reads would hold the server up.
             .stderr(Stdio::null());
-        Server::spawn(&mut command)
+        TestServer::spawn(&mut command)
     })
 }
 
 /// Watches for so long; the most that was resident.
 fn watch(process: u32, time: Duration) -> u64 {
     let (begun, mut most) = (Instant::now(), 0);
-    while begun.elapsed() < time && most < MOST_RESIDENT {
+    while begun.elapsed() < time && most < MAX_RESIDENT {
         most = most.max(resident(process));
         std::thread::sleep(Duration::from_millis(20));
     }
@@ -77,16 +77,19 @@ fn watch(process: u32, time: Duration) -> u64 {
 }
 
 /// What one honest client notices of `kind`, or of nobody.
-pub fn run(kind: Option<&'static Kind>) -> Row {
+pub fn run(kind: Option<&'static AttackKind>) -> AttackRow {
     let part = |seconds: f64| Duration::from_secs_f64(if quick() { seconds / 3.0 } else { seconds });
-    let keys = Arc::new(Keys::new());
+    let keys = Arc::new(TokenFile::new());
     let honest = keys.admit("honest", &[Role::Create, Role::Touch]);
     let attacker = keys.admit("attacker", &[Role::Create, Role::Touch]);
     let server = server(&keys, kind);
     let process = server.child.id();
-    let honest = Caller::new(&server.url, &honest);
-    let attacker =
-        if kind.is_some_and(|kind| kind.same_caller) { honest.clone() } else { Caller::new(&server.url, &attacker) };
+    let honest = TestCaller::new(&server.url, &honest);
+    let attacker = if kind.is_some_and(|kind| kind.same_caller) {
+        honest.clone()
+    } else {
+        TestCaller::new(&server.url, &attacker)
+    };
     // The wire has threads of its own: it carries on while the client stands still.
     let wires = Runtime::new().unwrap();
     let (tools, delay) = kind.map_or((1, 0), |kind| (kind.tools, kind.round_trip_ms / 2));
@@ -94,7 +97,7 @@ pub fn run(kind: Option<&'static Kind>) -> Row {
     let way = if delay == 0 { honest.clone() } else { honest.by(&proxy.url()) };
     let (client, newcomers) = kept_to(false, || {
         let client = Honest::start(way, tools);
-        let newcomers = Newcomers::start(honest, client.session_id.clone(), PATIENCE);
+        let newcomers = Newcomers::start(honest, client.session_id.clone(), NEWCOMER_TIMEOUT);
         (client, newcomers)
     });
     std::thread::sleep(part(1.0));
@@ -126,7 +129,7 @@ pub fn run(kind: Option<&'static Kind>) -> Row {
     for account in [&quiet, &besieged, &settling, &after, &verdict.account] {
         whole.add(account);
     }
-    Row {
+    AttackRow {
         name: kind.map_or("quiet", |kind| kind.name),
         about: kind.map_or("nobody", |kind| kind.about),
         quiet,
@@ -152,7 +155,7 @@ fn foremost(reasons: &std::collections::BTreeMap<String, u64>) -> String {
     most.map_or(String::new(), |(reason, count)| format!("{count} × {reason}"))
 }
 
-impl Row {
+impl AttackRow {
     pub fn header() -> Vec<String> {
         cells([
             "attack",
@@ -194,7 +197,7 @@ impl Row {
         let phases = |quantile: f64| {
             [&self.quiet, &self.besieged, &self.after].map(|account| digits(account.quantile_ms(quantile))).join(" / ")
         };
-        let gap = |account: &Account| digits(1e3 * account.longest_gap.as_secs_f64());
+        let gap = |account: &ClientLedger| digits(1e3 * account.longest_gap.as_secs_f64());
         let (whole, welcome) = (&self.whole, &self.welcome);
         let broken = whole.broken.first().map_or("0".to_owned(), |why| format!("{} ({why})", whole.broken.len()));
         cells([
@@ -220,7 +223,7 @@ impl Row {
     }
 
     pub fn figures(&self) -> Value {
-        let account = |account: &Account| {
+        let account = |account: &ClientLedger| {
             json!({
                 "sent": account.sent, "answered": account.answered, "refused": account.refused, "lost": account.lost,
                 "broken": account.broken, "p50_ms": account.quantile_ms(0.5), "p99_ms": account.quantile_ms(0.99),

@@ -124,13 +124,13 @@ pub const CASES: [Case; 9] = [
     },
     Case {
         name: "tissue",
-        about: "k = 25 K″ with flexion on 15 × 15 points; a grasped point is pressed in, moved aside and back",
+        about: "k = 25 K″ with bending on 15 × 15 points; a grasped point is pressed in, moved aside and back",
         scene: "paper",
         assignments: &[
             "sheet.points=[15, 15]",
             "sheet.spacing_m=0.05",
             "springs.stiffness_n_per_m=125",
-            "springs.flexion=true",
+            "springs.bending=true",
             "damping.coefficient_n_s_per_m=0.3",
         ],
         sample_points: "[[7, 7], [8, 7], [8, 8], [3, 7]]",

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use palpate::limits::Limits;
 use palpate::refusal::Result;
 use palpate::scene::{BUILT_IN, Integrator, Named, Scene};
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 
 /// The key of each name below.
 pub const INTEGRATOR: &str = "stepping.integrator";

@@ -99,8 +99,8 @@ namespace Palpate
     [StructLayout(LayoutKind.Sequential)]
     public struct Change
     {
-        public double Stiffness, Damping, VirtualStiffness, VolumeStiffness;
-        public static Change None { get { double n = double.NaN; return new Change { Stiffness = n, Damping = n, VirtualStiffness = n, VolumeStiffness = n }; } }
+        public double Stiffness, Damping, AnchorStiffness, VolumeStiffness;
+        public static Change None { get { double n = double.NaN; return new Change { Stiffness = n, Damping = n, AnchorStiffness = n, VolumeStiffness = n }; } }
     }
 
     /// <summary>What was written of a surface; see palpate_dirty.</summary>

@@ -14,7 +14,7 @@ use std::sync::{Arc, OnceLock};
 
 use glam::DVec3;
 use palpate::journal::records::{self, Chunk};
-use palpate::journal::{Reader, Replay, Topic, message as of_journal, pb as journal_pb};
+use palpate::journal::{JournalReader, Replay, Topic, message as of_journal, pb as journal_pb};
 use palpate::limits::Limits;
 use palpate::scene::check::check_tip;
 use palpate::scene::profile::Poke;
@@ -22,15 +22,15 @@ use palpate::scene::record::{Record, write_line};
 use palpate::scene::script::{Action, Script};
 use palpate::scene::{FixedVertices, Mesh, MeshShape, PAPER, Scene};
 use palpate::server::config::Config;
-use palpate::server::identity::{self, Credentials, Role};
+use palpate::server::identity::{self, KnownCallers, Role};
 use palpate::session::Session;
 use palpate::session::command::{Command, Due};
 use palpate::session::intake::Intake;
 use palpate::session::sampling::Sampler;
 use palpate::session::saved::{self, Saved};
 use palpate::shape::RestShape;
-use palpate::sheet::Model;
 use palpate::surface::Refinement;
+use palpate::tissue::Model;
 use palpate::wire;
 use palpate_mesh::{Group, TriangleMesh};
 use palpate_proto::{datagram as of_touch, pb, touch};
@@ -41,24 +41,24 @@ use prost::Message;
 pub type Taker = fn(&[u8]) -> bool;
 
 /// A decoder.
-pub struct Target {
+pub struct FuzzTarget {
     pub name: &'static str,
     pub run: Taker,
     /// Inputs that it takes, to begin with.
     pub seeds: fn() -> Vec<Vec<u8>>,
 }
 
-pub const TARGETS: [Target; 10] = [
-    Target { name: "journal", run: journal, seeds: journal_seeds },
-    Target { name: "scene", run: scene, seeds: scene_seeds },
-    Target { name: "script", run: script, seeds: script_seeds },
-    Target { name: "request", run: request, seeds: request_seeds },
-    Target { name: "datagram", run: datagram, seeds: datagram_seeds },
-    Target { name: "sample", run: sample, seeds: sample_seeds },
-    Target { name: "record", run: record, seeds: record_seeds },
-    Target { name: "frame", run: frame, seeds: frame_seeds },
-    Target { name: "config", run: config, seeds: config_seeds },
-    Target { name: "snapshot", run: snapshot, seeds: snapshot_seeds },
+pub const TARGETS: [FuzzTarget; 10] = [
+    FuzzTarget { name: "journal", run: journal, seeds: journal_seeds },
+    FuzzTarget { name: "scene", run: scene, seeds: scene_seeds },
+    FuzzTarget { name: "script", run: script, seeds: script_seeds },
+    FuzzTarget { name: "request", run: request, seeds: request_seeds },
+    FuzzTarget { name: "datagram", run: datagram, seeds: datagram_seeds },
+    FuzzTarget { name: "sample", run: sample, seeds: sample_seeds },
+    FuzzTarget { name: "record", run: record, seeds: record_seeds },
+    FuzzTarget { name: "frame", run: frame, seeds: frame_seeds },
+    FuzzTarget { name: "config", run: config, seeds: config_seeds },
+    FuzzTarget { name: "snapshot", run: snapshot, seeds: snapshot_seeds },
 ];
 
 /// What is read at all is read under these; what is compiled is smaller still.
@@ -335,7 +335,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
             vertices: None,
             fixed: Some(pb::mesh::Fixed::FixedGroup("base".into())),
         }),
-        springs: Some(pb::Springs { stiffness_n_per_m: Some(10.0), flexion_factor: Some(0.2), ..Default::default() }),
+        springs: Some(pb::Springs { stiffness_n_per_m: Some(10.0), bending_factor: Some(0.2), ..Default::default() }),
         ..wire::scene::scene(&model().scene)
     });
     let of_material = pb::create_session_request::Source::Scene(pb::Scene {
@@ -345,7 +345,7 @@ fn request_seeds() -> Vec<Vec<u8>> {
             thickness_m: Some(0.002),
             density_kg_per_m3: Some(1000.0),
             depth_m: Some(0.02),
-            bed_n_per_m3: Some(4e5),
+            foundation_n_per_m3: Some(4e5),
             damping_ratio: Some(0.7),
         }),
         inclusions: vec![
@@ -353,13 +353,13 @@ fn request_seeds() -> Vec<Vec<u8>> {
                 centre_m: vector(0.1, 0.0, 0.0),
                 radius_m: Some(0.02),
                 stiffness_factor: Some(3.0),
-                virtual_stiffness_factor: Some(2.0),
+                anchor_stiffness_factor: Some(2.0),
                 edge_m: Some(0.1),
                 ..Default::default()
             },
             pb::Inclusion { group: Some("base".into()), stiffness_factor: Some(0.5), ..Default::default() },
         ],
-        springs: Some(pb::Springs { flexion_factor: Some(0.2), ..Default::default() }),
+        springs: Some(pb::Springs { bending_factor: Some(0.2), ..Default::default() }),
         ..Default::default()
     });
     let places = [pb::force::Centre::Vertex(3), pb::force::Centre::AtM(pb::Vector3 { x: 0.01, y: 0.02, z: 0.0 })];
@@ -434,12 +434,12 @@ fn request_seeds() -> Vec<Vec<u8>> {
 }
 
 /// What a device would render of whatever a server sends, N: finite, and never above this.
-const MOST_N: f64 = 3.3;
+const MAX_N: f64 = 3.3;
 
 /// What a client hears in a haptic stream, up to the force at the device.
 /// A datagram of a client, and one of a server.
 pub fn datagram(bytes: &[u8]) -> bool {
-    use palpate_touch::carrier::Carrier;
+    use palpate_touch::datagram_health::Carrier;
     let mut carrier = Carrier::default();
     let from_server = pb::SampleDatagram::decode(bytes).is_ok_and(|message| {
         carrier.arrive(message.number, message.acknowledges, 0.0);
@@ -448,7 +448,7 @@ pub fn datagram(bytes: &[u8]) -> bool {
     });
     let Ok(message) = pb::PosesDatagram::decode(bytes) else { return from_server };
     let commands: Vec<pb::Command> = message.tools.iter().flat_map(of_touch::commands).collect();
-    assert!(commands.len() <= message.tools.len() * (1 + of_touch::MOST_EARLIER));
+    assert!(commands.len() <= message.tools.len() * (1 + of_touch::MAX_EARLIER));
     let mut intake = Intake::new(&model().scene, &limits());
     intake.acquire(&[0, 1, 2], "fuzz", 60.0, 1, 0).expect("tools are free");
     let mut session = Session::new(model());
@@ -503,7 +503,7 @@ pub fn sample(bytes: &[u8]) -> bool {
                 renderer.receive(touch::from_local_model(model, step), now_s);
             }
             let force_n = renderer.tick(now_s, DVec3::new(0.0, 0.0, -1e-3 * f64::from(tick)));
-            assert!(force_n.is_finite() && force_n.length() <= MOST_N + 1e-9, "{force_n}");
+            assert!(force_n.is_finite() && force_n.length() <= MAX_N + 1e-9, "{force_n}");
         }
     };
     match response.message {
@@ -577,7 +577,7 @@ fn record_seeds() -> Vec<Vec<u8>> {
         constraint_n: vector,
         ..Default::default()
     };
-    let energy = Some(pb::Energy { kinetic_j: 1.0, spring_j: 2.0, virtual_j: 3.0 });
+    let energy = Some(pb::Energy { kinetic_j: 1.0, spring_j: 2.0, anchor_j: 3.0 });
     let tool = pb::ToolRecord { tool: 1, place_m: vector, displacement_m: vector, force_on_tool_n: vector };
     let (points, tools) = (vec![point; 3], vec![tool]);
     let last = pb::ProbeResponse { step: 9, points, tools, energy, last: true, ..Default::default() };
@@ -629,7 +629,7 @@ fn frame_seeds() -> Vec<Vec<u8>> {
 /// A configuration, or a file of tokens.
 pub fn config(bytes: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(bytes) else { return false };
-    let known = Credentials::parse(Path::new("fuzz"), text).is_ok();
+    let known = KnownCallers::parse(Path::new("fuzz"), text).is_ok();
     Config::parse("fuzz", text).is_ok() || known
 }
 
@@ -711,7 +711,7 @@ pub fn journal(bytes: &[u8]) -> bool {
         }
         _ => bytes,
     };
-    let Ok(mut reader) = Reader::new("fuzz", std::io::Cursor::new(file)) else { return false };
+    let Ok(mut reader) = JournalReader::new("fuzz", std::io::Cursor::new(file)) else { return false };
     let Ok(survey) = reader.survey(&mut |_| {}) else { return false };
     assert!(survey.whole_bytes + survey.torn_bytes <= file.len() as u64);
     let header = reader.header();

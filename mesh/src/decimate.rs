@@ -26,14 +26,14 @@ const TURN: f64 = 0.3;
 const QUALITY: f64 = 0.2;
 
 /// Triangles around a vertex, above which it stays as it is: the work for a collapse grows with them.
-const MOST_AROUND: usize = 256;
+const MAX_AROUND: usize = 256;
 
 /// A closed surface has so many at least.
-pub const LEAST_VERTICES: usize = 4;
+pub const MIN_VERTICES: usize = 4;
 
 /// A place on a mesh.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Place {
+pub struct MeshPlace {
     /// The triangle.
     pub triangle: u32,
     /// Weights of its vertices; their sum is 1.
@@ -46,7 +46,7 @@ pub struct Decimated {
     /// The mesh; without texture coordinates. A vertex is in a group if one that it stands for was.
     pub mesh: TriangleMesh,
     /// For each vertex of the mesh before, the nearest place on this one; empty if this one has no triangle.
-    pub places: Vec<Place>,
+    pub places: Vec<MeshPlace>,
 }
 
 /// A sum of squared distances to planes: xᵀ·a·x + 2·b·x + c.
@@ -120,13 +120,13 @@ impl Eq for Candidate {}
 /// All coordinates must be finite and all indices in range; vertices without triangles are dropped.
 #[must_use]
 pub fn decimate(mesh: &TriangleMesh, vertices: usize) -> Decimated {
-    let mut work = Work::new(mesh);
+    let mut work = Decimation::new(mesh);
     work.collapse_down_to(vertices.max(4));
     work.finish(mesh)
 }
 
 /// A mesh while it is decimated.
-struct Work {
+struct Decimation {
     at: Vec<DVec3>,
     triangles: Vec<[u32; 3]>,
     /// The triangles of each vertex.
@@ -153,7 +153,7 @@ fn quality(triangle: [DVec3; 3]) -> f64 {
     2.0 * 3.0_f64.sqrt() * normal(triangle).length() / squares
 }
 
-impl Work {
+impl Decimation {
     fn new(mesh: &TriangleMesh) -> Self {
         let count = mesh.vertices_m.len();
         let topology = Topology::new(count, &mesh.triangles);
@@ -213,7 +213,7 @@ impl Work {
     /// Puts an edge on the heap, if it may collapse at all.
     fn consider(&mut self, vertices: [u32; 2]) {
         let [a, b] = vertices.map(|vertex| vertex as usize);
-        if self.around[a].len() + self.around[b].len() > MOST_AROUND {
+        if self.around[a].len() + self.around[b].len() > MAX_AROUND {
             return;
         }
         let both_border = self.is_border[a] && self.is_border[b];
@@ -284,7 +284,7 @@ impl Work {
         let shared = self.shared(candidate.vertices);
         let (of_a, of_b) = (self.neighbours(a), self.neighbours(b));
         let mut common = of_a.iter().filter(|vertex| of_b.binary_search(vertex).is_ok());
-        if common.clone().any(|vertex| self.around[*vertex as usize].len() > MOST_AROUND) {
+        if common.clone().any(|vertex| self.around[*vertex as usize].len() > MAX_AROUND) {
             return false;
         }
         let common = common.by_ref().count();
@@ -360,7 +360,8 @@ impl Work {
         let all = (0..).take(mesh.triangles.len());
         let tree = Tree::new(&mesh.vertices_m, &mesh.triangles, all);
         let nearest = before.vertices_m.iter().filter_map(|at| tree.nearest((&mesh.vertices_m, &mesh.triangles), *at));
-        let places = nearest.map(|found| Place { triangle: found.triangle, barycentric: found.barycentric }).collect();
+        let places =
+            nearest.map(|found| MeshPlace { triangle: found.triangle, barycentric: found.barycentric }).collect();
         drop(tree);
         Decimated { mesh, places }
     }

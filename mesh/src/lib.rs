@@ -27,5 +27,5 @@ pub use mesh::{Group, TriangleMesh};
 pub use prepare::{FileMesh, Prepared, prepare};
 pub use problem::{Element, MeshError, Problem};
 pub use read::{ReadLimits, ReadMesh, read, read_paid};
-pub use report::{Report, report};
+pub use report::{MeshReport, report};
 pub use unit::Unit;

@@ -5,7 +5,7 @@ use glam::DVec3;
 
 use crate::join::{Joined, Odd, join, places};
 use crate::orient::orient;
-use crate::report::{Report, report_within};
+use crate::report::{MeshReport, report_within};
 use crate::topology::is_proper;
 use crate::tree::Tree;
 use crate::walls::{doubled, match_diagonals};
@@ -38,13 +38,13 @@ pub struct FileMesh {
 impl Prepared {
     /// Reports the mesh to simulate, with the numbers that vertices and triangles have in the file.
     #[must_use]
-    pub fn report(&self) -> Report {
+    pub fn report(&self) -> MeshReport {
         self.report_within(&ReadLimits::default())
     }
 
     /// The same within other limits.
     #[must_use]
-    pub fn report_within(&self, limits: &ReadLimits) -> Report {
+    pub fn report_within(&self, limits: &ReadLimits) -> MeshReport {
         let mut report = report_within(&self.mesh, limits);
         let name = |names: &[u32], number: u32| names.get(number as usize).copied().unwrap_or(number);
         for finding in &mut report.problems {

@@ -75,16 +75,16 @@ pub struct Repaired {
     /// For each vertex of the mesh before, the vertex that it is now; `None` if it was dropped.
     pub vertex_of: Vec<Option<u32>>,
     /// What the surface was, and what it is.
-    pub before: Measure,
+    pub before: SurfaceMeasure,
     /// What the surface is now.
-    pub after: Measure,
+    pub after: SurfaceMeasure,
     /// Why this is not what was asked for; empty if it is.
     pub faults: Vec<String>,
 }
 
 /// How large a surface is.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
-pub struct Measure {
+pub struct SurfaceMeasure {
     /// The area of all triangles, m².
     pub area_m2: f64,
     /// The volume inside, m³, if the surface is closed and its triangles face the same side at each edge; with several at an
@@ -93,7 +93,7 @@ pub struct Measure {
     pub volume_m3: Option<f64>,
 }
 
-impl Measure {
+impl SurfaceMeasure {
     /// Measures a surface whose coordinates are finite and whose indices are in range.
     #[must_use]
     pub fn of(mesh: &TriangleMesh) -> Self {
@@ -117,19 +117,19 @@ impl Measure {
 /// Mends a mesh. Triangles whose vertices don't exist or are not finite are dropped.
 #[must_use]
 pub fn repair(mesh: &TriangleMesh, how: &Repair) -> Repaired {
-    let mut work = Work {
+    let mut work = RepairedMesh {
         mesh: mesh.clone(),
         told: Vec::new(),
         vertex_of: (0..).take(mesh.vertices_m.len()).map(Some).collect(),
         faults: Vec::new(),
     };
     work.drop_invalid();
-    let mut before = Measure::of(&work.mesh);
+    let mut before = SurfaceMeasure::of(&work.mesh);
     work.weld(how.weld_m);
     let copies = if how.degenerate { work.drop_degenerate() } else { 0 };
     let parts = work.join(how);
     if before.volume_m3.is_none() || copies > 0 || parts.oriented.is_turned.contains(&true) {
-        before.volume_m3 = Measure::of(&work.mesh).volume_m3;
+        before.volume_m3 = SurfaceMeasure::of(&work.mesh).volume_m3;
     }
     if how.largest {
         work.keep_largest(&parts);
@@ -142,13 +142,13 @@ pub fn repair(mesh: &TriangleMesh, how: &Repair) -> Repaired {
     if how.unused {
         work.drop_unused();
     }
-    let after = Measure::of(&work.mesh);
+    let after = SurfaceMeasure::of(&work.mesh);
     work.compare(&before, &after);
     Repaired { mesh: work.mesh, told: work.told, vertex_of: work.vertex_of, before, after, faults: work.faults }
 }
 
 /// A mesh while it is mended.
-struct Work {
+struct RepairedMesh {
     mesh: TriangleMesh,
     told: Vec<String>,
     vertex_of: Vec<Option<u32>>,
@@ -162,7 +162,7 @@ struct Parts {
     touching: Vec<[u32; 2]>,
 }
 
-impl Work {
+impl RepairedMesh {
     fn tell(&mut self, count: usize, what: &str) {
         note(&mut self.told, count, what);
     }
@@ -324,9 +324,9 @@ impl Work {
         }
         let keeps = |part: &u32| is_kept.get(*part as usize).copied().unwrap_or(false);
         let keep: Vec<bool> = oriented.part_of.iter().map(keeps).collect();
-        let before = Measure::of(&self.mesh).area_m2;
+        let before = SurfaceMeasure::of(&self.mesh).area_m2;
         let dropped = self.keep(&keep);
-        let lost = 1.0 - Measure::of(&self.mesh).area_m2 / before;
+        let lost = 1.0 - SurfaceMeasure::of(&self.mesh).area_m2 / before;
         self.told.push(format!(
             "Smaller surfaces dropped: {smaller}, with their triangles: {dropped}, and {:.2} % of the area.",
             100.0 * lost
@@ -405,7 +405,7 @@ impl Work {
     }
 
     /// Tells what is not as it was and should be.
-    fn compare(&mut self, before: &Measure, after: &Measure) {
+    fn compare(&mut self, before: &SurfaceMeasure, after: &SurfaceMeasure) {
         match (before.volume_m3, after.volume_m3) {
             (Some(was), Some(is)) if (is - was).abs() > LOST * was => self.faults.push(format!(
                 "the surface enclosed {:.3} ml, and encloses {:.3} ml now",

@@ -146,7 +146,7 @@ impl From<MeshError> for Finding {
 
 /// A report of a mesh.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct Report {
+pub struct MeshReport {
     /// Vertices.
     pub vertices: usize,
     /// Triangles.
@@ -175,7 +175,7 @@ pub struct Report {
     pub counts: BTreeMap<&'static str, usize>,
 }
 
-impl Report {
+impl MeshReport {
     /// The first problem for which the mesh is refused.
     #[must_use]
     pub fn refusal(&self) -> Option<&Finding> {
@@ -210,13 +210,13 @@ fn without_noise(place: DVec3, noise_m: f64) -> [f64; 3] {
 
 /// Reports what a mesh is, with the default limits.
 #[must_use]
-pub fn report(mesh: &TriangleMesh) -> Report {
+pub fn report(mesh: &TriangleMesh) -> MeshReport {
     report_within(mesh, &ReadLimits::default())
 }
 
 /// Reports what a mesh is; one above the limits is only counted.
 #[must_use]
-pub fn report_within(mesh: &TriangleMesh, limits: &ReadLimits) -> Report {
+pub fn report_within(mesh: &TriangleMesh, limits: &ReadLimits) -> MeshReport {
     let mut findings = Findings::default();
     let (vertices, triangles) = (&mesh.vertices_m, &mesh.triangles);
     for (count, what, limit) in
@@ -235,7 +235,7 @@ pub fn report_within(mesh: &TriangleMesh, limits: &ReadLimits) -> Report {
             findings.add(problem, Element::Triangle(number), None);
         }
     }
-    let mut report = Report { vertices: vertices.len(), triangles: triangles.len(), ..Report::default() };
+    let mut report = MeshReport { vertices: vertices.len(), triangles: triangles.len(), ..MeshReport::default() };
     // With these, nothing else can be said.
     if findings.list.is_empty() {
         examine(mesh, &mut report, &mut findings);
@@ -293,7 +293,7 @@ fn borders(vertices: &[DVec3], holes: &[Vec<u32>], extent: DVec3) -> Vec<Border>
 }
 
 /// Everything about a mesh whose coordinates are finite and whose indices are in range.
-fn examine(mesh: &TriangleMesh, report: &mut Report, findings: &mut Findings) {
+fn examine(mesh: &TriangleMesh, report: &mut MeshReport, findings: &mut Findings) {
     let (vertices, triangles) = (&mesh.vertices_m, &mesh.triangles);
     let at = |vertex: u32| Some(vertices[vertex as usize]);
     let middle = |triangle: u32| Some(corners(vertices, triangles[triangle as usize]).iter().sum::<DVec3>() / 3.0);

@@ -349,23 +349,23 @@ const WAYS: [usize; 2] = [48, 192];
 const WAYS_PER_EDGE: f64 = 32.0;
 
 /// The radius of the disc that hats are averaged over is at least this part of the disc's own, where it is matched to its area.
-const LEAST_PART: f64 = 0.05;
+const MIN_PART: f64 = 0.05;
 
 /// A disc that folds so much that its middle moves less than this part of the area that its place moves over has no normal to
 /// rely on. A cylinder's is 0.72 where the disc reaches half around it, 0.18 where it meets itself, and turns over beyond; a
 /// sphere's is 0.41 at the equator.
-const LEAST_SPAN: f64 = 0.25;
+const MIN_SPAN: f64 = 0.25;
 
 /// A disc may cover this part of its area a second time: more, and it meets itself, or wraps an end. (On a sphere, straight ways
 /// crowd: 8 % at an angle of 1, 17 % at 1.5.)
-const MOST_OVERLAP: f64 = 0.2;
+const MAX_OVERLAP: f64 = 0.2;
 
 /// Ways that are farther apart at the rim than this part of an edge can't tell how often they cover a vertex.
 const DENSE: f64 = 0.4;
 
 /// A disc of a larger radius, in edges, is first tried at half of it, and so on down.
 const STAGE_EDGES: f64 = 4.0;
-const MOST_STAGES: u32 = 20;
+const MAX_STAGES: u32 = 20;
 
 /// Times that the search for the largest plain disc halves its interval.
 const HALVINGS: u32 = 16;
@@ -379,16 +379,16 @@ const HALVINGS: u32 = 16;
 ///
 /// On a part that is thinner than the disc, straight ways lead around it: they meet on its far side, or wrap its end. Such a
 /// disc has no place and no normal. It is made smaller until it is plain: it covers hardly anything twice, and its middle
-/// moves with its place ([`LEAST_SPAN`]). On the end of a thread that is next to a point.
+/// moves with its place ([`MIN_SPAN`]). On the end of a thread that is next to a point.
 #[derive(Debug, Clone)]
-pub struct Disc {
+pub struct SurfaceDisc {
     radius_m: f64,
     edge_m: f64,
     /// ρ, that of the disc that hats are averaged over where it lies.
     drawn_m: f64,
     directions: Vec<DVec2>,
     /// The crossings of all ways, with places in `covered` for vertices; and where those of each way end.
-    crossings: Vec<Part>,
+    crossings: Vec<SurfacePart>,
     ends: Vec<usize>,
     covered: Vec<Covered>,
     areas_m2: Vec<f64>,
@@ -399,14 +399,14 @@ pub struct Disc {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Part {
+struct SurfacePart {
     covered: [u32; 3],
     from_m: f64,
     to_m: f64,
     hats: [[f64; 3]; 2],
 }
 
-impl Part {
+impl SurfacePart {
     /// What is within a radius, as a share of the whole part, which begins within it.
     fn share_within(&self, rho_m: f64) -> f64 {
         let whole_m = self.to_m - self.from_m;
@@ -431,15 +431,15 @@ fn ways_of(radius_m: f64, edge_m: f64) -> usize {
 
 /// The parts of each way that begin within a radius.
 fn ways<'c>(
-    crossings: &'c [Part],
+    crossings: &'c [SurfacePart],
     ends: &'c [usize],
     rho_m: f64,
-) -> impl Iterator<Item = impl Iterator<Item = &'c Part>> {
+) -> impl Iterator<Item = impl Iterator<Item = &'c SurfacePart>> {
     let begins = std::iter::once(0).chain(ends.iter().copied());
     begins.zip(ends).map(move |(begin, end)| crossings[begin..*end].iter().take_while(move |part| part.from_m < rho_m))
 }
 
-impl Disc {
+impl SurfaceDisc {
     /// A disc on a surface whose edges are about `edge_m` long.
     #[allow(clippy::cast_precision_loss)]
     pub fn new(radius_m: f64, edge_m: f64) -> Self {
@@ -448,7 +448,7 @@ impl Disc {
             let angle = std::f64::consts::TAU * (way as f64 + 0.5) / count as f64;
             DVec2::new(libm::cos(angle), libm::sin(angle))
         };
-        Disc {
+        SurfaceDisc {
             radius_m,
             edge_m,
             drawn_m: radius_m,
@@ -497,7 +497,7 @@ impl Disc {
     pub fn lay(&mut self, surface: &Surface, place: &Place) {
         // Around a thin part ways go on and on: a large disc is tried from a small one on.
         let mut stages = 0;
-        while self.radius_m / f64::from(1 << stages) > STAGE_EDGES * self.edge_m && stages < MOST_STAGES {
+        while self.radius_m / f64::from(1 << stages) > STAGE_EDGES * self.edge_m && stages < MAX_STAGES {
             stages += 1;
         }
         for stage in (1..=stages).rev() {
@@ -510,7 +510,7 @@ impl Disc {
         self.trace(surface, place, self.radius_m);
         let target_m2 = std::f64::consts::PI * self.radius_m * self.radius_m;
         // The radius ρ at which Σ(w²/A)·πa² is 1. It falls with ρ; Newton's method, kept between two bounds.
-        let (mut low, mut high) = (LEAST_PART * self.radius_m, self.radius_m);
+        let (mut low, mut high) = (MIN_PART * self.radius_m, self.radius_m);
         let mut rho_m = high;
         let (mut excess, mut slope) = self.weigh(rho_m, target_m2);
         let mut is_matched = false;
@@ -569,7 +569,7 @@ impl Disc {
         #[allow(clippy::cast_precision_loss)]
         let apart_m = std::f64::consts::TAU * rho_m / self.directions.len() as f64;
         let is_told = apart_m < DENSE * self.edge_m;
-        along[0].cross(along[1]).length() >= LEAST_SPAN && !(is_told && twice_m2 > MOST_OVERLAP * area_m2)
+        along[0].cross(along[1]).length() >= MIN_SPAN && !(is_told && twice_m2 > MAX_OVERLAP * area_m2)
     }
 
     /// Averages the hats over a disc of radius ρ, whatever its area. Returns whether it is plain.
@@ -598,12 +598,12 @@ impl Disc {
         self.covered.clear();
         self.areas_m2.clear();
         self.found.fill((NONE, 0));
-        let Disc { directions, crossings, ends, covered, areas_m2, found, .. } = self;
+        let SurfaceDisc { directions, crossings, ends, covered, areas_m2, found, .. } = self;
         for direction in directions.iter() {
             surface.trace(place, *direction, reach_m, |Crossing { vertices, from_m, to_m, hats }| {
                 let mut number = |corner: usize| number(vertices[corner], surface, covered, areas_m2, found);
                 let covered = [number(0), number(1), number(2)];
-                crossings.push(Part { covered, from_m, to_m, hats });
+                crossings.push(SurfacePart { covered, from_m, to_m, hats });
             });
             ends.push(crossings.len());
         }
@@ -613,12 +613,12 @@ impl Disc {
 
     /// Averages the hats over a disc of radius ρ. Returns Σ(w²/A)·πa² − 1, and its change with ρ, 1/m.
     fn weigh(&mut self, rho_m: f64, target_m2: f64) -> (f64, f64) {
-        let Disc { crossings, ends, covered, areas_m2, widening, .. } = self;
+        let SurfaceDisc { crossings, ends, covered, areas_m2, widening, .. } = self;
         covered.iter_mut().for_each(|covered| covered.weight = 0.0);
         widening.fill(0.0);
         let (mut area, mut rim) = (0.0, 0.0);
         for part in ways(crossings, ends, rho_m).flatten() {
-            let Part { from_m, to_m, hats: [first, last], .. } = part;
+            let SurfacePart { from_m, to_m, hats: [first, last], .. } = part;
             let (length_m, share) = (to_m.min(rho_m) - from_m, part.share_within(rho_m));
             // ∫ r dr, and ∫ of the part of the way that is done, times r.
             let (even, rising) =
@@ -647,7 +647,7 @@ impl Disc {
 
     /// The changes of the weights of a disc of radius ρ with its place: what comes in at its rim.
     fn incline(&mut self, rho_m: f64) {
-        let Disc { directions, crossings, ends, covered, .. } = self;
+        let SurfaceDisc { directions, crossings, ends, covered, .. } = self;
         covered.iter_mut().for_each(|covered| covered.gradient = DVec2::ZERO);
         let (mut area, mut whole) = (0.0, DVec2::ZERO);
         for (way, direction) in ways(crossings, ends, rho_m).zip(directions) {

@@ -8,7 +8,7 @@ use crate::work::spend;
 const LEAF: usize = 4;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Node {
+struct TreeNode {
     least: DVec3,
     most: DVec3,
     /// The triangles of the subtree: a range of `order`.
@@ -21,7 +21,7 @@ struct Node {
 /// The tree. Its methods are given the vertices and triangles that it was made of, so that the owner of both can keep it.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Tree {
-    nodes: Vec<Node>,
+    nodes: Vec<TreeNode>,
     order: Vec<u32>,
 }
 
@@ -50,14 +50,14 @@ impl Tree {
         while let Some((start, end, parent)) = waiting.pop() {
             let number = tree.nodes.len();
             if let Some(parent) = parent {
-                let parent: &mut Node = &mut tree.nodes[parent];
+                let parent: &mut TreeNode = &mut tree.nodes[parent];
                 parent.second = Some(number);
             }
             let range = &mut tree.order[start..end];
             spend(range.len());
             let all = range.iter().flat_map(|triangle| corners(vertices, triangles[*triangle as usize]));
             let (least, most) = all.fold((DVec3::INFINITY, DVec3::NEG_INFINITY), |(l, m), at| (l.min(at), m.max(at)));
-            tree.nodes.push(Node { least, most, start, end, second: None });
+            tree.nodes.push(TreeNode { least, most, start, end, second: None });
             if end - start > LEAF {
                 let size = most - least;
                 let axis = if size.x >= size.y && size.x >= size.z {
@@ -90,7 +90,7 @@ impl Tree {
         let mut looked = 0;
         let mut waiting = if self.nodes.is_empty() { Vec::new() } else { vec![0] };
         while let Some(number) = waiting.pop() {
-            let node: &Node = &self.nodes[number];
+            let node: &TreeNode = &self.nodes[number];
             looked += 1;
             spend(1);
             if node.least.cmpgt(most).any() || node.most.cmplt(least).any() {
@@ -129,7 +129,7 @@ impl Tree {
         point: DVec3,
         looks: &mut u64,
     ) -> Option<Nearest> {
-        let distance = |node: &Node| (point - point.clamp(node.least, node.most)).length_squared();
+        let distance = |node: &TreeNode| (point - point.clamp(node.least, node.most)).length_squared();
         let mut best: Option<Nearest> = None;
         let mut waiting = if self.nodes.is_empty() { Vec::new() } else { vec![0] };
         while let Some(number) = waiting.pop() {

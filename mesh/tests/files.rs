@@ -4,7 +4,7 @@
 mod common;
 
 use common::solids;
-use palpate_mesh::{MeshError, ReadLimits, ReadMesh, Report, Unit, read, report};
+use palpate_mesh::{MeshError, MeshReport, ReadLimits, ReadMesh, Unit, read, report};
 
 fn mm() -> Unit {
     "mm".parse().unwrap()
@@ -14,7 +14,7 @@ fn read_mm(name: &str, bytes: impl AsRef<[u8]>) -> Result<ReadMesh, MeshError> {
     read(name, bytes.as_ref(), mm(), &|_| None, &ReadLimits::default())
 }
 
-fn report_of(name: &str, bytes: impl AsRef<[u8]>) -> Report {
+fn report_of(name: &str, bytes: impl AsRef<[u8]>) -> MeshReport {
     report(&read_mm(name, bytes).unwrap_or_else(|e| panic!("{e}")).mesh)
 }
 

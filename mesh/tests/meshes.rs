@@ -4,14 +4,14 @@
 
 mod common;
 
-use common::{Sample, TRIANGLES, VERTICES, VOLUME_M3, octahedron, samples, sheet, sphere};
+use common::{SampleFile, TRIANGLES, VERTICES, VOLUME_M3, octahedron, samples, sheet, sphere};
 use fastrand::Rng;
 use glam::DVec3;
 use palpate_mesh::decimate::decimate;
 use palpate_mesh::delaunay::flip_to_delaunay;
 use palpate_mesh::repair::{Repair, Repaired, repair};
 use palpate_mesh::write::{Format, write};
-use palpate_mesh::{Element, MeshError, Problem, ReadLimits, ReadMesh, Report, TriangleMesh, Unit, read, report};
+use palpate_mesh::{Element, MeshError, MeshReport, Problem, ReadLimits, ReadMesh, TriangleMesh, Unit, read, report};
 
 fn unit(text: &str) -> Unit {
     text.parse().unwrap()
@@ -22,7 +22,7 @@ fn read_mm(name: &str, bytes: impl AsRef<[u8]>) -> Result<ReadMesh, MeshError> {
 }
 
 /// The names of what is refused.
-fn refused(report: &Report) -> Vec<&'static str> {
+fn refused(report: &MeshReport) -> Vec<&'static str> {
     report.problems.iter().filter(|found| found.problem.is_refused()).map(|found| found.problem.name()).collect()
 }
 
@@ -52,7 +52,7 @@ fn shape(mesh: &TriangleMesh) -> Vec<[[i64; 3]; 3]> {
 
 #[test]
 fn every_format_gives_the_same_mesh() {
-    for Sample { name, bytes, .. } in samples() {
+    for SampleFile { name, bytes, .. } in samples() {
         let found = read_mm(name, &bytes).unwrap_or_else(|e| panic!("{e}"));
         assert_eq!(shape(&found.mesh), shape(&octahedron()), "{name}");
         assert_eq!(found.mesh.vertices_m.len(), 6, "{name}");
@@ -140,7 +140,7 @@ fn lengths_are_in_the_unit_that_is_given() {
 
 #[test]
 fn a_file_that_ends_early_is_refused_with_a_place_or_read_as_far_as_it_goes() {
-    for Sample { name, bytes, knows_its_end } in samples() {
+    for SampleFile { name, bytes, knows_its_end } in samples() {
         for part in 0..100 {
             let end = bytes.len() * part / 100;
             match read_mm(name, &bytes[..end]) {
@@ -205,7 +205,7 @@ fn files_within_a_file_come_from_the_same_folder_only() {
 #[test]
 fn limits_hold_however_much_a_file_claims() {
     let small = ReadLimits { bytes: 1 << 16, vertices: 5, triangles: 7 };
-    for Sample { name, bytes, .. } in samples() {
+    for SampleFile { name, bytes, .. } in samples() {
         let error = read(name, &bytes, unit("mm"), &|_| None, &small).unwrap_err();
         assert_eq!(error.problem.name(), "too_large", "{error}");
         let few = ReadLimits { vertices: 7, ..small };

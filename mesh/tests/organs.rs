@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 use palpate_mesh::TriangleMesh;
-use palpate_mesh::organ::{MOST_VERTICES, Organ, OrganError, generate};
+use palpate_mesh::organ::{MAX_VERTICES, Organ, OrganError, generate};
 
 /// What the tests ask about a mesh.
 struct Measures {
@@ -288,7 +288,7 @@ fn what_does_not_fit_is_refused_with_what_fits() {
             assert!(matches!(generate(organ, edge_m, 1), Err(OrganError::NotALength { .. })));
         }
         let Err(OrganError::TooFine { fits_m, vertices, .. }) = generate(organ, 1e-5, 1) else { panic!("{organ}") };
-        assert!(vertices > MOST_VERTICES as u64 && fits_m > 1e-5 && fits_m < 1e-3);
+        assert!(vertices > MAX_VERTICES as u64 && fits_m > 1e-5 && fits_m < 1e-3);
         let refused = generate(organ, fits_m * 0.999, 1).unwrap_err().to_string();
         assert!(refused.contains(&format!("edges of {} mm fit", (fits_m * 1e6).round() / 1e3)), "{refused}");
         let Err(OrganError::TooCoarse { fits_m, .. }) = generate(organ, 1.0, 1) else { panic!("{organ}") };

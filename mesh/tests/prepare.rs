@@ -9,8 +9,8 @@ use common::{octahedron, sheet, sphere};
 use fastrand::Rng;
 use glam::DVec3;
 use palpate_mesh::organ::{Organ, generate};
-use palpate_mesh::repair::{Measure, Repair, Repaired, repair};
-use palpate_mesh::{Group, Prepared, ReadLimits, Report, TriangleMesh, Unit, prepare, read, report};
+use palpate_mesh::repair::{Repair, Repaired, SurfaceMeasure, repair};
+use palpate_mesh::{Group, MeshReport, Prepared, ReadLimits, TriangleMesh, Unit, prepare, read, report};
 
 /// Each corner of each triangle as a vertex of its own.
 fn soup(mesh: &TriangleMesh) -> TriangleMesh {
@@ -73,7 +73,7 @@ fn same(one: f64, other: f64) {
 }
 
 /// Checks that it can be used; returns its report.
-fn usable(prepared: &Prepared) -> Report {
+fn usable(prepared: &Prepared) -> MeshReport {
     let report = prepared.report();
     assert!(report.refusal().is_none(), "{:?} {:?}", report.problems, prepared.notes);
     // What has been prepared stays as it is.
@@ -92,7 +92,7 @@ fn usable(prepared: &Prepared) -> Report {
     report
 }
 
-fn mended(mesh: &TriangleMesh) -> (Repaired, Report) {
+fn mended(mesh: &TriangleMesh) -> (Repaired, MeshReport) {
     let repaired = repair(mesh, &Repair::default());
     let report = report(&repaired.mesh);
     assert!(report.refusal().is_none(), "{:?} {:?}", report.problems, repaired.told);
@@ -112,7 +112,7 @@ fn a_mesh_without_a_flaw_is_not_changed() {
 fn a_shape_is_the_same_however_its_triangles_are_numbered_and_turned() {
     let mut dice = Rng::with_seed(5);
     for mesh in [octahedron(), sphere(2), sphere(3), boxes(&[[0, 0, 0]])] {
-        let measure = Measure::of(&mesh);
+        let measure = SurfaceMeasure::of(&mesh);
         for round in 0..24 {
             let mut other = match round % 4 {
                 0 => turned(&mesh, |_| true),
@@ -147,7 +147,7 @@ fn closed_parts_face_outward_from_the_tissue_around_their_cavities() {
     let (outer, inner, island) =
         (sphere(2), moved(&sphere(2), 0.6, DVec3::new(0.01, 0.0, 0.005)), moved(&sphere(1), 0.3, DVec3::ZERO));
     let beside = moved(&sphere(2), 0.7, DVec3::new(0.3, 0.0, 0.0));
-    let volume = |mesh: &TriangleMesh| Measure::of(mesh).volume_m3.unwrap();
+    let volume = |mesh: &TriangleMesh| SurfaceMeasure::of(mesh).volume_m3.unwrap();
     for round in 0..32 {
         let either = |mesh: &TriangleMesh, bit: usize| turned(mesh, |_| round >> bit & 1 == 1);
         let mut mesh = both(&either(&outer, 0), &either(&inner, 1));
@@ -180,7 +180,7 @@ fn closed_parts_face_outward_from_the_tissue_around_their_cavities() {
 #[test]
 fn repair_keeps_the_walls_of_cavities_and_tells_what_it_drops() {
     let (outer, inner) = (sphere(3), moved(&sphere(3), 0.8, DVec3::ZERO));
-    let hollow = Measure::of(&outer).volume_m3.unwrap() * (1.0 - 0.8_f64.powi(3));
+    let hollow = SurfaceMeasure::of(&outer).volume_m3.unwrap() * (1.0 - 0.8_f64.powi(3));
     for is_inward in [false, true] {
         let (repaired, report) = mended(&both(&outer, &turned(&inner, |_| is_inward)));
         same(report.volume_m3.unwrap(), hollow);
@@ -407,7 +407,7 @@ fn cells_whose_diagonals_do_not_match_are_one_solid() {
                 _ => Some(dice.bool()),
             });
             let volume = f64::from(size[0] * size[1] * size[2]) * 385e-9;
-            same(Measure::of(&mesh).volume_m3.unwrap(), volume);
+            same(SurfaceMeasure::of(&mesh).volume_m3.unwrap(), volume);
             let prepared = prepare(mesh.clone());
             let found = usable(&prepared);
             assert_eq!((found.components, found.holes), (1, 0), "{size:?} {round} {:?}", prepared.notes);

@@ -9,7 +9,7 @@
 mod common;
 
 use glam::{DVec2, DVec3};
-use palpate_mesh::surface::{Disc, Place, Surface};
+use palpate_mesh::surface::{Place, Surface, SurfaceDisc};
 
 /// A flat mesh of nearly equilateral triangles with edges of about 1, its vertices moved by up to `jitter`.
 fn flat(side: u32, jitter: f64, seed: u64) -> Surface {
@@ -101,7 +101,7 @@ fn weights_add_up_to_1_about_the_place_with_the_area_of_the_disc() {
     for jitter in [0.0, 0.3] {
         let surface = flat(24, jitter, 4);
         for radius in [1.0, 1.5, 2.0, 4.0] {
-            let mut disc = Disc::new(radius, 1.0);
+            let mut disc = SurfaceDisc::new(radius, 1.0);
             for _ in 0..20 {
                 let at = place(&surface, 9.0 + 3.0 * dice.f64(), 11.0 + 3.0 * dice.f64());
                 disc.lay(&surface, &at);
@@ -123,7 +123,7 @@ fn the_gradient_is_the_change_of_the_weights() {
     let mut dice = fastrand::Rng::with_seed(5);
     let surface = flat(24, 0.3, 6);
     for radius in [1.2, 2.0, 4.0] {
-        let mut disc = Disc::new(radius, 1.0);
+        let mut disc = SurfaceDisc::new(radius, 1.0);
         let mut largest: f64 = 0.0;
         for _ in 0..50 {
             let at = place(&surface, 9.0 + 3.0 * dice.f64(), 11.0 + 3.0 * dice.f64());
@@ -153,7 +153,7 @@ fn weights_change_without_jumps_along_a_way() {
     // Relative to the disc's radius: on a curved surface a way comes to pass a vertex on the other side.
     for (surface, most) in [(flat(40, 0.3, 7), 1e-4), (sphere(4), 2e-3)] {
         let edge = (surface.areas_m2().iter().sum::<f64>() / surface.areas_m2().len() as f64).sqrt();
-        let mut disc = Disc::new(2.0 * edge, edge);
+        let mut disc = SurfaceDisc::new(2.0 * edge, edge);
         let mut at = surface.nearest(DVec3::new(10.0, 12.0, 0.0)).unwrap();
         let mut before: Option<DVec3> = None;
         let step = 0.005 * edge;
@@ -173,7 +173,7 @@ fn weights_change_without_jumps_along_a_way() {
 #[test]
 fn half_a_disc_over_the_rim_has_the_weights_of_what_is_on_the_surface() {
     let surface = flat(16, 0.2, 9);
-    let mut disc = Disc::new(2.0, 1.0);
+    let mut disc = SurfaceDisc::new(2.0, 1.0);
     for x in [0.0, 0.4, 1.1] {
         disc.lay(&surface, &place(&surface, x, 8.0));
         let whole: f64 = disc.covered().iter().map(|covered| covered.weight).sum();
@@ -186,7 +186,7 @@ fn half_a_disc_over_the_rim_has_the_weights_of_what_is_on_the_surface() {
 fn the_mean_curvature_under_a_disc_on_a_sphere_is_that_of_its_radius() {
     let surface = sphere(5);
     let mut dice = fastrand::Rng::with_seed(3);
-    let mut disc = Disc::new(0.25, surface.edge_m());
+    let mut disc = SurfaceDisc::new(0.25, surface.edge_m());
     for _ in 0..50 {
         let [x, y, z] = [(); 3].map(|()| dice.f64() - 0.5);
         let place = surface.nearest(DVec3::new(x, y, z).normalize()).unwrap();

@@ -14,10 +14,10 @@ use crate::measure::{MULTIPLE, ROOM, Shape};
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Largest number of fields at a request's top level: a batch of as many commands as may wait, and some more.
-const MOST_FIELDS: usize = 4096 + 256;
+const MAX_FIELDS: usize = 4096 + 256;
 
 /// Largest number of fields of all levels of a request together: such a batch of poses, or 20,000 fixed points.
-const MOST_FIELDS_IN_ALL: usize = 1 << 16;
+const MAX_FIELDS_IN_ALL: usize = 1 << 16;
 
 /// A request that takes less memory than this is not paid for, bytes: a caller has few calls at once, and thousands a second.
 const SMALL: usize = 16 << 10;
@@ -122,7 +122,7 @@ pub fn accepts<M: Name>(message: &[u8]) -> Result<()> {
 /// Refuses a message that takes more memory than any valid one, and a request with more fields.
 fn check(message: &[u8], shape: &Shape, is_request: bool) -> Result<()> {
     let most_memory = message.len().saturating_mul(MULTIPLE).saturating_add(ROOM);
-    let most_fields = if is_request { [MOST_FIELDS, MOST_FIELDS_IN_ALL] } else { [usize::MAX; 2] };
+    let most_fields = if is_request { [MAX_FIELDS, MAX_FIELDS_IN_ALL] } else { [usize::MAX; 2] };
     let measure = shape.measure(message, most_fields[1], most_memory);
     for (has, most, what) in [
         (measure.fields, most_fields[1], "fields in all"),

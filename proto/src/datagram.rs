@@ -1,7 +1,7 @@
 //! Datagrams of touch: what both ends agree on beside the messages.
 //!
 //! **Congestion.** The congestion control of a stream halves its rate when packets are lost, and what waits then is old when it
-//! goes out. Touch can't wait, and has a rate of its own: at most one datagram of [`MOST_BYTES`] each way and step, some 8 Mbit/s
+//! goes out. Touch can't wait, and has a rate of its own: at most one datagram of [`MAX_BYTES`] each way and step, some 8 Mbit/s
 //! at 1 kHz, and a thirtieth of that where both ends send news alone. So its window is constant ([`WINDOW_BYTES`]), and a buffer
 //! of a few packets drops the oldest when the network takes less.
 
@@ -16,16 +16,16 @@ use crate::geometry::{from_vector, vector};
 use crate::pb;
 
 /// Largest message, bytes: it fits in one packet on any path that QUIC can use.
-pub const MOST_BYTES: usize = 1024;
+pub const MAX_BYTES: usize = 1024;
 
 /// Most poses before the newest in a datagram.
-pub const MOST_EARLIER: usize = 8;
+pub const MAX_EARLIER: usize = 8;
 
 /// Bytes that may be under way: a second of 1 kHz at 250 bytes.
 const WINDOW_BYTES: u64 = 256 << 10;
 
 /// Bytes of datagrams that may wait to be sent, and to be read.
-const WAITING_BYTES: usize = 4 * MOST_BYTES;
+const WAITING_BYTES: usize = 4 * MAX_BYTES;
 
 /// A session over which nothing came for so long has ended. The client asks the server for another then: sooner than QUIC, whose
 /// pauses double, would find out that the network is back.
@@ -113,7 +113,7 @@ pub fn tool_poses<'a>(tool: u32, newest: &Posed, earlier: impl Iterator<Item = &
         sequence: newest.sequence,
         client_time_ns: newest.client_time_ns,
         pose: Some(newest.pose),
-        earlier: earlier.filter_map(difference).take(MOST_EARLIER).collect(),
+        earlier: earlier.filter_map(difference).take(MAX_EARLIER).collect(),
     }
 }
 
@@ -135,7 +135,7 @@ pub fn commands(message: &pb::ToolPoses) -> impl Iterator<Item = pb::Command> {
         Some(command(sequence, client_time_ns.checked_sub(before.client_time_ns)?, pose))
     };
     let newest = pose.map(|pose| command(*sequence, *client_time_ns, pose));
-    earlier.iter().take(MOST_EARLIER).rev().filter_map(before).chain(newest)
+    earlier.iter().take(MAX_EARLIER).rev().filter_map(before).chain(newest)
 }
 
 #[cfg(test)]
@@ -155,7 +155,7 @@ mod tests {
             .map(|k| posed(k.into(), DVec3::new(0.1 + 1e-5 * f64::from(k), -0.2, 0.003 * f64::from(k).sin()), &tip))
             .collect();
         let message = tool_poses(3, &all[19], all[..19].iter().rev());
-        assert_eq!(message.earlier.len(), MOST_EARLIER);
+        assert_eq!(message.earlier.len(), MAX_EARLIER);
         let datagram = pb::PosesDatagram {
             number: 1 << 40,
             acknowledges: 1 << 40,

@@ -30,7 +30,7 @@ pub fn code(reason: Reason) -> Code {
         | Reason::NotFinite
         | Reason::OutOfRange
         | Reason::ForceTooLarge
-        | Reason::OffSheet
+        | Reason::OffTissue
         | Reason::OutOfTurn => Code::InvalidArgument,
         Reason::TooLarge | Reason::QueueFull | Reason::TooMany | Reason::Overloaded | Reason::RateLimited => {
             Code::ResourceExhausted

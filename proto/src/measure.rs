@@ -21,10 +21,10 @@ const LEVELS: u32 = 16;
 const FIELDS: usize = 64;
 
 /// The least that a text takes, bytes.
-const LEAST_TEXT: usize = 8;
+const MIN_TEXT: usize = 8;
 
 /// What a field is in memory.
-enum Kind {
+enum FieldKind {
     /// A number or an enumeration, of so many bytes in memory. On the wire it has so many, or, if 0, as many as it needs.
     Number(usize, usize),
     /// A text or byte string.
@@ -37,7 +37,7 @@ enum Kind {
 struct Field {
     number: u64,
     is_list: bool,
-    kind: Kind,
+    kind: FieldKind,
 }
 
 /// What a message is made of.
@@ -130,16 +130,16 @@ impl Walk {
             let Some(place) = shape.fields.iter().position(|field| field.number == tag >> 3) else { continue };
             let Field { is_list, ref kind, .. } = shape.fields[place];
             let (entries, size) = match (kind, value) {
-                (Kind::Number(memory, 0), Some(packed)) => {
+                (FieldKind::Number(memory, 0), Some(packed)) => {
                     (packed.iter().filter(|byte| **byte < 0x80).count(), *memory)
                 }
-                (Kind::Number(memory, wire), Some(packed)) => (packed.len() / wire, *memory),
-                (Kind::Number(memory, _), None) => (1, *memory),
-                (Kind::Text, text) => {
-                    self.measure.memory += text.map_or(0, |text| text.len().max(LEAST_TEXT));
+                (FieldKind::Number(memory, wire), Some(packed)) => (packed.len() / wire, *memory),
+                (FieldKind::Number(memory, _), None) => (1, *memory),
+                (FieldKind::Text, text) => {
+                    self.measure.memory += text.map_or(0, |text| text.len().max(MIN_TEXT));
                     (1, size_of::<Vec<u8>>())
                 }
-                (Kind::Message(of), message) => {
+                (FieldKind::Message(of), message) => {
                     let of = &SHAPES[*of];
                     if let Some(message) = message.filter(|_| levels > 0) {
                         self.message(of, message, levels - 1);

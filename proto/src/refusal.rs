@@ -41,7 +41,7 @@ reasons! {
     /// A force above the limit on a point.
     ForceTooLarge = "FORCE_TOO_LARGE",
     /// A point or a control point that is not on the sheet.
-    OffSheet = "OFF_SHEET",
+    OffTissue = "OFF_TISSUE",
     /// No scene of that name.
     UnknownScene = "UNKNOWN_SCENE",
     /// No script of that name.
@@ -226,9 +226,9 @@ pub fn finite_vector(field: &str, value: glam::DVec3) -> Result<glam::DVec3> {
 /// # Errors
 /// Refuses a text that is too long or has control characters.
 pub fn label(field: &str, label: &str) -> Result<()> {
-    const MOST_BYTES: usize = 128;
-    if label.len() > MOST_BYTES || label.chars().any(acts) {
-        let message = format!("must be at most {MOST_BYTES} bytes, without control characters");
+    const MAX_BYTES: usize = 128;
+    if label.len() > MAX_BYTES || label.chars().any(acts) {
+        let message = format!("must be at most {MAX_BYTES} bytes, without control characters");
         return Err(Refusal::new(Reason::OutOfRange, field, message));
     }
     Ok(())
@@ -238,17 +238,17 @@ pub fn label(field: &str, label: &str) -> Result<()> {
 /// may be left out. None if no name is near.
 pub fn nearest<'n>(given: &str, names: impl IntoIterator<Item = &'n str>) -> Option<&'n str> {
     // A shorter beginning could be that of anything.
-    const LEAST_BEGINNING: usize = 3;
-    const LEAST_MISSPELT: usize = 5;
+    const MIN_BEGINNING: usize = 3;
+    const MIN_MISSPELT: usize = 5;
     let given = given.trim().to_lowercase();
     let letters = given.chars().count();
     let most = (letters / 3).clamp(1, 3);
     let misses = |name: &str| {
-        let begins = letters >= LEAST_BEGINNING && name.starts_with(&given);
+        let begins = letters >= MIN_BEGINNING && name.starts_with(&given);
         // A beginning is nearer than any misspelling.
         let apart = if begins { 0 } else { strsim::damerau_levenshtein(&given, &name.to_lowercase()) };
         let beginning = |count: usize| name.chars().take(count).collect::<String>().to_lowercase();
-        let of_beginning = if letters < LEAST_MISSPELT {
+        let of_beginning = if letters < MIN_MISSPELT {
             usize::MAX
         } else {
             let counts = [letters - 1, letters, letters + 1].into_iter();

@@ -197,7 +197,7 @@ pub struct Budget {
 }
 
 /// Of callers that have gone so many are remembered, at least for as long as what they spent.
-const MOST_FORMER: usize = 4096;
+const MAX_FORMER: usize = 4096;
 
 #[derive(Debug, Default)]
 struct Accounts {
@@ -248,7 +248,7 @@ impl Budget {
             budget: self.clone(),
             turn: tokio::sync::Mutex::default(),
         });
-        if accounts.known.len() > MOST_FORMER {
+        if accounts.known.len() > MAX_FORMER {
             accounts.known.retain(|_, (_, owner)| owner.strong_count() > 0);
         }
         accounts.known.insert(name.to_owned(), (number, Arc::downgrade(&owner)));

@@ -24,7 +24,7 @@ const HEALTH: Duration = Duration::from_secs(2);
 const LOOK: Duration = Duration::from_secs(1);
 
 /// An SDK that takes longer for one call counts as away.
-const PATIENCE: Duration = Duration::from_secs(5);
+const SDK_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The counter of the game server that has the sessions.
 const COUNTER: &str = "sessions";
@@ -34,7 +34,7 @@ const PORT: u16 = 9357;
 
 /// How a server stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Seen {
+pub struct ServerStatus {
     /// It may step and speak for sessions.
     pub acts: bool,
     /// Its sessions.
@@ -45,22 +45,22 @@ pub struct Seen {
 
 /// What Agones knows of the server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum State {
+enum AgonesState {
     Starting,
     Ready,
     Allocated,
     Shutdown,
 }
 
-impl State {
+impl AgonesState {
     /// The next that is to be told, if any. Agones hears `Ready` before anything else.
-    fn next(self, seen: Seen) -> Option<State> {
+    fn next(self, seen: ServerStatus) -> Option<AgonesState> {
         let wanted = match (self, seen) {
-            (State::Shutdown, _) | (State::Starting, Seen { acts: false, .. }) => return None,
-            (State::Starting, _) => State::Ready,
-            (_, Seen { sessions: 0, draining: true, .. }) => State::Shutdown,
-            (_, Seen { sessions: 0, .. }) => State::Ready,
-            _ => State::Allocated,
+            (AgonesState::Shutdown, _) | (AgonesState::Starting, ServerStatus { acts: false, .. }) => return None,
+            (AgonesState::Starting, _) => AgonesState::Ready,
+            (_, ServerStatus { sessions: 0, draining: true, .. }) => AgonesState::Shutdown,
+            (_, ServerStatus { sessions: 0, .. }) => AgonesState::Ready,
+            _ => AgonesState::Allocated,
         };
         (wanted != self).then_some(wanted)
     }
@@ -70,7 +70,7 @@ impl State {
 struct Sdk {
     sdk: SdkClient<Channel>,
     counters: Counters<Channel>,
-    state: State,
+    state: AgonesState,
     /// What the counter was told, and how far it goes.
     counted: Option<i64>,
     capacity: Option<i64>,
@@ -80,22 +80,22 @@ struct Sdk {
 
 /// One call, with patience.
 async fn within<T>(call: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
-    timeout(PATIENCE, call).await.unwrap_or_else(|_| Err(Status::deadline_exceeded("no answer")))
+    timeout(SDK_TIMEOUT, call).await.unwrap_or_else(|_| Err(Status::deadline_exceeded("no answer")))
 }
 
 impl Sdk {
     /// Tells what has changed.
-    async fn tell(&mut self, seen: Seen) -> Result<(), Status> {
+    async fn tell(&mut self, seen: ServerStatus) -> Result<(), Status> {
         if let Some(next) = self.state.next(seen) {
             match next {
-                State::Allocated => within(self.sdk.allocate(Empty {})).await?,
-                State::Shutdown => within(self.sdk.shutdown(Empty {})).await?,
-                State::Starting | State::Ready => within(self.sdk.ready(Empty {})).await?,
+                AgonesState::Allocated => within(self.sdk.allocate(Empty {})).await?,
+                AgonesState::Shutdown => within(self.sdk.shutdown(Empty {})).await?,
+                AgonesState::Starting | AgonesState::Ready => within(self.sdk.ready(Empty {})).await?,
             };
             info!(state = ?next, "Agones is told");
             self.state = next;
         }
-        if self.state == State::Starting || self.state == State::Shutdown {
+        if self.state == AgonesState::Starting || self.state == AgonesState::Shutdown {
             return Ok(());
         }
         let sessions = i64::try_from(seen.sessions).unwrap_or(i64::MAX);
@@ -129,11 +129,11 @@ impl Sdk {
 
 /// Tells for ever how the server stands, which `seen` tells: whether it is ready, has sessions, how many, and at last that it was
 /// drained.
-async fn tell_standing(channel: Channel, seen: impl Fn() -> Seen) {
+async fn tell_standing(channel: Channel, seen: impl Fn() -> ServerStatus) {
     let mut sdk = Sdk {
         sdk: SdkClient::new(channel.clone()),
         counters: Counters::new(channel),
-        state: State::Starting,
+        state: AgonesState::Starting,
         counted: None,
         capacity: None,
         is_away: false,
@@ -178,9 +178,9 @@ pub fn port() -> u16 {
 }
 
 /// Tells the SDK at `port` of this machine how a server stands, for ever. `seen` is called once a second and must not wait.
-pub async fn tell(port: u16, seen: impl Fn() -> Seen) {
+pub async fn tell(port: u16, seen: impl Fn() -> ServerStatus) {
     let Ok(endpoint) = Endpoint::from_shared(format!("http://localhost:{port}")) else { return };
-    let channel = endpoint.connect_timeout(PATIENCE).connect_lazy();
+    let channel = endpoint.connect_timeout(SDK_TIMEOUT).connect_lazy();
     tokio::join!(tell_health(channel.clone()), tell_standing(channel, seen));
 }
 
@@ -190,20 +190,20 @@ mod tests {
 
     #[test]
     fn agones_hears_of_each_change_in_its_order() {
-        let seen = |sessions, draining| Seen { acts: true, sessions, draining };
-        let fenced = Seen { acts: false, ..seen(0, false) };
+        let seen = |sessions, draining| ServerStatus { acts: true, sessions, draining };
+        let fenced = ServerStatus { acts: false, ..seen(0, false) };
         for (state, seen, next) in [
-            (State::Starting, fenced, None),
-            (State::Starting, seen(3, false), Some(State::Ready)),
-            (State::Ready, seen(0, false), None),
-            (State::Ready, seen(3, false), Some(State::Allocated)),
+            (AgonesState::Starting, fenced, None),
+            (AgonesState::Starting, seen(3, false), Some(AgonesState::Ready)),
+            (AgonesState::Ready, seen(0, false), None),
+            (AgonesState::Ready, seen(3, false), Some(AgonesState::Allocated)),
             // It is still there.
-            (State::Allocated, Seen { acts: false, ..seen(3, false) }, None),
-            (State::Allocated, seen(0, false), Some(State::Ready)),
-            (State::Allocated, seen(1, true), None),
-            (State::Allocated, seen(0, true), Some(State::Shutdown)),
-            (State::Ready, seen(0, true), Some(State::Shutdown)),
-            (State::Shutdown, seen(1, false), None),
+            (AgonesState::Allocated, ServerStatus { acts: false, ..seen(3, false) }, None),
+            (AgonesState::Allocated, seen(0, false), Some(AgonesState::Ready)),
+            (AgonesState::Allocated, seen(1, true), None),
+            (AgonesState::Allocated, seen(0, true), Some(AgonesState::Shutdown)),
+            (AgonesState::Ready, seen(0, true), Some(AgonesState::Shutdown)),
+            (AgonesState::Shutdown, seen(1, false), None),
         ] {
             assert_eq!(state.next(seen), next, "{state:?} {seen:?}");
         }

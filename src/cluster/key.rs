@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Longest name of a fleet or a node.
-const MOST_LETTERS: usize = 64;
+const MAX_LETTERS: usize = 64;
 
 /// Where the keys of a fleet are: `/palpate/FLEET/nodes/NODE` and `/palpate/FLEET/sessions/ID`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -51,10 +51,10 @@ impl Keys {
 pub fn check_name(field: &str, name: &str) -> Result<()> {
     let is_letter = |c: char| c.is_ascii_alphanumeric() || ".-_:".contains(c);
     let is_name = name.starts_with(|c: char| c.is_ascii_alphanumeric()) && name.chars().all(is_letter);
-    if is_name && name.len() <= MOST_LETTERS {
+    if is_name && name.len() <= MAX_LETTERS {
         return Ok(());
     }
-    let message = format!("must be 1 to {MOST_LETTERS} letters, digits, `.`, `-`, `_` or `:`, but is `{name}`");
+    let message = format!("must be 1 to {MAX_LETTERS} letters, digits, `.`, `-`, `_` or `:`, but is `{name}`");
     Err(Refusal::new(Reason::OutOfRange, field, message))
 }
 

@@ -13,8 +13,8 @@ use palpate_touch::law::{Law, Row};
 
 use super::disc::Disc;
 use super::exact::{ROWS as EXACT_ROWS, course, follow, pressed};
-use crate::sheet::Model;
-use crate::sheet::tangent::{self, Accuracy, Course};
+use crate::tissue::Model;
+use crate::tissue::tangent::{self, Accuracy, Course};
 
 /// The most work of a first law, springs times iterations: 46 ms of processor time, at the 27 ns that one takes on an AMD
 /// EPYC (family 26). Work is counted, not timed, so that every machine gives the same law.
@@ -166,16 +166,16 @@ mod tests {
     #[test]
     fn a_coarse_law_knows_the_rim_and_what_is_under_the_disc() {
         let never = AtomicBool::new(false);
-        // A membrane that hardly anything but its rim holds, and one that its virtual springs hold as well.
-        for virtual_stiffness in ["0.01", "0.5"] {
-            let virtual_stiffness = format!("virtual_springs.stiffness_n_per_m={virtual_stiffness}");
-            let model = Model::paper(&["sheet.points=[25, 25]", "sheet.fixed=\"edges\"", &virtual_stiffness]);
+        // A membrane that hardly anything but its rim holds, and one that its anchor springs hold as well.
+        for anchor_stiffness in ["0.01", "0.5"] {
+            let anchor_stiffness = format!("anchor_springs.stiffness_n_per_m={anchor_stiffness}");
+            let model = Model::paper(&["sheet.points=[25, 25]", "sheet.fixed=\"edges\"", &anchor_stiffness]);
             let radius_m = model.shape().edge_m();
             let first = first(&model, Disc::in_middle(&model, radius_m), &never).unwrap();
             let [force, stiffness] = apart(&exact(&model, radius_m), &first);
-            println!("{virtual_stiffness}: force {force:.4}, stiffness {stiffness:.4} apart");
+            println!("{anchor_stiffness}: force {force:.4}, stiffness {stiffness:.4} apart");
             assert!(first.is_coarse && first.is_sound());
-            assert!(force < 0.1 && stiffness < 0.15, "{virtual_stiffness}: {force} {stiffness}");
+            assert!(force < 0.1 && stiffness < 0.15, "{anchor_stiffness}: {force} {stiffness}");
         }
     }
 

@@ -2,8 +2,8 @@
 
 use glam::DVec3;
 
-use crate::sheet::alike::place_alike;
-use crate::sheet::{Feel, Model};
+use crate::tissue::representative_place::place_alike;
+use crate::tissue::{Model, ToolContact};
 
 /// A tool so many radii away from the surface wants no law of the place.
 const NEAR_IN_RADII: f64 = 4.0;
@@ -28,7 +28,7 @@ impl Disc {
 
     /// Where the tissue rests that a tool with this disc presses, or is about to press, m; none if it is far from the tissue. That is
     /// not the place nearest to the tool: deep in a tissue that is curved or folded, another part of it may be nearer.
-    pub fn pressed_m(&self, feel: &Feel) -> Option<DVec3> {
+    pub fn pressed_m(&self, feel: &ToolContact) -> Option<DVec3> {
         let is_near = feel.place_m.distance(feel.surface_m) <= NEAR_IN_RADII * self.radius_m;
         is_near.then_some(feel.anchor_m)
     }

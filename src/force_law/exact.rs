@@ -1,12 +1,12 @@
-//! The exact force law of a tissue under a disc: the whole sheet is pressed in, depth after depth (`sheet::tangent`).
+//! The exact force law of a tissue under a disc: the whole sheet is pressed in, depth after depth (`tissue::tangent`).
 
 use std::sync::atomic::AtomicBool;
 
 use palpate_touch::law::{Law, Row};
 
 use super::disc::Disc;
-use crate::sheet::Model;
-use crate::sheet::tangent::{self, Accuracy, Course, Deepened, Press, Pressed};
+use crate::tissue::Model;
+use crate::tissue::tangent::{self, Accuracy, Course, Deepened, Press, Pressed};
 
 /// Rows of an exact law.
 pub(super) const ROWS: u32 = 21;
@@ -20,7 +20,7 @@ pub struct Computation(Box<Press>);
 
 /// What became of a computation.
 #[derive(Debug)]
-pub enum Progress {
+pub enum LawProgress {
     /// It can go on.
     UnderWay(Computation),
     /// The law.
@@ -36,11 +36,11 @@ impl Computation {
     }
 
     /// Computes the next depth, unless `stop` is set. `model` is the one that it was begun for.
-    pub fn advance(mut self, model: &Model, stop: &AtomicBool) -> Progress {
+    pub fn advance(mut self, model: &Model, stop: &AtomicBool) -> LawProgress {
         match self.0.deepen(model, stop) {
-            Deepened::Further => Progress::UnderWay(self),
-            Deepened::Done => Progress::Done(from_pressed(self.0.pressed())),
-            Deepened::GivenUp => Progress::GivenUp,
+            Deepened::Further => LawProgress::UnderWay(self),
+            Deepened::Done => LawProgress::Done(from_pressed(self.0.pressed())),
+            Deepened::GivenUp => LawProgress::GivenUp,
         }
     }
 }
@@ -128,18 +128,19 @@ mod tests {
         let mut computation = Computation::new(&model, disc, u64::MAX).unwrap();
         for depth in 1.. {
             match computation.advance(&model, &go_on) {
-                Progress::UnderWay(further) => computation = further,
-                Progress::Done(law) => {
+                LawProgress::UnderWay(further) => computation = further,
+                LawProgress::Done(law) => {
                     assert_eq!((law, depth), (exact, 21));
                     break;
                 }
-                Progress::GivenUp => panic!("given up at depth {depth}"),
+                LawProgress::GivenUp => panic!("given up at depth {depth}"),
             }
         }
-        let Progress::UnderWay(computation) = Computation::new(&model, disc, u64::MAX).unwrap().advance(&model, &go_on)
+        let LawProgress::UnderWay(computation) =
+            Computation::new(&model, disc, u64::MAX).unwrap().advance(&model, &go_on)
         else {
             panic!("one depth is not all");
         };
-        assert!(matches!(computation.advance(&model, &stop), Progress::GivenUp));
+        assert!(matches!(computation.advance(&model, &stop), LawProgress::GivenUp));
     }
 }

@@ -8,4 +8,4 @@ mod exact;
 
 pub use coarse::first;
 pub use disc::Disc;
-pub use exact::{Computation, Progress, exact, exact_within};
+pub use exact::{Computation, LawProgress, exact, exact_within};

@@ -14,7 +14,7 @@ pub struct JournalFile {
 }
 
 /// Longest id of a session in a name.
-const MOST_LETTERS: usize = 128;
+const MAX_LETTERS: usize = 128;
 
 /// The name of the file of a run.
 pub fn name(session_id: &str, run: u64) -> String {
@@ -25,7 +25,7 @@ pub fn name(session_id: &str, run: u64) -> String {
 pub fn parse(name: &str) -> Option<(String, u64)> {
     let (session_id, run) = name.strip_suffix(".mcap")?.rsplit_once('.')?;
     let is_letter = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
-    let is_id = !session_id.is_empty() && session_id.len() <= MOST_LETTERS && session_id.chars().all(is_letter);
+    let is_id = !session_id.is_empty() && session_id.len() <= MAX_LETTERS && session_id.chars().all(is_letter);
     let number = run.parse().ok()?;
     // One name each: no sign, no zeros before.
     (is_id && number > 0 && run == format!("{number}")).then(|| (session_id.to_owned(), number))

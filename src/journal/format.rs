@@ -15,10 +15,10 @@ pub const REPLAYS: u32 = 3;
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// Most inputs in a batch. With more, a flush writes several.
-pub const MOST_INPUTS: usize = 1 << 16;
+pub const MAX_INPUTS: usize = 1 << 16;
 
 /// Largest chunk that is read, bytes. A writer begins another batch long before; only a single snapshot may be large.
-pub const MOST_BYTES: u64 = 1 << 30;
+pub const MAX_BYTES: u64 = 1 << 30;
 
 /// The messages of a journal. Their numbers are those of their channels and schemas.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -90,7 +90,7 @@ impl Topic {
 
 /// A file of the protocol, as far as its imports are concerned.
 #[derive(Clone, PartialEq, Message)]
-struct File {
+struct ProtoFile {
     #[prost(string, tag = "1")]
     name: String,
     #[prost(string, repeated, tag = "3")]
@@ -120,7 +120,7 @@ pub fn schema_of(file: &str) -> Vec<u8> {
     // Each file is after its imports.
     let mut kept: Vec<Vec<u8>> = Vec::new();
     for bytes in all.file.into_iter().rev() {
-        let file = File::decode(&*bytes).unwrap_or_default();
+        let file = ProtoFile::decode(&*bytes).unwrap_or_default();
         if wanted.contains(&file.name) {
             wanted.extend(file.dependency);
             kept.push(bytes);
@@ -160,7 +160,7 @@ mod tests {
             let files = Files::decode(&*schema(topic)).unwrap().file;
             let mut seen = BTreeSet::new();
             for file in &files {
-                let file = File::decode(&**file).unwrap();
+                let file = ProtoFile::decode(&**file).unwrap();
                 assert!(file.dependency.iter().all(|import| seen.contains(import)), "{topic:?}: {}", file.name);
                 seen.insert(file.name);
             }

@@ -129,7 +129,7 @@ impl<W: Write + Seek> Export<W> {
             time_s,
             kinetic_j: energy.kinetic,
             spring_j: energy.spring,
-            virtual_j: energy.virtual_springs,
+            anchor_j: energy.anchor_springs,
             largest_displacement_m: session.tissue().largest_displacement_m(),
             awake_points: session.tissue().awake_points() as u32,
         };

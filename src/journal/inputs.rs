@@ -9,18 +9,18 @@ use std::sync::Arc;
 use prost::Message;
 
 use super::message::{self, Tips, fill_tips, from_command, from_tissue};
-use super::reader::{Reader, Survey};
+use super::reader::{JournalReader, Survey};
 use crate::limits::Limits;
 use crate::refusal::Result;
 use crate::session::input::Input;
 use crate::session::rules::Rules;
-use crate::sheet::Model;
+use crate::tissue::Model;
 use palpate_proto::journal as pb;
 use palpate_proto::measure;
 
 /// Reads the inputs of a journal.
 pub struct Inputs<R> {
-    reader: Reader<R>,
+    reader: JournalReader<R>,
     first: Arc<Model>,
     rules: Rules,
     limits: Limits,
@@ -37,7 +37,7 @@ pub struct Piece {
 
 impl<R: Read + Seek> Inputs<R> {
     /// Those that act at `step` and later. `survey` is that of the journal, and `first` the tissue with which its session began.
-    pub fn new(mut reader: Reader<R>, survey: &Survey, first: &Arc<Model>, given: &Limits, step: u64) -> Self {
+    pub fn new(mut reader: JournalReader<R>, survey: &Survey, first: &Arc<Model>, given: &Limits, step: u64) -> Self {
         // A batch with a snapshot of a step has all inputs that act at that step, or later ones have.
         match survey.snapshots.iter().rev().find(|at| at.step <= step) {
             Some(at) => reader.go_to(at),
@@ -114,8 +114,8 @@ mod tests {
     use crate::scene::script::Action;
     use crate::session::Session;
     use crate::session::command::{Command, Due};
-    use crate::session::handing::Handed;
     use crate::session::intake::{Counts, Intake};
+    use crate::session::intake_transfer::Handed;
     use crate::session::lease::LeaseId;
 
     const LEASE: LeaseId = 7;

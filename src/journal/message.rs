@@ -15,23 +15,23 @@ use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::profile::Poke;
 use crate::scene::script::Action;
-use crate::scene::{Appearance, Body, Integrator, MeshShape, Named, Precision, Scene, Surface};
+use crate::scene::{Appearance, Body, Integrator, MeshShape, Named, PaintedSurface, Precision, Scene};
 use crate::session::command::{Command, Due};
 use crate::session::input::{Felt, Input};
 use crate::session::rules::Rules;
 use crate::shape::PointId;
-use crate::sheet::Model;
-use crate::sheet::saved::{CorrectedPlan, TissueState};
+use crate::tissue::Model;
+use crate::tissue::saved::{CorrectedPlan, TissueState};
 use crate::wire::required;
 use crate::wire::scene::{from_scene, sent};
 
 /// So many tools a journal is replayed with at least, whatever the limits of the server were.
-const MOST_TOOLS: u32 = 4096;
+const MAX_TOOLS: u32 = 4096;
 
 /// The limits under which a journal is read: what a server has accepted is not refused for its force, its reach or the number of
 /// its tool, which its configuration may allow to be larger.
 pub fn limits(limits: &Limits) -> Limits {
-    let tools = limits.tools.max(MOST_TOOLS);
+    let tools = limits.tools.max(MAX_TOOLS);
     Limits { point_force_n: f64::MAX, reach_in_sheets: f64::MAX, tools, ..limits.clone() }
 }
 
@@ -143,7 +143,7 @@ pub fn model(header: &pb::Header, given: &Limits) -> Result<Arc<Model>> {
 
 fn from_appearance(message: &pb::Appearance) -> Result<Appearance> {
     let texture = (!message.texture.is_empty()).then(|| PathBuf::from(&message.texture));
-    let surface = Surface::named("appearance.surface", &message.surface)?;
+    let surface = PaintedSurface::named("appearance.surface", &message.surface)?;
     let range = crate::scene::SMALLEST_TEXTURE..=Limits::default().texture_side;
     let texture_size = message.texture_size.clamp(*range.start(), *range.end());
     Ok(Appearance { texture, surface, texture_seed: message.texture_seed, texture_size })
@@ -154,7 +154,7 @@ pub fn tissue(model: &Model) -> pb::Tissue {
     let TissueState {
         stiffness_n_per_m,
         shear_stiffness_n_per_m,
-        virtual_stiffness_n_per_m,
+        anchor_stiffness_n_per_m,
         damping_n_s_per_m,
         volume_stiffness_pa,
         integrator,
@@ -170,7 +170,7 @@ pub fn tissue(model: &Model) -> pb::Tissue {
         shear_stiffness_n_per_m,
         damping_n_s_per_m,
         volume_stiffness_pa,
-        virtual_stiffness_n_per_m,
+        anchor_stiffness_n_per_m,
         integrator: integrator.name().to_owned(),
         substeps,
         precision: precision.name().to_owned(),
@@ -199,7 +199,7 @@ fn compiled(first: &Scene, message: &pb::Tissue, limits: &Limits) -> Result<Arc<
     let state = TissueState {
         stiffness_n_per_m: message.stiffness_n_per_m,
         shear_stiffness_n_per_m: message.shear_stiffness_n_per_m,
-        virtual_stiffness_n_per_m: message.virtual_stiffness_n_per_m,
+        anchor_stiffness_n_per_m: message.anchor_stiffness_n_per_m,
         damping_n_s_per_m: message.damping_n_s_per_m,
         volume_stiffness_pa: message.volume_stiffness_pa,
         integrator: Integrator::named("integrator", &message.integrator)?,
@@ -309,7 +309,7 @@ pub(super) fn from_command(message: &pb::Command, rules: &Rules, points: usize) 
         return Err(Refusal::new(Reason::OutOfRange, "tool", text));
     }
     let point = |field: &str, number: u32| {
-        let message = || Refusal::new(Reason::OffSheet, field, format!("the tissue has no point {number}"));
+        let message = || Refusal::new(Reason::OffTissue, field, format!("the tissue has no point {number}"));
         ((number as usize) < points).then(|| PointId::new(number as usize)).ok_or_else(message)
     };
     let action = match required("action", message.action.as_ref())? {

@@ -16,8 +16,8 @@
 //! **Proof.** Hashes show that the same inputs still give the same bits, not who wrote them: who can change an input can change the
 //! hashes too. A server with a key signs its journals ([`signature`]).
 //!
-//! **Use.** Who records makes a [`Writer`] with an [`Opening`], tells it what happens ([`crate::session::input::Input`]), and
-//! appends what each [`Writer::flush`] gives; after each sync it tells [`Writer::durable`]. Who goes on after a restart calls
+//! **Use.** Who records makes a [`JournalWriter`] with an [`Opening`], tells it what happens ([`crate::session::input::Input`]), and
+//! appends what each [`JournalWriter::flush`] gives; after each sync it tells [`JournalWriter::durable`]. Who goes on after a restart calls
 //! [`resume`].
 //!
 //! The crate `mcap` reads records here. Its writer keeps an index of every chunk in memory, and its output open; so journals are
@@ -27,19 +27,19 @@ pub mod file;
 pub mod format;
 pub mod foxglove;
 pub mod inputs;
-pub mod mend;
 pub mod message;
 pub mod reader;
 pub mod records;
+pub mod recover;
 pub mod replay;
 pub mod seal;
 pub mod signature;
 pub mod writer;
 
 pub use format::{REPLAYS, Topic};
-pub use reader::{Batch, Reader, SnapshotAt, Survey};
-pub use replay::{Difference, Replay, Resumed, Seen, Verdict, prediction, resume, session_at, verify};
-pub use writer::{Opening, Writer};
+pub use reader::{JournalBatch, JournalReader, SnapshotAt, Survey};
+pub use replay::{Difference, Replay, ReplayEvent, Resumed, Verdict, prediction, resume, session_at, verify};
+pub use writer::{JournalWriter, Opening};
 
 pub use palpate_proto::journal as pb;
 pub use palpate_proto::pb::Vector3;

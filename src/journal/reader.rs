@@ -18,7 +18,7 @@ use palpate_proto::journal as pb;
 use palpate_proto::measure::{self, memory_of, varint};
 use prost::Message;
 
-use super::format::{MOST_BYTES, MOST_INPUTS, Topic};
+use super::format::{MAX_BYTES, MAX_INPUTS, Topic};
 use super::message::fill_tips;
 use super::records::{
     CHANNEL, CHUNK, CHUNK_HEAD, DATA_END, HEAD, HEADER, MAGIC, MESSAGE, MESSAGE_HEAD, MESSAGE_INDEX, SCHEMA, number,
@@ -29,7 +29,7 @@ use crate::refusal::{Reason, Refusal, Result};
 
 /// A batch, whose messages are decoded when they are asked for.
 #[derive(Debug, Clone)]
-pub struct Batch {
+pub struct JournalBatch {
     /// Its number.
     pub number: u64,
     /// Where its chunk begins in the file.
@@ -51,14 +51,14 @@ pub struct Batch {
     places: Vec<(u16, u64, u64)>,
 }
 
-/// What the inputs of a batch may take in memory whatever their length, bytes: there are no more of them than [`MOST_INPUTS`], in a
+/// What the inputs of a batch may take in memory whatever their length, bytes: there are no more of them than [`MAX_INPUTS`], in a
 /// vector that has grown.
-const INPUTS_ROOM: usize = 2 * MOST_INPUTS * size_of::<pb::Input>();
+const INPUTS_ROOM: usize = 2 * MAX_INPUTS * size_of::<pb::Input>();
 
 /// What a message takes beside what it refers to, in the lists in which it waits, bytes.
 const MESSAGE_BYTES: usize = 1024;
 
-impl Batch {
+impl JournalBatch {
     /// What it takes when all of its messages are decoded, bytes.
     fn memory(&self) -> Result<u64> {
         let mut sum = self.data.len() + size_of_val(self.places.as_slice());
@@ -113,7 +113,7 @@ impl Batch {
 
     /// A refusal with the place of this batch.
     pub(super) fn placed(&self, refusal: Refusal) -> Refusal {
-        let Batch { number, offset, until_step, .. } = self;
+        let JournalBatch { number, offset, until_step, .. } = self;
         let field = if refusal.field.is_empty() { String::new() } else { format!("{}: ", refusal.field) };
         let message = format!("batch {number} at byte {offset}, up to step {until_step}: {field}{}", refusal.message);
         Refusal { place: Some(self.place.clone()), message, field: String::new(), ..refusal }
@@ -232,13 +232,13 @@ impl Survey {
 }
 
 /// Changes of the tissue that wait, at most: more than any session lets wait.
-const MOST_WAITING: usize = 4096;
+const MAX_WAITING: usize = 4096;
 
 /// An index is read over, not sought over, if it has no more bytes.
 const SHORT: usize = 4096;
 
 /// What comes next in a file.
-enum Next {
+enum NextRecord {
     Chunk(u64),
     DataEnd,
     End,
@@ -247,7 +247,7 @@ enum Next {
 }
 
 /// Reads a journal. It takes the memory of one batch.
-pub struct Reader<R> {
+pub struct JournalReader<R> {
     place: String,
     source: R,
     length: u64,
@@ -277,13 +277,13 @@ pub struct Reader<R> {
     batch_bytes: u64,
 }
 
-impl Reader<BufReader<File>> {
+impl JournalReader<BufReader<File>> {
     /// Opens a file.
     ///
     /// # Errors
-    /// Refuses a file that can't be read, and as [`Reader::new`] does.
+    /// Refuses a file that can't be read, and as [`JournalReader::new`] does.
     pub fn open(path: &Path) -> Result<Self> {
-        Reader::new(&path.display().to_string(), file(path)?)
+        JournalReader::new(&path.display().to_string(), file(path)?)
     }
 }
 
@@ -307,23 +307,23 @@ pub fn file(path: &Path) -> Result<BufReader<File>> {
     Ok(BufReader::with_capacity(1 << 16, file))
 }
 
-impl<R: Read + Seek> Reader<R> {
+impl<R: Read + Seek> JournalReader<R> {
     /// Reads the beginning of a journal; `place` is what refusals call it.
     ///
     /// # Errors
     /// Refuses what is no journal, and one without a whole batch ([`Reason::Missing`]): then its session was never told to be
     /// durable.
     pub fn new(place: &str, source: R) -> Result<Self> {
-        Reader::paid(place, source, None)
+        JournalReader::paid(place, source, None)
     }
 
     /// The same, for somebody who pays for its memory: `paid` grows by it.
     ///
     /// # Errors
-    /// As for [`Reader::new`]; refuses what is beyond the part of who pays.
+    /// As for [`JournalReader::new`]; refuses what is beyond the part of who pays.
     pub fn paid(place: &str, mut source: R, paid: Option<Taken>) -> Result<Self> {
         let length = source.seek(SeekFrom::End(0)).map_err(|e| unreadable(place, &e.to_string()))?;
-        let mut reader = Reader {
+        let mut reader = JournalReader {
             place: place.to_owned(),
             source,
             length,
@@ -378,11 +378,11 @@ impl<R: Read + Seek> Reader<R> {
         self
     }
 
-    /// For a user who wants what is whole: a journal that is damaged in the middle ends there, and [`Reader::damage`] tells why. Who
+    /// For a user who wants what is whole: a journal that is damaged in the middle ends there, and [`JournalReader::damage`] tells why. Who
     /// goes on with a session wants an error.
     #[must_use]
     pub fn up_to_damage(self) -> Self {
-        Reader { stops_at_damage: true, ..self }
+        JournalReader { stops_at_damage: true, ..self }
     }
 
     /// Why the last batch is not that of the journal, if it is damaged behind it; known after that batch.
@@ -459,7 +459,7 @@ impl<R: Read + Seek> Reader<R> {
             survey.unix_ns = [first, batch.unix_ns];
             survey.end = batch.end()?.or(survey.end);
             if let Some(mut waiting) = batch.waiting()? {
-                waiting.inputs.truncate(MOST_WAITING);
+                waiting.inputs.truncate(MAX_WAITING);
                 waiting.inputs.shrink_to_fit();
                 survey.waiting = waiting.inputs;
             }
@@ -476,15 +476,15 @@ impl<R: Read + Seek> Reader<R> {
     ///
     /// # Errors
     /// Refuses a file that is damaged before its end, unless it is read [up to that](Reader::up_to_damage).
-    pub fn next_batch(&mut self) -> Result<Option<Batch>> {
+    pub fn next_batch(&mut self) -> Result<Option<JournalBatch>> {
         while !self.ended {
             let wrong = match self.next_record()? {
-                Next::End | Next::DataEnd => {
+                NextRecord::End | NextRecord::DataEnd => {
                     self.ended = true;
                     break;
                 }
-                Next::Wrong(what) => what,
-                Next::Chunk(size) => {
+                NextRecord::Wrong(what) => what,
+                NextRecord::Chunk(size) => {
                     let mut data = self.buffer(size)?;
                     self.read_at(self.at + HEAD, &mut data)?;
                     match self.batch(data) {
@@ -575,20 +575,22 @@ impl<R: Read + Seek> Reader<R> {
         Ok(head)
     }
 
-    fn next_record(&mut self) -> Result<Next> {
+    fn next_record(&mut self) -> Result<NextRecord> {
         let left = self.length.saturating_sub(self.at);
         if left == 0 {
-            return Ok(Next::End);
+            return Ok(NextRecord::End);
         }
         if left < HEAD {
-            return Ok(Next::Wrong("a record is cut off".to_owned()));
+            return Ok(NextRecord::Wrong("a record is cut off".to_owned()));
         }
         let (kind, length) = self.head(self.at)?;
         Ok(match kind {
-            CHUNK if length > left - HEAD => Next::Wrong("a chunk is cut off".to_owned()),
-            CHUNK if length > MOST_BYTES => Next::Wrong(format!("a chunk has {length} bytes, more than {MOST_BYTES}")),
-            CHUNK if length < CHUNK_HEAD => Next::Wrong("a chunk is too short".to_owned()),
-            CHUNK => Next::Chunk(length),
+            CHUNK if length > left - HEAD => NextRecord::Wrong("a chunk is cut off".to_owned()),
+            CHUNK if length > MAX_BYTES => {
+                NextRecord::Wrong(format!("a chunk has {length} bytes, more than {MAX_BYTES}"))
+            }
+            CHUNK if length < CHUNK_HEAD => NextRecord::Wrong("a chunk is too short".to_owned()),
+            CHUNK => NextRecord::Chunk(length),
             DATA_END if length == 4 => {
                 // The last record is the footer, and the file ends as it began.
                 let mut magic = [0; 8];
@@ -596,9 +598,9 @@ impl<R: Read + Seek> Reader<R> {
                     self.read_at(self.length - 8, &mut magic)?;
                 }
                 self.sealed = magic == MAGIC;
-                Next::DataEnd
+                NextRecord::DataEnd
             }
-            kind => Next::Wrong(format!("there is a record of kind {kind}, where a chunk should be")),
+            kind => NextRecord::Wrong(format!("there is a record of kind {kind}, where a chunk should be")),
         })
     }
 
@@ -619,7 +621,7 @@ impl<R: Read + Seek> Reader<R> {
     }
 
     /// What a chunk has, or what is wrong with it.
-    fn batch(&mut self, data: Vec<u8>) -> std::result::Result<Batch, String> {
+    fn batch(&mut self, data: Vec<u8>) -> std::result::Result<JournalBatch, String> {
         let messages = messages_of(&data, if self.batch == 0 { None } else { Some(&self.channels) })?;
         if let Some(channels) = messages.channels {
             self.channels = channels;
@@ -634,7 +636,7 @@ impl<R: Read + Seek> Reader<R> {
         if head.first_input.checked_add(head.input_count).is_none() {
             return Err("the number of an input is too large".to_owned());
         }
-        Ok(Batch {
+        Ok(JournalBatch {
             number: head.batch,
             offset: self.at,
             until_step: head.until_step,
@@ -703,7 +705,7 @@ impl<R: Read + Seek> Reader<R> {
                 let Some(length) = plain_chunk(head).filter(|length| *length <= self.length - at - place - HEAD) else {
                     continue;
                 };
-                if length > budget.min(MOST_BYTES) {
+                if length > budget.min(MAX_BYTES) {
                     continue;
                 }
                 budget -= length;
@@ -784,7 +786,7 @@ impl InputsHead {
                 _ => return None,
             }
         }
-        (head.input_count <= MOST_INPUTS as u64).then_some(head)
+        (head.input_count <= MAX_INPUTS as u64).then_some(head)
     }
 }
 
@@ -799,7 +801,7 @@ struct Messages {
 }
 
 /// Most messages of a chunk, and records: a writer makes few.
-const MOST_MESSAGES: usize = 1 << 16;
+const MAX_MESSAGES: usize = 1 << 16;
 
 /// The messages of a chunk; `channels` are those that are known, if it does not define them itself.
 fn messages_of(data: &[u8], channels: Option<&[(u16, Topic)]>) -> std::result::Result<Messages, String> {
@@ -855,7 +857,7 @@ fn messages_of(data: &[u8], channels: Option<&[(u16, Topic)]>) -> std::result::R
             }
             kind => return Err(format!("a chunk has a record of kind {kind}")),
         }
-        if places.len() + defined.len() > MOST_MESSAGES {
+        if places.len() + defined.len() > MAX_MESSAGES {
             return Err("a chunk has too many messages".to_owned());
         }
         at = end;

@@ -9,7 +9,7 @@ use palpate_proto::journal as pb;
 use palpate_touch::{Predictor, Tip};
 
 use super::message::{self, check_replays, from_command, from_hash, from_tissue};
-use super::reader::{Batch, Reader, SnapshotAt, Survey};
+use super::reader::{JournalBatch, JournalReader, SnapshotAt, Survey};
 use crate::limits::Limits;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result};
@@ -19,12 +19,12 @@ use crate::session::input::Input;
 use crate::session::prediction::{TICK_POINT_SUBSTEPS, TissueCopy};
 use crate::session::rules::Rules;
 use crate::session::saved::{self, Saved};
-use crate::sheet::Model;
-use crate::sheet::choice::given_up;
+use crate::tissue::Model;
+use crate::tissue::scheme_selection::given_up;
 
 /// What a journal has in its order.
 #[derive(Debug, Clone)]
-pub enum Item {
+pub enum JournalItem {
     /// An input.
     Input(pb::Input),
     /// A hash to compare with.
@@ -33,13 +33,13 @@ pub enum Item {
     Snapshot(pb::Snapshot),
 }
 
-impl Item {
+impl JournalItem {
     /// Steps done when it happened.
     pub fn step(&self) -> u64 {
         match self {
-            Item::Input(input) => input.step,
-            Item::Hash(hash) => hash.step,
-            Item::Snapshot(snapshot) => snapshot.step,
+            JournalItem::Input(input) => input.step,
+            JournalItem::Hash(hash) => hash.step,
+            JournalItem::Snapshot(snapshot) => snapshot.step,
         }
     }
 }
@@ -48,10 +48,11 @@ impl Item {
 ///
 /// # Errors
 /// Refuses what can't be decoded, and what is not in the order of the inputs.
-pub fn items(batch: &Batch) -> Result<VecDeque<Item>> {
-    let hashes = batch.hashes()?.into_iter().map(|hash| (hash.after_inputs, Item::Hash(hash)));
-    let snapshots = batch.snapshots()?.into_iter().map(|snapshot| (snapshot.after_inputs, Item::Snapshot(snapshot)));
-    let mut compared: Vec<(u64, Item)> = hashes.chain(snapshots).collect();
+pub fn items(batch: &JournalBatch) -> Result<VecDeque<JournalItem>> {
+    let hashes = batch.hashes()?.into_iter().map(|hash| (hash.after_inputs, JournalItem::Hash(hash)));
+    let snapshots =
+        batch.snapshots()?.into_iter().map(|snapshot| (snapshot.after_inputs, JournalItem::Snapshot(snapshot)));
+    let mut compared: Vec<(u64, JournalItem)> = hashes.chain(snapshots).collect();
     compared.sort_by_key(|(after, item)| (*after, item.step()));
     let range = batch.first_input..=batch.first_input + batch.input_count;
     if compared.iter().any(|(after, _)| !range.contains(after)) {
@@ -62,7 +63,7 @@ pub fn items(batch: &Batch) -> Result<VecDeque<Item>> {
         while let Some((_, item)) = compared.next_if(|(after, _)| *after <= number) {
             items.push_back(item);
         }
-        items.push_back(Item::Input(input));
+        items.push_back(JournalItem::Input(input));
     }
     items.extend(compared.map(|(_, item)| item));
     Ok(items)
@@ -80,7 +81,7 @@ pub struct Difference {
 }
 
 /// What a replay tells on its way.
-pub enum Seen<'s> {
+pub enum ReplayEvent<'s> {
     /// A step was done, or skipped at rest.
     Step(&'s Session),
     /// An input acts now, before the next step.
@@ -89,13 +90,13 @@ pub enum Seen<'s> {
 
 /// A journal that is simulated again.
 pub struct Replay<R> {
-    reader: Reader<R>,
+    reader: JournalReader<R>,
     survey: Survey,
     limits: Limits,
     first: Arc<Model>,
     rules: Rules,
     session: Session,
-    items: VecDeque<Item>,
+    items: VecDeque<JournalItem>,
     /// What acts at the next step.
     commands: Vec<Due>,
     change: Option<Arc<Model>>,
@@ -114,7 +115,7 @@ impl<R: Read + Seek> Replay<R> {
     ///
     /// # Errors
     /// Refuses a journal of another generation, and one whose tissue or first snapshot is not valid.
-    pub fn new(reader: Reader<R>, survey: Survey, limits: &Limits) -> Result<Self> {
+    pub fn new(reader: JournalReader<R>, survey: Survey, limits: &Limits) -> Result<Self> {
         let header = reader.header();
         let begins = |at: &&SnapshotAt| at.step == header.begin_step && at.batch == 0;
         let at = survey.snapshots.iter().find(begins).copied();
@@ -125,12 +126,18 @@ impl<R: Read + Seek> Replay<R> {
     ///
     /// # Errors
     /// As for [`Replay::new`]; refuses a step before the beginning of the journal, or after its end.
-    pub fn near(reader: Reader<R>, survey: Survey, limits: &Limits, step: u64) -> Result<Self> {
+    pub fn near(reader: JournalReader<R>, survey: Survey, limits: &Limits, step: u64) -> Result<Self> {
         Replay::near_with(reader, survey, limits, step, None)
     }
 
     /// The same. If `known` is of a journal of the same session, its tissue is not made again.
-    fn near_with(reader: Reader<R>, survey: Survey, limits: &Limits, step: u64, known: Option<Known>) -> Result<Self> {
+    fn near_with(
+        reader: JournalReader<R>,
+        survey: Survey,
+        limits: &Limits,
+        step: u64,
+        known: Option<Known>,
+    ) -> Result<Self> {
         let begin = reader.header().begin_step;
         if !(begin..=survey.until_step).contains(&step) {
             let damage = survey.and_damage();
@@ -145,7 +152,7 @@ impl<R: Read + Seek> Replay<R> {
     }
 
     fn from_snapshot(
-        mut reader: Reader<R>,
+        mut reader: JournalReader<R>,
         survey: Survey,
         given: &Limits,
         at: Option<&SnapshotAt>,
@@ -248,11 +255,11 @@ impl<R: Read + Seek> Replay<R> {
     ///
     /// # Errors
     /// Refuses a journal that is damaged, or that has what no session accepts.
-    pub fn advance(&mut self, until: u64, see: &mut dyn FnMut(Seen<'_>) -> Result<()>) -> Result<()> {
+    pub fn advance(&mut self, until: u64, see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()>) -> Result<()> {
         let until = until.min(self.survey.until_step);
         while self.difference.is_none() {
             self.fill()?;
-            let next = self.items.front().map(|item| (item.step(), matches!(item, Item::Input(_))));
+            let next = self.items.front().map(|item| (item.step(), matches!(item, JournalItem::Input(_))));
             let Some((step, is_input)) = next else { break };
             if step > until || (step == until && is_input) {
                 break;
@@ -280,7 +287,7 @@ impl<R: Read + Seek> Replay<R> {
         Ok(())
     }
 
-    fn run_to(&mut self, target: u64, see: &mut dyn FnMut(Seen<'_>) -> Result<()>) -> Result<()> {
+    fn run_to(&mut self, target: u64, see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()>) -> Result<()> {
         while self.difference.is_none() && self.session.step_count() < target {
             let step = self.session.step_count();
             if let Some(model) = self.change.take() {
@@ -296,13 +303,13 @@ impl<R: Read + Seek> Replay<R> {
             if let Some(rests) = rests {
                 let stop = (step + 1).checked_next_multiple_of(self.stops_every).unwrap_or(u64::MAX);
                 self.session.skip_to(target.min(rests).min(stop));
-                see(Seen::Step(&self.session))?;
+                see(ReplayEvent::Step(&self.session))?;
                 continue;
             }
             let mut seen = Ok(());
             self.session.advance(&mut self.commands, |session| {
                 if seen.is_ok() {
-                    seen = see(Seen::Step(session));
+                    seen = see(ReplayEvent::Step(session));
                 }
             });
             seen?;
@@ -328,21 +335,21 @@ impl<R: Read + Seek> Replay<R> {
         self.difference.get_or_insert(Difference { step, equal_until: self.equal_until, what });
     }
 
-    fn take(&mut self, item: &Item, see: &mut dyn FnMut(Seen<'_>) -> Result<()>) -> Result<()> {
+    fn take(&mut self, item: &JournalItem, see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()>) -> Result<()> {
         match item {
-            Item::Input(input) => {
-                see(Seen::Input(input))?;
+            JournalItem::Input(input) => {
+                see(ReplayEvent::Input(input))?;
                 let acted = self.act(input);
                 return acted.map_err(|refusal| {
                     let field = if refusal.field.is_empty() { String::new() } else { format!("{}: ", refusal.field) };
                     self.reader.refuse(&format!("the input at step {}: {field}{}", input.step, refusal.message))
                 });
             }
-            Item::Hash(hash) => {
+            JournalItem::Hash(hash) => {
                 self.hashes += 1;
                 self.compare(&hash.hash, "state")?;
             }
-            Item::Snapshot(snapshot) => {
+            JournalItem::Snapshot(snapshot) => {
                 self.snapshots += 1;
                 self.compare(&snapshot.hash, "state")?;
                 if self.difference.is_none() {
@@ -398,7 +405,7 @@ impl<R: Read + Seek> Replay<R> {
     ///
     /// # Errors
     /// As for [`Replay::advance`]; refuses a journal whose hashes are others, and when `stop` is set.
-    pub fn reach(mut self, step: u64, stop: &AtomicBool) -> Result<(Session, Arc<Model>, Reader<R>)> {
+    pub fn reach(mut self, step: u64, stop: &AtomicBool) -> Result<(Session, Arc<Model>, JournalReader<R>)> {
         self.advance(step, &mut |_| if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) })?;
         match self.difference {
             Some(difference) => Err(self.reader.refuse(&difference.to_string())),
@@ -417,7 +424,7 @@ impl<R: Read + Seek> Replay<R> {
     pub fn verify(mut self, progress: &mut dyn FnMut(u64, u64)) -> Result<Verdict> {
         let (begin, end) = (self.reader.header().begin_step, self.survey.until_step);
         self.advance(u64::MAX, &mut |seen| {
-            if let Seen::Step(session) = seen
+            if let ReplayEvent::Step(session) = seen
                 && session.step_count().is_multiple_of(1024)
             {
                 progress(session.step_count(), end);
@@ -434,12 +441,13 @@ impl<R: Read + Seek> Replay<R> {
     /// # Errors
     /// As for [`Replay::advance`]; and refuses a journal whose hashes are others.
     pub fn resume(mut self) -> Result<Resumed> {
-        let see: &mut dyn FnMut(Seen<'_>) -> Result<()> = &mut |_| Ok(());
+        let see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()> = &mut |_| Ok(());
         self.advance(u64::MAX, see)?;
         loop {
             self.fill()?;
             let Some(item) = self.items.pop_front() else { break };
-            let is_command = matches!(&item, Item::Input(pb::Input { what: Some(pb::input::What::Command(_)), .. }));
+            let is_command =
+                matches!(&item, JournalItem::Input(pb::Input { what: Some(pb::input::What::Command(_)), .. }));
             if !is_command && item.step() == self.session.step_count() && self.difference.is_none() {
                 self.take(&item, see)?;
             }
@@ -490,7 +498,10 @@ impl std::fmt::Display for Difference {
 }
 
 /// The snapshot there: its batch, and what comes after it in that.
-fn snapshot<R: Read + Seek>(reader: &mut Reader<R>, at: &SnapshotAt) -> Result<(Batch, pb::Snapshot, VecDeque<Item>)> {
+fn snapshot<R: Read + Seek>(
+    reader: &mut JournalReader<R>,
+    at: &SnapshotAt,
+) -> Result<(JournalBatch, pb::Snapshot, VecDeque<JournalItem>)> {
     reader.go_to(at);
     let Some(batch) = reader.next_batch()? else {
         return Err(reader.refuse("the batch of a snapshot is missing"));
@@ -498,7 +509,7 @@ fn snapshot<R: Read + Seek>(reader: &mut Reader<R>, at: &SnapshotAt) -> Result<(
     let mut items = items(&batch)?;
     loop {
         match items.pop_front() {
-            Some(Item::Snapshot(snapshot)) if snapshot.step == at.step => return Ok((batch, snapshot, items)),
+            Some(JournalItem::Snapshot(snapshot)) if snapshot.step == at.step => return Ok((batch, snapshot, items)),
             Some(_) => {}
             None => return Err(batch.refuse("a snapshot is missing".to_owned())),
         }
@@ -548,7 +559,7 @@ pub struct Resumed {
 ///
 /// # Errors
 /// Refuses a journal that is damaged in the middle, is of another generation, or gives other hashes.
-pub fn resume<R: Read + Seek>(reader: Reader<R>, limits: &Limits) -> Result<Resumed> {
+pub fn resume<R: Read + Seek>(reader: JournalReader<R>, limits: &Limits) -> Result<Resumed> {
     resume_as(reader, limits, None)
 }
 
@@ -563,7 +574,7 @@ pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predict
     let limits = message::limits(&Limits { points: TICK_POINT_SUBSTEPS as usize, ..Limits::default() });
     let copy = || {
         // It came from a server: what it names of the machine there is not for this one.
-        let mut reader = Reader::new("the snapshot", Cursor::new(bytes))?.without_files();
+        let mut reader = JournalReader::new("the snapshot", Cursor::new(bytes))?.without_files();
         check_replays(reader.header())?;
         let survey = reader.survey(&mut |_| {})?;
         let Some(at) = survey.snapshots.last() else { return Err(reader.refuse("has no snapshot")) };
@@ -583,7 +594,11 @@ pub type Known = (pb::Header, Arc<Model>);
 ///
 /// # Errors
 /// As for [`resume`].
-pub fn resume_as<R: Read + Seek>(mut reader: Reader<R>, limits: &Limits, known: Option<Known>) -> Result<Resumed> {
+pub fn resume_as<R: Read + Seek>(
+    mut reader: JournalReader<R>,
+    limits: &Limits,
+    known: Option<Known>,
+) -> Result<Resumed> {
     let survey = reader.survey(&mut |_| {})?;
     let until = survey.until_step;
     Replay::near_with(reader, survey, limits, until, known)?.resume()
@@ -598,7 +613,7 @@ fn is_same_tissue(a: &pb::Header, b: &pb::Header) -> bool {
 /// # Errors
 /// Refuses a step that the journal has not, and as [`resume`] does; also when `stop` is set.
 pub fn session_at<R: Read + Seek>(
-    mut reader: Reader<R>,
+    mut reader: JournalReader<R>,
     limits: &Limits,
     step: u64,
     stop: &AtomicBool,
@@ -628,7 +643,7 @@ pub struct Verdict {
 /// # Errors
 /// Refuses a journal that can't be read or simulated.
 pub fn verify<R: Read + Seek>(
-    mut reader: Reader<R>,
+    mut reader: JournalReader<R>,
     limits: &Limits,
     progress: &mut dyn FnMut(u64, u64),
 ) -> Result<Verdict> {

@@ -11,7 +11,7 @@ use ring::digest::{Context, SHA256};
 use ring::signature::{ED25519, Ed25519KeyPair, KeyPair, UnparsedPublicKey};
 
 use super::format::Topic;
-use super::reader::Batch;
+use super::reader::JournalBatch;
 use crate::refusal::Result;
 
 /// What a signature is of begins so: the key may sign other things too.
@@ -150,7 +150,7 @@ impl Signatures {
     ///
     /// # Errors
     /// Refuses a signature by another key, and one that is not of what comes before it.
-    pub fn check(&mut self, batch: &Batch) -> Result<()> {
+    pub fn check(&mut self, batch: &JournalBatch) -> Result<()> {
         let mut ends = false;
         for (topic, bytes) in batch.messages() {
             ends |= topic == Topic::End;

@@ -4,12 +4,12 @@ use palpate_proto::journal as pb;
 use prost::Message;
 use std::sync::Arc;
 
-use super::format::{self, MOST_INPUTS, REPLAYS, Topic, VERSION};
+use super::format::{self, MAX_INPUTS, REPLAYS, Topic, VERSION};
 use super::message::{self, Tips};
 use super::records::{self, Chunk};
 use super::signature::{Key, Signer};
 use crate::session::input::{Felt, Input};
-use crate::sheet::Model;
+use crate::tissue::Model;
 
 /// What a journal begins with.
 #[derive(Debug, Clone)]
@@ -62,7 +62,7 @@ const USUAL_BYTES: usize = 4 << 20;
 
 /// The writer of a journal. It holds what waits for the next flush, and nothing else: neither a file nor an index.
 #[derive(Debug)]
-pub struct Writer {
+pub struct JournalWriter {
     /// Batches made so far, and inputs in them.
     batches: u64,
     inputs_before: u64,
@@ -86,19 +86,19 @@ pub struct Writer {
     ends: bool,
 }
 
-impl Writer {
+impl JournalWriter {
     /// Begins a journal. The first flush gives its beginning.
     ///
-    /// A session that does not begin at rest needs a snapshot of its beginning in the first batch ([`Writer::snapshot`]).
+    /// A session that does not begin at rest needs a snapshot of its beginning in the first batch ([`JournalWriter::snapshot`]).
     /// `unix_ns` is the time.
     pub fn new(opening: &Opening<'_>, unix_ns: u64) -> Self {
-        Writer::with_header(&opening.message(), unix_ns)
+        JournalWriter::with_header(&opening.message(), unix_ns)
     }
 
     /// The same with a header that another journal had.
     pub(super) fn with_header(header: &pb::Header, unix_ns: u64) -> Self {
         let bytes = header.encode_to_vec();
-        Writer {
+        JournalWriter {
             batches: 0,
             inputs_before: 0,
             durable: 0,
@@ -119,13 +119,13 @@ impl Writer {
     /// The same, which signs what it writes.
     #[must_use]
     pub fn signed(self, key: Option<&Key>) -> Self {
-        Writer { signer: key.map(|key| Signer::new(key.clone())), ..self }
+        JournalWriter { signer: key.map(|key| Signer::new(key.clone())), ..self }
     }
 
     /// For what is appended to a journal that has so many batches and inputs, up to a step.
     pub(super) fn after(batches: u64, inputs: u64, until_step: u64) -> Self {
-        let writer = Writer::with_header(&pb::Header { begin_step: until_step, ..Default::default() }, 0);
-        Writer { batches, inputs_before: inputs, durable: batches, messages: Vec::new(), bytes: 0, ..writer }
+        let writer = JournalWriter::with_header(&pb::Header { begin_step: until_step, ..Default::default() }, 0);
+        JournalWriter { batches, inputs_before: inputs, durable: batches, messages: Vec::new(), bytes: 0, ..writer }
     }
 
     /// An input that acts at `step`: on the state after so many steps. In the order in which they act.
@@ -143,7 +143,7 @@ impl Writer {
         }
         self.bytes += message.encoded_len();
         self.inputs.push(message);
-        if self.inputs.len() == MOST_INPUTS || self.bytes > USUAL_BYTES {
+        if self.inputs.len() == MAX_INPUTS || self.bytes > USUAL_BYTES {
             self.end_batch();
         }
     }
@@ -213,7 +213,7 @@ impl Writer {
         self.until_step
     }
 
-    /// Batches made so far: when what a flush gave is on the disk for certain, [`Writer::durable`] is to be told the number
+    /// Batches made so far: when what a flush gave is on the disk for certain, [`JournalWriter::durable`] is to be told the number
     /// that this was after that flush.
     pub fn batches(&self) -> u64 {
         self.batches

@@ -7,7 +7,7 @@ use palpate::printable::printable_lines;
 use palpate::scene::Body;
 use palpate::scene::collection::find_script;
 use palpate::session::check;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 
 use super::scene::{SceneArguments, compile, compile_with};
 use super::{Failure, clock_s, say};

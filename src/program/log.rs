@@ -38,9 +38,9 @@ mod tests {
 
     use super::*;
 
-    struct Sent(Sender<Vec<u8>>);
+    struct SentLine(Sender<Vec<u8>>);
 
-    impl Write for Sent {
+    impl Write for SentLine {
         fn write(&mut self, bytes: &[u8]) -> Result<usize> {
             let _ = self.0.send(bytes.to_vec());
             Ok(bytes.len())
@@ -61,10 +61,10 @@ mod tests {
             tracing::warn!(node = name, shown = %name, "{name}: is gone");
         };
         if json {
-            let builder = builder.json().with_writer(move || JsonRecords(Sent(sent.clone())));
+            let builder = builder.json().with_writer(move || JsonRecords(SentLine(sent.clone())));
             tracing::subscriber::with_default(builder.finish(), log);
         } else {
-            let builder = builder.fmt_fields(fields()).with_writer(move || Sent(sent.clone()));
+            let builder = builder.fmt_fields(fields()).with_writer(move || SentLine(sent.clone()));
             tracing::subscriber::with_default(builder.finish(), log);
         }
         String::from_utf8(received.into_iter().flatten().collect()).unwrap()

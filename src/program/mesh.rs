@@ -6,9 +6,9 @@ use std::path::{Path, PathBuf};
 
 use palpate::files;
 use palpate::printable::{printable, printable_json};
-use palpate_mesh::decimate::{LEAST_VERTICES, decimate};
-use palpate_mesh::repair::{Measure, Repair, repair};
-use palpate_mesh::report::{Finding, LISTED, Report, Spread};
+use palpate_mesh::decimate::{MIN_VERTICES, decimate};
+use palpate_mesh::repair::{Repair, SurfaceMeasure, repair};
+use palpate_mesh::report::{Finding, LISTED, MeshReport, Spread};
 use palpate_mesh::write::{Format, write};
 use palpate_mesh::{Group, MeshError, ReadLimits, TriangleMesh, Unit, prepare, read, report};
 use serde::Serialize;
@@ -38,18 +38,18 @@ pub(crate) struct MeshArguments {
 
 /// What is told of a mesh.
 #[derive(Default, Serialize)]
-struct Told {
+struct MeshDescription {
     file: String,
     /// What reading changed or left out.
     notes: Vec<String>,
     /// What was done with it, as every scene does, and by mending and decimation.
     done: Vec<String>,
     /// How large it was, if it was mended or made coarser.
-    before: Option<Measure>,
+    before: Option<SurfaceMeasure>,
     /// Why that is not what was asked for.
     faults: Vec<String>,
     #[serde(flatten)]
-    report: Report,
+    report: MeshReport,
     /// Vertices with a name, which `fixed` of a scene may give.
     groups: Vec<ToldGroup>,
     /// Of the file; places are told in it.
@@ -72,8 +72,8 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
         return Err(Failure::Refused(format!("{name}: {message}")));
     };
     let unit: Unit = unit.parse().map_err(|problem| Failure::Refused(format!("--unit: {problem}")))?;
-    if let Some(vertices) = arguments.vertices.filter(|vertices| *vertices < LEAST_VERTICES) {
-        let message = format!("--vertices: must be at least {LEAST_VERTICES}, but is {vertices}");
+    if let Some(vertices) = arguments.vertices.filter(|vertices| *vertices < MIN_VERTICES) {
+        let message = format!("--vertices: must be at least {MIN_VERTICES}, but is {vertices}");
         return Err(Failure::Refused(message));
     }
     let output = arguments.output.as_ref().map(|path| Ok((path, Format::of(&path.display().to_string())?)));
@@ -89,7 +89,7 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
         Err(error) => return refuse(arguments, &name, error, unit),
     };
     drop(bytes);
-    let told = Told { file: name, notes: found.notes, unit, ..Told::default() };
+    let told = MeshDescription { file: name, notes: found.notes, unit, ..MeshDescription::default() };
     let (mut told, mesh) = treat(arguments, found.mesh, told);
     let group = |group: &Group| ToldGroup { name: group.name.clone(), vertices: group.vertices.len() };
     told.groups = mesh.groups.iter().map(group).collect();
@@ -106,7 +106,7 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
 }
 
 /// Mends a mesh and makes it coarser, if asked to, and reports what comes out.
-fn treat(arguments: &MeshArguments, mesh: TriangleMesh, mut told: Told) -> (Told, TriangleMesh) {
+fn treat(arguments: &MeshArguments, mesh: TriangleMesh, mut told: MeshDescription) -> (MeshDescription, TriangleMesh) {
     let mut mesh = if arguments.repair {
         let repaired = repair(&mesh, &Repair::default());
         (told.done, told.faults, told.before) = (repaired.told, repaired.faults, Some(repaired.before));
@@ -120,7 +120,7 @@ fn treat(arguments: &MeshArguments, mesh: TriangleMesh, mut told: Told) -> (Told
     };
     if let Some(vertices) = arguments.vertices.filter(|vertices| *vertices < mesh.vertices_m.len()) {
         let before = mesh.vertices_m.len();
-        told.before = told.before.or_else(|| Some(Measure::of(&mesh)));
+        told.before = told.before.or_else(|| Some(SurfaceMeasure::of(&mesh)));
         mesh = decimate(&mesh, vertices).mesh;
         told.report = report(&mesh);
         told.done.push(format!("Vertices decimated: {before} to {}.", mesh.vertices_m.len()));
@@ -142,13 +142,13 @@ fn write_mesh(path: &Path, mesh: &TriangleMesh, format: Format) -> Result<(), Fa
 fn refuse(arguments: &MeshArguments, name: &str, error: MeshError, unit: Unit) -> Result<(), Failure> {
     let message = error.to_string();
     if arguments.json {
-        let report = Report { problems: vec![Finding::from(error)], ..Report::default() };
-        print(arguments, &Told { file: name.to_owned(), report, unit, ..Told::default() })?;
+        let report = MeshReport { problems: vec![Finding::from(error)], ..MeshReport::default() };
+        print(arguments, &MeshDescription { file: name.to_owned(), report, unit, ..MeshDescription::default() })?;
     }
     Err(Failure::Refused(message))
 }
 
-fn print(arguments: &MeshArguments, told: &Told) -> Result<(), Failure> {
+fn print(arguments: &MeshArguments, told: &MeshDescription) -> Result<(), Failure> {
     let text = if arguments.json {
         printable_json(serde_json::to_string_pretty(told).map_err(|e| Failure::Failed(e.to_string()))?) + "\n"
     } else {
@@ -167,7 +167,7 @@ const GROUPS_TOLD: usize = 20;
 /// The width of the names in the table.
 const NAMES: usize = 16;
 
-impl Display for Told {
+impl Display for MeshDescription {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let report = &self.report;
         let mut row = |name: &str, value: &dyn Display| writeln!(f, "{name:NAMES$}{}", printable(value));

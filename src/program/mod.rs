@@ -17,7 +17,7 @@ pub(crate) mod token;
 use std::io::IsTerminal;
 use std::path::Path;
 
-use palpate::pace::clock::now_ns;
+use palpate::realtime::clock::now_ns;
 use palpate::refusal::Refusal;
 use palpate::server::ServeError;
 use palpate::server::config::Config;

@@ -90,8 +90,8 @@ pub(crate) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     let refinement = Refinement::new(&model.scene, arguments.refine.unwrap_or(fine), &limits)?;
     let skin = if arguments.wireframe { None } else { Some(texture::image(&model.scene.appearance, &limits)?) };
     let view = View { camera, size, refinement, texture: skin };
-    let failed = |failure: render::Failure| match failure {
-        render::Failure::Refused(refusal) => Failure::from(refusal),
+    let failed = |failure: render::FilmFailure| match failure {
+        render::FilmFailure::Refused(refusal) => Failure::from(refusal),
         failure => Failure::Failed(failure.to_string()),
     };
     if moves {

@@ -48,11 +48,11 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     let ended = with_progress("step", script.steps, arguments.quiet, |progress| {
         run(&model, &script, arguments.held, &limits, &mut output, &clock_s, progress)
     });
-    let ended = ended.and_then(|summary| output.flush().map(|()| summary).map_err(run::Failure::Output));
+    let ended = ended.and_then(|summary| output.flush().map(|()| summary).map_err(run::RunFailure::Output));
     match ended {
         // A reader that closed the pipe is not an error.
-        Err(run::Failure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
-        Err(run::Failure::Refused(refusal)) => Err(refusal.into()),
+        Err(run::RunFailure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        Err(run::RunFailure::Refused(refusal)) => Err(refusal.into()),
         Err(failure) => Err(Failure::Failed(failure.to_string())),
         Ok(summary) => {
             tell(arguments, &summary);

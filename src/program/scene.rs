@@ -6,7 +6,7 @@ use std::sync::Arc;
 use palpate::limits::Limits;
 use palpate::refusal::Refusal;
 use palpate::scene::collection::find_scene;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 
 use super::{Failure, load_config};
 

@@ -7,6 +7,7 @@ use std::time::Duration;
 use palpate::budget;
 use palpate::priority::{NETWORK_TURN, take_short_turns};
 use palpate::server::{self, Listeners, signals};
+use palpate::tissue::check_processor;
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::fmt::format::FmtSpan;
 
@@ -207,6 +208,8 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         config.log.clone_from(log);
     }
     config.check()?;
+    // Clients don't choose lanes.
+    check_processor()?;
     let filter = tracing_subscriber::EnvFilter::try_new(&config.log)
         .map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
     let detailed = filter.max_level_hint().is_none_or(|level| level >= tracing::Level::DEBUG);

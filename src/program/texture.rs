@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use palpate::limits::Limits;
-use palpate::scene::{Named, Surface};
+use palpate::scene::{Named, PaintedSurface};
 use palpate::texture;
 
 use super::{Failure, write_file};
@@ -26,7 +26,7 @@ pub(crate) struct TextureArguments {
 
 /// Paints a texture.
 pub(crate) fn make_texture(arguments: &TextureArguments) -> Result<(), Failure> {
-    let surface = Surface::named("surface", &arguments.surface)?;
+    let surface = PaintedSurface::named("surface", &arguments.surface)?;
     let image = texture::painted(surface, arguments.seed, arguments.size, &Limits::default())?;
     write_file(&arguments.output, &image.png()?)
 }

@@ -36,8 +36,8 @@ pub(crate) fn token(arguments: &TokenArguments) -> Result<(), Failure> {
     };
     // The file with the entry has to be one that a server takes: another of that name is refused here, with its reason.
     if path.symlink_metadata().is_ok() {
-        let text = files::read_regular_text(path, files::MOST_SECRET_BYTES)?;
-        identity::Credentials::parse(path, &format!("{text}\n{entry}"))?;
+        let text = files::read_regular_text(path, files::MAX_SECRET_BYTES)?;
+        identity::KnownCallers::parse(path, &format!("{text}\n{entry}"))?;
     }
     let refuse = |e: std::io::Error| Failure::Refused(format!("{}: can't be written: {e}", path.display()));
     let mut options = std::fs::OpenOptions::new();

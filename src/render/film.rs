@@ -11,13 +11,13 @@ use crate::scene::profile::{Moment, Poke};
 use crate::scene::script::Script;
 use crate::session::Session;
 use crate::session::run::{self, Player};
-use crate::sheet::Model;
 use crate::surface::{Skin, Snapshot};
 use crate::texture::Image;
+use crate::tissue::Model;
 
 /// The reason why there is no picture.
 #[derive(Debug, thiserror::Error)]
-pub enum Failure {
+pub enum FilmFailure {
     /// The guard has ended the session.
     #[error("the run was stopped: {0}")]
     Held(String),
@@ -50,8 +50,8 @@ impl<'a> Film<'a> {
     ///
     /// # Errors
     /// Returns a failure if a change of the tissue is refused.
-    pub fn new(model: &Arc<Model>, script: &'a Script, limits: &Limits) -> Result<Self, Failure> {
-        let changes = model.course(&script.changes, limits)?;
+    pub fn new(model: &Arc<Model>, script: &'a Script, limits: &Limits) -> Result<Self, FilmFailure> {
+        let changes = model.apply_changes(&script.changes, limits)?;
         let mut session = Session::new(model);
         let player = Player::new(model, script, false, limits)?;
         player.begin(&mut session);
@@ -59,14 +59,14 @@ impl<'a> Film<'a> {
     }
 
     /// Advances until `step` steps are done.
-    fn advance(&mut self, step: u64) -> Result<(), Failure> {
+    fn advance(&mut self, step: u64) -> Result<(), FilmFailure> {
         while self.session.step_count() < step {
             run::change(&mut self.session, &mut self.changes);
             let mut due = Vec::new();
             self.player.commands(self.session.step_count(), &mut due)?;
             self.session.advance(&mut due, |_| {});
             if let Some(reason) = self.session.fault() {
-                return Err(Failure::Held(reason));
+                return Err(FilmFailure::Held(reason));
             }
         }
         Ok(())
@@ -76,7 +76,7 @@ impl<'a> Film<'a> {
     ///
     /// # Errors
     /// Returns a failure if the guard stops the run or a change of the tissue is refused.
-    pub fn at(&mut self, step: u64) -> Result<Still, Failure> {
+    pub fn at(&mut self, step: u64) -> Result<Still, FilmFailure> {
         self.advance(step)?;
         let model = self.session.model();
         // The force until now: at a jump, the one just before it.
@@ -92,7 +92,7 @@ impl<'a> Film<'a> {
     ///
     /// # Errors
     /// As for [`Film::at`].
-    pub fn deepest(&mut self) -> Result<Still, Failure> {
+    pub fn deepest(&mut self) -> Result<Still, FilmFailure> {
         let (mut most_m, mut found) = (f64::NEG_INFINITY, None);
         for step in (0..=self.script.steps).step_by(self.script.sample_every.max(1) as usize) {
             self.advance(step)?;
@@ -137,8 +137,8 @@ pub struct Gif<W: Write> {
     steps_a_frame: f64,
 }
 
-fn broken(e: &gif::EncodingError) -> Failure {
-    Failure::Output(e.to_string())
+fn broken(e: &gif::EncodingError) -> FilmFailure {
+    FilmFailure::Output(e.to_string())
 }
 
 impl<W: Write> Gif<W> {
@@ -146,7 +146,7 @@ impl<W: Write> Gif<W> {
     ///
     /// # Errors
     /// Returns a failure if the output can't be written.
-    pub fn new(output: W, view: &View, frames_hz: f64, rate_hz: f64) -> Result<Self, Failure> {
+    pub fn new(output: W, view: &View, frames_hz: f64, rate_hz: f64) -> Result<Self, FilmFailure> {
         let size = view.size.map(|pixels| pixels as u16);
         let mut encoder = gif::Encoder::new(output, size[0], size[1], &[]).map_err(|e| broken(&e))?;
         encoder.set_repeat(gif::Repeat::Infinite).map_err(|e| broken(&e))?;
@@ -164,7 +164,7 @@ impl<W: Write> Gif<W> {
     ///
     /// # Errors
     /// Returns a failure if the output can't be written.
-    pub fn add(&mut self, image: &Image) -> Result<(), Failure> {
+    pub fn add(&mut self, image: &Image) -> Result<(), FilmFailure> {
         let mut picture = gif::Frame::from_rgb_speed(self.size[0], self.size[1], &image.rgb, 10);
         picture.delay = self.delay as u16;
         self.encoder.write_frame(&picture).map_err(|e| broken(&e))
@@ -184,7 +184,7 @@ pub fn gif(
     frames_hz: f64,
     output: impl Write,
     progress: &mut dyn FnMut(u64),
-) -> Result<(), Failure> {
+) -> Result<(), FilmFailure> {
     let mut file = Gif::new(output, view, frames_hz, model.scene.stepping.rate_hz)?;
     let mut film = Film::new(model, script, limits)?;
     for frame in 0_u64.. {

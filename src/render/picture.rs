@@ -3,7 +3,7 @@
 use glam::{DVec2, DVec3, Vec3Swizzles};
 
 use super::canvas::{Canvas, Corner, SAMPLES, colour, linear};
-use super::surface::{Surface, Vertex};
+use super::surface::{DrawnSurface, Vertex};
 use crate::refusal::{Reason, Refusal, Result, number};
 use crate::shape::{PointId, PointName, RestShape};
 use crate::surface::{Refinement, Skin as Shown, Snapshot};
@@ -130,7 +130,7 @@ pub fn picture(
     arrows: &[Arrow],
     view: &View,
 ) -> Image {
-    let surface = Surface::new(shape, shown, snapshot, view.refinement);
+    let surface = DrawnSurface::new(shape, shown, snapshot, view.refinement);
     let eye = Eye::new(shape, view);
     let nearest_m = 0.01 * shape.longest_side_m();
     let background = if view.texture.is_some() { [20, 14, 13] } else { [255, 255, 255] };

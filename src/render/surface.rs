@@ -25,7 +25,7 @@ pub(super) struct Vertex {
 
 /// What is drawn.
 #[derive(Debug)]
-pub(super) struct Surface {
+pub(super) struct DrawnSurface {
     pub(super) vertices: Vec<Vertex>,
     pub(super) triangles: Vec<[usize; 3]>,
     /// The ends of the lines that show its mesh.
@@ -34,7 +34,7 @@ pub(super) struct Surface {
     pub(super) along: usize,
 }
 
-impl Surface {
+impl DrawnSurface {
     /// Of what a frame shows.
     pub(super) fn new(shape: &dyn RestShape, skin: Option<&Skin>, snapshot: &Snapshot, refinement: Refinement) -> Self {
         match skin {
@@ -78,7 +78,7 @@ impl Surface {
         lines.sort_unstable();
         lines.dedup();
         let along = (longest_m / skin.edge_m()).ceil() as usize;
-        let mut surface = Surface { vertices: (0..places_m.len()).map(vertex).collect(), triangles, lines, along };
+        let mut surface = DrawnSurface { vertices: (0..places_m.len()).map(vertex).collect(), triangles, lines, along };
         surface.part_at_seams(|place| at_rest[place].abs());
         surface
     }
@@ -129,7 +129,7 @@ impl Surface {
         let [nx, ny] = count;
         let beyond =
             |index: usize| [(index / ny + 1 < nx).then_some(index + ny), (index % ny + 1 < ny).then_some(index + 1)];
-        Surface {
+        DrawnSurface {
             vertices,
             triangles: (0..refinement.cell_count()).flat_map(|cell| halves(refinement.triangles(cell))).collect(),
             lines: (0..nx * ny)

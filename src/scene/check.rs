@@ -70,7 +70,7 @@ pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<
 }
 
 /// The largest radius of a tip on a mesh, in lengths of an edge.
-const MOST_EDGES: f64 = 32.0;
+const MAX_EDGES: f64 = 32.0;
 
 /// Checks whether a tool with this tip fits the tissue.
 ///
@@ -78,7 +78,7 @@ const MOST_EDGES: f64 = 32.0;
 /// Refuses a value that is not finite or out of range; `field` is the name that the refusal gives.
 pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
     let longest_m = shape.longest_side_m();
-    let (most_m, what) = match MOST_EDGES * shape.edge_m() {
+    let (most_m, what) = match MAX_EDGES * shape.edge_m() {
         // What a disc covers is looked up at each step.
         edges_m if shape.dimensions() > 2 && edges_m < longest_m => (edges_m, "32 lengths of an edge"),
         _ => (longest_m, "the longest side of the tissue"),

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::document::Document;
-use super::kind::{Kind, ORDER};
+use super::kind::{ORDER, TextKind};
 use super::reader::made_for;
 use super::script::{self, Script};
 use super::{BUILT_IN, Scene};
@@ -16,17 +16,17 @@ use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt};
 pub struct Collection {
     folder: PathBuf,
     built_in: &'static [(&'static str, &'static str)],
-    kind: Kind,
+    kind: TextKind,
     /// Whether refusals may name files of the present folder.
     names_files: bool,
 }
 
 impl Collection {
     /// The scenes or scripts of a folder, which may be missing, and the built-in ones.
-    pub fn new(kind: Kind, folder: &Path) -> Self {
+    pub fn new(kind: TextKind, folder: &Path) -> Self {
         let built_in: &'static [_] = match kind {
-            Kind::Scene => &BUILT_IN,
-            Kind::Script => &script::BUILT_IN,
+            TextKind::Scene => &BUILT_IN,
+            TextKind::Script => &script::BUILT_IN,
         };
         Collection { folder: folder.to_owned(), built_in, kind, names_files: false }
     }
@@ -143,8 +143,8 @@ impl Collection {
         };
         let message = format!("there is no {kind} `{}`; there are {}{hint}", excerpt(name), names.join(", "));
         let (reason, field) = match self.kind {
-            Kind::Scene => (Reason::UnknownScene, "scene_name"),
-            Kind::Script => (Reason::UnknownScript, "script_name"),
+            TextKind::Scene => (Reason::UnknownScene, "scene_name"),
+            TextKind::Script => (Reason::UnknownScript, "script_name"),
         };
         Refusal::new(reason, field, message)
     }
@@ -170,8 +170,8 @@ const SCRIPTS: &str = "scripts";
 /// Refuses what is no scene, and as [`Scene::parse`] does.
 pub fn find_scene(path: &Path, folder: &Path, assignments: &[String], limits: &Limits) -> Result<Scene> {
     let Some(name) = name_in(path) else { return Scene::load(path, assignments, limits) };
-    let scenes = Collection::new(Kind::Scene, folder).for_user();
-    let (file, text) = scenes.text(name, &Collection::new(Kind::Script, Path::new(SCRIPTS)), limits)?;
+    let scenes = Collection::new(TextKind::Scene, folder).for_user();
+    let (file, text) = scenes.text(name, &Collection::new(TextKind::Script, Path::new(SCRIPTS)), limits)?;
     Scene::parse_in(folder, &file, &text, assignments, limits)
 }
 
@@ -183,11 +183,11 @@ fn script_text(path: &Path, limits: &Limits) -> Result<(String, String, PathBuf)
         Ok((path.display().to_string(), files::read_text(path, limits.file_bytes)?, folder))
     };
     let Some(name) = name_in(path) else { return of_file(path) };
-    let scripts = Collection::new(Kind::Script, Path::new(SCRIPTS)).for_user();
+    let scripts = Collection::new(TextKind::Script, Path::new(SCRIPTS)).for_user();
     if let Some(file) = scripts.file(name) {
         return of_file(&file);
     }
-    let (file, text) = scripts.text(name, &Collection::new(Kind::Scene, Path::new("scenes")), limits)?;
+    let (file, text) = scripts.text(name, &Collection::new(TextKind::Scene, Path::new("scenes")), limits)?;
     Ok((file, text, PathBuf::from(SCRIPTS)))
 }
 
@@ -217,7 +217,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         std::fs::write(folder.path().join("poke.toml"), "duration_s = 1.0\n").unwrap();
         std::fs::write(folder.path().join("mine.toml"), "[sheet]\n").unwrap();
-        let [scenes, scripts] = [Kind::Scene, Kind::Script].map(|kind| Collection::new(kind, folder.path()));
+        let [scenes, scripts] = [TextKind::Scene, TextKind::Script].map(|kind| Collection::new(kind, folder.path()));
         let limits = Limits::default();
         let [of_scenes, of_scripts] = [scenes.names(&limits), scripts.names(&limits)];
         let has = |names: &[String], name: &str| names.iter().any(|other| other == name);
@@ -231,7 +231,7 @@ mod tests {
     #[test]
     fn an_unknown_name_is_refused_with_all_names_and_the_nearest() {
         let folder = Path::new("no-such-folder");
-        let [scenes, scripts] = [Kind::Scene, Kind::Script].map(|kind| Collection::new(kind, folder));
+        let [scenes, scripts] = [TextKind::Scene, TextKind::Script].map(|kind| Collection::new(kind, folder));
         let limits = Limits::default();
         let refused = scenes.text("papr", &scripts, &limits).unwrap_err();
         assert_eq!(refused.reason, Reason::UnknownScene);

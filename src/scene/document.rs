@@ -13,12 +13,12 @@ use crate::shape::PointName;
 #[derive(Debug)]
 pub struct Document {
     name: String,
-    root: Node,
+    root: DocumentNode,
 }
 
 /// A value and its line; no line if it came from `--set`.
 #[derive(Debug, Clone)]
-struct Node {
+struct DocumentNode {
     line: Option<usize>,
     value: Value,
 }
@@ -29,8 +29,8 @@ enum Value {
     Whole(i64),
     Number(f64),
     Flag(bool),
-    List(Vec<Node>),
-    Table(BTreeMap<String, Node>),
+    List(Vec<DocumentNode>),
+    Table(BTreeMap<String, DocumentNode>),
     Other,
 }
 
@@ -62,7 +62,7 @@ impl Document {
             let place = e.span().map_or(name.to_owned(), |span| format!("{name}:{}", line_of(span.start)));
             Refusal { place: Some(place), ..Refusal::new(Reason::Unreadable, "", e.message()) }
         })?;
-        let root = Node { line: Some(1), value: table_of(table.get_ref(), &line_of) };
+        let root = DocumentNode { line: Some(1), value: table_of(table.get_ref(), &line_of) };
         Ok(Document { name: name.to_owned(), root })
     }
 
@@ -91,10 +91,10 @@ impl Document {
             let Value::Table(entries) = &mut node.value else {
                 return Err(refuse(format!("`{key}` is not within a table")));
             };
-            let empty = Node { line: None, value: Value::Table(BTreeMap::new()) };
+            let empty = DocumentNode { line: None, value: Value::Table(BTreeMap::new()) };
             node = entries.entry(key.to_owned()).or_insert(empty);
         }
-        *node = Node { line: None, value };
+        *node = DocumentNode { line: None, value };
         node.forget_lines();
         Ok(())
     }
@@ -140,12 +140,12 @@ impl Document {
     }
 }
 
-impl Node {
+impl DocumentNode {
     fn forget_lines(&mut self) {
         self.line = None;
         match &mut self.value {
-            Value::List(items) => items.iter_mut().for_each(Node::forget_lines),
-            Value::Table(entries) => entries.values_mut().for_each(Node::forget_lines),
+            Value::List(items) => items.iter_mut().for_each(DocumentNode::forget_lines),
+            Value::Table(entries) => entries.values_mut().for_each(DocumentNode::forget_lines),
             _ => {}
         }
     }
@@ -155,7 +155,7 @@ fn table_of(table: &DeTable<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
     let entry = |(key, value): (&toml::Spanned<_>, &toml::Spanned<DeValue<'_>>)| {
         let key: &std::borrow::Cow<'_, str> = key.get_ref();
         let line = Some(line_of(value.span().start));
-        (key.to_string(), Node { line, value: value_of(value.get_ref(), line_of) })
+        (key.to_string(), DocumentNode { line, value: value_of(value.get_ref(), line_of) })
     };
     Value::Table(table.iter().map(entry).collect())
 }
@@ -177,7 +177,10 @@ fn value_of(value: &DeValue<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
         DeValue::Array(items) => Value::List(
             items
                 .iter()
-                .map(|item| Node { line: Some(line_of(item.span().start)), value: value_of(item.get_ref(), line_of) })
+                .map(|item| DocumentNode {
+                    line: Some(line_of(item.span().start)),
+                    value: value_of(item.get_ref(), line_of),
+                })
                 .collect(),
         ),
         DeValue::Table(table) => table_of(table, line_of),
@@ -188,7 +191,7 @@ fn value_of(value: &DeValue<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
 #[derive(Debug)]
 pub struct Fields<'a> {
     path: String,
-    entries: &'a BTreeMap<String, Node>,
+    entries: &'a BTreeMap<String, DocumentNode>,
     known: Vec<&'static str>,
 }
 
@@ -196,7 +199,7 @@ pub struct Fields<'a> {
 #[derive(Debug)]
 pub struct Item<'a> {
     path: String,
-    node: &'a Node,
+    node: &'a DocumentNode,
 }
 
 impl<'a> Fields<'a> {

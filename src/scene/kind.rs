@@ -5,7 +5,7 @@ use crate::refusal::{Reason, Result};
 
 /// What a text is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
+pub enum TextKind {
     /// A tissue.
     Scene,
     /// What is done to it.
@@ -15,12 +15,12 @@ pub enum Kind {
 /// How to give both.
 pub(super) const ORDER: &str = "give the scene first, then the script (of `replay`: the script, then --scene)";
 
-impl Kind {
+impl TextKind {
     /// What it is called.
     pub fn name(self) -> &'static str {
         match self {
-            Kind::Scene => "scene",
-            Kind::Script => "script",
+            TextKind::Scene => "scene",
+            TextKind::Script => "script",
         }
     }
 
@@ -28,16 +28,16 @@ impl Kind {
     #[must_use]
     pub fn other(self) -> Self {
         match self {
-            Kind::Scene => Kind::Script,
-            Kind::Script => Kind::Scene,
+            TextKind::Scene => TextKind::Script,
+            TextKind::Script => TextKind::Scene,
         }
     }
 
     /// Keys that the other does not have.
     fn keys(self) -> &'static [&'static str] {
         match self {
-            Kind::Scene => &["sheet", "mesh", "springs", "virtual_springs", "damping", "volume", "stepping"],
-            Kind::Script => &["scenes", "duration_s", "sample_every_s", "sample_points", "force", "tool", "tissue"],
+            TextKind::Scene => &["sheet", "mesh", "springs", "anchor_springs", "damping", "volume", "stepping"],
+            TextKind::Script => &["scenes", "duration_s", "sample_every_s", "sample_points", "force", "tool", "tissue"],
         }
     }
 
@@ -49,7 +49,7 @@ impl Kind {
 
     /// Refuses a document that has keys of the other kind and none of this one.
     pub(super) fn check(self, document: &Document) -> Result<()> {
-        let has_keys_of = |kind: Kind| kind.keys().iter().any(|key| document.has(key));
+        let has_keys_of = |kind: TextKind| kind.keys().iter().any(|key| document.has(key));
         if has_keys_of(self) || !has_keys_of(self.other()) {
             return Ok(());
         }
@@ -65,13 +65,13 @@ mod tests {
     fn a_scene_is_no_script_and_what_is_neither_is_read_on() {
         let parse = |text: &str| Document::parse("file.toml", text).unwrap();
         let (scene, script) = (parse("[sheet]\n"), parse("duration_s = 1.0\n"));
-        assert!(Kind::Scene.check(&scene).is_ok() && Kind::Script.check(&script).is_ok());
-        let refused = Kind::Script.check(&scene).unwrap_err().to_string();
+        assert!(TextKind::Scene.check(&scene).is_ok() && TextKind::Script.check(&script).is_ok());
+        let refused = TextKind::Script.check(&scene).unwrap_err().to_string();
         assert!(refused.starts_with("file.toml: is a scene: give the scene first, then the script"), "{refused}");
-        let refused = Kind::Scene.check(&script).unwrap_err().to_string();
+        let refused = TextKind::Scene.check(&script).unwrap_err().to_string();
         assert!(refused.starts_with("file.toml: is a script: give the scene first"), "{refused}");
         for neither in ["", "name = \"x\"\n", "[sheet]\n[[force]]\n"] {
-            assert!(Kind::Scene.check(&parse(neither)).is_ok() && Kind::Script.check(&parse(neither)).is_ok());
+            assert!(TextKind::Scene.check(&parse(neither)).is_ok() && TextKind::Script.check(&parse(neither)).is_ok());
         }
     }
 }

@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 use super::check::physical;
 use super::document::{Fields, Item};
 use super::membrane::settled_energy_j;
-use super::mesh::{Differences, Mesh, MeshShape, group_named};
+use super::mesh::{Mesh, MeshShape, PerNodeFactors, group_named};
 use crate::refusal::{Reason, Refusal, Result, finite_vector, not_negative, number, positive, unsigned_zero};
 use crate::shape::{PointId, RestShape};
 
@@ -32,8 +32,8 @@ pub struct Material {
     /// How deep that is, m.
     pub depth_m: f64,
     /// What pulls back to the rest shape, N/m for each m² of surface.
-    pub bed_n_per_m3: f64,
-    /// Damping of a point on its virtual spring, over the critical.
+    pub foundation_n_per_m3: f64,
+    /// Damping of a point on its anchor spring, over the critical.
     pub damping_ratio: f64,
 }
 
@@ -45,7 +45,7 @@ pub struct MadeOf {
     /// k of an edge between triangles with equal sides, N/m.
     pub stiffness_n_per_m: f64,
     /// K″ of a vertex of mean area, N/m.
-    pub virtual_stiffness_n_per_m: f64,
+    pub anchor_stiffness_n_per_m: f64,
     /// C of a vertex of mean area, N·s/m.
     pub damping_n_s_per_m: f64,
 }
@@ -58,16 +58,16 @@ impl Material {
     pub const OF_A_MESH: &str = "is for a mesh: a sheet has the same points and springs all over";
 
     /// One of the usual density, depth and damping.
-    pub fn new(youngs_modulus_pa: f64, thickness_m: f64, bed_n_per_m3: f64) -> Self {
+    pub fn new(youngs_modulus_pa: f64, thickness_m: f64, foundation_n_per_m3: f64) -> Self {
         let (density_kg_per_m3, depth_m, damping_ratio) = (1060.0, 0.03, 0.5);
-        Material { youngs_modulus_pa, thickness_m, density_kg_per_m3, depth_m, bed_n_per_m3, damping_ratio }
+        Material { youngs_modulus_pa, thickness_m, density_kg_per_m3, depth_m, foundation_n_per_m3, damping_ratio }
     }
 
     pub(super) fn read(fields: &mut Fields<'_>) -> Result<Self> {
         let youngs_modulus_pa = fields.required_number("youngs_modulus_pa")?;
         let thickness_m = fields.required_number("thickness_m")?;
-        let bed_n_per_m3 = fields.required_number("bed_n_per_m3")?;
-        let usual = Material::new(youngs_modulus_pa, thickness_m, bed_n_per_m3);
+        let foundation_n_per_m3 = fields.required_number("foundation_n_per_m3")?;
+        let usual = Material::new(youngs_modulus_pa, thickness_m, foundation_n_per_m3);
         Ok(Material {
             density_kg_per_m3: fields.number("density_kg_per_m3")?.unwrap_or(usual.density_kg_per_m3),
             depth_m: fields.number("depth_m")?.unwrap_or(usual.depth_m),
@@ -85,22 +85,22 @@ impl Material {
         ] {
             physical(field, positive(field, value)?)?;
         }
-        if not_negative("material.bed_n_per_m3", self.bed_n_per_m3)? > 0.0 {
-            physical("material.bed_n_per_m3", self.bed_n_per_m3)?;
+        if not_negative("material.foundation_n_per_m3", self.foundation_n_per_m3)? > 0.0 {
+            physical("material.foundation_n_per_m3", self.foundation_n_per_m3)?;
         }
         number("material.damping_ratio", self.damping_ratio, "from 0 to 100", |v| (0.0..=100.0).contains(&v))?;
         Ok(())
     }
 
-    /// A tissue of this material, with springs of flexion whose k is the part `flexion` of that of the edge they cross.
+    /// A tissue of this material, with springs of bending whose k is the part `bending` of that of the edge they cross.
     ///
     /// A vertex has a third of the area of its triangles, and mass, K″ and C by that (one without an edge those of the mean); an edge has k = E·t·(A₁ + A₂)/L² (van
-    /// Gelder 1998), times one factor for the mesh that makes its springs, those of flexion included, store what the material
+    /// Gelder 1998), times one factor for the mesh that makes its springs, those of bending included, store what the material
     /// does when it is stretched alike to all sides (`membrane`).
     ///
     /// # Errors
     /// Refuses a number out of its range, and a mesh with a vertex without area.
-    pub fn applied(&self, flexion: f64, shape: Arc<MeshShape>) -> Result<MadeOf> {
+    pub fn applied(&self, bending: f64, shape: Arc<MeshShape>) -> Result<MadeOf> {
         self.check()?;
         let Spread { of_vertices_m2, beside_edges_m2 } = Spread::of(&shape);
         let whole_m2: f64 = of_vertices_m2.iter().sum();
@@ -127,19 +127,19 @@ impl Material {
             .iter()
             .enumerate()
             .map(|(vertex, area_m2)| if shape.is_used(vertex) { area_m2 / mean_m2 } else { 1.0 });
-        let differences = Differences {
+        let differences = PerNodeFactors {
             relative_mass: relative_mass.collect(),
-            extra_virtual: Vec::new(),
+            extra_anchor: Vec::new(),
             edges: relative(&edges),
-            flexion: relative(&across),
+            bending: relative(&across),
         };
-        let (mass_per_m2, bed) = (MOVES_ALONG * self.density_kg_per_m3 * self.depth_m, self.bed_n_per_m3);
-        let mesh = Mesh::uneven(mass_per_m2 * mean_m2, flexion, shape, differences);
+        let (mass_per_m2, foundation) = (MOVES_ALONG * self.density_kg_per_m3 * self.depth_m, self.foundation_n_per_m3);
+        let mesh = Mesh::uneven(mass_per_m2 * mean_m2, bending, shape, differences);
         let membrane_n_per_m = self.youngs_modulus_pa * self.thickness_m;
         Ok(MadeOf {
             stiffness_n_per_m: EQUAL_SIDES * membrane_n_per_m / modulus(&mesh, whole_m2),
-            virtual_stiffness_n_per_m: bed * mean_m2,
-            damping_n_s_per_m: 2.0 * self.damping_ratio * (bed * mass_per_m2).sqrt() * mean_m2,
+            anchor_stiffness_n_per_m: foundation * mean_m2,
+            damping_n_s_per_m: 2.0 * self.damping_ratio * (foundation * mass_per_m2).sqrt() * mean_m2,
             mesh,
         })
     }
@@ -192,7 +192,7 @@ pub struct Inclusion {
     /// k of the springs there over that around.
     pub stiffness_factor: f64,
     /// K″ of the points there over that around.
-    pub virtual_stiffness_factor: f64,
+    pub anchor_stiffness_factor: f64,
     /// So far beyond the region the factors fall to 1, m.
     pub edge_m: f64,
 }
@@ -249,15 +249,15 @@ impl Region {
 }
 
 /// Inclusions of a scene at most.
-const MOST_INCLUSIONS: usize = 256;
+const MAX_INCLUSIONS: usize = 256;
 
 /// Vertices that all of them together look at, at most: each looks at every one.
-const MOST_LOOKED_AT: usize = 8_000_000;
+const MAX_LOOKED_AT: usize = 8_000_000;
 
 impl Inclusion {
     /// One that makes no difference.
     pub fn even(region: Region) -> Self {
-        Inclusion { region, stiffness_factor: 1.0, virtual_stiffness_factor: 1.0, edge_m: 0.0 }
+        Inclusion { region, stiffness_factor: 1.0, anchor_stiffness_factor: 1.0, edge_m: 0.0 }
     }
 
     pub(super) fn read(item: &Item<'_>) -> Result<Self> {
@@ -273,9 +273,9 @@ impl Inclusion {
             let even = Inclusion::even(region);
             Ok(Inclusion {
                 stiffness_factor: fields.number("stiffness_factor")?.unwrap_or(even.stiffness_factor),
-                virtual_stiffness_factor: fields
-                    .number("virtual_stiffness_factor")?
-                    .unwrap_or(even.virtual_stiffness_factor),
+                anchor_stiffness_factor: fields
+                    .number("anchor_stiffness_factor")?
+                    .unwrap_or(even.anchor_stiffness_factor),
                 edge_m: fields.number("edge_m")?.unwrap_or(even.edge_m),
                 ..even
             })
@@ -286,7 +286,7 @@ impl Inclusion {
     fn check(&self, field: &str, shape: &MeshShape) -> Result<()> {
         let named = |key: &str| format!("{field}.{key}");
         let factors =
-            [("stiffness_factor", self.stiffness_factor), ("virtual_stiffness_factor", self.virtual_stiffness_factor)];
+            [("stiffness_factor", self.stiffness_factor), ("anchor_stiffness_factor", self.anchor_stiffness_factor)];
         for (key, factor) in factors {
             number(&named(key), factor, "from 0.01 to 100", |v| (0.01..=100.0).contains(&v))?;
         }
@@ -331,7 +331,7 @@ impl Inclusion {
     pub fn put_into(inclusions: &[Inclusion], field: &str, mesh: &Mesh) -> Result<Mesh> {
         let shape = &mesh.shape;
         let count = shape.vertices_m().len();
-        let most = MOST_INCLUSIONS.min(MOST_LOOKED_AT / count);
+        let most = MAX_INCLUSIONS.min(MAX_LOOKED_AT / count);
         if inclusions.len() > most {
             let message = format!("are {}, more than {most} on a mesh of {count} vertices", inclusions.len());
             return Err(Refusal::new(Reason::TooLarge, field, message));
@@ -346,29 +346,29 @@ impl Inclusion {
             if list.is_empty() { vec![value; length] } else { list.to_vec() }
         };
         let known = &mesh.differences;
-        let mut differences = Differences {
+        let mut differences = PerNodeFactors {
             relative_mass: known.relative_mass.clone(),
-            extra_virtual: or(&known.extra_virtual, 0.0, count),
+            extra_anchor: or(&known.extra_anchor, 0.0, count),
             edges: or(&known.edges, 1.0, shape.edges().len()),
-            flexion: or(&known.flexion, 1.0, shape.opposite().len()),
+            bending: or(&known.bending, 1.0, shape.opposite().len()),
         };
         for inclusion in inclusions {
             let parts = inclusion.parts(shape);
-            for (extra, part) in differences.extra_virtual.iter_mut().zip(&parts) {
-                *extra = (1.0 + *extra) * (1.0 + (inclusion.virtual_stiffness_factor - 1.0) * part) - 1.0;
+            for (extra, part) in differences.extra_anchor.iter_mut().zip(&parts) {
+                *extra = (1.0 + *extra) * (1.0 + (inclusion.anchor_stiffness_factor - 1.0) * part) - 1.0;
             }
             let between = |[a, b]: &[u32; 2]| 0.5 * (parts[*a as usize] + parts[*b as usize]);
-            let both = [(&mut differences.edges, shape.edges()), (&mut differences.flexion, shape.opposite())];
+            let both = [(&mut differences.edges, shape.edges()), (&mut differences.bending, shape.opposite())];
             for (factors, ends) in both {
                 for (factor, ends) in factors.iter_mut().zip(ends) {
                     *factor *= 1.0 + (inclusion.stiffness_factor - 1.0) * between(ends);
                 }
             }
         }
-        if differences.extra_virtual.iter().all(|extra| *extra == 0.0) {
-            differences.extra_virtual = Vec::new();
+        if differences.extra_anchor.iter().all(|extra| *extra == 0.0) {
+            differences.extra_anchor = Vec::new();
         }
-        Ok(Mesh::uneven(mesh.point_mass_kg, mesh.flexion, shape.clone(), differences))
+        Ok(Mesh::uneven(mesh.point_mass_kg, mesh.bending, shape.clone(), differences))
     }
 }
 
@@ -385,7 +385,7 @@ mod tests {
         thickness_m: 0.01,
         density_kg_per_m3: 1000.0,
         depth_m: 0.03,
-        bed_n_per_m3: 9e5,
+        foundation_n_per_m3: 9e5,
         damping_ratio: 0.5,
     };
 
@@ -412,9 +412,9 @@ mod tests {
     #[test]
     fn a_patch_that_is_stretched_resists_as_the_material_says() {
         for jitter in [0.0, 0.15, 0.3] {
-            for flexion in [0.0, 0.3] {
+            for bending in [0.0, 0.3] {
                 let shape = Arc::new(patch(30, jitter));
-                let made = SOFT.applied(flexion, shape.clone()).unwrap();
+                let made = SOFT.applied(bending, shape.clone()).unwrap();
                 let area_m2: f64 = Spread::of(&shape).of_vertices_m2.iter().sum();
                 let springs = || made.mesh.springs().map(|(ends, k)| (ends, k * made.stiffness_n_per_m));
                 // Stretched along one side while the other gives way, by E·t; to all sides alike; and sheared.
@@ -428,8 +428,8 @@ mod tests {
                     let held = |vertex: usize| shape.is_on_rim(vertex);
                     let energy_j = settled_energy_j(at, springs(), held, DMat3::from_diagonal(strain));
                     let found = 2.0 * energy_j / area_m2;
-                    let within = if flexion > 0.0 { 0.06 } else { 0.035 };
-                    assert!((found / expected - 1.0).abs() < within, "{jitter} {flexion} {strain}: {found} {expected}");
+                    let within = if bending > 0.0 { 0.06 } else { 0.035 };
+                    assert!((found / expected - 1.0).abs() < within, "{jitter} {bending} {strain}: {found} {expected}");
                 }
             }
         }
@@ -442,7 +442,7 @@ mod tests {
         let with = MeshShape::new(with, alone.triangles().to_vec(), |_, _, _| false).unwrap();
         let [alone, with] = [alone, with].map(|shape| SOFT.applied(0.1, Arc::new(shape)).unwrap());
         assert_eq!(with.stiffness_n_per_m, alone.stiffness_n_per_m);
-        assert_eq!(with.virtual_stiffness_n_per_m, alone.virtual_stiffness_n_per_m);
+        assert_eq!(with.anchor_stiffness_n_per_m, alone.anchor_stiffness_n_per_m);
         assert_eq!(with.damping_n_s_per_m, alone.damping_n_s_per_m);
         assert_eq!(with.mesh.mass_kg(), alone.mesh.mass_kg());
         let count = alone.mesh.differences.relative_mass.len();
@@ -455,11 +455,11 @@ mod tests {
         let made = SOFT.applied(0.0, shape.clone()).unwrap();
         let area_m2: f64 = Spread::of(&shape).of_vertices_m2.iter().sum();
         assert!((made.mesh.mass_kg() / (1000.0 * 0.03 / 3.0 * area_m2) - 1.0).abs() < 1e-12);
-        let bed: f64 =
-            made.mesh.differences.relative_mass.iter().map(|mass| mass * made.virtual_stiffness_n_per_m).sum();
-        assert!((bed / (9e5 * area_m2) - 1.0).abs() < 1e-12);
+        let foundation: f64 =
+            made.mesh.differences.relative_mass.iter().map(|mass| mass * made.anchor_stiffness_n_per_m).sum();
+        assert!((foundation / (9e5 * area_m2) - 1.0).abs() < 1e-12);
         // 2ζ√(k″·ρH/3) on each m².
-        let damping = made.damping_n_s_per_m / made.virtual_stiffness_n_per_m * 9e5;
+        let damping = made.damping_n_s_per_m / made.anchor_stiffness_n_per_m * 9e5;
         assert!((damping - (9e5_f64 * 10.0).sqrt()).abs() < 1e-6 * damping, "{damping}");
     }
 
@@ -471,11 +471,11 @@ mod tests {
         let inclusion = |stiffness_factor: f64| Inclusion {
             region: Region::Ball { centre_m, radius_m: 0.005 },
             stiffness_factor,
-            virtual_stiffness_factor: 5.0,
+            anchor_stiffness_factor: 5.0,
             edge_m: 0.006,
         };
         let found = Inclusion::put_into(&[inclusion(3.0), inclusion(2.0)], "inclusion", &mesh).unwrap().differences;
-        for (vertex, extra) in found.extra_virtual.iter().enumerate() {
+        for (vertex, extra) in found.extra_anchor.iter().enumerate() {
             let away_m = shape.vertices_m()[vertex].distance(centre_m);
             let factor = extra + 1.0;
             let holds = match away_m {
@@ -485,7 +485,7 @@ mod tests {
             };
             assert!(holds, "{away_m}: {factor}");
         }
-        let most = found.edges.iter().chain(&found.flexion).copied().fold(0.0, f64::max);
+        let most = found.edges.iter().chain(&found.bending).copied().fold(0.0, f64::max);
         let least = found.edges.iter().copied().fold(f64::INFINITY, f64::min);
         assert!((most - 6.0).abs() < 1e-9 && least == 1.0, "{most} {least}");
     }

@@ -12,7 +12,7 @@ use palpate_mesh::work::spend;
 
 /// Steps of the conjugate gradients at most, and the part of the first residual at which they end. (What is left is then some
 /// ten thousandths of the energy.)
-const MOST_STEPS: usize = 120;
+const MAX_STEPS: usize = 120;
 const RESIDUAL: f64 = 1e-5;
 
 /// A spring with what it gains by the strain, and by movements of its ends along two tangents each.
@@ -84,7 +84,7 @@ pub(super) fn settled_energy_j(
     let mut direction = scaled(&residual);
     let mut left = dot(&residual, &direction);
     let enough = RESIDUAL * left;
-    for _ in 0..MOST_STEPS {
+    for _ in 0..MAX_STEPS {
         if left <= enough {
             break;
         }

@@ -5,7 +5,7 @@ use std::collections::BinaryHeap;
 use std::sync::{Arc, OnceLock};
 
 use glam::{DQuat, DVec3};
-use palpate_mesh::decimate::LEAST_VERTICES;
+use palpate_mesh::decimate::MIN_VERTICES;
 use palpate_mesh::surface::Surface;
 use palpate_mesh::work::spend;
 use palpate_mesh::{Group, TriangleMesh};
@@ -26,13 +26,13 @@ pub struct Mesh {
     /// Mass of each point, or that of reference, kg.
     pub point_mass_kg: f64,
     /// k of the springs between the two vertices opposite an edge, as a part of that of an edge; 0 without such springs.
-    pub flexion: f64,
+    pub bending: f64,
     /// Where the points rest and how they lie together.
     pub shape: Arc<MeshShape>,
     /// How its points and springs differ from each other.
-    pub differences: Arc<Differences>,
+    pub differences: Arc<PerNodeFactors>,
     /// The largest stiffness of its springs.
-    pub stiffest: Stiffest,
+    pub stiffest: StiffnessBound,
     /// What it encloses, if that resists.
     pub volume: Option<Arc<Volume>>,
 }
@@ -40,20 +40,20 @@ pub struct Mesh {
 /// How points and springs of a mesh differ from those of reference. A list is empty where none does. C/m is the same at every
 /// point.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Differences {
+pub struct PerNodeFactors {
     /// Mass of each point over that of reference.
     pub relative_mass: Vec<f64>,
     /// K″/m of each point over that of reference, minus 1.
-    pub extra_virtual: Vec<f64>,
+    pub extra_anchor: Vec<f64>,
     /// k of each edge over that of reference.
     pub edges: Vec<f64>,
-    /// k of each spring of flexion over the part `flexion` of that of reference.
-    pub flexion: Vec<f64>,
+    /// k of each spring of bending over the part `bending` of that of reference.
+    pub bending: Vec<f64>,
 }
 
 /// The largest eigenvalue of the stiffness of springs under any deformation, and where it comes from.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Stiffest {
+pub struct StiffnessBound {
     /// The eigenvalue, with the masses of reference, is at most this, over the k of reference.
     pub bound: f64,
     /// The vertex that has most of it.
@@ -61,7 +61,7 @@ pub struct Stiffest {
     /// What the bound would be by half of the springs.
     pub usual: f64,
     /// The largest of what K″/m of a point is above that of reference, over that, at least 0.
-    pub extra_virtual: f64,
+    pub extra_anchor: f64,
 }
 
 /// The rest shape of a mesh: point n is vertex n of the file, unless another mesh is shown.
@@ -83,16 +83,16 @@ pub struct MeshShape {
     top_m: DVec3,
     cells: Cells,
     surface: OnceLock<Surface>,
-    told: Told,
+    told: MeshMetadata,
     /// The mesh of the file, if the simulated one is coarser or has joined vertices.
     shown: Option<Shown>,
 }
 
 /// What clients are told of a mesh, and the tissue does not need.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct Told {
+pub struct MeshMetadata {
     /// How the scene says which vertices never move.
-    pub fixed: Fixed,
+    pub fixed: FixedVertices,
     /// Texture coordinates of each vertex, if the file has them; at a seam, those of one side.
     pub uv: Option<Vec<[f32; 2]>>,
     /// Vertices with a name.
@@ -118,9 +118,9 @@ impl Mesh {
         };
         let vertices = match fields.item("vertices") {
             Some(item) => {
-                let least = |vertices: &usize| *vertices >= LEAST_VERTICES;
+                let least = |vertices: &usize| *vertices >= MIN_VERTICES;
                 let vertices = usize::try_from(item.whole()?).ok().filter(least);
-                let message = format!("must be at least {LEAST_VERTICES}");
+                let message = format!("must be at least {MIN_VERTICES}");
                 Some(vertices.ok_or_else(|| item.refuse(Reason::OutOfRange, message))?)
             }
             None => None,
@@ -132,16 +132,17 @@ impl Mesh {
                 source.refuse(refusal.reason, format!("{name}{}", refusal.message))
             })?,
         };
-        let fixed = fields.item("fixed").map_or(Ok(Fixed::None), |item| Fixed::read(&item, &simulated.mesh))?;
+        let fixed =
+            fields.item("fixed").map_or(Ok(FixedVertices::None), |item| FixedVertices::read(&item, &simulated.mesh))?;
         let made = Self::simulating(simulated, point_mass_kg, fixed);
         made.map_err(|refusal| source.refuse(refusal.reason, refusal.message))
     }
 
-    /// Of a mesh without springs of flexion.
+    /// Of a mesh without springs of bending.
     ///
     /// # Errors
     /// As for [`MeshShape::new`].
-    pub fn of(mesh: TriangleMesh, point_mass_kg: f64, fixed: Fixed) -> Result<Self> {
+    pub fn of(mesh: TriangleMesh, point_mass_kg: f64, fixed: FixedVertices) -> Result<Self> {
         Self::simulating(Simulated { mesh, shown: None, findings: Vec::new() }, point_mass_kg, fixed)
     }
 
@@ -149,9 +150,9 @@ impl Mesh {
     ///
     /// # Errors
     /// As for [`MeshShape::new`].
-    pub fn simulating(simulated: Simulated, point_mass_kg: f64, fixed: Fixed) -> Result<Self> {
+    pub fn simulating(simulated: Simulated, point_mass_kg: f64, fixed: FixedVertices) -> Result<Self> {
         let Simulated { mesh, shown, mut findings } = simulated;
-        let balls = if let Fixed::Balls(balls) = &fixed { balls.as_slice() } else { &[] };
+        let balls = if let FixedVertices::Balls(balls) = &fixed { balls.as_slice() } else { &[] };
         let mut is_empty = vec![true; balls.len()];
         let uv = mesh.uv.as_ref().map(|_| {
             let mut of_vertex = vec![[0.0; 2]; mesh.vertices_m.len()];
@@ -159,10 +160,10 @@ impl Mesh {
             of_vertex
         });
         let mut shape = MeshShape::new(mesh.vertices_m, mesh.triangles, |rim, place_m, vertex| match &fixed {
-            Fixed::None => false,
-            Fixed::Rim => rim,
-            Fixed::Group(group) => group.vertices.binary_search(&vertex).is_ok(),
-            Fixed::Balls(balls) => {
+            FixedVertices::None => false,
+            FixedVertices::Rim => rim,
+            FixedVertices::Group(group) => group.vertices.binary_search(&vertex).is_ok(),
+            FixedVertices::Balls(balls) => {
                 spend(balls.len());
                 let mut is_within = false;
                 for ((centre_m, radius_m), is_empty) in balls.iter().zip(&mut is_empty) {
@@ -179,22 +180,22 @@ impl Mesh {
             0 => {}
             more => findings.push(format!("mesh.fixed: {more} more balls hold no vertex")),
         }
-        shape.told = Told { fixed, uv, groups: mesh.groups, findings };
+        shape.told = MeshMetadata { fixed, uv, groups: mesh.groups, findings };
         shape.shown = shown;
         Ok(Mesh::new(point_mass_kg, 0.0, Arc::new(shape)))
     }
 
-    /// Of a shape, a mass and the stiffness of its springs of flexion relative to that of its edges; all points and all edges
+    /// Of a shape, a mass and the stiffness of its springs of bending relative to that of its edges; all points and all edges
     /// are alike.
-    pub fn new(point_mass_kg: f64, flexion: f64, shape: Arc<MeshShape>) -> Self {
-        Self::uneven(point_mass_kg, flexion, shape, Differences::default())
+    pub fn new(point_mass_kg: f64, bending: f64, shape: Arc<MeshShape>) -> Self {
+        Self::uneven(point_mass_kg, bending, shape, PerNodeFactors::default())
     }
 
     /// The same where points and springs differ.
-    pub fn uneven(point_mass_kg: f64, flexion: f64, shape: Arc<MeshShape>, differences: Differences) -> Self {
-        let stiffest = Stiffest { bound: 0.0, vertex: 0, usual: 0.0, extra_virtual: 0.0 };
+    pub fn uneven(point_mass_kg: f64, bending: f64, shape: Arc<MeshShape>, differences: PerNodeFactors) -> Self {
+        let stiffest = StiffnessBound { bound: 0.0, vertex: 0, usual: 0.0, extra_anchor: 0.0 };
         let differences = Arc::new(differences);
-        let mut mesh = Mesh { point_mass_kg, flexion, shape, differences, stiffest, volume: None };
+        let mut mesh = Mesh { point_mass_kg, bending, shape, differences, stiffest, volume: None };
         mesh.stiffest = mesh.find_stiffest();
         mesh
     }
@@ -216,8 +217,8 @@ impl Mesh {
     }
 
     /// K″/m of a point over that of reference, minus 1.
-    pub fn extra_virtual(&self, point: PointId) -> f64 {
-        self.differences.extra_virtual.get(point.index()).copied().unwrap_or(0.0)
+    pub fn extra_anchor(&self, point: PointId) -> f64 {
+        self.differences.extra_anchor.get(point.index()).copied().unwrap_or(0.0)
     }
 
     /// The mass of all points that have an edge, kg.
@@ -228,12 +229,12 @@ impl Mesh {
 
     /// Every spring: its ends, and its k over that of reference.
     pub fn springs(&self) -> impl Iterator<Item = ([u32; 2], f64)> + '_ {
-        let (shape, part) = (&self.shape, self.flexion);
-        let Differences { edges, flexion, .. } = &*self.differences;
+        let (shape, part) = (&self.shape, self.bending);
+        let PerNodeFactors { edges, bending: bending_factors, .. } = &*self.differences;
         let of = |factors: &[f64], which: usize| factors.get(which).copied().unwrap_or(1.0);
         let bending: &[[u32; 2]] = if part > 0.0 { &shape.opposite } else { &[] };
         let along = shape.edges.iter().enumerate().map(move |(which, ends)| (*ends, of(edges, which)));
-        along.chain(bending.iter().enumerate().map(move |(which, ends)| (*ends, part * of(flexion, which))))
+        along.chain(bending.iter().enumerate().map(move |(which, ends)| (*ends, part * of(bending_factors, which))))
     }
 
     /// The vertices around the one that the fastest vibration has most of, at most so many, turned so that its normal is
@@ -274,13 +275,13 @@ impl Mesh {
                     };
                     if list.is_empty() { vec![] } else { ends.iter().map(of).collect() }
                 };
-                let differences = Differences {
+                let differences = PerNodeFactors {
                     relative_mass: of_points(&known.relative_mass),
-                    extra_virtual: of_points(&known.extra_virtual),
+                    extra_anchor: of_points(&known.extra_anchor),
                     edges: of_springs(&known.edges, &shape.edges, &part.edges),
-                    flexion: of_springs(&known.flexion, &shape.opposite, &part.opposite),
+                    bending: of_springs(&known.bending, &shape.opposite, &part.opposite),
                 };
-                let mut part = Mesh::uneven(self.point_mass_kg, self.flexion, Arc::new(part), differences);
+                let mut part = Mesh::uneven(self.point_mass_kg, self.bending, Arc::new(part), differences);
                 part.volume = self.volume.as_ref().and_then(|volume| {
                     let areas_m2 = found.iter().map(|vertex| turn * volume.areas_m2[*vertex]).collect();
                     volume.part(areas_m2, |vertex| part.relative_mass(PointId::new(vertex))).map(Arc::new)
@@ -292,7 +293,7 @@ impl Mesh {
         }
     }
 
-    /// A spring along n contributes at most k·I to the stiffness matrix, whatever the deformation (`sheet::stability`), so
+    /// A spring along n contributes at most k·I to the stiffness matrix, whatever the deformation (`tissue::stability`), so
     /// the matrix is at most the weighted Laplacian of the graph. Over the masses, its largest eigenvalue is at most the
     /// largest of
     ///
@@ -303,7 +304,7 @@ impl Mesh {
     /// λ·d = Σ k_il/m_i·(x_i − x_l) + Σ k_jl/m_j·(x_l − x_j), where no difference is above d, and the two of a common neighbour
     /// are d together. On a mesh of equal triangles that bound is 10 k/m, where 9 k/m is true and Gershgorin's bound says
     /// 12 k/m. It tells the vertex; the bound is closer by the method of Lanczos.
-    fn find_stiffest(&self) -> Stiffest {
+    fn find_stiffest(&self) -> StiffnessBound {
         let count = self.shape.vertices_m.len();
         let mass = |vertex: u32| self.relative_mass(PointId::new(vertex as usize));
         let mut around: Vec<Vec<(u32, f64)>> = vec![Vec::new(); count];
@@ -313,7 +314,7 @@ impl Mesh {
         }
         for of_vertex in &mut around {
             of_vertex.sort_unstable_by_key(|(other, _)| *other);
-            // An edge and a spring of flexion may join the same two vertices.
+            // An edge and a spring of bending may join the same two vertices.
             of_vertex.dedup_by(|next, kept| {
                 let same = next.0 == kept.0;
                 kept.1 += if same { next.1 } else { 0.0 };
@@ -321,8 +322,8 @@ impl Mesh {
             });
         }
         let weight: Vec<f64> = around.iter().map(|of_vertex| of_vertex.iter().map(|(_, k)| k).sum()).collect();
-        let extra_virtual = self.differences.extra_virtual.iter().copied().fold(0.0, f64::max);
-        let mut stiffest = Stiffest { bound: 0.0, vertex: 0, usual: 0.0, extra_virtual };
+        let extra_anchor = self.differences.extra_anchor.iter().copied().fold(0.0, f64::max);
+        let mut stiffest = StiffnessBound { bound: 0.0, vertex: 0, usual: 0.0, extra_anchor };
         let mut bounds = Vec::new();
         for ([a, b], _) in self.springs() {
             let [mut few, mut many] = [a, b].map(|end| around[end as usize].as_slice());
@@ -341,7 +342,7 @@ impl Mesh {
             let bound = of_a + of_b - common;
             bounds.push(bound);
             if bound > stiffest.bound {
-                stiffest = Stiffest { bound, vertex: if of_a >= of_b { a } else { b }, ..stiffest };
+                stiffest = StiffnessBound { bound, vertex: if of_a >= of_b { a } else { b }, ..stiffest };
             }
         }
         if !bounds.is_empty() {
@@ -368,10 +369,10 @@ impl Mesh {
     pub fn warnings(&self) -> Vec<String> {
         let shape = &self.shape;
         let mut warnings = shape.told.findings.clone();
-        if shape.told.fixed == Fixed::Rim && shape.is_closed() {
+        if shape.told.fixed == FixedVertices::Rim && shape.is_closed() {
             warnings.push("mesh.fixed: the mesh is closed and has no rim: \"rim\" fixes nothing".to_owned());
         }
-        if shape.told.fixed != Fixed::None && shape.is_fixed.iter().all(|fixed| *fixed) {
+        if shape.told.fixed != FixedVertices::None && shape.is_fixed.iter().all(|fixed| *fixed) {
             warnings.push("mesh.fixed: every vertex is fixed: nothing moves".to_owned());
         }
         if self.has_fast_vertex() {
@@ -421,7 +422,7 @@ const MUCH_FASTER: f64 = 2.5;
 
 /// Which vertices never move.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub enum Fixed {
+pub enum FixedVertices {
     /// None.
     #[default]
     None,
@@ -433,12 +434,12 @@ pub enum Fixed {
     Balls(Vec<(DVec3, f64)>),
 }
 
-impl Fixed {
+impl FixedVertices {
     fn read(item: &Item<'_>, mesh: &TriangleMesh) -> Result<Self> {
         const EXPECTED: &str = "\"none\", \"rim\", { group = \"…\" } or a list of balls { centre_m, radius_m }";
         match item.as_text() {
-            Some("none") => return Ok(Fixed::None),
-            Some("rim") => return Ok(Fixed::Rim),
+            Some("none") => return Ok(FixedVertices::None),
+            Some("rim") => return Ok(FixedVertices::Rim),
             Some(_) => return Err(item.wrong(EXPECTED)),
             None => {}
         }
@@ -449,11 +450,11 @@ impl Fixed {
                     Ok((centre_m, positive(&fields.path("radius_m"), fields.required_number("radius_m")?)?))
                 })
             };
-            return Ok(Fixed::Balls(list.iter().map(ball).collect::<Result<_>>()?));
+            return Ok(FixedVertices::Balls(list.iter().map(ball).collect::<Result<_>>()?));
         }
         item.table(|fields| {
             let group = fields.required("group")?;
-            let found = Fixed::group("", &group.text()?, mesh);
+            let found = FixedVertices::group("", &group.text()?, mesh);
             found.map_err(|refusal| group.refuse(refusal.reason, refusal.message))
         })
     }
@@ -463,7 +464,7 @@ impl Fixed {
     /// # Errors
     /// Refuses a name that no group has; `field` is the name that the refusal gives.
     pub fn group(field: &str, name: &str, mesh: &TriangleMesh) -> Result<Self> {
-        group_named(field, name, &mesh.groups).map(|group| Fixed::Group(group.clone()))
+        group_named(field, name, &mesh.groups).map(|group| FixedVertices::Group(group.clone()))
     }
 }
 
@@ -585,7 +586,7 @@ impl MeshShape {
             top_m,
             cells,
             surface: OnceLock::new(),
-            told: Told::default(),
+            told: MeshMetadata::default(),
             shown: None,
         })
     }
@@ -602,7 +603,7 @@ impl MeshShape {
     }
 
     /// What clients are told of it.
-    pub fn told(&self) -> &Told {
+    pub fn told(&self) -> &MeshMetadata {
         &self.told
     }
 
@@ -631,7 +632,7 @@ impl MeshShape {
         &self.opposite
     }
 
-    /// The edge that the spring of flexion between each two of these crosses.
+    /// The edge that the spring of bending between each two of these crosses.
     pub fn crossed(&self) -> &[[u32; 2]] {
         &self.crossed
     }
@@ -718,7 +719,7 @@ impl RestShape for MeshShape {
                 Ok(PointId::new(nearest as usize))
             }
             PointName::Vertex(_) => Err(Refusal::new(
-                Reason::OffSheet,
+                Reason::OffTissue,
                 field,
                 format!("{name} is not on the mesh, whose vertices are numbered from 0 to {}", count - 1),
             )),
@@ -931,12 +932,14 @@ mod tests {
             TriangleMesh { vertices_m, triangles: (0..around).flat_map(of).collect(), ..TriangleMesh::default() };
         let most = 1000 * mesh.triangles.len() as u64;
         let balls = vec![(DVec3::new(1.0, 1.0, 1.0), 0.1); 100];
-        let made =
-            palpate_mesh::work::within(&Arc::default(), most, || Mesh::of(mesh.clone(), 1e-3, Fixed::Balls(balls)));
+        let made = palpate_mesh::work::within(&Arc::default(), most, || {
+            Mesh::of(mesh.clone(), 1e-3, FixedVertices::Balls(balls))
+        });
         assert_eq!(made.unwrap().unwrap().stiffest.vertex, 0);
         // What can't be is given up.
         let balls = vec![(DVec3::new(1.0, 1.0, 1.0), 0.1); 100_000];
-        let made = palpate_mesh::work::within(&Arc::default(), most, || Mesh::of(mesh, 1e-3, Fixed::Balls(balls)));
+        let made =
+            palpate_mesh::work::within(&Arc::default(), most, || Mesh::of(mesh, 1e-3, FixedVertices::Balls(balls)));
         assert_eq!(made.map(|_| ()), Err(palpate_mesh::work::GivenUp::TooMuch(most)));
     }
 
@@ -995,8 +998,9 @@ mod tests {
             [[0.0; 3], [0.04, 0.0, 0.0], [0.04, 0.03, 0.0], [0.0, 0.03, 0.0]].map(DVec3::from_array).to_vec();
         let mesh = TriangleMesh { vertices_m, triangles: vec![[0, 1, 2], [0, 2, 3]], ..TriangleMesh::default() };
         let (held, empty) = ((DVec3::ZERO, 0.001), (DVec3::new(0.04, 0.03, 0.005), 0.004));
-        let told =
-            |balls: &[(DVec3, f64)]| Mesh::of(mesh.clone(), 1e-3, Fixed::Balls(balls.to_vec())).unwrap().warnings();
+        let told = |balls: &[(DVec3, f64)]| {
+            Mesh::of(mesh.clone(), 1e-3, FixedVertices::Balls(balls.to_vec())).unwrap().warnings()
+        };
         assert_eq!(told(&[held]), [""; 0]);
         assert_eq!(
             told(&[held, empty]),
@@ -1020,7 +1024,7 @@ mod tests {
             assert_eq!(with.nearest(stray_m), alone.nearest(stray_m), "{stray_m}");
             assert_eq!(with.around(stray_m, 0.02), alone.around(stray_m, 0.02), "{stray_m}");
             let [alone, with] = [alone, with].map(|shape| {
-                let mesh = Mesh::uneven(0.01, 0.0, Arc::new(shape), Differences::default());
+                let mesh = Mesh::uneven(0.01, 0.0, Arc::new(shape), PerNodeFactors::default());
                 (mesh.mass_kg(), mesh.stiffest.bound)
             });
             assert_eq!(with, alone, "{stray_m}");
@@ -1066,16 +1070,16 @@ mod tests {
             let triangles = triangles.into_iter().filter(|_| round == 0 || dice.f64() < 0.8).collect();
             let shape = MeshShape::new(vertices_m, triangles, |_, _, _| false).unwrap();
             let shape = Arc::new(shape);
-            for (flexion, is_uneven) in [(0.0, false), (0.3, false), (1.0, false), (0.0, true), (0.4, true)] {
+            for (bending, is_uneven) in [(0.0, false), (0.3, false), (1.0, false), (0.0, true), (0.4, true)] {
                 let mut dice = |count: usize| (0..count).map(|_| 0.3 + dice.f64()).collect::<Vec<f64>>();
-                let differences = Differences {
+                let differences = PerNodeFactors {
                     relative_mass: dice(60),
-                    extra_virtual: vec![],
+                    extra_anchor: vec![],
                     edges: dice(shape.edges.len()),
-                    flexion: dice(shape.opposite.len()),
+                    bending: dice(shape.opposite.len()),
                 };
-                let differences = if is_uneven { differences } else { Differences::default() };
-                let mesh = Mesh::uneven(1.0, flexion, shape.clone(), differences);
+                let differences = if is_uneven { differences } else { PerNodeFactors::default() };
+                let mesh = Mesh::uneven(1.0, bending, shape.clone(), differences);
                 let mass = |vertex: usize| mesh.relative_mass(PointId::new(vertex));
                 // Power iteration on the Laplacian over the masses; Rayleigh's quotient is never above an eigenvalue.
                 let (mut x, mut largest) = (dice(60), 0.0);
@@ -1093,8 +1097,8 @@ mod tests {
                     let length = y.iter().map(|y| y * y).sum::<f64>().sqrt();
                     x = y.into_iter().map(|y| y / length).collect();
                 }
-                let Stiffest { bound, .. } = mesh.stiffest;
-                assert!(bound >= largest && bound < 1.03 * largest, "{round} {flexion}: {bound} {largest}");
+                let StiffnessBound { bound, .. } = mesh.stiffest;
+                assert!(bound >= largest && bound < 1.03 * largest, "{round} {bending}: {bound} {largest}");
             }
         }
     }

@@ -31,10 +31,10 @@ use crate::refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negativ
 use crate::shape::{PointId, RestShape};
 use check::physical;
 use document::{Document, Fields, Item};
-use kind::Kind;
+use kind::TextKind;
 pub use material::{Inclusion, MadeOf, Material, Region};
-pub use mesh::{Differences, Fixed as FixedVertices, Mesh, MeshShape, Stiffest, Told};
-pub use sheet::{Fixed, LEAST_WIDTH, PointSet, Sheet};
+pub use mesh::{FixedVertices, Mesh, MeshMetadata, MeshShape, PerNodeFactors, StiffnessBound};
+pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet};
 pub use shown::{BoundPlace, Shown, Simulated};
 use source::Files;
 pub use volume::{Swelling, Volume};
@@ -67,7 +67,7 @@ pub struct Scene {
     /// Springs between neighbours.
     pub springs: Springs,
     /// K″ of the springs of zero rest length that pull each point to its rest position, N/m (the paper's eq. 4).
-    pub virtual_stiffness_n_per_m: f64,
+    pub anchor_stiffness_n_per_m: f64,
     /// C of the damping force −C·v, N·s/m.
     pub damping_n_s_per_m: f64,
     /// κ of the pressure −κ·ΔV/V0 on a mesh that encloses a volume, Pa; 0 on any other tissue.
@@ -116,7 +116,7 @@ pub struct Appearance {
     /// A PNG image for the surface; one is made if `None`.
     pub texture: Option<PathBuf>,
     /// What the one that is made shows.
-    pub surface: Surface,
+    pub surface: PaintedSurface,
     /// Which one of these is made.
     pub texture_seed: u64,
     /// Pixels along each side of that.
@@ -125,7 +125,7 @@ pub struct Appearance {
 
 impl Default for Appearance {
     fn default() -> Self {
-        Appearance { texture: None, surface: Surface::Mucosa, texture_seed: 1, texture_size: 1024 }
+        Appearance { texture: None, surface: PaintedSurface::Mucosa, texture_seed: 1, texture_size: 1024 }
     }
 }
 
@@ -139,7 +139,7 @@ impl Appearance {
 
 /// Surfaces that can be painted (`texture`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Surface {
+pub enum PaintedSurface {
     /// The lining of a stomach.
     Mucosa,
     /// The capsule of a liver.
@@ -150,31 +150,31 @@ pub enum Surface {
     Serosa,
 }
 
-impl Named for Surface {
+impl Named for PaintedSurface {
     const NAMES: &'static [(&'static str, Self)] = &[
-        ("mucosa", Surface::Mucosa),
-        ("liver", Surface::Liver),
-        ("nodular", Surface::Nodular),
-        ("serosa", Surface::Serosa),
+        ("mucosa", PaintedSurface::Mucosa),
+        ("liver", PaintedSurface::Liver),
+        ("nodular", PaintedSurface::Nodular),
+        ("serosa", PaintedSurface::Serosa),
     ];
 }
 
 /// What of a tissue may change while it is in use. What is `None` stays.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Change {
-    /// k of the structural springs, N/m. Those of shear and flexion keep their ratio to it.
+    /// k of the structural springs, N/m. Those of shear and bending keep their ratio to it.
     pub stiffness_n_per_m: Option<f64>,
     /// C, N·s/m.
     pub damping_n_s_per_m: Option<f64>,
     /// K″, N/m.
-    pub virtual_stiffness_n_per_m: Option<f64>,
+    pub anchor_stiffness_n_per_m: Option<f64>,
     /// κ of a tissue that encloses a volume, Pa.
     pub volume_stiffness_pa: Option<f64>,
 }
 
 impl Change {
     /// Why one that changes nothing is refused.
-    pub const NOTHING: &str = "names nothing to change: stiffness_n_per_m, damping_n_s_per_m, virtual_stiffness_n_per_m or \
+    pub const NOTHING: &str = "names nothing to change: stiffness_n_per_m, damping_n_s_per_m, anchor_stiffness_n_per_m or \
                                volume_stiffness_pa";
 }
 
@@ -186,7 +186,7 @@ pub struct Springs {
     /// k of (1,1) and (1,−1), N/m.
     pub shear_stiffness_n_per_m: f64,
     /// Whether there are springs (2,0) and (0,2), with the structural k.
-    pub flexion: bool,
+    pub bending: bool,
 }
 
 /// How time advances.
@@ -259,7 +259,7 @@ macro_rules! named {
 }
 
 named! {
-    /// The schemes (`sheet::integrate`).
+    /// The schemes (`tissue::integrate`).
     pub enum Integrator {
         /// Palpate's choice.
         Auto = "auto",
@@ -347,7 +347,7 @@ impl Scene {
 
     fn parse_with(name: &str, text: &str, assignments: &[String], files: Files<'_>, limits: &Limits) -> Result<Self> {
         let mut document = Document::parse(name, text)?;
-        Kind::Scene.check(&document)?;
+        TextKind::Scene.check(&document)?;
         for assignment in assignments {
             document.set(assignment)?;
         }
@@ -360,7 +360,7 @@ impl Scene {
                 material: substance.material,
                 inclusions: substance.inclusions,
                 springs: substance.springs,
-                virtual_stiffness_n_per_m: substance.virtual_stiffness_n_per_m,
+                anchor_stiffness_n_per_m: substance.anchor_stiffness_n_per_m,
                 damping_n_s_per_m: substance.damping_n_s_per_m,
                 volume_stiffness_pa: substance.volume_stiffness_pa,
                 stepping: fields.item("stepping").map_or(Ok(Stepping::default()), |item| read_stepping(&item))?,
@@ -393,7 +393,7 @@ impl Scene {
             };
         }
         scene.damping_n_s_per_m = change.damping_n_s_per_m.unwrap_or(scene.damping_n_s_per_m);
-        scene.virtual_stiffness_n_per_m = change.virtual_stiffness_n_per_m.unwrap_or(scene.virtual_stiffness_n_per_m);
+        scene.anchor_stiffness_n_per_m = change.anchor_stiffness_n_per_m.unwrap_or(scene.anchor_stiffness_n_per_m);
         scene.volume_stiffness_pa = change.volume_stiffness_pa.unwrap_or(scene.volume_stiffness_pa);
         scene
     }
@@ -457,11 +457,11 @@ impl Scene {
         }
     }
 
-    /// K″ of a point over that of reference, which is `virtual_stiffness_n_per_m`.
-    pub fn relative_virtual_stiffness(&self, point: PointId) -> f64 {
+    /// K″ of a point over that of reference, which is `anchor_stiffness_n_per_m`.
+    pub fn relative_anchor_stiffness(&self, point: PointId) -> f64 {
         match &self.body {
             Body::Sheet(_) => 1.0,
-            Body::Mesh(mesh) => mesh.relative_mass(point) * (1.0 + mesh.extra_virtual(point)),
+            Body::Mesh(mesh) => mesh.relative_mass(point) * (1.0 + mesh.extra_anchor(point)),
         }
     }
 
@@ -495,7 +495,7 @@ impl Scene {
         let coefficients = [
             ("springs.stiffness_n_per_m", self.springs.stiffness_n_per_m),
             ("springs.shear_stiffness_n_per_m", self.springs.shear_stiffness_n_per_m),
-            ("virtual_springs.stiffness_n_per_m", self.virtual_stiffness_n_per_m),
+            ("anchor_springs.stiffness_n_per_m", self.anchor_stiffness_n_per_m),
             ("damping.coefficient_n_s_per_m", self.damping_n_s_per_m),
             ("volume.stiffness_pa", self.volume_stiffness_pa),
         ];
@@ -533,7 +533,7 @@ pub struct Substance {
     /// Springs between neighbours.
     pub springs: Springs,
     /// K″, N/m.
-    pub virtual_stiffness_n_per_m: f64,
+    pub anchor_stiffness_n_per_m: f64,
     /// C, N·s/m.
     pub damping_n_s_per_m: f64,
     /// κ, Pa; 0 without a volume.
@@ -541,19 +541,19 @@ pub struct Substance {
 }
 
 impl Substance {
-    /// A mesh of a material, with springs of flexion whose k is the part `flexion` of that of the edge they cross.
+    /// A mesh of a material, with springs of bending whose k is the part `bending` of that of the edge they cross.
     ///
     /// # Errors
     /// As for [`Material::applied`].
-    pub fn of_material(material: Material, flexion: f64, shape: Arc<MeshShape>) -> Result<Self> {
-        let made = material.applied(flexion, shape)?;
+    pub fn of_material(material: Material, bending: f64, shape: Arc<MeshShape>) -> Result<Self> {
+        let made = material.applied(bending, shape)?;
         let stiffness_n_per_m = made.stiffness_n_per_m;
         Ok(Substance {
             body: Body::Mesh(made.mesh),
             material: Some(material),
             inclusions: Arc::default(),
-            springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, flexion: false },
-            virtual_stiffness_n_per_m: made.virtual_stiffness_n_per_m,
+            springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, bending: false },
+            anchor_stiffness_n_per_m: made.anchor_stiffness_n_per_m,
             damping_n_s_per_m: made.damping_n_s_per_m,
             volume_stiffness_pa: 0.0,
         })
@@ -633,8 +633,8 @@ fn read_coefficients(fields: &mut Fields<'_>, mut body: Body) -> Result<Substanc
         body,
         material: None,
         inclusions: Arc::default(),
-        virtual_stiffness_n_per_m: fields
-            .required("virtual_springs")?
+        anchor_stiffness_n_per_m: fields
+            .required("anchor_springs")?
             .table(|fields| fields.required_number("stiffness_n_per_m"))?,
         damping_n_s_per_m: fields
             .required("damping")?
@@ -646,47 +646,47 @@ fn read_coefficients(fields: &mut Fields<'_>, mut body: Body) -> Result<Substanc
 /// Reads the section `[material]`, and of `[springs]` what it leaves open.
 fn read_material(fields: &mut Fields<'_>, item: &Item<'_>, mesh: &Mesh) -> Result<Substance> {
     let material = item.table(Material::read)?;
-    let (virtual_springs, damping) = (fields.item("virtual_springs"), fields.item("damping"));
-    if let Some(other) = virtual_springs.or(damping) {
+    let (anchor_springs, damping) = (fields.item("anchor_springs"), fields.item("damping"));
+    if let Some(other) = anchor_springs.or(damping) {
         return Err(other.refuse(Reason::WrongKind, Material::FOLLOWS));
     }
-    let flexion = match fields.item("springs") {
+    let bending = match fields.item("springs") {
         None => 0.0,
         Some(springs) => springs.table(|fields| {
             let (stiffness, shear) = (fields.item("stiffness_n_per_m"), fields.item("shear_stiffness_n_per_m"));
             if let Some(item) = stiffness.or(shear) {
                 return Err(item.refuse(Reason::WrongKind, Material::FOLLOWS));
             }
-            fields.item("flexion").map_or(Ok(0.0), |item| read_flexion(&item))
+            fields.item("bending").map_or(Ok(0.0), |item| read_bending(&item))
         })?,
     };
-    Substance::of_material(material, flexion, mesh.shape.clone())
+    Substance::of_material(material, bending, mesh.shape.clone())
 }
 
-/// k of springs of flexion on a mesh, as a part of that of edges.
-fn read_flexion(item: &Item<'_>) -> Result<f64> {
+/// k of springs of bending on a mesh, as a part of that of edges.
+fn read_bending(item: &Item<'_>) -> Result<f64> {
     let part = item.flag().map(|flag| if flag { 1.0 } else { 0.0 }).or_else(|_| item.number())?;
-    number("springs.flexion", part, "from 0 to 10", |v| (0.0..=10.0).contains(&v))
+    number("springs.bending", part, "from 0 to 10", |v| (0.0..=10.0).contains(&v))
 }
 
-/// Reads the section `[springs]`. A mesh has springs along its edges; those of flexion may be a part as stiff.
+/// Reads the section `[springs]`. A mesh has springs along its edges; those of bending may be a part as stiff.
 fn read_springs(fields: &mut Fields<'_>, body: &mut Body) -> Result<Springs> {
     let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
-    let (shear, flexion) = (fields.item("shear_stiffness_n_per_m"), fields.item("flexion"));
+    let (shear, bending) = (fields.item("shear_stiffness_n_per_m"), fields.item("bending"));
     match body {
         Body::Sheet(_) => Ok(Springs {
             stiffness_n_per_m,
             shear_stiffness_n_per_m: shear.map_or(Ok(stiffness_n_per_m), |item| item.number())?,
-            flexion: flexion.map_or(Ok(false), |item| item.flag())?,
+            bending: bending.map_or(Ok(false), |item| item.flag())?,
         }),
         Body::Mesh(mesh) => {
             if let Some(shear) = shear {
                 return Err(shear.refuse(Reason::WrongKind, "is for sheets: the edges of a mesh resist shear as well"));
             }
-            if let Some(item) = flexion {
-                *mesh = Mesh::new(mesh.point_mass_kg, read_flexion(&item)?, mesh.shape.clone());
+            if let Some(item) = bending {
+                *mesh = Mesh::new(mesh.point_mass_kg, read_bending(&item)?, mesh.shape.clone());
             }
-            Ok(Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, flexion: false })
+            Ok(Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, bending: false })
         }
     }
 }
@@ -696,7 +696,7 @@ fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {
         let standard = Appearance::default();
         let texture = fields.text("texture")?.map(PathBuf::from);
         let surface = match fields.text("surface")? {
-            Some(name) => Some(Surface::named(&fields.path("surface"), &name)?),
+            Some(name) => Some(PaintedSurface::named(&fields.path("surface"), &name)?),
             None => None,
         };
         let seed = fields.item("texture_seed").map(|item| item.whole()).transpose()?;

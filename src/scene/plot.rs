@@ -8,7 +8,7 @@ use textplots::{Chart, LabelBuilder, LabelFormat, Plot, Shape};
 use crate::shape::RestShape;
 
 /// The number of values from which on every second one is left out. A terminal shows 140 dots side by side.
-const MOST_KEPT: usize = 4096;
+const MAX_KEPT: usize = 4096;
 
 /// Displacement and force of one tool or point over time: of a sheet along z, as in the paper's figures; of a mesh, which is
 /// pressed from any side, their lengths. The memory does not grow with the length of a run.
@@ -34,7 +34,7 @@ impl Curves {
     /// Adds the displacement, m, and the force of the tissue, N, at a time, s. Times ascend.
     #[allow(clippy::cast_possible_truncation)]
     pub fn add(&mut self, time_s: f64, displacement_m: DVec3, force_n: DVec3) {
-        if self.displacement.len() == MOST_KEPT {
+        if self.displacement.len() == MAX_KEPT {
             for curve in [&mut self.displacement, &mut self.force] {
                 let mut is_kept = false;
                 curve.retain(|_| {
@@ -97,7 +97,7 @@ mod tests {
         let mut curves = Curves::default();
         for index in 0..100_000_u32 {
             curves.add(f64::from(index), DVec3::X, f64::from(index) * DVec3::Z);
-            assert!(curves.force.len() <= MOST_KEPT);
+            assert!(curves.force.len() <= MAX_KEPT);
         }
         // 100,000 values fit in after five halvings.
         let times: Vec<f32> = curves.force.iter().map(|value| value.0).collect();

@@ -8,7 +8,7 @@ use palpate_touch::{Coupling, Tip};
 
 use super::check::{check_force, check_free, check_reach, check_tip};
 use super::document::{Document, Fields, Item};
-use super::kind::Kind;
+use super::kind::TextKind;
 use super::profile::{
     CentreProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile, weights,
 };
@@ -36,7 +36,7 @@ impl Script {
     /// Refuses a script that can't be parsed or bound to the scene.
     pub fn parse(name: &str, text: &str, folder: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
         let document = Document::parse(name, text)?;
-        Kind::Script.check(&document)?;
+        TextKind::Script.check(&document)?;
         document.read(|fields| Binding { folder, scene, limits, warnings: Vec::new() }.script(fields))
     }
 }
@@ -45,7 +45,7 @@ impl Script {
 const SHORTEST_MOVE_S: f64 = 1e-6;
 
 /// The least sum of the weights of a force with a radius.
-const LEAST_WEIGHT: f64 = 1e-3;
+const MIN_WEIGHT: f64 = 1e-3;
 
 /// Beyond this a phase has no digits left.
 const HIGHEST_HZ: f64 = 1e6;
@@ -90,8 +90,8 @@ impl Binding<'_> {
         let (mut moves, mut poses) = (Vec::new(), Vec::new());
         for item in items(fields, "tool")? {
             match self.tool(&item)? {
-                Tool::Moves(profile) => moves.push(profile),
-                Tool::Poses(profile) => poses.push(profile),
+                ToolTable::Moves(profile) => moves.push(profile),
+                ToolTable::Poses(profile) => poses.push(profile),
             }
         }
         control_points.extend(moves.iter().map(|profile| profile.point));
@@ -187,7 +187,7 @@ impl Binding<'_> {
                 let change = Change {
                     stiffness_n_per_m: fields.number("stiffness_n_per_m")?,
                     damping_n_s_per_m: fields.number("damping_n_s_per_m")?,
-                    virtual_stiffness_n_per_m: fields.number("virtual_stiffness_n_per_m")?,
+                    anchor_stiffness_n_per_m: fields.number("anchor_stiffness_n_per_m")?,
                     volume_stiffness_pa: fields.number("volume_stiffness_pa")?,
                 };
                 Ok((at, change))
@@ -207,7 +207,7 @@ impl Binding<'_> {
     fn force(&mut self, item: &Item<'_>, control_points: &mut Vec<PointId>) -> Result<LoadProfile> {
         item.table(|fields| {
             let centre = self.centre(item, fields, control_points)?;
-            let Field { unit, key, falloff_per_m, falloff_offset } = self.field(fields, &centre)?;
+            let ForceSpread { unit, key, falloff_per_m, falloff_offset } = self.field(fields, &centre)?;
             let factor = libm::exp(falloff_offset);
             let limit_n = self.limits.point_force_n;
             let within_limit = |field: &str, force_n: DVec3| check_force(field, force_n, factor, limit_n);
@@ -235,11 +235,11 @@ impl Binding<'_> {
 
     /// How a force spreads: as in the paper by `falloff_per_m` and `falloff_offset`, or by `radius_m`, where the weight is
     /// 1/e; then what is given is the force on all points together, at the first place.
-    fn field(&self, fields: &mut Fields<'_>, centre: &CentreProfile) -> Result<Field> {
+    fn field(&self, fields: &mut Fields<'_>, centre: &CentreProfile) -> Result<ForceSpread> {
         let Some(radius_m) = fields.number("radius_m")? else {
             let falloff_per_m = not_negative(&fields.path("falloff_per_m"), fields.required_number("falloff_per_m")?)?;
             let falloff_offset = fields.required_number("falloff_offset")?;
-            return Ok(Field { unit: 1.0, key: "force_n", falloff_per_m, falloff_offset });
+            return Ok(ForceSpread { unit: 1.0, key: "force_n", falloff_per_m, falloff_offset });
         };
         positive(&fields.path("radius_m"), radius_m)?;
         for key in ["force_n", "falloff_per_m", "falloff_offset"] {
@@ -251,11 +251,11 @@ impl Binding<'_> {
         }
         let shape = self.scene.shape();
         let sum = weights(shape, centre.begins_at_m(), radius_m.recip());
-        if sum < LEAST_WEIGHT {
+        if sum < MIN_WEIGHT {
             let message = format!("is so small that no point is reached: points are {} m apart", shape.edge_m());
             return Err(fields.refuse(Reason::OutOfRange, "radius_m", message));
         }
-        Ok(Field { unit: sum.recip(), key: "total_n", falloff_per_m: radius_m.recip(), falloff_offset: 0.0 })
+        Ok(ForceSpread { unit: sum.recip(), key: "total_n", falloff_per_m: radius_m.recip(), falloff_offset: 0.0 })
     }
 
     fn centre(
@@ -409,10 +409,10 @@ impl Binding<'_> {
         Ok(rows)
     }
 
-    fn tool(&mut self, item: &Item<'_>) -> Result<Tool> {
+    fn tool(&mut self, item: &Item<'_>) -> Result<ToolTable> {
         item.table(|fields| {
             if let Some(list) = fields.item("poses") {
-                return self.poses(fields, &list).map(Tool::Poses);
+                return self.poses(fields, &list).map(ToolTable::Poses);
             }
             let point = self.point_of(fields)?;
             check_free(&fields.path("point"), self.scene.shape(), point)?;
@@ -433,7 +433,7 @@ impl Binding<'_> {
             // The displacement is largest at the end of a move. Where moves overlap, their sum is an upper bound.
             let farthest: f64 = profile.moves.iter().map(|m| m.by_m.length()).sum();
             check_reach(&fields.path("moves"), self.scene.shape(), farthest, self.limits)?;
-            Ok(Tool::Moves(profile))
+            Ok(ToolTable::Moves(profile))
         })
     }
 
@@ -485,13 +485,13 @@ impl Binding<'_> {
 }
 
 /// A `[[tool]]`.
-enum Tool {
+enum ToolTable {
     Moves(MotionProfile),
     Poses(PoseProfile),
 }
 
 /// How a force spreads over the points.
-struct Field {
+struct ForceSpread {
     /// What the given vector is multiplied by.
     unit: f64,
     /// The name of that vector.

@@ -78,10 +78,10 @@ pub struct Point {
     pub displacement_m: [f64; 3],
     pub velocity_m_per_s: [f64; 3],
     pub spring_n: [f64; 3],
-    pub virtual_n: [f64; 3],
+    pub anchor_n: [f64; 3],
     pub damping_n: [f64; 3],
     pub applied_n: [f64; 3],
-    /// spring + virtual + damping.
+    /// springs + anchor spring + damping.
     pub reaction_n: [f64; 3],
     /// For a prescribed point, the force that holds it.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -108,7 +108,7 @@ pub struct EnergyJ {
     pub kinetic: f64,
     pub spring: f64,
     #[serde(rename = "virtual")]
-    pub virtual_springs: f64,
+    pub anchor_springs: f64,
 }
 
 /// The last line of a record.
@@ -183,7 +183,7 @@ pub fn far_warning(largest_m: f64, shape: &dyn RestShape) -> Option<String> {
 pub struct AuditedError {
     /// Largest difference of any component of a displacement.
     pub displacement: f64,
-    /// The same for the tissue's force on a tool: springs, virtual springs and damping.
+    /// The same for the tissue's force on a tool: springs, anchor springs and damping.
     pub force: f64,
 }
 

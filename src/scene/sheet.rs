@@ -14,7 +14,7 @@ use crate::refusal::{Reason, Refusal, Result, positive};
 use crate::shape::{Extent, PointId, PointName, RestShape};
 
 /// Points of a row that are computed at least: the lanes of the widest vector.
-pub const LEAST_WIDTH: usize = 16;
+pub const MIN_WIDTH: usize = 16;
 
 /// The grid: point [i, j] rests at (i·spacing, j·spacing, 0).
 #[derive(Debug, Clone, PartialEq)]
@@ -26,12 +26,12 @@ pub struct Sheet {
     /// Mass of each point, kg.
     pub point_mass_kg: f64,
     /// Points that never move.
-    pub fixed: Fixed,
+    pub fixed: FixedPoints,
 }
 
 /// Points that never move.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Fixed {
+pub enum FixedPoints {
     /// Every point of the rim.
     Edges,
     /// The four corners.
@@ -66,14 +66,14 @@ impl FromIterator<[usize; 2]> for PointSet {
     }
 }
 
-impl Fixed {
+impl FixedPoints {
     fn read(item: &Item<'_>) -> Result<Self> {
         match item.as_text() {
-            Some("edges") => Ok(Fixed::Edges),
-            Some("corners") => Ok(Fixed::Corners),
+            Some("edges") => Ok(FixedPoints::Edges),
+            Some("corners") => Ok(FixedPoints::Corners),
             Some(_) => Err(item.wrong("\"edges\", \"corners\" or a list of points")),
             None if item.list().is_err() => Err(item.wrong("\"edges\", \"corners\" or a list of points")),
-            None => Ok(Fixed::Points(item.list()?.iter().map(Item::point).collect::<Result<_>>()?)),
+            None => Ok(FixedPoints::Points(item.list()?.iter().map(Item::point).collect::<Result<_>>()?)),
         }
     }
 }
@@ -84,7 +84,9 @@ impl Sheet {
             points: fields.required("points")?.point()?,
             spacing_m: fields.required_number("spacing_m")?,
             point_mass_kg: fields.required_number("point_mass_kg")?,
-            fixed: fields.item("fixed").map_or(Ok(Fixed::Points(PointSet::default())), |item| Fixed::read(&item))?,
+            fixed: fields
+                .item("fixed")
+                .map_or(Ok(FixedPoints::Points(PointSet::default())), |item| FixedPoints::read(&item))?,
         })
     }
 
@@ -99,17 +101,17 @@ impl Sheet {
             return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
         }
         // A narrow sheet takes the memory and the time of one of this width, which may be sixteen times its own.
-        if nx.checked_mul(ny.max(LEAST_WIDTH)).is_none_or(|points| points > limits.points) {
+        if nx.checked_mul(ny.max(MIN_WIDTH)).is_none_or(|points| points > limits.points) {
             let message = format!(
-                "are {nx} × {ny}: rows of fewer than {LEAST_WIDTH} points are computed as if they had so many, and \
-                 {nx} × {LEAST_WIDTH} are above the limit of {} points in all; give the longer side last",
+                "are {nx} × {ny}: rows of fewer than {MIN_WIDTH} points are computed as if they had so many, and \
+                 {nx} × {MIN_WIDTH} are above the limit of {} points in all; give the longer side last",
                 limits.points
             );
             return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
         }
         physical("sheet.spacing_m", positive("sheet.spacing_m", self.spacing_m)?)?;
         physical("sheet.point_mass_kg", positive("sheet.point_mass_kg", self.point_mass_kg)?)?;
-        if let Fixed::Points(points) = &self.fixed
+        if let FixedPoints::Points(points) = &self.fixed
             && let Some(index) = points.as_slice().iter().position(|[i, j]| *i >= nx || *j >= ny)
         {
             self.find(&format!("sheet.fixed[{index}]"), PointName::Point(points.as_slice()[index]))?;
@@ -137,12 +139,12 @@ impl Sheet {
     pub(super) fn part(&self, side: usize) -> (Self, [PointId; 3]) {
         let points @ [nx, ny] = self.points.map(|points| points.min(side));
         let mut part = Sheet { points, ..self.clone() };
-        if let Fixed::Points(points) = &mut part.fixed {
+        if let FixedPoints::Points(points) = &mut part.fixed {
             *points = points.as_slice().iter().copied().filter(|[i, j]| *i < side && *j < side).collect();
         }
         let pushed = part.point([nx / 3, 2 * ny / 5]);
         if part.is_fixed(pushed) {
-            part.fixed = Fixed::Points(PointSet::default());
+            part.fixed = FixedPoints::Points(PointSet::default());
         }
         let others = [[nx / 2, ny / 2], [1.min(nx - 1), 1.min(ny - 1)]].map(|place| part.point(place));
         (part, [pushed, others[0], others[1]])
@@ -152,7 +154,7 @@ impl Sheet {
     pub fn fixed_indices(&self) -> Vec<usize> {
         let [nx, ny] = self.points;
         let mut indices: Vec<usize> = match &self.fixed {
-            Fixed::Points(points) => points.as_slice().iter().map(|[i, j]| i * ny + j).collect(),
+            FixedPoints::Points(points) => points.as_slice().iter().map(|[i, j]| i * ny + j).collect(),
             _ => {
                 // The rim, at most.
                 let mut indices = memory::with_room((2 * (nx + ny)).min(nx * ny), "the fixed points");
@@ -186,7 +188,7 @@ impl RestShape for Sheet {
             PointName::Point([i, j]) if i < nx && j < ny => Ok(self.point([i, j])),
             PointName::Point(_) => {
                 let message = format!("{name} is not on the sheet of {nx} × {ny} points");
-                Err(Refusal::new(Reason::OffSheet, field, message))
+                Err(Refusal::new(Reason::OffTissue, field, message))
             }
             PointName::Vertex(_) => {
                 let message = format!("is the number of a vertex; a point of a sheet is [i, j], here of {nx} × {ny}");
@@ -208,9 +210,9 @@ impl RestShape for Sheet {
         let ([nx, ny], [i, j]) = (self.points, self.place_of(point));
         let (rim_x, rim_y) = (i == 0 || i + 1 == nx, j == 0 || j + 1 == ny);
         match &self.fixed {
-            Fixed::Edges => rim_x || rim_y,
-            Fixed::Corners => rim_x && rim_y,
-            Fixed::Points(points) => points.contains([i, j]),
+            FixedPoints::Edges => rim_x || rim_y,
+            FixedPoints::Corners => rim_x && rim_y,
+            FixedPoints::Points(points) => points.contains([i, j]),
         }
     }
 
@@ -258,11 +260,12 @@ mod tests {
     use super::*;
     use crate::shape;
 
-    const SHEET: fn(Fixed) -> Sheet = |fixed| Sheet { points: [3, 7], spacing_m: 0.01, point_mass_kg: 0.1, fixed };
+    const SHEET: fn(FixedPoints) -> Sheet =
+        |fixed| Sheet { points: [3, 7], spacing_m: 0.01, point_mass_kg: 0.1, fixed };
 
     #[test]
     fn points_of_a_grid_are_numbered_by_rows_and_found_by_name_and_place() {
-        let sheet = SHEET(Fixed::Corners);
+        let sheet = SHEET(FixedPoints::Corners);
         let places: Vec<[usize; 2]> = (0..3).flat_map(|i| (0..7).map(move |j| [i, j])).collect();
         assert_eq!(shape::points(&sheet).map(|point| sheet.place_of(point)).collect::<Vec<_>>(), places);
         for point in shape::points(&sheet) {
@@ -276,7 +279,7 @@ mod tests {
 
     #[test]
     fn neighbours_know_each_other_and_lie_within_a_diagonal() {
-        let sheet = SHEET(Fixed::Edges);
+        let sheet = SHEET(FixedPoints::Edges);
         let counts: Vec<usize> = shape::points(&sheet).map(|point| sheet.neighbours(point).len()).collect();
         assert_eq!(&counts[..7], [3, 5, 5, 5, 5, 5, 3]);
         assert_eq!(&counts[7..14], [5, 8, 8, 8, 8, 8, 5]);
@@ -295,7 +298,7 @@ mod tests {
     #[test]
     fn a_part_of_a_sheet_is_a_corner_and_one_of_its_points_is_its_middle() {
         for points in [[1, 1], [1, 2], [2, 1], [9, 1], [1, 8], [2, 2], [11, 4], [12, 12], [40, 13]] {
-            let (part, looked_at) = Sheet { points, ..SHEET(Fixed::Corners) }.part(12);
+            let (part, looked_at) = Sheet { points, ..SHEET(FixedPoints::Corners) }.part(12);
             assert_eq!(part.points, points.map(|count| count.min(12)));
             assert!(looked_at.iter().all(|point| point.index() < part.point_count()) && !part.is_fixed(looked_at[0]));
             let middle = part.place_of(looked_at[1]);
@@ -309,7 +312,7 @@ mod tests {
 
     #[test]
     fn a_place_is_near_up_to_a_tenth_of_the_longest_side() {
-        let sheet = SHEET(Fixed::Edges);
+        let sheet = SHEET(FixedPoints::Edges);
         assert_eq!(sheet.extent().middle_m(), DVec3::new(0.01, 0.03, 0.0));
         for (place_m, is_near) in
             [([-0.0059, 0.0], true), ([-0.0061, 0.0], false), ([0.01, 0.0659], true), ([0.01, 0.0661], false)]

@@ -4,7 +4,7 @@
 //! joined: then each shown vertex moves with a place on it.
 
 use glam::DVec3;
-use palpate_mesh::decimate::{Place, decimate};
+use palpate_mesh::decimate::{MeshPlace, decimate};
 use palpate_mesh::delaunay::flip_to_delaunay;
 use palpate_mesh::surface::nearest_place;
 use palpate_mesh::work::spend;
@@ -141,14 +141,14 @@ impl Shown {
         vertices_m: &[DVec3],
         coarse: &TriangleMesh,
         before: &[[u32; 3]],
-        places: &[Place],
+        places: &[MeshPlace],
     ) -> Self {
         let mut around: Vec<Vec<u32>> = vec![Vec::new(); coarse.vertices_m.len()];
         for (number, triangle) in (0..).zip(&coarse.triangles) {
             triangle.iter().for_each(|vertex| around[*vertex as usize].push(number));
         }
         let at = |vertex: u32| coarse.vertices_m[vertex as usize];
-        let bind = |(place_m, place): (&DVec3, &Place)| {
+        let bind = |(place_m, place): (&DVec3, &MeshPlace)| {
             let old = before[place.triangle as usize];
             let own = [old, coarse.triangles[place.triangle as usize]];
             let mut candidates: Vec<u32> = vec![place.triangle];

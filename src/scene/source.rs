@@ -89,8 +89,8 @@ type Recipe = (&'static str, u64, u64);
 static KEPT: Mutex<Vec<(Recipe, Arc<TriangleMesh>)>> = Mutex::new(Vec::new());
 
 /// Organs that are kept, and their vertices in all, at most.
-const MOST_KEPT: usize = 4;
-const MOST_VERTICES_KEPT: usize = 200_000;
+const MAX_KEPT: usize = 4;
+const MAX_VERTICES_KEPT: usize = 200_000;
 
 /// Makes the organ of a table.
 fn made(item: &Item<'_>, limits: &Limits) -> Result<TriangleMesh> {
@@ -113,13 +113,13 @@ fn made(item: &Item<'_>, limits: &Limits) -> Result<TriangleMesh> {
             };
             fields.refuse(reason, key, error.to_string())
         })?;
-        if mesh.vertices_m.len() <= MOST_VERTICES_KEPT {
+        if mesh.vertices_m.len() <= MAX_VERTICES_KEPT {
             let mut kept = lock(&KEPT);
             kept.retain(|(other, _)| *other != recipe);
             kept.push((recipe, Arc::new(mesh.clone())));
             let too_many = |kept: &[(Recipe, Arc<TriangleMesh>)]| {
                 let vertices: usize = kept.iter().map(|(_, mesh)| mesh.vertices_m.len()).sum();
-                kept.len() > MOST_KEPT || vertices > MOST_VERTICES_KEPT
+                kept.len() > MAX_KEPT || vertices > MAX_VERTICES_KEPT
             };
             while too_many(&kept) {
                 kept.remove(0);

@@ -10,8 +10,8 @@ use tracing::info;
 use super::connections::Register;
 use super::services::Services;
 use crate::budget::{Account, Purpose, Resource, Work};
-use crate::pace::StreamKind;
-use crate::pace::clock::now_ns;
+use crate::realtime::StreamKind;
+use crate::realtime::clock::now_ns;
 use crate::refusal::{Reason, Refusal, excerpt};
 use palpate_proto::pb;
 use palpate_proto::pb::admin_service_server::AdminService;
@@ -51,8 +51,8 @@ impl AdminService for Admin {
         &self,
         request: Request<pb::ListStreamsRequest>,
     ) -> Result<Response<pb::ListStreamsResponse>, Status> {
-        let live = self.services.session(&request.get_ref().session_id).await?;
-        let streams = live.list_streams().into_iter().map(|stream| pb::StreamUse {
+        let handle = self.services.session(&request.get_ref().session_id).await?;
+        let streams = handle.list_streams().into_iter().map(|stream| pb::StreamUse {
             number: stream.number,
             call: stream.what.to_owned(),
             caller: stream.caller,
@@ -64,11 +64,11 @@ impl AdminService for Admin {
 
     async fn free_tool(&self, request: Request<pb::FreeToolRequest>) -> Result<Response<pb::FreeToolResponse>, Status> {
         let pb::FreeToolRequest { session_id, tool } = request.into_inner();
-        let live = self.services.session(&session_id).await?;
-        if live.at_intake(|intake, _| intake.free(|other, _| other == tool)) == 0 {
+        let handle = self.services.session(&session_id).await?;
+        if handle.at_intake(|intake, _| intake.free(|other, _| other == tool)) == 0 {
             return Err(Refusal::new(Reason::OutOfRange, "tool", format!("nobody holds tool {tool}")).into());
         }
-        info!(session = %live.id, tool, "tool released by an administrator");
+        info!(session = %handle.id, tool, "tool released by an administrator");
         Ok(Response::new(pb::FreeToolResponse {}))
     }
 
@@ -77,12 +77,12 @@ impl AdminService for Admin {
         request: Request<pb::CutStreamRequest>,
     ) -> Result<Response<pb::CutStreamResponse>, Status> {
         let pb::CutStreamRequest { session_id, number } = request.into_inner();
-        let live = self.services.session(&session_id).await?;
-        if live.cut_streams(|other, _| other == number) == 0 {
+        let handle = self.services.session(&session_id).await?;
+        if handle.cut_streams(|other, _| other == number) == 0 {
             let message = format!("the session has no stream {number}");
             return Err(Refusal::new(Reason::OutOfRange, "number", message).into());
         }
-        info!(session = %live.id, number, "stream cut");
+        info!(session = %handle.id, number, "stream cut");
         Ok(Response::new(pb::CutStreamResponse {}))
     }
 
@@ -97,12 +97,12 @@ impl AdminService for Admin {
                 Refusal::new(Reason::OutOfRange, "caller", format!("unknown caller `{}`", excerpt(&caller)))
             })?;
         let mut answer = pb::CutCallerResponse::default();
-        for live in pacer.list() {
-            answer.streams += live.cut_streams(|_, other| other.number() == account.number()) as u32;
+        for handle in pacer.list() {
+            answer.streams += handle.cut_streams(|_, other| other.number() == account.number()) as u32;
             let theirs = |payer: Option<&Account>| payer.is_some_and(|payer| payer.number() == account.number());
-            let freed = live.at_intake(|intake, _| intake.free(|_, payer| theirs(payer)));
+            let freed = handle.at_intake(|intake, _| intake.free(|_, payer| theirs(payer)));
             answer.tools += freed as u32;
-            if delete_sessions && live.owner.number() == account.number() && pacer.delete(&live.id).is_ok() {
+            if delete_sessions && handle.owner.number() == account.number() && pacer.delete(&handle.id).is_ok() {
                 answer.sessions += 1;
             }
         }
@@ -141,8 +141,8 @@ impl AdminService for Admin {
     ) -> Result<Response<pb::MoveSessionResponse>, Status> {
         let request = request.into_inner();
         let fleet = self.services.fleet()?;
-        let live = self.services.session(&request.session_id).await?;
-        let (ownership, gap_s) = fleet.clone().move_session(live, &request.node).await?;
+        let handle = self.services.session(&request.session_id).await?;
+        let (ownership, gap_s) = fleet.clone().move_session(handle, &request.node).await?;
         Ok(Response::new(pb::MoveSessionResponse { ownership: Some(ownership), gap_s }))
     }
 

@@ -14,21 +14,21 @@ use tracing::{Instrument, info, info_span};
 
 use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
+use super::cpu_account::CpuAccount;
 use super::fleet::FencedBody;
-use super::identity::{Access, Caller, Credentials, PresentedCredentials, access};
-use super::price::Price;
+use super::identity::{Access, Caller, KnownCallers, PresentedCredentials, access};
 use super::reload::Reloaded;
 use super::request::{RequestBody, TimeLimit, paid_for};
 use super::revocation::Calls;
 use super::traffic::Traffic;
 use crate::budget::Budget;
-use crate::pace::fence::Fence;
+use crate::realtime::fence::Fence;
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 
 /// Puts a [`CallAuthorizer`] in front of a service.
 #[derive(Clone)]
 pub(super) struct AuthorizeLayer {
-    pub(super) credentials: Arc<Reloaded<Credentials>>,
+    pub(super) credentials: Arc<Reloaded<KnownCallers>>,
     /// The running calls of authenticated callers.
     pub(super) calls: Arc<Calls>,
     /// Time limit for the messages of a call.
@@ -59,7 +59,7 @@ pub(super) struct CallAuthorizer<S> {
 }
 
 /// The answer to a call.
-type Answer<E> = Pin<Box<dyn Future<Output = std::result::Result<Response<Body>, E>> + Send>>;
+type CallResponse<E> = Pin<Box<dyn Future<Output = std::result::Result<Response<Body>, E>> + Send>>;
 
 /// A caller; if it was authenticated, with its credentials and the version of the token file that accepted them.
 type Identified = (Caller, Option<(PresentedCredentials, u64)>);
@@ -181,7 +181,7 @@ where
 {
     type Response = Response<Body>;
     type Error = S::Error;
-    type Future = Answer<S::Error>;
+    type Future = CallResponse<S::Error>;
 
     fn poll_ready(&mut self, cx: &mut Context<'_>) -> Poll<std::result::Result<(), S::Error>> {
         self.inner.poll_ready(cx)
@@ -207,7 +207,7 @@ where
                     path if path.starts_with(REFLECTION) => TimeLimit::EachMessage(self.layer.message_timeout),
                     _ => TimeLimit::WholeBody(self.layer.message_timeout),
                 };
-                let price = Price::of(request.uri().path(), &account);
+                let price = CpuAccount::of(request.uri().path(), &account);
                 let charged_caller = ChargedCaller::new(account.clone(), &request);
                 request.extensions_mut().insert(charged_caller);
                 let call = presented.map(|(presented, version)| self.layer.calls.begin(presented, from, version));

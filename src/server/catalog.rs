@@ -7,7 +7,7 @@ use crate::limits::Limits;
 use crate::lock::lock;
 use crate::refusal::{Refusal, Result};
 use crate::scene::collection::Collection;
-use crate::scene::kind::Kind;
+use crate::scene::kind::TextKind;
 use crate::scene::reader::fits;
 use crate::scene::script::Script;
 use crate::scene::{BUILT_IN, Scene};
@@ -25,8 +25,8 @@ impl Catalog {
     /// The scenes and scripts of two folders, either of which may be missing, and the built-in ones.
     pub fn new(scenes: &Path, scripts: &Path) -> Self {
         Catalog {
-            scenes: Collection::new(Kind::Scene, scenes),
-            scripts: Collection::new(Kind::Script, scripts),
+            scenes: Collection::new(TextKind::Scene, scenes),
+            scripts: Collection::new(TextKind::Script, scripts),
             built_in: Arc::default(),
         }
     }

@@ -6,7 +6,7 @@ use serde::Deserialize;
 
 use super::address::host_and_port;
 use super::cluster_config::{Beside, ClusterConfig};
-use super::journals::keep::Keep;
+use super::journals::retention::Keep;
 use crate::files;
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result, number, positive};

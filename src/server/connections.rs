@@ -27,7 +27,7 @@ use super::rate::RateLimiter;
 use super::reload::Reloaded;
 use super::tls::{self, Tls};
 use super::traffic::{Open, Traffic};
-use super::transport::{Frames, Gate, ReadPause};
+use super::transport::{FrameParser, Gate, ReadPause};
 use crate::budget::{Budget, Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::lock::lock;
@@ -99,7 +99,7 @@ pub(super) fn incoming(
             // Nagle's algorithm would delay a sample by milliseconds. An error means that the client has closed the
             // connection; reading will notice that.
             let _ = socket.set_nodelay(true);
-            let entry = Entry::new(address, Arc::new(slot), gate, window, &limits, &traffic, &register);
+            let entry = AcceptedConnection::new(address, Arc::new(slot), gate, window, &limits, &traffic, &register);
             let Some(tls) = &tls else {
                 let _ = ready.send(Ok(entry.connection(Transport::Plain(socket), None))).await;
                 continue;
@@ -291,7 +291,7 @@ impl Register {
 }
 
 /// An accepted connection before its TLS handshake.
-struct Entry {
+struct AcceptedConnection {
     address: SocketAddr,
     /// The memory that unread data may take.
     window: Taken,
@@ -305,7 +305,7 @@ struct Entry {
     gate: Arc<Gate>,
 }
 
-impl Entry {
+impl AcceptedConnection {
     fn new(
         address: SocketAddr,
         slot: Arc<ConnectionSlot>,
@@ -316,7 +316,7 @@ impl Entry {
         register: &Arc<Register>,
     ) -> Self {
         let per_minute = limits.sessions_per_minute;
-        Entry {
+        AcceptedConnection {
             address,
             window,
             calls: RateLimiter::new(limits.calls_per_s, limits.calls_per_s, "calls of this connection"),
@@ -330,7 +330,7 @@ impl Entry {
     }
 
     fn connection(self, transport: Transport, certificate: Option<Arc<[String]>>) -> Connection {
-        let Entry { address, window, calls, creations, deadline, traffic, register, slot, gate } = self;
+        let AcceptedConnection { address, window, calls, creations, deadline, traffic, register, slot, gate } = self;
         debug!(%address, "connected");
         let peer = Peer {
             address,
@@ -345,8 +345,8 @@ impl Entry {
         };
         Connection {
             transport,
-            inward: Frames::default(),
-            outward: Frames::of_server(),
+            inward: FrameParser::default(),
+            outward: FrameParser::of_server(),
             read_pause: ReadPause::new(),
             preface: Some((PREFACE_BYTES, deadline)),
             _open: traffic.open(),
@@ -370,8 +370,8 @@ pub(super) struct Connection {
     transport: Transport,
     peer: Peer,
     /// The frames that it receives and sends.
-    inward: Frames,
-    outward: Frames,
+    inward: FrameParser,
+    outward: FrameParser,
     read_pause: ReadPause,
     /// While the client has not sent this many bytes: how many are left, and the deadline.
     preface: Option<(usize, Pin<Box<Sleep>>)>,

@@ -14,14 +14,14 @@ use tonic::Status;
 use tonic_types::StatusExt;
 use tracing::{Instrument, debug};
 
-use super::workshop::{CancelFlag, Urgency, Workshop};
+use super::job_pool::{CancelFlag, JobPool, Urgency};
 use crate::budget::Account;
 use crate::force_law::Disc;
-use crate::pace::Live;
-use crate::pace::laws::{SoughtLaw, have_same_laws};
+use crate::realtime::SessionHandle;
+use crate::realtime::laws::{SoughtLaw, have_same_laws};
 use crate::session::Sample;
 use crate::session::laws::{FIRST, Laws};
-use crate::sheet::Model;
+use crate::tissue::Model;
 use palpate_proto::{pb, touch};
 use palpate_touch::Law;
 
@@ -102,22 +102,22 @@ struct Known {
 
 /// Who computes the laws of a stream.
 struct Maker {
-    workshop: Workshop,
+    job_pool: JobPool,
     account: Account,
-    live: Arc<Live>,
+    handle: Arc<SessionHandle>,
 }
 
 impl Maker {
     /// The law to begin with: at most 50 ms of work.
     async fn first(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
-        let sought = self.live.law(model, disc)?;
-        Ok(self.workshop.work_as(Urgency::Law, &self.account, move |stop| sought.first(stop.flag())).await??)
+        let sought = self.handle.law(model, disc)?;
+        Ok(self.job_pool.work_as(Urgency::Law, &self.account, move |stop| sought.first(stop.flag())).await??)
     }
 
     /// The exact law. It is computed depth by depth: between two of them it is the turn of other work, also of the same
     /// caller.
     async fn exact(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
-        let sought = self.live.law(model, disc)?;
+        let sought = self.handle.law(model, disc)?;
         let _turn = sought.turn().await;
         let mut computation = None;
         loop {
@@ -126,7 +126,7 @@ impl Maker {
             }
             let sought: Arc<SoughtLaw> = sought.clone();
             let advance = move |stop: &CancelFlag| sought.advance(computation, stop.flag());
-            computation = self.workshop.work_as(Urgency::BetterLaw, &self.account, advance).await?;
+            computation = self.job_pool.work_as(Urgency::BetterLaw, &self.account, advance).await?;
         }
     }
 
@@ -166,7 +166,7 @@ impl Maker {
         tell: &mpsc::Sender<LawUpdate>,
     ) {
         if let Err(status) = &law {
-            debug!(session = %self.live.id, message = status.message(), "a force law can't be had");
+            debug!(session = %self.handle.id, message = status.message(), "a force law can't be had");
         }
         let number = known.number.wrapping_add(u32::from(law.is_ok()));
         // A stream that has ended is told nothing.
@@ -183,19 +183,19 @@ pub(super) struct Computing {
 }
 
 impl Computing {
-    /// The law that a stream of `live` with a tip of `radius_m` begins with, and what comes after it.
+    /// The law that a stream of `handle` with a tip of `radius_m` begins with, and what comes after it.
     ///
     /// # Errors
     /// Returns an error if no law can be had now: for want of memory, work or time.
     pub(super) async fn begin(
-        workshop: &Workshop,
+        job_pool: &JobPool,
         account: &Account,
-        live: &Arc<Live>,
+        handle: &Arc<SessionHandle>,
         radius_m: f64,
     ) -> Result<(Arc<Law>, Self), Status> {
-        let mut tissue = live.tissue();
+        let mut tissue = handle.tissue();
         let model = tissue.borrow_and_update().1.clone();
-        let maker = Maker { workshop: workshop.clone(), account: account.clone(), live: live.clone() };
+        let maker = Maker { job_pool: job_pool.clone(), account: account.clone(), handle: handle.clone() };
         let disc = Disc::in_middle(&model, radius_m);
         let law = maker.first(&model, disc).await?;
         let known = Known { number: FIRST, model, disc, is_coarse: law.is_coarse, has_places: true };
@@ -246,54 +246,54 @@ mod tests {
     use super::*;
     use crate::budget::Budget;
     use crate::limits::Limits;
-    use crate::pace::Pacer;
+    use crate::realtime::Pacer;
     use crate::scene::{Change, PAPER, Scene};
-    use crate::sheet::choice::NEVER;
+    use crate::tissue::scheme_selection::NEVER;
 
     /// A session of a tissue whose exact law takes longer than a first one may.
-    struct Course {
+    struct LawSession {
         pacer: Arc<Pacer>,
-        workshop: Workshop,
+        job_pool: JobPool,
         account: Account,
-        live: Arc<Live>,
+        handle: Arc<SessionHandle>,
     }
 
-    impl Drop for Course {
+    impl Drop for LawSession {
         fn drop(&mut self) {
             self.pacer.stop();
         }
     }
 
-    impl Course {
+    impl LawSession {
         fn new(limits: &Limits) -> Self {
-            let sets = ["sheet.points=[21, 21]", "virtual_springs.stiffness_n_per_m=1.0"].map(str::to_owned);
+            let sets = ["sheet.points=[21, 21]", "anchor_springs.stiffness_n_per_m=1.0"].map(str::to_owned);
             let scene = Scene::parse("paper", PAPER, &sets, limits).unwrap();
             let budget = Budget::new(limits, 1, 1);
             let account = budget.account("one");
             let pacer = Pacer::start(1, 0.0, limits, budget).unwrap();
-            let live = pacer.create(&scene, false, 60.0, &account, &NEVER).unwrap();
-            Course { workshop: Workshop::open("test", limits).unwrap(), pacer, account, live }
+            let handle = pacer.create(&scene, false, 60.0, &account, &NEVER).unwrap();
+            LawSession { job_pool: JobPool::open("test", limits).unwrap(), pacer, account, handle }
         }
 
         fn radius_m(&self) -> f64 {
-            self.live.model.shape().edge_m()
+            self.handle.model.shape().edge_m()
         }
 
         /// The laws of a new stream.
         async fn begin(&self) -> (Arc<Law>, Arc<Laws>, Computing) {
-            let begun = Computing::begin(&self.workshop, &self.account, &self.live, self.radius_m()).await;
+            let begun = Computing::begin(&self.job_pool, &self.account, &self.handle, self.radius_m()).await;
             let (law, computing) = begun.unwrap();
             (law.clone(), Arc::new(Laws::new(law)), computing)
         }
 
         fn sought(&self) -> Arc<SoughtLaw> {
-            self.live.law(&self.live.model, Disc::in_middle(&self.live.model, self.radius_m())).unwrap()
+            self.handle.law(&self.handle.model, Disc::in_middle(&self.handle.model, self.radius_m())).unwrap()
         }
 
         /// Changes the tissue; tells the step from which on the other acts.
-        fn change(&self, virtual_stiffness_n_per_m: f64, at_step: Option<u64>) -> (u64, Arc<Model>) {
-            let change = Change { virtual_stiffness_n_per_m: Some(virtual_stiffness_n_per_m), ..Change::default() };
-            self.live.change(&change, at_step, |_| Ok(()), &NEVER).unwrap()
+        fn change(&self, anchor_stiffness_n_per_m: f64, at_step: Option<u64>) -> (u64, Arc<Model>) {
+            let change = Change { anchor_stiffness_n_per_m: Some(anchor_stiffness_n_per_m), ..Change::default() };
+            self.handle.change(&change, at_step, |_| Ok(()), &NEVER).unwrap()
         }
     }
 
@@ -303,7 +303,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_coarse_law_is_followed_by_the_exact_one() {
-        let course = Course::new(&Limits::default());
+        let course = LawSession::new(&Limits::default());
         let (first, laws, computing) = course.begin().await;
         let sought = course.sought();
         assert!(first.is_coarse && sought.exact().is_none());
@@ -326,7 +326,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_law_beyond_the_bound_stays_coarse_and_says_why() {
-        let course = Course::new(&Limits { law_work: 1 << 20, ..Limits::default() });
+        let course = LawSession::new(&Limits { law_work: 1 << 20, ..Limits::default() });
         for _ in 0..2 {
             let (_, laws, computing) = course.begin().await;
             let (mut updates, _computing) = computing.go_on(laws.clone(), None);
@@ -339,7 +339,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_computation_that_nobody_waits_for_ends_and_another_begins_anew() {
-        let course = Course::new(&Limits::default());
+        let course = LawSession::new(&Limits::default());
         let (_, laws, computing) = course.begin().await;
         let sought = course.sought();
         let (mut updates, handle) = computing.go_on(laws.clone(), None);
@@ -359,7 +359,7 @@ mod tests {
 
     #[tokio::test]
     async fn another_tissue_has_its_laws_told_when_it_acts() {
-        let course = Course::new(&Limits::default());
+        let course = LawSession::new(&Limits::default());
         let (_, laws, computing) = course.begin().await;
         let (mut updates, _computing) = computing.go_on(laws.clone(), None);
         assert_eq!(told(&mut updates).await.law.unwrap().number, 1);
@@ -380,7 +380,7 @@ mod tests {
 
     #[tokio::test]
     async fn a_newer_tissue_ends_the_computation_for_an_older_one() {
-        let course = Course::new(&Limits::default());
+        let course = LawSession::new(&Limits::default());
         let (_, laws, computing) = course.begin().await;
         let old = course.sought();
         let (mut updates, _computing) = computing.go_on(laws.clone(), None);

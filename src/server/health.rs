@@ -1,4 +1,4 @@
-//! What the health service reports: the services, the files of tokens, and the workshop.
+//! What the health service reports: the services, the files of tokens, and the job pool.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -9,11 +9,11 @@ use tonic_health::server::HealthReporter;
 use tracing::warn;
 
 use super::haptics::Haptics;
+use super::job_pool::JobPool;
 use super::protection::Protection;
 use super::sessions::Sessions;
 use super::traffic::Traffic;
 use super::views::Views;
-use super::workshop::Workshop;
 use palpate_proto::pb::haptic_service_server::HapticServiceServer;
 use palpate_proto::pb::session_service_server::SessionServiceServer;
 use palpate_proto::pb::view_service_server::ViewServiceServer;
@@ -25,7 +25,7 @@ pub(super) const SERVICES: [&str; 6] = [
     <HapticServiceServer<Haptics> as NamedService>::NAME,
     <ViewServiceServer<Views> as NamedService>::NAME,
     TOKENS,
-    WORKSHOP,
+    JOB_POOL,
 ];
 
 /// The health service that is serving while the tokens in use are those of the file.
@@ -77,15 +77,15 @@ pub(super) async fn end_health(mut health: HealthReporter) {
 }
 
 /// The health service that is serving while heavy work is done in time.
-const WORKSHOP: &str = "palpate.workshop";
+const JOB_POOL: &str = "palpate.job_pool";
 
-/// Reports by [`WORKSHOP`] whether the workshop's oldest job is within its deadline. Never completes.
-pub(super) async fn report_workshop(workshop: Workshop, health: HealthReporter) {
+/// Reports by [`JOB_POOL`] whether the job pool's oldest job is within its deadline. Never completes.
+pub(super) async fn report_job_pool(job_pool: JobPool, health: HealthReporter) {
     let mut checks = tokio::time::interval(Duration::from_millis(250));
     let mut was_late = None;
     loop {
         checks.tick().await;
-        let load = workshop.load();
+        let load = job_pool.load();
         if was_late.replace(load.is_late) == Some(load.is_late) {
             continue;
         }
@@ -93,6 +93,6 @@ pub(super) async fn report_workshop(workshop: Workshop, health: HealthReporter) 
             warn!(oldest_s = load.oldest_s, waiting = load.waiting, "heavy work is past its deadline");
         }
         let status = if load.is_late { ServingStatus::NotServing } else { ServingStatus::Serving };
-        health.set_service_status(WORKSHOP, status).await;
+        health.set_service_status(JOB_POOL, status).await;
     }
 }

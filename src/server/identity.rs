@@ -205,7 +205,7 @@ fn hash(token: &str) -> [u8; 32] {
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
-struct File {
+struct TokenFileContent {
     #[serde(default)]
     token: Vec<TokenEntry>,
     #[serde(default)]
@@ -228,7 +228,7 @@ struct CertificateEntry {
 }
 
 /// The callers that the server knows.
-pub struct Credentials {
+pub struct KnownCallers {
     /// Authentication is disabled.
     open: bool,
     /// There is no token file: every client certificate may do everything.
@@ -237,15 +237,15 @@ pub struct Credentials {
     certificates: Vec<(String, Caller)>,
 }
 
-impl Credentials {
+impl KnownCallers {
     /// Authentication is disabled: every caller may do everything.
     pub fn open() -> Self {
-        Credentials { open: true, any_certificate: false, tokens: Vec::new(), certificates: Vec::new() }
+        KnownCallers { open: true, any_certificate: false, tokens: Vec::new(), certificates: Vec::new() }
     }
 
     /// Every caller with a valid client certificate may do everything.
     pub fn certified() -> Self {
-        Credentials { open: false, any_certificate: true, ..Credentials::open() }
+        KnownCallers { open: false, any_certificate: true, ..KnownCallers::open() }
     }
 
     /// Whether authentication is disabled.
@@ -258,7 +258,7 @@ impl Credentials {
     /// # Errors
     /// Returns an error with the line or entry if the text is not TOML, or if an entry is invalid or a duplicate.
     pub fn parse(path: &Path, text: &str) -> Result<Self> {
-        let file: File = toml::from_str(text).map_err(|e| {
+        let file: TokenFileContent = toml::from_str(text).map_err(|e| {
             let line = e.span().map_or(1, |span| text[..span.start].matches('\n').count() + 1);
             // TOML's message may quote a token from the wrong place; a token must not appear in a log.
             let message =
@@ -280,7 +280,7 @@ impl Credentials {
             }
             Ok(Caller { name: name.into(), roles })
         };
-        let mut known = Credentials { open: false, ..Credentials::open() };
+        let mut known = KnownCallers { open: false, ..KnownCallers::open() };
         for (index, TokenEntry { name, roles, sha256 }) in file.token.into_iter().enumerate() {
             let field = format!("token[{index}]");
             let wrong = || {
@@ -360,7 +360,7 @@ pub(super) struct PresentedCredentials {
 
 impl PresentedCredentials {
     /// The caller, if the credentials are enough.
-    pub(super) fn check(&self, credentials: &Credentials) -> Result<Caller> {
+    pub(super) fn check(&self, credentials: &KnownCallers) -> Result<Caller> {
         let caller = credentials.caller(self.authorization.as_ref(), self.certificate.as_deref())?;
         caller.needs(self.role)?;
         Ok(caller)

@@ -5,11 +5,11 @@ use std::sync::{Arc, Mutex, Weak};
 
 use super::identity::PresentedCredentials;
 use crate::lock::lock;
-use crate::pace::Live;
+use crate::realtime::SessionHandle;
 use crate::session::lease::LeaseId;
 
 struct LastingLease {
-    live: Weak<Live>,
+    handle: Weak<SessionHandle>,
     id: LeaseId,
     /// The credentials of its holder, if they decide when it ends.
     presented: Option<PresentedCredentials>,
@@ -17,12 +17,14 @@ struct LastingLease {
 
 impl LastingLease {
     fn is_held(&self) -> bool {
-        self.live.upgrade().is_some_and(|live| live.at_intake(|intake, _| intake.tools_of(self.id).next().is_some()))
+        self.handle
+            .upgrade()
+            .is_some_and(|handle| handle.at_intake(|intake, _| intake.tools_of(self.id).next().is_some()))
     }
 
     /// False if it had ended already.
     fn end(&self) -> bool {
-        self.live.upgrade().is_some_and(|live| live.at_intake(|intake, _| intake.release(self.id)).is_ok())
+        self.handle.upgrade().is_some_and(|handle| handle.at_intake(|intake, _| intake.release(self.id)).is_ok())
     }
 }
 
@@ -38,12 +40,12 @@ impl std::fmt::Debug for LastingLeases {
 
 impl LastingLeases {
     /// One more. Those that have ended otherwise are forgotten, now and then.
-    pub(super) fn add(&self, live: &Arc<Live>, id: LeaseId, presented: Option<PresentedCredentials>) {
+    pub(super) fn add(&self, handle: &Arc<SessionHandle>, id: LeaseId, presented: Option<PresentedCredentials>) {
         let mut leases = lock(&self.0);
         if leases.len().is_power_of_two() && leases.len() >= 64 {
             leases.retain(LastingLease::is_held);
         }
-        leases.push(LastingLease { live: Arc::downgrade(live), id, presented });
+        leases.push(LastingLease { handle: Arc::downgrade(handle), id, presented });
     }
 
     /// Ends those for which `chosen` holds, by their holder's credentials; tells how many were still held.

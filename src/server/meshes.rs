@@ -10,13 +10,13 @@ use palpate_mesh::{Element, MeshError, ReadLimits, TriangleMesh, Unit};
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
 
-use super::uploads::{Kind, Part, Received, Uploads};
+use super::uploads::{FilePart, Received, UploadKind, Uploads};
 use crate::budget::{Account, Purpose};
 use crate::limits::Limits;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 use crate::shape::Extent;
-use crate::sheet::choice::given_up;
+use crate::tissue::scheme_selection::given_up;
 use crate::wire;
 
 /// Triangles for each vertex that a mesh may have: a closed surface has two.
@@ -53,7 +53,7 @@ pub(super) fn unit(text: &str) -> Result<Unit> {
 impl Meshes {
     /// None yet.
     pub(super) fn new(limits: &Limits) -> Self {
-        let uploads = Uploads::new(Kind {
+        let uploads = Uploads::new(UploadKind {
             names: ["mesh", "meshes"],
             id: "mesh_id",
             unknown: Reason::UnknownMesh,
@@ -71,7 +71,7 @@ impl Meshes {
     /// As for [`Uploads::add`].
     pub(super) fn add(&self, request: &pb::UploadMeshRequest, account: &Account) -> Result<pb::UploadMeshResponse> {
         let pb::UploadMeshRequest { mesh_id, offset, part, last, .. } = request;
-        let part = Part { id: mesh_id, offset: *offset, bytes: part, last: *last };
+        let part = FilePart { id: mesh_id, offset: *offset, bytes: part, last: *last };
         let (mesh_id, received_bytes) = self.uploads.add(&part, account)?;
         Ok(pb::UploadMeshResponse { mesh_id, received_bytes, ..Default::default() })
     }
@@ -81,8 +81,8 @@ impl Meshes {
     ///
     /// # Errors
     /// Refuses a mesh that this caller is not sending.
-    pub(super) fn read(&self, id: &str, file_name: &str, account: &Account) -> Result<Reading> {
-        Ok(Reading { received: self.uploads.take(id, account)?, name: name_of(file_name), limits: self.limits() })
+    pub(super) fn read(&self, id: &str, file_name: &str, account: &Account) -> Result<UploadReading> {
+        Ok(UploadReading { received: self.uploads.take(id, account)?, name: name_of(file_name), limits: self.limits() })
     }
 
     /// A mesh that this caller has sent.
@@ -120,13 +120,13 @@ fn name_of(file_name: &str) -> String {
 }
 
 /// A file that is being read.
-pub(super) struct Reading {
+pub(super) struct UploadReading {
     received: Received<TriangleMesh>,
     name: String,
     limits: ReadLimits,
 }
 
-impl Reading {
+impl UploadReading {
     /// Reads the file, mends it if asked to, and reports it. It can be used from then on, unless the report refuses it.
     ///
     /// # Errors
@@ -229,7 +229,7 @@ fn refuse(error: MeshError) -> Refusal {
 mod tests {
     use super::*;
     use crate::budget::{Budget, Resource};
-    use crate::pace::clock::now_ns;
+    use crate::realtime::clock::now_ns;
 
     const TETRAHEDRON: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n";
 

@@ -22,21 +22,21 @@ use tokio_util::sync::CancellationToken;
 
 use super::connections::{self, Connection, ConnectionSlots};
 use super::fleet::{Fleet, Standing};
+use super::job_pool::JobPool;
 use super::journals::{Journals, KeeperTally};
 use super::traffic::Traffic;
-use super::workshop::Workshop;
 use crate::budget::{Budget, Purpose, Resource};
 use crate::limits::Limits;
 use crate::lock::lock;
-use crate::pace::tally::{Count, Tally, Times};
-use crate::pace::{Pacer, RunState};
+use crate::realtime::thread_counters::{Count, ThreadCounters, Times};
+use crate::realtime::{Pacer, RunState};
 use crate::scene::record::AuditedError;
 
 /// Everything, as it is when it is asked for.
 pub(super) fn registry(
     pacer: &Arc<Pacer>,
     traffic: &Traffic,
-    workshop: &Workshop,
+    job_pool: &JobPool,
     journals: Option<&Journals>,
     fleet: Option<Arc<Fleet>>,
 ) -> Registry {
@@ -64,9 +64,9 @@ pub(super) fn registry(
     let refusals = "Calls and commands that were refused, by reason";
     registry.register("refusals", refusals, traffic.refusals.clone());
     registry.register_collector(Box::new(Stepping(pacer.clone())));
-    registry.register_collector(Box::new(Heavy(workshop.clone())));
+    registry.register_collector(Box::new(Heavy(job_pool.clone())));
     if let Some(journals) = journals {
-        registry.register_collector(Box::new(Kept(journals.tally.clone())));
+        registry.register_collector(Box::new(JournalGauges(journals.tally.clone())));
     }
     if let Some(fleet) = fleet {
         registry.register_collector(Box::new(InFleet(move || fleet.standing())));
@@ -120,9 +120,9 @@ impl<F: Fn() -> Standing + Send + Sync + 'static> Collector for InFleet<F> {
 
 /// The journals.
 #[derive(Debug)]
-struct Kept(Arc<KeeperTally>);
+struct JournalGauges(Arc<KeeperTally>);
 
-impl Collector for Kept {
+impl Collector for JournalGauges {
     #[allow(clippy::cast_precision_loss)]
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
         let KeeperTally { bytes, rounds, broken, lag_ns } = &*self.0;
@@ -140,8 +140,8 @@ impl Collector for Kept {
     }
 }
 
-/// What waits in the workshop.
-struct Heavy(Workshop);
+/// What waits in the job pool.
+struct Heavy(JobPool);
 
 impl fmt::Debug for Heavy {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -155,10 +155,10 @@ impl Collector for Heavy {
         let load = self.0.load();
         let waiting = ConstGauge::new(load.waiting as f64);
         let help = "Pieces of heavy work (sessions laid out, force laws) that wait for their turn";
-        waiting.encode(encoder.encode_descriptor("workshop_waiting", help, None, MetricType::Gauge)?)?;
+        waiting.encode(encoder.encode_descriptor("job_pool_waiting", help, None, MetricType::Gauge)?)?;
         let (unit, help) = (Some(&Unit::Seconds), "Age of the oldest piece of heavy work, under way or waiting");
         ConstGauge::new(load.oldest_s).encode(encoder.encode_descriptor(
-            "workshop_oldest",
+            "job_pool_oldest",
             help,
             unit,
             MetricType::Gauge,
@@ -205,9 +205,9 @@ impl EncodeMetric for Histogram {
 }
 
 /// Counts of the stepping threads: name, what it is, and where.
-type Counts = [(&'static str, &'static str, fn(&Tally) -> &Count); 11];
+type CounterTable = [(&'static str, &'static str, fn(&ThreadCounters) -> &Count); 11];
 
-const COUNTS: Counts = [
+const COUNTS: CounterTable = [
     ("rested_steps", "Steps that were passed over at rest", |tally| &tally.rested_steps),
     ("overruns", "Steps that were due and dropped", |tally| &tally.overruns),
     ("late_commands", "Commands that came too late for their step", |tally| &tally.late_commands),
@@ -253,12 +253,12 @@ impl Collector for Stepping {
         tell("audit_time", "Processor time of the auditor", Some(&Unit::Seconds), &ConstCounter::new(busy_s))?;
 
         let sessions = pacer.list();
-        let statuses: Vec<_> = sessions.iter().map(|live| live.status()).collect();
+        let statuses: Vec<_> = sessions.iter().map(|handle| handle.status()).collect();
         let mut states = encoder.encode_descriptor("sessions", "Sessions, by state", None, MetricType::Gauge)?;
         for (name, is) in [
             (
                 "running",
-                (|status| status.state == RunState::Running && !status.resting) as fn(&crate::pace::Status) -> bool,
+                (|status| status.state == RunState::Running && !status.resting) as fn(&crate::realtime::Status) -> bool,
             ),
             ("resting", |status| status.state == RunState::Running && status.resting),
             ("paused", |status| status.state == RunState::Paused),
@@ -278,9 +278,9 @@ impl Collector for Stepping {
             let gauge = ConstGauge::new(value);
             gauge.encode(encoder.encode_descriptor(name, help, None, MetricType::Gauge)?)
         };
-        let points: usize = sessions.iter().map(|live| live.model.len()).sum();
+        let points: usize = sessions.iter().map(|handle| handle.model.len()).sum();
         let awake: usize = statuses.iter().map(|status| status.awake_points).sum();
-        let streams: usize = sessions.iter().map(|live| live.streams()).sum();
+        let streams: usize = sessions.iter().map(|handle| handle.streams()).sum();
         gauge("memory_budget_bytes", "Memory that there is for callers", budget.bytes() as f64)?;
         gauge("callers", "Callers that have something, or are there", budget.accounts().len() as f64)?;
         gauge("held_tools", "Tools that are held", budget.taken(Resource::Leases) as f64)?;
@@ -288,7 +288,7 @@ impl Collector for Stepping {
         gauge("awake_points", "Mass points that the last steps of all sessions computed", awake as f64)?;
         gauge("streams", "Streams that read a session", streams as f64)?;
         gauge("viewers", "Streams of frames", pacer.viewers() as f64)?;
-        let newest = sessions.iter().filter_map(|live| live.audited().newest);
+        let newest = sessions.iter().filter_map(|handle| handle.audited().newest);
         let worst = newest.map(|(_, error)| error).reduce(AuditedError::max).unwrap_or_default();
         let help = "Of the newest audits of all sessions the largest error of a displacement, relative to the largest";
         gauge("audited_displacement_error_max", help, worst.displacement)?;

@@ -55,17 +55,17 @@ fn content_type(path: &str) -> &'static str {
 }
 
 /// Bytes of all files that are kept. A larger file is not served.
-const MOST_BYTES: usize = 64 << 20;
+const MAX_BYTES: usize = 64 << 20;
 
 /// Files that are kept, at most.
-const MOST_FILES: usize = 256;
+const MAX_FILES: usize = 256;
 
 /// Length and time of change of a file of the folder; none of one within the program.
 type Stamp = Option<(u64, Option<SystemTime>)>;
 
 /// A file of the page.
 #[derive(Debug, Clone)]
-struct File {
+struct PageFile {
     stamp: Stamp,
     bytes: Bytes,
     /// For `ETag`.
@@ -76,13 +76,13 @@ struct File {
 #[derive(Debug)]
 pub(super) struct Page {
     folder: PathBuf,
-    kept: Arc<tokio::sync::Mutex<Kept>>,
+    kept: Arc<tokio::sync::Mutex<PageFiles>>,
     policy: HeaderValue,
 }
 
 /// Files by their paths.
 #[derive(Debug, Default)]
-struct Kept(BTreeMap<String, File>);
+struct PageFiles(BTreeMap<String, PageFile>);
 
 impl Page {
     /// The page in a folder. It may open datagrams at its own port; `datagrams` is HOST:PORT of another, if they are there.
@@ -100,7 +100,7 @@ impl Page {
 
     /// A file. They are looked up one at a time, so requests take one thread for files, and none reads what another is
     /// reading.
-    async fn file(self: &Arc<Self>, path: &str) -> Option<File> {
+    async fn file(self: &Arc<Self>, path: &str) -> Option<PageFile> {
         let inside = PathBuf::from(path);
         // Nothing that could lead out of the folder.
         if !inside.components().all(|part| matches!(part, Component::Normal(_))) {
@@ -112,9 +112,9 @@ impl Page {
     }
 }
 
-impl Kept {
+impl PageFiles {
     /// The file of that path, read anew if it has changed.
-    fn find(&mut self, file: &Path, path: String) -> Option<File> {
+    fn find(&mut self, file: &Path, path: String) -> Option<PageFile> {
         let stamp = match std::fs::metadata(file) {
             Ok(data) => data.is_file().then(|| (data.len(), data.modified().ok())),
             Err(e) if matches!(e.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => None,
@@ -132,10 +132,10 @@ impl Kept {
             None => (None, embedded(&path)?),
         };
         let all = self.0.values().map(|file| file.bytes.len()).sum::<usize>() + bytes.len();
-        if all > MOST_BYTES || self.0.len() == MOST_FILES {
+        if all > MAX_BYTES || self.0.len() == MAX_FILES {
             self.0.clear();
         }
-        let file = File { stamp, tag: format!("\"{:032x}\"", xxh3_128(&bytes)), bytes };
+        let file = PageFile { stamp, tag: format!("\"{:032x}\"", xxh3_128(&bytes)), bytes };
         self.0.insert(path, file.clone());
         Some(file)
     }
@@ -144,10 +144,10 @@ impl Kept {
 /// All of a file of the folder.
 fn read(file: &Path) -> Option<Bytes> {
     let mut bytes = Vec::new();
-    let read = std::fs::File::open(file).and_then(|file| file.take(MOST_BYTES as u64 + 1).read_to_end(&mut bytes));
+    let read = std::fs::File::open(file).and_then(|file| file.take(MAX_BYTES as u64 + 1).read_to_end(&mut bytes));
     match read {
-        Ok(_) if bytes.len() <= MOST_BYTES => return Some(bytes.into()),
-        Ok(_) => warn!("{}: is larger than {MOST_BYTES} bytes", file.display()),
+        Ok(_) if bytes.len() <= MAX_BYTES => return Some(bytes.into()),
+        Ok(_) => warn!("{}: is larger than {MAX_BYTES} bytes", file.display()),
         Err(e) => warn!("{}: can't be read: {e}", file.display()),
     }
     None
@@ -201,10 +201,10 @@ pub(super) async fn page(page: Arc<Page>, request: Request) -> Response {
     .to_owned();
     match page.file(&path).await {
         // Names in assets/ have a hash of what is in them.
-        Some(File { bytes, tag, .. }) if path.starts_with("assets/") => {
+        Some(PageFile { bytes, tag, .. }) if path.starts_with("assets/") => {
             page.guarded(cached(bytes, tag, content_type(&path), "public, max-age=31536000, immutable", headers))
         }
-        Some(File { bytes, tag, .. }) => page.guarded(cached(bytes, tag, content_type(&path), "no-cache", headers)),
+        Some(PageFile { bytes, tag, .. }) => page.guarded(cached(bytes, tag, content_type(&path), "no-cache", headers)),
         None if path == "index.html" => {
             let html = [(header::CONTENT_TYPE, content_type(&path)), (header::CACHE_CONTROL, "no-store")];
             // Without this the policy would keep the page's own few rules out.
@@ -256,17 +256,17 @@ mod tests {
     #[tokio::test]
     async fn what_is_kept_is_bounded() {
         let (page, folder) = page();
-        for name in 0..MOST_FILES + 10 {
+        for name in 0..MAX_FILES + 10 {
             std::fs::write(folder.path().join(name.to_string()), name.to_string()).unwrap();
             assert_eq!(page.file(&name.to_string()).await.unwrap().bytes, name.to_string());
-            assert!(page.kept.lock().await.0.len() <= MOST_FILES);
+            assert!(page.kept.lock().await.0.len() <= MAX_FILES);
         }
         // Sparse: they take nothing of the disk.
-        for (name, bytes) in [("half", MOST_BYTES / 2), ("more", MOST_BYTES / 2 + 1), ("huge", MOST_BYTES + 1)] {
+        for (name, bytes) in [("half", MAX_BYTES / 2), ("more", MAX_BYTES / 2 + 1), ("huge", MAX_BYTES + 1)] {
             std::fs::File::create(folder.path().join(name)).unwrap().set_len(bytes as u64).unwrap();
-            assert_eq!(page.file(name).await.map(|file| file.bytes.len()), (bytes <= MOST_BYTES).then_some(bytes));
+            assert_eq!(page.file(name).await.map(|file| file.bytes.len()), (bytes <= MAX_BYTES).then_some(bytes));
             let kept: usize = page.kept.lock().await.0.values().map(|file| file.bytes.len()).sum();
-            assert!(kept <= MOST_BYTES, "{kept}");
+            assert!(kept <= MAX_BYTES, "{kept}");
         }
     }
 }

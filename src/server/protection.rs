@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::config::Config;
-use super::identity::Credentials;
+use super::identity::KnownCallers;
 use super::reload::{Reloaded, of_file, warn_if_readable};
 use super::tls::{self, Tls};
 use crate::refusal::{Reason, Refusal, Result};
@@ -19,7 +19,7 @@ const MINUTES_OF_DAY: u32 = 24 * 60;
 /// The protection of one server.
 pub(super) struct Protection {
     pub(super) tls: Option<Arc<Reloaded<Tls>>>,
-    pub(super) credentials: Arc<Reloaded<Credentials>>,
+    pub(super) credentials: Arc<Reloaded<KnownCallers>>,
 }
 
 impl Protection {
@@ -54,12 +54,12 @@ impl Protection {
             warn_if_readable(path, "the hashes of tokens");
         }
         let credentials = Reloaded::load("tokens", paths, move |texts| match (&tokens, texts) {
-            (Some(path), [text]) => Credentials::parse(path, text).map_err(|refusal| match refusal.place {
+            (Some(path), [text]) => KnownCallers::parse(path, text).map_err(|refusal| match refusal.place {
                 Some(_) => refusal,
                 None => of_file(path)(refusal),
             }),
-            _ if certified => Ok(Credentials::certified()),
-            _ => Ok(Credentials::open()),
+            _ if certified => Ok(KnownCallers::certified()),
+            _ => Ok(KnownCallers::open()),
         })?;
         Ok(Protection { tls, credentials: Arc::new(credentials) })
     }

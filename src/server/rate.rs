@@ -8,7 +8,7 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use crate::lock::lock;
-use crate::pace::clock::now_ns;
+use crate::realtime::clock::now_ns;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// A token bucket.

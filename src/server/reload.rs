@@ -11,14 +11,14 @@ use xxhash_rust::xxh3::xxh3_128;
 
 use crate::files;
 use crate::lock::lock;
-use crate::pace::clock::now_ns;
+use crate::realtime::clock::now_ns;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Time between two checks. They compare contents, not times: so a changed symbolic link counts too.
 const INTERVAL: Duration = Duration::from_millis(500);
 
 /// A check that takes longer is reported: the files may be on a disk that does not answer.
-const PATIENCE: Duration = Duration::from_secs(5);
+const CHECK_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// For this long an empty file counts as one that is being written; then it takes effect as an empty file.
 const EMPTY_NS: u64 = 60_000_000_000;
@@ -161,8 +161,8 @@ impl<T: Send + Sync + 'static> Reloaded<T> {
             }
             let this = self.clone();
             let mut checking = tokio::task::spawn_blocking(move || this.refresh(now_ns()));
-            if tokio::time::timeout(PATIENCE, &mut checking).await.is_err() {
-                let message = format!("the files could not be read within {} s", PATIENCE.as_secs());
+            if tokio::time::timeout(CHECK_TIMEOUT, &mut checking).await.is_err() {
+                let message = format!("the files could not be read within {} s", CHECK_TIMEOUT.as_secs());
                 self.report(Some(Refusal::new(Reason::TimedOut, self.what, message)));
                 let _ = checking.await;
             }
@@ -171,7 +171,7 @@ impl<T: Send + Sync + 'static> Reloaded<T> {
 }
 
 fn read(paths: &[PathBuf]) -> Result<Vec<String>> {
-    paths.iter().map(|path| files::read_regular_text(path, files::MOST_SECRET_BYTES)).collect()
+    paths.iter().map(|path| files::read_regular_text(path, files::MAX_SECRET_BYTES)).collect()
 }
 
 fn digest(texts: &[String]) -> u128 {

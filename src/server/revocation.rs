@@ -17,11 +17,11 @@ use tonic::body::Body;
 use tracing::{info, warn};
 
 use super::connections::Peer;
-use super::identity::{Credentials, PresentedCredentials};
+use super::identity::{KnownCallers, PresentedCredentials};
 use super::leases::LastingLeases;
 use super::reload::Reloaded;
 use crate::lock::lock;
-use crate::pace::Live;
+use crate::realtime::SessionHandle;
 use crate::refusal::{Refusal, Result};
 use crate::session::lease::LeaseId;
 
@@ -30,7 +30,7 @@ const GRACE: Duration = Duration::from_secs(1);
 
 /// The calls under way of authenticated callers.
 pub(super) struct Calls {
-    credentials: Arc<Reloaded<Credentials>>,
+    credentials: Arc<Reloaded<KnownCallers>>,
     under_way: Mutex<HashMap<u64, Weak<Call>>>,
     begun: AtomicU64,
     /// What calls that are over have left.
@@ -38,7 +38,7 @@ pub(super) struct Calls {
 }
 
 impl Calls {
-    pub(super) fn new(credentials: Arc<Reloaded<Credentials>>) -> Arc<Self> {
+    pub(super) fn new(credentials: Arc<Reloaded<KnownCallers>>) -> Arc<Self> {
         Arc::new(Calls {
             credentials,
             under_way: Mutex::default(),
@@ -110,11 +110,11 @@ impl Tenure {
     ///
     /// # Errors
     /// Refuses, and ends the lease, if that is so already.
-    pub(super) fn bind(&self, live: &Arc<Live>, lease: LeaseId) -> Result<()> {
-        self.calls.leases.add(live, lease, Some(self.presented.clone()));
+    pub(super) fn bind(&self, handle: &Arc<SessionHandle>, lease: LeaseId) -> Result<()> {
+        self.calls.leases.add(handle, lease, Some(self.presented.clone()));
         // The file may have changed since the call was let in. A change from now on finds the lease.
         self.presented.check(&self.calls.credentials.get()).map(|_| ()).inspect_err(|_| {
-            let _ = live.at_intake(|intake, _| intake.release(lease));
+            let _ = handle.at_intake(|intake, _| intake.release(lease));
         })
     }
 }
@@ -127,13 +127,13 @@ pub(super) struct Call {
     peer: Option<Peer>,
     /// Of the file by which it was looked at last.
     version: AtomicU64,
-    state: Mutex<State>,
+    state: Mutex<RevocationState>,
     inward: AtomicWaker,
     outward: AtomicWaker,
 }
 
 #[derive(Default)]
-struct State {
+struct RevocationState {
     answer: Option<Body>,
     refusal: Option<Refusal>,
 }

@@ -18,7 +18,8 @@ use super::config::Config;
 use super::connections::ConnectionSlots;
 use super::datagrams;
 use super::fleet::{self, Fleet};
-use super::health::{SERVICES, end_health, report_files, report_workshop};
+use super::health::{SERVICES, end_health, report_files, report_job_pool};
+use super::job_pool::JobPool;
 use super::journals::Journals;
 use super::journals::recorded::Recorded;
 use super::listeners::{Listeners, ServeError};
@@ -27,11 +28,10 @@ use super::revocation::Calls;
 use super::services::Services;
 use super::textures::Textures;
 use super::traffic::Traffic;
-use super::workshop::Workshop;
 use super::{admin, connections, descriptors, haptics, metrics, nodes, page, sessions, textures, views};
 use crate::budget::{Budget, give_back_to_the_system};
-use crate::pace::Pacer;
-use crate::pace::clock::now_ns;
+use crate::realtime::Pacer;
+use crate::realtime::clock::now_ns;
 use palpate_proto::pb;
 use palpate_proto::pb::admin_service_server::AdminServiceServer;
 use palpate_proto::pb::haptic_service_server::HapticServiceServer;
@@ -90,7 +90,7 @@ pub async fn serve(
     descriptors::raise();
     limits.connections =
         descriptors::connections(limits.connections, metrics.as_ref().map_or(0, |_| metrics::SCRAPERS));
-    let workshop = Workshop::open("workshop", &limits)?;
+    let job_pool = JobPool::open("job", &limits)?;
     let config = Arc::new(config);
     let fleet = match config.cluster.is_on() {
         true => Some(Fleet::join(&config, &pacer).await?),
@@ -108,7 +108,7 @@ pub async fn serve(
         fleet.begin(journals);
     }
     if let Some(listener) = metrics {
-        let registry = metrics::registry(&pacer, &traffic, &workshop, journals.as_deref(), fleet.clone());
+        let registry = metrics::registry(&pacer, &traffic, &job_pool, journals.as_deref(), fleet.clone());
         let (limits, shutdown) = (limits.clone(), shutdown.clone());
         tokio::spawn(async move { metrics::serve(listener, &limits, registry, shutdown).await });
     }
@@ -140,7 +140,7 @@ pub async fn serve(
         config,
         textures: textures.clone(),
         meshes: meshes.clone(),
-        workshop: workshop.clone(),
+        job_pool: job_pool.clone(),
         traffic: traffic.clone(),
         recorded: recorded.clone(),
         fleet: fleet.clone(),
@@ -157,7 +157,7 @@ pub async fn serve(
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
 
-    let reporting_work = report_workshop(workshop, health.clone());
+    let reporting_work = report_job_pool(job_pool, health.clone());
     let (unused, memory, sent) = (pacer.clone(), budget.clone(), recorded.clone());
     let mut most_bytes = 0;
     let sweeping = async move {
@@ -195,7 +195,7 @@ pub async fn serve(
         .max_decoding_message_size(bytes);
     let node_calls = fleet.clone().map(|fleet| {
         let sessions = sessions::Sessions(services.clone());
-        NodeServiceServer::new(nodes::Nodes { sessions, fleet }).max_decoding_message_size(fleet::MOST_MESSAGE_BYTES)
+        NodeServiceServer::new(nodes::Nodes { sessions, fleet }).max_decoding_message_size(fleet::MAX_MESSAGE_BYTES)
     });
     let views = ViewServiceServer::new(views::Views(services)).max_decoding_message_size(bytes);
     let routes = Routes::new(health_service)

@@ -6,13 +6,13 @@ use super::catalog::Catalog;
 use super::config::Config;
 use super::datagrams::Datagrams;
 use super::fleet::Fleet;
+use super::job_pool::JobPool;
 use super::journals::recorded::Recorded;
 use super::meshes::Meshes;
 use super::status;
 use super::textures::Textures;
 use super::traffic::Traffic;
-use super::workshop::Workshop;
-use crate::pace::{Live, Pacer};
+use crate::realtime::{Pacer, SessionHandle};
 use crate::refusal::{Reason, Refusal, Result};
 use palpate_proto::pb;
 
@@ -26,7 +26,7 @@ pub(crate) struct Services {
     pub(crate) textures: Textures,
     pub(crate) meshes: Meshes,
     /// Creates and changes sessions, reads meshes and scripts and computes force laws.
-    pub(crate) workshop: Workshop,
+    pub(crate) job_pool: JobPool,
     pub(crate) traffic: Arc<Traffic>,
     pub(super) recorded: Arc<Recorded>,
     /// The fleet that this server is of, if it is of one.
@@ -39,7 +39,7 @@ impl Services {
     /// # Errors
     /// Refuses an unknown ID, a session that another server of the fleet has, and all while this server may not speak for its
     /// sessions.
-    pub(super) async fn session(&self, id: &str) -> Result<Arc<Live>> {
+    pub(super) async fn session(&self, id: &str) -> Result<Arc<SessionHandle>> {
         match (self.pacer.get(id), &self.fleet) {
             (Err(unknown), Some(fleet)) if unknown.reason == Reason::UnknownSession => {
                 Err(fleet.refuse(id, unknown).await)
@@ -49,9 +49,9 @@ impl Services {
     }
 
     /// A session as clients are told of it.
-    pub(super) fn told(&self, live: &Live) -> pb::Session {
-        let ownership = self.fleet.as_ref().map(|fleet| fleet.own(live));
-        pb::Session { ownership, ..status::session(live) }
+    pub(super) fn told(&self, handle: &SessionHandle) -> pb::Session {
+        let ownership = self.fleet.as_ref().map(|fleet| fleet.own(handle));
+        pb::Session { ownership, ..status::session(handle) }
     }
 
     /// The fleet that this server is of.

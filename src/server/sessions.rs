@@ -12,15 +12,15 @@ use tracing::{info, warn};
 
 use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
-use super::cut::until_cut;
+use super::job_pool::CancelFlag;
 use super::journals;
 use super::meshes;
 use super::services::Services;
 use super::status;
-use super::workshop::CancelFlag;
+use super::stream_termination::until_cut;
 use crate::budget::{Account, Purpose, Resource, Work};
-use crate::pace::clock::now_ns;
-use crate::pace::{Birth, StreamKind};
+use crate::realtime::clock::now_ns;
+use crate::realtime::{SessionReservation, StreamKind};
 use crate::refusal::{Reason, Refusal, number};
 use crate::scene::script::Script;
 use crate::wire;
@@ -58,9 +58,9 @@ impl Sessions {
         let (catalog, config, recorded) = (self.0.catalog.clone(), self.0.config.clone(), self.0.recorded.clone());
         let birth = match &self.0.fleet {
             Some(fleet) => fleet.birth().await?,
-            None => Birth::new()?,
+            None => SessionReservation::new()?,
         };
-        let birth = Birth { recorded: config.journal_meshes || mesh.is_none(), ..birth };
+        let birth = SessionReservation { recorded: config.journal_meshes || mesh.is_none(), ..birth };
         let named = birth.clone();
         let create = move |cancel: &CancelFlag| {
             let scene = match &source {
@@ -79,19 +79,19 @@ impl Sessions {
             };
             pacer.create_as(named, &scene, (request.paused, idle_timeout_s), &payer, cancel.flag())
         };
-        let made = self.0.workshop.work(&account, create).await.and_then(|made| Ok(made?));
+        let made = self.0.job_pool.work(&account, create).await.and_then(|made| Ok(made?));
         if let Some(fleet) = &self.0.fleet {
             fleet.born(&birth, made.is_ok()).await;
         }
-        let live = made?;
-        info!(session = %live.id, scene = %live.model.scene.name, points = live.model.len(), "session created");
-        let not_kept = journals::until_durable(&live).await;
-        for warning in &live.model.warnings {
-            warn!(session = %live.id, warning);
+        let handle = made?;
+        info!(session = %handle.id, scene = %handle.model.scene.name, points = handle.model.len(), "session created");
+        let not_kept = journals::until_durable(&handle).await;
+        for warning in &handle.model.warnings {
+            warn!(session = %handle.id, warning);
         }
-        let mut session = self.0.told(&live);
+        let mut session = self.0.told(&handle);
         if let (Some(why), Some(journal)) = (not_kept, &mut session.journal) {
-            warn!(session = %live.id, why, "session created, but not kept");
+            warn!(session = %handle.id, why, "session created, but not kept");
             journal.fault = why;
         }
         Ok(session)
@@ -141,7 +141,7 @@ impl SessionService for Sessions {
         let Some(unit) = unit else { return Ok(Response::new(answer)) };
         let reading = self.0.meshes.read(&answer.mesh_id, &request.file_name, &account)?;
         let read = move |cancel: &CancelFlag| reading.finish(unit, request.repair, cancel.flag());
-        let report = self.0.workshop.work(&account, read).await??;
+        let report = self.0.job_pool.work(&account, read).await??;
         info!(
             caller = account.name(),
             bytes = answer.received_bytes,
@@ -164,7 +164,7 @@ impl SessionService for Sessions {
         if request.last {
             let (recorded, payer, id) = (self.0.recorded.clone(), account.clone(), answer.upload_id.clone());
             let read = move |cancel: &CancelFlag| recorded.read(&id, &payer, cancel.flag());
-            let told = self.0.workshop.work(&account, read).await??;
+            let told = self.0.job_pool.work(&account, read).await??;
             info!(caller = account.name(), bytes = answer.received_bytes, steps = told.end_step, "journal received");
             answer.journal = Some(told);
         }
@@ -177,7 +177,7 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::ListJournalsResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let (recorded, pacer) = (self.0.recorded.clone(), self.0.pacer.clone());
-        Ok(Response::new(self.0.workshop.work(&account, move |_: &CancelFlag| recorded.list(&pacer)).await??))
+        Ok(Response::new(self.0.job_pool.work(&account, move |_: &CancelFlag| recorded.list(&pacer)).await??))
     }
 
     async fn get_journal(
@@ -187,7 +187,7 @@ impl SessionService for Sessions {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let (recorded, pacer, request) = (self.0.recorded.clone(), self.0.pacer.clone(), request.into_inner());
         let tell = move |_: &CancelFlag| recorded.told(&request, &pacer);
-        Ok(Response::new(self.0.workshop.work(&account, tell).await??))
+        Ok(Response::new(self.0.job_pool.work(&account, tell).await??))
     }
 
     async fn save_snapshot(
@@ -195,12 +195,12 @@ impl SessionService for Sessions {
         request: Request<pb::SaveSnapshotRequest>,
     ) -> Result<Response<Self::SaveSnapshotStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
-        let live = self.0.session(&request.get_ref().session_id).await?;
-        let bytes = 4 * live.model.state_bytes() + live.model.bytes();
+        let handle = self.0.session(&request.get_ref().session_id).await?;
+        let bytes = 4 * handle.model.state_bytes() + handle.model.bytes();
         let taken = account.take(Resource::Memory(Purpose::Records), bytes, "session_id")?;
-        let present = live.save().await?;
-        let encode = move |_: &CancelFlag| journals::recorded::snapshot(&live, &present);
-        let file = self.0.workshop.work(&account, encode).await??;
+        let present = handle.save().await?;
+        let encode = move |_: &CancelFlag| journals::recorded::snapshot(&handle, &present);
+        let file = self.0.job_pool.work(&account, encode).await??;
         let parts = stream::unfold((file, 0, taken), |(file, from, taken)| async move {
             let end = file.len().min(from + SNAPSHOT_PART_BYTES);
             let part = (from < end).then(|| file[from..end].to_vec())?;
@@ -213,17 +213,17 @@ impl SessionService for Sessions {
         &self,
         request: Request<pb::GetSessionRequest>,
     ) -> Result<Response<pb::GetSessionResponse>, Status> {
-        let live = self.0.session(&request.get_ref().session_id).await?;
-        Ok(Response::new(pb::GetSessionResponse { session: Some(self.0.told(&live)) }))
+        let handle = self.0.session(&request.get_ref().session_id).await?;
+        Ok(Response::new(pb::GetSessionResponse { session: Some(self.0.told(&handle)) }))
     }
 
     async fn list_sessions(
         &self,
         _: Request<pb::ListSessionsRequest>,
     ) -> Result<Response<pb::ListSessionsResponse>, Status> {
-        let without_scene = |live: &Arc<_>| pb::Session { scene: None, ..self.0.told(live) };
-        let served = self.0.pacer.list().into_iter().filter(|live| !live.is_coming());
-        let sessions = served.map(|live| without_scene(&live)).collect();
+        let without_scene = |handle: &Arc<_>| pb::Session { scene: None, ..self.0.told(handle) };
+        let served = self.0.pacer.list().into_iter().filter(|handle| !handle.is_coming());
+        let sessions = served.map(|handle| without_scene(&handle)).collect();
         Ok(Response::new(pb::ListSessionsResponse { sessions }))
     }
 
@@ -232,10 +232,10 @@ impl SessionService for Sessions {
         request: Request<pb::DeleteSessionRequest>,
     ) -> Result<Response<pb::DeleteSessionResponse>, Status> {
         let id = &request.get_ref().session_id;
-        let live = self.0.session(id).await?;
+        let handle = self.0.session(id).await?;
         self.0.pacer.delete(id)?;
         info!(session = %id, "session deleted");
-        let journal_fault = journals::until_complete(&live).await.unwrap_or_default();
+        let journal_fault = journals::until_complete(&handle).await.unwrap_or_default();
         if let Some(fleet) = &self.0.fleet {
             fleet.until_deleted(id).await?;
         }
@@ -250,7 +250,7 @@ impl SessionService for Sessions {
         let id = request.into_inner().session_id;
         let (recorded, pacer) = (self.0.recorded.clone(), self.0.pacer.clone());
         let remove = move |_: &CancelFlag| recorded.remove(&id, &pacer);
-        let files = self.0.workshop.work(&account, remove).await??;
+        let files = self.0.job_pool.work(&account, remove).await??;
         Ok(Response::new(pb::DeleteJournalResponse { files }))
     }
 
@@ -259,8 +259,8 @@ impl SessionService for Sessions {
         request: Request<pb::StartSessionRequest>,
     ) -> Result<Response<pb::StartSessionResponse>, Status> {
         let request = request.into_inner();
-        let live = self.0.session(&request.session_id).await?;
-        let step = self.0.pacer.start_session(&live, request.until_step).await?;
+        let handle = self.0.session(&request.session_id).await?;
+        let step = self.0.pacer.start_session(&handle, request.until_step).await?;
         Ok(Response::new(pb::StartSessionResponse { step }))
     }
 
@@ -270,24 +270,24 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::UpdateTissueResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.session(&request.session_id).await?;
-        let (change, to_change, pacer) = (wire::scene::from_change(&request), live.clone(), self.0.pacer.clone());
+        let handle = self.0.session(&request.session_id).await?;
+        let (change, to_change, pacer) = (wire::scene::from_change(&request), handle.clone(), self.0.pacer.clone());
         let change =
             move |cancel: &CancelFlag| pacer.change_tissue(&to_change, &change, request.at_step, cancel.flag());
-        let (step, model) = self.0.workshop.work(&account, change).await??;
+        let (step, model) = self.0.job_pool.work(&account, change).await??;
         info!(
-            session = %live.id,
+            session = %handle.id,
             step,
             stiffness_n_per_m = model.scene.springs.stiffness_n_per_m,
             damping_n_s_per_m = model.scene.damping_n_s_per_m,
-            virtual_stiffness_n_per_m = model.scene.virtual_stiffness_n_per_m,
+            anchor_stiffness_n_per_m = model.scene.anchor_stiffness_n_per_m,
             volume_stiffness_pa = model.scene.volume_stiffness_pa,
             "tissue changed"
         );
         for warning in &model.warnings {
-            warn!(session = %live.id, warning);
+            warn!(session = %handle.id, warning);
         }
-        let session = Some(status::with_model(self.0.told(&live), &model));
+        let session = Some(status::with_model(self.0.told(&handle), &model));
         Ok(Response::new(pb::UpdateTissueResponse { step, session }))
     }
 
@@ -305,13 +305,13 @@ impl SessionService for Sessions {
     ) -> Result<Response<pb::GetStateHashResponse>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.session(&request.session_id).await?;
+        let handle = self.0.session(&request.session_id).await?;
         // A request for the current hash waits for its caller's share. A request for a later step must reach that step.
         let wait_ns = account.must_wait_ns(Work::Reading, now_ns());
         if request.at_step.is_none() && wait_ns > 0 {
             tokio::time::sleep(Duration::from_nanos(wait_ns)).await;
         }
-        let (step, hash) = live.hash_at(request.at_step, &account).await?;
+        let (step, hash) = handle.hash_at(request.at_step, &account).await?;
         Ok(Response::new(pb::GetStateHashResponse { step, state_hash: format!("{hash:032x}") }))
     }
 
@@ -331,8 +331,8 @@ impl SessionService for Sessions {
         let script_names = if session_id.is_empty() {
             self.0.catalog.script_names(&self.0.config.limits)
         } else {
-            let live = self.0.session(&session_id).await?;
-            self.0.catalog.script_names_for(&live.model.scene.name, &self.0.config.limits)
+            let handle = self.0.session(&session_id).await?;
+            self.0.catalog.script_names_for(&handle.model.scene.name, &self.0.config.limits)
         };
         Ok(Response::new(pb::ListScriptsResponse { script_names }))
     }
@@ -343,13 +343,13 @@ impl SessionService for Sessions {
     ) -> Result<Response<Self::GetScriptStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.session(&request.session_id).await?;
-        let guard = live.open_stream("GetScript", StreamKind::ReadsOnly, &account)?;
+        let handle = self.0.session(&request.session_id).await?;
+        let guard = handle.open_stream("GetScript", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());
         // A script may have megabytes of traces.
-        let read = move |_: &CancelFlag| catalog.script(&request.script_name, &live.model.scene, &config.limits);
-        let script = self.0.workshop.work(&account, read).await??;
+        let read = move |_: &CancelFlag| catalog.script(&request.script_name, &handle.model.scene, &config.limits);
+        let script = self.0.job_pool.work(&account, read).await??;
         let out = stream::unfold(Some((script, 0, guard)), |state| async move {
             let (script, from, guard) = state?;
             let (message, next) = script_part(&script, from);

@@ -1,20 +1,20 @@
 //! A session as a message: its state, counts, audits and tissue.
 
-use crate::pace::feed::Playback;
-use crate::pace::tape::Tape;
-use crate::pace::{Live, RunState};
+use crate::realtime::event_log::EventLog;
+use crate::realtime::playback::Playback;
+use crate::realtime::{RunState, SessionHandle};
 use crate::scene::Named;
 use crate::scene::record::AuditedError;
-use crate::sheet::Model;
-use crate::sheet::audit::Origin;
+use crate::tissue::Model;
+use crate::tissue::audit::Origin;
 use crate::wire;
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
 
 /// The current state of a session as a message.
-pub(super) fn session(live: &Live) -> pb::Session {
-    let status = live.status();
-    let (held_tools, lapsed_leases, counts) = live.at_intake(|intake, _| {
+pub(super) fn session(handle: &SessionHandle) -> pb::Session {
+    let status = handle.status();
+    let (held_tools, lapsed_leases, counts) = handle.at_intake(|intake, _| {
         let held = intake.holders().map(|(tool, holder)| pb::HeldTool { tool, holder: holder.to_owned() });
         (held.collect(), intake.lapsed(), intake.counts())
     });
@@ -23,7 +23,7 @@ pub(super) fn session(live: &Live) -> pb::Session {
     #[allow(clippy::cast_precision_loss)]
     let simulation_time_s = status.step as f64 / model.scene.stepping.rate_hz;
     let session = pb::Session {
-        session_id: live.id.clone(),
+        session_id: handle.id.clone(),
         state: match status.state {
             RunState::Running => pb::SessionState::Running,
             RunState::Paused => pb::SessionState::Paused,
@@ -39,7 +39,7 @@ pub(super) fn session(live: &Live) -> pb::Session {
         hold_reason: status.hold_reason.unwrap_or_default(),
         held_tools,
         lapsed_leases,
-        idle_timeout_s: live.idle_timeout_s,
+        idle_timeout_s: handle.idle_timeout_s,
         guard_events: status.guard_events,
         recovery_count: status.recovery_count,
         recoveries: status.recoveries.into_iter().map(wire::sample::recovery).collect(),
@@ -51,16 +51,16 @@ pub(super) fn session(live: &Live) -> pb::Session {
             superseded: counts.superseded,
             dropped: counts.dropped,
             waiting: counts.waiting,
-            refused: live.refused(),
+            refused: handle.refused(),
         }),
         awake_points: count(status.awake_points),
-        streams: count(live.streams()),
+        streams: count(handle.streams()),
         scene_name: model.scene.name.clone(),
         points: count(model.len()),
         extent: Some(pb::Extent { top_m: vector(model.shape().top_m()), ..wire::extent(&model.shape().extent()) }),
-        audit: audit(live),
-        journal: live.tape.as_deref().map(journal),
-        playback: live.playback.as_ref().map(playback),
+        audit: audit(handle),
+        journal: handle.event_log.as_deref().map(journal),
+        playback: handle.playback.as_ref().map(playback),
         ..Default::default()
     };
     with_model(session, model)
@@ -78,8 +78,8 @@ fn playback(playback: &Playback) -> pb::Playback {
 }
 
 /// How far a session is kept on disk.
-fn journal(tape: &Tape) -> pb::Journal {
-    let progress = tape.progress().borrow().clone();
+fn journal(event_log: &EventLog) -> pb::Journal {
+    let progress = event_log.progress().borrow().clone();
     pb::Journal {
         durable_step: progress.durable_step,
         lag_s: progress.lag_s,
@@ -90,8 +90,8 @@ fn journal(tape: &Tape) -> pb::Journal {
 }
 
 /// The results of a session's audits; `None` before the first.
-fn audit(live: &Live) -> Option<pb::Audit> {
-    let audited = live.audited();
+fn audit(handle: &SessionHandle) -> Option<pb::Audit> {
+    let audited = handle.audited();
     let (step, newest) = audited.newest?;
     let error = |error: AuditedError| Some(pb::AuditedError { displacement: error.displacement, force: error.force });
     Some(pb::Audit {

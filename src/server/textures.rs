@@ -9,13 +9,13 @@ use tonic::Status;
 
 use super::catalog::Catalog;
 use super::config::Config;
+use super::job_pool::JobPool;
 use super::page;
-use super::workshop::Workshop;
 use crate::budget::{Purpose, Resource, Taken};
 use crate::limits::Limits;
 use crate::lock::lock;
 use crate::memory;
-use crate::pace::Pacer;
+use crate::realtime::Pacer;
 use crate::refusal::Refusal;
 use crate::scene::Appearance;
 use crate::texture::{Texture, texture};
@@ -24,7 +24,7 @@ use crate::texture::{Texture, texture};
 const ACCOUNT: &str = "textures";
 
 /// Number of textures that a server keeps.
-const MOST_KEPT: usize = 8;
+const MAX_KEPT: usize = 8;
 
 /// Memory for painting a texture, bytes per pixel.
 const BYTES_PER_PIXEL: u64 = 16;
@@ -34,7 +34,7 @@ const BYTES_PER_PIXEL: u64 = 16;
 pub(crate) struct Textures {
     kept: Arc<Mutex<Vec<(Appearance, Texture, Taken)>>>,
     /// Separate threads: a texture may take a second, and sessions must not wait for it.
-    workshop: Workshop,
+    job_pool: JobPool,
     config: Arc<Config>,
     catalog: Catalog,
     pacer: Arc<Pacer>,
@@ -63,7 +63,7 @@ impl Textures {
     ) -> std::io::Result<Self> {
         Ok(Textures {
             kept: Arc::default(),
-            workshop: Workshop::open("textures", limits)?,
+            job_pool: JobPool::open("textures", limits)?,
             config: config.clone(),
             catalog: catalog.clone(),
             pacer: pacer.clone(),
@@ -79,14 +79,14 @@ impl Textures {
         let (textures, name) = (self.clone(), name.to_owned());
         // One account, so one at a time: the next request may be for the same texture.
         let account = self.pacer.budget.account(ACCOUNT);
-        Ok(self.workshop.work(&account, move |_| textures.find(&name)).await??)
+        Ok(self.job_pool.work(&account, move |_| textures.find(&name)).await??)
     }
 
     fn find(&self, name: &str) -> Result<Texture, Refusal> {
         let limits = &self.config.limits;
         let appearance = match (name, self.pacer.get(name)) {
             ("default", _) => Appearance::default(),
-            (_, Ok(live)) => live.model.scene.appearance.clone(),
+            (_, Ok(handle)) => handle.model.scene.appearance.clone(),
             _ => self.catalog.load(name, &[], limits)?.appearance,
         };
         let mut kept = lock(&self.kept);
@@ -95,7 +95,7 @@ impl Textures {
         }
         let account = self.pacer.budget.account(ACCOUNT);
         let side = u64::from(appearance.texture_size);
-        if kept.len() == MOST_KEPT {
+        if kept.len() == MAX_KEPT {
             kept.remove(0);
         }
         let mut taken =

@@ -26,7 +26,7 @@ const PORTIONS: usize = 16;
 
 /// Longest time without reading while readers take nothing. Then another portion is read regardless: an answer may depend on
 /// later frames, and frames of a stream that has ended are never taken.
-const PATIENCE: Duration = Duration::from_millis(100);
+const READER_TIMEOUT: Duration = Duration::from_millis(100);
 
 /// Control frames that are read in a second, and at once. A client that reads from this server as fast as it can sends some
 /// thousand a second.
@@ -117,7 +117,7 @@ impl ReadPause {
     pub(super) fn poll(&mut self, gate: &Gate, context: &mut Context<'_>) -> Poll<()> {
         ready!(self.poll_slowed(gate, context));
         if gate.is_full() {
-            let until = Instant::now() + PATIENCE;
+            let until = Instant::now() + READER_TIMEOUT;
             let pause = self.untaken.get_or_insert_with(|| Box::pin(tokio::time::sleep_until(until)));
             ready!(pause.as_mut().poll(context));
             gate.charged_bytes.store(0, Ordering::Release);
@@ -160,7 +160,7 @@ pub(super) struct Cut {
 
 /// A reader of the frame headers in one direction of a connection: the state of its parser.
 #[derive(Debug, Default)]
-pub(super) enum Frames {
+pub(super) enum FrameParser {
     /// Nothing has arrived yet.
     #[default]
     Unknown,
@@ -182,7 +182,7 @@ const GOAWAY: u8 = 7;
 const CONTINUATION: u8 = 9;
 
 /// Bytes of a GOAWAY's payload that are kept: the last stream, the error code, and the beginning of the debug data.
-const MOST_OF_GOAWAY: usize = 8 + 64;
+const MAX_OF_GOAWAY: usize = 8 + 64;
 
 /// Names of the error codes, RFC 9113, section 7.
 const REASONS: [&str; 14] = [
@@ -202,15 +202,15 @@ const REASONS: [&str; 14] = [
     "HTTP_1_1_REQUIRED",
 ];
 
-impl Frames {
+impl FrameParser {
     /// The state before a server's first frame: a server sends no preface.
     pub(super) fn of_server() -> Self {
-        Frames::Head([0; HEAD_BYTES], 0)
+        FrameParser::Head([0; HEAD_BYTES], 0)
     }
 
     /// Whether the protocol is HTTP/2.
     pub(super) fn are_read(&self) -> bool {
-        !matches!(self, Frames::Unknown | Frames::Preface(_) | Frames::Other)
+        !matches!(self, FrameParser::Unknown | FrameParser::Preface(_) | FrameParser::Other)
     }
 
     /// Parses further bytes and counts their DATA frames at `gate`. Returns the reason if they end the connection.
@@ -218,21 +218,21 @@ impl Frames {
         let mut cut = None;
         while !bytes.is_empty() {
             match self {
-                Frames::Unknown => *self = Frames::Preface(0),
-                Frames::Other => break,
-                Frames::Preface(read) => {
+                FrameParser::Unknown => *self = FrameParser::Preface(0),
+                FrameParser::Other => break,
+                FrameParser::Preface(read) => {
                     let here = bytes.len().min(PREFACE.len() - *read);
                     if bytes[..here] != PREFACE[*read..*read + here] {
-                        *self = Frames::Other;
+                        *self = FrameParser::Other;
                         break;
                     }
                     *read += here;
                     bytes = &bytes[here..];
                     if *read == PREFACE.len() {
-                        *self = Frames::Head([0; HEAD_BYTES], 0);
+                        *self = FrameParser::Head([0; HEAD_BYTES], 0);
                     }
                 }
-                Frames::Head(head, read) => {
+                FrameParser::Head(head, read) => {
                     let here = bytes.len().min(HEAD_BYTES - *read);
                     head[*read..*read + here].copy_from_slice(&bytes[..here]);
                     *read += here;
@@ -245,28 +245,28 @@ impl Frames {
                             (_, Some(gate)) => _ = gate.control_frames.fetch_add(1, Ordering::AcqRel),
                         }
                         *self = match (head[3], length) {
-                            (_, 0) => Frames::Head([0; HEAD_BYTES], 0),
-                            (GOAWAY, _) => Frames::GoAway(length, Vec::new()),
-                            _ => Frames::Payload(length),
+                            (_, 0) => FrameParser::Head([0; HEAD_BYTES], 0),
+                            (GOAWAY, _) => FrameParser::GoAway(length, Vec::new()),
+                            _ => FrameParser::Payload(length),
                         };
                     }
                 }
-                Frames::Payload(left) => {
+                FrameParser::Payload(left) => {
                     let here = bytes.len().min(*left);
                     bytes = &bytes[here..];
                     *left -= here;
                     if *left == 0 {
-                        *self = Frames::Head([0; HEAD_BYTES], 0);
+                        *self = FrameParser::Head([0; HEAD_BYTES], 0);
                     }
                 }
-                Frames::GoAway(left, kept) => {
+                FrameParser::GoAway(left, kept) => {
                     let here = bytes.len().min(*left);
-                    kept.extend(&bytes[..here.min(MOST_OF_GOAWAY - kept.len())]);
+                    kept.extend(&bytes[..here.min(MAX_OF_GOAWAY - kept.len())]);
                     bytes = &bytes[here..];
                     *left -= here;
                     if *left == 0 {
                         cut = parse_goaway(kept).or(cut);
-                        *self = Frames::Head([0; HEAD_BYTES], 0);
+                        *self = FrameParser::Head([0; HEAD_BYTES], 0);
                     }
                 }
             }
@@ -305,7 +305,7 @@ mod tests {
         let said = [PREFACE, &frame(4, &[0; 18]), &frame(DATA, &[7; 56]), &frame(DATA, &[0; 300]), &frame(DATA, &[])];
         let said = [&said.concat()[..], &frame(GOAWAY, &goaway), &frame(DATA, &[9; 6])].concat();
         for piece in 1..said.len() {
-            let (gate, mut frames) = (Gate::new(WINDOW_BYTES), Frames::default());
+            let (gate, mut frames) = (Gate::new(WINDOW_BYTES), FrameParser::default());
             let cuts: Vec<_> = said.chunks(piece).filter_map(|bytes| frames.pass(bytes, Some(&gate))).collect();
             assert!(frames.are_read());
             assert_eq!(charged(&gate), 200 + 250, "in pieces of {piece}");
@@ -321,10 +321,10 @@ mod tests {
 
     #[test]
     fn an_orderly_end_is_no_error_and_another_protocol_is_not_parsed() {
-        let mut frames = Frames::of_server();
+        let mut frames = FrameParser::of_server();
         assert_eq!(frames.pass(&frame(GOAWAY, &[0; 8]), None), None);
         assert_eq!(frames.pass(&frame(GOAWAY, &[0; 3]), None), None);
-        let (gate, mut frames) = (Gate::new(WINDOW_BYTES), Frames::default());
+        let (gate, mut frames) = (Gate::new(WINDOW_BYTES), FrameParser::default());
         assert_eq!(frames.pass(b"PRI * HTTP/1.1\r\n", Some(&gate)), None);
         assert_eq!(frames.pass(&frame(DATA, &[1; 4]), Some(&gate)), None);
         assert!(!frames.are_read() && charged(&gate) == 0);
@@ -339,14 +339,14 @@ mod tests {
         let begun = Instant::now();
         let passed = std::future::poll_fn(|context| read_pause.poll(&gate, context));
         passed.await;
-        assert!(begun.elapsed() >= PATIENCE);
+        assert!(begun.elapsed() >= READER_TIMEOUT);
         assert_eq!(charged(&gate), 0);
         std::future::poll_fn(|context| read_pause.poll(&gate, context)).await;
     }
 
     #[test]
     fn control_frames_are_counted_and_read_at_a_limited_rate() {
-        let (gate, mut frames, mut read_pause) = (Gate::new(WINDOW_BYTES), Frames::default(), ReadPause::new());
+        let (gate, mut frames, mut read_pause) = (Gate::new(WINDOW_BYTES), FrameParser::default(), ReadPause::new());
         frames.pass(PREFACE, Some(&gate));
         frames.pass(&[frame(6, &[0; 8]), frame(1, &[0; 8]), frame(DATA, &[0; 8]), frame(4, &[])].concat(), Some(&gate));
         assert_eq!(gate.control_frames.load(Ordering::Acquire), 2);

@@ -5,11 +5,11 @@ use std::sync::{Arc, Mutex};
 use crate::budget::{Account, Purpose, Resource, Taken};
 use crate::ids::random_id;
 use crate::lock::lock;
-use crate::pace::clock::now_ns;
+use crate::realtime::clock::now_ns;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// What is sent: how refusals name it, and its bounds.
-pub(super) struct Kind {
+pub(super) struct UploadKind {
     /// One of it, and several.
     pub(super) names: [&'static str; 2],
     /// The field of requests that names it.
@@ -26,7 +26,7 @@ pub(super) struct Kind {
 }
 
 /// A part of a file.
-pub(super) struct Part<'p> {
+pub(super) struct FilePart<'p> {
     /// Names the file; empty with its first part.
     pub(super) id: &'p str,
     /// So many bytes of the file come before it.
@@ -39,13 +39,13 @@ pub(super) struct Part<'p> {
 /// A file that a client is sending or has sent.
 struct Upload<T> {
     id: String,
-    state: State<T>,
+    state: UploadState<T>,
     /// When the last part came, or it was used last.
     touched_ns: u64,
     taken: Taken,
 }
 
-enum State<T> {
+enum UploadState<T> {
     /// What has come so far.
     Receiving(Vec<u8>),
     /// A job reads it.
@@ -54,13 +54,13 @@ enum State<T> {
     Ready(Arc<T>),
 }
 
-struct Shared<T> {
-    kind: Kind,
+struct UploadShared<T> {
+    kind: UploadKind,
     uploads: Mutex<Vec<Upload<T>>>,
 }
 
 /// The files of one kind of all clients, each read as a `T` when it has come in full.
-pub(super) struct Uploads<T>(Arc<Shared<T>>);
+pub(super) struct Uploads<T>(Arc<UploadShared<T>>);
 
 impl<T> Clone for Uploads<T> {
     fn clone(&self) -> Self {
@@ -70,11 +70,11 @@ impl<T> Clone for Uploads<T> {
 
 impl<T> Uploads<T> {
     /// None yet.
-    pub(super) fn new(kind: Kind) -> Self {
-        Uploads(Arc::new(Shared { kind, uploads: Mutex::default() }))
+    pub(super) fn new(kind: UploadKind) -> Self {
+        Uploads(Arc::new(UploadShared { kind, uploads: Mutex::default() }))
     }
 
-    pub(super) fn kind(&self) -> &Kind {
+    pub(super) fn kind(&self) -> &UploadKind {
         &self.0.kind
     }
 
@@ -83,14 +83,19 @@ impl<T> Uploads<T> {
     /// # Errors
     /// Refuses a part that does not follow what has come before, a file that this caller is not sending, and more than the
     /// limits or the caller's part of the memory allow.
-    pub(super) fn add(&self, part: &Part<'_>, account: &Account) -> Result<(String, u64)> {
+    pub(super) fn add(&self, part: &FilePart<'_>, account: &Account) -> Result<(String, u64)> {
         let (now, kind) = (now_ns(), self.kind());
         self.forget_expired(now);
         let mut uploads = lock(&self.0.uploads);
         let index = if part.id.is_empty() {
             self.make_room(&mut uploads, account)?;
             let taken = account.take(Resource::Memory(kind.purpose), 0, "part")?;
-            uploads.push(Upload { id: random_id()?, state: State::Receiving(Vec::new()), touched_ns: now, taken });
+            uploads.push(Upload {
+                id: random_id()?,
+                state: UploadState::Receiving(Vec::new()),
+                touched_ns: now,
+                taken,
+            });
             uploads.len() - 1
         } else {
             self.find(&uploads, part.id, account)?
@@ -112,12 +117,12 @@ impl<T> Uploads<T> {
 
     /// Makes room for a further file of a caller: the oldest one that has come in full gives way.
     fn make_room(&self, uploads: &mut Vec<Upload<T>>, account: &Account) -> Result<()> {
-        let Kind { names: [_, names], most_each: (most, key), .. } = self.kind();
+        let UploadKind { names: [_, names], most_each: (most, key), .. } = self.kind();
         let of_caller = || uploads.iter().enumerate().filter(|(_, upload)| upload.is_of(account));
         if of_caller().count() < *most {
             return Ok(());
         }
-        let ready = of_caller().filter(|(_, upload)| matches!(upload.state, State::Ready(_)));
+        let ready = of_caller().filter(|(_, upload)| matches!(upload.state, UploadState::Ready(_)));
         let Some((oldest, _)) = ready.min_by_key(|(_, upload)| upload.touched_ns) else {
             let message = format!(
                 "this caller is sending {most} {names} already ({key}); finish one, or wait until one has expired"
@@ -136,8 +141,8 @@ impl<T> Uploads<T> {
         let mut uploads = lock(&self.0.uploads);
         let index = self.find(&uploads, id, account)?;
         let upload = &mut uploads[index];
-        match std::mem::replace(&mut upload.state, State::Reading) {
-            State::Receiving(bytes) => Ok(Received { uploads: self.clone(), id: id.to_owned(), bytes }),
+        match std::mem::replace(&mut upload.state, UploadState::Reading) {
+            UploadState::Receiving(bytes) => Ok(Received { uploads: self.clone(), id: id.to_owned(), bytes }),
             state => {
                 upload.state = state;
                 Err(complete(self.kind()))
@@ -155,8 +160,8 @@ impl<T> Uploads<T> {
         let index = self.find(&uploads, id, account)?;
         uploads[index].touched_ns = now_ns();
         match &uploads[index].state {
-            State::Ready(value) => Ok(value.clone()),
-            State::Receiving(_) | State::Reading => {
+            UploadState::Ready(value) => Ok(value.clone()),
+            UploadState::Receiving(_) | UploadState::Reading => {
                 let message = "has not come in full: its last part is missing, or is being read";
                 Err(Refusal::new(Reason::OutOfTurn, self.kind().id, message))
             }
@@ -177,7 +182,7 @@ impl<T> Uploads<T> {
     }
 }
 
-fn unknown(kind: &Kind) -> Refusal {
+fn unknown(kind: &UploadKind) -> Refusal {
     let name = kind.names[0];
     let message = format!(
         "names no {name} that this caller has sent, or it has expired: send the {name} again, from its first part"
@@ -185,7 +190,7 @@ fn unknown(kind: &Kind) -> Refusal {
     Refusal::new(kind.unknown, kind.id, message)
 }
 
-fn complete(kind: &Kind) -> Refusal {
+fn complete(kind: &UploadKind) -> Refusal {
     Refusal::new(Reason::OutOfTurn, kind.id, "has come in full already: no further part follows")
 }
 
@@ -195,8 +200,8 @@ impl<T> Upload<T> {
     }
 
     /// Adds a part; returns how many bytes there are now.
-    fn add(&mut self, part: &Part<'_>, kind: &Kind) -> Result<u64> {
-        let State::Receiving(bytes) = &mut self.state else { return Err(complete(kind)) };
+    fn add(&mut self, part: &FilePart<'_>, kind: &UploadKind) -> Result<u64> {
+        let UploadState::Receiving(bytes) = &mut self.state else { return Err(complete(kind)) };
         let length = bytes.len() as u64;
         if part.offset != length {
             let message = format!("must be {length}, the bytes that have come so far, but is {}", part.offset);
@@ -229,7 +234,7 @@ pub(super) struct Received<T> {
 
 impl<T> Drop for Received<T> {
     fn drop(&mut self) {
-        let is_given_up = |upload: &Upload<T>| upload.id == self.id && matches!(upload.state, State::Reading);
+        let is_given_up = |upload: &Upload<T>| upload.id == self.id && matches!(upload.state, UploadState::Reading);
         lock(&self.uploads.0.uploads).retain(|upload| !is_given_up(upload));
     }
 }
@@ -256,7 +261,7 @@ impl<T> Received<T> {
     pub(super) fn finish(&self, value: T, bytes: u64) -> Result<()> {
         self.charge(bytes)?;
         if let Some(upload) = lock(&self.uploads.0.uploads).iter_mut().find(|upload| upload.id == self.id) {
-            upload.state = State::Ready(Arc::new(value));
+            upload.state = UploadState::Ready(Arc::new(value));
             upload.touched_ns = now_ns();
         }
         Ok(())

@@ -11,12 +11,12 @@ use tonic::{Request, Response, Status};
 use tracing::info;
 
 use super::charged_caller::ChargedCaller;
-use super::cut::until_cut;
 use super::mesh_parts::mesh_part;
 use super::services::Services;
+use super::stream_termination::until_cut;
 use crate::ids::random_id;
-use crate::pace::frames::Viewer;
-use crate::pace::{FrameReader, StreamGuard, StreamKind};
+use crate::realtime::frames::Viewer;
+use crate::realtime::{FrameReader, StreamGuard, StreamKind};
 use crate::refusal::number;
 use crate::surface::Refinement;
 use crate::texture::Texture;
@@ -24,13 +24,13 @@ use crate::wire;
 
 pub(super) struct Views(pub(super) Services);
 
-type Out<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+type ViewMessages<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 /// Frames a second if the viewer does not say.
 const DEFAULT_RATE_HZ: f64 = 60.0;
 
 /// A stream of frames under way.
-struct Frames {
+struct ViewStream {
     viewer_id: String,
     reader: FrameReader,
     _guard: StreamGuard,
@@ -40,8 +40,8 @@ struct Frames {
     skipped: u64,
 }
 
-impl Frames {
-    async fn next(mut self) -> Option<(Result<pb::WatchFramesResponse, Status>, Option<Frames>)> {
+impl ViewStream {
+    async fn next(mut self) -> Option<(Result<pb::WatchFramesResponse, Status>, Option<ViewStream>)> {
         if self.messages.is_empty() {
             match self.reader.pop().await {
                 Ok((delivery, _)) => {
@@ -65,18 +65,18 @@ impl Frames {
 
 #[tonic::async_trait]
 impl ViewService for Views {
-    type GetMeshStream = Out<pb::GetMeshResponse>;
-    type GetTextureStream = Out<pb::GetTextureResponse>;
-    type WatchFramesStream = Out<pb::WatchFramesResponse>;
+    type GetMeshStream = ViewMessages<pb::GetMeshResponse>;
+    type GetTextureStream = ViewMessages<pb::GetTextureResponse>;
+    type WatchFramesStream = ViewMessages<pb::WatchFramesResponse>;
 
     async fn get_mesh(&self, request: Request<pb::GetMeshRequest>) -> Result<Response<Self::GetMeshStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.session(&request.session_id).await?;
-        let grid = Refinement::new(&live.model.scene, request.refinement, &self.0.config.limits)?;
-        let guard = live.open_stream("GetMesh", StreamKind::ReadsOnly, &account)?;
+        let handle = self.0.session(&request.session_id).await?;
+        let grid = Refinement::new(&handle.model.scene, request.refinement, &self.0.config.limits)?;
+        let guard = handle.open_stream("GetMesh", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
-        let skin = live.skin.clone();
+        let skin = handle.skin.clone();
         let out = stream::unfold((0, guard, skin), move |(part, guard, skin)| async move {
             mesh_part(skin.as_deref(), grid, part).map(|message| (Ok(message), (part + 1, guard, skin)))
         });
@@ -112,17 +112,17 @@ impl ViewService for Views {
     ) -> Result<Response<Self::WatchFramesStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.session(&request.session_id).await?;
-        let grid = Refinement::new(&live.model.scene, request.refinement, &self.0.config.limits)?;
+        let handle = self.0.session(&request.session_id).await?;
+        let grid = Refinement::new(&handle.model.scene, request.refinement, &self.0.config.limits)?;
         let encoding = wire::sample::from_encoding(request.encoding)?;
-        let most_hz = live.model.scene.stepping.rate_hz;
+        let most_hz = handle.model.scene.stepping.rate_hz;
         let rate_hz = request.rate_hz.unwrap_or(DEFAULT_RATE_HZ.min(most_hz));
         let range = format!("above 0 and at most the session's {most_hz}");
         number("rate_hz", rate_hz, &range, |v| v > 0.0 && v <= most_hz)?;
         if let Some(most) = request.max_frames_in_flight {
             number("max_frames_in_flight", f64::from(most), "from 1 to 64", |v| (1.0..=64.0).contains(&v))?;
         }
-        let guard = live.open_stream("WatchFrames", StreamKind::ReadsOnly, &account)?;
+        let guard = handle.open_stream("WatchFrames", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let room = self.0.config.limits.queued_bytes;
         let viewer_id = random_id()?;
@@ -136,9 +136,9 @@ impl ViewService for Views {
             room,
             &account,
         )?;
-        self.0.pacer.add_viewer(&live, &viewer);
-        info!(session = %live.id, refinement = request.refinement, ?encoding, rate_hz, "viewer joined");
-        let frames = Frames { viewer_id, reader, _guard: guard, messages: VecDeque::new(), last: None, skipped: 0 };
+        self.0.pacer.add_viewer(&handle, &viewer);
+        info!(session = %handle.id, refinement = request.refinement, ?encoding, rate_hz, "viewer joined");
+        let frames = ViewStream { viewer_id, reader, _guard: guard, messages: VecDeque::new(), last: None, skipped: 0 };
         let out = stream::unfold(Some(frames), |frames| async move { frames?.next().await });
         Ok(Response::new(until_cut(out, cut)))
     }

@@ -11,8 +11,8 @@ use super::command::Due;
 use crate::scene::Precision;
 use crate::scene::record::{AuditedError, Record};
 use crate::scene::script::Script;
-use crate::sheet::Model;
-use crate::sheet::audit::{Extent, FINER, Finding, Inputs, Mark, Opening};
+use crate::tissue::Model;
+use crate::tissue::audit::{AuditFinding, ErrorExtent, FINER, Mark, WindowInputs, WindowOpening};
 
 /// The model of the session to compare with.
 fn twin_of(model: &Model) -> Arc<Model> {
@@ -23,15 +23,15 @@ fn twin_of(model: &Model) -> Arc<Model> {
 pub struct Twin {
     session: Session,
     records: VecDeque<Record>,
-    differences: Extent,
-    largest: Extent,
+    differences: ErrorExtent,
+    largest: ErrorExtent,
 }
 
 impl Twin {
     /// A twin of a session of `model` that has not begun.
     pub fn new(model: &Model) -> Self {
         let session = Session::new(&twin_of(model));
-        Twin { session, records: VecDeque::new(), differences: Extent::default(), largest: Extent::default() }
+        Twin { session, records: VecDeque::new(), differences: ErrorExtent::default(), largest: ErrorExtent::default() }
     }
 
     /// The twin's session, for inputs equal to those of the other session.
@@ -65,12 +65,12 @@ impl Twin {
         for (point, truth) in record.points.iter().zip(&truth.points) {
             for c in 0..3 {
                 let (displacement_m, force_n) = (truth.displacement_m[c], truth.reaction_n[c]);
-                let found = Extent {
+                let found = ErrorExtent {
                     displacement_m: (point.displacement_m[c] - displacement_m).abs(),
                     force_n: (point.reaction_n[c] - force_n).abs(),
                 };
                 self.differences = self.differences.max(found);
-                let size = Extent { displacement_m: displacement_m.abs(), force_n: force_n.abs() };
+                let size = ErrorExtent { displacement_m: displacement_m.abs(), force_n: force_n.abs() };
                 self.largest = self.largest.max(size);
             }
         }
@@ -85,16 +85,16 @@ impl Twin {
 /// Audits windows of a session one after the other. The choice of steps depends only on the scene and its inputs.
 #[derive(Default)]
 pub struct Windows {
-    opening: Option<Opening>,
-    largest: Extent,
+    opening: Option<WindowOpening>,
+    largest: ErrorExtent,
     begun: bool,
 }
 
 impl Windows {
     /// Call after each step, and before the first: audits the window that has ended, if one has.
-    pub fn look(&mut self, session: &mut Session) -> Option<Finding> {
+    pub fn look(&mut self, session: &mut Session) -> Option<AuditFinding> {
         if !std::mem::replace(&mut self.begun, true) {
-            session.request_audit(Inputs::default());
+            session.request_audit(WindowInputs::default());
         }
         let mut found = None;
         match session.take_mark()? {
@@ -109,7 +109,7 @@ impl Windows {
             Mark::Dropped => self.opening = None,
         }
         self.largest = found.map_or(self.largest, |finding| finding.largest);
-        session.request_audit(Inputs::default());
+        session.request_audit(WindowInputs::default());
         found
     }
 }

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use super::command::Command;
 use super::intake::Intake;
 use super::lease::LeaseId;
-use super::rules::{Checked, check_contact_work, check_tip, tip_radius_m};
+use super::rules::{CheckedCommands, check_contact_work, check_tip, tip_radius_m};
 use crate::refusal::{Reason, Refusal, Result};
 
 /// Commands that are put in the queue in one turn at the intake.
@@ -15,7 +15,7 @@ pub const SLICE: usize = 256;
 /// The rest of a batch that was accepted. [`Intake::go_on`] takes it in.
 #[derive(Debug)]
 #[must_use]
-pub struct Batch {
+pub struct AcceptedBatch {
     id: LeaseId,
     commands: std::vec::IntoIter<Command>,
 }
@@ -27,12 +27,17 @@ impl Intake {
     ///
     /// # Errors
     /// As for [`Intake::submit`]; and refuses commands of a lease of which a batch is being taken in.
-    pub fn accept(&mut self, id: LeaseId, Checked(mut commands): Checked, now_ns: u64) -> Result<Batch> {
+    pub fn accept(
+        &mut self,
+        id: LeaseId,
+        CheckedCommands(mut commands): CheckedCommands,
+        now_ns: u64,
+    ) -> Result<AcceptedBatch> {
         self.check_open()?;
         self.lapse(now_ns);
         if commands.is_empty() {
             self.renew(id, now_ns)?;
-            return Ok(Batch { id, commands: commands.into_iter() });
+            return Ok(AcceptedBatch { id, commands: commands.into_iter() });
         }
         if self.leases.of(id).any(|lease| lease.batch_since.is_some()) {
             let message = "commands of this lease are being taken in: send them one call after another";
@@ -80,12 +85,12 @@ impl Intake {
             lease.batch_since = Some(arrivals);
         }
         self.renew(id, now_ns)?;
-        Ok(Batch { id, commands: commands.into_iter() })
+        Ok(AcceptedBatch { id, commands: commands.into_iter() })
     }
 
     /// Puts at most [`SLICE`] commands of a batch in the queue. Returns whether there are more. What is meant for a tool
     /// that has been released meanwhile is dropped.
-    pub fn go_on(&mut self, batch: &mut Batch) -> bool {
+    pub fn go_on(&mut self, batch: &mut AcceptedBatch) -> bool {
         let slice = batch.commands.len().min(SLICE);
         self.coming -= slice;
         for command in batch.commands.by_ref().take(slice) {

@@ -7,19 +7,19 @@ use std::sync::Arc;
 use glam::DVec3;
 
 use super::Session;
-use super::prospect::Prospect;
+use super::scene_report::Prospect;
 use crate::limits::Limits;
 use crate::scene::profile::Poke;
 use crate::scene::script::Script;
-use crate::scene::{Body, Named, Stiffest};
+use crate::scene::{Body, Named, StiffnessBound};
 use crate::shape::PointId;
-use crate::sheet::choice::{self, Choice};
-use crate::sheet::integrate::Oscillator;
-use crate::sheet::{Model, Plan, Push};
+use crate::tissue::integrate::Oscillator;
+use crate::tissue::scheme_selection::{self, Choice};
+use crate::tissue::{Model, Plan, Push};
 
 /// The report on a scene.
 #[derive(Debug)]
-pub struct Report {
+pub struct CheckReport {
     model: Arc<Model>,
     /// What was chosen, and what would have been of each other integrator alone.
     candidates: Vec<Choice>,
@@ -38,8 +38,8 @@ const WINDOWS: usize = 50;
 const WINDOW_S: f64 = 0.004;
 
 /// Reports on a scene and on a script for it, and times a step under a poke. `clock_s` returns the time.
-pub fn check(model: &Arc<Model>, script: Option<&Script>, limits: &Limits, clock_s: &dyn Fn() -> f64) -> Report {
-    let mut candidates = choice::candidates(&model.scene, limits);
+pub fn check(model: &Arc<Model>, script: Option<&Script>, limits: &Limits, clock_s: &dyn Fn() -> f64) -> CheckReport {
+    let mut candidates = scheme_selection::candidates(&model.scene, limits);
     // What was chosen did not try what would be dearer; another format of it alone is none.
     let Plan { integrator, substeps, .. } = model.plan;
     let chosen = Choice { integrator, substeps, precision: model.precision, expected_error: model.expected_error };
@@ -47,10 +47,10 @@ pub fn check(model: &Arc<Model>, script: Option<&Script>, limits: &Limits, clock
         Some(same) => *same = chosen,
         None => candidates.push(chosen),
     }
-    Report {
+    CheckReport {
         model: model.clone(),
         candidates,
-        by_auto: choice::by_auto(&model.scene, limits),
+        by_auto: scheme_selection::by_auto(&model.scene, limits),
         prospect: Prospect::new(model, script),
         step_s: (model.predicted_step_s() <= LONGEST_STEP_S).then(|| time(model, clock_s)).flatten(),
     }
@@ -63,7 +63,7 @@ fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
     awake.sleep_tolerance = 0.0;
     let mut session = Session::new(&Arc::new(awake));
     let scene = &model.scene;
-    let stiffness = scene.virtual_stiffness_n_per_m + 0.1 * scene.springs.stiffness_n_per_m;
+    let stiffness = scene.anchor_stiffness_n_per_m + 0.1 * scene.springs.stiffness_n_per_m;
     session.tissue.push(
         0,
         Some(Push::Constant(Poke {
@@ -103,7 +103,7 @@ fn row(f: &mut fmt::Formatter<'_>, choice: &Choice) -> fmt::Result {
     writeln!(f, "  {integrator:<15} {substeps:>8}  {precision:<11}  {}", error(*expected_error))
 }
 
-impl fmt::Display for Report {
+impl fmt::Display for CheckReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let model = &self.model;
         let (scene, plan) = (&model.scene, &model.plan);
@@ -116,17 +116,17 @@ impl fmt::Display for Report {
             scene.stepping.rate_hz
         )?;
         write!(f, "{}", self.prospect)?;
-        let slowest = (sheet.virtual_stiffness_n_per_m / sheet.mass_kg).sqrt();
+        let slowest = (sheet.anchor_stiffness_n_per_m / sheet.mass_kg).sqrt();
         writeln!(
             f,
-            "frequencies   {:.3} Hz (a point on its virtual spring alone) to at most {:.3} Hz (ω_b = {:.4} rad/s, under any \
+            "frequencies   {:.3} Hz (a point on its anchor spring alone) to at most {:.3} Hz (ω_b = {:.4} rad/s, under any \
              deformation)",
             slowest / TAU,
             model.omega_bound_per_s / TAU,
             model.omega_bound_per_s
         )?;
         if let Body::Mesh(mesh) = &scene.body {
-            let Stiffest { bound, usual, vertex, .. } = mesh.stiffest;
+            let StiffnessBound { bound, usual, vertex, .. } = mesh.stiffest;
             let point = PointId::new(vertex as usize);
             let is_volume = scene.volume_is_fastest();
             writeln!(
@@ -145,7 +145,7 @@ impl fmt::Display for Report {
                     f,
                     "volume        {:.3} ml, which swells and shrinks with at most {:.3} Hz{}; the pressure rises by {:.4} Pa a ml",
                     volume.volume_m3 * 1e6,
-                    ((stiffness_n_per_m + sheet.virtual_stiffness_n_per_m) / sheet.mass_kg).sqrt() / TAU,
+                    ((stiffness_n_per_m + sheet.anchor_stiffness_n_per_m) / sheet.mass_kg).sqrt() / TAU,
                     if is_volume { " and decides the substeps" } else { "" },
                     scene.volume_stiffness_pa / volume.volume_m3 * 1e-6
                 )?;
@@ -155,7 +155,11 @@ impl fmt::Display for Report {
         if decay_s.is_finite() {
             writeln!(f, "damping       vibrations decay by e in {decay_s:.4} s")?;
         } else {
-            writeln!(f, "damping       none: vibrations last, and errors of {} s are expected", choice::LASTING_S)?;
+            writeln!(
+                f,
+                "damping       none: vibrations last, and errors of {} s are expected",
+                scheme_selection::LASTING_S
+            )?;
         }
         let times = if plan.substeps == 1 { "once" } else { "times" };
         let count = if plan.substeps == 1 { String::new() } else { format!("{} ", plan.substeps) };

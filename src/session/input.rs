@@ -6,7 +6,7 @@ use glam::DVec3;
 
 use super::command::Due;
 use super::{Session, ToolSample};
-use crate::sheet::Model;
+use crate::tissue::Model;
 
 /// One input. With the inputs of a session in their order, each at its step, a session gives the same bits again.
 #[derive(Debug, Clone)]

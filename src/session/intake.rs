@@ -14,7 +14,7 @@ use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::Scene;
 use crate::scene::script::Action;
-use crate::sheet::Model;
+use crate::tissue::Model;
 
 /// Counts of the accepted commands by outcome: `accepted` is the sum of the others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -6,11 +6,11 @@ use glam::{DMat3, DVec3};
 use palpate_touch::law::{Law, Row};
 use palpate_touch::local::{self, ContactState, LocalModel};
 
-use crate::sheet::tangent::Tangent;
-use crate::sheet::{Feel, Surroundings};
+use crate::tissue::tangent::Tangent;
+use crate::tissue::{TangentInput, ToolContact};
 
 /// Smaller forces do not limit the valid distance, N.
-const LEAST_N: f64 = 0.05;
+const MIN_N: f64 = 0.05;
 
 /// After first contact the tissue may bounce off the tool for this many samples.
 const BOUNCE_SAMPLES: u32 = 5;
@@ -37,7 +37,7 @@ pub struct Modeller {
 /// A pending computation of the stiffness under a tool, for a thread where no step waits for it.
 #[derive(Debug)]
 pub struct StiffnessJob {
-    surroundings: Surroundings,
+    surroundings: TangentInput,
     tangent: Arc<Mutex<Option<Tangent>>>,
 }
 
@@ -80,12 +80,12 @@ impl Modeller {
     }
 
     /// A computation of the stiffness from the sheet around the tool.
-    pub fn refinement(&self, surroundings: Surroundings) -> StiffnessJob {
+    pub fn refinement(&self, surroundings: TangentInput) -> StiffnessJob {
         StiffnessJob { surroundings, tangent: self.tangent.clone() }
     }
 
     /// The model after a step. K and B are the newest that were computed at the tool, or else the law's.
-    pub fn model(&mut self, feel: &Feel, step: u64, client_time_s: f64) -> LocalModel {
+    pub fn model(&mut self, feel: &ToolContact, step: u64, client_time_s: f64) -> LocalModel {
         self.sequence += 1;
         self.contact_state = feel.contact_state;
         let touches = matches!(feel.contact_state, ContactState::Sticking | ContactState::Sliding);
@@ -136,7 +136,7 @@ impl Modeller {
             surface_m,
             normal,
             curvature_per_m: feel.rest.map_or(DMat3::ZERO, |rest| rest.curvature_per_m),
-            valid_m: local::valid_m(force_n, LEAST_N, self.hardening(depth_m, &row)),
+            valid_m: local::valid_m(force_n, MIN_N, self.hardening(depth_m, &row)),
             friction: feel.friction,
             contact_state: feel.contact_state,
             law: self.number,
@@ -162,8 +162,8 @@ mod tests {
     use super::*;
 
     /// Of a tool at a height, over a surface that is level at `surface_m`.
-    fn feel(height_m: f64, surface_m: f64, contact_state: ContactState) -> Feel {
-        Feel {
+    fn tool_contact(height_m: f64, surface_m: f64, contact_state: ContactState) -> ToolContact {
+        ToolContact {
             place_m: height_m * DVec3::Z,
             velocity_m_per_s: DVec3::ZERO,
             contact_state,
@@ -194,16 +194,16 @@ mod tests {
     #[test]
     fn a_surface_that_the_tool_knocks_away_stays_in_the_model_for_some_samples() {
         let mut modeller = modeller();
-        assert_eq!(modeller.model(&feel(0.001, 0.0, ContactState::Free), 0, 0.0).surface_m, DVec3::ZERO);
+        assert_eq!(modeller.model(&tool_contact(0.001, 0.0, ContactState::Free), 0, 0.0).surface_m, DVec3::ZERO);
         // Above the surface it is where it is.
-        assert_eq!(modeller.model(&feel(0.001, -0.0005, ContactState::Free), 1, 0.0).surface_m.z, -0.0005);
+        assert_eq!(modeller.model(&tool_contact(0.001, -0.0005, ContactState::Free), 1, 0.0).surface_m.z, -0.0005);
         // Knocked: the tool is below where the surface was, and does not touch it.
         for step in 0..BOUNCE_SAMPLES {
-            let model = modeller.model(&feel(-0.001, -0.002, ContactState::Free), 2 + u64::from(step), 0.0);
+            let model = modeller.model(&tool_contact(-0.001, -0.002, ContactState::Free), 2 + u64::from(step), 0.0);
             assert_eq!(model.surface_m.z, -0.0005, "sample {step}");
         }
         // It did not come back: that is where it is now.
-        assert_eq!(modeller.model(&feel(-0.001, -0.002, ContactState::Free), 20, 0.0).surface_m.z, -0.002);
+        assert_eq!(modeller.model(&tool_contact(-0.001, -0.002, ContactState::Free), 20, 0.0).surface_m.z, -0.002);
     }
 
     #[test]
@@ -211,7 +211,7 @@ mod tests {
         let mut modeller = modeller();
         let by_law = DMat3::IDENTITY * 400.0;
         let near = |a: DMat3, b: DMat3| (a - b).abs_diff_eq(DMat3::ZERO, 1e-9);
-        assert!(near(modeller.model(&feel(0.0, 0.0, ContactState::Holding), 0, 0.0).stiffness_n_per_m, by_law));
+        assert!(near(modeller.model(&tool_contact(0.0, 0.0, ContactState::Holding), 0, 0.0).stiffness_n_per_m, by_law));
         let tangent = Tangent {
             stiffness_n_per_m: DMat3::IDENTITY * 123.0,
             damping_n_s_per_m: DMat3::IDENTITY * 4.0,
@@ -220,17 +220,18 @@ mod tests {
             iterations: 1,
         };
         *modeller.tangent.lock().unwrap_or_else(PoisonError::into_inner) = Some(tangent);
-        let model = modeller.model(&feel(0.0, 0.0, ContactState::Holding), 1, 0.0);
+        let model = modeller.model(&tool_contact(0.0, 0.0, ContactState::Holding), 1, 0.0);
         assert_eq!(model.stiffness_n_per_m, tangent.stiffness_n_per_m);
         assert_eq!(model.damping_n_s_per_m, tangent.damping_n_s_per_m);
         // It belongs to the place that was grasped.
-        modeller.model(&feel(0.001, 0.0, ContactState::Free), 2, 0.0);
-        assert!(near(modeller.model(&feel(0.0, 0.0, ContactState::Holding), 3, 0.0).stiffness_n_per_m, by_law));
+        modeller.model(&tool_contact(0.001, 0.0, ContactState::Free), 2, 0.0);
+        assert!(near(modeller.model(&tool_contact(0.0, 0.0, ContactState::Holding), 3, 0.0).stiffness_n_per_m, by_law));
     }
 
     #[test]
     fn a_stiffness_is_valid_as_far_as_half_its_change_is_a_tenth_of_the_force() {
-        let holding = Feel { force_on_tool_n: DVec3::new(0.0, 1.2, 1.6), ..feel(0.0, 0.0, ContactState::Holding) };
+        let holding =
+            ToolContact { force_on_tool_n: DVec3::new(0.0, 1.2, 1.6), ..tool_contact(0.0, 0.0, ContactState::Holding) };
         // That of a spring does not change.
         assert!(modeller().model(&holding, 0, 0.0).valid_m > 1.0);
         // This one gets 3 N/m stiffer with each millimetre.
@@ -242,7 +243,7 @@ mod tests {
         let law = Law { step_m: 0.002, rows: [0.0, 0.002, 0.004, 0.006].map(row).to_vec(), is_coarse: false };
         let mut modeller = Modeller::new(0, Arc::new(law), false);
         for depth_m in [0.0, 0.002] {
-            let feel = Feel { place_m: -depth_m * DVec3::Z, ..holding };
+            let feel = ToolContact { place_m: -depth_m * DVec3::Z, ..holding };
             let valid_m = modeller.model(&feel, 0, 0.0).valid_m;
             let change_n = 0.5 * 3000.0 * valid_m * valid_m;
             assert!((change_n - 0.2).abs() < 1e-6, "{depth_m} m deep: {valid_m} m, {change_n} N");
@@ -252,7 +253,8 @@ mod tests {
     #[test]
     fn models_are_numbered_from_1_on_and_go_on_after_the_tool_has_let_go() {
         let mut modeller = modeller();
-        let next = |modeller: &mut Modeller| modeller.model(&feel(0.001, 0.0, ContactState::Free), 0, 0.0).sequence;
+        let next =
+            |modeller: &mut Modeller| modeller.model(&tool_contact(0.001, 0.0, ContactState::Free), 0, 0.0).sequence;
         assert_eq!([next(&mut modeller), next(&mut modeller), next(&mut modeller)], [1, 2, 3]);
         modeller.let_go();
         assert_eq!(next(&mut modeller), 4);

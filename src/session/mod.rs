@@ -15,21 +15,21 @@ pub mod audit;
 pub mod batch;
 pub mod check;
 pub mod command;
-mod dent;
-pub mod handing;
+mod indentation;
 pub mod input;
 pub mod intake;
+pub mod intake_transfer;
 pub mod laws;
 pub mod lease;
 pub mod local;
 pub mod prediction;
-mod prospect;
 pub mod queue;
 pub mod recovery;
 pub mod rules;
 pub mod run;
 pub mod sampling;
 pub mod saved;
+mod scene_report;
 pub mod schedule;
 mod tool_depth;
 
@@ -42,8 +42,8 @@ use crate::scene::profile::{LoadProfile, MotionProfile, Poke};
 use crate::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
 use crate::scene::script::Action;
 use crate::shape::{self, PointId, PointName};
-use crate::sheet::audit::{Inputs, Mark};
-use crate::sheet::{self, BlowUp, Energy, Feel, Grasp, Model, PointState, Push, SheetCopy, Tissue};
+use crate::tissue::audit::{Mark, WindowInputs};
+use crate::tissue::{self, BlowUp, Energy, Grasp, Model, PointState, Push, ReadCopy, Tissue, ToolContact};
 use command::Due;
 use palpate_touch::LocalModel;
 use palpate_touch::Tip;
@@ -67,7 +67,7 @@ pub struct ToolSample {
     /// Motion and forces at the tool's control point, if it acts.
     pub contact: Option<Contact>,
     /// Motion and force of a position-controlled tool itself.
-    pub feel: Option<Feel>,
+    pub feel: Option<ToolContact>,
     /// Client time of the place of such a tool, s.
     pub place_time_s: f64,
     /// The local model from which a client renders, for a stream that requests it.
@@ -94,7 +94,7 @@ pub struct Contact {
     pub surface_displacement_m: DVec3,
     /// m/s.
     pub velocity_m_per_s: DVec3,
-    /// Force of the tissue on the tool: springs + virtual spring + damping, N.
+    /// Force of the tissue on the tool: springs + anchor spring + damping, N.
     pub force_on_tool_n: DVec3,
     /// Force of all tools on the point, N.
     pub applied_force_n: DVec3,
@@ -160,7 +160,7 @@ impl Session {
     /// Creates a session of a tissue at rest.
     pub fn new(model: &Arc<Model>) -> Self {
         Session {
-            tissue: sheet::at_rest(model),
+            tissue: tissue::at_rest(model),
             tools: Vec::new(),
             late_commands: 0,
             paused_commands: 0,
@@ -246,8 +246,8 @@ impl Session {
         }
     }
 
-    /// Requests an audit of a window of steps ([`sheet::audit`]).
-    pub fn request_audit(&mut self, inputs: Inputs) {
+    /// Requests an audit of a window of steps ([`tissue::audit`]).
+    pub fn request_audit(&mut self, inputs: WindowInputs) {
         self.tissue.request_audit(inputs);
     }
 
@@ -514,8 +514,8 @@ impl Session {
     pub fn sample(&self, only: Option<&[u32]>) -> Sample {
         let sample_of = |number: u32| {
             let tool = self.tools.get(number as usize).cloned().unwrap_or_default();
-            let feel = self.tissue.feel(number as usize);
-            let contact_of = |feel: Feel| Contact {
+            let feel = self.tissue.tool_contact(number as usize);
+            let contact_of = |feel: ToolContact| Contact {
                 point: self.model().shape().nearest(feel.anchor_m),
                 displacement_m: feel.surface_m - feel.anchor_m,
                 surface_displacement_m: self.tissue.surface_displacement_m(feel.anchor_m),
@@ -572,7 +572,7 @@ impl Session {
     }
 
     /// A copy of the tissue as it is now, of which [`record_of`] tells the points later.
-    pub fn copy(&self) -> SheetCopy {
+    pub fn copy(&self) -> ReadCopy {
         self.tissue.copy()
     }
 
@@ -585,7 +585,7 @@ impl Session {
     #[allow(clippy::cast_possible_truncation)]
     pub fn tool_records(&self) -> Vec<ToolRecord> {
         let of = |number: usize| {
-            let feel = self.tissue.feel(number)?;
+            let feel = self.tissue.tool_contact(number)?;
             Some(ToolRecord {
                 tool: number as u32,
                 place_m: array(feel.place_m),
@@ -600,7 +600,7 @@ impl Session {
     /// tissue.
     pub fn tool_on_fixed(&self) -> Option<u32> {
         let presses = |number: &usize| {
-            let feel = self.tissue.feel(*number);
+            let feel = self.tissue.tool_contact(*number);
             feel.is_some_and(|feel| feel.is_on_fixed && (feel.place_m - feel.surface_m).dot(feel.normal) < 0.0)
         };
         (0..self.tools.len()).find(presses).map(|number| number as u32)
@@ -624,12 +624,12 @@ impl Session {
 }
 
 /// The record of a point of a copy.
-pub fn record_of(copy: &SheetCopy, point: PointId) -> Point {
+pub fn record_of(copy: &ReadCopy, point: PointId) -> Point {
     point_record(copy.model().shape().name(point), &copy.point(point))
 }
 
 fn energy_record(energy: Energy) -> EnergyJ {
-    EnergyJ { kinetic: energy.kinetic_j, spring: energy.spring_j, virtual_springs: energy.virtual_j }
+    EnergyJ { kinetic: energy.kinetic_j, spring: energy.spring_j, anchor_springs: energy.anchor_j }
 }
 
 /// A vector in a record: −0 is written as 0.
@@ -643,7 +643,7 @@ fn point_record(name: PointName, state: &PointState) -> Point {
         displacement_m: array(state.displacement_m),
         velocity_m_per_s: array(state.velocity_m_per_s),
         spring_n: array(state.spring_n),
-        virtual_n: array(state.virtual_n),
+        anchor_n: array(state.anchor_n),
         damping_n: array(state.damping_n),
         applied_n: array(state.applied_n),
         reaction_n: array(state.reaction_n()),

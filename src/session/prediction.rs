@@ -10,7 +10,7 @@ use super::command::{Command, Due};
 use crate::refusal::{Result, legible, number};
 use crate::scene::check::check_tip;
 use crate::scene::script::Action;
-use crate::sheet::Model;
+use crate::tissue::Model;
 
 /// The tool of a copy.
 const TOOL: u32 = 0;
@@ -19,13 +19,13 @@ const TOOL: u32 = 0;
 pub const TICK_POINT_SUBSTEPS: u64 = 100_000;
 
 /// The largest radius of a tip on a copy, in lengths of an edge: contact costs what the tip covers.
-const MOST_EDGES: f64 = 32.0;
+const MAX_EDGES: f64 = 32.0;
 
 /// A client's usual tick, s.
 const TICK_S: f64 = 1e-3;
 
 /// A copy that has more than this to catch up goes on from now, s: the client was not there for so long.
-const MOST_BEHIND_S: f64 = 0.005;
+const MAX_BEHIND_S: f64 = 0.005;
 
 /// A tissue with one tool.
 pub struct TissueCopy {
@@ -60,8 +60,8 @@ impl TissueCopy {
     pub fn of_stranger(model: &Arc<Model>, tip: Tip) -> Result<Self> {
         let shape = model.shape();
         check_tip("tip", shape, &tip)?;
-        let most_m = MOST_EDGES * shape.edge_m();
-        let range = format!("at most {} for a copy of this tissue, {MOST_EDGES} lengths of an edge", legible(most_m));
+        let most_m = MAX_EDGES * shape.edge_m();
+        let range = format!("at most {} for a copy of this tissue, {MAX_EDGES} lengths of an edge", legible(most_m));
         number("tip.radius_m", tip.radius_m, &range, |radius_m| radius_m <= most_m)?;
         Ok(TissueCopy::new(model, tip).within(TICK_POINT_SUBSTEPS))
     }
@@ -72,7 +72,7 @@ impl TissueCopy {
         let step_s = self.session.model().scene.stepping.rate_hz.recip();
         let time_s = self.session.time_s();
         let behind_s = self.ahead_s.map(|ahead_s| now_s - ahead_s - time_s);
-        let behind_s = behind_s.filter(|behind_s| *behind_s <= MOST_BEHIND_S.max(2.0 * step_s)).unwrap_or_else(|| {
+        let behind_s = behind_s.filter(|behind_s| *behind_s <= MAX_BEHIND_S.max(2.0 * step_s)).unwrap_or_else(|| {
             // The tool goes there at once; no tool leaps farther than its largest speed lets it.
             (self.ahead_s, self.place_m) = (Some(now_s - step_s - time_s), place_m);
             step_s
@@ -108,7 +108,7 @@ impl Predictor for TissueCopy {
             return None;
         }
         self.step_to(now_s, place_m)?;
-        let felt = self.session.tissue().feel(TOOL as usize);
+        let felt = self.session.tissue().tool_contact(TOOL as usize);
         let free = Predicted { force_n: DVec3::ZERO, contact_state: ContactState::Free };
         Some(felt.map_or(free, |feel| Predicted { force_n: feel.force_on_tool_n, contact_state: feel.contact_state }))
     }
@@ -144,7 +144,7 @@ mod tests {
         let felt = (0..ticks).map(|tick| {
             let action = Action::Pose { place_m: place_m(tick), velocity_m_per_s: None, tip };
             session.advance(&mut vec![Due::in_time(Command::new(0, None, action))], |_| {});
-            session.tissue().feel(0).map_or(DVec3::ZERO, |feel| feel.force_on_tool_n)
+            session.tissue().tool_contact(0).map_or(DVec3::ZERO, |feel| feel.force_on_tool_n)
         });
         felt.collect()
     }

@@ -5,15 +5,15 @@
 //! recovery depends on steps and commands alone, so the same commands give the same bits.
 //!
 //! A recovery is expensive: the guard has repeated up to [`INTERVAL_SUBSTEPS`] substeps with shorter and shorter ones.
-//! So at the [`MOST`]th recovery within [`WINDOW_STEPS`] steps the tissue is brought to rest, and the tools that acted are
+//! So at the [`MAX_RECOVERIES`]th recovery within [`WINDOW_STEPS`] steps the tissue is brought to rest, and the tools that acted are
 //! paused: until the window is over their commands have no effect, except releases. Other tools can still cause a
 //! recovery, which pauses them as well.
 //!
 //! After a blow-up, the session is held only if nothing has acted on the tissue since it was at rest. Then no command has
 //! caused the fault, and another recovery would not help. (A fault of the program, or memory that the system refuses,
-//! holds a session too: `pace::running`.)
+//! holds a session too: `realtime::running`.)
 //!
-//! [`INTERVAL_SUBSTEPS`]: crate::sheet::guard::INTERVAL_SUBSTEPS
+//! [`INTERVAL_SUBSTEPS`]: crate::tissue::guard::INTERVAL_SUBSTEPS
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use std::sync::Arc;
 use crate::scene::record::Recovery;
 
 /// As many recoveries within [`WINDOW_STEPS`] pause the tools that acted.
-pub const MOST: usize = 4;
+pub const MAX_RECOVERIES: usize = 4;
 
 /// Length of the window, steps.
 pub const WINDOW_STEPS: u64 = 10_000;
@@ -58,7 +58,7 @@ pub(super) struct Acts {
 #[derive(Debug, Default)]
 pub struct Recoveries {
     pub(super) count: u64,
-    /// The newest, at most [`MOST`], by ascending step.
+    /// The newest, at most [`MAX_RECOVERIES`], by ascending step.
     pub(super) newest: VecDeque<Arc<Recovered>>,
     /// The commands since the guard's checkpoint, by step. The guard brings the checkpoint forward when there are many.
     pub(super) acts: VecDeque<Acts>,
@@ -77,7 +77,7 @@ impl Recoveries {
         self.newest.back().cloned()
     }
 
-    /// The newest, at most [`MOST`], by ascending step.
+    /// The newest, at most [`MAX_RECOVERIES`], by ascending step.
     pub fn list(&self) -> Vec<Recovery> {
         self.newest.iter().map(|recovered| recovered.recovery.clone()).collect()
     }
@@ -115,8 +115,8 @@ impl Recoveries {
     /// The step until which a recovery at `step` pauses the tools that acted: the end of the window, if there are too
     /// many in it.
     pub(super) fn pause_end(&self, step: u64) -> Option<u64> {
-        // The first of the newest [`MOST`], of which the one at `step` is the last.
-        let first = self.newest.iter().rev().nth(MOST - 2)?;
+        // The first of the newest [`MAX_RECOVERIES`], of which the one at `step` is the last.
+        let first = self.newest.iter().rev().nth(MAX_RECOVERIES - 2)?;
         let end = first.recovery.step + WINDOW_STEPS;
         (end > step).then_some(end)
     }
@@ -125,7 +125,7 @@ impl Recoveries {
     pub(super) fn add(&mut self, recovered: Recovered) {
         self.count += 1;
         self.disturbed = !recovered.recovery.at_rest;
-        if self.newest.len() == MOST {
+        if self.newest.len() == MAX_RECOVERIES {
             self.newest.pop_front();
         }
         self.newest.push_back(Arc::new(recovered));
@@ -139,7 +139,7 @@ pub fn describe(recovery: &Recovery) -> String {
     let rest = if *at_rest { ", brought to rest" } else { "" };
     let pause = paused_until_step.map_or(String::new(), |end| {
         format!(
-            "; there were {MOST} recoveries within {WINDOW_STEPS} steps, so commands to the tools that acted have no effect \
+            "; there were {MAX_RECOVERIES} recoveries within {WINDOW_STEPS} steps, so commands to the tools that acted have no effect \
              before step {end}"
         )
     });
@@ -156,8 +156,8 @@ mod tests {
     use crate::session::Session;
     use crate::session::command::{Command, Due};
     use crate::shape::{PointId, PointName};
-    use crate::sheet::guard::CheckFailure;
-    use crate::sheet::{BlowUp, Model};
+    use crate::tissue::guard::CheckFailure;
+    use crate::tissue::{BlowUp, Model};
 
     fn blow_up(step: u64) -> BlowUp {
         BlowUp { step, cause: CheckFailure::NotFinite { point: PointName::Point([0, 0]) } }
@@ -188,7 +188,7 @@ mod tests {
     fn a_tool_that_causes_too_many_recoveries_is_paused_and_no_other() {
         let mut session = Session::new(&Model::paper(&["sheet.points=[5, 5]"]));
         let mut sequence = 0;
-        for _ in 0..MOST {
+        for _ in 0..MAX_RECOVERIES {
             sequence += 1;
             session.advance(&mut vec![grasp(0, sequence)], |_| {});
             assert!(session.tools[0].paused_until.is_none());
@@ -196,8 +196,11 @@ mod tests {
         }
         let list = session.recoveries().list();
         let end = list[0].step + WINDOW_STEPS;
-        assert_eq!(list.iter().map(|recovery| recovery.paused_until_step).collect::<Vec<_>>()[MOST - 1], Some(end));
-        assert!(describe(&list[MOST - 1]).contains(&format!("before step {end}")));
+        assert_eq!(
+            list.iter().map(|recovery| recovery.paused_until_step).collect::<Vec<_>>()[MAX_RECOVERIES - 1],
+            Some(end)
+        );
+        assert!(describe(&list[MAX_RECOVERIES - 1]).contains(&format!("before step {end}")));
         let sample = |session: &Session, tool: usize| session.sample(Some(&[0, 1])).tools[tool].clone();
         // The command is acknowledged and has no effect; nor has a new holder's.
         session.advance(&mut vec![grasp(0, 5)], |_| {});

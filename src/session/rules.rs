@@ -1,6 +1,6 @@
 //! The rules that a command has to keep to, whenever it comes. So it is checked before its turn at the intake.
 
-use palpate_mesh::surface::Disc;
+use palpate_mesh::surface::SurfaceDisc;
 
 use super::command::Command;
 use crate::limits::Limits;
@@ -19,7 +19,7 @@ pub struct Rules {
 
 /// Commands that keep to the rules of a session.
 #[derive(Debug)]
-pub struct Checked(pub(super) Vec<Command>);
+pub struct CheckedCommands(pub(super) Vec<Command>);
 
 impl Rules {
     /// Those of a session of `scene`.
@@ -36,13 +36,13 @@ impl Rules {
     ///
     /// # Errors
     /// Refuses too many commands, and the first command that does not keep to the rules.
-    pub fn check(&self, commands: Vec<Command>) -> Result<Checked> {
+    pub fn check(&self, commands: Vec<Command>) -> Result<CheckedCommands> {
         if commands.len() > self.limits.queued_commands_per_tool {
             let message = format!("{} commands are more than a tool may have waiting", commands.len());
             return Err(Refusal::new(Reason::QueueFull, "", message));
         }
         commands.iter().try_for_each(|command| self.check_one(command))?;
-        Ok(Checked(commands))
+        Ok(CheckedCommands(commands))
     }
 
     /// Whether a command keeps to the rules.
@@ -85,12 +85,12 @@ fn check_played_by_time(command: &Command) -> Result<()> {
 }
 
 /// How many triangles a tip makes a session look up in a step of so many substeps: its disc is laid twice in each. A disc on a
-/// sheet is bounded however large it is (`sheet::footprint`), and counts nothing.
+/// sheet is bounded however large it is (`tissue::footprint`), and counts nothing.
 fn contact_work(shape: &dyn RestShape, radius_m: f64, substeps: u32) -> u64 {
     if shape.dimensions() < 3 {
         return 0;
     }
-    Disc::crossings(radius_m, shape.edge_m()).saturating_mul(2 * u64::from(substeps))
+    SurfaceDisc::crossings(radius_m, shape.edge_m()).saturating_mul(2 * u64::from(substeps))
 }
 
 /// Refuses tips that make a step longer than others of its thread can wait. `tips_m` are the radii of all tips of a session.

@@ -14,12 +14,12 @@ use crate::scene::Named;
 use crate::scene::plot::Curves;
 use crate::scene::record::{Correction, Line, Record, Run, Summary, far_warning, write_line};
 use crate::scene::script::{Action, Script};
-use crate::sheet::audit::Finding;
-use crate::sheet::{Model, Tissue};
+use crate::tissue::audit::AuditFinding;
+use crate::tissue::{Model, Tissue};
 
 /// The reason why a run ends early.
 #[derive(Debug, thiserror::Error)]
-pub enum Failure {
+pub enum RunFailure {
     /// The guard has ended the session.
     #[error("the run was stopped: {0}")]
     Held(String),
@@ -115,7 +115,7 @@ pub fn change(session: &mut Session, changes: &mut VecDeque<(u64, Arc<Model>)>) 
 }
 
 /// What a run tells on its way.
-pub enum Told<'t> {
+pub enum RunEvent<'t> {
     /// It begins.
     Run(&'t Run),
     /// A record.
@@ -139,7 +139,7 @@ pub fn run(
     output: &mut dyn Write,
     clock_s: &dyn Fn() -> f64,
     progress: &mut dyn FnMut(u64),
-) -> std::result::Result<Summary, Failure> {
+) -> std::result::Result<Summary, RunFailure> {
     self::told(model, script, [held, false], limits, clock_s, &mut |told| write(output, progress, told))
 }
 
@@ -156,7 +156,7 @@ pub fn audited(
     output: &mut dyn Write,
     clock_s: &dyn Fn() -> f64,
     progress: &mut dyn FnMut(u64),
-) -> std::result::Result<Summary, Failure> {
+) -> std::result::Result<Summary, RunFailure> {
     self::told(model, script, [held, true], limits, clock_s, &mut |told| write(output, progress, told))
 }
 
@@ -170,19 +170,19 @@ pub fn told(
     [held, audit]: [bool; 2],
     limits: &Limits,
     clock_s: &dyn Fn() -> f64,
-    tell: &mut dyn FnMut(Told<'_>) -> std::io::Result<()>,
-) -> std::result::Result<Summary, Failure> {
+    tell: &mut dyn FnMut(RunEvent<'_>) -> std::io::Result<()>,
+) -> std::result::Result<Summary, RunFailure> {
     let twin = audit.then(|| Twin::new(model));
     Playing { model, script, held, limits, twin, corrections: Vec::new() }.play(clock_s, tell)
 }
 
 /// Writes what a run tells, as JSON Lines.
-fn write(output: &mut dyn Write, progress: &mut dyn FnMut(u64), told: Told<'_>) -> std::io::Result<()> {
+fn write(output: &mut dyn Write, progress: &mut dyn FnMut(u64), told: RunEvent<'_>) -> std::io::Result<()> {
     match told {
-        Told::Run(run) => write_line(output, &Line::Run(run)),
-        Told::Record(record) => write_line(output, &record),
-        Told::Summary(summary) => write_line(output, &Line::Summary(summary)),
-        Told::Steps(steps) => {
+        RunEvent::Run(run) => write_line(output, &Line::Run(run)),
+        RunEvent::Record(record) => write_line(output, &record),
+        RunEvent::Summary(summary) => write_line(output, &Line::Summary(summary)),
+        RunEvent::Steps(steps) => {
             // The first of so many.
             if steps % 1024 == 1 {
                 progress(steps - 1);
@@ -206,15 +206,15 @@ impl Playing<'_> {
     fn play(
         mut self,
         clock_s: &dyn Fn() -> f64,
-        tell: &mut dyn FnMut(Told<'_>) -> std::io::Result<()>,
-    ) -> std::result::Result<Summary, Failure> {
+        tell: &mut dyn FnMut(RunEvent<'_>) -> std::io::Result<()>,
+    ) -> std::result::Result<Summary, RunFailure> {
         let Playing { model, script, held, limits, .. } = self;
         let mut session = Session::new(model);
-        let mut changes = model.course(&script.changes, limits)?;
+        let mut changes = model.apply_changes(&script.changes, limits)?;
         let mut player = Player::new(model, script, held, limits)?;
         player.begin(&mut session);
         self.twin.iter_mut().for_each(|twin| player.begin(twin.session()));
-        tell(Told::Run(&header(model, &script.name)))?;
+        tell(RunEvent::Run(&header(model, &script.name)))?;
         let mut due = Vec::new();
         let mut written: std::io::Result<()> = Ok(());
         let mut windows = (self.twin.is_some() && model.scene.stepping.correct).then(Windows::default);
@@ -239,7 +239,7 @@ impl Playing<'_> {
             if let Some(twin) = &mut self.twin {
                 twin.advance(&due, script);
                 if let Some(reason) = twin.fault() {
-                    return Err(Failure::Held(reason));
+                    return Err(RunFailure::Held(reason));
                 }
             }
             resumed_s = clock_s();
@@ -258,7 +258,7 @@ impl Playing<'_> {
                             curves.add(record.time_s, displacement_m.into(), force_n.into());
                         }
                         self.twin.iter_mut().for_each(|twin| twin.compare(&record));
-                        written = tell(Told::Record(record));
+                        written = tell(RunEvent::Record(record));
                     }
                     resumed_s = clock_s();
                 }
@@ -267,9 +267,9 @@ impl Playing<'_> {
             // A tissue that went back can't be compared with a twin that did not.
             let ended = if self.twin.is_some() { session.fault() } else { session.hold_reason().map(str::to_owned) };
             if let Some(reason) = ended {
-                return Err(Failure::Held(reason));
+                return Err(RunFailure::Held(reason));
             }
-            tell(Told::Steps(step + 1))?;
+            tell(RunEvent::Steps(step + 1))?;
         }
         stepping_s += clock_s() - resumed_s;
         let audited_error = self.twin.as_ref().map(Twin::error);
@@ -291,7 +291,7 @@ impl Playing<'_> {
             curves,
             ..summary(session.tissue(), stepping_s)
         };
-        tell(Told::Summary(&summary))?;
+        tell(RunEvent::Summary(&summary))?;
         Ok(summary)
     }
 
@@ -299,7 +299,7 @@ impl Playing<'_> {
     fn correct(
         &mut self,
         session: &mut Session,
-        finding: &Finding,
+        finding: &AuditFinding,
         changes: &mut VecDeque<(u64, Arc<Model>)>,
     ) -> Result<()> {
         let step = session.step_count();
@@ -408,7 +408,7 @@ mod tests {
             summary
         };
         let plain = run_with("");
-        let changed = run_with("[[tissue]]\nat_s = 0.01\nvirtual_stiffness_n_per_m = 50.0\n");
+        let changed = run_with("[[tissue]]\nat_s = 0.01\nanchor_stiffness_n_per_m = 50.0\n");
         assert_eq!((plain.steps, changed.steps), (20, 20));
         assert_ne!(plain.final_hash, changed.final_hash);
         // While a clock stands still, nothing takes time.
@@ -416,7 +416,7 @@ mod tests {
         let summary = run(&model, &script, false, &Limits::default(), &mut Vec::new(), &|| 1e6, &mut |_| {}).unwrap();
         assert_eq!(summary.wall_s, 0.0);
         // At the very end it changes nothing any more.
-        let late = run_with("[[tissue]]\nat_s = 0.02\nvirtual_stiffness_n_per_m = 50.0\n");
+        let late = run_with("[[tissue]]\nat_s = 0.02\nanchor_stiffness_n_per_m = 50.0\n");
         assert_eq!(plain.final_hash, late.final_hash);
     }
 

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use palpate_touch::news::FASTEST_S;
+use palpate_touch::dead_reckoning::FASTEST_S;
 use palpate_touch::{Law, LocalModel};
 
 use super::laws::{FIRST, Laws};
@@ -21,7 +21,7 @@ use crate::refusal::{Reason, Refusal, Result, number};
 pub const HEARTBEAT_S: f64 = 0.05;
 
 /// The longest heartbeat, s: clients take a longer silence for the end of the stream.
-pub const MOST_HEARTBEAT_S: f64 = 10.0;
+pub const MAX_HEARTBEAT_S: f64 = 10.0;
 
 /// The changes that are not worth a sample. A quantity without a bound is not compared.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -131,8 +131,8 @@ impl Sampling {
         if let Some(deadband) = &self.deadband {
             deadband.check()?;
         }
-        let range = format!("above 0 and at most {MOST_HEARTBEAT_S}");
-        number("heartbeat_s", self.heartbeat_s, &range, |v| v > 0.0 && v <= MOST_HEARTBEAT_S).map(|_| ())
+        let range = format!("above 0 and at most {MAX_HEARTBEAT_S}");
+        number("heartbeat_s", self.heartbeat_s, &range, |v| v > 0.0 && v <= MAX_HEARTBEAT_S).map(|_| ())
     }
 }
 
@@ -243,7 +243,7 @@ impl Sampler {
     pub fn refinements(&self, session: &Session) -> impl Iterator<Item = StiffnessJob> {
         let wanted = self.followed.iter().filter(|(_, followed)| followed.modeller.wants_refinement());
         wanted.filter_map(|(tool, followed)| {
-            Some(followed.modeller.refinement(session.tissue().surroundings(*tool as usize)?))
+            Some(followed.modeller.refinement(session.tissue().tangent_input(*tool as usize)?))
         })
     }
 
@@ -277,7 +277,7 @@ mod tests {
     use crate::scene::script::Action;
     use crate::session::command::{Command, Due};
     use crate::shape::PointId;
-    use crate::sheet::Model;
+    use crate::tissue::Model;
     use glam::DVec3;
     use palpate_touch::Tip;
 
@@ -333,7 +333,7 @@ mod tests {
                 model = sampler.pick(&session, false).and_then(|sample| sample.tools[0].local);
                 let refinements: Vec<_> = sampler.refinements(&session).collect();
                 // A touch begins where the tool meets the surface.
-                let touches = session.tissue().surroundings(0).is_some();
+                let touches = session.tissue().tangent_input(0).is_some();
                 assert_eq!(
                     refinements.len(),
                     usize::from(computed && touches),
@@ -475,7 +475,7 @@ mod tests {
     #[test]
     fn a_heartbeat_is_above_0_and_at_most_10_s() {
         let check = |heartbeat_s: f64| Sampling { heartbeat_s, ..sampling() }.check();
-        for good_s in [f64::MIN_POSITIVE, 0.05, MOST_HEARTBEAT_S] {
+        for good_s in [f64::MIN_POSITIVE, 0.05, MAX_HEARTBEAT_S] {
             assert_eq!(check(good_s), Ok(()), "{good_s}");
         }
         for bad_s in [0.0, -0.05, 10.001, f64::INFINITY, f64::NAN] {

@@ -1,6 +1,6 @@
 //! Snapshots: a session at one moment, as bytes, from which it goes on with the same bits as if it had never stopped.
 //!
-//! **What it has**: the state of the tissue ([`sheet::saved`]), of each tool (with its path), what recoveries depend on, and
+//! **What it has**: the state of the tissue ([`tissue::saved`]), of each tool (with its path), what recoveries depend on, and
 //! counts. It has no command that waits in an intake, no lease, no audit that is under way, and not the scene.
 //!
 //! **What a caller keeps beside it**: the scene that the session began with, no more. Changes of the tissue and corrections
@@ -25,16 +25,16 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::Xxh3;
 
-use super::recovery::{Acts, Ended, MOST, Recovered, Recoveries};
+use super::recovery::{Acts, Ended, MAX_RECOVERIES, Recovered, Recoveries};
 use super::{Posed, Session, Tool};
 use crate::limits::Limits;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::record::Recovery;
-use crate::sheet::saved::{
+use crate::tissue::saved::{
     Checks, PlainTissue, SNAPSHOT, SavedPoke, SavedTip, SavedTissue, TissueParts, TissueState, ensure, tool_above,
     unsound,
 };
-use crate::sheet::{self, Model, Tissue};
+use crate::tissue::{self, Model, Tissue};
 use palpate_touch::path::{Path, PathState};
 
 /// The first bytes of a snapshot.
@@ -117,17 +117,17 @@ struct SavedPosed {
     client_time_s: f64,
 }
 
-type Vector = [f64; 3];
+type SavedVector = [f64; 3];
 
 /// [`PathState`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct SavedPath {
     at_once: bool,
-    begins_m: Option<Vector>,
-    waiting: Vec<(f64, Vector)>,
-    heading: Option<(f64, Vector, Vector)>,
-    played: Option<(f64, Vector)>,
-    place_m: Option<Vector>,
+    begins_m: Option<SavedVector>,
+    waiting: Vec<(f64, SavedVector)>,
+    heading: Option<(f64, SavedVector, SavedVector)>,
+    played: Option<(f64, SavedVector)>,
+    place_m: Option<SavedVector>,
     arrived_s: f64,
     spare_s: f64,
     watched_s: f64,
@@ -182,10 +182,10 @@ impl Session {
         match &saved.content {
             Content::Taken { own, tissue, .. } => {
                 let PlainTissue { parts, values } = tissue.plain();
-                Session::restored(model, own, sheet::restored(model, &parts, &values, &saved.limits)?, &saved.limits)
+                Session::restored(model, own, tissue::restored(model, &parts, &values, &saved.limits)?, &saved.limits)
             }
             Content::Read { parts, values } => {
-                let tissue = sheet::restored(model, &parts.tissue, values, &saved.limits)?;
+                let tissue = tissue::restored(model, &parts.tissue, values, &saved.limits)?;
                 Session::restored(model, &parts.session, tissue, &saved.limits)
             }
         }
@@ -430,7 +430,7 @@ impl SavedRecoveries {
     }
 
     fn restored(&self, now: u64, checks: &Checks<'_>) -> Result<Recoveries> {
-        ensure(self.newest.len() <= MOST, "more recoveries than are kept")?;
+        ensure(self.newest.len() <= MAX_RECOVERIES, "more recoveries than are kept")?;
         let newest = self.newest.iter().map(|saved| {
             ensure(saved.step <= now, "a recovery that has not been yet")?;
             let recovery = Recovery {
@@ -448,9 +448,9 @@ impl SavedRecoveries {
             Ok(Arc::new(Recovered { recovery, tools: ended.collect::<Result<_>>()? }))
         });
         // Their counts are added.
-        const MOST_COUNTED: u64 = 1 << 24;
+        const MAX_COUNTED: u64 = 1 << 24;
         let acts = self.acts.iter().map(|(step, tool, count)| {
-            ensure(*step <= now && *count < MOST_COUNTED, "commands that have not come yet")?;
+            ensure(*step <= now && *count < MAX_COUNTED, "commands that have not come yet")?;
             checks.tool(u64::from(*tool))?;
             Ok(Acts { step: *step, tool: *tool, count: *count })
         });

@@ -4,7 +4,7 @@ use glam::DVec3;
 use palpate_mesh::surface::Surface;
 
 /// Samples of a straight part of a way, at most: each looks for the nearest place.
-const MOST_SAMPLES: u32 = 256;
+const MAX_SAMPLES: u32 = 256;
 
 /// The deepest place of a tool's way.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -15,7 +15,7 @@ pub(super) struct Deepest {
     pub(super) rest_m: DVec3,
 }
 
-/// The deepest place of a way along these points by a tip of `radius_m`, m, as a tool meets a mesh (`sheet::contact`): on the side where
+/// The deepest place of a way along these points by a tip of `radius_m`, m, as a tool meets a mesh (`tissue::contact`): on the side where
 /// it begins, and only while the nearest place of the surface is within its radius across the normal. None if it is beside the mesh all
 /// the time.
 pub(super) fn deepest(surface: &Surface, way_m: &[DVec3], radius_m: f64) -> Option<Deepest> {
@@ -42,7 +42,7 @@ pub(super) fn deepest(surface: &Surface, way_m: &[DVec3], radius_m: f64) -> Opti
 /// The beginning of a straight way, and places on it that are at most `apart_m` from each other.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn samples([from_m, to_m]: [DVec3; 2], apart_m: f64) -> impl Iterator<Item = DVec3> {
-    let count = ((from_m.distance(to_m) / apart_m).ceil() as u32).clamp(1, MOST_SAMPLES);
+    let count = ((from_m.distance(to_m) / apart_m).ceil() as u32).clamp(1, MAX_SAMPLES);
     (0..count).map(move |k| from_m.lerp(to_m, f64::from(k) / f64::from(count)))
 }
 

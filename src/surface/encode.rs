@@ -8,7 +8,7 @@ use glam::DVec3;
 use super::refine::Refinement;
 use super::refine::{COMPONENTS, Points, Rows, Source, Written};
 use super::snapshot::Snapshot;
-use super::wide::{Available, SixteenLanes, Width, Work};
+use super::wide::{Available, SixteenLanes, WideWork, Width};
 use crate::memory;
 
 /// Number format of displacements.
@@ -181,7 +181,7 @@ struct Fill<'f, 'v, const BYTES: usize> {
     rows: &'f mut Rows<'v>,
 }
 
-impl<const BYTES: usize> Work for Fill<'_, '_, BYTES>
+impl<const BYTES: usize> WideWork for Fill<'_, '_, BYTES>
 where
     [u8; BYTES]: Written,
 {

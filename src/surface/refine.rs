@@ -241,7 +241,7 @@ pub(super) struct Rows<'v> {
     far: Vec<Block<f32>>,
     /// A row of points before refinement, with padding for reads beyond it.
     points: Vec<f32>,
-    spread: Vec<Spread>,
+    spread: Vec<BlockPattern>,
 }
 
 /// Aligned to one cache line: a load across two costs twice as much.
@@ -251,7 +251,7 @@ struct Block<T>([T; LANES]);
 
 /// A block of vertices in a row. The pattern repeats 16 points on, after as many blocks as a point has components of
 /// vertices.
-struct Spread {
+struct BlockPattern {
     /// Beginning of the block of points that it is made from.
     begin: usize,
     /// Indices of the components on the left and right side in that block.
@@ -268,7 +268,7 @@ impl<'v> Rows<'v> {
         let periods = if cells == 1 { 0 } else { most.div_ceil(cells * LANES) };
         let [near, far] = [(); 2].map(|()| memory::filled(periods * COMPONENTS * cells, Block([0.0; LANES]), ROW));
         let points = memory::zeroed((periods + 1) * COMPONENTS * LANES, ROW);
-        let spread = (0..COMPONENTS * cells).map(|block| Spread::new(cells, block)).collect();
+        let spread = (0..COMPONENTS * cells).map(|block| BlockPattern::new(cells, block)).collect();
         Rows { cells, source, near, far, points, spread }
     }
 
@@ -319,7 +319,7 @@ impl<'v> Rows<'v> {
     }
 }
 
-impl Spread {
+impl BlockPattern {
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_precision_loss)]
     fn new(cells: usize, block: usize) -> Self {
         let begin = block * LANES / COMPONENTS / cells * COMPONENTS;
@@ -330,7 +330,7 @@ impl Spread {
             part[lane] = (vertex % cells) as f32 / cells as f32;
         }
         let right = left.map(|left| left + COMPONENTS as i32);
-        Spread { begin, left: Block(left), right: Block(right), part: Block(part) }
+        BlockPattern { begin, left: Block(left), right: Block(right), part: Block(part) }
     }
 }
 

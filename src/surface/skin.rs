@@ -9,7 +9,7 @@ use palpate_mesh::Group;
 use crate::memory;
 use crate::scene::{Body, BoundPlace, MeshShape};
 use crate::shape::RestShape;
-use crate::sheet::Model;
+use crate::tissue::Model;
 
 /// The name of its tables in messages.
 const TABLES: &str = "what is shown of a mesh";
@@ -24,14 +24,14 @@ pub struct Skin {
     /// Texture coordinates of each vertex, if the file has them.
     uv: Option<Vec<[f32; 2]>>,
     /// Where another mesh is simulated: how each place moves with it.
-    bound: Vec<Bound>,
+    bound: Vec<SkinVertex>,
     /// Where the vertices of that mesh rest, in the order of memory, m.
     rest_m: Vec<DVec3>,
 }
 
 /// A vertex that moves with a triangle of the simulated mesh.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Bound {
+struct SkinVertex {
     /// Places of its corners in memory.
     corners: [u32; 3],
     weights: [f64; 3],
@@ -61,7 +61,7 @@ impl Skin {
         }
         let bound = vertices.iter().map(|vertex| {
             let place = &shown.places[*vertex as usize];
-            Bound { corners: corners(place), weights: place.barycentric, height_m: place.height_m }
+            SkinVertex { corners: corners(place), weights: place.barycentric, height_m: place.height_m }
         });
         let bound = memory::collected(bound, TABLES);
         let rest_m = memory::collected(order.iter().map(|vertex| shape.vertices_m()[*vertex as usize]), TABLES);

@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 
 use super::refine::{Points, grid};
 use super::skin::Skin;
-use super::wide::{Available, LANES, SixteenLanes, Width, Work};
+use super::wide::{Available, LANES, SixteenLanes, WideWork, Width};
 use crate::scene::Scene;
 
 /// The displacements of a sheet at one moment, from which frames are made.
@@ -87,7 +87,7 @@ struct Range<'v> {
     range: &'v mut [f32; 2],
 }
 
-impl Work for Range<'_> {
+impl WideWork for Range<'_> {
     #[inline(always)]
     fn work<L: SixteenLanes>(self, with: Available<L>) {
         // Enough parallel comparisons to hide their latency.

@@ -14,7 +14,7 @@ use std::sync::Arc;
 use super::encode::{Encoding, Frame, Patch, Quanta, fill, lay_out};
 use super::refine::{COMPONENTS, Points, Refinement, Rows};
 use super::snapshot::Snapshot;
-use super::wide::{Available, LANES, SixteenLanes, Width, Work};
+use super::wide::{Available, LANES, SixteenLanes, WideWork, Width};
 
 /// Points along a side of a tile.
 const SIDE: usize = 16;
@@ -247,7 +247,7 @@ struct Compare<'v> {
     moved: &'v mut bool,
 }
 
-impl Work for Compare<'_> {
+impl WideWork for Compare<'_> {
     #[inline(always)]
     fn work<L: SixteenLanes>(self, with: Available<L>) {
         let Compare { now, shown, unseen_m, moved } = self;

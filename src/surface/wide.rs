@@ -79,7 +79,7 @@ impl<L: SixteenLanes> Available<L> {
 }
 
 /// A computation that can run at any width.
-pub(super) trait Work {
+pub(super) trait WideWork {
     /// Runs it; implement it with `#[inline(always)]`.
     fn work<L: SixteenLanes>(self, with: Available<L>);
 }
@@ -115,7 +115,7 @@ impl Width {
     }
 
     /// Runs `work` with these instructions, or with plain ones if they are not available.
-    pub(super) fn run(self, work: impl Work) {
+    pub(super) fn run(self, work: impl WideWork) {
         match self {
             // SAFETY: the processor has the instructions.
             #[cfg(target_arch = "x86_64")]
@@ -209,12 +209,12 @@ impl SixteenLanes for Plain {
 mod x86 {
     use std::arch::x86_64::*;
 
-    use super::{Available, LANES, SixteenLanes, Work};
+    use super::{Available, LANES, SixteenLanes, WideWork};
 
     /// # Safety
     /// The processor has these instructions.
     #[target_feature(enable = "avx512f,avx512bw")]
-    pub(super) unsafe fn with_avx512(work: impl Work) {
+    pub(super) unsafe fn with_avx512(work: impl WideWork) {
         // SAFETY: the caller's promise.
         work.work(unsafe { Available::<Wide>::new() });
     }
@@ -222,7 +222,7 @@ mod x86 {
     /// # Safety
     /// The processor has these instructions.
     #[target_feature(enable = "avx2")]
-    pub(super) unsafe fn with_avx2(work: impl Work) {
+    pub(super) unsafe fn with_avx2(work: impl WideWork) {
         // SAFETY: the caller's promise.
         work.work(unsafe { Available::<Narrow>::new() });
     }

@@ -19,7 +19,7 @@ use crate::files;
 use crate::limits::Limits;
 use crate::memory;
 use crate::refusal::{Reason, Refusal, Result, number};
-use crate::scene::{Appearance, SMALLEST_TEXTURE, Surface};
+use crate::scene::{Appearance, PaintedSurface, SMALLEST_TEXTURE};
 
 /// An image: rows of pixels from the top, sRGB.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -45,16 +45,16 @@ pub struct Texture {
 ///
 /// # Errors
 /// Refuses a size outside the limits.
-pub fn painted(surface: Surface, seed: u64, size: u32, limits: &Limits) -> Result<Image> {
+pub fn painted(surface: PaintedSurface, seed: u64, size: u32, limits: &Limits) -> Result<Image> {
     let range = format!("from {SMALLEST_TEXTURE} to {} pixels", limits.texture_side);
     let holds = |v| v >= f64::from(SMALLEST_TEXTURE) && v <= f64::from(limits.texture_side);
     number("texture_size", f64::from(size), &range, holds)?;
     let side = size as usize;
     let rgb = match surface {
-        Surface::Mucosa => mucosa::paint(seed, side),
-        Surface::Liver => liver::paint(seed, side),
-        Surface::Nodular => nodular::paint(seed, side),
-        Surface::Serosa => serosa::paint(seed, side),
+        PaintedSurface::Mucosa => mucosa::paint(seed, side),
+        PaintedSurface::Liver => liver::paint(seed, side),
+        PaintedSurface::Nodular => nodular::paint(seed, side),
+        PaintedSurface::Serosa => serosa::paint(seed, side),
     };
     Ok(Image { width: side, height: side, rgb })
 }

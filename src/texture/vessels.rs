@@ -52,7 +52,7 @@ pub(super) fn paint(seed: u32, size: usize, habit: Habit) -> Vec<f32> {
 }
 
 /// Most strokes of all trees together.
-const MOST: usize = 40_000;
+const MAX_SEGMENTS: usize = 40_000;
 
 /// Length of a stroke.
 const PIECE: f32 = 0.006;
@@ -75,7 +75,7 @@ fn grow(seed: u32, habit: Habit) -> Vec<Stroke> {
         tips.push((place, turned(inwards, numbers.between(-0.7, 0.7)), habit.radius * numbers.between(0.7, 1.2)));
     }
     while let Some((mut place, mut towards, mut radius)) = tips.pop() {
-        while radius > habit.thinnest && strokes.len() < MOST {
+        while radius > habit.thinnest && strokes.len() < MAX_SEGMENTS {
             // A slow meander that neighbours share, and a tremor of its own.
             let meander = 1.2 * gradient(seed ^ 0x51, 6.0 * place[0], 6.0 * place[1]);
             towards = turned(towards, PIECE * 14.0 * meander + numbers.between(-0.16, 0.16));

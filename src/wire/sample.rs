@@ -1,8 +1,8 @@
 //! Conversion of samples, records and frames to messages, and of records back.
 
 use super::{every, from_record, point};
-use crate::pace::frames::Delivery;
-use crate::pace::{PacedSample, Recorded};
+use crate::realtime::frames::Delivery;
+use crate::realtime::{PacedSample, Recorded};
 use crate::refusal::{Reason, Refusal, Result};
 use crate::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
 use crate::session::ToolSample;
@@ -131,7 +131,7 @@ pub fn record(paced: &Recorded, dropped: u64, part: usize) -> Option<pb::ProbeRe
         message.energy = record.energy_j.map(|energy| pb::Energy {
             kinetic_j: energy.kinetic,
             spring_j: energy.spring,
-            virtual_j: energy.virtual_springs,
+            anchor_j: energy.anchor_springs,
         });
         message.tools = record.tools.iter().map(tool_record).collect();
     }
@@ -147,7 +147,7 @@ fn point_record(record: &Point) -> pb::PointRecord {
         displacement_m: vector(record.displacement_m),
         velocity_m_per_s: vector(record.velocity_m_per_s),
         spring_n: vector(record.spring_n),
-        virtual_n: vector(record.virtual_n),
+        anchor_n: vector(record.anchor_n),
         damping_n: vector(record.damping_n),
         applied_n: vector(record.applied_n),
         reaction_n: vector(record.reaction_n),
@@ -173,7 +173,7 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
         displacement_m: array(&point.displacement_m),
         velocity_m_per_s: array(&point.velocity_m_per_s),
         spring_n: array(&point.spring_n),
-        virtual_n: array(&point.virtual_n),
+        anchor_n: array(&point.anchor_n),
         damping_n: array(&point.damping_n),
         applied_n: array(&point.applied_n),
         reaction_n: array(&point.reaction_n),
@@ -184,7 +184,7 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
         record.energy_j = message.energy.as_ref().map(|energy| EnergyJ {
             kinetic: energy.kinetic_j,
             spring: energy.spring_j,
-            virtual_springs: energy.virtual_j,
+            anchor_springs: energy.anchor_j,
         });
         record.tools = message
             .tools

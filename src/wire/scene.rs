@@ -10,8 +10,8 @@ use palpate_proto::pb;
 use super::required;
 use crate::refusal::{Reason, Refusal, Result, finite, number, positive};
 use crate::scene::{
-    Appearance, Body, Change, Fixed, FixedVertices, Inclusion, Integrator, Lanes, Material, Mesh, Named, PointSet,
-    Precision, Region, Scene, Sheet, Simulated, Springs, Stepping, Substance, Volume,
+    Appearance, Body, Change, FixedPoints, FixedVertices, Inclusion, Integrator, Lanes, Material, Mesh, Named,
+    PointSet, Precision, Region, Scene, Sheet, Simulated, Springs, Stepping, Substance, Volume,
 };
 use crate::shape::RestShape;
 
@@ -35,7 +35,7 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
         material: substance.material,
         inclusions: substance.inclusions,
         springs: substance.springs,
-        virtual_stiffness_n_per_m: substance.virtual_stiffness_n_per_m,
+        anchor_stiffness_n_per_m: substance.anchor_stiffness_n_per_m,
         damping_n_s_per_m: substance.damping_n_s_per_m,
         volume_stiffness_pa: substance.volume_stiffness_pa,
         stepping: message.stepping.as_ref().map_or(Ok(Stepping::default()), from_stepping)?,
@@ -47,7 +47,7 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
 /// A tissue whose coefficients the message gives.
 fn from_coefficients(message: &pb::Scene, body: Body) -> Result<Substance> {
     let springs = required("springs", message.springs.as_ref())?;
-    let virtual_springs = required("virtual_springs", message.virtual_springs.as_ref())?;
+    let anchor_springs = required("anchor_springs", message.anchor_springs.as_ref())?;
     let damping = required("damping", message.damping.as_ref())?;
     let stiffness_n_per_m = required("springs.stiffness_n_per_m", springs.stiffness_n_per_m)?;
     Ok(Substance {
@@ -57,9 +57,9 @@ fn from_coefficients(message: &pb::Scene, body: Body) -> Result<Substance> {
         springs: Springs {
             stiffness_n_per_m,
             shear_stiffness_n_per_m: springs.shear_stiffness_n_per_m.unwrap_or(stiffness_n_per_m),
-            flexion: springs.flexion,
+            bending: springs.bending,
         },
-        virtual_stiffness_n_per_m: required("virtual_springs.stiffness_n_per_m", virtual_springs.stiffness_n_per_m)?,
+        anchor_stiffness_n_per_m: required("anchor_springs.stiffness_n_per_m", anchor_springs.stiffness_n_per_m)?,
         damping_n_s_per_m: required("damping.coefficient_n_s_per_m", damping.coefficient_n_s_per_m)?,
         volume_stiffness_pa: 0.0,
     })
@@ -73,9 +73,9 @@ fn from_sheet(message: &pb::Scene) -> Result<Substance> {
     if message.volume.is_some() {
         return Err(Refusal::new(Reason::WrongKind, "volume", Volume::OF_A_MESH));
     }
-    if message.springs.is_some_and(|springs| springs.flexion_factor.is_some()) {
-        let message = "is for meshes: a sheet has springs of flexion (`flexion`) or none";
-        return Err(Refusal::new(Reason::WrongKind, "springs.flexion_factor", message));
+    if message.springs.is_some_and(|springs| springs.bending_factor.is_some()) {
+        let message = "is for meshes: a sheet has springs of bending (`bending`) or none";
+        return Err(Refusal::new(Reason::WrongKind, "springs.bending_factor", message));
     }
     let sheet = required("sheet", message.sheet.as_ref())?;
     let body = Body::Sheet(Sheet {
@@ -100,8 +100,8 @@ fn from_mesh(message: &pb::Scene, of_mesh: &pb::Mesh, mesh: &TriangleMesh) -> Re
         let message = "is for sheets: the edges of a mesh resist shear as well";
         return Err(Refusal::new(Reason::WrongKind, "springs.shear_stiffness_n_per_m", message));
     }
-    let flexion = springs.flexion_factor.unwrap_or(if springs.flexion { 1.0 } else { 0.0 });
-    let flexion = number("springs.flexion_factor", flexion, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
+    let bending = springs.bending_factor.unwrap_or(if springs.bending { 1.0 } else { 0.0 });
+    let bending = number("springs.bending_factor", bending, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
     // A material says later what a point weighs.
     let point_mass_kg = required("mesh.point_mass_kg", of_mesh.point_mass_kg.or(material.map(|_| 1.0)))?;
     let vertices = of_mesh.vertices.map(|vertices| vertices as usize);
@@ -127,8 +127,8 @@ fn from_mesh(message: &pb::Scene, of_mesh: &pb::Mesh, mesh: &TriangleMesh) -> Re
     };
     let made = Mesh::simulating(simulated, point_mass_kg, fixed)?;
     let substance = match material {
-        Some(material) => Substance::of_material(material, flexion, made.shape)?,
-        None if flexion > 0.0 => from_coefficients(message, Body::Mesh(Mesh::new(point_mass_kg, flexion, made.shape)))?,
+        Some(material) => Substance::of_material(material, bending, made.shape)?,
+        None if bending > 0.0 => from_coefficients(message, Body::Mesh(Mesh::new(point_mass_kg, bending, made.shape)))?,
         None => from_coefficients(message, Body::Mesh(made))?,
     };
     let inclusions = message.inclusions.iter().enumerate().map(from_inclusion).collect::<Result<_>>()?;
@@ -143,7 +143,7 @@ fn from_material(message: &pb::Material) -> Result<Material> {
     let usual = Material::new(
         required("material.youngs_modulus_pa", message.youngs_modulus_pa)?,
         required("material.thickness_m", message.thickness_m)?,
-        required("material.bed_n_per_m3", message.bed_n_per_m3)?,
+        required("material.foundation_n_per_m3", message.foundation_n_per_m3)?,
     );
     Ok(Material {
         density_kg_per_m3: message.density_kg_per_m3.unwrap_or(usual.density_kg_per_m3),
@@ -158,7 +158,7 @@ fn refuse_coefficients(message: &pb::Scene, of_mesh: &pb::Mesh) -> Result<()> {
     let springs = message.springs.unwrap_or_default();
     for (field, is_there, why) in [
         ("mesh.point_mass_kg", of_mesh.point_mass_kg.is_some(), Mesh::WEIGHED),
-        ("virtual_springs", message.virtual_springs.is_some(), Material::FOLLOWS),
+        ("anchor_springs", message.anchor_springs.is_some(), Material::FOLLOWS),
         ("damping", message.damping.is_some(), Material::FOLLOWS),
         ("springs.stiffness_n_per_m", springs.stiffness_n_per_m.is_some(), Material::FOLLOWS),
         ("springs.shear_stiffness_n_per_m", springs.shear_stiffness_n_per_m.is_some(), Material::FOLLOWS),
@@ -176,20 +176,22 @@ fn from_inclusion((index, message): (usize, &pb::Inclusion)) -> Result<Inclusion
     let even = Inclusion::even(region.map_err(|refusal| refusal.within(&format!("inclusions[{index}]")))?);
     Ok(Inclusion {
         stiffness_factor: message.stiffness_factor.unwrap_or(even.stiffness_factor),
-        virtual_stiffness_factor: message.virtual_stiffness_factor.unwrap_or(even.virtual_stiffness_factor),
+        anchor_stiffness_factor: message.anchor_stiffness_factor.unwrap_or(even.anchor_stiffness_factor),
         edge_m: message.edge_m.unwrap_or(even.edge_m),
         ..even
     })
 }
 
-fn from_fixed(fixed: Option<&pb::sheet::Fixed>) -> Result<Fixed> {
+fn from_fixed(fixed: Option<&pb::sheet::Fixed>) -> Result<FixedPoints> {
     Ok(match fixed {
-        None => Fixed::Points(PointSet::default()),
-        Some(pb::sheet::Fixed::FixedPoints(points)) => Fixed::Points(points.points.iter().map(from_point).collect()),
+        None => FixedPoints::Points(PointSet::default()),
+        Some(pb::sheet::Fixed::FixedPoints(points)) => {
+            FixedPoints::Points(points.points.iter().map(from_point).collect())
+        }
         Some(pb::sheet::Fixed::FixedSet(set)) => match pb::FixedSet::try_from(*set) {
-            Ok(pb::FixedSet::Unspecified) => Fixed::Points(PointSet::default()),
-            Ok(pb::FixedSet::Edges) => Fixed::Edges,
-            Ok(pb::FixedSet::Corners) => Fixed::Corners,
+            Ok(pb::FixedSet::Unspecified) => FixedPoints::Points(PointSet::default()),
+            Ok(pb::FixedSet::Edges) => FixedPoints::Edges,
+            Ok(pb::FixedSet::Corners) => FixedPoints::Corners,
             Err(_) => {
                 return Err(Refusal::new(Reason::WrongKind, "sheet.fixed_set", format!("unknown set of points {set}")));
             }
@@ -217,7 +219,7 @@ pub fn from_change(message: &pb::UpdateTissueRequest) -> Change {
     Change {
         stiffness_n_per_m: message.stiffness_n_per_m,
         damping_n_s_per_m: message.damping_n_s_per_m,
-        virtual_stiffness_n_per_m: message.virtual_stiffness_n_per_m,
+        anchor_stiffness_n_per_m: message.anchor_stiffness_n_per_m,
         volume_stiffness_pa: message.volume_stiffness_pa,
     }
 }
@@ -228,7 +230,7 @@ pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::Update
         session_id: session_id.to_owned(),
         stiffness_n_per_m: change.stiffness_n_per_m,
         damping_n_s_per_m: change.damping_n_s_per_m,
-        virtual_stiffness_n_per_m: change.virtual_stiffness_n_per_m,
+        anchor_stiffness_n_per_m: change.anchor_stiffness_n_per_m,
         volume_stiffness_pa: change.volume_stiffness_pa,
         at_step: Some(step),
     }
@@ -238,7 +240,7 @@ pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::Update
 pub fn sent(scene: &Scene) -> pb::Scene {
     let mut message = self::scene(scene);
     if message.material.is_some() {
-        message.virtual_springs = None;
+        message.anchor_springs = None;
         message.damping = None;
         if let (Some(springs), Some(mesh)) = (&mut message.springs, &mut message.mesh) {
             springs.stiffness_n_per_m = None;
@@ -264,10 +266,10 @@ pub fn scene(scene: &Scene) -> pb::Scene {
             stiffness_n_per_m: Some(scene.springs.stiffness_n_per_m),
             // The edges of a mesh resist shear as well.
             shear_stiffness_n_per_m: scene.sheet().map(|_| scene.springs.shear_stiffness_n_per_m),
-            flexion: scene.springs.flexion,
-            flexion_factor: of_mesh.map(|mesh| mesh.flexion),
+            bending: scene.springs.bending,
+            bending_factor: of_mesh.map(|mesh| mesh.bending),
         }),
-        virtual_springs: Some(pb::VirtualSprings { stiffness_n_per_m: Some(scene.virtual_stiffness_n_per_m) }),
+        anchor_springs: Some(pb::AnchorSprings { stiffness_n_per_m: Some(scene.anchor_stiffness_n_per_m) }),
         damping: Some(pb::Damping { coefficient_n_s_per_m: Some(scene.damping_n_s_per_m) }),
         volume: scene.volume().map(|_| pb::Volume { stiffness_pa: Some(scene.volume_stiffness_pa) }),
         stepping: Some(pb::Stepping {
@@ -304,7 +306,7 @@ fn material(material: &Material) -> pb::Material {
         thickness_m: Some(material.thickness_m),
         density_kg_per_m3: Some(material.density_kg_per_m3),
         depth_m: Some(material.depth_m),
-        bed_n_per_m3: Some(material.bed_n_per_m3),
+        foundation_n_per_m3: Some(material.foundation_n_per_m3),
         damping_ratio: Some(material.damping_ratio),
     }
 }
@@ -319,7 +321,7 @@ fn inclusion(inclusion: &Inclusion) -> pb::Inclusion {
         radius_m,
         group,
         stiffness_factor: Some(inclusion.stiffness_factor),
-        virtual_stiffness_factor: Some(inclusion.virtual_stiffness_factor),
+        anchor_stiffness_factor: Some(inclusion.anchor_stiffness_factor),
         edge_m: Some(inclusion.edge_m),
     }
 }
@@ -329,10 +331,10 @@ fn sheet(sheet: &Sheet) -> pb::Sheet {
     #[allow(clippy::cast_possible_truncation)]
     let [points_x, points_y] = sheet.points.map(|points| Some(points as u32));
     let fixed = match &sheet.fixed {
-        Fixed::Edges => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Edges.into())),
-        Fixed::Corners => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Corners.into())),
-        Fixed::Points(points) if points.as_slice().is_empty() => None,
-        Fixed::Points(points) => {
+        FixedPoints::Edges => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Edges.into())),
+        FixedPoints::Corners => Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Corners.into())),
+        FixedPoints::Points(points) if points.as_slice().is_empty() => None,
+        FixedPoints::Points(points) => {
             let points = points.as_slice().iter().copied().map(point).collect();
             Some(pb::sheet::Fixed::FixedPoints(pb::GridPoints { points }))
         }
@@ -351,8 +353,8 @@ mod tests {
     #[test]
     fn a_scene_survives_conversion_both_ways() {
         let mut paper = paper();
-        let points = |points: &[[usize; 2]]| Fixed::Points(points.iter().copied().collect());
-        for fixed in [Fixed::Edges, Fixed::Corners, points(&[]), points(&[[30, 0], [1, 2], [30, 0]])] {
+        let points = |points: &[[usize; 2]]| FixedPoints::Points(points.iter().copied().collect());
+        for fixed in [FixedPoints::Edges, FixedPoints::Corners, points(&[]), points(&[[30, 0], [1, 2], [30, 0]])] {
             paper.sheet_mut().unwrap().fixed = fixed;
             assert_eq!(from_scene(&scene(&paper), None).unwrap(), paper);
         }
@@ -396,7 +398,7 @@ mod tests {
             material: Some(pb::Material {
                 youngs_modulus_pa: Some(5000.0),
                 thickness_m: Some(0.002),
-                bed_n_per_m3: Some(4e5),
+                foundation_n_per_m3: Some(4e5),
                 ..Default::default()
             }),
             inclusions: vec![
@@ -408,12 +410,12 @@ mod tests {
                 },
                 pb::Inclusion {
                     group: Some("lump".to_owned()),
-                    virtual_stiffness_factor: Some(4.0),
+                    anchor_stiffness_factor: Some(4.0),
                     edge_m: Some(0.15),
                     ..Default::default()
                 },
             ],
-            springs: Some(pb::Springs { flexion_factor: Some(0.2), ..Default::default() }),
+            springs: Some(pb::Springs { bending_factor: Some(0.2), ..Default::default() }),
             volume: Some(pb::Volume { stiffness_pa: Some(300.0) }),
             ..Default::default()
         }
@@ -424,15 +426,15 @@ mod tests {
         let read = |message: &pb::Scene| from_scene(message, Some(&tetrahedron())).unwrap();
         let made = read(&of_a_material());
         let Body::Mesh(mesh) = &made.body else { panic!("of another kind") };
-        let [edges, flexion] = [&mesh.differences.edges, &mesh.differences.flexion];
-        assert!(edges.len() == 6 && flexion.len() == 6 && mesh.flexion == 0.2, "{mesh:?}");
-        assert_eq!(mesh.differences.extra_virtual[1], 3.0);
+        let [edges, bending] = [&mesh.differences.edges, &mesh.differences.bending];
+        assert!(edges.len() == 6 && bending.len() == 6 && mesh.bending == 0.2, "{mesh:?}");
+        assert_eq!(mesh.differences.extra_anchor[1], 3.0);
         assert_eq!(read(&sent(&made)), made);
         assert_eq!((made.volume_stiffness_pa, mesh.volume.is_some()), (300.0, true));
         let told = scene(&made);
         let material = told.material.unwrap();
         assert_eq!((material.density_kg_per_m3, material.damping_ratio), (Some(1060.0), Some(0.5)));
-        assert_eq!((told.inclusions[0].virtual_stiffness_factor, told.inclusions[1].radius_m), (Some(1.0), None));
+        assert_eq!((told.inclusions[0].anchor_stiffness_factor, told.inclusions[1].radius_m), (Some(1.0), None));
         assert_eq!(told.springs.unwrap().stiffness_n_per_m, Some(made.springs.stiffness_n_per_m));
         assert_eq!(told.mesh.as_ref().unwrap().point_mass_kg, Some(made.point_mass_kg()));
         let change = Change { stiffness_n_per_m: Some(1.0), ..Change::default() };
@@ -451,7 +453,7 @@ mod tests {
         let changes: [(Change, &str, Reason, &str); 38] = [
             (|s| material_of(s).youngs_modulus_pa = None, "material.youngs_modulus_pa", Reason::Missing, ""),
             (|s| material_of(s).thickness_m = None, "material.thickness_m", Reason::Missing, ""),
-            (|s| material_of(s).bed_n_per_m3 = None, "material.bed_n_per_m3", Reason::Missing, ""),
+            (|s| material_of(s).foundation_n_per_m3 = None, "material.foundation_n_per_m3", Reason::Missing, ""),
             (
                 |s| material_of(s).youngs_modulus_pa = Some(0.0),
                 "material.youngs_modulus_pa",
@@ -473,14 +475,24 @@ mod tests {
                 "above 0",
             ),
             (|s| material_of(s).depth_m = Some(f64::INFINITY), "material.depth_m", Reason::NotFinite, ""),
-            (|s| material_of(s).bed_n_per_m3 = Some(-1.0), "material.bed_n_per_m3", Reason::OutOfRange, "0 or more"),
-            (|s| material_of(s).bed_n_per_m3 = Some(1e300), "material.bed_n_per_m3", Reason::OutOfRange, "1e12"),
+            (
+                |s| material_of(s).foundation_n_per_m3 = Some(-1.0),
+                "material.foundation_n_per_m3",
+                Reason::OutOfRange,
+                "0 or more",
+            ),
+            (
+                |s| material_of(s).foundation_n_per_m3 = Some(1e300),
+                "material.foundation_n_per_m3",
+                Reason::OutOfRange,
+                "1e12",
+            ),
             (|s| material_of(s).damping_ratio = Some(101.0), "material.damping_ratio", Reason::OutOfRange, "100"),
             (|s| material_of(s).damping_ratio = Some(-0.1), "material.damping_ratio", Reason::OutOfRange, "from 0"),
             (|s| mesh_of(s).point_mass_kg = Some(1.0), "mesh.point_mass_kg", Reason::WrongKind, "what a point weighs"),
             (|s| s.springs = scene(&paper()).springs, "springs.stiffness_n_per_m", Reason::WrongKind, "follows"),
             (|s| s.damping = scene(&paper()).damping, "damping", Reason::WrongKind, "follows"),
-            (|s| s.virtual_springs = scene(&paper()).virtual_springs, "virtual_springs", Reason::WrongKind, "follows"),
+            (|s| s.anchor_springs = scene(&paper()).anchor_springs, "anchor_springs", Reason::WrongKind, "follows"),
             (|s| s.material = None, "mesh.point_mass_kg", Reason::Missing, ""),
             (|s| s.mesh = None, "material", Reason::WrongKind, "is for a mesh"),
             (|s| s.volume = Some(pb::Volume::default()), "volume.stiffness_pa", Reason::Missing, ""),
@@ -531,8 +543,8 @@ mod tests {
                 "0.01",
             ),
             (
-                |s| s.inclusions[1].virtual_stiffness_factor = Some(f64::NAN),
-                "inclusions[1].virtual_stiffness_factor",
+                |s| s.inclusions[1].anchor_stiffness_factor = Some(f64::NAN),
+                "inclusions[1].anchor_stiffness_factor",
                 Reason::NotFinite,
                 "",
             ),

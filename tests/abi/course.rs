@@ -4,18 +4,18 @@ use std::time::Duration;
 
 use glam::DVec3;
 use palpate_client::Reading;
-use palpate_client::bridge::{Offline, Origin};
+use palpate_client::bridge::{Offline, PositionOrigin};
 use palpate_proto::{pb, touch};
 use palpate_touch::{Device, Tip};
 use pb::command::Action;
 use pb::touch_response::Message as Heard;
 use prost::Message;
 
-use crate::server::{PATIENCE, Server, Touch, open};
+use crate::server::{TEST_TIMEOUT, TestServer, TestTouch, open};
 use crate::{ALONE, compiled, compiled_cs, done, folder, has_mono, mono, ours, root, told};
 
 /// What happened at the client, in order.
-enum Event {
+enum ClientEvent {
     Arrived(Vec<u8>),
     Ticked { time_s: f64, place_m: DVec3, enable: bool },
 }
@@ -28,7 +28,7 @@ fn place_m(time_s: f64) -> DVec3 {
 }
 
 /// A second and a half of touch of a real server, as it came, with a sample every so many steps.
-async fn recorded(server: &Server, every: u32) -> (DVec3, Vec<Event>) {
+async fn recorded(server: &TestServer, every: u32) -> (DVec3, Vec<ClientEvent>) {
     let source = pb::create_session_request::Source::SceneName("liver".into());
     let session = server.create(source, false).await.unwrap();
     let middle_m = palpate_proto::geometry::from_vector(session.extent.unwrap().middle_m.as_ref());
@@ -38,13 +38,13 @@ async fn recorded(server: &Server, every: u32) -> (DVec3, Vec<Event>) {
         sample_every_steps: Some(every),
         ..open(&session.session_id, &[0])
     };
-    let mut stream = Touch::open(server, request).await.unwrap();
-    let bytes = |message: Heard| Event::Arrived(pb::TouchResponse { message: Some(message) }.encode_to_vec());
+    let mut stream = TestTouch::open(server, request).await.unwrap();
+    let bytes = |message: Heard| ClientEvent::Arrived(pb::TouchResponse { message: Some(message) }.encode_to_vec());
     let mut events = vec![bytes(Heard::Opened(stream.opened.clone().unwrap()))];
     for tick in 0..1500_u32 {
         let time_s = 1e-3 * f64::from(tick);
         let place_m = middle_m + place_m(time_s);
-        events.push(Event::Ticked { time_s, place_m, enable: tick > 5 });
+        events.push(ClientEvent::Ticked { time_s, place_m, enable: tick > 5 });
         let command = pb::Command {
             sequence: Some(1 + u64::from(tick)),
             // The clock of a ticker begins at 1 s.
@@ -63,18 +63,18 @@ async fn recorded(server: &Server, every: u32) -> (DVec3, Vec<Event>) {
 }
 
 /// The file of `replay.c`.
-fn written(middle_m: DVec3, events: &[Event]) -> Vec<u8> {
+fn written(middle_m: DVec3, events: &[ClientEvent]) -> Vec<u8> {
     let mut file = Vec::new();
     let numbers = |file: &mut Vec<u8>, numbers: &[f64]| numbers.iter().for_each(|x| file.extend(x.to_le_bytes()));
     numbers(&mut file, &middle_m.to_array());
     for event in events {
         match event {
-            Event::Arrived(bytes) => {
+            ClientEvent::Arrived(bytes) => {
                 file.extend(0_u32.to_le_bytes());
                 file.extend(u32::try_from(bytes.len()).unwrap().to_le_bytes());
                 file.extend(bytes);
             }
-            Event::Ticked { time_s, place_m, enable } => {
+            ClientEvent::Ticked { time_s, place_m, enable } => {
                 file.extend(1_u32.to_le_bytes());
                 numbers(&mut file, &[*time_s, place_m.x, place_m.y, place_m.z, f64::from(u8::from(*enable))]);
             }
@@ -84,7 +84,7 @@ fn written(middle_m: DVec3, events: &[Event]) -> Vec<u8> {
 }
 
 /// What [`written`] has written.
-fn read(file: &[u8]) -> (DVec3, Vec<Event>) {
+fn read(file: &[u8]) -> (DVec3, Vec<ClientEvent>) {
     fn take<'f, const N: usize>(rest: &mut &'f [u8]) -> &'f [u8; N] {
         let (taken, left) = rest.split_first_chunk().expect("the record ends within an event");
         *rest = left;
@@ -99,24 +99,24 @@ fn read(file: &[u8]) -> (DVec3, Vec<Event>) {
             let length = u32::from_le_bytes(*take(&mut rest)) as usize;
             let (bytes, left) = rest.split_at(length);
             rest = left;
-            Event::Arrived(bytes.to_vec())
+            ClientEvent::Arrived(bytes.to_vec())
         } else {
             let time_s = number(&mut rest);
-            Event::Ticked { time_s, place_m: vector(&mut rest), enable: number(&mut rest) != 0.0 }
+            ClientEvent::Ticked { time_s, place_m: vector(&mut rest), enable: number(&mut rest) != 0.0 }
         });
     }
     (middle_m, events)
 }
 
 /// The forces of Rust, as `replay.c` writes them; those of C and C# are the same.
-fn assert_same_forces(name: &str, middle_m: DVec3, events: &[Event]) {
+fn assert_same_forces(name: &str, middle_m: DVec3, events: &[ClientEvent]) {
     let device = Device::named("omega3").unwrap();
-    let Offline { mut ticker, mut record } = Offline::new(device, Origin::Tissue, middle_m, 0.0);
+    let Offline { mut ticker, mut record } = Offline::new(device, PositionOrigin::Tissue, middle_m, 0.0);
     let (mut forces, mut most_n) = (Vec::new(), 0.0_f64);
     for event in events {
         match event {
-            Event::Arrived(bytes) => record.arrive(bytes).unwrap(),
-            Event::Ticked { time_s, place_m, enable } => {
+            ClientEvent::Arrived(bytes) => record.arrive(bytes).unwrap(),
+            ClientEvent::Ticked { time_s, place_m, enable } => {
                 let force_n = ticker.tick(Reading { place_m: *place_m, enable: *enable }, *time_s);
                 most_n = most_n.max(force_n.length());
                 force_n.to_array().iter().for_each(|part| forces.extend(part.to_le_bytes()));
@@ -149,7 +149,7 @@ async fn the_kept_record_gives_the_same_forces_in_every_language() {
     let _alone = ALONE.lock().await;
     let kept = root().join("tests/abi/touch.record");
     if std::env::var_os("PALPATE_RECORD").is_some() {
-        let server = Server::start(&[]);
+        let server = TestServer::start(&[]);
         let (middle_m, events) = recorded(&server, 20).await;
         std::fs::write(&kept, written(middle_m, &events)).unwrap();
     }
@@ -162,7 +162,8 @@ async fn the_kept_record_gives_the_same_forces_in_every_language() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn the_force_course_is_the_same_in_every_language() {
     let _alone = ALONE.lock().await;
-    let server = Server::start(&[]);
-    let (middle_m, events) = tokio::time::timeout(PATIENCE, recorded(&server, 1)).await.expect("the server is silent");
+    let server = TestServer::start(&[]);
+    let (middle_m, events) =
+        tokio::time::timeout(TEST_TIMEOUT, recorded(&server, 1)).await.expect("the server is silent");
     assert_same_forces("fresh", middle_m, &events);
 }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
-use server::Server;
+use server::TestServer;
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -107,7 +107,7 @@ const RUN: [&str; 2] = ["liver", "2"];
 #[test]
 fn examples_in_c_press_look_and_connect_a_device() {
     let _alone = ALONE.blocking_lock();
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let run = |program: &Path| done(ours(program).arg(&server.url).args(RUN));
     let touch = compiled("clients/c/examples/touch.c", &[]);
     let output = run(&touch);
@@ -132,7 +132,7 @@ fn examples_in_c_press_look_and_connect_a_device() {
 #[test]
 fn the_touch_of_the_example_finds_the_surface_of_a_mesh_and_is_in_the_static_library() {
     let _alone = ALONE.blocking_lock();
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let archive = prefix().join("lib/libpalpate.a");
     let program = folder().join("touch-static");
     let mut compiler = Command::new("cc");
@@ -146,7 +146,7 @@ fn the_touch_of_the_example_finds_the_surface_of_a_mesh_and_is_in_the_static_lib
 #[test]
 fn what_is_wrong_in_c_is_an_error_with_words() {
     let _alone = ALONE.blocking_lock();
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     done(ours(&compiled("clients/c/tests/errors.c", &[])).arg(&server.url));
 }
 
@@ -156,7 +156,7 @@ fn examples_in_cpp_press_look_and_show() {
         return;
     }
     let _alone = ALONE.blocking_lock();
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let run = |program: &Path| done(ours(program).arg(&server.url).args(RUN));
     assert_looked(&run(&compiled("clients/cpp/examples/look.cpp", &["-fno-exceptions"])), "z_m");
     // The others by the CMake package, where there is CMake.
@@ -202,7 +202,7 @@ fn examples_in_cs_press_look_and_show() {
         return;
     }
     let _alone = ALONE.blocking_lock();
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let run = |program: &Path| done(mono(program).arg(&server.url).args(RUN));
     assert_looked(&run(&compiled_cs("clients/csharp/examples/Look.cs")), "y_m");
     assert_pressed(&run(&compiled_cs("clients/csharp/examples/TouchIt.cs")), true);

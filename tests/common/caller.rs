@@ -19,18 +19,18 @@ use tonic::{Request, Status};
 use tonic_types::StatusExt;
 
 /// A file of tokens that changes while a server reads it.
-pub struct Keys {
+pub struct TokenFile {
     _folder: TempDir,
     file: PathBuf,
     /// Entries of the file, by name.
     entries: Mutex<BTreeMap<String, String>>,
 }
 
-impl Keys {
+impl TokenFile {
     pub fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("tokens.toml");
-        let keys = Keys { _folder: folder, file, entries: Mutex::default() };
+        let keys = TokenFile { _folder: folder, file, entries: Mutex::default() };
         keys.change(|_| {});
         keys
     }
@@ -72,9 +72,9 @@ impl Keys {
 
 /// Shows a token with each call.
 #[derive(Clone)]
-pub struct Bearer(MetadataValue<Ascii>);
+pub struct TestBearer(MetadataValue<Ascii>);
 
-impl Interceptor for Bearer {
+impl Interceptor for TestBearer {
     fn call(&mut self, mut request: Request<()>) -> Result<Request<()>, Status> {
         request.metadata_mut().insert("authorization", self.0.clone());
         Ok(request)
@@ -82,23 +82,23 @@ impl Interceptor for Bearer {
 }
 
 /// A connection over which a token is shown.
-pub type Door = InterceptedService<Channel, Bearer>;
+pub type Door = InterceptedService<Channel, TestBearer>;
 
 /// Who calls a server, and by which token.
 #[derive(Clone)]
-pub struct Caller {
+pub struct TestCaller {
     pub url: String,
-    bearer: Bearer,
+    bearer: TestBearer,
 }
 
-impl Caller {
+impl TestCaller {
     pub fn new(url: &str, token: &str) -> Self {
-        Caller { url: url.to_owned(), bearer: Bearer(format!("Bearer {token}").parse().unwrap()) }
+        TestCaller { url: url.to_owned(), bearer: TestBearer(format!("Bearer {token}").parse().unwrap()) }
     }
 
     /// The same caller by another way, such as a proxy.
     pub fn by(&self, url: &str) -> Self {
-        Caller { url: url.to_owned(), ..self.clone() }
+        TestCaller { url: url.to_owned(), ..self.clone() }
     }
 
     /// "127.0.0.1:7117".

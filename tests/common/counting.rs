@@ -7,7 +7,7 @@ use std::cell::Cell;
 thread_local! {
     /// Bytes that this thread has, and the most that it has had; what other threads free for it is not known.
     static NOW: Cell<isize> = const { Cell::new(0) };
-    static MOST: Cell<isize> = const { Cell::new(0) };
+    static PEAK: Cell<isize> = const { Cell::new(0) };
     /// A large piece that was asked for last. If it goes back at once, it was a question (`palpate::memory`) and never had a page.
     static ASKED: Cell<isize> = const { Cell::new(0) };
 }
@@ -20,13 +20,13 @@ struct Counting;
 fn add(bytes: isize) {
     let asked = ASKED.take();
     if asked > 0 && bytes != -asked {
-        MOST.set(MOST.get().max(NOW.get()));
+        PEAK.set(PEAK.get().max(NOW.get()));
     }
     NOW.set(NOW.get() + bytes);
     if bytes >= LARGE {
         ASKED.set(bytes);
     } else {
-        MOST.set(MOST.get().max(NOW.get()));
+        PEAK.set(PEAK.get().max(NOW.get()));
     }
 }
 
@@ -64,8 +64,8 @@ static ALLOCATOR: Counting = Counting;
 /// What `work` returns, and the most bytes that it had at once, its result included.
 pub fn counted<T>(work: impl FnOnce() -> T) -> (T, usize) {
     let before = NOW.get();
-    MOST.set(before);
+    PEAK.set(before);
     let result = work();
     add(0);
-    (result, (MOST.get() - before).max(0) as usize)
+    (result, (PEAK.get() - before).max(0) as usize)
 }

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 /// A tick of a bridge's course.
-struct Tick {
+struct TraceTick {
     time_s: f64,
     force_n: [f64; 3],
     state: String,
@@ -15,9 +15,9 @@ fn length(v: [f64; 3]) -> f64 {
 }
 
 /// The course of a device, without the file it was in.
-pub struct Course(Vec<Tick>);
+pub struct DeviceTrace(Vec<TraceTick>);
 
-impl Course {
+impl DeviceTrace {
     /// Reads the file, and removes it.
     pub fn take(path: &Path) -> Self {
         let text = std::fs::read_to_string(path).unwrap();
@@ -25,9 +25,9 @@ impl Course {
         let tick = |line: &str| {
             let fields: Vec<&str> = line.split(',').collect();
             let number = |at: usize| fields[at].parse::<f64>().unwrap();
-            Tick { time_s: number(0), force_n: [number(4), number(5), number(6)], state: fields[7].to_owned() }
+            TraceTick { time_s: number(0), force_n: [number(4), number(5), number(6)], state: fields[7].to_owned() }
         };
-        Course(text.lines().skip(1).map(tick).collect())
+        DeviceTrace(text.lines().skip(1).map(tick).collect())
     }
 
     /// Every force is within the envelope: its size, its slew, what is left of it 0.3 s after a pause, and that it never

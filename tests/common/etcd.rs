@@ -18,20 +18,20 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal, kill_process};
 
 /// Long enough for any machine; a test that waits so long has failed.
-const PATIENCE: Duration = Duration::from_secs(60);
+const ETCD_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// How soon members notice that their leader is gone.
 #[derive(Debug, Clone, Copy)]
-pub struct Times {
+pub struct FailoverTimes {
     pub heartbeat_ms: u32,
     pub election_ms: u32,
 }
 
 /// What etcd has by default.
-pub const DEFAULT_TIMES: Times = Times { heartbeat_ms: 100, election_ms: 1000 };
+pub const DEFAULT_TIMES: FailoverTimes = FailoverTimes { heartbeat_ms: 100, election_ms: 1000 };
 
 /// For tests of what happens without a leader.
-pub const SHORT_TIMES: Times = Times { heartbeat_ms: 50, election_ms: 500 };
+pub const SHORT_TIMES: FailoverTimes = FailoverTimes { heartbeat_ms: 50, election_ms: 500 };
 
 /// The certificates of members and their clients (PEM files).
 #[derive(Debug, Clone)]
@@ -42,7 +42,7 @@ pub struct Certificates {
 }
 
 /// Members that found each other. They end with this.
-pub struct Etcd {
+pub struct EtcdMembers {
     members: Vec<Member>,
     arguments: Vec<String>,
     certificates: Option<Certificates>,
@@ -56,7 +56,7 @@ struct Member {
     child: Option<Child>,
 }
 
-impl Etcd {
+impl EtcdMembers {
     /// Whether etcd is on this machine. It says so if not, and fails where CI is set.
     pub fn is_there() -> bool {
         // Without arguments, etcd would serve.
@@ -71,13 +71,13 @@ impl Etcd {
 
     /// So many members, with etcd's default times.
     pub fn start(members: usize) -> Self {
-        Etcd::start_with(members, DEFAULT_TIMES, &[], |_| None)
+        EtcdMembers::start_with(members, DEFAULT_TIMES, &[], |_| None)
     }
 
     /// So many members, with these times, more arguments, and certificates if `certify` makes some for their addresses.
     pub fn start_with(
         members: usize,
-        times: Times,
+        times: FailoverTimes,
         arguments: &[&str],
         certify: impl FnOnce(&[SocketAddr]) -> Option<Certificates>,
     ) -> Self {
@@ -98,7 +98,7 @@ impl Etcd {
             "--log-outputs=stderr".to_owned(),
         ];
         all.extend(arguments.iter().map(|&argument| argument.to_owned()));
-        let mut etcd = Etcd { members, arguments: all, certificates, folder };
+        let mut etcd = EtcdMembers { members, arguments: all, certificates, folder };
         etcd.restart_all();
         etcd
     }
@@ -201,7 +201,7 @@ impl Etcd {
             let metrics = self.members[index].metrics;
             while self.members[index].child.is_some() && !get(metrics, "/health").contains("\"true\"") {
                 let ended = self.members[index].child.as_mut().and_then(|child| child.try_wait().unwrap());
-                let late = begun.elapsed() > PATIENCE;
+                let late = begun.elapsed() > ETCD_TIMEOUT;
                 assert!(ended.is_none() && !late, "member {index} does not serve: {ended:?}\n{}", self.said(index));
                 std::thread::sleep(Duration::from_millis(20));
             }
@@ -239,7 +239,7 @@ impl Etcd {
     }
 }
 
-impl Drop for Etcd {
+impl Drop for EtcdMembers {
     fn drop(&mut self) {
         for child in self.members.iter_mut().filter_map(|member| member.child.as_mut()) {
             let _ = child.kill();

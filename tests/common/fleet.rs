@@ -13,14 +13,14 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use palpate::journal::{Reader, file, replay};
+use palpate::journal::{JournalReader, file, replay};
 use palpate::limits::Limits;
 use palpate_proto::pb;
 use pb::admin_service_client::AdminServiceClient;
 use rustix::process::{Pid, Signal, kill_process};
 use tonic::Status;
 
-use crate::server::{PATIENCE, Server};
+use crate::server::{TEST_TIMEOUT, TestServer};
 
 /// A port that is free now.
 pub fn port() -> u16 {
@@ -33,7 +33,7 @@ pub struct Node {
     pub url: String,
     pub journals: PathBuf,
     arguments: Vec<String>,
-    pub server: Option<Server>,
+    pub server: Option<TestServer>,
 }
 
 impl Node {
@@ -64,10 +64,10 @@ impl Node {
     pub fn begin(&mut self) {
         let listen = self.url.trim_start_matches("http://").to_owned();
         let arguments: Vec<&str> = self.arguments.iter().map(String::as_str).collect();
-        self.server = Some(Server::start_at(&listen, &arguments));
+        self.server = Some(TestServer::start_at(&listen, &arguments));
     }
 
-    pub fn there(&self) -> &Server {
+    pub fn there(&self) -> &TestServer {
         self.server.as_ref().unwrap()
     }
 
@@ -164,7 +164,7 @@ pub async fn create(node: &Node) -> pb::Session {
 pub async fn until(what: &str, mut holds: impl AsyncFnMut() -> bool) -> Duration {
     let begun = Instant::now();
     while !holds().await {
-        assert!(begun.elapsed() < PATIENCE, "never: {what}");
+        assert!(begun.elapsed() < TEST_TIMEOUT, "never: {what}");
         tokio::time::sleep(Duration::from_millis(10)).await;
     }
     begun.elapsed()
@@ -202,7 +202,7 @@ pub async fn goes_on(nodes: &[Node], id: &str, after: &Node, lets_go: bool) {
         let session = after.session(id).await.ok();
         let run = session.and_then(|session| session.journal).map_or(0, |journal| u64::from(journal.run));
         let path = after.journals.join(file::name(id, run));
-        let batch = Reader::open(&path).ok().and_then(|mut reader| reader.next_batch().ok().flatten());
+        let batch = JournalReader::open(&path).ok().and_then(|mut reader| reader.next_batch().ok().flatten());
         let first = batch.and_then(|batch| batch.snapshots().ok()?.into_iter().next());
         begun = first.map(|first| (run, first));
         begun.is_some()
@@ -212,13 +212,14 @@ pub async fn goes_on(nodes: &[Node], id: &str, after: &Node, lets_go: bool) {
     let before = || nodes.iter().flat_map(|node| node.runs(id)).filter(|file| file.run == run - 1);
     // A server that died may have more on its own disk than the one that has taken over got.
     let fits = |path: &std::path::Path| {
-        let mut survey = Reader::open(path).unwrap();
+        let mut survey = JournalReader::open(path).unwrap();
         let end = survey.survey(&mut |_| {}).unwrap().until_step;
         if end < first.step {
             return false;
         }
         let (mut session, _) =
-            replay::session_at(Reader::open(path).unwrap(), &Limits::default(), first.step, &false.into()).unwrap();
+            replay::session_at(JournalReader::open(path).unwrap(), &Limits::default(), first.step, &false.into())
+                .unwrap();
         if lets_go {
             session.let_go();
         }
@@ -233,7 +234,7 @@ pub async fn goes_on(nodes: &[Node], id: &str, after: &Node, lets_go: bool) {
 
 /// All hashes and snapshots of a journal are those of an offline run of its inputs. Tells how many were compared.
 pub fn verify(path: &Path) -> u64 {
-    let verdict = replay::verify(Reader::open(path).unwrap(), &Limits::default(), &mut |_, _| {}).unwrap();
+    let verdict = replay::verify(JournalReader::open(path).unwrap(), &Limits::default(), &mut |_, _| {}).unwrap();
     assert_eq!(verdict.difference, None, "{}", path.display());
     verdict.compared.iter().sum()
 }

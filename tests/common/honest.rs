@@ -16,8 +16,8 @@ use tokio::time::MissedTickBehavior;
 use tokio_stream::wrappers::UnboundedReceiverStream;
 use tonic::{Status, Streaming};
 
-use crate::caller::{Caller, Door, MIDDLE, SIDE, create, haptics, push, sessions, sheet, why};
-use crate::server::PATIENCE;
+use crate::caller::{Door, MIDDLE, SIDE, TestCaller, create, haptics, push, sessions, sheet, why};
+use crate::server::TEST_TIMEOUT;
 
 fn alone<T>(work: impl Future<Output = T>) -> T {
     tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap().block_on(work)
@@ -25,7 +25,7 @@ fn alone<T>(work: impl Future<Output = T>) -> T {
 
 /// What an honest client has seen.
 #[derive(Clone)]
-pub struct Account {
+pub struct ClientLedger {
     pub sent: u64,
     pub answered: u64,
     /// With a reason.
@@ -39,9 +39,9 @@ pub struct Account {
     pub longest_gap: Duration,
 }
 
-impl Default for Account {
+impl Default for ClientLedger {
     fn default() -> Self {
-        Account {
+        ClientLedger {
             sent: 0,
             answered: 0,
             refused: 0,
@@ -54,8 +54,8 @@ impl Default for Account {
     }
 }
 
-impl Account {
-    pub fn add(&mut self, other: &Account) {
+impl ClientLedger {
+    pub fn add(&mut self, other: &ClientLedger) {
         self.sent += other.sent;
         self.answered += other.answered;
         self.refused += other.refused;
@@ -80,7 +80,7 @@ struct Shared {
     over: AtomicBool,
     /// Stand still for so long, ms.
     freeze_ms: AtomicU64,
-    account: Mutex<Account>,
+    account: Mutex<ClientLedger>,
 }
 
 /// Makes an honest client stand still, and its socket with it.
@@ -101,16 +101,16 @@ pub struct Honest {
 }
 
 /// What a client that has ended its work can say of all of it.
-pub struct Verdict {
+pub struct ClientVerdict {
     /// Since it was last asked.
-    pub account: Account,
+    pub account: ClientLedger,
     /// What the server says of the session's commands, if there is a server and a session.
     pub counts: Option<pb::CommandCounts>,
 }
 
 impl Honest {
     /// With so many tools in a session of its own.
-    pub fn start(caller: Caller, tools: u32) -> Self {
+    pub fn start(caller: TestCaller, tools: u32) -> Self {
         let shared = Arc::new(Shared::default());
         let (ready, made) = mpsc::channel();
         let thread = std::thread::spawn({
@@ -126,22 +126,27 @@ impl Honest {
     }
 
     /// What it has seen since it was last asked.
-    pub fn take(&self) -> Account {
+    pub fn take(&self) -> ClientLedger {
         std::mem::take(&mut self.shared.account.lock().unwrap())
     }
 
     /// Sends no more, waits for what is not answered, asks the server for its own account, and deletes the session.
-    pub fn end(self) -> Verdict {
+    pub fn end(self) -> ClientVerdict {
         self.shared.over.store(true, Ordering::Relaxed);
         let counts = self.thread.join().unwrap();
-        Verdict { account: std::mem::take(&mut self.shared.account.lock().unwrap()), counts }
+        ClientVerdict { account: std::mem::take(&mut self.shared.account.lock().unwrap()), counts }
     }
 }
 
 /// A tool's commands that are not answered: number, and when it was sent.
 type Waiting = VecDeque<(u64, Instant)>;
 
-async fn work(caller: Caller, tools: u32, shared: &Shared, ready: &mpsc::Sender<String>) -> Option<pb::CommandCounts> {
+async fn work(
+    caller: TestCaller,
+    tools: u32,
+    shared: &Shared,
+    ready: &mpsc::Sender<String>,
+) -> Option<pb::CommandCounts> {
     let door = caller.door().await.unwrap();
     let session_id = create(&door, sheet(SIDE, SIDE), false).await.unwrap();
     ready.send(session_id.clone()).unwrap();
@@ -170,7 +175,7 @@ async fn work(caller: Caller, tools: u32, shared: &Shared, ready: &mpsc::Sender<
     }
     if let Ok(door) = door {
         let deleted = async { sessions(&door).delete_session(pb::DeleteSessionRequest { session_id }).await };
-        let _ = tokio::time::timeout(PATIENCE, deleted).await;
+        let _ = tokio::time::timeout(TEST_TIMEOUT, deleted).await;
     }
     counts
 }
@@ -206,7 +211,7 @@ async fn visit(
                     if waiting.iter().all(VecDeque::is_empty) {
                         return counts(door, session_id).await;
                     }
-                    if over.elapsed() > PATIENCE {
+                    if over.elapsed() > TEST_TIMEOUT {
                         return Err(Status::deadline_exceeded("the last commands are not answered"));
                     }
                     continue;
@@ -309,7 +314,7 @@ pub struct Newcomers {
 impl Newcomers {
     /// Each makes a session, feels one command in it and one in the session `shared`, and deletes its own. Who is not done
     /// within `patience` gives up.
-    pub fn start(caller: Caller, shared: String, patience: Duration) -> Self {
+    pub fn start(caller: TestCaller, shared: String, patience: Duration) -> Self {
         let (over, welcome) = (Arc::new(AtomicBool::new(false)), Arc::new(Mutex::new(Welcome::default())));
         let thread = std::thread::spawn({
             let (over, welcome) = (over.clone(), welcome.clone());
@@ -342,7 +347,7 @@ impl Newcomers {
 }
 
 /// One newcomer, kept account of.
-async fn round(caller: &Caller, shared: &str, patience: Duration, welcome: &Mutex<Welcome>) {
+async fn round(caller: &TestCaller, shared: &str, patience: Duration, welcome: &Mutex<Welcome>) {
     let begun = Instant::now();
     {
         let mut welcome = welcome.lock().unwrap();
@@ -360,7 +365,7 @@ async fn round(caller: &Caller, shared: &str, patience: Duration, welcome: &Mute
     }
 }
 
-async fn newcomer(caller: &Caller, shared: &str) -> Result<(), Status> {
+async fn newcomer(caller: &TestCaller, shared: &str) -> Result<(), Status> {
     let door = caller.door().await?;
     let session_id = create(&door, sheet(SIDE, SIDE), false).await?;
     let own = feel(&door, &session_id).await;

@@ -41,10 +41,10 @@ pub enum Wrong {
 
 /// What it was told.
 #[derive(Clone, Default)]
-pub struct Heard(Arc<Mutex<Told>>);
+pub struct Heard(Arc<Mutex<ServiceState>>);
 
 #[derive(Default)]
-struct Told {
+struct ServiceState {
     forces_n: Vec<DVec3>,
     fields: BTreeSet<String>,
     profiles: Vec<String>,

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use palpate::journal::Opening;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 
 /// A running session of ann's that begins with the tissue of `first`.
 pub fn opening(first: &Arc<Model>) -> Opening<'_> {

@@ -16,7 +16,7 @@ use palpate::scene::profile::Poke;
 use palpate::scene::script::Script;
 use palpate::scene::{Integrator, Named, Scene};
 use palpate::session::Session;
-use palpate::sheet::{Model, Push};
+use palpate::tissue::{Model, Push};
 
 pub fn scene(text: &str) -> Scene {
     Scene::parse("test scene", text, &[], &Limits::default()).unwrap()
@@ -80,7 +80,7 @@ spacing_m = 0.05
 point_mass_kg = 0.02
 [springs]
 stiffness_n_per_m = 30.0
-[virtual_springs]
+[anchor_springs]
 stiffness_n_per_m = 5.0
 [damping]
 coefficient_n_s_per_m = 0.2

@@ -8,11 +8,11 @@ use std::io::Cursor;
 use std::sync::Arc;
 
 use palpate::budget::{Budget, Purpose, Resource};
-use palpate::journal::{Opening, Reader, Writer, pb as kept, replay};
+use palpate::journal::{JournalReader, JournalWriter, Opening, pb as kept, replay};
 use palpate::limits::Limits;
 use palpate::refusal::Result;
 use palpate::session::Session;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate_proto::codec::accepts;
 use palpate_proto::pb;
 use prost::Message;
@@ -24,7 +24,7 @@ const PART_BYTES: usize = 256 << 10;
 pub fn journal(first: &Arc<Model>, session: &Session) -> Vec<u8> {
     let step = session.step_count();
     let opening = Opening { owner: "test", begin_step: step, ownership_revision: 1, ..journal_opening::opening(first) };
-    let mut writer = Writer::new(&opening, 1);
+    let mut writer = JournalWriter::new(&opening, 1);
     writer.snapshot(step, session.tissue().state_hash(), session.model(), session.save().to_bytes());
     writer.finish(kept::Why::Cut, "a snapshot", step, 1)
 }
@@ -55,6 +55,6 @@ pub fn moved(first: &Arc<Model>, session: &Session, limits: &Limits) -> Result<S
     let bytes = received(&journal(first, session))?;
     let account = Budget::new(&Limits { memory_bytes: 4 << 30, ..limits.clone() }, 1, 1).account("test");
     let paid = account.take(Resource::Memory(Purpose::Journals), 0, "")?;
-    let reader = Reader::paid("the state of a session", Cursor::new(bytes), Some(paid))?;
+    let reader = JournalReader::paid("the state of a session", Cursor::new(bytes), Some(paid))?;
     Ok(replay::resume(reader, limits)?.session)
 }

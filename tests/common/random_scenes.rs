@@ -9,7 +9,7 @@ use palpate::limits::Limits;
 use palpate::scene::Scene;
 use palpate::scene::script::Script;
 use palpate::session::{Session, run};
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 
 #[path = "closed_mesh.rs"]
 mod closed_mesh;
@@ -17,7 +17,7 @@ mod closed_mesh;
 use closed_mesh::closed_mesh;
 
 /// A scene and a script as files say them, and what they are in short.
-pub struct Case {
+pub struct RandomScene {
     pub scene: String,
     pub script: String,
     /// The file `mesh.obj` of the scene, if it has one.
@@ -26,9 +26,9 @@ pub struct Case {
 }
 
 /// Sheets of 4 to 33 points a side, spacing 1 mm to 0.1 m, points of 10⁻⁵ to 0.1 kg, fastest vibration × 1 ms from 0.02 to
-/// 1.5, k/K″ from 0.3 to 200, ζ from 0.02 to 5 (of a point on its virtual spring), in part with flexion and fixed points;
+/// 1.5, k/K″ from 0.3 to 200, ζ from 0.02 to 5 (of a point on its anchor spring), in part with bending and fixed points;
 /// forces that strain springs by 1 to 50 %, constant, as a pulse, a ramp or a sine of 0.5 to 20 Hz, some of which move.
-pub fn case(seed: u64) -> Case {
+pub fn case(seed: u64) -> RandomScene {
     let mut random = fastrand::Rng::with_seed(seed);
     let mut uniform = |from: f64, to: f64| from + (to - from) * random.f64();
     let [mut sides, mut control] = [[0.0; 2]; 2];
@@ -41,14 +41,14 @@ pub fn case(seed: u64) -> Case {
     let stiffness = mass * (turn / 1e-3_f64).powi(2) / 12.0;
     let (ratio, zeta, strain) = (decades(0.3, 200.0), decades(0.02, 5.0), decades(0.01, 0.5));
     let falloff = decades(0.3, 3.0);
-    let virtual_stiffness = stiffness / ratio;
-    let damping = 2.0 * zeta * (virtual_stiffness * mass).sqrt();
-    let force = strain * spacing * (virtual_stiffness + 0.3 * stiffness);
+    let anchor_stiffness = stiffness / ratio;
+    let damping = 2.0 * zeta * (anchor_stiffness * mass).sqrt();
+    let force = strain * spacing * (anchor_stiffness + 0.3 * stiffness);
     // A direction, all alike.
     let (along_z, angle) = (uniform(-1.0, 1.0), uniform(0.0, std::f64::consts::TAU));
     let level = (1.0 - along_z * along_z).sqrt();
     let force = [level * angle.cos(), level * angle.sin(), along_z].map(|part| part * force);
-    let flexion = uniform(0.0, 1.0) < 0.4;
+    let bending = uniform(0.0, 1.0) < 0.4;
     let fixed = ["", "fixed = \"edges\"\n", "fixed = \"corners\"\n"][uniform(0.0, 3.0) as usize];
     let profile = match uniform(0.0, 4.0) as usize {
         0 => "{ type = \"constant\" }".to_owned(),
@@ -73,12 +73,12 @@ pub fn case(seed: u64) -> Case {
         }
     }
     let watched: Vec<String> = watched.iter().map(|[i, j]| format!("[{i}, {j}]")).collect();
-    Case {
+    RandomScene {
         mesh: None,
         scene: format!(
             "name = \"random {seed}\"\n[sheet]\npoints = [{nx}, {ny}]\nspacing_m = {spacing:?}\npoint_mass_kg = {mass:?}\n{fixed}\
-             [springs]\nstiffness_n_per_m = {stiffness:?}\nflexion = {flexion}\n\
-             [virtual_springs]\nstiffness_n_per_m = {virtual_stiffness:?}\n[damping]\ncoefficient_n_s_per_m = {damping:?}\n"
+             [springs]\nstiffness_n_per_m = {stiffness:?}\nbending = {bending}\n\
+             [anchor_springs]\nstiffness_n_per_m = {anchor_stiffness:?}\n[damping]\ncoefficient_n_s_per_m = {damping:?}\n"
         ),
         script: format!(
             "name = \"random {seed}\"\nduration_s = {duration:?}\nsample_every_s = 0.025\nsample_points = [{}]\n\
@@ -88,7 +88,7 @@ pub fn case(seed: u64) -> Case {
         ),
         about: format!(
             "seed {seed}: {nx} × {ny}, k/K″ {ratio:.3}, ω·1 ms {turn:.2}, ζ {zeta:.2}, strain {strain:.2}, falloff \
-             {falloff:.2} a spacing, flexion {flexion}, {} {}",
+             {falloff:.2} a spacing, bending {bending}, {} {}",
             fixed.trim_end(),
             profile.replace("type = ", "")
         ),
@@ -98,7 +98,7 @@ pub fn case(seed: u64) -> Case {
 /// The same on closed meshes of uneven triangles: fastest vibration × 1 ms from about 0.02 to 1.5, k/K″ of an even edge from 0.3
 /// to 200; forces inward that strain its
 /// springs by 1 to 50 %.
-pub fn mesh_case(seed: u64) -> Case {
+pub fn mesh_case(seed: u64) -> RandomScene {
     let mut random = fastrand::Rng::with_seed(seed);
     let mesh = closed_mesh(&mut random);
     let edge_m = mesh.edge_m();
@@ -109,12 +109,12 @@ pub fn mesh_case(seed: u64) -> Case {
     let (density, depth_m) = (1000.0, 0.03);
     // The fastest vibration of even triangles has (10k + K″)/m.
     let mass_kg_per_m2 = density * depth_m / 3.0;
-    let bed_n_per_m3 = mass_kg_per_m2 * (turn / 1e-3_f64).powi(2) / (10.0 * ratio + 1.0);
+    let foundation_n_per_m3 = mass_kg_per_m2 * (turn / 1e-3_f64).powi(2) / (10.0 * ratio + 1.0);
     let area_m2 = 0.75_f64.sqrt() * edge_m * edge_m;
-    let (thickness_m, virtual_n_per_m) = (1e-3, bed_n_per_m3 * area_m2);
-    let stiffness_n_per_m = ratio * virtual_n_per_m;
+    let (thickness_m, anchor_n_per_m) = (1e-3, foundation_n_per_m3 * area_m2);
+    let stiffness_n_per_m = ratio * anchor_n_per_m;
     let modulus_pa = stiffness_n_per_m / (0.75_f64.sqrt() * thickness_m);
-    let flexion = [0.0, 0.1, 0.5][uniform(0.0, 3.0) as usize];
+    let bending = [0.0, 0.1, 0.5][uniform(0.0, 3.0) as usize];
     let vertex = uniform(0.0, mesh.places_m.len() as f64) as usize;
     let place_m = mesh.places_m[vertex];
     let profile = match uniform(0.0, 4.0) as usize {
@@ -124,21 +124,21 @@ pub fn mesh_case(seed: u64) -> Case {
         _ => format!("{{ type = \"sine\", frequency_hz = {:?} }}", uniform(0.5, 20.0)),
     };
     let away_m = place_m.iter().map(|c| c * c).sum::<f64>().sqrt();
-    let force_n = strain * edge_m * (virtual_n_per_m + 0.3 * stiffness_n_per_m);
+    let force_n = strain * edge_m * (anchor_n_per_m + 0.3 * stiffness_n_per_m);
     let towards = [(); 3].map(|()| uniform(-1.0, 1.0));
     let force_n = [0, 1, 2].map(|c| force_n * (0.3 * towards[c] - place_m[c] / away_m));
     let others = mesh.triangles.iter().find(|triangle| triangle.contains(&(vertex as u32)));
     let watched: Vec<u32> = others.into_iter().flatten().copied().collect();
-    Case {
+    RandomScene {
         mesh: Some(mesh.obj()),
         scene: format!(
             "name = \"random {seed}\"\n[mesh]\nfile = \"mesh.obj\"\nunit = \"m\"\n[material]\nyoungs_modulus_pa = {modulus_pa:?}\n\
-             thickness_m = {thickness_m:?}\ndensity_kg_per_m3 = {density:?}\ndepth_m = {depth_m:?}\nbed_n_per_m3 = {bed_n_per_m3:?}\n\
-             damping_ratio = {zeta:?}\n[springs]\nflexion = {flexion}\n"
+             thickness_m = {thickness_m:?}\ndensity_kg_per_m3 = {density:?}\ndepth_m = {depth_m:?}\nfoundation_n_per_m3 = {foundation_n_per_m3:?}\n\
+             damping_ratio = {zeta:?}\n[springs]\nbending = {bending}\n"
         ),
         about: format!(
             "mesh of seed {seed}: {} vertices, k/K″ {ratio:.3}, ω·1 ms {turn:.2}, ζ {zeta:.2}, strain {strain:.2}, falloff \
-             {falloff:.2} an edge, flexion {flexion}, {}",
+             {falloff:.2} an edge, bending {bending}, {}",
             mesh.places_m.len(),
             profile.replace("type = ", "")
         ),
@@ -151,18 +151,18 @@ pub fn mesh_case(seed: u64) -> Case {
 }
 
 /// Displacement and reaction, each x, y and z, of every watched point at each sample time.
-pub type Course = Vec<Vec<[[f64; 3]; 2]>>;
+pub type PointHistory = Vec<Vec<[[f64; 3]; 2]>>;
 
 /// A case that was played.
 pub struct Played {
-    pub course: Course,
+    pub course: PointHistory,
     pub model: Arc<Model>,
     /// What a step took on average, if a clock was given, s.
     pub step_s: f64,
 }
 
 /// A case's scene with assignments over it.
-pub fn scene(case: &Case, assignments: &[String], limits: &Limits) -> Result<Scene, String> {
+pub fn scene(case: &RandomScene, assignments: &[String], limits: &Limits) -> Result<Scene, String> {
     let text = |refusal: palpate::refusal::Refusal| refusal.to_string();
     match &case.mesh {
         None => Scene::parse("random", &case.scene, assignments, limits).map_err(text),
@@ -178,7 +178,7 @@ pub fn scene(case: &Case, assignments: &[String], limits: &Limits) -> Result<Sce
 }
 
 /// The same, compiled with its script.
-pub fn compile(case: &Case, assignments: &[String]) -> Result<(Arc<Model>, Script), String> {
+pub fn compile(case: &RandomScene, assignments: &[String]) -> Result<(Arc<Model>, Script), String> {
     // Offline, as `palpate run`: the truth takes more than a server would do.
     let limits = Limits { rehearsal_work: 1 << 32, ..Limits::default() };
     let text = |refusal: palpate::refusal::Refusal| refusal.to_string();
@@ -188,7 +188,7 @@ pub fn compile(case: &Case, assignments: &[String]) -> Result<(Arc<Model>, Scrip
 }
 
 /// The errors of displacement and force that `palpate run --audit` tells of a case.
-pub fn audited_errors(case: &Case, assignments: &[String]) -> Result<[f64; 2], String> {
+pub fn audited_errors(case: &RandomScene, assignments: &[String]) -> Result<[f64; 2], String> {
     let (model, script) = compile(case, assignments)?;
     let (limits, mut output) = (Limits::default(), std::io::sink());
     let summary = run::audited(&model, &script, false, &limits, &mut output, &|| 0.0, &mut |_| {});
@@ -197,7 +197,7 @@ pub fn audited_errors(case: &Case, assignments: &[String]) -> Result<[f64; 2], S
 }
 
 /// Plays a case with assignments over its scene.
-pub fn play(case: &Case, assignments: &[String], clock_s: &dyn Fn() -> f64) -> Result<Played, String> {
+pub fn play(case: &RandomScene, assignments: &[String], clock_s: &dyn Fn() -> f64) -> Result<Played, String> {
     let (model, script) = compile(case, assignments)?;
     let mut session = Session::new(&model);
     run::play(&mut session, &script);
@@ -217,13 +217,13 @@ pub fn play(case: &Case, assignments: &[String], clock_s: &dyn Fn() -> f64) -> R
 }
 
 /// The same in f64 at a tolerance of 1e-10, with everything awake.
-pub fn truth(case: &Case) -> Result<Played, String> {
+pub fn truth(case: &RandomScene) -> Result<Played, String> {
     let settings = ["stepping.precision=f64", "stepping.tolerance=1e-10", "sleep.tolerance=0"];
     play(case, &settings.map(str::to_owned), &|| 0.0)
 }
 
 /// The largest difference of any component, relative to the largest: of displacements, and of forces.
-pub fn errors(truth: &Course, other: &Course) -> [f64; 2] {
+pub fn errors(truth: &PointHistory, other: &PointHistory) -> [f64; 2] {
     [0, 1].map(|which: usize| {
         let (mut largest, mut error) = (0.0_f64, 0.0_f64);
         for (a, b) in truth.iter().flatten().zip(other.iter().flatten()) {

@@ -28,7 +28,7 @@ use tonic::{Code, Status, Streaming};
 use tonic_types::StatusExt;
 
 /// Long enough for any machine; a test that waits so long has failed.
-pub const PATIENCE: Duration = Duration::from_secs(60);
+pub const TEST_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// The client program, built if it is not there or not new.
 pub fn client_program() -> PathBuf {
@@ -65,16 +65,16 @@ pub fn palpate(arguments: &[&str]) -> Output {
         .unwrap()
 }
 
-pub struct Server {
+pub struct TestServer {
     pub child: Child,
     pub url: String,
     /// What it prints after the line with its address.
     pub out: BufReader<ChildStdout>,
 }
 
-impl Server {
+impl TestServer {
     pub fn start(arguments: &[&str]) -> Self {
-        Server::start_at("127.0.0.1:0", arguments)
+        TestServer::start_at("127.0.0.1:0", arguments)
     }
 
     /// The same, at that address.
@@ -82,16 +82,16 @@ impl Server {
         let mut command = Command::new(env!("CARGO_BIN_EXE_palpate"));
         command.args(["serve", "--listen", listen]).args(arguments);
         if std::env::var_os("PALPATE_SHOW_LOGS").is_some() {
-            return Server::spawn(command.stderr(Stdio::inherit()));
+            return TestServer::spawn(command.stderr(Stdio::inherit()));
         }
-        Server::spawn(command.stderr(Stdio::piped()))
+        TestServer::spawn(command.stderr(Stdio::piped()))
     }
 
     /// A server that a script of the shell starts, such as one that sets limits: `$0` is the program, `$1` and so on `arguments`.
     pub fn by_script(script: &str, arguments: &[&std::ffi::OsStr]) -> Self {
         let mut command = Command::new("sh");
         command.args(["-c", script, env!("CARGO_BIN_EXE_palpate")]).args(arguments);
-        Server::spawn(command.stderr(Stdio::piped()))
+        TestServer::spawn(command.stderr(Stdio::piped()))
     }
 
     /// A server that a command starts, which prints its address first.
@@ -102,7 +102,7 @@ impl Server {
         out.read_line(&mut line).unwrap();
         let url = line.split_whitespace().last().unwrap_or_default().to_owned();
         assert!(url.contains("://127.0.0.1:"), "{line:?}");
-        Server { child, url, out }
+        TestServer { child, url, out }
     }
 
     pub async fn channel(&self) -> Channel {
@@ -144,7 +144,7 @@ impl Server {
     pub async fn hash_at(&self, session_id: &str, step: u64) -> String {
         let request = pb::GetStateHashRequest { session_id: session_id.into(), at_step: Some(step) };
         let mut sessions = self.sessions().await;
-        let answer = tokio::time::timeout(PATIENCE, sessions.get_state_hash(request));
+        let answer = tokio::time::timeout(TEST_TIMEOUT, sessions.get_state_hash(request));
         answer.await.unwrap().unwrap().into_inner().state_hash
     }
 
@@ -157,7 +157,7 @@ impl Server {
     /// sessions they are.
     pub async fn until_applied(&self, scene_name: &str, more: u64) -> Vec<pb::Session> {
         let mut sessions = self.sessions().await;
-        let waited = tokio::time::timeout(PATIENCE, async {
+        let waited = tokio::time::timeout(TEST_TIMEOUT, async {
             let mut before = None;
             loop {
                 let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
@@ -175,7 +175,7 @@ impl Server {
     /// Waits until nobody holds a tool of any session.
     pub async fn until_let_go(&self) {
         let mut sessions = self.sessions().await;
-        let waited = tokio::time::timeout(PATIENCE, async {
+        let waited = tokio::time::timeout(TEST_TIMEOUT, async {
             loop {
                 let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
                 if listed.iter().all(|session| session.held_tools.is_empty()) {
@@ -197,7 +197,7 @@ impl Server {
     }
 }
 
-impl Drop for Server {
+impl Drop for TestServer {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -205,18 +205,18 @@ impl Drop for Server {
 }
 
 /// A haptic stream.
-pub struct Touch {
+pub struct TestTouch {
     outbound: Option<mpsc::Sender<pb::TouchRequest>>,
     inbound: Streaming<pb::TouchResponse>,
     pub opened: Option<pb::TouchOpened>,
 }
 
-impl Touch {
-    pub async fn open(server: &Server, open: pb::TouchOpen) -> Result<Self, Status> {
+impl TestTouch {
+    pub async fn open(server: &TestServer, open: pb::TouchOpen) -> Result<Self, Status> {
         let (outbound, messages) = mpsc::channel(4096);
         outbound.send(pb::TouchRequest { message: Some(Say::Open(open)) }).await.unwrap();
         let inbound = server.haptics().await.touch(ReceiverStream::new(messages)).await?.into_inner();
-        let mut touch = Touch { outbound: Some(outbound), inbound, opened: None };
+        let mut touch = TestTouch { outbound: Some(outbound), inbound, opened: None };
         match touch.hear().await? {
             Some(Heard::Opened(opened)) => touch.opened = Some(opened),
             other => panic!("{other:?}"),
@@ -225,8 +225,8 @@ impl Touch {
     }
 
     /// Holds tool 0 for a minute.
-    pub async fn hold(server: &Server, session_id: &str) -> Self {
-        Touch::open(server, open(session_id, &[0])).await.unwrap()
+    pub async fn hold(server: &TestServer, session_id: &str) -> Self {
+        TestTouch::open(server, open(session_id, &[0])).await.unwrap()
     }
 
     pub async fn say(&self, message: Say) {
@@ -249,7 +249,8 @@ impl Touch {
     }
 
     pub async fn hear(&mut self) -> Result<Option<Heard>, Status> {
-        let message = tokio::time::timeout(PATIENCE, self.inbound.message()).await.expect("the server is silent")?;
+        let message =
+            tokio::time::timeout(TEST_TIMEOUT, self.inbound.message()).await.expect("the server is silent")?;
         Ok(message.map(|message| message.message.unwrap()))
     }
 
@@ -344,7 +345,7 @@ pub fn sheet(nx: u32, ny: u32) -> pb::create_session_request::Source {
 
 /// The steps of the changes of the tissue that wait, as a journal has them. `None`: it can't be read yet.
 pub fn waiting(journal: &Path) -> Option<Vec<u64>> {
-    let survey = palpate::journal::Reader::open(journal).and_then(|mut reader| reader.survey(&mut |_| {}));
+    let survey = palpate::journal::JournalReader::open(journal).and_then(|mut reader| reader.survey(&mut |_| {}));
     Some(survey.ok()?.waiting.iter().map(|input| input.step).collect())
 }
 

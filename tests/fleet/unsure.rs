@@ -8,9 +8,9 @@ use palpate_proto::pb;
 use tonic::Code;
 
 use crate::alone;
-use crate::etcd::Etcd;
+use crate::etcd::EtcdMembers;
 use crate::fleet::{Node, create, owner, three, until, until_stood_by};
-use crate::random::Random;
+use crate::random::TestRandom;
 
 async fn move_to(from: &Node, id: &str, to: &Node) -> Result<pb::MoveSessionResponse, tonic::Status> {
     let request = pb::MoveSessionRequest { session_id: id.to_owned(), node: to.name.clone() };
@@ -44,7 +44,7 @@ async fn a_session_stays_if_the_other_server_can_not_write_its_journal() {
 }
 
 /// Servers whose leases outlast a silence of etcd.
-async fn patient(folder: &Path, etcd: &Etcd) -> Vec<Node> {
+async fn patient(folder: &Path, etcd: &EtcdMembers) -> Vec<Node> {
     let config = folder.join("palpate.toml");
     std::fs::write(&config, "[cluster]\nttl_s = 60\n").unwrap();
     let more = ["--config", config.to_str().unwrap(), "--log", "warn"];
@@ -54,7 +54,7 @@ async fn patient(folder: &Path, etcd: &Etcd) -> Vec<Node> {
 }
 
 /// A new session, and which server has it. etcd is silent since it was created, and is about to be told who stands by for it.
-async fn being_named(nodes: &[Node], etcd: &Etcd) -> (String, usize) {
+async fn being_named(nodes: &[Node], etcd: &EtcdMembers) -> (String, usize) {
     let session = create(&nodes[0]).await;
     etcd.pause(0);
     let (id, name) = (session.session_id, session.ownership.unwrap().node);
@@ -128,7 +128,7 @@ async fn a_session_has_one_server_whenever_the_one_that_takes_it_dies() {
     let Some((_one, folder, etcd)) = alone().await else { return };
     let mut nodes = three(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await.session_id;
-    let (mut random, mut revision, mut durable_step) = (Random(7), 0, 0);
+    let (mut random, mut revision, mut durable_step) = (TestRandom(7), 0, 0);
     for round in 0..5 {
         let (at, session) = until_stood_by(&nodes, &id).await;
         let now = session.ownership.as_ref().unwrap().revision;

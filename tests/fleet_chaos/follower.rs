@@ -114,7 +114,7 @@ pub struct Return {
 
 /// What a client has seen.
 #[derive(Debug, Clone, Default)]
-pub struct Seen {
+pub struct FollowerObservation {
     pub spoken: BTreeMap<u64, Spoken>,
     /// The same for each stream by itself.
     pub stretches: Vec<Spoken>,
@@ -132,7 +132,7 @@ pub struct Seen {
     pub faults: Vec<String>,
 }
 
-impl Seen {
+impl FollowerObservation {
     fn says(&mut self, revision: u64, words: Spoken) {
         self.stretches.push(words.clone());
         if let Some(known) = self.spoken.get_mut(&revision) {
@@ -161,7 +161,7 @@ impl Seen {
 /// A client at work.
 pub struct Follower {
     pub id: String,
-    seen: Arc<Mutex<Seen>>,
+    seen: Arc<Mutex<FollowerObservation>>,
     over: Arc<AtomicBool>,
     task: JoinHandle<()>,
 }
@@ -169,13 +169,14 @@ pub struct Follower {
 impl Follower {
     /// Presses at 1 kHz, and gets a sample every so many steps.
     pub fn start(doors: &Arc<Doors>, id: &str, every: u32) -> Self {
-        let (seen, over, id) = (Arc::new(Mutex::new(Seen::default())), Arc::new(AtomicBool::new(false)), id.to_owned());
+        let (seen, over, id) =
+            (Arc::new(Mutex::new(FollowerObservation::default())), Arc::new(AtomicBool::new(false)), id.to_owned());
         let (doors, told) = (doors.clone(), (seen.clone(), over.clone()));
         let press = Press { doors, id: id.clone(), every, seen: told.0, over: told.1, last: None };
         Follower { id, seen, over, task: tokio::spawn(press.follow()) }
     }
 
-    pub fn seen(&self) -> Seen {
+    pub fn seen(&self) -> FollowerObservation {
         self.seen.lock().unwrap().clone()
     }
 
@@ -195,7 +196,7 @@ impl Follower {
     }
 
     /// Works no more; what it has seen.
-    pub async fn end(mut self) -> Seen {
+    pub async fn end(mut self) -> FollowerObservation {
         self.over.store(true, Ordering::Relaxed);
         if timeout(2 * SILENCE, &mut self.task).await.is_err() {
             // Nobody has its session.
@@ -215,7 +216,7 @@ struct Press {
     doors: Arc<Doors>,
     id: String,
     every: u32,
-    seen: Arc<Mutex<Seen>>,
+    seen: Arc<Mutex<FollowerObservation>>,
     over: Arc<AtomicBool>,
     /// The newest sample: when, and the force.
     last: Option<(Instant, [f64; 3])>,
@@ -371,12 +372,12 @@ fn distance(a: [f64; 3], b: [f64; 3]) -> f64 {
 }
 
 /// Somebody who looks at a session, wherever it is.
-pub struct Viewer {
+pub struct FollowingViewer {
     newest: Arc<Mutex<Option<(Instant, usize)>>>,
     task: JoinHandle<()>,
 }
 
-impl Viewer {
+impl FollowingViewer {
     pub fn start(doors: &Arc<Doors>, id: &str) -> Self {
         let newest = Arc::new(Mutex::new(None));
         let (doors, id, told) = (doors.clone(), id.to_owned(), newest.clone());
@@ -395,7 +396,7 @@ impl Viewer {
                 tokio::time::sleep(AGAIN).await;
             }
         });
-        Viewer { newest, task }
+        FollowingViewer { newest, task }
     }
 
     /// The server that has shown the session since a moment.
@@ -404,7 +405,7 @@ impl Viewer {
     }
 }
 
-impl Drop for Viewer {
+impl Drop for FollowingViewer {
     fn drop(&mut self) {
         self.task.abort();
     }

@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 
 use glam::DVec3;
-use palpate::journal::{Reader, Vector3, message, pb};
+use palpate::journal::{JournalReader, Vector3, message, pb};
 use palpate::limits::Limits;
 use palpate::scene::profile::Poke;
 use palpate::scene::script::Action;
@@ -47,13 +47,13 @@ fn advance(session: &mut Session, step: u64, commands: &mut Vec<Due>) {
 
 /// Compares all hashes of the runs, in their order, with those of a session that has done all of it in one place. Tells how many.
 pub fn compare(runs: &[PathBuf]) -> u64 {
-    let first = Reader::open(&runs[0]).unwrap();
+    let first = JournalReader::open(&runs[0]).unwrap();
     let model = message::model(first.header(), &Limits::default()).unwrap();
-    let begins: Vec<u64> = runs.iter().map(|run| Reader::open(run).unwrap().header().begin_step).collect();
+    let begins: Vec<u64> = runs.iter().map(|run| JournalReader::open(run).unwrap().header().begin_step).collect();
     let mut session = Session::new(&model);
     let (mut compared, mut commands) = (0, Vec::new());
     for (index, run) in runs.iter().enumerate() {
-        let mut reader = Reader::open(run).unwrap();
+        let mut reader = JournalReader::open(run).unwrap();
         // From there on the next run tells.
         let end = begins.get(index + 1).copied().unwrap_or(u64::MAX);
         while let Some(batch) = reader.next_batch().unwrap() {

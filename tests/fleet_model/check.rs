@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use crate::broken::Broken;
-use crate::world::{Event, Sample, World};
+use crate::world::{ModelEvent, ModelSample, World};
 use crate::{N, Ns, S};
 
 /// What is known of a session from outside.
@@ -16,11 +16,11 @@ pub(crate) struct Truth {
     pub(crate) claims: u32,
     /// The first time it acted since faults stopped.
     pub(crate) acted: Option<Ns>,
-    client: Client,
+    client: ClientState,
 }
 
 #[derive(Debug, Clone, Default)]
-struct Client {
+struct ClientState {
     revision: u64,
     node: N,
     durable: u64,
@@ -67,8 +67,8 @@ impl Check {
     }
 
     /// A node speaks for it.
-    fn speaks(&mut self, sample: &Sample) {
-        let Sample { sid, node, count, durable, .. } = *sample;
+    fn speaks(&mut self, sample: &ModelSample) {
+        let ModelSample { sid, node, count, durable, .. } = *sample;
         let truth = self.of(sid);
         if let Some(before) = truth.durable.filter(|before| count < *before) {
             self.fail(format!("s{sid} has {count} inputs on n{node}, but {before} were durable"));
@@ -94,10 +94,10 @@ impl World {
             live.rests = rests;
             live.count += u64::from(!rests);
             let (count, revision) = (live.count, live.revision);
-            let sample = Sample { sid, node: n, revision, count, durable, claims };
+            let sample = ModelSample { sid, node: n, revision, count, durable, claims };
             self.check.speaks(&sample);
             let late = self.between(1, 250);
-            self.at(self.now + late, Event::Sample(sample));
+            self.at(self.now + late, ModelEvent::Sample(sample));
             if !rests {
                 let write = self.between(10, 40);
                 self.timer(n, write, crate::world::Timer::Write(sid, run));
@@ -108,7 +108,7 @@ impl World {
     }
 
     /// A client reads a sample.
-    pub(crate) fn read(&mut self, sample: Sample) {
+    pub(crate) fn read(&mut self, sample: ModelSample) {
         let takes_all = self.is(Broken::ClientTakesAll);
         let Some(truth) = self.check.sessions.get_mut(&sample.sid) else { return };
         let client = &mut truth.client;

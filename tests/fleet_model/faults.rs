@@ -5,11 +5,11 @@ use palpate::cluster::placement;
 
 use crate::broken::Broken;
 use crate::node::{Memory, WHOLE};
-use crate::world::{ETCD, Event, Input, World};
+use crate::world::{ETCD, ModelEvent, NodeInput, World};
 use crate::{BOUND, MS, N, Ns, S};
 
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Fault {
+pub(crate) enum ModelFault {
     /// A node begins, if it still waits since that crash.
     Start(N, u32),
     Resume(N, u32),
@@ -21,7 +21,7 @@ pub(crate) enum Fault {
 
 /// What a run has had.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Counts {
+pub(crate) struct FaultCounts {
     pub(crate) seeds: u64,
     pub(crate) seconds: u64,
     pub(crate) crashes: u64,
@@ -39,8 +39,8 @@ pub(crate) struct Counts {
     pub(crate) longest: Ns,
 }
 
-impl Counts {
-    pub(crate) fn add(&mut self, other: &Counts) {
+impl FaultCounts {
+    pub(crate) fn add(&mut self, other: &FaultCounts) {
         let sums = [
             (&mut self.seeds, other.seeds),
             (&mut self.seconds, other.seconds),
@@ -78,7 +78,7 @@ impl World {
         let node = &mut self.nodes[n];
         // What came while it was paused is lost with it.
         streams.extend(node.held.iter().filter_map(|event| match event {
-            Event::Node(_, _, Input::Peer(_, stream, _)) => Some(*stream),
+            ModelEvent::Node(_, _, NodeInput::Peer(_, stream, _)) => Some(*stream),
             _ => None,
         }));
         (node.up, node.serving, node.paused) = (false, false, false);
@@ -87,16 +87,16 @@ impl World {
         streams.into_iter().for_each(|stream| self.doom(stream));
     }
 
-    pub(crate) fn fault(&mut self, fault: Fault) {
+    pub(crate) fn fault(&mut self, fault: ModelFault) {
         match fault {
-            Fault::Start(n, epoch) if self.nodes[n].epoch == epoch && !self.nodes[n].up => self.start(n),
-            Fault::Resume(n, epoch) if self.nodes[n].epoch == epoch => self.resume(n),
-            Fault::Heal(a, b, round) if self.round == round => {
+            ModelFault::Start(n, epoch) if self.nodes[n].epoch == epoch && !self.nodes[n].up => self.start(n),
+            ModelFault::Resume(n, epoch) if self.nodes[n].epoch == epoch => self.resume(n),
+            ModelFault::Heal(a, b, round) if self.round == round => {
                 self.note(|| format!("n{a} and {b} reach each other again"));
                 self.cut.remove(&(a, b));
             }
-            Fault::EtcdBack(round) if self.round == round => self.etcd_back(),
-            Fault::Silence(stream, n, epoch) if self.nodes[n].epoch == epoch && self.nodes[n].paused => {
+            ModelFault::EtcdBack(round) if self.round == round => self.etcd_back(),
+            ModelFault::Silence(stream, n, epoch) if self.nodes[n].epoch == epoch && self.nodes[n].paused => {
                 self.doom(stream);
             }
             _ => {}
@@ -115,9 +115,9 @@ impl World {
         for stream in self.streams(n) {
             let opener = self.opened.get(&stream).map(|opened| opened.0);
             let late = if opener == Some(n) { self.between(10_000, 20_000) } else { self.between(1_000, 2_000) };
-            self.at(self.now + late, Event::Fault(Fault::Silence(stream, n, epoch)));
+            self.at(self.now + late, ModelEvent::Fault(ModelFault::Silence(stream, n, epoch)));
         }
-        self.at(self.now + long, Event::Fault(Fault::Resume(n, epoch)));
+        self.at(self.now + long, ModelEvent::Fault(ModelFault::Resume(n, epoch)));
     }
 
     fn resume(&mut self, n: N) {
@@ -152,7 +152,7 @@ impl World {
                     self.crash(n);
                     let long = if self.chance(0.5) { self.between(100, 2_000) } else { self.between(1_000, 20_000) };
                     let epoch = self.nodes[n].epoch;
-                    self.at(self.now + long, Event::Fault(Fault::Start(n, epoch)));
+                    self.at(self.now + long, ModelEvent::Fault(ModelFault::Start(n, epoch)));
                 }
             }
             14..26 => self.pause(n),
@@ -170,7 +170,7 @@ impl World {
                         cut.into_iter().for_each(|stream| self.doom(stream));
                     }
                     let long = self.between(200, 15_000);
-                    self.at(self.now + long, Event::Fault(Fault::Heal(n, to, round)));
+                    self.at(self.now + long, ModelEvent::Fault(ModelFault::Heal(n, to, round)));
                 }
             }
             38..42 => {
@@ -180,7 +180,7 @@ impl World {
                     self.etcd_is_down = true;
                     (0..self.nodes.len()).for_each(|n| self.lose_watch(n));
                     let long = self.between(200, 9_000);
-                    self.at(self.now + long, Event::Fault(Fault::EtcdBack(round)));
+                    self.at(self.now + long, ModelEvent::Fault(ModelFault::EtcdBack(round)));
                 }
             }
             42..46 => self.lose_watch(n),

@@ -7,7 +7,7 @@ use palpate::cluster::rules;
 use crate::broken::Broken;
 use crate::node::Memory;
 use crate::store::Change;
-use crate::world::{Answer, Ask, Input, Next, Then, Timer, World};
+use crate::world::{Ask, KeyChange, ModelAnswer, NodeInput, Then, Timer, World};
 use crate::{MS, N, TTL_S};
 
 const PAUSE: u64 = 100 * MS;
@@ -29,24 +29,24 @@ impl World {
         self.timer(n, 0, Timer::Join);
     }
 
-    pub(crate) fn hear(&mut self, n: N, input: Input) {
+    pub(crate) fn hear(&mut self, n: N, input: NodeInput) {
         match input {
-            Input::Timer(timer) => self.wake(n, timer),
-            Input::Answer(call, answer) => {
+            NodeInput::Timer(timer) => self.wake(n, timer),
+            NodeInput::Answer(call, answer) => {
                 if let Some((then, _)) = self.nodes[n].memory.calls.remove(&call) {
                     self.go_on_with(n, then, answer);
                 }
             }
-            Input::Timeout(call) => {
+            NodeInput::Timeout(call) => {
                 if let Some((then, is_txn)) = self.nodes[n].memory.calls.remove(&call) {
-                    self.go_on_with(n, then, if is_txn { Answer::Unknown } else { Answer::Unreachable });
+                    self.go_on_with(n, then, if is_txn { ModelAnswer::Unknown } else { ModelAnswer::Unreachable });
                 }
             }
-            Input::Watch(watch, change) if self.nodes[n].memory.watch == watch => self.see(n, &change),
-            Input::WatchLost(watch) if self.nodes[n].memory.watch == watch => self.wake(n, Timer::ListNodes),
-            Input::Watch(..) | Input::WatchLost(_) => {}
-            Input::Peer(from, stream, say) => self.hear_peer(n, from, stream, say),
-            Input::End(stream) => self.stream_ended(n, stream),
+            NodeInput::Watch(watch, change) if self.nodes[n].memory.watch == watch => self.see(n, &change),
+            NodeInput::WatchLost(watch) if self.nodes[n].memory.watch == watch => self.wake(n, Timer::ListNodes),
+            NodeInput::Watch(..) | NodeInput::WatchLost(_) => {}
+            NodeInput::Peer(from, stream, say) => self.hear_peer(n, from, stream, say),
+            NodeInput::End(stream) => self.stream_ended(n, stream),
         }
     }
 
@@ -90,18 +90,18 @@ impl World {
         }
     }
 
-    fn go_on_with(&mut self, n: N, then: Then, answer: Answer) {
+    fn go_on_with(&mut self, n: N, then: Then, answer: ModelAnswer) {
         match then {
             Then::KeptAlive(sent) => self.kept_alive(n, sent, &answer),
             Then::Granted => match answer {
-                Answer::Lease(Some(lease)) => {
+                ModelAnswer::Lease(Some(lease)) => {
                     let key = self.keys.node(&self.nodes[n].name);
                     self.ask(n, Ask::Get(key), Then::SeenOwnKey(lease));
                 }
                 _ => self.not_registered(n),
             },
             Then::SeenOwnKey(lease) => match answer {
-                Answer::Got(found) => {
+                ModelAnswer::Got(found) => {
                     let key = self.keys.node(&self.nodes[n].name);
                     let as_seen = found.map_or(Compare::Absent(key.clone()), |found| {
                         Compare::ModRevision(key.clone(), found.mod_revision)
@@ -115,20 +115,20 @@ impl World {
                 _ => self.not_registered(n),
             },
             Then::Registered(lease) => match answer {
-                Answer::Done(outcome) if outcome.succeeded => self.registered(n, lease, outcome.revision),
-                Answer::Unknown => {
+                ModelAnswer::Done(outcome) if outcome.succeeded => self.registered(n, lease, outcome.revision),
+                ModelAnswer::Unknown => {
                     let key = self.keys.node(&self.nodes[n].name);
                     self.ask(n, Ask::Get(key), Then::Checked(lease));
                 }
                 _ => self.not_registered(n),
             },
             Then::Checked(lease) => match answer {
-                Answer::Got(Some(found)) if found.lease == lease => self.registered(n, lease, found.mod_revision),
+                ModelAnswer::Got(Some(found)) if found.lease == lease => self.registered(n, lease, found.mod_revision),
                 _ => self.not_registered(n),
             },
             Then::ListedFirst | Then::Listed => {
                 let is_first = matches!(then, Then::ListedFirst);
-                let Answer::Listed(found, revision) = answer else {
+                let ModelAnswer::Listed(found, revision) = answer else {
                     return if is_first { self.not_registered(n) } else { self.timer(n, PAUSE, Timer::ListNodes) };
                 };
                 let prefix = self.keys.nodes();
@@ -146,14 +146,14 @@ impl World {
             // It gives no answer: only that it failed is heard.
             Then::Watching => {
                 let is_watched = self.nodes[n].memory.watch;
-                if matches!(answer, Answer::Unreachable) && !self.is_watching(n, is_watched) {
+                if matches!(answer, ModelAnswer::Unreachable) && !self.is_watching(n, is_watched) {
                     self.timer(n, PAUSE, Timer::ListNodes);
                 }
             }
             Then::Told => self.has_told(n, &answer),
             Then::ToldChecked => {
                 let lease = self.nodes[n].memory.lease;
-                if let Answer::Got(Some(found)) = answer
+                if let ModelAnswer::Got(Some(found)) = answer
                     && found.lease == lease
                 {
                     self.nodes[n].memory.key_revision = found.mod_revision;
@@ -216,9 +216,9 @@ impl World {
         }
     }
 
-    fn kept_alive(&mut self, n: N, sent: u64, answer: &Answer) {
+    fn kept_alive(&mut self, n: N, sent: u64, answer: &ModelAnswer) {
         match answer {
-            Answer::Lease(Some(_)) => {
+            ModelAnswer::Lease(Some(_)) => {
                 let mut fence = rules::fence_ns(sent, TTL_S);
                 if self.is(Broken::FenceLate) {
                     fence = sent + TTL_S * 1_200 * MS;
@@ -227,8 +227,8 @@ impl World {
                 let taken = self.nodes[n].clock(self.now) - sent;
                 self.timer(n, (TTL_S * 1_000 * MS / 6).saturating_sub(taken), Timer::KeepAlive);
             }
-            Answer::Lease(None) if !self.nodes[n].serving => self.restart(n),
-            Answer::Lease(None) => {
+            ModelAnswer::Lease(None) if !self.nodes[n].serving => self.restart(n),
+            ModelAnswer::Lease(None) => {
                 self.note(|| format!("n{n} its lease has ended"));
                 let memory = &mut self.nodes[n].memory;
                 (memory.fence, memory.rejoining) = (0, true);
@@ -247,7 +247,7 @@ impl World {
             return self.is_taken_back(n);
         };
         let txn = self.keep(n, sid, owned.revision, "");
-        self.ask(n, Ask::Txn(txn), Then::Txn(sid, Next::TakenBack));
+        self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::TakenBack));
     }
 
     /// All is taken back or lost: from the next keepalive on it may act.
@@ -308,10 +308,10 @@ impl World {
         self.ask(n, Ask::Txn(Txn { if_all: vec![is_own], then: vec![put], otherwise: vec![] }), Then::Told);
     }
 
-    fn has_told(&mut self, n: N, answer: &Answer) {
+    fn has_told(&mut self, n: N, answer: &ModelAnswer) {
         let memory = &mut self.nodes[n].memory;
         match answer {
-            Answer::Done(outcome) if outcome.succeeded => memory.key_revision = outcome.revision,
+            ModelAnswer::Done(outcome) if outcome.succeeded => memory.key_revision = outcome.revision,
             _ => {
                 memory.told = None;
                 let key = self.keys.node(&self.nodes[n].name);

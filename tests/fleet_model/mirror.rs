@@ -3,8 +3,8 @@
 use palpate::cluster::placement;
 
 use crate::broken::Broken;
-use crate::node::{Kept, Stream, WHOLE};
-use crate::world::{Ask, Next, Say, Then, World};
+use crate::node::{ReplicaJournal, ReplicationStream, WHOLE};
+use crate::world::{Ask, KeyChange, Say, Then, World};
 use crate::{MS, N, S};
 
 impl World {
@@ -25,7 +25,7 @@ impl World {
             match (is_there, known) {
                 (true, None) => {
                     let id = self.open(n, to);
-                    self.nodes[n].memory.streams.insert(to, Stream { id, ..Stream::default() });
+                    self.nodes[n].memory.streams.insert(to, ReplicationStream { id, ..ReplicationStream::default() });
                     self.say(n, to, id, Say::Open);
                 }
                 (false, Some((id, _))) => {
@@ -177,7 +177,7 @@ impl World {
             return self.stream_ended(n, stream);
         }
         let since = self.nodes[n].clock(self.now);
-        self.nodes[n].kept.insert(sid, Kept { run, bytes: to, sender: from, stream: Some(stream), since });
+        self.nodes[n].kept.insert(sid, ReplicaJournal { run, bytes: to, sender: from, stream: Some(stream), since });
         let sync = self.between(1, 8);
         self.say_after(n, from, stream, Say::Confirm(sid, run, to), sync);
     }
@@ -216,7 +216,7 @@ impl World {
         }
         let standby = self.nodes[to].name.clone();
         let txn = self.keep(n, sid, owned.revision, &standby);
-        self.ask(n, Ask::Txn(txn), Then::Txn(sid, Next::Named(to, bytes)));
+        self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::Named(to, bytes)));
     }
 
     pub(crate) fn named(
@@ -225,7 +225,7 @@ impl World {
         sid: S,
         to: N,
         bytes: u64,
-        result: Result<Result<u64, crate::owner::Found>, ()>,
+        result: Result<Result<u64, crate::owner::KeyState>, ()>,
     ) {
         let stale = self.is(Broken::StaleRevision);
         let me = self.nodes[n].name.clone();

@@ -5,8 +5,8 @@ use palpate::cluster::rules;
 
 use crate::broken::Broken;
 use crate::node::{Coming, Moving, Owned};
-use crate::owner::Found;
-use crate::world::{Answer, Ask, Move, Next, Say, Then, Timer, World};
+use crate::owner::KeyState;
+use crate::world::{Ask, KeyChange, ModelAnswer, Move, Say, Then, Timer, World};
 use crate::{MS, N, S};
 
 impl World {
@@ -113,12 +113,12 @@ impl World {
                 let names = [&*self.nodes[n].name, &*self.nodes[to].name];
                 let revision = self.nodes[n].memory.moving[&id].revision;
                 let txn = rules::hand_over(&self.keys, self.id(sid), revision, names);
-                self.ask(n, Ask::Txn(txn), Then::Txn(sid, Next::Handed(id)));
+                self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::Handed(id)));
             }
         }
     }
 
-    pub(crate) fn handed(&mut self, n: N, id: u64, result: Result<Result<u64, Found>, ()>) {
+    pub(crate) fn handed(&mut self, n: N, id: u64, result: Result<Result<u64, KeyState>, ()>) {
         let Some(moving) = self.nodes[n].memory.moving.get(&id).cloned().filter(|moving| !moving.unsure) else {
             return;
         };
@@ -168,10 +168,10 @@ impl World {
         };
         let standby = self.nodes[n].memory.standbys.get(&moving.sid).map(|standby| self.nodes[*standby].name.clone());
         let txn = self.keep(n, moving.sid, owned.revision, &standby.unwrap_or_default());
-        self.ask(n, Ask::Txn(txn), Then::Txn(moving.sid, Next::Fixed(id)));
+        self.ask(n, Ask::Txn(txn), Then::Txn(moving.sid, KeyChange::Fixed(id)));
     }
 
-    pub(crate) fn fixed(&mut self, n: N, id: u64, result: Result<Result<u64, Found>, ()>) {
+    pub(crate) fn fixed(&mut self, n: N, id: u64, result: Result<Result<u64, KeyState>, ()>) {
         let Some(moving) = self.nodes[n].memory.moving.get(&id).cloned() else { return };
         let sid = moving.sid;
         match result {
@@ -199,8 +199,8 @@ impl World {
     }
 
     /// What the owner has read.
-    pub(crate) fn is_certain(&mut self, n: N, id: u64, answer: &Answer) {
-        let Answer::Got(found) = answer else { return self.timer(n, 100 * MS, Timer::Certain(id)) };
+    pub(crate) fn is_certain(&mut self, n: N, id: u64, answer: &ModelAnswer) {
+        let ModelAnswer::Got(found) = answer else { return self.timer(n, 100 * MS, Timer::Certain(id)) };
         let Some(moving) = self.nodes[n].memory.moving.get(&id).cloned() else { return };
         let value: Option<SessionValue> = found.as_ref().and_then(|found| decode(&found.value));
         if value.is_some_and(|value| value.node == self.nodes[moving.to].name) {
@@ -250,11 +250,11 @@ impl World {
         self.ask(n, Ask::Get(key), Then::Held(id));
     }
 
-    pub(crate) fn held(&mut self, n: N, id: u64, answer: &Answer) {
+    pub(crate) fn held(&mut self, n: N, id: u64, answer: &ModelAnswer) {
         let Some(coming) = self.nodes[n].memory.coming.get(&id).cloned() else { return };
         let once = self.is(Broken::TakeReadsOnce);
         match answer {
-            Answer::Got(found) => {
+            ModelAnswer::Got(found) => {
                 let revision = found.as_ref().map_or(0, |found| found.mod_revision);
                 let value: Option<SessionValue> = found.as_ref().and_then(|found| decode(&found.value));
                 if value.is_some_and(|value| value.node == self.nodes[n].name) {

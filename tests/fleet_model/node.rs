@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use palpate::cluster::key::NodeValue;
 
-use crate::world::{Event, Then};
+use crate::world::{ModelEvent, Then};
 use crate::{N, Ns, S};
 
 /// A journal of `count` inputs has `count + WHOLE` bytes; one with fewer bytes has not even its first state.
@@ -12,7 +12,7 @@ pub(crate) const WHOLE: u64 = 2;
 
 /// The journal of one run of a session.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct File {
+pub(crate) struct JournalRun {
     pub(crate) bytes: u64,
     /// It was deleted, or went to another node.
     pub(crate) ended: bool,
@@ -20,7 +20,7 @@ pub(crate) struct File {
 
 /// A journal for which the node stands by.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Kept {
+pub(crate) struct ReplicaJournal {
     pub(crate) run: u32,
     pub(crate) bytes: u64,
     pub(crate) sender: N,
@@ -32,7 +32,7 @@ pub(crate) struct Kept {
 
 /// A session in memory.
 #[derive(Debug, Clone)]
-pub(crate) struct Live {
+pub(crate) struct OwnedSession {
     pub(crate) count: u64,
     pub(crate) run: u32,
     pub(crate) local: Option<u64>,
@@ -62,7 +62,7 @@ pub(crate) struct Owned {
 
 /// A stream of journals to another node.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Stream {
+pub(crate) struct ReplicationStream {
     pub(crate) id: u64,
     /// The other has said what it has.
     pub(crate) is_open: bool,
@@ -106,12 +106,12 @@ pub(crate) struct Memory {
     pub(crate) key_revision: u64,
     pub(crate) view: BTreeMap<String, NodeValue>,
     pub(crate) watch: u64,
-    pub(crate) live: BTreeMap<S, Live>,
+    pub(crate) live: BTreeMap<S, OwnedSession>,
     pub(crate) owned: BTreeMap<S, Owned>,
     pub(crate) standbys: BTreeMap<S, N>,
     pub(crate) growth: BTreeMap<S, Growth>,
     pub(crate) runs: BTreeMap<S, u32>,
-    pub(crate) streams: BTreeMap<N, Stream>,
+    pub(crate) streams: BTreeMap<N, ReplicationStream>,
     pub(crate) inbound: BTreeMap<u64, N>,
     /// Sessions about which a transaction of the mirror is under way.
     pub(crate) naming: BTreeSet<S>,
@@ -131,21 +131,21 @@ pub(crate) struct Memory {
     pub(crate) has_settled: bool,
 }
 
-pub(crate) struct Node {
+pub(crate) struct ModelNode {
     pub(crate) name: String,
     pub(crate) rate: f64,
     pub(crate) offset: Ns,
     pub(crate) up: bool,
     pub(crate) serving: bool,
     pub(crate) paused: bool,
-    pub(crate) held: Vec<Event>,
+    pub(crate) held: Vec<ModelEvent>,
     pub(crate) epoch: u32,
-    pub(crate) folder: BTreeMap<S, BTreeMap<u32, File>>,
-    pub(crate) kept: BTreeMap<S, Kept>,
+    pub(crate) folder: BTreeMap<S, BTreeMap<u32, JournalRun>>,
+    pub(crate) kept: BTreeMap<S, ReplicaJournal>,
     pub(crate) memory: Memory,
 }
 
-impl Node {
+impl ModelNode {
     /// What its clock shows.
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(crate) fn clock(&self, now: Ns) -> Ns {
@@ -184,7 +184,7 @@ impl Node {
         if !with_old {
             files.clear();
         }
-        files.insert(kept.run, File { bytes: kept.bytes, ended: false });
+        files.insert(kept.run, JournalRun { bytes: kept.bytes, ended: false });
         true
     }
 

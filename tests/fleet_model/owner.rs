@@ -5,14 +5,14 @@ use palpate::cluster::key::{SessionValue, decode};
 use palpate::cluster::rules;
 
 use crate::broken::Broken;
-use crate::node::{Growth, Live, Owned, WHOLE};
-use crate::world::{Answer, Ask, Next, Then, Timer, World};
+use crate::node::{Growth, Owned, OwnedSession, WHOLE};
+use crate::world::{Ask, KeyChange, ModelAnswer, Then, Timer, World};
 use crate::{MS, N, S};
 
 /// Who stood by and is not needed keeps what it has for so long: a transaction that names it may be under way.
 const KEEPS: u64 = 30_000 * MS;
 
-pub(crate) type Found = Option<(SessionValue, u64)>;
+pub(crate) type KeyState = Option<(SessionValue, u64)>;
 
 impl World {
     pub(crate) fn keep(&self, n: N, sid: S, revision: u64, standby: &str) -> Txn {
@@ -33,7 +33,7 @@ impl World {
         let id = format!("{:032x}", self.rng.u128(..));
         self.ids.push(id);
         let txn = rules::create(&self.keys, self.id(sid), &self.nodes[n].name);
-        self.ask(n, Ask::Txn(txn), Then::Txn(sid, Next::Born));
+        self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::Born));
     }
 
     /// A client deletes a session.
@@ -65,42 +65,44 @@ impl World {
             if self.is(Broken::DeleteBlind) {
                 txn.if_all.clear();
             }
-            self.ask(n, Ask::Txn(txn), Then::Txn(sid, Next::Deleted));
+            self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::Deleted));
         }
     }
 
-    pub(crate) fn transacted(&mut self, n: N, sid: S, next: Next, answer: Answer) {
+    pub(crate) fn transacted(&mut self, n: N, sid: S, next: KeyChange, answer: ModelAnswer) {
         match answer {
-            Answer::Done(outcome) if outcome.succeeded => self.ended(n, sid, next, Ok(Ok(outcome.revision))),
-            Answer::Done(_) | Answer::Unknown => {
+            ModelAnswer::Done(outcome) if outcome.succeeded => self.ended(n, sid, next, Ok(Ok(outcome.revision))),
+            ModelAnswer::Done(_) | ModelAnswer::Unknown => {
                 let key = self.key(sid);
-                self.ask(n, Ask::Get(key), Then::Resolve(sid, next, matches!(answer, Answer::Unknown)));
+                self.ask(n, Ask::Get(key), Then::Resolve(sid, next, matches!(answer, ModelAnswer::Unknown)));
             }
             _ => self.ended(n, sid, next, Err(())),
         }
     }
 
-    pub(crate) fn resolved(&mut self, n: N, sid: S, next: Next, was_unknown: bool, answer: Answer) {
-        let Answer::Got(found) = answer else { return self.ended(n, sid, next, Err(())) };
-        let found: Found = found.and_then(|found| Some((decode(&found.value)?, found.mod_revision)));
+    pub(crate) fn resolved(&mut self, n: N, sid: S, next: KeyChange, was_unknown: bool, answer: ModelAnswer) {
+        let ModelAnswer::Got(found) = answer else { return self.ended(n, sid, next, Err(())) };
+        let found: KeyState = found.and_then(|found| Some((decode(&found.value)?, found.mod_revision)));
         let me = &self.nodes[n].name;
         let is_done = match (next, &found) {
-            (Next::Deleted, found) => found.is_none(),
-            (Next::Settled, _) => true,
+            (KeyChange::Deleted, found) => found.is_none(),
+            (KeyChange::Settled, _) => true,
             (_, None) => false,
-            (Next::Born, Some(_)) => true,
-            (Next::Named(to, _), Some((value, revision))) => {
+            (KeyChange::Born, Some(_)) => true,
+            (KeyChange::Named(to, _), Some((value, revision))) => {
                 // A key that was so before is not proof: what was asked for earlier may still come.
                 let known = self.nodes[n].memory.owned.get(&sid).map_or(0, |owned| owned.revision);
                 value.node == *me && value.standby == self.nodes[to].name && *revision > known
             }
-            (Next::Handed(id), Some((value, _))) => {
+            (KeyChange::Handed(id), Some((value, _))) => {
                 let to = self.nodes[n].memory.moving.get(&id).map(|moving| moving.to);
                 to.is_some_and(|to| value.node == self.nodes[to].name)
             }
-            (Next::OwnKept | Next::Regained, Some((value, _))) => value.node == *me && value.standby.is_empty(),
+            (KeyChange::OwnKept | KeyChange::Regained, Some((value, _))) => {
+                value.node == *me && value.standby.is_empty()
+            }
             // That it was done can't be told from what is there: it is done again.
-            (Next::Fixed(_), _) => false,
+            (KeyChange::Fixed(_), _) => false,
             (_, Some((value, _))) => value.node == *me,
         };
         let result = if was_unknown && is_done { Ok(found.map_or(0, |found| found.1)) } else { Err(found) };
@@ -108,26 +110,26 @@ impl World {
     }
 
     /// A transaction about a session has ended: at a revision, or with what is there instead; or that is not known.
-    fn ended(&mut self, n: N, sid: S, next: Next, result: Result<Result<u64, Found>, ()>) {
+    fn ended(&mut self, n: N, sid: S, next: KeyChange, result: Result<Result<u64, KeyState>, ()>) {
         let me = self.nodes[n].name.clone();
-        let is_mine = |found: &Found| found.as_ref().is_some_and(|(value, _)| value.node == me);
+        let is_mine = |found: &KeyState| found.as_ref().is_some_and(|(value, _)| value.node == me);
         let learns = !self.is(Broken::StaleRevision);
         self.note(|| format!("n{n} s{sid} {next:?}: {result:?}"));
         match (next, result) {
-            (Next::Born, Ok(Ok(revision))) => {
+            (KeyChange::Born, Ok(Ok(revision))) => {
                 self.counts.created += 1;
                 self.nodes[n].memory.owned.insert(sid, Owned { revision, was_here: true });
                 self.run_session(n, sid, 0, 0, revision);
             }
-            (Next::Regained, Ok(Ok(revision))) => {
+            (KeyChange::Regained, Ok(Ok(revision))) => {
                 let memory = &self.nodes[n].memory;
                 if !memory.owned.contains_key(&sid) && !memory.live.contains_key(&sid) {
                     self.nodes[n].memory.owned.insert(sid, Owned { revision, was_here: true });
                     self.continue_own(n, sid, revision);
                 }
             }
-            (Next::Born | Next::Settled | Next::Regained, _) => {}
-            (Next::Deleted, result) => {
+            (KeyChange::Born | KeyChange::Settled | KeyChange::Regained, _) => {}
+            (KeyChange::Deleted, result) => {
                 let memory = &mut self.nodes[n].memory;
                 memory.deleting.remove(&sid);
                 let is_gone = match &result {
@@ -150,9 +152,9 @@ impl World {
                     self.check.is_deleted(sid);
                 }
             }
-            (Next::TakenBack, Err(()) | Ok(Err(_))) if !self.nodes[n].memory.taking_back.contains(&sid) => {}
-            (Next::TakenBack, Err(())) => self.timer(n, 100 * MS, Timer::TakeBack(sid)),
-            (Next::TakenBack, Ok(Ok(revision))) => {
+            (KeyChange::TakenBack, Err(()) | Ok(Err(_))) if !self.nodes[n].memory.taking_back.contains(&sid) => {}
+            (KeyChange::TakenBack, Err(())) => self.timer(n, 100 * MS, Timer::TakeBack(sid)),
+            (KeyChange::TakenBack, Ok(Ok(revision))) => {
                 self.counts.take_backs += 1;
                 let memory = &mut self.nodes[n].memory;
                 if let Some(owned) = memory.owned.get_mut(&sid) {
@@ -166,7 +168,7 @@ impl World {
                     self.is_taken_back(n);
                 }
             }
-            (Next::TakenBack, Ok(Err(found))) => {
+            (KeyChange::TakenBack, Ok(Err(found))) => {
                 if learns && is_mine(&found) {
                     let known = self.nodes[n].memory.owned.get(&sid).map(|owned| owned.revision);
                     if known == found.as_ref().map(|found| found.1) {
@@ -183,8 +185,8 @@ impl World {
                 self.nodes[n].memory.taking_back.remove(&sid);
                 self.is_taken_back(n);
             }
-            (Next::Named(to, bytes), result) => self.named(n, sid, to, bytes, result),
-            (Next::Claimed, result) => match result {
+            (KeyChange::Named(to, bytes), result) => self.named(n, sid, to, bytes, result),
+            (KeyChange::Claimed, result) => match result {
                 Ok(Ok(revision)) => {
                     self.counts.claims += 1;
                     self.nodes[n].memory.owned.insert(sid, Owned { revision, was_here: false });
@@ -193,25 +195,25 @@ impl World {
                 }
                 _ => _ = self.nodes[n].memory.claiming.remove(&sid),
             },
-            (Next::OwnKept, Err(())) => self.restart(n),
-            (Next::OwnKept, Ok(Ok(revision))) => {
+            (KeyChange::OwnKept, Err(())) => self.restart(n),
+            (KeyChange::OwnKept, Ok(Ok(revision))) => {
                 self.nodes[n].memory.own.insert(sid, revision);
                 self.next_own(n);
             }
-            (Next::OwnKept, Ok(Err(found))) => {
+            (KeyChange::OwnKept, Ok(Err(found))) => {
                 if learns && is_mine(&found) && !self.is(Broken::JoinSkips) {
                     // What was under way from the process before: once more.
                     self.nodes[n].memory.own_left.push(sid);
                 }
                 self.next_own(n);
             }
-            (Next::Handed(id), result) => self.handed(n, id, result),
-            (Next::Fixed(id), result) => self.fixed(n, id, result),
+            (KeyChange::Handed(id), result) => self.handed(n, id, result),
+            (KeyChange::Fixed(id), result) => self.fixed(n, id, result),
         }
     }
 
     /// The newest write was this node's own, though it has heard no answer.
-    pub(crate) fn adopt(&mut self, n: N, sid: S, found: &Found) {
+    pub(crate) fn adopt(&mut self, n: N, sid: S, found: &KeyState) {
         if let (Some(owned), Some((_, revision))) = (self.nodes[n].memory.owned.get_mut(&sid), found) {
             owned.revision = owned.revision.max(*revision);
         }
@@ -242,7 +244,7 @@ impl World {
         let run = memory.runs.get(&sid).copied().unwrap_or_default().max(after_run) + 1;
         memory.runs.insert(sid, run);
         let (local, mirrored, frozen) = (None, None, coming);
-        let live = Live { count, run, local, mirrored, frozen, coming, revision, rests, broken: false };
+        let live = OwnedSession { count, run, local, mirrored, frozen, coming, revision, rests, broken: false };
         memory.live.insert(sid, live);
         let write = self.between(10, 40);
         self.timer(n, write, Timer::Write(sid, run));
@@ -312,16 +314,19 @@ impl World {
     /// The process ends, and is started again.
     pub(crate) fn restart(&mut self, n: N) {
         self.crash(n);
-        self.at(self.now + 500 * MS, crate::world::Event::Fault(crate::faults::Fault::Start(n, self.nodes[n].epoch)));
+        self.at(
+            self.now + 500 * MS,
+            crate::world::ModelEvent::Fault(crate::faults::ModelFault::Start(n, self.nodes[n].epoch)),
+        );
     }
 
-    pub(crate) fn own_seen(&mut self, n: N, sid: S, answer: Answer) {
-        let Answer::Got(found) = answer else { return self.restart(n) };
-        let found: Found = found.and_then(|found| Some((decode(&found.value)?, found.mod_revision)));
+    pub(crate) fn own_seen(&mut self, n: N, sid: S, answer: ModelAnswer) {
+        let ModelAnswer::Got(found) = answer else { return self.restart(n) };
+        let found: KeyState = found.and_then(|found| Some((decode(&found.value)?, found.mod_revision)));
         match found {
             Some((value, revision)) if value.node == self.nodes[n].name => {
                 let txn = self.keep(n, sid, revision, "");
-                self.ask(n, Ask::Txn(txn), Then::Txn(sid, Next::OwnKept));
+                self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::OwnKept));
             }
             _ => self.next_own(n),
         }
@@ -341,16 +346,16 @@ impl World {
         }
     }
 
-    fn is_unsent(&self, n: N, kept: &crate::node::Kept) -> bool {
+    fn is_unsent(&self, n: N, kept: &crate::node::ReplicaJournal) -> bool {
         let is_there = self.nodes[n].memory.view.contains_key(&self.nodes[kept.sender].name);
         kept.stream.is_none() || (!is_there && !self.is(Broken::ClaimAwaitsStream))
     }
 
-    pub(crate) fn claim(&mut self, n: N, sid: S, answer: Answer) {
+    pub(crate) fn claim(&mut self, n: N, sid: S, answer: ModelAnswer) {
         let is_there = |world: &World, name: &str| world.nodes[n].memory.view.contains_key(name);
         let done = |world: &mut World| _ = world.nodes[n].memory.claiming.remove(&sid);
-        let Answer::Got(found) = answer else { return done(self) };
-        let found: Found = found.and_then(|found| Some((decode(&found.value)?, found.mod_revision)));
+        let ModelAnswer::Got(found) = answer else { return done(self) };
+        let found: KeyState = found.and_then(|found| Some((decode(&found.value)?, found.mod_revision)));
         let Some((value, revision)) = found else {
             self.nodes[n].kept.remove(&sid);
             return done(self);
@@ -364,7 +369,7 @@ impl World {
             }
             // What was read may be old by now: it counts when it is written again.
             let txn = self.keep(n, sid, revision, "");
-            return self.ask(n, Ask::Txn(txn), Then::Txn(sid, Next::Claimed));
+            return self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::Claimed));
         }
         if value.standby != me {
             let Some(kept) = self.nodes[n].kept.get(&sid).copied() else { return done(self) };
@@ -390,7 +395,7 @@ impl World {
         if blind {
             txn.if_all.retain(|compare| !matches!(compare, Compare::Absent(_)));
         }
-        self.ask(n, Ask::Txn(txn), Then::Txn(sid, Next::Claimed));
+        self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::Claimed));
     }
 
     /// A claimed session goes on from the journal that is here.
@@ -413,8 +418,8 @@ impl World {
     }
 
     /// Sessions that etcd says are this node's, and that it has not got.
-    pub(crate) fn settle(&mut self, n: N, answer: Answer) {
-        let Answer::Listed(found, _) = answer else { return self.timer(n, 500 * MS, Timer::Settle) };
+    pub(crate) fn settle(&mut self, n: N, answer: ModelAnswer) {
+        let ModelAnswer::Listed(found, _) = answer else { return self.timer(n, 500 * MS, Timer::Settle) };
         let prefix = self.keys.sessions();
         let before = std::mem::take(&mut self.nodes[n].memory.settle_seen);
         for found in found {
@@ -439,7 +444,7 @@ impl World {
             if !self.is(Broken::SettleAll) && !self.is(Broken::JoinSkips) && self.nodes[n].has_any(sid) {
                 if !self.nodes[n].memory.claiming.contains(&sid) {
                     let txn = self.keep(n, sid, found.mod_revision, "");
-                    self.ask(n, Ask::Txn(txn), Then::Txn(sid, Next::Regained));
+                    self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::Regained));
                 }
                 continue;
             }
@@ -449,7 +454,7 @@ impl World {
             } else {
                 rules::give_up(&self.keys, self.id(sid), found.mod_revision, &value.standby)
             };
-            self.ask(n, Ask::Txn(txn), Then::Txn(sid, Next::Settled));
+            self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::Settled));
         }
         self.nodes[n].memory.has_settled = true;
         if !self.is(Broken::SettleAll) {

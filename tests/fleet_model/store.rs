@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use palpate::cluster::etcd::{Compare, KeyValue, Op, Outcome, Txn};
+use palpate::cluster::etcd::{Compare, KeyValue, Op, TransactionOutcome, Txn};
 
 use crate::Ns;
 
@@ -50,7 +50,7 @@ impl Store {
     }
 
     /// `None`: refused, because a lease is not there.
-    pub(crate) fn transact(&mut self, txn: &Txn) -> Option<Outcome> {
+    pub(crate) fn transact(&mut self, txn: &Txn) -> Option<TransactionOutcome> {
         let succeeded = txn.if_all.iter().all(|compare| self.holds(compare));
         let ops = if succeeded { &txn.then } else { &txn.otherwise };
         let has_lease = |op: &Op| !matches!(op, Op::Put { lease: Some(id), .. } if !self.leases.contains_key(id));
@@ -71,7 +71,7 @@ impl Store {
                 Op::Get(key) => got.push(self.get(key)),
             }
         }
-        Some(Outcome { succeeded, revision: self.revision, got })
+        Some(TransactionOutcome { succeeded, revision: self.revision, got })
     }
 
     fn put(&mut self, key: &str, value: &[u8], lease: i64) {

@@ -3,31 +3,31 @@
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap, VecDeque};
 
-use palpate::cluster::etcd::{KeyValue, Outcome, Txn};
+use palpate::cluster::etcd::{KeyValue, TransactionOutcome, Txn};
 use palpate::cluster::key::Keys;
 
 use crate::broken::Broken;
 use crate::check::Check;
-use crate::faults::{Counts, Fault};
-use crate::node::{Memory, Node};
+use crate::faults::{FaultCounts, ModelFault};
+use crate::node::{Memory, ModelNode};
 use crate::store::{Change, Store};
 use crate::{MS, N, Ns, S, TTL_S};
 
 /// A member of etcd that has not answered within this time is given up.
-const PATIENCE: Ns = 1_000 * MS;
+const ETCD_TIMEOUT: Ns = 1_000 * MS;
 
 #[derive(Debug, Clone)]
-pub(crate) enum Event {
-    Node(N, u32, Input),
+pub(crate) enum ModelEvent {
+    Node(N, u32, NodeInput),
     Etcd(N, u32, u64, Ask),
     Expire(i64),
-    Sample(Sample),
-    Fault(Fault),
+    Sample(ModelSample),
+    Fault(ModelFault),
 }
 
 /// What a client reads.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Sample {
+pub(crate) struct ModelSample {
     pub(crate) sid: S,
     pub(crate) node: N,
     pub(crate) revision: u64,
@@ -49,11 +49,11 @@ pub(crate) enum Ask {
 }
 
 #[derive(Debug, Clone)]
-pub(crate) enum Answer {
+pub(crate) enum ModelAnswer {
     Lease(Option<i64>),
     Got(Option<KeyValue>),
     Listed(Vec<KeyValue>, u64),
-    Done(Outcome),
+    Done(TransactionOutcome),
     Refused,
     Unreachable,
     Unknown,
@@ -61,9 +61,9 @@ pub(crate) enum Answer {
 
 /// What a node hears.
 #[derive(Debug, Clone)]
-pub(crate) enum Input {
+pub(crate) enum NodeInput {
     Timer(Timer),
-    Answer(u64, Answer),
+    Answer(u64, ModelAnswer),
     Timeout(u64),
     Watch(u64, Change),
     WatchLost(u64),
@@ -117,7 +117,7 @@ pub(crate) enum Say {
 
 /// Why a session's key is changed.
 #[derive(Debug, Clone, Copy)]
-pub(crate) enum Next {
+pub(crate) enum KeyChange {
     Born,
     Deleted,
     TakenBack,
@@ -143,8 +143,8 @@ pub(crate) enum Then {
     Watching,
     Told,
     ToldChecked,
-    Txn(S, Next),
-    Resolve(S, Next, bool),
+    Txn(S, KeyChange),
+    Resolve(S, KeyChange, bool),
     Own(S),
     Claim(S),
     Certain(u64),
@@ -159,11 +159,11 @@ pub(crate) struct World {
     pub(crate) on_two: bool,
     pub(crate) keys: Keys,
     pub(crate) store: Store,
-    pub(crate) nodes: Vec<Node>,
+    pub(crate) nodes: Vec<ModelNode>,
     pub(crate) check: Check,
-    pub(crate) counts: Counts,
+    pub(crate) counts: FaultCounts,
     queue: BinaryHeap<Reverse<(Ns, u64)>>,
-    events: BTreeMap<u64, Event>,
+    events: BTreeMap<u64, ModelEvent>,
     next: u64,
     pub(crate) etcd_is_down: bool,
     /// The round of faults, and when its faults stopped.
@@ -190,7 +190,7 @@ impl World {
         let mut rng = fastrand::Rng::with_seed(seed);
         let count = rng.usize(3..=5);
         let off = if broken == Broken::Clocks { 0.3 } else { 0.05 };
-        let node = |index: usize| Node {
+        let node = |index: usize| ModelNode {
             name: format!("n{index}"),
             rate: 1.0 + off * (2.0 * rng.f64() - 1.0),
             offset: rng.u64(0..1_000_000 * MS),
@@ -203,7 +203,7 @@ impl World {
             kept: BTreeMap::new(),
             memory: Memory::default(),
         };
-        let nodes: Vec<Node> = (0..count).map(node).collect();
+        let nodes: Vec<ModelNode> = (0..count).map(node).collect();
         World {
             now: 0,
             rng,
@@ -213,7 +213,7 @@ impl World {
             store: Store::default(),
             nodes,
             check: Check::default(),
-            counts: Counts::default(),
+            counts: FaultCounts::default(),
             queue: BinaryHeap::new(),
             events: BTreeMap::new(),
             next: 0,
@@ -248,7 +248,7 @@ impl World {
         self.log.push_back((self.now, text()));
     }
 
-    pub(crate) fn at(&mut self, time: Ns, event: Event) {
+    pub(crate) fn at(&mut self, time: Ns, event: ModelEvent) {
         let number = self.number();
         self.queue.push(Reverse((time.max(self.now), number)));
         self.events.insert(number, event);
@@ -257,7 +257,7 @@ impl World {
     /// A node is woken after what its clock calls `ns`.
     pub(crate) fn timer(&mut self, n: N, ns: Ns, timer: Timer) {
         let (time, epoch) = (self.now + self.nodes[n].lasting(ns), self.nodes[n].epoch);
-        self.at(time, Event::Node(n, epoch, Input::Timer(timer)));
+        self.at(time, ModelEvent::Node(n, epoch, NodeInput::Timer(timer)));
     }
 
     pub(crate) fn between(&mut self, from_ms: u64, to_ms: u64) -> Ns {
@@ -292,22 +292,22 @@ impl World {
         self.now = self.now.max(end);
     }
 
-    fn happen(&mut self, event: Event) {
+    fn happen(&mut self, event: ModelEvent) {
         match event {
-            Event::Node(n, epoch, input) if self.nodes[n].epoch != epoch || !self.nodes[n].up => {
-                if let Input::Peer(_, stream, _) = input {
+            ModelEvent::Node(n, epoch, input) if self.nodes[n].epoch != epoch || !self.nodes[n].up => {
+                if let NodeInput::Peer(_, stream, _) = input {
                     self.doom(stream);
                 }
             }
-            Event::Node(n, ..) if self.nodes[n].paused => self.nodes[n].held.push(event),
-            Event::Node(n, _, input) => {
+            ModelEvent::Node(n, ..) if self.nodes[n].paused => self.nodes[n].held.push(event),
+            ModelEvent::Node(n, _, input) => {
                 self.hear(n, input);
                 self.check_owners(n);
             }
-            Event::Etcd(from, epoch, call, ask) => self.etcd(from, epoch, call, ask),
-            Event::Expire(lease) => self.expire(lease),
-            Event::Sample(sample) => self.read(sample),
-            Event::Fault(fault) => self.fault(fault),
+            ModelEvent::Etcd(from, epoch, call, ask) => self.etcd(from, epoch, call, ask),
+            ModelEvent::Expire(lease) => self.expire(lease),
+            ModelEvent::Sample(sample) => self.read(sample),
+            ModelEvent::Fault(fault) => self.fault(fault),
         }
     }
 
@@ -319,7 +319,7 @@ impl World {
                 continue;
             }
             self.check.acts(*sid, self.now);
-            let other = |(m, node): &(usize, &Node)| *m != n && node.can_act(self.now, *sid);
+            let other = |(m, node): &(usize, &ModelNode)| *m != n && node.can_act(self.now, *sid);
             if let Some((m, _)) = self.nodes.iter().enumerate().find(other) {
                 self.check.fail(format!("n{n} and n{m} can act for s{sid} at once"));
                 return;
@@ -334,11 +334,11 @@ impl World {
         self.nodes[n].memory.calls.insert(call, (then, is_txn));
         let epoch = self.nodes[n].epoch;
         if (self.etcd_is_down || self.is_cut(n, ETCD)) && self.chance(0.3) {
-            let answer = Event::Node(n, epoch, Input::Answer(call, Answer::Unreachable));
+            let answer = ModelEvent::Node(n, epoch, NodeInput::Answer(call, ModelAnswer::Unreachable));
             return self.at(self.now + 2 * MS, answer);
         }
-        let patience = self.now + self.nodes[n].lasting(PATIENCE);
-        self.at(patience, Event::Node(n, epoch, Input::Timeout(call)));
+        let patience = self.now + self.nodes[n].lasting(ETCD_TIMEOUT);
+        self.at(patience, ModelEvent::Node(n, epoch, NodeInput::Timeout(call)));
         // It waits in etcd, or on the way there, and is done when nobody waits for it any more.
         let is_late = is_txn && self.is_chaos && self.now + 7_000 * MS < self.chaos_ends && self.chance(0.02);
         let delay = if is_late { self.between(900, 6_000) } else { self.delay() };
@@ -346,7 +346,7 @@ impl World {
             self.note(|| format!("n{n} a transaction is late by {} ms", delay / MS));
         }
         if !self.is_cut(n, ETCD) {
-            self.at(self.now + delay, Event::Etcd(n, epoch, call, ask));
+            self.at(self.now + delay, ModelEvent::Etcd(n, epoch, call, ask));
         }
     }
 
@@ -360,15 +360,15 @@ impl World {
             Ask::Grant => {
                 let lease = self.store.grant(self.now + ttl);
                 let late = self.between(0, 600);
-                self.at(self.now + ttl + late, Event::Expire(lease));
-                Answer::Lease(Some(lease))
+                self.at(self.now + ttl + late, ModelEvent::Expire(lease));
+                ModelAnswer::Lease(Some(lease))
             }
-            Ask::KeepAlive(lease) => Answer::Lease(self.store.keep_alive(lease, self.now + ttl).then_some(lease)),
-            Ask::Get(key) => Answer::Got(self.store.get(&key)),
-            Ask::List(prefix) => Answer::Listed(self.store.list(&prefix), self.store.revision),
+            Ask::KeepAlive(lease) => ModelAnswer::Lease(self.store.keep_alive(lease, self.now + ttl).then_some(lease)),
+            Ask::Get(key) => ModelAnswer::Got(self.store.get(&key)),
+            Ask::List(prefix) => ModelAnswer::Listed(self.store.list(&prefix), self.store.revision),
             Ask::Txn(txn) => {
                 self.counts.transactions += 1;
-                self.store.transact(&txn).map_or(Answer::Refused, Answer::Done)
+                self.store.transact(&txn).map_or(ModelAnswer::Refused, ModelAnswer::Done)
             }
             Ask::Watch(watch, from) => {
                 self.watches.retain(|(node, ..)| *node != n);
@@ -384,18 +384,18 @@ impl World {
         let is_lost = self.is_chaos && self.chance(0.01);
         if !is_lost && !self.is_cut(n, ETCD) {
             let delay = self.delay();
-            self.at(self.now + delay, Event::Node(n, epoch, Input::Answer(call, answer)));
+            self.at(self.now + delay, ModelEvent::Node(n, epoch, NodeInput::Answer(call, answer)));
         }
     }
 
     fn expire(&mut self, lease: i64) {
         let Some(until) = self.store.until(lease) else { return };
         if self.etcd_is_down {
-            return self.at(self.now + 100 * MS, Event::Expire(lease));
+            return self.at(self.now + 100 * MS, ModelEvent::Expire(lease));
         }
         if until > self.now {
             let late = self.between(0, 600);
-            return self.at(until + late, Event::Expire(lease));
+            return self.at(until + late, ModelEvent::Expire(lease));
         }
         let before = self.store.history.len();
         self.store.end(lease);
@@ -429,7 +429,7 @@ impl World {
         }
         let delay = self.delay();
         let time = self.in_order(watch, n, self.now + delay);
-        self.at(time, Event::Node(n, epoch, Input::Watch(watch, change)));
+        self.at(time, ModelEvent::Node(n, epoch, NodeInput::Watch(watch, change)));
     }
 
     /// A node's watch is gone; it notices some time later.
@@ -437,7 +437,7 @@ impl World {
         let Some(at) = self.watches.iter().position(|(node, ..)| *node == n) else { return };
         let (_, epoch, watch) = self.watches.remove(at);
         let late = self.between(500, 2_000);
-        self.at(self.now + late, Event::Node(n, epoch, Input::WatchLost(watch)));
+        self.at(self.now + late, ModelEvent::Node(n, epoch, NodeInput::WatchLost(watch)));
     }
 
     fn in_order(&mut self, stream: u64, to: N, time: Ns) -> Ns {
@@ -461,7 +461,7 @@ impl World {
         let delay = self.delay();
         let time = self.in_order(stream, to, self.now + ns + delay);
         let epoch = self.nodes[to].epoch;
-        self.at(time, Event::Node(to, epoch, Input::Peer(from, stream, say)));
+        self.at(time, ModelEvent::Node(to, epoch, NodeInput::Peer(from, stream, say)));
     }
 
     /// A stream is broken. Who opened it notices by his keepalive of 1 s, the other by his of 10 s; both at once if the other has died.
@@ -474,7 +474,7 @@ impl World {
             let is_told = !self.nodes[m].up && !self.is_cut(n, m);
             let late = if is_told { self.between(1, 5) } else { self.between(from_ms, to_ms) };
             let epoch = self.nodes[n].epoch;
-            self.at(self.now + late, Event::Node(n, epoch, Input::End(stream)));
+            self.at(self.now + late, ModelEvent::Node(n, epoch, NodeInput::End(stream)));
         }
     }
 

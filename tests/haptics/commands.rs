@@ -1,7 +1,7 @@
 //! Touch over the network: commands, samples, leases, probes.
 
 use crate::metrics;
-use crate::server::{PATIENCE, Server, Touch, force, open, position, told};
+use crate::server::{TEST_TIMEOUT, TestServer, TestTouch, force, open, position, told};
 use palpate_proto::pb;
 use pb::command::Action;
 use pb::touch_response::Message as Heard;
@@ -9,9 +9,9 @@ use tonic::Code;
 
 #[tokio::test]
 async fn a_force_is_felt_and_acknowledged() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     let mut command = force(0, 7, -1.0);
     command.client_time_ns = 123;
     touch.command(command).await;
@@ -31,9 +31,9 @@ async fn a_force_is_felt_and_acknowledged() {
 
 #[tokio::test]
 async fn bad_commands_are_refused_with_a_reason_and_change_nothing() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let (session, untouched) = (server.paper(true).await, server.paper(true).await);
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     type Change = fn(&mut pb::Command);
     fn force_of(command: &mut pb::Command) -> &mut pb::Force {
         let Some(Action::Force(force)) = &mut command.action else { unreachable!() };
@@ -53,12 +53,12 @@ async fn bad_commands_are_refused_with_a_reason_and_change_nothing() {
         (|c| force_of(c).centre = None, "MISSING", "force.centre"),
         (
             |c| force_of(c).centre = Some(pb::force::Centre::Point(pb::GridPoint { x: 31, y: 0 })),
-            "OFF_SHEET",
+            "OFF_TISSUE",
             "force.point",
         ),
         (
             |c| force_of(c).centre = Some(pb::force::Centre::CentreM(pb::Vector2 { x: 1.5, y: 0.5 })),
-            "OFF_SHEET",
+            "OFF_TISSUE",
             "force.centre_m",
         ),
         (
@@ -76,7 +76,7 @@ async fn bad_commands_are_refused_with_a_reason_and_change_nothing() {
                 let target = Some(pb::position::Target::DisplacementM(pb::Vector3::default()));
                 to_position(c, pb::Position { point, target, vertex: None });
             },
-            "OFF_SHEET",
+            "OFF_TISSUE",
             "position.point",
         ),
         (
@@ -109,9 +109,9 @@ async fn bad_commands_are_refused_with_a_reason_and_change_nothing() {
 
 #[tokio::test]
 async fn every_refused_command_of_a_burst_is_told_of_or_counted() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     for sequence in 1..=1000 {
         // Tool 1 is nobody's.
         touch.command(force(1, sequence, -1.0)).await;
@@ -128,9 +128,9 @@ async fn every_refused_command_of_a_burst_is_told_of_or_counted() {
 
 #[tokio::test]
 async fn stale_sequences_are_refused() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     touch.command(force(0, 10, -1.0)).await;
     for stale in [10, 9, 0] {
         touch.command(force(0, stale, -2.0)).await;
@@ -144,10 +144,10 @@ async fn stale_sequences_are_refused() {
 }
 
 /// The hash after 60 steps in which tool 0 gets these commands, one a step.
-async fn hash_after(server: &Server, scene: &str, actions: Vec<Action>) -> String {
+async fn hash_after(server: &TestServer, scene: &str, actions: Vec<Action>) -> String {
     let source = pb::create_session_request::Source::SceneName(scene.into());
     let session = server.create(source, true).await.unwrap().session_id;
-    let mut touch = Touch::hold(server, &session).await;
+    let mut touch = TestTouch::hold(server, &session).await;
     for (step, action) in (0..).zip(actions) {
         touch.command(pb::Command { at_step: Some(step), action: Some(action), ..Default::default() }).await;
     }
@@ -158,7 +158,7 @@ async fn hash_after(server: &Server, scene: &str, actions: Vec<Action>) -> Strin
 
 #[tokio::test]
 async fn fields_that_a_command_leaves_out_have_defaults_and_zeros_count_as_zeros() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let mut forces = Vec::new();
     for (falloff_per_m, falloff_offset) in [(None, None), (Some(200.0), Some(0.0)), (Some(0.0), None)] {
         let Some(Action::Force(force)) = force(0, 1, -1e-3).action else { unreachable!() };
@@ -184,9 +184,9 @@ async fn fields_that_a_command_leaves_out_have_defaults_and_zeros_count_as_zeros
 
 #[tokio::test]
 async fn commands_without_a_sequence_are_acknowledged_by_their_time_and_their_count() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     for (client_time_ns, sequence) in [(700, 0), (800, 1), (900, 2)] {
         touch.command(pb::Command { sequence: None, client_time_ns, ..force(0, 0, -1.0) }).await;
         let sample = touch.sample_with(|sample| sample.tools[0].client_time_ns == client_time_ns).await;
@@ -198,10 +198,10 @@ async fn commands_without_a_sequence_are_acknowledged_by_their_time_and_their_co
 
 #[tokio::test]
 async fn a_tool_has_one_holder_until_it_is_let_go() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
-    let mut first = Touch::hold(&server, &session).await;
-    let refused = Touch::open(&server, open(&session, &[1, 0])).await.err().unwrap();
+    let mut first = TestTouch::hold(&server, &session).await;
+    let refused = TestTouch::open(&server, open(&session, &[1, 0])).await.err().unwrap();
     assert_eq!(told(&refused), (Code::AlreadyExists, "TOOL_HELD".into(), "tools".into()));
     assert!(refused.message().contains("held by `test`"), "{}", refused.message());
     let mut haptics = server.haptics().await;
@@ -209,7 +209,7 @@ async fn a_tool_has_one_holder_until_it_is_let_go() {
     let refused = told(&haptics.acquire_tool(acquire.clone()).await.unwrap_err());
     assert_eq!((refused.1.as_str(), refused.2.as_str()), ("TOOL_HELD", "tool"));
     // The refused stream did not take tool 1.
-    drop(Touch::open(&server, open(&session, &[1])).await.unwrap());
+    drop(TestTouch::open(&server, open(&session, &[1])).await.unwrap());
 
     first.command(force(0, 1, -1.0)).await;
     first.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
@@ -225,10 +225,10 @@ async fn a_tool_has_one_holder_until_it_is_let_go() {
 
 #[tokio::test]
 async fn a_client_that_vanishes_leaves_no_force_behind() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
-    let mut watcher = Touch::open(&server, open(&session, &[])).await.unwrap();
-    let touch = Touch::hold(&server, &session).await;
+    let mut watcher = TestTouch::open(&server, open(&session, &[])).await.unwrap();
+    let touch = TestTouch::hold(&server, &session).await;
     touch.command(force(0, 1, -1.0)).await;
     let pushed = |sample: &pb::Sample| sample.tools.iter().any(|tool| tool.applied_force_n.unwrap().z != 0.0);
     watcher.sample_with(pushed).await;
@@ -239,9 +239,10 @@ async fn a_client_that_vanishes_leaves_no_force_behind() {
 
 #[tokio::test]
 async fn a_lease_lapses_by_itself_and_ends_what_the_tool_did() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
-    let mut touch = Touch::open(&server, pb::TouchOpen { lease_s: Some(0.2), ..open(&session, &[0]) }).await.unwrap();
+    let mut touch =
+        TestTouch::open(&server, pb::TouchOpen { lease_s: Some(0.2), ..open(&session, &[0]) }).await.unwrap();
     touch.command(force(0, 1, -1.0)).await;
     touch.sample_with(|sample| sample.tools[0].applied_force_n.is_some_and(|force| force.z == -1.0)).await;
     // The holder sends nothing, though it keeps reading.
@@ -254,9 +255,9 @@ async fn a_lease_lapses_by_itself_and_ends_what_the_tool_did() {
 
 #[tokio::test]
 async fn a_command_outlives_its_time_by_no_step() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     let command = pb::Command { at_step: Some(10), time_to_live_s: Some(0.02), ..force(0, 1, -1.0) };
     touch.command(command).await;
     touch.settle().await;
@@ -276,9 +277,9 @@ async fn a_command_outlives_its_time_by_no_step() {
 
 #[tokio::test]
 async fn commands_act_at_their_step_and_late_ones_are_told() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     touch.command(pb::Command { at_step: Some(20), ..force(0, 1, -1.0) }).await;
     touch.settle().await;
     server.start_until(&session, 30).await;
@@ -296,9 +297,9 @@ async fn commands_act_at_their_step_and_late_ones_are_told() {
 
 #[tokio::test]
 async fn a_position_is_reached_by_the_end_of_its_step_and_the_latest_wins() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     // More than a queue holds: each replaces the one before.
     for sequence in 1..=6000 {
         touch.command(position(0, sequence, -0.01 * (sequence % 7) as f64)).await;
@@ -319,9 +320,9 @@ async fn a_position_is_reached_by_the_end_of_its_step_and_the_latest_wins() {
 
 #[tokio::test]
 async fn a_late_position_counts_as_late_also_when_another_takes_its_place() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     server.start_until(&session, 10).await;
     touch.sample_with(|sample| sample.step == 10).await;
     for (sequence, at_step) in [(1, 5), (2, 6), (3, 10)] {
@@ -335,12 +336,12 @@ async fn a_late_position_counts_as_late_also_when_another_takes_its_place() {
 
 #[tokio::test]
 async fn the_order_in_which_two_clients_commands_arrive_does_not_matter() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let mut hashes = Vec::new();
     for order in [[0, 1], [1, 0]] {
         let session = server.paper(true).await;
-        let mut touches = [Touch::open(&server, open(&session, &[0])).await.unwrap(), {
-            Touch::open(&server, open(&session, &[1])).await.unwrap()
+        let mut touches = [TestTouch::open(&server, open(&session, &[0])).await.unwrap(), {
+            TestTouch::open(&server, open(&session, &[1])).await.unwrap()
         }];
         for tool in order {
             let z_m = if tool == 0 { -0.01 } else { 0.01 };
@@ -355,7 +356,7 @@ async fn the_order_in_which_two_clients_commands_arrive_does_not_matter() {
 
 #[tokio::test]
 async fn a_batch_is_answered_also_when_time_is_stopped_under_it() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let mut scene = paper_scene();
     scene.stepping.as_mut().unwrap().rate_hz = Some(0.01);
     scene.stepping.as_mut().unwrap().tolerance = Some(1.0);
@@ -371,29 +372,29 @@ async fn a_batch_is_answered_also_when_time_is_stopped_under_it() {
     let pause = pb::PauseSessionRequest { session_id: session.clone() };
     server.sessions().await.pause_session(pause).await.unwrap();
     assert_eq!(server.status(&session).await.state(), pb::SessionState::Paused);
-    let answer = tokio::time::timeout(PATIENCE, waiting).await.unwrap().unwrap().unwrap().into_inner();
+    let answer = tokio::time::timeout(TEST_TIMEOUT, waiting).await.unwrap().unwrap().unwrap().into_inner();
     assert_eq!(answer.sample.unwrap().step, 1);
 }
 
 #[tokio::test]
 async fn what_people_read_is_short_and_on_one_line() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
     for holder in ["x".repeat(129), "two\nlines".to_owned()] {
-        let refused = Touch::open(&server, pb::TouchOpen { holder, ..open(&session, &[0]) }).await.err().unwrap();
+        let refused = TestTouch::open(&server, pb::TouchOpen { holder, ..open(&session, &[0]) }).await.err().unwrap();
         assert_eq!(told(&refused), (Code::InvalidArgument, "OUT_OF_RANGE".into(), "holder".into()));
     }
-    let refused = Touch::open(&server, open(&"x".repeat(100_000), &[0])).await.err().unwrap();
+    let refused = TestTouch::open(&server, open(&"x".repeat(100_000), &[0])).await.err().unwrap();
     assert_eq!(told(&refused).1, "UNKNOWN_SESSION");
 }
 
 #[tokio::test]
 async fn a_fixed_point_can_not_be_grasped() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let mut scene = paper_scene();
     scene.sheet.as_mut().unwrap().fixed = Some(pb::sheet::Fixed::FixedSet(pb::FixedSet::Corners.into()));
     let session = server.create(pb::create_session_request::Source::Scene(scene), true).await.unwrap().session_id;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     let mut command = position(0, 1, -0.01);
     let Some(Action::Position(position)) = &mut command.action else { unreachable!() };
     position.point = Some(pb::GridPoint { x: 30, y: 30 });
@@ -407,9 +408,9 @@ async fn a_full_queue_refuses_and_keeps_what_it_has() {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, "[limits]\nqueued_commands_per_tool = 5\n").unwrap();
-    let server = Server::start(&["--config", config.to_str().unwrap()]);
+    let server = TestServer::start(&["--config", config.to_str().unwrap()]);
     let session = server.paper(true).await;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     for sequence in 1..=8 {
         touch.command(pb::Command { at_step: Some(sequence), ..force(0, sequence, -(sequence as f64)) }).await;
     }
@@ -424,7 +425,7 @@ async fn a_full_queue_refuses_and_keeps_what_it_has() {
 
 #[tokio::test]
 async fn a_unary_batch_is_taken_whole_or_not_at_all() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
     let mut haptics = server.haptics().await;
     let acquire = pb::AcquireToolRequest { session_id: session.clone(), tool: 3, ..Default::default() };
@@ -451,7 +452,7 @@ async fn a_unary_batch_is_taken_whole_or_not_at_all() {
 
 #[tokio::test]
 async fn a_stream_must_begin_with_open_and_only_once() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
     for (open, code, reason, field) in [
         (open("nobody", &[0]), Code::NotFound, "UNKNOWN_SESSION", "session_id"),
@@ -470,10 +471,10 @@ async fn a_stream_must_begin_with_open_and_only_once() {
             "lease_s",
         ),
     ] {
-        let refused = Touch::open(&server, open).await.err().unwrap();
+        let refused = TestTouch::open(&server, open).await.err().unwrap();
         assert_eq!(told(&refused), (code, reason.into(), field.into()));
     }
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     touch.say(pb::touch_request::Message::Open(open(&session, &[2]))).await;
     let refused = loop {
         match touch.hear().await {
@@ -487,10 +488,10 @@ async fn a_stream_must_begin_with_open_and_only_once() {
 
 #[tokio::test]
 async fn every_nth_sample_comes_and_watchers_see_all_tools() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
     let wanted = pb::TouchOpen { sample_every_steps: Some(5), ..open(&session, &[0, 4]) };
-    let mut touch = Touch::open(&server, wanted).await.unwrap();
+    let mut touch = TestTouch::open(&server, wanted).await.unwrap();
     touch.command(force(4, 1, -1.0)).await;
     let mut last = 0;
     for _ in 0..20 {
@@ -509,12 +510,12 @@ async fn every_nth_sample_comes_and_watchers_see_all_tools() {
 
 #[tokio::test]
 async fn who_watches_a_still_tissue_gets_heartbeats_at_the_rate_that_was_said() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(false).await;
-    let mut usual = Touch::open(&server, open(&session, &[])).await.unwrap();
+    let mut usual = TestTouch::open(&server, open(&session, &[])).await.unwrap();
     assert_eq!(usual.opened.as_ref().unwrap().heartbeat_s, 0.05);
     let wanted = pb::TouchOpen { heartbeat_s: Some(0.1), sample_every_steps: Some(30), ..open(&session, &[0]) };
-    let mut seldom = Touch::open(&server, wanted).await.unwrap();
+    let mut seldom = TestTouch::open(&server, wanted).await.unwrap();
     for (touch, apart) in [(&mut usual, 50), (&mut seldom, 120)] {
         let mut last = touch.sample().await;
         for _ in 0..4 {
@@ -533,11 +534,11 @@ async fn who_watches_a_still_tissue_gets_heartbeats_at_the_rate_that_was_said() 
 
 #[tokio::test]
 async fn a_deadband_leaves_out_what_changes_too_little() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
     let deadband = pb::Deadband { displacement_m: Some(0.0025), ..Default::default() };
     let wanted = pb::TouchOpen { deadband: Some(deadband), heartbeat_s: Some(0.1), ..open(&session, &[0]) };
-    let mut touch = Touch::open(&server, wanted).await.unwrap();
+    let mut touch = TestTouch::open(&server, wanted).await.unwrap();
     for step in 0..100_u64 {
         // A millimetre per step for ten steps, then held.
         let z_m = -0.001 * (step + 1).min(10) as f64;
@@ -561,7 +562,7 @@ async fn a_deadband_leaves_out_what_changes_too_little() {
 
 #[tokio::test]
 async fn what_a_stream_can_not_ask_for_is_refused() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
     let band = |force_n, force_fraction, displacement_m| pb::Deadband {
         force_n,
@@ -581,7 +582,7 @@ async fn what_a_stream_can_not_ask_for_is_refused() {
     ];
     for (deadband, heartbeat_s, reason, field) in cases {
         let touch = pb::TouchOpen { deadband, heartbeat_s, ..open(&session, &[0]) };
-        let refused = Touch::open(&server, touch).await.err().unwrap();
+        let refused = TestTouch::open(&server, touch).await.err().unwrap();
         assert_eq!(told(&refused), (Code::InvalidArgument, reason.into(), field.into()));
         let watch =
             pb::WatchSamplesRequest { session_id: session.clone(), deadband, heartbeat_s, ..Default::default() };
@@ -589,12 +590,12 @@ async fn what_a_stream_can_not_ask_for_is_refused() {
         assert_eq!(told(&refused), (Code::InvalidArgument, reason.into(), field.into()));
     }
     // None of them has taken the tool.
-    Touch::hold(&server, &session).await;
+    TestTouch::hold(&server, &session).await;
 }
 
 #[tokio::test]
 async fn probes_tell_every_part_of_the_force_from_step_0_on() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = server.paper(true).await;
     let points = [(15, 15), (16, 15), (0, 0)].map(|(x, y)| pb::GridPoint { x, y }).to_vec();
     let request = pb::ProbeRequest {
@@ -606,12 +607,12 @@ async fn probes_tell_every_part_of_the_force_from_step_0_on() {
     };
     let mut haptics = server.haptics().await;
     let mut records = haptics.probe(request.clone()).await.unwrap().into_inner();
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     touch.command(pb::Command { at_step: Some(0), ..force(0, 1, -1.0) }).await;
     touch.settle().await;
     server.start_until(&session, 100).await;
     for expected in (0..=100).step_by(10) {
-        let record = tokio::time::timeout(PATIENCE, records.message()).await.unwrap().unwrap().unwrap();
+        let record = tokio::time::timeout(TEST_TIMEOUT, records.message()).await.unwrap().unwrap().unwrap();
         assert_eq!((record.step, record.last, record.dropped_records), (expected, true, 0));
         let named: Vec<_> = record.points.iter().map(|point| point.point.unwrap()).collect();
         assert_eq!(named, points);
@@ -620,9 +621,9 @@ async fn probes_tell_every_part_of_the_force_from_step_0_on() {
         assert_eq!(centre.applied_n.unwrap().z, -1.0);
         assert_eq!(centre.displacement_m.unwrap().z < 0.0, expected > 0);
         let z = |v: &Option<pb::Vector3>| v.unwrap().z;
-        let sum = z(&centre.spring_n) + z(&centre.virtual_n) + z(&centre.damping_n);
+        let sum = z(&centre.spring_n) + z(&centre.anchor_n) + z(&centre.damping_n);
         assert!((z(&centre.reaction_n) - sum).abs() < 1e-12);
-        assert_eq!(record.energy.unwrap().virtual_j > 0.0, expected > 0);
+        assert_eq!(record.energy.unwrap().anchor_j > 0.0, expected > 0);
     }
     for (request, field) in [
         (pb::ProbeRequest { every_steps: Some(0), ..request.clone() }, "every_steps"),
@@ -643,7 +644,7 @@ async fn probes_tell_every_part_of_the_force_from_step_0_on() {
 
 #[tokio::test]
 async fn a_record_of_all_points_comes_in_parts() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let mut scene = paper_scene();
     scene.sheet.as_mut().unwrap().points_x = Some(70);
     let session = server.create(pb::create_session_request::Source::Scene(scene), true).await.unwrap().session_id;
@@ -656,7 +657,7 @@ async fn a_record_of_all_points_comes_in_parts() {
     server.start_until(&session, 1).await;
     let (mut points, mut parts) = (Vec::new(), 0);
     loop {
-        let part = tokio::time::timeout(PATIENCE, records.message()).await.unwrap().unwrap().unwrap();
+        let part = tokio::time::timeout(TEST_TIMEOUT, records.message()).await.unwrap().unwrap().unwrap();
         assert_eq!(part.step, 0);
         parts += 1;
         points.extend(part.points.iter().map(|point| point.point.unwrap()));
@@ -681,14 +682,14 @@ async fn a_session_that_blows_up_again_and_again_goes_on_without_the_tool_and_se
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, "[limits]\nrehearsal_work = 1\n").unwrap();
     let config = config.to_str().unwrap();
-    let mut server = Server::start(&["--log", "warn", "--metrics", "127.0.0.1:0", "--config", config]);
+    let mut server = TestServer::start(&["--log", "warn", "--metrics", "127.0.0.1:0", "--config", config]);
     let metrics = metrics::url(&mut server.out);
     let mut scene = paper_scene();
     scene.springs.as_mut().unwrap().stiffness_n_per_m = Some(1e9);
     scene.springs.as_mut().unwrap().shear_stiffness_n_per_m = None;
     scene.stepping.as_mut().unwrap().substeps = Some(1);
     let session = server.create(pb::create_session_request::Source::Scene(scene), true).await.unwrap().session_id;
-    let mut touch = Touch::hold(&server, &session).await;
+    let mut touch = TestTouch::hold(&server, &session).await;
     touch.command(force(0, 1, -1.0)).await;
     touch.settle().await;
     server.start_until(&session, 5000).await;

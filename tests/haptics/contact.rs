@@ -6,7 +6,7 @@ use crate::common::{model, scene_with};
 use glam::{DVec2, DVec3};
 use palpate::force_law;
 use palpate::scene::BUILT_IN;
-use palpate::sheet::{self, Feel, Model, Tissue, tangent};
+use palpate::tissue::{self, Model, Tissue, ToolContact, tangent};
 use palpate_touch::{ContactState, Coupling, Tip};
 
 /// Flat punches of 5 mm radius, 2aE/(1 − ν²), N/m.
@@ -28,12 +28,18 @@ fn smooth(x: f64) -> f64 {
 }
 
 /// Moves tool 0 along a path, and calls `look` with the force after each step.
-fn lead(sheet: &mut dyn Tissue, tip: Tip, steps: u32, way: impl Fn(f64) -> DVec3, mut look: impl FnMut(f64, &Feel)) {
+fn lead(
+    sheet: &mut dyn Tissue,
+    tip: Tip,
+    steps: u32,
+    way: impl Fn(f64) -> DVec3,
+    mut look: impl FnMut(f64, &ToolContact),
+) {
     for step in 1..=steps {
         let time_s = f64::from(step) * 1e-3;
         sheet.pose(0, way(time_s), tip);
         sheet.step().unwrap();
-        look(time_s, &sheet.feel(0).unwrap());
+        look(time_s, &sheet.tool_contact(0).unwrap());
     }
     assert_eq!(sheet.guard_events(), 0, "the guard had to mend a touch");
 }
@@ -50,7 +56,7 @@ fn stroke(middle: DVec3, depth_m: f64) -> impl Fn(f64) -> DVec3 {
 fn a_touch_enters_slides_and_leaves_without_a_jump_and_never_pulls() {
     for (name, depth_m, friction) in [("liver", 0.008, 0.2), ("fibrotic", 0.003, 0.0), ("stomach", 0.01, 0.5)] {
         let model = tissue(name, &[]);
-        let mut sheet = sheet::at_rest(&model);
+        let mut sheet = tissue::at_rest(&model);
         let (mut before, mut largest, mut jump, mut slid) = (DVec3::ZERO, 0.0_f64, (0.0_f64, 0.0), false);
         let tip = Tip { friction, ..Tip::default() };
         lead(&mut *sheet, tip, 2000, stroke(middle(&model), depth_m), |time_s, feel| {
@@ -69,13 +75,13 @@ fn a_touch_enters_slides_and_leaves_without_a_jump_and_never_pulls() {
         assert!(largest > 0.5 && slid, "{name}: {largest} N, slid: {slid}");
         assert!(jump.0 < 0.03 * largest, "{name}: a jump of {jump:?} (N, s) where {largest} N is the most");
         assert_eq!(before, DVec3::ZERO, "{name} is still felt in the air");
-        assert_eq!(sheet.feel(0).unwrap().contact_state, ContactState::Free);
+        assert_eq!(sheet.tool_contact(0).unwrap().contact_state, ContactState::Free);
     }
 }
 
 #[test]
 fn stiffness_converges_as_the_grid_gets_finer() {
-    // The same tissue on finer grids: masses, virtual springs and damping scale with h², springs stay.
+    // The same tissue on finer grids: masses, anchor springs and damping scale with h², springs stay.
     let stiffness = |spacing_m: f64, points: usize| {
         let base = tissue("liver", &[]);
         let share = (spacing_m / base.scene.sheet().unwrap().spacing_m).powi(2);
@@ -85,7 +91,7 @@ fn stiffness_converges_as_the_grid_gets_finer() {
                 &format!("sheet.points=[{points}, {points}]"),
                 &format!("sheet.spacing_m={spacing_m}"),
                 &format!("sheet.point_mass_kg={}", share * base.scene.sheet().unwrap().point_mass_kg),
-                &format!("virtual_springs.stiffness_n_per_m={}", share * base.scene.virtual_stiffness_n_per_m),
+                &format!("anchor_springs.stiffness_n_per_m={}", share * base.scene.anchor_stiffness_n_per_m),
                 &format!("damping.coefficient_n_s_per_m={}", share * base.scene.damping_n_s_per_m),
             ],
         );
@@ -120,7 +126,7 @@ fn a_slow_press_feels_the_law_that_was_computed() {
     let model = tissue("liver", &[]);
     let law = force_law::exact(&model, 0.005);
     assert!(law.is_sound());
-    let mut sheet = sheet::at_rest(&model);
+    let mut sheet = tissue::at_rest(&model);
     let way = |t: f64| middle(&model) + DVec3::new(0.0, 0.0, 0.001 - 0.009 * smooth(t / 1.5));
     lead(&mut *sheet, Tip::default(), 1700, way, |time_s, feel| {
         let depth_m = -feel.place_m.z;
@@ -138,11 +144,11 @@ fn a_grasp_pulls_as_well_as_it_pushes_and_a_touch_does_not() {
     let model = tissue("liver", &[]);
     let up = |t: f64| middle(&model) + DVec3::new(0.0, 0.0, 0.005 * smooth(t / 0.5));
     let force = |grasps: bool| {
-        let mut sheet = sheet::at_rest(&model);
+        let mut sheet = tissue::at_rest(&model);
         let tip = Tip { grasps, ..Tip::default() };
         let mut last = DVec3::ZERO;
         lead(&mut *sheet, tip, 700, up, |_, feel| last = feel.force_on_tool_n);
-        (last, sheet.feel(0).unwrap().contact_state)
+        (last, sheet.tool_contact(0).unwrap().contact_state)
     };
     let (held, contact_state) = force(true);
     assert_eq!(contact_state, ContactState::Holding);
@@ -155,10 +161,10 @@ fn a_coupling_spring_is_felt_in_series_with_the_tissue() {
     let model = tissue("liver", &[]);
     let down = |t: f64| middle(&model) - DVec3::new(0.0, 0.0, 0.001 * smooth(t / 0.5));
     let force = |coupling: Coupling| {
-        let mut sheet = sheet::at_rest(&model);
+        let mut sheet = tissue::at_rest(&model);
         let mut last = 0.0;
         lead(&mut *sheet, Tip { coupling, ..Tip::default() }, 900, down, |_, feel| last = feel.force_on_tool_n.z);
-        (last, -sheet.feel(0).unwrap().surface_m.z)
+        (last, -sheet.tool_contact(0).unwrap().surface_m.z)
     };
     let (rigid_n, _) = force(Coupling::Constraint);
     for stiffness_n_per_m in [50.0, 500.0, 50_000.0] {
@@ -178,7 +184,7 @@ fn a_disc_that_slides_lags_by_what_its_coupling_spring_stretches() {
     let stiffness_n_per_m = 500.0;
     let coupling = Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m: 0.1 };
     let tip = Tip { friction: 0.4, coupling, ..Tip::default() };
-    let mut sheet = sheet::at_rest(&model);
+    let mut sheet = tissue::at_rest(&model);
     let from_m = middle(&model) - DVec3::new(0.012, 0.0, 0.0);
     let way =
         |t: f64| from_m + DVec3::new(0.024 * ((t - 0.4) / 0.8).clamp(0.0, 1.0), 0.0, 0.001 - 0.005 * smooth(t / 0.3));
@@ -205,7 +211,7 @@ fn a_disc_that_slides_lags_by_what_its_coupling_spring_stretches() {
 #[test]
 fn two_tools_press_one_tissue_each_for_itself() {
     let model = tissue("liver", &[]);
-    let mut sheet = sheet::at_rest(&model);
+    let mut sheet = tissue::at_rest(&model);
     for step in 1..=800 {
         let down = 0.003 * smooth(f64::from(step) * 1e-3 / 0.5);
         for (tool, x) in [(0, -0.018), (1, 0.018)] {
@@ -213,13 +219,13 @@ fn two_tools_press_one_tissue_each_for_itself() {
         }
         sheet.step().unwrap();
     }
-    let [a, b] = [0, 1].map(|tool| sheet.feel(tool).unwrap().force_on_tool_n);
+    let [a, b] = [0, 1].map(|tool| sheet.tool_contact(tool).unwrap().force_on_tool_n);
     assert!((a.z - b.z).abs() < 1e-3 * a.z && (a.x + b.x).abs() < 1e-3 * a.z, "{a} and {b} are not mirror images");
     let alone = tangent::press(&model, 0.005, middle(&model), 0.003, 2)[1].force_n;
     assert!((a.z / alone - 1.0).abs() < 0.1, "{} N beside another tool, {alone} N alone", a.z);
     sheet.release(1);
     sheet.step().unwrap();
-    assert!(sheet.feel(1).is_none());
+    assert!(sheet.tool_contact(1).is_none());
 }
 
 /// In the plane, the presets' lattice is an isotropic sheet with ν = 1/3: under even strain it stays even and pulls
@@ -228,19 +234,19 @@ fn two_tools_press_one_tissue_each_for_itself() {
 fn the_lattice_passes_the_patch_test() {
     let model = tissue(
         "liver",
-        &["sheet.points=[9, 9]", "sheet.fixed=[]", "virtual_springs.stiffness_n_per_m=0.0", "stepping.precision=f64"],
+        &["sheet.points=[9, 9]", "sheet.fixed=[]", "anchor_springs.stiffness_n_per_m=0.0", "stepping.precision=f64"],
     );
     let (strain, contraction) = (1e-4, -1e-4 / 3.0);
     let spacing_m = model.scene.sheet().unwrap().spacing_m;
     let even =
         |[i, j]: [usize; 2]| spacing_m * DVec3::new(strain * (i as f64 - 4.0), contraction * (j as f64 - 4.0), 0.0);
-    let mut sheet = sheet::at_rest(&model);
+    let mut sheet = tissue::at_rest(&model);
     let rim = |[i, j]: [usize; 2]| i % 8 == 0 || j % 8 == 0;
     let mut tool = 0;
     for point in model.points() {
         let place = model.scene.sheet().unwrap().place_of(point);
         if rim(place) {
-            sheet.grasp(tool, point, sheet::Grasp::Target(even(place)));
+            sheet.grasp(tool, point, tissue::Grasp::Target(even(place)));
             tool += 1;
         }
     }
@@ -268,7 +274,7 @@ fn a_touch_beside_the_sheet_or_far_above_feels_nothing() {
     for place in
         [DVec3::new(-0.02, 0.02, -0.01), (extent + DVec2::splat(0.02)).extend(-0.01), (extent / 2.0).extend(0.05)]
     {
-        let mut sheet = sheet::at_rest(&model);
+        let mut sheet = tissue::at_rest(&model);
         lead(
             &mut *sheet,
             Tip::default(),
@@ -290,17 +296,17 @@ fn a_tip_beside_what_is_fixed_feels_no_more_than_springs_and_depth_allow() {
     let model = tissue("liver", &["sheet.fixed=edges"]);
     let extent_m = model.scene.sheet().unwrap().extent_m();
     let pressed = |place_m: DVec3, grasps: bool, radius_m: f64| {
-        let mut sheet = sheet::at_rest(&model);
+        let mut sheet = tissue::at_rest(&model);
         let tip = Tip { grasps, radius_m, friction: 0.0, ..Tip::default() };
         lead(&mut *sheet, tip, 600, |t| place_m - depth_m * smooth(t / 0.3) * DVec3::Z, |_, _| {});
         assert_eq!(sheet.guard_events(), 0, "{place_m}");
-        sheet.feel(0).unwrap()
+        sheet.tool_contact(0).unwrap()
     };
     for radius_m in [0.001, 0.005] {
         for grasps in [false, true] {
             // A quarter of a disc moves at most four times as far as the tool, and its force counts four times.
             let scene = &model.scene;
-            let stiffness_n_per_m = 8.0 * scene.springs.stiffness_n_per_m + scene.virtual_stiffness_n_per_m;
+            let stiffness_n_per_m = 8.0 * scene.springs.stiffness_n_per_m + scene.anchor_stiffness_n_per_m;
             let most_n = 16.0 * stiffness_n_per_m * depth_m;
             let mut told = 0;
             for from_rim_m in [0.0, 1e-6, 1e-5, 1e-4, 3e-4, 1e-3, 2e-3, 4e-3] {

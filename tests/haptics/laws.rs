@@ -5,11 +5,11 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use crate::common::{model, scene_with};
-use crate::server::{PATIENCE, Server, Touch, open};
+use crate::server::{TEST_TIMEOUT, TestServer, TestTouch, open};
 use glam::DVec3;
 use palpate::force_law::{self, Disc};
 use palpate::scene::BUILT_IN;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate::wire;
 use palpate_proto::{pb, touch};
 use palpate_touch::law::{Law, Row};
@@ -49,7 +49,7 @@ fn apart(exact: &Law, coarse: &Law) -> [f64; 3] {
 #[test]
 fn a_first_law_is_within_a_tenth_of_the_exact_one() {
     let never = AtomicBool::new(false);
-    let membrane = "virtual_springs.stiffness_n_per_m=1e-3";
+    let membrane = "anchor_springs.stiffness_n_per_m=1e-3";
     let cases: [(&str, &[&str]); 5] = [
         ("paper", &[]),
         ("liver", &["sheet.points=[32, 24]", membrane]),
@@ -78,8 +78,8 @@ fn a_first_law_is_within_a_tenth_of_the_exact_one() {
 fn every_tissue_has_a_first_law() {
     let never = AtomicBool::new(false);
     let cases: [(&str, &[&str], f64); 6] = [
-        ("liver", &["sheet.points=[331, 331]", "virtual_springs.stiffness_n_per_m=1e-6"], 0.005),
-        ("liver", &["sheet.points=[1001, 1001]", "virtual_springs.stiffness_n_per_m=1e-6"], 0.003),
+        ("liver", &["sheet.points=[331, 331]", "anchor_springs.stiffness_n_per_m=1e-6"], 0.005),
+        ("liver", &["sheet.points=[1001, 1001]", "anchor_springs.stiffness_n_per_m=1e-6"], 0.003),
         ("liver", &["sheet.points=[2001, 3]"], 0.005),
         ("paper", &["sheet.points=[501, 501]"], 0.005),
         ("paper", &["sheet.points=[2, 2]"], 0.005),
@@ -97,7 +97,7 @@ fn every_tissue_has_a_first_law() {
 
 /// Leads tool 0 of a stream by the client's clock.
 struct Lead {
-    touch: Touch,
+    touch: TestTouch,
     begun: Instant,
     sequence: u64,
 }
@@ -129,15 +129,15 @@ fn with_device(session: &str, tools: &[u32]) -> pb::TouchOpen {
 }
 
 /// A server with these keys of `[limits]`. No deadline decides here.
-fn limited(limits: &str) -> Server {
+fn limited(limits: &str) -> TestServer {
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, format!("[limits]\nwork_s = 3600.0\n{limits}\n")).unwrap();
-    Server::start(&["--config", config.to_str().unwrap()])
+    TestServer::start(&["--config", config.to_str().unwrap()])
 }
 
 /// A session of `paper`, whose exact law takes twice the work of a first one.
-async fn session(server: &Server) -> String {
+async fn session(server: &TestServer) -> String {
     let scene = scene_with(palpate::scene::PAPER, &["stepping.integrator=\"lagged\"", "stepping.substeps=1"]);
     let source = pb::create_session_request::Source::Scene(wire::scene::scene(&scene));
     server.create(source, false).await.unwrap().session_id
@@ -147,14 +147,14 @@ async fn session(server: &Server) -> String {
 async fn a_coarse_law_is_changed_for_the_exact_one_by_a_model_that_names_it() {
     let server = limited("");
     let session = session(&server).await;
-    let mut touch = Touch::open(&server, with_device(&session, &[0])).await.unwrap();
+    let mut touch = TestTouch::open(&server, with_device(&session, &[0])).await.unwrap();
     let opened = touch.opened.take().unwrap().law.unwrap();
     assert!(opened.coarse && opened.number == 0, "{opened:?}");
     let mut laws = vec![touch::from_law(&opened).unwrap()];
     let mut lead = Lead { touch, begun: Instant::now(), sequence: 0 };
     // Until some models have named either law; the tool is pressed in all the while.
     let mut named = [0_u32; 2];
-    tokio::time::timeout(10 * PATIENCE, async {
+    tokio::time::timeout(10 * TEST_TIMEOUT, async {
         while named.iter().any(|models| *models < 20) {
             lead.press(-0.002).await;
             match lead.touch.hear().await.unwrap().unwrap() {
@@ -177,7 +177,7 @@ async fn a_coarse_law_is_changed_for_the_exact_one_by_a_model_that_names_it() {
     .await
     .unwrap_or_else(|_| panic!("models that named each law: {named:?}"));
     // Whoever comes later begins with the exact law, and is told nothing more.
-    let mut later = Touch::open(&server, with_device(&session, &[1])).await.unwrap();
+    let mut later = TestTouch::open(&server, with_device(&session, &[1])).await.unwrap();
     let law = later.opened.take().unwrap().law.unwrap();
     assert!(!law.coarse && law.number == 0);
     assert_eq!(touch::from_law(&law).unwrap(), laws[1]);
@@ -192,7 +192,7 @@ async fn a_law_beyond_the_bound_stays_coarse_and_says_so_once() {
     let session = session(&server).await;
     // Of each stream: also where it is known already.
     for tool in 0..2 {
-        let mut touch = Touch::open(&server, with_device(&session, &[tool])).await.unwrap();
+        let mut touch = TestTouch::open(&server, with_device(&session, &[tool])).await.unwrap();
         assert!(touch.opened.take().unwrap().law.unwrap().coarse);
         let (mut updates, mut after) = (Vec::new(), 0);
         while after < 10 {
@@ -213,19 +213,19 @@ async fn a_law_beyond_the_bound_stays_coarse_and_says_so_once() {
 async fn another_tissue_brings_its_law_which_models_then_name() {
     let server = limited("");
     let session = session(&server).await;
-    let mut touch = Touch::open(&server, with_device(&session, &[0])).await.unwrap();
+    let mut touch = TestTouch::open(&server, with_device(&session, &[0])).await.unwrap();
     let mut laws = vec![touch::from_law(&touch.opened.take().unwrap().law.unwrap()).unwrap()];
     laws.push(touch.exact_law().await);
     let mut lead = Lead { touch, begun: Instant::now(), sequence: 0 };
     let request = pb::UpdateTissueRequest {
         session_id: session.clone(),
         stiffness_n_per_m: Some(20.0),
-        virtual_stiffness_n_per_m: Some(10.0),
+        anchor_stiffness_n_per_m: Some(10.0),
         ..Default::default()
     };
     let changed = server.sessions().await.update_tissue(request).await.unwrap().into_inner();
     let mut named = [0_u32; 4];
-    tokio::time::timeout(10 * PATIENCE, async {
+    tokio::time::timeout(10 * TEST_TIMEOUT, async {
         while named[3] < 20 {
             lead.press(-0.002).await;
             match lead.touch.hear().await.unwrap().unwrap() {
@@ -249,7 +249,7 @@ async fn another_tissue_brings_its_law_which_models_then_name() {
     assert_eq!(named[0], 0, "a law that was replaced");
     // It is the law of the tissue as the session has it.
     let scene = wire::scene::from_scene(&changed.session.unwrap().scene.unwrap(), None).unwrap();
-    assert_eq!((scene.springs.stiffness_n_per_m, scene.virtual_stiffness_n_per_m), (20.0, 10.0));
+    assert_eq!((scene.springs.stiffness_n_per_m, scene.anchor_stiffness_n_per_m), (20.0, 10.0));
     let exact = force_law::exact(&model(&scene), 0.005);
     assert_eq!(laws[3], exact);
     assert!(apart(&exact, &laws[1])[1] > 0.1, "the tissues hardly differ");
@@ -263,7 +263,7 @@ async fn a_tool_that_goes_to_the_rim_gets_the_law_of_the_rim_and_none_on_the_way
     let session = server.create(source, false).await.unwrap().session_id;
     let model = model(&scene);
     let in_middle = Disc::in_middle(&model, 0.005);
-    let mut touch = Touch::open(&server, with_device(&session, &[0])).await.unwrap();
+    let mut touch = TestTouch::open(&server, with_device(&session, &[0])).await.unwrap();
     let mut laws = vec![touch::from_law(&touch.opened.take().unwrap().law.unwrap()).unwrap()];
     let mut lead = Lead { touch, begun: Instant::now(), sequence: 0 };
     let at_rim = in_middle.follow(&model, DVec3::new(0.005, 0.0375, 0.0));
@@ -274,7 +274,7 @@ async fn a_tool_that_goes_to_the_rim_gets_the_law_of_the_rim_and_none_on_the_way
     let course = [(0.0375, 0.0375, &middle), (0.03, 0.045, &middle), (0.005, 0.0375, &rim), (0.045, 0.07, &rim)];
     for (at, (x_m, y_m, law)) in course.into_iter().enumerate() {
         let mut named = 0_u32;
-        tokio::time::timeout(10 * PATIENCE, async {
+        tokio::time::timeout(10 * TEST_TIMEOUT, async {
             let from = lead.sequence + 1;
             while named < 20 {
                 lead.lead(DVec3::new(x_m, y_m, 0.002)).await;

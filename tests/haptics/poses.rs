@@ -1,6 +1,6 @@
 //! Tools controlled by poses over a real server: local models, the force law, deadbands, and refusals.
 
-use crate::server::{Server, Touch, open, told};
+use crate::server::{TestServer, TestTouch, open, told};
 use palpate_proto::{pb, touch};
 use palpate_touch::device::DEVICES;
 use palpate_touch::{Device, Touching};
@@ -24,7 +24,7 @@ fn pose(sequence: u64, time_ms: u64, z_m: f64) -> pb::Command {
     }
 }
 
-async fn liver(server: &Server) -> String {
+async fn liver(server: &TestServer) -> String {
     let request = pb::CreateSessionRequest {
         source: Some(pb::create_session_request::Source::SceneName("liver".into())),
         ..Default::default()
@@ -34,10 +34,10 @@ async fn liver(server: &Server) -> String {
 
 #[tokio::test]
 async fn a_pressed_tool_gets_local_models_that_agree_with_the_law() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = liver(&server).await;
     let mut touch =
-        Touch::open(&server, pb::TouchOpen { device: Some(device()), ..open(&session, &[0]) }).await.unwrap();
+        TestTouch::open(&server, pb::TouchOpen { device: Some(device()), ..open(&session, &[0]) }).await.unwrap();
     let opened = touch.opened.take().unwrap();
     assert!((opened.max_force_n - 3.3).abs() < 1e-12);
     let law = touch.exact_law().await;
@@ -64,10 +64,10 @@ async fn a_pressed_tool_gets_local_models_that_agree_with_the_law() {
 
 #[tokio::test]
 async fn without_poses_the_tool_is_held_and_then_lets_go() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = liver(&server).await;
     let mut touch =
-        Touch::open(&server, pb::TouchOpen { device: Some(device()), ..open(&session, &[0]) }).await.unwrap();
+        TestTouch::open(&server, pb::TouchOpen { device: Some(device()), ..open(&session, &[0]) }).await.unwrap();
     for k in 0..200_u64 {
         touch.command(pose(k + 1, 1000 + k, 0.001 - 2e-5 * k as f64)).await;
     }
@@ -81,7 +81,7 @@ async fn without_poses_the_tool_is_held_and_then_lets_go() {
 
 #[tokio::test]
 async fn what_makes_no_sense_is_refused() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = liver(&server).await;
     let broken = |change: fn(&mut pb::Device)| {
         let mut device = device();
@@ -96,13 +96,13 @@ async fn what_makes_no_sense_is_refused() {
         (pb::TouchOpen { tip: Some(tip), ..open(&session, &[0]) }, "OUT_OF_RANGE", "tip.radius_m"),
         (pb::TouchOpen { touch_stiffness: true, ..open(&session, &[0]) }, "MISSING", "device"),
     ] {
-        let refused = Touch::open(&server, request).await.err().unwrap();
+        let refused = TestTouch::open(&server, request).await.err().unwrap();
         let (code, told_reason, told_field) = told(&refused);
         assert_eq!((told_reason.as_str(), told_field.as_str()), (reason, field));
         assert_ne!(code, Code::Internal);
     }
     let mut touch =
-        Touch::open(&server, pb::TouchOpen { device: Some(device()), ..open(&session, &[0]) }).await.unwrap();
+        TestTouch::open(&server, pb::TouchOpen { device: Some(device()), ..open(&session, &[0]) }).await.unwrap();
     for (sequence, z_m, reason) in [(1, f64::NAN, "NOT_FINITE"), (2, 0.08, "OUT_OF_RANGE"), (3, 1e9, "OUT_OF_RANGE")] {
         touch.command(pose(sequence, sequence, z_m)).await;
         let rejection = touch.rejection().await;
@@ -113,9 +113,9 @@ async fn what_makes_no_sense_is_refused() {
 
 #[tokio::test]
 async fn a_tool_at_the_fixed_rim_says_so() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = liver(&server).await;
-    let mut touch = Touch::open(&server, open(&session, &[0, 1])).await.unwrap();
+    let mut touch = TestTouch::open(&server, open(&session, &[0, 1])).await.unwrap();
     for (tool, x) in [(0, 0.0375), (1, 0.0)] {
         let position_m = Some(pb::Vector3 { x, y: 0.0375, z: -0.001 });
         let action = Some(pb::command::Action::Pose(pb::Pose { position_m, ..Default::default() }));
@@ -133,10 +133,10 @@ fn foretold() -> pb::Deadband {
 
 #[tokio::test]
 async fn a_deadband_sends_heartbeats_and_little_else() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = liver(&server).await;
     let thrifty = pb::TouchOpen { device: Some(device()), deadband: Some(foretold()), ..open(&session, &[0]) };
-    let mut touch = Touch::open(&server, thrifty).await.unwrap();
+    let mut touch = TestTouch::open(&server, thrifty).await.unwrap();
     // A better law is news.
     touch.exact_law().await;
     touch.command(pose(1, 1, 0.001)).await;
@@ -149,14 +149,14 @@ async fn a_deadband_sends_heartbeats_and_little_else() {
 
 #[tokio::test]
 async fn a_tissue_beyond_the_device_is_told_of() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let source = pb::create_session_request::Source::SceneName("fibrotic".into());
     let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
     let session =
         server.sessions().await.create_session(request).await.unwrap().into_inner().session.unwrap().session_id;
     for (tool, device, warnings) in [(0, "touch", 1), (1, "lambda7", 0)] {
         let device = touch::device(&Device::named(device).unwrap());
-        let opened = Touch::open(&server, pb::TouchOpen { device: Some(device), ..open(&session, &[tool]) }).await;
+        let opened = TestTouch::open(&server, pb::TouchOpen { device: Some(device), ..open(&session, &[tool]) }).await;
         let told = opened.unwrap().opened.take().unwrap().warnings;
         assert_eq!(told.len(), warnings, "{told:?}");
     }
@@ -165,9 +165,9 @@ async fn a_tissue_beyond_the_device_is_told_of() {
 /// No tool ever leaps, whatever commands ask for it.
 #[tokio::test]
 async fn a_pose_across_the_sheet_is_walked_to() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session = liver(&server).await;
-    let mut touch = Touch::open(&server, open(&session, &[0])).await.unwrap();
+    let mut touch = TestTouch::open(&server, open(&session, &[0])).await.unwrap();
     touch.command(pose(1, 0, 0.001)).await;
     let there = touch.sample_with(|sample| sample.tools[0].displacement_m.is_some()).await;
     let mut far = pose(2, 0, -0.01);

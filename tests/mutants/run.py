@@ -30,7 +30,7 @@ TREE = WORK / "tree"
 NEXT = WORK / "next"
 # What mutants are drawn from: a module by its folder, and the package that it is in.
 MODULES = {
-    "src/sheet": "palpate",
+    "src/tissue": "palpate",
     "src/force_law": "palpate",
     "src/session": "palpate",
     "clients/touch/src": "palpate-touch",
@@ -38,7 +38,7 @@ MODULES = {
 PACKAGES = {"palpate": ".", "palpate-touch": "clients/touch"}
 
 # Unit tests of these modules; those of others keep times, which say more about what else the machine does.
-UNITS = ("sheet::", "force_law::", "session::")
+UNITS = ("tissue::", "force_law::", "session::")
 # Integration tests. Left out are those of servers under load, of programs other than the server, and those that look for
 # rare failures at length.
 TESTS = [

@@ -1,9 +1,9 @@
-//! Changes of a tissue's springs, virtual springs and damping while it is in use.
+//! Changes of a tissue's springs, anchor springs and damping while it is in use.
 
 use std::sync::Arc;
 
 use crate::common::{advance, scene_with};
-use crate::server::{PATIENCE, Server, Touch, force, open, told};
+use crate::server::{TEST_TIMEOUT, TestServer, TestTouch, force, open, told};
 use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::refusal::Reason;
@@ -12,7 +12,7 @@ use palpate::session::Session;
 use palpate::session::command::{Command, Due};
 use palpate::session::intake::Intake;
 use palpate::session::schedule::Schedule;
-use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
+use palpate::tissue::{Grasp, Model, Push, Tissue, at_rest};
 use palpate_proto::pb;
 use tonic::Code;
 
@@ -23,7 +23,7 @@ const SCHEMES: [&[&str]; 7] = [
     &["stepping.integrator=rk4", "stepping.precision=f64"],
     &["stepping.integrator=exponential2", "stepping.precision=compensated"],
     &["stepping.integrator=exponential4", "stepping.precision=f64"],
-    &["springs.shear_stiffness_n_per_m=5", "springs.flexion=true", "sheet.fixed=edges"],
+    &["springs.shear_stiffness_n_per_m=5", "springs.bending=true", "sheet.fixed=edges"],
 ];
 
 fn compile(sets: &[&str]) -> Arc<Model> {
@@ -31,16 +31,16 @@ fn compile(sets: &[&str]) -> Arc<Model> {
 }
 
 fn changed(model: &Model, change: Change) -> Arc<Model> {
-    // Undamped tissue without virtual springs takes more rehearsals than a server has time for.
+    // Undamped tissue without anchor springs takes more rehearsals than a server has time for.
     let limits = Limits { rehearsal_work: u64::MAX, ..Limits::default() };
     model.changed(&change, &model.scene, &limits).unwrap()
 }
 
-fn other(k: f64, c: f64, virtual_k: f64) -> Change {
+fn other(k: f64, c: f64, anchor_k: f64) -> Change {
     Change {
         stiffness_n_per_m: Some(k),
         damping_n_s_per_m: Some(c),
-        virtual_stiffness_n_per_m: Some(virtual_k),
+        anchor_stiffness_n_per_m: Some(anchor_k),
         volume_stiffness_pa: None,
     }
 }
@@ -64,7 +64,7 @@ fn step(tissue: &mut dyn Tissue, steps: u64) {
 
 fn energy_j(tissue: &dyn Tissue) -> f64 {
     let energy = tissue.energy();
-    energy.kinetic_j + energy.spring_j + energy.virtual_j
+    energy.kinetic_j + energy.spring_j + energy.anchor_j
 }
 
 /// The largest distance of any point in two states, m.
@@ -189,7 +189,7 @@ fn a_sheet_at_rest_wakes_for_it_and_sleeps_again() {
     let sleep = |tissue: &mut dyn Tissue| (0..20_000).any(|_| tissue.step().is_ok() && tissue.is_still());
     assert!(sleep(&mut *tissue));
     let before = places(&*tissue);
-    let next = changed(&model, Change { virtual_stiffness_n_per_m: Some(10.0), ..Change::default() });
+    let next = changed(&model, Change { anchor_stiffness_n_per_m: Some(10.0), ..Change::default() });
     tissue.change(&next);
     assert!(!tissue.is_still());
     assert!(sleep(&mut *tissue));
@@ -198,7 +198,7 @@ fn a_sheet_at_rest_wakes_for_it_and_sleeps_again() {
     assert!(sleep(&mut *fresh));
     let off_m = apart_m(&*tissue, &places(&*fresh));
     assert!(off_m < 2e-5 * fresh.largest_displacement_m(), "{off_m}");
-    // Twice the virtual stiffness, with the other springs unchanged: less deep, and more than half as deep.
+    // Twice the anchor stiffness, with the other springs unchanged: less deep, and more than half as deep.
     let centre = model.scene.sheet().unwrap().point([15, 15]);
     let ratio = tissue.point(centre).displacement_m.z / before[centre.index()].z;
     assert!((0.5..0.9).contains(&ratio), "{ratio}");
@@ -206,7 +206,7 @@ fn a_sheet_at_rest_wakes_for_it_and_sleeps_again() {
 
 #[test]
 fn shear_keeps_its_ratio_through_a_k_of_nothing() {
-    let model = compile(&["springs.shear_stiffness_n_per_m=4", "springs.flexion=true"]);
+    let model = compile(&["springs.shear_stiffness_n_per_m=4", "springs.bending=true"]);
     let k = |k: f64| Change { stiffness_n_per_m: Some(k), ..Change::default() };
     let none = changed(&model, k(0.0));
     let springs = &none.scene.springs;
@@ -234,8 +234,8 @@ fn what_is_refused_is_refused_as_in_a_scene() {
     assert_eq!((refusal.reason, refusal.field), (Reason::TooLarge, field("stepping.substeps")));
     let c = Change { damping_n_s_per_m: Some(f64::INFINITY), ..change };
     assert_eq!(refused(c), (Reason::NotFinite, field("damping.coefficient_n_s_per_m")));
-    let both = Change { stiffness_n_per_m: Some(20.0), virtual_stiffness_n_per_m: Some(-2.0), ..change };
-    assert_eq!(refused(both), (Reason::OutOfRange, field("virtual_springs.stiffness_n_per_m")));
+    let both = Change { stiffness_n_per_m: Some(20.0), anchor_stiffness_n_per_m: Some(-2.0), ..change };
+    assert_eq!(refused(both), (Reason::OutOfRange, field("anchor_springs.stiffness_n_per_m")));
 }
 
 #[test]
@@ -280,7 +280,7 @@ fn update(session_id: &str, change: Change, at_step: Option<u64>) -> pb::UpdateT
         session_id: session_id.into(),
         stiffness_n_per_m: change.stiffness_n_per_m,
         damping_n_s_per_m: change.damping_n_s_per_m,
-        virtual_stiffness_n_per_m: change.virtual_stiffness_n_per_m,
+        anchor_stiffness_n_per_m: change.anchor_stiffness_n_per_m,
         volume_stiffness_pa: change.volume_stiffness_pa,
         at_step,
     }
@@ -288,10 +288,10 @@ fn update(session_id: &str, change: Change, at_step: Option<u64>) -> pb::UpdateT
 
 /// The result in a server of a push and two changes, and its reports.
 async fn over_the_network(threads: &str) -> String {
-    let server = Server::start(&["--threads", threads]);
+    let server = TestServer::start(&["--threads", threads]);
     let session_id = server.paper(true).await;
     let mut sessions = server.sessions().await;
-    let mut touch = Touch::hold(&server, &session_id).await;
+    let mut touch = TestTouch::hold(&server, &session_id).await;
     touch.command(pb::Command { at_step: Some(5), ..force(0, 1, -2.0) }).await;
     touch.settle().await;
     let first = Change { stiffness_n_per_m: Some(60.0), ..Change::default() };
@@ -303,13 +303,10 @@ async fn over_the_network(threads: &str) -> String {
     let scene = server.status(&session_id).await.scene.unwrap();
     assert_eq!(scene.springs.unwrap().stiffness_n_per_m, Some(10.0));
     // A refused change has no effect, neither now nor later.
-    let bad = Change { damping_n_s_per_m: Some(0.1), virtual_stiffness_n_per_m: Some(f64::NAN), ..Change::default() };
+    let bad = Change { damping_n_s_per_m: Some(0.1), anchor_stiffness_n_per_m: Some(f64::NAN), ..Change::default() };
     let refused = sessions.update_tissue(update(&session_id, bad, Some(60))).await.unwrap_err();
-    assert_eq!(
-        told(&refused),
-        (Code::InvalidArgument, "NOT_FINITE".into(), "virtual_springs.stiffness_n_per_m".into())
-    );
-    let second = Change { virtual_stiffness_n_per_m: Some(12.0), ..Change::default() };
+    assert_eq!(told(&refused), (Code::InvalidArgument, "NOT_FINITE".into(), "anchor_springs.stiffness_n_per_m".into()));
+    let second = Change { anchor_stiffness_n_per_m: Some(12.0), ..Change::default() };
     sessions.update_tissue(update(&session_id, second, Some(120))).await.unwrap();
     let early = sessions.update_tissue(update(&session_id, second, Some(119))).await.unwrap_err();
     assert_eq!(told(&early), (Code::InvalidArgument, "OUT_OF_TURN".into(), "at_step".into()));
@@ -317,7 +314,7 @@ async fn over_the_network(threads: &str) -> String {
     let hash = server.hash_at(&session_id, 300).await;
     let scene = server.status(&session_id).await.scene.unwrap();
     assert_eq!(scene.springs.unwrap().stiffness_n_per_m, Some(60.0));
-    assert_eq!(scene.virtual_springs.unwrap().stiffness_n_per_m, Some(12.0));
+    assert_eq!(scene.anchor_springs.unwrap().stiffness_n_per_m, Some(12.0));
     assert_eq!(scene.damping.unwrap().coefficient_n_s_per_m, Some(0.5));
     hash
 }
@@ -337,24 +334,24 @@ async fn the_same_bits_on_any_number_of_threads_and_offline() {
     let stiff = changed(&model, Change { stiffness_n_per_m: Some(60.0), ..Change::default() });
     session.change(&stiff);
     advance(&mut session, 70);
-    session.change(&changed(&stiff, Change { virtual_stiffness_n_per_m: Some(12.0), ..Change::default() }));
+    session.change(&changed(&stiff, Change { anchor_stiffness_n_per_m: Some(12.0), ..Change::default() }));
     advance(&mut session, 180);
     assert_eq!((session.step_count(), format!("{:032x}", session.tissue().state_hash())), (300, hash));
 }
 
 #[tokio::test]
 async fn a_running_session_changes_at_once_and_logs_it() {
-    let server = Server::start(&[]);
+    let server = TestServer::start(&[]);
     let session_id = server.paper(false).await;
     // The holder sends nothing while the tissue comes to rest.
     let patient = pb::TouchOpen { lease_s: Some(600.0), ..open(&session_id, &[0]) };
-    let mut touch = Touch::open(&server, patient).await.unwrap();
+    let mut touch = TestTouch::open(&server, patient).await.unwrap();
     touch.command(force(0, 1, -2.0)).await;
     let depth_m = |sample: &pb::Sample| -sample.tools[0].displacement_m.map_or(0.0, |at| at.z);
     touch.sample_with(|sample| depth_m(sample) > 0.01).await;
     // Another client than the one that holds the tool.
     let mut sessions = server.sessions().await;
-    let softer = Change { virtual_stiffness_n_per_m: Some(1.0), ..Change::default() };
+    let softer = Change { anchor_stiffness_n_per_m: Some(1.0), ..Change::default() };
     let answer = sessions.update_tissue(update(&session_id, softer, None)).await.unwrap().into_inner();
     let mut fresh = Session::new(&changed(&compile(&[]), softer));
     let command = palpate::wire::command::from_command(&force(0, 1, -2.0), fresh.model().shape(), 0).unwrap();
@@ -363,11 +360,11 @@ async fn a_running_session_changes_at_once_and_logs_it() {
     let fresh_m = -fresh.sample(None).tools[0].contact.unwrap().displacement_m.z;
     let balanced =
         touch.sample_with(|sample| sample.step > answer.step && (depth_m(sample) / fresh_m - 1.0).abs() < 1e-4);
-    tokio::time::timeout(PATIENCE, balanced).await.expect("it comes to the balance of one that began so");
+    tokio::time::timeout(TEST_TIMEOUT, balanced).await.expect("it comes to the balance of one that began so");
     let nothing = sessions.update_tissue(update(&session_id, Change::default(), None)).await.unwrap_err();
     assert_eq!(told(&nothing).1, "MISSING");
     let nobody = sessions.update_tissue(update("nobody", softer, None)).await.unwrap_err();
     assert_eq!(told(&nobody).1, "UNKNOWN_SESSION");
     let log = server.log();
-    assert!(log.contains("tissue changed") && log.contains("virtual_stiffness_n_per_m=1"), "{log}");
+    assert!(log.contains("tissue changed") && log.contains("anchor_stiffness_n_per_m=1"), "{log}");
 }

@@ -6,11 +6,11 @@ use palpate::scene::Scene;
 use palpate::scene::profile::{LoadProfile, Moment};
 use palpate::session::Session;
 use palpate::shape::PointId;
-use palpate::sheet::{self, Energy, Grasp, Tissue};
+use palpate::tissue::{self, Energy, Grasp, Tissue};
 
 /// A tissue in motion: pushed at a point for some steps, then released.
 fn shaken(scene: &Scene, steps: u64) -> Box<dyn Tissue> {
-    let mut tissue = sheet::at_rest(&model(scene));
+    let mut tissue = tissue::at_rest(&model(scene));
     tissue.push(0, Some(push_on(scene, [3, 2], [0.4, 0.3, -0.6])));
     for _ in 0..steps {
         tissue.step().unwrap();
@@ -21,7 +21,7 @@ fn shaken(scene: &Scene, steps: u64) -> Box<dyn Tissue> {
 }
 
 fn total_j(energy: Energy) -> f64 {
-    energy.kinetic_j + energy.spring_j + energy.virtual_j
+    energy.kinetic_j + energy.spring_j + energy.anchor_j
 }
 
 /// The closed form of m·a + C·v + K·u = F from rest: displacement and velocity.
@@ -46,7 +46,7 @@ fn oscillator(m: f64, c: f64, k: f64, f: f64, t: f64) -> (f64, f64) {
 
 #[test]
 fn a_point_without_springs_is_the_damped_oscillator() {
-    let (mass, virtual_stiffness) = (0.02, 5.0);
+    let (mass, anchor_stiffness) = (0.02, 5.0);
     // Under-, nearly critically and overdamped.
     for damping in [0.0, 0.2, 0.63, 6.0] {
         let set = format!("damping.coefficient_n_s_per_m={damping}");
@@ -64,7 +64,7 @@ fn a_point_without_springs_is_the_damped_oscillator() {
                 for _ in 0..1000 {
                     advance(&mut session, (rate_hz / 1000.0) as u64);
                     let point = session.tissue().point(session.model().scene.sheet().unwrap().point([3, 2]));
-                    let (u, v) = oscillator(mass, damping, virtual_stiffness, -0.2, session.time_s());
+                    let (u, v) = oscillator(mass, damping, anchor_stiffness, -0.2, session.time_s());
                     largest[0] = largest[0].max((point.displacement_m.z - u).abs());
                     largest[1] = largest[1].max((point.velocity_m_per_s.z - v).abs());
                 }
@@ -130,13 +130,13 @@ fn damping_only_takes_energy() {
 
 #[test]
 fn momentum_changes_by_the_outer_forces_alone() {
-    let sets = ["damping.coefficient_n_s_per_m=0.0", "virtual_springs.stiffness_n_per_m=0.0"];
+    let sets = ["damping.coefficient_n_s_per_m=0.0", "anchor_springs.stiffness_n_per_m=0.0"];
     let scene = scene_with(SMALL, &sets);
     let momentum = |tissue: &dyn Tissue| -> DVec3 {
         let velocities = tissue.model().points().map(|index| tissue.point(index).velocity_m_per_s);
         scene.sheet().unwrap().point_mass_kg * velocities.sum::<DVec3>()
     };
-    let mut tissue = sheet::at_rest(&model(&scene));
+    let mut tissue = tissue::at_rest(&model(&scene));
     let force_n = DVec3::new(0.4, 0.3, -0.6);
     tissue.push(0, Some(push_on(&scene, [3, 2], force_n.to_array())));
     for _ in 0..40 {
@@ -155,7 +155,7 @@ fn momentum_changes_by_the_outer_forces_alone() {
 #[test]
 fn a_centred_poke_keeps_the_symmetry_of_the_sheet() {
     let square = scene_with(SMALL, &["sheet.points=[9, 9]"]);
-    let mut tissue = sheet::at_rest(&model(&square));
+    let mut tissue = tissue::at_rest(&model(&square));
     tissue.push(0, Some(push_on(&square, [4, 4], [0.0, 0.0, -0.8])));
     for _ in 0..200 {
         tissue.step().unwrap();
@@ -176,9 +176,9 @@ fn a_centred_poke_keeps_the_symmetry_of_the_sheet() {
 #[test]
 fn equilibrium_is_the_solution_of_newtons_method() {
     let scene =
-        scene_with(SMALL, &["springs.flexion=true", "springs.shear_stiffness_n_per_m=12.0", "sleep.tolerance=0"]);
+        scene_with(SMALL, &["springs.bending=true", "springs.shear_stiffness_n_per_m=12.0", "sleep.tolerance=0"]);
     let load = DVec3::new(0.2, -0.1, -0.5);
-    let mut tissue = sheet::at_rest(&model(&scene));
+    let mut tissue = tissue::at_rest(&model(&scene));
     tissue.push(0, Some(push_on(&scene, [3, 2], load.to_array())));
     for _ in 0..20_000 {
         tissue.step().unwrap();
@@ -209,7 +209,7 @@ impl Static<'_> {
             (1, 1, springs.shear_stiffness_n_per_m),
             (1, -1, springs.shear_stiffness_n_per_m),
         ];
-        if springs.flexion {
+        if springs.bending {
             links.extend([(2, 0, springs.stiffness_n_per_m), (0, 2, springs.stiffness_n_per_m)]);
         }
         let mut energy = 0.0;
@@ -225,7 +225,7 @@ impl Static<'_> {
                 }
             }
         }
-        energy + u.iter().map(|u| 0.5 * self.scene.virtual_stiffness_n_per_m * u.length_squared()).sum::<f64>()
+        energy + u.iter().map(|u| 0.5 * self.scene.anchor_stiffness_n_per_m * u.length_squared()).sum::<f64>()
     }
 
     /// Minus the gradient of the energy, by central differences, plus the load.
@@ -293,14 +293,14 @@ fn exact_forces_n(problem: &Static<'_>, u: &[DVec3]) -> Vec<f64> {
             let k = match (di.abs(), dj.abs()) {
                 (1.0, 0.0) | (0.0, 1.0) => springs.stiffness_n_per_m,
                 (1.0, 1.0) => springs.shear_stiffness_n_per_m,
-                (2.0, 0.0) | (0.0, 2.0) if springs.flexion => springs.stiffness_n_per_m,
+                (2.0, 0.0) | (0.0, 2.0) if springs.bending => springs.stiffness_n_per_m,
                 _ => continue,
             };
             let rest = scene.sheet().unwrap().spacing_m * DVec3::new(di, dj, 0.0);
             let now = rest + u[b] - u[a];
             forces[a] += k * (now.length() - rest.length()) / now.length() * now;
         }
-        forces[a] -= scene.virtual_stiffness_n_per_m * u[a];
+        forces[a] -= scene.anchor_stiffness_n_per_m * u[a];
     }
     forces[problem.loaded] += problem.load;
     forces.iter().flat_map(DVec3::to_array).collect()
@@ -333,7 +333,7 @@ fn solve(mut system: Vec<Vec<f64>>) -> Vec<f64> {
 #[test]
 fn the_force_field_is_minus_the_gradient_of_the_energy() {
     // Central differences: the displacement is exactly the one at which the springs were evaluated.
-    let sets = ["springs.flexion=true", "springs.shear_stiffness_n_per_m=12.0", "stepping.integrator=central"];
+    let sets = ["springs.bending=true", "springs.shear_stiffness_n_per_m=12.0", "stepping.integrator=central"];
     let scene = scene_with(SMALL, &sets);
     let tissue = shaken(&scene, 60);
     let u: Vec<DVec3> = tissue.model().points().map(|index| tissue.point(index).displacement_m).collect();
@@ -341,18 +341,18 @@ fn the_force_field_is_minus_the_gradient_of_the_energy() {
     let problem = Static { scene: &scene, loaded: 0, load: DVec3::ZERO };
     for (index, expected) in problem.forces_n(&u).chunks(3).enumerate() {
         let point = tissue.point(PointId::new(index));
-        let force_n = point.spring_n + point.virtual_n;
+        let force_n = point.spring_n + point.anchor_n;
         let expected = DVec3::new(expected[0], expected[1], expected[2]);
         assert!((force_n - expected).length() < 1e-8, "point {index}: {force_n}, expected {expected}");
     }
     let energy = tissue.energy();
-    assert!((energy.spring_j + energy.virtual_j - problem.energy_j(&u)).abs() < 1e-14);
+    assert!((energy.spring_j + energy.anchor_j - problem.energy_j(&u)).abs() < 1e-14);
 }
 
 #[test]
-fn virtual_springs_alone_leave_every_point_to_itself() {
+fn anchor_springs_alone_leave_every_point_to_itself() {
     let scene = scene_with(SMALL, &["springs.stiffness_n_per_m=0.0", "sleep.tolerance=0"]);
-    let mut tissue = sheet::at_rest(&model(&scene));
+    let mut tissue = tissue::at_rest(&model(&scene));
     tissue.push(0, Some(push_on(&scene, [3, 2], [0.0, 0.0, -0.5])));
     for _ in 0..5000 {
         tissue.step().unwrap();
@@ -364,8 +364,8 @@ fn virtual_springs_alone_leave_every_point_to_itself() {
 }
 
 #[test]
-fn a_sheet_without_virtual_springs_is_the_conventional_model_and_floats_away() {
-    let sets = ["virtual_springs.stiffness_n_per_m=0.0", "damping.coefficient_n_s_per_m=0.0"];
+fn a_sheet_without_anchor_springs_is_the_conventional_model_and_floats_away() {
+    let sets = ["anchor_springs.stiffness_n_per_m=0.0", "damping.coefficient_n_s_per_m=0.0"];
     let scene = scene_with(SMALL, &sets);
     let mut tissue = shaken(&scene, 40);
     for _ in 0..5000 {
@@ -378,8 +378,8 @@ fn a_sheet_without_virtual_springs_is_the_conventional_model_and_floats_away() {
 fn fixed_points_never_move_and_carry_the_load() {
     for fixed in ["edges", "corners", "[[0, 0], [6, 4], [0, 4]]"] {
         let set = format!("sheet.fixed={fixed}");
-        let scene = scene_with(SMALL, &[&set, "virtual_springs.stiffness_n_per_m=0.0"]);
-        let mut tissue = sheet::at_rest(&model(&scene));
+        let scene = scene_with(SMALL, &[&set, "anchor_springs.stiffness_n_per_m=0.0"]);
+        let mut tissue = tissue::at_rest(&model(&scene));
         let load = DVec3::new(0.05, 0.0, -0.1);
         tissue.push(0, Some(push_on(&scene, [3, 2], load.to_array())));
         for _ in 0..40_000 {
@@ -391,7 +391,7 @@ fn fixed_points_never_move_and_carry_the_load() {
             assert_eq!(held[index].displacement_m, DVec3::ZERO);
             carried += held[index].constraint_n.unwrap();
         }
-        // A sheet without virtual springs creeps for long: damping carries what the fixed points do not.
+        // A sheet without anchor springs creeps for long: damping carries what the fixed points do not.
         let damping: DVec3 = held.iter().map(|point| point.damping_n).sum();
         assert!((carried + damping + load).length() < 1e-6, "{fixed}: {carried}, {damping}");
         assert!(damping.length() < 2e-3 * load.length(), "{fixed}: {damping}");
@@ -414,7 +414,7 @@ fn a_let_go_point_goes_on_with_its_velocity() {
             "stepping.integrator=central",
         ];
         let scene = scene_with(SMALL, &sets);
-        let mut tissue = sheet::at_rest(&model(&scene));
+        let mut tissue = tissue::at_rest(&model(&scene));
         let index = tissue.model().scene.sheet().unwrap().point([3, 2]);
         let steps = (0.1 * rate_hz) as u64;
         for step in 0..steps {
@@ -441,7 +441,7 @@ fn a_point_let_go_as_a_force_begins_starts_like_any_free_point() {
     let scene = scene_with(SMALL, &["stepping.substeps=2"]);
     let index = model(&scene).scene.sheet().unwrap().point([3, 2]);
     let run = |hold: bool| {
-        let mut tissue = sheet::at_rest(&model(&scene));
+        let mut tissue = tissue::at_rest(&model(&scene));
         if hold {
             tissue.grasp(0, index, Grasp::Target(DVec3::ZERO));
         }
@@ -480,7 +480,7 @@ fn to_grasp_and_let_go_between_two_steps_changes_nothing() {
 #[test]
 fn a_grasped_point_taken_over_by_another_tool_follows_that_one() {
     let scene = scene(SMALL);
-    let mut tissue = sheet::at_rest(&model(&scene));
+    let mut tissue = tissue::at_rest(&model(&scene));
     let index = tissue.model().scene.sheet().unwrap().point([3, 2]);
     tissue.grasp(0, index, Grasp::Target(DVec3::new(0.0, 0.0, 0.01)));
     tissue.step().unwrap();
@@ -564,7 +564,7 @@ fn a_spring_pressed_to_no_length_stays_finite() {
         ["stepping.precision=f64", "stepping.integrator=exponential4"],
     ] {
         let scene = scene_with(SMALL, &sets);
-        let mut tissue = sheet::at_rest(&model(&scene));
+        let mut tissue = tissue::at_rest(&model(&scene));
         let (moved, held) =
             (tissue.model().scene.sheet().unwrap().point([3, 2]), tissue.model().scene.sheet().unwrap().point([4, 2]));
         let check = |tissue: &dyn Tissue, step: u32| {
@@ -608,7 +608,7 @@ fn a_vibration_without_damping_keeps_its_phase() {
     let shaken_for_a_second = |substeps: Option<u32>| {
         let substeps = substeps.map_or("stepping.substeps=auto".to_owned(), |n| format!("stepping.substeps={n}"));
         let scene = scene_with(SMALL, &[&sets[..], &[substeps.as_str()]].concat());
-        let mut tissue = sheet::at_rest(&model(&scene));
+        let mut tissue = tissue::at_rest(&model(&scene));
         tissue.push(0, Some(push_on(&scene, [7, 7], [0.1, 0.0, -0.6])));
         let mut path = Vec::new();
         for step in 0..1000 {
@@ -629,25 +629,25 @@ fn a_vibration_without_damping_keeps_its_phase() {
 
 #[test]
 fn substeps_follow_the_bound_and_a_bound_is_never_below_a_vibration() {
-    use palpate::sheet::stability::largest_stiffness_of_a_sheet_n_per_m;
+    use palpate::tissue::stability::largest_stiffness_of_a_sheet_n_per_m;
     // λ over the whole infinite grid, by brute force.
-    for (k1, k2, flexion) in
+    for (k1, k2, bending) in
         [(1.0, 1.0, false), (1.0, 1.0, true), (1.0, 0.3, true), (0.2, 1.0, false), (1.0, 0.0, true)]
     {
         let mut springs = scene(SMALL).springs;
-        (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m, springs.flexion) = (k1, k2, flexion);
+        (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m, springs.bending) = (k1, k2, bending);
         let mut largest = 0.0_f64;
         for a in 0..=200 {
             for b in 0..=200 {
                 let (a, b) = (f64::from(a) / 200.0 * std::f64::consts::PI, f64::from(b) / 200.0 * std::f64::consts::PI);
                 let mut value = k1 * (4.0 - 2.0 * a.cos() - 2.0 * b.cos()) + k2 * (4.0 - 4.0 * a.cos() * b.cos());
-                if flexion {
+                if bending {
                     value += k1 * (4.0 - 2.0 * (2.0 * a).cos() - 2.0 * (2.0 * b).cos());
                 }
                 largest = largest.max(value);
             }
         }
         let bound = largest_stiffness_of_a_sheet_n_per_m(&springs);
-        assert!(bound >= largest - 1e-12 && bound < largest * 1.001, "{k1}, {k2}, {flexion}: {bound} and {largest}");
+        assert!(bound >= largest - 1e-12 && bound < largest * 1.001, "{k1}, {k2}, {bending}: {bound} and {largest}");
     }
 }

@@ -4,7 +4,7 @@ use glam::DVec3;
 use palpate::limits::Limits;
 use palpate::scene::profile::{CentreProfile, LoadProfile, Profile, StrengthProfile};
 use palpate::scene::{PAPER, Scene};
-use palpate::sheet::{Grasp, Model, Push, Tissue, at_rest};
+use palpate::tissue::{Grasp, Model, Push, Tissue, at_rest};
 
 fn sheet(settings: &[&str]) -> Box<dyn Tissue> {
     let settings: Vec<String> = settings.iter().map(|text| (*text).to_owned()).collect();
@@ -42,7 +42,7 @@ fn cases() -> Vec<(&'static str, Vec<&'static str>, Vec<Push>)> {
     vec![
         ("local", vec![], vec![push(at(1.0, 1.5), [0.0, 0.0, -3.0], 150.0, pulse)]),
         ("stiff", vec!["springs.stiffness_n_per_m=200"], vec![push(at(1.0, 1.5), [0.3, 0.0, -1.0], 60.0, pulse)]),
-        ("flexion", vec!["springs.flexion=true"], vec![push(at(0.53, 0.53), [1.0, 0.5, -2.0], 100.0, pulse)]),
+        ("bending", vec!["springs.bending=true"], vec![push(at(0.53, 0.53), [1.0, 0.5, -2.0], 100.0, pulse)]),
         ("stroke", vec![], vec![push(path, [0.2, 0.3, -1.0], 60.0, Profile::Constant)]),
         (
             "two tools",
@@ -116,7 +116,7 @@ fn a_sheet_at_rest_computes_nothing_and_wakes_within_the_step_that_touches_it() 
     assert_eq!(tissue.point(tissue.model().scene.sheet().unwrap().point([15, 15])), held);
     assert_eq!(held.velocity_m_per_s, DVec3::ZERO);
     // All forces balance within the tolerance.
-    let rest = held.spring_n + held.virtual_n + held.applied_n;
+    let rest = held.spring_n + held.anchor_n + held.applied_n;
     assert!(rest.length() < 1e-5 * held.applied_n.length(), "{rest}");
     tissue.push(0, None);
     tissue.step().unwrap();
@@ -235,9 +235,9 @@ fn energies_by_points(tissue: &dyn Tissue) -> [f64; 3] {
     }
     let kinetic_j =
         points.iter().map(|point| 0.5 * scene.sheet().unwrap().point_mass_kg * point.velocity_m_per_s.length_squared());
-    let virtual_j =
-        points.iter().map(|point| 0.5 * scene.virtual_stiffness_n_per_m * point.displacement_m.length_squared());
-    [kinetic_j.sum(), spring_j, virtual_j.sum()]
+    let anchor_j =
+        points.iter().map(|point| 0.5 * scene.anchor_stiffness_n_per_m * point.displacement_m.length_squared());
+    [kinetic_j.sum(), spring_j, anchor_j.sum()]
 }
 
 #[test]
@@ -264,7 +264,7 @@ fn the_energy_of_tiles_that_sleep_is_counted_to_the_last_digits() {
             partly += usize::from((1..65 * 97).contains(&asked.awake_points()));
             let truth = energies_by_points(&*asked);
             let total_j: f64 = truth.iter().sum();
-            for (found_j, truth_j) in [energy.kinetic_j, energy.spring_j, energy.virtual_j].into_iter().zip(truth) {
+            for (found_j, truth_j) in [energy.kinetic_j, energy.spring_j, energy.anchor_j].into_iter().zip(truth) {
                 assert!((found_j - truth_j).abs() <= part * total_j, "{integrator}, {step}: {energy:?}, {truth:?}");
             }
             // Earlier calls make no difference.

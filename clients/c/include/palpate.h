@@ -469,9 +469,9 @@ typedef struct palpate_change {
    */
   double damping_n_s_per_m;
   /**
-   * Of virtual springs, N/m.
+   * Of anchor springs, N/m.
    */
-  double virtual_stiffness_n_per_m;
+  double anchor_stiffness_n_per_m;
   /**
    * Of the volume of a closed mesh, Pa.
    */

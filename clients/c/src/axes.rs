@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::error::Fault;
+use crate::error::CodedError;
 
 /// Axes and unit of positions, normals and forces.
 #[repr(C)]
@@ -43,12 +43,12 @@ impl palpate_vector {
 
 impl palpate_axes {
     /// The axes of a number from outside.
-    pub(crate) fn of(number: u32) -> Result<Self, Fault> {
+    pub(crate) fn of(number: u32) -> Result<Self, CodedError> {
         match number {
             0 => Ok(PALPATE_AXES_OWN),
             1 => Ok(PALPATE_AXES_UNITY),
             2 => Ok(PALPATE_AXES_UNREAL),
-            _ => Err(Fault::argument("axes: must be one of palpate_axes")),
+            _ => Err(CodedError::argument("axes: must be one of palpate_axes")),
         }
     }
 

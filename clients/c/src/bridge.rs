@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use palpate_client::bridge::{Disable, Options, Origin, Report, Tick, run_told};
+use palpate_client::bridge::{BridgeReport, Disable, Options, PositionOrigin, Tick, run_told};
 use palpate_client::os::Priority;
 use palpate_client::{Error, HapticDevice, Reading};
 use palpate_touch::Device;
@@ -14,7 +14,7 @@ use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
 use crate::axes::{palpate_axes, palpate_vector};
-use crate::error::{Fault, PALPATE_CONNECTION, PALPATE_INTERNAL, PALPATE_OK, at, at_mut, guard, palpate_result};
+use crate::error::{CodedError, PALPATE_CONNECTION, PALPATE_INTERNAL, PALPATE_OK, at, at_mut, guard, palpate_result};
 use crate::options::{options_at, palpate_limits, palpate_touch_options};
 use crate::server::{CONNECTING, Connected, palpate_session};
 use crate::touch::{palpate_reading, palpate_state, state_of};
@@ -38,10 +38,10 @@ pub struct palpate_device {
 /// The loop of a device.
 pub struct palpate_bridge {
     shared: Arc<Connected>,
-    seen: Arc<Mutex<Seen>>,
+    seen: Arc<Mutex<LoopObservation>>,
     disable: Disable,
     stop: Arc<Notify>,
-    task: JoinHandle<Result<Report, Error>>,
+    task: JoinHandle<Result<BridgeReport, Error>>,
     axes: palpate_axes,
 }
 
@@ -102,13 +102,13 @@ pub struct palpate_bridge_report {
 
 /// What the loop shows of itself.
 #[derive(Default)]
-struct Seen {
+struct LoopObservation {
     ticks: u64,
     newest: Option<Tick>,
     priority: palpate_priority,
 }
 
-fn seen_of(seen: &Mutex<Seen>) -> MutexGuard<'_, Seen> {
+fn seen_of(seen: &Mutex<LoopObservation>) -> MutexGuard<'_, LoopObservation> {
     seen.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -118,7 +118,7 @@ struct Called {
     limits: Device,
     axes: palpate_axes,
     ticks: u64,
-    seen: Arc<Mutex<Seen>>,
+    seen: Arc<Mutex<LoopObservation>>,
 }
 
 // SAFETY: the header says that a thread of the library calls the functions.
@@ -178,18 +178,18 @@ pub unsafe extern "C" fn palpate_bridge_begin(
             )
         };
         *out = std::ptr::null_mut();
-        if options.origin != Origin::Workspace {
-            return Err(Fault::argument(
+        if options.origin != PositionOrigin::Workspace {
+            return Err(CodedError::argument(
                 "in_tissue_frame is not for devices: their origin lies on the top of the tissue",
             ));
         }
         let (Some(descriptor), Some(_), Some(_)) = (device.descriptor, device.read, device.write) else {
-            return Err(Fault::argument("device: all three functions must be there"));
+            return Err(CodedError::argument("device: all three functions must be there"));
         };
         let mut limits = palpate_limits::from(palpate_touch::device::UNDECLARED);
         // SAFETY: the caller's promise.
         checked("descriptor", unsafe { descriptor(device.user, &mut limits) }).map_err(Error::Device)?;
-        let seen = Arc::new(Mutex::new(Seen::default()));
+        let seen = Arc::new(Mutex::new(LoopObservation::default()));
         let called = Called { device, limits: limits.device()?, axes: options.axes, ticks: 0, seen: seen.clone() };
         let shared = session.shared.clone();
         let target = session.target(&options);
@@ -226,22 +226,22 @@ pub unsafe extern "C" fn palpate_bridge_begin(
             std::thread::sleep(Duration::from_millis(2));
         }
         // It never connected, so there is an error.
-        Err(bridge.end().1.unwrap_or_else(|| Fault::new(PALPATE_CONNECTION, "the server does not answer")))
+        Err(bridge.end().1.unwrap_or_else(|| CodedError::new(PALPATE_CONNECTION, "the server does not answer")))
     })
 }
 
 impl palpate_bridge {
     /// Ends the loop, and waits for that. What it has done, and why it could not go on, if it couldn't.
-    fn end(self) -> (palpate_bridge_report, Option<Fault>) {
+    fn end(self) -> (palpate_bridge_report, Option<CodedError>) {
         self.stop.notify_one();
         let (report, fault) = match self.shared.threads.block_on(self.task) {
             Err(fault) => (None, Some(fault)),
             Ok(Ok(Ok(mut report))) => {
                 let failure = report.failure.take();
-                (Some(report), failure.map(Fault::from))
+                (Some(report), failure.map(CodedError::from))
             }
             Ok(Ok(Err(error))) => (None, Some(error.into())),
-            Ok(Err(_)) => (None, Some(Fault::new(PALPATE_INTERNAL, "the loop panicked"))),
+            Ok(Err(_)) => (None, Some(CodedError::new(PALPATE_INTERNAL, "the loop panicked"))),
         };
         let seen = seen_of(&self.seen);
         let traffic = report.as_ref().map(|report| report.traffic).unwrap_or_default();
@@ -253,7 +253,7 @@ impl palpate_bridge {
             samples: traffic.samples,
             positions: traffic.poses,
             priority: seen.priority as u32,
-            result: fault.as_ref().map_or(PALPATE_OK, Fault::code) as u32,
+            result: fault.as_ref().map_or(PALPATE_OK, CodedError::code) as u32,
         };
         (told, fault)
     }
@@ -304,7 +304,7 @@ pub unsafe extern "C" fn palpate_bridge_end(
         // SAFETY: the caller's promise.
         let out = unsafe { report.as_mut() };
         if bridge.is_null() {
-            return Err(Fault::argument("bridge is null"));
+            return Err(CodedError::argument("bridge is null"));
         }
         // SAFETY: the caller's promise.
         let (told, fault) = unsafe { Box::from_raw(bridge) }.end();

@@ -60,15 +60,15 @@ pub extern "C" fn palpate_last_error() -> *const c_char {
 }
 
 /// An error with a code.
-pub(crate) struct Fault {
+pub(crate) struct CodedError {
     code: palpate_result,
     /// Those of a tick are there already: it asks for no memory.
     words: Cow<'static, str>,
 }
 
-impl Fault {
+impl CodedError {
     pub(crate) fn argument(words: impl Into<Cow<'static, str>>) -> Self {
-        Fault::new(PALPATE_ARGUMENT, words)
+        CodedError::new(PALPATE_ARGUMENT, words)
     }
 
     pub(crate) fn code(&self) -> palpate_result {
@@ -76,11 +76,11 @@ impl Fault {
     }
 
     pub(crate) fn new(code: palpate_result, words: impl Into<Cow<'static, str>>) -> Self {
-        Fault { code, words: words.into() }
+        CodedError { code, words: words.into() }
     }
 }
 
-impl From<Error> for Fault {
+impl From<Error> for CodedError {
     fn from(error: Error) -> Self {
         let code = match &error {
             Error::Argument(_) => PALPATE_ARGUMENT,
@@ -90,21 +90,21 @@ impl From<Error> for Fault {
             Error::Device(_) => PALPATE_DEVICE,
             Error::Internal(_) => PALPATE_INTERNAL,
         };
-        Fault::new(code, error.to_string())
+        CodedError::new(code, error.to_string())
     }
 }
 
-impl From<tonic::Status> for Fault {
+impl From<tonic::Status> for CodedError {
     fn from(status: tonic::Status) -> Self {
         Error::from(status).into()
     }
 }
 
 /// Runs an entry: keeps the words of its error, and lets no panic out. It asks for no memory itself.
-pub(crate) fn guard(entry: impl FnOnce() -> Result<(), Fault>) -> palpate_result {
+pub(crate) fn guard(entry: impl FnOnce() -> Result<(), CodedError>) -> palpate_result {
     match catch_unwind(AssertUnwindSafe(entry)) {
         Ok(Ok(())) => PALPATE_OK,
-        Ok(Err(Fault { code, words })) => {
+        Ok(Err(CodedError { code, words })) => {
             keep(&words);
             code
         }
@@ -119,40 +119,43 @@ pub(crate) fn guard(entry: impl FnOnce() -> Result<(), Fault>) -> palpate_result
 ///
 /// # Safety
 /// It is null or valid.
-pub(crate) unsafe fn at<'a, T>(pointer: *const T, words: &'static str) -> Result<&'a T, Fault> {
+pub(crate) unsafe fn at<'a, T>(pointer: *const T, words: &'static str) -> Result<&'a T, CodedError> {
     // SAFETY: the caller's promise.
-    unsafe { pointer.as_ref() }.ok_or_else(|| Fault::argument(words))
+    unsafe { pointer.as_ref() }.ok_or_else(|| CodedError::argument(words))
 }
 
 /// The same, to be written.
 ///
 /// # Safety
 /// It is null or valid, and nobody else uses it meanwhile.
-pub(crate) unsafe fn at_mut<'a, T>(pointer: *mut T, words: &'static str) -> Result<&'a mut T, Fault> {
+pub(crate) unsafe fn at_mut<'a, T>(pointer: *mut T, words: &'static str) -> Result<&'a mut T, CodedError> {
     // SAFETY: the caller's promise.
-    unsafe { pointer.as_mut() }.ok_or_else(|| Fault::argument(words))
+    unsafe { pointer.as_mut() }.ok_or_else(|| CodedError::argument(words))
 }
 
 /// A text.
 ///
 /// # Safety
 /// It is null or ends with a zero byte.
-pub(crate) unsafe fn text<'a>(pointer: *const c_char, name: &'static str) -> Result<&'a str, Fault> {
+pub(crate) unsafe fn text<'a>(pointer: *const c_char, name: &'static str) -> Result<&'a str, CodedError> {
     // SAFETY: the caller's promise.
-    unsafe { optional_text(pointer, name) }?.ok_or_else(|| Fault::argument(format!("{name} is null")))
+    unsafe { optional_text(pointer, name) }?.ok_or_else(|| CodedError::argument(format!("{name} is null")))
 }
 
 /// A text that may be absent.
 ///
 /// # Safety
 /// It is null or ends with a zero byte.
-pub(crate) unsafe fn optional_text<'a>(pointer: *const c_char, name: &'static str) -> Result<Option<&'a str>, Fault> {
+pub(crate) unsafe fn optional_text<'a>(
+    pointer: *const c_char,
+    name: &'static str,
+) -> Result<Option<&'a str>, CodedError> {
     if pointer.is_null() {
         return Ok(None);
     }
     // SAFETY: the caller's promise.
     let text = unsafe { CStr::from_ptr(pointer) };
-    text.to_str().map(Some).map_err(|_| Fault::argument(format!("{name} is not UTF-8")))
+    text.to_str().map(Some).map_err(|_| CodedError::argument(format!("{name} is not UTF-8")))
 }
 
 /// Writes a text into a buffer of the caller's, with a zero byte, and how many bytes it takes.
@@ -164,16 +167,16 @@ pub(crate) unsafe fn write_text(
     buffer: *mut c_char,
     capacity: usize,
     needed: *mut usize,
-) -> Result<(), Fault> {
+) -> Result<(), CodedError> {
     // SAFETY: the caller's promise.
     if let Some(needed) = unsafe { needed.as_mut() } {
         *needed = text.len() + 1;
     }
     if buffer.is_null() {
-        return if needed.is_null() { Err(Fault::argument("both `text` and `needed` are null")) } else { Ok(()) };
+        return if needed.is_null() { Err(CodedError::argument("both `text` and `needed` are null")) } else { Ok(()) };
     }
     if capacity <= text.len() {
-        return Err(Fault::new(PALPATE_BUFFER, format!("the text takes {} bytes", text.len() + 1)));
+        return Err(CodedError::new(PALPATE_BUFFER, format!("the text takes {} bytes", text.len() + 1)));
     }
     // SAFETY: the caller's promise; it fits.
     unsafe {

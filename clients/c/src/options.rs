@@ -4,12 +4,12 @@ use std::ffi::{c_char, c_void};
 use std::sync::Arc;
 
 use palpate::journal;
-use palpate_client::bridge::{Copies, Origin, Warn};
+use palpate_client::bridge::{Copies, PositionOrigin, Warn};
 use palpate_proto::{pb, touch};
 use palpate_touch::{Device, Tip};
 
 use crate::axes::palpate_axes;
-use crate::error::{Fault, guard, optional_text, palpate_result, text};
+use crate::error::{CodedError, guard, optional_text, palpate_result, text};
 
 /// A function of the caller's that is shown texts for people.
 pub type palpate_warn = Option<unsafe extern "C" fn(user: *mut c_void, message: *const c_char)>;
@@ -145,7 +145,7 @@ pub unsafe extern "C" fn palpate_limits_of(name: *const c_char, limits: *mut pal
         // SAFETY: the caller's promise.
         let limits = unsafe { crate::error::at_mut(limits, "limits is null") }?;
         let device =
-            Device::named(name).ok_or_else(|| Fault::argument(format!("name: no device is called `{name}`")))?;
+            Device::named(name).ok_or_else(|| CodedError::argument(format!("name: no device is called `{name}`")))?;
         *limits = device.into();
         Ok(())
     })
@@ -165,7 +165,7 @@ impl From<Device> for palpate_limits {
 
 impl palpate_limits {
     /// The device with these limits.
-    pub(crate) fn device(&self) -> Result<Device, Fault> {
+    pub(crate) fn device(&self) -> Result<Device, CodedError> {
         let message = pb::Device {
             name: "libpalpate".to_owned(),
             max_force_n: self.max_force_n,
@@ -174,7 +174,7 @@ impl palpate_limits {
             max_damping_n_s_per_m: self.max_damping_n_s_per_m,
             workspace_radius_m: self.workspace_radius_m,
         };
-        touch::from_device(&message).map_err(|refusal| Fault::argument(refusal.to_string()))
+        touch::from_device(&message).map_err(|refusal| CodedError::argument(refusal.to_string()))
     }
 }
 
@@ -237,11 +237,11 @@ unsafe impl Versioned for palpate_surface_options {
 unsafe fn init<T: Versioned>(options: *mut T, size: usize) -> palpate_result {
     guard(|| {
         if options.is_null() {
-            return Err(Fault::argument("options is null"));
+            return Err(CodedError::argument("options is null"));
         }
         if size < size_of::<usize>() || size > size_of::<T>() {
             let why = format!("size is {size}: the header is of another version than the library ({})", size_of::<T>());
-            return Err(Fault::argument(why));
+            return Err(CodedError::argument(why));
         }
         let initial = T::initial();
         // SAFETY: so many bytes are valid on both sides; the structure of an older header is shorter.
@@ -257,7 +257,7 @@ unsafe fn init<T: Versioned>(options: *mut T, size: usize) -> palpate_result {
 ///
 /// # Safety
 /// It is null, or as many bytes as its first field says are valid.
-pub(crate) unsafe fn options_at<T: Versioned>(pointer: *const T) -> Result<T, Fault> {
+pub(crate) unsafe fn options_at<T: Versioned>(pointer: *const T) -> Result<T, CodedError> {
     let mut options = T::initial();
     if pointer.is_null() {
         return Ok(options);
@@ -269,7 +269,7 @@ pub(crate) unsafe fn options_at<T: Versioned>(pointer: *const T) -> Result<T, Fa
         let why = format!(
             "options.size is {size}: fill the structure by its _init function first; or the header is newer than the library"
         );
-        return Err(Fault::argument(why));
+        return Err(CodedError::argument(why));
     }
     // SAFETY: so many bytes are valid on both sides.
     unsafe { std::ptr::copy_nonoverlapping(pointer.cast::<u8>(), (&raw mut options).cast::<u8>(), size) };
@@ -280,7 +280,7 @@ pub(crate) unsafe fn options_at<T: Versioned>(pointer: *const T) -> Result<T, Fa
 pub(crate) struct TouchOptions {
     pub(crate) tool: u32,
     pub(crate) axes: palpate_axes,
-    pub(crate) origin: Origin,
+    pub(crate) origin: PositionOrigin,
     pub(crate) tip: Tip,
     pub(crate) device: Device,
     pub(crate) deadband: f64,
@@ -293,25 +293,25 @@ pub(crate) struct TouchOptions {
 }
 
 /// By the number of `palpate_touch_options`.
-fn copies(number: u32) -> Result<Option<Copies>, Fault> {
+fn copies(number: u32) -> Result<Option<Copies>, CodedError> {
     if number > 2 {
-        return Err(Fault::argument(format!("prediction is {number}: must be 0, 1 or 2")));
+        return Err(CodedError::argument(format!("prediction is {number}: must be 0, 1 or 2")));
     }
     Ok((number > 0).then(|| Copies { make: Arc::new(journal::prediction), of_sheets: number == 2 }))
 }
 
 /// A caller's function for texts.
-struct Shown {
+struct TextCallback {
     show: unsafe extern "C" fn(*mut c_void, *const c_char),
     user: *mut c_void,
 }
 
 // SAFETY: the header says that any thread of the library may call it.
-unsafe impl Send for Shown {}
+unsafe impl Send for TextCallback {}
 // SAFETY: as above.
-unsafe impl Sync for Shown {}
+unsafe impl Sync for TextCallback {}
 
-impl Shown {
+impl TextCallback {
     fn show(&self, message: &str) {
         let text = std::ffi::CString::new(message.replace('\0', " ")).unwrap_or_default();
         // SAFETY: the caller's promise; the text is valid during the call.
@@ -322,14 +322,15 @@ impl Shown {
 impl palpate_touch_options {
     /// # Safety
     /// `holder` is null or a text.
-    pub(crate) unsafe fn checked(&self) -> Result<TouchOptions, Fault> {
+    pub(crate) unsafe fn checked(&self) -> Result<TouchOptions, CodedError> {
         let within = |name: &str, value: f64, range: std::ops::RangeInclusive<f64>| {
-            let wrong =
-                || Fault::argument(format!("{name} is {value}: must be from {} to {}", range.start(), range.end()));
+            let wrong = || {
+                CodedError::argument(format!("{name} is {value}: must be from {} to {}", range.start(), range.end()))
+            };
             if range.contains(&value) { Ok(value) } else { Err(wrong()) }
         };
         let warn = |show| -> Warn {
-            let shown = Shown { show, user: self.warn_user };
+            let shown = TextCallback { show, user: self.warn_user };
             Box::new(move |message| shown.show(message))
         };
         // SAFETY: the caller's promise.
@@ -343,7 +344,7 @@ impl palpate_touch_options {
         Ok(TouchOptions {
             tool: self.tool,
             axes: palpate_axes::of(self.axes)?,
-            origin: if self.in_tissue_frame == 0 { Origin::Workspace } else { Origin::Tissue },
+            origin: if self.in_tissue_frame == 0 { PositionOrigin::Workspace } else { PositionOrigin::Tissue },
             tip,
             device: self.limits.device()?,
             deadband: within("deadband", self.deadband, 0.0..=1.0)?,

@@ -8,7 +8,7 @@ use std::future::Future;
 use tokio::runtime::{Builder, Runtime};
 use tokio::task::JoinHandle;
 
-use crate::error::{Fault, PALPATE_INTERNAL};
+use crate::error::{CodedError, PALPATE_INTERNAL};
 
 /// Threads for the network, which no closed connection ends. A child that was forked has not got them: there every use is
 /// refused, which would wait for ever.
@@ -20,33 +20,33 @@ pub(crate) struct Threads {
 }
 
 impl Threads {
-    pub(crate) fn start() -> Result<Self, Fault> {
+    pub(crate) fn start() -> Result<Self, CodedError> {
         let runtime = Builder::new_multi_thread()
             .worker_threads(2)
             .thread_name("palpate")
             .on_thread_start(|| _ = sigpipe::block())
             .enable_all()
             .build()
-            .map_err(|error| Fault::new(PALPATE_INTERNAL, format!("threads can't be started: {error}")))?;
+            .map_err(|error| CodedError::new(PALPATE_INTERNAL, format!("threads can't be started: {error}")))?;
         Ok(Threads { runtime: Some(runtime), process: std::process::id() })
     }
 
     /// The threads, if this process has them.
-    pub(crate) fn here(&self) -> Result<&Runtime, Fault> {
+    pub(crate) fn here(&self) -> Result<&Runtime, CodedError> {
         let words = "the handle is of the process that this one was forked from: connect here for a handle of its own";
         let is_here = self.process == std::process::id();
-        self.runtime.as_ref().filter(|_| is_here).ok_or_else(|| Fault::argument(words))
+        self.runtime.as_ref().filter(|_| is_here).ok_or_else(|| CodedError::argument(words))
     }
 
     /// Waits for `future` in this thread, which no closed connection ends meanwhile.
-    pub(crate) fn block_on<F: Future>(&self, future: F) -> Result<F::Output, Fault> {
+    pub(crate) fn block_on<F: Future>(&self, future: F) -> Result<F::Output, CodedError> {
         let runtime = self.here()?;
         let _blocked = sigpipe::Blocked::new();
         Ok(runtime.block_on(future))
     }
 
     /// Does `future` on these threads.
-    pub(crate) fn spawn<F>(&self, future: F) -> Result<JoinHandle<F::Output>, Fault>
+    pub(crate) fn spawn<F>(&self, future: F) -> Result<JoinHandle<F::Output>, CodedError>
     where
         F: Future<Output: Send> + Send + 'static,
     {

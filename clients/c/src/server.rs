@@ -9,7 +9,7 @@ use palpate::limits::Limits;
 use palpate::refusal::Refusal;
 use palpate::scene::sent::{self, MeshFile, mesh_file};
 use palpate::scene::{Body, Scene};
-use palpate_client::bridge::{Session, Target};
+use palpate_client::bridge::{SessionChoice, Target};
 use palpate_client::upload::upload_mesh;
 use palpate_client::{Channel, Credentials, Server, Token, fleet};
 use palpate_proto::geometry::from_vector;
@@ -18,7 +18,9 @@ use pb::create_session_request::Source;
 use pb::session_service_client::SessionServiceClient;
 
 use crate::axes::palpate_vector;
-use crate::error::{Fault, PALPATE_CONNECTION, at, at_mut, guard, optional_text, palpate_result, text, write_text};
+use crate::error::{
+    CodedError, PALPATE_CONNECTION, at, at_mut, guard, optional_text, palpate_result, text, write_text,
+};
 use crate::options::{TouchOptions, options_at, palpate_connect_options};
 use crate::os::Threads;
 
@@ -64,33 +66,40 @@ pub struct palpate_change {
     pub stiffness_n_per_m: f64,
     /// N·s/m.
     pub damping_n_s_per_m: f64,
-    /// Of virtual springs, N/m.
-    pub virtual_stiffness_n_per_m: f64,
+    /// Of anchor springs, N/m.
+    pub anchor_stiffness_n_per_m: f64,
     /// Of the volume of a closed mesh, Pa.
     pub volume_stiffness_pa: f64,
 }
 
 impl Connected {
     /// Waits for a call, for no longer than the time for calls.
-    pub(crate) fn wait<T, E: Into<Fault>>(&self, call: impl Future<Output = Result<T, E>>) -> Result<T, Fault> {
+    pub(crate) fn wait<T, E: Into<CodedError>>(
+        &self,
+        call: impl Future<Output = Result<T, E>>,
+    ) -> Result<T, CodedError> {
         self.wait_for(1, call)
     }
 
     /// The same for so many calls, one after the other.
-    fn wait_for<T, E: Into<Fault>>(&self, calls: u32, call: impl Future<Output = Result<T, E>>) -> Result<T, Fault> {
+    fn wait_for<T, E: Into<CodedError>>(
+        &self,
+        calls: u32,
+        call: impl Future<Output = Result<T, E>>,
+    ) -> Result<T, CodedError> {
         let timeout = self.timeout.saturating_mul(calls);
         let limited = async { tokio::time::timeout(timeout, call).await };
         match self.threads.block_on(limited)? {
             Ok(answer) => answer.map_err(Into::into),
             Err(_) => {
                 let why = format!("the server has not answered within {} s", timeout.as_secs_f64());
-                Err(Fault::new(PALPATE_CONNECTION, why))
+                Err(CodedError::new(PALPATE_CONNECTION, why))
             }
         }
     }
 
     /// A call for a session: of a fleet, another server may have it.
-    pub(crate) fn follow<T, F>(&self, call: impl Fn(SessionServiceClient<Channel>) -> F) -> Result<T, Fault>
+    pub(crate) fn follow<T, F>(&self, call: impl Fn(SessionServiceClient<Channel>) -> F) -> Result<T, CodedError>
     where
         F: Future<Output = Result<T, tonic::Status>>,
     {
@@ -109,7 +118,7 @@ impl palpate_session {
     pub(crate) fn target(&self, options: &TouchOptions) -> Target {
         Target {
             server: self.shared.server.clone(),
-            session: Session::Existing(self.session_id.clone()),
+            session: SessionChoice::Existing(self.session_id.clone()),
             tool: options.tool,
             tip: options.tip,
             deadband: options.deadband,
@@ -149,7 +158,7 @@ pub unsafe extern "C" fn palpate_connect(
         let cert_and_key = match (certificate, key) {
             (Some(certificate), Some(key)) => Some((certificate.to_owned(), key.to_owned())),
             (None, None) => None,
-            _ => return Err(Fault::argument("certificate_pem and key_pem go together")),
+            _ => return Err(CodedError::argument("certificate_pem and key_pem go together")),
         };
         let credentials = Credentials {
             token: token.map(Token::new).transpose()?,
@@ -158,7 +167,7 @@ pub unsafe extern "C" fn palpate_connect(
             cert_and_key,
         };
         let timeout = Duration::try_from_secs_f64(options.timeout_s).ok().filter(|time| !time.is_zero());
-        let timeout = timeout.ok_or_else(|| Fault::argument("timeout_s must be above 0"))?;
+        let timeout = timeout.ok_or_else(|| CodedError::argument("timeout_s must be above 0"))?;
         let server = Server::new(url, &credentials)?.within(timeout.min(CONNECTING));
         let threads = Threads::start()?;
         let channel = threads.block_on(server.connect())??;
@@ -177,7 +186,7 @@ pub unsafe extern "C" fn palpate_server_free(server: *mut palpate_server) {
 
 /// # Safety
 /// It is null or from `Box::into_raw`.
-pub(crate) unsafe fn free<T>(handle: *mut T) -> Result<(), Fault> {
+pub(crate) unsafe fn free<T>(handle: *mut T) -> Result<(), CodedError> {
     if !handle.is_null() {
         // SAFETY: the caller's promise.
         drop(unsafe { Box::from_raw(handle) });
@@ -204,8 +213,8 @@ pub unsafe extern "C" fn palpate_scenes(
     })
 }
 
-fn handle(shared: &Arc<Connected>, session: Option<pb::Session>) -> Result<*mut palpate_session, Fault> {
-    let session = session.ok_or_else(|| Fault::new(PALPATE_CONNECTION, "the server sent no session"))?;
+fn handle(shared: &Arc<Connected>, session: Option<pb::Session>) -> Result<*mut palpate_session, CodedError> {
+    let session = session.ok_or_else(|| CodedError::new(PALPATE_CONNECTION, "the server sent no session"))?;
     let extent = session.extent.unwrap_or_default();
     let place = |place: Option<pb::Vector3>| palpate_vector::own(from_vector(place.as_ref()));
     let top_m = extent.top_m.or(extent.middle_m);
@@ -215,7 +224,7 @@ fn handle(shared: &Arc<Connected>, session: Option<pb::Session>) -> Result<*mut 
     Ok(Box::into_raw(Box::new(handle)))
 }
 
-fn create(shared: &Arc<Connected>, source: Source) -> Result<*mut palpate_session, Fault> {
+fn create(shared: &Arc<Connected>, source: Source) -> Result<*mut palpate_session, CodedError> {
     let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
     let answer = shared.wait(shared.sessions().create_session(request))?;
     handle(shared, answer.into_inner().session)
@@ -248,7 +257,11 @@ pub unsafe extern "C" fn palpate_session_create(
 const PART_BYTES: usize = 256 << 10;
 
 /// A session of a scene that was read here; its mesh is sent first. `said` is what its text says of that.
-fn create_own(shared: &Arc<Connected>, scene: &Scene, said: Option<MeshFile>) -> Result<*mut palpate_session, Fault> {
+fn create_own(
+    shared: &Arc<Connected>,
+    scene: &Scene,
+    said: Option<MeshFile>,
+) -> Result<*mut palpate_session, CodedError> {
     let mut message = palpate::wire::scene::sent(scene);
     if let (Body::Mesh(mesh), Some(of_scene)) = (&scene.body, &mut message.mesh) {
         // As many vertices as were asked for, of which there may be some fewer here.
@@ -259,15 +272,15 @@ fn create_own(shared: &Arc<Connected>, scene: &Scene, said: Option<MeshFile>) ->
         let answer = shared.wait_for(calls, upload_mesh(shared.channel.clone(), name, &bytes, unit, false))?;
         if let Some(report) = answer.report.filter(|report| report.refused) {
             let what = report.problems.first().map(|problem| format!("{}: {}", problem.element, problem.what));
-            return Err(Fault::argument(format!("the mesh can't be used: {}", what.unwrap_or_default())));
+            return Err(CodedError::argument(format!("the mesh can't be used: {}", what.unwrap_or_default())));
         }
         of_scene.mesh_id = answer.mesh_id;
     }
     create(shared, Source::Scene(message))
 }
 
-fn refused(refusal: Refusal) -> Fault {
-    Fault::argument(refusal.to_string())
+fn refused(refusal: Refusal) -> CodedError {
+    CodedError::argument(refusal.to_string())
 }
 
 /// The same of a scene file of your own (TOML), by its path. The file of its mesh, if it names one, is read where the scene file
@@ -318,7 +331,7 @@ pub unsafe extern "C" fn palpate_session_create_from_mesh(
         };
         *out = std::ptr::null_mut();
         if mesh_bytes.is_null() {
-            return Err(Fault::argument("mesh_bytes is null"));
+            return Err(CodedError::argument("mesh_bytes is null"));
         }
         // SAFETY: the caller's promise, that there are so many.
         let bytes = unsafe { std::slice::from_raw_parts(mesh_bytes, byte_count) };
@@ -417,7 +430,7 @@ pub unsafe extern "C" fn palpate_change_init(change: *mut palpate_change) -> pal
         *change = palpate_change {
             stiffness_n_per_m: stays,
             damping_n_s_per_m: stays,
-            virtual_stiffness_n_per_m: stays,
+            anchor_stiffness_n_per_m: stays,
             volume_stiffness_pa: stays,
         };
         Ok(())
@@ -438,7 +451,7 @@ pub unsafe extern "C" fn palpate_session_change(
             session_id: session.session_id.clone(),
             stiffness_n_per_m: given(change.stiffness_n_per_m),
             damping_n_s_per_m: given(change.damping_n_s_per_m),
-            virtual_stiffness_n_per_m: given(change.virtual_stiffness_n_per_m),
+            anchor_stiffness_n_per_m: given(change.anchor_stiffness_n_per_m),
             volume_stiffness_pa: given(change.volume_stiffness_pa),
             at_step: None,
         };

@@ -3,12 +3,12 @@
 use std::sync::Arc;
 
 use palpate_client::fleet;
-use palpate_client::shown::Shown;
+use palpate_client::shown::ShownSurface;
 use palpate_proto::pb;
 use pb::session_service_client::SessionServiceClient;
 
 use crate::axes::palpate_axes;
-use crate::error::{Fault, PALPATE_BUFFER, PALPATE_CONNECTION, at, at_mut, guard, palpate_result};
+use crate::error::{CodedError, PALPATE_BUFFER, PALPATE_CONNECTION, at, at_mut, guard, palpate_result};
 use crate::options::{options_at, palpate_surface_options};
 use crate::server::{Connected, free, palpate_session};
 use crate::touch::Exclusive;
@@ -17,14 +17,14 @@ use crate::touch::Exclusive;
 pub struct palpate_surface {
     axes: palpate_axes,
     vertices: usize,
-    seen: Exclusive<Seen>,
+    seen: Exclusive<SurfaceObservation>,
     // After what runs on it.
     _shared: Arc<Connected>,
 }
 
 /// What the caller has seen.
-struct Seen {
-    shown: Shown,
+struct SurfaceObservation {
+    shown: ShownSurface,
     position_m: Vec<[f32; 3]>,
     normal: Vec<[f32; 3]>,
 }
@@ -90,7 +90,7 @@ pub unsafe extern "C" fn palpate_surface_open(
         *out = std::ptr::null_mut();
         let axes = palpate_axes::of(options.axes)?;
         if !(options.rate_hz > 0.0 && options.rate_hz.is_finite()) {
-            return Err(Fault::argument("rate_hz must be above 0"));
+            return Err(CodedError::argument("rate_hz must be above 0"));
         }
         let shared = session.shared.clone();
         let opening = async {
@@ -100,12 +100,12 @@ pub unsafe extern "C" fn palpate_surface_open(
                 let request = request.clone();
                 async move { SessionServiceClient::new(channel).get_session(request).await }
             });
-            Shown::open(at.await?.channel, &session.session_id, options.refinement, options.rate_hz).await
+            ShownSurface::open(at.await?.channel, &session.session_id, options.refinement, options.rate_hz).await
         };
         let shown = shared.wait(opening)?;
         let (position_m, normal) = shown.read(|moment| (moment.position_m.clone(), moment.normal.clone()));
         let vertices = position_m.len();
-        let seen = Exclusive::new(Seen { shown, position_m, normal });
+        let seen = Exclusive::new(SurfaceObservation { shown, position_m, normal });
         *out = Box::into_raw(Box::new(palpate_surface { axes, vertices, seen, _shared: shared }));
         Ok(())
     })
@@ -148,7 +148,7 @@ pub unsafe extern "C" fn palpate_surface_indices(
         surface.seen.with(|seen| {
             let triangles = &seen.shown.mesh().triangles;
             if capacity < 3 * triangles.len() {
-                return Err(Fault::new(PALPATE_BUFFER, "there are more indices: see palpate_surface_size_of"));
+                return Err(CodedError::new(PALPATE_BUFFER, "there are more indices: see palpate_surface_size_of"));
             }
             for (k, [a, b, c]) in triangles.iter().copied().enumerate() {
                 let corners = if surface.axes.is_clockwise() { [a, c, b] } else { [a, b, c] };
@@ -177,13 +177,13 @@ pub unsafe extern "C" fn palpate_surface_uv(
         surface.seen.with(|seen| {
             let texture = &seen.shown.mesh().texture;
             if texture.is_empty() {
-                return Err(Fault::argument("the surface has no texture coordinates"));
+                return Err(CodedError::argument("the surface has no texture coordinates"));
             }
             if stride < 8 {
-                return Err(Fault::argument("stride must be 8 bytes or more"));
+                return Err(CodedError::argument("stride must be 8 bytes or more"));
             }
             if vertices < texture.len() {
-                return Err(Fault::new(PALPATE_BUFFER, "there are more vertices: see palpate_surface_size_of"));
+                return Err(CodedError::new(PALPATE_BUFFER, "there are more vertices: see palpate_surface_size_of"));
             }
             for (k, [u, v]) in texture.iter().copied().enumerate() {
                 let v = if surface.axes.has_top_first() { 1.0 - v } else { v };
@@ -214,11 +214,11 @@ pub unsafe extern "C" fn palpate_surface_read(
             [(buffers.positions, buffers.positions_stride), (buffers.normals, buffers.normals_stride)]
         {
             if !buffer.is_null() && stride < 12 {
-                return Err(Fault::argument("a stride must be 12 bytes or more"));
+                return Err(CodedError::argument("a stride must be 12 bytes or more"));
             }
         }
         if buffers.vertices < surface.vertices {
-            return Err(Fault::new(PALPATE_BUFFER, format!("the surface has {} vertices", surface.vertices)));
+            return Err(CodedError::new(PALPATE_BUFFER, format!("the surface has {} vertices", surface.vertices)));
         }
         surface.seen.with(|seen| {
             *dirty = seen.take(buffers.everything != 0);
@@ -237,16 +237,16 @@ pub unsafe extern "C" fn palpate_surface_read(
                     }
                 }
             }
-            seen.shown.lost().map_or(Ok(()), |why| Err(Fault::new(PALPATE_CONNECTION, why.to_owned())))
+            seen.shown.lost().map_or(Ok(()), |why| Err(CodedError::new(PALPATE_CONNECTION, why.to_owned())))
         })?
     })
 }
 
-impl Seen {
+impl SurfaceObservation {
     /// Takes the newest moment; tells which vertices are to be written.
     fn take(&mut self, everything: bool) -> palpate_dirty {
         let is_new = self.shown.refresh();
-        let Seen { shown, position_m, normal, .. } = self;
+        let SurfaceObservation { shown, position_m, normal, .. } = self;
         shown.read(|moment| {
             let (mut first, mut end) = (position_m.len(), 0);
             if is_new {

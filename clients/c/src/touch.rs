@@ -5,11 +5,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use ::palpate_touch::RenderingState;
-use palpate_client::bridge::{self, Connection, Offline, Options, Record, Ticker};
+use palpate_client::bridge::{self, Connection, Offline, OfflineNetwork, Options, Ticker};
 use palpate_client::{Error, Reading};
 
 use crate::axes::{palpate_axes, palpate_vector};
-use crate::error::{Fault, PALPATE_BUSY, at, at_mut, guard, palpate_result};
+use crate::error::{CodedError, PALPATE_BUSY, at, at_mut, guard, palpate_result};
 use crate::options::{options_at, palpate_touch_options};
 use crate::server::{Connected, palpate_session};
 
@@ -25,7 +25,7 @@ pub struct palpate_touch {
 enum Far {
     // In this order: the connection ends on the runtime.
     Server { connection: Connection, shared: Arc<Connected> },
-    Record(Exclusive<Record>),
+    Record(Exclusive<OfflineNetwork>),
 }
 
 /// Whether forces are rendered.
@@ -101,7 +101,7 @@ impl<T> Exclusive<T> {
         Exclusive { is_busy: AtomicBool::new(false), value: UnsafeCell::new(value) }
     }
 
-    pub(crate) fn with<R>(&self, change: impl FnOnce(&mut T) -> R) -> Result<R, Fault> {
+    pub(crate) fn with<R>(&self, change: impl FnOnce(&mut T) -> R) -> Result<R, CodedError> {
         /// Also if `change` panics.
         struct Leave<'a>(&'a AtomicBool);
         impl Drop for Leave<'_> {
@@ -110,7 +110,7 @@ impl<T> Exclusive<T> {
             }
         }
         if self.is_busy.swap(true, Ordering::Acquire) {
-            return Err(Fault::new(PALPATE_BUSY, "another thread is in a function of this handle"));
+            return Err(CodedError::new(PALPATE_BUSY, "another thread is in a function of this handle"));
         }
         let _leave = Leave(&self.is_busy);
         // SAFETY: nobody else is here.
@@ -170,7 +170,7 @@ pub unsafe extern "C" fn palpate_touch_begin_offline(
         *out = std::ptr::null_mut();
         let middle_m = middle_m.vector();
         if !middle_m.is_finite() {
-            return Err(Fault::argument("middle_m must be finite"));
+            return Err(CodedError::argument("middle_m must be finite"));
         }
         let Offline { ticker, record } = Offline::new(options.device, options.origin, middle_m, options.up_deadband);
         let far = Far::Record(Exclusive::new(record));
@@ -190,14 +190,14 @@ pub unsafe extern "C" fn palpate_touch_arrive(
     guard(|| {
         // SAFETY: the caller's promise.
         let Far::Record(record) = &unsafe { at(touch, "touch is null") }?.far else {
-            return Err(Fault::argument("touch has a server, which sends it messages"));
+            return Err(CodedError::argument("touch has a server, which sends it messages"));
         };
         if bytes.is_null() && count > 0 || count > isize::MAX as usize {
-            return Err(Fault::argument("bytes is null, or count too large"));
+            return Err(CodedError::argument("bytes is null, or count too large"));
         }
         // SAFETY: the caller's promise.
         let bytes = if count == 0 { &[] } else { unsafe { std::slice::from_raw_parts(bytes, count) } };
-        record.with(|record| record.arrive(bytes))?.map_err(Fault::from)
+        record.with(|record| record.arrive(bytes))?.map_err(CodedError::from)
     })
 }
 
@@ -231,7 +231,7 @@ pub unsafe extern "C" fn palpate_touch_tick(
             age_s: age_s.unwrap_or(-1.0),
         };
         if !(reading.place_m.is_finite() && time_s.is_finite()) {
-            return Err(Fault::argument("the position or the time is not finite: the force falls to zero"));
+            return Err(CodedError::argument("the position or the time is not finite: the force falls to zero"));
         }
         Ok(())
     })

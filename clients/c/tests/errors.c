@@ -133,7 +133,7 @@ int main(int count, char **arguments) {
     EXPECT(palpate_session_create_from_text(server, "", &session), PALPATE_ARGUMENT, NULL);
     /* Scenes of your own on a mesh: generated, in memory, in a file. */
     const char *of_mesh = "[mesh]\nfile = \"ball.obj\"\nunit = \"mm\"\npoint_mass_kg = 0.01\n[springs]\nstiffness_n_per_m = 100.0\n"
-                          "[virtual_springs]\nstiffness_n_per_m = 5.0\n[damping]\ncoefficient_n_s_per_m = 1.0\n";
+                          "[anchor_springs]\nstiffness_n_per_m = 5.0\n[damping]\ncoefficient_n_s_per_m = 1.0\n";
     const char *ball = "v 50 0 0\nv -50 0 0\nv 0 50 0\nv 0 -50 0\nv 0 0 50\nv 0 0 -50\n"
                        "f 1 3 5\nf 3 2 5\nf 2 4 5\nf 4 1 5\nf 3 1 6\nf 2 3 6\nf 4 2 6\nf 1 4 6\n";
     const unsigned char *bytes = (const unsigned char *)ball;

@@ -36,7 +36,7 @@ static class Errors
             Expect(Code.Refused, "nowhere", () => server.Create("nowhere"));
             // A mesh of Unity's axes: y is up there, and triangles are clockwise.
             const string scene = "[mesh]\nfile = \"ball.obj\"\nunit = \"m\"\npoint_mass_kg = 0.01\n[springs]\nstiffness_n_per_m = 100.0\n"
-                + "[virtual_springs]\nstiffness_n_per_m = 5.0\n[damping]\ncoefficient_n_s_per_m = 1.0\n";
+                + "[anchor_springs]\nstiffness_n_per_m = 5.0\n[damping]\ncoefficient_n_s_per_m = 1.0\n";
             float[] corners = { 0.05f, 0, 0, -0.05f, 0, 0, 0, 0.07f, 0, 0, -0.07f, 0, 0, 0, 0.05f, 0, 0, -0.05f };
             int[] faces = { 0, 2, 4, 2, 1, 4, 1, 3, 4, 3, 0, 4, 2, 0, 5, 1, 2, 5, 3, 1, 5, 0, 3, 5 };
             Expect(Code.Argument, "names a file", () => server.CreateFromText(scene));

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use glam::{DMat3, DVec3};
 use palpate_client::Reading;
-use palpate_client::bridge::{Offline, Origin, Ticker};
+use palpate_client::bridge::{Offline, PositionOrigin, Ticker};
 use palpate_proto::{pb, touch};
 use palpate_touch::law::Row;
 use palpate_touch::{ContactState, Device, Law, LocalModel};
@@ -17,7 +17,7 @@ use prost::Message;
 /// Ticks that are measured of each round trip; a tenth of them with a sample before each.
 const TICKS: u32 = 10_000_000;
 /// The longest time that is counted by itself, in steps of 10 ns.
-const MOST: usize = 100_000;
+const MAX_TICKS: usize = 100_000;
 
 fn bytes(message: Heard) -> Vec<u8> {
     pb::TouchResponse { message: Some(message) }.encode_to_vec()
@@ -77,21 +77,21 @@ fn sample_of(models: &[Vec<u8>], tick: u32) -> Vec<u8> {
 }
 
 fn offline() -> Offline {
-    let mut offline = Offline::new(Device::named("omega3").unwrap(), Origin::Tissue, DVec3::ZERO, 0.05);
+    let mut offline = Offline::new(Device::named("omega3").unwrap(), PositionOrigin::Tissue, DVec3::ZERO, 0.05);
     let opened = pb::TouchOpened { law: Some(touch::law(&law(), 0)), ..Default::default() };
     offline.record.arrive(&bytes(Heard::Opened(opened))).unwrap();
     offline
 }
 
 /// Times, each counted in steps of 10 ns.
-struct Times {
+struct TickTimes {
     counts: Vec<u64>,
     most_ns: u128,
 }
 
-impl Times {
+impl TickTimes {
     fn new() -> Self {
-        Times { counts: vec![0; MOST], most_ns: 0 }
+        TickTimes { counts: vec![0; MAX_TICKS], most_ns: 0 }
     }
 
     fn tick(&mut self, ticker: &mut Ticker, tick: u32) {
@@ -100,7 +100,7 @@ impl Times {
         std::hint::black_box(ticker.tick(reading, 1e-3 * f64::from(tick)));
         let ns = began.elapsed().as_nanos();
         self.most_ns = self.most_ns.max(ns);
-        self.counts[usize::try_from(ns / 10).unwrap().min(MOST - 1)] += 1;
+        self.counts[usize::try_from(ns / 10).unwrap().min(MAX_TICKS - 1)] += 1;
     }
 
     fn row(&self, round_trip_ms: u32) {
@@ -111,7 +111,7 @@ impl Times {
                 seen += count;
                 seen >= wanted
             });
-            0.01 * (place.unwrap_or(MOST) as f64 + 1.0)
+            0.01 * (place.unwrap_or(MAX_TICKS) as f64 + 1.0)
         };
         let [p50, p99, p999] = [0.5, 0.99, 0.999].map(share);
         println!("| {round_trip_ms} | {p50:.2} | {p99:.2} | {p999:.2} | {:.0} |", self.most_ns as f64 * 1e-3);
@@ -144,7 +144,7 @@ fn main() {
             println!("\n{what}:\n\n{HEAD}");
         }
         let Offline { mut ticker, mut record } = offline();
-        let (mut times, is_over) = (Times::new(), AtomicBool::new(false));
+        let (mut times, is_over) = (TickTimes::new(), AtomicBool::new(false));
         std::thread::scope(|scope| {
             busy(scope, others, &is_over);
             for tick in 0..TICKS / 10 {
@@ -163,7 +163,7 @@ fn main() {
     for round_trip in [1, 5, 50] {
         let Offline { mut ticker, mut record } = offline();
         let (now, is_over) = (AtomicU32::new(0), AtomicBool::new(false));
-        let mut times = Times::new();
+        let mut times = TickTimes::new();
         std::thread::scope(|scope| {
             let (now, is_over, models) = (&now, &is_over, &round);
             scope.spawn(move || {

@@ -110,9 +110,9 @@ pub struct Server {
 }
 
 /// Default time limit for the connection and the first answer.
-const PATIENCE: Duration = Duration::from_secs(10);
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// A connection that is silent for so long is pinged, and closed after a further [`PATIENCE`]. That is longer than a server
+/// A connection that is silent for so long is pinged, and closed after a further [`CONNECT_TIMEOUT`]. That is longer than a server
 /// may stall.
 const SILENCE: Duration = Duration::from_secs(5);
 
@@ -152,7 +152,7 @@ impl Server {
             .tcp_nodelay(true)
             .initial_connection_window_size(WINDOW_BYTES)
             .http2_keep_alive_interval(SILENCE)
-            .keep_alive_timeout(PATIENCE)
+            .keep_alive_timeout(CONNECT_TIMEOUT)
             .keep_alive_while_idle(true);
         if secure {
             endpoint = endpoint.tls_config(tls(credentials)).map_err(|e| refuse(&root(&e)))?;
@@ -166,7 +166,7 @@ impl Server {
             endpoint,
             bearer,
             credentials: credentials.clone(),
-            patience: PATIENCE,
+            patience: CONNECT_TIMEOUT,
             is_secure: secure,
             host: (host, port),
         })
@@ -251,7 +251,7 @@ impl Server {
 /// Whether a server speaks TLS: it answers what is not TLS with an alert of TLS.
 async fn speaks_tls((host, port): &(String, u16)) -> bool {
     const ALERT: [u8; 2] = [0x15, 0x03];
-    const PATIENCE: Duration = Duration::from_secs(1);
+    const TLS_PROBE_TIMEOUT: Duration = Duration::from_secs(1);
     let asked = async {
         let mut stream = tokio::net::TcpStream::connect((host.as_str(), *port)).await?;
         stream.write_all(b"GET / HTTP/1.0\r\n\r\n").await?;
@@ -259,7 +259,7 @@ async fn speaks_tls((host, port): &(String, u16)) -> bool {
         stream.read_exact(&mut answer).await?;
         Ok::<bool, std::io::Error>(answer == ALERT)
     };
-    matches!(tokio::time::timeout(PATIENCE, asked).await, Ok(Ok(true)))
+    matches!(tokio::time::timeout(TLS_PROBE_TIMEOUT, asked).await, Ok(Ok(true)))
 }
 
 /// The text that a program shows for a status: the server's message, or how the connection broke.

@@ -25,11 +25,11 @@ use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use palpate_proto::datagram::{self, MOST_BYTES, MOST_EARLIER, Posed};
+use palpate_proto::datagram::{self, MAX_BYTES, MAX_EARLIER, Posed};
 use palpate_proto::pb;
-use palpate_touch::carrier::{Carried, Carrier, LIFE_S};
+use palpate_touch::datagram_health::{Carried, Carrier, LIFE_S};
+use palpate_touch::dead_reckoning::{FASTEST_S, SendInterval};
 use palpate_touch::deadband::HEARTBEAT_S;
-use palpate_touch::news::{FASTEST_S, Pulse};
 use prost::Message;
 use tokio::task::JoinSet;
 use tokio::time::{Interval, MissedTickBehavior, interval};
@@ -41,7 +41,7 @@ use crate::connect::Server;
 /// Time for the session to open, and how often it is tried: within the ten seconds of a ticket, which is used up only when a session
 /// is open. (HTTP/3 below may wait for ever for settings that were sent again after a loss: wtransport 0.7.) The stream carries
 /// everything until then.
-const PATIENCE: Duration = Duration::from_secs(2);
+const OPEN_TIMEOUT: Duration = Duration::from_secs(2);
 const ATTEMPTS: usize = 4;
 
 /// A session that has ended, or did not open, is opened anew as often as this, s: a blocked port costs a few packets each time.
@@ -57,7 +57,7 @@ pub struct Datagrams {
     opening: JoinSet<Option<Connection>>,
     connection: Option<Connection>,
     carrier: Carrier,
-    pulse: Pulse,
+    pulse: SendInterval,
     begun: Instant,
     life: Interval,
     /// Of each tool the newest poses, newest first: what was lost goes out again with the next.
@@ -78,7 +78,7 @@ impl Datagrams {
             opening: JoinSet::new(),
             connection: None,
             carrier: Carrier::default(),
-            pulse: Pulse::default(),
+            pulse: SendInterval::default(),
             begun: Instant::now(),
             life,
             recent: BTreeMap::new(),
@@ -99,7 +99,7 @@ impl Datagrams {
         (self.connection, self.opening) = (None, JoinSet::new());
         self.opening.spawn(async move {
             for _ in 0..ATTEMPTS {
-                if let Ok(opened) = tokio::time::timeout(PATIENCE, open(&host, &offer)).await {
+                if let Ok(opened) = tokio::time::timeout(OPEN_TIMEOUT, open(&host, &offer)).await {
                     // What was refused stays so.
                     return opened;
                 }
@@ -139,7 +139,7 @@ impl Datagrams {
         let recent = self.recent.entry(command.tool).or_default();
         let message = datagram::tool_poses(command.tool, &newest, recent.iter());
         recent.push_front(newest);
-        recent.truncate(MOST_EARLIER);
+        recent.truncate(MAX_EARLIER);
         let now_s = self.now_s();
         self.carrier.carries(now_s) && self.datagram(vec![message], now_s)
     }
@@ -150,7 +150,7 @@ impl Datagrams {
         let (number, acknowledges) = self.carrier.send(now_s);
         let heartbeat_s = self.pulse.heartbeat_s(now_s) as f32;
         let message = pb::PosesDatagram { number, acknowledges, heartbeat_s, tools, sent_ns: (now_s * 1e9) as u64 };
-        let most = connection.max_datagram_size().map_or(0, |most| most.min(MOST_BYTES));
+        let most = connection.max_datagram_size().map_or(0, |most| most.min(MAX_BYTES));
         message.encoded_len() <= most && connection.send_datagram(message.encode_to_vec()).is_ok()
     }
 

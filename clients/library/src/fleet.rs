@@ -33,10 +33,10 @@ pub struct At<T> {
 pub(crate) const AGAIN: Duration = Duration::from_millis(250);
 
 /// The largest number of servers that are asked for one session.
-const MOST_SERVERS: usize = 16;
+const MAX_SERVERS: usize = 16;
 
 /// The largest number of servers that a call is sent on by, one after the other.
-const MOST_HOPS: u32 = 8;
+const MAX_HOPS: u32 = 8;
 
 /// Whether a server of a fleet asks for patience: another is about to have the session, or it has lost touch with the fleet.
 pub fn is_fenced(status: &Status) -> bool {
@@ -92,7 +92,7 @@ where
             Err(status) => status,
         };
         match elsewhere(&status) {
-            Some(endpoint) if hops < MOST_HOPS => {
+            Some(endpoint) if hops < MAX_HOPS => {
                 hops += 1;
                 server = server.at(&endpoint)?;
                 channel = server.connect().await?;
@@ -166,7 +166,7 @@ impl Trail {
         let before = std::mem::replace(&mut self.server, next).url().to_owned();
         self.others.retain(|url| *url != before);
         self.others.insert(0, before);
-        self.others.truncate(MOST_SERVERS);
+        self.others.truncate(MAX_SERVERS);
         Ok(())
     }
 
@@ -243,7 +243,7 @@ impl Trail {
         self.server = server;
         (self.others, self.revision) = match ownership {
             Some(ownership) => {
-                let others = ownership.others.iter().take(MOST_SERVERS).cloned().collect();
+                let others = ownership.others.iter().take(MAX_SERVERS).cloned().collect();
                 (others, ownership.revision)
             }
             None => (Vec::new(), 0),
@@ -261,7 +261,7 @@ fn is_broken(status: &Status) -> bool {
 }
 
 /// What a server says.
-type Told = (Server, Result<(Channel, pb::Session), Error>);
+type ServerMetadata = (Server, Result<(Channel, pb::Session), Error>);
 
 /// Servers as they are asked.
 struct Round {
@@ -273,8 +273,8 @@ struct Round {
     /// URLs of those that are asked, and whether they can't be reached.
     asked: Vec<(String, bool)>,
     asking: JoinSet<()>,
-    tell: mpsc::Sender<Told>,
-    answers: mpsc::Receiver<Told>,
+    tell: mpsc::Sender<ServerMetadata>,
+    answers: mpsc::Receiver<ServerMetadata>,
     /// When the next one is asked.
     turn: Instant,
     last: Option<Error>,
@@ -282,7 +282,7 @@ struct Round {
 
 impl Round {
     fn new(session_id: &str, server: Server, first: Server) -> Self {
-        let (tell, answers) = mpsc::channel(MOST_SERVERS);
+        let (tell, answers) = mpsc::channel(MAX_SERVERS);
         let mut round = Round {
             session_id: session_id.to_owned(),
             first,
@@ -300,7 +300,7 @@ impl Round {
 
     /// Asks a server again and again, unless it is asked already.
     fn ask(&mut self, server: Server) {
-        if self.asked.len() >= MOST_SERVERS || self.asked.iter().any(|(url, _)| url == server.url()) {
+        if self.asked.len() >= MAX_SERVERS || self.asked.iter().any(|(url, _)| url == server.url()) {
             return;
         }
         self.asked.push((server.url().to_owned(), false));
@@ -335,7 +335,7 @@ impl Round {
 }
 
 /// Asks a server for a session until nobody listens.
-async fn ask(server: Server, session_id: String, tell: mpsc::Sender<Told>) {
+async fn ask(server: Server, session_id: String, tell: mpsc::Sender<ServerMetadata>) {
     let mut channel = None;
     loop {
         let request = pb::GetSessionRequest { session_id: session_id.clone() };

@@ -13,20 +13,20 @@ use crate::connect::{Channel, Server};
 use crate::fleet::{At, Trail};
 
 /// How often a call goes on to another server, or to one that has the session again.
-const MOST_MOVES: u32 = 8;
+const MAX_MOVES: u32 = 8;
 
 /// A session that is followed from server to server. A server of no fleet is called as any client does.
 #[derive(Debug)]
 pub struct Followed {
     session_id: String,
-    place: Mutex<Place>,
+    place: Mutex<LastOwner>,
     /// Only one call at a time asks who has the session: others wait for what it finds.
     seeking: tokio::sync::Mutex<Trail>,
 }
 
 /// Who had the session at last.
 #[derive(Debug, Clone)]
-struct Place {
+struct LastOwner {
     server: Server,
     channel: Channel,
     /// Counts the places.
@@ -49,7 +49,7 @@ fn is_ending(status: &Status) -> bool {
 impl Followed {
     /// A session that `server` has, or had at last, with a connection to it.
     pub fn new(server: Server, channel: Channel, session_id: String) -> Self {
-        let place = Place { server: server.clone(), channel, number: 0, revision: 0 };
+        let place = LastOwner { server: server.clone(), channel, number: 0, revision: 0 };
         Followed { session_id, place: Mutex::new(place), seeking: Trail::new(server).into() }
     }
 
@@ -73,7 +73,7 @@ impl Followed {
         self.place().server.clone()
     }
 
-    fn place(&self) -> MutexGuard<'_, Place> {
+    fn place(&self) -> MutexGuard<'_, LastOwner> {
         self.place.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -93,7 +93,7 @@ impl Followed {
         let At { server, channel, answer } = trail.seek(&self.session_id).await?;
         let revision = answer.ownership.as_ref().map_or(0, |ownership| ownership.revision);
         let mut place = self.place();
-        *place = Place { server, channel, number: place.number + 1, revision: place.revision.max(revision) };
+        *place = LastOwner { server, channel, number: place.number + 1, revision: place.revision.max(revision) };
         Ok(answer)
     }
 
@@ -108,13 +108,13 @@ impl Followed {
     {
         let mut moves = 0;
         loop {
-            let Place { channel, number, .. } = self.place().clone();
+            let LastOwner { channel, number, .. } = self.place().clone();
             let status = match call(channel).await {
                 Ok(answer) => return Ok(answer),
                 Err(status) => status,
             };
             moves += 1;
-            if !is_away(&status) || moves > MOST_MOVES {
+            if !is_away(&status) || moves > MAX_MOVES {
                 return Err(status.into());
             }
             // Unless another call has found it by now.

@@ -20,14 +20,14 @@
 //! Touches a new session of the scene `liver` with a device, until the program is interrupted:
 //!
 //! ```no_run
-//! use palpate_client::bridge::{Options, Session, Target};
+//! use palpate_client::bridge::{Options, SessionChoice, Target};
 //! use palpate_client::{Credentials, HapticDevice, Server};
 //! use palpate_touch::Tip;
 //!
 //! async fn touch(device: impl HapticDevice + 'static) -> Result<(), palpate_client::Error> {
 //!     let target = Target {
 //!         server: Server::new("https://server.example:7117", &Credentials::default())?,
-//!         session: Session::New { scene: "liver".to_owned() },
+//!         session: SessionChoice::New { scene: "liver".to_owned() },
 //!         tool: 0,
 //!         tip: Tip::default(),
 //!         deadband: 0.0,
@@ -55,7 +55,6 @@ pub mod followed;
 pub mod os;
 pub mod shown;
 pub mod snapshot;
-mod sync;
 pub mod touch;
 pub mod upload;
 pub mod view;

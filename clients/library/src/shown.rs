@@ -8,12 +8,12 @@ use tokio::task::JoinSet;
 
 use crate::Error;
 use crate::connect::Channel;
-use crate::exchange::{Listener, Teller, newest};
-use crate::view::{Frames, MOST_VERTICES, Surface};
+use crate::exchange::{NewestReader, NewestWriter, newest};
+use crate::view::{Frames, MAX_VERTICES, SurfaceState};
 
 /// What of a surface stays.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Mesh {
+pub struct ShownMesh {
     /// Where each vertex rests, m.
     pub rest_m: Vec<[f32; 3]>,
     /// u, v of each vertex, from the lower left; empty if the surface has none.
@@ -24,7 +24,7 @@ pub struct Mesh {
 
 /// A surface at one moment.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Moment {
+pub struct SurfaceMoment {
     /// Frames so far, counted from 1; 0 at rest, before the first.
     pub frames: u64,
     /// Steps done.
@@ -38,16 +38,16 @@ pub struct Moment {
 }
 
 /// The newest moment of a session's surface. It ends when this is dropped.
-pub struct Shown {
-    mesh: Arc<Mesh>,
-    newest: Listener<Moment>,
+pub struct ShownSurface {
+    mesh: Arc<ShownMesh>,
+    newest: NewestReader<SurfaceMoment>,
     lost: Arc<OnceLock<String>>,
     _watching: JoinSet<()>,
 }
 
-impl std::fmt::Debug for Shown {
+impl std::fmt::Debug for ShownSurface {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Mesh { rest_m, triangles, .. } = &*self.mesh;
+        let ShownMesh { rest_m, triangles, .. } = &*self.mesh;
         f.debug_struct("Shown")
             .field("vertices", &rest_m.len())
             .field("triangles", &triangles.len())
@@ -55,7 +55,7 @@ impl std::fmt::Debug for Shown {
     }
 }
 
-impl Shown {
+impl ShownSurface {
     /// Gets the mesh and begins to watch. Positions and normals are computed on the tasks of the runtime; set a time limit around
     /// this call.
     ///
@@ -71,23 +71,23 @@ impl Shown {
             ..Default::default()
         };
         let frames = Frames::open(channel, request).await?;
-        let at_rest = Moment {
+        let at_rest = SurfaceMoment {
             position_m: mesh.rest_m.clone(),
             normal: normals(&mesh.rest_m, &mesh.triangles),
-            ..Moment::default()
+            ..SurfaceMoment::default()
         };
-        let (teller, newest) = newest(at_rest);
+        let (writer, newest) = newest(&at_rest);
         let lost = Arc::new(OnceLock::new());
         let mut watching = JoinSet::new();
         let (of_task, told) = (mesh.clone(), lost.clone());
         watching.spawn(async move {
-            let _ = told.set(watch(frames, &of_task, teller).await);
+            let _ = told.set(watch(frames, &of_task, writer).await);
         });
-        Ok(Shown { mesh, newest, lost, _watching: watching })
+        Ok(ShownSurface { mesh, newest, lost, _watching: watching })
     }
 
     /// What of it stays.
-    pub fn mesh(&self) -> &Mesh {
+    pub fn mesh(&self) -> &ShownMesh {
         &self.mesh
     }
 
@@ -96,9 +96,9 @@ impl Shown {
         self.newest.refresh()
     }
 
-    /// Shows the moment of the last [`Shown::refresh`]. Never waits.
-    pub fn read<R>(&self, read: impl FnOnce(&Moment) -> R) -> R {
-        self.newest.read(read)
+    /// Shows the moment of the last [`ShownSurface::refresh`]. Never waits.
+    pub fn read<R>(&self, read: impl FnOnce(&SurfaceMoment) -> R) -> R {
+        read(self.newest.read())
     }
 
     /// Why no newer moment comes any more.
@@ -108,13 +108,13 @@ impl Shown {
 }
 
 /// Takes frames until there are no more; returns why.
-async fn watch(mut frames: Frames, mesh: &Mesh, mut teller: Teller<Moment>) -> String {
+async fn watch(mut frames: Frames, mesh: &ShownMesh, mut writer: NewestWriter<SurfaceMoment>) -> String {
     let mut count = 0;
     loop {
         match frames.next().await {
             Ok(Some((last, surface))) => {
                 count += 1;
-                teller.tell(|moment| {
+                writer.write(|moment| {
                     (moment.frames, moment.step) = (count, last.step);
                     moment.simulation_time_s = last.simulation_time_s;
                     place(mesh, surface, moment);
@@ -127,7 +127,7 @@ async fn watch(mut frames: Frames, mesh: &Mesh, mut teller: Teller<Moment>) -> S
 }
 
 /// Writes positions and normals.
-fn place(mesh: &Mesh, surface: &Surface, moment: &mut Moment) {
+fn place(mesh: &ShownMesh, surface: &SurfaceState, moment: &mut SurfaceMoment) {
     // A frame may have places beyond the last vertex.
     for ((position_m, rest_m), moved_m) in moment.position_m.iter_mut().zip(&mesh.rest_m).zip(&surface.displacement_m) {
         *position_m = [rest_m[0] + moved_m[0], rest_m[1] + moved_m[1], rest_m[2] + moved_m[2]];
@@ -165,15 +165,15 @@ fn write_normals(position_m: &[[f32; 3]], triangles: &[[u32; 3]], normals: &mut 
 ///
 /// # Errors
 /// Returns the server's refusal, how the connection broke, or that the mesh can't be used.
-pub async fn mesh(channel: Channel, session_id: &str, refinement: u32) -> Result<Mesh, Error> {
+pub async fn mesh(channel: Channel, session_id: &str, refinement: u32) -> Result<ShownMesh, Error> {
     let request = pb::GetMeshRequest { session_id: session_id.to_owned(), refinement };
     let mut parts = ViewServiceClient::new(channel).get_mesh(request).await?.into_inner();
-    let mut mesh = Mesh::default();
+    let mut mesh = ShownMesh::default();
     while let Some(part) = parts.message().await? {
         mesh.rest_m.extend_from_slice(part.rest_position_m.as_chunks().0);
         mesh.texture.extend_from_slice(part.texture_coordinates.as_chunks().0);
         mesh.triangles.extend_from_slice(part.triangles.as_chunks().0);
-        if mesh.rest_m.len() > MOST_VERTICES || mesh.triangles.len() > 4 * MOST_VERTICES {
+        if mesh.rest_m.len() > MAX_VERTICES || mesh.triangles.len() > 4 * MAX_VERTICES {
             return Err(Error::Connection("the server's mesh is too large to be shown".to_owned()));
         }
     }
@@ -206,9 +206,10 @@ mod tests {
 
     #[test]
     fn a_frame_moves_vertices_and_what_it_has_beyond_the_last_is_left_out() {
-        let mesh = Mesh { rest_m: vec![[1.0, 2.0, 3.0]; 3], ..Mesh::default() };
-        let surface = Surface { vertices: [1, 4], displacement_m: vec![[0.5, 0.0, -1.0]; 4] };
-        let mut moment = Moment { position_m: mesh.rest_m.clone(), normal: vec![[0.0; 3]; 3], ..Moment::default() };
+        let mesh = ShownMesh { rest_m: vec![[1.0, 2.0, 3.0]; 3], ..ShownMesh::default() };
+        let surface = SurfaceState { vertices: [1, 4], displacement_m: vec![[0.5, 0.0, -1.0]; 4] };
+        let mut moment =
+            SurfaceMoment { position_m: mesh.rest_m.clone(), normal: vec![[0.0; 3]; 3], ..SurfaceMoment::default() };
         place(&mesh, &surface, &mut moment);
         assert_eq!(moment.position_m, [[1.5, 2.0, 2.0]; 3]);
     }

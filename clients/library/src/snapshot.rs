@@ -4,14 +4,14 @@ use palpate_proto::pb;
 use tonic::{Status, Streaming};
 
 /// No snapshot is larger, bytes: more would fill the memory.
-const MOST_BYTES: usize = 1 << 31;
+const MAX_BYTES: usize = 1 << 31;
 
 /// The bytes of a snapshot (`SaveSnapshot`): a journal of one moment.
 ///
 /// # Errors
 /// Returns the server's refusal, or how the connection broke; refuses a snapshot of more than 2 GiB.
 pub async fn collect(parts: Streaming<pb::SaveSnapshotResponse>) -> Result<Vec<u8>, Status> {
-    collect_within(parts, MOST_BYTES).await
+    collect_within(parts, MAX_BYTES).await
 }
 
 /// The same, of at most `most_bytes`.

@@ -11,12 +11,12 @@ use crate::connect::Channel;
 #[derive(Debug)]
 pub struct Frames {
     parts: Streaming<pb::WatchFramesResponse>,
-    surface: Surface,
+    surface: SurfaceState,
 }
 
 /// The displacement of a surface from rest. A frame changes parts of it.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Surface {
+pub struct SurfaceState {
     /// Vertices along x and along y.
     pub vertices: [usize; 2],
     /// x, y, z of each vertex, m; y runs fastest.
@@ -24,7 +24,7 @@ pub struct Surface {
 }
 
 /// The largest number of vertices that a viewer keeps: 200 MB.
-pub(crate) const MOST_VERTICES: usize = 1 << 24;
+pub(crate) const MAX_VERTICES: usize = 1 << 24;
 
 impl Frames {
     /// Begins to watch. With `max_frames_in_flight`, acknowledge frames by `ViewServiceClient::acknowledge_frames`.
@@ -33,7 +33,7 @@ impl Frames {
     /// Returns the server's refusal, or how the connection broke.
     pub async fn open(channel: Channel, request: pb::WatchFramesRequest) -> Result<Self, Status> {
         let parts = ViewServiceClient::new(channel).watch_frames(request).await?.into_inner();
-        Ok(Frames { parts, surface: Surface::default() })
+        Ok(Frames { parts, surface: SurfaceState::default() })
     }
 
     /// The next part of a frame, without reading its displacements; `None` after the last. Use it to count frames.
@@ -49,7 +49,7 @@ impl Frames {
     ///
     /// # Errors
     /// Returns why the server ended the stream, how the connection broke, or that a frame can't be read.
-    pub async fn next(&mut self) -> Result<Option<(pb::WatchFramesResponse, &Surface)>, Status> {
+    pub async fn next(&mut self) -> Result<Option<(pb::WatchFramesResponse, &SurfaceState)>, Status> {
         while let Some(part) = self.parts.message().await? {
             self.surface.write(&part).map_err(Status::data_loss)?;
             if part.last {
@@ -60,7 +60,7 @@ impl Frames {
     }
 }
 
-impl Surface {
+impl SurfaceState {
     /// Writes a part of a frame over the surface.
     ///
     /// # Errors
@@ -68,9 +68,9 @@ impl Surface {
     pub fn write(&mut self, part: &pb::WatchFramesResponse) -> Result<(), String> {
         let vertices = [part.vertices_x as usize, part.vertices_y as usize];
         if vertices != self.vertices {
-            let count = vertices[0].checked_mul(vertices[1]).filter(|count| *count <= MOST_VERTICES);
+            let count = vertices[0].checked_mul(vertices[1]).filter(|count| *count <= MAX_VERTICES);
             let count = count.ok_or_else(|| format!("a surface of {} × {} vertices", vertices[0], vertices[1]))?;
-            *self = Surface { vertices, displacement_m: vec![[0.0; 3]; count] };
+            *self = SurfaceState { vertices, displacement_m: vec![[0.0; 3]; count] };
         }
         let array = |v: Option<&pb::Vector3>| from_vector(v).to_array();
         let (bytes, component, [origin_m, scale_m]): (usize, Component, _) = match part.encoding.try_into() {
@@ -132,7 +132,7 @@ mod tests {
 
     #[test]
     fn patches_are_written_over_the_surface() {
-        let mut surface = Surface::default();
+        let mut surface = SurfaceState::default();
         let values: Vec<f32> = (0..12).map(|k| 0.5 * k as f32).collect();
         let bytes = values.iter().flat_map(|value| value.to_le_bytes()).collect();
         surface.write(&part(pb::Encoding::F32, patch([1, 0], [2, 2], bytes))).unwrap();
@@ -147,7 +147,7 @@ mod tests {
 
     #[test]
     fn what_does_not_fit_is_an_error() {
-        let mut surface = Surface::default();
+        let mut surface = SurfaceState::default();
         for (first, count, bytes) in [
             ([3, 0], [1, 1], 12),
             ([0, 1], [1, 2], 24),

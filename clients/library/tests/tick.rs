@@ -6,7 +6,7 @@ use std::cell::Cell;
 
 use glam::{DMat3, DVec3};
 use palpate_client::Reading;
-use palpate_client::bridge::{Offline, Origin};
+use palpate_client::bridge::{Offline, PositionOrigin};
 use palpate_proto::{pb, touch};
 use palpate_touch::{ContactState, Device, Law, LocalModel, Predicted, Predictor, RenderingState};
 use pb::touch_response::Message as Heard;
@@ -18,10 +18,10 @@ thread_local! {
 }
 
 /// The system's, counted.
-struct Counting;
+struct CountingAllocator;
 
 // SAFETY: it only counts.
-unsafe impl GlobalAlloc for Counting {
+unsafe impl GlobalAlloc for CountingAllocator {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         REQUESTS.set(REQUESTS.get() + 1);
         // SAFETY: the caller's promise.
@@ -36,7 +36,7 @@ unsafe impl GlobalAlloc for Counting {
 }
 
 #[global_allocator]
-static ALLOCATOR: Counting = Counting;
+static ALLOCATOR: CountingAllocator = CountingAllocator;
 
 fn bytes(message: Heard) -> Vec<u8> {
     pb::TouchResponse { message: Some(message) }.encode_to_vec()
@@ -85,9 +85,9 @@ fn z_m(time_s: f64) -> f64 {
 }
 
 /// A copy of the tissue: a spring, N/m.
-struct Spring(f64);
+struct SpringCopy(f64);
 
-impl Predictor for Spring {
+impl Predictor for SpringCopy {
     fn feel(&mut self, _: f64, place_m: DVec3) -> Option<Predicted> {
         let contact_state = if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free };
         Some(Predicted { force_n: self.0 * (-place_m.z).max(0.0) * DVec3::Z, contact_state })
@@ -97,7 +97,8 @@ impl Predictor for Spring {
 #[test]
 fn a_tick_asks_for_no_memory_and_gives_none_back() {
     for up_deadband in [0.0, 0.1] {
-        let Offline { mut ticker, mut record } = Offline::new(device(), Origin::Tissue, DVec3::ZERO, up_deadband);
+        let Offline { mut ticker, mut record } =
+            Offline::new(device(), PositionOrigin::Tissue, DVec3::ZERO, up_deadband);
         let (mut most_n, mut requests) = (0.0_f64, 0);
         for tick in 0..6000_u32 {
             let time_s = 1e-3 * f64::from(tick);
@@ -110,7 +111,7 @@ fn a_tick_asks_for_no_memory_and_gives_none_back() {
             }
             // Copies come, take each other's place, and go with their connection. None is freed in a tick.
             if tick % 1000 == 300 {
-                record.predict(Box::new(Spring(400.0)));
+                record.predict(Box::new(SpringCopy(400.0)));
             }
             let sent_s = time_s - 0.02;
             record.arrive(&sample(1 + u64::from(tick), 1.0 + sent_s, z_m(sent_s), 1 + tick / 7 * 7)).unwrap();
@@ -129,7 +130,7 @@ fn a_tick_asks_for_no_memory_and_gives_none_back() {
 
 #[test]
 fn laws_that_do_not_fit_wait_and_the_newest_model_counts() {
-    let Offline { mut ticker, mut record } = Offline::new(device(), Origin::Tissue, DVec3::ZERO, 0.0);
+    let Offline { mut ticker, mut record } = Offline::new(device(), PositionOrigin::Tissue, DVec3::ZERO, 0.0);
     record.arrive(&opened()).unwrap();
     let enable = Reading { place_m: 0.001 * DVec3::Z, enable: true };
     for tick in 0..700_u32 {
@@ -158,14 +159,14 @@ fn laws_that_do_not_fit_wait_and_the_newest_model_counts() {
 
 #[test]
 fn clocks_that_jump_and_places_that_are_none_are_harmless() {
-    let Offline { mut ticker, mut record } = Offline::new(device(), Origin::Workspace, DVec3::X, 0.1);
+    let Offline { mut ticker, mut record } = Offline::new(device(), PositionOrigin::Workspace, DVec3::X, 0.1);
     // Before the first connection there is no force.
     assert_eq!(ticker.tick(Reading { place_m: DVec3::ZERO, enable: true }, 5.0), DVec3::ZERO);
     assert_eq!((ticker.state(), ticker.model_age_s()), (None, None));
     record.arrive(&opened()).unwrap();
     let mut sequence = 0;
     let mut at = |ticker: &mut palpate_client::bridge::Ticker,
-                  record: &mut palpate_client::bridge::Record,
+                  record: &mut palpate_client::bridge::OfflineNetwork,
                   time_s: f64,
                   z_m: f64,
                   enable| {
@@ -192,7 +193,7 @@ fn clocks_that_jump_and_places_that_are_none_are_harmless() {
 
 #[test]
 fn bytes_that_are_no_message_are_refused() {
-    let mut record = Offline::new(device(), Origin::Tissue, DVec3::ZERO, 0.0).record;
+    let mut record = Offline::new(device(), PositionOrigin::Tissue, DVec3::ZERO, 0.0).record;
     assert!(record.arrive(&[0xff; 9]).is_err());
     let unsound = pb::TouchOpened { law: Some(pb::ForceLaw::default()), ..Default::default() };
     assert!(record.arrive(&bytes(Heard::Opened(unsound))).is_err());
@@ -205,9 +206,9 @@ fn bytes_that_are_no_message_are_refused() {
 fn a_tick_takes_no_lock() {
     let source = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
     let touch = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../touch/src");
-    let files = ["bridge/ticker.rs", "exchange.rs", "sync.rs"].map(|name| source.join(name));
-    let rules =
-        ["renderer.rs", "envelope.rs", "local.rs", "law.rs", "news.rs", "prediction.rs"].map(|name| touch.join(name));
+    let files = ["bridge/ticker.rs", "exchange.rs"].map(|name| source.join(name));
+    let rules = ["renderer.rs", "envelope.rs", "local.rs", "law.rs", "dead_reckoning.rs", "prediction.rs"]
+        .map(|name| touch.join(name));
     for file in files.iter().chain(&rules) {
         let text = std::fs::read_to_string(file).unwrap();
         for word in ["Mutex", "RwLock", "Condvar", "OnceLock", "Instant", "SystemTime", "park()", "mpsc"] {

@@ -6,14 +6,14 @@ use palpate_proto::printable::printable;
 use pb::admin_service_client::AdminServiceClient;
 use pb::session_service_client::SessionServiceClient;
 
-use crate::Failure;
+use crate::ClientFailure;
 use crate::credentials::CredentialOptions;
 
 /// Arguments of `admin`.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {
+pub(crate) struct AdminArguments {
     #[command(subcommand)]
-    act: Act,
+    act: AdminAction,
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117", global = true)]
     server: String,
@@ -22,7 +22,7 @@ pub(crate) struct Arguments {
 }
 
 #[derive(clap::Subcommand)]
-enum Act {
+enum AdminAction {
     /// Show what each caller uses: memory, sessions, streams, tools, recent processor time
     Callers,
     /// Show the streams of a session: number, caller, age
@@ -70,50 +70,50 @@ enum Act {
 }
 
 /// Performs the action and prints the result.
-pub(crate) async fn admin(arguments: &Arguments) -> Result<(), Failure> {
+pub(crate) async fn admin(arguments: &AdminArguments) -> Result<(), ClientFailure> {
     let server = arguments.credentials.server(&arguments.server)?;
     let channel = server.connect().await?;
     // Another server of the fleet may have the session.
     let done = fleet::follow_from(&server, channel, |channel| act(&arguments.act, channel)).await;
-    let done = done.map_err(|error| Failure::Failed(error.to_string()))?;
+    let done = done.map_err(|error| ClientFailure::Failed(error.to_string()))?;
     crate::tell!("{}", done.answer);
     Ok(())
 }
 
-async fn act(act: &Act, channel: Channel) -> Result<String, tonic::Status> {
+async fn act(act: &AdminAction, channel: Channel) -> Result<String, tonic::Status> {
     let mut admin = AdminServiceClient::new(channel.clone());
     Ok(match act {
-        Act::Callers => callers(&admin.list_callers(pb::ListCallersRequest {}).await?.into_inner().callers),
-        Act::Streams { session } => {
+        AdminAction::Callers => callers(&admin.list_callers(pb::ListCallersRequest {}).await?.into_inner().callers),
+        AdminAction::Streams { session } => {
             let request = pb::ListStreamsRequest { session_id: session.clone() };
             streams(&admin.list_streams(request).await?.into_inner().streams)
         }
-        Act::FreeTool { session, tool } => {
+        AdminAction::FreeTool { session, tool } => {
             admin.free_tool(pb::FreeToolRequest { session_id: session.clone(), tool: *tool }).await?;
             format!("tool {tool} is free")
         }
-        Act::CutStream { session, number } => {
+        AdminAction::CutStream { session, number } => {
             admin.cut_stream(pb::CutStreamRequest { session_id: session.clone(), number: *number }).await?;
             format!("stream {number} is cut")
         }
-        Act::CutCaller { caller, delete_sessions } => {
+        AdminAction::CutCaller { caller, delete_sessions } => {
             let request = pb::CutCallerRequest { caller: caller.clone(), delete_sessions: *delete_sessions };
             let pb::CutCallerResponse { streams, tools, connections, sessions } =
                 admin.cut_caller(request).await?.into_inner();
             format!("{streams} streams, {tools} tools, {connections} connections, {sessions} sessions ended")
         }
-        Act::Revive { session } => {
+        AdminAction::Revive { session } => {
             let request = pb::ReviveSessionRequest { session_id: session.clone() };
             let step = admin.revive_session(request).await?.into_inner().step;
             format!("paused at step {step}")
         }
-        Act::DeleteJournal { session } => {
+        AdminAction::DeleteJournal { session } => {
             let mut sessions = SessionServiceClient::new(channel);
             let request = pb::DeleteJournalRequest { session_id: session.clone() };
             let files = sessions.delete_journal(request).await?.into_inner().files;
             format!("{files} {} removed", if files == 1 { "file" } else { "files" })
         }
-        Act::Delete { session } => {
+        AdminAction::Delete { session } => {
             let mut sessions = SessionServiceClient::new(channel);
             sessions.delete_session(pb::DeleteSessionRequest { session_id: session.clone() }).await?;
             "deleted".to_owned()

@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use glam::DVec3;
 use palpate_client::HapticDevice;
-use palpate_client::bridge::{Options, Report, Session, Target, Tick, Traffic, Warn, run};
-use palpate_client::devices::{self, Kind, Placed};
+use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, Traffic, Warn, run};
+use palpate_client::devices::{self, DeviceKind, Placed};
 use palpate_proto::printable::printable_json;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{LEAD_S, Task};
@@ -16,11 +16,11 @@ use crate::credentials::CredentialOptions;
 use crate::placement::PlacementOptions;
 use crate::prediction::When;
 use crate::simulated::{Simulated, device_named, hand_named};
-use crate::{Failure, interrupted, table, warn};
+use crate::{ClientFailure, interrupted, table, warn};
 
 /// Arguments of `bridge`.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {
+pub(crate) struct BridgeArguments {
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
@@ -81,14 +81,14 @@ pub(crate) struct Arguments {
 const SCALE: f64 = 0.2;
 
 /// Opens a real device, or makes a simulated one.
-fn device(arguments: &Arguments) -> Result<Box<dyn HapticDevice>, Failure> {
-    if Kind::of(&arguments.device).is_some() {
+fn device(arguments: &BridgeArguments) -> Result<Box<dyn HapticDevice>, ClientFailure> {
+    if DeviceKind::of(&arguments.device).is_some() {
         return Ok(devices::open(&arguments.device, arguments.library.as_deref())?);
     }
     let hand = hand_named(&arguments.hand)?;
     let device = device_named(&arguments.device).map_err(|refusal| {
-        let real: Vec<&str> = Kind::ALL.iter().map(|kind| kind.1).collect();
-        Failure::Refused(format!("{refusal}; or a real device: {}", real.join(", ")))
+        let real: Vec<&str> = DeviceKind::ALL.iter().map(|kind| kind.1).collect();
+        ClientFailure::Refused(format!("{refusal}; or a real device: {}", real.join(", ")))
     })?;
     let seconds = arguments.seconds.unwrap_or(3600.0);
     let task = Task::new(DVec3::ZERO, LEAD_S, seconds, SCALE, &mut Random::new(arguments.seed, 0));
@@ -100,13 +100,13 @@ fn device(arguments: &Arguments) -> Result<Box<dyn HapticDevice>, Failure> {
 /// # Errors
 /// Returns an error if an argument is refused, the device is missing or fails, no connection succeeds or none stands at the end, or the course can't be
 /// written.
-pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
+pub(crate) async fn bridge(arguments: &BridgeArguments) -> Result<(), ClientFailure> {
     let placement = arguments.placement.placement()?;
     let target = Target {
         server: arguments.credentials.server(&arguments.server)?,
         session: match &arguments.session {
-            Some(id) => Session::Existing(id.clone()),
-            None => Session::New { scene: arguments.scene.clone() },
+            Some(id) => SessionChoice::Existing(id.clone()),
+            None => SessionChoice::New { scene: arguments.scene.clone() },
         },
         tool: arguments.tool,
         tip: Tip::default(),
@@ -116,7 +116,7 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
         holder: "palpate-client bridge".to_owned(),
     };
     let lasts = arguments.seconds.map(Duration::try_from_secs_f64).transpose();
-    let lasts = lasts.map_err(|error| Failure::Refused(format!("--seconds: {error}")))?;
+    let lasts = lasts.map_err(|error| ClientFailure::Refused(format!("--seconds: {error}")))?;
     // Last, so that what is refused is refused before a device moves.
     let device = Placed::new(device(arguments)?, placement)?;
     let (remembers, keeps_session) = (arguments.course.is_some(), arguments.keep_session);
@@ -142,7 +142,7 @@ pub(crate) async fn bridge(arguments: &Arguments) -> Result<(), Failure> {
 }
 
 /// The results for programs.
-fn as_json(served: &Report, session_id: Option<&str>) -> serde_json::Value {
+fn as_json(served: &BridgeReport, session_id: Option<&str>) -> serde_json::Value {
     let traffic = served.traffic;
     let mut report = json!({
         "connections": traffic.connections, "samples": traffic.samples, "commands_refused": traffic.refused,
@@ -162,7 +162,7 @@ fn as_json(served: &Report, session_id: Option<&str>) -> serde_json::Value {
 }
 
 /// The results for people.
-fn rows(served: &Report) -> Vec<(&'static str, String)> {
+fn rows(served: &BridgeReport) -> Vec<(&'static str, String)> {
     let Traffic { connections, samples, bytes, refused, failed, poses, carried, deepest_m } = served.traffic;
     #[allow(clippy::cast_precision_loss)]
     let kilobytes = bytes as f64 / 1e3;
@@ -190,12 +190,12 @@ fn rows(served: &Report) -> Vec<(&'static str, String)> {
     rows
 }
 
-fn write_course(path: &std::path::Path, course: &[Tick]) -> Result<(), Failure> {
+fn write_course(path: &std::path::Path, course: &[Tick]) -> Result<(), ClientFailure> {
     let mut text = "time_s,x_m,y_m,z_m,force_x_n,force_y_n,force_z_n,state\n".to_owned();
     for Tick { time_s, place_m, force_n, state } in course {
         let state = state.map_or("waiting".to_owned(), |state| format!("{state:?}").to_lowercase());
         let [place, force] = [place_m, force_n].map(|v| format!("{:.7},{:.7},{:.7}", v.x, v.y, v.z));
         text += &format!("{time_s:.9},{place},{force},{state}\n");
     }
-    std::fs::write(path, text).map_err(|error| Failure::Failed(format!("{}: {error}", path.display())))
+    std::fs::write(path, text).map_err(|error| ClientFailure::Failed(format!("{}: {error}", path.display())))
 }

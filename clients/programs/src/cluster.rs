@@ -12,13 +12,13 @@ use tonic::Status;
 
 use crate::credentials::CredentialOptions;
 use crate::unanswered::Unanswered;
-use crate::{Failure, interrupted};
+use crate::{ClientFailure, interrupted};
 
 /// Arguments of `cluster`.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {
+pub(crate) struct ClusterArguments {
     #[command(subcommand)]
-    act: Act,
+    act: ClusterAction,
     /// Any server of the fleet
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117", global = true)]
     server: String,
@@ -30,7 +30,7 @@ pub(crate) struct Arguments {
 }
 
 #[derive(clap::Subcommand)]
-enum Act {
+enum ClusterAction {
     /// Show the servers: name, URL, release, threads, load, sessions, whether they take new sessions
     Nodes,
     /// Show the sessions: which server has each, since which revision, and which is its standby
@@ -62,19 +62,19 @@ enum Act {
 const EVERY: Duration = Duration::from_secs(1);
 
 /// Time limit for an answer; a move has another.
-const PATIENCE: Duration = Duration::from_secs(10);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// Performs the action and prints the result.
 ///
 /// # Errors
 /// Returns an error if an argument is refused, if the server can't be reached or refuses, or if sessions could not be moved.
-pub(crate) async fn cluster(arguments: &Arguments) -> Result<(), Failure> {
-    let Arguments { act, json: is_json, .. } = arguments;
+pub(crate) async fn cluster(arguments: &ClusterArguments) -> Result<(), ClientFailure> {
+    let ClusterArguments { act, json: is_json, .. } = arguments;
     let server = arguments.credentials.server(&arguments.server)?;
-    let unreached = |why| Failure::Failed(format!("{why}; --server names any server of the fleet"));
+    let unreached = |why| ClientFailure::Failed(format!("{why}; --server names any server of the fleet"));
     let channel = server.connect().await.map_err(unreached)?;
     match act {
-        Act::Nodes => {
+        ClusterAction::Nodes => {
             let nodes = nodes(&channel).await?;
             print(&if *is_json {
                 format!("{}\n", printable_json(json_of(&nodes, node_json)))
@@ -82,7 +82,7 @@ pub(crate) async fn cluster(arguments: &Arguments) -> Result<(), Failure> {
                 nodes_table(&nodes)
             })
         }
-        Act::Sessions => {
+        ClusterAction::Sessions => {
             let sessions = sessions(channel).await?;
             print(&if *is_json {
                 format!("{}\n", printable_json(json_of(&sessions, session_json)))
@@ -90,7 +90,7 @@ pub(crate) async fn cluster(arguments: &Arguments) -> Result<(), Failure> {
                 sessions_table(&sessions)
             })
         }
-        Act::Move { session, node } => {
+        ClusterAction::Move { session, node } => {
             let request =
                 pb::MoveSessionRequest { session_id: session.clone(), node: node.clone().unwrap_or_default() };
             let moved = fleet::follow_from(&server, channel, |channel| {
@@ -109,22 +109,22 @@ pub(crate) async fn cluster(arguments: &Arguments) -> Result<(), Failure> {
                 format!("session {session} is at {node} ({}) now; no step for {gap_ms:.0} ms\n", printable(&endpoint))
             })
         }
-        Act::Drain { node, stop } => drain(&server, &channel, node, *stop, *is_json).await,
-        Act::Top { once } => top(&channel, *once, *is_json).await,
+        ClusterAction::Drain { node, stop } => drain(&server, &channel, node, *stop, *is_json).await,
+        ClusterAction::Top { once } => top(&channel, *once, *is_json).await,
     }
 }
 
-fn failed(status: Status) -> Failure {
+fn failed(status: Status) -> ClientFailure {
     Error::Call(status).into()
 }
 
 async fn within<T>(answer: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
-    let silent = |_| Err(Status::unavailable(format!("no answer within {} s", PATIENCE.as_secs())));
-    tokio::time::timeout(PATIENCE, answer).await.unwrap_or_else(silent)
+    let silent = |_| Err(Status::unavailable(format!("no answer within {} s", ANSWER_TIMEOUT.as_secs())));
+    tokio::time::timeout(ANSWER_TIMEOUT, answer).await.unwrap_or_else(silent)
 }
 
 /// The servers, by name.
-async fn nodes(channel: &Channel) -> Result<Vec<pb::Node>, Failure> {
+async fn nodes(channel: &Channel) -> Result<Vec<pb::Node>, ClientFailure> {
     look(channel).await.map_err(failed)
 }
 
@@ -134,7 +134,7 @@ async fn look(channel: &Channel) -> Result<Vec<pb::Node>, Status> {
 }
 
 /// The sessions, by ID.
-async fn sessions(channel: Channel) -> Result<Vec<pb::FleetSession>, Failure> {
+async fn sessions(channel: Channel) -> Result<Vec<pb::FleetSession>, ClientFailure> {
     let mut admin = AdminServiceClient::new(channel);
     let listed = async {
         let mut parts = admin.list_fleet_sessions(pb::ListFleetSessionsRequest {}).await?.into_inner();
@@ -148,11 +148,11 @@ async fn sessions(channel: Channel) -> Result<Vec<pb::FleetSession>, Failure> {
 }
 
 /// Moves all sessions of a server to others, or lets it take new ones again.
-async fn drain(server: &Server, channel: &Channel, node: &str, stop: bool, is_json: bool) -> Result<(), Failure> {
+async fn drain(server: &Server, channel: &Channel, node: &str, stop: bool, is_json: bool) -> Result<(), ClientFailure> {
     let nodes = nodes(channel).await?;
     let Some(found) = nodes.iter().find(|other| other.node == node) else {
         let names: Vec<String> = nodes.iter().map(|other| printable(&other.node)).collect();
-        return Err(Failure::Refused(format!("there is no server `{node}`; there are {}", names.join(", "))));
+        return Err(ClientFailure::Refused(format!("there is no server `{node}`; there are {}", names.join(", "))));
     };
     let mut admin = AdminServiceClient::new(server.at(&found.endpoint)?.connect().await?);
     let mut moves = admin.drain_node(pb::DrainNodeRequest { stop }).await.map_err(failed)?.into_inner();
@@ -171,7 +171,7 @@ async fn drain(server: &Server, channel: &Channel, node: &str, stop: bool, is_js
         crate::tell!("{line}");
     }
     if stayed > 0 {
-        return Err(Failure::Failed(format!("{stayed} sessions of {node} could not be moved ({moved} moved)")));
+        return Err(ClientFailure::Failed(format!("{stayed} sessions of {node} could not be moved ({moved} moved)")));
     }
     if !is_json {
         let done =
@@ -182,7 +182,7 @@ async fn drain(server: &Server, channel: &Channel, node: &str, stop: bool, is_js
 }
 
 /// Shows the servers until it is interrupted or its output is closed.
-async fn top(channel: &Channel, once: bool, is_json: bool) -> Result<(), Failure> {
+async fn top(channel: &Channel, once: bool, is_json: bool) -> Result<(), ClientFailure> {
     let terminal = std::io::stdout().is_terminal() && !is_json && !once;
     let mut ticks = tokio::time::interval(EVERY);
     let mut unanswered = Unanswered::default();
@@ -211,12 +211,12 @@ async fn top(channel: &Channel, once: bool, is_json: bool) -> Result<(), Failure
     }
 }
 
-fn print(text: &str) -> Result<(), Failure> {
+fn print(text: &str) -> Result<(), ClientFailure> {
     let mut output = std::io::stdout();
     match output.write_all(text.as_bytes()).and_then(|()| output.flush()) {
         Ok(()) => Ok(()),
-        Err(e) if e.kind() == ErrorKind::BrokenPipe => Err(Failure::Unread),
-        Err(e) => Err(Failure::Failed(e.to_string())),
+        Err(e) if e.kind() == ErrorKind::BrokenPipe => Err(ClientFailure::Unread),
+        Err(e) => Err(ClientFailure::Failed(e.to_string())),
     }
 }
 
@@ -279,8 +279,8 @@ fn sessions_table(sessions: &[pb::FleetSession]) -> String {
 
 /// Lines of cells, one below the other. Of a long cell only the beginning is shown: each row is as wide as the widest cells are.
 fn aligned<const N: usize>(rows: impl Iterator<Item = [String; N]>) -> String {
-    const MOST_LETTERS: usize = 128;
-    let short = |cell: String| match cell.char_indices().nth(MOST_LETTERS) {
+    const MAX_LETTERS: usize = 128;
+    let short = |cell: String| match cell.char_indices().nth(MAX_LETTERS) {
         Some((end, _)) => format!("{}…", &cell[..end]),
         None => cell,
     };

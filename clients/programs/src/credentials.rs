@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use palpate::files;
 use palpate_client::{Credentials, Server, Token};
 
-use crate::Failure;
+use crate::ClientFailure;
 
 /// The caller's credentials, and which servers are trusted.
 #[derive(clap::Args, Debug, Clone, Default)]
@@ -51,7 +51,7 @@ impl CredentialOptions {
     ///
     /// # Errors
     /// Returns an error if the URL or a file is refused.
-    pub(crate) fn server(&self, url: &str) -> Result<Server, Failure> {
+    pub(crate) fn server(&self, url: &str) -> Result<Server, ClientFailure> {
         let credentials = Credentials {
             token: self.token()?,
             ca: self.ca.as_deref().map(|path| read("--ca", path)).transpose()?,
@@ -61,11 +61,11 @@ impl CredentialOptions {
                 _ => None,
             },
         };
-        credentials.check().map_err(|error| Failure::Refused(format!("--{error}")))?;
-        Server::new(url, &credentials).map_err(|error| Failure::Refused(format!("--server {error}")))
+        credentials.check().map_err(|error| ClientFailure::Refused(format!("--{error}")))?;
+        Server::new(url, &credentials).map_err(|error| ClientFailure::Refused(format!("--server {error}")))
     }
 
-    fn token(&self) -> Result<Option<Token>, Failure> {
+    fn token(&self) -> Result<Option<Token>, ClientFailure> {
         let (text, place) = match (&self.token_file, std::env::var("PALPATE_TOKEN")) {
             (Some(path), _) => {
                 warn_if_readable(path);
@@ -74,7 +74,7 @@ impl CredentialOptions {
             (None, Ok(text)) => (text, "PALPATE_TOKEN".to_owned()),
             (None, Err(_)) => return Ok(None),
         };
-        Token::new(&text).map(Some).map_err(|error| Failure::Refused(format!("{place}: {error}")))
+        Token::new(&text).map(Some).map_err(|error| ClientFailure::Refused(format!("{place}: {error}")))
     }
 }
 
@@ -94,6 +94,7 @@ fn warn_if_readable(path: &Path) {
     let _ = path;
 }
 
-fn read(option: &str, path: &Path) -> Result<String, Failure> {
-    files::read_text(path, files::MOST_SECRET_BYTES).map_err(|refusal| Failure::Refused(format!("{option} {refusal}")))
+fn read(option: &str, path: &Path) -> Result<String, ClientFailure> {
+    files::read_text(path, files::MAX_SECRET_BYTES)
+        .map_err(|refusal| ClientFailure::Refused(format!("{option} {refusal}")))
 }

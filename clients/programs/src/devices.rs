@@ -3,17 +3,17 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use palpate_client::devices::{Checked, Found, check, list, open};
+use palpate_client::devices::{DeviceReport, Found, check, list, open};
 use palpate_client::{Error, HapticDevice};
 use palpate_proto::printable::{printable, printable_json};
 use palpate_touch::Device;
 use serde_json::{Value, json};
 
-use crate::{Failure, table, within};
+use crate::{ClientFailure, table, within};
 
 /// Arguments of `devices`.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {
+pub(crate) struct DevicesArguments {
     /// Read this device for some seconds, set no force, and report how well it keeps time
     #[arg(long, value_name = "NAME")]
     test: Option<String>,
@@ -36,7 +36,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 ///
 /// # Errors
 /// Returns an error if the device to test is not there, or fails.
-pub(crate) async fn devices(arguments: &Arguments) -> Result<(), Failure> {
+pub(crate) async fn devices(arguments: &DevicesArguments) -> Result<(), ClientFailure> {
     let (library, is_json) = (arguments.library.clone(), arguments.json);
     let Some(name) = arguments.test.clone() else {
         let found = tokio::task::spawn_blocking(move || list(library.as_deref())).await.unwrap_or_default();
@@ -55,15 +55,15 @@ pub(crate) async fn devices(arguments: &Arguments) -> Result<(), Failure> {
             Ok::<_, Error>((device.descriptor(), check(&mut *device, lasts)))
         }
     });
-    let (device, checked) = tested.await.map_err(|error| Failure::Failed(error.to_string()))??;
+    let (device, checked) = tested.await.map_err(|error| ClientFailure::Failed(error.to_string()))??;
     if is_json {
         crate::tell!("{}", printable_json(report(&name, &device, &checked)));
     } else {
         table::print(&rows(&device, &checked));
     }
     match &checked.failure {
-        Some(why) => Err(Failure::Failed(format!("{name}: {why}"))),
-        None if checked.not_finite > 0 => Err(Failure::Failed(format!("{name}: positions are not finite"))),
+        Some(why) => Err(ClientFailure::Failed(format!("{name}: {why}"))),
+        None if checked.not_finite > 0 => Err(ClientFailure::Failed(format!("{name}: positions are not finite"))),
         None => Ok(()),
     }
 }
@@ -80,7 +80,7 @@ fn show(found: &[Found]) {
     crate::tell!("\n`palpate-client devices --test NAME` reads one for 5 s; `bridge --device NAME` touches with it.");
 }
 
-fn report(name: &str, device: &Device, checked: &Checked) -> Value {
+fn report(name: &str, device: &Device, checked: &DeviceReport) -> Value {
     let micros = |[p50, p99, max]: [f64; 3]| json!({ "p50": 1e6 * p50, "p99": 1e6 * p99, "max": 1e6 * max });
     json!({
         "name": name, "model": device.name, "force_n": device.force_n, "continuous_n": device.continuous_n,
@@ -92,7 +92,7 @@ fn report(name: &str, device: &Device, checked: &Checked) -> Value {
     })
 }
 
-fn rows(device: &Device, checked: &Checked) -> Vec<(&'static str, String)> {
+fn rows(device: &Device, checked: &DeviceReport) -> Vec<(&'static str, String)> {
     let micros = |[p50, p99, max]: [f64; 3]| format!("{:.0} / {:.0} / {:.0} µs", 1e6 * p50, 1e6 * p99, 1e6 * max);
     let place = checked.place_m.map(|corners| {
         let [least, most] = corners.map(|corner| 1e3 * corner);

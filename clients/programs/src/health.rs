@@ -7,12 +7,12 @@ use tonic_health::ServingStatus;
 use tonic_health::pb::HealthCheckRequest;
 use tonic_health::pb::health_client::HealthClient;
 
-use crate::Failure;
+use crate::ClientFailure;
 use crate::credentials::{CredentialOptions, ServerOption};
 
 /// Arguments of `health`.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {
+pub(crate) struct HealthArguments {
     #[command(flatten)]
     server: ServerOption,
     #[command(flatten)]
@@ -20,20 +20,21 @@ pub(crate) struct Arguments {
 }
 
 /// A healthy server answers sooner.
-const PATIENCE: Duration = Duration::from_secs(2);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Fails unless the server reports that it is serving.
-pub(crate) async fn health(arguments: &Arguments) -> Result<(), Failure> {
-    let server = arguments.credentials.server(arguments.server.url())?.within(PATIENCE);
+pub(crate) async fn health(arguments: &HealthArguments) -> Result<(), ClientFailure> {
+    let server = arguments.credentials.server(arguments.server.url())?.within(ANSWER_TIMEOUT);
     let asked = async {
         let mut health =
             HealthClient::new(server.connect().await.map_err(|error| format!("{error}; --server names another"))?);
         health.check(HealthCheckRequest::default()).await.map_err(|status| describe(&status))
     };
-    let answer = tokio::time::timeout(PATIENCE, asked).await.map_err(|_| Failure::Failed("no answer".into()))?;
-    let status = answer.map_err(Failure::Failed)?.into_inner().status;
+    let answer =
+        tokio::time::timeout(ANSWER_TIMEOUT, asked).await.map_err(|_| ClientFailure::Failed("no answer".into()))?;
+    let status = answer.map_err(ClientFailure::Failed)?.into_inner().status;
     if status != ServingStatus::Serving as i32 {
-        return Err(Failure::Failed("the server is not serving".into()));
+        return Err(ClientFailure::Failed("the server is not serving".into()));
     }
     crate::tell!("serving");
     Ok(())

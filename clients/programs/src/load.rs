@@ -7,14 +7,16 @@ use std::time::Instant;
 use palpate_client::{Error, Server};
 use palpate_proto::pb::create_session_request::Source;
 use palpate_proto::printable::{printable_json, printable_lines};
-use palpate_simulated::load::{Course, Deadbands, Objective, Outcome, Plan, Progress, Second, Trial, trial};
+use palpate_simulated::load::{
+    Deadbands, LoadOutcome, LoadPlan, LoadTrial, Objective, PreparedPlan, Second, TrialProgress, trial,
+};
 use palpate_simulated::scene_file::SceneFile;
 
 use crate::credentials::CredentialOptions;
-use crate::{Failure, interrupted, within};
+use crate::{ClientFailure, interrupted, within};
 
 #[derive(clap::Args)]
-pub(crate) struct Arguments {
+pub(crate) struct LoadArguments {
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
@@ -99,15 +101,15 @@ const RESOLUTION: usize = 40;
 const AGREE: usize = 2;
 
 /// The largest number that is tried.
-const MOST_SESSIONS: usize = 1 << 16;
+const MAX_SESSIONS: usize = 1 << 16;
 
-pub(crate) async fn load(arguments: &Arguments) -> Result<(), Failure> {
+pub(crate) async fn load(arguments: &LoadArguments) -> Result<(), ClientFailure> {
     if let Some(path) = &arguments.plan {
         return by_plan(path, arguments).await;
     }
     let server = arguments.credentials.server(&arguments.server)?;
     let file = SceneFile::read(&arguments.scene)?;
-    let source = file.source(server.connect().await.map_err(Failure::from)?).await?;
+    let source = file.source(server.connect().await.map_err(ClientFailure::from)?).await?;
     let sessions = arguments.sessions as usize;
     let ended = async {
         match &arguments.find_limit {
@@ -124,10 +126,10 @@ pub(crate) async fn load(arguments: &Arguments) -> Result<(), Failure> {
         print!("{}", printable_lines(outcome.table(limit)));
     }
     if limit.is_none() && outcome.samples == 0 && arguments.clients_per_session > 0 && arguments.seconds > 0.0 {
-        return Err(Failure::Failed("no sample arrived".to_owned()));
+        return Err(ClientFailure::Failed("no sample arrived".to_owned()));
     }
     if limit.is_none() && outcome.broken > 0 {
-        return Err(Failure::Failed(format!("{} streams broke", outcome.broken)));
+        return Err(ClientFailure::Failed(format!("{} streams broke", outcome.broken)));
     }
     Ok(())
 }
@@ -147,12 +149,12 @@ async fn agreed<T, E>(mut trial: impl AsyncFnMut() -> Result<(T, bool), E>) -> R
 
 /// The largest number of sessions that meets the objective, and its outcome: doubled until it fails, then bisected.
 async fn find_limit(
-    arguments: &Arguments,
+    arguments: &LoadArguments,
     server: &Server,
     source: &Source,
     first: usize,
     objective: &Objective,
-) -> Result<(Outcome, usize), Error> {
+) -> Result<(LoadOutcome, usize), Error> {
     // 0 sessions meet every objective.
     let (mut best, mut low, mut high) = (None, 0, None);
     let mut next = first;
@@ -185,7 +187,7 @@ async fn find_limit(
             }
         }
         next = match high {
-            None if low >= MOST_SESSIONS => break,
+            None if low >= MAX_SESSIONS => break,
             None => 2 * low,
             Some(high) if high - low <= (low / RESOLUTION).max(1) => break,
             Some(high) => usize::midpoint(low, high),
@@ -201,8 +203,13 @@ async fn called_off() {
 }
 
 /// A trial, with its progress and warnings.
-async fn measured(arguments: &Arguments, server: &Server, source: &Source, sessions: usize) -> Result<Outcome, Error> {
-    let of_all = Trial {
+async fn measured(
+    arguments: &LoadArguments,
+    server: &Server,
+    source: &Source,
+    sessions: usize,
+) -> Result<LoadOutcome, Error> {
+    let of_all = LoadTrial {
         clients_per_session: arguments.clients_per_session,
         viewers: arguments.viewers,
         seconds: arguments.seconds,
@@ -213,7 +220,7 @@ async fn measured(arguments: &Arguments, server: &Server, source: &Source, sessi
         clients_per_connection: arguments.clients_per_connection,
         threads: arguments.threads,
     };
-    let mut shown = Shown::new(arguments, sessions);
+    let mut shown = TrialProgressPrinter::new(arguments, sessions);
     let outcome = trial(&of_all, server, source, sessions, |progress| shown.tell(progress), called_off()).await?;
     shown.end();
     if let Some(why) = &outcome.first_break {
@@ -227,8 +234,8 @@ async fn measured(arguments: &Arguments, server: &Server, source: &Source, sessi
 }
 
 /// Loads a server by a plan, and prints and writes the report.
-async fn by_plan(path: &Path, arguments: &Arguments) -> Result<(), Failure> {
-    let course = Course::new(Plan::read(path)?)?;
+async fn by_plan(path: &Path, arguments: &LoadArguments) -> Result<(), ClientFailure> {
+    let course = PreparedPlan::new(LoadPlan::read(path)?)?;
     let server = arguments.credentials.server(&arguments.server)?;
     let quiet = arguments.quiet;
     let told = move |second: &Second| {
@@ -239,34 +246,34 @@ async fn by_plan(path: &Path, arguments: &Arguments) -> Result<(), Failure> {
     let report = course.run(&server, told, crate::warn, called_off()).await?;
     if let Some(file) = &arguments.report {
         let written = std::fs::write(file, report.page());
-        written.map_err(|error| Failure::Failed(format!("{}: {error}", file.display())))?;
+        written.map_err(|error| ClientFailure::Failed(format!("{}: {error}", file.display())))?;
     }
     if arguments.json {
         crate::tell!("{}", printable_json(report.json()));
     } else {
         print!("{}", printable_lines(report.table()));
     }
-    report.verdict().map_or(Ok(()), |why| Err(Failure::Failed(why)))
+    report.verdict().map_or(Ok(()), |why| Err(ClientFailure::Failed(why)))
 }
 
 /// Prints the progress of a trial.
-struct Shown {
+struct TrialProgressPrinter {
     quiet: bool,
     sessions: usize,
     /// Number of samples at the last report, and its time.
     last: (u64, Instant),
 }
 
-impl Shown {
-    fn new(arguments: &Arguments, sessions: usize) -> Self {
-        Shown { quiet: arguments.quiet, sessions, last: (0, Instant::now()) }
+impl TrialProgressPrinter {
+    fn new(arguments: &LoadArguments, sessions: usize) -> Self {
+        TrialProgressPrinter { quiet: arguments.quiet, sessions, last: (0, Instant::now()) }
     }
 
-    fn tell(&mut self, progress: &Progress) {
+    fn tell(&mut self, progress: &TrialProgress) {
         if self.quiet {
             return;
         }
-        let Progress { at_s, samples, rejected, round_trip_p99_s } = *progress;
+        let TrialProgress { at_s, samples, rejected, round_trip_p99_s } = *progress;
         let elapsed_s = self.last.1.elapsed().as_secs_f64();
         let text = format!(
             "{at_s:.0} s  {} sessions  {:.0} samples/s  round trip p99 {:.2} ms  rejected {rejected}",

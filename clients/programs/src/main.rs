@@ -49,13 +49,13 @@ use palpate_proto::refusal::{Reason, Refusal};
 /// Programs that talk to a Palpate server.
 #[derive(Parser)]
 #[command(version, about, max_term_width = 100)]
-struct Arguments {
+struct ClientArguments {
     #[command(subcommand)]
-    command: Command,
+    command: ClientCommand,
 }
 
 #[derive(Subcommand)]
-enum Command {
+enum ClientCommand {
     /// Play a script through a server in real time; write the records that it streams as JSON Lines
     #[command(after_help = "Examples:\n  \
         palpate-client replay vertical-60 --server http://127.0.0.1:7117\n  \
@@ -63,7 +63,7 @@ enum Command {
         The session is created paused. Each command carries the step at which it acts and is sent ahead of time. So the \
         final hash equals that of `palpate run --held`, whatever the network did, unless late commands are reported.\n\n\
         Exit status: 0; 1 when the replay failed; 2 when an input was refused.")]
-    Replay(replay::Arguments),
+    Replay(replay::ReplayArguments),
     /// Send a journal or a snapshot to a server, and play it there for others to see, or go on live from one of its moments
     #[command(after_help = "Examples:\n  \
         palpate-client play 3f0c….1.mcap --speed 2\n  \
@@ -72,7 +72,7 @@ enum Command {
         plays. Anybody may touch a live one, and it stays after the end. Each hash of the journal is compared with the \
         session's. `palpate journal replay` without a server writes records as fast as it goes.\n\n\
         Exit status: 0; 1 when a hash differs, the connection broke or the session was held; 2 when an input was refused.")]
-    Play(play::Arguments),
+    Play(play::PlayArguments),
     /// Simulate hand, device, network and tissue in one loop in virtual time; report how accurate and safe the touch is
     #[command(after_help = "Examples:\n  \
         palpate-client link --scene fibrotic --hand medium --device omega3 --rtt-ms 50\n  \
@@ -88,7 +88,7 @@ enum Command {
         With `prediction` the client's copy is that same tissue. Where nothing else acts and nothing is lost, it hardly errs \
         by that; loss, jitter, a second tool, a change of the tissue and --server show what it is worth.\n\n\
         Exit status: 0; 1 when a run failed; 2 when an input was refused, or the system has no memory for the sheet.")]
-    Link(Box<link::Arguments>),
+    Link(Box<link::LinkArguments>),
     /// Connect a haptic device to a server at 1 kHz: one of your own, or a simulated one in a simulated hand
     #[command(after_help = "Examples:\n  \
         palpate-client bridge --server http://127.0.0.1:7117 --scene liver --seconds 10\n  \
@@ -101,7 +101,7 @@ enum Command {
         implement `HapticDevice` of the crate palpate-client (clients/library).\n\n\
         Exit status: 0; 1 when the device is missing or fails, when no connection succeeded or none stood at the end; 2 when \
         an input was refused.")]
-    Bridge(Box<bridge::Arguments>),
+    Bridge(Box<bridge::BridgeArguments>),
     /// List haptic devices; read one for some seconds, and report how well it keeps time
     #[command(after_help = "Examples:\n  \
         palpate-client devices\n  \
@@ -110,7 +110,7 @@ enum Command {
         The test sets no force. Move the device while it runs: positions that changed tell how often the device itself \
         measures.\n\n\
         Exit status: 0; 1 when the device to test is missing or fails; 2 when an input was refused.")]
-    Devices(devices::Arguments),
+    Devices(devices::DevicesArguments),
     /// A bad network on this machine: relay TCP and UDP to a server with delay, jitter, loss and outages
     #[command(after_help = "Examples:\n  \
         palpate-client proxy 127.0.0.1:7200 127.0.0.1:7117 --delay-ms 25 --loss 0.01\n  \
@@ -119,7 +119,7 @@ enum Command {
         as well. Lost TCP packets are sent again by the rule of RFC 6298, which delays everything behind them. Ctrl-C ends the \
         proxy, which then prints what went through.\n\n\
         Exit status: 0; 1 when it can't listen; 2 when an input was refused.")]
-    Proxy(proxy::Arguments),
+    Proxy(proxy::ProxyArguments),
     /// Load a server with many sessions, haptic clients and viewers; report delays, losses and dilation
     #[command(after_help = "Examples:\n  \
         palpate-client load --sessions 50 --seconds 10\n  \
@@ -133,13 +133,13 @@ enum Command {
         server's \
         machine the generator takes processor time from it; the report says how much.\n\n\
         Exit status: 0; 1 when streams broke or the server could not be reached; 2 when an input was refused.")]
-    Load(load::Arguments),
+    Load(load::LoadArguments),
     /// Check that a server is serving; for scripts and containers
     #[command(after_help = "Examples:\n  \
         palpate-client health\n  \
         palpate-client health --server https://localhost:7117 --ca /etc/palpate/ca.pem\n\n\
         Needs no token. Exit status: 0 if the server is serving; 1 if not; 2 when an input was refused.")]
-    Health(health::Arguments),
+    Health(health::HealthArguments),
     /// Show the sessions of a server once a second: state, step rate, dilation, awake points, holders of tools
     #[command(after_help = "Examples:\n  \
         palpate-client top\n  \
@@ -147,7 +147,7 @@ enum Command {
         palpate-client top --once --json | jq '.sessions[] | select(.time_dilation < 0.999)'\n\n\
         If the server authenticates clients, your token needs the role `administer`.\n\n\
         Exit status: 0; 1 when the server can't be reached or refuses; 2 when an input was refused.")]
-    Top(top::Arguments),
+    Top(top::TopArguments),
     /// Show what each caller uses of a server; release a tool, cut a stream or a caller, revive or delete a session
     #[command(after_help = "Examples:\n  \
         palpate-client admin callers\n  \
@@ -157,7 +157,7 @@ enum Command {
         certificate, without authentication by their address. A caller that you cut can come back: remove its entry from \
         the token file first.\n\n\
         Exit status: 0; 1 when the server can't be reached or refuses; 2 when an input was refused.")]
-    Admin(admin::Arguments),
+    Admin(admin::AdminArguments),
     /// Show the servers and sessions of a fleet; move sessions between servers, and drain a server for an upgrade
     #[command(after_help = "Examples:\n  \
         palpate-client cluster nodes\n  \
@@ -170,11 +170,11 @@ enum Command {
         follow by themselves. A server that is drained takes no new sessions until you say --stop, or start it again.\n\n\
         Exit status: 0; 1 when a server can't be reached or refuses, or when sessions could not be moved; 2 when an input was \
         refused.")]
-    Cluster(cluster::Arguments),
+    Cluster(cluster::ClusterArguments),
 }
 
 /// Why a program ends early.
-pub(crate) enum Failure {
+pub(crate) enum ClientFailure {
     /// Exit status 1.
     Failed(String),
     /// Exit status 2.
@@ -183,15 +183,19 @@ pub(crate) enum Failure {
     Unread,
 }
 
-impl From<Error> for Failure {
+impl From<Error> for ClientFailure {
     fn from(error: Error) -> Self {
-        if error.is_refusal() { Failure::Refused(error.to_string()) } else { Failure::Failed(error.to_string()) }
+        if error.is_refusal() {
+            ClientFailure::Refused(error.to_string())
+        } else {
+            ClientFailure::Failed(error.to_string())
+        }
     }
 }
 
-impl From<Refusal> for Failure {
+impl From<Refusal> for ClientFailure {
     fn from(refusal: Refusal) -> Self {
-        Failure::Refused(refusal.to_string())
+        ClientFailure::Refused(refusal.to_string())
     }
 }
 
@@ -215,23 +219,23 @@ pub(crate) async fn interrupted() {
 // Two threads for the network; a device runs on its own thread.
 #[tokio::main(worker_threads = 2)]
 async fn main() -> ExitCode {
-    let ended = match palpate::arguments::parse::<Arguments>().command {
-        Command::Replay(arguments) => replay::replay(&arguments).await,
-        Command::Play(arguments) => play::play(&arguments).await,
-        Command::Link(arguments) => link::link(&arguments).await,
-        Command::Bridge(arguments) => bridge::bridge(&arguments).await,
-        Command::Devices(arguments) => devices::devices(&arguments).await,
-        Command::Proxy(arguments) => proxy::proxy(&arguments).await,
-        Command::Load(arguments) => load::load(&arguments).await,
-        Command::Health(arguments) => health::health(&arguments).await,
-        Command::Top(arguments) => top::top(&arguments).await,
-        Command::Admin(arguments) => admin::admin(&arguments).await,
-        Command::Cluster(arguments) => cluster::cluster(&arguments).await,
+    let ended = match palpate::arguments::parse::<ClientArguments>().command {
+        ClientCommand::Replay(arguments) => replay::replay(&arguments).await,
+        ClientCommand::Play(arguments) => play::play(&arguments).await,
+        ClientCommand::Link(arguments) => link::link(&arguments).await,
+        ClientCommand::Bridge(arguments) => bridge::bridge(&arguments).await,
+        ClientCommand::Devices(arguments) => devices::devices(&arguments).await,
+        ClientCommand::Proxy(arguments) => proxy::proxy(&arguments).await,
+        ClientCommand::Load(arguments) => load::load(&arguments).await,
+        ClientCommand::Health(arguments) => health::health(&arguments).await,
+        ClientCommand::Top(arguments) => top::top(&arguments).await,
+        ClientCommand::Admin(arguments) => admin::admin(&arguments).await,
+        ClientCommand::Cluster(arguments) => cluster::cluster(&arguments).await,
     };
     let (status, message) = match ended {
-        Ok(()) | Err(Failure::Unread) => return ExitCode::SUCCESS,
-        Err(Failure::Failed(message)) => (1, message),
-        Err(Failure::Refused(message)) => (2, message),
+        Ok(()) | Err(ClientFailure::Unread) => return ExitCode::SUCCESS,
+        Err(ClientFailure::Failed(message)) => (1, message),
+        Err(ClientFailure::Refused(message)) => (2, message),
     };
     crate::say!("palpate-client: {message}");
     if message.contains(Reason::Unauthenticated.as_str()) {
@@ -248,13 +252,13 @@ mod tests {
 
     #[test]
     fn the_arguments_of_all_subcommands_are_sound() {
-        super::Arguments::command().debug_assert();
+        super::ClientArguments::command().debug_assert();
     }
 
     #[test]
     fn help_fits_into_a_terminal_of_any_width() {
         for width in [40, 80, 100, 160] {
-            for subcommand in super::Arguments::command().get_subcommands() {
+            for subcommand in super::ClientArguments::command().get_subcommands() {
                 let help = subcommand.clone().term_width(width).render_long_help().to_string();
                 for line in help.lines() {
                     // Single words and the names of options can't be broken.
@@ -268,7 +272,7 @@ mod tests {
 
     #[test]
     fn paragraphs_of_help_are_wrapped_by_the_terminal_alone() {
-        for subcommand in super::Arguments::command().get_subcommands() {
+        for subcommand in super::ClientArguments::command().get_subcommands() {
             let text = subcommand.get_after_help().map(ToString::to_string).unwrap_or_default();
             let lines: Vec<&str> = text.lines().collect();
             for pair in lines.windows(2) {

@@ -9,7 +9,7 @@ use palpate_client::devices::{Enables, Placement};
 use palpate_proto::refusal::{Reason, Result};
 
 /// Largest placement file, bytes.
-const MOST_BYTES: u64 = 1 << 16;
+const MAX_BYTES: u64 = 1 << 16;
 
 /// The options; they override the file.
 #[derive(clap::Args)]
@@ -53,7 +53,7 @@ impl PlacementOptions {
     /// Refuses a file that can't be read, and values that are out of range, by key.
     pub(crate) fn placement(&self) -> Result<Placement> {
         let mut placement = match &self.placement {
-            Some(path) => parse(&path.display().to_string(), &read_text(path, MOST_BYTES)?)?,
+            Some(path) => parse(&path.display().to_string(), &read_text(path, MAX_BYTES)?)?,
             None => Placement::default(),
         };
         placement.offset_m = self.offset_m.unwrap_or(placement.offset_m);

@@ -24,15 +24,15 @@ use tonic::{Status, Streaming};
 
 use crate::credentials::CredentialOptions;
 use crate::table::progress_bar;
-use crate::{Failure, interrupted, table};
+use crate::{ClientFailure, interrupted, table};
 use recorded::Compared;
 
 /// Bytes of a journal, at most: no server takes more.
-const MOST_BYTES: u64 = 1 << 32;
+const MAX_BYTES: u64 = 1 << 32;
 
 /// Arguments of `play`.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {
+pub(crate) struct PlayArguments {
     /// The journal, or a snapshot (MCAP)
     #[arg(value_name = "FILE")]
     file: PathBuf,
@@ -76,7 +76,7 @@ pub(crate) struct Arguments {
 /// The session is looked at so often.
 const LOOK: Duration = Duration::from_millis(100);
 
-fn refused(status: Status) -> Failure {
+fn refused(status: Status) -> ClientFailure {
     Error::Call(status).into()
 }
 
@@ -90,11 +90,11 @@ struct Records {
 impl Records {
     /// Of the steps from `begin` to `end` of a session that stands.
     async fn open(
-        arguments: &Arguments,
+        arguments: &PlayArguments,
         channel: Channel,
         session: &pb::Session,
         [begin, end]: [u64; 2],
-    ) -> Result<Option<Self>, Failure> {
+    ) -> Result<Option<Self>, ClientFailure> {
         let Some(path) = &arguments.output else { return Ok(None) };
         let every = u64::from(arguments.every);
         let mut output = output(Some(path), false)?;
@@ -122,14 +122,15 @@ impl Records {
     }
 
     /// Writes them, to the last.
-    async fn write(mut self) -> Result<(), Failure> {
+    async fn write(mut self) -> Result<(), ClientFailure> {
         let mut record = Record::default();
         while self.left > 0 {
             let message = self.stream.message().await.map_err(refused)?;
-            let message = message.ok_or_else(|| Failure::Failed("the server has ended the records".to_owned()))?;
+            let message =
+                message.ok_or_else(|| ClientFailure::Failed("the server has ended the records".to_owned()))?;
             if message.dropped_records > 0 {
                 let why = "records were lost: this client can't keep up with so many points at this rate";
-                return Err(Failure::Failed(why.to_owned()));
+                return Err(ClientFailure::Failed(why.to_owned()));
             }
             // Of the beginning there is one only at step 0.
             if wire::sample::add_to_record(&mut record, &message) && message.step == 0 {
@@ -143,17 +144,17 @@ impl Records {
     }
 }
 
-fn unwritten(error: std::io::Error) -> Failure {
-    Failure::Failed(format!("the records can't be written: {error}"))
+fn unwritten(error: std::io::Error) -> ClientFailure {
+    ClientFailure::Failed(format!("the records can't be written: {error}"))
 }
 
 /// Sends the journal, and plays it to its end.
 ///
 /// # Errors
 /// Returns an error if the file can't be read, the server refuses it, the connection breaks, or a hash differs from the journal's.
-pub(crate) async fn play(arguments: &Arguments) -> Result<(), Failure> {
-    let Arguments { file, from, to, speed, live, quiet, .. } = arguments;
-    let bytes = files::read_regular(file, MOST_BYTES)?;
+pub(crate) async fn play(arguments: &PlayArguments) -> Result<(), ClientFailure> {
+    let PlayArguments { file, from, to, speed, live, quiet, .. } = arguments;
+    let bytes = files::read_regular(file, MAX_BYTES)?;
     let mut recorded = recorded::hashes(&file.display().to_string(), &bytes)?;
     let server = arguments.credentials.server(&arguments.server)?;
     let channel = server.connect().await?;
@@ -168,7 +169,7 @@ pub(crate) async fn play(arguments: &Arguments) -> Result<(), Failure> {
     let begin = from.unwrap_or(if *live { last } else { first });
     for (option, step, least) in [("--from", begin, first), ("--to", end, begin)] {
         if !(least..=last).contains(&step) {
-            return Err(Failure::Refused(format!("{option}: must be from {least} to {last}, but is {step}")));
+            return Err(ClientFailure::Refused(format!("{option}: must be from {least} to {last}, but is {step}")));
         }
     }
     let moment = pb::JournalMoment {
@@ -217,7 +218,7 @@ pub(crate) async fn play(arguments: &Arguments) -> Result<(), Failure> {
     };
     let played = tokio::select! {
         played = run => played,
-        () = interrupted() => Err(Failure::Failed("interrupted".to_owned())),
+        () = interrupted() => Err(ClientFailure::Failed("interrupted".to_owned())),
     };
     bar.finish_and_clear();
     let hash = match (&played, live) {
@@ -237,7 +238,7 @@ pub(crate) async fn play(arguments: &Arguments) -> Result<(), Failure> {
             let request = request.clone();
             async move { SessionServiceClient::new(channel).delete_session(request).await }
         });
-        if let Err(Failure::Failed(why) | Failure::Refused(why)) = deleted.await {
+        if let Err(ClientFailure::Failed(why) | ClientFailure::Refused(why)) = deleted.await {
             crate::warn(&format!("session {id} was not deleted: {why}"));
         }
     }
@@ -255,13 +256,13 @@ pub(crate) async fn play(arguments: &Arguments) -> Result<(), Failure> {
         table::print(&rows);
     }
     match compared.difference {
-        Some(difference) => Err(Failure::Failed(format!("{}: differs: {difference}", file.display()))),
+        Some(difference) => Err(ClientFailure::Failed(format!("{}: differs: {difference}", file.display()))),
         None => Ok(()),
     }
 }
 
 /// A call to whichever server of a fleet has the session.
-async fn call<T, F>(at: &mut At<()>, call: impl Fn(Channel) -> F) -> Result<T, Failure>
+async fn call<T, F>(at: &mut At<()>, call: impl Fn(Channel) -> F) -> Result<T, ClientFailure>
 where
     F: Future<Output = Result<tonic::Response<T>, Status>>,
 {
@@ -271,7 +272,7 @@ where
 }
 
 /// Waits until a session has done `end` steps. Returns how many it has done.
-async fn follow(at: &mut At<()>, id: &str, end: u64, bar: &ProgressBar) -> Result<u64, Failure> {
+async fn follow(at: &mut At<()>, id: &str, end: u64, bar: &ProgressBar) -> Result<u64, ClientFailure> {
     loop {
         let asked = pb::GetSessionRequest { session_id: id.to_owned() };
         let answer = call(at, |channel| {
@@ -281,7 +282,7 @@ async fn follow(at: &mut At<()>, id: &str, end: u64, bar: &ProgressBar) -> Resul
         let session = answer.await?.session.unwrap_or_default();
         bar.set_position(session.step);
         if !session.hold_reason.is_empty() {
-            return Err(Failure::Failed(format!(
+            return Err(ClientFailure::Failed(format!(
                 "the session is held at step {}: {}",
                 session.step, session.hold_reason
             )));

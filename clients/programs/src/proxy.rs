@@ -5,14 +5,14 @@ use std::sync::Arc;
 
 use palpate_proto::refusal::{Refusal, number};
 use palpate_simulated::network::Conditions;
-use palpate_simulated::relay::{MOST_FLOWS, Network, Passed};
+use palpate_simulated::relay::{MAX_FLOWS, Passed, RelayNetwork};
 use serde_json::json;
 
-use crate::{Failure, interrupted, table};
+use crate::{ClientFailure, interrupted, table};
 
 /// Arguments of `proxy`.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {
+pub(crate) struct ProxyArguments {
     /// Where it listens; port 0 takes a free one
     #[arg(value_name = "LISTEN")]
     listen: SocketAddr,
@@ -52,10 +52,10 @@ pub(crate) struct Arguments {
 ///
 /// # Errors
 /// Returns an error if an argument is refused or the address is not free.
-pub(crate) async fn proxy(arguments: &Arguments) -> Result<(), Failure> {
-    let network = Network::new(conditions(arguments)?, arguments.seed, MOST_FLOWS, Arc::new(Box::new(crate::warn)));
+pub(crate) async fn proxy(arguments: &ProxyArguments) -> Result<(), ClientFailure> {
+    let network = RelayNetwork::new(conditions(arguments)?, arguments.seed, MAX_FLOWS, Arc::new(Box::new(crate::warn)));
     let mut listen = arguments.listen;
-    let unheard = |error: std::io::Error| Failure::Failed(error.to_string());
+    let unheard = |error: std::io::Error| ClientFailure::Failed(error.to_string());
     if !arguments.udp {
         listen = network.relay_tcp(listen, arguments.to).map_err(unheard)?;
     }
@@ -74,7 +74,7 @@ pub(crate) async fn proxy(arguments: &Arguments) -> Result<(), Failure> {
     Ok(())
 }
 
-fn conditions(arguments: &Arguments) -> Result<Conditions, Refusal> {
+fn conditions(arguments: &ProxyArguments) -> Result<Conditions, Refusal> {
     let part = |field: &str, value: f64, range: &str, least: f64, most: f64| {
         number(field, value, range, |value| (least..=most).contains(&value))
     };

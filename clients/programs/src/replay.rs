@@ -28,7 +28,7 @@ use tokio::task::JoinHandle;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Status;
 
-use crate::Failure;
+use crate::ClientFailure;
 use crate::credentials::CredentialOptions;
 use crate::table::progress_bar;
 use measured::{Measured, percentiles_us};
@@ -47,10 +47,10 @@ const HEARTBEAT: Duration = Duration::from_millis(5);
 const SILENCE: Duration = Duration::from_secs(10);
 
 /// Time limit for creating the session.
-const PATIENCE: Duration = Duration::from_secs(120);
+const CREATE_TIMEOUT: Duration = Duration::from_secs(120);
 
 #[derive(clap::Args)]
-pub(crate) struct Arguments {
+pub(crate) struct ReplayArguments {
     /// A script file, or the name of one that is in ./scripts or built in: `press`, `stroke`, …
     script: PathBuf,
     /// The server
@@ -111,13 +111,15 @@ impl Sampling {
 
     /// Checks that samples arrive at least twice while the commands sent ahead last: samples pace the commands.
     #[allow(clippy::cast_precision_loss)]
-    fn check(&self, rate_hz: f64, ahead: u64) -> Result<(), Failure> {
+    fn check(&self, rate_hz: f64, ahead: u64) -> Result<(), ClientFailure> {
         let most_s = 0.5 * ahead as f64 / rate_hz;
         let apart_s = f64::from(self.every) / rate_hz;
         for (option, seconds) in [("--every", apart_s), ("--heartbeat-s", self.heartbeat_s.unwrap_or(0.0) + apart_s)] {
             if seconds > most_s {
                 let why = "samples pace the commands, so they must be at most";
-                return Err(Failure::Refused(format!("{option}: {why} {most_s} s apart, but would be {seconds} s")));
+                return Err(ClientFailure::Refused(format!(
+                    "{option}: {why} {most_s} s apart, but would be {seconds} s"
+                )));
             }
         }
         Ok(())
@@ -128,7 +130,7 @@ impl Sampling {
 type LastHeard = Mutex<Instant>;
 
 /// The replay's session. It is deleted even when the replay fails.
-struct Session {
+struct ReplaySession {
     client: SessionServiceClient<Channel>,
     id: String,
 }
@@ -137,7 +139,7 @@ struct Session {
 ///
 /// # Errors
 /// Returns an error if an input is refused, the server fails or is silent, or the output can't be written.
-pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
+pub(crate) async fn replay(arguments: &ReplayArguments) -> Result<(), ClientFailure> {
     let server = arguments.credentials.server(&arguments.server)?;
     let scene = match &arguments.scene {
         Some(scene) => scene.clone(),
@@ -146,26 +148,28 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
         }
     };
     let file = SceneFile::read(&scene)?;
-    let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server, --server names another"));
+    let unreached =
+        |why| ClientFailure::Failed(format!("{why}; `palpate serve` starts a server, --server names another"));
     let channel = server.connect().await.map_err(unreached)?;
     let mut client = SessionServiceClient::new(channel.clone());
     let source = file.source(channel.clone()).await?;
     let request =
         pb::CreateSessionRequest { source: Some(source), paused: true, idle_timeout_s: Some(SILENCE.as_secs_f64()) };
-    let silent = |_| Failure::Failed(format!("the server created no session within {} s", PATIENCE.as_secs()));
-    let created = tokio::time::timeout(PATIENCE, client.create_session(request)).await.map_err(silent)?;
+    let silent =
+        |_| ClientFailure::Failed(format!("the server created no session within {} s", CREATE_TIMEOUT.as_secs()));
+    let created = tokio::time::timeout(CREATE_TIMEOUT, client.create_session(request)).await.map_err(silent)?;
     let created = created.map_err(|status| with_hint(&scene, refused_or_failed(status)))?.into_inner().session;
-    let created = created.ok_or_else(|| Failure::Failed("the server's answer has no session".into()))?;
+    let created = created.ok_or_else(|| ClientFailure::Failed("the server's answer has no session".into()))?;
     let home = fleet::home(&server, &created)?;
     let channel = if home.url() == server.url() { channel } else { home.connect().await? };
     let client = SessionServiceClient::new(channel.clone());
-    let mut session = Session { client, id: created.session_id.clone() };
+    let mut session = ReplaySession { client, id: created.session_id.clone() };
     let sessions = session.client.clone();
     let heard = LastHeard::new(Instant::now());
     let ended = tokio::select! {
         ended = play(arguments, &file, &created, sessions, channel, &heard) => ended,
         failure = silence(&heard) => Err(failure),
-        _ = tokio::signal::ctrl_c() => Err(Failure::Failed("interrupted".into())),
+        _ = tokio::signal::ctrl_c() => Err(ClientFailure::Failed("interrupted".into())),
     };
     // The result does not matter: a server that has ended has no sessions any more.
     let deleted = session.client.delete_session(pb::DeleteSessionRequest { session_id: session.id });
@@ -175,26 +179,26 @@ pub(crate) async fn replay(arguments: &Arguments) -> Result<(), Failure> {
 
 /// The failure of a session with this scene. If the server does not know the name, it may be meant as a file: the message
 /// says how to give one.
-fn with_hint(scene: &str, failure: Failure) -> Failure {
+fn with_hint(scene: &str, failure: ClientFailure) -> ClientFailure {
     let file = format!("{scene}.toml");
     match failure {
-        Failure::Refused(why) if why.contains(Reason::UnknownScene.as_str()) => {
+        ClientFailure::Refused(why) if why.contains(Reason::UnknownScene.as_str()) => {
             let hint = if std::path::Path::new(&file).is_file() {
                 format!("did you mean the file `{file}`?")
             } else {
                 "give your own scene by its path, --scene FILE.toml".to_owned()
             };
-            Failure::Refused(format!("{why}; {hint}"))
+            ClientFailure::Refused(format!("{why}; {hint}"))
         }
         failure => failure,
     }
 }
 
-fn failed(status: Status) -> Failure {
-    Failure::Failed(format!("the server ended the replay: {}", describe(&status)))
+fn failed(status: Status) -> ClientFailure {
+    ClientFailure::Failed(format!("the server ended the replay: {}", describe(&status)))
 }
 
-fn refused_or_failed(status: Status) -> Failure {
+fn refused_or_failed(status: Status) -> ClientFailure {
     Error::Call(status).into()
 }
 
@@ -209,9 +213,9 @@ struct Streamer<'s> {
 }
 
 impl Streamer<'_> {
-    async fn say(&self, message: Say) -> Result<(), Failure> {
+    async fn say(&self, message: Say) -> Result<(), ClientFailure> {
         let sent = self.outbound.send(message).await;
-        sent.map_err(|_| Failure::Failed("the server closed the haptic stream".into()))
+        sent.map_err(|_| ClientFailure::Failed("the server closed the haptic stream".into()))
     }
 
     #[allow(clippy::cast_possible_truncation)]
@@ -220,7 +224,7 @@ impl Streamer<'_> {
     }
 
     /// Sends the commands of all steps before `step`.
-    async fn send_before(&mut self, step: u64) -> Result<(), Failure> {
+    async fn send_before(&mut self, step: u64) -> Result<(), ClientFailure> {
         while self.next_step < step.min(self.script.steps) {
             for (tool, action) in self.script.actions_at(self.next_step) {
                 let command =
@@ -232,7 +236,7 @@ impl Streamer<'_> {
         Ok(())
     }
 
-    async fn heartbeat(&mut self) -> Result<(), Failure> {
+    async fn heartbeat(&mut self) -> Result<(), ClientFailure> {
         self.sent_before.push_back(self.next_step);
         self.say(Say::Renew(pb::Renew { client_time_ns: self.now_ns(), datagrams: false })).await
     }
@@ -252,22 +256,25 @@ fn run_until(sessions: &SessionServiceClient<Channel>, session_id: &str, step: u
 }
 
 /// The message that `message` waits for.
-async fn next<T>(message: impl Future<Output = Result<Option<T>, Status>>, heard: &LastHeard) -> Result<T, Failure> {
+async fn next<T>(
+    message: impl Future<Output = Result<Option<T>, Status>>,
+    heard: &LastHeard,
+) -> Result<T, ClientFailure> {
     let message = message.await;
     *heard.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
     match message {
         Ok(Some(message)) => Ok(message),
-        Ok(None) => Err(Failure::Failed("the server ended the stream".into())),
+        Ok(None) => Err(ClientFailure::Failed("the server ended the stream".into())),
         Err(status) => Err(failed(status)),
     }
 }
 
 /// Completes when the server has been silent for too long, whatever the replay waits for.
-async fn silence(heard: &LastHeard) -> Failure {
+async fn silence(heard: &LastHeard) -> ClientFailure {
     loop {
         let last = *heard.lock().unwrap_or_else(PoisonError::into_inner);
         if last.elapsed() >= SILENCE {
-            return Failure::Failed(format!("the server was silent for {} s", SILENCE.as_secs()));
+            return ClientFailure::Failed(format!("the server was silent for {} s", SILENCE.as_secs()));
         }
         tokio::time::sleep_until((last + SILENCE).into()).await;
     }
@@ -275,13 +282,13 @@ async fn silence(heard: &LastHeard) -> Failure {
 
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 async fn play(
-    arguments: &Arguments,
+    arguments: &ReplayArguments,
     file: &SceneFile,
     created: &pb::Session,
     mut sessions: SessionServiceClient<Channel>,
     channel: Channel,
     heard: &LastHeard,
-) -> Result<(), Failure> {
+) -> Result<(), ClientFailure> {
     let session_id = &created.session_id;
     let scene = file.scene(created, channel.clone()).await?;
     let limits = Limits::default();
@@ -291,8 +298,8 @@ async fn play(
     }
     let mut output = output(arguments.output.as_deref(), arguments.plot)?;
     let written = |e: std::io::Error| match e.kind() {
-        std::io::ErrorKind::BrokenPipe => Failure::Unread,
-        _ => Failure::Failed(format!("can't write the output: {e}")),
+        std::io::ErrorKind::BrokenPipe => ClientFailure::Unread,
+        _ => ClientFailure::Failed(format!("can't write the output: {e}")),
     };
     let run = Run {
         scene: scene.name.clone(),
@@ -383,7 +390,7 @@ async fn play(
                         let asked = pb::GetSessionRequest { session_id: session_id.clone() };
                         let session = sessions.get_session(asked).await.map_err(failed)?.into_inner().session;
                         let reason = session.map(|session| session.hold_reason).unwrap_or_default();
-                        return Err(Failure::Failed(format!("the run was stopped: {reason}")));
+                        return Err(ClientFailure::Failed(format!("the run was stopped: {reason}")));
                     }
                     measured.sample(&sample, arguments.sampling.every);
                     wall_s = started.elapsed().as_secs_f64();
@@ -407,7 +414,7 @@ async fn play(
                 let message = message?;
                 if message.dropped_records > 0 {
                     let why = "records were lost: this client can't keep up with so many points at this rate";
-                    return Err(Failure::Failed(why.into()));
+                    return Err(ClientFailure::Failed(why.into()));
                 }
                 if wire::sample::add_to_record(&mut record, &message) {
                     let record = std::mem::take(&mut record);
@@ -417,11 +424,11 @@ async fn play(
                 }
             },
             answer = &mut running, if !is_answered => {
-                answer.map_err(|e| Failure::Failed(e.to_string()))?.map_err(refused_or_failed)?;
+                answer.map_err(|e| ClientFailure::Failed(e.to_string()))?.map_err(refused_or_failed)?;
                 is_answered = true;
             }
             answer = &mut hash, if final_hash.is_none() => {
-                let answer = answer.map_err(|e| Failure::Failed(e.to_string()))?.map_err(failed)?;
+                let answer = answer.map_err(|e| ClientFailure::Failed(e.to_string()))?.map_err(failed)?;
                 final_hash = Some(answer.into_inner().state_hash);
             }
             _ = heartbeat.tick(), if measured.last.0 < script.steps => streamer.heartbeat().await?,
@@ -476,10 +483,10 @@ async fn play(
     summary.warnings.iter().for_each(|warning| crate::warn(warning));
     if measured.rejected > 0 {
         let why = "commands were rejected, so the run differs from the script";
-        return Err(Failure::Failed(format!("{} {why}", measured.rejected)));
+        return Err(ClientFailure::Failed(format!("{} {why}", measured.rejected)));
     }
     if let Some(fault) = summary.fault() {
-        return Err(Failure::Failed(fault));
+        return Err(ClientFailure::Failed(fault));
     }
     Ok(())
 }
@@ -488,12 +495,12 @@ fn rejection_text(rejection: &pb::Rejection) -> String {
     format!("tool {}, command {}: {} ({})", rejection.tool, rejection.sequence, rejection.message, rejection.reason)
 }
 
-fn rejected(rejection: &pb::Rejection) -> Failure {
-    Failure::Refused(rejection_text(rejection))
+fn rejected(rejection: &pb::Rejection) -> ClientFailure {
+    ClientFailure::Refused(rejection_text(rejection))
 }
 
 /// Prints the summary as a table, on the output that the records do not go to.
-fn table(arguments: &Arguments, summary: &Summary, network: &Network, measured: &Measured<'_>) {
+fn table(arguments: &ReplayArguments, summary: &Summary, network: &Network, measured: &Measured<'_>) {
     let percentiles = |p: &Percentiles| format!("{:.0} / {:.0} / {:.0} µs", p.p50, p.p99, p.max);
     let rows = [
         ("steps", format!("{} in {:.2} s", summary.steps, summary.wall_s)),

@@ -40,7 +40,7 @@ pub(crate) fn hand_named(name: &str) -> Result<Hand, Refusal> {
 
 /// One part of a simulated hand's course.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Part {
+pub(crate) struct CoursePart {
     /// The end of the part, since the beginning of the course, s.
     pub(crate) time_s: f64,
     /// Position of the hand at the end, m.
@@ -62,7 +62,7 @@ pub(crate) struct Simulated {
     energy_j: f64,
     energy_min_j: f64,
     /// The parts of the course, if they are remembered.
-    course: Option<Vec<Part>>,
+    course: Option<Vec<CoursePart>>,
 }
 
 /// Longest part of a simulated hand's course, s.
@@ -77,7 +77,7 @@ impl Simulated {
     }
 
     /// The course so far; empty if it is not remembered.
-    pub(crate) fn course(&self) -> &[Part] {
+    pub(crate) fn course(&self) -> &[CoursePart] {
         self.course.as_deref().unwrap_or_default()
     }
 
@@ -101,7 +101,7 @@ impl Simulated {
             self.energy_j -= self.force_n.dot(self.held.place_m - before_m);
             self.energy_min_j = self.energy_min_j.min(self.energy_j);
             if let Some(course) = &mut self.course {
-                course.push(Part { time_s: self.time_s, place_m: self.held.place_m, force_n: self.force_n });
+                course.push(CoursePart { time_s: self.time_s, place_m: self.held.place_m, force_n: self.force_n });
             }
         }
     }

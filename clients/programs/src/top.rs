@@ -11,13 +11,13 @@ use palpate_proto::pb::{Audit, AuditedError, ListSessionsRequest, Session, Sessi
 use palpate_proto::printable::{printable, printable_json};
 use serde_json::{Value, json};
 
-use crate::Failure;
+use crate::ClientFailure;
 use crate::credentials::{CredentialOptions, ServerOption};
 use crate::unanswered::Unanswered;
 
 /// Arguments of `top`.
 #[derive(clap::Args)]
-pub(crate) struct Arguments {
+pub(crate) struct TopArguments {
     #[command(flatten)]
     server: ServerOption,
     /// Print one table, after a second, and exit
@@ -34,22 +34,23 @@ pub(crate) struct Arguments {
 const EVERY: Duration = Duration::from_secs(1);
 
 /// A session with its steps and overruns per second since the last query.
-struct Row {
+struct SessionRow {
     session: Session,
     steps_per_s: f64,
     overruns_per_s: f64,
 }
 
 /// Steps and overruns of each session at a moment.
-struct Seen {
+struct StepCounts {
     at: Instant,
     counts: BTreeMap<String, (u64, u64)>,
 }
 
 /// Shows a server's sessions until it is interrupted or its output is closed.
-pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
+pub(crate) async fn top(arguments: &TopArguments) -> Result<(), ClientFailure> {
     let server = arguments.credentials.server(arguments.server.url())?;
-    let unreached = |why| Failure::Failed(format!("{why}; `palpate serve` starts a server, --server names another"));
+    let unreached =
+        |why| ClientFailure::Failed(format!("{why}; `palpate serve` starts a server, --server names another"));
     let mut sessions = SessionServiceClient::new(server.connect().await.map_err(unreached)?);
     let terminal = std::io::stdout().is_terminal() && !arguments.json && !arguments.once;
     let (mut seen, mut unanswered) = (None, Unanswered::default());
@@ -59,13 +60,13 @@ pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
             _ = ticks.tick() => {}
             _ = tokio::signal::ctrl_c() => return Ok(()),
         }
-        let looked = tokio::time::timeout(PATIENCE, look(&mut sessions, seen.as_ref())).await;
-        let silent = |_| Err(tonic::Status::unavailable(format!("no answer within {} s", PATIENCE.as_secs())));
+        let looked = tokio::time::timeout(ANSWER_TIMEOUT, look(&mut sessions, seen.as_ref())).await;
+        let silent = |_| Err(tonic::Status::unavailable(format!("no answer within {} s", ANSWER_TIMEOUT.as_secs())));
         let (rows, now) = match looked.unwrap_or_else(silent) {
             Ok(looked) => looked,
             // The channel reconnects by itself.
             Err(status) if unanswered.may_ask_again(&status) && !arguments.once => continue,
-            Err(status) => return Err(Failure::Failed(describe(&status))),
+            Err(status) => return Err(ClientFailure::Failed(describe(&status))),
         };
         unanswered = Unanswered::default();
         // A rate needs two queries.
@@ -83,8 +84,8 @@ pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
             }
         };
         match std::io::stdout().write_all(text.as_bytes()).and_then(|()| std::io::stdout().flush()) {
-            Err(e) if e.kind() == ErrorKind::BrokenPipe => return Err(Failure::Unread),
-            Err(e) => return Err(Failure::Failed(e.to_string())),
+            Err(e) if e.kind() == ErrorKind::BrokenPipe => return Err(ClientFailure::Unread),
+            Err(e) => return Err(ClientFailure::Failed(e.to_string())),
             Ok(()) if arguments.once => return Ok(()),
             Ok(()) => {}
         }
@@ -92,13 +93,13 @@ pub(crate) async fn top(arguments: &Arguments) -> Result<(), Failure> {
 }
 
 /// Time limit for an answer.
-const PATIENCE: Duration = Duration::from_secs(10);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 
 #[allow(clippy::cast_precision_loss)]
 async fn look(
     sessions: &mut SessionServiceClient<Channel>,
-    seen: Option<&Seen>,
-) -> Result<(Vec<Row>, Seen), tonic::Status> {
+    seen: Option<&StepCounts>,
+) -> Result<(Vec<SessionRow>, StepCounts), tonic::Status> {
     let listed = sessions.list_sessions(ListSessionsRequest {}).await?.into_inner().sessions;
     let at = Instant::now();
     let counts =
@@ -110,9 +111,9 @@ async fn look(
             let per_s = |count: u64| count as f64 / (at - before).as_secs_f64().max(1e-3);
             (per_s(session.step.saturating_sub(*steps)), per_s(session.overrun_count.saturating_sub(*overruns)))
         });
-        Row { session, steps_per_s, overruns_per_s }
+        SessionRow { session, steps_per_s, overruns_per_s }
     };
-    Ok((listed.into_iter().map(row).collect(), Seen { at, counts }))
+    Ok((listed.into_iter().map(row).collect(), StepCounts { at, counts }))
 }
 
 fn state(session: &Session) -> &'static str {
@@ -125,8 +126,8 @@ fn state(session: &Session) -> &'static str {
     }
 }
 
-fn as_json(rows: &[Row]) -> Value {
-    let one = |Row { session, steps_per_s, overruns_per_s }: &Row| {
+fn as_json(rows: &[SessionRow]) -> Value {
+    let one = |SessionRow { session, steps_per_s, overruns_per_s }: &SessionRow| {
         let holders = session.held_tools.iter().map(|held| json!({ "tool": held.tool, "holder": held.holder }));
         json!({
             "session_id": session.session_id, "scene": session.scene_name, "state": state(session),
@@ -155,10 +156,10 @@ fn audit(audit: &Audit) -> Value {
 }
 
 /// A line of totals, a header, and a line for each session; if there are more than `most`, the busiest.
-fn table(server: &str, rows: &[Row], most: usize) -> String {
+fn table(server: &str, rows: &[SessionRow], most: usize) -> String {
     let count = |wanted: &str| rows.iter().filter(|row| state(&row.session) == wanted).count();
     // Not `sum()`: the sum of nothing is −0 and would be printed with its sign.
-    let sum = |of: &dyn Fn(&Row) -> f64| rows.iter().map(of).fold(0.0, |sum, value| sum + value);
+    let sum = |of: &dyn Fn(&SessionRow) -> f64| rows.iter().map(of).fold(0.0, |sum, value| sum + value);
     let mut text = format!(
         "{server}: {} sessions ({} running, {} resting, {} paused, {} held), {:.0} awake points, {:.0} steps/s, \
          {:.0} overruns/s\n\n",
@@ -186,11 +187,11 @@ fn table(server: &str, rows: &[Row], most: usize) -> String {
         "error",
         "streams"
     );
-    let mut rows: Vec<&Row> = rows.iter().collect();
+    let mut rows: Vec<&SessionRow> = rows.iter().collect();
     if rows.len() > most {
         rows.sort_by_key(|row| std::cmp::Reverse((row.session.awake_points, row.session.streams)));
     }
-    for Row { session, steps_per_s, .. } in rows.iter().take(most) {
+    for SessionRow { session, steps_per_s, .. } in rows.iter().take(most) {
         let holders: Vec<_> = session.held_tools.iter().map(|held| format!("{}: {}", held.tool, held.holder)).collect();
         let newest = session.audit.as_ref().and_then(|audit| audit.newest_error.as_ref());
         let error = newest.map_or("-".to_owned(), |error| format!("{:.1e}", error.displacement.max(error.force)));
@@ -230,7 +231,7 @@ mod tests {
         let name = || "a\x1b[2J\r\n\u{9b}\u{202e}z".to_owned();
         let held_tools = vec![HeldTool { holder: name(), ..Default::default() }];
         let session = Session { session_id: name(), scene_name: name(), held_tools, ..Default::default() };
-        let rows = [Row { session, steps_per_s: 0.0, overruns_per_s: 0.0 }];
+        let rows = [SessionRow { session, steps_per_s: 0.0, overruns_per_s: 0.0 }];
         let table = table("here", &rows, 10);
         assert!(table.lines().count() == 4 && table.matches("a?[2J????z").count() == 3, "{table:?}");
         let json = printable_json(as_json(&rows));

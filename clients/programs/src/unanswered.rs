@@ -9,14 +9,14 @@ pub(crate) struct Unanswered(u32);
 
 impl Unanswered {
     /// After so many a program gives up: half a minute of a server that refuses connections, five minutes of a silent one.
-    const MOST: u32 = 30;
+    const MAX_UNANSWERED: u32 = 30;
 
     /// Counts a query that failed. Whether to ask once more, of which the user is told.
     pub(crate) fn may_ask_again(&mut self, status: &Status) -> bool {
         self.0 += 1;
-        let may = status.code() == Code::Unavailable && self.0 < Self::MOST;
+        let may = status.code() == Code::Unavailable && self.0 < Self::MAX_UNANSWERED;
         if may {
-            crate::warn(&format!("{}; trying again ({} of {})", describe(status), self.0, Self::MOST - 1));
+            crate::warn(&format!("{}; trying again ({} of {})", describe(status), self.0, Self::MAX_UNANSWERED - 1));
         }
         may
     }

@@ -2,7 +2,7 @@
 
     python study.py [SCENES]       needs palpate and numpy; numba is left out if it is not installed
 
-1000 sheets of 31 × 31 points with springs and virtual springs of their own, pushed for 0.3 s. The peers are written as an expert
+1000 sheets of 31 × 31 points with springs and anchor springs of their own, pushed for 0.3 s. The peers are written as an expert
 would: central differences with implicit damping, steps of 1 ms, f32; NumPy takes many sheets at once, numba one on each
 processor. Palpate is measured with the same scheme, and within 1e-5: with a plan of its own for each sheet, which takes a search,
 and with the plan of the stiffest for all. Errors are those of the depth at the end,
@@ -44,7 +44,7 @@ push = (-np.exp(-150 * H * np.hypot(i - 15, j - 15))).astype(np.float32)
 
 def in_palpate(one_plan=False, **settings):
     def scene(k, k2, plan=None):
-        own = {"springs.stiffness_n_per_m": float(k), "virtual_springs.stiffness_n_per_m": float(k2)}
+        own = {"springs.stiffness_n_per_m": float(k), "anchor_springs.stiffness_n_per_m": float(k2)}
         return palpate.Scene("paper", set={**own, **settings}, plan=plan)
 
     def study():

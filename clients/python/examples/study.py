@@ -36,7 +36,7 @@ virtual = 10 ** random.uniform(0.5, 1.5, arguments.scenes)  # K″, N/m
 
 
 def scene(k, k2, plan=None):
-    settings = {"springs.stiffness_n_per_m": k, "virtual_springs.stiffness_n_per_m": k2}
+    settings = {"springs.stiffness_n_per_m": k, "anchor_springs.stiffness_n_per_m": k2}
     return palpate.Scene("paper", set=settings, plan=plan)
 
 

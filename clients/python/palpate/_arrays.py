@@ -15,7 +15,7 @@ POINT = _of(
     "displacement_m",
     "velocity_m_per_s",
     "spring_n",
-    "virtual_n",
+    "anchor_n",
     "damping_n",
     "applied_n",
     "reaction_n",

@@ -10,7 +10,7 @@ import numpy as np
 class Run:
     """The records of a run: one row of each array for each moment.
 
-    `points` has the fields displacement_m, velocity_m_per_s, spring_n, virtual_n, damping_n, applied_n, reaction_n and constraint_n
+    `points` has the fields displacement_m, velocity_m_per_s, spring_n, anchor_n, damping_n, applied_n, reaction_n and constraint_n
     (NaN of a point that is not held) for each moment and point, `tools` place_m, displacement_m and force_on_tool_n (NaN while the
     tool is away) for each moment and tool with a tip, `energy_j` kinetic, spring and virtual.
     """

@@ -24,7 +24,7 @@ class RemoteSession:
         *,
         stiffness_n_per_m: Optional[float] = None,
         damping_n_s_per_m: Optional[float] = None,
-        virtual_stiffness_n_per_m: Optional[float] = None,
+        anchor_stiffness_n_per_m: Optional[float] = None,
         volume_stiffness_pa: Optional[float] = None,
         at_step: Optional[int] = None,
     ) -> int: ...

@@ -74,7 +74,7 @@ pub(crate) fn add_point(into: &mut Vec<f64>, point: &Point) {
         &point.displacement_m,
         &point.velocity_m_per_s,
         &point.spring_n,
-        &point.virtual_n,
+        &point.anchor_n,
         &point.damping_n,
         &point.applied_n,
         &point.reaction_n,

@@ -26,10 +26,10 @@ use crate::held::Held;
 use crate::load::load;
 use crate::play::play;
 use crate::scene::{Scene, Script, point_name};
-use crate::sent::Sent;
-use crate::streams::{self, Following, Frames, Samples};
+use crate::sent::SessionSource;
+use crate::streams::{self, Following, FrameStream, Samples};
 use crate::tip::Tip;
-use crate::told::{Bytes, Mesh, Status, Touched};
+use crate::told::{Bytes, Status, SurfaceMesh, Touched};
 use crate::waiting::{answer, answer_in_order};
 
 /// What a call gives that gives nothing: `None`.
@@ -124,12 +124,12 @@ impl Server {
         idle_timeout_s: Option<f64>,
     ) -> PyResult<Bound<'py, PyAny>> {
         let (source, own) = match scene.cast::<Scene>() {
-            Ok(scene) => (Sent::of(scene.get()).map_err(refused)?, Some(Arc::new(scene.get().scene.clone()))),
+            Ok(scene) => (SessionSource::of(scene.get()).map_err(refused)?, Some(Arc::new(scene.get().scene.clone()))),
             Err(_) => {
                 let name = scene.extract().map_err(|_| {
                     wrong("scene", "must be the name of a scene that the server has, or a palpate.Scene")
                 })?;
-                (Sent::Name(name), None)
+                (SessionSource::Name(name), None)
             }
         };
         let (server, awaited) = (self.clone(), self.awaited);
@@ -264,14 +264,14 @@ impl RemoteSession {
 
     /// Makes the tissue softer or stiffer, from a step on if one is named; gives that step. What is not named stays as
     /// it is.
-    #[pyo3(signature = (*, stiffness_n_per_m=None, damping_n_s_per_m=None, virtual_stiffness_n_per_m=None,
+    #[pyo3(signature = (*, stiffness_n_per_m=None, damping_n_s_per_m=None, anchor_stiffness_n_per_m=None,
         volume_stiffness_pa=None, at_step=None))]
     fn change<'py>(
         &self,
         py: Python<'py>,
         stiffness_n_per_m: Option<f64>,
         damping_n_s_per_m: Option<f64>,
-        virtual_stiffness_n_per_m: Option<f64>,
+        anchor_stiffness_n_per_m: Option<f64>,
         volume_stiffness_pa: Option<f64>,
         at_step: Option<u64>,
     ) -> PyResult<Bound<'py, PyAny>> {
@@ -280,7 +280,7 @@ impl RemoteSession {
             session_id,
             stiffness_n_per_m,
             damping_n_s_per_m,
-            virtual_stiffness_n_per_m,
+            anchor_stiffness_n_per_m,
             volume_stiffness_pa,
             at_step,
         };
@@ -354,7 +354,7 @@ impl RemoteSession {
         let (session, awaited) = (self.session.clone(), self.awaited);
         answer(py, awaited, async move {
             let frames = streams::frames(&session, &request).await?;
-            Ok(Frames { stream: Arc::new(Mutex::new(Following::new(session, request, frames))), awaited })
+            Ok(FrameStream { stream: Arc::new(Mutex::new(Following::new(session, request, frames))), awaited })
         })
     }
 
@@ -365,7 +365,7 @@ impl RemoteSession {
         answer(py, self.awaited, async move {
             let request = pb::GetMeshRequest { session_id, refinement };
             let mut parts = called!(session, ViewServiceClient.get_mesh(request))?;
-            let mut mesh = Mesh::default();
+            let mut mesh = SurfaceMesh::default();
             while let Some(part) = parts.message().await.map_err(of_status)? {
                 mesh.grid = (part.vertices_x, part.vertices_y);
                 mesh.rest_m.extend(part.rest_position_m);
@@ -415,7 +415,7 @@ impl RemoteSession {
         let lasts = seconds.or(device.lasts_s()).map(|seconds| duration("seconds", seconds)).transpose()?;
         let target = Target {
             server: self.session.server(),
-            session: bridge::Session::Existing(self.session.session_id().to_owned()),
+            session: bridge::SessionChoice::Existing(self.session.session_id().to_owned()),
             tool,
             tip: tip.map(|tip| tip.0).unwrap_or_default(),
             deadband,

@@ -18,7 +18,7 @@ use pyo3_async_runtimes::generic::{ContextExt, Runtime};
 use crate::waiting::runtime;
 
 /// The end of a program waits so long for what is inside: a device of Python that never returns must not keep it for ever.
-const PATIENCE: Duration = Duration::from_secs(5);
+const EXIT_TIMEOUT: Duration = Duration::from_secs(5);
 
 #[derive(Default)]
 struct Gate {
@@ -84,7 +84,7 @@ fn close(py: Python<'_>) {
     py.detach(|| {
         let mut gate = gate();
         gate.is_closed = true;
-        drop(LEFT.wait_timeout_while(gate, PATIENCE, |gate| gate.inside > 0));
+        drop(LEFT.wait_timeout_while(gate, EXIT_TIMEOUT, |gate| gate.inside > 0));
     });
 }
 
@@ -95,9 +95,9 @@ pub(crate) fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
 }
 
 /// The runtime of futures that Python awaits. Their results go to Python from threads that may block.
-pub(crate) struct Network;
+pub(crate) struct NetworkRuntime;
 
-impl Runtime for Network {
+impl Runtime for NetworkRuntime {
     type JoinError = tokio::task::JoinError;
     type JoinHandle = tokio::task::JoinHandle<()>;
 
@@ -114,7 +114,7 @@ impl Runtime for Network {
     }
 }
 
-impl ContextExt for Network {
+impl ContextExt for NetworkRuntime {
     // No future of this package calls coroutines of Python, which would need to know their loop.
     fn scope<F, R>(_locals: TaskLocals, future: F) -> Pin<Box<dyn Future<Output = R> + Send>>
     where

@@ -2,7 +2,7 @@
 
 use palpate::printable::printable;
 use palpate::refusal::Refusal;
-use palpate::session::run::Failure;
+use palpate::session::run::RunFailure;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyOSError};
 use pyo3::prelude::*;
 use pyo3::types::PyType;
@@ -37,12 +37,14 @@ pub(crate) fn failed(message: &str) -> PyErr {
 }
 
 /// Why a run ended early.
-pub(crate) fn of_run(failure: Failure) -> PyErr {
+pub(crate) fn of_run(failure: RunFailure) -> PyErr {
     match failure {
-        Failure::Refused(refusal) => refused(refusal),
-        Failure::Held(message) => failed(&message),
-        Failure::Output(error) if error.kind() == std::io::ErrorKind::Interrupted => PyKeyboardInterrupt::new_err(()),
-        Failure::Output(error) => PyOSError::new_err(error.to_string()),
+        RunFailure::Refused(refusal) => refused(refusal),
+        RunFailure::Held(message) => failed(&message),
+        RunFailure::Output(error) if error.kind() == std::io::ErrorKind::Interrupted => {
+            PyKeyboardInterrupt::new_err(())
+        }
+        RunFailure::Output(error) => PyOSError::new_err(error.to_string()),
     }
 }
 

@@ -6,9 +6,9 @@ use std::io::BufReader;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
-use palpate::journal::{self, Reader, Survey, pb, replay};
+use palpate::journal::{self, JournalReader, Survey, pb, replay};
 use palpate::refusal::Refusal;
-use palpate::sheet::choice::given_up;
+use palpate::tissue::scheme_selection::given_up;
 use palpate_proto::geometry::from_vector;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
@@ -16,7 +16,7 @@ use pyo3::types::{PyDict, PyList};
 use crate::arrays::{column, rows};
 use crate::error::refused;
 use crate::scene::limits;
-use crate::session::{Inner, Session};
+use crate::session::{Session, SessionState};
 use crate::waiting::work;
 
 /// A recorded session: a file of `palpate serve --journal`.
@@ -29,7 +29,7 @@ pub(crate) struct Journal {
 
 /// What a tool did and felt.
 #[derive(Default)]
-struct Course {
+struct ToolHistory {
     step: Vec<u64>,
     place_m: Vec<f64>,
     displacement_m: Vec<f64>,
@@ -38,7 +38,7 @@ struct Course {
 
 /// Commands, one a row.
 #[derive(Default)]
-struct Commands {
+struct CommandColumns {
     step: Vec<u64>,
     tool: Vec<u32>,
     kind: Vec<&'static str>,
@@ -51,7 +51,7 @@ struct Commands {
 
 const NONE: [f64; 3] = [f64::NAN; 3];
 
-impl Commands {
+impl CommandColumns {
     fn add(&mut self, step: u64, command: &pb::Command) {
         use pb::command::Action;
         let (kind, place_m, force_n, point) = match &command.action {
@@ -78,8 +78,8 @@ impl Commands {
 }
 
 impl Journal {
-    fn open(&self) -> Result<Reader<BufReader<File>>, Refusal> {
-        Reader::open(&self.path)
+    fn open(&self) -> Result<JournalReader<BufReader<File>>, Refusal> {
+        JournalReader::open(&self.path)
     }
 
     #[allow(clippy::cast_precision_loss)]
@@ -96,7 +96,7 @@ impl Journal {
     #[new]
     fn new(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
         let opened = py.detach(|| {
-            let mut reader = Reader::open(&path)?;
+            let mut reader = JournalReader::open(&path)?;
             let survey = reader.survey(&mut |_| {})?;
             Ok((reader.header().clone(), survey))
         });
@@ -130,7 +130,7 @@ impl Journal {
     /// What each tool did and felt, by its number.
     fn tools<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let read = py.detach(|| {
-            let mut courses: BTreeMap<u32, Course> = BTreeMap::new();
+            let mut courses: BTreeMap<u32, ToolHistory> = BTreeMap::new();
             let mut reader = self.open()?;
             let numbers = |v: Option<pb::Vector>| v.map_or([0.0; 3], |v| [v.x, v.y, v.z].map(f64::from));
             while let Some(batch) = reader.next_batch()? {
@@ -162,7 +162,7 @@ impl Journal {
     /// Every command, by the step at which it acted.
     fn commands<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let read = py.detach(|| {
-            let (mut commands, mut reader) = (Commands::default(), self.open()?);
+            let (mut commands, mut reader) = (CommandColumns::default(), self.open()?);
             while let Some(batch) = reader.next_batch()? {
                 for input in batch.inputs()? {
                     if let Some(pb::input::What::Command(command)) = &input.what {
@@ -209,7 +209,7 @@ impl Journal {
         let step = step.unwrap_or(self.survey.until_step);
         let found = work(py, |stop| replay::session_at(self.open()?, &limits(), step, stop))?;
         let (session, first) = found.map_err(refused)?;
-        Ok(Session::of(Inner::of(session, first.scene.clone())))
+        Ok(Session::of(SessionState::of(session, first.scene.clone())))
     }
 
     fn __repr__(&self) -> String {

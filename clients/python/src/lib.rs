@@ -45,7 +45,7 @@ fn native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<client::RemoteSession>()?;
     module.add_class::<offline::Offline>()?;
     module.add_class::<streams::Samples>()?;
-    module.add_class::<streams::Frames>()?;
+    module.add_class::<streams::FrameStream>()?;
     module.add_function(wrap_pyfunction!(scene::scenes, module)?)?;
     module.add_function(wrap_pyfunction!(scene::scripts, module)?)?;
     module.add_function(wrap_pyfunction!(run::run, module)?)?;

@@ -6,36 +6,36 @@ use std::path::PathBuf;
 
 use palpate::refusal::Refusal;
 use palpate_client::Server;
-use palpate_simulated::load::{Course, Plan};
+use palpate_simulated::load::{LoadPlan, PreparedPlan};
 use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use tokio::sync::oneshot;
 
 use crate::error::{of_client, refused};
-use crate::scene::{Source, TEXT, toml};
+use crate::scene::{SceneSource, TEXT, toml};
 use crate::waiting::answer_in_order;
 
 /// The plan of a dict, a file, or a text.
-fn plan(value: &Bound<'_, PyAny>) -> PyResult<Plan> {
+fn plan(value: &Bound<'_, PyAny>) -> PyResult<LoadPlan> {
     let read = if let Ok(table) = value.cast::<PyDict>() {
         let lines = table.iter().map(|(key, value)| Ok(format!("{} = {}\n", key.str()?, toml("plan", &value)?)));
         let text = lines.collect::<PyResult<String>>()?;
         // Its lines are ours, and mean nothing to who wrote a dict.
-        Plan::parse(TEXT, &text).map_err(|refusal| Refusal { place: None, ..refusal })
+        LoadPlan::parse(TEXT, &text).map_err(|refusal| Refusal { place: None, ..refusal })
     } else {
-        match Source::of("plan", value)? {
-            Source::Text(text) => Plan::parse(TEXT, &text),
-            Source::Path(path) => Plan::read(&path),
+        match SceneSource::of("plan", value)? {
+            SceneSource::Text(text) => LoadPlan::parse(TEXT, &text),
+            SceneSource::Path(path) => LoadPlan::read(&path),
         }
     };
     read.map_err(refused)
 }
 
 /// A report, for Python as a dict.
-struct Told(String);
+struct ReportDict(String);
 
-impl<'py> IntoPyObject<'py> for Told {
+impl<'py> IntoPyObject<'py> for ReportDict {
     type Target = PyAny;
     type Output = Bound<'py, PyAny>;
     type Error = PyErr;
@@ -55,7 +55,7 @@ pub(crate) fn load<'py>(
     awaited: bool,
 ) -> PyResult<Bound<'py, PyAny>> {
     let plan = plan(given)?;
-    let course = py.detach(|| Course::new(plan)).map_err(refused)?;
+    let course = py.detach(|| PreparedPlan::new(plan)).map_err(refused)?;
     let unwritten = |path: &PathBuf, error: std::io::Error| PyOSError::new_err(format!("{}: {error}", path.display()));
     // Before the load: a wrong path must not cost what is measured.
     let page = page.map(|path| File::create(&path).map_err(|error| unwritten(&path, error)).map(|file| (path, file)));
@@ -70,6 +70,6 @@ pub(crate) fn load<'py>(
         if let Some((path, mut file)) = page {
             file.write_all(report.page().as_bytes()).map_err(|error| unwritten(&path, error))?;
         }
-        Ok(Told(report.json().to_string()))
+        Ok(ReportDict(report.json().to_string()))
     })
 }

@@ -5,7 +5,7 @@ use std::sync::{Mutex, PoisonError};
 use glam::DVec3;
 use palpate::refusal::finite_vector;
 use palpate_client::Reading;
-use palpate_client::bridge::{self, Origin};
+use palpate_client::bridge::{self, PositionOrigin};
 use palpate_touch::RenderingState;
 use pyo3::prelude::*;
 
@@ -41,7 +41,7 @@ impl Offline {
     ) -> PyResult<Self> {
         let middle_m = middle_m.map(|place| vector("middle_m", place)).transpose()?.unwrap_or(DVec3::ZERO);
         finite_vector("middle_m", middle_m).map_err(refused)?;
-        let origin = if in_tissue_frame { Origin::Tissue } else { Origin::Workspace };
+        let origin = if in_tissue_frame { PositionOrigin::Tissue } else { PositionOrigin::Workspace };
         let inner = bridge::Offline::new(descriptor(limits)?, origin, middle_m, up_deadband);
         Ok(Offline { inner: Mutex::new(inner) })
     }

@@ -18,7 +18,7 @@ use pyo3::prelude::*;
 use crate::client::called;
 use crate::error::{failed, of_client, of_status, refused, wrong};
 use crate::held::{acquire, send};
-use crate::run::Recorded;
+use crate::run::RunRecord;
 use crate::scene::Script;
 
 /// Commands are sent so many steps at a time, and twice as many ahead: fewer than a session queues.
@@ -31,7 +31,7 @@ const LOOK: Duration = Duration::from_millis(10);
 const RENEWAL: Duration = Duration::from_secs(1);
 
 /// What is played, and where.
-struct Player {
+struct PlaySource {
     session: Arc<Followed>,
     script: scene::script::Script,
     /// The step of the session at which the script begins.
@@ -41,7 +41,7 @@ struct Player {
     renewed: Instant,
 }
 
-impl Player {
+impl PlaySource {
     fn id(&self) -> String {
         self.session.session_id().to_owned()
     }
@@ -127,7 +127,7 @@ impl Player {
 async fn records(
     mut stream: tonic::Streaming<pb::ProbeResponse>,
     mut left: u64,
-    recorded: &mut Recorded,
+    recorded: &mut RunRecord,
 ) -> PyResult<()> {
     let mut record = Record::default();
     while left > 0 {
@@ -158,7 +158,11 @@ fn scene_of(own: Option<Arc<scene::Scene>>, session: &pb::Session) -> PyResult<A
 
 /// Plays a script through a session that stands.
 #[allow(clippy::cast_precision_loss)]
-pub(crate) async fn play(session: Arc<Followed>, own: Option<Arc<scene::Scene>>, script: Script) -> PyResult<Recorded> {
+pub(crate) async fn play(
+    session: Arc<Followed>,
+    own: Option<Arc<scene::Scene>>,
+    script: Script,
+) -> PyResult<RunRecord> {
     let request = pb::GetSessionRequest { session_id: session.session_id().to_owned() };
     let told = called!(session, SessionServiceClient.get_session(request))?.session.unwrap_or_default();
     if told.state() != pb::SessionState::Paused {
@@ -170,7 +174,7 @@ pub(crate) async fn play(session: Arc<Followed>, own: Option<Arc<scene::Scene>>,
     let scene = scene_of(own, &told)?;
     let script = script.bound(&scene).map_err(refused)?;
     let (begin, steps, every) = (told.step, script.steps, script.sample_every);
-    let mut recorded = Recorded::of(&script);
+    let mut recorded = RunRecord::of(&script);
     let run = Run {
         scene: scene.name.clone(),
         script: script.name.clone(),
@@ -198,7 +202,7 @@ pub(crate) async fn play(session: Arc<Followed>, own: Option<Arc<scene::Scene>>,
     let stream = called!(session, HapticServiceClient.probe(probe))?;
     // They are counted from step 0 of the session, whose record has that of the beginning as well.
     let expected = (begin + steps) / every - begin / every + u64::from(begin == 0);
-    let mut player = Player { session, script, begin, leases: BTreeMap::new(), renewed: Instant::now() };
+    let mut player = PlaySource { session, script, begin, leases: BTreeMap::new(), renewed: Instant::now() };
     player.take_tools().await?;
     let begun = Instant::now();
     let (ended, ()) = tokio::try_join!(player.drive(), records(stream, expected, &mut recorded))?;

@@ -9,10 +9,10 @@ use std::time::Instant;
 use palpate::refusal::{Reason, Refusal};
 use palpate::scene;
 use palpate::scene::record::{Record, Run, Summary};
-use palpate::session::run::{Failure, Told, told};
+use palpate::session::run::{RunEvent, RunFailure, told};
 use palpate::shape::PointName;
-use palpate::sheet::Model;
-use palpate::sheet::choice::given_up;
+use palpate::tissue::Model;
+use palpate::tissue::scheme_selection::given_up;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 
@@ -23,7 +23,7 @@ use crate::waiting::{LOOK, STACK_BYTES, work};
 
 /// What a run told, as numbers.
 #[derive(Default)]
-pub(crate) struct Recorded {
+pub(crate) struct RunRecord {
     header: Option<Run>,
     summary: Option<Summary>,
     point_names: Vec<PointName>,
@@ -36,14 +36,14 @@ pub(crate) struct Recorded {
     warnings: Vec<String>,
 }
 
-impl Recorded {
+impl RunRecord {
     /// Nothing yet, of a script.
     #[allow(clippy::cast_possible_truncation)]
     pub(crate) fn of(script: &scene::script::Script) -> Self {
         let point_names = script.sample_points.iter().map(|point| script.shape.name(*point)).collect();
         // Those with a tip follow the others.
         let tools = script.first_tip().map_or_else(Vec::new, |first| (first as u32..script.tools() as u32).collect());
-        Recorded { point_names, tools, ..Recorded::default() }
+        RunRecord { point_names, tools, ..RunRecord::default() }
     }
 
     /// How it was played, and what came of it.
@@ -66,7 +66,7 @@ impl Recorded {
             }
         }
         let energy =
-            record.energy_j.map_or([f64::NAN; 3], |energy| [energy.kinetic, energy.spring, energy.virtual_springs]);
+            record.energy_j.map_or([f64::NAN; 3], |energy| [energy.kinetic, energy.spring, energy.anchor_springs]);
         self.energy_j.extend(energy);
         self.awake_points.push(record.awake_points as u64);
     }
@@ -92,19 +92,19 @@ impl Recorded {
 }
 
 /// Plays a script. `stop` ends it.
-fn play(model: &Arc<Model>, script: &Script, how: [bool; 2], stop: &AtomicBool) -> Result<Recorded, Failure> {
+fn play(model: &Arc<Model>, script: &Script, how: [bool; 2], stop: &AtomicBool) -> Result<RunRecord, RunFailure> {
     let script = script.bound(&model.scene)?;
-    let mut recorded = Recorded::of(&script);
+    let mut recorded = RunRecord::of(&script);
     let records = usize::try_from(script.steps / script.sample_every).unwrap_or(0).saturating_add(1).min(1 << 16);
     recorded.points.reserve(records.saturating_mul(script.sample_points.len() * OF_POINT).min(1 << 24));
     let begun = Instant::now();
     let clock_s = || begun.elapsed().as_secs_f64();
     let summary = told(model, &script, how, &limits(), &clock_s, &mut |news| {
         match news {
-            Told::Run(run) => recorded.header = Some(run.clone()),
-            Told::Record(record) => recorded.add(&record),
-            Told::Steps(_) if stop.load(Ordering::Relaxed) => return Err(ErrorKind::Interrupted.into()),
-            Told::Steps(_) | Told::Summary(_) => {}
+            RunEvent::Run(run) => recorded.header = Some(run.clone()),
+            RunEvent::Record(record) => recorded.add(&record),
+            RunEvent::Steps(_) if stop.load(Ordering::Relaxed) => return Err(ErrorKind::Interrupted.into()),
+            RunEvent::Steps(_) | RunEvent::Summary(_) => {}
         }
         Ok(())
     })?;
@@ -114,7 +114,7 @@ fn play(model: &Arc<Model>, script: &Script, how: [bool; 2], stop: &AtomicBool) 
     Ok(recorded)
 }
 
-impl<'py> IntoPyObject<'py> for Recorded {
+impl<'py> IntoPyObject<'py> for RunRecord {
     type Target = PyAny;
     type Output = Bound<'py, PyAny>;
     type Error = PyErr;
@@ -195,7 +195,7 @@ pub(crate) fn study<'py>(
         Some(threads) => threads,
         None => std::thread::available_parallelism().map_or(1, Into::into),
     };
-    let mut found: Vec<Option<Result<Recorded, Failure>>> = Vec::new();
+    let mut found: Vec<Option<Result<RunRecord, RunFailure>>> = Vec::new();
     found.resize_with(cases.len(), || None);
     let progress = progress.map(Bound::unbind);
     let (stop, next) = (AtomicBool::new(false), AtomicUsize::new(0));
@@ -211,7 +211,7 @@ pub(crate) fn study<'py>(
                         let Some((given, script)) = cases.get(case).filter(|_| !stop.load(Ordering::Relaxed)) else {
                             break;
                         };
-                        let played = given.model(stop).map_err(Failure::from);
+                        let played = given.model(stop).map_err(RunFailure::from);
                         let played = played.and_then(|model| play(&model, script, [held, false], stop));
                         if tell.send((case, played)).is_err() {
                             break;
@@ -262,11 +262,11 @@ pub(crate) fn study<'py>(
 }
 
 /// Whether a run failed by itself.
-fn is_cause(played: &Result<Recorded, Failure>) -> bool {
+fn is_cause(played: &Result<RunRecord, RunFailure>) -> bool {
     match played {
-        Err(Failure::Output(error)) => error.kind() != ErrorKind::Interrupted,
-        Err(Failure::Refused(refusal)) => refusal.message != given_up().message,
-        Err(Failure::Held(_)) => true,
+        Err(RunFailure::Output(error)) => error.kind() != ErrorKind::Interrupted,
+        Err(RunFailure::Refused(refusal)) => refusal.message != given_up().message,
+        Err(RunFailure::Held(_)) => true,
         Ok(_) => false,
     }
 }

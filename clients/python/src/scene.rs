@@ -7,11 +7,11 @@ use std::sync::{Arc, Mutex, PoisonError};
 use palpate::limits::Limits;
 use palpate::refusal::{Reason, Refusal};
 use palpate::scene::collection::{Collection, find_scene, find_script};
-use palpate::scene::kind::Kind;
+use palpate::scene::kind::TextKind;
 use palpate::scene::{self, Body, Named};
 use palpate::shape::{PointId, PointName};
-use palpate::sheet::Model;
-use palpate::sheet::saved::TissueState;
+use palpate::tissue::Model;
+use palpate::tissue::saved::TissueState;
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyDict, PyFloat, PyInt, PyString};
 
@@ -29,22 +29,22 @@ pub(crate) fn limits() -> Limits {
 
 /// Where a scene, a script or a plan is from.
 #[derive(Debug, Clone)]
-pub(crate) enum Source {
+pub(crate) enum SceneSource {
     Text(String),
     /// A file, or a name.
     Path(PathBuf),
 }
 
-impl Source {
+impl SceneSource {
     pub(crate) fn of(field: &str, value: &Bound<'_, PyAny>) -> PyResult<Self> {
         if let Ok(text) = value.cast::<PyString>() {
             let text: String = text.extract()?;
             // Neither is in a name, and who means a file of such a name gives a pathlib.Path.
             let is_text = text.contains('\n') || text.contains('=');
-            return Ok(if is_text { Source::Text(text) } else { Source::Path(text.into()) });
+            return Ok(if is_text { SceneSource::Text(text) } else { SceneSource::Path(text.into()) });
         }
         let path: PyResult<PathBuf> = value.extract();
-        path.map(Source::Path).map_err(|_| wrong(field, "must be TOML text, a path, or a name"))
+        path.map(SceneSource::Path).map_err(|_| wrong(field, "must be TOML text, a path, or a name"))
     }
 }
 
@@ -132,7 +132,7 @@ fn planned(scene: &scene::Scene, plan: &Model) -> TissueState {
     TissueState {
         stiffness_n_per_m: scene.springs.stiffness_n_per_m,
         shear_stiffness_n_per_m: scene.springs.shear_stiffness_n_per_m,
-        virtual_stiffness_n_per_m: scene.virtual_stiffness_n_per_m,
+        anchor_stiffness_n_per_m: scene.anchor_stiffness_n_per_m,
         damping_n_s_per_m: scene.damping_n_s_per_m,
         volume_stiffness_pa: scene.volume_stiffness_pa,
         sleep_tolerance: scene.sleep_tolerance.unwrap_or(plan.sleep_tolerance),
@@ -153,7 +153,7 @@ impl Scene {
         folder: PathBuf,
         plan: Option<&Bound<'_, Tissue>>,
     ) -> PyResult<Self> {
-        let (source, sets, limits) = (Source::of("source", source)?, assignments(set)?, limits());
+        let (source, sets, limits) = (SceneSource::of("source", source)?, assignments(set)?, limits());
         let read = source_scene(&source, &sets, &folder, &limits).map_err(refused)?;
         Ok(Scene { plan: plan.map(|plan| plan.get().model.clone()), ..read })
     }
@@ -181,10 +181,10 @@ impl Scene {
     }
 }
 
-fn source_scene(source: &Source, sets: &[String], folder: &Path, limits: &Limits) -> Result<Scene, Refusal> {
+fn source_scene(source: &SceneSource, sets: &[String], folder: &Path, limits: &Limits) -> Result<Scene, Refusal> {
     let (scene, place) = match source {
-        Source::Text(text) => (scene::Scene::parse_in(Path::new(""), TEXT, text, sets, limits)?, TEXT.to_owned()),
-        Source::Path(path) => (find_scene(path, folder, sets, limits)?, path.display().to_string()),
+        SceneSource::Text(text) => (scene::Scene::parse_in(Path::new(""), TEXT, text, sets, limits)?, TEXT.to_owned()),
+        SceneSource::Path(path) => (find_scene(path, folder, sets, limits)?, path.display().to_string()),
     };
     Ok(Scene { scene, place, plan: None, model: Mutex::new(None) })
 }
@@ -194,7 +194,7 @@ fn source_scene(source: &Source, sets: &[String], folder: &Path, limits: &Limits
 #[pyclass(frozen, module = "palpate")]
 #[derive(Debug, Clone)]
 pub(crate) struct Script {
-    source: Source,
+    source: SceneSource,
     folder: PathBuf,
 }
 
@@ -210,8 +210,8 @@ impl Script {
     /// Bound to a scene.
     pub(crate) fn bound(&self, scene: &scene::Scene) -> Result<scene::script::Script, Refusal> {
         match &self.source {
-            Source::Text(text) => scene::script::Script::parse(TEXT, text, &self.folder, scene, &limits()),
-            Source::Path(path) => find_script(path, scene, &limits()),
+            SceneSource::Text(text) => scene::script::Script::parse(TEXT, text, &self.folder, scene, &limits()),
+            SceneSource::Path(path) => find_script(path, scene, &limits()),
         }
     }
 }
@@ -221,7 +221,7 @@ impl Script {
     #[new]
     #[pyo3(signature = (source, *, folder=PathBuf::new()))]
     fn new(source: &Bound<'_, PyAny>, folder: PathBuf) -> PyResult<Self> {
-        Ok(Script { source: Source::of("source", source)?, folder })
+        Ok(Script { source: SceneSource::of("source", source)?, folder })
     }
 
     /// Binds it to a scene: name, steps, sample_every_steps, tools, warnings. Raises Refused if it does not fit.
@@ -239,8 +239,8 @@ impl Script {
 
     fn __repr__(&self) -> String {
         match &self.source {
-            Source::Text(_) => "<palpate.Script>".to_owned(),
-            Source::Path(path) => format!("<palpate.Script {:?}>", path.display().to_string()),
+            SceneSource::Text(_) => "<palpate.Script>".to_owned(),
+            SceneSource::Path(path) => format!("<palpate.Script {:?}>", path.display().to_string()),
         }
     }
 }
@@ -442,7 +442,7 @@ impl Tissue {
     }
 }
 
-fn names(kind: Kind, folder: &Path) -> Vec<String> {
+fn names(kind: TextKind, folder: &Path) -> Vec<String> {
     Collection::new(kind, folder).names(&limits())
 }
 
@@ -450,12 +450,12 @@ fn names(kind: Kind, folder: &Path) -> Vec<String> {
 #[pyfunction]
 #[pyo3(signature = (folder="scenes".into()))]
 pub(crate) fn scenes(folder: PathBuf) -> Vec<String> {
-    names(Kind::Scene, &folder)
+    names(TextKind::Scene, &folder)
 }
 
 /// The names of the scripts that are shipped, and of the files in a folder.
 #[pyfunction]
 #[pyo3(signature = (folder="scripts".into()))]
 pub(crate) fn scripts(folder: PathBuf) -> Vec<String> {
-    names(Kind::Script, &folder)
+    names(TextKind::Script, &folder)
 }

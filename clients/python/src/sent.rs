@@ -16,7 +16,7 @@ use crate::error::{of_status, refused};
 use crate::scene::{Scene, limits};
 
 /// What a session is to be made of.
-pub(crate) enum Sent {
+pub(crate) enum SessionSource {
     /// A scene of the server's.
     Name(String),
     Scene {
@@ -26,11 +26,13 @@ pub(crate) enum Sent {
     },
 }
 
-impl Sent {
+impl SessionSource {
     /// Of a scene that was read here.
     pub(crate) fn of(scene: &Scene) -> Result<Self, Refusal> {
         let mut message = Box::new(wire::scene::sent(&scene.scene));
-        let Body::Mesh(mesh) = &scene.scene.body else { return Ok(Sent::Scene { scene: message, mesh: None }) };
+        let Body::Mesh(mesh) = &scene.scene.body else {
+            return Ok(SessionSource::Scene { scene: message, mesh: None });
+        };
         let file = Path::new(&scene.place);
         // As many vertices as were asked for, of which there may be some fewer.
         if file.is_file()
@@ -39,14 +41,14 @@ impl Sent {
         {
             told.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
         }
-        Ok(Sent::Scene { scene: message, mesh: Some(sent::file(mesh).1) })
+        Ok(SessionSource::Scene { scene: message, mesh: Some(sent::file(mesh).1) })
     }
 
     /// What a session is to be made of; sends the mesh, if there is one.
     pub(crate) async fn source(self, channel: Channel) -> PyResult<Source> {
         let (mut scene, mesh) = match self {
-            Sent::Name(name) => return Ok(Source::SceneName(name)),
-            Sent::Scene { scene, mesh } => (scene, mesh),
+            SessionSource::Name(name) => return Ok(Source::SceneName(name)),
+            SessionSource::Scene { scene, mesh } => (scene, mesh),
         };
         if let (Some(file), Some(of_scene)) = (mesh, &mut scene.mesh) {
             let answer = upload_mesh(channel, "mesh.obj", &file, "m", false).await.map_err(of_status)?;

@@ -14,7 +14,7 @@ use palpate::session::intake::Intake;
 use palpate::session::saved::Saved;
 use palpate::session::{self, run};
 use palpate::shape::PointId;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
@@ -26,13 +26,13 @@ use crate::waiting::LOOK;
 
 /// What is led by a pose, until it is released or does something else.
 #[derive(Debug, Clone, Copy)]
-struct Led {
+struct PoseTarget {
     place_m: DVec3,
     tip: palpate_touch::Tip,
 }
 
 /// A session and what a client has beside it.
-pub(crate) struct Inner {
+pub(crate) struct SessionState {
     session: session::Session,
     /// The scene with which it began: changes are made of that.
     first: scene::Scene,
@@ -40,15 +40,15 @@ pub(crate) struct Inner {
     held: BTreeSet<u32>,
     /// Tips of the tools that were in the tissue when the session went on, until they are told something.
     tips: BTreeMap<u32, palpate_touch::Tip>,
-    led: BTreeMap<u32, Led>,
+    led: BTreeMap<u32, PoseTarget>,
     due: Vec<Due>,
 }
 
-impl Inner {
+impl SessionState {
     pub(crate) fn of(session: session::Session, first: scene::Scene) -> Self {
         let intake = Intake::new(&first, &limits()).continued(&session, None);
         let tips = session.tips().collect();
-        Inner { session, first, intake, held: BTreeSet::new(), tips, led: BTreeMap::new(), due: Vec::new() }
+        SessionState { session, first, intake, held: BTreeSet::new(), tips, led: BTreeMap::new(), due: Vec::new() }
     }
 
     /// A tool does something from the next step on.
@@ -64,7 +64,7 @@ impl Inner {
         self.intake.submit(lease, vec![command], 0)?;
         self.tips.remove(&tool);
         match action {
-            Action::Pose { place_m, tip, .. } => self.led.insert(tool, Led { place_m, tip }),
+            Action::Pose { place_m, tip, .. } => self.led.insert(tool, PoseTarget { place_m, tip }),
             _ => self.led.remove(&tool),
         };
         Ok(())
@@ -73,8 +73,8 @@ impl Inner {
     fn step(&mut self) -> Result<(), Refusal> {
         let step = self.session.step_count();
         // A tool of which nothing is heard lets go; these are to stay.
-        let led: Vec<(u32, Led)> = self.led.iter().map(|(tool, led)| (*tool, *led)).collect();
-        for (tool, Led { place_m, tip }) in led {
+        let led: Vec<(u32, PoseTarget)> = self.led.iter().map(|(tool, led)| (*tool, *led)).collect();
+        for (tool, PoseTarget { place_m, tip }) in led {
             self.submit(tool, Action::Pose { place_m, velocity_m_per_s: None, tip })?;
         }
         self.intake.take_due(step, 0, &mut self.due);
@@ -91,16 +91,16 @@ impl Inner {
 /// may use one session; the interpreter's lock is free while it steps.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Session {
-    inner: Mutex<Inner>,
+    inner: Mutex<SessionState>,
 }
 
 impl Session {
-    pub(crate) fn of(inner: Inner) -> Self {
+    pub(crate) fn of(inner: SessionState) -> Self {
         Session { inner: Mutex::new(inner) }
     }
 
     /// Does something with the session, without the interpreter's lock: another thread may have it for long.
-    fn with<T: Send>(&self, py: Python<'_>, work: impl FnOnce(&mut Inner) -> T + Send) -> T {
+    fn with<T: Send>(&self, py: Python<'_>, work: impl FnOnce(&mut SessionState) -> T + Send) -> T {
         py.detach(|| work(&mut self.inner.lock().unwrap_or_else(PoisonError::into_inner)))
     }
 
@@ -114,7 +114,7 @@ impl Session {
     #[new]
     fn new(py: Python<'_>, tissue: &Bound<'_, PyAny>) -> PyResult<Self> {
         let model = Tissue::given(py, tissue)?;
-        Ok(Session::of(py.detach(|| Inner::of(session::Session::new(&model), model.scene.clone()))))
+        Ok(Session::of(py.detach(|| SessionState::of(session::Session::new(&model), model.scene.clone()))))
     }
 
     /// Goes on from `save()`, of a session that began with `scene`: tools stay where they are, with their tips.
@@ -127,7 +127,7 @@ impl Session {
         let restored = py.detach(|| {
             let saved = Saved::from_bytes(snapshot, &limits())?;
             let model = Model::resumed(&scene, saved.tissue(), &limits())?;
-            Ok(Inner::of(session::Session::restore(&model, &saved)?, scene))
+            Ok(SessionState::of(session::Session::restore(&model, &saved)?, scene))
         });
         restored.map(Session::of).map_err(refused)
     }
@@ -269,16 +269,16 @@ impl Session {
     }
 
     /// Makes the tissue softer or stiffer from the next step on. What is not named stays as it is.
-    #[pyo3(signature = (*, stiffness_n_per_m=None, damping_n_s_per_m=None, virtual_stiffness_n_per_m=None, volume_stiffness_pa=None))]
+    #[pyo3(signature = (*, stiffness_n_per_m=None, damping_n_s_per_m=None, anchor_stiffness_n_per_m=None, volume_stiffness_pa=None))]
     fn change(
         &self,
         py: Python<'_>,
         stiffness_n_per_m: Option<f64>,
         damping_n_s_per_m: Option<f64>,
-        virtual_stiffness_n_per_m: Option<f64>,
+        anchor_stiffness_n_per_m: Option<f64>,
         volume_stiffness_pa: Option<f64>,
     ) -> PyResult<()> {
-        let change = Change { stiffness_n_per_m, damping_n_s_per_m, virtual_stiffness_n_per_m, volume_stiffness_pa };
+        let change = Change { stiffness_n_per_m, damping_n_s_per_m, anchor_stiffness_n_per_m, volume_stiffness_pa };
         let changed = self.with(py, |inner| {
             let model = inner.session.model().changed(&change, &inner.first, &limits())?;
             inner.session.change(&model);
@@ -291,14 +291,14 @@ impl Session {
     /// array to write into.
     #[pyo3(signature = (out=None))]
     fn displacements<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
-        let read = |inner: &mut Inner, into: &mut Vec<f64>| inner.session.tissue().whole_displacements_m(into);
+        let read = |inner: &mut SessionState, into: &mut Vec<f64>| inner.session.tissue().whole_displacements_m(into);
         self.read(py, out, &read)
     }
 
     /// Where each point is. `out` is an array to write into.
     #[pyo3(signature = (out=None))]
     fn positions<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
-        let read = |inner: &mut Inner, into: &mut Vec<f64>| {
+        let read = |inner: &mut SessionState, into: &mut Vec<f64>| {
             inner.session.tissue().whole_displacements_m(into);
             let model = inner.session.model();
             let shape = model.shape();
@@ -311,7 +311,7 @@ impl Session {
     /// The velocity of each point, m/s. `out` is an array to write into.
     #[pyo3(signature = (out=None))]
     fn velocities<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
-        let read = |inner: &mut Inner, into: &mut Vec<f64>| {
+        let read = |inner: &mut SessionState, into: &mut Vec<f64>| {
             let (tissue, points) = (inner.session.tissue(), inner.session.model().points());
             into.clear();
             into.extend(points.flat_map(|point| (tissue.point(point).velocity_m_per_s + DVec3::ZERO).to_array()));
@@ -343,7 +343,7 @@ impl Session {
         let found = PyDict::new(py);
         found.set_item("kinetic", energy.kinetic)?;
         found.set_item("spring", energy.spring)?;
-        found.set_item("virtual", energy.virtual_springs)?;
+        found.set_item("virtual", energy.anchor_springs)?;
         Ok(found)
     }
 
@@ -365,7 +365,7 @@ impl Session {
         &self,
         py: Python<'py>,
         out: Option<Bound<'py, PyAny>>,
-        read: &(dyn Fn(&mut Inner, &mut Vec<f64>) + Sync),
+        read: &(dyn Fn(&mut SessionState, &mut Vec<f64>) + Sync),
     ) -> PyResult<Bound<'py, PyAny>> {
         let mut numbers = Vec::new();
         self.with(py, |inner| read(inner, &mut numbers));

@@ -16,7 +16,7 @@ use crate::error::of_client;
 use crate::waiting::answer;
 
 /// How often a stream is opened again before anything comes of it.
-const MOST_TRIES: u32 = 8;
+const MAX_TRIES: u32 = 8;
 
 /// A stream that goes on where its session is.
 pub(crate) struct Following<S, R> {
@@ -47,7 +47,7 @@ impl<S, R> Following<S, R> {
     /// After a stream has ended with `status`: whether to open it again.
     async fn follow(&mut self, status: Status) -> PyResult<()> {
         self.tries += 1;
-        if self.tries > MOST_TRIES {
+        if self.tries > MAX_TRIES {
             return Err(of_client(status.into()));
         }
         self.session.after(status).await.map_err(of_client)
@@ -73,12 +73,12 @@ impl Following<watch::Samples, pb::WatchSamplesRequest> {
 }
 
 impl Following<view::Frames, pb::WatchFramesRequest> {
-    async fn next(&mut self) -> PyResult<Option<Frame>> {
+    async fn next(&mut self) -> PyResult<Option<SurfaceFrame>> {
         loop {
             match self.stream.next().await {
                 Ok(frame) => {
                     self.tries = 0;
-                    return Ok(frame.map(|(part, surface)| Frame {
+                    return Ok(frame.map(|(part, surface)| SurfaceFrame {
                         step: part.step,
                         time_s: part.simulation_time_s,
                         frame_id: part.frame_id,
@@ -169,7 +169,7 @@ impl<'py> IntoPyObject<'py> for Sampled {
 
 /// A sample, whether it has tools or not.
 #[derive(IntoPyObject)]
-struct Sample {
+struct StreamSample {
     step: u64,
     time_s: f64,
     awake_points: u32,
@@ -195,7 +195,7 @@ struct ToolSample {
     stale: bool,
 }
 
-impl Sample {
+impl StreamSample {
     fn of(sample: &pb::Sample) -> Self {
         let numbers = |v: Option<&pb::Vector3>| from_vector(v).into();
         let tools = sample.tools.iter().map(|tool| {
@@ -211,7 +211,7 @@ impl Sample {
             };
             (tool.tool, sampled)
         });
-        Sample {
+        StreamSample {
             step: sample.step,
             time_s: sample.simulation_time_s,
             awake_points: sample.awake_points,
@@ -251,7 +251,7 @@ impl Samples {
         let (stream, awaited) = (self.stream.clone(), self.awaited);
         answer(py, awaited, async move {
             let sample = stream.lock().await.next().await?;
-            sample.map(|sample| Sample::of(&sample)).ok_or_else(|| at_end(awaited))
+            sample.map(|sample| StreamSample::of(&sample)).ok_or_else(|| at_end(awaited))
         })
     }
 
@@ -265,14 +265,14 @@ impl Samples {
 }
 
 /// The frames of a session, one after the other: the moving surface.
-#[pyclass(frozen, module = "palpate")]
-pub(crate) struct Frames {
+#[pyclass(frozen, name = "Frames", module = "palpate")]
+pub(crate) struct FrameStream {
     pub(crate) stream: Arc<Mutex<Following<view::Frames, pb::WatchFramesRequest>>>,
     pub(crate) awaited: bool,
 }
 
 /// A frame: the whole surface.
-struct Frame {
+struct SurfaceFrame {
     step: u64,
     time_s: f64,
     frame_id: u64,
@@ -281,7 +281,7 @@ struct Frame {
     displacement_m: Vec<[f32; 3]>,
 }
 
-impl<'py> IntoPyObject<'py> for Frame {
+impl<'py> IntoPyObject<'py> for SurfaceFrame {
     type Target = PyAny;
     type Output = Bound<'py, PyAny>;
     type Error = PyErr;
@@ -299,7 +299,7 @@ impl<'py> IntoPyObject<'py> for Frame {
 }
 
 #[pymethods]
-impl Frames {
+impl FrameStream {
     fn __iter__(slf: Bound<'_, Self>) -> Bound<'_, Self> {
         slf
     }

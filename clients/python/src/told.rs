@@ -1,6 +1,6 @@
 //! What a server tells of a session, as Python sees it.
 
-use palpate_client::bridge::Report;
+use palpate_client::bridge::BridgeReport;
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
 use palpate_touch::{LimitCause, RenderingState};
@@ -86,7 +86,7 @@ impl<'py> IntoPyObject<'py> for Bytes {
 
 /// What of a surface stays.
 #[derive(Default)]
-pub(crate) struct Mesh {
+pub(crate) struct SurfaceMesh {
     pub(crate) grid: (u32, u32),
     pub(crate) rest_m: Vec<f32>,
     pub(crate) uv: Vec<f32>,
@@ -94,7 +94,7 @@ pub(crate) struct Mesh {
     pub(crate) file_vertex: Vec<u32>,
 }
 
-impl<'py> IntoPyObject<'py> for Mesh {
+impl<'py> IntoPyObject<'py> for SurfaceMesh {
     type Target = PyDict;
     type Output = Bound<'py, PyDict>;
     type Error = PyErr;
@@ -111,7 +111,7 @@ impl<'py> IntoPyObject<'py> for Mesh {
 }
 
 /// What came of a touch.
-pub(crate) struct Touched(pub(crate) Report);
+pub(crate) struct Touched(pub(crate) BridgeReport);
 
 impl<'py> IntoPyObject<'py> for Touched {
     type Target = PyAny;
@@ -123,7 +123,8 @@ impl<'py> IntoPyObject<'py> for Touched {
             let text = std::ffi::CString::new(why)?;
             PyErr::warn(py, &py.get_type::<PyRuntimeWarning>(), &text, 1)?;
         }
-        let Report { course, ages_s, envelope, late_ticks, missed_ticks, predicted_ticks, traffic, lost, .. } = self.0;
+        let BridgeReport { course, ages_s, envelope, late_ticks, missed_ticks, predicted_ticks, traffic, lost, .. } =
+            self.0;
         let found = PyDict::new(py);
         let place_m = course.iter().flat_map(|tick| tick.place_m.to_array()).collect();
         let force_n = course.iter().flat_map(|tick| tick.force_n.to_array()).collect();

@@ -13,7 +13,7 @@ use pyo3_async_runtimes::generic::future_into_py;
 use tokio::runtime::Runtime;
 use tokio::sync::oneshot;
 
-use crate::ending::Network;
+use crate::ending::NetworkRuntime;
 
 /// So often signals are looked at.
 pub(crate) const LOOK: Duration = Duration::from_millis(50);
@@ -93,7 +93,7 @@ where
 {
     let runtime = runtime()?;
     if awaited {
-        return future_into_py::<Network, _, _>(py, async move {
+        return future_into_py::<NetworkRuntime, _, _>(py, async move {
             let _end = end;
             future.await
         });

@@ -12,7 +12,7 @@ import unittest
 
 from common import PROGRAM, ROOT
 
-PATIENCE_S = 60.0
+TEST_TIMEOUT_S = 60.0
 
 
 def port():
@@ -32,7 +32,7 @@ def needs_etcd():
 
 def until(what, holds):
     """Waits until `holds`; gives what it gave."""
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + TEST_TIMEOUT_S
     while time.monotonic() < end:
         found = holds()
         if found:

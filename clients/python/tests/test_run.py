@@ -14,7 +14,7 @@ import numpy as np
 import palpate
 from common import ROOT, program_run
 
-FIELDS = ["displacement_m", "velocity_m_per_s", "spring_n", "virtual_n", "damping_n", "applied_n", "reaction_n"]
+FIELDS = ["displacement_m", "velocity_m_per_s", "spring_n", "anchor_n", "damping_n", "applied_n", "reaction_n"]
 
 FORCE = """
 duration_s = 0.05
@@ -126,7 +126,7 @@ class Runs(unittest.TestCase):
         cases = [("paper", FORCE), ("paper", FORCE.replace("[15, 15]", "[99, 15]")), ("paper", FORCE)]
         with self.assertRaises(palpate.Refused) as raised:
             palpate.study(cases, threads=2)
-        self.assertEqual(raised.exception.reason, "OFF_SHEET")
+        self.assertEqual(raised.exception.reason, "OFF_TISSUE")
         if sys.version_info >= (3, 11):
             self.assertEqual(raised.exception.__notes__, ["in case 1 of the study"])
         first, refused, last = palpate.study(cases, errors="return")

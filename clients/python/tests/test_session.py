@@ -158,9 +158,9 @@ class Sessions(unittest.TestCase):
         self.assertEqual(hashes[0], hashes[1])
 
     def test_a_change_has_the_bits_of_a_script_that_changes(self):
-        script = PUSH + "[[tissue]]\nat_s = 0.01\nvirtual_stiffness_n_per_m = 50.0\n"
+        script = PUSH + "[[tissue]]\nat_s = 0.01\nanchor_stiffness_n_per_m = 50.0\n"
         session = pushed(10)
-        session.change(virtual_stiffness_n_per_m=50.0)
+        session.change(anchor_stiffness_n_per_m=50.0)
         session.step(10)
         self.assertEqual(session.hash, palpate.run("paper", script, held=True).final_hash)
 
@@ -169,8 +169,8 @@ class Sessions(unittest.TestCase):
         before = session.hash
         for refused, reason in [
             (lambda: session.push(0, (0, 0, 1e9), point=(15, 15)), "FORCE_TOO_LARGE"),
-            (lambda: session.push(0, (0, 0, 1), point=(31, 0)), "OFF_SHEET"),
-            (lambda: session.push(0, (0, 0, 1), at_m=(9, 9, 0)), "OFF_SHEET"),
+            (lambda: session.push(0, (0, 0, 1), point=(31, 0)), "OFF_TISSUE"),
+            (lambda: session.push(0, (0, 0, 1), at_m=(9, 9, 0)), "OFF_TISSUE"),
             (lambda: session.push(0, (0, 0, 1)), "WRONG_KIND"),
             (lambda: session.push(64, (0, 0, 1), point=(15, 15)), "OUT_OF_RANGE"),
             (lambda: session.push(0, "down", point=(15, 15)), "WRONG_KIND"),

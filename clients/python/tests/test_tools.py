@@ -61,7 +61,7 @@ class Tools(Served, unittest.TestCase):
         for call, reason in [
             (lambda: other.push(0, (0.0, 0.0, -0.1), point=(15, 15)), "TOOL_HELD"),
             (lambda: session.push(0, (0.0, 0.0, float("nan")), point=(15, 15)), "NOT_FINITE"),
-            (lambda: session.push(0, (0.0, 0.0, -0.1), point=(99, 15)), "OFF_SHEET"),
+            (lambda: session.push(0, (0.0, 0.0, -0.1), point=(99, 15)), "OFF_TISSUE"),
             (lambda: session.push(0, (0.0, 0.0, -0.1)), "WRONG_KIND"),
             (lambda: session.grasp(0, 3, (0.0, 0.0, 0.0)), "WRONG_KIND"),
             (lambda: session.pose(0, (0.0, 0.0)), "WRONG_KIND"),
@@ -158,7 +158,7 @@ def dome(test, more):
         {more}
         [springs]
         stiffness_n_per_m = 40.0
-        [virtual_springs]
+        [anchor_springs]
         stiffness_n_per_m = 5.0
         [damping]
         coefficient_n_s_per_m = 0.1

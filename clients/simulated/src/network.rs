@@ -102,7 +102,7 @@ impl Link {
 }
 
 /// Least retransmission timeout of TCP, s (RFC 6298 requires 1 s, Linux uses 200 ms).
-const LEAST_RTO_S: f64 = 0.2;
+const MIN_RTO_S: f64 = 0.2;
 
 /// The moments at which something stands still, once a second.
 pub struct Stalls {
@@ -221,10 +221,10 @@ impl<T> Direction<T> {
             Transport::Datagram => {}
             Transport::Stream => {
                 if is_lost {
-                    arrives_s += self.random.between(round_trip_s, (2.0 * round_trip_s).max(LEAST_RTO_S));
+                    arrives_s += self.random.between(round_trip_s, (2.0 * round_trip_s).max(MIN_RTO_S));
                 }
                 // The timer of the retransmission that meets no outage any more may run for another timeout.
-                let again_s = outage.map_or(now_s, |end_s| end_s + self.random.between(0.0, LEAST_RTO_S));
+                let again_s = outage.map_or(now_s, |end_s| end_s + self.random.between(0.0, MIN_RTO_S));
                 arrives_s = (arrives_s + again_s - now_s).max(self.last_s);
                 self.last_s = arrives_s;
             }

@@ -11,10 +11,10 @@ use palpate_client::bridge::Warn;
 use crate::network::{Conditions, Direction, Transport};
 
 /// Connections, and senders of datagrams, at a time.
-pub const MOST_FLOWS: u64 = 64;
+pub const MAX_FLOWS: u64 = 64;
 
 /// Packets of a flow that are under way each way; beyond, TCP waits and datagrams are lost.
-const MOST_UNDER_WAY: usize = 4096;
+const MAX_UNDER_WAY: usize = 4096;
 
 /// A sender of datagrams that was silent for so long has gone.
 const GONE: Duration = Duration::from_secs(60);
@@ -23,7 +23,7 @@ const GONE: Duration = Duration::from_secs(60);
 const PACKET_BYTES: [usize; 2] = [1400, 65536];
 
 #[derive(Default)]
-struct Counts {
+struct PacketCounts {
     flows: AtomicU64,
     open: AtomicU64,
     packets: [AtomicU64; 2],
@@ -41,22 +41,29 @@ pub struct Passed {
 }
 
 /// The network of all flows.
-pub struct Network {
+pub struct RelayNetwork {
     conditions: [Conditions; 2],
     most_flows: u64,
     seed: u64,
     begun: Instant,
-    counts: Counts,
+    counts: PacketCounts,
     warn: Arc<Warn>,
 }
 
-impl Network {
+impl RelayNetwork {
     /// A network under these conditions, whatever the transport in them, for so many flows at a time. `warn`
     /// shows people what is not relayed.
     pub fn new(conditions: Conditions, seed: u64, most_flows: u64, warn: Arc<Warn>) -> Arc<Self> {
         let of = |transport| Conditions { transport, ..conditions };
         let conditions = [of(Transport::Stream), of(Transport::Datagram)];
-        Arc::new(Network { conditions, most_flows, seed, begun: Instant::now(), counts: Counts::default(), warn })
+        Arc::new(RelayNetwork {
+            conditions,
+            most_flows,
+            seed,
+            begun: Instant::now(),
+            counts: PacketCounts::default(),
+            warn,
+        })
     }
 
     /// Relays connections to an address here, on threads of its own, until the program ends. Returns the address.
@@ -87,7 +94,7 @@ impl Network {
 
     /// What went through so far.
     pub fn passed(&self) -> Passed {
-        let Counts { flows, packets, bytes, .. } = &self.counts;
+        let PacketCounts { flows, packets, bytes, .. } = &self.counts;
         let read = |counts: &[AtomicU64; 2]| [0, 1].map(|way| counts[way].load(Ordering::Relaxed));
         Passed { flows: flows.load(Ordering::Relaxed), packets: read(packets), bytes: read(bytes) }
     }
@@ -99,28 +106,28 @@ fn thread(work: impl FnOnce() + Send + 'static) -> io::Result<()> {
 }
 
 /// One direction of a flow: what was read and has not arrived.
-struct Way {
-    network: Arc<Network>,
+struct RelayDirection {
+    network: Arc<RelayNetwork>,
     way: usize,
-    inner: Mutex<Inner>,
+    inner: Mutex<RelayState>,
     changed: Condvar,
 }
 
-struct Inner {
+struct RelayState {
     direction: Direction<Vec<u8>>,
     is_over: bool,
 }
 
-impl Way {
-    fn new(network: &Arc<Network>, transport: Transport, flow: u64, way: usize) -> Arc<Self> {
+impl RelayDirection {
+    fn new(network: &Arc<RelayNetwork>, transport: Transport, flow: u64, way: usize) -> Arc<Self> {
         let conditions = network.conditions[usize::from(transport == Transport::Datagram)];
         // The outages of all flows are those of the seed. The first streams of random numbers are theirs.
         let direction = Direction::new(conditions, network.seed, 8 + 2 * flow + way as u64, 0.0);
-        let inner = Mutex::new(Inner { direction, is_over: false });
-        Arc::new(Way { network: network.clone(), way, inner, changed: Condvar::new() })
+        let inner = Mutex::new(RelayState { direction, is_over: false });
+        Arc::new(RelayDirection { network: network.clone(), way, inner, changed: Condvar::new() })
     }
 
-    fn lock(&self) -> MutexGuard<'_, Inner> {
+    fn lock(&self) -> MutexGuard<'_, RelayState> {
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -131,10 +138,10 @@ impl Way {
     /// Sends a packet off. `waits`: waits for room, in place of dropping it.
     fn send(&self, packet: &[u8], waits: bool) {
         let mut inner = self.lock();
-        while waits && !inner.is_over && inner.direction.under_way() >= MOST_UNDER_WAY {
+        while waits && !inner.is_over && inner.direction.under_way() >= MAX_UNDER_WAY {
             inner = self.changed.wait(inner).unwrap_or_else(PoisonError::into_inner);
         }
-        if inner.is_over || inner.direction.under_way() >= MOST_UNDER_WAY {
+        if inner.is_over || inner.direction.under_way() >= MAX_UNDER_WAY {
             return;
         }
         inner.direction.send(self.now_s(), packet.len() as u64, packet.to_vec());
@@ -154,7 +161,7 @@ impl Way {
             let now_s = self.now_s();
             if let Some(packet) = inner.direction.receive(now_s) {
                 self.changed.notify_all();
-                let Counts { packets, bytes, .. } = &self.network.counts;
+                let PacketCounts { packets, bytes, .. } = &self.network.counts;
                 packets[self.way].fetch_add(1, Ordering::Relaxed);
                 bytes[self.way].fetch_add(packet.len() as u64, Ordering::Relaxed);
                 return Some(packet);
@@ -172,11 +179,11 @@ impl Way {
 }
 
 /// A place among the flows, until it is dropped.
-struct Flow(Arc<Network>, u64);
+struct Flow(Arc<RelayNetwork>, u64);
 
 impl Flow {
-    fn begin(network: &Arc<Network>) -> Option<Flow> {
-        let Counts { open, flows, .. } = &network.counts;
+    fn begin(network: &Arc<RelayNetwork>) -> Option<Flow> {
+        let PacketCounts { open, flows, .. } = &network.counts;
         if open.fetch_add(1, Ordering::Relaxed) >= network.most_flows {
             open.fetch_sub(1, Ordering::Relaxed);
             (network.warn)("too many connections at a time: one was refused");
@@ -193,7 +200,7 @@ impl Drop for Flow {
 }
 
 /// Relays connections.
-fn accept(listener: &TcpListener, to: SocketAddr, network: &Arc<Network>) {
+fn accept(listener: &TcpListener, to: SocketAddr, network: &Arc<RelayNetwork>) {
     for near in listener.incoming() {
         let relayed = near.and_then(|near| {
             let Some(flow) = Flow::begin(network) else { return Ok(()) };
@@ -202,7 +209,7 @@ fn accept(listener: &TcpListener, to: SocketAddr, network: &Arc<Network>) {
             far.set_nodelay(true)?;
             let flow = Arc::new(flow);
             for (way, from, to) in [(0, near.try_clone()?, far.try_clone()?), (1, far, near)] {
-                let (flow, way) = (flow.clone(), Way::new(network, Transport::Stream, flow.1, way));
+                let (flow, way) = (flow.clone(), RelayDirection::new(network, Transport::Stream, flow.1, way));
                 let begun = thread({
                     let way = way.clone();
                     move || read(from, &way)
@@ -217,7 +224,7 @@ fn accept(listener: &TcpListener, to: SocketAddr, network: &Arc<Network>) {
     }
 }
 
-fn read(mut from: TcpStream, way: &Way) {
+fn read(mut from: TcpStream, way: &RelayDirection) {
     let mut packet = [0; PACKET_BYTES[0]];
     while let Ok(bytes @ 1..) = from.read(&mut packet) {
         way.send(&packet[..bytes], true);
@@ -225,7 +232,7 @@ fn read(mut from: TcpStream, way: &Way) {
     way.end();
 }
 
-fn write(mut to: TcpStream, way: &Way, _flow: &Flow) {
+fn write(mut to: TcpStream, way: &RelayDirection, _flow: &Flow) {
     while let Some(packet) = way.next() {
         if to.write_all(&packet).is_err() {
             way.end();
@@ -238,8 +245,8 @@ fn write(mut to: TcpStream, way: &Way, _flow: &Flow) {
 }
 
 /// Relays datagrams, those of each sender from a socket of its own.
-fn receive(near: &UdpSocket, to: SocketAddr, network: &Arc<Network>) {
-    let mut senders: Vec<(SocketAddr, Arc<Way>)> = Vec::new();
+fn receive(near: &UdpSocket, to: SocketAddr, network: &Arc<RelayNetwork>) {
+    let mut senders: Vec<(SocketAddr, Arc<RelayDirection>)> = Vec::new();
     let mut packet = vec![0; PACKET_BYTES[1]];
     loop {
         // An error is of a packet that was sent before, to who has gone.
@@ -268,14 +275,14 @@ fn begin_sender(
     near: &UdpSocket,
     from: SocketAddr,
     to: SocketAddr,
-    network: &Arc<Network>,
-) -> io::Result<Option<Arc<Way>>> {
+    network: &Arc<RelayNetwork>,
+) -> io::Result<Option<Arc<RelayDirection>>> {
     let Some(flow) = Flow::begin(network) else { return Ok(None) };
     let any = if to.is_ipv4() { SocketAddr::from(([0, 0, 0, 0], 0)) } else { SocketAddr::from(([0_u16; 8], 0)) };
     let far = UdpSocket::bind(any)?;
     far.connect(to)?;
     far.set_read_timeout(Some(GONE))?;
-    let [up, down] = [0, 1].map(|way| Way::new(network, Transport::Datagram, flow.1, way));
+    let [up, down] = [0, 1].map(|way| RelayDirection::new(network, Transport::Datagram, flow.1, way));
     let (near, back, answers) = (near.try_clone()?, far.try_clone()?, down.clone());
     let gone = up.clone();
     // A server that is not there yet answers by an error, and may come.

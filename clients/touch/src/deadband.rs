@@ -10,7 +10,7 @@ use crate::law::Law;
 use crate::local::{LocalModel, Touching};
 
 /// Smaller differences are not worth a message, N.
-pub const LEAST_N: f64 = 0.01;
+pub const MIN_N: f64 = 0.01;
 
 /// Longest time without a sample for a rendering client, s: well below `envelope::FRESH_S`.
 pub const HEARTBEAT_S: f64 = 0.04;
@@ -34,7 +34,7 @@ impl ForceDeadband {
         let Some((sent, touching)) = &mut self.sent else { return true };
         touching.move_to(sent, law, model.place_m);
         let rendered_n: DVec3 = touching.force_n(sent, law, model.velocity_m_per_s);
-        let most_n = (self.fraction * model.force_n.length()).max(LEAST_N);
+        let most_n = (self.fraction * model.force_n.length()).max(MIN_N);
         self.fraction <= 0.0 || (model.force_n - rendered_n).length() > most_n
     }
 
@@ -99,7 +99,7 @@ mod tests {
     #[test]
     fn differences_that_no_hand_feels_are_not_sent_and_a_first_sample_and_each_of_no_fraction_are() {
         let mut deadband = sent(0.1);
-        for (true_n, is_sent) in [(0.0, false), (0.8 * LEAST_N, false), (1.2 * LEAST_N, true)] {
+        for (true_n, is_sent) in [(0.0, false), (0.8 * MIN_N, false), (1.2 * MIN_N, true)] {
             assert_eq!(deadband.is_exceeded(&model(-0.001, true_n), &law()), is_sent, "{true_n} N");
         }
         assert!(ForceDeadband::new(0.1).is_exceeded(&model(0.0, 0.0), &law()));

@@ -13,7 +13,7 @@
 //! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick. A force f that moves with the
 //! hand at v, and that slew lets fall no faster than S, still gives f²·v/2S before it is zero. So it is limited to
 //! f ≤ √(2·S·E/v): a spring of K, pressed in and released at v, is not limited as long as its force falls no faster than
-//! the slew allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least `LEAST_SPEED_M_PER_S`. A device
+//! the slew allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least `MIN_SPEED_M_PER_S`. A device
 //! that nobody holds gets faster while the force falls: with an acceleration a, which falls with the force, it gets
 //! f²/2S · a·f/4S more, so a·f/4S is added to v. A hand hardly gets faster within a few hundredths of a second, so for a hand
 //! nothing changes.
@@ -44,7 +44,7 @@ pub const ENGAGE_S: f64 = 0.5;
 /// Largest rate of change of the force, N/s.
 pub const SLEW_N_PER_S: f64 = 100.0;
 /// Least speed that passivity assumes for the hand, m/s.
-const LEAST_SPEED_M_PER_S: f64 = 0.08;
+const MIN_SPEED_M_PER_S: f64 = 0.08;
 /// Margin for a hand that speeds up while a force falls, and for a turning force, which falls slower along its old
 /// direction.
 const SPEED_MARGIN: f64 = 1.5;
@@ -337,7 +337,7 @@ impl Envelope {
         let along_m_per_s = velocity_m_per_s.dot(along);
         let faster_m_per_s2 = self.acceleration_m_per_s2.dot(along).max(0.0);
         let gained_m_per_s = faster_m_per_s2 * force_n.length() / (4.0 * SLEW_N_PER_S);
-        let speed = (SPEED_MARGIN * along_m_per_s).max(LEAST_SPEED_M_PER_S) + gained_m_per_s;
+        let speed = (SPEED_MARGIN * along_m_per_s).max(MIN_SPEED_M_PER_S) + gained_m_per_s;
         let most_n = (2.0 * SLEW_N_PER_S * self.tank_j.max(0.0) / speed).sqrt();
         if along_m_per_s < 0.0 { most_n.max(FIRST_N) } else { most_n }
     }

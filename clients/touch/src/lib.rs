@@ -54,25 +54,25 @@
 //! assert!((force_n - 0.8 * DVec3::Z).length() < 1e-3, "{force_n}");
 //! ```
 
-pub mod carrier;
+pub mod datagram_health;
+pub mod dead_reckoning;
 pub mod deadband;
 pub mod device;
 pub mod envelope;
 pub mod hand;
 pub mod law;
 pub mod local;
-pub mod news;
 pub mod path;
 pub mod prediction;
 pub mod renderer;
 pub mod tip;
 
+pub use dead_reckoning::{MotionState, News, SendInterval};
 pub use deadband::ForceDeadband;
 pub use device::Device;
 pub use envelope::{Envelope, LimitCause, RenderingState};
 pub use law::Law;
 pub use local::{ContactState, LocalModel, Touching, Track};
-pub use news::{News, Pulse, Told};
 pub use prediction::{Predicted, Prediction, Predictor};
 pub use renderer::Renderer;
 pub use tip::{Coupling, Tip};

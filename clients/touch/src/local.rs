@@ -142,7 +142,7 @@ pub struct Touching {
 }
 
 /// The surface turns by no more than this along a way for which it is curved: tan of the angle.
-const MOST_TURN: f64 = 1.0;
+const MAX_TURN: f64 = 1.0;
 
 impl Touching {
     /// The state when the sample was taken.
@@ -190,7 +190,7 @@ impl Touching {
         let moved_m = self.place_m - model.place_m - (self.stretch_m - self.begun_m);
         for _ in 0..2 {
             let gone_m = across(moved_m + depth_m * normal, model.normal);
-            let turn = within(across(model.curvature_per_m * gone_m, model.normal), MOST_TURN);
+            let turn = within(across(model.curvature_per_m * gone_m, model.normal), MAX_TURN);
             normal = (model.normal + turn).normalize();
             let height_m = (above_m - self.stretch_m).dot(model.normal) + 0.5 * gone_m.dot(turn);
             depth_m = -height_m / normal.dot(model.normal);

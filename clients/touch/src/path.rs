@@ -41,7 +41,7 @@ const WATCHED_S: f64 = 0.25;
 /// No time of a path is longer, s.
 const LONGEST_S: f64 = 1e12;
 /// Most places in the queue.
-const MOST: usize = 1024;
+const MAX_POINTS: usize = 1024;
 
 /// The action of a tool in a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -99,7 +99,7 @@ impl PathState {
         let is_heading = |(time_s, place_m, velocity): &(f64, DVec3, DVec3)| {
             is_passed(&(*time_s, *place_m)) && velocity.length() <= 2.0 * SPEED_M_PER_S
         };
-        self.waiting.len() <= MOST
+        self.waiting.len() <= MAX_POINTS
             && self.waiting.iter().chain(&self.played).all(is_passed)
             && self.waiting.is_sorted_by(|a, b| a.0 < b.0)
             && self.heading.iter().all(is_heading)
@@ -220,7 +220,7 @@ impl Path {
 
     fn wait(&mut self, at: usize, time_s: f64, place_m: DVec3) {
         self.waiting.insert(at, (time_s, place_m));
-        if self.waiting.len() > MOST {
+        if self.waiting.len() > MAX_POINTS {
             self.waiting.pop_front();
         }
     }

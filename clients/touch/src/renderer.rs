@@ -32,11 +32,11 @@ use crate::prediction::Prediction;
 pub const BIAS_S: f64 = 0.02;
 
 /// Laws that a renderer keeps.
-pub const MOST_LAWS: usize = 16;
+pub const MAX_LAWS: usize = 16;
 
 /// A way that nobody feels, and one that everybody does, m: [`Renderer::way_m`] is between them.
-const LEAST_WAY_M: f64 = 2e-5;
-const MOST_WAY_M: f64 = 1e-3;
+const MIN_WAY_M: f64 = 2e-5;
+const MAX_WAY_M: f64 = 1e-3;
 
 /// One tool's renderer.
 #[derive(Debug)]
@@ -68,7 +68,7 @@ impl Renderer {
     /// A renderer for a tissue with `law`, which must be sound and is number 0, behind `envelope`.
     pub fn new(law: Law, envelope: Envelope) -> Self {
         // Room for all that are ever kept.
-        let mut laws = Vec::with_capacity(MOST_LAWS);
+        let mut laws = Vec::with_capacity(MAX_LAWS);
         laws.push((0, law));
         Renderer {
             laws,
@@ -107,7 +107,7 @@ impl Renderer {
     }
 
     /// Like [`Renderer::begin`], without asking for memory or giving any back: `used` gets the laws of before, at most
-    /// [`MOST_LAWS`], which are to be dropped elsewhere. So is what [`Renderer::predict`] gives back, which is to be called with
+    /// [`MAX_LAWS`], which are to be dropped elsewhere. So is what [`Renderer::predict`] gives back, which is to be called with
     /// `None`: the copy is of another tissue.
     pub fn begin_with(&mut self, law: Law, mut used: impl FnMut(Law)) {
         self.laws.drain(..).for_each(|known| used(known.1));
@@ -116,7 +116,7 @@ impl Renderer {
     }
 
     /// Takes a further law, which models may name from now on. False: it is not sound, or its number is known already. Of
-    /// [`MOST_LAWS`] it takes the place of the oldest that no model at hand names. Models that name a law which is not known
+    /// [`MAX_LAWS`] it takes the place of the oldest that no model at hand names. Models that name a law which is not known
     /// are rendered with the oldest.
     pub fn learn(&mut self, number: u32, law: Law) -> bool {
         law.is_sound() && self.learn_with(number, law, drop)
@@ -129,7 +129,7 @@ impl Renderer {
             used(law);
             return false;
         }
-        if self.laws.len() == MOST_LAWS {
+        if self.laws.len() == MAX_LAWS {
             let in_use = [self.newest.map(|newest| newest.0.law), self.arrived.map(|arrived| arrived.0.law)];
             let oldest = self.laws.iter().position(|known| !in_use.contains(&Some(known.0)));
             used(self.laws.remove(oldest.unwrap_or(0)).1);
@@ -220,14 +220,14 @@ impl Renderer {
     /// The way by which a server may be wrong about the tool so that the force is off by no more than `share` of itself, m. Above
     /// the tissue half the way to it counts, as far as a hand would notice.
     pub fn way_m(&self, share: f64) -> f64 {
-        let Some((model, touching)) = &self.newest else { return LEAST_WAY_M };
+        let Some((model, touching)) = &self.newest else { return MIN_WAY_M };
         let (depth_m, row) = touching.at_law(model, law_of(&self.laws, model));
         let way_m = if depth_m > 0.0 {
             share * row.force_n / row.stiffness_n_per_m.max(row.across_n_per_m).max(f64::MIN_POSITIVE)
         } else {
             share * -depth_m
         };
-        way_m.clamp(LEAST_WAY_M, MOST_WAY_M)
+        way_m.clamp(MIN_WAY_M, MAX_WAY_M)
     }
 
     /// The force to render until the next tick, for a tool at `place_m` now, N.

@@ -67,7 +67,7 @@ fn sample(tick: u32) -> LocalModel {
 }
 
 /// What a course is like.
-struct Found {
+struct CourseSummary {
     /// Force error, root mean square over the ticks in contact, N.
     error_n: f64,
     largest_jump_n: f64,
@@ -75,7 +75,7 @@ struct Found {
 }
 
 /// Renders a course of four seconds with a copy that comes, and is switched off, at these ticks.
-fn course(factor: Option<f64>, comes: u32, goes: u32) -> Found {
+fn course(factor: Option<f64>, comes: u32, goes: u32) -> CourseSummary {
     let mut envelope = Envelope::new(Device::named("omega3").unwrap(), DVec3::ZERO);
     envelope.enable();
     let mut renderer = Renderer::new(Law::linear(200.0, 0.0), envelope);
@@ -101,7 +101,7 @@ fn course(factor: Option<f64>, comes: u32, goes: u32) -> Found {
         largest_jump_n = largest_jump_n.max((rendered_n - before_n).length());
         before_n = rendered_n;
     }
-    Found { error_n: f64::sqrt(squared / count), largest_jump_n, predicted: renderer.predicted() }
+    CourseSummary { error_n: f64::sqrt(squared / count), largest_jump_n, predicted: renderer.predicted() }
 }
 
 #[test]

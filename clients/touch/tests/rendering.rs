@@ -6,7 +6,7 @@ use palpate_touch::device::{DEVICES, Device, SAFE_FORCE_N, UNDECLARED};
 use palpate_touch::envelope::{ENGAGE_S, FRESH_S, PAUSE_S, SLEW_N_PER_S, STALE_S, Wanted};
 use palpate_touch::law::Row;
 use palpate_touch::path::{Path, Play, RELEASE_S, SPEED_M_PER_S};
-use palpate_touch::renderer::{BIAS_S, MOST_LAWS};
+use palpate_touch::renderer::{BIAS_S, MAX_LAWS};
 use palpate_touch::{ContactState, Envelope, Law, LimitCause, LocalModel, Renderer, RenderingState, Touching};
 use proptest::prelude::*;
 
@@ -307,7 +307,7 @@ fn laws_are_bounded_and_one_that_is_not_known_changes_nothing() {
     let before_n = deeper_n(&mut before, now_s);
     // It is kept, whatever comes; others go when there are too many.
     let (mut renderer, now_s) = met();
-    let most = u32::try_from(MOST_LAWS).unwrap();
+    let most = u32::try_from(MAX_LAWS).unwrap();
     assert!((100..100 + 2 * most).all(|number| renderer.learn(number, law())));
     assert!(renderer.learn(1, law()) && !renderer.learn(8, law()), "a law that was forgotten is new");
     assert_eq!(deeper_n(&mut renderer, now_s), before_n);

@@ -1,9 +1,9 @@
-// The datagrams of a lease: poses and samples by WebTransport (courier.ts), where browser, server and network let them
+// The datagrams of a lease: poses and samples by WebTransport (datagram-worker.ts), where browser, server and network let them
 // through. Nothing depends on that: calls carry everything else, and everything if there are none.
 
-import type { Counts, Heard, Led, Order, Word } from "./courier.js";
+import type { Counts, Heard, Led, Order, Word } from "./datagram-worker.js";
 import type { DatagramOffer, Sample } from "./gen/palpate/v1/haptic_pb.js";
-import { isUnimplemented, PATIENCE_MS, reasonOf, type Server } from "./server.js";
+import { isUnimplemented, CALL_TIMEOUT_MS, reasonOf, type Server } from "./server.js";
 
 /** Longest wait before a session is tried again: a network that blocks it still will. */
 const AVOID_MS = 60_000;
@@ -56,7 +56,7 @@ export class Datagrams {
   private async ask(leaseId: string): Promise<void> {
     const { sessionId, sampleEverySteps } = this;
     try {
-      const { offer } = await this.server.haptics.openDatagrams({ sessionId, leaseId, sampleEverySteps }, { timeoutMs: PATIENCE_MS });
+      const { offer } = await this.server.haptics.openDatagrams({ sessionId, leaseId, sampleEverySteps }, { timeoutMs: CALL_TIMEOUT_MS });
       if (offer && leaseId === this.leaseId) this.start(offer);
     } catch (error) {
       // The server has none, or is older than they are. Any other refusal is of this lease, or of the moment.
@@ -76,7 +76,7 @@ export class Datagrams {
   private start(offer: DatagramOffer): void {
     const host = offer.host || new URL(this.server.urlOf(this.sessionId)).hostname;
     const ticket = [...offer.ticket].map((byte) => byte.toString(16).padStart(2, "0")).join("");
-    const worker = new Worker(new URL("./courier.js", import.meta.url), { type: "module", name: "datagrams" });
+    const worker = new Worker(new URL("./datagram-worker.js", import.meta.url), { type: "module", name: "datagrams" });
     this.worker = worker;
     worker.onmessage = ({ data }: MessageEvent<Heard>) => {
       if (this.worker === worker) this.heard(data);

@@ -15,7 +15,7 @@ export interface Rectangle {
 const FARTHEST_M = 1e6;
 
 /** Vertices of a surface, at most. */
-export const MOST_VERTICES = 1 << 24;
+export const MAX_VERTICES = 1 << 24;
 
 /** Whether an encoding writes integers, with origin and scale, or floats. */
 function hasIntegers(encoding: Encoding): boolean {
@@ -42,7 +42,7 @@ export class Field {
     readonly ny: number,
   ) {
     const isWhole = [nx, ny].every((count) => Number.isInteger(count) && count >= 0);
-    if (!isWhole || nx * ny > MOST_VERTICES) throw new RangeError(`a surface of ${nx} × ${ny} vertices can't be shown`);
+    if (!isWhole || nx * ny > MAX_VERTICES) throw new RangeError(`a surface of ${nx} × ${ny} vertices can't be shown`);
     this.displacementM = new Float32Array(3 * nx * ny);
   }
 

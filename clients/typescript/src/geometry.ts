@@ -1,7 +1,7 @@
 // The mesh of a session, as `GetMesh` tells it: what does not change while the tissue moves.
 
 import type { GetMeshResponse } from "./gen/palpate/v1/view_pb.js";
-import { PATIENCE_MS, type Server } from "./server.js";
+import { CALL_TIMEOUT_MS, type Server } from "./server.js";
 
 export interface MeshData {
   /** Vertices of a frame along x and along y; a frame's last places may stand for no vertex. */
@@ -63,15 +63,15 @@ export function meshOf(parts: Part[]): MeshData {
 }
 
 /** Numbers of a mesh, at most: of one and a half million vertices. Above that browsers get slow on any machine. */
-const MOST_NUMBERS = 12 * 1_500_000;
+const MAX_NUMBERS = 12 * 1_500_000;
 
 /** Asks for the mesh of a session. */
 export async function fetchMesh(server: Server, sessionId: string): Promise<MeshData> {
   const parts: GetMeshResponse[] = [];
   let numbers = 0;
-  for await (const part of server.views.getMesh({ sessionId }, { timeoutMs: PATIENCE_MS })) {
+  for await (const part of server.views.getMesh({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS })) {
     numbers += part.restPositionM.length + part.textureCoordinates.length + part.triangles.length + part.fileVertex.length + 1;
-    if (numbers > MOST_NUMBERS) throw new RangeError("the server's mesh has no end");
+    if (numbers > MAX_NUMBERS) throw new RangeError("the server's mesh has no end");
     parts.push(part);
     if (part.last) break;
   }

@@ -16,7 +16,7 @@ export {
   isUnimplemented,
   isUnreached,
   keepOpen,
-  PATIENCE_MS,
+  CALL_TIMEOUT_MS,
   reasonOf,
   Server,
   sleep,

@@ -3,14 +3,14 @@
 
 import { Field, type Rectangle } from "./field.js";
 import { Encoding, type WatchFramesResponse } from "./gen/palpate/v1/view_pb.js";
-import { type Failure, keepOpen, PATIENCE_MS, Server } from "./server.js";
+import { type Failure, keepOpen, CALL_TIMEOUT_MS, Server } from "./server.js";
 
 /** Frames in flight: a round trip of 60 ms at 60 frames a second. */
 const IN_FLIGHT = 4;
 
 /** A part of a frame, and a patch of it, cost as much as so many values; a frame has at most so many parts and patches. */
 const PART_VALUES = 64;
-const MOST_PARTS = 1 << 16;
+const MAX_PARTS = 1 << 16;
 
 /** The stream to receive: the page's first message. Each later message returns the buffer. */
 export interface Order {
@@ -80,7 +80,7 @@ class Intake {
       parts.push(part);
       // A frame has each vertex once.
       values += PART_VALUES + part.patches.reduce((sum, patch) => sum + PART_VALUES + patch.displacement.byteLength / 2, 0);
-      if (values > 2 * this.field.displacementM.length + MOST_PARTS * PART_VALUES) throw new RangeError("a frame has no end");
+      if (values > 2 * this.field.displacementM.length + MAX_PARTS * PART_VALUES) throw new RangeError("a frame has no end");
       if (!part.last) continue;
       // Apply all parts at once, so that half a frame is never visible.
       for (const each of parts) each.patches.forEach((patch) => this.field.write(each, patch));
@@ -133,7 +133,7 @@ class Credit {
       const [viewerId, frameId] = this.due;
       this.due = undefined;
       try {
-        await this.server.views.acknowledgeFrames({ viewerId, frameId }, { signal: this.signal, timeoutMs: PATIENCE_MS });
+        await this.server.views.acknowledgeFrames({ viewerId, frameId }, { signal: this.signal, timeoutMs: CALL_TIMEOUT_MS });
       } catch {
         // The stream fails as well and reports it; or the next acknowledgement covers this one.
       }

@@ -5,7 +5,7 @@ import type { EarlierPoseSchema, PoseSchema, ToolPosesSchema } from "./gen/palpa
 import type { Vec3 } from "./vector.js";
 
 /** Poses before the newest. */
-const MOST_EARLIER = 8;
+const MAX_EARLIER = 8;
 /** What is farther away has no place in the message, nm. */
 const FAR_NM = 1e10;
 
@@ -51,7 +51,7 @@ export class Poses {
   message(lead: Lead, timeNs: bigint): MessageInitShape<typeof ToolPosesSchema> {
     const newest = { sequence: this.sequence, timeNs, positionM: lead.positionM };
     const earlier = this.recent.flatMap((before) => earlierPose(newest, before));
-    this.recent = [newest, ...this.recent].slice(0, MOST_EARLIER);
+    this.recent = [newest, ...this.recent].slice(0, MAX_EARLIER);
     this.sequence += 1n;
     return { tool: this.tool, sequence: newest.sequence, clientTimeNs: timeNs, pose: poseOf(lead), earlier };
   }

@@ -9,10 +9,10 @@ import { type Session, SessionService } from "./gen/palpate/v1/session_pb.js";
 import { ViewService } from "./gen/palpate/v1/view_pb.js";
 
 /** A call is sent on this often, one server after the other. */
-const MOST_HOPS = 8;
+const MAX_HOPS = 8;
 
 /** Bytes of a message, at most: no honest server sends a longer one. */
-const MOST_MESSAGE_BYTES = 4 << 20;
+const MAX_MESSAGE_BYTES = 4 << 20;
 
 /** The lengths of the messages in a body, each after a byte of flags. They are kept until they are whole. */
 class Lengths {
@@ -33,7 +33,7 @@ class Lengths {
       if (this.filled < 5) continue;
       this.filled = 0;
       this.left = this.head.getUint32(1);
-      if (this.left > MOST_MESSAGE_BYTES) throw new RangeError(`the server sends a message of ${this.left} bytes`);
+      if (this.left > MAX_MESSAGE_BYTES) throw new RangeError(`the server sends a message of ${this.left} bytes`);
     }
   }
 }
@@ -96,7 +96,7 @@ export class Server {
         } catch (error) {
           const isSentOn = this.note(error, base, sessionId);
           // The refusal says more than that a browser does not call that server.
-          if (!isSentOn || hops >= MOST_HOPS) throw refusal !== undefined && isUnreached(error) ? refusal : error;
+          if (!isSentOn || hops >= MAX_HOPS) throw refusal !== undefined && isUnreached(error) ? refusal : error;
           refusal = error;
           base = this.urlOf(sessionId);
         }
@@ -187,7 +187,7 @@ export class Server {
  * Timeout of every call that is not a stream: a server that takes longer is gone. It is long, because a busy window
  * sees answers late; a server that is not running refuses at once.
  */
-export const PATIENCE_MS = 20_000;
+export const CALL_TIMEOUT_MS = 20_000;
 
 /** The server's reason code (docs/protocol.md, "Errors"); empty if it gave none. */
 export function reasonOf(error: unknown): string {

@@ -7,7 +7,7 @@ import type { MessageInitShape } from "@bufbuild/protobuf";
 import { Datagrams } from "./datagrams.js";
 import type { CommandSchema, Sample } from "./gen/palpate/v1/haptic_pb.js";
 import { type Lead, poseOf } from "./poses.js";
-import { backoffMs, describe, isGone, isUnreached, PATIENCE_MS, reasonOf, type Server } from "./server.js";
+import { backoffMs, describe, isGone, isUnreached, CALL_TIMEOUT_MS, reasonOf, type Server } from "./server.js";
 
 type Command = MessageInitShape<typeof CommandSchema>;
 
@@ -93,7 +93,7 @@ export class Tool {
   private async acquire(): Promise<boolean> {
     const { sessionId, tool, holder } = this;
     try {
-      const call = { timeoutMs: PATIENCE_MS };
+      const call = { timeoutMs: CALL_TIMEOUT_MS };
       const { leaseId } = await this.server.haptics.acquireTool({ sessionId, tool, leaseS: LEASE_S, holder }, call);
       this.leaseId = leaseId;
       this.sequence = 0n;
@@ -151,7 +151,7 @@ export class Tool {
     this.lost();
     if (!leaseId) return;
     try {
-      await this.server.haptics.releaseTool({ sessionId, leaseId }, { timeoutMs: PATIENCE_MS });
+      await this.server.haptics.releaseTool({ sessionId, leaseId }, { timeoutMs: CALL_TIMEOUT_MS });
     } catch {
       // The lease lapses by itself, and the tool's action ends with it.
     }
@@ -210,7 +210,7 @@ export class Tool {
     this.underWay += 1;
     try {
       const request = { sessionId: this.sessionId, leaseId, commands };
-      const { sample } = await this.server.haptics.sendCommands(request, { timeoutMs: PATIENCE_MS });
+      const { sample } = await this.server.haptics.sendCommands(request, { timeoutMs: CALL_TIMEOUT_MS });
       this.unreached = 0;
       if (sample && commands.length > 0) this.measure(sample, performance.now() - begun);
     } catch (error) {

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { after, before, test } from "node:test";
 import { fileURLToPath } from "node:url";
-import { launch, PATIENCE_MS, PICTURES, Server } from "../../viewer/test/harness.mjs";
+import { launch, TEST_TIMEOUT_MS, PICTURES, Server } from "../../viewer/test/harness.mjs";
 
 /** @type {import("playwright-core").Browser} */
 let browser;
@@ -23,7 +23,7 @@ after(async () => {
 /** Opens an example, and waits until its text fits a pattern. @param {string} address @param {RegExp} pattern */
 async function says(address, pattern) {
   const page = await browser.newPage();
-  page.setDefaultTimeout(PATIENCE_MS);
+  page.setDefaultTimeout(TEST_TIMEOUT_MS);
   /** @type {string[]} */
   const faults = [];
   page.on("pageerror", (error) => faults.push(String(error)));

@@ -4,7 +4,7 @@
 
 import { Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, type Ray, Vector3 } from "three";
 import { Field, type MeshData, type Vec3 } from "palpate";
-import { Looks, type Openness } from "./openness";
+import { Looks, type AmbientOcclusion } from "./ambient-occlusion";
 import { edgesOf, type Lists, lists, opening, touching } from "./topology";
 import type { Felt } from "./samples";
 import type { Centre, Place, Point, Push, Surface } from "./surface";
@@ -15,7 +15,7 @@ const BLOCK = 8;
 const SLICE_MS = 8;
 /** How much darker a dent is, for each length that a push falls off over. */
 const DENT = 0.28;
-/** The server tells the mean force within so many lengths of a push, at least and at most so many edges (src/sheet/around.rs). */
+/** The server tells the mean force within so many lengths of a push, at least and at most so many edges (src/tissue/interpolate.rs). */
 const TOLD_WITHIN = { lengths: 7, least: 1.5, most: 4 };
 /** A texture whose scale differs by more than this from the usual, on more than this part of the triangles, has seams. */
 const SEAM = { times: 6, part: 0.001 };
@@ -39,7 +39,7 @@ export class Body implements Surface {
   readonly field: Field;
   readonly geometry = new BufferGeometry();
   readonly lines = new BufferGeometry();
-  readonly flank = undefined;
+  readonly edge = undefined;
   readonly box = new Box3();
   readonly sizeM: number;
   readonly every = 1;
@@ -67,7 +67,7 @@ export class Body implements Surface {
   private readonly half = new Float64Array(3);
   private readonly blocks: number;
   private readonly byFile: Map<number, number>;
-  private light: Openness | undefined;
+  private light: AmbientOcclusion | undefined;
   private lighting: ReturnType<typeof setTimeout> | undefined;
   private movedM = 0;
   private readonly found = new Vector3();

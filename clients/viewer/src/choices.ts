@@ -4,16 +4,16 @@ import { type JournalName, lengthText, type Listed, listJournals, whenText } fro
 import { part } from "./page";
 import { entryOf, pictureOf } from "./pictures";
 import { DEFAULT_SCENE, groupOf, GROUPS, inOrder, titleOf } from "./scenes";
-import { backoffMs, isPassing, PATIENCE_MS, sessions, sleep } from "./server";
+import { backoffMs, isPassing, CALL_TIMEOUT_MS, sessions, sleep } from "./server";
 import { excerpt } from "./text";
 
 /** What somebody chose. */
 export type Choice = { kind: "scene"; scene: string } | ({ kind: "live" | "recorded" } & JournalName);
 
 /** So many scenes are listed. */
-const MOST_SCENES = 1000;
+const MAX_SCENES = 1000;
 /** So many of each group are listed, the newest. */
-const MOST_LISTED = 40;
+const MAX_LISTED = 40;
 /** A list this old is asked for again when somebody turns to it. */
 const OLD_MS = 3000;
 
@@ -44,7 +44,7 @@ export class Choices {
 
   /** The scene that the page begins with: the usual one, or the first that the server has. */
   async first(): Promise<string> {
-    const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
+    const { sceneNames } = await sessions.listScenes({}, { timeoutMs: CALL_TIMEOUT_MS });
     return sceneNames.includes(DEFAULT_SCENE) ? DEFAULT_SCENE : (sceneNames[0] ?? DEFAULT_SCENE);
   }
 
@@ -52,9 +52,9 @@ export class Choices {
   async fill(): Promise<void> {
     for (let failures = 0; ; failures++) {
       try {
-        const { sceneNames } = await sessions.listScenes({}, { timeoutMs: PATIENCE_MS });
+        const { sceneNames } = await sessions.listScenes({}, { timeoutMs: CALL_TIMEOUT_MS });
         this.scenes.forEach((group, index) => {
-          const within = inOrder(sceneNames.slice(0, MOST_SCENES).filter((scene) => groupOf(scene) === GROUPS[index]));
+          const within = inOrder(sceneNames.slice(0, MAX_SCENES).filter((scene) => groupOf(scene) === GROUPS[index]));
           group.replaceChildren(...within.map(entryOf));
           group.hidden = within.length === 0;
         });
@@ -79,7 +79,7 @@ export class Choices {
       [this.recorded, listed.filter(({ isLive }) => !isLive), "recorded"],
     ] as const;
     for (const [group, journals, kind] of groups) {
-      group.replaceChildren(...journals.slice(0, MOST_LISTED).map((journal) => this.entry(journal, kind)));
+      group.replaceChildren(...journals.slice(0, MAX_LISTED).map((journal) => this.entry(journal, kind)));
       group.hidden = journals.length === 0;
     }
     this.mark(this.marked.value, this.marked.name);

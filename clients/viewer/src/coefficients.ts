@@ -16,7 +16,7 @@ const DEPTH = 0.12;
 /** Part of the damping at which nothing swings any more. */
 const DAMPING_RATIO = 0.5;
 /** With more vertices than this the server is asked to compute with so many. Frames show all of them. */
-export const MOST_VERTICES = 12_000;
+export const MAX_VERTICES = 12_000;
 
 /** The length over which a push falls off: a finger's, but no less than an edge. */
 export function fingerM(sizeM: number, edgeM: number): number {
@@ -34,10 +34,10 @@ export function sizeOf({ extent }: MeshReport): number {
  * push falls off:
  *
  * - The area is about T·(√3/4)·L², of one vertex A = that / n.
- * - A push F in the middle is F·exp(−r/ℓ) at a distance r: together F·Σexp(−r/ℓ) ≈ F·2πℓ²/A. Borne by the virtual springs
+ * - A push F in the middle is F·exp(−r/ℓ) at a distance r: together F·Σexp(−r/ℓ) ≈ F·2πℓ²/A. Borne by the anchor springs
  *   alone, it dents the middle by d = F/K″. For a dent d₀ under a push of 1 N altogether, K″ = 1 N·A/(2πℓ²·d₀).
  * - A dent as deep as it is wide stretches the net of springs as well, which draws each vertex back with about
- *   2k·(L/ℓ)²·d. It shall bear as much as the virtual springs: k = K″·(ℓ/L)²/2.
+ *   2k·(L/ℓ)²·d. It shall bear as much as the anchor springs: k = K″·(ℓ/L)²/2.
  * - A third of what lies beneath moves along (docs/scenes.md, "Tissue"): m = ρ·H·A/3.
  * - C = 2ζ·√(K″·m).
  *
@@ -49,14 +49,14 @@ export function sceneOf(name: string, meshId: string, report: MeshReport, vertic
   const edgeM = (report.edgeM || sizeM) * Math.sqrt(report.vertices / vertices);
   const areaM2 = (report.triangles * Math.sqrt(3) * (report.edgeM || sizeM) ** 2) / 4 / vertices;
   const lengthM = fingerM(sizeM, edgeM);
-  const virtual = (PUSH_N * areaM2) / (2 * Math.PI * lengthM ** 2 * DENT * sizeM);
+  const anchor = (PUSH_N * areaM2) / (2 * Math.PI * lengthM ** 2 * DENT * sizeM);
   const mass = (DENSITY_KG_PER_M3 * DEPTH * sizeM * areaM2) / 3;
   return {
     name,
     mesh: { meshId, pointMassKg: mass, ...(vertices < report.vertices ? { vertices } : {}) },
-    springs: { stiffnessNPerM: (virtual * (lengthM / edgeM) ** 2) / 2, flexionFactor: 0.2 },
-    virtualSprings: { stiffnessNPerM: virtual },
-    damping: { coefficientNSPerM: 2 * DAMPING_RATIO * Math.sqrt(virtual * mass) },
+    springs: { stiffnessNPerM: (anchor * (lengthM / edgeM) ** 2) / 2, bendingFactor: 0.2 },
+    anchorSprings: { stiffnessNPerM: anchor },
+    damping: { coefficientNSPerM: 2 * DAMPING_RATIO * Math.sqrt(anchor * mass) },
     stepping: { tolerance: 1e-3 },
   };
 }

@@ -16,7 +16,7 @@ const DEBT_MS = 150;
 /** A longer time was not a picture: the window was hidden, or the machine asleep. */
 const PAUSE_MS = 5000;
 /** After this time without a late picture a greater effort is tried; twice as long after each failed try. */
-const PATIENCE_MS = { least: 4000, most: 128_000 };
+const RETRY_MS = { least: 4000, most: 128_000 };
 
 export class Effort {
   private index: number;
@@ -24,7 +24,7 @@ export class Effort {
   private debtMs = 0;
   private lateOnes = 0;
   private wellMs = 0;
-  private patienceMs = PATIENCE_MS.least;
+  private patienceMs = RETRY_MS.least;
   private isFirst = true;
 
   /** With `isFixed`, always uses the greatest effort, however long a picture takes. */
@@ -56,7 +56,7 @@ export class Effort {
     }
     if (this.wellMs < this.patienceMs || this.index === 0) return false;
     // If the greater effort fails, the next try is later.
-    this.patienceMs = Math.min(2 * this.patienceMs, PATIENCE_MS.most);
+    this.patienceMs = Math.min(2 * this.patienceMs, RETRY_MS.most);
     return this.change(this.index - 1);
   }
 

@@ -12,7 +12,7 @@ import {
   Vector3,
 } from "three";
 import { Body } from "./body";
-import type { Flank } from "./flank";
+import type { SheetEdge } from "./sheet-edge";
 import { Table } from "./material";
 import type { Surface } from "./surface";
 
@@ -44,11 +44,11 @@ export class Ground {
       height!.value = surface.box.max.z - floorOf(surface);
       this.dark = shadowOf(surface, half_!.value as Vector2);
       this.cloth.uniforms.dark!.value = this.dark;
-    } else if (surface.flank) {
-      (half_!.value as Vector2).set(size.x, size.y).multiplyScalar(0.5).addScalar(0.6 * surface.flank.roundM);
-      height!.value = surface.flank.heightM;
+    } else if (surface.edge) {
+      (half_!.value as Vector2).set(size.x, size.y).multiplyScalar(0.5).addScalar(0.6 * surface.edge.roundM);
+      height!.value = surface.edge.heightM;
     }
-    const geometry = surface.flank ? holed([size.x, size.y], surface.flank, 8 * surface.sizeM) : square(surface, 8 * surface.sizeM);
+    const geometry = surface.edge ? holed([size.x, size.y], surface.edge, 8 * surface.sizeM) : square(surface, 8 * surface.sizeM);
     this.mesh = new Mesh(geometry, this.cloth);
     this.mesh.frustumCulled = false;
     this.colours(colour, background);
@@ -78,7 +78,7 @@ function square(surface: Surface, farM: number): BufferGeometry {
 }
 
 /** With a hole beneath the tissue: a dent may reach below the table. */
-function holed([width, length]: [number, number], { roundM, heightM }: Flank, farM: number): BufferGeometry {
+function holed([width, length]: [number, number], { roundM, heightM }: SheetEdge, farM: number): BufferGeometry {
   const places: number[] = [];
   const corners = [[0, 0], [width, 0], [width, length], [0, length]] as const;
   const segments = 8;

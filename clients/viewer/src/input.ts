@@ -161,7 +161,7 @@ export class Input {
 
   /** What keys aim at first: the middle of what is seen. */
   private first({ surface }: Touched): Place {
-    return (surface.flank ? undefined : this.stage.pickMiddle()) ?? surface.middle();
+    return (surface.edge ? undefined : this.stage.pickMiddle()) ?? surface.middle();
   }
 
   /** A way, and out of the tissue besides as far as a pull lifts. */

@@ -1,7 +1,7 @@
 // What the server has recorded: the journals that it lists, and what is in one, as the page shows it.
 
 import type { ForceMoment, GetJournalResponse } from "palpate/v1";
-import { PATIENCE_MS, sessions } from "./server";
+import { CALL_TIMEOUT_MS, sessions } from "./server";
 
 /** A journal: of a session, in one run of the server. 0 is the newest. */
 export interface JournalName {
@@ -24,7 +24,7 @@ export interface Listed extends JournalName {
  */
 export async function listJournals(): Promise<Listed[]> {
   try {
-    const { journals } = await sessions.listJournals({}, { timeoutMs: PATIENCE_MS });
+    const { journals } = await sessions.listJournals({}, { timeoutMs: CALL_TIMEOUT_MS });
     const looked = journals.some(({ live }) => live) ? await lookedAt() : new Set();
     const listed = journals
       .filter(({ fault, live, sessionId }) => fault === "" && (!live || looked.has(sessionId)))
@@ -44,7 +44,7 @@ export async function listJournals(): Promise<Listed[]> {
 
 /** The sessions that somebody looks at: one whose pages are closed goes on for a while, and ends by itself. */
 async function lookedAt(): Promise<Set<string>> {
-  const { sessions: all } = await sessions.listSessions({}, { timeoutMs: PATIENCE_MS });
+  const { sessions: all } = await sessions.listSessions({}, { timeoutMs: CALL_TIMEOUT_MS });
   return new Set(all.filter(({ streams }) => streams > 0).map(({ sessionId }) => sessionId));
 }
 
@@ -65,7 +65,7 @@ export class Recording implements JournalName {
   readonly fault: string;
 
   static async of({ sessionId, run }: JournalName): Promise<Recording> {
-    return new Recording(await sessions.getJournal({ sessionId, run }, { timeoutMs: PATIENCE_MS }));
+    return new Recording(await sessions.getJournal({ sessionId, run }, { timeoutMs: CALL_TIMEOUT_MS }));
   }
 
   private constructor({ info, rateHz, beginStep, endStep, forces, snapshotSteps }: GetJournalResponse) {

@@ -8,7 +8,7 @@ import { part } from "./page";
 import { describe } from "./server";
 import type { Stage } from "./stage";
 import type { Place } from "./surface";
-import type { Visit } from "./visit";
+import type { ShownSession } from "./session";
 
 /** A ball in the tissue. */
 export interface Lump {
@@ -41,13 +41,13 @@ function lumpAt({ restM, outward }: Place, sizeM: number, edgeM: number): Inclus
     radiusM,
     edgeM: EDGE * radiusM,
     stiffnessFactor: STIFFER.springs,
-    virtualStiffnessFactor: STIFFER.support,
+    anchorStiffnessFactor: STIFFER.support,
   });
 }
 
 /** What lumps need of the page. */
 export interface Host {
-  present: () => Visit | undefined;
+  present: () => ShownSession | undefined;
   /** The scene that the page has made of a mesh of one's own, if that is what it shows. */
   scene: () => Scene | undefined;
   /** Shows another scene of the same mesh in its place. */
@@ -66,8 +66,8 @@ export class Lumps {
     private readonly host: Host,
   ) {
     this.box.addEventListener("change", () => {
-      const visit = host.present();
-      if (visit) this.show(visit.session);
+      const shownSession = host.present();
+      if (shownSession) this.show(shownSession.session);
     });
     this.put.addEventListener("click", () => this.place(this.input.onPlace === undefined));
     this.take.addEventListener("click", () => void this.change());
@@ -95,9 +95,9 @@ export class Lumps {
   /** Puts a lump beneath a place, or takes all out. */
   private async change(place?: Place): Promise<void> {
     this.place(false);
-    const [scene, visit] = [this.host.scene(), this.host.present()];
-    if (!scene || !visit) return;
-    scene.inclusions = place ? [...scene.inclusions, lumpAt(place, visit.surface.sizeM, visit.edgeM)] : [];
+    const [scene, shownSession] = [this.host.scene(), this.host.present()];
+    if (!scene || !shownSession) return;
+    scene.inclusions = place ? [...scene.inclusions, lumpAt(place, shownSession.surface.sizeM, shownSession.edgeM)] : [];
     try {
       // Whoever puts one in wants to see where it is.
       if (place) this.box.checked = true;

@@ -24,7 +24,7 @@ import { keepPicture } from "./pictures";
 import { BACK_S, discard, type Opened, Player } from "./player";
 import { Plots } from "./plot";
 import { playScript } from "./script";
-import { backoffMs, describe, type Failure, isGone, isPassing, PATIENCE_MS, reasonOf, server, sessions, sleep } from "./server";
+import { backoffMs, describe, type Failure, isGone, isPassing, CALL_TIMEOUT_MS, reasonOf, server, sessions, sleep } from "./server";
 import { Stage } from "./stage";
 import { Status } from "./status";
 import { excerpt } from "./text";
@@ -32,7 +32,7 @@ import { tissueTexture } from "./texture";
 import { TissueValues } from "./tissue";
 import { TokenForm } from "./token-form";
 import { FileOpener } from "./upload";
-import { Visit } from "./visit";
+import { ShownSession } from "./session";
 
 /**
  * A session that nobody asks for is deleted after this time: its pages are closed. Browsers let a hidden page ask once a
@@ -47,10 +47,10 @@ const PICTURE_MS = 1500;
 const STILL_S = 0.25;
 
 /** So many scripts are listed. */
-const MOST_SCRIPTS = 1000;
+const MAX_SCRIPTS = 1000;
 
 /** Of warnings and of holders of tools, so many are told. */
-const MOST_TOLD = 16;
+const MAX_TOLD = 16;
 
 /** A server of a fleet that has not answered for so long may be gone: another takes its sessions over within 4 s. */
 const GONE_MS = 3000;
@@ -77,7 +77,7 @@ const tissue = new TissueValues(heard, notice);
 part("try-now", HTMLButtonElement).addEventListener("click", () => tryNow());
 addEventListener("online", () => tryNow());
 const holder = holderName();
-let visit: Visit | undefined;
+let shownSession: ShownSession | undefined;
 let playing: AbortController | undefined;
 
 const choices = new Choices((choice) => {
@@ -86,7 +86,7 @@ const choices = new Choices((choice) => {
   else void open({ moment: choice, isNew: true });
 });
 const player = new Player({
-  present: () => visit,
+  present: () => shownSession,
   exchange: (session, step) => show(session, { keeps: true, step }),
   goLive: async (session) => {
     if (await show(session, { keeps: true, isNew: true })) canvas.focus({ preventScroll: true });
@@ -96,17 +96,17 @@ const player = new Player({
 });
 
 // What is recorded can be looked at only.
-const input = new Input(canvas, stage, latency, () => (visit?.session.playback ? undefined : visit));
-input.onPoint = (place) => overlay.point(place, visit?.reach.lengthM);
+const input = new Input(canvas, stage, latency, () => (shownSession?.session.playback ? undefined : shownSession));
+input.onPoint = (place) => overlay.point(place, shownSession?.reach.lengthM);
 
 const lumps = new Lumps(stage, input, {
-  present: () => visit,
-  scene: () => (made?.case === "scene" && !visit?.session.playback ? create(SceneSchema, made.value) : undefined),
+  present: () => shownSession,
+  scene: () => (made?.case === "scene" && !shownSession?.session.playback ? create(SceneSchema, made.value) : undefined),
   exchange: async (scene) => {
-    const of = visit;
+    const of = shownSession;
     const source: Source = { case: "scene", value: scene };
-    const { session } = await sessions.createSession({ source, idleTimeoutS: IDLE_S }, { timeoutMs: PATIENCE_MS });
-    if (!of || !session || visit !== of) return;
+    const { session } = await sessions.createSession({ source, idleTimeoutS: IDLE_S }, { timeoutMs: CALL_TIMEOUT_MS });
+    if (!of || !session || shownSession !== of) return;
     made = source;
     await show(session, { isNew: true, keeps: true });
     discard(of.session);
@@ -142,8 +142,8 @@ let left = 0;
 /** Leaves what is shown. */
 function leave(): void {
   left += 1;
-  visit?.leave();
-  visit = undefined;
+  shownSession?.leave();
+  shownSession = undefined;
   playing?.abort();
   player.close();
 }
@@ -165,7 +165,7 @@ async function open(target: Target): Promise<void> {
         return;
       }
       const session = sessionId
-        ? (await sessions.getSession({ sessionId }, { timeoutMs: PATIENCE_MS })).session
+        ? (await sessions.getSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS })).session
         : (await sessions.createSession({ source: (made ??= named(await choices.first())), idleTimeoutS: IDLE_S }, {})).session;
       if (!session) throw new RangeError("it tells of no session");
       // Another window's playback: this one gets its own.
@@ -194,13 +194,13 @@ async function open(target: Target): Promise<void> {
 /** Asks at once whether a lost server is back. */
 function tryNow(): void {
   hurry.abort();
-  visit?.askNow();
+  shownSession?.askNow();
 }
 
 /** The server no longer lets the caller do what it did. */
 function barred(reason: string): void {
   // Another token leads back to the same session.
-  if (visit && !visit.session.playback) refused = { sessionId: visit.session.sessionId };
+  if (shownSession && !shownSession.session.playback) refused = { sessionId: shownSession.session.sessionId };
   leave();
   status.end("barred", "");
   tokenForm.show(reason);
@@ -248,18 +248,18 @@ async function showOpened(opened: Opened, how: Showing): Promise<void> {
 async function show(session: Session, { isNew = false, keeps = false, step }: Showing): Promise<boolean> {
   const isPlayback = session.playback !== undefined;
   const wanted = (opening += 1);
-  const former = keeps ? visit : undefined;
+  const former = keeps ? shownSession : undefined;
   const told = {
     onSession: heard,
-    onTrouble: (failure: Failure, waitMs: number) => visit === next && trouble(failure, waitMs),
-    onWell: () => visit === next && status.found(wellText(next.session)),
-    onBarred: (reason: string) => visit === next && barred(reason),
+    onTrouble: (failure: Failure, waitMs: number) => shownSession === next && trouble(failure, waitMs),
+    onWell: () => shownSession === next && status.found(wellText(next.session)),
+    onBarred: (reason: string) => shownSession === next && barred(reason),
   };
-  const next = await Visit.to(session, holder, askedNumber("refinement", 0, 10), told, former);
+  const next = await ShownSession.to(session, holder, askedNumber("refinement", 0, 10), told, former);
   if (wanted !== opening) return false;
-  const before = visit?.session;
-  visit?.leave();
-  visit = next;
+  const before = shownSession?.session;
+  shownSession?.leave();
+  shownSession = next;
   if (session.playback) writeMoment(session.playback, step ?? Number(session.step), isNew);
   else writeAddress(session.sessionId, isNew && new URLSearchParams(location.search).size > 0);
   if (!isPlayback) player.close();
@@ -299,12 +299,12 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   if (before?.sessionId !== session.sessionId) {
     heard(session);
     // What the server has to say of the scene: of a mesh what was done with it, and what is doubtful.
-    if (session.warnings.length > 0) notice(session.warnings.slice(0, MOST_TOLD).join(" "), 15);
+    if (session.warnings.length > 0) notice(session.warnings.slice(0, MAX_TOLD).join(" "), 15);
   }
   next.begin();
   if (document.hidden) next.lookAway();
   if (!former || !stage.isTextured) void dress(session.sessionId);
-  if (!isPlayback && !former) setTimeout(() => visit === next && takePicture(next), PICTURE_MS);
+  if (!isPlayback && !former) setTimeout(() => shownSession === next && takePicture(next), PICTURE_MS);
   return true;
 }
 
@@ -318,7 +318,7 @@ async function dress(sessionId: string): Promise<void> {
 
 /** Plays what has just happened in the session that is shown. */
 async function whatWasThat(): Promise<void> {
-  const of = visit;
+  const of = shownSession;
   const run = of?.session.journal?.run;
   if (!of || run === undefined) return;
   const button = part("what-was-that", HTMLButtonElement);
@@ -327,7 +327,7 @@ async function whatWasThat(): Promise<void> {
     void of.hand.letGo();
     const { sessionId } = of.session;
     const opened = await player.begin({ sessionId, run }, (recording) => recording.after(recording.end, -BACK_S));
-    if (visit !== of) return discard(opened.session);
+    if (shownSession !== of) return discard(opened.session);
     await showOpened(opened, { keeps: true, isNew: true });
     player.focus();
   } catch (error) {
@@ -338,7 +338,7 @@ async function whatWasThat(): Promise<void> {
 }
 
 /** Takes a picture of a scene that has none in the list, if nobody has touched it or turned the view. */
-function takePicture(of: Visit): void {
+function takePicture(of: ShownSession): void {
   const scene = of.session.scene?.name ?? "";
   const entry = choices.withoutPicture(scene);
   if (!entry || document.hidden || of.samples.history.length > 0 || !stage.isAtHome) return;
@@ -353,15 +353,15 @@ function trouble(failure: Failure, waitMs: number): void {
   if (failure.isGone && player.isOpen) return player.revive();
   if (failure.isGone) return over("The session has ended.");
   status.lose(waitMs);
-  const { session, heardMs } = visit ?? {};
+  const { session, heardMs } = shownSession ?? {};
   if (!session?.ownership || session.playback || performance.now() - (heardMs ?? Infinity) < GONE_MS) return;
   seeking ??= seekAt(session.ownership.others, session.sessionId).finally(() => (seeking = undefined));
 }
 
 /** Handles the session's status. */
 function heard(session: Session): void {
-  if (session.sessionId !== visit?.session.sessionId) return;
-  visit.session = session;
+  if (session.sessionId !== shownSession?.session.sessionId) return;
+  shownSession.session = session;
   player.heard(session);
   tissue.show(session);
   part("what-was-that", HTMLButtonElement).hidden = session.journal?.durableStep === undefined;
@@ -369,22 +369,22 @@ function heard(session: Session): void {
 }
 
 function holding(): void {
-  if (!visit) return;
-  if (visit.session.playback) {
+  if (!shownSession) return;
+  if (shownSession.session.playback) {
     part("holder", HTMLElement).textContent = "Recorded: to touch it, go on from here";
     return;
   }
-  const mine = visit.hand.holds;
-  const others = visit.session.heldTools.filter((tool) => !mine || tool.tool !== 0);
-  const names = others.slice(0, MOST_TOLD).map((tool) => `${tool.holder || "Somebody"} holds ${tool.tool === 0 ? "the tool" : `tool ${tool.tool}`}`);
+  const mine = shownSession.hand.holds;
+  const others = shownSession.session.heldTools.filter((tool) => !mine || tool.tool !== 0);
+  const names = others.slice(0, MAX_TOLD).map((tool) => `${tool.holder || "Somebody"} holds ${tool.tool === 0 ? "the tool" : `tool ${tool.tool}`}`);
   const whose = excerpt(names.join(", "));
   part("holder", HTMLElement).textContent = mine ? `You (${holder}) hold the tool` : whose || "Nobody touches: press to begin";
   part("release", HTMLButtonElement).disabled = !mine;
 }
 
 /** Shows the tools and the forces on them. */
-function felt(of: Visit): void {
-  if (of !== visit) return;
+function felt(of: ShownSession): void {
+  if (of !== shownSession) return;
   const { hand, reach } = of;
   const shown = of.samples.tools.flatMap((tool) => {
     const place = of.placeOf(tool);
@@ -397,13 +397,13 @@ function felt(of: Visit): void {
 }
 
 function tellControls(): void {
-  if (!visit) return;
-  const text = strengthText(visit);
-  part("strength-name", HTMLElement).textContent = visit.hand.mode === "tip" ? "Depth" : "Strength";
+  if (!shownSession) return;
+  const text = strengthText(shownSession);
+  part("strength-name", HTMLElement).textContent = shownSession.hand.mode === "tip" ? "Depth" : "Strength";
   part("strength-value", HTMLOutputElement).value = text;
   part("strength", HTMLInputElement).setAttribute("aria-valuetext", text);
-  part("refinement-value", HTMLOutputElement).value = String(visit.refinement);
-  part("meaning", HTMLElement).textContent = meaningText(visit);
+  part("refinement-value", HTMLOutputElement).value = String(shownSession.refinement);
+  part("meaning", HTMLElement).textContent = meaningText(shownSession);
 }
 
 function chosenMode(): Mode {
@@ -412,22 +412,22 @@ function chosenMode(): Mode {
 }
 
 part("mode", HTMLElement).addEventListener("change", () => {
-  if (!visit) return;
-  visit.hand.lift();
-  visit.hand.mode = chosenMode();
+  if (!shownSession) return;
+  shownSession.hand.lift();
+  shownSession.hand.mode = chosenMode();
   tellControls();
 });
 part("strength", HTMLInputElement).addEventListener("input", (event) => {
-  if (visit) visit.hand.strength = Number((event.target as HTMLInputElement).value);
+  if (shownSession) shownSession.hand.strength = Number((event.target as HTMLInputElement).value);
   tellControls();
 });
-part("release", HTMLButtonElement).addEventListener("click", () => void visit?.hand.letGo());
+part("release", HTMLButtonElement).addEventListener("click", () => void shownSession?.hand.letGo());
 part("wireframe", HTMLInputElement).addEventListener("change", (event) => {
   stage.setWireframe((event.target as HTMLInputElement).checked);
 });
 part("refinement", HTMLInputElement).addEventListener("input", (event) => {
-  if (!visit) return;
-  const surface = visit.refine(Number((event.target as HTMLInputElement).value));
+  if (!shownSession) return;
+  const surface = shownSession.refine(Number((event.target as HTMLInputElement).value));
   stage.show(surface, true);
   tellControls();
 });
@@ -460,15 +460,15 @@ new FileOpener((session, scene) => {
 async function play(): Promise<void> {
   const button = part("play", HTMLButtonElement);
   if (playing) return playing.abort();
-  if (!visit) return;
+  if (!shownSession) return;
   const own = (playing = new AbortController());
-  const { sessionId } = visit.session;
+  const { sessionId } = shownSession.session;
   button.textContent = "Stop";
   try {
     // A script takes the tools itself.
-    await visit.hand.letGo();
+    await shownSession.hand.letGo();
     const name = part("script", HTMLSelectElement).value;
-    const warnings = await playScript(sessionId, name, visit.rateHz, `${holder}, ${name}`, own.signal, (done) => {
+    const warnings = await playScript(sessionId, name, shownSession.rateHz, `${holder}, ${name}`, own.signal, (done) => {
       button.textContent = `Stop (${Math.round(100 * done)} %)`;
     });
     if (warnings.length > 0) notice(warnings.join(" "));
@@ -480,10 +480,10 @@ async function play(): Promise<void> {
   }
 }
 
-/** The visit in which the user was warned. */
-let warnedIn: Visit | undefined;
+/** The session in which the user was warned. */
+let warnedIn: ShownSession | undefined;
 /** Warns once if the tissue moved farther than it is long: then a unit is probably wrong. */
-function warnIfFar(of: Visit): void {
+function warnIfFar(of: ShownSession): void {
   if (of === warnedIn || of.surface.largestM() <= Math.max(of.surface.sizeM, of.reach.lengthM)) return;
   warnedIn = of;
   notice("The tissue moved farther than its longest side. Look at the forces and the stiffness: a unit may be wrong.", 15);
@@ -498,12 +498,12 @@ stage.onDrawn = () => {
 // A hidden window releases its connections for visible ones.
 document.addEventListener("visibilitychange", () => {
   player.look(!document.hidden);
-  if (document.hidden) visit?.lookAway();
-  else visit?.look();
+  if (document.hidden) shownSession?.lookAway();
+  else shownSession?.look();
 });
 addEventListener("pagehide", () => {
   server.leave();
-  void visit?.hand.letGo();
+  void shownSession?.hand.letGo();
   player.close();
 });
 // What was kept of a page that was left has no session of its own any more.
@@ -512,39 +512,39 @@ addEventListener("popstate", () => {
   const { sessionId, moment } = addressed();
   if (moment) void open({ moment });
   else if (sessionId === undefined) void open({});
-  else if (sessionId !== visit?.session.sessionId) void open({ sessionId });
+  else if (sessionId !== shownSession?.session.sessionId) void open({ sessionId });
 });
 
 // Ten times a second for values read as they change, once a second for figures.
 setInterval(() => {
-  if (!visit || document.hidden) return;
-  const { samples, reach } = visit;
+  if (!shownSession || document.hidden) return;
+  const { samples, reach } = shownSession;
   plots.draw(samples.history, samples.newest?.simulationTimeS ?? 0, 0.4 * reach.lengthM, 0.1 * reach.mostN);
   const tool = samples.tools[0];
   const told = tool && samples.tell(tool);
   overlay.tell(told);
-  part("felt", HTMLElement).textContent = feltText(visit, told);
-  part("why", HTMLElement).classList.toggle("none", !isLess(visit, told));
+  part("felt", HTMLElement).textContent = feltText(shownSession, told);
+  part("why", HTMLElement).classList.toggle("none", !isLess(shownSession, told));
 }, 100);
 setInterval(() => {
   status.count();
-  if (!visit || document.hidden) return;
-  warnIfFar(visit);
-  const { session, samples, frames } = visit;
+  if (!shownSession || document.hidden) return;
+  warnIfFar(shownSession);
+  const { session, samples, frames } = shownSession;
   const { newest } = samples;
   const audited = session.audit?.newestError;
   status.show({
-    roundTripMs: visit.roundTripMs,
-    networkMs: visit.hand.tool.networkMs,
-    way: wayText(visit),
-    frameAgeMs: visit.frameAgeMs,
-    isStill: isStill(visit),
-    silentMs: performance.now() - visit.heardMs,
+    roundTripMs: shownSession.roundTripMs,
+    networkMs: shownSession.hand.tool.networkMs,
+    way: wayText(shownSession),
+    frameAgeMs: shownSession.frameAgeMs,
+    isStill: isStill(shownSession),
+    silentMs: performance.now() - shownSession.heardMs,
     framesTaken: frames.taken,
     framesDrawn: stage.drawn,
     framesSkipped: frames.skipped,
     picture: stage.describe(),
-    speed: visit.speed,
+    speed: shownSession.speed,
     overruns: newest?.overrunCount ?? session.overrunCount,
     dilation: newest?.timeDilation ?? session.timeDilation,
     awakePoints: newest?.awakePoints,
@@ -556,10 +556,10 @@ setInterval(() => {
 
 /** Fills the list of scripts with those that are made for the session's scene. */
 async function listScripts(sessionId: string): Promise<void> {
-  for (let failures = 0; visit?.session.sessionId === sessionId; failures++) {
+  for (let failures = 0; shownSession?.session.sessionId === sessionId; failures++) {
     try {
-      const { scriptNames } = await sessions.listScripts({ sessionId }, { timeoutMs: PATIENCE_MS });
-      part("script", HTMLSelectElement).replaceChildren(...scriptNames.slice(0, MOST_SCRIPTS).map((name) => new Option(excerpt(name), name)));
+      const { scriptNames } = await sessions.listScripts({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
+      part("script", HTMLSelectElement).replaceChildren(...scriptNames.slice(0, MAX_SCRIPTS).map((name) => new Option(excerpt(name), name)));
       part("scripts", HTMLElement).hidden = scriptNames.length === 0;
       return;
     } catch {
@@ -569,14 +569,14 @@ async function listScripts(sessionId: string): Promise<void> {
 }
 
 /** Whether no frame is due: the server sends none while nothing moves, and samples go on. */
-function isStill({ frames, samples, session, speed }: Visit): boolean {
+function isStill({ frames, samples, session, speed }: ShownSession): boolean {
   const { newest } = samples;
   if (session.state !== SessionState.RUNNING) return true;
   if (newest?.asleep ?? session.resting) return true;
   return newest !== undefined && frames.newest !== undefined && newest.simulationTimeS - frames.newest.timeS > STILL_S * speed;
 }
 
-Object.assign(window, { palpate: pageState(() => visit, stage, player, latency) });
+Object.assign(window, { palpate: pageState(() => shownSession, stage, player, latency) });
 
 const wireframe = part("wireframe", HTMLInputElement);
 wireframe.checked = asked.get("wireframe") === "1";

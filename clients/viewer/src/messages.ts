@@ -4,7 +4,7 @@ import { type Session, SessionState } from "palpate/v1";
 import { depthText } from "./overlay";
 import { quantity } from "./plot";
 import type { Told } from "./samples";
-import type { Visit } from "./visit";
+import type { ShownSession } from "./session";
 
 /** A tip that is less deep than this part of what it is set to has slipped off. */
 const SLIPPED = 0.6;
@@ -44,18 +44,18 @@ export function refusedText(message: string, reason: string, session: Session): 
 }
 
 /** What the strength is of the present tool. */
-export function strengthText({ hand: { mode, strength }, reach }: Visit): string {
+export function strengthText({ hand: { mode, strength }, reach }: ShownSession): string {
   if (mode === "pull") return "as you drag";
   return mode === "tip" ? quantity(strength * reach.depthM, "m") : quantity(strength * reach.mostN, "N");
 }
 
 /** What the strength means, and how that differs from what is felt. */
-export function meaningText({ hand, reach, surface }: Visit): string {
+export function meaningText({ hand, reach, surface }: ShownSession): string {
   const range = quantity(reach.lengthM, "m");
   if (hand.mode === "tip") {
     return `The tip is a disc of ${range} radius. Depth is how far it goes below the tissue at rest; what pushes back follows from that.`;
   }
-  return surface.flank
+  return surface.edge
     ? "Strength is the push in the middle of the tool. It fades out over about " +
       `${range}. What pushes back is the mean over the tissue around, weighted as the push is. The push is strongest in the ` +
       "middle, so that mean is less than the strength while nothing moves. While the tissue moves it may be more."
@@ -64,12 +64,12 @@ export function meaningText({ hand, reach, surface }: Visit): string {
 }
 
 /** Whether a push is told as clearly less than its strength: then somebody may ask why. */
-export function isLess({ hand: { mode, strength }, reach }: Visit, told: Told | undefined): boolean {
+export function isLess({ hand: { mode, strength }, reach }: ShownSession, told: Told | undefined): boolean {
   return told !== undefined && ["push", "stroke"].includes(mode) && told.allN < LESS * strength * reach.mostN;
 }
 
 /** What a tool feels, in words. */
-export function feltText({ hand }: Visit, told: Told | undefined): string {
+export function feltText({ hand }: ShownSession, told: Told | undefined): string {
   const { setM } = hand;
   if (setM !== undefined && (told?.deepM ?? 0) < SLIPPED * setM) {
     const now = told ? `now ${depthText(told)}, not ${quantity(setM, "m")}` : "it does not touch any more";
@@ -80,7 +80,7 @@ export function feltText({ hand }: Visit, told: Told | undefined): string {
 }
 
 /** Datagrams belong to a lease. */
-export function wayText({ hand }: Visit): string {
+export function wayText({ hand }: ShownSession): string {
   if (!hand.holds) return "no tool is held";
   return hand.tool.datagrams.carries ? "datagrams" : "gRPC-web";
 }

@@ -7,10 +7,10 @@ import type { Player } from "./player";
 import { received } from "./server";
 import { Sheet } from "./sheet";
 import type { Stage } from "./stage";
-import type { Visit } from "./visit";
+import type { ShownSession } from "./session";
 
 /** The page's state as numbers, for tests and measurements. */
-export function pageState(present: () => Visit | undefined, stage: Stage, player: Player, latency: Latency) {
+export function pageState(present: () => ShownSession | undefined, stage: Stage, player: Player, latency: Latency) {
   return {
     get frames() {
       const { taken, skipped, newest } = present()?.frames ?? { taken: 0, skipped: 0n };
@@ -53,8 +53,8 @@ export function pageState(present: () => Visit | undefined, stage: Stage, player
     },
     /** The least room between a tool and the tissue as drawn, of the width of the tissue; undefined without a tool. */
     get clear() {
-      const [{ clearM }, visit] = [stage, present()];
-      return clearM === undefined || !visit ? undefined : clearM / visit.widthM;
+      const [{ clearM }, shownSession] = [stage, present()];
+      return clearM === undefined || !shownSession ? undefined : clearM / shownSession.widthM;
     },
     /** Whether the first picture of the tissue was drawn, and had a texture; and whether it has one now. */
     get drawing() {
@@ -62,8 +62,8 @@ export function pageState(present: () => Visit | undefined, stage: Stage, player
     },
     /** The camera's height above the table and the tissue beneath it, of the width of the tissue. */
     get cameraHeight() {
-      const visit = present();
-      return visit ? stage.heightM / visit.widthM : 0;
+      const shownSession = present();
+      return shownSession ? stage.heightM / shownSession.widthM : 0;
     },
     /** Width of the tissue, m. */
     get widthM() {

@@ -4,10 +4,10 @@
 import { type Session, SessionState } from "palpate/v1";
 import { clockText, type JournalName, Recording, whenText } from "./journal";
 import { part } from "./page";
-import { backoffMs, describe, isGone, isPassing, PATIENCE_MS, sessions, sleep } from "./server";
+import { backoffMs, describe, isGone, isPassing, CALL_TIMEOUT_MS, sessions, sleep } from "./server";
 import { excerpt } from "./text";
 import { Timeline } from "./timeline";
-import type { Visit } from "./visit";
+import type { ShownSession } from "./session";
 
 /** A playback that nobody asks for is deleted after this time: a window that vanished can't do that itself. */
 const IDLE_S = 120;
@@ -22,7 +22,7 @@ const TICK_MS = 50;
 
 /** What the player needs of the page. */
 export interface Host {
-  present: () => Visit | undefined;
+  present: () => ShownSession | undefined;
   /** Shows a session in place of the present one, which has the same tissue. False if the page has gone elsewhere since. */
   exchange: (session: Session, step: number) => Promise<boolean>;
   /** Leaves for a live session, which has the same tissue. */
@@ -53,7 +53,7 @@ export interface Shown extends JournalName {
 
 /** Ends a playback, whatever comes of it: the server does so too, later. */
 export function discard({ sessionId }: Session): void {
-  void sessions.deleteSession({ sessionId }, { timeoutMs: PATIENCE_MS }).catch(() => {});
+  void sessions.deleteSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS }).catch(() => {});
 }
 
 /** A playback of a recording from a step on. */
@@ -64,7 +64,7 @@ function playback(recording: Recording, step: number, speed: number, paused: boo
 }
 
 async function created(request: Parameters<typeof sessions.createSession>[0]): Promise<Session> {
-  const { session } = await sessions.createSession(request, { timeoutMs: PATIENCE_MS });
+  const { session } = await sessions.createSession(request, { timeoutMs: CALL_TIMEOUT_MS });
   if (!session) throw new Error("the server made no session");
   return session;
 }
@@ -195,9 +195,9 @@ export class Player {
     if (!this.opened) return 0;
     if (this.aimed !== undefined) return this.aimed;
     const { recording, session } = this.opened;
-    const visit = this.host.present();
-    const isShown = visit?.session.sessionId === session.sessionId;
-    const newest = isShown ? Math.max(Number(visit.samples.newest?.step ?? 0n), Number(visit.session.step)) : 0;
+    const shownSession = this.host.present();
+    const isShown = shownSession?.session.sessionId === session.sessionId;
+    const newest = isShown ? Math.max(Number(shownSession.samples.newest?.step ?? 0n), Number(shownSession.session.step)) : 0;
     return recording.clamp(Math.max(newest, Number(session.step)));
   }
 
@@ -243,8 +243,8 @@ export class Player {
           await this.exchange(opened, this.aimed, !shallRun);
         } else if (this.runs.is !== shallRun && !(shallRun && this.isAtEnd)) {
           const { sessionId } = opened.session;
-          if (shallRun) await sessions.startSession({ sessionId }, { timeoutMs: PATIENCE_MS });
-          else await sessions.pauseSession({ sessionId }, { timeoutMs: PATIENCE_MS });
+          if (shallRun) await sessions.startSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
+          else await sessions.pauseSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
           this.runs = { is: shallRun, sinceMs: performance.now() };
         } else {
           break;
@@ -298,8 +298,8 @@ export class Player {
       this.isPlaying = false;
       await this.calm();
       const { sessionId } = opened.session;
-      if (this.runs.is) await sessions.pauseSession({ sessionId }, { timeoutMs: PATIENCE_MS });
-      const { session: shown } = await sessions.getSession({ sessionId }, { timeoutMs: PATIENCE_MS });
+      if (this.runs.is) await sessions.pauseSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
+      const { session: shown } = await sessions.getSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
       const { recording } = opened;
       const value = { sessionId: recording.sessionId, run: recording.run, step: shown?.step ?? BigInt(this.step) };
       const session = await created({ source: { case: "journal", value } });
@@ -323,7 +323,7 @@ export class Player {
     if (!opened) return;
     try {
       const { sessionId } = opened.recording;
-      const { session } = await sessions.getSession({ sessionId }, { timeoutMs: PATIENCE_MS });
+      const { session } = await sessions.getSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS });
       if (session && this.opened === opened) await this.host.goLive(session);
     } catch (error) {
       this.host.notice(isGone(error) ? "The session has ended." : `The session can't be reached: ${describe(error)}.`);
@@ -341,7 +341,7 @@ export class Player {
       try {
         const { sessionId } = opened.recording;
         // The session itself is deleted if nobody asks for it.
-        await sessions.getSession({ sessionId }, { timeoutMs: PATIENCE_MS }).catch(() => {});
+        await sessions.getSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS }).catch(() => {});
         opened.recording = await Recording.of(opened.recording);
       } catch {
         // The playback's own streams tell if the server is lost.

@@ -50,8 +50,8 @@ export function sampleEvery(stepRateHz: number): number {
 export const HISTORY_S = 6;
 
 /** Moments of the plots, and tools of a sample, at most. */
-const MOST_MOMENTS = 8 * HISTORY_S * RATE_HZ;
-const MOST_TOOLS = 256;
+const MAX_MOMENTS = 8 * HISTORY_S * RATE_HZ;
+const MAX_TOOLS = 256;
 
 /** A tool counts as touching above this fraction of the strongest push. */
 const FELT = 0.01;
@@ -111,7 +111,7 @@ export class Samples {
     if (!Number.isFinite(sample.simulationTimeS) || (this.newest && sample.step < this.newest.step)) return;
     this.newest = sample;
     const felt = tools
-      .slice(0, MOST_TOOLS)
+      .slice(0, MAX_TOOLS)
       .filter((tool) => tool.point !== undefined || tool.vertex !== undefined)
       .map((tool) => ({
         tool: tool.tool,
@@ -131,7 +131,7 @@ export class Samples {
     if (first) this.history.push({ timeS, displacementM: first.displacementM, ...this.tell(first) });
     // A gap of a second or more stays visible. Older samples are dropped.
     const isOld = ({ timeS: thenS }: Moment) => !(thenS > timeS - HISTORY_S && thenS <= timeS);
-    while (this.history.length > MOST_MOMENTS || (this.history[0] && isOld(this.history[0]))) this.history.shift();
+    while (this.history.length > MAX_MOMENTS || (this.history[0] && isOld(this.history[0]))) this.history.shift();
     this.onSample(sample);
   }
 }

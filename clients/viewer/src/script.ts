@@ -2,7 +2,7 @@
 
 import { create } from "@bufbuild/protobuf";
 import { type Command, CommandSchema } from "palpate/v1";
-import { haptics, PATIENCE_MS, sessions, sleep } from "./server";
+import { haptics, CALL_TIMEOUT_MS, sessions, sleep } from "./server";
 
 /** Delay from the start to the first command's step, and how far ahead the others are sent, s. */
 const LEAD_S = 0.3;
@@ -30,7 +30,7 @@ export async function playScript(
     tools = part.tools;
   }
   const leases: string[] = [];
-  const call = { timeoutMs: PATIENCE_MS, signal };
+  const call = { timeoutMs: CALL_TIMEOUT_MS, signal };
   try {
     for (let tool = 0; tool < tools; tool++) {
       const { leaseId } = await haptics.acquireTool({ sessionId, tool, leaseS: LEASE_S, holder }, call);
@@ -59,7 +59,7 @@ export async function playScript(
   } finally {
     // The tools' actions end with their leases.
     for (const leaseId of leases) {
-      await haptics.releaseTool({ sessionId, leaseId }, { timeoutMs: PATIENCE_MS }).catch(() => {});
+      await haptics.releaseTool({ sessionId, leaseId }, { timeoutMs: CALL_TIMEOUT_MS }).catch(() => {});
     }
   }
   return warnings;

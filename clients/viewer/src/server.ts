@@ -5,4 +5,4 @@ import { Server } from "palpate";
 export const server = new Server(location.origin);
 export const { sessions, haptics, received } = server;
 
-export { backoffMs, describe, type Failure, isGone, isPassing, isUnimplemented, keepOpen, PATIENCE_MS, reasonOf, sleep } from "palpate";
+export { backoffMs, describe, type Failure, isGone, isPassing, isUnimplemented, keepOpen, CALL_TIMEOUT_MS, reasonOf, sleep } from "palpate";

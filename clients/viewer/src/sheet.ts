@@ -3,12 +3,12 @@
 
 import { Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, Plane, type Ray, Vector3 } from "three";
 import { Field, type Rectangle } from "palpate";
-import { Flank } from "./flank";
+import { SheetEdge } from "./sheet-edge";
 import type { Felt } from "./samples";
 import type { Centre, Place, Point, Push, Surface } from "./surface";
 
 /** With fewer vertices than this, a sheet shows its coarse drawing. */
-const LEAST_VERTICES = 6000;
+const MIN_VERTICES = 6000;
 /** How many spacings of mass points away the surroundings count for the light in a dent. */
 const WIDEST = 4;
 /** How far beside the sheet a press still means its edge, of its size. */
@@ -22,7 +22,7 @@ export class Sheet implements Surface {
   readonly geometry = new BufferGeometry();
   /** Geometry of the lines between mass points. */
   readonly lines = new BufferGeometry();
-  readonly flank: Flank;
+  readonly edge: SheetEdge;
   readonly box: Box3;
   readonly sizeM: number;
   readonly isOpen = false;
@@ -54,7 +54,7 @@ export class Sheet implements Surface {
     this.spanM = [(nx - 1) * spacingM, (ny - 1) * spacingM];
     this.box = new Box3(new Vector3(), new Vector3(...this.spanM, 0));
     this.sizeM = Math.hypot(...this.spanM);
-    this.flank = new Flank(...this.spanM);
+    this.edge = new SheetEdge(...this.spanM);
     this.drawEvery(1);
   }
 
@@ -62,7 +62,7 @@ export class Sheet implements Surface {
   drawEvery(wanted: number): boolean {
     const { nx, ny } = this.field;
     let every = wanted;
-    while (every > 1 && nx * ny < LEAST_VERTICES * every * every) every /= 2;
+    while (every > 1 && nx * ny < MIN_VERTICES * every * every) every /= 2;
     if (every === this.every) return false;
     this.every = every;
     const among = (n: number) => Uint32Array.from({ length: Math.ceil((n - 1) / every) + 1 }, (_, i) => Math.min(i * every, n - 1));
@@ -95,7 +95,7 @@ export class Sheet implements Surface {
     this.geometry.setIndex(new BufferAttribute(triangles, 1));
     this.lines.setAttribute("position", this.position);
     this.lines.setIndex(new BufferAttribute(gridLines(rows, columns, this.pointEvery), 1));
-    this.flank.begin(this.position, this.normal, mx, my);
+    this.edge.begin(this.position, this.normal, mx, my);
     this.work({ a0: 0, a1: mx - 1, b0: 0, b1: my - 1 });
     return true;
   }
@@ -134,7 +134,7 @@ export class Sheet implements Surface {
       attribute.addUpdateRange(attribute.itemSize * first * my, attribute.itemSize * (last - first + 1) * my);
       attribute.needsUpdate = true;
     }
-    if (first === 0 || left === 0 || last === mx - 1 || right === my - 1) this.flank.follow();
+    if (first === 0 || left === 0 || last === mx - 1 || right === my - 1) this.edge.follow();
   }
 
   private place({ a0, a1, b0, b1 }: Rectangle): void {
@@ -354,7 +354,7 @@ export class Sheet implements Surface {
   dispose(): void {
     this.geometry.dispose();
     this.lines.dispose();
-    this.flank.geometry.dispose();
+    this.edge.geometry.dispose();
   }
 }
 

@@ -26,7 +26,7 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { Body } from "./body";
 import { Effort, isDrawnBySoftware } from "./effort";
 import { Ground } from "./ground";
-import { homeOfBody, homeOfSheet } from "./home";
+import { defaultCameraOfBody, defaultCameraOfSheet } from "./default-camera";
 import { light, Skin, SHADOWS } from "./material";
 import { norm, type Vec3 } from "palpate";
 import type { Lump } from "./lumps";
@@ -47,7 +47,7 @@ const FIELD_OF_VIEW = 28;
 /** Corners of the ring where the pointer is. */
 const RING_POINTS = 32;
 /** Least height of the camera above a sheet, of its size. */
-const LEAST_HEIGHT = 0.06;
+const MIN_HEIGHT = 0.06;
 /** The least distance of the camera from a closed body, and of what it turns about in an open one, of its size. */
 const NEAREST = 0.05;
 const AHEAD = 0.15;
@@ -83,7 +83,7 @@ export class Stage {
   private readonly lumpy = new MeshBasicMaterial({ color: 0x3d8bff, depthTest: false, transparent: true, opacity: 0.45 });
   private lumps: Mesh[] = [];
   private mesh: Mesh | undefined;
-  private flank: Mesh | undefined;
+  private edge: Mesh | undefined;
   private lines: LineSegments | undefined;
   private surface: Surface | undefined;
   private readonly marks: ToolMark[] = [];
@@ -143,7 +143,7 @@ export class Stage {
   /** Shows a surface. `keepView` keeps the camera and the texture; else the tissue is seen above what is covered. */
   show(surface: Surface, keepView: boolean, coveredPx = 0): void {
     if (!keepView) this.coveredPx = coveredPx;
-    for (const old of [this.mesh, this.flank, this.lines, this.ground?.mesh]) if (old) this.scene.remove(old);
+    for (const old of [this.mesh, this.edge, this.lines, this.ground?.mesh]) if (old) this.scene.remove(old);
     this.surface?.dispose();
     this.ground?.dispose();
     this.surface = surface;
@@ -162,10 +162,10 @@ export class Stage {
       surface.onLight = () => this.draw();
     }
     this.mesh = new Mesh(surface.geometry, skin);
-    this.flank = surface.flank && new Mesh(surface.flank.geometry, skin);
+    this.edge = surface.edge && new Mesh(surface.edge.geometry, skin);
     this.lines = new LineSegments(surface.lines, this.wires);
     this.ground = new Ground(surface, this.colour.table, this.colour.background);
-    for (const part of [this.mesh, this.flank, this.lines, this.ground.mesh]) {
+    for (const part of [this.mesh, this.edge, this.lines, this.ground.mesh]) {
       if (!part) continue;
       // Bounds of a moving surface are not worth computing.
       part.frustumCulled = false;
@@ -204,8 +204,8 @@ export class Stage {
     const surface = this.surface;
     if (!surface || width === 0 || height === 0) return;
     const home = [this.camera, this.orbit.target, { width, height, coveredPx: this.coveredPx }] as const;
-    if (surface instanceof Body) homeOfBody(surface, ...home);
-    else homeOfSheet(surface, ...home);
+    if (surface instanceof Body) defaultCameraOfBody(surface, ...home);
+    else defaultCameraOfSheet(surface, ...home);
     this.orbit.update();
     this.views += 1;
     this.draw();
@@ -215,7 +215,7 @@ export class Stage {
     this.wireframe = on;
     if (this.mesh) this.mesh.material = on ? this.hidden : this.skin;
     if (this.lines) this.lines.visible = on;
-    if (this.flank) this.flank.visible = !on;
+    if (this.edge) this.edge.visible = !on;
     if (this.ground) this.ground.mesh.visible = !on;
     this.draw();
   }
@@ -481,10 +481,10 @@ export class Stage {
     if (!surface) return;
     const { position } = this.camera;
     const { target } = this.orbit;
-    if (surface.flank) {
+    if (surface.edge) {
       target.x = Math.min(Math.max(target.x, surface.box.min.x), surface.box.max.x);
       target.y = Math.min(Math.max(target.y, surface.box.min.y), surface.box.max.y);
-      const floor = Math.max(surface.heightAt(position.x, position.y) ?? 0, 0) + LEAST_HEIGHT * surface.sizeM;
+      const floor = Math.max(surface.heightAt(position.x, position.y) ?? 0, 0) + MIN_HEIGHT * surface.sizeM;
       if (position.z < floor) {
         position.z = floor;
         this.camera.lookAt(target);

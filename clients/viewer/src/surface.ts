@@ -4,7 +4,7 @@
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { Box3, BufferGeometry, Ray, Vector3 } from "three";
 import type { Field, Vec3 } from "palpate";
-import type { Flank } from "./flank";
+import type { SheetEdge } from "./sheet-edge";
 import type { ForceSchema, PositionSchema } from "palpate/v1";
 import type { Felt } from "./samples";
 
@@ -42,7 +42,7 @@ export interface Surface {
   /** Geometry of the lines between mass points. */
   readonly lines: BufferGeometry;
   /** Around a sheet. */
-  readonly flank: Flank | undefined;
+  readonly edge: SheetEdge | undefined;
   /** Around the tissue at rest, without its flank, m. */
   readonly box: Box3;
   /** Length of its diagonal. */

@@ -3,7 +3,7 @@
 import { part } from "./page";
 import { quantity } from "./plot";
 import type { Scene, Session } from "palpate/v1";
-import { describe, isUnimplemented, PATIENCE_MS, sessions } from "./server";
+import { describe, isUnimplemented, CALL_TIMEOUT_MS, sessions } from "./server";
 
 interface Values {
   k: number;
@@ -18,7 +18,7 @@ function valuesOf(scene: Scene | undefined): Values {
   return {
     k: scene?.springs?.stiffnessNPerM ?? 0,
     c: scene?.damping?.coefficientNSPerM ?? 0,
-    v: scene?.virtualSprings?.stiffnessNPerM ?? 0,
+    v: scene?.anchorSprings?.stiffnessNPerM ?? 0,
   };
 }
 
@@ -84,10 +84,10 @@ export class TissueValues {
         sessionId: this.sessionId,
         stiffnessNPerM: k,
         dampingNSPerM: c,
-        virtualStiffnessNPerM: v,
+        anchorStiffnessNPerM: v,
       };
       try {
-        newest = (await sessions.updateTissue(request, { timeoutMs: PATIENCE_MS })).session ?? newest;
+        newest = (await sessions.updateTissue(request, { timeoutMs: CALL_TIMEOUT_MS })).session ?? newest;
       } catch (error) {
         this.onRefused(isUnimplemented(error) ? "This server can't change a running tissue." : describe(error));
         newest = (await sessions.getSession({ sessionId: this.sessionId }).catch(() => undefined))?.session ?? newest;

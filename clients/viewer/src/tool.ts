@@ -36,7 +36,7 @@ const SHAFT = 0.42;
 const LENGTH = 0.75;
 /** A tool that is closer to the eye than this part of the tissue's size is drawn smaller, down to this part of itself. */
 const NEAR = 0.9;
-const LEAST = 0.25;
+const MIN_SCALE = 0.25;
 /** How far the shaft leans aside, as long as there is room. */
 const LEAN = new Vector3(0.5, 0.28, 0.82).normalize();
 /** The gauge of the depth is not drawn when one looks along it: from so much of its direction, a cosine, on. */
@@ -117,7 +117,7 @@ export class ToolMark {
     const moved = this.moved.copy(surface.displacementAt(place));
     // From within a body one looks at it from close by.
     const apart = this.tipM.set(...place.restM).add(moved).distanceTo(eye);
-    const near = surface.flank ? 1 : Math.min(1, Math.max(apart / (NEAR * size), LEAST));
+    const near = surface.edge ? 1 : Math.min(1, Math.max(apart / (NEAR * size), MIN_SCALE));
     const r = (this.radiusM = (near * size) / 64);
     this.lengthM = LENGTH * size;
     surface.restOn(place, r, this.tipM);
@@ -129,7 +129,7 @@ export class ToolMark {
     this.probe.scale.setScalar(r);
     this.probe.quaternion.setFromUnitVectors(UP, this.axis);
     const whole = HANDLE.to * r;
-    const free = surface.flank ? whole : whole + Math.min(0, surface.room(this.tipM, this.axis, whole, r, 0));
+    const free = surface.edge ? whole : whole + Math.min(0, surface.room(this.tipM, this.axis, whole, r, 0));
     this.lengthM = Math.min(this.lengthM, free);
     this.handle.scale.z = Math.max((ARROW.room * free) / r - HANDLE.from, 0.01) / (HANDLE.to - HANDLE.from);
     const strength = norm(tool.forceN);
@@ -139,7 +139,7 @@ export class ToolMark {
       this.force.set(...tool.forceN).divideScalar(strength);
       let long = near * Math.min(tool.part, 1.2) * ARROW.size * size + 2.4 * r;
       // Within a tube it ends before the wall.
-      if (!surface.flank) long = Math.max(ARROW.room * (long + Math.min(0, surface.room(this.tipM, this.force, long, r, 0))), 3 * r);
+      if (!surface.edge) long = Math.max(ARROW.room * (long + Math.min(0, surface.room(this.tipM, this.force, long, r, 0))), 3 * r);
       this.arrow.position.copy(this.tipM);
       this.arrow.quaternion.setFromUnitVectors(UP, this.force);
       this.rod.scale.set(r, r, long - 1.5 * r);
@@ -171,7 +171,7 @@ export class ToolMark {
     const end = this.tried.copy(this.tipM).addScaledVector(this.axis, this.lengthM);
     light.shafts.value[this.index]!.set(end.x, end.y, end.z, 1.2 * SHAFT * r);
     // In a dent of a body it would be several rings, where its walls meet the ball.
-    light.rings.value[this.index]!.copy(light.tips.value[this.index]!).setW(deep && !surface.flank ? 0 : 2.1 * r);
+    light.rings.value[this.index]!.copy(light.tips.value[this.index]!).setW(deep && !surface.edge ? 0 : 2.1 * r);
   }
 
   /** The directions of the place: a shaft that stands on it goes on leaning as it did. */
@@ -201,7 +201,7 @@ export class ToolMark {
     let best = -Infinity;
     const [dx, dy] = [this.moved.dot(this.across), this.moved.dot(this.aside)];
     const back = Math.hypot(dx, dy) / this.radiusM;
-    for (let k = 0; k < 8 + (surface.flank ? 0 : BESIDE_EYE.length + AROUND); k++) {
+    for (let k = 0; k < 8 + (surface.edge ? 0 : BESIDE_EYE.length + AROUND); k++) {
       const part = (0.3 * (k - 4)) / (this.radiusM * Math.max(back, 1));
       if (k < 5) this.along(LEAN.x * (1 - k / 4), LEAN.y * (1 - k / 4), LEAN.z * (1 - k / 4) + k / 4);
       else if (k < 8) this.along(-dx * part, -dy * part, 1);

@@ -4,10 +4,10 @@
 // metres, and from the size that it reports follows that in every other unit.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
-import { MOST_VERTICES, sceneOf } from "./coefficients";
+import { MAX_VERTICES, sceneOf } from "./coefficients";
 import type { MeshProblem, MeshReport, SceneSchema, Session } from "palpate/v1";
 import { part } from "./page";
-import { describe, PATIENCE_MS, sessions } from "./server";
+import { describe, CALL_TIMEOUT_MS, sessions } from "./server";
 import { excerpt } from "./text";
 
 /** Bytes of a part. */
@@ -74,7 +74,7 @@ function reportText(report: MeshReport): string {
 class Ended extends Error {}
 
 /** Problems of a mesh that are told. */
-const MOST_PROBLEMS = 100;
+const MAX_PROBLEMS = 100;
 
 export class FileOpener {
   private readonly dialog = part("own", HTMLDialogElement);
@@ -167,7 +167,7 @@ export class FileOpener {
       const last = offset + PART_BYTES >= file.size;
       if (last) this.said.textContent = repair ? "The server mends the mesh …" : "The server reads the mesh …";
       const request = { meshId, fileName: file.name, offset: BigInt(offset), part: bytes, last, unit, repair };
-      const answer = await sessions.uploadMesh(request, { signal, timeoutMs: last ? READING_MS : PATIENCE_MS });
+      const answer = await sessions.uploadMesh(request, { signal, timeoutMs: last ? READING_MS : CALL_TIMEOUT_MS });
       meshId = answer.meshId;
       this.progress.value = Math.min(1, (offset + bytes.length) / file.size);
       if (!last) continue;
@@ -219,7 +219,7 @@ export class FileOpener {
   private async make(fileName: string, { meshId, report }: Sent, signal: AbortSignal): Promise<[Session | undefined, Scene]> {
     const name = fileName.replace(/\.[^.]*$/, "") || fileName;
     const call = { signal, timeoutMs: READING_MS };
-    const fewer = Math.min(report.vertices, MOST_VERTICES);
+    const fewer = Math.min(report.vertices, MAX_VERTICES);
     const scene = sceneOf(name, meshId, report, fewer);
     const create = async (value: Scene) => (await sessions.createSession({ source: { case: "scene", value } }, call)).session;
     const session = await create(scene);
@@ -235,7 +235,7 @@ export class FileOpener {
     this.progress.hidden = true;
     this.units.hidden = true;
     this.problems.replaceChildren(
-      ...problems.slice(0, MOST_PROBLEMS).map((problem) => {
+      ...problems.slice(0, MAX_PROBLEMS).map((problem) => {
         const line = document.createElement("li");
         line.textContent = excerpt(problem);
         return line;

@@ -19,7 +19,7 @@ spacing_m = 0.003
 point_mass_kg = 0.004
 [springs]
 stiffness_n_per_m = 10.0
-[virtual_springs]
+[anchor_springs]
 stiffness_n_per_m = 1.0
 [damping]
 coefficient_n_s_per_m = 0.06

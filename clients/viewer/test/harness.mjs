@@ -14,7 +14,7 @@ export const PICTURES = join(ROOT, "target/viewer");
 mkdirSync(PICTURES, { recursive: true });
 
 /** Long enough for any machine; what waits so long has failed. */
-export const PATIENCE_MS = 120_000;
+export const TEST_TIMEOUT_MS = 120_000;
 
 const NAMES = ["chromium", "chromium-browser", "google-chrome", "google-chrome-stable"];
 
@@ -219,7 +219,7 @@ export class Page {
     this.page = page;
     /** @type {string[]} */
     this.complaints = [];
-    page.setDefaultTimeout(PATIENCE_MS);
+    page.setDefaultTimeout(TEST_TIMEOUT_MS);
     page.on("console", (message) => {
       // Without a graphics processor the browser itself reads each picture back, and tells the page of it.
       if (!message.text().endsWith("GPU stall due to ReadPixels") && !message.text().includes("no longer repeat")) {
@@ -245,7 +245,7 @@ export class Page {
     const source = `window.palpate !== undefined && (${condition.toString()})(window.palpate, ${JSON.stringify(argument)})`;
     const begun = Date.now();
     while (!(await this.page.evaluate(source).catch(whileLoading))) {
-      if (Date.now() - begun > PATIENCE_MS) {
+      if (Date.now() - begun > TEST_TIMEOUT_MS) {
         const told = await this.page.evaluate("JSON.stringify(window.palpate)").catch(String);
         throw new Error(`waited in vain for ${condition.toString()} with ${JSON.stringify(argument)}: ${told}`);
       }

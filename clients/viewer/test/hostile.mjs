@@ -31,7 +31,7 @@ export const SESSION = {
     name: "sheet",
     sheet: { pointsX: 5, pointsY: 5, spacingM: 0.01, pointMassKg: 1e-3 },
     springs: { stiffnessNPerM: 10 },
-    virtualSprings: { stiffnessNPerM: 5 },
+    anchorSprings: { stiffnessNPerM: 5 },
     damping: { coefficientNSPerM: 0.1 },
     stepping: { rateHz: 1000, tolerance: 1e-3 },
   },

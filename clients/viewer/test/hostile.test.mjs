@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { after, before, describe, test } from "node:test";
-import { launch, PATIENCE_MS } from "./harness.mjs";
+import { launch, TEST_TIMEOUT_MS } from "./harness.mjs";
 import { Hostile, pause, SESSION } from "./hostile.mjs";
 
 /** @typedef {import("./hostile.mjs").Way} Way */
@@ -20,7 +20,7 @@ async function at(ways, /** @type {(page: import("playwright-core").Page, hostil
   const context = await browser.newContext({ viewport: { width: 820, height: 540 } });
   try {
     const page = await context.newPage();
-    page.setDefaultTimeout(PATIENCE_MS);
+    page.setDefaultTimeout(TEST_TIMEOUT_MS);
     await page.goto(hostile.url);
     await look(page, hostile);
   } finally {

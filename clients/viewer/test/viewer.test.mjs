@@ -670,7 +670,7 @@ unit = "m"
 point_mass_kg = 5e-4
 [springs]
 stiffness_n_per_m = 20.0
-[virtual_springs]
+[anchor_springs]
 stiffness_n_per_m = 20.0
 [damping]
 coefficient_n_s_per_m = 0.1

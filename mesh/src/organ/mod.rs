@@ -28,7 +28,7 @@ use shape::Shape;
 use crate::{Group, TriangleMesh};
 
 /// The most vertices of an organ.
-pub const MOST_VERTICES: usize = 500_000;
+pub const MAX_VERTICES: usize = 500_000;
 
 /// The area of an equilateral triangle, and so half the area a vertex, with edges of length 1: √3/4.
 const EQUILATERAL: f64 = 0.433_012_701_892_219_3;
@@ -180,18 +180,18 @@ fn in_mm(length_m: f64) -> f64 {
 /// vertices of whole triangles, so that formats which group triangles can keep it.
 ///
 /// # Errors
-/// Refuses an edge length that is not a number above 0, that would give more than [`MOST_VERTICES`], or that is too long for
+/// Refuses an edge length that is not a number above 0, that would give more than [`MAX_VERTICES`], or that is too long for
 /// the thinnest part of the organ; the refusal tells the nearest one that fits.
 pub fn generate(organ: Organ, edge_m: f64, seed: u64) -> Result<TriangleMesh, OrganError> {
-    generate_within(organ, edge_m, seed, MOST_VERTICES)
+    generate_within(organ, edge_m, seed, MAX_VERTICES)
 }
 
-/// The same with another bound of the number of vertices, if it is less than [`MOST_VERTICES`].
+/// The same with another bound of the number of vertices, if it is less than [`MAX_VERTICES`].
 ///
 /// # Errors
 /// As for [`generate`].
 pub fn generate_within(organ: Organ, edge_m: f64, seed: u64, most: usize) -> Result<TriangleMesh, OrganError> {
-    let most = most.min(MOST_VERTICES);
+    let most = most.min(MAX_VERTICES);
     if !(edge_m.is_finite() && edge_m > 0.0) {
         return Err(OrganError::NotALength { edge_m });
     }

@@ -16,7 +16,7 @@ const LONG: f64 = 4.0 / 3.0;
 const SHORT: f64 = 4.0 / 5.0;
 
 /// More rounds than the finest mesh needs: each halves what is too long.
-const MOST_ROUNDS: usize = 24;
+const MAX_ROUNDS: usize = 24;
 
 /// Rounds in a row that change hardly anything before the mesh is taken for even.
 const CALM_ROUNDS: usize = 3;
@@ -62,7 +62,7 @@ impl<'s> Remesh<'s> {
     /// Makes the mesh even.
     pub(super) fn even(mut self) -> Even {
         let mut calm = 0;
-        for _ in 0..MOST_ROUNDS {
+        for _ in 0..MAX_ROUNDS {
             let changed = self.split_long() + self.collapse_short();
             self.flip_to_delaunay();
             self.relax(1);

@@ -17,17 +17,17 @@ use super::draft::Draft;
 use super::source::{Order, Scalar, named};
 use super::without_mark;
 use crate::{Element, MeshError, Problem};
-use json::{Head, MOST, Root, other_extension, other_version};
+use json::{Head, MAX_NESTED, Root, other_extension, other_version};
 
 /// Memory of the short entries of lists in JSON, for each byte of its text, and at most, bytes: lists are short.
 const ENTRIES_MULTIPLE: usize = 24;
-const MOST_ENTRIES: usize = 16 << 20;
+const MAX_ENTRIES: usize = 16 << 20;
 
 /// A node that waits, with its place.
 const WAITING: usize = 2 * size_of::<(usize, DMat4)>();
 
 /// A file that is being read.
-struct File<'a> {
+struct GltfFile<'a> {
     name: &'a str,
     root: Root,
     buffers: Vec<Cow<'a, [u8]>>,
@@ -108,14 +108,14 @@ pub(super) fn read(
     let json = without_mark(&json[..end]);
     let fail_whole = |problem| MeshError { file: name.to_owned(), element: Element::Whole, place_m: None, problem };
     // With texts, which are no longer in memory than in the file.
-    let entries = json.len().saturating_mul(ENTRIES_MULTIPLE).min(MOST_ENTRIES);
+    let entries = json.len().saturating_mul(ENTRIES_MULTIPLE).min(MAX_ENTRIES);
     draft.allowance.take(2 * json.len() + entries).map_err(fail_whole)?;
     let head: Head = parsed(name, json)?;
     if let Some(problem) = head.refusal() {
         return Err(MeshError { file: name.to_owned(), element: Element::Whole, place_m: None, problem });
     }
     let root: Root = parsed(name, json)?;
-    let mut file = File { name, root, buffers: Vec::new(), primitives: Cell::new(0) };
+    let mut file = GltfFile { name, root, buffers: Vec::new(), primitives: Cell::new(0) };
     let mut buffers: Vec<Cow<'_, [u8]>> = Vec::new();
     for (number, buffer) in file.root.buffers.0.iter().enumerate() {
         let fail = |problem| file.fail("buffer", number, problem);
@@ -158,7 +158,7 @@ pub(super) fn read(
     file.nodes(draft)
 }
 
-impl File<'_> {
+impl GltfFile<'_> {
     fn fail(&self, part: &'static str, number: usize, problem: Problem) -> MeshError {
         MeshError { file: self.name.to_owned(), element: Element::Part(part, number as u64), place_m: None, problem }
     }
@@ -226,8 +226,8 @@ impl File<'_> {
         let mesh = self.root.meshes.0.get(number).ok_or_else(|| self.missing("mesh", number))?;
         for primitive in &mesh.primitives.0 {
             self.primitives.set(self.primitives.get() + 1);
-            if self.primitives.get() > MOST {
-                return Err(self.fail("mesh", number, Problem::TooLarge { what: "primitives", limit: MOST }));
+            if self.primitives.get() > MAX_NESTED {
+                return Err(self.fail("mesh", number, Problem::TooLarge { what: "primitives", limit: MAX_NESTED }));
             }
             let mode = primitive.mode.unwrap_or(4);
             if !(4..=6).contains(&mode) {

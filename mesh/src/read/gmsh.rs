@@ -14,7 +14,7 @@ const PHYSICAL: usize = 16;
 
 /// What an element is, by its corners.
 #[derive(Clone, Copy)]
-enum Kind {
+enum ElementKind {
     /// A point or line: no surface.
     Line,
     Face(usize),
@@ -22,57 +22,57 @@ enum Kind {
 }
 
 /// An element type of Gmsh: how many nodes it has, the corners first, and its dimension.
-fn element_type(number: i64) -> Option<(usize, i64, Kind)> {
+fn element_type(number: i64) -> Option<(usize, i64, ElementKind)> {
     use Cell::{Hexahedron, Prism, Pyramid, Tetrahedron};
     Some(match number {
-        15 => (1, 0, Kind::Line),
-        1 => (2, 1, Kind::Line),
-        8 => (3, 1, Kind::Line),
-        26 => (4, 1, Kind::Line),
-        27 => (5, 1, Kind::Line),
-        28 => (6, 1, Kind::Line),
+        15 => (1, 0, ElementKind::Line),
+        1 => (2, 1, ElementKind::Line),
+        8 => (3, 1, ElementKind::Line),
+        26 => (4, 1, ElementKind::Line),
+        27 => (5, 1, ElementKind::Line),
+        28 => (6, 1, ElementKind::Line),
         // Curved ones have more nodes, up to the fifth order.
-        2 => (3, 2, Kind::Face(3)),
-        9 => (6, 2, Kind::Face(3)),
-        20 => (9, 2, Kind::Face(3)),
-        21 => (10, 2, Kind::Face(3)),
-        22 => (12, 2, Kind::Face(3)),
-        23 => (15, 2, Kind::Face(3)),
-        24 => (15, 2, Kind::Face(3)),
-        25 => (21, 2, Kind::Face(3)),
-        3 => (4, 2, Kind::Face(4)),
-        10 => (9, 2, Kind::Face(4)),
-        16 => (8, 2, Kind::Face(4)),
-        36 => (16, 2, Kind::Face(4)),
-        37 => (25, 2, Kind::Face(4)),
-        38 => (36, 2, Kind::Face(4)),
-        39 => (12, 2, Kind::Face(4)),
-        4 => (4, 3, Kind::Cell(Tetrahedron)),
-        11 => (10, 3, Kind::Cell(Tetrahedron)),
-        29 => (20, 3, Kind::Cell(Tetrahedron)),
-        30 => (35, 3, Kind::Cell(Tetrahedron)),
-        31 => (56, 3, Kind::Cell(Tetrahedron)),
-        5 => (8, 3, Kind::Cell(Hexahedron)),
-        12 => (27, 3, Kind::Cell(Hexahedron)),
-        17 => (20, 3, Kind::Cell(Hexahedron)),
-        92 => (64, 3, Kind::Cell(Hexahedron)),
-        93 => (125, 3, Kind::Cell(Hexahedron)),
-        6 => (6, 3, Kind::Cell(Prism)),
-        13 => (18, 3, Kind::Cell(Prism)),
-        18 => (15, 3, Kind::Cell(Prism)),
-        90 => (40, 3, Kind::Cell(Prism)),
-        91 => (75, 3, Kind::Cell(Prism)),
-        7 => (5, 3, Kind::Cell(Pyramid)),
-        14 => (14, 3, Kind::Cell(Pyramid)),
-        19 => (13, 3, Kind::Cell(Pyramid)),
-        118 => (30, 3, Kind::Cell(Pyramid)),
-        119 => (55, 3, Kind::Cell(Pyramid)),
+        2 => (3, 2, ElementKind::Face(3)),
+        9 => (6, 2, ElementKind::Face(3)),
+        20 => (9, 2, ElementKind::Face(3)),
+        21 => (10, 2, ElementKind::Face(3)),
+        22 => (12, 2, ElementKind::Face(3)),
+        23 => (15, 2, ElementKind::Face(3)),
+        24 => (15, 2, ElementKind::Face(3)),
+        25 => (21, 2, ElementKind::Face(3)),
+        3 => (4, 2, ElementKind::Face(4)),
+        10 => (9, 2, ElementKind::Face(4)),
+        16 => (8, 2, ElementKind::Face(4)),
+        36 => (16, 2, ElementKind::Face(4)),
+        37 => (25, 2, ElementKind::Face(4)),
+        38 => (36, 2, ElementKind::Face(4)),
+        39 => (12, 2, ElementKind::Face(4)),
+        4 => (4, 3, ElementKind::Cell(Tetrahedron)),
+        11 => (10, 3, ElementKind::Cell(Tetrahedron)),
+        29 => (20, 3, ElementKind::Cell(Tetrahedron)),
+        30 => (35, 3, ElementKind::Cell(Tetrahedron)),
+        31 => (56, 3, ElementKind::Cell(Tetrahedron)),
+        5 => (8, 3, ElementKind::Cell(Hexahedron)),
+        12 => (27, 3, ElementKind::Cell(Hexahedron)),
+        17 => (20, 3, ElementKind::Cell(Hexahedron)),
+        92 => (64, 3, ElementKind::Cell(Hexahedron)),
+        93 => (125, 3, ElementKind::Cell(Hexahedron)),
+        6 => (6, 3, ElementKind::Cell(Prism)),
+        13 => (18, 3, ElementKind::Cell(Prism)),
+        18 => (15, 3, ElementKind::Cell(Prism)),
+        90 => (40, 3, ElementKind::Cell(Prism)),
+        91 => (75, 3, ElementKind::Cell(Prism)),
+        7 => (5, 3, ElementKind::Cell(Pyramid)),
+        14 => (14, 3, ElementKind::Cell(Pyramid)),
+        19 => (13, 3, ElementKind::Cell(Pyramid)),
+        118 => (30, 3, ElementKind::Cell(Pyramid)),
+        119 => (55, 3, ElementKind::Cell(Pyramid)),
         _ => return None,
     })
 }
 
 /// A file that is being read.
-struct File<'s, 'd, 'l> {
+struct GmshFile<'s, 'd, 'l> {
     source: Source<'s>,
     draft: &'d mut Draft<'l>,
     /// Of binary files.
@@ -88,7 +88,7 @@ struct File<'s, 'd, 'l> {
 }
 
 pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), MeshError> {
-    let mut file = File {
+    let mut file = GmshFile {
         source,
         draft,
         order: None,
@@ -136,7 +136,7 @@ pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), Mesh
     Ok(())
 }
 
-impl File<'_, '_, '_> {
+impl GmshFile<'_, '_, '_> {
     /// The line of the version; whether the file is binary.
     fn format(&mut self) -> Result<f64, MeshError> {
         let version: f64 = self.source.number("the version")?;
@@ -310,7 +310,7 @@ impl File<'_, '_, '_> {
         Ok(())
     }
 
-    fn kind_of(&self, number: i64) -> Result<(usize, i64, Kind), MeshError> {
+    fn kind_of(&self, number: i64) -> Result<(usize, i64, ElementKind), MeshError> {
         let message = || format!("elements of type {number} are not read: export triangles or tetrahedra");
         element_type(number).ok_or_else(|| self.source.fail(Problem::Unsupported { message: message() }))
     }
@@ -318,7 +318,7 @@ impl File<'_, '_, '_> {
     /// Adds an element of a type, with nodes by their tags, to the groups of its physical tags.
     fn element(
         &mut self,
-        (_, dimension, kind): (usize, i64, Kind),
+        (_, dimension, kind): (usize, i64, ElementKind),
         tags: &mut [i64],
         physical: &[i64],
     ) -> Result<(), MeshError> {
@@ -333,15 +333,15 @@ impl File<'_, '_, '_> {
             groups.push(self.draft.group(&name).map_err(|problem| self.source.fail(problem))?);
         }
         let added = match kind {
-            Kind::Line => {
+            ElementKind::Line => {
                 self.draft.lines += 1;
                 self.draft.assign(tags, &groups)
             }
-            Kind::Face(corners) => {
+            ElementKind::Face(corners) => {
                 self.draft.drops_unused |= tags.len() > corners;
                 self.draft.polygon(&tags[..corners.min(tags.len())], &[], &groups)
             }
-            Kind::Cell(cell) => self.draft.cell(cell, tags, &groups),
+            ElementKind::Cell(cell) => self.draft.cell(cell, tags, &groups),
         };
         added.map_err(|problem| self.source.fail(problem))
     }

@@ -12,7 +12,7 @@ use crate::{Element as Place, MeshError, Problem};
 type Encoding = Option<Order>;
 
 /// Properties of an element and elements of a file; no mesh has as many.
-const MOST: usize = 256;
+const MAX_ELEMENTS: usize = 256;
 
 struct Property {
     name: String,
@@ -21,7 +21,7 @@ struct Property {
     scalar: Scalar,
 }
 
-struct Element {
+struct PlyElement {
     name: String,
     count: i64,
     properties: Vec<Property>,
@@ -43,9 +43,9 @@ fn scalar(word: &[u8]) -> Option<Scalar> {
     })
 }
 
-fn header(source: &mut Source<'_>) -> Result<(Encoding, Vec<Element>), MeshError> {
+fn header(source: &mut Source<'_>) -> Result<(Encoding, Vec<PlyElement>), MeshError> {
     let mut encoding = None;
-    let mut elements: Vec<Element> = Vec::new();
+    let mut elements: Vec<PlyElement> = Vec::new();
     loop {
         let line = source.line().ok_or_else(|| source.truncated("`end_header`"))?;
         let words: Vec<&[u8]> = words(line).collect();
@@ -60,9 +60,9 @@ fn header(source: &mut Source<'_>) -> Result<(Encoding, Vec<Element>), MeshError
                     _ => return Err(source.syntax(format!("`{}` is not a format of PLY", shown(name)))),
                 });
             }
-            [b"element", name, count] if elements.len() < MOST => {
+            [b"element", name, count] if elements.len() < MAX_ELEMENTS => {
                 let count = parsed(count).ok_or_else(|| source.syntax("the count of an element is not a number"))?;
-                elements.push(Element { name: named(name), count, properties: Vec::new() });
+                elements.push(PlyElement { name: named(name), count, properties: Vec::new() });
             }
             [b"property", rest @ ..] => {
                 let property = match rest {
@@ -73,7 +73,7 @@ fn header(source: &mut Source<'_>) -> Result<(Encoding, Vec<Element>), MeshError
                     _ => None,
                 };
                 let (count, scalar, name) = property.ok_or_else(|| source.syntax("no property of PLY"))?;
-                let element = elements.last_mut().filter(|element| element.properties.len() < MOST);
+                let element = elements.last_mut().filter(|element| element.properties.len() < MAX_ELEMENTS);
                 let element = element.ok_or_else(|| source.syntax("a property without an element, or too many"))?;
                 element.properties.push(Property { name: named(name), count, scalar });
             }
@@ -117,7 +117,7 @@ enum Role {
     Other,
 }
 
-impl Element {
+impl PlyElement {
     fn role(&self) -> Role {
         match self.name.as_str() {
             "vertex" => Role::Vertex,
@@ -159,7 +159,7 @@ fn next_row<'a>(source: &mut Source<'a>) -> Option<Source<'a>> {
 
 /// The numbers of one row that count here.
 #[derive(Default)]
-struct Row {
+struct PlyRow {
     at: [f64; 3],
     /// Of a vertex.
     uv: [f32; 2],
@@ -168,13 +168,13 @@ struct Row {
     corner_uv: Vec<[f32; 2]>,
 }
 
-impl Row {
+impl PlyRow {
     /// Reads the properties of an element; its lists of corners are in property number `corners`.
     #[allow(clippy::cast_possible_truncation)]
     fn read(
         &mut self,
         source: &mut Source<'_>,
-        element: &Element,
+        element: &PlyElement,
         corners: Option<usize>,
         encoding: Encoding,
         allowance: &mut MemoryAllowance<'_>,
@@ -225,7 +225,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
     source.is_binary = encoding.is_some();
     // Texture coordinates of the vertices, if they have any.
     let mut uv_of: Vec<[f32; 2]> = Vec::new();
-    let (mut row, mut wider) = (Row::default(), 0_usize);
+    let (mut row, mut wider) = (PlyRow::default(), 0_usize);
     for element in &elements {
         if element.properties.is_empty() {
             continue;

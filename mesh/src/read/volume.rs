@@ -61,7 +61,7 @@ const SORTED: usize = 48;
 const OUTER: usize = 80;
 
 /// A volume element.
-struct Element {
+struct VolumeElement {
     kind: Cell,
     corners: [u32; 8],
 }
@@ -69,7 +69,7 @@ struct Element {
 /// The volume elements of a file.
 #[derive(Default)]
 pub(super) struct Volume {
-    elements: Vec<Element>,
+    elements: Vec<VolumeElement>,
 }
 
 /// The surface around volume elements.
@@ -95,12 +95,12 @@ impl Volume {
     ) -> Result<(), Problem> {
         let mut own = [NONE; 8];
         own.iter_mut().zip(corners).for_each(|(own, corner)| *own = *corner);
-        allowance.push(&mut self.elements, Element { kind, corners: own })
+        allowance.push(&mut self.elements, VolumeElement { kind, corners: own })
     }
 
     /// Whether each element has the corners of an earlier one.
     fn repeated(&self) -> Vec<bool> {
-        let sorted = |(number, element): (u32, &Element)| {
+        let sorted = |(number, element): (u32, &VolumeElement)| {
             let mut corners = element.corners;
             corners.sort_unstable();
             (corners, number)
@@ -176,7 +176,7 @@ fn is_better_from_second(vertices: &[DVec3], face: &[u32]) -> bool {
     between > FLAT * first.max(second).powi(3) && second < first
 }
 
-impl Element {
+impl VolumeElement {
     /// The vertices of a face, each once: bricks are collapsed to wedges by naming a vertex twice. `None` if nothing is left.
     fn face(&self, places: &[usize]) -> Option<Vec<u32>> {
         let mut face = Vec::with_capacity(4);

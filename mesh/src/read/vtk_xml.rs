@@ -14,7 +14,7 @@ use super::vtk::{Cells, Faces};
 use crate::{Element, MeshError, Problem};
 
 /// Arrays and pieces of a file; no mesh has as many.
-const MOST: usize = 1 << 12;
+const MAX_ARRAYS: usize = 1 << 12;
 
 /// Of what is unpacked, so many bytes for each that was packed count as bytes of the file.
 const PACKED: usize = 4;
@@ -32,7 +32,7 @@ const WANTED: [(&str, &str); 8] = [
 ];
 
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Format {
+enum ArrayFormat {
     Text,
     Base64,
     Appended,
@@ -42,7 +42,7 @@ struct Array {
     /// Which of `WANTED`.
     role: usize,
     scalar: Scalar,
-    format: Format,
+    format: ArrayFormat,
     /// Within the appended data.
     offset: usize,
     text: Vec<u8>,
@@ -113,12 +113,12 @@ impl<'a> Document<'a> {
                             has_begun = true;
                             document.root(&element).map_err(fail)?;
                         }
-                        "Piece" if document.pieces.len() < MOST => document.pieces.push(Vec::new()),
-                        "Piece" => return Err(fail(Problem::TooLarge { what: "pieces", limit: MOST })),
+                        "Piece" if document.pieces.len() < MAX_ARRAYS => document.pieces.push(Vec::new()),
+                        "Piece" => return Err(fail(Problem::TooLarge { what: "pieces", limit: MAX_ARRAYS })),
                         "DataArray" => {
                             arrays += 1;
-                            if arrays > MOST {
-                                return Err(fail(Problem::TooLarge { what: "arrays", limit: MOST }));
+                            if arrays > MAX_ARRAYS {
+                                return Err(fail(Problem::TooLarge { what: "arrays", limit: MAX_ARRAYS }));
                             }
                             let array = document.array(&element, &section, byte).map_err(fail)?;
                             if let Some((array, piece)) = array.zip(document.pieces.last_mut()) {
@@ -203,9 +203,9 @@ impl<'a> Document<'a> {
         let scalar =
             scalar(&kind).ok_or_else(|| syntax(format!("`{}` is not a type of an array", shown(kind.as_bytes()))))?;
         let format = match attribute(element, "format").as_deref() {
-            None | Some("ascii") => Format::Text,
-            Some("binary") => Format::Base64,
-            Some("appended") => Format::Appended,
+            None | Some("ascii") => ArrayFormat::Text,
+            Some("binary") => ArrayFormat::Base64,
+            Some("appended") => ArrayFormat::Appended,
             Some(other) => return Err(syntax(format!("`{}` is not a format of an array", shown(other.as_bytes())))),
         };
         let offset = attribute(element, "offset").and_then(|offset| offset.parse().ok()).unwrap_or(0);
@@ -221,7 +221,7 @@ impl<'a> Document<'a> {
         let fail = |problem| self.fail(array, problem);
         let text: Vec<u8> = array.text.iter().copied().filter(|byte| !byte.is_ascii_whitespace()).collect();
         let (stored, is_base64) = match array.format {
-            Format::Appended => (self.appended.get(array.offset..).unwrap_or_default(), !self.coding.is_raw),
+            ArrayFormat::Appended => (self.appended.get(array.offset..).unwrap_or_default(), !self.coding.is_raw),
             _ => (text.as_slice(), true),
         };
         let mut stored = Stored { bytes: stored, is_base64 };
@@ -295,7 +295,7 @@ impl<'a> Document<'a> {
         allowance: &mut MemoryAllowance<'_>,
         number: fn(Scalar, &[u8], Order) -> T,
     ) -> Result<Vec<T>, MeshError> {
-        if array.format == Format::Text {
+        if array.format == ArrayFormat::Text {
             return self.text(array, allowance);
         }
         let (bytes, size) = (self.bytes(array, allowance)?, array.scalar.size());

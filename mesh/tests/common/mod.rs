@@ -33,15 +33,15 @@ const MIDDLE: [f64; 3] = [0.0; 3];
 pub const VOLUME_M3: f64 = 4.0 / 3.0 * 1e-3;
 
 /// A file: name and content.
-pub struct Sample {
+pub struct SampleFile {
     pub name: &'static str,
     pub bytes: Vec<u8>,
     /// Whether a file that ends early can be told from a whole one.
     pub knows_its_end: bool,
 }
 
-fn sample(name: &'static str, bytes: impl Into<Vec<u8>>) -> Sample {
-    Sample { name, bytes: bytes.into(), knows_its_end: true }
+fn sample(name: &'static str, bytes: impl Into<Vec<u8>>) -> SampleFile {
+    SampleFile { name, bytes: bytes.into(), knows_its_end: true }
 }
 
 /// The octahedron as a mesh in metres.
@@ -472,7 +472,7 @@ pub fn vtu() -> String {
 }
 
 /// The octahedron in every format.
-pub fn samples() -> Vec<Sample> {
+pub fn samples() -> Vec<SampleFile> {
     let mut obj = sample("octahedron.obj", obj());
     obj.knows_its_end = false;
     let mut old = sample("old.obj", obj_of_old());

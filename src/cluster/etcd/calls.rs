@@ -11,7 +11,7 @@ use tonic::metadata::MetadataValue;
 use tonic::transport::Channel;
 use tonic::{Request, Status};
 
-use super::error::{EtcdError, Result, Verdict, advice, is_of_transport, judge, text};
+use super::error::{ErrorVerdict, EtcdError, EtcdResult, advice, is_of_transport, judge, text};
 use super::login::{Login, Token};
 use super::member::{BACK_OFF, Member};
 use super::options::EtcdOptions;
@@ -20,7 +20,7 @@ use super::options::EtcdOptions;
 const FIRST_WAIT: Duration = Duration::from_millis(25);
 
 /// All members, and what calls know of them.
-pub(super) struct Calls {
+pub(super) struct MemberCalls {
     pub(super) members: Vec<Member>,
     /// Time limit of an attempt.
     pub(super) limit: Duration,
@@ -32,7 +32,7 @@ pub(super) struct Calls {
 }
 
 /// An attempt at a member.
-pub(super) struct Way {
+pub(super) struct MemberCall {
     pub(super) member: usize,
     /// The number of the connection.
     pub(super) number: u64,
@@ -40,7 +40,7 @@ pub(super) struct Way {
     token: Option<Token>,
 }
 
-impl Way {
+impl MemberCall {
     /// A request with our token, which only a member with a leader takes.
     pub(super) fn request<M>(&self, message: M) -> Request<M> {
         let mut request = Request::new(message);
@@ -69,8 +69,8 @@ enum Attempt<T> {
     Lost(String),
 }
 
-impl Calls {
-    pub(super) fn new(options: EtcdOptions, limit: Duration) -> Result<Self> {
+impl MemberCalls {
+    pub(super) fn new(options: EtcdOptions, limit: Duration) -> EtcdResult<Self> {
         let uris = options.checked()?;
         let options = Arc::new(options);
         // Many clients begin at different members.
@@ -78,7 +78,7 @@ impl Calls {
         let first = getrandom::fill(&mut random).map_or(0, |()| u32::from_le_bytes(random) as usize % uris.len());
         let members = uris.into_iter().map(|uri| Member::new(uri, options.clone(), limit)).collect();
         let (preferred, term) = (AtomicUsize::new(first), AtomicU64::new(0));
-        Ok(Calls { members, limit, login: Login::new(options), preferred, term })
+        Ok(MemberCalls { members, limit, login: Login::new(options), preferred, term })
     }
 
     /// The member that answered last.
@@ -101,9 +101,9 @@ impl Calls {
 
     /// Does a call at the first member that can. It is tried for as long as all members together have time for an attempt, then
     /// the attempt that is under way ends.
-    pub(super) async fn call<T, F, A>(&self, what: &str, repeat: Repeat, attempt: F) -> Result<T>
+    pub(super) async fn call<T, F, A>(&self, what: &str, repeat: Repeat, attempt: F) -> EtcdResult<T>
     where
-        F: Fn(Way) -> A,
+        F: Fn(MemberCall) -> A,
         A: Future<Output = std::result::Result<T, Status>>,
     {
         let count = self.members.len();
@@ -152,7 +152,7 @@ impl Calls {
 
     async fn attempt<T, F, A>(&self, index: usize, attempt: &F) -> Attempt<T>
     where
-        F: Fn(Way) -> A,
+        F: Fn(MemberCall) -> A,
         A: Future<Output = std::result::Result<T, Status>>,
     {
         let member = &self.members[index];
@@ -164,7 +164,7 @@ impl Calls {
         loop {
             let token = match timeout(self.limit, self.login.token(&channel, stale)).await {
                 Ok(Ok(token)) => token,
-                Ok(Err(status)) if judge(&status) == Verdict::Refused => return Attempt::Refused(text(&status)),
+                Ok(Err(status)) if judge(&status) == ErrorVerdict::Refused => return Attempt::Refused(text(&status)),
                 Ok(Err(status)) => {
                     if is_of_transport(&status) {
                         member.give_up(number).await;
@@ -177,7 +177,7 @@ impl Calls {
                 }
             };
             let used = token.as_ref().map(|token| token.number);
-            let way = Way { member: index, number, channel: channel.clone(), token };
+            let way = MemberCall { member: index, number, channel: channel.clone(), token };
             let status = match timeout(self.limit, attempt(way)).await {
                 Ok(Ok(answer)) => return Attempt::Done(answer),
                 Ok(Err(status)) => status,
@@ -191,10 +191,10 @@ impl Calls {
             }
             match judge(&status) {
                 // Once: a new token that is not taken either is a refusal.
-                Verdict::Stale if used.is_some() && stale.is_none() => stale = used,
-                Verdict::Stale | Verdict::Refused => return Attempt::Refused(text(&status)),
-                Verdict::Elsewhere => return Attempt::NotDone(text(&status)),
-                Verdict::Lost => return Attempt::Lost(text(&status)),
+                ErrorVerdict::Stale if used.is_some() && stale.is_none() => stale = used,
+                ErrorVerdict::Stale | ErrorVerdict::Refused => return Attempt::Refused(text(&status)),
+                ErrorVerdict::Elsewhere => return Attempt::NotDone(text(&status)),
+                ErrorVerdict::Lost => return Attempt::Lost(text(&status)),
             }
         }
     }

@@ -21,11 +21,11 @@ pub enum EtcdError {
 }
 
 /// What came of an attempt, or why it can't be done.
-pub type Result<T> = std::result::Result<T, EtcdError>;
+pub type EtcdResult<T> = std::result::Result<T, EtcdError>;
 
 /// What an answer that is an error says of the request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Verdict {
+pub(super) enum ErrorVerdict {
     /// Every member would refuse it.
     Refused,
     /// It was not done here, and another member may do it.
@@ -36,23 +36,23 @@ pub(super) enum Verdict {
     Lost,
 }
 
-/// Judges an error. What is not known to be harmless is [`Verdict::Lost`].
-pub(super) fn judge(status: &Status) -> Verdict {
+/// Judges an error. What is not known to be harmless is [`ErrorVerdict::Lost`].
+pub(super) fn judge(status: &Status) -> ErrorVerdict {
     if is_of_transport(status) {
         let mut causes = std::iter::successors(status.source(), |&cause| cause.source());
         let unconnected = causes.any(<dyn Error>::is::<ConnectError>);
-        return if unconnected { Verdict::Elsewhere } else { Verdict::Lost };
+        return if unconnected { ErrorVerdict::Elsewhere } else { ErrorVerdict::Lost };
     }
     let says = |text: &str| status.message().contains(text);
     match status.code() {
-        Code::Unauthenticated => Verdict::Stale,
-        Code::Unknown | Code::InvalidArgument if says("revision of auth store is old") => Verdict::Stale,
+        Code::Unauthenticated => ErrorVerdict::Stale,
+        Code::Unknown | Code::InvalidArgument if says("revision of auth store is old") => ErrorVerdict::Stale,
         // The first is told before anything is done, since requests ask for a leader.
-        Code::Unavailable if says("no leader") || says("not capable") || says("for learner") => Verdict::Elsewhere,
-        Code::ResourceExhausted if says("too many requests") => Verdict::Elsewhere,
-        Code::FailedPrecondition if says("not leader") => Verdict::Elsewhere,
+        Code::Unavailable if says("no leader") || says("not capable") || says("for learner") => ErrorVerdict::Elsewhere,
+        Code::ResourceExhausted if says("too many requests") => ErrorVerdict::Elsewhere,
+        Code::FailedPrecondition if says("not leader") => ErrorVerdict::Elsewhere,
         // Our own complaint about an answer that was too large.
-        Code::OutOfRange if says("decoded message length") => Verdict::Lost,
+        Code::OutOfRange if says("decoded message length") => ErrorVerdict::Lost,
         Code::InvalidArgument
         | Code::NotFound
         | Code::AlreadyExists
@@ -60,8 +60,8 @@ pub(super) fn judge(status: &Status) -> Verdict {
         | Code::ResourceExhausted
         | Code::FailedPrecondition
         | Code::OutOfRange
-        | Code::Unimplemented => Verdict::Refused,
-        _ => Verdict::Lost,
+        | Code::Unimplemented => ErrorVerdict::Refused,
+        _ => ErrorVerdict::Lost,
     }
 }
 
@@ -114,17 +114,17 @@ mod tests {
     #[test]
     fn what_may_have_been_done_is_never_sent_again() {
         for (code, message, verdict) in [
-            (Code::Unavailable, "etcdserver: request timed out", Verdict::Lost),
-            (Code::Unavailable, "etcdserver: server stopped", Verdict::Lost),
-            (Code::Unavailable, "etcdserver: leader changed", Verdict::Lost),
-            (Code::Unknown, "anything", Verdict::Lost),
-            (Code::Cancelled, "", Verdict::Lost),
-            (Code::OutOfRange, "Error, decoded message length too large", Verdict::Lost),
-            (Code::Unavailable, "etcdserver: no leader", Verdict::Elsewhere),
-            (Code::ResourceExhausted, "etcdserver: too many requests", Verdict::Elsewhere),
-            (Code::ResourceExhausted, "etcdserver: mvcc: database space exceeded", Verdict::Refused),
-            (Code::OutOfRange, "etcdserver: mvcc: required revision has been compacted", Verdict::Refused),
-            (Code::Unauthenticated, "etcdserver: invalid auth token", Verdict::Stale),
+            (Code::Unavailable, "etcdserver: request timed out", ErrorVerdict::Lost),
+            (Code::Unavailable, "etcdserver: server stopped", ErrorVerdict::Lost),
+            (Code::Unavailable, "etcdserver: leader changed", ErrorVerdict::Lost),
+            (Code::Unknown, "anything", ErrorVerdict::Lost),
+            (Code::Cancelled, "", ErrorVerdict::Lost),
+            (Code::OutOfRange, "Error, decoded message length too large", ErrorVerdict::Lost),
+            (Code::Unavailable, "etcdserver: no leader", ErrorVerdict::Elsewhere),
+            (Code::ResourceExhausted, "etcdserver: too many requests", ErrorVerdict::Elsewhere),
+            (Code::ResourceExhausted, "etcdserver: mvcc: database space exceeded", ErrorVerdict::Refused),
+            (Code::OutOfRange, "etcdserver: mvcc: required revision has been compacted", ErrorVerdict::Refused),
+            (Code::Unauthenticated, "etcdserver: invalid auth token", ErrorVerdict::Stale),
         ] {
             assert_eq!(judge(&Status::new(code, message)), verdict, "{message}");
         }
@@ -133,8 +133,8 @@ mod tests {
     #[test]
     fn only_a_connection_that_was_not_made_is_known_to_have_sent_nothing() {
         let broken = std::io::Error::other("reset");
-        assert_eq!(judge(&Status::from_error(broken.into())), Verdict::Lost);
+        assert_eq!(judge(&Status::from_error(broken.into())), ErrorVerdict::Lost);
         let unmade = ConnectError(std::io::Error::other("refused").into());
-        assert_eq!(judge(&Status::from_error(unmade.into())), Verdict::Elsewhere);
+        assert_eq!(judge(&Status::from_error(unmade.into())), ErrorVerdict::Elsewhere);
     }
 }

@@ -6,7 +6,7 @@ use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Status, Streaming};
 
-use super::calls::{Calls, Way};
+use super::calls::{MemberCall, MemberCalls};
 
 /// A lease: keys that are written with it are deleted when it ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -18,7 +18,7 @@ pub struct Lease {
 }
 
 /// An open stream. It is given up as soon as an answer does not come: a late one would be taken for the next.
-pub(super) struct Pulse {
+pub(super) struct LeaseKeepAlive {
     pub(super) member: usize,
     /// The number of the connection.
     pub(super) number: u64,
@@ -26,26 +26,26 @@ pub(super) struct Pulse {
     answers: Streaming<LeaseKeepAliveResponse>,
 }
 
-impl Pulse {
-    /// Opens a stream, and asks for `lease` with it. The answer as in [`Pulse::ask`].
-    pub(super) async fn open(way: Way, calls: &Calls, lease: i64) -> Result<(Self, Option<u64>), Status> {
+impl LeaseKeepAlive {
+    /// Opens a stream, and asks for `lease` with it. The answer as in [`LeaseKeepAlive::ask`].
+    pub(super) async fn open(way: MemberCall, calls: &MemberCalls, lease: i64) -> Result<(Self, Option<u64>), Status> {
         let (questions, asked) = mpsc::channel(1);
         // etcd says nothing, not even that the stream is open, before it has a question.
         questions.try_send(LeaseKeepAliveRequest { id: lease }).map_err(|_| ended())?;
         let request = way.request(ReceiverStream::new(asked));
         let answers = LeaseClient::new(way.channel).lease_keep_alive(request).await?.into_inner();
-        let mut pulse = Pulse { member: way.member, number: way.number, questions, answers };
+        let mut pulse = LeaseKeepAlive { member: way.member, number: way.number, questions, answers };
         let ttl_s = pulse.answer(calls, lease).await?;
         Ok((pulse, ttl_s))
     }
 
     /// Has a lease begin anew: the seconds that it lasts, `None` if there is none.
-    pub(super) async fn ask(&mut self, calls: &Calls, lease: i64) -> Result<Option<u64>, Status> {
+    pub(super) async fn ask(&mut self, calls: &MemberCalls, lease: i64) -> Result<Option<u64>, Status> {
         self.questions.try_send(LeaseKeepAliveRequest { id: lease }).map_err(|_| ended())?;
         self.answer(calls, lease).await
     }
 
-    async fn answer(&mut self, calls: &Calls, lease: i64) -> Result<Option<u64>, Status> {
+    async fn answer(&mut self, calls: &MemberCalls, lease: i64) -> Result<Option<u64>, Status> {
         let answer = self.answers.message().await?.ok_or_else(ended)?;
         if answer.id != lease {
             return Err(Status::unavailable("answers for another lease"));

@@ -33,13 +33,13 @@ use tokio::sync::{Mutex, Semaphore};
 use tokio::time::timeout;
 use tonic::{Code, Response};
 
-use calls::{Calls, Repeat, Way};
+use calls::{MemberCall, MemberCalls, Repeat};
 pub(crate) use error::root;
-pub use error::{EtcdError, Result};
+pub use error::{EtcdError, EtcdResult};
 pub use lease::Lease;
-use lease::Pulse;
+use lease::LeaseKeepAlive;
 pub use options::EtcdOptions;
-pub use store::{Compare, KeyValue, Op, Outcome, Txn};
+pub use store::{Compare, KeyValue, Op, TransactionOutcome, Txn};
 use store::{key_value, prefix_range, revision, signed};
 pub use watch::{Watch, WatchError, WatchEvent};
 
@@ -50,7 +50,7 @@ pub const LIMIT: Duration = Duration::from_secs(1);
 const PAGE: i64 = 1000;
 
 /// Most keys of a list: a hundred thousand sessions have a few each.
-const MOST_KEYS: usize = 1 << 20;
+const MAX_KEYS: usize = 1 << 20;
 
 /// Largest answer that is taken.
 const LARGEST_BYTES: usize = 64 << 20;
@@ -64,8 +64,8 @@ const LIST_ATTEMPTS: usize = 3;
 /// A client of etcd. Clones share connections.
 #[derive(Clone)]
 pub struct Etcd {
-    calls: Arc<Calls>,
-    pulse: Arc<Mutex<Option<Pulse>>>,
+    calls: Arc<MemberCalls>,
+    pulse: Arc<Mutex<Option<LeaseKeepAlive>>>,
     turns: Arc<Semaphore>,
 }
 
@@ -81,7 +81,7 @@ impl Etcd {
     ///
     /// # Errors
     /// Returns an error if the options are wrong or a file can't be read.
-    pub fn open(options: &EtcdOptions) -> Result<Self> {
+    pub fn open(options: &EtcdOptions) -> EtcdResult<Self> {
         Etcd::open_within(options, LIMIT)
     }
 
@@ -89,8 +89,8 @@ impl Etcd {
     ///
     /// # Errors
     /// As for [`Etcd::open`].
-    pub fn open_within(options: &EtcdOptions, limit: Duration) -> Result<Self> {
-        let calls = Arc::new(Calls::new(options.clone(), limit)?);
+    pub fn open_within(options: &EtcdOptions, limit: Duration) -> EtcdResult<Self> {
+        let calls = Arc::new(MemberCalls::new(options.clone(), limit)?);
         Ok(Etcd { calls, pulse: Arc::default(), turns: Arc::new(Semaphore::new(AT_A_TIME)) })
     }
 
@@ -103,7 +103,7 @@ impl Etcd {
     ///
     /// # Errors
     /// Returns an error if no member can tell.
-    pub async fn get(&self, key: &str) -> Result<(Option<KeyValue>, u64)> {
+    pub async fn get(&self, key: &str) -> EtcdResult<(Option<KeyValue>, u64)> {
         let request = RangeRequest { key: key.into(), ..Default::default() };
         let response = self.range(&format!("read the key `{key}`"), request).await?;
         let revision = revision(response.header.as_ref());
@@ -115,7 +115,7 @@ impl Etcd {
     ///
     /// # Errors
     /// Returns an error if no member can tell, or if there are more than 1,048,576.
-    pub async fn list(&self, prefix: &str) -> Result<(Vec<KeyValue>, u64)> {
+    pub async fn list(&self, prefix: &str) -> EtcdResult<(Vec<KeyValue>, u64)> {
         let what = format!("list the keys `{prefix}…`");
         let mut attempts = 1..=LIST_ATTEMPTS;
         loop {
@@ -127,7 +127,7 @@ impl Etcd {
         }
     }
 
-    async fn list_once(&self, what: &str, prefix: &str) -> Result<(Vec<KeyValue>, u64)> {
+    async fn list_once(&self, what: &str, prefix: &str) -> EtcdResult<(Vec<KeyValue>, u64)> {
         let (key, range_end) = prefix_range(prefix);
         let mut request = RangeRequest { key, range_end, limit: PAGE, revision: 0 };
         let mut listed = Vec::new();
@@ -141,8 +141,8 @@ impl Etcd {
             let Some(last) = last.filter(|_| page.more) else {
                 return Ok((listed, store::unsigned(request.revision)));
             };
-            if listed.len() > MOST_KEYS {
-                let why = format!("can't {what}: there are more than {MOST_KEYS}; give this fleet a prefix of its own");
+            if listed.len() > MAX_KEYS {
+                let why = format!("can't {what}: there are more than {MAX_KEYS}; give this fleet a prefix of its own");
                 return Err(EtcdError::Refused(why));
             }
             // The next key that there could be.
@@ -151,8 +151,8 @@ impl Etcd {
         }
     }
 
-    async fn range(&self, what: &str, request: RangeRequest) -> Result<RangeResponse> {
-        let attempt = |way: Way| {
+    async fn range(&self, what: &str, request: RangeRequest) -> EtcdResult<RangeResponse> {
+        let attempt = |way: MemberCall| {
             let request = way.request(request.clone());
             let mut client = KvClient::new(way.channel).max_decoding_message_size(LARGEST_BYTES);
             async move { client.range(request).await.map(Response::into_inner) }
@@ -168,10 +168,10 @@ impl Etcd {
     /// # Errors
     /// Returns [`EtcdError::Unknown`] if it may have been done although there is no answer: read its keys again. With every
     /// other error it was not done.
-    pub async fn transact(&self, transaction: Txn) -> Result<Outcome> {
+    pub async fn transact(&self, transaction: Txn) -> EtcdResult<TransactionOutcome> {
         let repeat = if transaction.only_reads() { Repeat::Freely } else { Repeat::Never };
         let request = TxnRequest::from(transaction);
-        let attempt = |way: Way| {
+        let attempt = |way: MemberCall| {
             let request = way.request(request.clone());
             let mut client = KvClient::new(way.channel).max_decoding_message_size(LARGEST_BYTES);
             async move { client.txn(request).await.map(Response::into_inner) }
@@ -186,9 +186,9 @@ impl Etcd {
     ///
     /// # Errors
     /// Returns an error if no member can, or if etcd refuses so long a time.
-    pub async fn grant(&self, ttl_s: u64) -> Result<Lease> {
+    pub async fn grant(&self, ttl_s: u64) -> EtcdResult<Lease> {
         let message = LeaseGrantRequest { ttl: signed(ttl_s), id: 0 };
-        let attempt = |way: Way| {
+        let attempt = |way: MemberCall| {
             let request = way.request(message);
             async move { LeaseClient::new(way.channel).lease_grant(request).await.map(Response::into_inner) }
         };
@@ -202,7 +202,7 @@ impl Etcd {
     ///
     /// # Errors
     /// Returns an error if no member can. The lease may have begun anew all the same.
-    pub async fn keep_alive(&self, lease: i64) -> Result<Option<u64>> {
+    pub async fn keep_alive(&self, lease: i64) -> EtcdResult<Option<u64>> {
         let mut kept = self.pulse.lock().await;
         // It is back only with an answer: who gives up waiting gives the stream up as well.
         if let Some(mut pulse) = kept.take() {
@@ -216,7 +216,7 @@ impl Etcd {
                 self.calls.members[pulse.member].give_up(pulse.number).await;
             }
         }
-        let attempt = |way: Way| Pulse::open(way, &self.calls, lease);
+        let attempt = |way: MemberCall| LeaseKeepAlive::open(way, &self.calls, lease);
         let (pulse, ttl_s) = self.calls.call("keep a lease alive", Repeat::Freely, attempt).await?;
         *kept = Some(pulse);
         Ok(ttl_s)
@@ -226,8 +226,8 @@ impl Etcd {
     ///
     /// # Errors
     /// Returns an error if no member can.
-    pub async fn revoke(&self, lease: i64) -> Result<()> {
-        let attempt = |way: Way| {
+    pub async fn revoke(&self, lease: i64) -> EtcdResult<()> {
+        let attempt = |way: MemberCall| {
             let request = way.request(LeaseRevokeRequest { id: lease });
             async move {
                 match LeaseClient::new(way.channel).lease_revoke(request).await {

@@ -5,11 +5,11 @@ use std::path::{Path, PathBuf};
 
 use tonic::transport::{Certificate, ClientTlsConfig, Identity, Uri};
 
-use super::error::{EtcdError, Result};
+use super::error::{EtcdError, EtcdResult};
 use crate::files;
 
 /// Most members that are named: etcd itself advises seven at most.
-const MOST_ENDPOINTS: usize = 16;
+const MAX_ENDPOINTS: usize = 16;
 
 /// Where etcd is, and who we are there. It has no secret in it: passwords and keys are read from their files when they are
 /// needed, so that files that have changed hold from the next connection on.
@@ -31,12 +31,12 @@ pub struct EtcdOptions {
 
 impl EtcdOptions {
     /// The endpoints, if everything fits together and the files can be read.
-    pub(super) fn checked(&self) -> Result<Vec<Uri>> {
+    pub(super) fn checked(&self) -> EtcdResult<Vec<Uri>> {
         let refuse = |why: String| Err(EtcdError::Refused(why));
-        if self.endpoints.is_empty() || self.endpoints.len() > MOST_ENDPOINTS {
-            return refuse(format!("name 1 to {MOST_ENDPOINTS} endpoints of etcd, not {}", self.endpoints.len()));
+        if self.endpoints.is_empty() || self.endpoints.len() > MAX_ENDPOINTS {
+            return refuse(format!("name 1 to {MAX_ENDPOINTS} endpoints of etcd, not {}", self.endpoints.len()));
         }
-        let uris: Vec<Uri> = self.endpoints.iter().map(|url| self.endpoint(url)).collect::<Result<_>>()?;
+        let uris: Vec<Uri> = self.endpoints.iter().map(|url| self.endpoint(url)).collect::<EtcdResult<_>>()?;
         let tls = uris.iter().any(is_secure);
         if !tls && (self.ca.is_some() || self.certificate.is_some() || self.key.is_some()) {
             return refuse(
@@ -55,7 +55,7 @@ impl EtcdOptions {
         Ok(uris)
     }
 
-    fn endpoint(&self, url: &str) -> Result<Uri> {
+    fn endpoint(&self, url: &str) -> EtcdResult<Uri> {
         // What can't be read is not quoted if it may have a password in it.
         let quoted = if url.contains('@') { "an endpoint of etcd" } else { url };
         let refuse = |why: &str| EtcdError::Refused(format!("{quoted}: {why}"));
@@ -111,7 +111,7 @@ pub(super) fn is_secure(uri: &Uri) -> bool {
 }
 
 fn read(path: &Path) -> std::result::Result<Vec<u8>, String> {
-    files::read_regular(path, files::MOST_SECRET_BYTES).map_err(|refusal| refusal.to_string())
+    files::read_regular(path, files::MAX_SECRET_BYTES).map_err(|refusal| refusal.to_string())
 }
 
 #[cfg(test)]

@@ -66,7 +66,7 @@ pub struct Txn {
 
 /// What came of a transaction.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Outcome {
+pub struct TransactionOutcome {
     /// Whether the conditions held.
     pub succeeded: bool,
     /// The revision of the store after it: of what it wrote, if it wrote.
@@ -122,14 +122,14 @@ impl From<Op> for RequestOp {
     }
 }
 
-impl From<TxnResponse> for Outcome {
+impl From<TxnResponse> for TransactionOutcome {
     fn from(response: TxnResponse) -> Self {
         let got = response.responses.into_iter().filter_map(|one| match one.response {
             Some(Response::ResponseRange(range)) => Some(range.kvs.into_iter().next().and_then(key_value)),
             _ => None,
         });
         let got = got.collect();
-        Outcome { succeeded: response.succeeded, revision: revision(response.header.as_ref()), got }
+        TransactionOutcome { succeeded: response.succeeded, revision: revision(response.header.as_ref()), got }
     }
 }
 

@@ -15,7 +15,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::transport::Channel;
 use tonic::{Status, Streaming};
 
-use super::calls::{Calls, Repeat, Way};
+use super::calls::{MemberCall, MemberCalls, Repeat};
 use super::error::{EtcdError, text};
 use super::member::BACK_OFF;
 use super::store::{KeyValue, key_value, prefix_range, revision, signed, unsigned};
@@ -57,14 +57,14 @@ pub enum WatchError {
 /// Changes of the keys that begin with a prefix. It works only while [`Watch::next`] is waited for, and takes no more from etcd
 /// than fits the connection's window. It has a connection of its own, so that what waits there delays nothing else.
 pub struct Watch {
-    calls: Arc<Calls>,
+    calls: Arc<MemberCalls>,
     /// The member that it was last open at; `usize::MAX` before the first.
     member: Arc<AtomicUsize>,
     /// What the next batch comes from. Who gives up waiting leaves it to who waits next, so that nothing is lost.
-    next: Pin<Box<dyn Future<Output = (Following, Batch)> + Send>>,
+    next: Pin<Box<dyn Future<Output = (Following, WatchEvents)> + Send>>,
 }
 
-type Batch = Result<Vec<WatchEvent>, WatchError>;
+type WatchEvents = Result<Vec<WatchEvent>, WatchError>;
 
 impl std::fmt::Debug for Watch {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
@@ -73,9 +73,9 @@ impl std::fmt::Debug for Watch {
 }
 
 impl Watch {
-    pub(super) fn new(calls: Arc<Calls>, prefix: &str, from: u64) -> Self {
+    pub(super) fn new(calls: Arc<MemberCalls>, prefix: &str, from: u64) -> Self {
         let member = Arc::new(AtomicUsize::new(usize::MAX));
-        let place = Place { from, seen: 0 };
+        let place = WatchPosition { from, seen: 0 };
         let prefix = prefix.to_owned();
         let following =
             Following { calls: calls.clone(), member: member.clone(), prefix, place, open: None, ended: None };
@@ -103,37 +103,37 @@ impl Watch {
 
 /// Where a watch has got to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Place {
+struct WatchPosition {
     /// The first revision that is not wholly seen; 0 before the watch was opened from now on.
     from: u64,
     /// Events of that revision that were seen.
     seen: usize,
 }
 
-impl Place {
+impl WatchPosition {
     /// The place after events of these revisions, of which more may come if `parted`.
-    fn after(self, revisions: impl Iterator<Item = u64>, parted: bool) -> Place {
+    fn after(self, revisions: impl Iterator<Item = u64>, parted: bool) -> WatchPosition {
         let mut place = self;
         for revision in revisions {
             let seen = if revision == place.from { place.seen + 1 } else { 1 };
-            place = Place { from: revision, seen };
+            place = WatchPosition { from: revision, seen };
         }
-        if parted { place } else { Place { from: place.from + 1, seen: 0 } }
+        if parted { place } else { WatchPosition { from: place.from + 1, seen: 0 } }
     }
 }
 
 /// A watch at work.
 struct Following {
-    calls: Arc<Calls>,
+    calls: Arc<MemberCalls>,
     member: Arc<AtomicUsize>,
     prefix: String,
-    place: Place,
-    open: Option<Open>,
+    place: WatchPosition,
+    open: Option<WatchStream>,
     ended: Option<WatchError>,
 }
 
 /// An open stream.
-struct Open {
+struct WatchStream {
     member: usize,
     questions: mpsc::Sender<WatchRequest>,
     answers: Streaming<WatchResponse>,
@@ -150,7 +150,7 @@ enum Break {
 }
 
 impl Following {
-    async fn next(mut self) -> (Self, Batch) {
+    async fn next(mut self) -> (Self, WatchEvents) {
         loop {
             if let Some(ended) = &self.ended {
                 let ended = ended.clone();
@@ -182,7 +182,7 @@ impl Following {
     }
 
     /// Opens it at a member, from its place on.
-    async fn open(&mut self) -> Result<Open, EtcdError> {
+    async fn open(&mut self) -> Result<WatchStream, EtcdError> {
         let (key, range_end) = prefix_range(&self.prefix);
         let create = WatchCreateRequest {
             key,
@@ -193,7 +193,7 @@ impl Following {
         };
         let what = format!("watch the keys `{}…`", self.prefix);
         let calls = &self.calls;
-        let attempt = |way: Way| {
+        let attempt = |way: MemberCall| {
             let create = create.clone();
             async move {
                 let channel = calls.members[way.member].connect().await.map_err(Status::unavailable)?;
@@ -210,7 +210,7 @@ impl Following {
 }
 
 /// Opens a stream; the revision at which etcd has taken it.
-async fn opened(way: Way, channel: Channel, create: WatchCreateRequest) -> Result<(Open, u64), Status> {
+async fn opened(way: MemberCall, channel: Channel, create: WatchCreateRequest) -> Result<(WatchStream, u64), Status> {
     let (questions, asked) = mpsc::channel(2);
     let create = WatchRequest { request_union: Some(RequestUnion::CreateRequest(create)) };
     questions.try_send(create).map_err(|_| ended())?;
@@ -224,13 +224,17 @@ async fn opened(way: Way, channel: Channel, create: WatchCreateRequest) -> Resul
         // etcd says so of a token that is no longer valid, too.
         return Err(Status::unauthenticated(first.cancel_reason));
     }
-    let open = Open { member: way.member, questions, answers, asked: false, again: 0 };
+    let open = WatchStream { member: way.member, questions, answers, asked: false, again: 0 };
     Ok((open, revision(first.header.as_ref())))
 }
 
-impl Open {
+impl WatchStream {
     /// What etcd sends next, and the place after it. Nothing if that is no change.
-    async fn receive(&mut self, place: &mut Place, limit: std::time::Duration) -> Result<Vec<WatchEvent>, Break> {
+    async fn receive(
+        &mut self,
+        place: &mut WatchPosition,
+        limit: std::time::Duration,
+    ) -> Result<Vec<WatchEvent>, Break> {
         let Ok(answer) = timeout(limit, self.answers.message()).await else {
             // A member that lives answers this at once.
             let progress = WatchRequest { request_union: Some(RequestUnion::ProgressRequest(WatchProgressRequest {})) };
@@ -259,7 +263,7 @@ impl Open {
         if answer.events.is_empty() {
             let next = revision(answer.header.as_ref()) + 1;
             if next > place.from {
-                *place = Place { from: next, seen: 0 };
+                *place = WatchPosition { from: next, seen: 0 };
             }
             return Ok(Vec::new());
         }
@@ -301,11 +305,11 @@ mod tests {
 
     #[test]
     fn the_place_is_within_a_revision_while_parts_of_it_come() {
-        let place = Place { from: 7, seen: 0 };
-        assert_eq!(place.after([7, 9].into_iter(), false), Place { from: 10, seen: 0 });
+        let place = WatchPosition { from: 7, seen: 0 };
+        assert_eq!(place.after([7, 9].into_iter(), false), WatchPosition { from: 10, seen: 0 });
         let within = place.after([8, 9, 9].into_iter(), true);
-        assert_eq!(within, Place { from: 9, seen: 2 });
-        assert_eq!(within.after([9].into_iter(), true), Place { from: 9, seen: 3 });
-        assert_eq!(within.after([9, 9, 11].into_iter(), false), Place { from: 12, seen: 0 });
+        assert_eq!(within, WatchPosition { from: 9, seen: 2 });
+        assert_eq!(within.after([9].into_iter(), true), WatchPosition { from: 9, seen: 3 });
+        assert_eq!(within.after([9, 9, 11].into_iter(), false), WatchPosition { from: 12, seen: 0 });
     }
 }

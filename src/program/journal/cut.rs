@@ -2,16 +2,16 @@
 
 use std::path::PathBuf;
 
-use palpate::journal::mend;
+use palpate::journal::recover;
 
 use super::super::Failure;
-use super::Source;
+use super::JournalSource;
 use super::output::{new_file, unwritten};
 
 #[derive(clap::Args)]
 pub(super) struct CutArguments {
     #[command(flatten)]
-    source: Source,
+    source: JournalSource,
     /// The step that it begins with
     #[arg(long, value_name = "STEP")]
     from: u64,
@@ -29,7 +29,7 @@ pub(super) fn cut(arguments: &CutArguments) -> Result<(), Failure> {
     let limits = source.limits()?;
     let reader = source.open()?;
     let mut file = new_file(output)?;
-    let survey = mend::cut(reader, [*from, *to], &limits, &mut file).inspect_err(|_| {
+    let survey = recover::cut(reader, [*from, *to], &limits, &mut file).inspect_err(|_| {
         // What is half of a journal helps nobody.
         let _ = std::fs::remove_file(output);
     })?;

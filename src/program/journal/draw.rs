@@ -2,19 +2,19 @@
 
 use std::path::PathBuf;
 
-use palpate::journal::{Replay, Seen};
+use palpate::journal::{Replay, ReplayEvent};
 use palpate::render::{self, Arrow, Gif, Still, View};
 use palpate::session::Session;
 use palpate::surface::{Refinement, Skin};
 use palpate::texture;
 
 use super::super::{Failure, with_progress, write_file};
-use super::Source;
+use super::JournalSource;
 
 #[derive(clap::Args)]
 pub(super) struct RenderArguments {
     #[command(flatten)]
-    source: Source,
+    source: JournalSource,
     /// The file to write: a .png of one moment, or a .gif
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
@@ -41,9 +41,9 @@ pub(super) struct RenderArguments {
     frames_hz: f64,
 }
 
-fn failed(failure: render::Failure) -> Failure {
+fn failed(failure: render::FilmFailure) -> Failure {
     match failure {
-        render::Failure::Refused(refusal) => Failure::from(refusal),
+        render::FilmFailure::Refused(refusal) => Failure::from(refusal),
         failure => Failure::Failed(failure.to_string()),
     }
 }
@@ -60,7 +60,7 @@ fn still(session: &Session, shown: Option<&std::sync::Arc<Skin>>) -> Still {
 }
 
 /// The moment at which the largest force was felt, as it was recorded.
-fn strongest(source: &Source) -> Result<u64, Failure> {
+fn strongest(source: &JournalSource) -> Result<u64, Failure> {
     let mut reader = source.open()?;
     let mut found = (0.0, reader.header().begin_step);
     while let Some(batch) = reader.next_batch()? {
@@ -79,7 +79,7 @@ fn strongest(source: &Source) -> Result<u64, Failure> {
     Ok(found.1)
 }
 
-fn check(replay: &Replay<std::io::BufReader<std::fs::File>>, source: &Source) -> Result<(), Failure> {
+fn check(replay: &Replay<std::io::BufReader<std::fs::File>>, source: &JournalSource) -> Result<(), Failure> {
     let differs = replay.difference().map(|difference| format!("{}: {difference}", source.file.display()));
     differs.map_or(Ok(()), |message| Err(Failure::Failed(message)))
 }
@@ -114,7 +114,7 @@ pub(super) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     let view = View { camera: arguments.camera.parse()?, size, refinement, texture: skin };
     let shown = Skin::of(&model);
     let go_to = |replay: &mut Replay<_>, step: u64| -> Result<(), Failure> {
-        replay.advance(step, &mut |_: Seen<'_>| Ok(()))?;
+        replay.advance(step, &mut |_: ReplayEvent<'_>| Ok(()))?;
         check(replay, source)
     };
     let begin = begin.unwrap_or_else(|| replay.session().step_count());

@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::super::{Failure, with_progress};
 use super::output::{output, written};
-use super::{Source, foxglove};
+use super::{JournalSource, foxglove};
 
 #[derive(clap::Args)]
 #[command(
@@ -19,17 +19,17 @@ use super::{Source, foxglove};
 )]
 pub(super) struct ExportArguments {
     #[command(flatten)]
-    source: Source,
+    source: JournalSource,
     /// What to write
     #[arg(long, value_enum)]
-    format: Format,
+    format: ExportFormat,
     /// Write here; required for mcap [default: the standard output]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum Format {
+enum ExportFormat {
     /// One object a line
     Jsonl,
     /// One row a line, with names in the first
@@ -45,7 +45,7 @@ fn array(v: Option<pb::Vector>) -> [f32; 3] {
 /// Exports a journal.
 pub(super) fn export(arguments: &ExportArguments) -> Result<(), Failure> {
     let ExportArguments { source, format, output: file } = arguments;
-    if *format == Format::Mcap {
+    if *format == ExportFormat::Mcap {
         let missing = || Failure::Refused("--output: is missing; mcap is written to a file".to_owned());
         return foxglove::export(source, file.as_deref().ok_or_else(missing)?);
     }
@@ -53,12 +53,12 @@ pub(super) fn export(arguments: &ExportArguments) -> Result<(), Failure> {
     let (length, rate_hz) = (reader.length(), reader.header().rate_hz);
     let mut out = output(file.as_deref())?;
     let result = match format {
-        Format::Csv => writeln!(
+        ExportFormat::Csv => writeln!(
             out,
             "step,time_s,tool,place_x_m,place_y_m,place_z_m,displacement_x_m,displacement_y_m,displacement_z_m,force_x_n,\
              force_y_n,force_z_n"
         ),
-        Format::Jsonl | Format::Mcap => Ok(()),
+        ExportFormat::Jsonl | ExportFormat::Mcap => Ok(()),
     };
     type Written = (std::io::Result<()>, u64);
     let (result, until_step) = with_progress("byte", length, file.is_none(), |progress| -> Result<Written, Failure> {
@@ -80,10 +80,10 @@ pub(super) fn export(arguments: &ExportArguments) -> Result<(), Failure> {
 }
 
 #[allow(clippy::cast_precision_loss)]
-fn row(out: &mut dyn Write, format: Format, step: u64, rate_hz: f64, felt: &pb::FeltTool) -> std::io::Result<()> {
+fn row(out: &mut dyn Write, format: ExportFormat, step: u64, rate_hz: f64, felt: &pb::FeltTool) -> std::io::Result<()> {
     let time_s = if rate_hz > 0.0 { step as f64 / rate_hz } else { 0.0 };
     let [place_m, displacement_m, force_n] = [felt.place_m, felt.displacement_m, felt.force_n].map(array);
-    if format == Format::Jsonl {
+    if format == ExportFormat::Jsonl {
         let line = json!({ "step": step, "time_s": time_s, "tool": felt.tool, "place_m": place_m,
             "displacement_m": displacement_m, "force_n": force_n });
         return writeln!(out, "{line}");

@@ -3,11 +3,11 @@
 use std::io::BufWriter;
 use std::path::Path;
 
-use palpate::journal::Seen;
+use palpate::journal::ReplayEvent;
 use palpate::journal::foxglove::Export;
 
 use super::super::{Failure, with_progress};
-use super::Source;
+use super::JournalSource;
 use super::output::{new_file, unwritten};
 
 /// Curves a second, of tools and energies.
@@ -18,7 +18,7 @@ const SURFACES_HZ: f64 = 30.0;
 
 /// Simulates a journal again and writes what Foxglove shows.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-pub(super) fn export(source: &Source, path: &Path) -> Result<(), Failure> {
+pub(super) fn export(source: &JournalSource, path: &Path) -> Result<(), Failure> {
     let replay = source.replay(None)?;
     let rate_hz = replay.first().scene.stepping.rate_hz;
     let every = |hz: f64| (rate_hz / hz).round().max(1.0) as u64;
@@ -29,7 +29,7 @@ pub(super) fn export(source: &Source, path: &Path) -> Result<(), Failure> {
     let mut export = Export::new(BufWriter::new(file), begun_ns, replay.session())?;
     with_progress("step", last, false, |progress| {
         replay.advance(last, &mut |seen| {
-            let Seen::Step(session) = seen else { return Ok(()) };
+            let ReplayEvent::Step(session) = seen else { return Ok(()) };
             let step = session.step_count();
             if step.is_multiple_of(curves) {
                 export.curves(session)?;

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use palpate::journal::file::{self, JournalFile};
-use palpate::journal::{Reader, Survey, pb};
+use palpate::journal::{JournalReader, Survey, pb};
 use palpate::printable::{printable, printable_json};
 use serde::Serialize;
 
@@ -23,7 +23,7 @@ pub(super) struct ListArguments {
 /// How a journal ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-enum State {
+enum JournalEnd {
     /// The session was deleted.
     Deleted,
     /// The server ended, and the session goes on in the next run.
@@ -43,12 +43,12 @@ enum State {
 }
 
 #[derive(Serialize)]
-struct Row {
+struct ListRow {
     session_id: String,
     run: u64,
     file: PathBuf,
     bytes: u64,
-    state: State,
+    state: JournalEnd,
     #[serde(skip_serializing_if = "Option::is_none")]
     problem: Option<String>,
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
@@ -73,21 +73,21 @@ struct More {
     sealed: bool,
 }
 
-fn state(survey: &Survey) -> State {
+fn state(survey: &Survey) -> JournalEnd {
     match survey.end.as_ref().map(pb::End::why) {
-        Some(pb::Why::Deleted) => State::Deleted,
-        Some(pb::Why::Drained | pb::Why::Unspecified) => State::Drained,
-        Some(pb::Why::Cut) => State::Cut,
-        Some(pb::Why::Recovered) => State::Recovered,
-        Some(pb::Why::Moved) => State::Moved,
-        None if survey.torn_bytes > 0 => State::Torn,
-        None => State::Unfinished,
+        Some(pb::Why::Deleted) => JournalEnd::Deleted,
+        Some(pb::Why::Drained | pb::Why::Unspecified) => JournalEnd::Drained,
+        Some(pb::Why::Cut) => JournalEnd::Cut,
+        Some(pb::Why::Recovered) => JournalEnd::Recovered,
+        Some(pb::Why::Moved) => JournalEnd::Moved,
+        None if survey.torn_bytes > 0 => JournalEnd::Torn,
+        None => JournalEnd::Unfinished,
     }
 }
 
-fn row(JournalFile { session_id, run, path }: JournalFile) -> Row {
+fn row(JournalFile { session_id, run, path }: JournalFile) -> ListRow {
     let bytes = std::fs::metadata(&path).map_or(0, |metadata| metadata.len());
-    let read = Reader::open(&path).and_then(|reader| {
+    let read = JournalReader::open(&path).and_then(|reader| {
         let mut reader = reader.up_to_damage();
         let survey = reader.survey(&mut |_| {})?;
         let header = reader.header();
@@ -109,11 +109,11 @@ fn row(JournalFile { session_id, run, path }: JournalFile) -> Row {
         Ok((state(&survey), survey.damage, more))
     });
     let (state, problem, more) = match read {
-        Ok((_, Some(damage), more)) => (State::Damaged, Some(damage), Some(more)),
+        Ok((_, Some(damage), more)) => (JournalEnd::Damaged, Some(damage), Some(more)),
         Ok((state, None, more)) => (state, None, Some(more)),
-        Err(refusal) => (State::Damaged, Some(refusal.message), None),
+        Err(refusal) => (JournalEnd::Damaged, Some(refusal.message), None),
     };
-    Row { session_id, run, file: path, bytes, state, problem, more }
+    ListRow { session_id, run, file: path, bytes, state, problem, more }
 }
 
 /// Lists the journals of a folder.
@@ -125,7 +125,7 @@ pub(super) fn list(arguments: &ListArguments) -> Result<(), Failure> {
     let rows = files.into_iter().map(row);
     let mut text = String::new();
     if *json {
-        let rows: Vec<Row> = rows.collect();
+        let rows: Vec<ListRow> = rows.collect();
         text = printable_json(serde_json::to_string_pretty(&rows).map_err(|e| Failure::Failed(e.to_string()))?) + "\n";
     } else {
         let head = ["session", "run", "state", "begun (UTC)", "from step", "durable step", "kB", "scene"];

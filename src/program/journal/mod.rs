@@ -16,7 +16,7 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
-use palpate::journal::{Reader, Replay};
+use palpate::journal::{JournalReader, Replay};
 use palpate::limits::Limits;
 
 use super::{Failure, load_config, say, with_progress};
@@ -24,11 +24,11 @@ use super::{Failure, load_config, say, with_progress};
 #[derive(clap::Args)]
 pub(crate) struct JournalArguments {
     #[command(subcommand)]
-    command: Command,
+    command: JournalCommand,
 }
 
 #[derive(clap::Subcommand)]
-enum Command {
+enum JournalCommand {
     /// List the journals of a folder: sessions, runs, steps, sizes, and how each ends
     List(list::ListArguments),
     /// Show what happened in a session, as lines
@@ -58,7 +58,7 @@ enum Command {
 
 /// A journal that is simulated.
 #[derive(clap::Args)]
-struct Source {
+struct JournalSource {
     /// The journal
     file: PathBuf,
     /// Configuration file (TOML) with other limits, in a section [limits]
@@ -66,14 +66,14 @@ struct Source {
     config: Option<PathBuf>,
 }
 
-impl Source {
+impl JournalSource {
     fn limits(&self) -> Result<Limits, Failure> {
         limits(self.config.as_deref())
     }
 
     /// The journal, up to where it is damaged, if it is.
-    fn open(&self) -> Result<Reader<BufReader<File>>, Failure> {
-        Ok(Reader::open(&self.file)?.up_to_damage())
+    fn open(&self) -> Result<JournalReader<BufReader<File>>, Failure> {
+        Ok(JournalReader::open(&self.file)?.up_to_damage())
     }
 
     /// Tells, after all that is whole was written, what is not. It is an error if more was wanted: steps after `until`.
@@ -107,14 +107,14 @@ fn limits(config: Option<&Path>) -> Result<Limits, Failure> {
 /// Does what the arguments say.
 pub(crate) fn journal(arguments: &JournalArguments) -> Result<(), Failure> {
     match &arguments.command {
-        Command::List(arguments) => list::list(arguments),
-        Command::Show(arguments) => show::show(arguments),
-        Command::Verify(arguments) => verify::verify(arguments),
-        Command::Replay(arguments) => records::replay(arguments),
-        Command::Render(arguments) => draw::render(arguments),
-        Command::Export(arguments) => export::export(arguments),
-        Command::Cut(arguments) => cut::cut(arguments),
-        Command::Recover(arguments) => recover::recover(arguments),
-        Command::Key(arguments) => key::key(arguments),
+        JournalCommand::List(arguments) => list::list(arguments),
+        JournalCommand::Show(arguments) => show::show(arguments),
+        JournalCommand::Verify(arguments) => verify::verify(arguments),
+        JournalCommand::Replay(arguments) => records::replay(arguments),
+        JournalCommand::Render(arguments) => draw::render(arguments),
+        JournalCommand::Export(arguments) => export::export(arguments),
+        JournalCommand::Cut(arguments) => cut::cut(arguments),
+        JournalCommand::Recover(arguments) => recover::recover(arguments),
+        JournalCommand::Key(arguments) => key::key(arguments),
     }
 }

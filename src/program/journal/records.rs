@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use palpate::journal::{Replay, Seen};
+use palpate::journal::{Replay, ReplayEvent};
 use palpate::refusal::{Reason, Refusal};
 use palpate::scene::record::{Line, Record, Run, Summary, write_line};
 use palpate::session::Session;
@@ -12,13 +12,13 @@ use palpate::shape::{PointId, PointName};
 
 use super::super::client::client;
 use super::super::{Failure, clock_s, say, with_progress};
-use super::Source;
+use super::JournalSource;
 use super::output::{output, written};
 
 #[derive(clap::Args)]
 pub(super) struct ReplayArguments {
     #[command(flatten)]
-    source: Source,
+    source: JournalSource,
     /// Write the records here instead of to the standard output
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
@@ -170,7 +170,7 @@ fn play(
     recorder.see(replay.session());
     let begun_s = clock_s();
     let advanced = replay.advance(to, &mut |seen| {
-        let Seen::Step(session) = seen else { return Ok(()) };
+        let ReplayEvent::Step(session) = seen else { return Ok(()) };
         recorder.see(session);
         let step = session.step_count();
         if let Some(speed) = speed {

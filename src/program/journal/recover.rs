@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use palpate::journal::{Reader, Survey, mend};
+use palpate::journal::{JournalReader, Survey, recover};
 
 use super::super::{Failure, say, with_progress};
 use super::output::{new_file, unwritten};
@@ -21,10 +21,10 @@ pub(super) fn recover(arguments: &RecoverArguments) -> Result<(), Failure> {
     let RecoverArguments { file, output } = arguments;
     let beside = file.with_extension("mcap.part");
     let target = output.as_deref().unwrap_or(&beside);
-    let reader = Reader::open(file)?.up_to_damage();
+    let reader = JournalReader::open(file)?.up_to_damage();
     let length = reader.length();
     let mut new = new_file(target)?;
-    let recovered = with_progress("byte", length, false, |progress| mend::recover(reader, &mut new, progress));
+    let recovered = with_progress("byte", length, false, |progress| recover::recover(reader, &mut new, progress));
     let survey = match recovered {
         Ok(survey) => survey,
         Err(refusal) => {

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::PathBuf;
 
-use palpate::journal::replay::{Item, items};
-use palpate::journal::{Reader, pb};
+use palpate::journal::replay::{JournalItem, items};
+use palpate::journal::{JournalReader, pb};
 use palpate::printable::{printable, printable_json};
 use serde_json::{Value, json};
 
@@ -25,20 +25,20 @@ pub(super) struct ShowArguments {
 }
 
 /// Commands of one kind to one tool, in a row.
-struct Row {
+struct CommandRow {
     kind: &'static str,
     from: u64,
     to: u64,
     count: u64,
 }
 
-struct Shown<'a> {
+struct ShownJournal<'a> {
     out: &'a mut dyn Write,
     rate_hz: f64,
-    rows: BTreeMap<u32, Row>,
+    rows: BTreeMap<u32, CommandRow>,
 }
 
-impl Shown<'_> {
+impl ShownJournal<'_> {
     #[allow(clippy::cast_precision_loss)]
     fn line(&mut self, step: u64, text: &str) -> std::io::Result<()> {
         writeln!(self.out, "{:>12.3} s  step {step:<10} {}", step as f64 / self.rate_hz, printable(text))
@@ -50,7 +50,7 @@ impl Shown<'_> {
 
     /// Ends the row of a tool.
     fn end(&mut self, tool: u32) -> std::io::Result<()> {
-        let Some(Row { kind, from, to, count }) = self.rows.remove(&tool) else { return Ok(()) };
+        let Some(CommandRow { kind, from, to, count }) = self.rows.remove(&tool) else { return Ok(()) };
         let many = if count == 1 { String::new() } else { format!(", {count} times until step {to}") };
         self.line(from, &format!("tool {tool}: {kind}{many}"))
     }
@@ -71,7 +71,7 @@ impl Shown<'_> {
             Some(row) if row.kind == kind => (row.to, row.count) = (step, row.count + 1),
             _ => {
                 self.end(command.tool)?;
-                self.rows.insert(command.tool, Row { kind, from: step, to: step, count: 1 });
+                self.rows.insert(command.tool, CommandRow { kind, from: step, to: step, count: 1 });
             }
         }
         Ok(())
@@ -107,7 +107,7 @@ fn tissue(tissue: &pb::Tissue) -> String {
     format!(
         "the tissue: k {} N/m, K″ {} N/m, C {} N·s/m; {} with {} substeps in {}",
         tissue.stiffness_n_per_m,
-        tissue.virtual_stiffness_n_per_m,
+        tissue.anchor_stiffness_n_per_m,
         tissue.damping_n_s_per_m,
         tissue.integrator,
         tissue.substeps,
@@ -181,7 +181,7 @@ fn in_json(input: &pb::Input) -> Value {
 
 /// Shows what a journal has.
 pub(super) fn show(arguments: &ShowArguments) -> Result<(), Failure> {
-    let mut reader = Reader::open(&arguments.file)?;
+    let mut reader = JournalReader::open(&arguments.file)?;
     let mut out = output(None)?;
     let mut failed = None;
     let shown = write(arguments, &mut reader, &mut *out, &mut failed);
@@ -191,7 +191,7 @@ pub(super) fn show(arguments: &ShowArguments) -> Result<(), Failure> {
 
 fn write(
     arguments: &ShowArguments,
-    reader: &mut Reader<std::io::BufReader<std::fs::File>>,
+    reader: &mut JournalReader<std::io::BufReader<std::fs::File>>,
     out: &mut dyn Write,
     failed: &mut Option<Failure>,
 ) -> std::io::Result<()> {
@@ -209,7 +209,7 @@ fn write(
         writeln!(out, "written by Palpate {version}")?;
     }
     let rate_hz = if header.rate_hz > 0.0 { header.rate_hz } else { 1.0 };
-    let mut shown = Shown { out, rate_hz, rows: BTreeMap::new() };
+    let mut shown = ShownJournal { out, rate_hz, rows: BTreeMap::new() };
     let (mut last, mut waiting) = ((header.begin_step, 0, None), Vec::new());
     loop {
         let read = reader.next_batch().and_then(|batch| match batch {
@@ -229,24 +229,24 @@ fn write(
         };
         for item in items {
             match item {
-                Item::Input(input) if arguments.json => shown.json(&in_json(&input))?,
-                Item::Hash(hash) if arguments.json => {
+                JournalItem::Input(input) if arguments.json => shown.json(&in_json(&input))?,
+                JournalItem::Hash(hash) if arguments.json => {
                     shown.json(&json!({ "step": hash.step, "hash": hash.hash }))?;
                 }
-                Item::Snapshot(snapshot) if arguments.json => {
+                JournalItem::Snapshot(snapshot) if arguments.json => {
                     let pb::Snapshot { step, hash, saved, .. } = snapshot;
                     shown.json(&json!({ "step": step, "snapshot_bytes": saved.len(), "hash": hash }))?;
                 }
-                Item::Input(input) => match &input.what {
+                JournalItem::Input(input) => match &input.what {
                     Some(pb::input::What::Command(command)) => shown.command(input.step, command, arguments.all)?,
                     _ => {
                         shown.end_all()?;
                         shown.line(input.step, &self::input(&input))?;
                     }
                 },
-                Item::Hash(hash) if arguments.all => shown.line(hash.step, &format!("hash {}", hash.hash))?,
-                Item::Hash(_) => {}
-                Item::Snapshot(snapshot) => {
+                JournalItem::Hash(hash) if arguments.all => shown.line(hash.step, &format!("hash {}", hash.hash))?,
+                JournalItem::Hash(_) => {}
+                JournalItem::Snapshot(snapshot) => {
                     shown.end_all()?;
                     let size = snapshot.saved.len();
                     shown.line(snapshot.step, &format!("snapshot, {size} bytes, hash {}", snapshot.hash))?;

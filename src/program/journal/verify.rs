@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use palpate::files;
 use palpate::journal::signature::{PublicKey, Signatures, Signed};
-use palpate::journal::{Reader, Replay, Verdict};
+use palpate::journal::{JournalReader, Replay, Verdict};
 use palpate::refusal::Refusal;
 use palpate::server::journal_key;
 
@@ -33,7 +33,7 @@ pub(super) fn verify(arguments: &VerifyArguments) -> Result<(), Failure> {
     let (mut differs, mut unread) = (Vec::new(), Vec::new());
     for path in &arguments.files {
         let (name, begun_s) = (path.display(), clock_s());
-        let verdict = Reader::open(path).and_then(|reader| {
+        let verdict = JournalReader::open(path).and_then(|reader| {
             let mut reader = reader.up_to_damage();
             let survey = reader.survey(&mut |_| {})?;
             let (last, damage) = (survey.until_step, survey.damage.clone());
@@ -75,12 +75,12 @@ pub(super) fn verify(arguments: &VerifyArguments) -> Result<(), Failure> {
 /// The key in a file.
 fn public_key(path: &Path) -> Result<PublicKey, Failure> {
     let refuse = |why: String| Failure::Refused(format!("--signed-by {}: {why}", path.display()));
-    let text = files::read_text(path, files::MOST_SECRET_BYTES).map_err(|refusal| refuse(refusal.message))?;
+    let text = files::read_text(path, files::MAX_SECRET_BYTES).map_err(|refusal| refuse(refusal.message))?;
     journal_key::public(&text).map_err(|refusal| refuse(refusal.message))
 }
 
 /// Checks the signatures of a journal, which is read from its beginning and stands there afterwards.
-fn signed(reader: &mut Reader<BufReader<File>>, key: PublicKey) -> Result<Option<Signed>, Refusal> {
+fn signed(reader: &mut JournalReader<BufReader<File>>, key: PublicKey) -> Result<Option<Signed>, Refusal> {
     let mut signatures = Signatures::of(key);
     reader.rewind();
     let mut check = || {

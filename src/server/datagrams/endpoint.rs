@@ -17,8 +17,8 @@ use wtransport::{Endpoint, ServerConfig, VarInt};
 use super::certificate::{self, ROTATED};
 use super::offers::{Datagrams, Offers, Socket};
 use crate::lock::lock;
-use crate::pace::clock::now_ns;
 use crate::priority::{give_way_a_little, thread};
+use crate::realtime::clock::now_ns;
 use crate::server::address::network;
 use crate::server::authorize::is_own_or_among;
 use crate::server::rate::Bucket;
@@ -29,7 +29,7 @@ use palpate_proto::datagram;
 const HANDSHAKES: usize = 64;
 
 /// Time for a handshake and the ticket.
-const PATIENCE: Duration = Duration::from_secs(5);
+const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Handshakes of a network: so many a second, and at once.
 const EACH: (f64, f64) = (10.0, 40.0);
@@ -50,7 +50,7 @@ pub(in crate::server) async fn receive(
 ) -> Datagrams {
     let Some(Socket { socket, advertised }) = socket else { return Datagrams::default() };
     let (ready, is_ready) = oneshot::channel();
-    let receiving = move || -> Result<(), Failure> {
+    let receiving = move || -> Result<(), EndpointError> {
         give_way_a_little();
         tokio::runtime::Builder::new_current_thread().enable_all().build()?.block_on(async {
             let listener = Listener::open(socket, advertised, origins, traffic)?;
@@ -70,7 +70,7 @@ pub(in crate::server) async fn receive(
     Datagrams(is_ready.await.ok())
 }
 
-type Failure = Box<dyn std::error::Error + Send + Sync>;
+type EndpointError = Box<dyn std::error::Error + Send + Sync>;
 
 struct Listener {
     endpoint: Endpoint<endpoint_side::Server>,
@@ -93,7 +93,7 @@ impl Listener {
         advertised: (String, u16),
         origins: Arc<[HeaderValue]>,
         traffic: Arc<Traffic>,
-    ) -> Result<Self, Failure> {
+    ) -> Result<Self, EndpointError> {
         let (identity, hash) = certificate::make()?;
         let config = ServerConfig::builder().with_bind_socket(socket);
         let endpoint = Endpoint::server(settled(config.with_identity(identity).build()))?;
@@ -162,7 +162,7 @@ fn settled(mut config: ServerConfig) -> ServerConfig {
 impl Door {
     /// Lets a session in that presents a good ticket.
     async fn admit(self: Arc<Self>, incoming: IncomingSession, address: SocketAddr, _slot: OwnedSemaphorePermit) {
-        let refused = match timeout(PATIENCE, self.enter(incoming)).await {
+        let refused = match timeout(HANDSHAKE_TIMEOUT, self.enter(incoming)).await {
             Ok(Ok(())) => return,
             Ok(Err(why)) => why,
             Err(_) => "timed out".to_owned(),

@@ -7,7 +7,7 @@ use palpate_proto::pb;
 
 use super::tickets::{Arrival, Tickets};
 use crate::lock::lock;
-use crate::pace::clock::now_ns;
+use crate::realtime::clock::now_ns;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::server::address::host_and_port;
 use crate::server::config::Config;

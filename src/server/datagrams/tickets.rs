@@ -17,7 +17,7 @@ pub(in crate::server) const GOOD: Duration = Duration::from_secs(10);
 const GOOD_NS: u64 = 1_000_000_000 * GOOD.as_secs();
 
 /// The most tickets that are out at a time; each belongs to a stream or a call.
-const MOST: usize = 4096;
+const MAX_TICKETS: usize = 4096;
 
 /// The tickets that are out.
 #[derive(Debug, Default)]
@@ -32,10 +32,10 @@ struct Ticket {
 impl Tickets {
     /// A new ticket, and the session that will present it; `None` if too many are out.
     pub(super) fn give(&mut self, now_ns: u64) -> Result<Option<([u8; 16], Arrival)>> {
-        if self.0.len() >= MOST {
+        if self.0.len() >= MAX_TICKETS {
             self.0.retain(|_, ticket| ticket.is_good(now_ns));
         }
-        if self.0.len() >= MOST {
+        if self.0.len() >= MAX_TICKETS {
             return Ok(None);
         }
         let number = random_bits()?.to_be_bytes();
@@ -87,7 +87,7 @@ mod tests {
     fn tickets_are_bounded_and_make_room_as_they_lapse() {
         let mut tickets = Tickets::default();
         let kept: Vec<_> = std::iter::from_fn(|| tickets.give(0).unwrap()).collect();
-        assert_eq!(kept.len(), MOST);
+        assert_eq!(kept.len(), MAX_TICKETS);
         assert!(tickets.give(GOOD_NS).unwrap().is_none());
         assert!(tickets.give(GOOD_NS + 1).unwrap().is_some());
         assert_eq!(tickets.0.len(), 1);

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use super::Fleet;
-use crate::cluster::agones::{self, Seen};
+use crate::cluster::agones::{self, ServerStatus};
 
 impl Fleet {
     /// Tells Agones for ever; without `cluster.agones` nothing at all.
@@ -12,7 +12,7 @@ impl Fleet {
         if !self.config.cluster.agones {
             return;
         }
-        let seen = || Seen {
+        let seen = || ServerStatus {
             acts: self.pacer.fence.may_act(),
             sessions: self.pacer.list().len(),
             draining: self.is_draining.load(Ordering::Relaxed),

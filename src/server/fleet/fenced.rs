@@ -11,8 +11,8 @@ use http_body::Frame;
 use tonic::Status;
 use tonic::body::Body;
 
-use crate::pace::fence::Fence;
-use crate::pace::fenced;
+use crate::realtime::fence::Fence;
+use crate::realtime::fenced;
 
 /// The body of an answer, until the fence is passed.
 pub(in crate::server) struct FencedBody {

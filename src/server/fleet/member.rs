@@ -9,14 +9,14 @@ use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until};
 use tracing::{error, info, warn};
 
+use super::counters::Standing;
 use super::owned::Found;
-use super::tally::Standing;
-use super::{Fleet, Held, Nodes, elsewhere};
+use super::{Fleet, HeldLease, Nodes, elsewhere};
 use crate::cluster::etcd::{Compare, EtcdError, Op, Txn, WatchError, WatchEvent};
 use crate::cluster::key::{NodeValue, decode, encode};
 use crate::cluster::rules;
 use crate::lock::lock;
-use crate::pace::fence::boot_ns;
+use crate::realtime::fence::boot_ns;
 use crate::refusal::{Reason, Refusal, Result};
 use crate::server::journals::Journals;
 
@@ -92,7 +92,7 @@ impl Fleet {
                 "is being taken by another server at this moment",
             ));
         };
-        *lock(&self.held) = Held { lease: lease.id, key_revision };
+        *lock(&self.held) = HeldLease { lease: lease.id, key_revision };
         info!(node = self.node, lease = lease.id, ttl_s = lease.ttl_s, "this server is of the fleet");
         Ok(())
     }
@@ -222,7 +222,11 @@ impl Fleet {
                     if self.owns_since(id, now) {
                         self.names_nobody(id);
                     }
-                    self.pacer.list().iter().filter(|live| live.id == id).for_each(|live| live.is_owned_since(now));
+                    self.pacer
+                        .list()
+                        .iter()
+                        .filter(|handle| handle.id == id)
+                        .for_each(|handle| handle.is_owned_since(now));
                     return true;
                 }
                 Ok(Err(Some((value, _)))) if value.node == self.node => return false,
@@ -344,7 +348,7 @@ impl Fleet {
     /// Writes the server's key, as this process has left it: so an older process, or one that waited, can't bring it under an older
     /// lease.
     async fn tell_once(&self, own: &NodeValue) -> bool {
-        let Held { lease, key_revision } = *lock(&self.held);
+        let HeldLease { lease, key_revision } = *lock(&self.held);
         let key = self.keys.node(&self.node);
         let put = Op::Put { key: key.clone(), value: encode(own), lease: Some(lease) };
         let as_left = Compare::ModRevision(key.clone(), key_revision);
@@ -373,7 +377,7 @@ impl Fleet {
     #[allow(clippy::cast_precision_loss)]
     fn measure(&self) -> NodeValue {
         let sessions = self.pacer.list();
-        let share: f64 = sessions.iter().map(|live| live.share()).sum();
+        let share: f64 = sessions.iter().map(|handle| handle.share()).sum();
         let mut own = lock(&self.own);
         own.load = (share / f64::from(own.threads.max(1)) * 100.0).round().abs() / 100.0;
         own.sessions = u32::try_from(sessions.len()).unwrap_or(u32::MAX);

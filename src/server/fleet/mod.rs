@@ -6,19 +6,19 @@
 //! Clients connect to the owner of a session. No call is passed on but the creation of a session.
 
 mod agones;
+mod counters;
+mod failover;
 mod fenced;
 mod follow;
-mod hand_over;
 mod member;
-mod mirror;
+mod migrate;
 mod owned;
 mod peers;
 mod receive;
-mod settle;
-mod stand_by;
-mod take_in;
-mod take_over;
-mod tally;
+mod reconcile;
+mod replica;
+mod replica_receiver;
+mod replication;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -28,26 +28,26 @@ use palpate_proto::pb;
 use tokio::sync::{Notify, watch};
 use tokio_util::sync::CancellationToken;
 
+pub(super) use counters::Standing;
 pub(super) use fenced::FencedBody;
-pub(super) use peers::MOST_MESSAGE_BYTES;
-pub(super) use tally::Standing;
+pub(super) use peers::MAX_MESSAGE_BYTES;
 
 use super::config::Config;
 use super::journals::Journals;
-use super::journals::growth::Growth;
+use super::journals::progress::Growth;
 use crate::budget::Account;
 use crate::cluster::etcd::{Etcd, EtcdError, EtcdOptions, KeyValue};
 use crate::cluster::key::{Keys, NodeValue, SessionValue, decode};
 use crate::cluster::placement;
 use crate::lock::lock;
-use crate::pace::clock::now_ns;
-use crate::pace::{Live, Pacer};
+use crate::realtime::clock::now_ns;
+use crate::realtime::{Pacer, SessionHandle};
 use crate::refusal::{Reason, Refusal, Result, excerpt};
 use peers::Peers;
-use stand_by::StandBy;
+use replica::StandBy;
 
 /// URLs of other servers that a client is told.
-const MOST_OTHERS: usize = 8;
+const MAX_OTHERS: usize = 8;
 
 /// The nodes of a fleet, by name.
 type Nodes = BTreeMap<String, NodeValue>;
@@ -78,14 +78,14 @@ pub(super) struct Fleet {
     /// The end of a transaction is unknown: etcd may say of this server what is not so.
     unsettled: Notify,
     growth: Arc<Growth>,
-    tally: tally::FleetTally,
+    tally: counters::FleetTally,
     stand_by: StandBy,
     /// Who stands by for each session.
     standbys: Mutex<BTreeMap<String, Standby>>,
     /// Sessions that are deleted or were moved, and that servers need not stand by for any more, by the server.
     past: Mutex<BTreeMap<String, Vec<String>>>,
     journals: OnceLock<Arc<Journals>>,
-    held: Mutex<Held>,
+    held: Mutex<HeldLease>,
     /// The fence that etcd has confirmed, also before this server acts for sessions.
     confirmed_ns: AtomicU64,
     is_draining: AtomicBool,
@@ -95,7 +95,7 @@ pub(super) struct Fleet {
 
 /// What this server holds in etcd.
 #[derive(Debug, Clone, Copy, Default)]
-struct Held {
+struct HeldLease {
     /// Its lease; 0 before it has one.
     lease: i64,
     /// The revision at which this process has last written the server's key.
@@ -165,7 +165,7 @@ impl Fleet {
         let stand_by = StandBy::open(&folder)?;
         let own = NodeValue {
             endpoint: cluster.endpoint().to_owned(),
-            instance: stand_by::instance(&folder)?,
+            instance: replica::instance(&folder)?,
             version: env!("CARGO_PKG_VERSION").to_owned(),
             replays: crate::journal::format::REPLAYS,
             threads: u32::try_from(config.stepping_threads()).unwrap_or(u32::MAX),
@@ -191,7 +191,7 @@ impl Fleet {
             left_alone: Mutex::default(),
             unsettled: Notify::new(),
             growth: Arc::default(),
-            tally: tally::FleetTally::default(),
+            tally: counters::FleetTally::default(),
             stand_by,
             standbys: Mutex::default(),
             past: Mutex::default(),
@@ -228,7 +228,7 @@ impl Fleet {
     fn ownership(&self, value: &SessionValue, revision: u64) -> pb::Ownership {
         let nodes = self.nodes.borrow();
         let owner = nodes.get(&value.node);
-        let others = nodes.iter().filter(|(name, _)| **name != value.node).take(MOST_OTHERS);
+        let others = nodes.iter().filter(|(name, _)| **name != value.node).take(MAX_OTHERS);
         pb::Ownership {
             endpoint: owner.map(|node| node.endpoint.clone()).unwrap_or_default(),
             node: value.node.clone(),
@@ -239,9 +239,9 @@ impl Fleet {
     }
 
     /// Who serves a session of this server, as clients are told.
-    pub(super) fn own(&self, live: &Live) -> pb::Ownership {
-        let standby = lock(&self.standbys).get(&live.id).map(|standby| standby.named.clone()).unwrap_or_default();
-        self.ownership(&SessionValue { node: self.node.clone(), standby }, live.revision())
+    pub(super) fn own(&self, handle: &SessionHandle) -> pb::Ownership {
+        let standby = lock(&self.standbys).get(&handle.id).map(|standby| standby.named.clone()).unwrap_or_default();
+        self.ownership(&SessionValue { node: self.node.clone(), standby }, handle.revision())
     }
 
     /// Who serves a session.

@@ -8,20 +8,20 @@ use tokio::time::{Instant, sleep};
 use tracing::warn;
 
 use super::{Fleet, Owned, of_etcd};
-use crate::cluster::etcd::{Compare, EtcdError, Outcome, Txn};
+use crate::cluster::etcd::{Compare, EtcdError, TransactionOutcome, Txn};
 use crate::cluster::key::{SessionValue, decode};
 use crate::cluster::rules;
 use crate::ids::random_id;
 use crate::lock::lock;
-use crate::pace::Birth;
-use crate::pace::clock::now_ns;
+use crate::realtime::SessionReservation;
+use crate::realtime::clock::now_ns;
 use crate::refusal::{Reason, Refusal, Result};
 
 /// A session that does not come within this time, ns, was given up by who wanted it.
 const COMES_NS: u64 = 300_000_000_000;
 
 /// A deletion waits so long for etcd.
-const PATIENCE: Duration = Duration::from_secs(5);
+const DELETE_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// etcd is asked again so soon.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -66,7 +66,7 @@ impl Fleet {
         let before = found_at(&txn, &key);
         let outcome = self.etcd.transact(txn).await;
         let unknown = match outcome {
-            Ok(Outcome { succeeded: true, revision, .. }) => return Ok(Ok(revision)),
+            Ok(TransactionOutcome { succeeded: true, revision, .. }) => return Ok(Ok(revision)),
             Ok(_) => None,
             Err(error @ EtcdError::Unknown(_)) => Some(error),
             Err(error) => return Err(of_etcd(error)),
@@ -130,16 +130,16 @@ impl Fleet {
     ///
     /// # Errors
     /// Refuses while etcd can't be reached, and if this server has lost its lease.
-    pub(in crate::server) async fn birth(&self) -> Result<Birth> {
+    pub(in crate::server) async fn birth(&self) -> Result<SessionReservation> {
         let id = random_id()?;
         let made = self.transact(rules::create(&self.keys, &id, &self.node), &id, |found| found.is_some()).await?;
-        let revision = made.map_err(|_| crate::pace::fenced())?;
+        let revision = made.map_err(|_| crate::realtime::fenced())?;
         lock(&self.owned).insert(id.clone(), Owned::since(revision));
-        Ok(Birth { id, revision, recorded: true })
+        Ok(SessionReservation { id, revision, recorded: true })
     }
 
     /// The session of a birth is there; or, if `is_there` is false, will not come.
-    pub(in crate::server) async fn born(&self, birth: &Birth, is_there: bool) {
+    pub(in crate::server) async fn born(&self, birth: &SessionReservation, is_there: bool) {
         if let Some(owned) = lock(&self.owned).get_mut(&birth.id) {
             owned.was_here = true;
         }
@@ -187,7 +187,7 @@ impl Fleet {
     /// Refuses if etcd does not confirm that in time: then the deletion goes on later. Refuses if another server has the session by
     /// now.
     pub(in crate::server) async fn until_deleted(&self, id: &str) -> Result<()> {
-        let until = Instant::now() + PATIENCE;
+        let until = Instant::now() + DELETE_TIMEOUT;
         loop {
             let Some(revision) = self.revision(id) else {
                 // Somebody else here was quicker.

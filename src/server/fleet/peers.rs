@@ -113,10 +113,10 @@ impl Peers {
 }
 
 /// Bytes of a message between nodes, at most.
-pub(in crate::server) const MOST_MESSAGE_BYTES: usize = 8 << 20;
+pub(in crate::server) const MAX_MESSAGE_BYTES: usize = 8 << 20;
 
 fn client(channel: Channel) -> NodeServiceClient<Channel> {
     NodeServiceClient::new(channel)
-        .max_decoding_message_size(MOST_MESSAGE_BYTES)
-        .max_encoding_message_size(MOST_MESSAGE_BYTES)
+        .max_decoding_message_size(MAX_MESSAGE_BYTES)
+        .max_encoding_message_size(MAX_MESSAGE_BYTES)
 }

@@ -4,7 +4,7 @@ use palpate_proto::pb;
 use tonic::Status;
 
 /// What a haptic stream is told besides samples.
-pub(super) enum Event {
+pub(super) enum StreamEvent {
     Rejected(pb::Rejection),
     /// The client's time, and when it came; another session for datagrams, if it asked for one.
     Renewed {

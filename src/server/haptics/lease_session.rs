@@ -7,27 +7,27 @@ use palpate_proto::pb;
 use prost::Message;
 use tracing::{Instrument, debug, info};
 
-use super::event::Event;
-use super::holder::Holder;
-use super::outlet::Outlet;
-use super::stream::Life;
+use super::event::StreamEvent;
+use super::lease_controller::LeaseController;
+use super::response_stream::ResponseStream;
+use super::stream::KeepaliveTimer;
 use super::tools::lease_id;
 use crate::budget::Account;
-use crate::pace::StreamKind;
-use crate::pace::queue::{Writer, queue};
+use crate::realtime::StreamKind;
+use crate::realtime::queue::{Writer, queue};
 use crate::refusal::{Refusal, Result};
-use crate::server::datagrams::{Arrival, GOOD, Way, not_available};
+use crate::server::datagrams::{Arrival, DatagramChannel, GOOD, not_available};
 use crate::server::recovered::Notices;
 use crate::server::services::Services;
 use crate::wire;
 
 /// A session that was offered for a lease.
 struct LeaseSession {
-    holder: Holder,
-    outlet: Outlet,
-    way: Arc<Way>,
+    controller: LeaseController,
+    responses: ResponseStream,
+    channel: Arc<DatagramChannel>,
     arrival: Option<Arrival>,
-    events: Writer<Event>,
+    events: Writer<StreamEvent>,
 }
 
 /// Offers datagrams for the tools of a lease.
@@ -36,25 +36,25 @@ pub(super) async fn offer(
     request: &pb::OpenDatagramsRequest,
     account: &Account,
 ) -> Result<pb::DatagramOffer> {
-    let live = services.session(&request.session_id).await?;
+    let handle = services.session(&request.session_id).await?;
     let lease = lease_id(&request.lease_id)?;
     let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
-    let (tools, step) = live.at_intake(|intake, now| {
+    let (tools, step) = handle.at_intake(|intake, now| {
         intake.renew(lease, now)?;
         Ok::<_, Refusal>((intake.tools_of(lease).collect::<Vec<u32>>(), intake.next_step()))
     })?;
     let mut sampling = wire::sample::sampling(every, Some(tools.clone()), deadband, request.heartbeat_s, false)?;
-    let guard = live.open_stream("OpenDatagrams", StreamKind::HoldsTools, account)?;
+    let guard = handle.open_stream("OpenDatagrams", StreamKind::HoldsTools, account)?;
     let (offer, arrival) = services.datagrams.offer()?.ok_or_else(not_available)?;
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
-    let holder = Holder::new(live.clone(), lease, &tools, None, true, limits, traffic);
-    let way = Arc::new(Way::new(holder.pace()));
-    sampling.wanted = Some(way.wanted());
+    let controller = LeaseController::new(handle.clone(), lease, &tools, None, true, limits, traffic);
+    let channel = Arc::new(DatagramChannel::new(controller.pace()));
+    sampling.wanted = Some(channel.wanted());
     let (events, heard) = queue(limits.queued_samples);
     let cut = guard.cut().clone();
-    let samples = live.samples(sampling, Some(account));
-    let outlet = Outlet::new(None, heard, samples, Notices::new(tools, step), guard, way.clone());
-    let session = LeaseSession { holder, outlet, way, arrival: Some(arrival), events };
+    let samples = handle.samples(sampling, Some(account));
+    let responses = ResponseStream::new(None, heard, samples, Notices::new(tools, step), guard, channel.clone());
+    let session = LeaseSession { controller, responses, channel, arrival: Some(arrival), events };
     let serving = async move {
         tokio::select! {
             why = session.serve() => debug!("datagrams of a lease ended: {why}"),
@@ -68,9 +68,9 @@ pub(super) async fn offer(
 impl LeaseSession {
     /// Serves until the lease or the session ends; says why it did.
     async fn serve(self) -> String {
-        let LeaseSession { mut holder, mut outlet, way, mut arrival, events } = self;
+        let LeaseSession { mut controller, mut responses, channel, mut arrival, events } = self;
         // Until then it has a place among the streams of the session.
-        let Ok(Some(connection)) = tokio::time::timeout(GOOD, way.arrive(&mut arrival)).await else {
+        let Ok(Some(connection)) = tokio::time::timeout(GOOD, channel.arrive(&mut arrival)).await else {
             return "nobody took the ticket".to_owned();
         };
         let telling = async {
@@ -79,7 +79,7 @@ impl LeaseSession {
                 Err(error) => return Err(error.to_string()),
             };
             loop {
-                let message = match poll_fn(|context| outlet.poll(context)).await {
+                let message = match poll_fn(|context| responses.poll(context)).await {
                     Some(Ok(message)) => pb::TouchResponse { message: Some(message) },
                     Some(Err(status)) => return Err(status.message().to_owned()),
                     None => return Ok(()),
@@ -90,19 +90,19 @@ impl LeaseSession {
                 stream.write_all(&bytes).await.map_err(|error| error.to_string())?;
             }
         };
-        let mut life = Life::of(true);
-        let (live, lease) = (holder.live.clone(), holder.lease);
+        let mut life = KeepaliveTimer::of(true);
+        let (handle, lease) = (controller.handle.clone(), controller.lease);
         let listening = async {
             loop {
                 tokio::select! {
-                    datagram = way.next(&mut arrival) => {
-                        if let Err(refusal) = holder.datagram(datagram, &events) {
+                    datagram = channel.next(&mut arrival) => {
+                        if let Err(refusal) = controller.datagram(datagram, &events) {
                             return refusal.to_string();
                         }
                     }
                     () = life.tick() => {
-                        way.stay_alive();
-                        if live.at_intake(|intake, _| intake.tools_of(lease).next().is_none()) {
+                        channel.stay_alive();
+                        if handle.at_intake(|intake, _| intake.tools_of(lease).next().is_none()) {
                             return "the lease is over".to_owned();
                         }
                     }

@@ -1,10 +1,10 @@
 //! `HapticService`: streams of commands and samples, single commands, hashes and records.
 
-mod early;
 mod event;
-mod holder;
+mod lease_controller;
 mod lease_session;
-mod outlet;
+mod pending_messages;
+mod response_stream;
 mod stream;
 mod tools;
 
@@ -18,12 +18,12 @@ use tools::{charges, lease_id};
 
 use super::charged_caller::ChargedCaller;
 use super::connections::Peer;
-use super::cut::until_cut;
 use super::revocation::Tenure;
 use super::services::Services;
+use super::stream_termination::until_cut;
 use crate::ids::random_bits;
-use crate::pace::StreamKind;
-use crate::pace::clock::now_ns;
+use crate::realtime::StreamKind;
+use crate::realtime::clock::now_ns;
 use crate::refusal::{Reason, Refusal};
 use crate::session::command::Command;
 use crate::shape::{PointId, PointName, RestShape};
@@ -34,7 +34,7 @@ use palpate_proto::pb::haptic_service_server::HapticService;
 #[derive(Clone)]
 pub(super) struct Haptics(pub(super) Services);
 
-type Out<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
+type TouchMessages<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
 /// The refusal of a call for a single tool, whose field is called `tool`.
 fn of_one_tool(refusal: Refusal) -> Refusal {
@@ -55,9 +55,9 @@ impl Haptics {
 
 #[tonic::async_trait]
 impl HapticService for Haptics {
-    type TouchStream = Out<pb::TouchResponse>;
-    type WatchSamplesStream = Out<pb::WatchSamplesResponse>;
-    type ProbeStream = Out<pb::ProbeResponse>;
+    type TouchStream = TouchMessages<pb::TouchResponse>;
+    type WatchSamplesStream = TouchMessages<pb::WatchSamplesResponse>;
+    type ProbeStream = TouchMessages<pb::ProbeResponse>;
 
     async fn touch(
         &self,
@@ -75,24 +75,25 @@ impl HapticService for Haptics {
         let (peer, tenure) =
             (request.extensions().get::<Peer>().cloned(), request.extensions().get::<Tenure>().cloned());
         let request = request.into_inner();
-        let live = self.0.session(&request.session_id).await?;
+        let handle = self.0.session(&request.session_id).await?;
         let mut lease_s = request.lease_s.unwrap_or(self.0.config.lease_s);
         if may_vanish && !request.outlives_connection {
             lease_s = lease_s.min(self.0.config.limits.browser_lease_s);
         }
         let lease = random_bits()?;
         let charges = charges(&account, 1).map_err(of_one_tool)?;
-        live.at_intake(|intake, now| {
-            intake.acquire(&[request.tool], &request.holder, lease_s, lease, now)?;
-            intake.charge(lease, charges);
-            Ok::<_, Refusal>(())
-        })
-        .map_err(of_one_tool)?;
+        handle
+            .at_intake(|intake, now| {
+                intake.acquire(&[request.tool], &request.holder, lease_s, lease, now)?;
+                intake.charge(lease, charges);
+                Ok::<_, Refusal>(())
+            })
+            .map_err(of_one_tool)?;
         if let Some(peer) = peer.filter(|_| !may_vanish && !request.outlives_connection) {
-            peer.leases.add(&live, lease, None);
+            peer.leases.add(&handle, lease, None);
         }
-        tenure.map_or(Ok(()), |tenure| tenure.bind(&live, lease))?;
-        info!(session = %live.id, tool = request.tool, holder = ?request.holder, "tool acquired");
+        tenure.map_or(Ok(()), |tenure| tenure.bind(&handle, lease))?;
+        info!(session = %handle.id, tool = request.tool, holder = ?request.holder, "tool acquired");
         Ok(Response::new(pb::AcquireToolResponse { lease_id: format!("{lease:032x}"), lease_s }))
     }
 
@@ -101,9 +102,9 @@ impl HapticService for Haptics {
         request: Request<pb::ReleaseToolRequest>,
     ) -> Result<Response<pb::ReleaseToolResponse>, Status> {
         let request = request.into_inner();
-        let live = self.0.session(&request.session_id).await?;
+        let handle = self.0.session(&request.session_id).await?;
         let lease = lease_id(&request.lease_id)?;
-        live.at_intake(|intake, _| intake.release(lease))?;
+        handle.at_intake(|intake, _| intake.release(lease))?;
         Ok(Response::new(pb::ReleaseToolResponse {}))
     }
 
@@ -113,22 +114,22 @@ impl HapticService for Haptics {
     ) -> Result<Response<pb::SendCommandsResponse>, Status> {
         let now = now_ns();
         let request = request.into_inner();
-        let live = self.0.session(&request.session_id).await?;
+        let handle = self.0.session(&request.session_id).await?;
         let lease = lease_id(&request.lease_id)?;
-        let shape = live.model.shape();
+        let shape = handle.model.shape();
         let read = |(index, command): (usize, &pb::Command)| {
             let command = wire::command::from_command(command, shape, now);
             command.map_err(|refusal| refusal.within(&format!("commands[{index}]")))
         };
         let commands: Result<Vec<Command>, Refusal> = request.commands.iter().enumerate().map(read).collect();
-        let accepted = commands.and_then(|commands| live.submit(lease, commands)).inspect_err(|refusal| {
-            live.count_refused(request.commands.len());
+        let accepted = commands.and_then(|commands| handle.submit(lease, commands)).inspect_err(|refusal| {
+            handle.count_refused(request.commands.len());
             self.0.traffic.refused(refusal.reason);
         })?;
         accepted.taken_in().await;
-        let tools = live.at_intake(|intake, _| intake.tools_of(lease).collect());
+        let tools = handle.at_intake(|intake, _| intake.tools_of(lease).collect());
         self.0.traffic.commanded(request.commands.len());
-        let sample = live.next_sample(tools).await?;
+        let sample = handle.next_sample(tools).await?;
         let sample = Some(wire::sample::sample(&sample, shape, 0, now_ns()));
         Ok(Response::new(pb::SendCommandsResponse { sample }))
     }
@@ -148,12 +149,12 @@ impl HapticService for Haptics {
     ) -> Result<Response<Self::WatchSamplesStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.session(&request.session_id).await?;
+        let handle = self.0.session(&request.session_id).await?;
         let (every, deadband) = (request.sample_every_steps, request.deadband.as_ref());
         let sampling = wire::sample::sampling(every, None, deadband, request.heartbeat_s, false)?;
-        let guard = live.open_stream("WatchSamples", StreamKind::ReadsOnly, &account)?;
+        let guard = handle.open_stream("WatchSamples", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
-        let samples = live.samples(sampling, Some(&account));
+        let samples = handle.samples(sampling, Some(&account));
         let out = unfold(Some((samples, guard)), |state| async move {
             let (mut samples, guard) = state?;
             Some(match samples.pop().await {
@@ -170,15 +171,15 @@ impl HapticService for Haptics {
     async fn probe(&self, request: Request<pb::ProbeRequest>) -> Result<Response<Self::ProbeStream>, Status> {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
-        let live = self.0.session(&request.session_id).await?;
+        let handle = self.0.session(&request.session_id).await?;
         let every = wire::every("every_steps", request.every_steps)?;
         let points = match wire::from_probed(request.r#where.as_ref())? {
-            Some((field, names)) => Some(self.probed(field, live.model.shape(), names)?),
+            Some((field, names)) => Some(self.probed(field, handle.model.shape(), names)?),
             None => None,
         };
-        let guard = live.open_stream("Probe", StreamKind::ReadsOnly, &account)?;
+        let guard = handle.open_stream("Probe", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
-        let records = live.probe(every, points, request.energy, request.tools, &account)?;
+        let records = handle.probe(every, points, request.energy, request.tools, &account)?;
         let out = unfold(Some((records, guard, None)), |state| async move {
             let (mut records, guard, begun) = state?;
             let (record, dropped, part) = match begun {

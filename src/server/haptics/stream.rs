@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use futures_util::stream::Stream;
 use palpate_proto::{pb, touch};
-use palpate_touch::carrier::LIFE_S;
+use palpate_touch::datagram_health::LIFE_S;
 use palpate_touch::device::UNDECLARED_FORCE_N;
 use tokio::sync::oneshot;
 use tokio::time::{Interval, MissedTickBehavior};
@@ -15,19 +15,19 @@ use tokio_util::task::AbortOnDropHandle;
 use tonic::{Status, Streaming};
 use tracing::{Instrument, debug, info};
 
-use super::early::Early;
-use super::event::Event;
-use super::holder::Holder;
-use super::outlet::Outlet;
+use super::event::StreamEvent;
+use super::lease_controller::LeaseController;
+use super::pending_messages::PendingMessages;
+use super::response_stream::ResponseStream;
 use super::tools::charges;
 use crate::budget::Account;
 use crate::ids::random_bits;
-use crate::pace::clock::now_ns;
-use crate::pace::queue::{Reader, Writer, queue};
-use crate::pace::{PacedSample, StreamGuard, StreamKind};
+use crate::realtime::clock::now_ns;
+use crate::realtime::queue::{Reader, Writer, queue};
+use crate::realtime::{PacedSample, StreamGuard, StreamKind};
 use crate::refusal::{Reason, Refusal};
 use crate::scene::check::check_tip;
-use crate::server::datagrams::{Arrival, Way};
+use crate::server::datagrams::{Arrival, DatagramChannel};
 use crate::server::force_law::{Computing, Updates};
 use crate::server::recovered::Notices;
 use crate::server::services::Services;
@@ -42,14 +42,14 @@ struct Opened {
     samples: Reader<PacedSample>,
     notices: Notices,
     guard: StreamGuard,
-    way: Arc<Way>,
+    channel: Arc<DatagramChannel>,
 }
 
 /// The tools of a stream, given back when it ends however it ends.
 struct StreamTools {
     tools: usize,
-    holder: Holder,
-    way: Arc<Way>,
+    controller: LeaseController,
+    channel: Arc<DatagramChannel>,
     /// If the client wants datagrams: when a session was last offered, and that session until it has come.
     offered_ns: Option<u64>,
     arrival: Option<Arrival>,
@@ -66,7 +66,7 @@ impl StreamTools {
         self.offered_ns.filter(|before_ns| now_ns.saturating_sub(*before_ns) >= BETWEEN_OFFERS_NS)?;
         // Without random numbers there is no ticket, and the stream goes on.
         let (offer, arrival) = services.datagrams.offer().ok().flatten()?;
-        self.way.part();
+        self.channel.part();
         (self.offered_ns, self.arrival) = (Some(now_ns), Some(arrival));
         Some(offer)
     }
@@ -76,17 +76,17 @@ impl Drop for StreamTools {
     fn drop(&mut self) {
         if self.tools > 0 {
             // A lease that has lapsed already has nothing to give back.
-            let _ = self.holder.live.at_intake(|intake, _| intake.release(self.holder.lease));
+            let _ = self.controller.handle.at_intake(|intake, _| intake.release(self.controller.lease));
         }
     }
 }
 
 /// Ticks while a stream has datagrams to keep alive.
-pub(super) struct Life(Option<Interval>);
+pub(super) struct KeepaliveTimer(Option<Interval>);
 
-impl Life {
+impl KeepaliveTimer {
     pub(super) fn of(has_datagrams: bool) -> Self {
-        Life(has_datagrams.then(|| {
+        KeepaliveTimer(has_datagrams.then(|| {
             let mut interval = tokio::time::interval(Duration::from_secs_f64(0.5 * LIFE_S));
             interval.set_missed_tick_behavior(MissedTickBehavior::Delay);
             interval
@@ -103,12 +103,12 @@ impl Life {
 
 /// Answers the first message of a haptic stream.
 async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, StreamTools), Status> {
-    let live = services.session(&open.session_id).await?;
+    let handle = services.session(&open.session_id).await?;
     let device = open.device.as_ref().map(touch::from_device).transpose()?;
     let tip = touch::from_tip(open.tip.as_ref());
     // A stream that neither renders nor says anything of a tip may push with forces on any tissue.
     if device.is_some() || open.tip.is_some() {
-        check_tip("tip", live.model.shape(), &tip)?;
+        check_tip("tip", handle.model.shape(), &tip)?;
     }
     let only = (!open.tools.is_empty()).then(|| open.tools.clone());
     let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
@@ -119,9 +119,9 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     }
     sampling.touch_stiffness = open.touch_stiffness;
     let kind = if open.tools.is_empty() { StreamKind::ReadsOnly } else { StreamKind::HoldsTools };
-    let guard = live.open_stream("Touch", kind, account)?;
+    let guard = handle.open_stream("Touch", kind, account)?;
     let begun = match device {
-        Some(_) => Some(Computing::begin(&services.workshop, account, &live, tip.radius_m).await?),
+        Some(_) => Some(Computing::begin(&services.job_pool, account, &handle, tip.radius_m).await?),
         None => None,
     };
     let (law, computing) = begun.unzip();
@@ -131,7 +131,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     let goes_on = !open.lease_id.is_empty() && !open.tools.is_empty();
     let lease = if goes_on { super::tools::lease_id(&open.lease_id)? } else { random_bits()? };
     let charges = charges(account, open.tools.len())?;
-    let step = live.at_intake(|intake, now| {
+    let step = handle.at_intake(|intake, now| {
         if goes_on {
             intake.renew(lease, now)?;
             if !open.tools.iter().all(|tool| intake.tools_of(lease).any(|held| held == *tool)) {
@@ -149,20 +149,21 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     // Held from here on: what fails below gives the tools back.
     let tools = open.tools.len();
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
-    let holder = Holder::new(live.clone(), lease, &open.tools, device, open.datagrams, limits, traffic);
-    let way = Arc::new(Way::new(holder.pace()));
-    let mut held = StreamTools { tools, holder, way: way.clone(), offered_ns: None, arrival: None, _computing };
+    let controller = LeaseController::new(handle.clone(), lease, &open.tools, device, open.datagrams, limits, traffic);
+    let channel = Arc::new(DatagramChannel::new(controller.pace()));
+    let mut held =
+        StreamTools { tools, controller, channel: channel.clone(), offered_ns: None, arrival: None, _computing };
     let offered = if open.datagrams { services.datagrams.offer()? } else { None };
     let (datagrams, arrival) = offered.unzip();
     held.offered_ns = arrival.is_some().then(now_ns);
     held.arrival = arrival;
     if datagrams.is_some() {
-        sampling.wanted = Some(way.wanted());
+        sampling.wanted = Some(channel.wanted());
     }
     let law = law.as_deref();
     let answer = pb::TouchOpened {
         step,
-        rate_hz: live.model.scene.stepping.rate_hz,
+        rate_hz: handle.model.scene.stepping.rate_hz,
         lease_s,
         heartbeat_s: sampling.heartbeat_s,
         law: law.map(|law| touch::law(law, FIRST)),
@@ -171,10 +172,10 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
         datagrams,
         lease_id: if open.tools.is_empty() { String::new() } else { format!("{lease:032x}") },
     };
-    let samples = live.samples(sampling, open.tools.is_empty().then_some(account));
-    info!(session = %live.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
+    let samples = handle.samples(sampling, open.tools.is_empty().then_some(account));
+    info!(session = %handle.id, tools = ?open.tools, holder = ?open.holder, "haptic stream opened");
     let notices = Notices::new(open.tools.clone(), step);
-    Ok((Opened { answer, updates, samples, notices, guard, way }, held))
+    Ok((Opened { answer, updates, samples, notices, guard, channel }, held))
 }
 
 /// Opens a stream and reads what the client says, until it ends.
@@ -184,7 +185,7 @@ pub(super) fn open(services: Services, inbound: Streaming<pb::TouchRequest>, acc
     let (opened, opening) = oneshot::channel();
     let listening = tokio::spawn(listen(services, inbound, account, opened, writer).in_current_span());
     let _listening = AbortOnDropHandle::new(listening);
-    Output { stage: Stage::Opening(opening, Some(events)), _listening }
+    Output { stage: StreamStage::Opening(opening, Some(events)), _listening }
 }
 
 /// Reads what the client says until it ends.
@@ -193,7 +194,7 @@ async fn listen(
     mut inbound: Streaming<pb::TouchRequest>,
     account: Account,
     opening: oneshot::Sender<Result<Opened, Status>>,
-    events: Writer<Event>,
+    events: Writer<StreamEvent>,
 ) {
     use pb::touch_request::Message;
     let patience = Duration::from_secs_f64(services.config.limits.open_s);
@@ -202,7 +203,7 @@ async fn listen(
         let _ = opening.send(Err(Refusal::new(Reason::TimedOut, "open", message).into()));
         return;
     };
-    let mut early = Early::default();
+    let mut early = PendingMessages::default();
     let first = match first {
         Ok(Some(pb::TouchRequest { message: Some(Message::Open(open)) })) => {
             let opening = begin(&services, &open, &account);
@@ -225,63 +226,63 @@ async fn listen(
             return;
         }
     };
-    let (live, way) = (held.holder.live.clone(), held.way.clone());
+    let (handle, channel) = (held.controller.handle.clone(), held.channel.clone());
     for command in early.dropped.drain(..) {
         let message = "was one of too many that came before the stream was open";
         let refusal = Refusal::new(Reason::QueueFull, "command", message);
         services.traffic.refused(refusal.reason);
-        events.push(Event::Rejected(wire::sample::rejection(command.0, command.1, &refusal)));
+        events.push(StreamEvent::Rejected(wire::sample::rejection(command.0, command.1, &refusal)));
     }
-    live.count_refused(early.refused);
-    let mut life = Life::of(held.arrival.is_some());
+    handle.count_refused(early.refused);
+    let mut life = KeepaliveTimer::of(held.arrival.is_some());
     loop {
         let message = tokio::select! {
             message = early.next(&mut inbound) => message,
-            datagram = way.next(&mut held.arrival) => {
-                if let Err(refusal) = held.holder.datagram(datagram, &events) {
+            datagram = channel.next(&mut held.arrival) => {
+                if let Err(refusal) = held.controller.datagram(datagram, &events) {
                     return events.close(refusal);
                 }
                 continue;
             }
             () = life.tick() => {
-                way.stay_alive();
+                channel.stay_alive();
                 continue;
             }
-            () = cut.cancelled() => return events.close(crate::pace::streams::cut()),
+            () = cut.cancelled() => return events.close(crate::realtime::streams::cut()),
         };
         match message {
             Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {
-                if let Err(refusal) = held.holder.command(&command, &events) {
+                if let Err(refusal) = held.controller.command(&command, &events) {
                     return events.close(refusal);
                 }
             }
             Ok(Some(pb::TouchRequest { message: Some(Message::Renew(renew)) })) => {
                 let now = now_ns();
-                if let Err((refusal, is_abuse)) = held.holder.message(now) {
+                if let Err((refusal, is_abuse)) = held.controller.message(now) {
                     if is_abuse {
                         return events.close(refusal);
                     }
-                    events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
+                    events.push(StreamEvent::Rejected(wire::sample::rejection(0, 0, &refusal)));
                     continue;
                 }
                 if held.tools > 0
-                    && let Err(refusal) = live.at_intake(|intake, now| intake.renew(held.holder.lease, now))
+                    && let Err(refusal) = handle.at_intake(|intake, now| intake.renew(held.controller.lease, now))
                 {
                     // A lease is not named in a stream.
                     let refusal = Refusal { field: String::new(), ..refusal };
-                    events.push(Event::Rejected(wire::sample::rejection(0, 0, &refusal)));
+                    events.push(StreamEvent::Rejected(wire::sample::rejection(0, 0, &refusal)));
                 }
                 let datagrams = if renew.datagrams { held.offer(&services, now) } else { None };
-                events.push(Event::Renewed { client_time_ns: renew.client_time_ns, arrival_ns: now, datagrams });
+                events.push(StreamEvent::Renewed { client_time_ns: renew.client_time_ns, arrival_ns: now, datagrams });
             }
             Ok(Some(_)) => {
                 let refusal = Refusal::new(Reason::OutOfTurn, "message", "must be a command or `renew`");
                 return events.close(refusal);
             }
-            Ok(None) => return events.push(Event::Finished),
+            Ok(None) => return events.push(StreamEvent::Finished),
             Err(status) => {
-                debug!(session = %live.id, %status, "a client vanished, or sent what can't be read");
-                return events.push(Event::Failed(status));
+                debug!(session = %handle.id, %status, "a client vanished, or sent what can't be read");
+                return events.push(StreamEvent::Failed(status));
             }
         }
     }
@@ -289,14 +290,14 @@ async fn listen(
 
 /// The output of a haptic stream. When nobody wants it any more, nothing is listened to any more, and tools are let go.
 pub(super) struct Output {
-    stage: Stage,
+    stage: StreamStage,
     _listening: AbortOnDropHandle<()>,
 }
 
 /// First the answer to `open`, then samples and rejections.
-enum Stage {
-    Opening(oneshot::Receiver<Result<Opened, Status>>, Option<Reader<Event>>),
-    Open(Outlet),
+enum StreamStage {
+    Opening(oneshot::Receiver<Result<Opened, Status>>, Option<Reader<StreamEvent>>),
+    Open(ResponseStream),
     Over,
 }
 
@@ -307,20 +308,20 @@ impl Stream for Output {
         use pb::touch_response::Message;
         let stage = &mut self.get_mut().stage;
         let message = match stage {
-            Stage::Opening(opening, events) => match (ready!(Pin::new(opening).poll(context)), events.take()) {
-                (Ok(Ok(Opened { answer, updates, samples, notices, guard, way })), Some(events)) => {
-                    *stage = Stage::Open(Outlet::new(updates, events, samples, notices, guard, way));
+            StreamStage::Opening(opening, events) => match (ready!(Pin::new(opening).poll(context)), events.take()) {
+                (Ok(Ok(Opened { answer, updates, samples, notices, guard, channel })), Some(events)) => {
+                    *stage = StreamStage::Open(ResponseStream::new(updates, events, samples, notices, guard, channel));
                     Some(Ok(Message::Opened(answer)))
                 }
                 (Ok(Err(status)), _) => Some(Err(status)),
                 // The client vanished before it said anything.
                 _ => None,
             },
-            Stage::Open(outlet) => ready!(outlet.poll(context)),
-            Stage::Over => None,
+            StreamStage::Open(responses) => ready!(responses.poll(context)),
+            StreamStage::Over => None,
         };
         if !matches!(message, Some(Ok(_))) {
-            *stage = Stage::Over;
+            *stage = StreamStage::Over;
         }
         Poll::Ready(message.map(|message| message.map(|message| pb::TouchResponse { message: Some(message) })))
     }

@@ -20,7 +20,7 @@ const LOCK_PAUSE: Duration = Duration::from_millis(20);
 const ROOM: u64 = 16 << 20;
 
 /// So many files are synced one by one; of more, the whole file system at once.
-const MOST_SINGLE: usize = 4;
+const MAX_SINGLE: usize = 4;
 
 /// A folder that no other server uses while this lives.
 pub(super) struct Folder {
@@ -75,7 +75,7 @@ impl Folder {
     /// # Errors
     /// Returns the system's error.
     pub(super) fn sync<'f>(&self, files: impl ExactSizeIterator<Item = &'f File>, is_new: bool) -> std::io::Result<()> {
-        if files.len() > MOST_SINGLE {
+        if files.len() > MAX_SINGLE {
             #[cfg(target_os = "linux")]
             return rustix::fs::syncfs(&self.directory).map_err(Into::into);
         }

@@ -9,14 +9,14 @@ use std::sync::{Arc, Weak};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use super::folder::{Folder, Grown};
-use super::growth::Growth;
-use super::keep::Keep;
-use super::old;
+use super::progress::Growth;
+use super::purge;
+use super::retention::Keep;
 use crate::journal::signature::Key;
-use crate::journal::{self, Opening, Writer, pb};
-use crate::pace::Leaving;
-use crate::pace::clock::now_ns;
-use crate::pace::tape::{About, Beginning, Event, Noted, Tape, TapeQueue};
+use crate::journal::{self, JournalWriter, Opening, pb};
+use crate::realtime::Leaving;
+use crate::realtime::clock::now_ns;
+use crate::realtime::event_log::{About, Beginning, Event, EventLog, Noted, TapeQueue};
 
 /// A round of syncs begins so long after the one before at the earliest: what happens meanwhile goes with it.
 const ROUND: Duration = Duration::from_millis(20);
@@ -41,10 +41,10 @@ pub(crate) struct KeeperTally {
 }
 
 /// The journal of a session, while it is written.
-struct Entry {
-    tape: Arc<Tape>,
+struct OpenJournal {
+    event_log: Arc<EventLog>,
     /// `None` when it is complete.
-    writer: Option<Writer>,
+    writer: Option<JournalWriter>,
     file: Grown,
     /// Nothing of it is on the disk yet.
     is_new: bool,
@@ -61,20 +61,20 @@ pub(super) struct Keeper {
     runs: BTreeMap<String, u64>,
     /// Journals that nobody could continue: they are left as they are.
     left_alone: BTreeSet<PathBuf>,
-    entries: BTreeMap<String, Entry>,
+    entries: BTreeMap<String, OpenJournal>,
     /// Tapes of sessions that have come back before the journal of when they left is complete.
-    waiting: Vec<Arc<Tape>>,
+    waiting: Vec<Arc<EventLog>>,
     /// Tapes that broke because there was no room.
-    without_room: Vec<Weak<Tape>>,
+    without_room: Vec<Weak<EventLog>>,
     /// Who mirrors journals is told of what was written.
     growth: Option<Arc<Growth>>,
     /// Whether files tell how old they are.
-    ages: old::Ages,
+    ages: purge::Ages,
 }
 
 /// What a folder held at the beginning.
 #[derive(Debug, Default)]
-pub(super) struct Found {
+pub(super) struct FolderContent {
     /// The newest run of each session.
     pub(super) runs: BTreeMap<String, u64>,
     /// Journals of sessions that were not continued, though they have not ended.
@@ -96,28 +96,29 @@ impl Keeper {
         (keep, key): (Keep, Option<Key>),
         queue: Arc<TapeQueue>,
         tally: Arc<KeeperTally>,
-        found: Found,
+        found: FolderContent,
         growth: Option<Arc<Growth>>,
     ) -> Self {
-        let Found { runs, left_alone } = found;
+        let FolderContent { runs, left_alone } = found;
         let (entries, waiting, without_room) = (BTreeMap::new(), Vec::new(), Vec::new());
-        let ages = old::Ages::default();
+        let ages = purge::Ages::default();
         Keeper { folder, keep, key, queue, tally, runs, left_alone, entries, waiting, without_room, growth, ages }
     }
 
     /// Works until the queue is stopped, and everything in it is written.
     pub(super) fn work(mut self) {
         let (mut swept_ns, mut begun_ns, mut tried_ns) = (0, 0, 0);
-        while let Some(mut tapes) = self.queue.wait(Some(if self.without_room.is_empty() { SWEEP } else { RETRY })) {
+        while let Some(mut event_logs) = self.queue.wait(Some(if self.without_room.is_empty() { SWEEP } else { RETRY }))
+        {
             let now = now_ns();
             if let Some(rest) = ROUND.checked_sub(Duration::from_nanos(now.saturating_sub(begun_ns)))
                 && !self.queue.is_stopped()
             {
                 std::thread::sleep(rest);
-                tapes.extend(self.queue.take());
+                event_logs.extend(self.queue.take());
             }
             begun_ns = now_ns();
-            self.round(&tapes);
+            self.round(&event_logs);
             if begun_ns > tried_ns + RETRY.as_nanos() as u64 {
                 tried_ns = begun_ns;
                 self.try_again();
@@ -131,19 +132,19 @@ impl Keeper {
     }
 
     /// Writes what these tapes hold, and gets it to the disk: those of a session one after the other.
-    fn round(&mut self, tapes: &[Arc<Tape>]) {
+    fn round(&mut self, event_logs: &[Arc<EventLog>]) {
         let mut left = std::mem::take(&mut self.waiting);
-        left.extend_from_slice(tapes);
+        left.extend_from_slice(event_logs);
         loop {
-            let mut now: BTreeMap<String, Arc<Tape>> = BTreeMap::new();
-            for tape in std::mem::take(&mut left) {
-                let id = &tape.about.id;
-                let is_another = |of: &Arc<Tape>| !Arc::ptr_eq(of, &tape);
-                let others = [now.get(id), self.entries.get(id).map(|entry| &entry.tape)];
+            let mut now: BTreeMap<String, Arc<EventLog>> = BTreeMap::new();
+            for event_log in std::mem::take(&mut left) {
+                let id = &event_log.about.id;
+                let is_another = |of: &Arc<EventLog>| !Arc::ptr_eq(of, &event_log);
+                let others = [now.get(id), self.entries.get(id).map(|entry| &entry.event_log)];
                 if others.into_iter().flatten().any(is_another) {
-                    left.push(tape);
+                    left.push(event_log);
                 } else {
-                    now.insert(id.clone(), tape);
+                    now.insert(id.clone(), event_log);
                 }
             }
             if now.is_empty() {
@@ -154,8 +155,8 @@ impl Keeper {
         }
     }
 
-    fn write_all<'t>(&mut self, tapes: impl Iterator<Item = &'t Arc<Tape>>) {
-        let written: Vec<Written> = tapes.filter_map(|tape| self.write(tape)).collect();
+    fn write_all<'t>(&mut self, event_logs: impl Iterator<Item = &'t Arc<EventLog>>) {
+        let written: Vec<Written> = event_logs.filter_map(|event_log| self.write(event_log)).collect();
         if written.is_empty() {
             return;
         }
@@ -177,7 +178,7 @@ impl Keeper {
             let lag_ns = now.saturating_sub(noted_ns);
             self.tally.lag_ns.store(lag_ns, Ordering::Relaxed);
             #[allow(clippy::cast_precision_loss)]
-            entry.tape.is_durable(until_step, lag_ns as f64 * 1e-9);
+            entry.event_log.is_durable(until_step, lag_ns as f64 * 1e-9);
             if is_still {
                 entry.file.close();
             }
@@ -188,14 +189,14 @@ impl Keeper {
     }
 
     /// Writes what a tape holds. `None` if that is nothing, or can't be.
-    fn write(&mut self, tape: &Arc<Tape>) -> Option<Written> {
-        let taken = tape.take();
+    fn write(&mut self, event_log: &Arc<EventLog>) -> Option<Written> {
+        let taken = event_log.take();
         if taken.is_broken {
             return None;
         }
-        let id = tape.about.id.clone();
+        let id = event_log.about.id.clone();
         if !self.entries.contains_key(&id) {
-            self.begin(tape, taken.anew);
+            self.begin(event_log, taken.anew);
         }
         let entry = self.entries.get_mut(&id)?;
         let mut writer = entry.writer.take()?;
@@ -235,7 +236,7 @@ impl Keeper {
         }
         self.append(&id, &bytes)?;
         if let (Some(growth), Some(entry)) = (&self.growth, self.entries.get(&id)) {
-            growth.grew(&entry.tape, self.runs.get(&id).copied().unwrap_or_default(), &entry.file, until_step);
+            growth.grew(&entry.event_log, self.runs.get(&id).copied().unwrap_or_default(), &entry.file, until_step);
         }
         Some(Written { id, until_step, batches, noted_ns, is_still: taken.is_still })
     }
@@ -251,9 +252,9 @@ impl Keeper {
     }
 
     /// Begins the journal of a session: where its tape began, or does so anew.
-    fn begin(&mut self, tape: &Arc<Tape>, anew: Option<Beginning>) {
+    fn begin(&mut self, event_log: &Arc<EventLog>, anew: Option<Beginning>) {
         let About { id, owner, idle_timeout_s, first, begin_step, running, until_step, after_run, revision } =
-            &tape.about;
+            &event_log.about;
         let first_of = Beginning { step: *begin_step, running: *running, until_step: *until_step };
         let Beginning { step: begin_step, running, until_step } = anew.unwrap_or(first_of);
         let run = self.runs.entry(id.clone()).or_default();
@@ -270,10 +271,10 @@ impl Keeper {
             ownership_revision: *revision,
         };
         let file = Grown::new(self.folder.path().join(journal::file::name(id, *run)));
-        let writer = Writer::new(&opening, unix_ns()).signed(self.key.as_ref());
-        let entry = Entry { tape: tape.clone(), writer: Some(writer), file, is_new: true };
+        let writer = JournalWriter::new(&opening, unix_ns()).signed(self.key.as_ref());
+        let entry = OpenJournal { event_log: event_log.clone(), writer: Some(writer), file, is_new: true };
         self.entries.insert(id.clone(), entry);
-        tape.begins(u32::try_from(*run).unwrap_or(u32::MAX));
+        event_log.begins(u32::try_from(*run).unwrap_or(u32::MAX));
         if anew.is_some() {
             tracing::info!(session = %id, run = *run, step = begin_step, "the journal of a session begins anew");
         }
@@ -284,29 +285,29 @@ impl Keeper {
         let Some(mut entry) = self.entries.remove(id) else { return };
         self.runs.remove(id);
         if let Some(growth) = &self.growth {
-            growth.is_complete(id, entry.tape.progress().borrow().run);
+            growth.is_complete(id, entry.event_log.progress().borrow().run);
         }
         if self.keep.age.is_zero() {
-            old::remove(entry.file.path());
+            purge::remove(entry.file.path());
         } else {
             seal(&mut entry.file);
         }
-        entry.tape.is_complete();
+        entry.event_log.is_complete();
     }
 
     /// A session that was coming does not: nothing of it is kept. Its run is not used again.
     fn withdraw(&mut self, id: &str) {
         let Some(mut entry) = self.entries.remove(id) else { return };
         entry.file.close();
-        old::remove(entry.file.path());
-        entry.tape.is_complete();
+        purge::remove(entry.file.path());
+        entry.event_log.is_complete();
     }
 
     /// Removes journals that are too old, or too much, and forgets those that have broken.
     fn sweep(&mut self) {
-        self.entries.retain(|_, entry| entry.tape.progress().borrow().broken.is_none());
+        self.entries.retain(|_, entry| entry.event_log.progress().borrow().broken.is_none());
         let current = |path: &Path| self.entries.values().any(|entry| entry.file.path() == path);
-        old::sweep(self.folder.path(), self.keep, &mut self.ages, |path| {
+        purge::sweep(self.folder.path(), self.keep, &mut self.ages, |path| {
             current(path) || self.left_alone.contains(path)
         });
     }
@@ -330,7 +331,7 @@ impl Keeper {
         }
         for (id, until_step, _) in ended {
             if let Some(entry) = self.entries.get_mut(&id) {
-                entry.tape.is_durable(until_step, 0.0);
+                entry.event_log.is_durable(until_step, 0.0);
                 seal(&mut entry.file);
             }
         }
@@ -342,19 +343,22 @@ impl Keeper {
         // A run of which nothing is there is none.
         if entry.file.bytes() == 0 {
             entry.file.close();
-            old::remove(entry.file.path());
+            purge::remove(entry.file.path());
             self.runs.get_mut(id).into_iter().for_each(|run| *run = run.saturating_sub(1));
         }
-        entry.tape.break_off(&format!("{what}: {error}"));
+        entry.event_log.break_off(&format!("{what}: {error}"));
         if matches!(error.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge) {
-            self.without_room.push(Arc::downgrade(&entry.tape));
+            self.without_room.push(Arc::downgrade(&entry.event_log));
         }
     }
 
     /// Journals that broke because there was no room begin anew, if there is some now.
     fn try_again(&mut self) {
         if !self.without_room.is_empty() && self.folder.has_room() {
-            self.without_room.drain(..).filter_map(|tape| tape.upgrade()).for_each(|tape| tape.may_begin_anew());
+            self.without_room
+                .drain(..)
+                .filter_map(|event_log| event_log.upgrade())
+                .for_each(|event_log| event_log.may_begin_anew());
         }
     }
 }

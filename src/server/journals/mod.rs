@@ -1,13 +1,13 @@
 //! Journals of a server's sessions: written while they go on, and continued from when the server is started again.
 
 mod folder;
-pub(super) mod growth;
-pub(super) mod keep;
 mod keeper;
-mod old;
 mod player;
+pub(super) mod progress;
+mod purge;
 pub(super) mod recorded;
 mod resume;
+pub(super) mod retention;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -15,7 +15,7 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-pub use keep::Keep;
+pub use retention::Keep;
 
 use super::config::Config;
 use super::{journal_key, reload};
@@ -23,17 +23,17 @@ use crate::files;
 use crate::journal::signature::Key;
 use crate::limits::Limits;
 use crate::lock::lock;
-use crate::pace::tape::{Progress, TapeQueue};
-use crate::pace::{Live, Pacer};
 use crate::priority::{give_way_a_little, thread};
+use crate::realtime::event_log::{JournalProgress, TapeQueue};
+use crate::realtime::{Pacer, SessionHandle};
 use crate::refusal::{Reason, Refusal, Result};
 use folder::Folder;
-use growth::Growth;
 use keeper::Keeper;
 pub(crate) use keeper::KeeperTally;
+use progress::Growth;
 
 /// So long a call waits until a session is on the disk, or all of it.
-const PATIENCE: Duration = Duration::from_secs(5);
+const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The journals of a server, and the thread that writes them.
 pub(super) struct Journals {
@@ -114,7 +114,7 @@ impl Journals {
     pub(super) fn remove_from(&self, id: &str, run: u64) {
         for file in crate::journal::file::list(self.folder.path()).unwrap_or_default() {
             if file.session_id == id && file.run >= run {
-                old::remove(&file.path);
+                purge::remove(&file.path);
             }
         }
     }
@@ -134,7 +134,7 @@ fn signing_key(path: &Path) -> Result<Key> {
         let refusal = Refusal::new(Reason::Unreadable, "", why);
         Refusal { place: Some(path.display().to_string()), ..refusal }
     };
-    let text = files::read_text(path, files::MOST_SECRET_BYTES)?;
+    let text = files::read_text(path, files::MAX_SECRET_BYTES)?;
     reload::warn_if_readable(path, "the key of the journals");
     let key = journal_key::private(&text).map_err(|refusal| refuse(refusal.message))?;
     tracing::info!(public_key = %key.public(), "journals are signed");
@@ -142,29 +142,30 @@ fn signing_key(path: &Path) -> Result<Key> {
 }
 
 /// Waits until a session is on the disk; if that takes too long, tells why.
-pub(super) async fn until_durable(live: &Live) -> Option<String> {
-    until(live, |progress| progress.durable_step.is_some(), "the session is").await
+pub(super) async fn until_durable(handle: &SessionHandle) -> Option<String> {
+    until(handle, |progress| progress.durable_step.is_some(), "the session is").await
 }
 
 /// Waits until a session is on the disk of this server, whatever others have; if that takes too long, tells why.
-pub(super) async fn until_on_disk(live: &Live) -> Option<String> {
-    until(live, |progress| progress.local_step.is_some(), "the session is").await
+pub(super) async fn until_on_disk(handle: &SessionHandle) -> Option<String> {
+    until(handle, |progress| progress.local_step.is_some(), "the session is").await
 }
 
 /// Waits until all of a session that is deleted is on the disk; if that takes too long, tells why.
-pub(super) async fn until_complete(live: &Live) -> Option<String> {
-    until(live, |progress| progress.is_complete, "the end of the session is").await
+pub(super) async fn until_complete(handle: &SessionHandle) -> Option<String> {
+    until(handle, |progress| progress.is_complete, "the end of the session is").await
 }
 
-async fn until(live: &Live, is_there: impl Fn(&Progress) -> bool, what: &str) -> Option<String> {
-    let mut progress = live.tape.as_ref()?.progress();
-    let waited = tokio::time::timeout(PATIENCE, progress.wait_for(|now| is_there(now) || now.broken.is_some())).await;
+async fn until(handle: &SessionHandle, is_there: impl Fn(&JournalProgress) -> bool, what: &str) -> Option<String> {
+    let mut progress = handle.event_log.as_ref()?.progress();
+    let waited =
+        tokio::time::timeout(WRITE_TIMEOUT, progress.wait_for(|now| is_there(now) || now.broken.is_some())).await;
     match waited {
         Ok(Ok(now)) => now.broken.as_ref().map(ToString::to_string),
         // The tape is gone: nothing was to be written.
         Ok(Err(_)) => None,
         Err(_) => {
-            let seconds = PATIENCE.as_secs();
+            let seconds = WRITE_TIMEOUT.as_secs();
             Some(format!(
                 "{what} not on the disk after {seconds} s: the disk is slow; what happens is written as soon as it can be"
             ))

@@ -6,41 +6,46 @@ use std::time::Duration;
 
 use crate::journal::inputs::Inputs;
 use crate::lock::lock;
-use crate::pace::Live;
-use crate::pace::feed::Feed;
+use crate::realtime::SessionHandle;
+use crate::realtime::playback::PlaybackSource;
 use crate::refusal::Result;
 
 /// It looks so often whether a session has played much of what was read.
 const LOOK: Duration = Duration::from_millis(100);
 
 /// What a journal is read from.
-pub(super) trait Source: Read + Seek + Send {}
+pub(super) trait JournalBytes: Read + Seek + Send {}
 
-impl<T: Read + Seek + Send> Source for T {}
+impl<T: Read + Seek + Send> JournalBytes for T {}
 
 struct Played {
-    live: Weak<Live>,
-    feed: Arc<Feed>,
-    inputs: Inputs<Box<dyn Source>>,
+    handle: Weak<SessionHandle>,
+    feed: Arc<PlaybackSource>,
+    inputs: Inputs<Box<dyn JournalBytes>>,
 }
 
 /// What it reads for.
 #[derive(Default)]
 pub(super) struct Player {
-    state: Mutex<State>,
+    state: Mutex<PlayerState>,
     wake: Condvar,
 }
 
 #[derive(Default)]
-struct State {
+struct PlayerState {
     new: Vec<Played>,
     stop: bool,
 }
 
 impl Player {
-    /// Reads on for `live` until it is deleted.
-    pub(super) fn play(&self, live: &Arc<Live>, feed: &Arc<Feed>, inputs: Inputs<Box<dyn Source>>) {
-        lock(&self.state).new.push(Played { live: Arc::downgrade(live), feed: feed.clone(), inputs });
+    /// Reads on for `handle` until it is deleted.
+    pub(super) fn play(
+        &self,
+        handle: &Arc<SessionHandle>,
+        feed: &Arc<PlaybackSource>,
+        inputs: Inputs<Box<dyn JournalBytes>>,
+    ) {
+        lock(&self.state).new.push(Played { handle: Arc::downgrade(handle), feed: feed.clone(), inputs });
         self.wake.notify_one();
     }
 
@@ -66,10 +71,10 @@ impl Player {
             }
             played.append(&mut state.new);
             drop(state);
-            played.retain_mut(|Played { live, feed, inputs }| {
-                let Some(live) = live.upgrade() else { return false };
-                if let Err(refusal) = read_ahead(feed, inputs, live.status().step) {
-                    tracing::error!(session = %live.id, %refusal, "the recording can't be played any further");
+            played.retain_mut(|Played { handle, feed, inputs }| {
+                let Some(handle) = handle.upgrade() else { return false };
+                if let Err(refusal) = read_ahead(feed, inputs, handle.status().step) {
+                    tracing::error!(session = %handle.id, %refusal, "the recording can't be played any further");
                     feed.complete();
                 }
                 feed.wants_more(0).is_some()
@@ -79,7 +84,7 @@ impl Player {
 }
 
 /// Reads ahead of a session that has done `step` steps.
-pub(super) fn read_ahead(feed: &Feed, inputs: &mut Inputs<Box<dyn Source>>, step: u64) -> Result<()> {
+pub(super) fn read_ahead(feed: &PlaybackSource, inputs: &mut Inputs<Box<dyn JournalBytes>>, step: u64) -> Result<()> {
     while feed.wants_more(step) == Some(true) {
         match inputs.next_batch()? {
             Some(piece) => feed.add(piece.inputs, piece.until_step),

@@ -11,25 +11,25 @@ use std::time::UNIX_EPOCH;
 use palpate_proto::pb;
 
 use super::super::config::Config;
-use super::super::uploads::{Kind, Part, Uploads};
+use super::super::uploads::{FilePart, UploadKind, Uploads};
 use super::folder::Folder;
 use super::keeper::unix_ns;
-use super::player::{Player, Source, read_ahead};
+use super::player::{JournalBytes, Player, read_ahead};
 use super::{Journals, Keep};
 use crate::budget::{Account, Purpose, Resource, Taken};
 use crate::journal::file::{self, JournalFile};
 use crate::journal::inputs::Inputs;
-use crate::journal::{self, Opening, Reader, Replay, Writer, pb as kept, seal};
+use crate::journal::{self, JournalReader, JournalWriter, Opening, Replay, pb as kept, seal};
 use crate::limits::Limits;
 use crate::lock::lock;
-use crate::pace::feed::{Feed, Playback};
-use crate::pace::{Begin, Birth, Live, Pacer, Present};
 use crate::priority::thread;
+use crate::realtime::playback::{Playback, PlaybackSource};
+use crate::realtime::{Begin, Pacer, Present, SessionHandle, SessionReservation};
 use crate::refusal::{Reason, Refusal, Result, number};
-use crate::sheet::choice::{NEVER, given_up};
+use crate::tissue::scheme_selection::{NEVER, given_up};
 
 /// Moments of a curve of forces.
-const MOST_MOMENTS: usize = 2000;
+const MAX_MOMENTS: usize = 2000;
 
 /// The journals of a folder.
 fn listed(folder: &Path) -> Result<Vec<JournalFile>> {
@@ -44,7 +44,7 @@ fn find(
     session_id: &str,
     run: u32,
     payer: Option<&Account>,
-) -> Result<(JournalFile, Reader<Box<dyn Source>>)> {
+) -> Result<(JournalFile, JournalReader<Box<dyn JournalBytes>>)> {
     let unknown = |message: &str| Refusal::new(Reason::UnknownSession, "session_id", message.to_owned());
     // A name that is none would be a path.
     if file::parse(&file::name(session_id, 1)).is_none() {
@@ -62,10 +62,10 @@ fn find(
     Err(unknown("there is no journal of this session and run; ListJournals tells which there are"))
 }
 
-fn open(file: &JournalFile, payer: Option<&Account>) -> Result<Reader<Box<dyn Source>>> {
-    let source: Box<dyn Source> = Box::new(journal::reader::file(&file.path).map_err(Refusal::without_folder)?);
+fn open(file: &JournalFile, payer: Option<&Account>) -> Result<JournalReader<Box<dyn JournalBytes>>> {
+    let source: Box<dyn JournalBytes> = Box::new(journal::reader::file(&file.path).map_err(Refusal::without_folder)?);
     // Callers are told what is wrong with it, and not where it is.
-    Ok(Reader::paid(&file::name(&file.session_id, file.run), source, paid_by(payer)?)?.up_to_damage())
+    Ok(JournalReader::paid(&file::name(&file.session_id, file.run), source, paid_by(payer)?)?.up_to_damage())
 }
 
 /// Grows by what is read, from who pays for it.
@@ -76,7 +76,7 @@ fn paid_by(payer: Option<&Account>) -> Result<Option<Taken>> {
 /// A journal in a list: `reader` is it, open, or why it can't be opened.
 fn info(
     file: &JournalFile,
-    reader: std::result::Result<&mut Reader<Box<dyn Source>>, String>,
+    reader: std::result::Result<&mut JournalReader<Box<dyn JournalBytes>>, String>,
     pacer: &Pacer,
 ) -> pb::JournalInfo {
     let metadata = std::fs::metadata(&file.path).ok();
@@ -125,7 +125,7 @@ impl Recorded {
         let playing = thread("player").spawn(move || reader.work()).map_err(|error| {
             Refusal::new(Reason::Overloaded, "journal", format!("no thread can be started to play journals: {error}"))
         })?;
-        let sent = Uploads::new(Kind {
+        let sent = Uploads::new(UploadKind {
             names: ["journal", "journals"],
             id: "upload_id",
             unknown: Reason::UnknownJournal,
@@ -244,7 +244,7 @@ impl Recorded {
         account: &Account,
     ) -> Result<pb::UploadJournalResponse> {
         let pb::UploadJournalRequest { upload_id, offset, part, last } = request;
-        let part = Part { id: upload_id, offset: *offset, bytes: part, last: *last };
+        let part = FilePart { id: upload_id, offset: *offset, bytes: part, last: *last };
         let (upload_id, received_bytes) = self.sent.add(&part, account)?;
         Ok(pb::UploadJournalResponse { upload_id, received_bytes, journal: None })
     }
@@ -262,7 +262,7 @@ impl Recorded {
         let mut received = self.sent.take(id, account)?;
         let bytes = std::mem::take(&mut received.bytes);
         let paid = paid_by(Some(account))?;
-        let reader = Reader::paid(SENT, Cursor::new(&bytes), paid).map_err(within_upload)?.up_to_damage();
+        let reader = JournalReader::paid(SENT, Cursor::new(&bytes), paid).map_err(within_upload)?.up_to_damage();
         let header = reader.header();
         let known = pb::JournalInfo {
             session_id: header.session_id.clone(),
@@ -290,8 +290,8 @@ impl Recorded {
         let bytes = self.sent.get(&moment.upload_id, payer)?;
         // A session that plays it keeps it, also when the upload has expired.
         let taken = payer.take(Resource::Memory(Purpose::Journals), bytes.len() as u64, "upload_id")?;
-        let source: Box<dyn Source> = Box::new(Cursor::new(Sent { bytes, _taken: taken }));
-        let reader = Reader::paid(SENT, source, paid_by(Some(payer))?)?.without_files().up_to_damage();
+        let source: Box<dyn JournalBytes> = Box::new(Cursor::new(UploadedJournal { bytes, _taken: taken }));
+        let reader = JournalReader::paid(SENT, source, paid_by(Some(payer))?)?.without_files().up_to_damage();
         let (session_id, run) = (reader.header().session_id.clone(), reader.header().run);
         Ok((reader, session_id, run))
     }
@@ -304,12 +304,12 @@ impl Recorded {
     pub(in crate::server) fn begin(
         &self,
         moment: &pb::JournalMoment,
-        Birth { id, revision, .. }: Birth,
+        SessionReservation { id, revision, .. }: SessionReservation,
         (paused, idle_timeout_s): (bool, f64),
         (payer, pacer): (&Account, &Pacer),
         limits: &Limits,
         stop: &AtomicBool,
-    ) -> Result<Arc<Live>> {
+    ) -> Result<Arc<SessionHandle>> {
         let speed = moment.speed.unwrap_or(1.0);
         number("journal.speed", speed, "from 0.1 to 8", |speed| (0.1..=8.0).contains(&speed))?;
         let within = |refusal: Refusal| refusal.within("journal");
@@ -347,18 +347,18 @@ impl Recorded {
                 stop,
             );
         }
-        let feed = Arc::new(Feed::default());
+        let feed = Arc::new(PlaybackSource::default());
         let mut inputs = Inputs::new(reader, &survey, &first, limits, step);
         read_ahead(&feed, &mut inputs, step)?;
         begin.playback = Some(Playback { session_id, run, steps, speed, feed: feed.clone() });
-        let live = pacer.resume(begin, payer, || Ok(session), stop)?;
-        self.player.play(&live, &feed, inputs);
-        Ok(live)
+        let handle = pacer.resume(begin, payer, || Ok(session), stop)?;
+        self.player.play(&handle, &feed, inputs);
+        Ok(handle)
     }
 }
 
 /// A journal, and the session and run that it is of.
-type Opened = (Reader<Box<dyn Source>>, String, u64);
+type Opened = (JournalReader<Box<dyn JournalBytes>>, String, u64);
 
 /// What refusals call a journal that a client has sent.
 const SENT: &str = "the journal";
@@ -369,12 +369,12 @@ fn within_upload(refusal: Refusal) -> Refusal {
 }
 
 /// A journal that a client has sent.
-struct Sent {
+struct UploadedJournal {
     bytes: Arc<Vec<u8>>,
     _taken: Taken,
 }
 
-impl AsRef<[u8]> for Sent {
+impl AsRef<[u8]> for UploadedJournal {
     fn as_ref(&self) -> &[u8] {
         &self.bytes
     }
@@ -382,7 +382,7 @@ impl AsRef<[u8]> for Sent {
 
 /// What is in a journal, of which `info` is known. One that is damaged is told up to there.
 fn tell<R: Read + Seek>(
-    mut reader: Reader<R>,
+    mut reader: JournalReader<R>,
     info: pb::JournalInfo,
     stop: &AtomicBool,
 ) -> Result<pb::GetJournalResponse> {
@@ -410,7 +410,7 @@ fn tell<R: Read + Seek>(
     })
 }
 
-/// A curve of forces with at most [`MOST_MOMENTS`] moments, the largest of each while.
+/// A curve of forces with at most [`MAX_MOMENTS`] moments, the largest of each while.
 #[derive(Default)]
 struct Forces {
     moments: Vec<pb::ForceMoment>,
@@ -427,7 +427,7 @@ impl Forces {
             *newest = pb::ForceMoment { step, force_n: newest.force_n.max(force_n) };
         }
         self.in_newest = (self.in_newest + 1) % (1 << self.halvings);
-        if self.moments.len() == MOST_MOMENTS && self.in_newest == 0 {
+        if self.moments.len() == MAX_MOMENTS && self.in_newest == 0 {
             let pair = |pair: &[pb::ForceMoment]| {
                 let force_n = pair.iter().map(|moment| moment.force_n).fold(0.0, f64::max);
                 pb::ForceMoment { step: pair[pair.len() - 1].step, force_n }
@@ -438,24 +438,24 @@ impl Forces {
     }
 }
 
-/// A journal of one moment: of a session of `live` as it stood.
-pub(in crate::server) fn snapshot(live: &Live, present: &Present) -> Result<Vec<u8>> {
+/// A journal of one moment: of a session of `handle` as it stood.
+pub(in crate::server) fn snapshot(handle: &SessionHandle, present: &Present) -> Result<Vec<u8>> {
     let Present { saved, copy, running, until_step } = present;
     let step = saved.step();
-    let run = live.tape.as_ref().map_or(0, |tape| tape.progress().borrow().run);
+    let run = handle.event_log.as_ref().map_or(0, |event_log| event_log.progress().borrow().run);
     let opening = Opening {
-        session_id: &live.id,
+        session_id: &handle.id,
         run: u64::from(run.max(1)),
-        owner: live.owner.name(),
-        idle_timeout_s: live.idle_timeout_s,
-        first: &live.model,
+        owner: handle.owner.name(),
+        idle_timeout_s: handle.idle_timeout_s,
+        first: &handle.model,
         begin_step: step,
         running: *running,
         until_step: *until_step,
-        ownership_revision: live.revision(),
+        ownership_revision: handle.revision(),
     };
     let now = unix_ns();
-    let mut writer = Writer::new(&opening, now);
+    let mut writer = JournalWriter::new(&opening, now);
     writer.snapshot(step, copy.state_hash(), copy.model(), saved.to_bytes());
     let mut file = Cursor::new(writer.finish(kept::Why::Cut, "a snapshot", step, now));
     seal::seal(&mut file).map_err(|error| Refusal::new(Reason::Overloaded, "", error.to_string()))?;
@@ -473,7 +473,7 @@ mod tests {
             for step in 0..count {
                 forces.add(step, if step == count / 3 { 7.0 } else { 1.0 });
             }
-            assert!(forces.moments.len() <= MOST_MOMENTS);
+            assert!(forces.moments.len() <= MAX_MOMENTS);
             assert!(forces.moments.is_sorted_by_key(|moment| moment.step));
             if count > 0 {
                 assert_eq!(forces.moments.last().unwrap().step, count - 1);

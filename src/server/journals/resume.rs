@@ -5,17 +5,17 @@ use std::path::Path;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use super::keeper::Found;
+use super::keeper::FolderContent;
 use crate::journal::file::JournalFile;
-use crate::journal::{self, Reader, Replay, Survey, pb};
+use crate::journal::{self, JournalReader, Replay, Survey, pb};
 use crate::limits::Limits;
 use crate::lock::lock;
-use crate::pace::{Begin, Pacer};
+use crate::realtime::{Begin, Pacer};
 use crate::refusal::{Reason, Refusal, Result};
-use crate::sheet::choice::NEVER;
+use crate::tissue::scheme_selection::NEVER;
 
 /// What became of a session's journals.
-enum Outcome {
+enum ResumeOutcome {
     /// It goes on.
     Continued,
     /// It was deleted, went to another server, or there was nothing yet to continue.
@@ -30,14 +30,19 @@ enum Outcome {
 /// Refuses a folder that can't be read.
 ///
 /// In a fleet, `own` has those that are still this server's, and the revision of each; others are left as they are.
-pub(super) fn all(folder: &Path, own: Option<&BTreeMap<String, u64>>, pacer: &Pacer, limits: &Limits) -> Result<Found> {
+pub(super) fn all(
+    folder: &Path,
+    own: Option<&BTreeMap<String, u64>>,
+    pacer: &Pacer,
+    limits: &Limits,
+) -> Result<FolderContent> {
     let listed = list(folder)?;
     let mut by_session: BTreeMap<String, Vec<JournalFile>> = BTreeMap::new();
     for file in listed {
         by_session.entry(file.session_id.clone()).or_default().push(file);
     }
     let sessions: Vec<_> = by_session.into_iter().collect();
-    let (next, found) = (AtomicUsize::new(0), Mutex::new(Found::default()));
+    let (next, found) = (AtomicUsize::new(0), Mutex::new(FolderContent::default()));
     let work = || {
         while let Some((id, files)) = sessions.get(next.fetch_add(1, Ordering::Relaxed)) {
             let revision = own.map_or(Some(0), |own| own.get(id).copied());
@@ -46,8 +51,8 @@ pub(super) fn all(folder: &Path, own: Option<&BTreeMap<String, u64>>, pacer: &Pa
             found.runs.insert(id.clone(), ended.1.map_or(0, |file| file.run));
             let Some((outcome, newest)) = ended.0 else { continue };
             match outcome {
-                Outcome::Continued | Outcome::Ended => {}
-                Outcome::Refused(refusal) => {
+                ResumeOutcome::Continued | ResumeOutcome::Ended => {}
+                ResumeOutcome::Refused(refusal) => {
                     let path = newest.path.display();
                     tracing::error!(session = %id, %path, "not continued: {refusal}; the file stays as it is");
                     found.left_alone.insert(newest.path.clone());
@@ -80,7 +85,7 @@ fn list(folder: &Path) -> Result<Vec<JournalFile>> {
 pub(super) fn can_go_on(folder: &Path, id: &str) -> bool {
     let files = list(folder).unwrap_or_default().into_iter().rev().filter(|file| file.session_id == id);
     for file in files {
-        match Reader::open(&file.path).and_then(|mut reader| reader.survey(&mut |_| {})) {
+        match JournalReader::open(&file.path).and_then(|mut reader| reader.survey(&mut |_| {})) {
             Ok(survey) => return !has_ended(&survey),
             Err(refusal) if refusal.reason == Reason::Missing => {}
             Err(_) => return true,
@@ -111,16 +116,21 @@ pub(super) fn session(
         return Err(Refusal::new(Reason::UnknownSession, "session_id", "there is no journal of this session"));
     }
     match one(&files, revision, pacer, limits).0 {
-        Outcome::Continued => Ok(()),
-        Outcome::Ended => {
+        ResumeOutcome::Continued => Ok(()),
+        ResumeOutcome::Ended => {
             Err(Refusal::new(Reason::SessionDeleted, "session_id", "its journal says that it is deleted"))
         }
-        Outcome::Refused(refusal) => Err(refusal),
+        ResumeOutcome::Refused(refusal) => Err(refusal),
     }
 }
 
 /// Continues a session of which these are the journals, by ascending run.
-fn one<'f>(files: &'f [JournalFile], revision: u64, pacer: &Pacer, limits: &Limits) -> (Outcome, &'f JournalFile) {
+fn one<'f>(
+    files: &'f [JournalFile],
+    revision: u64,
+    pacer: &Pacer,
+    limits: &Limits,
+) -> (ResumeOutcome, &'f JournalFile) {
     let mut newest = &files[files.len() - 1];
     for file in files.iter().rev() {
         newest = file;
@@ -128,17 +138,17 @@ fn one<'f>(files: &'f [JournalFile], revision: u64, pacer: &Pacer, limits: &Limi
             Ok(outcome) => return (outcome, newest),
             // The server ended before anything of this run was on the disk: the run before has all.
             Err(refusal) if refusal.reason == Reason::Missing => {}
-            Err(refusal) => return (Outcome::Refused(refusal), newest),
+            Err(refusal) => return (ResumeOutcome::Refused(refusal), newest),
         }
     }
-    (Outcome::Ended, newest)
+    (ResumeOutcome::Ended, newest)
 }
 
-fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) -> Result<Outcome> {
-    let mut reader = Reader::open(&file.path)?;
+fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) -> Result<ResumeOutcome> {
+    let mut reader = JournalReader::open(&file.path)?;
     let survey = reader.survey(&mut |_| {})?;
     if has_ended(&survey) {
-        return Ok(Outcome::Ended);
+        return Ok(ResumeOutcome::Ended);
     }
     let until_step = survey.until_step;
     let mut resumed = Replay::near(reader, survey, limits, until_step)?.resume()?;
@@ -166,5 +176,5 @@ fn continued(file: &JournalFile, revision: u64, pacer: &Pacer, limits: &Limits) 
     };
     pacer.resume(begin, &owner, session, &NEVER)?;
     tracing::info!(session = %file.session_id, step, torn_bytes, run = file.run, "session continued");
-    Ok(Outcome::Continued)
+    Ok(ResumeOutcome::Continued)
 }

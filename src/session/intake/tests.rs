@@ -209,7 +209,7 @@ fn a_closed_intake_refuses_with_its_reason_until_it_is_opened_again() {
 fn a_change_of_tissue_is_made_from_the_newest() {
     let (mut intake, _) = intake();
     let [first, second] = ["4.0", "6.0"]
-        .map(|k| Model::paper(&["sheet.points=[3, 3]", &format!("virtual_springs.stiffness_n_per_m={k}")]));
+        .map(|k| Model::paper(&["sheet.points=[3, 3]", &format!("anchor_springs.stiffness_n_per_m={k}")]));
     assert_eq!(intake.change(Some(&first), &second, Some(7), 0), Ok(None));
     assert_eq!(intake.change(None, &first, Some(7), 0), Ok(Some(7)));
     // Made from what is no longer the newest.
@@ -366,7 +366,7 @@ fn a_tool_that_is_in_the_tissue_when_a_session_goes_on_keeps_its_tip() {
     taken.submit(LEASE, vec![Command::new(0, None, pose(0.03)), Command::new(1, None, pose(0.01))], 0).unwrap();
     let (handed, _) = taken.hand_over(Refusal::new(Reason::Elsewhere, "session_id", "another server has it"));
     let mut adopting = Intake::new(&model.scene, &limits).continued(&session, None);
-    adopting.adopt(crate::session::handing::Handed { waiting: Vec::new(), ..handed }, 0);
+    adopting.adopt(crate::session::intake_transfer::Handed { waiting: Vec::new(), ..handed }, 0);
     assert_eq!(other(&mut adopting, 0), refused);
     // Once it has let go, a new tip is as good as another; and a lease that ends takes the tip with it.
     adopting.submit(LEASE, vec![Command::new(0, None, Action::Release), Command::new(0, None, pose(0.01))], 0).unwrap();

@@ -13,7 +13,7 @@ use serde::Deserialize;
 use syn::spanned::Spanned;
 use syn::visit::{self, Visit};
 
-type Result<T> = std::result::Result<T, Box<dyn std::error::Error>>;
+type AnyResult<T> = std::result::Result<T, Box<dyn std::error::Error>>;
 
 /// A mutant as `cargo mutants --list` describes it.
 #[derive(Deserialize)]
@@ -190,7 +190,7 @@ impl<'a> Visit<'a> for Fitter<'_> {
 }
 
 /// Fits mutants into the text of a file. Returns the text, and the ids of those without a place.
-fn fitted(source: &str, mutants: Vec<Mutant>) -> Result<(String, Vec<u32>)> {
+fn fitted(source: &str, mutants: Vec<Mutant>) -> AnyResult<(String, Vec<u32>)> {
     let lines = std::iter::once(0).chain(source.match_indices('\n').map(|(at, _)| at + 1)).collect();
     let mut fitter = Fitter { source, lines, waiting: mutants, insertions: Vec::new() };
     fitter.visit_file(&syn::parse_file(source)?);
@@ -205,7 +205,7 @@ fn fitted(source: &str, mutants: Vec<Mutant>) -> Result<(String, Vec<u32>)> {
     Ok((text + &source[from..], waiting.into_iter().map(|mutant| mutant.id).collect()))
 }
 
-fn main() -> Result<()> {
+fn main() -> AnyResult<()> {
     let arguments: Vec<String> = std::env::args().collect();
     let [_, list, root] = &arguments[..] else { return Err("usage: palpate-mutants MUTANTS.json ROOT".into()) };
     let mutants: Vec<Mutant> = serde_json::from_str(&std::fs::read_to_string(list)?)?;

@@ -16,7 +16,7 @@ use crate::snapshot;
 type Made = Result<Box<dyn Predictor>, Error>;
 
 /// A snapshot of more bytes is of a tissue that no client could step in time.
-const MOST_BYTES: usize = 64 << 20;
+const MAX_BYTES: usize = 64 << 20;
 
 /// Makes copies for a bridge, over all its connections: one at a time, because nothing stops the thread of one until its step
 /// ends.
@@ -62,7 +62,7 @@ impl Copying {
             let permit = places.acquire_owned().await.map_err(none)?;
             let request = pb::SaveSnapshotRequest { session_id };
             let parts = SessionServiceClient::new(channel).save_snapshot(request).await?.into_inner();
-            let bytes = snapshot::collect_within(parts, MOST_BYTES).await?;
+            let bytes = snapshot::collect_within(parts, MAX_BYTES).await?;
             let none = |error| Error::Internal(format!("no thread for a copy of the tissue: {error}"));
             let made = stepping::made_apart(move || make(&bytes, tip), permit).map_err(none)?;
             let panicked = |_| Error::Internal("making a copy of the tissue panicked".to_owned());

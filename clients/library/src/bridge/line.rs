@@ -10,7 +10,7 @@ use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::refusal::Reason;
 use palpate_proto::{pb, touch};
 use palpate_touch::Device;
-use palpate_touch::carrier::Carried;
+use palpate_touch::datagram_health::Carried;
 use palpate_touch::deadband::HEARTBEAT_S;
 use pb::command::Action;
 use pb::session_service_client::SessionServiceClient;
@@ -21,12 +21,12 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic_types::StatusExt;
 
 use super::copying::{Copier, Copying};
-use super::ticker::{Command, Feed};
-use super::{Copies, Session, Target};
+use super::ticker::{LoopFeed, ToolPose};
+use super::{Copies, SessionChoice, Target};
 use crate::Error;
 use crate::connect::Server;
 use crate::datagrams::Datagrams;
-use crate::exchange::Reader;
+use crate::exchange::QueueReader;
 use crate::fleet::{AGAIN, At, Trail, follow};
 use crate::touch::Touch;
 
@@ -79,14 +79,14 @@ impl Shared {
 
 /// The commands of a loop, for the network.
 pub(super) struct Commands {
-    pub(super) queue: Reader<Command>,
+    pub(super) queue: QueueReader<ToolPose>,
     /// Told when something is in the queue, or the loop is over.
     pub(super) news: Arc<Notify>,
 }
 
 impl Commands {
     /// The next; `None` after the last. None is lost if you drop the future.
-    async fn recv(&mut self) -> Option<Command> {
+    async fn recv(&mut self) -> Option<ToolPose> {
         loop {
             let is_over = self.queue.is_over();
             if let Some(command) = self.queue.pop() {
@@ -104,7 +104,7 @@ impl Commands {
 const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(2)];
 
 /// A session that is sent on more often than this, with no sample in between, waits as after a break.
-const MOST_MOVES: u32 = 8;
+const MAX_MOVES: u32 = 8;
 
 /// A connection on which the server is silent for longer than this is given up.
 const SILENCE: Duration = Duration::from_secs(2);
@@ -122,7 +122,7 @@ pub(super) async fn keep(
     copies: Option<Copies>,
     device: Device,
     shared: &Shared,
-    mut feed: Feed,
+    mut feed: LoopFeed,
     mut commands: Commands,
     warn: &(impl Fn(&str) + Sync),
 ) {
@@ -146,7 +146,7 @@ pub(super) async fn keep(
         if shared.inbound().traffic.samples > before.samples {
             moves = 0;
         }
-        if let Some(endpoint) = moved_to(&error).filter(|_| moves < MOST_MOVES)
+        if let Some(endpoint) = moved_to(&error).filter(|_| moves < MAX_MOVES)
             && trail.go(&endpoint).is_ok()
         {
             moves += 1;
@@ -230,8 +230,8 @@ pub(super) async fn delete_made(server: &Server, shared: &Shared) {
 async fn session(target: &Target, trail: &mut Trail, shared: &Shared) -> Result<At<pb::Session>, Error> {
     let made = shared.inbound().made.clone();
     let (id, scene) = match &target.session {
-        Session::Existing(id) => (Some(id), None),
-        Session::New { scene } => (made.as_ref(), Some(scene)),
+        SessionChoice::Existing(id) => (Some(id), None),
+        SessionChoice::New { scene } => (made.as_ref(), Some(scene)),
     };
     let is_unknown = |error: &Error| matches!(error, Error::Call(status) if status.code() == tonic::Code::NotFound);
     let mut known = None;
@@ -284,7 +284,7 @@ async fn connect(
     trail: &mut Trail,
     device: &Device,
     shared: &Shared,
-    feed: &mut Feed,
+    feed: &mut LoopFeed,
     commands: &mut Commands,
     warn: &(impl Fn(&str) + Sync),
 ) -> Result<(), Error> {
@@ -327,7 +327,7 @@ async fn connect(
     let mut datagrams = Datagrams::dial(stream.opened().datagrams.as_ref(), &server);
     // Those of earlier connections.
     let before = shared.inbound().traffic.carried;
-    let take = |sample: &pb::Sample, datagrams: &mut Datagrams, feed: &mut Feed| {
+    let take = |sample: &pb::Sample, datagrams: &mut Datagrams, feed: &mut LoopFeed| {
         let now = datagrams.carried();
         {
             let mut inbound = shared.inbound();
@@ -393,7 +393,7 @@ async fn connect(
                 }
             }
             command = commands.recv() => {
-                let Some(Command { client_time_ns, place_m, velocity_m_per_s }) = command else { return Ok(()) };
+                let Some(ToolPose { client_time_ns, place_m, velocity_m_per_s }) = command else { return Ok(()) };
                 trail.sequence += 1;
                 let velocity_m_per_s = velocity_m_per_s.and_then(vector);
                 let pose = pb::Pose { velocity_m_per_s, ..touch::pose(place_m, &target.tip) };

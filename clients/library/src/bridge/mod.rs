@@ -30,9 +30,9 @@ use crate::os::{self, Priority};
 use line::{Commands, Shared};
 
 pub use line::Traffic;
-pub use offline::{Offline, Record};
+pub use offline::{Offline, OfflineNetwork};
 pub use tick::{TICK_S, Tick};
-pub use ticker::{Origin, Ticker};
+pub use ticker::{PositionOrigin, Ticker};
 
 /// What a device is connected to.
 #[derive(Debug, Clone)]
@@ -40,7 +40,7 @@ pub struct Target {
     /// The server.
     pub server: Server,
     /// The session to touch.
-    pub session: Session,
+    pub session: SessionChoice,
     /// The number of the tool that the device moves.
     pub tool: u32,
     /// The tool's tip.
@@ -57,7 +57,7 @@ pub struct Target {
 
 /// A session to touch.
 #[derive(Debug, Clone)]
-pub enum Session {
+pub enum SessionChoice {
     /// The session with this ID.
     Existing(String),
     /// A new one, and again a new one if the server has forgotten it. It is deleted at the end.
@@ -108,7 +108,7 @@ pub struct Options {
     pub lasts: Option<Duration>,
     /// [`run`] keeps the course and the ages of the models, of at most an hour.
     pub remembers: bool,
-    /// The loop of [`run`] asks the system for real-time priority. [`Report::priority`] and `warn` tell what came of it.
+    /// The loop of [`run`] asks the system for real-time priority. [`BridgeReport::priority`] and `warn` tell what came of it.
     pub real_time: bool,
     /// Keeps the session that was made for the target, for others; the server deletes it when nobody has used it for long.
     pub keeps_session: bool,
@@ -136,7 +136,7 @@ impl fmt::Debug for Options {
 
 /// The results of [`run`].
 #[derive(Debug)]
-pub struct Report {
+pub struct BridgeReport {
     /// The ticks; empty unless they were to be remembered.
     pub course: Vec<Tick>,
     /// Age of the local model at each tick, s; empty unless it was to be remembered.
@@ -164,18 +164,18 @@ pub struct Report {
 }
 
 /// No hand feels a smaller force, N.
-const LEAST_FELT_N: f64 = 1e-3;
+const MIN_FELT_N: f64 = 1e-3;
 
 /// A tool that moved the tissue by less has not touched it, m: what an earlier touch has left still moves.
-const LEAST_MOVED_M: f64 = 1e-5;
+const MIN_MOVED_M: f64 = 1e-5;
 
-impl Report {
+impl BridgeReport {
     /// Why no force was felt at all, in words; `None` if one was.
     pub fn unfelt(&self) -> Option<&'static str> {
-        if self.most_force_n >= LEAST_FELT_N {
+        if self.most_force_n >= MIN_FELT_N {
             return None;
         }
-        Some(if self.traffic.deepest_m >= LEAST_MOVED_M {
+        Some(if self.traffic.deepest_m >= MIN_MOVED_M {
             "the tool moved the tissue, but no force was rendered: ask for forces while the tool is out of the tissue"
         } else {
             "the tool never touched the tissue: the device has its origin on the top of the surface, with z up"
@@ -194,12 +194,12 @@ pub async fn run<D: HapticDevice + 'static>(
     target: Target,
     options: Options,
     stop: impl Future<Output = ()> + Send + 'static,
-) -> Result<(D, Report), Error> {
+) -> Result<(D, BridgeReport), Error> {
     let (device, mut report) = run_told(device, target, options, stop).await?;
     report.failure.take().map_or(Ok((device, report)), Err)
 }
 
-/// Like [`run`], but of a device that fails it tells what was done until then: [`Report::failure`].
+/// Like [`run`], but of a device that fails it tells what was done until then: [`BridgeReport::failure`].
 ///
 /// # Errors
 /// Returns an error if the server refuses the session or the tool at first, or if no connection succeeds.
@@ -208,11 +208,12 @@ pub async fn run_told<D: HapticDevice + 'static>(
     target: Target,
     options: Options,
     stop: impl Future<Output = ()> + Send + 'static,
-) -> Result<(D, Report), Error> {
+) -> Result<(D, BridgeReport), Error> {
     let Options { lasts, remembers, real_time, keeps_session, warn, begun, disable, copies } = options;
     let descriptor = device.descriptor();
     let warn = Arc::new(warn);
-    let (ticker, mut line) = line(target, copies, descriptor, Origin::Workspace, keeps_session, warn.clone(), stop);
+    let (ticker, mut line) =
+        line(target, copies, descriptor, PositionOrigin::Workspace, keeps_session, warn.clone(), stop);
     let (news, of_loop) = (line.news.clone(), warn.clone());
     let (tell, ended) = oneshot::channel();
     std::thread::Builder::new().name("device".to_owned()).spawn(move || {
@@ -238,7 +239,7 @@ pub async fn run_told<D: HapticDevice + 'static>(
     if traffic.connections == 0 {
         return Err(failure.or(lost).unwrap_or_else(silent));
     }
-    let report = Report {
+    let report = BridgeReport {
         course,
         ages_s,
         envelope,
@@ -267,7 +268,7 @@ fn line(
     target: Target,
     copies: Option<Copies>,
     device: Device,
-    origin: Origin,
+    origin: PositionOrigin,
     keeps_session: bool,
     warn: Arc<Option<Warn>>,
     stop: impl Future<Output = ()> + Send + 'static,
@@ -306,16 +307,16 @@ const ROUND: Duration = Duration::from_micros(250);
 pub async fn begin(
     target: Target,
     device: Device,
-    origin: Origin,
+    origin: PositionOrigin,
     options: Options,
 ) -> Result<(Ticker, Connection), Error> {
     let Options { keeps_session, warn, copies, .. } = options;
     let (ticker, mut line) =
         line(target, copies, device, origin, keeps_session, Arc::new(warn), std::future::pending());
-    let (peek, news) = (ticker.peek(), line.news.clone());
-    std::thread::Builder::new().name("courier".to_owned()).spawn(move || {
-        while !peek.is_over() {
-            if peek.is_waiting() {
+    let (commands, news) = (ticker.commands_view(), line.news.clone());
+    std::thread::Builder::new().name("bridge-wake".to_owned()).spawn(move || {
+        while !commands.is_over() {
+            if commands.is_waiting() {
                 news.notify_one();
             }
             std::thread::sleep(ROUND);
@@ -326,7 +327,7 @@ pub async fn begin(
         () = line.shared.opened.notified() => true,
         _ = line.network.join_next() => false,
         // A server that can't be reached may be so for long.
-        () = tokio::time::sleep(PATIENCE) => false,
+        () = tokio::time::sleep(CONNECT_TIMEOUT) => false,
     };
     if is_open {
         return Ok((ticker, line));
@@ -337,7 +338,7 @@ pub async fn begin(
 }
 
 /// Time for the first connection of [`begin`].
-const PATIENCE: Duration = Duration::from_secs(10);
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 
 /// The network's side of a [`Ticker`]. When this is dropped, the forces of the ticker fade.
 pub struct Connection {

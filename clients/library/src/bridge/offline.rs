@@ -6,9 +6,9 @@ use palpate_touch::{Device, Predictor};
 use pb::touch_response::Message as Heard;
 use prost::Message;
 
-use super::ticker::{self, Command, Feed, Origin, Ticker};
+use super::ticker::{self, LoopFeed, PositionOrigin, Ticker, ToolPose};
 use crate::Error;
-use crate::exchange::Reader;
+use crate::exchange::QueueReader;
 
 /// A loop whose server is a record.
 #[derive(Debug)]
@@ -16,17 +16,17 @@ pub struct Offline {
     /// The half of the loop.
     pub ticker: Ticker,
     /// The half of the network. It may be on another thread.
-    pub record: Record,
+    pub record: OfflineNetwork,
 }
 
 /// The half of the network, of a record.
-pub struct Record {
-    feed: Feed,
-    commands: Reader<Command>,
+pub struct OfflineNetwork {
+    feed: LoopFeed,
+    commands: QueueReader<ToolPose>,
     origin_m: DVec3,
 }
 
-impl std::fmt::Debug for Record {
+impl std::fmt::Debug for OfflineNetwork {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Record").field("origin_m", &self.origin_m).finish_non_exhaustive()
     }
@@ -35,13 +35,13 @@ impl std::fmt::Debug for Record {
 impl Offline {
     /// A loop of a device whose forces stay within its limits, with the middle of its workspace on `origin_m` of the tissue.
     /// `up_deadband` as in [`super::Target`]: it changes no force.
-    pub fn new(device: Device, origin: Origin, origin_m: DVec3, up_deadband: f64) -> Self {
+    pub fn new(device: Device, origin: PositionOrigin, origin_m: DVec3, up_deadband: f64) -> Self {
         let (ticker, feed, commands) = ticker::ticker(device, origin, up_deadband);
-        Offline { ticker, record: Record { feed, commands, origin_m } }
+        Offline { ticker, record: OfflineNetwork { feed, commands, origin_m } }
     }
 }
 
-impl Record {
+impl OfflineNetwork {
     /// A copy of the tissue arrives now, until another connection begins.
     pub fn predict(&mut self, copy: Box<dyn Predictor>) {
         self.feed.predict(Some(copy));

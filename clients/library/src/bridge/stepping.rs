@@ -11,10 +11,10 @@ use glam::DVec3;
 use palpate_touch::{Predicted, Predictor};
 use tokio::sync::{OwnedSemaphorePermit, oneshot};
 
-use crate::exchange::{Listener, Teller, newest};
+use crate::exchange::{NewestReader, NewestWriter, newest};
 
 /// What was felt longer ago than this is not rendered: local models know more, s.
-const MOST_LATE_S: f64 = 0.0045;
+const MAX_LATE_S: f64 = 0.0045;
 
 /// How often the thread looks whether there is a new place. A tick wakes nobody, because that would be a call of the system.
 const ROUND: Duration = Duration::from_micros(200);
@@ -25,7 +25,7 @@ const LONG_ROUND: Duration = Duration::from_millis(5);
 
 /// Where the tool is.
 #[derive(Clone, Copy)]
-struct Place {
+struct ToolPlace {
     now_s: f64,
     place_m: DVec3,
 }
@@ -40,17 +40,17 @@ struct Felt {
 /// A copy that another thread steps. A tick of it takes a fixed number of operations. The thread ends when this is dropped, after
 /// the step that it is in.
 struct Stepped {
-    places: Teller<Place>,
-    felt: Listener<Felt>,
+    places: NewestWriter<ToolPlace>,
+    felt: NewestReader<Felt>,
     is_over: Arc<AtomicBool>,
 }
 
 impl Predictor for Stepped {
     fn feel(&mut self, now_s: f64, place_m: DVec3) -> Option<Predicted> {
         self.felt.refresh();
-        let Felt { now_s: then_s, felt } = self.felt.read(|felt| *felt);
-        self.places.tell(|place| *place = Place { now_s, place_m });
-        felt.filter(|_| now_s - then_s <= MOST_LATE_S)
+        let Felt { now_s: then_s, felt } = *self.felt.read();
+        self.places.write(|place| *place = ToolPlace { now_s, place_m });
+        felt.filter(|_| now_s - then_s <= MAX_LATE_S)
     }
 }
 
@@ -62,8 +62,8 @@ impl Drop for Stepped {
 
 /// The other end, of the thread.
 struct Stepper {
-    places: Listener<Place>,
-    felt: Teller<Felt>,
+    places: NewestReader<ToolPlace>,
+    felt: NewestWriter<Felt>,
     is_over: Arc<AtomicBool>,
 }
 
@@ -73,9 +73,9 @@ impl Stepper {
         if !self.places.refresh() {
             return false;
         }
-        let Place { now_s, place_m } = self.places.read(|place| *place);
+        let ToolPlace { now_s, place_m } = *self.places.read();
         let felt = copy.feel(now_s, place_m);
-        self.felt.tell(|newest| *newest = Felt { now_s, felt });
+        self.felt.write(|newest| *newest = Felt { now_s, felt });
         true
     }
 
@@ -99,8 +99,8 @@ impl Stepper {
 
 /// The two ends of a copy.
 fn ends() -> (Stepped, Stepper) {
-    let (places, to_step) = newest(Place { now_s: 0.0, place_m: DVec3::ZERO });
-    let (told, felt) = newest(Felt { now_s: f64::NEG_INFINITY, felt: None });
+    let (places, to_step) = newest(&ToolPlace { now_s: 0.0, place_m: DVec3::ZERO });
+    let (told, felt) = newest(&Felt { now_s: f64::NEG_INFINITY, felt: None });
     let is_over = Arc::new(AtomicBool::new(false));
     (Stepped { places, felt, is_over: is_over.clone() }, Stepper { places: to_step, felt: told, is_over })
 }
@@ -143,9 +143,9 @@ mod tests {
     }
 
     /// A spring.
-    struct Spring;
+    struct CopySpring;
 
-    impl Predictor for Spring {
+    impl Predictor for CopySpring {
         fn feel(&mut self, _: f64, place_m: DVec3) -> Option<Predicted> {
             Some(pressed(place_m))
         }
@@ -158,14 +158,14 @@ mod tests {
         for tick in 0..50 {
             let felt = stepped.feel(f64::from(tick) * 1e-3, place_m(tick));
             assert_eq!(felt, tick.checked_sub(1).map(|last| pressed(place_m(last))));
-            assert!(stepper.step(&mut Spring) && !stepper.step(&mut Spring));
+            assert!(stepper.step(&mut CopySpring) && !stepper.step(&mut CopySpring));
         }
         // The thread is in a step that does not end.
         let felt: Vec<bool> =
             (50..60).map(|tick| stepped.feel(f64::from(tick) * 1e-3, place_m(tick)).is_some()).collect();
         assert_eq!(felt, [true, true, true, true, false, false, false, false, false, false]);
         // It goes on with the newest place.
-        assert!(stepper.step(&mut Spring));
+        assert!(stepper.step(&mut CopySpring));
         assert_eq!(stepped.feel(0.060, place_m(60)), Some(pressed(place_m(59))));
         drop(stepped);
         assert!(stepper.is_over());

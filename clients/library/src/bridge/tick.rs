@@ -14,10 +14,10 @@ use crate::device::HapticDevice;
 pub const TICK_S: f64 = 1e-3;
 
 /// After a longer delay the loop skips the missed ticks: catching up would cause a burst.
-const MOST_LATE: Duration = Duration::from_millis(5);
+const MAX_LATE: Duration = Duration::from_millis(5);
 
 /// Largest number of ticks that are remembered.
-const MOST_REMEMBERED: usize = 3_600_000;
+const MAX_REMEMBERED: usize = 3_600_000;
 
 /// One tick of a device's loop.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -93,7 +93,7 @@ fn tick(
     let mut catch_up = |due: &mut Instant| {
         let now = Instant::now();
         let late = now.saturating_duration_since(*due);
-        if late > MOST_LATE {
+        if late > MAX_LATE {
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
             let missed = (late.as_secs_f64() / TICK_S) as u64;
             *missed_ticks += missed;
@@ -123,7 +123,7 @@ fn tick(
         device.ticked(&tick);
         if remember {
             ages_s.extend(ticker.model_age_s());
-            if course.len() < MOST_REMEMBERED {
+            if course.len() < MAX_REMEMBERED {
                 course.push(tick);
             }
         }
@@ -148,7 +148,7 @@ mod tests {
     use palpate_touch::device::{Device, UNDECLARED};
 
     use super::*;
-    use crate::bridge::ticker::{Origin, ticker};
+    use crate::bridge::ticker::{PositionOrigin, ticker};
     use crate::device::Reading;
 
     /// Fails to be read at its 20th tick; remembers what it was last told.
@@ -206,7 +206,7 @@ mod tests {
     #[test]
     fn a_slow_reading_is_no_reason_for_a_step_at_the_next_tick() {
         let mut device = Slow { ticks: 0, forces: Vec::new() };
-        let (ticker, mut feed, _commands) = ticker(device.descriptor(), Origin::Workspace, 0.0);
+        let (ticker, mut feed, _commands) = ticker(device.descriptor(), PositionOrigin::Workspace, 0.0);
         feed.begin(&palpate_proto::touch::law(&Law::linear(400.0, 0.5), 0), DVec3::ZERO).unwrap();
         let lasts = Some(Duration::from_millis(300));
         let served = serve(&mut device, ticker, &Notify::new(), &Disable::default(), lasts, true);
@@ -222,7 +222,7 @@ mod tests {
     #[test]
     fn a_device_that_fails_is_left_without_a_force() {
         let mut device = Failing { ticks: 0, force_n: DVec3::X };
-        let (ticker, mut feed, _commands) = ticker(device.descriptor(), Origin::Workspace, 0.0);
+        let (ticker, mut feed, _commands) = ticker(device.descriptor(), PositionOrigin::Workspace, 0.0);
         feed.begin(&palpate_proto::touch::law(&Law::linear(400.0, 0.5), 0), DVec3::ZERO).unwrap();
         let served = serve(&mut device, ticker, &Notify::new(), &Disable::default(), None, true);
         assert_eq!(served.failure.map(|error| error.kind()), Some(std::io::ErrorKind::BrokenPipe));

@@ -5,19 +5,19 @@
 
 use glam::DVec3;
 use palpate_proto::{pb, touch};
+use palpate_touch::dead_reckoning::News;
 use palpate_touch::deadband::HEARTBEAT_S;
-use palpate_touch::news::News;
-use palpate_touch::renderer::MOST_LAWS;
+use palpate_touch::renderer::MAX_LAWS;
 use palpate_touch::{Device, Envelope, Law, LocalModel, Prediction, Predictor, Renderer, RenderingState};
 use std::collections::VecDeque;
 
 use crate::Error;
 use crate::device::Reading;
-use crate::exchange::{Listener, Peek, Reader, Teller, Writer, newest, queue};
+use crate::exchange::{NewestReader, NewestWriter, QueueReader, QueueView, QueueWriter, newest, queue};
 
 /// Where a tool was.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Command {
+pub(super) struct ToolPose {
     /// By the client's clock.
     pub(super) client_time_ns: u64,
     /// m.
@@ -27,7 +27,7 @@ pub(super) struct Command {
 }
 
 /// What a tick learns, in order.
-enum Told {
+enum LoopEvent {
     /// A new connection, its first law and where the middle of the device's workspace is laid, m.
     Begin { connection: u64, law: Law, origin_m: DVec3 },
     /// A further law of this connection, which is sound, and its number.
@@ -56,15 +56,15 @@ struct Newest {
 /// Largest number of commands on their way to the network: more would be a backlog.
 const COMMANDS: usize = 64;
 /// Largest number of laws on their way to a tick. What does not fit waits on the network's side.
-const LAWS: usize = 2 * MOST_LAWS;
+const LAWS: usize = 2 * MAX_LAWS;
 /// Largest number of laws and copies on their way back: with as many as a renderer has, a tick can always take one more.
-const USED: usize = 4 * MOST_LAWS;
+const USED: usize = 4 * MAX_LAWS;
 /// A clock that jumps ahead by more than this did not do so because of a late tick, s.
-const MOST_AHEAD_S: f64 = 3600.0;
+const MAX_AHEAD_S: f64 = 3600.0;
 
 /// What positions of a device mean.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Origin {
+pub enum PositionOrigin {
     /// They are in the device's frame, whose origin is the middle of its workspace. That is laid on the top of the tissue: of a sheet, on
     /// its middle.
     #[default]
@@ -75,17 +75,17 @@ pub enum Origin {
 
 /// The half that a loop at 1 kHz owns, on whichever thread that runs.
 pub struct Ticker {
-    told: Reader<Told>,
-    newest: Listener<Newest>,
+    told: QueueReader<LoopEvent>,
+    newest: NewestReader<Newest>,
     /// The newest was not shown to the renderer.
     is_fresh: bool,
-    used: Writer<Used>,
-    commands: Writer<Command>,
+    used: QueueWriter<Used>,
+    commands: QueueWriter<ToolPose>,
     has_spoken: bool,
     device: Device,
-    origin: Origin,
+    origin: PositionOrigin,
     up_deadband: f64,
-    /// Of [`Told::Begin`]; 0 before the first.
+    /// Of [`LoopEvent::Begin`]; 0 before the first.
     connection: u64,
     origin_m: DVec3,
     renderer: Renderer,
@@ -96,26 +96,30 @@ pub struct Ticker {
 }
 
 /// The other half, of the network.
-pub(super) struct Feed {
-    told: Writer<Told>,
-    newest: Teller<Newest>,
-    used: Reader<Used>,
+pub(super) struct LoopFeed {
+    told: QueueWriter<LoopEvent>,
+    newest: NewestWriter<Newest>,
+    used: QueueReader<Used>,
     connection: u64,
     /// What did not fit yet.
-    waiting: VecDeque<Told>,
+    waiting: VecDeque<LoopEvent>,
     model: Option<LocalModel>,
     wanted_s: f64,
 }
 
 /// Both halves, and the commands that the ticks send. The device is what the forces are limited to.
-pub(super) fn ticker(device: Device, origin: Origin, up_deadband: f64) -> (Ticker, Feed, Reader<Command>) {
+pub(super) fn ticker(
+    device: Device,
+    origin: PositionOrigin,
+    up_deadband: f64,
+) -> (Ticker, LoopFeed, QueueReader<ToolPose>) {
     let (to_learn, told) = queue(LAWS);
     let (used, back) = queue(USED);
     let (commands, received) = queue(COMMANDS);
-    let (teller, listener) = newest(Newest { connection: 0, model: None, wanted_s: 0.0 });
+    let (newest_writer, newest_reader) = newest(&Newest { connection: 0, model: None, wanted_s: 0.0 });
     let ticker = Ticker {
         told,
-        newest: listener,
+        newest: newest_reader,
         is_fresh: false,
         used,
         commands,
@@ -132,9 +136,9 @@ pub(super) fn ticker(device: Device, origin: Origin, up_deadband: f64) -> (Ticke
         clock: Clock::default(),
         place_m: DVec3::ZERO,
     };
-    let feed = Feed {
+    let feed = LoopFeed {
         told: to_learn,
-        newest: teller,
+        newest: newest_writer,
         used: back,
         connection: 0,
         waiting: VecDeque::new(),
@@ -161,8 +165,8 @@ impl Clock {
         let origin_s = *self.origin_s.get_or_insert(time_s);
         let now_s = 1.0 + (time_s - origin_s);
         // Also before the first tick, when `now_s` is 0.
-        if now_s < self.now_s || now_s - self.now_s > MOST_AHEAD_S {
-            self.now_s = if now_s < self.now_s { self.now_s } else { self.now_s + MOST_AHEAD_S };
+        if now_s < self.now_s || now_s - self.now_s > MAX_AHEAD_S {
+            self.now_s = if now_s < self.now_s { self.now_s } else { self.now_s + MAX_AHEAD_S };
             self.origin_s = Some(time_s - (self.now_s - 1.0));
         } else {
             self.now_s = now_s;
@@ -183,8 +187,8 @@ impl Ticker {
         self.learn();
         self.has_spoken = false;
         self.place_m = match self.origin {
-            Origin::Workspace => reading.place_m + self.origin_m,
-            Origin::Tissue => reading.place_m,
+            PositionOrigin::Workspace => reading.place_m + self.origin_m,
+            PositionOrigin::Tissue => reading.place_m,
         };
         let (was_asked, place_m) = (std::mem::replace(&mut self.was_asked, reading.enable), self.place_m);
         // Before the first connection it is not known where the tissue is.
@@ -196,8 +200,7 @@ impl Ticker {
             renderer.envelope.reset();
             renderer.envelope.enable();
         }
-        let (connection, model, wanted_s) =
-            self.newest.read(|newest| (newest.connection, newest.model, newest.wanted_s));
+        let Newest { connection, model, wanted_s } = *self.newest.read();
         if self.is_fresh && connection == self.connection {
             self.is_fresh = false;
             model.into_iter().for_each(|model| renderer.receive(model, now_s));
@@ -211,9 +214,9 @@ impl Ticker {
         let command = if self.up_deadband > 0.0 {
             let heartbeat_s = if connection == self.connection && wanted_s > 0.0 { wanted_s } else { HEARTBEAT_S };
             let told = self.news.tell(now_s, place_m, renderer.way_m(self.up_deadband), heartbeat_s);
-            told.map(|told| Command { client_time_ns, place_m, velocity_m_per_s: Some(told.velocity_m_per_s) })
+            told.map(|told| ToolPose { client_time_ns, place_m, velocity_m_per_s: Some(told.velocity_m_per_s) })
         } else {
-            Some(Command { client_time_ns, place_m, velocity_m_per_s: None })
+            Some(ToolPose { client_time_ns, place_m, velocity_m_per_s: None })
         };
         // If the network does not keep up, this position is dropped; the next one replaces it.
         self.has_spoken = command.is_some_and(|command| self.commands.push(command).is_ok());
@@ -223,7 +226,7 @@ impl Ticker {
     /// Takes what was told since the last tick, as far as there is room for what it takes the place of.
     fn learn(&mut self) {
         for _ in 0..LAWS {
-            if self.used.room() <= MOST_LAWS {
+            if self.used.room() <= MAX_LAWS {
                 return;
             }
             let Some(told) = self.told.pop() else { return };
@@ -231,7 +234,7 @@ impl Ticker {
             // There is room.
             let mut give_back = |value: Used| drop(used.push(value));
             match told {
-                Told::Begin { connection, law, origin_m } => {
+                LoopEvent::Begin { connection, law, origin_m } => {
                     self.renderer.begin_with(law, |law| give_back(Used::Law(law)));
                     self.renderer.predict(None).into_iter().for_each(|copy| give_back(Used::Copy(copy)));
                     if self.connection == 0 {
@@ -241,10 +244,10 @@ impl Ticker {
                     // at the slew limit.
                     (self.connection, self.origin_m) = (connection, origin_m);
                 }
-                Told::Learn { number, law } => {
+                LoopEvent::Learn { number, law } => {
                     self.renderer.learn_with(number, law, |law| give_back(Used::Law(law)));
                 }
-                Told::Copy(copy) => {
+                LoopEvent::Copy(copy) => {
                     self.renderer.predict(copy).into_iter().for_each(|copy| give_back(Used::Copy(copy)));
                 }
             }
@@ -292,8 +295,8 @@ impl Ticker {
     }
 
     /// To see from another thread whether something is to be sent.
-    pub(super) fn peek(&self) -> Peek<Command> {
-        self.commands.peek()
+    pub(super) fn commands_view(&self) -> QueueView {
+        self.commands.view()
     }
 }
 
@@ -311,7 +314,7 @@ fn law(message: &pb::ForceLaw) -> Result<Law, Error> {
     touch::from_law(message).map_err(|refusal| Error::Connection(refusal.to_string()))
 }
 
-impl Feed {
+impl LoopFeed {
     /// A new connection to a tissue; the middle of the device's workspace is laid on `origin_m`.
     ///
     /// # Errors
@@ -322,7 +325,7 @@ impl Feed {
         (self.model, self.wanted_s) = (None, 0.0);
         // What a tick has not learned of the connection before.
         self.waiting.clear();
-        self.waiting.push_back(Told::Begin { connection: self.connection, law, origin_m });
+        self.waiting.push_back(LoopEvent::Begin { connection: self.connection, law, origin_m });
         self.pass_on();
         Ok(())
     }
@@ -333,9 +336,9 @@ impl Feed {
     /// Returns an error if the law can't be used.
     pub(super) fn learn(&mut self, message: &pb::ForceLaw) -> Result<(), Error> {
         let law = law(message)?;
-        self.waiting.push_back(Told::Learn { number: message.number, law });
-        let is_law = |told: &Told| matches!(told, Told::Learn { .. });
-        if self.waiting.iter().filter(|told| is_law(told)).count() > MOST_LAWS {
+        self.waiting.push_back(LoopEvent::Learn { number: message.number, law });
+        let is_law = |told: &LoopEvent| matches!(told, LoopEvent::Learn { .. });
+        if self.waiting.iter().filter(|told| is_law(told)).count() > MAX_LAWS {
             let first = self.waiting.iter().position(is_law);
             first.and_then(|first| self.waiting.remove(first));
         }
@@ -346,8 +349,8 @@ impl Feed {
     /// A copy of the connection's tissue; none if that has become another.
     pub(super) fn predict(&mut self, copy: Option<Box<dyn Predictor>>) {
         // Only the newest counts.
-        self.waiting.retain(|told| !matches!(told, Told::Copy(_)));
-        self.waiting.push_back(Told::Copy(copy.map(Prediction::new)));
+        self.waiting.retain(|told| !matches!(told, LoopEvent::Copy(_)));
+        self.waiting.push_back(LoopEvent::Copy(copy.map(Prediction::new)));
         self.pass_on();
     }
 
@@ -373,6 +376,6 @@ impl Feed {
             }
         }
         let newest = Newest { connection: self.connection, model: self.model, wanted_s: self.wanted_s };
-        self.newest.tell(|place| *place = newest);
+        self.newest.write(|place| *place = newest);
     }
 }

@@ -9,7 +9,7 @@ use crate::device::HapticDevice;
 
 /// What the check of a device found.
 #[derive(Debug, Clone, Default)]
-pub struct Checked {
+pub struct DeviceReport {
     /// Number of ticks.
     pub ticks: u64,
     /// Ticks a second.
@@ -31,9 +31,9 @@ pub struct Checked {
 }
 
 /// Reads a device a thousand times a second, and sets a force of zero each time.
-pub fn check(device: &mut dyn HapticDevice, lasts: Duration) -> Checked {
+pub fn check(device: &mut dyn HapticDevice, lasts: Duration) -> DeviceReport {
     let begun = Instant::now();
-    let (mut checked, mut changes) = (Checked::default(), 0_u32);
+    let (mut checked, mut changes) = (DeviceReport::default(), 0_u32);
     let (mut periods, mut calls) = (Vec::new(), Vec::new());
     let (mut before, mut last_m) = (None, None);
     let mut due = begun;
@@ -90,9 +90,9 @@ mod tests {
     use crate::device::Reading;
 
     /// Moves by a millimetre at each reading, and is unplugged at the 40th.
-    struct Counting(u32, Vec<DVec3>);
+    struct CountingDevice(u32, Vec<DVec3>);
 
-    impl HapticDevice for Counting {
+    impl HapticDevice for CountingDevice {
         fn descriptor(&self) -> Device {
             UNDECLARED
         }
@@ -113,7 +113,7 @@ mod tests {
 
     #[test]
     fn a_check_sets_no_force_and_tells_why_it_ended() {
-        let mut device = Counting(0, Vec::new());
+        let mut device = CountingDevice(0, Vec::new());
         let checked = check(&mut device, Duration::from_secs(5));
         assert!(device.1.len() == 40 && device.1.iter().all(|force_n| *force_n == DVec3::ZERO));
         assert_eq!((checked.ticks, checked.buttons, checked.not_finite), (40, 1, 0));

@@ -60,7 +60,7 @@ type Set3 = unsafe extern "system" fn(f64, f64, f64, c_char) -> c_int;
 
 /// The functions in use.
 #[derive(Debug, Clone, Copy)]
-struct Calls {
+struct LibraryCalls {
     count: unsafe extern "system" fn() -> c_int,
     open: unsafe extern "system" fn() -> c_int,
     open_id: ByDevice,
@@ -78,12 +78,12 @@ struct Calls {
     version: Option<unsafe extern "system" fn(*mut c_int, *mut c_int, *mut c_int, *mut c_int)>,
 }
 
-impl Calls {
+impl LibraryCalls {
     fn load(library: Option<&Path>) -> io::Result<(Self, Loaded)> {
         let loaded = Loaded::find(library, &NAMES, "libdhd", "Install the Force Dimension SDK")?;
         // SAFETY: the types are those of dhdc.h.
         let calls = unsafe {
-            Calls {
+            LibraryCalls {
                 count: loaded.function("dhdGetDeviceCount")?,
                 open: loaded.function("dhdOpen")?,
                 open_id: loaded.function("dhdOpenID")?,
@@ -127,7 +127,7 @@ impl Calls {
 /// An open device.
 #[derive(Debug)]
 pub(super) struct ForceDimension {
-    calls: Calls,
+    calls: LibraryCalls,
     id: c_char,
     model: String,
     descriptor: Device,
@@ -149,7 +149,7 @@ impl ForceDimension {
             })
         });
         let number = number.transpose()?;
-        let (calls, loaded) = Calls::load(library)?;
+        let (calls, loaded) = LibraryCalls::load(library)?;
         calls.version(&loaded)?;
         // SAFETY: these functions take a number, or nothing.
         let opened = unsafe { number.map_or_else(|| (calls.open)(), |number| (calls.open_id)(number)) };
@@ -227,7 +227,7 @@ impl HapticDevice for ForceDimension {
 
 impl Drop for ForceDimension {
     fn drop(&mut self) {
-        let Calls { set_force, enable_force, close, .. } = self.calls;
+        let LibraryCalls { set_force, enable_force, close, .. } = self.calls;
         // SAFETY: the device is open, and nobody uses it after this.
         unsafe {
             set_force(0.0, 0.0, 0.0, self.id);
@@ -242,7 +242,7 @@ impl Drop for ForceDimension {
 /// # Errors
 /// Returns an error if the library is missing, or of another version.
 pub(super) fn tell(library: Option<&Path>) -> io::Result<(bool, String)> {
-    let (calls, loaded) = Calls::load(library)?;
+    let (calls, loaded) = LibraryCalls::load(library)?;
     let version = calls.version(&loaded)?;
     // SAFETY: a function without arguments.
     let count = unsafe { (calls.count)() };

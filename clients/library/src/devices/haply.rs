@@ -21,7 +21,7 @@ use crate::device::{HapticDevice, Reading};
 const ADDRESS: &str = "ws://localhost:10001";
 
 /// How long the service may take to answer at first.
-const PATIENCE: Duration = Duration::from_secs(2);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// A service that leaves a message unanswered for longer has stopped; a device of which it says nothing for longer has gone.
 const SILENCE: Duration = Duration::from_millis(500);
@@ -33,7 +33,7 @@ const STALE: Duration = Duration::from_millis(50);
 const UNANSWERED: u32 = 4;
 
 /// Largest message that is read, bytes.
-const MOST_BYTES: usize = 1 << 20;
+const MAX_BYTES: usize = 1 << 20;
 
 /// The versions of the service that are known here: from the first, before the last.
 const VERSIONS: [(u32, u32); 2] = [(3, 1), (4, 0)];
@@ -75,11 +75,11 @@ fn host_of(address: &str) -> io::Result<&str> {
 fn connect(host: &str) -> io::Result<TcpStream> {
     let mut last = io::Error::new(ErrorKind::NotFound, "no address");
     for address in host.to_socket_addrs()? {
-        match TcpStream::connect_timeout(&address, PATIENCE) {
+        match TcpStream::connect_timeout(&address, ANSWER_TIMEOUT) {
             Ok(stream) => {
                 stream.set_nodelay(true)?;
-                stream.set_read_timeout(Some(PATIENCE))?;
-                stream.set_write_timeout(Some(PATIENCE))?;
+                stream.set_read_timeout(Some(ANSWER_TIMEOUT))?;
+                stream.set_write_timeout(Some(ANSWER_TIMEOUT))?;
                 return Ok(stream);
             }
             Err(error) => last = error,
@@ -197,7 +197,7 @@ fn begin(address: &str) -> io::Result<(WebSocket<TcpStream>, Value, &'static str
     // Before it is spoken to in words of a version that is not known here.
     field(version.as_deref(), &Value::Null)?;
     let stream = connect(host).map_err(|error| missing(host, &error))?;
-    let bounds = WebSocketConfig::default().max_message_size(Some(MOST_BYTES)).max_frame_size(Some(MOST_BYTES));
+    let bounds = WebSocketConfig::default().max_message_size(Some(MAX_BYTES)).max_frame_size(Some(MAX_BYTES));
     let (mut socket, _) = tungstenite::client::client_with_config(format!("ws://{host}/"), stream, Some(bounds))
         .map_err(|error| missing(host, &io::Error::other(error.to_string())))?;
     let first = loop {

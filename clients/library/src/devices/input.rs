@@ -42,7 +42,7 @@ const DEAD: f64 = 0.08;
 const RESTS: Duration = Duration::from_millis(100);
 
 /// Longest time that the position moves between two readings, s.
-const MOST_S: f64 = 0.02;
+const MAX_S: f64 = 0.02;
 
 /// Parts of the largest force between which a movement against it becomes slower, until it stops.
 const STOPS: [f64; 2] = [0.6, 0.9];
@@ -140,7 +140,7 @@ fn dead(deflection: f64) -> f64 {
 
 /// What events have told.
 #[derive(Debug)]
-struct Told {
+struct InputState {
     map: Map,
     ranges: [[f64; 2]; AXES],
     values: [f64; AXES],
@@ -149,9 +149,9 @@ struct Told {
     buttons: u32,
 }
 
-impl Told {
+impl InputState {
     fn new(map: Map, ranges: [[f64; 2]; AXES]) -> Self {
-        let mut told = Told { map, ranges, values: [0.0; AXES], relative: [None; AXES], buttons: 0 };
+        let mut told = InputState { map, ranges, values: [0.0; AXES], relative: [None; AXES], buttons: 0 };
         told.rest();
         told
     }
@@ -252,13 +252,13 @@ impl Rumble {
 }
 
 /// An open device.
-pub(super) struct Input {
+pub(super) struct InputDevice {
     path: PathBuf,
     events: File,
     /// A part of an event that was read.
     part: Vec<u8>,
     has_told: bool,
-    told: Told,
+    told: InputState,
     rumble: Option<Rumble>,
     /// That was written last.
     force_n: DVec3,
@@ -266,7 +266,7 @@ pub(super) struct Input {
     moved: Option<Instant>,
 }
 
-impl Input {
+impl InputDevice {
     /// Opens the events at a path, or of the first device of that kind.
     ///
     /// # Errors
@@ -301,9 +301,9 @@ impl Input {
             let message = format!("{}: is neither an input device nor a pipe", path.display());
             return Err(io::Error::new(ErrorKind::InvalidInput, message));
         }
-        let told = Told::new(map, ranges);
+        let told = InputState::new(map, ranges);
         let (part, place_m, force_n) = (Vec::new(), DVec3::ZERO, DVec3::ZERO);
-        Ok(Input { path, events, part, has_told: false, told, rumble, force_n, place_m, moved: None })
+        Ok(InputDevice { path, events, part, has_told: false, told, rumble, force_n, place_m, moved: None })
     }
 
     /// Reads what has come, without waiting.
@@ -336,7 +336,7 @@ impl Input {
     }
 }
 
-impl HapticDevice for Input {
+impl HapticDevice for InputDevice {
     fn descriptor(&self) -> Device {
         UNDECLARED
     }
@@ -345,7 +345,7 @@ impl HapticDevice for Input {
         let now = Instant::now();
         self.take(now)?;
         let passed_s =
-            self.moved.replace(now).map_or(0.0, |before| now.duration_since(before).as_secs_f64().min(MOST_S));
+            self.moved.replace(now).map_or(0.0, |before| now.duration_since(before).as_secs_f64().min(MAX_S));
         let moved_m = stopped(SPEED_M_PER_S * passed_s * self.told.velocity(now), self.force_n);
         // Within the workspace: beyond it the envelope would take the force away.
         self.place_m = (self.place_m + moved_m).clamp_length_max(0.95 * UNDECLARED.workspace_m);
@@ -424,11 +424,11 @@ mod tests {
         let now = Instant::now();
         let later = now + RESTS + Duration::from_millis(1);
         // Pushed to the right, away and down.
-        let mut mouse = Told::new(Map::SpaceMouse, Map::SpaceMouse.ranges());
+        let mut mouse = InputState::new(Map::SpaceMouse, Map::SpaceMouse.ranges());
         for (code, value) in [(0, 200), (1, -200), (2, 200)] {
             mouse.take(&event(EV_REL, code, value), now).unwrap();
         }
-        let mut pad = Told::new(Map::Gamepad, Map::Gamepad.ranges());
+        let mut pad = InputState::new(Map::Gamepad, Map::Gamepad.ranges());
         assert_eq!(pad.velocity(now), DVec3::ZERO);
         for (code, value) in [(0, 20000), (1, -20000), (4, 20000)] {
             pad.take(&event(EV_ABS, code, value), now).unwrap();
@@ -441,7 +441,7 @@ mod tests {
         // A stick is where it was last said to be.
         assert!(pad.velocity(later).x > 0.3);
         // The right trigger goes down.
-        let mut pad = Told::new(Map::Gamepad, Map::Gamepad.ranges());
+        let mut pad = InputState::new(Map::Gamepad, Map::Gamepad.ranges());
         pad.take(&event(EV_ABS, 5, 255), now).unwrap();
         assert_eq!(pad.velocity(now), -DVec3::Z);
     }
@@ -463,7 +463,7 @@ mod tests {
     #[test]
     fn buttons_go_to_their_bits_and_dropped_events_let_all_go() {
         let now = Instant::now();
-        let mut told = Told::new(Map::Gamepad, Map::Gamepad.ranges());
+        let mut told = InputState::new(Map::Gamepad, Map::Gamepad.ranges());
         told.take(&event(EV_KEY, KeyCode::BTN_EAST.0, 1), now).unwrap();
         told.take(&event(EV_KEY, KeyCode::BTN_NORTH.0, 1), now).unwrap();
         assert_eq!(told.buttons, 2);

@@ -27,12 +27,12 @@ use std::path::Path;
 use crate::Error;
 use crate::device::HapticDevice;
 
-pub use check::{Checked, check};
+pub use check::{DeviceReport, check};
 pub use placement::{ENGAGED_N, Enables, Placed, Placement};
 
 /// A kind of device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
+pub enum DeviceKind {
     /// By `libdhd`.
     ForceDimension,
     /// By `libHD`.
@@ -45,20 +45,20 @@ pub enum Kind {
     Gamepad,
 }
 
-impl Kind {
+impl DeviceKind {
     /// All kinds, with their names.
-    pub const ALL: [(Kind, &'static str); 5] = [
-        (Kind::ForceDimension, "force-dimension"),
-        (Kind::OpenHaptics, "openhaptics"),
-        (Kind::Haply, "haply"),
-        (Kind::SpaceMouse, "spacemouse"),
-        (Kind::Gamepad, "gamepad"),
+    pub const ALL: [(DeviceKind, &'static str); 5] = [
+        (DeviceKind::ForceDimension, "force-dimension"),
+        (DeviceKind::OpenHaptics, "openhaptics"),
+        (DeviceKind::Haply, "haply"),
+        (DeviceKind::SpaceMouse, "spacemouse"),
+        (DeviceKind::Gamepad, "gamepad"),
     ];
 
     /// The kind that a name begins with, and what follows its `:`.
-    pub fn of(name: &str) -> Option<(Kind, Option<&str>)> {
+    pub fn of(name: &str) -> Option<(DeviceKind, Option<&str>)> {
         let (kind, which) = name.split_once(':').map_or((name, None), |(kind, which)| (kind, Some(which)));
-        Kind::ALL.iter().find(|entry| entry.1 == kind).map(|entry| (entry.0, which))
+        DeviceKind::ALL.iter().find(|entry| entry.1 == kind).map(|entry| (entry.0, which))
     }
 }
 
@@ -68,20 +68,20 @@ impl Kind {
 /// Returns [`Error::Argument`] if there is no such kind of device, and [`Error::Device`] with what to do if the library, the
 /// service or the device is missing, or of a version that is not known here.
 pub fn open(name: &str, library: Option<&Path>) -> Result<Box<dyn HapticDevice>, Error> {
-    let Some((kind, which)) = Kind::of(name) else {
-        let names: Vec<&str> = Kind::ALL.iter().map(|entry| entry.1).collect();
+    let Some((kind, which)) = DeviceKind::of(name) else {
+        let names: Vec<&str> = DeviceKind::ALL.iter().map(|entry| entry.1).collect();
         return Err(Error::Argument(format!("no device `{name}`: known are {}", names.join(", "))));
     };
     Ok(match kind {
-        Kind::ForceDimension => Box::new(force_dimension::ForceDimension::open(which, library)?),
-        Kind::OpenHaptics => Box::new(open_haptics::OpenHaptics::open(which, library)?),
-        Kind::Haply => Box::new(haply::Inverse3::open(which)?),
+        DeviceKind::ForceDimension => Box::new(force_dimension::ForceDimension::open(which, library)?),
+        DeviceKind::OpenHaptics => Box::new(open_haptics::OpenHaptics::open(which, library)?),
+        DeviceKind::Haply => Box::new(haply::Inverse3::open(which)?),
         #[cfg(target_os = "linux")]
-        Kind::SpaceMouse => Box::new(input::Input::open(input::Map::SpaceMouse, which)?),
+        DeviceKind::SpaceMouse => Box::new(input::InputDevice::open(input::Map::SpaceMouse, which)?),
         #[cfg(target_os = "linux")]
-        Kind::Gamepad => Box::new(input::Input::open(input::Map::Gamepad, which)?),
+        DeviceKind::Gamepad => Box::new(input::InputDevice::open(input::Map::Gamepad, which)?),
         #[cfg(not(target_os = "linux"))]
-        Kind::SpaceMouse | Kind::Gamepad => {
+        DeviceKind::SpaceMouse | DeviceKind::Gamepad => {
             let message = "a SpaceMouse and a gamepad are read on Linux only";
             return Err(std::io::Error::new(std::io::ErrorKind::Unsupported, message).into());
         }

@@ -44,7 +44,7 @@ const CALLBACK_CONTINUE: c_uint = 1;
 /// Errors of forces: warm motors, or a force or speed above the device's own limits. The device goes on.
 const FORCE_ERRORS: std::ops::Range<c_uint> = 0x0200..0x0300;
 /// Errors that are asked for at a time.
-const MOST_ERRORS: u32 = 16;
+const MAX_ERRORS: u32 = 16;
 /// `HD_MAX_SCHEDULER_PRIORITY`.
 const PRIORITY: c_ushort = c_ushort::MAX;
 
@@ -69,13 +69,13 @@ struct ErrorInfo {
     handle: c_uint,
 }
 
-type Frame = unsafe extern "system" fn(*mut c_void) -> c_uint;
+type SdkFrame = unsafe extern "system" fn(*mut c_void) -> c_uint;
 type OfHandle = unsafe extern "system" fn(c_uint);
 type Bare = unsafe extern "system" fn();
 
 /// The functions in use.
 #[derive(Debug, Clone, Copy)]
-struct Calls {
+struct OpenHapticsCalls {
     init: unsafe extern "system" fn(*const c_char) -> c_uint,
     disable_device: OfHandle,
     make_current: OfHandle,
@@ -90,17 +90,17 @@ struct Calls {
     error_text: unsafe extern "system" fn(c_uint) -> *const c_char,
     start: Bare,
     stop: Bare,
-    schedule: unsafe extern "system" fn(Frame, *mut c_void, c_ushort) -> c_ulong,
+    schedule: unsafe extern "system" fn(SdkFrame, *mut c_void, c_ushort) -> c_ulong,
     unschedule: unsafe extern "system" fn(c_ulong),
     calibration: Option<unsafe extern "system" fn() -> c_uint>,
 }
 
-impl Calls {
+impl OpenHapticsCalls {
     fn load(library: Option<&Path>) -> io::Result<(Self, Loaded)> {
         let loaded = Loaded::find(library, &NAMES, "libHD", "Install OpenHaptics and the driver of the device")?;
         // SAFETY: the types are those of hd.h and hdDevice.h.
         let calls = unsafe {
-            Calls {
+            OpenHapticsCalls {
                 init: loaded.function("hdInitDevice")?,
                 disable_device: loaded.function("hdDisableDevice")?,
                 make_current: loaded.function("hdMakeCurrentDevice")?,
@@ -134,7 +134,7 @@ impl Calls {
     fn failure(&self) -> Option<c_uint> {
         // The library keeps errors until they are asked for, one by one.
         // SAFETY: a function without arguments.
-        let errors = (0..MOST_ERRORS).map(|_| unsafe { (self.error)() }.code).take_while(|code| *code != 0);
+        let errors = (0..MAX_ERRORS).map(|_| unsafe { (self.error)() }.code).take_while(|code| *code != 0);
         errors.fold(None, |found, code| found.or(Some(code).filter(|code| !FORCE_ERRORS.contains(code))))
     }
 
@@ -180,13 +180,13 @@ struct Exchange {
 }
 
 #[derive(Debug)]
-struct Shared {
-    calls: Calls,
+struct SharedState {
+    calls: OpenHapticsCalls,
     handle: c_uint,
     exchange: Mutex<Exchange>,
 }
 
-impl Shared {
+impl SharedState {
     fn exchange(&self) -> MutexGuard<'_, Exchange> {
         self.exchange.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -199,9 +199,9 @@ impl Shared {
 
 /// One frame, on the library's thread.
 unsafe extern "system" fn frame(shared: *mut c_void) -> c_uint {
-    // SAFETY: `open` passes a `Shared` that is never freed.
-    let shared = unsafe { &*shared.cast::<Shared>() };
-    let Shared { calls, handle, .. } = shared;
+    // SAFETY: `open` passes a `SharedState` that is never freed.
+    let shared = unsafe { &*shared.cast::<SharedState>() };
+    let SharedState { calls, handle, .. } = shared;
     let mut place_mm = [0.0; 16];
     let mut buttons = 0;
     // SAFETY: the device is open; there is room for the numbers.
@@ -243,7 +243,7 @@ unsafe extern "system" fn frame(shared: *mut c_void) -> c_uint {
 /// An open device.
 #[derive(Debug)]
 pub(super) struct OpenHaptics {
-    shared: &'static Shared,
+    shared: &'static SharedState,
     task: c_ulong,
     descriptor: Device,
     /// Middle of the workspace, mm, in the library's axes.
@@ -257,7 +257,7 @@ impl OpenHaptics {
     /// # Errors
     /// Returns an error if library or device are missing, or of another version.
     pub(super) fn open(which: Option<&str>, library: Option<&Path>) -> io::Result<Self> {
-        let (calls, loaded) = Calls::load(library)?;
+        let (calls, loaded) = OpenHapticsCalls::load(library)?;
         calls.version(&loaded)?;
         let name = which.map(CString::new).transpose()?;
         // SAFETY: null is the default device.
@@ -289,7 +289,8 @@ impl OpenHaptics {
             fault: None,
         };
         // Never freed: a frame of the library may be under way for as long as the program runs.
-        let shared: &'static Shared = Box::leak(Box::new(Shared { calls, handle, exchange: Mutex::new(exchange) }));
+        let shared: &'static SharedState =
+            Box::leak(Box::new(SharedState { calls, handle, exchange: Mutex::new(exchange) }));
         // SAFETY: the function has the type of a frame, and `shared` lives for ever.
         let task = unsafe {
             let task = (calls.schedule)(frame, std::ptr::from_ref(shared).cast_mut().cast(), PRIORITY);
@@ -323,7 +324,7 @@ impl OpenHaptics {
 }
 
 /// The limits of the current device as it tells them, and the middle of its workspace, mm.
-fn describe(calls: &Calls) -> (Device, DVec3) {
+fn describe(calls: &OpenHapticsCalls) -> (Device, DVec3) {
     // SAFETY: the library's texts are constants.
     let model = unsafe { text_of((calls.get_text)(MODEL)) }.unwrap_or_default().to_lowercase();
     let _ = calls.failure();
@@ -399,7 +400,7 @@ impl Drop for OpenHaptics {
             }
             std::thread::sleep(Duration::from_millis(1));
         }
-        let Calls { stop, unschedule, disable_device, .. } = self.shared.calls;
+        let OpenHapticsCalls { stop, unschedule, disable_device, .. } = self.shared.calls;
         // SAFETY: the device is open, and nobody uses it after this.
         unsafe {
             stop();
@@ -414,7 +415,7 @@ impl Drop for OpenHaptics {
 /// # Errors
 /// Returns an error if the library is missing, or of another version.
 pub(super) fn tell(library: Option<&Path>) -> io::Result<(bool, String)> {
-    let (calls, loaded) = Calls::load(library)?;
+    let (calls, loaded) = OpenHapticsCalls::load(library)?;
     let version = calls.version(&loaded)?;
     Ok((true, format!("{} {version}: it finds out about devices when one is opened", loaded.name())))
 }

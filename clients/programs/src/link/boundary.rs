@@ -7,13 +7,13 @@ use palpate_touch::hand::{HANDS, Hand, HandState};
 use serde_json::{Value, json};
 
 use super::setup::TICK_S;
-use crate::Failure;
+use crate::ClientFailure;
 
 /// Stiffnesses to try, N/m.
 pub(super) const STIFFNESSES_N_PER_M: [f64; 9] = [150.0, 250.0, 300.0, 400.0, 500.0, 700.0, 1000.0, 1500.0, 3000.0];
 
 /// Longest delay to try, ticks.
-const MOST_TICKS: u32 = 200;
+const MAX_TICKS: u32 = 200;
 
 /// Simulated duration of each try, s.
 const DURATION_S: f64 = 4.0;
@@ -24,7 +24,7 @@ pub(super) struct Boundary {
     pub(super) stiffness_n_per_m: f64,
     /// The delay by theory, s.
     pub(super) predicted_s: f64,
-    /// The measured delay, s; infinite if the loop is stable up to [`MOST_TICKS`].
+    /// The measured delay, s; infinite if the loop is stable up to [`MAX_TICKS`].
     pub(super) observed_s: f64,
 }
 
@@ -69,7 +69,7 @@ fn growth_per_s(hand: &Hand, stiffness_n_per_m: f64, ticks: u32) -> f64 {
 /// held for a tick is half a tick older on average.
 fn observed_s(hand: &Hand, stiffness_n_per_m: f64) -> f64 {
     let mut before = f64::NEG_INFINITY;
-    for ticks in 0..=MOST_TICKS {
+    for ticks in 0..=MAX_TICKS {
         let growth = growth_per_s(hand, stiffness_n_per_m, ticks);
         if growth > 0.0 {
             let part = if growth.is_finite() && before.is_finite() { before / (before - growth) } else { 1.0 };
@@ -87,7 +87,7 @@ pub(super) fn all() -> Vec<Boundary> {
         for stiffness_n_per_m in STIFFNESSES_N_PER_M {
             let predicted_s = hand.critical_delay_s(stiffness_n_per_m);
             // A delay below a tick can't be resolved.
-            if predicted_s > TICK_S && predicted_s < f64::from(MOST_TICKS) * TICK_S {
+            if predicted_s > TICK_S && predicted_s < f64::from(MAX_TICKS) * TICK_S {
                 let observed_s = observed_s(hand, stiffness_n_per_m);
                 found.push(Boundary { hand: hand.name, stiffness_n_per_m, predicted_s, observed_s });
             }
@@ -97,7 +97,7 @@ pub(super) fn all() -> Vec<Boundary> {
 }
 
 /// Prints all combinations.
-pub(super) fn print(as_json: bool) -> Result<(), Failure> {
+pub(super) fn print(as_json: bool) -> Result<(), ClientFailure> {
     let all = all();
     if as_json {
         let rows = all.iter().map(|row| {

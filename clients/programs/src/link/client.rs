@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use palpate::session::prediction::TissueCopy;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate_touch::envelope::{Envelope, Wanted};
 use palpate_touch::{Law, LocalModel, Predicted, Prediction, Predictor, Renderer};
 
@@ -12,7 +12,7 @@ use super::setup::{Rendering, Setup, TICK_S};
 use super::spot::Spot;
 
 /// The client at the device, by scheme.
-pub(super) enum Client {
+pub(super) enum LinkClient {
     Raw(Option<LocalModel>),
     Hold(Option<LocalModel>, Option<f64>, Option<DVec3>, Box<Envelope>),
     Model(Box<Renderer>),
@@ -31,7 +31,7 @@ impl Predictor for Copied {
     }
 }
 
-impl Client {
+impl LinkClient {
     /// Of a setup, enabled.
     pub(super) fn new(setup: &Setup) -> Self {
         let envelope = || {
@@ -40,10 +40,10 @@ impl Client {
             envelope
         };
         match setup.scheme {
-            Rendering::Raw => Client::Raw(None),
-            Rendering::Hold => Client::Hold(None, None, None, Box::new(envelope())),
+            Rendering::Raw => LinkClient::Raw(None),
+            Rendering::Hold => LinkClient::Hold(None, None, None, Box::new(envelope())),
             Rendering::Model | Rendering::Prediction => {
-                let mut client = Client::Model(Box::new(Renderer::new((*setup.law).clone(), envelope())));
+                let mut client = LinkClient::Model(Box::new(Renderer::new((*setup.law).clone(), envelope())));
                 client.copy(setup, &setup.model);
                 client
             }
@@ -52,7 +52,7 @@ impl Client {
 
     /// Takes a copy of a tissue, if it renders from one.
     pub(super) fn copy(&mut self, setup: &Setup, model: &Arc<Model>) {
-        if let (Client::Model(renderer), Rendering::Prediction) = (self, setup.scheme) {
+        if let (LinkClient::Model(renderer), Rendering::Prediction) = (self, setup.scheme) {
             let copied = Copied { tissue: TissueCopy::new(model, setup.tip), spot: setup.spot };
             renderer.predict(Some(Prediction::new(Box::new(copied))));
         }
@@ -60,7 +60,7 @@ impl Client {
 
     /// Takes a further law, which samples may name from now on.
     pub(super) fn learn(&mut self, number: u32, law: &Law) {
-        if let Client::Model(renderer) = self {
+        if let LinkClient::Model(renderer) = self {
             renderer.learn(number, law.clone());
         }
     }
@@ -68,17 +68,17 @@ impl Client {
     /// Takes a sample that has arrived.
     pub(super) fn receive(&mut self, model: LocalModel, now_s: f64) {
         match self {
-            Client::Raw(newest) => *newest = Some(model),
-            Client::Hold(newest, arrived_s, ..) => (*newest, *arrived_s) = (Some(model), Some(now_s)),
-            Client::Model(renderer) => renderer.receive(model, now_s),
+            LinkClient::Raw(newest) => *newest = Some(model),
+            LinkClient::Hold(newest, arrived_s, ..) => (*newest, *arrived_s) = (Some(model), Some(now_s)),
+            LinkClient::Model(renderer) => renderer.receive(model, now_s),
         }
     }
 
     /// The force that the device holds until the next tick, N.
     pub(super) fn tick(&mut self, now_s: f64, place_m: DVec3) -> DVec3 {
         match self {
-            Client::Raw(newest) => newest.map_or(DVec3::ZERO, |model| model.force_n),
-            Client::Hold(newest, arrived_s, before, envelope) => {
+            LinkClient::Raw(newest) => newest.map_or(DVec3::ZERO, |model| model.force_n),
+            LinkClient::Hold(newest, arrived_s, before, envelope) => {
                 let moved_m = before.replace(place_m).map_or(DVec3::ZERO, |before_m| place_m - before_m);
                 envelope.render(&Wanted {
                     now_s,
@@ -88,14 +88,14 @@ impl Client {
                     age_s: arrived_s.map(|arrived_s| now_s - arrived_s),
                 })
             }
-            Client::Model(renderer) => renderer.tick(now_s, place_m),
+            LinkClient::Model(renderer) => renderer.tick(now_s, place_m),
         }
     }
 
     /// How many ticks were rendered from a copy of the tissue.
     pub(super) fn predicted(&self) -> u64 {
         match self {
-            Client::Model(renderer) => renderer.predicted(),
+            LinkClient::Model(renderer) => renderer.predicted(),
             _ => 0,
         }
     }
@@ -103,17 +103,17 @@ impl Client {
     /// The envelope, if there is one.
     pub(super) fn envelope(&mut self) -> Option<&mut Envelope> {
         match self {
-            Client::Raw(_) => None,
-            Client::Hold(.., envelope) => Some(envelope),
-            Client::Model(renderer) => Some(&mut renderer.envelope),
+            LinkClient::Raw(_) => None,
+            LinkClient::Hold(.., envelope) => Some(envelope),
+            LinkClient::Model(renderer) => Some(&mut renderer.envelope),
         }
     }
 
     /// Time of the newest sample by the client's clock, s.
     pub(super) fn model_time_s(&self) -> Option<f64> {
         match self {
-            Client::Raw(newest) | Client::Hold(newest, ..) => newest.map(|model| model.client_time_s),
-            Client::Model(renderer) => renderer.model_time_s(),
+            LinkClient::Raw(newest) | LinkClient::Hold(newest, ..) => newest.map(|model| model.client_time_s),
+            LinkClient::Model(renderer) => renderer.model_time_s(),
         }
     }
 }

@@ -4,14 +4,14 @@
 use palpate_touch::hand::HandState;
 
 use super::setup::{Setup, TICK_S, ticks};
-use super::tissue::Tissue;
+use super::tissue::LinkTissue;
 
 use glam::DVec3;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{self, Task};
 
 /// Least scale: a smaller task would hardly touch the tissue.
-const LEAST_SCALE: f64 = 0.01;
+const MIN_SCALE: f64 = 0.01;
 
 /// What such a hand does.
 pub(super) struct Direct {
@@ -32,7 +32,7 @@ impl Direct {
         let mut scale = task::scale(&setup.hand, &setup.law, setup.device.most_n());
         loop {
             let (depths_m, largest_n) = Self::performed(setup, lead_s, scale, most_n)?;
-            if largest_n <= most_n || scale < LEAST_SCALE {
+            if largest_n <= most_n || scale < MIN_SCALE {
                 return Ok(Direct { scale, depths_m });
             }
             scale *= 0.9;
@@ -43,7 +43,7 @@ impl Direct {
     fn performed(setup: &Setup, lead_s: f64, scale: f64, most_n: f64) -> Result<(Vec<f64>, f64), String> {
         let (middle_m, hand) = (setup.spot.at_m, &setup.hand);
         let task = Task::new(middle_m, lead_s, setup.duration_s, scale, &mut Random::new(setup.seed, 0));
-        let mut tissue = Tissue::new(setup)?;
+        let mut tissue = LinkTissue::new(setup)?;
         let mut held = HandState { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
         let (mut depths_m, mut largest_n) = (Vec::new(), 0.0_f64);
         for tick in 0..ticks(setup.duration_s) {

@@ -1,15 +1,15 @@
 //! The figures of a run as they are printed: a table for people, and JSON.
 
 use palpate_simulated::network::Conditions;
-use palpate_touch::carrier::Carried;
+use palpate_touch::datagram_health::Carried;
 use serde_json::{Value, json};
 
-use super::measure::Outcome;
+use super::measure::LinkOutcome;
 use super::setup::{Rendering, Setup};
 use crate::table;
 
 /// The figures of a run for people; `server` is that of a run in real time.
-pub(super) fn rows(setup: &Setup, outcome: &Outcome, server: Option<&str>) -> Vec<(&'static str, String)> {
+pub(super) fn rows(setup: &Setup, outcome: &LinkOutcome, server: Option<&str>) -> Vec<(&'static str, String)> {
     let (scene, hand, device) = (&setup.model.scene.name, setup.hand.name, setup.device.name);
     let scheme = format!("{:?}", setup.scheme).to_lowercase();
     let Conditions { transport, round_trip_s, jitter_s, loss, burst, outage_s, rate_bit_per_s, queue_s } =
@@ -145,7 +145,7 @@ pub(super) fn rows(setup: &Setup, outcome: &Outcome, server: Option<&str>) -> Ve
 }
 
 /// The figures of a run that are printed: what was asked for, and what was found.
-pub(super) fn figures(setup: &Setup, outcome: &Outcome) -> Value {
+pub(super) fn figures(setup: &Setup, outcome: &LinkOutcome) -> Value {
     let (Value::Object(mut all), Value::Object(found)) = (asked(setup), found(outcome)) else { return Value::Null };
     all.extend(found);
     if let Some(Carried { sent, came, fell_back }) = outcome.carried {
@@ -181,7 +181,7 @@ fn asked(setup: &Setup) -> Value {
     })
 }
 
-fn found(outcome: &Outcome) -> Value {
+fn found(outcome: &LinkOutcome) -> Value {
     let interventions: serde_json::Map<String, Value> =
         outcome.interventions.iter().map(|(name, ticks)| ((*name).to_owned(), json!(ticks))).collect();
     let [limited, dropped, released] = outcome.path;

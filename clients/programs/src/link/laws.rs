@@ -4,7 +4,7 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use palpate::force_law::{self, Disc};
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate_touch::Law;
 
 /// Those of one tissue.

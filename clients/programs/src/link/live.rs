@@ -5,7 +5,7 @@
 use std::time::Duration;
 
 use glam::DVec3;
-use palpate_client::bridge::{self, Options, Session, Target, Warn};
+use palpate_client::bridge::{self, Options, SessionChoice, Target, Warn};
 use palpate_client::{HapticDevice, Reading, Server};
 use palpate_simulated::network::Transport;
 use palpate_simulated::random::Random;
@@ -13,14 +13,14 @@ use palpate_simulated::task::Task;
 use palpate_touch::Device;
 
 use super::direct::Direct;
-use super::measure::{Outcome, Tick, Totals};
+use super::measure::{LinkOutcome, LinkTick, Totals};
 use super::setup::{Rendering, Setup, TICK_S};
 use super::spot::Spot;
-use super::tissue::Tissue;
+use super::tissue::LinkTissue;
 use super::with_tissue;
 use crate::prediction::When;
-use crate::simulated::{Part, Simulated};
-use crate::{Failure, interrupted, warn};
+use crate::simulated::{CoursePart, Simulated};
+use crate::{ClientFailure, interrupted, warn};
 
 /// Time before the first press, s: the server computes its force law first.
 const LEAD_S: f64 = 3.0;
@@ -51,7 +51,7 @@ impl HapticDevice for Laid {
 }
 
 /// Performs the run at a server, which must know the scene by its name.
-pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failure> {
+pub(super) async fn run(setup: &Setup, server: Server) -> Result<LinkOutcome, ClientFailure> {
     let Setup { model, tip, spot, hand, device, deadband, up_deadband, conditions, duration_s, seed, .. } = setup;
     let direct = with_tissue(|| Direct::new(setup, LEAD_S))?;
     let task = Task::new(DVec3::ZERO, LEAD_S, *duration_s, direct.scale, &mut Random::new(*seed, 0));
@@ -59,7 +59,7 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     let laid = Laid { device, spot: *spot, top_m: model.shape().top_m() };
     let target = Target {
         server,
-        session: Session::New { scene: model.scene.name.clone() },
+        session: SessionChoice::New { scene: model.scene.name.clone() },
         tool: 0,
         tip: *tip,
         deadband: *deadband,
@@ -83,14 +83,14 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
     }
     let mut totals = Totals::default();
     with_tissue(|| {
-        let mut twin = Tissue::new(setup)?;
+        let mut twin = LinkTissue::new(setup)?;
         for (tick, part) in (0_u32..).zip(steps(simulated.course())) {
-            let Part { time_s: now_s, place_m, force_n } = part;
+            let CoursePart { time_s: now_s, place_m, force_n } = part;
             // The hand's place is relative to the spot.
             let (true_n, touches) = twin.truth(place_m + spot.at_m, f64::from(tick) * TICK_S)?;
             totals.moved(place_m);
             let (depth_m, direct_m) = (-place_m.z, direct.depth_m(tick + 1));
-            totals.rendered(&Tick { now_s, depth_m, direct_m, force_n, true_n, touches, age_s: None }, None);
+            totals.rendered(&LinkTick { now_s, depth_m, direct_m, force_n, true_n, touches, age_s: None }, None);
         }
         Ok(())
     })?;
@@ -112,11 +112,11 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<Outcome, Failur
 }
 
 /// Parts of the ticks that may be late or skipped: above that, the figures are those of this machine.
-const MOST_LATE: f64 = 0.01;
+const MAX_LATE: f64 = 0.01;
 
 /// What to say of a run in which too many ticks were late or skipped.
 fn too_late([late, missed]: [f64; 2], ticks: f64) -> Option<String> {
-    (late + missed > MOST_LATE * ticks).then(|| {
+    (late + missed > MAX_LATE * ticks).then(|| {
         let percent = |count: f64| 100.0 * count / ticks;
         format!(
             "this machine was too late to judge server and network: {:.1} % of the ticks began more than 1 ms late, {:.1} % were \
@@ -128,7 +128,7 @@ fn too_late([late, missed]: [f64; 2], ticks: f64) -> Option<String> {
 }
 
 /// A course resampled at each whole tick: the place, interpolated linearly, and the force that the device held.
-fn steps(course: &[Part]) -> impl Iterator<Item = Part> {
+fn steps(course: &[CoursePart]) -> impl Iterator<Item = CoursePart> {
     let (mut at, mut tick) = (1, 0_u32);
     std::iter::from_fn(move || {
         tick += 1;
@@ -138,7 +138,7 @@ fn steps(course: &[Part]) -> impl Iterator<Item = Part> {
         }
         let (before, after) = (&course[at - 1], &course[at]);
         let part = ((time_s - before.time_s) / (after.time_s - before.time_s)).clamp(0.0, 1.0);
-        Some(Part { time_s, place_m: before.place_m.lerp(after.place_m, part), force_n: after.force_n })
+        Some(CoursePart { time_s, place_m: before.place_m.lerp(after.place_m, part), force_n: after.force_n })
     })
 }
 
@@ -155,7 +155,7 @@ mod tests {
 
     #[test]
     fn a_course_with_a_stall_is_resampled_by_the_time_that_passed() {
-        let part = |time_s: f64, z_m: f64, z_n: f64| Part {
+        let part = |time_s: f64, z_m: f64, z_n: f64| CoursePart {
             time_s,
             place_m: DVec3::new(0.0, 0.0, z_m),
             force_n: DVec3::new(0.0, 0.0, z_n),
@@ -163,7 +163,7 @@ mod tests {
         // Two parts, a stall of a tenth of a second, and one more.
         let course =
             [part(0.0005, 0.0, 1.0), part(0.0015, 1.0, 2.0), part(0.1015, 101.0, 3.0), part(0.1025, 101.5, 4.0)];
-        let steps: Vec<Part> = steps(&course).collect();
+        let steps: Vec<CoursePart> = steps(&course).collect();
         assert_eq!(steps.len(), 102);
         assert!((steps[0].place_m.z - 0.5).abs() < 1e-9 && steps[0].force_n.z == 2.0);
         assert!((steps[50].place_m.z - 50.5).abs() < 1e-6 && steps[50].force_n.z == 3.0);

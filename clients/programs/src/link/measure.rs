@@ -6,7 +6,7 @@
 
 use glam::DVec3;
 use palpate_simulated::network::Outages;
-use palpate_touch::carrier::Carried;
+use palpate_touch::datagram_health::Carried;
 use palpate_touch::envelope::Envelope;
 use palpate_touch::{LimitCause, RenderingState};
 
@@ -14,7 +14,7 @@ use palpate_touch::{LimitCause, RenderingState};
 const UNSTABLE_J: f64 = -0.1;
 
 /// A smaller rendered force counts as none, N.
-const LEAST_FORCE_N: f64 = 1e-6;
+const MIN_FORCE_N: f64 = 1e-6;
 
 /// After the end of an outage, what it has done to the force may last for this long, s.
 const RECOVERS_S: f64 = 0.05;
@@ -22,7 +22,7 @@ const RECOVERS_S: f64 = 0.05;
 /// The outcome of a run. A tick is in contact if the twin touches or a force is rendered; figures without another word are
 /// over these ticks.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Outcome {
+pub(super) struct LinkOutcome {
     /// Scale of the task's depths.
     pub(super) scale: f64,
     pub(super) force_error_rms_percent: Option<f64>,
@@ -70,7 +70,7 @@ pub(super) struct Outcome {
 }
 
 /// What there is to measure in a tick. The normal is z.
-pub(super) struct Tick {
+pub(super) struct LinkTick {
     pub(super) now_s: f64,
     /// The tool's depth, m, and that of a hand that feels the tissue itself, where it is known.
     pub(super) depth_m: f64,
@@ -92,7 +92,7 @@ struct Errors {
 }
 
 impl Errors {
-    fn add(&mut self, tick: &Tick) {
+    fn add(&mut self, tick: &LinkTick) {
         self.count += 1.0;
         self.error_squared += (tick.force_n - tick.true_n).length_squared();
         self.true_squared += tick.true_n.length_squared();
@@ -137,7 +137,7 @@ impl Regression {
 /// Accumulates the outcome of a run.
 #[derive(Default)]
 pub(super) struct Totals {
-    pub(super) outcome: Outcome,
+    pub(super) outcome: LinkOutcome,
     energy_j: f64,
     before: Option<DVec3>,
     force_n: DVec3,
@@ -176,7 +176,7 @@ impl Totals {
     }
 
     /// Counts a tick's rendered force against the true one; `envelope` is what it has passed.
-    pub(super) fn rendered(&mut self, tick: &Tick, envelope: Option<&Envelope>) {
+    pub(super) fn rendered(&mut self, tick: &LinkTick, envelope: Option<&Envelope>) {
         let is_settled = self.is_settled(tick.now_s, envelope);
         let outcome = &mut self.outcome;
         outcome.jump_max_n = outcome.jump_max_n.max((tick.force_n - self.force_n).length());
@@ -186,7 +186,7 @@ impl Totals {
         outcome.true_force_max_n = outcome.true_force_max_n.max(truth);
         outcome.course.push([tick.now_s, tick.depth_m, rendered, truth]);
         self.ages_s.extend(tick.age_s);
-        if !tick.touches && rendered <= LEAST_FORCE_N {
+        if !tick.touches && rendered <= MIN_FORCE_N {
             return;
         }
         self.errors.add(tick);
@@ -222,7 +222,7 @@ impl Totals {
     }
 
     /// Computes the outcome from the sums.
-    pub(super) fn close(mut self) -> Outcome {
+    pub(super) fn close(mut self) -> LinkOutcome {
         let outcome = &mut self.outcome;
         outcome.force_error_rms_percent = self.errors.percent();
         let has_outages = self.outages.as_ref().is_some_and(Outages::are_any);
@@ -258,8 +258,8 @@ mod tests {
     use palpate_simulated::network::Conditions;
 
     /// A tick in contact under a true force along the normal.
-    fn tick(now_s: f64, true_n: f64, force_n: f64, apart_m: f64) -> Tick {
-        Tick {
+    fn tick(now_s: f64, true_n: f64, force_n: f64, apart_m: f64) -> LinkTick {
+        LinkTick {
             now_s,
             depth_m: 0.01 + apart_m,
             direct_m: Some(0.01),
@@ -278,7 +278,7 @@ mod tests {
             totals.rendered(&tick(0.0, true_n, 1.1 * true_n + 0.3, 1e-4), None);
         }
         // What is neither touched nor rendered does not count.
-        totals.rendered(&Tick { touches: false, ..tick(0.0, 0.0, 0.0, 1.0) }, None);
+        totals.rendered(&LinkTick { touches: false, ..tick(0.0, 0.0, 0.0, 1.0) }, None);
         let outcome = totals.close();
         let near = |found: Option<f64>, expected: f64| found.is_some_and(|found| (found - expected).abs() < 1e-9);
         assert!(near(outcome.force_gain, 1.1) && near(outcome.force_bias_n, 0.4), "{outcome:?}");

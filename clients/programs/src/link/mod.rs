@@ -27,12 +27,12 @@ use palpate::memory;
 use palpate::scene::Change;
 use palpate::scene::check::check_tip;
 use palpate::scene::collection::find_scene;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate_proto::refusal::{Reason, Refusal, number};
 use palpate_simulated::network::{Conditions, Transport};
 use palpate_touch::{Law, Tip};
 
-use crate::Failure;
+use crate::ClientFailure;
 use crate::credentials::CredentialOptions;
 use crate::simulated::{device_named, hand_named};
 use crate::table;
@@ -44,7 +44,7 @@ use spot::Spot;
 
 /// Arguments of `link`.
 #[derive(Args)]
-pub(crate) struct Arguments {
+pub(crate) struct LinkArguments {
     /// A scene file, or the name of a scene in ./scenes or built in (colon, fibrotic, gallbladder, liver, liver-organ, paper,
     /// stomach)
     #[arg(long, default_value = "liver")]
@@ -173,7 +173,7 @@ const LONGEST_S: f64 = 3600.0;
 ///
 /// # Errors
 /// Returns an error if an argument is refused, a run fails, or a file can't be written.
-pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
+pub(crate) async fn link(arguments: &LinkArguments) -> Result<(), ClientFailure> {
     if arguments.boundary {
         return boundary::print(arguments.json);
     }
@@ -190,7 +190,7 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
         for [time_s, depth_m, rendered_n, true_n] in &outcome.course {
             text += &format!("{time_s:.3},{depth_m:.6},{rendered_n:.6},{true_n:.6}\n");
         }
-        std::fs::write(path, text).map_err(|error| Failure::Failed(format!("{}: {error}", path.display())))?;
+        std::fs::write(path, text).map_err(|error| ClientFailure::Failed(format!("{}: {error}", path.display())))?;
     }
     if arguments.json {
         crate::tell!("{}", figures(&setup, &outcome));
@@ -204,11 +204,11 @@ pub(crate) async fn link(arguments: &Arguments) -> Result<(), Failure> {
 ///
 /// # Errors
 /// Returns an error if the system has no memory for the tissue (exit status 2), or if the guard stops it (1).
-fn with_tissue<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, Failure> {
-    memory::attempt("--scene", || Ok(work()))?.map_err(Failure::Failed)
+fn with_tissue<T>(work: impl FnOnce() -> Result<T, String>) -> Result<T, ClientFailure> {
+    memory::attempt("--scene", || Ok(work()))?.map_err(ClientFailure::Failed)
 }
 
-fn setup(arguments: &Arguments) -> Result<Setup, Refusal> {
+fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
     let limits = Limits::default();
     let hand = hand_named(&arguments.hand)?;
     let device = device_named(&arguments.device)?;
@@ -310,7 +310,7 @@ fn changed(model: &Model, at_s: f64, factor: f64) -> Result<TissueChange, Refusa
     let scene = &model.scene;
     let change = Change {
         stiffness_n_per_m: Some(factor * scene.springs.stiffness_n_per_m),
-        virtual_stiffness_n_per_m: Some(factor * scene.virtual_stiffness_n_per_m),
+        anchor_stiffness_n_per_m: Some(factor * scene.anchor_stiffness_n_per_m),
         ..Change::default()
     };
     let model = model.changed(&change, scene, &Limits::default())?;

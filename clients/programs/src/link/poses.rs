@@ -6,16 +6,16 @@ use std::collections::VecDeque;
 use glam::DVec3;
 use palpate_simulated::network::{Direction, Transport};
 use palpate_touch::deadband::HEARTBEAT_S;
-use palpate_touch::{LocalModel, News, Pulse, Told};
+use palpate_touch::{LocalModel, MotionState, News, SendInterval};
 
-use super::client::Client;
+use super::client::LinkClient;
 
 /// A message to the server.
 pub(super) struct Up {
     pub(super) number: u64,
     pub(super) sent_s: f64,
     /// Places by the number of their command, the newest last.
-    pub(super) told: Vec<(u64, Told)>,
+    pub(super) told: Vec<(u64, MotionState)>,
     /// How often the client wants a sample at least, s.
     pub(super) heartbeat_s: f64,
 }
@@ -50,9 +50,9 @@ pub(super) struct Poses {
     /// Commands so far.
     count: u64,
     /// What the server may not have yet, the newest last.
-    unanswered: VecDeque<(u64, Told)>,
+    unanswered: VecDeque<(u64, MotionState)>,
     /// Of the samples.
-    pulse: Pulse,
+    pulse: SendInterval,
     heartbeat_s: f64,
 }
 
@@ -64,21 +64,21 @@ impl Poses {
             news: News::default(),
             count: 0,
             unanswered: VecDeque::new(),
-            pulse: Pulse::default(),
+            pulse: SendInterval::default(),
             heartbeat_s: HEARTBEAT_S,
         }
     }
 
     /// Tells a place, if it is news.
-    pub(super) fn tell(&mut self, now_s: f64, place_m: DVec3, client: &Client, up: &mut Direction<Up>) {
+    pub(super) fn tell(&mut self, now_s: f64, place_m: DVec3, client: &LinkClient, up: &mut Direction<Up>) {
         let told = if self.deadband > 0.0 {
             let most_m = match client {
-                Client::Model(renderer) => renderer.way_m(self.deadband),
-                Client::Raw(_) | Client::Hold(..) => 0.0,
+                LinkClient::Model(renderer) => renderer.way_m(self.deadband),
+                LinkClient::Raw(_) | LinkClient::Hold(..) => 0.0,
             };
             self.news.tell(now_s, place_m, most_m, self.heartbeat_s)
         } else {
-            Some(Told { time_s: now_s, place_m, velocity_m_per_s: DVec3::ZERO })
+            Some(MotionState { time_s: now_s, place_m, velocity_m_per_s: DVec3::ZERO })
         };
         let Some(told) = told else { return };
         self.count += 1;
@@ -86,7 +86,7 @@ impl Poses {
         if self.unanswered.len() > if self.transport == Transport::Stream { 1 } else { PLACES } {
             self.unanswered.pop_front();
         }
-        let told: Vec<(u64, Told)> = self.unanswered.iter().copied().collect();
+        let told: Vec<(u64, MotionState)> = self.unanswered.iter().copied().collect();
         let bytes = FIRST_BYTES + FURTHER_BYTES * (told.len() as u64 - 1);
         let heartbeat_s = self.pulse.heartbeat_s(now_s);
         up.send(now_s, bytes, Up { number: up.sent() + 1, sent_s: now_s, told, heartbeat_s });

@@ -7,7 +7,7 @@ use glam::DVec3;
 use palpate::force_law::Disc;
 use palpate::limits::Limits;
 use palpate::scene::{BUILT_IN, Scene};
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate_proto::refusal::Refusal;
 use palpate_simulated::network::{Conditions, Transport};
 use palpate_simulated::random::Random;
@@ -18,12 +18,12 @@ use serde_json::{Value, json};
 
 use super::figures::figures;
 use super::laws::PlaceLaws;
-use super::measure::Outcome;
+use super::measure::LinkOutcome;
 use super::run::run;
 use super::setup::{Rendering, Setup, TissueChange};
 use super::spot::Spot;
-use super::{Arguments, changed, law_of};
-use crate::Failure;
+use super::{LinkArguments, changed, law_of};
+use crate::ClientFailure;
 use crate::table;
 
 /// Tissues of the random runs.
@@ -84,12 +84,12 @@ struct Worst {
     name: &'static str,
     /// Whether a larger value is worse.
     largest: bool,
-    of: fn(&Outcome) -> Option<f64>,
+    of: fn(&LinkOutcome) -> Option<f64>,
     found: Option<(f64, Value)>,
 }
 
 /// Performs the runs on all processors and prints the worst value of each figure.
-pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
+pub(super) fn print(arguments: &LinkArguments, runs: u64) -> Result<(), ClientFailure> {
     let tip = Tip::default();
     let mut tissues = BTreeMap::new();
     for (name, text) in BUILT_IN.iter().filter(|scene| TISSUES.contains(&scene.0)) {
@@ -119,13 +119,13 @@ pub(super) fn print(arguments: &Arguments, runs: u64) -> Result<(), Failure> {
             });
         }
     });
-    let mut results = results.into_inner().map_err(|error| Failure::Failed(error.to_string()))?;
+    let mut results = results.into_inner().map_err(|error| ClientFailure::Failed(error.to_string()))?;
     results.sort_by_key(|result| result.0);
     report(arguments, &results)
 }
 
 /// The run of a seed.
-fn drawn(arguments: &Arguments, tissues: &BTreeMap<&str, Choice>, tip: Tip, seed: u64) -> Setup {
+fn drawn(arguments: &LinkArguments, tissues: &BTreeMap<&str, Choice>, tip: Tip, seed: u64) -> Setup {
     let mut random = Random::new(seed, 3);
     let choice = &tissues[random.one_of(&TISSUES)];
     let profiles = <super::Profile as clap::ValueEnum>::value_variants();
@@ -173,7 +173,10 @@ fn drawn(arguments: &Arguments, tissues: &BTreeMap<&str, Choice>, tip: Tip, seed
     }
 }
 
-fn report(arguments: &Arguments, results: &[(u64, Setup, Result<Outcome, String>)]) -> Result<(), Failure> {
+fn report(
+    arguments: &LinkArguments,
+    results: &[(u64, Setup, Result<LinkOutcome, String>)],
+) -> Result<(), ClientFailure> {
     let worst = |name, largest, of| Worst { name, largest, of, found: None };
     let mut all = [
         worst("energy_min_j", false, |outcome| Some(outcome.energy_min_j)),
@@ -186,7 +189,7 @@ fn report(arguments: &Arguments, results: &[(u64, Setup, Result<Outcome, String>
     ];
     let mut unstable = 0_u64;
     for (seed, setup, outcome) in results {
-        let outcome = outcome.as_ref().map_err(|error| Failure::Failed(format!("seed {seed}: {error}")))?;
+        let outcome = outcome.as_ref().map_err(|error| ClientFailure::Failed(format!("seed {seed}: {error}")))?;
         unstable += u64::from(outcome.unstable_at_s.is_some());
         for worst in &mut all {
             let Some(value) = (worst.of)(outcome) else { continue };

@@ -9,13 +9,13 @@ use palpate_touch::RenderingState;
 use palpate_touch::envelope::Envelope;
 use palpate_touch::hand::HandState;
 
-use super::client::Client;
+use super::client::LinkClient;
 use super::direct::Direct;
-use super::measure::{Outcome, Tick, Totals};
+use super::measure::{LinkOutcome, LinkTick, Totals};
 use super::poses::{Down, Poses, Up};
-use super::server::{Other, Server};
+use super::server::{LinkServer, Other};
 use super::setup::{Setup, TICK_S, ticks};
-use super::tissue::Tissue;
+use super::tissue::LinkTissue;
 
 /// A run is unstable, too, if the tool moves away farther than this many times the task's amplitude.
 const UNSTABLE_AMPLITUDES: f64 = 3.0;
@@ -27,17 +27,17 @@ const PAUSE_S: f64 = 0.3;
 const EMPTY_BYTES: u64 = 120;
 
 /// The ways between client and server. The two ways of a connection have their outages together.
-struct Network {
+struct LinkNetwork {
     up: Direction<Up>,
     down: Direction<Down>,
     /// A law must not be lost, so it comes by stream in any case.
     laws: Direction<Other>,
 }
 
-impl Network {
+impl LinkNetwork {
     fn new(conditions: Conditions, seed: u64) -> Self {
         let stream = Conditions { transport: Transport::Stream, rate_bit_per_s: 0.0, ..conditions };
-        Network {
+        LinkNetwork {
             up: Direction::new(conditions, seed, 1, task::LEAD_S),
             down: Direction::new(conditions, seed, 2, task::LEAD_S),
             laws: Direction::new(stream, seed, 8, task::LEAD_S),
@@ -49,14 +49,14 @@ impl Network {
 ///
 /// # Errors
 /// Returns the reason if the guard stops the tissue.
-pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
+pub(super) fn run(setup: &Setup) -> Result<LinkOutcome, String> {
     let direct = Direct::new(setup, task::LEAD_S)?;
     let Setup { spot, hand, conditions, duration_s, seed, .. } = setup;
     let task = Task::new(spot.at_m, task::LEAD_S, *duration_s, direct.scale, &mut Random::new(*seed, 0));
-    let (mut server, mut twin) = (Server::new(setup)?, Tissue::new(setup)?);
-    let mut network = Network::new(*conditions, *seed);
+    let (mut server, mut twin) = (LinkServer::new(setup)?, LinkTissue::new(setup)?);
+    let mut network = LinkNetwork::new(*conditions, *seed);
     let mut poses = Poses::new(conditions.transport, setup.up_deadband);
-    let mut client = Client::new(setup);
+    let mut client = LinkClient::new(setup);
     let mut held = HandState { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
     let mut totals = Totals::with(Outages::new(conditions, *seed, task::LEAD_S));
     totals.outcome.scale = direct.scale;
@@ -94,7 +94,7 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
         let age_s = client.model_time_s().map(|time_s| now_s - time_s);
         let (depth_m, direct_m) = (spot.depth_m(place_m), direct.depth_m(tick));
         totals.rendered(
-            &Tick { now_s, depth_m, direct_m, force_n, true_n, touches, age_s },
+            &LinkTick { now_s, depth_m, direct_m, force_n, true_n, touches, age_s },
             client.envelope().map(|envelope| &*envelope),
         );
         if let Some(envelope) = client.envelope().filter(|_| !is_stalled) {
@@ -110,7 +110,7 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
     totals.outcome.predicted_ticks = client.predicted();
     let mut outcome = totals.close();
     let lasted_s = outcome.unstable_at_s.unwrap_or(*duration_s).max(TICK_S);
-    let Network { up, down, .. } = network;
+    let LinkNetwork { up, down, .. } = network;
     outcome.packets_per_s = down.sent() as f64 / lasted_s;
     outcome.kbit_per_s = bytes as f64 * 8e-3 / lasted_s;
     outcome.commands_per_s = up.sent() as f64 / lasted_s;
@@ -120,7 +120,7 @@ pub(super) fn run(setup: &Setup) -> Result<Outcome, String> {
 }
 
 /// The server's part of a tick: what has arrived, a step, and what the stream gets of it. Returns the bytes of its samples.
-fn serve(server: &mut Server, network: &mut Network, now_s: f64) -> Result<u64, String> {
+fn serve(server: &mut LinkServer, network: &mut LinkNetwork, now_s: f64) -> Result<u64, String> {
     while let Some(message) = network.up.receive(now_s) {
         server.receive(&message, now_s);
     }
@@ -135,7 +135,7 @@ fn serve(server: &mut Server, network: &mut Network, now_s: f64) -> Result<u64, 
 }
 
 /// The simulated operator notices that rendering has paused, and enables it again after [`PAUSE_S`].
-fn operate(envelope: &mut Envelope, now_s: f64, paused_s: &mut Option<f64>, outcome: &mut Outcome) {
+fn operate(envelope: &mut Envelope, now_s: f64, paused_s: &mut Option<f64>, outcome: &mut LinkOutcome) {
     match (envelope.state(), *paused_s) {
         (RenderingState::Enabled, _) => *paused_s = None,
         (_, None) => {

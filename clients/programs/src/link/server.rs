@@ -8,17 +8,17 @@ use palpate::scene::script::Action;
 use palpate::session::command::Command;
 use palpate::session::laws::{FIRST, Laws};
 use palpate::session::sampling::{Deadband, Sampler, Sampling, WantedHeartbeat};
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate_simulated::network::Transport;
-use palpate_touch::carrier::Seen;
+use palpate_touch::datagram_health::ReceiveWindow;
 use palpate_touch::deadband::HEARTBEAT_S;
-use palpate_touch::{Law, LocalModel, Pulse, Told};
+use palpate_touch::{Law, LocalModel, MotionState, SendInterval};
 
 use super::laws::PlaceLaws;
 use super::poses::Up;
 use super::setup::{Setup, TICK_S};
 use super::spot::Spot;
-use super::tissue::{LEASE, Tissue, ns};
+use super::tissue::{LEASE, LinkTissue, ns};
 
 /// The law of another tissue is known so long after the tissue has changed, s.
 const LAW_S: f64 = 0.1;
@@ -31,8 +31,8 @@ pub(super) struct Other {
 }
 
 /// A tissue behind a network.
-pub(super) struct Server {
-    tissue: Tissue,
+pub(super) struct LinkServer {
+    tissue: LinkTissue,
     spot: Spot,
     sampler: Sampler,
     laws: Arc<Laws>,
@@ -49,17 +49,17 @@ pub(super) struct Server {
     /// Whether places come with velocities.
     is_moving: bool,
     /// Of the commands: a datagram repeats what is not acknowledged.
-    seen: Seen,
+    seen: ReceiveWindow,
     /// Of what arrives.
-    pulse: Pulse,
+    pulse: SendInterval,
     refused: u64,
 }
 
-impl Server {
+impl LinkServer {
     /// # Errors
     /// Returns why the intake refuses the tools.
     pub(super) fn new(setup: &Setup) -> Result<Self, String> {
-        let tissue = Tissue::new(setup)?;
+        let tissue = LinkTissue::new(setup)?;
         let laws = Arc::new(Laws::new(setup.law.clone()));
         let wanted = Arc::new(WantedHeartbeat::default());
         let rendered = Deadband { rendered_fraction: Some(setup.deadband), ..Deadband::default() };
@@ -72,7 +72,7 @@ impl Server {
             touch_stiffness: false,
             wanted: Some(wanted.clone()),
         };
-        Ok(Server {
+        Ok(LinkServer {
             tissue,
             spot: setup.spot,
             sampler: Sampler::new(sampling, TICK_S.recip()),
@@ -85,8 +85,8 @@ impl Server {
             number: FIRST,
             transport: setup.conditions.transport,
             is_moving: setup.up_deadband > 0.0,
-            seen: Seen::default(),
-            pulse: Pulse::default(),
+            seen: ReceiveWindow::default(),
+            pulse: SendInterval::default(),
             refused: 0,
         })
     }
@@ -105,7 +105,7 @@ impl Server {
         self.refused += u64::from(self.tissue.submit(LEASE, commands, now_s).is_err());
     }
 
-    fn command(&self, number: u64, told: &Told) -> Command {
+    fn command(&self, number: u64, told: &MotionState) -> Command {
         let mut command = self.tissue.pose(told.place_m);
         if let Action::Pose { velocity_m_per_s, .. } = &mut command.action {
             *velocity_m_per_s = self.is_moving.then(|| self.spot.direction_of_tissue(told.velocity_m_per_s));

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use palpate::force_law::Disc;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate_simulated::network::Conditions;
 use palpate_touch::hand::Hand;
 use palpate_touch::{Device, Law, Tip};

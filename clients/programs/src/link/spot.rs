@@ -1,7 +1,7 @@
 //! The place at which a task is done.
 
 use glam::{DMat3, DQuat, DVec3};
-use palpate::sheet::{Footprint, Model};
+use palpate::tissue::{Footprint, Model};
 use palpate_touch::LocalModel;
 
 /// The place of a surface at which a task is done, seen by the hand: the task's own place is there, and z is out of the

@@ -11,7 +11,7 @@ use palpate::session::Session;
 use palpate::session::command::{Command, Due};
 use palpate::session::intake::Intake;
 use palpate::session::lease::LeaseId;
-use palpate::sheet::Model;
+use palpate::tissue::Model;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{self, Task};
 use palpate_touch::{ContactState, Tip};
@@ -29,7 +29,7 @@ const SECOND_LEASE: LeaseId = 2;
 const SECOND_DEPTHS: f64 = 0.5;
 
 /// A tissue with its tools.
-pub(super) struct Tissue {
+pub(super) struct LinkTissue {
     session: Session,
     intake: Intake,
     due: Vec<Due>,
@@ -60,7 +60,7 @@ impl Second {
     }
 }
 
-impl Tissue {
+impl LinkTissue {
     /// At rest, before anything has touched it.
     ///
     /// # Errors
@@ -72,7 +72,7 @@ impl Tissue {
             let acquired = intake.acquire(&[tool], "palpate-client link", limits.lease_s, lease, 0);
             acquired.map_err(|refusal| refusal.to_string())?;
         }
-        Ok(Tissue {
+        Ok(LinkTissue {
             session: Session::new(&setup.model),
             intake,
             due: Vec::new(),
@@ -141,11 +141,11 @@ impl Tissue {
     /// The force on a tool that is at `place_m` now, without any network, N; and whether it touches the tissue.
     ///
     /// # Errors
-    /// As [`Tissue::step`] does.
+    /// As [`LinkTissue::step`] does.
     pub(super) fn truth(&mut self, place_m: DVec3, now_s: f64) -> Result<(DVec3, bool), String> {
         self.submit(LEASE, vec![self.pose(place_m)], now_s)?;
         self.step(now_s)?;
-        Ok(self.session.tissue().feel(TOOL as usize).map_or((DVec3::ZERO, false), |feel| {
+        Ok(self.session.tissue().tool_contact(TOOL as usize).map_or((DVec3::ZERO, false), |feel| {
             (self.spot.direction(feel.force_on_tool_n), feel.contact_state != ContactState::Free)
         }))
     }

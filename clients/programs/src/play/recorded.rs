@@ -3,14 +3,14 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::io::Cursor;
 
-use palpate::journal::Reader;
+use palpate::journal::JournalReader;
 use palpate_client::Channel;
 use palpate_proto::pb;
 use palpate_proto::refusal::Refusal;
 use pb::session_service_client::SessionServiceClient;
 use tonic::Code;
 
-use crate::Failure;
+use crate::ClientFailure;
 
 /// Hashes that are asked for before their steps are done.
 const AHEAD: usize = 8;
@@ -20,7 +20,7 @@ pub(super) type Hashes = BTreeMap<u64, String>;
 
 /// The hashes of a journal; refusals call it `place`.
 pub(super) fn hashes(place: &str, journal: &[u8]) -> Result<Hashes, Refusal> {
-    let mut reader = Reader::new(place, Cursor::new(journal))?;
+    let mut reader = JournalReader::new(place, Cursor::new(journal))?;
     let mut hashes = Hashes::new();
     while let Some(batch) = reader.next_batch()? {
         let of_snapshots = batch.snapshots()?.into_iter().map(|snapshot| (snapshot.step, snapshot.hash));
@@ -54,7 +54,7 @@ impl Compared {
 }
 
 /// Compares the hashes of a session with those that were `recorded`, till the first that differs. Ends when all their steps are done.
-pub(super) async fn compare(channel: &Channel, session_id: &str, recorded: Hashes) -> Result<Compared, Failure> {
+pub(super) async fn compare(channel: &Channel, session_id: &str, recorded: Hashes) -> Result<Compared, ClientFailure> {
     let (mut compared, mut left, mut asked) = (Compared::default(), recorded.into_iter(), VecDeque::new());
     loop {
         for (step, hash) in left.by_ref().take(AHEAD - asked.len()) {
@@ -63,7 +63,7 @@ pub(super) async fn compare(channel: &Channel, session_id: &str, recorded: Hashe
             asked.push_back((step, hash, tokio::spawn(async move { sessions.get_state_hash(request).await })));
         }
         let Some((step, recorded, answer)) = asked.pop_front() else { return Ok(compared) };
-        match answer.await.map_err(|error| Failure::Failed(error.to_string()))? {
+        match answer.await.map_err(|error| ClientFailure::Failed(error.to_string()))? {
             Ok(answer) if answer.get_ref().state_hash == recorded => compared.equal += 1,
             Ok(answer) => {
                 let played = &answer.get_ref().state_hash;

@@ -7,7 +7,7 @@ use palpate::scene::script::Script;
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
 
-use crate::Failure;
+use crate::ClientFailure;
 
 /// What a replay has measured.
 pub(super) struct Measured<'s> {
@@ -34,8 +34,8 @@ pub(super) struct Measured<'s> {
 }
 
 impl<'s> Measured<'s> {
-    pub(super) fn new(script: &'s Script) -> Result<Self, Failure> {
-        let histogram = || Histogram::new(3).map_err(|e| Failure::Failed(e.to_string()));
+    pub(super) fn new(script: &'s Script) -> Result<Self, ClientFailure> {
+        let histogram = || Histogram::new(3).map_err(|e| ClientFailure::Failed(e.to_string()));
         Ok(Measured {
             script,
             round_trip_ns: histogram()?,

@@ -15,7 +15,7 @@ use tokio_stream::wrappers::WatchStream;
 
 use super::stroke::Stroke;
 use super::tally::Tally;
-use super::tip::{self, Lead, Led};
+use super::tip::{self, Lead, LedTip};
 
 pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
@@ -81,7 +81,7 @@ struct Sent {
     last_tick: Option<u64>,
     is_open: bool,
     /// The tool of a client that leads one with a tip, and the command that a sample acknowledged last, with its time, ns.
-    led: Option<Led>,
+    led: Option<LedTip>,
     newest: (u64, u64),
 }
 
@@ -148,7 +148,7 @@ pub(crate) struct Client {
 }
 
 /// How long a client waits for outstanding answers.
-const PATIENCE: Duration = Duration::from_secs(2);
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// A session that was silent for longer than this at the end of the measurement had stopped, ns.
 const SILENCE_NS: u64 = 50_000_000;
@@ -186,7 +186,7 @@ impl Client {
         let inbound = Touch::open(channel, open, commands.map(Say::Command)).await?;
         {
             let mut sent = lock(&sent);
-            sent.led = touches.and_then(|lead| Led::new(inbound.opened(), &lead, self.middle_m));
+            sent.led = touches.and_then(|lead| LedTip::new(inbound.opened(), &lead, self.middle_m));
             if touches.is_some() && sent.led.is_none() {
                 return Err(tonic::Status::failed_precondition("the server tells no force law for --touch"));
             }
@@ -227,14 +227,14 @@ impl Client {
         tally.dilation_min = tally.dilation_min.min(heartbeat.dilation(self.rate_hz, &self.common.stage));
     }
 
-    /// Completes when no answer is outstanding any more, or [`PATIENCE`] has passed.
+    /// Completes when no answer is outstanding any more, or [`ANSWER_TIMEOUT`] has passed.
     async fn drained(&self, sent: &Mutex<Sent>) {
         let mut begun: Option<Instant> = None;
         loop {
             tokio::time::sleep(Duration::from_millis(100)).await;
             if self.common.stage.is(Stage::DRAIN) {
                 let begun = *begun.get_or_insert_with(Instant::now);
-                if lock(sent).outstanding() == 0 || begun.elapsed() > PATIENCE {
+                if lock(sent).outstanding() == 0 || begun.elapsed() > ANSWER_TIMEOUT {
                     return;
                 }
             }

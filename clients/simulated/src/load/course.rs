@@ -15,28 +15,28 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 
 use super::client::{Arrivals, Client, Common, Stage, lock};
-use super::plan::{Mover, Plan, User, Viewers};
-use super::report::{Report, Second};
+use super::plan::{LoadPlan, Mover, User, Viewers};
+use super::report::{LoadReport, Second};
 use super::stroke::Stroke;
 use super::swarm::{middle_m, rate_hz, view};
 use super::tally::Tally;
 use super::tip::Lead;
 use super::{PHASES, tick};
-use crate::relay::Network;
+use crate::relay::RelayNetwork;
 use crate::scene_file::SceneFile;
 
 /// Flows of one network at a time.
-const MOST_FLOWS: u64 = 20_000;
+const MAX_FLOWS: u64 = 20_000;
 
 /// How long a user waits for the server before going away again.
-const PATIENCE: Duration = Duration::from_secs(20);
+const SERVER_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// The server deletes a session that nobody uses for so long, if this program dies, s.
 const IDLE_S: f64 = 10.0;
 
 /// Counts of users.
 #[derive(Default)]
-struct Counts {
+struct UserCounts {
     here: AtomicU64,
     arrived: AtomicU64,
     left: AtomicU64,
@@ -44,33 +44,33 @@ struct Counts {
 
 /// What all users share.
 struct World {
-    plan: Plan,
+    plan: LoadPlan,
     /// By the plan's networks.
     servers: Vec<Server>,
     /// By the plan's scenes.
     sources: Vec<Source>,
     clock: Instant,
     tally: Arc<Mutex<Tally>>,
-    counts: Counts,
+    counts: UserCounts,
     phases: Vec<watch::Receiver<u64>>,
     /// Whether all are to leave.
     over: watch::Receiver<bool>,
 }
 
 /// A plan with its scenes, ready to be run.
-pub struct Course {
-    plan: Plan,
+pub struct PreparedPlan {
+    plan: LoadPlan,
     scenes: Vec<SceneFile>,
 }
 
-impl Course {
+impl PreparedPlan {
     /// Reads the scene files that a plan names.
     ///
     /// # Errors
     /// Refuses a scene that can't be read.
-    pub fn new(plan: Plan) -> Result<Self, Refusal> {
+    pub fn new(plan: LoadPlan) -> Result<Self, Refusal> {
         let scenes = plan.scenes.iter().map(|scene| SceneFile::read(&scene.what)).collect::<Result<_, _>>()?;
-        Ok(Course { plan, scenes })
+        Ok(PreparedPlan { plan, scenes })
     }
 
     /// Loads a server by the plan, until its end or until `stop` completes; then all users leave. `told` is told of each second,
@@ -84,8 +84,8 @@ impl Course {
         told: impl FnMut(&Second) + Send + 'static,
         warn: impl Fn(&str) + Send + Sync + 'static,
         stop: impl Future<Output = ()> + Send + 'static,
-    ) -> Result<Report, Error> {
-        let Course { plan, scenes } = self;
+    ) -> Result<LoadReport, Error> {
+        let PreparedPlan { plan, scenes } = self;
         let channel = server.connect().await?;
         let mut sources = Vec::new();
         for scene in scenes {
@@ -99,7 +99,7 @@ impl Course {
                 None => server.clone(),
                 Some(conditions) => {
                     let to = address(server.url())?;
-                    let network = Network::new(conditions, 100 + index as u64, MOST_FLOWS, warn.clone());
+                    let network = RelayNetwork::new(conditions, 100 + index as u64, MAX_FLOWS, warn.clone());
                     let near = network.relay_tcp(SocketAddr::from(([127, 0, 0, 1], 0)), to);
                     let near = near.map_err(|error| Error::Internal(error.to_string()))?;
                     server.at(&format!("http://{near}"))?
@@ -130,19 +130,19 @@ fn address(url: &str) -> Result<SocketAddr, Error> {
 }
 
 /// What a loop waits for next.
-enum Next {
+enum NextEvent {
     User(User),
     Second,
     Stop,
 }
 
 async fn run(
-    plan: Plan,
+    plan: LoadPlan,
     servers: Vec<Server>,
     sources: Vec<Source>,
     mut told: impl FnMut(&Second),
     stop: impl Future<Output = ()>,
-) -> Report {
+) -> LoadReport {
     let (senders, phases): (Vec<_>, Vec<_>) = (0..PHASES).map(|_| watch::channel(0)).unzip();
     let (beating, beats) = watch::channel(());
     let (leave, over) = watch::channel(false);
@@ -150,9 +150,9 @@ async fn run(
     let ticker = std::thread::spawn(move || tick(&senders, rate_hz, &beats));
     let tally = Arc::new(Mutex::new(Tally::new()));
     let (users, lasts_s) = (plan.users(), plan.lasts_s());
-    let mut report = Report::new(&plan, &users);
+    let mut report = LoadReport::new(&plan, &users);
     let clock = Instant::now();
-    let counts = Counts::default();
+    let counts = UserCounts::default();
     let world = Arc::new(World { plan, servers, sources, clock, tally, counts, phases, over });
     let mut tasks = JoinSet::new();
     let mut coming = users.into_iter().peekable();
@@ -164,23 +164,23 @@ async fn run(
         let due_s = user_s.min(second);
         let next = tokio::select! {
             biased;
-            () = &mut stop => Next::Stop,
+            () = &mut stop => NextEvent::Stop,
             () = tokio::time::sleep_until(begun + Duration::from_secs_f64(due_s)) => {
-                coming.next_if(|user| user.at_s < second).map_or(Next::Second, Next::User)
+                coming.next_if(|user| user.at_s < second).map_or(NextEvent::Second, NextEvent::User)
             }
         };
         match next {
-            Next::User(user) => {
+            NextEvent::User(user) => {
                 world.counts.arrived.fetch_add(1, Ordering::Relaxed);
                 tasks.spawn(visit(world.clone(), user));
             }
-            Next::Second => {
+            NextEvent::Second => {
                 let counted = count(&world, second);
                 told(&counted);
                 report.add(counted);
                 second += 1.0;
             }
-            Next::Stop => {
+            NextEvent::Stop => {
                 report.is_interrupted = true;
                 break;
             }
@@ -200,7 +200,7 @@ async fn run(
 /// What was counted since the last time.
 fn count(world: &World, at_s: f64) -> Second {
     let tally = std::mem::replace(&mut *lock(&world.tally), Tally::new());
-    let Counts { here, arrived, left } = &world.counts;
+    let UserCounts { here, arrived, left } = &world.counts;
     Second {
         at_s,
         users: here.load(Ordering::Relaxed),
@@ -233,7 +233,7 @@ struct Streams {
 /// The life of a user.
 async fn visit(world: Arc<World>, user: User) {
     let begun = Instant::now();
-    let starting = tokio::time::timeout(PATIENCE, start(&world, &user)).await;
+    let starting = tokio::time::timeout(SERVER_TIMEOUT, start(&world, &user)).await;
     let silent = || Error::Connection("the server is silent".to_owned());
     let mut streams = match starting.map_err(|_| silent()).and_then(|started| started) {
         Ok(streams) => streams,
@@ -259,7 +259,7 @@ async fn visit(world: Arc<World>, user: User) {
     world.counts.here.fetch_sub(1, Ordering::Relaxed);
     world.counts.left.fetch_add(1, Ordering::Relaxed);
     let request = pb::DeleteSessionRequest { session_id: streams.session_id };
-    let _ = tokio::time::timeout(PATIENCE, streams.sessions.delete_session(request)).await;
+    let _ = tokio::time::timeout(SERVER_TIMEOUT, streams.sessions.delete_session(request)).await;
 }
 
 /// Makes a session, and opens the streams of its hand and viewers.

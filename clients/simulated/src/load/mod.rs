@@ -1,6 +1,6 @@
 //! Loads of a server: sessions, users with tools, and viewers, and how it copes.
 //!
-//! A [`Trial`] has a number of sessions that stay; by a [`Plan`], users arrive, stay and leave in phases.
+//! A [`LoadTrial`] has a number of sessions that stay; by a [`LoadPlan`], users arrive, stay and leave in phases.
 
 mod client;
 mod course;
@@ -13,13 +13,13 @@ mod tally;
 mod tip;
 mod trial;
 
-pub use course::Course;
+pub use course::PreparedPlan;
 pub use objective::Objective;
-pub use plan::Plan;
-pub use report::{Report, Second};
-pub use tally::Outcome;
+pub use plan::LoadPlan;
+pub use report::{LoadReport, Second};
+pub use tally::LoadOutcome;
 pub use tip::Deadbands;
-pub use trial::{Progress, Trial, trial};
+pub use trial::{LoadTrial, TrialProgress, trial};
 
 use std::time::{Duration, Instant};
 

@@ -2,10 +2,10 @@
 
 use std::str::FromStr;
 
-use super::tally::Outcome;
+use super::tally::LoadOutcome;
 
 /// Reads a quantity from an outcome.
-type Quantity = fn(&Outcome) -> f64;
+type Quantity = fn(&LoadOutcome) -> f64;
 
 /// The quantities that an objective may bound.
 #[allow(clippy::cast_precision_loss)]
@@ -27,7 +27,7 @@ const QUANTITIES: &[(&str, Quantity)] = &[
 
 /// One bound.
 #[derive(Debug, Clone)]
-struct Bound {
+struct ObjectiveBound {
     text: String,
     quantity: Quantity,
     is_above: bool,
@@ -37,7 +37,7 @@ struct Bound {
 
 /// Bounds that must all hold.
 #[derive(Debug, Clone)]
-pub struct Objective(Vec<Bound>);
+pub struct Objective(Vec<ObjectiveBound>);
 
 impl FromStr for Objective {
     type Err = String;
@@ -47,7 +47,7 @@ impl FromStr for Objective {
     }
 }
 
-impl FromStr for Bound {
+impl FromStr for ObjectiveBound {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -68,14 +68,14 @@ impl FromStr for Bound {
             return Err(format!("`{bound}` is not a valid bound of {name}: {example}"));
         }
         let bound = number.trim().parse::<f64>().map_err(|_| format!("`{bound}` is not a number: {example}"))? * unit;
-        Ok(Bound { text: text.to_owned(), quantity: *quantity, is_above: text.as_bytes()[at] == b'>', bound })
+        Ok(ObjectiveBound { text: text.to_owned(), quantity: *quantity, is_above: text.as_bytes()[at] == b'>', bound })
     }
 }
 
 impl Objective {
     /// The bounds that a run does not meet.
-    pub fn missed(&self, outcome: &Outcome) -> Vec<&str> {
-        let misses = |bound: &&Bound| {
+    pub fn missed(&self, outcome: &LoadOutcome) -> Vec<&str> {
+        let misses = |bound: &&ObjectiveBound| {
             let value = (bound.quantity)(outcome);
             // NaN, which means not measured, meets no bound.
             let meets = if bound.is_above { value > bound.bound } else { value < bound.bound };

@@ -15,23 +15,23 @@ use crate::network::Conditions;
 use crate::random::Random;
 
 /// Largest plan, bytes.
-const MOST_BYTES: u64 = 1 << 20;
+const MAX_BYTES: u64 = 1 << 20;
 
 /// Most users of a plan, in all.
-const MOST_USERS: usize = 10_000;
+const MAX_USERS: usize = 10_000;
 
 /// Most entries of a list.
-const MOST_ENTRIES: usize = 64;
+const MAX_ENTRIES: usize = 64;
 
 /// One of several things, and how often it is taken.
 #[derive(Debug, Clone)]
-pub(crate) struct Part<T> {
+pub(crate) struct Share<T> {
     share: f64,
     pub(crate) what: T,
 }
 
 /// The index of one of several parts, by their shares.
-fn draw<T>(parts: &[Part<T>], random: &mut Random) -> usize {
+fn draw<T>(parts: &[Share<T>], random: &mut Random) -> usize {
     let mut left = random.between(0.0, parts.iter().map(|part| part.share).sum());
     let found = parts.iter().position(|part| {
         left -= part.share;
@@ -91,15 +91,15 @@ pub(crate) struct Phase {
 
 /// A plan.
 #[derive(Debug, Clone)]
-pub struct Plan {
+pub struct LoadPlan {
     pub(crate) name: String,
     seed: u64,
     /// Commands a second of each hand.
     pub(crate) rate_hz: f64,
-    pub(crate) scenes: Vec<Part<String>>,
-    pub(crate) movers: Vec<Part<Mover>>,
-    pub(crate) wires: Vec<Part<Wire>>,
-    pub(crate) viewers: Vec<Part<Viewers>>,
+    pub(crate) scenes: Vec<Share<String>>,
+    pub(crate) movers: Vec<Share<Mover>>,
+    pub(crate) wires: Vec<Share<Wire>>,
+    pub(crate) viewers: Vec<Share<Viewers>>,
     pub(crate) phases: Vec<Phase>,
     /// Of the whole.
     pub(crate) objective: Option<Objective>,
@@ -120,13 +120,13 @@ pub(crate) struct User {
     pub(crate) seed: u64,
 }
 
-impl Plan {
+impl LoadPlan {
     /// Reads a plan from a file.
     ///
     /// # Errors
     /// Refuses a file that can't be read, and what is wrong in it, by line and key.
     pub fn read(path: &Path) -> Result<Self> {
-        Plan::parse(&path.display().to_string(), &read_text(path, MOST_BYTES)?)
+        LoadPlan::parse(&path.display().to_string(), &read_text(path, MAX_BYTES)?)
     }
 
     /// Reads a plan from text (TOML); refusals call it `name`.
@@ -136,11 +136,11 @@ impl Plan {
     pub fn parse(name: &str, text: &str) -> Result<Self> {
         let document = Document::parse(name, text)?;
         let plan = document.read(plan)?;
-        if plan.users().len() > MOST_USERS {
+        if plan.users().len() > MAX_USERS {
             return Err(document.locate(Refusal::new(
                 Reason::TooLarge,
                 "phase",
-                format!("more than {MOST_USERS} users would arrive: lower the rates, or shorten the phases"),
+                format!("more than {MAX_USERS} users would arrive: lower the rates, or shorten the phases"),
             )));
         }
         Ok(plan)
@@ -151,14 +151,14 @@ impl Plan {
         self.phases.iter().map(|phase| phase.seconds).sum()
     }
 
-    /// All users, by arrival: the same for the same plan. At most one more than [`MOST_USERS`].
+    /// All users, by arrival: the same for the same plan. At most one more than [`MAX_USERS`].
     pub(crate) fn users(&self) -> Vec<User> {
         let (mut times, mut mix) = (Random::new(self.seed, 1), Random::new(self.seed, 2));
         let (mut users, mut from_s) = (Vec::new(), 0.0);
         for phase in &self.phases {
             let mut moments = Vec::new();
             let mut at_s = 0.0;
-            while at_s < phase.seconds && users.len() + moments.len() <= MOST_USERS {
+            while at_s < phase.seconds && users.len() + moments.len() <= MAX_USERS {
                 match phase.arrivals {
                     Arrivals::Steady(rate) => {
                         moments.push((at_s, phase.stays_s));
@@ -221,13 +221,13 @@ fn parts<T>(
     key: &'static str,
     instead: T,
     read: impl Fn(&mut Fields<'_>) -> Result<T>,
-) -> Result<Vec<Part<T>>> {
-    let Some(item) = fields.item(key) else { return Ok(vec![Part { share: 1.0, what: instead }]) };
+) -> Result<Vec<Share<T>>> {
+    let Some(item) = fields.item(key) else { return Ok(vec![Share { share: 1.0, what: instead }]) };
     let tables = item.tables()?;
-    if tables.len() > MOST_ENTRIES {
-        return Err(item.refuse(Reason::TooLarge, format!("has more than {MOST_ENTRIES} entries")));
+    if tables.len() > MAX_ENTRIES {
+        return Err(item.refuse(Reason::TooLarge, format!("has more than {MAX_ENTRIES} entries")));
     }
-    let entry = |table: &Item<'_>| table.table(|fields| Ok(Part { share: share(fields)?, what: read(fields)? }));
+    let entry = |table: &Item<'_>| table.table(|fields| Ok(Share { share: share(fields)?, what: read(fields)? }));
     let parts = tables.iter().map(entry).collect::<Result<Vec<_>>>()?;
     if parts.iter().all(|part| part.share <= 0.0) {
         return Err(item.refuse(Reason::OutOfRange, "needs at least one entry with a share above 0"));
@@ -235,7 +235,7 @@ fn parts<T>(
     Ok(parts)
 }
 
-fn plan(fields: &mut Fields<'_>) -> Result<Plan> {
+fn plan(fields: &mut Fields<'_>) -> Result<LoadPlan> {
     let name = fields.text("name")?.unwrap_or_else(|| "load".to_owned());
     let seed = fields.item("seed").map_or(Ok(1), |item| item.whole())?;
     let rate_hz = within(fields, "rate_hz", "from 1 to 4000", 1.0, 4000.0)?.unwrap_or(1000.0);
@@ -251,12 +251,12 @@ fn plan(fields: &mut Fields<'_>) -> Result<Plan> {
     let objective = objective(fields)?;
     let item = fields.required("phase")?;
     let tables = item.tables()?;
-    if tables.is_empty() || tables.len() > MOST_ENTRIES {
-        return Err(item.refuse(Reason::OutOfRange, format!("needs 1 to {MOST_ENTRIES} entries")));
+    if tables.is_empty() || tables.len() > MAX_ENTRIES {
+        return Err(item.refuse(Reason::OutOfRange, format!("needs 1 to {MAX_ENTRIES} entries")));
     }
     let phases = tables.iter().enumerate().map(|(index, table)| table.table(|fields| phase(fields, index)));
     let phases = phases.collect::<Result<Vec<_>>>()?;
-    Ok(Plan { name, seed, rate_hz, scenes, movers, wires, viewers, phases, objective })
+    Ok(LoadPlan { name, seed, rate_hz, scenes, movers, wires, viewers, phases, objective })
 }
 
 /// One of several names, quoted for people.
@@ -404,9 +404,9 @@ seconds = 5
 
     #[test]
     fn a_plan_says_who_comes_when_and_says_it_again_the_same() {
-        let plan = Plan::parse("plan.toml", PLAN).unwrap();
+        let plan = LoadPlan::parse("plan.toml", PLAN).unwrap();
         let users = plan.users();
-        assert_eq!(users, Plan::parse("plan.toml", PLAN).unwrap().users());
+        assert_eq!(users, LoadPlan::parse("plan.toml", PLAN).unwrap().users());
         assert!((plan.lasts_s() - 117.0).abs() < 1e-9 && users.is_sorted_by(|a, b| a.at_s <= b.at_s));
         let of = |from: f64, to: f64| users.iter().filter(|user| (from..to).contains(&user.at_s)).collect::<Vec<_>>();
         assert!(of(0.0, 10.0).len() == 40 && of(0.0, 10.0).iter().all(|user| user.stays_s == 3.0));
@@ -447,7 +447,7 @@ seconds = 5
             (&format!("{phase}[[scene]]\nname = \"x\"\nshare = 0"), "", "scene", "share above 0"),
             ("[[phase]]\nseconds = 80000\narrivals = \"steady\"\nrate_per_s = 1", "", "phase", "10000 users"),
         ] {
-            let refusal = Plan::parse("plan.toml", text).unwrap_err();
+            let refusal = LoadPlan::parse("plan.toml", text).unwrap_err();
             assert_eq!(refusal.field, field, "{text}: {refusal}");
             assert!(refusal.to_string().contains(says), "{text}: {refusal}");
             let found = refusal.place.as_deref().unwrap_or_default();

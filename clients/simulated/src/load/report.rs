@@ -6,8 +6,8 @@ use std::fmt::Write;
 use serde_json::{Value, json};
 
 use super::objective::Objective;
-use super::plan::{Mover, Plan, User};
-use super::tally::{Outcome, Tally, listed};
+use super::plan::{LoadPlan, Mover, User};
+use super::tally::{LoadOutcome, Tally, listed};
 
 /// What was counted within a second.
 pub struct Second {
@@ -39,7 +39,7 @@ impl Second {
 struct Point {
     at_s: f64,
     users: u64,
-    outcome: Outcome,
+    outcome: LoadOutcome,
 }
 
 /// A phase, or the whole.
@@ -55,7 +55,7 @@ struct Stretch {
 }
 
 /// The report of a plan.
-pub struct Report {
+pub struct LoadReport {
     name: String,
     points: Vec<Point>,
     phases: Vec<Stretch>,
@@ -71,7 +71,7 @@ fn away(reasons: &BTreeMap<String, u64>) -> String {
 }
 
 /// How many users of a plan have which scene, hand, network and number of viewers.
-fn mix(plan: &Plan, users: &[User]) -> Value {
+fn mix(plan: &LoadPlan, users: &[User]) -> Value {
     let mut counts: [BTreeMap<String, u64>; 4] = Default::default();
     for user in users {
         let mover = match &plan.movers[user.mover].what {
@@ -93,10 +93,10 @@ fn mix(plan: &Plan, users: &[User]) -> Value {
 }
 
 /// An outcome in which the dilation is that of the worst second.
-fn outcome(tally: &Tally, users: u64) -> Outcome {
+fn outcome(tally: &Tally, users: u64) -> LoadOutcome {
     let dilation = tally.dilation_s_min;
     let dilation_min = if dilation.is_finite() { dilation } else { f64::NAN };
-    Outcome { dilation_min, ..tally.outcome(usize::try_from(users).unwrap_or(usize::MAX)) }
+    LoadOutcome { dilation_min, ..tally.outcome(usize::try_from(users).unwrap_or(usize::MAX)) }
 }
 
 fn milliseconds(us: f64) -> String {
@@ -109,7 +109,7 @@ impl Stretch {
         Stretch { name, from_s, to_s, objective, arrived: 0, left: 0, most_users: 0, tally: Tally::new() }
     }
 
-    fn outcome(&self) -> Outcome {
+    fn outcome(&self) -> LoadOutcome {
         outcome(&self.tally, self.most_users)
     }
 
@@ -146,9 +146,9 @@ impl Stretch {
     }
 }
 
-impl Report {
+impl LoadReport {
     /// Of a plan and its users.
-    pub(crate) fn new(plan: &Plan, users: &[User]) -> Self {
+    pub(crate) fn new(plan: &LoadPlan, users: &[User]) -> Self {
         let mut from_s = 0.0;
         let phases = plan.phases.iter().map(|phase| {
             let begin_s = from_s;
@@ -157,7 +157,7 @@ impl Report {
         });
         let phases: Vec<Stretch> = phases.collect();
         let whole = Stretch::new("all", 0.0, from_s, plan.objective.clone());
-        Report {
+        LoadReport {
             name: plan.name.clone(),
             points: Vec::new(),
             phases,
@@ -284,7 +284,7 @@ const SIZE: [f64; 2] = [860.0, 220.0];
 const MARGINS: [f64; 4] = [64.0, 12.0, 12.0, 28.0];
 
 /// A course over time: its name, its colour, and its values; one that is not finite is left out.
-type Course<'c> = (&'c str, &'c str, Vec<f64>);
+type Curve<'c> = (&'c str, &'c str, Vec<f64>);
 
 /// A round number that is at least this.
 fn round_up(value: f64) -> f64 {
@@ -296,7 +296,7 @@ fn round_up(value: f64) -> f64 {
 }
 
 /// A plot of courses over the seconds, with the phases behind it.
-fn plot(report: &Report, title: &str, courses: &[Course<'_>]) -> String {
+fn plot(report: &LoadReport, title: &str, courses: &[Curve<'_>]) -> String {
     let [width, height] = SIZE;
     let [left, top, right, bottom] = MARGINS;
     let last_s = report.points.last().map_or(1.0, |point| point.at_s).max(report.whole.to_s);
@@ -357,8 +357,9 @@ fn plot(report: &Report, title: &str, courses: &[Course<'_>]) -> String {
 }
 
 /// The report as one page that needs nothing else.
-fn page(report: &Report) -> String {
-    let of = |value: fn(&Outcome) -> f64| report.points.iter().map(|point| value(&point.outcome)).collect::<Vec<f64>>();
+fn page(report: &LoadReport) -> String {
+    let of =
+        |value: fn(&LoadOutcome) -> f64| report.points.iter().map(|point| value(&point.outcome)).collect::<Vec<f64>>();
     #[allow(clippy::cast_precision_loss)]
     let users = report.points.iter().map(|point| point.users as f64).collect();
     #[allow(clippy::cast_precision_loss)]

@@ -48,9 +48,9 @@ impl Stroke {
             }
         };
         let springs = scene.springs.as_ref().and_then(|springs| springs.stiffness_n_per_m);
-        let virtual_springs = scene.virtual_springs.as_ref().and_then(|springs| springs.stiffness_n_per_m);
+        let anchor_springs = scene.anchor_springs.as_ref().and_then(|springs| springs.stiffness_n_per_m);
         // With this force the middle moves by about a third of a spacing.
-        let stiffness_n_per_m = virtual_springs.unwrap_or(0.0) + 0.1 * springs.unwrap_or(0.0);
+        let stiffness_n_per_m = anchor_springs.unwrap_or(0.0) + 0.1 * springs.unwrap_or(0.0);
         Stroke {
             over,
             force_n: 0.3 * stiffness_n_per_m * spacing_m,

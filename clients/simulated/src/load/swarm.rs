@@ -205,10 +205,10 @@ async fn keep_awake(
     lasts_s: f64,
 ) -> Result<(), Error> {
     /// Fewer than a session queues.
-    const MOST_COMMANDS: u64 = 4000;
+    const MAX_COMMANDS: u64 = 4000;
     const APART_S: f64 = 0.05;
     let steps = (lasts_s * rate_hz) as u64;
-    let apart = ((APART_S * rate_hz) as u64).max(steps / MOST_COMMANDS).max(1);
+    let apart = ((APART_S * rate_hz) as u64).max(steps / MAX_COMMANDS).max(1);
     let mut haptics = HapticServiceClient::new(channel);
     let acquire = pb::AcquireToolRequest {
         session_id: id.to_owned(),

@@ -104,8 +104,8 @@ impl Tally {
 
     /// Summary of the counts.
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn outcome(&self, sessions: usize) -> Outcome {
-        Outcome {
+    pub(crate) fn outcome(&self, sessions: usize) -> LoadOutcome {
+        LoadOutcome {
             sessions,
             samples: self.samples,
             frames: self.frames,
@@ -166,7 +166,7 @@ pub(crate) fn listed(reasons: &BTreeMap<String, u64>) -> String {
 
 /// Summary of one load.
 #[derive(Debug, Clone)]
-pub struct Outcome {
+pub struct LoadOutcome {
     pub(crate) sessions: usize,
     /// Samples that came.
     pub samples: u64,
@@ -196,7 +196,7 @@ pub struct Outcome {
     pub(crate) generator_cores: f64,
 }
 
-impl Outcome {
+impl LoadOutcome {
     /// As one JSON object; what was not measured is `null`.
     pub fn json(&self, limit_sessions: Option<usize>) -> Value {
         let mut object = json!({

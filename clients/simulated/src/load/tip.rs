@@ -4,9 +4,9 @@
 use glam::DVec3;
 use palpate_proto::geometry::vector;
 use palpate_proto::{pb, touch};
+use palpate_touch::dead_reckoning::News;
 use palpate_touch::deadband::HEARTBEAT_S;
 use palpate_touch::hand::{Hand, HandState};
-use palpate_touch::news::News;
 use palpate_touch::{Device, Envelope, Renderer, RenderingState, Tip};
 use pb::command::Action;
 
@@ -43,7 +43,7 @@ const LASTS_S: f64 = 3600.0;
 const ASKS_EVERY_S: f64 = 0.3;
 
 /// Longest time that a hand moves between two ticks, s.
-const MOST_S: f64 = 0.02;
+const MAX_S: f64 = 0.02;
 
 /// What a haptic stream of such a client asks for.
 pub(crate) fn opening(open: pb::TouchOpen, lead: &Lead) -> pb::TouchOpen {
@@ -82,7 +82,7 @@ impl Holding {
         if self.began_s.is_nan() {
             (self.began_s, self.last_s) = (now_s, now_s);
         }
-        let (passed_s, from_s) = ((now_s - self.last_s).clamp(0.0, MOST_S), self.last_s - self.began_s);
+        let (passed_s, from_s) = ((now_s - self.last_s).clamp(0.0, MAX_S), self.last_s - self.began_s);
         if passed_s > 0.0 {
             let (from_m, to_m) = (self.task.at(from_s), self.task.at(from_s + passed_s));
             let string_n = self.hand.string_n(from_m, self.held.place_m);
@@ -94,20 +94,20 @@ impl Holding {
 }
 
 /// One client's tool.
-pub(crate) struct Led {
+pub(crate) struct LedTip {
     up: f64,
     renderer: Renderer,
     news: News,
     holding: Option<Holding>,
 }
 
-impl Led {
+impl LedTip {
     /// Of a stream that was opened, on a tissue with this middle; `None` if the server tells no law.
     pub(crate) fn new(opened: &pb::TouchOpened, lead: &Lead, middle_m: DVec3) -> Option<Self> {
         let law = touch::from_law(opened.law.as_ref()?).ok()?;
         let renderer = Renderer::new(law, Envelope::new(lead.device, middle_m));
         let holding = lead.hand.map(|hand| Holding::new(hand, middle_m));
-        Some(Led { up: lead.deadbands.up, renderer, news: News::default(), holding })
+        Some(LedTip { up: lead.deadbands.up, renderer, news: News::default(), holding })
     }
 
     /// A further law.

@@ -10,7 +10,7 @@ use tokio::sync::watch;
 
 use super::client::{Common, Stage, lock};
 use super::swarm::{Orders, Swarm};
-use super::tally::{Outcome, Tally};
+use super::tally::{LoadOutcome, Tally};
 use super::tip::{DEVICE, Deadbands, Lead};
 use super::{PHASES, tick};
 
@@ -19,7 +19,7 @@ const SETTLE: Duration = Duration::from_millis(500);
 
 /// What all sessions of a trial have.
 #[derive(Debug, Clone)]
-pub struct Trial {
+pub struct LoadTrial {
     /// Clients of each session, with one tool each. With 0, commands sent beforehand keep each session awake.
     pub clients_per_session: u32,
     /// Viewers of each session.
@@ -42,7 +42,7 @@ pub struct Trial {
 
 /// How a trial stands.
 #[derive(Debug, Clone, Copy)]
-pub struct Progress {
+pub struct TrialProgress {
     /// Since it began, s.
     pub at_s: f64,
     /// Samples so far.
@@ -53,7 +53,7 @@ pub struct Progress {
     pub round_trip_p99_s: f64,
 }
 
-impl Progress {
+impl TrialProgress {
     #[allow(clippy::cast_precision_loss)]
     fn of(tallies: &[Arc<Mutex<Tally>>], clock: Instant) -> Self {
         let (mut samples, mut rejected, mut p99_ns) = (0, 0, 0);
@@ -63,7 +63,7 @@ impl Progress {
             rejected += tally.rejected.values().sum::<u64>();
             p99_ns = p99_ns.max(tally.round_trip_ns.value_at_quantile(0.99));
         }
-        Progress { at_s: clock.elapsed().as_secs_f64(), samples, rejected, round_trip_p99_s: p99_ns as f64 * 1e-9 }
+        TrialProgress { at_s: clock.elapsed().as_secs_f64(), samples, rejected, round_trip_p99_s: p99_ns as f64 * 1e-9 }
     }
 }
 
@@ -73,13 +73,13 @@ impl Progress {
 /// # Errors
 /// Returns why the server refused a session, or could not be reached.
 pub async fn trial(
-    trial: &Trial,
+    trial: &LoadTrial,
     server: &Server,
     source: &Source,
     sessions: usize,
-    mut told: impl FnMut(&Progress),
+    mut told: impl FnMut(&TrialProgress),
     stop: impl Future<Output = ()>,
-) -> Result<Outcome, Error> {
+) -> Result<LoadOutcome, Error> {
     let stage = Arc::new(Stage::new());
     let clock = Instant::now();
     let threads = (trial.threads as usize).min(sessions);
@@ -131,7 +131,7 @@ pub async fn trial(
         let length = Duration::from_secs_f64(trial.seconds);
         while begun.elapsed() < length {
             tokio::time::sleep((length - begun.elapsed()).min(Duration::from_secs(1))).await;
-            told(&Progress::of(&tallies, clock));
+            told(&TrialProgress::of(&tallies, clock));
             // No stream is left to measure.
             let broken: u64 = tallies.iter().map(|tally| lock(tally).broken).sum();
             if broken > 0 && broken >= streams {
@@ -161,7 +161,7 @@ pub async fn trial(
     for tally in &tallies {
         all.add(&lock(tally));
     }
-    Ok(Outcome { generator_cores: cores.unwrap_or(f64::NAN), ..all.outcome(sessions) })
+    Ok(LoadOutcome { generator_cores: cores.unwrap_or(f64::NAN), ..all.outcome(sessions) })
 }
 
 /// The work of one thread.

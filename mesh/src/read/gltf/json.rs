@@ -10,12 +10,12 @@ use crate::Problem;
 use crate::read::source::named;
 
 /// Nodes, meshes, accessors and so on of a file. They take more memory than the text that they are from.
-pub(super) const MOST: usize = 1 << 14;
+pub(super) const MAX_NESTED: usize = 1 << 14;
 
 /// Extensions that are named in a refusal.
 const NAMED: usize = 8;
 
-/// A list of at most [`MOST`] entries.
+/// A list of at most [`MAX_NESTED`] entries.
 pub(super) struct Few<T>(pub(super) Vec<T>);
 
 impl<T> Default for Few<T> {
@@ -31,14 +31,14 @@ impl<'de, T: Deserialize<'de>> Deserialize<'de> for Few<T> {
             type Value = Few<T>;
 
             fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                write!(f, "a list of at most {MOST} entries")
+                write!(f, "a list of at most {MAX_NESTED} entries")
             }
 
             fn visit_seq<A: SeqAccess<'de>>(self, mut entries: A) -> Result<Few<T>, A::Error> {
                 let mut list = Vec::new();
                 while let Some(entry) = entries.next_element()? {
-                    if list.len() >= MOST {
-                        return Err(serde::de::Error::invalid_length(MOST + 1, &self));
+                    if list.len() >= MAX_NESTED {
+                        return Err(serde::de::Error::invalid_length(MAX_NESTED + 1, &self));
                     }
                     list.push(entry);
                 }
@@ -196,11 +196,11 @@ pub(super) struct Root {
     #[serde(default)]
     pub(super) scene: usize,
     #[serde(default)]
-    pub(super) scenes: Few<Scene>,
+    pub(super) scenes: Few<GltfScene>,
     #[serde(default)]
-    pub(super) nodes: Few<Node>,
+    pub(super) nodes: Few<GltfNode>,
     #[serde(default)]
-    pub(super) meshes: Few<Mesh>,
+    pub(super) meshes: Few<GltfMesh>,
     #[serde(default)]
     pub(super) materials: Few<Named>,
     #[serde(default)]
@@ -212,13 +212,13 @@ pub(super) struct Root {
 }
 
 #[derive(Deserialize)]
-pub(super) struct Scene {
+pub(super) struct GltfScene {
     #[serde(default)]
     pub(super) nodes: Few<u32>,
 }
 
 #[derive(Deserialize)]
-pub(super) struct Node {
+pub(super) struct GltfNode {
     pub(super) name: Option<String>,
     pub(super) mesh: Option<usize>,
     #[serde(default)]
@@ -235,7 +235,7 @@ pub(super) struct Named {
 }
 
 #[derive(Deserialize)]
-pub(super) struct Mesh {
+pub(super) struct GltfMesh {
     pub(super) name: Option<String>,
     #[serde(default)]
     pub(super) primitives: Few<Primitive>,

@@ -1,0 +1,229 @@
+// A worker that carries datagrams: a WebTransport session that belongs to a lease. It works however long the page takes to
+// draw: it repeats the newest pose, tells the server that it is there, and passes on what comes.
+
+import { create, fromBinary, toBinary } from "@bufbuild/protobuf";
+import { DatagramHealth } from "./datagram-health.js";
+import { PosesDatagramSchema, SampleDatagramSchema, TouchResponseSchema } from "./gen/palpate/v1/haptic_pb.js";
+import type { Rejection, Sample } from "./gen/palpate/v1/haptic_pb.js";
+import { type Lead, Poses } from "./poses.js";
+
+/** Interval between poses of a tool that rests: the server holds a tool after 50 ms without one. */
+const REPEAT_MS = 20;
+/** Interval between checks for something to send. */
+const TICK_MS = 10;
+/** A page that says nothing for so long leads nothing: a call's command has this time to live. */
+const PAGE_MS = 2000;
+/** Largest datagram, bytes. */
+const MAX_BYTES = 1024;
+/** Largest message of the stream, bytes. */
+const MAX_MESSAGE = 1 << 20;
+/** A datagram that has waited so long is out of date. */
+const OLD_MS = 50;
+
+/** The session to open: the page's first message. */
+export interface Order {
+  url: string;
+  certificateSha256: Uint8Array<ArrayBuffer>;
+  tool: number;
+}
+
+/** The page's further messages: where the tip is led. `from`: the sequence of the first pose since something else was commanded. */
+export interface Led {
+  lead: Lead;
+  from: bigint;
+}
+
+/** No pose goes out until another comes; and the end of the session. */
+export type Word = "rest" | "close";
+
+export interface Counts {
+  /** Datagrams. */
+  sent: number;
+  came: number;
+  /** Poses and samples in them. */
+  poses: number;
+  samples: number;
+  fellBack: number;
+}
+
+/** What the page hears. */
+export interface Heard {
+  carries: boolean;
+  counts: Counts;
+  /** Round trip minus the time that the server held a pose, ms. */
+  networkMs?: number;
+  sample?: Sample;
+  rejection?: Pick<Rejection, "reason" | "message">;
+  /** The session is over. */
+  isOver?: boolean;
+}
+
+// TypeScript can't load the type libraries for workers and for pages together.
+const page = self as unknown as {
+  onmessage: (event: MessageEvent<Order | Led | Word>) => void;
+  postMessage: (message: Heard) => void;
+  close: () => void;
+};
+
+class DatagramWorker {
+  private readonly session: WebTransport;
+  private readonly health = new DatagramHealth();
+  private readonly writer: WritableStreamDefaultWriter<Uint8Array>;
+  private counted = { poses: 0, samples: 0 };
+  private poses: Poses | undefined;
+  private led: Led | undefined;
+  private ledMs = 0;
+  private posedMs = 0;
+  private timeNs = 0n;
+  private repeatMs = REPEAT_MS;
+  private carries = false;
+  private networkMs: number | undefined;
+
+  constructor(private readonly order: Order) {
+    this.session = new WebTransport(order.url, {
+      serverCertificateHashes: [{ algorithm: "sha-256", value: order.certificateSha256 }],
+      requireUnreliable: true,
+    });
+    this.session.datagrams.outgoingMaxAge = OLD_MS;
+    this.writer = (this.session.datagrams.writable as WritableStream<Uint8Array>).getWriter();
+    // `run` tells how it ends.
+    this.session.closed.catch(() => undefined);
+    void this.run().catch(() => this.over());
+  }
+
+  private async run(): Promise<void> {
+    await this.session.ready;
+    const timer = setInterval(() => this.tick(), TICK_MS);
+    void this.session.closed.catch(() => undefined).then(() => clearInterval(timer));
+    await Promise.all([this.readDatagrams(), this.readStream(), this.session.closed]);
+    this.over();
+  }
+
+  close(): void {
+    // A session that is not open yet refuses to close.
+    void this.session.ready.then(() => this.session.close(), () => undefined).finally(() => page.close());
+  }
+
+  private over(): void {
+    this.carries = false;
+    this.tell({ isOver: true });
+    page.close();
+  }
+
+  lead(led: Led): void {
+    if (this.led?.from !== led.from) this.poses = new Poses(this.order.tool, led.from);
+    this.led = led;
+    this.ledMs = performance.now();
+    this.pose(this.ledMs);
+  }
+
+  rest(): void {
+    this.led = undefined;
+  }
+
+  private tick(): void {
+    const now = performance.now();
+    const carries = this.health.carries(now);
+    if (carries !== this.carries) {
+      this.carries = carries;
+      this.tell({});
+    }
+    // Meanwhile the page leads by calls, and begins anew.
+    if (!carries || now - this.ledMs > PAGE_MS) this.rest();
+    if (this.led && now - this.posedMs >= this.repeatMs) this.pose(now);
+    if (this.health.isSilent(now)) this.send([], now);
+  }
+
+  private pose(now: number): void {
+    if (!this.led || !this.poses || !this.carries) return;
+    const timeNs = BigInt(Math.round(now * 1e6));
+    // The clock of a page is coarse, and each pose needs a time of its own.
+    this.timeNs = timeNs > this.timeNs ? timeNs : this.timeNs + 1n;
+    this.posedMs = now;
+    this.counted.poses += 1;
+    this.send([this.poses.message(this.led.lead, this.timeNs)], now);
+  }
+
+  private send(tools: ReturnType<Poses["message"]>[], now: number): void {
+    const sentNs = BigInt(Math.round(now * 1e6));
+    const message = create(PosesDatagramSchema, { ...this.health.send(now), tools, sentNs });
+    const bytes = toBinary(PosesDatagramSchema, message);
+    if (bytes.length > Math.min(MAX_BYTES, this.session.datagrams.maxDatagramSize)) return;
+    // The end of the session is told by `closed`.
+    this.writer.write(bytes).catch(() => undefined);
+  }
+
+  private async readDatagrams(): Promise<void> {
+    const reader = (this.session.datagrams.readable as ReadableStream<Uint8Array>).getReader();
+    for (;;) {
+      const { value, done } = await reader.read();
+      if (done) return;
+      const now = performance.now();
+      const { number, acknowledges, heartbeatS, sample } = fromBinary(SampleDatagramSchema, value);
+      this.health.arrive(number, acknowledges, now);
+      this.carries = this.health.carries(now);
+      if (heartbeatS > 0) this.repeatMs = Math.min(REPEAT_MS, Math.max(10, 1000 * heartbeatS));
+      if (sample) this.counted.samples += 1;
+      this.passOn(sample, now);
+    }
+  }
+
+  /** What must not be lost, or is too long: each message after its length. */
+  private async readStream(): Promise<void> {
+    const streams = (this.session.incomingUnidirectionalStreams as ReadableStream<ReadableStream<Uint8Array>>).getReader();
+    const { value: stream } = await streams.read();
+    if (!stream) return;
+    const reader = stream.getReader();
+    let bytes = new Uint8Array();
+    for (;;) {
+      const { value, done } = await reader.read();
+      if (done) return;
+      bytes = joined(bytes, value);
+      while (bytes.length >= 4) {
+        const length = new DataView(bytes.buffer, bytes.byteOffset).getUint32(0, true);
+        if (length > MAX_MESSAGE) return this.session.close();
+        if (bytes.length < 4 + length) break;
+        const { message } = fromBinary(TouchResponseSchema, bytes.subarray(4, 4 + length));
+        bytes = bytes.slice(4 + length);
+        if (message.case === "sample") this.passOn(message.value, performance.now());
+        if (message.case === "rejection") {
+          const { reason, message: text } = message.value;
+          this.tell({ rejection: { reason, message: text } });
+        }
+      }
+    }
+  }
+
+  private passOn(sample: Sample | undefined, now: number): void {
+    if (!sample) return this.tell({});
+    const tool = sample.tools.find(({ tool }) => tool === this.order.tool);
+    // Calls have times of another clock.
+    if (tool && this.led && this.poses?.has(tool.acknowledgedSequence)) {
+      this.networkMs = Math.max(0, now - Number(tool.clientTimeNs + tool.serverHoldNs) / 1e6);
+    } else {
+      this.networkMs = undefined;
+    }
+    this.tell({ sample });
+  }
+
+  private tell(heard: Partial<Heard>): void {
+    const { sent, came, fellBack } = this.health;
+    const counts = { ...this.counted, sent: Number(sent), came: Number(came), fellBack };
+    page.postMessage({ carries: this.carries, counts, networkMs: this.networkMs, ...heard });
+  }
+}
+
+function joined(a: Uint8Array<ArrayBuffer>, b: Uint8Array): Uint8Array<ArrayBuffer> {
+  const both = new Uint8Array(a.length + b.length);
+  both.set(a);
+  both.set(b, a.length);
+  return both;
+}
+
+let worker: DatagramWorker | undefined;
+page.onmessage = ({ data }) => {
+  if (data === "close") return worker ? worker.close() : page.close();
+  if (data === "rest") return worker?.rest();
+  if ("lead" in data) return worker?.lead(data);
+  worker = new DatagramWorker(data);
+};

@@ -1,0 +1,135 @@
+//! A datagram session of a stream: what it carries, and when the stream has to.
+
+use std::sync::{Arc, Mutex};
+
+use palpate_proto::datagram::MAX_BYTES;
+use palpate_proto::pb;
+use palpate_touch::datagram_health::Carrier;
+use palpate_touch::dead_reckoning::SendInterval;
+use prost::Message;
+use wtransport::{Connection, VarInt};
+
+use super::tickets::Arrival;
+use crate::lock::lock;
+use crate::realtime::clock::now_ns;
+use crate::refusal::{Reason, Refusal, Result};
+use crate::server::rate::Bucket;
+use crate::session::sampling::WantedHeartbeat;
+
+/// The datagrams of a stream, in both directions. Who listens and who tells share it.
+#[derive(Debug)]
+pub(in crate::server) struct DatagramChannel {
+    /// How often a message is taken in. More of them overflow their buffer, which costs nothing.
+    pace: Mutex<Bucket>,
+    inner: Mutex<Inner>,
+    wanted: Arc<WantedHeartbeat>,
+}
+
+#[derive(Debug, Default)]
+struct Inner {
+    connection: Option<Connection>,
+    carrier: Carrier,
+    pulse: SendInterval,
+}
+
+fn seconds(ns: u64) -> f64 {
+    ns as f64 * 1e-9
+}
+
+impl DatagramChannel {
+    /// Messages are taken in at this pace.
+    pub(in crate::server) fn new(pace: Bucket) -> Self {
+        DatagramChannel { pace: Mutex::new(pace), inner: Mutex::default(), wanted: Arc::default() }
+    }
+
+    /// Waits for the session; `None` if nobody takes its ticket.
+    pub(in crate::server) async fn arrive(&self, arrival: &mut Option<Arrival>) -> Option<Connection> {
+        if let Some(waiting) = arrival {
+            let connection = waiting.await.ok();
+            *arrival = None;
+            lock(&self.inner).connection = connection;
+        }
+        lock(&self.inner).connection.clone()
+    }
+
+    /// The next message of the client, when there is time for it. Waits for ever if there is no session, or no more.
+    pub(in crate::server) async fn next(&self, arrival: &mut Option<Arrival>) -> Result<pb::PosesDatagram> {
+        let Some(connection) = self.arrive(arrival).await else { return std::future::pending().await };
+        loop {
+            let early = lock(&self.pace).time_to_one(now_ns());
+            let Some(early) = early else { break };
+            tokio::time::sleep(early).await;
+        }
+        let Ok(datagram) = connection.receive_datagram().await else {
+            lock(&self.inner).connection = None;
+            return std::future::pending().await;
+        };
+        let _ = lock(&self.pace).take(now_ns(), "datagrams of this stream");
+        let bytes = datagram.payload();
+        let wrong = |why: String| Refusal::new(Reason::Unreadable, "datagram", why);
+        if bytes.len() > MAX_BYTES {
+            return Err(wrong(format!("has {} bytes, more than {MAX_BYTES}", bytes.len())));
+        }
+        let message = pb::PosesDatagram::decode(bytes).map_err(|error| wrong(error.to_string()))?;
+        let now_s = seconds(now_ns());
+        let mut inner = lock(&self.inner);
+        inner.carrier.arrive(message.number, message.acknowledges, now_s);
+        inner.pulse.arrive(message.number, seconds(message.sent_ns), now_s);
+        drop(inner);
+        self.wanted.set(f64::from(message.heartbeat_s));
+        Ok(message)
+    }
+
+    /// Sends a sample, unless the stream has to carry it. Returns false then.
+    pub(in crate::server) fn send(&self, sample: &pb::Sample) -> bool {
+        let now_ns = now_ns();
+        let mut inner = lock(&self.inner);
+        inner.connection.is_some()
+            && inner.carrier.carries(seconds(now_ns))
+            && inner.datagram(Some(sample.clone()), now_ns).is_some()
+    }
+
+    /// Sends a sign of life if nothing was sent for a while.
+    pub(in crate::server) fn stay_alive(&self) {
+        let now_ns = now_ns();
+        let mut inner = lock(&self.inner);
+        if inner.connection.is_some() && inner.carrier.is_silent(seconds(now_ns)) {
+            inner.datagram(None, now_ns);
+        }
+    }
+
+    /// Ends the session, if there is one.
+    pub(in crate::server) fn part(&self) {
+        if let Some(connection) = lock(&self.inner).connection.take() {
+            connection.close(VarInt::from_u32(0), b"it is over");
+        }
+    }
+
+    /// How often the client wants samples.
+    pub(in crate::server) fn wanted(&self) -> Arc<WantedHeartbeat> {
+        self.wanted.clone()
+    }
+}
+
+impl Inner {
+    /// Sends a datagram; `None` if it is too long, or the session is over.
+    fn datagram(&mut self, sample: Option<pb::Sample>, now_ns: u64) -> Option<()> {
+        let connection = self.connection.as_ref()?;
+        let heartbeat_s = self.pulse.heartbeat_s(seconds(now_ns)) as f32;
+        let mut message = pb::SampleDatagram { number: 0, acknowledges: 0, heartbeat_s, sample, sent_ns: now_ns };
+        // Numbers are counted only for what is sent. They take a few bytes.
+        const NUMBERS_BYTES: usize = 22;
+        let most = connection.max_datagram_size().map_or(0, |most| most.min(MAX_BYTES));
+        if message.encoded_len() + NUMBERS_BYTES > most {
+            return None;
+        }
+        (message.number, message.acknowledges) = self.carrier.send(seconds(now_ns));
+        connection.send_datagram(message.encode_to_vec()).ok()
+    }
+}
+
+impl Drop for DatagramChannel {
+    fn drop(&mut self) {
+        self.part();
+    }
+}

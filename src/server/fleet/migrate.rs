@@ -1,0 +1,321 @@
+//! Moves sessions of this server to others while they go on.
+//!
+//! The other server first gets the session's state while it goes on, and makes its tissue of that: the longer part. Then the session
+//! stands here, the other gets its last state, and etcd says in one transaction that it is the owner. If anything fails before that,
+//! the session goes on here.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures_util::stream::{self, Stream};
+use palpate_proto::geometry::vector;
+use palpate_proto::{pb, touch};
+use palpate_touch::Law;
+use pb::take_session_request::Message as Say;
+use tokio::sync::mpsc;
+use tokio::time::timeout;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::Streaming;
+use tracing::{info, warn};
+
+use super::owned::Found;
+use super::{Fleet, elsewhere};
+use crate::cluster::key::SessionValue;
+use crate::cluster::{placement, rules};
+use crate::force_law::Disc;
+use crate::journal::inputs;
+use crate::lock::lock;
+use crate::realtime::clock::now_ns;
+use crate::realtime::{Present, SessionHandle};
+use crate::refusal::{Reason, Refusal, Result, excerpt};
+use crate::server::journals::recorded;
+use crate::session::intake_transfer::Handed;
+use crate::session::lease::HandedLease;
+
+/// The other server makes the tissue within this time, or the session stays.
+const PREPARATION: Duration = Duration::from_secs(30);
+
+/// etcd says within this time what is at the session's key, or the session stays.
+const CERTAINTY: Duration = Duration::from_secs(5);
+
+/// The session stands for no longer than this.
+const STANDSTILL: Duration = Duration::from_secs(2);
+
+/// Bytes in one message.
+const PART_BYTES: usize = 256 << 10;
+
+pub(super) fn broken(why: &str) -> Refusal {
+    Refusal::new(Reason::NotAvailable, "node", format!("the session stays here: {why}"))
+}
+
+/// One stream to the server that is to take a session.
+struct Handing {
+    say: mpsc::Sender<pb::TakeSessionRequest>,
+    heard: Streaming<pb::TakeSessionResponse>,
+}
+
+impl Handing {
+    async fn send(&self, message: Say) -> Result<()> {
+        let message = pb::TakeSessionRequest { message: Some(message) };
+        self.say.send(message).await.map_err(|_| broken("the other server has ended the stream"))
+    }
+
+    /// Sends a state, and waits until the other server has made a session of it.
+    async fn state(&mut self, bytes: &[u8]) -> Result<()> {
+        for part in bytes.chunks(PART_BYTES) {
+            self.send(Say::Part(part.to_vec())).await?;
+        }
+        self.send(Say::Part(Vec::new())).await?;
+        self.answered().await
+    }
+
+    async fn answered(&mut self) -> Result<()> {
+        match self.heard.message().await {
+            Ok(Some(_)) => Ok(()),
+            Ok(None) => Err(broken("the other server has ended the stream")),
+            Err(status) => Err(broken(status.message())),
+        }
+    }
+}
+
+#[allow(clippy::cast_precision_loss)]
+fn held_lease(lease: HandedLease) -> pb::HeldLease {
+    let HandedLease { tool, id, holder, duration_ns, owner } = lease;
+    pb::HeldLease { tool, lease_id: format!("{id:032x}"), holder, lease_s: duration_ns as f64 * 1e-9, owner }
+}
+
+/// Tells the other server that it has the session, what was in its intake, and what is known of its tissue.
+async fn hand(handing: &mut Handing, revision: u64, handed: Handed, laws: Vec<(Disc, Arc<Law>)>) -> Result<()> {
+    for piece in inputs::encoded(&handed.waiting) {
+        handing.send(Say::Waiting(piece)).await?;
+    }
+    let leases = handed.leases.into_iter().map(held_lease).collect();
+    let known = |(disc, law): &(Disc, Arc<Law>)| pb::KnownLaw {
+        radius_m: disc.radius_m,
+        at_m: vector(disc.at_m),
+        law: Some(touch::law(law, 0)),
+    };
+    let laws = laws.iter().map(known).collect();
+    handing.send(Say::TakeOver(pb::TakeOver { revision, leases, laws })).await?;
+    handing.answered().await
+}
+
+/// A session that is being handed over, till this is dropped.
+struct Moving<'f> {
+    fleet: &'f Fleet,
+    id: String,
+}
+
+impl Drop for Moving<'_> {
+    fn drop(&mut self) {
+        lock(&self.fleet.moving).remove(&self.id);
+    }
+}
+
+impl Fleet {
+    /// Moves a session of this server to `node`, or, if that is empty, to the one with the most room. Tells who has it then, and for
+    /// how long no step was done, s.
+    ///
+    /// # Errors
+    /// Refuses an unknown node, one that gives other bits, and if the other does not take it: then the session goes on here.
+    pub(in crate::server) async fn move_session(
+        self: Arc<Self>,
+        handle: Arc<SessionHandle>,
+        node: &str,
+    ) -> Result<(pb::Ownership, f64)> {
+        // Also if nobody waits for the answer any more: a session must not be left standing.
+        let (fleet, node) = (self.clone(), node.to_owned());
+        let moved = tokio::spawn(async move { fleet.move_to(&handle, &node).await });
+        moved.await.map_err(|error| broken(&error.to_string()))?
+    }
+
+    async fn move_to(&self, handle: &Arc<SessionHandle>, node: &str) -> Result<(pb::Ownership, f64)> {
+        let (name, there) = {
+            let nodes = self.nodes.borrow();
+            let own = lock(&self.own).replays;
+            let mut others = (**nodes).clone();
+            others.retain(|name, there| *name != self.node && there.replays == own);
+            let name = if node.is_empty() {
+                placement::roomiest(&others).unwrap_or_default().to_owned()
+            } else {
+                node.to_owned()
+            };
+            let Some(there) = others.remove(&name) else {
+                let message = if node.is_empty() {
+                    "no other server of the fleet takes sessions of this release".to_owned()
+                } else {
+                    format!("the fleet has no other server `{}` that computes the same bits", excerpt(node))
+                };
+                return Err(Refusal::new(Reason::OutOfRange, "node", message));
+            };
+            (name, there)
+        };
+        if handle.playback.is_some() {
+            return Err(Refusal::new(
+                Reason::NotAvailable,
+                "session_id",
+                "a session that plays a recording can't be moved",
+            ));
+        }
+        let _moving = self.begins_to_move(&handle.id)?;
+        self.ends_naming(&handle.id).await?;
+        let (say, said) = mpsc::channel(16);
+        let opening = self.peers.at(&there.endpoint)?.take_session(ReceiverStream::new(said)).await;
+        let heard = opening.map_err(|status| broken(status.message()))?.into_inner();
+        let mut handing = Handing { say, heard };
+        let first = self.state_of(handle, handle.save().await?).await?;
+        timeout(PREPARATION, handing.state(&first)).await.map_err(|_| broken("the other server is too slow"))??;
+        let present = handle.freeze().await?;
+        let begun_ns = now_ns();
+        let handed = timeout(STANDSTILL, self.hand_over(handle, present, &name, &mut handing)).await;
+        let revision = match handed.unwrap_or_else(|_| Err(broken("the other server or etcd is too slow"))) {
+            Ok(revision) => revision,
+            Err(refusal) => match self.settled(&handle.id).await {
+                Some((value, revision)) if value.node == name => revision,
+                Some((value, _)) if value.node == self.node => {
+                    handle.thaw();
+                    return Err(refusal);
+                }
+                found => {
+                    // Else who found that out has done so.
+                    if self.revision(&handle.id).is_some() {
+                        self.lose(&handle.id, self.is_lost(found));
+                    }
+                    return Err(refusal);
+                }
+            },
+        };
+        #[allow(clippy::cast_precision_loss)]
+        let gap_s = now_ns().saturating_sub(begun_ns) as f64 * 1e-9;
+        let standby = lock(&self.standbys).remove(&handle.id).unwrap_or_default();
+        self.lose(&handle.id, elsewhere(&name, there.endpoint.clone()));
+        self.tell_past(&handle.id, standby);
+        self.tally.moved.one_more();
+        info!(session = %handle.id, node = name, revision, gap_s, "session moved");
+        let value = SessionValue { node: name, standby: String::new() };
+        Ok((self.ownership(&value, revision), gap_s))
+    }
+
+    /// A session begins to be handed over, till what is returned is dropped.
+    ///
+    /// # Errors
+    /// Refuses one that is not this server's, or is being handed over.
+    fn begins_to_move(&self, id: &str) -> Result<Moving<'_>> {
+        if !lock(&self.moving).insert(id.to_owned()) {
+            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "the session is being moved already"));
+        }
+        let moving = Moving { fleet: self, id: id.to_owned() };
+        self.revision(id).map(|_| moving).ok_or_else(|| broken("it is not this server's"))
+    }
+
+    /// Waits until etcd says for certain who stands by for a session that begins to move. One that has just been created is about to
+    /// be told of its first: with that its key changes, and what was asked for at the revision before fails.
+    ///
+    /// # Errors
+    /// Refuses if etcd does not say so in time, and if another server has the session.
+    async fn ends_naming(&self, id: &str) -> Result<()> {
+        if lock(&self.standbys).get(id).is_none_or(|standby| standby.naming.is_none()) {
+            return Ok(());
+        }
+        let told = timeout(CERTAINTY, self.settled(id)).await;
+        let late = format!("etcd has not said within {} s who stands by for it", CERTAINTY.as_secs());
+        match told.map_err(|_| broken(&late))? {
+            Some((value, _)) if value.node == self.node => Ok(()),
+            found => Err(broken(&self.why_not(found.as_ref(), 0))),
+        }
+    }
+
+    /// Why a transaction for a session of this server at `revision` was not done, by what is at the session's key instead.
+    fn why_not(&self, found: Option<&(SessionValue, u64)>, revision: u64) -> String {
+        match found {
+            None => "it is not this server's any more".to_owned(),
+            Some((value, _)) if value.node != self.node => format!("etcd says that the server `{}` has it", value.node),
+            Some((_, now)) if *now == revision => "this server or the other has lost its lease".to_owned(),
+            Some(_) => "this server has just taken it back; try again".to_owned(),
+        }
+    }
+
+    /// The last part: the session stands.
+    async fn hand_over(
+        &self,
+        handle: &Arc<SessionHandle>,
+        present: Present,
+        to: &str,
+        handing: &mut Handing,
+    ) -> Result<u64> {
+        // The other server is told the revision at which it is handed over, and goes by that: at another it is not.
+        let revision = self.revision(&handle.id).ok_or_else(|| broken("it is not this server's"))?;
+        handle.is_owned_since(revision);
+        let last = self.state_of(handle, present).await?;
+        handing.state(&last).await?;
+        if !self.pacer.has(&handle.id) {
+            return Err(broken("it is deleted"));
+        }
+        let over = rules::hand_over(&self.keys, &handle.id, revision, [&self.node, to]);
+        let made = self.transact(over, &handle.id, |found| found.is_some_and(|value| value.node == to)).await?;
+        let revision = made.map_err(|found| broken(&self.why_not(found.as_ref(), revision)))?;
+        // From here on the session is the other's, whatever becomes of this stream.
+        let endpoint = self.nodes.borrow().get(to).map(|node| node.endpoint.clone()).unwrap_or_default();
+        let (handed, _) = handle.at_intake(|intake, _| intake.hand_over(elsewhere(to, endpoint)));
+        if hand(handing, revision, handed, handle.known_laws()).await.is_err() {
+            warn!(session = %handle.id, "the other server has the session, but has not said so");
+        }
+        Ok(revision)
+    }
+
+    /// Who has the session, after a transaction that may still be done: this server says once more that it has it, after which the
+    /// other can't be done any more. However long that takes, the session stands.
+    async fn settled(&self, id: &str) -> Found {
+        loop {
+            let revision = self.revision(id)?;
+            // Who certainly stands by goes on to do so.
+            let named = lock(&self.standbys).get(id).filter(|standby| standby.naming.is_none()).cloned();
+            let standby = named.unwrap_or_default().named;
+            let keep = |revision| rules::keep(&self.keys, id, revision, &self.node, &standby);
+            match self.change(id, revision, keep, |found| self.is_own(found, &standby)).await {
+                Ok(Ok(now)) => {
+                    if standby.is_empty() {
+                        self.names_nobody(id);
+                    }
+                    self.owns_since(id, now);
+                    self.pacer
+                        .list()
+                        .iter()
+                        .filter(|handle| handle.id == id)
+                        .for_each(|handle| handle.is_owned_since(now));
+                    return Some((SessionValue { node: self.node.clone(), standby }, now));
+                }
+                // Its lease has ended: what was asked for may still be done when it has another.
+                Ok(Err(Some((value, _)))) if value.node == self.node => {}
+                Ok(Err(found)) => return found,
+                Err(refusal) => warn!(session = %id, "who has this session is not known: {refusal}"),
+            }
+            tokio::time::sleep(Duration::from_millis(100)).await;
+        }
+    }
+
+    async fn state_of(&self, handle: &Arc<SessionHandle>, present: Present) -> Result<Vec<u8>> {
+        let handle = handle.clone();
+        let encoded = tokio::task::spawn_blocking(move || recorded::snapshot(&handle, &present)).await;
+        encoded.map_err(|error| broken(&error.to_string()))?
+    }
+
+    /// Takes no new sessions, and moves all to others; or takes sessions again. Tells what became of each.
+    pub(in crate::server) fn drain(self: Arc<Self>, is_on: bool) -> impl Stream<Item = pb::DrainNodeResponse> {
+        self.set_draining(is_on);
+        let sessions = if is_on { self.pacer.list() } else { Vec::new() };
+        let left: Vec<Arc<SessionHandle>> = sessions.into_iter().rev().filter(|handle| !handle.is_coming()).collect();
+        stream::unfold((self, left), |(fleet, mut left)| async move {
+            let handle = left.pop()?;
+            let session_id = handle.id.clone();
+            let moved = fleet.clone().move_session(handle, "").await;
+            let (node, fault) = match moved {
+                Ok((ownership, _)) => (ownership.node, String::new()),
+                Err(refusal) => (String::new(), refusal.to_string()),
+            };
+            let told =
+                pb::DrainNodeResponse { session_id, node, fault, left: u32::try_from(left.len()).unwrap_or(u32::MAX) };
+            Some((told, (fleet, left)))
+        })
+    }
+}

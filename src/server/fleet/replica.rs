@@ -1,0 +1,272 @@
+//! The journals of sessions for which this server stands by: received, written, and synced.
+
+use std::collections::BTreeMap;
+use std::fs::{DirBuilder, File};
+use std::os::unix::fs::{DirBuilderExt, FileExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use palpate_proto::pb;
+
+use crate::files;
+use crate::ids::random_id;
+use crate::journal;
+use crate::lock::lock;
+use crate::realtime::clock::now_ns;
+use crate::refusal::{Reason, Refusal, Result};
+
+/// Where they are, in the folder of journals.
+const FOLDER: &str = "standby";
+
+/// Where the server's own random number is, in the folder of journals.
+const INSTANCE: &str = "node";
+
+fn unusable(path: &Path, error: &std::io::Error) -> Refusal {
+    Refusal::new(Reason::Unreadable, "journal", format!("{}: can't be used: {error}", path.display()))
+}
+
+/// The number of the server whose journals are in `folder`; a new one if there is none.
+///
+/// # Errors
+/// Refuses a folder that can't be used.
+pub(super) fn instance(folder: &Path) -> Result<String> {
+    let path = folder.join(INSTANCE);
+    if path.symlink_metadata().is_ok() {
+        return Ok(files::read_regular_text(&path, files::MAX_SECRET_BYTES)?.trim().to_owned());
+    }
+    let id = random_id()?;
+    std::fs::write(&path, &id).map_err(|error| unusable(&path, &error))?;
+    Ok(id)
+}
+
+/// A journal for which this server stands by.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct ReplicaFile {
+    run: u32,
+    bytes: u64,
+    /// The server that sends it, or has sent it last; empty if that was before this process.
+    from: String,
+    /// The stream by which it comes; 0 if by none now.
+    stream: u64,
+    /// Since when none, if none.
+    since_ns: u64,
+}
+
+/// What is not needed any more is kept so long after its stream has ended, ns: a transaction that names this server may still be under
+/// way.
+const KEEPS_NS: u64 = 30_000_000_000;
+
+/// The journals for which this server stands by.
+pub(super) struct StandBy {
+    folder: PathBuf,
+    kept: Mutex<BTreeMap<String, ReplicaFile>>,
+    /// Streams so far.
+    streams: AtomicU64,
+}
+
+impl StandBy {
+    /// Those that are on the disk.
+    ///
+    /// # Errors
+    /// Refuses a folder that can't be used.
+    pub(super) fn open(journals: &Path) -> Result<Self> {
+        let folder = journals.join(FOLDER);
+        DirBuilder::new().recursive(true).mode(0o700).create(&folder).map_err(|error| unusable(&folder, &error))?;
+        let mut kept = BTreeMap::new();
+        for file in journal::file::list(&folder).map_err(|error| unusable(&folder, &error))? {
+            let bytes = std::fs::metadata(&file.path).map_or(0, |metadata| metadata.len());
+            // By ascending run: the newest stays.
+            let run = u32::try_from(file.run).unwrap_or(u32::MAX);
+            kept.insert(
+                file.session_id,
+                ReplicaFile { run, bytes, from: String::new(), stream: 0, since_ns: now_ns() },
+            );
+        }
+        Ok(StandBy { folder, kept: Mutex::new(kept), streams: 0.into() })
+    }
+
+    fn path(&self, id: &str, run: u32) -> PathBuf {
+        self.folder.join(journal::file::name(id, u64::from(run)))
+    }
+
+    /// All that is there.
+    pub(super) fn list(&self) -> Vec<pb::Mirrored> {
+        let kept = lock(&self.kept);
+        let of = |(id, kept): (&String, &ReplicaFile)| pb::Mirrored {
+            session_id: id.clone(),
+            run: kept.run,
+            durable_bytes: kept.bytes,
+        };
+        kept.iter().map(of).collect()
+    }
+
+    /// The number of a stream that begins.
+    pub(super) fn new_stream(&self) -> u64 {
+        self.streams.fetch_add(1, Ordering::Relaxed) + 1
+    }
+
+    /// A server begins to send. Tells it all that is there.
+    pub(super) fn stream_begins(&self, node: &str, stream: u64) -> Vec<pb::Mirrored> {
+        lock(&self.kept).values_mut().filter(|kept| kept.from == node).for_each(|kept| kept.stream = stream);
+        self.list()
+    }
+
+    /// Nothing more comes by a stream.
+    pub(super) fn stream_ended(&self, stream: u64) {
+        let by_it = |kept: &&mut ReplicaFile| kept.stream == stream;
+        for kept in lock(&self.kept).values_mut().filter(by_it) {
+            (kept.stream, kept.since_ns) = (0, now_ns());
+        }
+    }
+
+    /// Sessions whose journals no server sends now: by no stream, or by that of a server that is gone. One that is frozen keeps its
+    /// stream.
+    pub(super) fn unsent(&self, is_there: impl Fn(&str) -> bool) -> Vec<String> {
+        let kept = lock(&self.kept);
+        let unsent = kept.iter().filter(|(_, kept)| kept.stream == 0 || !is_there(&kept.from));
+        unsent.map(|(id, _)| id.clone()).collect()
+    }
+
+    /// Whether nobody has sent a journal for so long that nobody will.
+    pub(super) fn is_long_unsent(&self, id: &str) -> bool {
+        let is_long = |kept: &ReplicaFile| kept.stream == 0 && now_ns().saturating_sub(kept.since_ns) > KEEPS_NS;
+        lock(&self.kept).get(id).is_some_and(is_long)
+    }
+
+    /// The run of a session's journal that is here, if the session can go on from it.
+    pub(super) fn whole_run(&self, id: &str) -> Option<u32> {
+        let run = lock(&self.kept).get(id)?.run;
+        journal::JournalReader::open(&self.path(id, run)).is_ok().then_some(run)
+    }
+
+    /// Writes what a server has sent by a stream, and gets it to the disk. Tells how far the journals are there. Those of older runs
+    /// than are here come from a server that has lost the session, and does not know it yet: they are passed over.
+    ///
+    /// # Errors
+    /// Refuses parts that do not fit what is there, and what can't be written.
+    pub(super) fn take(&self, (node, stream): (&str, u64), parts: &[pb::MirrorPart]) -> Result<Vec<pb::Mirrored>> {
+        let mut files: BTreeMap<(&str, u32), File> = BTreeMap::new();
+        let mut taken: BTreeMap<&str, pb::Mirrored> = BTreeMap::new();
+        for pb::MirrorPart { session_id, run, offset, bytes } in parts {
+            let name = journal::file::name(session_id, u64::from(*run));
+            if journal::file::parse(&name).is_none() {
+                return Err(Refusal::new(Reason::OutOfRange, "session_id", "is not the ID of a session"));
+            }
+            let path = self.path(session_id, *run);
+            let known = lock(&self.kept).get(session_id).map(|kept| (kept.run, kept.bytes));
+            if known.is_some_and(|(newest, _)| *run < newest) {
+                continue;
+            }
+            let known = known.filter(|(of, _)| of == run).map_or(0, |(_, bytes)| bytes);
+            let there = if *offset == 0 { 0 } else { known };
+            if *offset != there {
+                let message = format!("is {offset}, but {there} bytes are there");
+                return Err(Refusal::new(Reason::OutOfTurn, "offset", message));
+            }
+            let failed = |error: std::io::Error| unusable(&path, &error);
+            let key = (session_id.as_str(), *run);
+            if *offset == 0 || !files.contains_key(&key) {
+                let mut options = File::options();
+                let file =
+                    options.write(true).create(true).truncate(*offset == 0).mode(0o600).open(&path).map_err(failed)?;
+                files.insert(key, file);
+            }
+            files[&key].write_all_at(bytes, *offset).map_err(failed)?;
+            let bytes = offset + bytes.len() as u64;
+            let kept = ReplicaFile { run: *run, bytes, from: node.to_owned(), stream, since_ns: 0 };
+            let before = lock(&self.kept).insert(session_id.clone(), kept);
+            if let Some(before) = before.filter(|before| before.run < *run) {
+                let _ = std::fs::remove_file(self.path(session_id, before.run));
+            }
+            let at = pb::Mirrored { session_id: session_id.clone(), run: *run, durable_bytes: bytes };
+            taken.insert(session_id, at);
+        }
+        for ((id, run), file) in &files {
+            file.sync_data().map_err(|error| unusable(&self.path(id, *run), &error))?;
+        }
+        Ok(taken.into_values().collect())
+    }
+
+    /// This server stands by for a session no longer.
+    pub(super) fn forget(&self, id: &str) {
+        if let Some(kept) = lock(&self.kept).remove(id) {
+            let _ = std::fs::remove_file(self.path(id, kept.run));
+        }
+    }
+
+    /// The same, if the journal has come from that server.
+    pub(super) fn forget_from(&self, node: &str, id: &str) {
+        let is_its = lock(&self.kept).get(id).is_some_and(|kept| kept.from == node);
+        if is_its {
+            self.forget(id);
+        }
+    }
+
+    /// Takes a journal out, to go on with it from `folder`. Tells its run.
+    ///
+    /// # Errors
+    /// Refuses if there is none, or it can't be moved.
+    pub(super) fn hand_out(&self, id: &str, folder: &Path) -> Result<u32> {
+        let missing = || Refusal::new(Reason::UnknownSession, "session_id", "no journal of this session is here");
+        let kept = lock(&self.kept).remove(id).ok_or_else(missing)?;
+        let from = self.path(id, kept.run);
+        let to = folder.join(journal::file::name(id, u64::from(kept.run)));
+        std::fs::rename(&from, &to).map_err(|error| unusable(&from, &error))?;
+        Ok(kept.run)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn part(id: &str, run: u32, offset: u64, bytes: &[u8]) -> pb::MirrorPart {
+        pb::MirrorPart { session_id: id.to_owned(), run, offset, bytes: bytes.to_vec() }
+    }
+
+    #[test]
+    fn parts_of_a_journal_come_in_order_and_stay_over_a_restart() {
+        let folder = tempfile::tempdir().unwrap();
+        let stand_by = StandBy::open(folder.path()).unwrap();
+        let from_a = ("a", stand_by.new_stream());
+        let at =
+            stand_by.take(from_a, &[part("s1", 1, 0, b"ab"), part("s1", 1, 2, b"cd"), part("s2", 7, 0, b"x")]).unwrap();
+        assert_eq!(at.iter().map(|at| at.durable_bytes).collect::<Vec<_>>(), [4, 1]);
+        // A gap, a path, and an offset of another run.
+        for bad in [part("s1", 1, 9, b"z"), part("../s1", 1, 0, b"z"), part("s1", 2, 4, b"z")] {
+            assert!(stand_by.take(from_a, &[bad]).is_err());
+        }
+        // A newer stream of the same server goes on when the older one ends. What the server does when it is gone is another matter.
+        let newer = stand_by.new_stream();
+        assert_eq!(stand_by.stream_begins("a", newer).len(), 2);
+        stand_by.stream_ended(from_a.1);
+        assert!(stand_by.unsent(|node| node == "a").is_empty());
+        assert_eq!(stand_by.unsent(|_| false), ["s1", "s2"]);
+        stand_by.stream_ended(newer);
+        assert_eq!(stand_by.unsent(|node| node == "a"), ["s1", "s2"]);
+        // Not at once: etcd may yet name this server.
+        assert!(!stand_by.is_long_unsent("s1"));
+        let again = StandBy::open(folder.path()).unwrap();
+        assert_eq!(again.list().iter().map(|at| at.durable_bytes).collect::<Vec<_>>(), [4, 1]);
+        // The next run takes the place of the one before, which is not taken any more.
+        let from_b = ("b", again.new_stream());
+        again.take(from_b, &[part("s1", 2, 0, b"n")]).unwrap();
+        assert!(!folder.path().join("standby/s1.1.mcap").exists());
+        assert_eq!(again.take(("a", again.new_stream()), &[part("s1", 1, 0, b"old")]).unwrap(), []);
+        assert_eq!(again.whole_run("s1"), None);
+        // Who has not sent it can't have it forgotten.
+        again.forget_from("a", "s1");
+        assert_eq!(again.hand_out("s1", folder.path()).unwrap(), 2);
+        assert_eq!(std::fs::read(folder.path().join("s1.2.mcap")).unwrap(), b"n");
+        again.forget("s2");
+        assert!(again.list().is_empty() && again.hand_out("s2", folder.path()).is_err());
+    }
+
+    #[test]
+    fn a_server_keeps_its_number() {
+        let folder = tempfile::tempdir().unwrap();
+        let first = instance(folder.path()).unwrap();
+        assert_eq!(instance(folder.path()).unwrap(), first);
+    }
+}

@@ -1,0 +1,144 @@
+//! Who holds tools: takes in what is said to them, by the stream or by datagram.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use palpate_proto::{datagram, pb};
+use palpate_touch::datagram_health::ReceiveWindow;
+use palpate_touch::device::Device;
+use tracing::{debug, info};
+
+use super::event::StreamEvent;
+use crate::limits::Limits;
+use crate::realtime::SessionHandle;
+use crate::realtime::clock::now_ns;
+use crate::realtime::queue::Writer;
+use crate::refusal::{Refusal, Result, number};
+use crate::scene::script::Action;
+use crate::server::rate::Bucket;
+use crate::server::traffic::Traffic;
+use crate::session::command::Command;
+use crate::session::lease::LeaseId;
+use crate::wire;
+
+/// Whoever holds the tools of a lease.
+pub(super) struct LeaseController {
+    pub(super) handle: Arc<SessionHandle>,
+    pub(super) lease: LeaseId,
+    device: Option<Device>,
+    traffic: Arc<Traffic>,
+    commands: Bucket,
+    /// Of each tool whose poses may come more than once those that have come.
+    seen: BTreeMap<u32, ReceiveWindow>,
+}
+
+/// A command, unless its pose is outside the declared workspace.
+fn within_reach(command: Command, handle: &SessionHandle, device: Option<&Device>) -> Result<Command> {
+    if let (Action::Pose { place_m, .. }, Some(device)) = (&command.action, device) {
+        // A device has its origin on the top; other clients may have it in the middle.
+        let shape = handle.model.shape();
+        let away_m = place_m.distance(shape.top_m()).min(place_m.distance(shape.extent().middle_m()));
+        let range =
+            format!("within {} m of the top or the middle of the tissue, the device's workspace", device.workspace_m);
+        number("pose.position_m", away_m, &range, |away_m| away_m <= device.workspace_m)?;
+    }
+    Ok(command)
+}
+
+/// Whether a command may also come by datagram: a pose that is played by the client's time.
+fn may_overtake(command: &pb::Command) -> bool {
+    let is_pose = matches!(command.action, Some(pb::command::Action::Pose(_)));
+    is_pose && command.client_time_ns != 0 && command.at_step.is_none() && command.sequence.is_some()
+}
+
+impl LeaseController {
+    /// Of the tools of a lease. `by_datagram`: their poses may come by datagram as well.
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn new(
+        handle: Arc<SessionHandle>,
+        lease: LeaseId,
+        tools: &[u32],
+        device: Option<Device>,
+        by_datagram: bool,
+        limits: &Limits,
+        traffic: Arc<Traffic>,
+    ) -> Self {
+        // So many for each step and tool, and at once twice what may wait.
+        let seen = tools.iter().filter(|_| by_datagram).map(|tool| (*tool, ReceiveWindow::default())).collect();
+        let tools = tools.len().max(1) as f64;
+        let per_s = limits.commands_per_step * handle.model.scene.stepping.rate_hz * tools;
+        let commands = Bucket::new(per_s, per_s.max(2.0 * limits.queued_commands_per_tool as f64 * tools));
+        LeaseController { handle, lease, device, traffic, commands, seen }
+    }
+
+    /// Takes in a command of the stream. Tells `events` if it is refused.
+    ///
+    /// # Errors
+    /// Returns a refusal that ends the stream: commands come far too fast.
+    pub(super) fn command(&mut self, command: &pb::Command, events: &Writer<StreamEvent>) -> Result<()> {
+        let by_datagram = self.seen.contains_key(&command.tool) && may_overtake(command);
+        // It may have come by datagram before.
+        if by_datagram && !self.is_new(command) {
+            return Ok(());
+        }
+        self.take(command, by_datagram, events)
+    }
+
+    /// How often commands may come.
+    pub(super) fn pace(&self) -> Bucket {
+        self.commands.clone()
+    }
+
+    /// Takes in the poses of a datagram. One that can't be read is dropped.
+    ///
+    /// # Errors
+    /// As for a command.
+    pub(super) fn datagram(&mut self, datagram: Result<pb::PosesDatagram>, events: &Writer<StreamEvent>) -> Result<()> {
+        let Ok(message) = datagram else { return Ok(()) };
+        for command in message.tools.iter().flat_map(datagram::commands) {
+            if may_overtake(&command) && self.is_new(&command) {
+                self.take(&command, true, events)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Counts something else that came with the commands.
+    ///
+    /// # Errors
+    /// Refuses it if too much comes; the flag tells whether that ends the stream.
+    pub(super) fn message(&mut self, now_ns: u64) -> std::result::Result<(), (Refusal, bool)> {
+        self.commands.take(now_ns, "messages of this stream").map_err(|refusal| (refusal, self.commands.is_abused()))
+    }
+
+    fn is_new(&mut self, command: &pb::Command) -> bool {
+        // A tool of somebody else is refused below.
+        let seen = self.seen.get_mut(&command.tool).zip(command.sequence);
+        seen.is_none_or(|(seen, sequence)| seen.take(sequence))
+    }
+
+    fn take(&mut self, message: &pb::Command, by_datagram: bool, events: &Writer<StreamEvent>) -> Result<()> {
+        let (handle, now) = (&self.handle, now_ns());
+        let taken = self
+            .commands
+            .take(now, "commands of this stream")
+            .and_then(|()| wire::command::from_command(message, handle.model.shape(), now))
+            .and_then(|command| within_reach(command, handle, self.device.as_ref()))
+            .and_then(|command| handle.submit(self.lease, vec![Command { by_datagram, ..command }]).map(drop));
+        self.traffic.commanded(usize::from(taken.is_ok()));
+        let Err(refusal) = taken else { return Ok(()) };
+        handle.count_refused(1);
+        self.traffic.refused(refusal.reason);
+        debug!(session = %handle.id, reason = refusal.reason.as_str(), %refusal, "command refused");
+        events.push(StreamEvent::Rejected(wire::sample::rejection(
+            message.tool,
+            message.sequence.unwrap_or_default(),
+            &refusal,
+        )));
+        if self.commands.is_abused() {
+            info!(session = %handle.id, "haptic stream ended: its commands come far too fast");
+            return Err(refusal);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,130 @@
+//! How far the journals of this server have grown, for who mirrors them.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+
+use tokio::sync::Notify;
+
+use super::folder::Grown as Growing;
+use crate::lock::lock;
+use crate::realtime::event_log::EventLog;
+
+/// Positions of a journal whose steps are remembered. Who is further behind is told of when it has caught up.
+const MAX_POSITIONS: usize = 256;
+
+/// The journal of a session.
+struct JournalFile {
+    run: u32,
+    path: PathBuf,
+    bytes: u64,
+    /// At so many bytes the journal is complete up to that step.
+    steps: VecDeque<(u64, u64)>,
+    event_log: Arc<EventLog>,
+    /// So many bytes of it are mirrored, anywhere.
+    mirrored_bytes: u64,
+}
+
+/// Where a journal is, and how long.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(in crate::server) struct Grown {
+    pub(in crate::server) session_id: String,
+    pub(in crate::server) run: u32,
+    pub(in crate::server) path: PathBuf,
+    pub(in crate::server) bytes: u64,
+}
+
+/// The journals that grow.
+#[derive(Default)]
+pub(in crate::server) struct Growth {
+    files: Mutex<BTreeMap<String, JournalFile>>,
+    news: Notify,
+    /// Of all journals so far.
+    mirrored_bytes: AtomicU64,
+}
+
+impl Growth {
+    /// A journal has so many bytes now, with which it is complete up to `step`.
+    pub(super) fn grew(&self, event_log: &Arc<EventLog>, run: u64, file: &Growing, step: u64) {
+        let (path, bytes) = (file.path(), file.bytes());
+        let run = u32::try_from(run).unwrap_or(u32::MAX);
+        let mut files = lock(&self.files);
+        let new = || JournalFile {
+            run,
+            path: path.to_owned(),
+            bytes,
+            steps: VecDeque::new(),
+            event_log: event_log.clone(),
+            mirrored_bytes: 0,
+        };
+        let file = files.entry(event_log.about.id.clone()).or_insert_with(new);
+        if file.run != run {
+            *file = new();
+        }
+        file.bytes = bytes;
+        if file.steps.len() >= MAX_POSITIONS {
+            file.steps.pop_front();
+        }
+        file.steps.push_back((bytes, step));
+        drop(files);
+        self.news.notify_waiters();
+    }
+
+    /// Nothing more comes of a session.
+    pub(in crate::server) fn ended(&self, session_id: &str) {
+        lock(&self.files).remove(session_id);
+        self.news.notify_waiters();
+    }
+
+    /// Nothing more comes of that run.
+    pub(super) fn is_complete(&self, session_id: &str, run: u32) {
+        let mut files = lock(&self.files);
+        if files.get(session_id).is_some_and(|file| file.run == run) {
+            files.remove(session_id);
+        }
+    }
+
+    /// Of what grew after this was called.
+    pub(in crate::server) fn news(&self) -> tokio::sync::futures::Notified<'_> {
+        self.news.notified()
+    }
+
+    /// The journals of sessions for which `chosen` holds.
+    pub(in crate::server) fn chosen(&self, chosen: impl Fn(&str) -> bool) -> Vec<Grown> {
+        let files = lock(&self.files);
+        let theirs = files.iter().filter(|(id, _)| chosen(id));
+        theirs
+            .map(|(id, file)| Grown {
+                session_id: id.clone(),
+                run: file.run,
+                path: file.path.clone(),
+                bytes: file.bytes,
+            })
+            .collect()
+    }
+
+    /// So many bytes of a run are mirrored: the step up to which that is complete, and the tape to tell.
+    pub(in crate::server) fn mirrored(&self, session_id: &str, run: u32, bytes: u64) -> Option<(Arc<EventLog>, u64)> {
+        let mut files = lock(&self.files);
+        let file = files.get_mut(session_id).filter(|file| file.run == run)?;
+        // A server that has just come to stand by begins anew: what another had before is counted once.
+        let more = bytes.min(file.bytes).saturating_sub(file.mirrored_bytes);
+        file.mirrored_bytes += more;
+        self.mirrored_bytes.fetch_add(more, Ordering::Relaxed);
+        let covered = file.steps.partition_point(|(at, _)| *at <= bytes);
+        let (_, step) = file.steps.get(covered.checked_sub(1)?)?;
+        Some((file.event_log.clone(), *step))
+    }
+
+    /// Bytes that another server has had on its disk so far; and those of journals that grow, and that none has had.
+    pub(in crate::server) fn mirrored_bytes(&self) -> (u64, u64) {
+        let unmirrored = lock(&self.files).values().map(|file| file.bytes.saturating_sub(file.mirrored_bytes)).sum();
+        (self.mirrored_bytes.load(Ordering::Relaxed), unmirrored)
+    }
+
+    /// Whether all is mirrored.
+    pub(in crate::server) fn is_mirrored(&self) -> bool {
+        lock(&self.files).values().all(|file| file.mirrored_bytes >= file.bytes)
+    }
+}

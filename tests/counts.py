@@ -1,0 +1,85 @@
+#!/usr/bin/env python3
+"""Counts what the rules of the code forbid, and exits with 1 if it finds any of it.
+
+    python3 tests/counts.py             every count, and the places beyond it
+    python3 tests/counts.py types       one count alone
+
+A type name means one thing: a public one is defined once in the workspace, a private one in at most two modules. Constants are
+named MAX_…, MIN_… and …_TIMEOUT in every language. A cell of a table in ARCHITECTURE.md has at most 40 words. (Circles of imports
+are counted by tests/architecture.rs.)
+"""
+
+import re
+import subprocess
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+CODE = (".rs", ".ts", ".mjs", ".js", ".py", ".pyi", ".cs", ".hpp", ".cpp", ".h", ".c", ".proto")
+TYPE = re.compile(r"^[ \t]*(pub(?:\([^)]*\))?[ \t]+)?(?:struct|enum|union|trait|type)[ \t]+([A-Z]\w*)", re.MULTILINE)
+CONSTANT = re.compile(r"\b(?:PATIENCE(?:_\w+)?|MOST_\w+|LEAST_\w+|OFF_SHEET)\b")
+MAX_WORDS = 40
+
+
+def files(*endings):
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout.split("\n")
+    here = Path(__file__).resolve()
+    for name in listed:
+        path = ROOT / name
+        if name.endswith(endings) and path.is_file() and path != here:
+            yield name, path.read_text(encoding="utf-8")
+
+
+def types():
+    public, all_of = defaultdict(list), defaultdict(set)
+    for name, text in files(".rs"):
+        for match in TYPE.finditer(text):
+            # `type` within a block is an associated type, or local to a function.
+            if match[0].lstrip().startswith("type") and match[0][0] in " \t":
+                continue
+            all_of[match[2]].add(name)
+            if (match[1] or "").strip() == "pub":
+                public[match[2]].append(name)
+    for kind, places in sorted(public.items()):
+        if len(places) > 1:
+            yield f"public type {kind} is defined {len(places)} times: {', '.join(places)}"
+    for kind, places in sorted(all_of.items()):
+        if len(places) > 2 and len(public[kind]) < 2:
+            yield f"type {kind} is defined in {len(places)} modules: {', '.join(sorted(places))}"
+
+
+def constants():
+    for name, text in files(*CODE):
+        for number, line in enumerate(text.split("\n"), 1):
+            for match in CONSTANT.finditer(line):
+                yield f"{name}:{number}: {match[0]}"
+
+
+def cells():
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    for number, line in enumerate(text.split("\n"), 1):
+        if line.startswith("|"):
+            for cell in line.strip("|").split("|"):
+                if len(cell.split()) > MAX_WORDS:
+                    yield f"ARCHITECTURE.md:{number}: {len(cell.split())} words: {cell.strip()[:60]}…"
+
+
+COUNTS = {"types": types, "constants": constants, "cells": cells}
+
+
+def main():
+    unknown = [name for name in sys.argv[1:] if name not in COUNTS]
+    if unknown:
+        sys.exit(f"unknown count {unknown[0]!r}: there are {', '.join(COUNTS)}")
+    found = False
+    for name in sys.argv[1:] or COUNTS:
+        places = list(COUNTS[name]())
+        print(f"{name}: {len(places)}")
+        print(*(f"  {place}" for place in places), sep="\n", end="\n" if places else "")
+        found |= bool(places)
+    sys.exit(1 if found else 0)
+
+
+if __name__ == "__main__":
+    main()
