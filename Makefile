@@ -66,7 +66,7 @@ help:
 	@echo 'make bench-organ     organs: time of a step, sleep, tips, and how even touch is: docs/benchmarks/organ.md'
 	@echo 'make bench-python    a run in Python beside the program, and a study of 1000 tissues beside numba and NumPy'
 	@echo 'make bench-load      sessions that one core bears, with clients and without: docs/benchmarks/load.md'
-	@echo '                     ATTACK=all: what a client notices of 41 attacks (an hour): docs/benchmarks/attacks.md;'
+	@echo '                     ATTACK=all: what a client notices of 59 attacks (half an hour): docs/benchmarks/attacks.md;'
 	@echo '                     one attack alone: make bench-load ATTACK=endless-scene'
 	@echo 'make bench-fleet     a fleet beside one server, and what etcd bears: docs/benchmarks/fleet.md;'
 	@echo '                     one part alone: ARGUMENTS=calls (or spread, steps, etcd)'
