@@ -284,32 +284,28 @@ fn what_a_crate_must_not_have_is_not_in_its_tree() {
     }
 }
 
+/// The parts of `text` between each `by` that is not in parentheses.
+fn split_outside<'t>(text: &'t str, by: &str) -> Vec<&'t str> {
+    let (mut parts, mut depth, mut begin) = (Vec::new(), 0, 0);
+    for (at, letter) in text.char_indices() {
+        depth += i32::from(letter == '(') - i32::from(letter == ')');
+        if depth == 0 && at >= begin && text[at..].starts_with(by) {
+            parts.push(&text[begin..at]);
+            begin = at + by.len();
+        }
+    }
+    parts.push(&text[begin..]);
+    parts
+}
+
 /// Whether an SPDX expression can be met by licences that are `allowed`. `AND` binds closer than `OR`, for which some write `/`.
 fn is_met(expression: &str, allowed: &dyn Fn(&str) -> bool) -> bool {
-    let (mut depth, mut ends, mut begin) = (0, Vec::new(), 0);
     let text = expression.replace('/', " OR ");
-    let mut split = |by: &str| {
-        ends.clear();
-        (depth, begin) = (0, 0);
-        for (at, letter) in text.char_indices() {
-            depth += i32::from(letter == '(') - i32::from(letter == ')');
-            if depth == 0 && at >= begin && text[at..].starts_with(by) {
-                ends.push(text[begin..at].trim().to_owned());
-                begin = at + by.len();
-            }
-        }
-        ends.push(text[begin..].trim().to_owned());
-        ends.clone()
+    let is_one_met = |one: &str| match one.trim().strip_prefix('(').and_then(|inner| inner.strip_suffix(')')) {
+        Some(inner) => is_met(inner, allowed),
+        None => allowed(one.trim()),
     };
-    let (alternatives, all) = (split(" OR "), split(" AND "));
-    match () {
-        () if alternatives.len() > 1 => alternatives.iter().any(|part| is_met(part, allowed)),
-        () if all.len() > 1 => all.iter().all(|part| is_met(part, allowed)),
-        () => match text.trim().strip_prefix('(').and_then(|inner| inner.strip_suffix(')')) {
-            Some(inner) => is_met(inner, allowed),
-            None => allowed(text.trim()),
-        },
-    }
+    split_outside(&text, " OR ").into_iter().any(|part| split_outside(part, " AND ").into_iter().all(is_one_met))
 }
 
 #[test]

@@ -17,15 +17,15 @@ use server::{TEST_TIMEOUT, TestServer, TestTouch, force, position};
 
 /// What one client has sent and heard.
 #[derive(Default)]
-struct ClientLedger {
+struct SoakLedger {
     sent: u64,
     refused: u64,
     seen: u64,
 }
 
 /// A session of its own for a while, with a client, a viewer or both, that ends well or badly.
-async fn life(server: &TestServer, random: &mut TestRandom) -> ClientLedger {
-    let mut account = ClientLedger::default();
+async fn life(server: &TestServer, random: &mut TestRandom) -> SoakLedger {
+    let mut account = SoakLedger::default();
     let session = server.paper(false).await;
     let mut touch = TestTouch::hold(server, &session).await;
     let mut frames = None;
@@ -117,7 +117,7 @@ fn nothing_grows_and_no_command_is_lost() {
                 let mut random = TestRandom(round * 1000 + number);
                 let until = Instant::now() + length;
                 runtime.spawn(async move {
-                    let (mut lives, mut account) = (0_u64, ClientLedger::default());
+                    let (mut lives, mut account) = (0_u64, SoakLedger::default());
                     while Instant::now() < until {
                         let one = life(&server, &mut random).await;
                         account.sent += one.sent;

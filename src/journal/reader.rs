@@ -220,7 +220,7 @@ pub struct Survey {
     pub torn_bytes: u64,
     /// Whether the file has a summary, so that every tool opens it.
     pub sealed: bool,
-    /// Why reading ended before the end, if the file is damaged there and is read [up to that](Reader::up_to_damage).
+    /// Why reading ended before the end, if the file is damaged there and is read [up to that](JournalReader::up_to_damage).
     pub damage: Option<String>,
 }
 
@@ -440,7 +440,7 @@ impl<R: Read + Seek> JournalReader<R> {
     /// One pass over the file, from its beginning, which is where it is afterwards. `progress` gets the bytes that are read.
     ///
     /// # Errors
-    /// Refuses a file that is damaged in the middle, unless it is read [up to that](Reader::up_to_damage).
+    /// Refuses a file that is damaged in the middle, unless it is read [up to that](JournalReader::up_to_damage).
     pub fn survey(&mut self, progress: &mut dyn FnMut(u64)) -> Result<Survey> {
         self.rewind();
         let mut survey = Survey { whole_bytes: self.begin, ..Survey::default() };
@@ -475,7 +475,7 @@ impl<R: Read + Seek> JournalReader<R> {
     /// The next batch; `None` after the last whole one.
     ///
     /// # Errors
-    /// Refuses a file that is damaged before its end, unless it is read [up to that](Reader::up_to_damage).
+    /// Refuses a file that is damaged before its end, unless it is read [up to that](JournalReader::up_to_damage).
     pub fn next_batch(&mut self) -> Result<Option<JournalBatch>> {
         while !self.ended {
             let wrong = match self.next_record()? {

@@ -1,5 +1,5 @@
 //! What is read of large sheets: records of many points and hashes. A stepping thread copies the sheet
-//! ([`ReadCopy`](crate::tissue::ReadCopy)); a thread with a lower priority, named `records`, reads the copies in slices,
+//! ([`ReadCopy`]); a thread with a lower priority, named `records`, reads the copies in slices,
 //! callers in turns. What one caller reads is read in order. The same thread frees what deleted sessions leave behind.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};

@@ -53,7 +53,7 @@ pub struct Status {
     pub path_counts: [u64; 3],
     /// Tools whose lease lapsed.
     pub lapsed_leases: u64,
-    /// The tissue as it is: [`SessionHandle::change`](super::Live::change) may have made another of it.
+    /// The tissue as it is: [`SessionHandle::change`](super::SessionHandle::change) may have made another of it.
     pub model: Arc<Model>,
 }
 

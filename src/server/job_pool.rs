@@ -58,7 +58,7 @@ struct Job {
 }
 
 #[derive(Default)]
-struct JobQueue {
+struct PoolState {
     waiting: Turns<Job>,
     /// The running jobs: the account's number, and when the job was requested, ns.
     running: Vec<(u64, u64)>,
@@ -66,18 +66,25 @@ struct JobQueue {
     is_closed: bool,
 }
 
-impl JobQueue {
-    fn is_running(&self, account: u64) -> bool {
-        self.running.iter().any(|running| running.0 == account)
-    }
+/// Whether one of the `running` jobs is of `account`.
+fn is_running(running: &[(u64, u64)], account: u64) -> bool {
+    running.iter().any(|job| job.0 == account)
+}
 
+impl PoolState {
     /// Starts the first job of the next account without a running job, and returns both.
     fn start_next(&mut self) -> Option<(u64, Job)> {
-        let (account, job) = self.waiting.next(|account| !self.running.iter().any(|running| running.0 == account))?;
+        let (account, job) = self.waiting.next(|account| !is_running(&self.running, account))?;
         self.running.push((account, job.requested_ns));
         Some((account, job))
     }
 
+    /// Returns whether another job may start.
+    fn may_start(&self) -> bool {
+        self.waiting.accounts().any(|account| !is_running(&self.running, account))
+    }
+
+    /// Ends the running job of `account`.
     fn end(&mut self, account: u64) {
         if let Some(done) = self.running.iter().position(|running| running.0 == account) {
             self.running.swap_remove(done);
@@ -86,7 +93,7 @@ impl JobQueue {
 }
 
 struct PoolShared {
-    queue: Mutex<JobQueue>,
+    queue: Mutex<PoolState>,
     changed: Condvar,
     deadline: Duration,
     most_waiting: usize,
@@ -108,7 +115,9 @@ impl PoolShared {
     /// job, for as short as can be, and wakes others without it.
     fn next(&self, done: Option<u64>) -> Option<(u64, Job)> {
         let mut queue = lock(&self.queue);
-        done.into_iter().for_each(|account| queue.end(account));
+        if let Some(account) = done {
+            queue.end(account);
+        }
         let next = loop {
             if let Some(next) = queue.start_next() {
                 break next;
@@ -118,7 +127,7 @@ impl PoolShared {
             }
             queue = self.changed.wait(queue).unwrap_or_else(PoisonError::into_inner);
         };
-        let is_more = queue.waiting.accounts().any(|account| !queue.is_running(account));
+        let is_more = queue.may_start();
         drop(queue);
         if is_more {
             self.changed.notify_one();

@@ -11,7 +11,7 @@
 //! tool ever leaps.
 //!
 //! **News alone.** A command may say how fast the tool moves. Then its client sends the next one only when the tool is not
-//! where this movement leads ([`crate::news`]), and over a gap the tool goes on along it, for [`EXTRAPOLATE_S`] at most. So the
+//! where this movement leads ([`crate::dead_reckoning`]), and over a gap the tool goes on along it, for [`EXTRAPOLATE_S`] at most. So the
 //! played moment need not stop when nothing newer is there. It keeps to the arrivals instead: it falls back by a tenth while
 //! commands come too late for it, and catches up as above.
 //!

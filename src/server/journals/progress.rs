@@ -15,7 +15,7 @@ use crate::realtime::event_log::EventLog;
 const MAX_POSITIONS: usize = 256;
 
 /// The journal of a session.
-struct JournalFile {
+struct TrackedJournal {
     run: u32,
     path: PathBuf,
     bytes: u64,
@@ -38,7 +38,7 @@ pub(in crate::server) struct Grown {
 /// The journals that grow.
 #[derive(Default)]
 pub(in crate::server) struct Growth {
-    files: Mutex<BTreeMap<String, JournalFile>>,
+    files: Mutex<BTreeMap<String, TrackedJournal>>,
     news: Notify,
     /// Of all journals so far.
     mirrored_bytes: AtomicU64,
@@ -50,7 +50,7 @@ impl Growth {
         let (path, bytes) = (file.path(), file.bytes());
         let run = u32::try_from(run).unwrap_or(u32::MAX);
         let mut files = lock(&self.files);
-        let new = || JournalFile {
+        let new = || TrackedJournal {
             run,
             path: path.to_owned(),
             bytes,
