@@ -19,7 +19,7 @@ MODULES := clients/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
 	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
-.PHONY: help run programs install header test-abi bench-tick build release viewer page-if-node test test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run programs install header test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos
 
@@ -30,6 +30,7 @@ help:
 	@echo 'make header          clients/c/include/palpate.h from its sources'
 	@echo 'make viewer          the page that shows the tissue, clients/viewer/dist (Node.js; make run does it by itself)'
 	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
+	@echo 'make test-long       every test of Rust in its long form, an hour: docs/tests.md tells what is longer'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): tests/determinism under qemu-user; says what it needs'
@@ -150,6 +151,10 @@ test: build $(VENV)/ready test-viewer test-python
 	sh tests/abi/check.sh $(BUILT) interface
 	$(VENV)/bin/python -m unittest discover -s tests/python -v
 
+test-long: build
+	PALPATE_LONG=1 PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace --no-fail-fast -- --include-ignored \
+		--skip write_the_golden_file
+
 test-viewer: build viewer
 	cd $(VIEWER) && $(NPM) test
 	cd $(TYPESCRIPT) && $(NPM) test
@@ -207,9 +212,12 @@ stress: need-rust
 	PALPATE_STRESS_SCENES=10000 PALPATE_STRESS_MESHES=200 PALPATE_STRESS_THIN=1000 PALPATE_SNAPSHOTS=5000 $(CARGO) test --release \
 		--test stress --test legal --test physics --test thin --test restored -- --include-ignored --nocapture
 
+# The unit tests of the tissue, and the golden hashes.
+KERNEL := --package palpate-tissue --package palpate --lib --test determinism
+
 # Another processor, the same bits. The compiler and the standard library for ARM are Debian's. An emulated vector takes some
 # thousand times as long: `make test-arm ARM_TESTS="--test determinism"` for whole courses, and hours.
-ARM_TESTS ?= --lib -- a_plan_gives every_operation
+ARM_TESTS ?= --package palpate-tissue --lib -- a_plan_gives every_operation
 ARM := aarch64-unknown-linux-gnu
 need-arm:
 	@test -x /usr/bin/cargo -a -d /usr/lib/rustlib/$(ARM) && command -v aarch64-linux-gnu-gcc qemu-aarch64 >/dev/null || \
@@ -226,21 +234,21 @@ test-arm: need-arm
 test-asan: need-rust
 	CARGO_PROFILE_RELEASE_OPT_LEVEL=1 CARGO_PROFILE_RELEASE_CODEGEN_UNITS=16 CARGO_PROFILE_RELEASE_DEBUG=false \
 		RUSTC_BOOTSTRAP=1 RUSTFLAGS=-Zsanitizer=address $(CARGO) test --release --target $(shell uname -m)-unknown-linux-gnu \
-		--target-dir target/asan --lib --test determinism -- tissue:: bits hash
+		--target-dir target/asan $(KERNEL) -- --skip scene:: --skip texture::
 
 # Memcheck does not know AVX-512: `auto` becomes AVX2.
 test-valgrind: need-rust
 	@command -v valgrind >/dev/null || { echo 'valgrind is missing (Debian: apt-get install valgrind)' >&2; exit 1; }
 	CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER='valgrind --error-exitcode=1 --quiet' \
-		$(CARGO) test --release --lib --test determinism -- every_operation region:: a_plan_gives the_golden_hash --test-threads=1
+		$(CARGO) test --release $(KERNEL) -- every_operation region:: a_plan_gives the_golden_hash --test-threads=1
 
 # tests/abi/check.sh says what it leaves out because a tool is missing.
 test-abi: build
 	sh tests/abi/check.sh $(BUILT)
 
 test-debug: need-rust
-	CARGO_PROFILE_RELEASE_DEBUG_ASSERTIONS=true $(CARGO) test --release --target-dir target/assertions --lib \
-		--test determinism --test physics
+	CARGO_PROFILE_RELEASE_DEBUG_ASSERTIONS=true $(CARGO) test --release --target-dir target/assertions $(KERNEL) \
+		--package palpate-session --test physics
 
 # `make test-mutants ARGUMENTS='--count 20 --seed 7 --afresh'`; exit status 1 if fewer than nine in ten are caught.
 test-mutants: need-rust need-python
@@ -250,7 +258,7 @@ test-mutants: need-rust need-python
 # A million inputs a decoder; FUZZ_INPUTS=… for more.
 FUZZ_INPUTS ?= 1000000
 fuzz: need-rust
-	PALPATE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(CARGO) test --release --package palpate --package palpate-mesh --test fuzz --test allocated -- --nocapture
+	PALPATE_FUZZ_INPUTS=$(FUZZ_INPUTS) $(CARGO) test --release --package palpate --package palpate-geometry --test fuzz --test allocated -- --nocapture
 
 # The same functions under libFuzzer, which looks for inputs that reach further; needs a C++ compiler, and no other Rust.
 TARGET ?= request

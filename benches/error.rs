@@ -20,10 +20,10 @@ use std::sync::Arc;
 
 use frontier::{Curve, SchemeTrial, cheapest, is_best, on_any_frontier};
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::script::Script;
-use palpate::session::Session;
-use palpate::tissue::Model;
+use palpate_session::Session;
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::script::Script;
 use report::chart::{Look, Panel, Series};
 use report::{BenchReport, cells, digits, least, quick, rough, seconds};
 use scenes::{CASES, Case};

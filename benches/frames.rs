@@ -13,12 +13,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::realtime::frames::Delivery;
-use palpate::scene::profile::Poke;
-use palpate::scene::{PAPER, Scene};
-use palpate::surface::{Encoding, Frame, FrameTiles, Refinement, Snapshot, encode, encode_over};
-use palpate::tissue::{Push, at_rest};
+use palpate_realtime::frames::Delivery;
+use palpate_session::surface::{Encoding, Frame, FrameTiles, Refinement, Snapshot, encode, encode_over};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::{PAPER, Scene};
+use palpate_tissue::{Push, at_rest};
 use report::chart::Panel;
 use report::{BenchReport, cells, digits, quick, seconds};
 use serde_json::json;
@@ -195,7 +195,7 @@ fn poke(force_n: DVec3, refinement: u32, report: &mut BenchReport, rows: &mut Ve
                     time_dilation: 1.0,
                 };
                 // Including the protocol's overhead.
-                let messages = palpate::wire::sample::frame(&"0".repeat(32), &delivery, 0);
+                let messages = palpate::server::frame_message::frame_messages(&"0".repeat(32), &delivery, 0);
                 sent.bytes += messages.iter().map(prost::Message::encoded_len).sum::<usize>();
                 sent.frames += 1;
                 // Comparing every frame would take too long.

@@ -20,8 +20,8 @@ use std::path::Path;
 use std::process::Command;
 
 use glam::DVec3;
-use palpate::scene::profile::Poke;
-use palpate::tissue::{Push, Tissue, at_rest};
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::{Push, Tissue, at_rest};
 use report::chart::{Look, Panel, Series};
 use report::{BenchReport, digits, quick, seconds};
 use serde_json::{Value, json};

@@ -13,9 +13,9 @@ mod report;
 mod server;
 
 use links::{by_seed, link, links, number};
-use palpate::limits::Limits;
-use palpate::scene::{BUILT_IN, Scene};
-use palpate::tissue::{Model, tangent};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{BUILT_IN, Scene};
+use palpate_tissue::{Model, tangent};
 use report::chart::{Look, Panel, Series};
 use report::{BenchReport, cells, digits, quick, rough};
 use serde_json::{Value, json};

@@ -21,10 +21,10 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use glam::DVec3;
-use palpate::scene::profile::Poke;
-use palpate::scene::{Lanes, Named};
-use palpate::tissue::mesh::{MeshGraph, MeshSpring, MeshTrial};
-use palpate::tissue::{Push, Tissue, at_rest};
+use palpate_tissue::mesh::{MeshGraph, MeshSpring, MeshTrial};
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::{Lanes, Named};
+use palpate_tissue::{Push, Tissue, at_rest};
 use report::chart::{Look, Panel, Series};
 use report::{BenchReport, digits, least, quick, seconds};
 use serde_json::json;

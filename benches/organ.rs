@@ -8,12 +8,12 @@ mod report;
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::profile::Poke;
-use palpate::scene::{BUILT_IN, Named, Scene};
-use palpate::shape::points;
-use palpate::tissue::{Model, Push, Tissue, at_rest, tangent};
-use palpate_touch::{Coupling, Tip};
+use palpate_haptics::{Coupling, Tip};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::{BUILT_IN, Named, Scene};
+use palpate_tissue::shape::points;
+use palpate_tissue::{Model, Push, Tissue, at_rest, tangent};
 use report::chart::{Look, Panel, Series};
 use report::{BenchReport, cells, digits, least, quick, seconds};
 use serde_json::json;

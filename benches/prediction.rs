@@ -15,12 +15,12 @@ use std::time::{Duration, Instant};
 
 use glam::DVec3;
 use links::{by_seed, link, links, number};
-use palpate::limits::Limits;
-use palpate::scene::{BUILT_IN, Scene};
-use palpate::session::prediction::TissueCopy;
-use palpate::tissue::{Footprint, Model};
+use palpate_haptics::{Predictor, Tip};
 use palpate_proto::pb;
-use palpate_touch::{Predictor, Tip};
+use palpate_session::prediction::TissueCopy;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{BUILT_IN, Scene};
+use palpate_tissue::{Footprint, Model};
 use report::chart::{Look, Panel, Series};
 use report::{BenchReport, cells, digits, quick};
 use serde_json::{Value, json};
@@ -221,7 +221,7 @@ fn cost(report: &mut BenchReport) {
         let at = |part: f64| times_us[((times_us.len() - 1) as f64 * part) as usize];
         let snapshot = runtime.block_on(snapshot(&server, name));
         let began = Instant::now();
-        drop(palpate::journal::prediction(&snapshot, Tip::default()).unwrap());
+        drop(palpate_session::journal::prediction(&snapshot, Tip::default()).unwrap());
         let made_ms = 1e3 * began.elapsed().as_secs_f64();
         let (points, megabytes) = (model.shape().point_count(), 1e-6 * snapshot.len() as f64);
         let values = [at(0.5), at(0.99), at(1.0), megabytes, made_ms];

@@ -8,8 +8,8 @@ mod report;
 mod subject;
 
 use glam::DVec3;
-use palpate::scene::profile::{CentreProfile, LoadProfile, Profile, StrengthProfile};
-use palpate::tissue::{Push, at_rest};
+use palpate_tissue::scene::profile::{CentreProfile, LoadProfile, Profile, StrengthProfile};
+use palpate_tissue::{Push, at_rest};
 use report::chart::{Look, Panel, Series};
 use report::{BenchReport, cells, digits, quick, rough, seconds};
 use serde_json::json;

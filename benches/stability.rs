@@ -16,12 +16,12 @@ mod subject;
 use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
-use palpate::limits::Limits;
-use palpate::scene::profile::{CentreProfile, LoadProfile, Poke, Profile, StrengthProfile};
-use palpate::scene::{Body, Integrator, Mesh, Named, Scene};
-use palpate::session::Session;
-use palpate::shape::PointId;
-use palpate::tissue::{Model, Push, at_rest};
+use palpate_session::Session;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::{CentreProfile, LoadProfile, Poke, Profile, StrengthProfile};
+use palpate_tissue::scene::{Body, Integrator, Mesh, Named, Scene};
+use palpate_tissue::shape::PointId;
+use palpate_tissue::{Model, Push, at_rest};
 use report::chart::Panel;
 use report::{BenchReport, cells, digits};
 use serde_json::{Value, json};
@@ -49,7 +49,7 @@ struct SchemeCase {
 }
 
 impl SchemeCase {
-    fn model(self, step_s: f64) -> palpate::refusal::Result<Arc<Model>> {
+    fn model(self, step_s: f64) -> palpate_refusal::Result<Arc<Model>> {
         let varied = [
             set(INTEGRATOR, self.integrator),
             set("springs.stiffness_n_per_m", self.spring_n_per_m),

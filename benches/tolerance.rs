@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::process::ExitCode;
 use std::time::Instant;
 
-use palpate::scene::{Named, Precision};
+use palpate_tissue::scene::{Named, Precision};
 use random_scenes::{audited_errors, case, errors, play, truth};
 use report::chart::{Look, Panel, Series};
 use report::{BenchReport, quick, rough};

@@ -11,14 +11,14 @@ use std::sync::Arc;
 
 use chart::{Look, Panel, Series, svg};
 use glam::DVec3;
-use palpate::limits::Limits;
 use palpate::render::{Camera, Film, View};
-use palpate::scene::script::Script;
-use palpate::scene::{BUILT_IN, PAPER, Scene};
-use palpate::session::{Session, run};
-use palpate::surface::Refinement;
-use palpate::texture;
-use palpate::tissue::{Model, tangent};
+use palpate_session::surface::Refinement;
+use palpate_session::{Session, run};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::script::Script;
+use palpate_tissue::scene::{BUILT_IN, PAPER, Scene};
+use palpate_tissue::texture;
+use palpate_tissue::{Model, tangent};
 
 const SIZE: [usize; 2] = [560, 420];
 

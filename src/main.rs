@@ -160,7 +160,7 @@ enum ServerCommand {
 }
 
 fn main() -> ExitCode {
-    let ended = match palpate::arguments::parse::<ServerArguments>().command {
+    let ended = match palpate_arguments::parse::<ServerArguments>().command {
         ServerCommand::Run(arguments) => within_memory(|| run::run_script(&arguments)),
         ServerCommand::Check(arguments) => within_memory(|| check::check(&arguments)),
         ServerCommand::Render(arguments) => within_memory(|| render::render(&arguments)),

@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use palpate::cluster::agones::{self, ServerStatus};
+use palpate_cluster::agones::{self, ServerStatus};
 use palpate_proto::agones::Empty;
 use palpate_proto::agones::beta::sdk_server::{Sdk as Counters, SdkServer as CountersServer};
 use palpate_proto::agones::beta::{Counter, GetCounterRequest, UpdateCounterRequest};

@@ -13,6 +13,8 @@
 
 #[path = "common/counting.rs"]
 mod counting;
+#[path = "common/form.rs"]
+mod form;
 #[path = "common/moved.rs"]
 mod moved;
 
@@ -22,19 +24,19 @@ use std::sync::Arc;
 
 use counting::counted;
 use fastrand::Rng;
-use palpate::budget::{Account, Budget, Purpose, Resource};
-use palpate::journal::records::{self, Chunk};
-use palpate::journal::{JournalReader, REPLAYS, Topic, message, pb as kept};
-use palpate::limits::Limits;
-use palpate::refusal::{Reason, Result};
-use palpate::scene::{BUILT_IN, PAPER, Scene};
-use palpate::session::Session;
-use palpate::session::saved::{self, Saved};
-use palpate::tissue::Model;
-use palpate::wire;
-use palpate_mesh::TriangleMesh;
+use palpate_geometry::TriangleMesh;
 use palpate_proto::measure::{MULTIPLE, ROOM, Shape};
 use palpate_proto::pb;
+use palpate_refusal::{Reason, Result};
+use palpate_session::Session;
+use palpate_session::budget::{Account, Budget, Purpose, Resource};
+use palpate_session::journal::records::{self, Chunk};
+use palpate_session::journal::{JournalReader, REPLAYS, Topic, message, pb as kept};
+use palpate_session::saved::{self, Saved};
+use palpate_session::wire;
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{BUILT_IN, PAPER, Scene};
 use prost::Message;
 
 /// What is not counted: short texts of refusals, and the least that an allocation is.
@@ -95,7 +97,8 @@ fn random_message(random: &mut Rng, levels: u32) -> Vec<u8> {
 
 #[test]
 fn a_message_takes_no_more_than_was_measured() {
-    let inputs: u64 = std::env::var("PALPATE_FUZZ_INPUTS").map_or(10_000, |text| text.parse().unwrap());
+    let inputs: u64 =
+        std::env::var("PALPATE_FUZZ_INPUTS").map_or_else(|_| form::form(3000, 100_000), |text| text.parse().unwrap());
     let mut random = Rng::with_seed(0x3e_a5);
     let mut most: BTreeMap<&str, f64> = BTreeMap::new();
     let (mut decoded, mut refused) = (0, 0);
@@ -185,7 +188,7 @@ fn read_all(file: &[u8], account: &Account) -> Result<()> {
     let mut reader = JournalReader::paid("test", Cursor::new(file), Some(paid))?;
     let _survey = reader.survey(&mut |_| {})?;
     while let Some(batch) = reader.next_batch()? {
-        let _items = palpate::journal::replay::items(&batch)?;
+        let _items = palpate_session::journal::replay::items(&batch)?;
         let (_felt, _waiting, _end) = (batch.felt()?, batch.waiting()?, batch.end()?);
     }
     Ok(())
@@ -245,7 +248,8 @@ fn a_snapshot_takes_no_more_than_its_header_says() {
     let parts = &whole[36..36 + length];
     let mut random = Rng::with_seed(0x5a_7e);
     let mut most: f64 = 0.0;
-    let inputs: u64 = std::env::var("PALPATE_FUZZ_INPUTS").map_or(2_000, |text| text.parse().unwrap());
+    let inputs: u64 =
+        std::env::var("PALPATE_FUZZ_INPUTS").map_or_else(|_| form::form(1000, 20_000), |text| text.parse().unwrap());
     let mut try_one = |parts: &[u8]| {
         let bytes = snapshot(parts);
         let (_, took) = counted(|| Saved::from_bytes(&bytes, &Limits::default()).map(drop));

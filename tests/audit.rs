@@ -11,18 +11,18 @@ use std::time::Instant;
 
 use common::{SMALL, model, playing, scene_with, script};
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::record::{AuditedError, Correction, Summary};
-use palpate::scene::script::Action;
-use palpate::scene::{BUILT_IN, Integrator, Precision, Scene};
-use palpate::session::Session;
-use palpate::session::audit::Windows;
-use palpate::session::command::Due;
-use palpate::session::run::{self, command};
-use palpate::tissue::Model;
-use palpate::tissue::audit::{AuditFinding, ErrorExtent, FINER, Mark, Origin, WindowInputs};
+use palpate_haptics::Tip;
 use palpate_proto::pb;
-use palpate_touch::Tip;
+use palpate_session::Session;
+use palpate_session::audit::Windows;
+use palpate_session::command::Due;
+use palpate_session::run::{self, command};
+use palpate_tissue::Model;
+use palpate_tissue::audit::{AuditFinding, ErrorExtent, FINER, Mark, Origin, WindowInputs};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::record::{AuditedError, Correction, Summary};
+use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::{BUILT_IN, Integrator, Precision, Scene};
 use pb::create_session_request::Source;
 use serde_json::Value;
 use server::{TEST_TIMEOUT, TestServer, TestTouch, force};
@@ -341,9 +341,9 @@ fn a_correction_brings_the_error_below_the_tolerance() {
 /// A session with steps too coarse for its tolerance.
 fn coarse(correct: bool) -> Source {
     let settings = ["stepping.integrator=lagged".to_owned(), "stepping.substeps=1".to_owned()];
-    let mut scene = Scene::parse("paper", palpate::scene::PAPER, &settings, &Limits::default()).unwrap();
+    let mut scene = Scene::parse("paper", palpate_tissue::scene::PAPER, &settings, &Limits::default()).unwrap();
     scene.stepping.correct = correct;
-    Source::Scene(palpate::wire::scene::scene(&scene))
+    Source::Scene(palpate_session::wire::scene::scene(&scene))
 }
 
 /// Pushes up and down until the status is as `wanted`.
@@ -411,7 +411,7 @@ async fn a_correction_that_would_take_longer_than_a_scene_may_is_refused_and_tol
     let Source::Scene(scene) = coarse(true) else { unreachable!() };
     // Without rehearsals, which would find another scheme, a correction is more substeps of this one.
     let limits = Limits { rehearsal_work: 1, ..Limits::default() };
-    let model = Model::compile(&palpate::wire::scene::from_scene(&scene, None).unwrap(), &limits).unwrap();
+    let model = Model::compile(&palpate_session::wire::scene::from_scene(&scene, None).unwrap(), &limits).unwrap();
     // As long as the scene's own steps are predicted to take, and no longer.
     let periods = 1.000_001 * model.predicted_step_s() * model.scene.stepping.rate_hz;
     let folder = tempfile::tempdir().unwrap();

@@ -16,16 +16,16 @@ use std::time::Instant;
 use closed_mesh::closed_mesh;
 use fastrand::Rng;
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::refusal::Refusal;
-use palpate::scene::Scene;
-use palpate::scene::profile::Poke;
-use palpate::scene::script::{Action, Script};
-use palpate::session::command::Command;
-use palpate::session::intake::Intake;
-use palpate::session::{Session, check};
-use palpate::tissue::Model;
-use palpate_touch::{Coupling, Tip};
+use palpate_haptics::{Coupling, Tip};
+use palpate_refusal::Refusal;
+use palpate_session::command::Command;
+use palpate_session::intake::Intake;
+use palpate_session::{Session, check};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Scene;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::script::{Action, Script};
 
 const LEASE: u128 = 1;
 

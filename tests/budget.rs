@@ -110,7 +110,7 @@ async fn force_laws_are_charged_and_go_with_their_session() {
     let session_id = server.paper(true).await;
     let laws = || metric(&metrics, "palpate_memory_taken_bytes{for=\"laws\"}");
     assert_eq!(laws(), 0.0);
-    let device = palpate_touch::Device::named("omega3").unwrap();
+    let device = palpate_haptics::Device::named("omega3").unwrap();
     let device = Some(palpate_proto::touch::device(&device));
     let touch =
         server::TestTouch::open(&server, pb::TouchOpen { device, ..server::open(&session_id, &[0]) }).await.unwrap();

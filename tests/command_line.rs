@@ -4,8 +4,8 @@
 use std::path::Path;
 use std::process::Command;
 
-use palpate_mesh::write::{Format, write};
-use palpate_mesh::{TriangleMesh, organ};
+use palpate_geometry::write::{Format, write};
+use palpate_geometry::{TriangleMesh, organ};
 
 /// Exit status, and both outputs.
 fn palpate(folder: &Path, arguments: &[&str]) -> (i32, String) {

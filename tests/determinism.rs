@@ -6,10 +6,10 @@ mod common;
 use std::sync::Arc;
 
 use common::{playing, scene_with, script};
-use palpate::limits::Limits;
-use palpate::scene::{PAPER, Scene};
-use palpate::session::run::run;
-use palpate::tissue::{self, Grasp, Model};
+use palpate_session::run::run;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{PAPER, Scene};
+use palpate_tissue::{self as tissue, Grasp, Model};
 
 const ALL_LAWS: &str = r#"
 duration_s = 0.3

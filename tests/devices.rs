@@ -22,8 +22,8 @@ use inverse_service::{InverseService, Wrong};
 use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, run};
 use palpate_client::devices::{Enables, Placed, Placement, open};
 use palpate_client::{Credentials, HapticDevice, Reading};
-use palpate_touch::device::SAFE_FORCE_N;
-use palpate_touch::{Device, RenderingState, Tip};
+use palpate_haptics::device::SAFE_FORCE_N;
+use palpate_haptics::{Device, RenderingState, Tip};
 use server::{TEST_TIMEOUT, TestServer, client_program};
 
 /// The middle of the scene `liver`.

@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use etcd::{Certificates, EtcdMembers, SHORT_TIMES};
-use palpate::cluster::etcd::{
+use palpate_cluster::etcd::{
     Compare, Etcd as Client, EtcdError, EtcdOptions, Op, TransactionOutcome, Txn, Watch, WatchError, WatchEvent,
 };
 use rcgen::{BasicConstraints, CertificateParams, DistinguishedName, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair};

@@ -1,6 +1,6 @@
 //! A fleet in virtual time: nodes with clocks, pauses, crashes and partitions, etcd by its promises, and clients. The histories of
 //! seeded random runs are checked: never two owners at once, no durable input lost, no revision goes back, an owner soon after
-//! faults stop, and what is deleted stays so. The rules are those of `palpate::cluster`; each of them broken on purpose is found.
+//! faults stop, and what is deleted stays so. The rules are those of `palpate_cluster`; each of them broken on purpose is found.
 #![allow(unreachable_pub, clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "fleet_model/broken.rs"]

@@ -17,14 +17,14 @@ use std::sync::{Arc, Mutex};
 use etcd::EtcdMembers;
 use fleet::{Node, until, until_stood_by};
 use glam::DVec3;
-use palpate::journal::{JournalReader, file};
-use palpate::limits::Limits;
-use palpate::scene::collection::find_scene;
 use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, run};
 use palpate_client::{Credentials, HapticDevice, Reading};
+use palpate_haptics::envelope::{PAUSE_S, SLEW_N_PER_S};
+use palpate_haptics::{Device, RenderingState, Tip};
 use palpate_proto::pb;
-use palpate_touch::envelope::{PAUSE_S, SLEW_N_PER_S};
-use palpate_touch::{Device, RenderingState, Tip};
+use palpate_session::journal::{JournalReader, file};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::collection::find_scene;
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 
@@ -178,7 +178,7 @@ async fn two(folder: &Path, etcd: &[String]) -> Vec<Node> {
 async fn create(node: &Node) -> String {
     let (limits, points) = (Limits::default(), "sheet.points=[9, 9]".to_owned());
     let scene = find_scene(Path::new("liver"), Path::new("scenes"), &[points], &limits).unwrap();
-    let source = pb::create_session_request::Source::Scene(palpate::wire::scene::sent(&scene));
+    let source = pb::create_session_request::Source::Scene(palpate_session::wire::scene::sent(&scene));
     node.there().create(source, false).await.unwrap().session_id
 }
 
@@ -204,7 +204,7 @@ fn ended_leases(node: &Node, id: &str) -> usize {
     let (mut reader, mut ended) = (JournalReader::open(&newest.path).unwrap(), 0);
     while let Some(batch) = reader.next_batch().unwrap() {
         for input in batch.inputs().unwrap() {
-            if let Some(palpate::journal::pb::input::What::Command(command)) = input.what {
+            if let Some(palpate_session::journal::pb::input::What::Command(command)) = input.what {
                 ended += usize::from(command.ends_lease);
             }
         }

@@ -6,6 +6,8 @@
 
 #[path = "common/counting.rs"]
 mod counting;
+#[path = "common/form.rs"]
+mod form;
 #[path = "../fuzz/src/lib.rs"]
 #[allow(dead_code, clippy::cast_possible_truncation)]
 mod targets;
@@ -156,7 +158,8 @@ fn fuzz(target: &FuzzTarget, inputs: u64) {
 }
 
 fn fuzz_named(name: &str) {
-    let inputs = std::env::var("PALPATE_FUZZ_INPUTS").map_or(20_000, |text| text.parse().unwrap());
+    let inputs =
+        std::env::var("PALPATE_FUZZ_INPUTS").map_or_else(|_| form::form(6000, 200_000), |text| text.parse().unwrap());
     fuzz(TARGETS.iter().find(|target| target.name == name).unwrap(), inputs);
 }
 

@@ -366,9 +366,9 @@ async fn who_does_not_read_loses_samples_and_delays_nobody() {
 
 /// A sheet of so many points, 10,000 times a second.
 fn frequent(points_x: u32, points_y: u32) -> Source {
-    let limits = palpate::limits::Limits::default();
-    let paper = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[], &limits).unwrap();
-    let mut scene = palpate::wire::scene::scene(&paper);
+    let limits = palpate_tissue::limits::Limits::default();
+    let paper = palpate_tissue::scene::Scene::parse("paper", palpate_tissue::scene::PAPER, &[], &limits).unwrap();
+    let mut scene = palpate_session::wire::scene::scene(&paper);
     let sheet = scene.sheet.as_mut().unwrap();
     (sheet.points_x, sheet.points_y) = (Some(points_x), Some(points_y));
     scene.stepping.as_mut().unwrap().rate_hz = Some(10_000.0);

@@ -1,6 +1,8 @@
 //! Journals: what is written is read again, whatever happens to the file, and gives the same bits.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_possible_truncation)]
 
+#[path = "common/form.rs"]
+mod form;
 #[path = "common/journal_opening.rs"]
 mod journal_opening;
 
@@ -10,18 +12,18 @@ use std::sync::Arc;
 
 use glam::DVec3;
 use journal_opening::opening;
-use palpate::journal::replay::{JournalItem, items};
-use palpate::journal::{self, JournalReader, JournalWriter, Opening, ReplayEvent, pb, recover};
-use palpate::limits::Limits;
-use palpate::refusal::Reason;
-use palpate::scene::script::Action;
-use palpate::scene::{Change, PAPER, Scene};
-use palpate::session::Session;
-use palpate::session::command::{Command, Due};
-use palpate::session::input::Input;
-use palpate::tissue::Model;
-use palpate::tissue::scheme_selection::NEVER;
-use palpate_touch::Tip;
+use palpate_haptics::Tip;
+use palpate_refusal::Reason;
+use palpate_session::Session;
+use palpate_session::command::{Command, Due};
+use palpate_session::input::Input;
+use palpate_session::journal::replay::{JournalItem, items};
+use palpate_session::journal::{self, JournalReader, JournalWriter, Opening, ReplayEvent, pb, recover};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::{Change, PAPER, Scene};
+use palpate_tissue::scheme_selection::NEVER;
 
 /// 2026-01-01.
 const BEGUN_NS: u64 = 1_767_225_600_000_000_000;
@@ -103,7 +105,7 @@ fn small() -> Arc<Model> {
     model(&["sheet.points=[7, 7]"])
 }
 
-fn survey(bytes: &[u8]) -> palpate::refusal::Result<palpate::journal::Survey> {
+fn survey(bytes: &[u8]) -> palpate_refusal::Result<palpate_session::journal::Survey> {
     JournalReader::new("test", Cursor::new(bytes))?.survey(&mut |_| {})
 }
 
@@ -185,7 +187,7 @@ fn a_bit_that_is_other_is_found_or_harmless() {
     let all = inputs(&file);
     let (mut refused, mut torn, mut harmless) = (0, 0, 0);
     let mut rng = fastrand::Rng::with_seed(1);
-    let count = if std::env::var_os("PALPATE_LONG").is_some() { 100_000 } else { 3000 };
+    let count = form::form(3000, 100_000);
     for _ in 0..count {
         let mut bent = file.clone();
         let (at, bit) = (rng.usize(..bent.len()), rng.u8(..8));
@@ -216,7 +218,7 @@ fn a_sealed_file_opens_with_the_reader_of_mcap() {
     let first = small();
     let (mut file, ends) = written(&first, 200, true);
     let mut sealed = Cursor::new(std::mem::take(&mut file));
-    palpate::journal::seal::seal(&mut sealed).unwrap();
+    palpate_session::journal::seal::seal(&mut sealed).unwrap();
     let file = sealed.into_inner();
     let found = survey(&file).unwrap();
     assert!(found.sealed && found.torn_bytes == 0 && found.batches == ends.len() as u64, "{found:?}");
@@ -231,9 +233,9 @@ fn a_sealed_file_opens_with_the_reader_of_mcap() {
         assert_eq!(indexes.len(), index.message_index_offsets.len());
     }
     let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join(palpate::journal::file::name("abc", 3));
+    let path = folder.path().join(palpate_session::journal::file::name("abc", 3));
     std::fs::write(&path, &file).unwrap();
-    assert_eq!(palpate::journal::file::list(folder.path()).unwrap()[0].run, 3);
+    assert_eq!(palpate_session::journal::file::list(folder.path()).unwrap()[0].run, 3);
     assert!(JournalReader::open(&path).is_ok());
     assert!(JournalReader::open(Path::new("nowhere.1.mcap")).is_err());
 }
@@ -243,7 +245,7 @@ fn a_sealed_file_opens_with_the_reader_of_mcap() {
 #[test]
 #[allow(clippy::disallowed_methods)] // The time is told, and decides nothing.
 fn a_long_touch_verifies() {
-    let steps = if std::env::var_os("PALPATE_LONG").is_some() { 600_000 } else { 3000 };
+    let steps = form::form(3000, 600_000);
     let (file, _) = written(&model(&["sheet.points=[31, 31]"]), steps, true);
     let begun = std::time::Instant::now();
     let verdict = journal::verify(reader(&file), &Limits::default(), &mut |_, _| {}).unwrap();
@@ -354,7 +356,7 @@ fn steps_at_rest_are_skipped_and_seen_where_somebody_wants_to() {
     let survey = read.survey(&mut |_| {}).unwrap();
     let mut seen = Vec::new();
     let mut replay = journal::Replay::new(read, survey, &Limits::default()).unwrap().stopping_every(1500);
-    let see: &mut dyn FnMut(ReplayEvent<'_>) -> palpate::refusal::Result<()> = &mut |what| {
+    let see: &mut dyn FnMut(ReplayEvent<'_>) -> palpate_refusal::Result<()> = &mut |what| {
         if let ReplayEvent::Step(session) = what {
             seen.push(session.step_count());
         }
@@ -414,7 +416,7 @@ fn a_copy_for_a_client_is_bounded_whatever_a_server_sends() {
     let copy = |sets: &[&str]| {
         let model = model(sets);
         let radius_m = 2.0 * model.shape().edge_m();
-        palpate::journal::prediction(&snapshot_bytes(&model, radius_m), tip)
+        palpate_session::journal::prediction(&snapshot_bytes(&model, radius_m), tip)
     };
     let refused = |sets: &[&str], why: &str| {
         let said = copy(sets).err().unwrap();

@@ -17,10 +17,10 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use palpate::journal::file::JournalFile;
-use palpate::journal::{JournalReader, file, pb as kept, replay};
-use palpate::limits::Limits;
 use palpate_proto::pb;
+use palpate_session::journal::file::JournalFile;
+use palpate_session::journal::{JournalReader, file, pb as kept, replay};
+use palpate_tissue::limits::Limits;
 use pb::touch_response::Message as Heard;
 use random::TestRandom;
 use server::{TestServer, TestTouch, force};

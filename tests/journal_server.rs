@@ -13,9 +13,9 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use journal_opening::opening;
-use palpate::limits::Limits;
-use palpate::tissue::scheme_selection::NEVER;
 use palpate_proto::pb;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scheme_selection::NEVER;
 use server::{TEST_TIMEOUT, TestServer, TestTouch, force, waiting};
 
 fn start(folder: &Path) -> TestServer {
@@ -24,14 +24,14 @@ fn start(folder: &Path) -> TestServer {
 
 /// The journals of a session, by run.
 fn files(folder: &Path, session_id: &str) -> Vec<PathBuf> {
-    let listed = palpate::journal::file::list(folder).unwrap();
+    let listed = palpate_session::journal::file::list(folder).unwrap();
     listed.into_iter().filter(|file| file.session_id == session_id).map(|file| file.path).collect()
 }
 
 fn verifies(files: &[PathBuf]) {
     for path in files {
-        let reader = palpate::journal::JournalReader::open(path).unwrap();
-        let verdict = palpate::journal::replay::verify(reader, &Limits::default(), &mut |_, _| {}).unwrap();
+        let reader = palpate_session::journal::JournalReader::open(path).unwrap();
+        let verdict = palpate_session::journal::replay::verify(reader, &Limits::default(), &mut |_, _| {}).unwrap();
         assert_eq!(verdict.difference, None, "{}", path.display());
     }
 }
@@ -143,9 +143,10 @@ async fn changes_of_the_tissue_that_wait_for_their_step_outlive_a_kill() {
     let kept = files(folder.path(), &id);
     let mut acted = Vec::new();
     for path in &kept {
-        let mut reader = palpate::journal::JournalReader::open(path).unwrap();
+        let mut reader = palpate_session::journal::JournalReader::open(path).unwrap();
         while let Some(batch) = reader.next_batch().unwrap() {
-            let is_tissue = |what: &Option<_>| matches!(what, Some(palpate::journal::pb::input::What::Tissue(_)));
+            let is_tissue =
+                |what: &Option<_>| matches!(what, Some(palpate_session::journal::pb::input::What::Tissue(_)));
             acted.extend(batch.inputs().unwrap().iter().filter(|input| is_tissue(&input.what)).map(|input| input.step));
         }
     }
@@ -395,8 +396,8 @@ async fn a_snapshot_is_a_journal_of_one_moment_and_goes_on_at_another_server() {
     let request = pb::SaveSnapshotRequest { session_id: id.clone() };
     let parts = server.sessions().await.save_snapshot(request).await.unwrap().into_inner();
     let bytes = palpate_client::snapshot::collect(parts).await.unwrap();
-    let reader = palpate::journal::JournalReader::new("snapshot", std::io::Cursor::new(&bytes)).unwrap();
-    let (session, _) = palpate::journal::session_at(reader, &Limits::default(), 77, &NEVER).unwrap();
+    let reader = palpate_session::journal::JournalReader::new("snapshot", std::io::Cursor::new(&bytes)).unwrap();
+    let (session, _) = palpate_session::journal::session_at(reader, &Limits::default(), 77, &NEVER).unwrap();
     assert_eq!(format!("{:032x}", session.tissue().state_hash()), hash);
 
     let other = TestServer::start(&["--log", "error"]);
@@ -524,14 +525,14 @@ async fn what_a_server_plays_is_compared_with_the_journal_and_written() {
     let (status, _, err) = replay(&file, &[&on_server[..], &["--point", "1,1"]].concat());
     assert!(status == Some(2) && err.contains("--output"), "{err}");
     // A journal that has another hash than its inputs give.
-    let mut reader = palpate::journal::JournalReader::open(&file).unwrap();
+    let mut reader = palpate_session::journal::JournalReader::open(&file).unwrap();
     let survey = reader.survey(&mut |_| {}).unwrap();
-    let first = palpate::journal::Replay::new(reader, survey, &Limits::default()).unwrap().first().clone();
-    let opening = palpate::journal::Opening { session_id: &id, ..opening(&first) };
-    let mut writer = palpate::journal::JournalWriter::new(&opening, 1);
+    let first = palpate_session::journal::Replay::new(reader, survey, &Limits::default()).unwrap().first().clone();
+    let opening = palpate_session::journal::Opening { session_id: &id, ..opening(&first) };
+    let mut writer = palpate_session::journal::JournalWriter::new(&opening, 1);
     writer.hash(100, 7);
     let wrong = folder.path().join("wrong.mcap");
-    std::fs::write(&wrong, writer.finish(palpate::journal::pb::Why::Deleted, "", 200, 2)).unwrap();
+    std::fs::write(&wrong, writer.finish(palpate_session::journal::pb::Why::Deleted, "", 200, 2)).unwrap();
     let (status, out, err) = replay(&wrong, &on_server);
     assert!(
         status == Some(1) && err.contains("differs: the state at step 100 was 00000000000000000000000000000007"),

@@ -9,13 +9,13 @@ use std::path::Path;
 use std::process::Command;
 
 use journal_opening::opening;
-use palpate::journal::signature::{Key, Signatures};
-use palpate::journal::{JournalReader, JournalWriter, Opening, pb};
-use palpate::limits::Limits;
-use palpate::scene::{PAPER, Scene};
 use palpate::server::journal_key;
-use palpate::session::Session;
-use palpate::tissue::Model;
+use palpate_session::Session;
+use palpate_session::journal::signature::{Key, Signatures};
+use palpate_session::journal::{JournalReader, JournalWriter, Opening, pb};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{PAPER, Scene};
 
 /// 2026-01-01.
 const BEGUN_NS: u64 = 1_767_225_600_000_000_000;
@@ -170,7 +170,7 @@ fn every_bit_that_decides_something_is_signed() {
         while let Some(batch) = reader.next_batch()? {
             signatures.check(&batch)?;
         }
-        Ok::<_, palpate::refusal::Refusal>(signatures.signed())
+        Ok::<_, palpate_refusal::Refusal>(signatures.signed())
     };
     let all = signed(&whole).unwrap().unwrap();
     assert!(all.ended && all.unsigned == 0 && all.until_step == 400, "{all:?}");

@@ -1,23 +1,26 @@
 //! Whatever a legal scene says, to look at it, to make a session of it and to step that is bounded work, or it is refused
 //! with a reason.
 //!
-//! A hundred scenes in every run of the tests; `make stress` draws ten thousand (`PALPATE_STRESS_SCENES`). What decides is
+//! Fifty scenes in every run of the tests; `make stress` draws ten thousand (`PALPATE_STRESS_SCENES`). What decides is
 //! the work, counted in points × substeps; the processor time is shown.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 #![allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 
+#[path = "common/form.rs"]
+mod form;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use palpate::budget::Budget;
-use palpate::limits::Limits;
-use palpate::realtime::Pacer;
-use palpate::refusal::Reason;
-use palpate::scene::{
+use palpate_realtime::Pacer;
+use palpate_refusal::Reason;
+use palpate_session::budget::Budget;
+use palpate_tissue as tissue;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{
     Body, FixedPoints, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping,
 };
-use palpate::tissue;
-use palpate::tissue::scheme_selection::NEVER;
+use palpate_tissue::scheme_selection::NEVER;
 
 fn name<T: Named>(random: &mut fastrand::Rng) -> T {
     T::NAMES[random.usize(..T::NAMES.len())].1
@@ -61,7 +64,7 @@ fn legal(seed: u64, limits: &Limits) -> Scene {
             correct: random.bool(),
         },
         sleep_tolerance: random.bool().then(|| decades(&mut random, -16.0, 0.0)),
-        appearance: palpate::scene::Appearance::default(),
+        appearance: palpate_tissue::scene::Appearance::default(),
     }
 }
 
@@ -81,7 +84,8 @@ const STEPS: u64 = 10;
 
 #[test]
 fn every_legal_scene_is_bounded_work_or_refused() {
-    let scenes = std::env::var("PALPATE_STRESS_SCENES").map_or(100, |scenes| scenes.parse().unwrap());
+    let scenes =
+        std::env::var("PALPATE_STRESS_SCENES").map_or_else(|_| form::form(50, 1000), |scenes| scenes.parse().unwrap());
     // An unoptimized build takes a hundred times as long for each.
     let rehearsal_work = if cfg!(debug_assertions) { 1 << 18 } else { Limits::default().rehearsal_work };
     let limits = Limits { rehearsal_work, ..Limits::default() };
@@ -148,7 +152,7 @@ fn what_no_number_of_substeps_can_do_is_refused_at_once_with_the_figure() {
 
 #[test]
 fn a_step_longer_than_its_period_is_refused_with_the_figure() {
-    let large = scene(palpate::scene::PAPER, &["sheet.points=[1001, 1001]"]);
+    let large = scene(palpate_tissue::scene::PAPER, &["sheet.points=[1001, 1001]"]);
     let limits = Limits::default();
     let pacer = one_thread(&limits);
     let Err(refusal) = pacer.create(&large, true, 60.0, &pacer.budget.account("test"), &NEVER) else {
@@ -165,7 +169,7 @@ fn a_step_longer_than_its_period_is_refused_with_the_figure() {
 #[test]
 fn the_scenes_that_are_built_in_are_never_refused() {
     let pacer = one_thread(&Limits::default());
-    for (name, text) in palpate::scene::BUILT_IN {
+    for (name, text) in palpate_tissue::scene::BUILT_IN {
         let account = pacer.budget.account("test");
         pacer
             .create(&scene(text, &[]), true, 60.0, &account, &NEVER)

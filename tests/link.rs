@@ -3,6 +3,8 @@
 
 #[path = "common/course.rs"]
 mod course;
+#[path = "common/form.rs"]
+mod form;
 #[path = "common/proxy.rs"]
 mod proxy;
 #[path = "common/server.rs"]
@@ -12,7 +14,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::time::Duration;
 
 use course::DeviceTrace;
-use palpate_touch::envelope::PAUSE_S;
+use palpate_haptics::envelope::PAUSE_S;
 use proxy::Proxy;
 use serde_json::Value;
 use server::{TestServer, client_program};
@@ -49,7 +51,7 @@ fn touch_is_true_passive_and_smooth_up_to_100_ms() {
     for (scene, at_once_percent, delayed_percent) in [("liver", 0.95, 0.68), ("fibrotic", 2.3, 0.44)] {
         for rtt_ms in [0.0, 10.0, 50.0, 100.0] {
             let most_percent = if rtt_ms > 0.0 { delayed_percent } else { at_once_percent };
-            for hand in ["light", "medium", "firm"] {
+            for hand in form::form(&["firm"][..], &["light", "medium", "firm"]) {
                 let found = link(&format!("--scene {scene} --hand {hand} --rtt-ms {rtt_ms} --seconds 6 --seed 3"));
                 let error = number(&found, "force_error_rms_percent");
                 assert!(error < most_percent, "{scene}, {hand}, {rtt_ms} ms: {error} %");
@@ -262,8 +264,9 @@ fn a_deadband_sends_a_twentieth_and_is_not_felt() {
 /// `palpate-client link --random 1000` is the long form.
 #[test]
 fn random_combinations_are_passive() {
-    let found = link("--random 24 --seconds 5 --seed 100");
-    assert_eq!((&found["runs"], &found["unstable"]), (&Value::from(24), &Value::from(0)));
+    let runs = form::form(8, 100);
+    let found = link(&format!("--random {runs} --seconds 5 --seed 100"));
+    assert_eq!((&found["runs"], &found["unstable"]), (&Value::from(runs), &Value::from(0)));
     let worst = |name: &str| found[name]["worst"].as_f64().unwrap();
     assert!(worst("energy_min_j") >= -1e-3, "{found}");
     assert!(worst("jump_max_n") <= 0.1 + 1e-9, "{found}");
@@ -276,7 +279,7 @@ fn random_combinations_are_passive() {
 fn a_sheet_for_which_there_is_no_memory_is_refused_with_a_reason() {
     let folder = tempfile::tempdir().unwrap();
     let scene = folder.path().join("large.toml");
-    std::fs::write(&scene, palpate::scene::PAPER.replace("points = [31, 31]", "points = [2048, 2048]")).unwrap();
+    std::fs::write(&scene, palpate_tissue::scene::PAPER.replace("points = [31, 31]", "points = [2048, 2048]")).unwrap();
     let mut limited = Command::new("sh");
     limited.args(["-c", "ulimit -v 524288; exec \"$@\"", "sh"]).arg(client_program());
     let ended = limited.args(["link", "--seconds", "1", "--scene"]).arg(&scene).output().unwrap();

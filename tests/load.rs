@@ -52,7 +52,7 @@ async fn every_command_of_a_load_is_accounted_for_and_no_session_stays() {
 async fn the_dilation_of_sessions_that_are_too_heavy_is_told() {
     let folder = tempfile::tempdir().unwrap();
     let (scene, config) = (folder.path().join("heavy.toml"), folder.path().join("palpate.toml"));
-    let paper = palpate::scene::PAPER.replace("points = [31, 31]", "points = [800, 500]");
+    let paper = palpate_tissue::scene::PAPER.replace("points = [31, 31]", "points = [800, 500]");
     std::fs::write(&scene, paper + "[stepping]\nrate_hz = 10000.0\n[sleep]\ntolerance = 0.0\n").unwrap();
     std::fs::write(&config, "[limits]\nthread_share = 1000.0\nperiods_per_step = 20.0\n").unwrap();
     let server = TestServer::start(&["--config", config.to_str().unwrap()]);

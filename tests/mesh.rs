@@ -7,17 +7,17 @@ use std::path::Path;
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::collection::find_scene;
-use palpate::scene::profile::Poke;
-use palpate::scene::{Body, Inclusion, Material, Mesh, MeshShape, PerNodeFactors, Region, Scene};
-use palpate::shape::{PointId, PointName, RestShape};
-use palpate::tissue::{Grasp, Model, Push, Tissue, at_rest};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::collection::find_scene;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::{Body, Inclusion, Material, Mesh, MeshShape, PerNodeFactors, Region, Scene};
+use palpate_tissue::shape::{PointId, PointName, RestShape};
+use palpate_tissue::{Grasp, Model, Push, Tissue, at_rest};
 
 /// The paper's scene with another body, and with some values set.
 fn scene(body: Option<Body>, sets: &[&str]) -> Scene {
     let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
-    let mut scene = Scene::parse("paper", palpate::scene::PAPER, &sets, &Limits::default()).unwrap();
+    let mut scene = Scene::parse("paper", palpate_tissue::scene::PAPER, &sets, &Limits::default()).unwrap();
     if let Some(body) = body {
         scene.body = body;
     }
@@ -129,7 +129,7 @@ fn a_flat_mesh_with_the_springs_of_a_sheet_is_that_sheet() {
                 }
                 tissue.step().unwrap();
             }
-            for point in palpate::shape::points(sheet).step_by(7) {
+            for point in palpate_tissue::shape::points(sheet).step_by(7) {
                 let [a, b] = [flat.point(point), mesh.point(point)];
                 for (which, [a, b]) in
                     [[a.displacement_m, b.displacement_m], [a.reaction_n(), b.reaction_n()]].into_iter().enumerate()
@@ -595,8 +595,8 @@ fn a_shape_is_the_same_tissue_however_its_file_is_written() {
                 assert!(mesh.shape.point_count() <= 60);
             }
             // A client that sends it, and a journal that keeps it, make the same tissue.
-            let sent = palpate::wire::scene::sent(&scene);
-            let again = palpate::wire::scene::from_scene(&sent, Some(&shown.mesh)).unwrap();
+            let sent = palpate_session::wire::scene::sent(&scene);
+            let again = palpate_session::wire::scene::from_scene(&sent, Some(&shown.mesh)).unwrap();
             let Body::Mesh(other) = &again.body else { panic!("of another kind") };
             assert_eq!(other.shape.vertices_m(), mesh.shape.vertices_m());
             assert_eq!(other.shape.triangles(), mesh.shape.triangles());
@@ -663,7 +663,7 @@ fn of_a_decimated_mesh_the_vertices_of_the_file_are_named() {
         assert!(shape.rest_m(point).distance(*place_m) < 0.04, "{vertex}");
     }
     assert!(shape.find("test", PointName::Vertex(count as u32)).is_err());
-    for point in palpate::shape::points(&**shape) {
+    for point in palpate_tissue::shape::points(&**shape) {
         let PointName::Vertex(vertex) = shape.name(point) else { panic!("of another kind") };
         assert!(shape.rest_m(point).distance(fine.vertices_m()[vertex as usize]) < 0.03, "{vertex}");
     }
@@ -687,7 +687,7 @@ fn the_organs_that_are_built_in_give_way_under_a_fingertip_and_less_so_at_a_lump
             let point = shape.nearest(DVec3::from_array(place_m));
             // In all as much as a disc of 5 mm.
             let falloff_per_m = 2.0_f64.sqrt() / 0.005;
-            let force_n = total_n / palpate::scene::profile::weights(shape, shape.rest_m(point), falloff_per_m);
+            let force_n = total_n / palpate_tissue::scene::profile::weights(shape, shape.rest_m(point), falloff_per_m);
             tissue.push(0, poke(shape.rest_m(point), -force_n * shape.normal(point), falloff_per_m));
             (0..60).for_each(|_| tissue.step().unwrap());
             assert_eq!(tissue.guard_events(), 0);

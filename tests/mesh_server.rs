@@ -10,17 +10,17 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use glam::DVec3;
-use palpate::force_law::{self, Disc};
-use palpate::limits::Limits;
-use palpate::scene::profile::Poke;
-use palpate::scene::{Body, Scene};
-use palpate::shape::{PointId, PointName, RestShape};
-use palpate::tissue::{Grasp, Model, Push, Tissue, at_rest};
 use palpate_client::view::SurfaceState;
+use palpate_haptics::Tip;
+use palpate_haptics::device::Device;
 use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::{pb, touch};
-use palpate_touch::Tip;
-use palpate_touch::device::Device;
+use palpate_tissue::force_law::{self, Disc};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::{Body, Scene};
+use palpate_tissue::shape::{PointId, PointName, RestShape};
+use palpate_tissue::{Grasp, Model, Push, Tissue, at_rest};
 use pb::create_session_request::Source;
 use pb::force::Centre;
 use pb::touch_response::Message as Heard;
@@ -120,8 +120,8 @@ fn by_name() -> Source {
 fn small_sheet() -> Source {
     let sets = ["sheet.points=[5, 5]", "sheet.spacing_m=0.1", "stepping.integrator=central", "stepping.substeps=2"];
     let sets = sets.map(str::to_owned);
-    let scene = Scene::parse("small", palpate::scene::PAPER, &sets, &Limits::default()).unwrap();
-    Source::Scene(palpate::wire::scene::scene(&scene))
+    let scene = Scene::parse("small", palpate_tissue::scene::PAPER, &sets, &Limits::default()).unwrap();
+    Source::Scene(palpate_session::wire::scene::scene(&scene))
 }
 
 fn push(tool: u32, sequence: u64, centre: Centre, force_n: DVec3) -> pb::Command {
@@ -411,7 +411,7 @@ async fn upload(
 
 /// The ball's scene on a mesh that was sent.
 fn on(mesh_id: &str, scene: &Scene) -> pb::Scene {
-    let mut message = palpate::wire::scene::sent(scene);
+    let mut message = palpate_session::wire::scene::sent(scene);
     message.mesh.as_mut().unwrap().mesh_id = mesh_id.to_owned();
     message
 }
@@ -485,7 +485,7 @@ async fn a_mesh_that_was_sent_stays_in_journals_only_as_long_as_its_owner_is_tol
         let usual = ["--journal", journals.to_str().unwrap(), "--config", config.to_str().unwrap()];
         TestServer::start(&[&usual[..], more].concat())
     };
-    let kept = || palpate::journal::file::list(&journals).unwrap().len();
+    let kept = || palpate_session::journal::file::list(&journals).unwrap().len();
     let server = start(&[]);
     let sent = upload(&server, &file, 100_000, "m", false).await.unwrap();
     assert!(sent.kept.contains("30 days") && sent.kept.contains("DeleteJournal"), "{}", sent.kept);
@@ -520,7 +520,7 @@ async fn a_material_and_inclusions_are_told_and_what_is_wrong_with_them_is_named
     let by_name = server.create(Source::SceneName("lumps".into()), true).await.unwrap();
     let told_scene = own.scene.unwrap();
     assert_eq!(told_scene, by_name.scene.unwrap());
-    assert_eq!(told_scene, palpate::wire::scene::scene(&scene));
+    assert_eq!(told_scene, palpate_session::wire::scene::scene(&scene));
     let material = told_scene.material.unwrap();
     assert_eq!((material.youngs_modulus_pa, material.density_kg_per_m3), (Some(2000.0), Some(1060.0)));
     assert_eq!(told_scene.inclusions[1].group.as_deref(), Some("lump"));

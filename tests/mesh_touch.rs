@@ -6,10 +6,10 @@ mod common;
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::{Body, Mesh, MeshShape, Scene};
-use palpate::tissue::{Model, Tissue, ToolContact, at_rest, tangent};
-use palpate_touch::{ContactState, Tip};
+use palpate_haptics::{ContactState, Tip};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{Body, Mesh, MeshShape, Scene};
+use palpate_tissue::{Model, Tissue, ToolContact, at_rest, tangent};
 
 /// Membrane and foundation of a liver: N/m along an edge, N/m³ beneath, kg/m², and the damping ratio of a point on the foundation.
 const EDGE_N_PER_M: f64 = 80.0;
@@ -28,7 +28,7 @@ fn scene(shape: MeshShape, area_m2: f64, sets: &[&str]) -> Scene {
         "stepping.tolerance=1e-4".to_owned(),
     ];
     all.extend(sets.iter().map(|set| (*set).to_owned()));
-    let mut scene = Scene::parse("paper", palpate::scene::PAPER, &all, &Limits::default()).unwrap();
+    let mut scene = Scene::parse("paper", palpate_tissue::scene::PAPER, &all, &Limits::default()).unwrap();
     scene.body = Body::Mesh(Mesh::new(mass_kg, 0.0, Arc::new(shape)));
     scene
 }
@@ -60,8 +60,8 @@ fn flat(edge_m: f64, size_m: f64, jitter: f64, seed: u64) -> (MeshShape, f64) {
             triangles.extend(if i % 2 == 0 { [[a, b, c], [b, d, c]] } else { [[a, b, d], [a, d, c]] });
         }
     }
-    let mut mesh = palpate_mesh::TriangleMesh { vertices_m, triangles, ..Default::default() };
-    palpate_mesh::delaunay::flip_to_delaunay(&mut mesh);
+    let mut mesh = palpate_geometry::TriangleMesh { vertices_m, triangles, ..Default::default() };
+    palpate_geometry::delaunay::flip_to_delaunay(&mut mesh);
     let area_m2 = edge_m * edge_m * 0.75_f64.sqrt();
     (MeshShape::new(mesh.vertices_m, mesh.triangles, |rim, _, _| rim).unwrap(), area_m2)
 }
@@ -110,7 +110,7 @@ fn sphere(times: u32, radius_m: f64) -> (MeshShape, f64) {
     (MeshShape::new(vertices_m, triangles, |_, _, _| false).unwrap(), area_m2)
 }
 
-const TIP: Tip = Tip { radius_m: 0.005, friction: 0.0, grasps: false, coupling: palpate_touch::Coupling::Constraint };
+const TIP: Tip = Tip { radius_m: 0.005, friction: 0.0, grasps: false, coupling: palpate_haptics::Coupling::Constraint };
 
 /// Moves a tool straight from one place to another in so many steps, and leaves it there for `rest` more.
 fn lead(tissue: &mut dyn Tissue, from_m: DVec3, to_m: DVec3, steps: u32, rest: u32, tip: Tip) -> ToolContact {

@@ -14,22 +14,22 @@ use std::sync::Arc;
 
 use common::scene_with;
 use glam::DVec3;
-use palpate::journal::{self, JournalReader, JournalWriter, Opening};
-use palpate::limits::Limits;
-use palpate::refusal::Refusal;
-use palpate::scene::profile::Poke;
-use palpate::scene::script::{Action, Script};
-use palpate::scene::{PAPER, Scene};
-use palpate::session::Session;
-use palpate::session::command::{Command, Due};
-use palpate::session::input::Input;
-use palpate::session::intake::Intake;
-use palpate::session::saved::Saved;
-use palpate::tissue::Model;
-use palpate::wire;
-use palpate_mesh::{Group, TriangleMesh};
+use palpate_geometry::{Group, TriangleMesh};
+use palpate_haptics::Tip;
 use palpate_proto::pb;
-use palpate_touch::Tip;
+use palpate_refusal::Refusal;
+use palpate_session::Session;
+use palpate_session::command::{Command, Due};
+use palpate_session::input::Input;
+use palpate_session::intake::Intake;
+use palpate_session::journal::{self, JournalReader, JournalWriter, Opening};
+use palpate_session::saved::Saved;
+use palpate_session::wire;
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::script::{Action, Script};
+use palpate_tissue::scene::{PAPER, Scene};
 use prost::Message;
 use prost_types::field_descriptor_proto::{Label, Type};
 use prost_types::{DescriptorProto, FileDescriptorSet};
@@ -158,7 +158,7 @@ const STEPS: u64 = 24;
 
 /// Lets a session of a scene go every way, if it is not held at once. Returns whether there is one: else it was refused, with a
 /// reason.
-fn is_taken_on_every_way(scene: palpate::refusal::Result<Scene>, about: &str) -> bool {
+fn is_taken_on_every_way(scene: palpate_refusal::Result<Scene>, about: &str) -> bool {
     match scene.and_then(|scene| Model::compile(&scene, &limits())) {
         Err(refusal) => {
             assert_told(&refusal, about);
@@ -461,7 +461,7 @@ fn a_zero_has_no_sign_in_any_number_of_a_journal() {
     let descriptors = messages(journal::pb::DESCRIPTORS);
     let first = Model::compile(&sheet("f64", &["damping.coefficient_n_s_per_m=0.0"]), &limits()).unwrap();
     // Of the tissue: the same model, or none.
-    let change = palpate::scene::Change { anchor_stiffness_n_per_m: Some(0.0), ..Default::default() };
+    let change = palpate_tissue::scene::Change { anchor_stiffness_n_per_m: Some(0.0), ..Default::default() };
     let changed = first.changed(&change, &first.scene, &limits()).unwrap();
     let tissue = |more: &[u8]| -> Result<Arc<Model>, Refusal> {
         match with_more(&descriptors, &Input::Tissue(changed.clone()), more, &first)? {
@@ -487,7 +487,7 @@ fn a_zero_has_no_sign_in_any_number_of_a_journal() {
     let rest_m = first.shape().rest_m(first.scene.sheet().unwrap().point([4, 3]));
     let tip = Tip {
         radius_m: 0.05,
-        coupling: palpate_touch::Coupling::Spring { stiffness_n_per_m: 50.0, damping_n_s_per_m: 0.1 },
+        coupling: palpate_haptics::Coupling::Spring { stiffness_n_per_m: 50.0, damping_n_s_per_m: 0.1 },
         ..Tip::default()
     };
     let point = first.scene.sheet().unwrap().point([4, 3]);
@@ -582,12 +582,12 @@ fn every_number_of_a_script_gives_the_same_bits_on_every_way_or_is_refused() {
         for step in 0..STEPS {
             let commands = script
                 .actions_at(step)
-                .map(|(tool, action)| Due::in_time(palpate::session::run::command(tool, step, action)));
+                .map(|(tool, action)| Due::in_time(palpate_session::run::command(tool, step, action)));
             acting.insert(step, commands.collect());
         }
         // And as functions of time.
         let mut session = Session::new(&model);
-        palpate::session::run::play(&mut session, &script);
+        palpate_session::run::play(&mut session, &script);
         for _ in 0..STEPS {
             session.advance(&mut Vec::new(), |_| {});
             assert!(is_finite(&session), "{text}");

@@ -10,12 +10,12 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::path::Path;
 
-use palpate::limits::Limits;
-use palpate::scene::Scene;
-use palpate::scene::collection::find_script;
 use palpate::server::identity::{self, Role};
-use palpate::wire;
 use palpate_proto::pb;
+use palpate_session::wire;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Scene;
+use palpate_tissue::scene::collection::find_script;
 use prost::Message;
 use server::{TEST_TIMEOUT, TestServer, told};
 

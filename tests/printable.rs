@@ -9,11 +9,11 @@ use std::process::Command;
 use std::sync::Arc;
 
 use journal_opening::opening;
-use palpate::journal::{JournalWriter, Opening, pb};
-use palpate::limits::Limits;
-use palpate::scene::{PAPER, Scene};
-use palpate::session::input::Input;
-use palpate::tissue::Model;
+use palpate_session::input::Input;
+use palpate_session::journal::{JournalWriter, Opening, pb};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{PAPER, Scene};
 
 /// ESC, CR, LF, BEL, DEL, controls C1, controls of direction, a separator of lines.
 const HOSTILE: &str = "a\x1b[2J\r\nFORGED\x07\x7f\u{9b}2J\u{85}\u{202e}\u{2066}\u{200f}\u{2028}z";

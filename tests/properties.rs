@@ -3,19 +3,21 @@
 #![allow(clippy::unwrap_used)]
 
 mod common;
+#[path = "common/form.rs"]
+mod form;
 
 use std::path::Path;
 
 use common::{SMALL, model, scene};
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::profile::Poke;
-use palpate::scene::script::{Action, Script};
-use palpate::scene::{PAPER, Scene};
-use palpate::session::Session;
-use palpate::session::command::Command;
-use palpate::session::intake::Intake;
-use palpate::shape::PointId;
+use palpate_session::Session;
+use palpate_session::command::Command;
+use palpate_session::intake::Intake;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::script::{Action, Script};
+use palpate_tissue::scene::{PAPER, Scene};
+use palpate_tissue::shape::PointId;
 use proptest::prelude::*;
 
 const SCRIPT: &str = include_str!("../scripts/oblique-60.toml");
@@ -82,7 +84,7 @@ fn command() -> impl Strategy<Value = Command> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: form::form(100, 4000), failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn no_scene_text_panics(text in spoilt(PAPER)) {

@@ -4,15 +4,15 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::profile::Poke;
-use palpate::scene::script::Action;
-use palpate::scene::{Change, PAPER, Scene};
-use palpate::session::Session;
-use palpate::session::command::Command;
-use palpate::session::intake::Intake;
-use palpate::session::recovery::{MAX_RECOVERIES, WINDOW_STEPS};
-use palpate::tissue::Model;
+use palpate_session::Session;
+use palpate_session::command::Command;
+use palpate_session::intake::Intake;
+use palpate_session::recovery::{MAX_RECOVERIES, WINDOW_STEPS};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::{Change, PAPER, Scene};
 
 /// What the holder of tools 0 and 1 sends, and when.
 type Order = (u64, u32, Action);

@@ -6,10 +6,10 @@ mod common;
 
 use common::{playing, script};
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::{Integrator, Named, Scene};
-use palpate::session::Session;
-use palpate::shape::PointName;
+use palpate_session::Session;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{Integrator, Named, Scene};
+use palpate_tissue::shape::PointName;
 use serde_json::Value;
 
 const SCENES: [&str; 6] = ["poke31", "ringdown9x14", "overdamped19", "tool15", "icosphere", "filled"];
@@ -194,7 +194,7 @@ fn each_scheme_has_its_order() {
             Integrator::Rk4 => 2000.0,
             _ => 1000.0,
         };
-        let order = palpate::tissue::order(*scheme);
+        let order = palpate_tissue::order(*scheme);
         for name in SCENES {
             for gain in gains(name, integrator, rate_hz) {
                 println!("{integrator} {name}: {:.2}", gain.log2() / 2.0);

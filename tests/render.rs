@@ -4,10 +4,10 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
-use palpate::limits::Limits;
-use palpate::refusal::Reason;
-use palpate::scene::{Appearance, Named, PAPER, PaintedSurface, Scene};
-use palpate::texture::{Image, image, painted, texture};
+use palpate_refusal::Reason;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{Appearance, Named, PAPER, PaintedSurface, Scene};
+use palpate_tissue::texture::{Image, image, painted, texture};
 
 fn palpate(arguments: &[&str]) -> Output {
     let program = env!("CARGO_BIN_EXE_palpate");

@@ -469,7 +469,7 @@ fn a_recovery_is_the_same_in_a_replay_and_offline_and_neither_calls_that_the_scr
         std::fs::write(&path, text).unwrap();
         path
     };
-    let stiff = palpate::scene::PAPER.replace("stiffness_n_per_m = 10.0", "stiffness_n_per_m = 1e9");
+    let stiff = palpate_tissue::scene::PAPER.replace("stiffness_n_per_m = 10.0", "stiffness_n_per_m = 1e9");
     let scene = write("stiff.toml", format!("{stiff}\n[stepping]\nsubsteps = 1\n"));
     let force = |on_s: f64| {
         let profile = format!("{{ type = \"pulse\", on_s = {on_s}, off_s = {} }}", on_s + 0.1);

@@ -5,6 +5,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
 
 mod common;
+#[path = "common/form.rs"]
+mod form;
 #[path = "common/moved.rs"]
 mod moved;
 #[path = "common/random_scenes.rs"]
@@ -15,17 +17,17 @@ use std::sync::{Arc, OnceLock};
 
 use fastrand::Rng;
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::profile::Poke;
-use palpate::scene::script::Action;
-use palpate::scene::{BUILT_IN, Change, Integrator, Named, Precision, Scene};
-use palpate::session::Session;
-use palpate::session::command::{Command, Due};
-use palpate::session::intake::Intake;
-use palpate::session::saved::Saved;
-use palpate::shape::PointId;
-use palpate::tissue::Model;
-use palpate_touch::{Coupling, Tip};
+use palpate_haptics::{Coupling, Tip};
+use palpate_session::Session;
+use palpate_session::command::{Command, Due};
+use palpate_session::intake::Intake;
+use palpate_session::saved::Saved;
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::{BUILT_IN, Change, Integrator, Named, Precision, Scene};
+use palpate_tissue::shape::PointId;
 
 /// Steps for which a restored session is compared with the one that was saved.
 const COMPARED_STEPS: u64 = 50;
@@ -43,7 +45,7 @@ fn limits() -> Limits {
 
 /// How many snapshots are tried.
 fn wanted() -> usize {
-    std::env::var("PALPATE_SNAPSHOTS").ok().and_then(|text| text.parse().ok()).unwrap_or(200)
+    std::env::var("PALPATE_SNAPSHOTS").ok().and_then(|text| text.parse().ok()).unwrap_or_else(|| form::form(80, 1000))
 }
 
 /// What acts before a step.
@@ -103,7 +105,7 @@ fn direction(random: &mut Rng) -> DVec3 {
     DVec3::new(part(), part(), part())
 }
 
-fn any_point(shape: &dyn palpate::shape::RestShape, random: &mut Rng) -> PointId {
+fn any_point(shape: &dyn palpate_tissue::shape::RestShape, random: &mut Rng) -> PointId {
     PointId::new(random.usize(0..shape.point_count()))
 }
 
@@ -366,7 +368,7 @@ fn what_a_session_has_reached_its_snapshot_restores_with_the_same_bits() {
 fn pushed(precision: &str, forces: &[(u64, Poke)]) -> Session {
     let precision = format!("stepping.precision={precision}");
     let sets = ["sheet.points=[40, 40]", "stepping.integrator=central", "stepping.substeps=2", "sleep.tolerance=1e-3"];
-    let scene = common::scene_with(palpate::scene::PAPER, &[&sets[..], &[precision.as_str()]].concat());
+    let scene = common::scene_with(palpate_tissue::scene::PAPER, &[&sets[..], &[precision.as_str()]].concat());
     let mut session = Session::new(&Model::compile(&scene, &limits()).unwrap());
     for step in 0..60 {
         let acting = forces.iter().filter(|(at, _)| *at == step);
@@ -377,7 +379,7 @@ fn pushed(precision: &str, forces: &[(u64, Poke)]) -> Session {
 }
 
 fn force_at_a_point(force_n: DVec3, falloff_per_m: f64, falloff_offset: f64) -> Poke {
-    let scene = common::scene_with(palpate::scene::PAPER, &["sheet.points=[40, 40]"]);
+    let scene = common::scene_with(palpate_tissue::scene::PAPER, &["sheet.points=[40, 40]"]);
     let centre_m = scene.shape().rest_m(scene.sheet().unwrap().point([20, 20]));
     Poke { point: None, centre_m, force_n, falloff_per_m, falloff_offset }
 }

@@ -477,7 +477,7 @@ fn the_pages_on_scenes_scripts_and_records_tell_the_truth() {
     let page = pages.map(|name| std::fs::read_to_string(folder.join(name)).unwrap()).concat();
     let blocks: Vec<&str> = page.split("```toml\n").skip(1).map(|rest| rest.split("```").next().unwrap()).collect();
     let [scene, script, people, ..] = blocks.as_slice() else { panic!("{} blocks", blocks.len()) };
-    let liver = palpate::scene::BUILT_IN.iter().find(|scene| scene.0 == "liver").unwrap().1;
+    let liver = palpate_tissue::scene::BUILT_IN.iter().find(|scene| scene.0 == "liver").unwrap().1;
     assert_eq!(lines(&run(liver, people, &[])).len(), 1 + 21 + 1);
     let output = run(scene, script, &[]);
     assert_eq!(lines(&output).len(), 1 + 21 + 1);

@@ -9,14 +9,14 @@ use std::sync::Arc;
 
 use common::{model, scene_with, script};
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::record::Summary;
-use palpate::scene::script::{Action, BUILT_IN, Script};
-use palpate::scene::{self, Scene, reader};
-use palpate::session::Session;
-use palpate::session::command::Command;
-use palpate::session::run;
-use palpate::tissue::Model;
+use palpate_session::Session;
+use palpate_session::command::Command;
+use palpate_session::run;
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::record::Summary;
+use palpate_tissue::scene::script::{Action, BUILT_IN, Script};
+use palpate_tissue::scene::{self, Scene, reader};
 
 fn built_in(scene: &str, sets: &[&str]) -> Scene {
     let (_, text) = scene::BUILT_IN.iter().find(|(name, _)| *name == scene).unwrap();
@@ -89,7 +89,7 @@ fn records_tell_what_a_tip_feels_and_where_it_is() {
     let mut session = Session::new(&model);
     let mut told = Vec::new();
     for step in 0..script.steps {
-        let due = script.actions_at(step).map(|(tool, action)| palpate::session::command::Due {
+        let due = script.actions_at(step).map(|(tool, action)| palpate_session::command::Due {
             command: run::command(tool, step, action),
             late: false,
             late_commands: 0,
@@ -282,7 +282,7 @@ fn a_pose_beside_the_tissue_is_warned_of() {
 }
 
 /// A session of liver, and what a command for the coming step tells in the sample after it.
-fn told(session: &mut Session, sequence: u64, action: Action) -> palpate::session::Contact {
+fn told(session: &mut Session, sequence: u64, action: Action) -> palpate_session::Contact {
     let (sequence, at_step) = (Some(sequence), Some(session.step_count()));
     let command = Command {
         tool: 0,
@@ -294,14 +294,14 @@ fn told(session: &mut Session, sequence: u64, action: Action) -> palpate::sessio
         action,
         arrival_ns: 0,
     };
-    let due = palpate::session::command::Due { command, late: false, late_commands: 0, ends_lease: false };
+    let due = palpate_session::command::Due { command, late: false, late_commands: 0, ends_lease: false };
     session.advance(&mut vec![due], |_| {});
     session.sample(None).tools[0].contact.unwrap()
 }
 
 #[test]
 fn a_force_that_moves_between_points_feels_smooth_and_one_on_a_point_feels_that_point() {
-    use palpate::scene::profile::Poke;
+    use palpate_tissue::scene::profile::Poke;
     let scene = built_in("liver", &[]);
     let model = model(&scene);
     let spacing_m = scene.sheet().unwrap().spacing_m;
@@ -352,7 +352,7 @@ fn the_surface_under_a_tip_is_deeper_than_the_mean_over_it() {
         let action = Action::Pose {
             place_m: DVec3::new(0.0375, 0.0375, z_m),
             velocity_m_per_s: None,
-            tip: palpate_touch::Tip::default(),
+            tip: palpate_haptics::Tip::default(),
         };
         contact = Some(told(&mut session, step + 1, action));
     }

@@ -12,9 +12,9 @@ use server::{TEST_TIMEOUT, TestServer, TestTouch, force, open, palpate, told};
 use tonic::Code;
 
 fn paper() -> pb::Scene {
-    let limits = palpate::limits::Limits::default();
-    let paper = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[], &limits).unwrap();
-    palpate::wire::scene::scene(&paper)
+    let limits = palpate_tissue::limits::Limits::default();
+    let paper = palpate_tissue::scene::Scene::parse("paper", palpate_tissue::scene::PAPER, &[], &limits).unwrap();
+    palpate_session::wire::scene::scene(&paper)
 }
 
 #[tokio::test]

@@ -13,16 +13,16 @@ use std::collections::{BTreeMap, BinaryHeap};
 use std::task::{Context, Poll, Waker};
 
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::realtime::queue::{Reader, Writer, queue};
-use palpate::refusal::Reason;
-use palpate::scene::profile::Poke;
-use palpate::scene::script::Action;
-use palpate::session::command::Command;
-use palpate::session::intake::Intake;
-use palpate::session::lease::LeaseId;
-use palpate::session::schedule::Schedule;
-use palpate::session::{Sample, Session};
+use palpate_realtime::queue::{Reader, Writer, queue};
+use palpate_refusal::Reason;
+use palpate_session::command::Command;
+use palpate_session::intake::Intake;
+use palpate_session::lease::LeaseId;
+use palpate_session::schedule::Schedule;
+use palpate_session::{Sample, Session};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::script::Action;
 use random::TestRandom;
 
 const MS: u64 = 1_000_000;

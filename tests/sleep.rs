@@ -16,12 +16,12 @@ mod thin_mesh;
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::Scene;
-use palpate::scene::profile::Poke;
-use palpate::shape::PointId;
-use palpate::tissue::{self, Grasp, Model, Push, Tissue};
-use palpate_touch::Tip;
+use palpate_haptics::Tip;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Scene;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::shape::PointId;
+use palpate_tissue::{self as tissue, Grasp, Model, Push, Tissue};
 use thin_mesh::thread;
 
 const STEPS: u64 = 400;

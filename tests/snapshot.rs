@@ -8,17 +8,17 @@ use std::sync::{Arc, OnceLock};
 
 use fastrand::Rng;
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::profile::{CentreProfile, LoadProfile, MotionProfile, Move, Poke, Profile, StrengthProfile};
-use palpate::scene::record::{AuditedError, Correction};
-use palpate::scene::script::Action;
-use palpate::scene::{Change, Integrator, Lanes, Named, PAPER, Precision, Scene};
-use palpate::session::Session;
-use palpate::session::command::{Command, Due};
-use palpate::session::saved::{Saved, VERSION, seal};
-use palpate::tissue::Model;
-use palpate::tissue::saved::TissueState;
-use palpate_touch::{ContactState, Coupling, Tip};
+use palpate_haptics::{ContactState, Coupling, Tip};
+use palpate_session::Session;
+use palpate_session::command::{Command, Due};
+use palpate_session::saved::{Saved, VERSION, seal};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::saved::TissueState;
+use palpate_tissue::scene::profile::{CentreProfile, LoadProfile, MotionProfile, Move, Poke, Profile, StrengthProfile};
+use palpate_tissue::scene::record::{AuditedError, Correction};
+use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::{Change, Integrator, Lanes, Named, PAPER, Precision, Scene};
 
 /// Little is rehearsed: most scenes give the number of substeps.
 fn limits() -> Limits {
@@ -190,10 +190,10 @@ fn case(seed: u64) -> SnapshotCase {
 }
 
 /// A point that may be grasped.
-fn free(case: &SnapshotCase, random: &mut Rng) -> palpate::shape::PointId {
+fn free(case: &SnapshotCase, random: &mut Rng) -> palpate_tissue::shape::PointId {
     let shape = case.first.shape();
     loop {
-        let point = palpate::shape::PointId::new(random.usize(0..shape.point_count()));
+        let point = palpate_tissue::shape::PointId::new(random.usize(0..shape.point_count()));
         if !shape.is_fixed(point) || shape.point_count() < 10 {
             return point;
         }
@@ -412,7 +412,7 @@ impl Coverage {
         }
         let shape = session.model().shape();
         let holds = |point| tissue.point(point).constraint_n.is_some() && !shape.is_fixed(point);
-        add("grasped", palpate::shape::points(shape).any(holds));
+        add("grasped", palpate_tissue::shape::points(shape).any(holds));
     }
 }
 

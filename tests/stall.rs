@@ -13,11 +13,11 @@ use std::io::{BufRead, Read, Write};
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::Scene;
-use palpate::wire;
+use palpate_haptics::{Device, Tip};
 use palpate_proto::{pb, touch};
-use palpate_touch::{Device, Tip};
+use palpate_session::wire;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Scene;
 use pb::create_session_request::Source;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::touch_request::Message as Say;

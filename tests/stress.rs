@@ -1,22 +1,24 @@
 //! Random scenes under random tools, and adversarial ones: everything stays finite, no energy appears from nowhere, no
 //! panic.
 //!
-//! A hundred in every test run; `make stress` does ten thousand (`PALPATE_STRESS_SCENES`) and a soak of 10⁷ steps. Of closed
+//! Fifty in every test run; `make stress` does ten thousand (`PALPATE_STRESS_SCENES`) and a soak of 10⁷ steps. Of closed
 //! meshes of a random material there are 4 for 250 steps each, and 200 for 5,000 (`PALPATE_STRESS_MESHES`).
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/closed_mesh.rs"]
 mod closed_mesh;
 mod common;
+#[path = "common/form.rs"]
+mod form;
 
 use closed_mesh::closed_mesh;
 use common::{SMALL, model, scene_with};
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::profile::Poke;
-use palpate::scene::{Integrator, Named, Scene};
-use palpate::tissue::guard::INTERVAL_SUBSTEPS;
-use palpate::tissue::{self, Grasp, Model, Push, Tissue};
+use palpate_tissue::guard::INTERVAL_SUBSTEPS;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::{Integrator, Named, Scene};
+use palpate_tissue::{self as tissue, Grasp, Model, Push, Tissue};
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 
@@ -162,7 +164,8 @@ fn play(text: &str, acts: &[RandomAction]) -> Result<(), TestCaseError> {
 
 #[test]
 fn random_scenes_stay_finite_and_take_no_energy_from_nowhere() {
-    let cases = std::env::var("PALPATE_STRESS_SCENES").map_or(100, |scenes| scenes.parse().unwrap());
+    let cases =
+        std::env::var("PALPATE_STRESS_SCENES").map_or_else(|_| form::form(50, 1000), |scenes| scenes.parse().unwrap());
     let mut runner =
         TestRunner::new(Config { cases, failure_persistence: None, max_shrink_iters: 200, ..Config::default() });
     let done = std::cell::Cell::new(0_u32);
@@ -197,7 +200,8 @@ fn energy_that_appears_between_two_looks_of_the_guard_does_not_outlast_the_secon
 
 #[test]
 fn closed_meshes_of_any_material_stay_finite() {
-    let meshes = std::env::var("PALPATE_STRESS_MESHES").map_or(4, |meshes| meshes.parse().unwrap());
+    let meshes =
+        std::env::var("PALPATE_STRESS_MESHES").map_or_else(|_| form::form(4, 20), |meshes| meshes.parse().unwrap());
     let steps: u64 = if meshes > 4 { 5000 } else { 250 };
     let (folder, limits) = (tempfile::tempdir().unwrap(), Limits { substeps: 400, ..Limits::default() });
     let mut played = 0;
@@ -225,7 +229,7 @@ fn closed_meshes_of_any_material_stay_finite() {
         played += 1;
         for step in 0..steps {
             if step % 25 == 0 {
-                let point = palpate::shape::PointId::new(dice.usize(0..shape.point_count()));
+                let point = palpate_tissue::shape::PointId::new(dice.usize(0..shape.point_count()));
                 let towards = DVec3::from_array([(); 3].map(|()| 2.0 * dice.f64() - 1.0));
                 let tool = dice.usize(0..3);
                 match dice.u8(0..4) {

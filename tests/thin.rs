@@ -17,10 +17,10 @@ mod thin_mesh;
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::Scene;
-use palpate::tissue::{self, Model, Tissue};
-use palpate_touch::{Coupling, Tip};
+use palpate_haptics::{Coupling, Tip};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Scene;
+use palpate_tissue::{self as tissue, Model, Tissue};
 use thin_mesh::{ThinMesh, thin_mesh, thread};
 
 /// A scene on a mesh, of a random material. One in fifty chooses its own scheme, which takes longer than the steps of a test.
@@ -136,7 +136,7 @@ fn play(seed: u64, steps: u64) -> Option<(Extremes, &'static str)> {
     for step in 0..steps {
         let is_put = step % 40 == 0 || std::mem::take(&mut has_recovered);
         if step % 40 == 0 {
-            let point = palpate::shape::PointId::new(dice.usize(0..shape.point_count()));
+            let point = palpate_tissue::shape::PointId::new(dice.usize(0..shape.point_count()));
             let mut random = || DVec3::from_array([(); 3].map(|()| 2.0 * dice.f64() - 1.0));
             let target_m = shape.rest_m(point) + 0.5 * now.radius_m * random();
             let from_m = target_m + 2.0 * now.radius_m * random();

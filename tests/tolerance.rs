@@ -2,14 +2,16 @@
 //! meshes there are 8 here, and more by `PALPATE_TOLERANCE_MESHES`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/form.rs"]
+mod form;
 #[path = "common/random_scenes.rs"]
 mod random_scenes;
 
-use palpate::limits::Limits;
-use palpate::refusal::Reason;
-use palpate::scene::{PAPER, Precision, Scene};
-use palpate::tissue::integrate::Oscillator;
-use palpate::tissue::{Model, scheme_selection, stability};
+use palpate_refusal::Reason;
+use palpate_tissue::integrate::Oscillator;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{PAPER, Precision, Scene};
+use palpate_tissue::{Model, scheme_selection, stability};
 use random_scenes::{RandomScene, case, errors, mesh_case, play, truth};
 
 /// With the scheme that is chosen for each.
@@ -37,11 +39,12 @@ fn every_tolerance_is_kept_on_random_scenes() {
 
 #[test]
 fn every_tolerance_is_kept_on_random_meshes() {
-    let meshes = std::env::var("PALPATE_TOLERANCE_MESHES").map_or(8, |meshes| meshes.parse().unwrap());
+    let meshes =
+        std::env::var("PALPATE_TOLERANCE_MESHES").map_or_else(|_| form::form(4, 40), |meshes| meshes.parse().unwrap());
     (0..meshes).for_each(|seed| keeps_every_tolerance(&mesh_case(seed)));
 }
 
-fn paper_with(assignments: &[&str]) -> palpate::refusal::Result<std::sync::Arc<Model>> {
+fn paper_with(assignments: &[&str]) -> palpate_refusal::Result<std::sync::Arc<Model>> {
     let (assignments, limits) =
         (assignments.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>(), Limits::default());
     Model::compile(&Scene::parse("paper", PAPER, &assignments, &limits)?, &limits)

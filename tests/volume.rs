@@ -8,13 +8,13 @@ use std::sync::Arc;
 
 use common::{model, scene_with, schemes};
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::refusal::Reason;
-use palpate::scene::profile::Poke;
-use palpate::scene::{Body, Change, Scene};
-use palpate::shape::{PointId, RestShape};
-use palpate::tissue::{Model, Push, Tissue, at_rest, tangent};
-use palpate_touch::{Coupling, Tip};
+use palpate_haptics::{Coupling, Tip};
+use palpate_refusal::Reason;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::{Body, Change, Scene};
+use palpate_tissue::shape::{PointId, RestShape};
+use palpate_tissue::{Model, Push, Tissue, at_rest, tangent};
 
 /// A ball of 162 vertices and 0.1 m.
 fn ball(sets: &[&str]) -> Scene {
@@ -278,7 +278,7 @@ fn an_audit_in_f64_finds_the_error_within_the_tolerance_also_of_what_sleeps() {
         let (script, limits) = (common::script(text, &scene), Limits::default());
         let mut output = Vec::new();
         let summary =
-            palpate::session::run::audited(&model(&scene), &script, false, &limits, &mut output, &|| 0.0, &mut |_| {});
+            palpate_session::run::audited(&model(&scene), &script, false, &limits, &mut output, &|| 0.0, &mut |_| {});
         let summary = summary.unwrap();
         let found = summary.audited_error.unwrap();
         println!("{found:?}, {:e} asked for", scene.stepping.tolerance);
@@ -317,7 +317,7 @@ fn its_stiffness_changes_under_way_and_other_tissue_gets_none() {
     // The guard's last resort.
     tissue.recover(tissue.step_count(), false);
     tissue.step().unwrap();
-    let refused = model(&common::scene(palpate::scene::PAPER)).changed(&softer(5.0), &first.scene, &limits);
+    let refused = model(&common::scene(palpate_tissue::scene::PAPER)).changed(&softer(5.0), &first.scene, &limits);
     let refused = refused.unwrap_err();
     assert_eq!((refused.reason, refused.field.as_str()), (Reason::WrongKind, "volume.stiffness_pa"));
     for bad in [-1.0, f64::NAN, 1e13] {

@@ -7,8 +7,8 @@ mod server;
 
 use std::path::Path;
 
-use palpate::limits::Limits;
 use palpate_proto::pb;
+use palpate_tissue::limits::Limits;
 use prost::Message;
 use server::TestServer;
 use tonic::Status;
@@ -123,9 +123,12 @@ async fn a_session_that_was_told_negative_zeros_is_verified_and_outlives_a_kill(
     let session = after.status(&id).await;
     assert_eq!(session.step, 1010);
     assert_eq!(after.hash_at(&id, 1010).await, hash);
-    let file =
-        palpate::journal::file::list(folder.path()).unwrap().into_iter().find(|file| file.session_id == id).unwrap();
-    let reader = palpate::journal::JournalReader::open(&file.path).unwrap();
-    let verdict = palpate::journal::verify(reader, &Limits::default(), &mut |_, _| {}).unwrap();
+    let file = palpate_session::journal::file::list(folder.path())
+        .unwrap()
+        .into_iter()
+        .find(|file| file.session_id == id)
+        .unwrap();
+    let reader = palpate_session::journal::JournalReader::open(&file.path).unwrap();
+    let verdict = palpate_session::journal::verify(reader, &Limits::default(), &mut |_, _| {}).unwrap();
     assert!(verdict.difference.is_none() && verdict.compared[0] > 0, "{verdict:?}");
 }

@@ -95,7 +95,7 @@ pub async fn forged_tickets(ground: &Ground) -> Result<(), Status> {
 pub async fn chatter(ground: &Ground) -> Result<(), Status> {
     let (offer, _kept) = offered(ground).await?;
     let connection = dial(ground, &offer.certificate_sha256, &offer.ticket).await?;
-    let pose = palpate_proto::touch::pose(glam::DVec3::ZERO, &palpate_touch::Tip::default());
+    let pose = palpate_proto::touch::pose(glam::DVec3::ZERO, &palpate_haptics::Tip::default());
     for number in 1.. {
         let poses = |tool| pb::ToolPoses {
             tool,

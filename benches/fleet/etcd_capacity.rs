@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
-use palpate::cluster::etcd::{Etcd as Client, EtcdOptions, Op, Txn};
-use palpate::cluster::key::{Keys, NodeValue, encode};
-use palpate::cluster::rules;
+use palpate_cluster::etcd::{Etcd as Client, EtcdOptions, Op, Txn};
+use palpate_cluster::key::{Keys, NodeValue, encode};
+use palpate_cluster::rules;
 use serde_json::json;
 
 use crate::FleetTimes;

@@ -24,12 +24,12 @@ const SYSTEM: [(&str, &str); 8] = [
 
 /// Matched against the leaf, outside the system; the first match counts.
 const PROGRAM: [(&str, &str); 17] = [
-    ("palpate::tissue::lanes", "the sweep over the springs"),
+    ("palpate_tissue::lanes", "the sweep over the springs"),
     ("palpate::tissue", "the sheet beside the sweep: forces, samples, checks"),
     ("libm", "the sheet beside the sweep: forces, samples, checks"),
     ("fma", "the sheet beside the sweep: forces, samples, checks"),
     ("palpate::session", "session and schedule"),
-    ("palpate::realtime", "session and schedule"),
+    ("palpate_realtime", "session and schedule"),
     ("palpate", "wire and services"),
     ("tonic", "gRPC and protobuf"),
     ("prost", "gRPC and protobuf"),

@@ -5,10 +5,10 @@
 
 use std::sync::Arc;
 
-use palpate::limits::Limits;
-use palpate::refusal::Result;
-use palpate::scene::{BUILT_IN, Integrator, Named, Scene};
-use palpate::tissue::Model;
+use palpate_refusal::Result;
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{BUILT_IN, Integrator, Named, Scene};
 
 /// The key of each name below.
 pub const INTEGRATOR: &str = "stepping.integrator";

@@ -13,28 +13,28 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use glam::DVec3;
-use palpate::journal::records::{self, Chunk};
-use palpate::journal::{JournalReader, Replay, Topic, message as of_journal, pb as journal_pb};
-use palpate::limits::Limits;
-use palpate::scene::check::check_tip;
-use palpate::scene::profile::Poke;
-use palpate::scene::record::{Record, write_line};
-use palpate::scene::script::{Action, Script};
-use palpate::scene::{FixedVertices, Mesh, MeshShape, PAPER, Scene};
 use palpate::server::config::Config;
 use palpate::server::identity::{self, KnownCallers, Role};
-use palpate::session::Session;
-use palpate::session::command::{Command, Due};
-use palpate::session::intake::Intake;
-use palpate::session::sampling::Sampler;
-use palpate::session::saved::{self, Saved};
-use palpate::shape::RestShape;
-use palpate::surface::Refinement;
-use palpate::tissue::Model;
-use palpate::wire;
-use palpate_mesh::{Group, TriangleMesh};
+use palpate_geometry::{Group, TriangleMesh};
+use palpate_haptics::{Device, Envelope, Law, Renderer};
 use palpate_proto::{datagram as of_touch, pb, touch};
-use palpate_touch::{Device, Envelope, Law, Renderer};
+use palpate_session::Session;
+use palpate_session::command::{Command, Due};
+use palpate_session::intake::Intake;
+use palpate_session::journal::records::{self, Chunk};
+use palpate_session::journal::{JournalReader, Replay, Topic, message as of_journal, pb as journal_pb};
+use palpate_session::sampling::Sampler;
+use palpate_session::saved::{self, Saved};
+use palpate_session::surface::Refinement;
+use palpate_session::wire;
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::check::check_tip;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::record::{Record, write_line};
+use palpate_tissue::scene::script::{Action, Script};
+use palpate_tissue::scene::{FixedVertices, Mesh, MeshShape, PAPER, Scene};
+use palpate_tissue::shape::RestShape;
 use prost::Message;
 
 /// Whether an input is taken.
@@ -176,9 +176,9 @@ pub const REQUESTS: &[(&str, Taker)] = &[
     ("UploadMeshRequest", |bytes| {
         pb::UploadMeshRequest::decode(bytes).is_ok_and(|request| {
             let Ok(unit) = request.unit.parse() else { return false };
-            let within = palpate_mesh::ReadLimits { bytes: 1 << 16, vertices: 1000, triangles: 4000 };
-            palpate_mesh::read(&request.file_name, &request.part, unit, &|_| None, &within).is_ok_and(|read| {
-                let report = palpate_mesh::report(&read.mesh);
+            let within = palpate_geometry::ReadLimits { bytes: 1 << 16, vertices: 1000, triangles: 4000 };
+            palpate_geometry::read(&request.file_name, &request.part, unit, &|_| None, &within).is_ok_and(|read| {
+                let report = palpate_geometry::report(&read.mesh);
                 report.refusal().is_some() || Mesh::of(read.mesh, 0.01, FixedVertices::Rim).is_ok()
             })
         })
@@ -439,7 +439,7 @@ const MAX_N: f64 = 3.3;
 /// What a client hears in a haptic stream, up to the force at the device.
 /// A datagram of a client, and one of a server.
 pub fn datagram(bytes: &[u8]) -> bool {
-    use palpate_touch::datagram_health::Carrier;
+    use palpate_haptics::datagram_health::Carrier;
     let mut carrier = Carrier::default();
     let from_server = pb::SampleDatagram::decode(bytes).is_ok_and(|message| {
         carrier.arrive(message.number, message.acknowledges, 0.0);
@@ -473,7 +473,7 @@ fn datagram_seeds() -> Vec<Vec<u8>> {
     let posed = |sequence: u64, moves: bool| {
         let place_m = DVec3::new(0.1, 0.1, 1e-4 * sequence as f64);
         let velocity_m_per_s = moves.then_some(pb::Vector3 { x: 0.01, y: 0.0, z: -0.1 });
-        let pose = pb::Pose { velocity_m_per_s, ..touch::pose(place_m, &palpate_touch::Tip::default()) };
+        let pose = pb::Pose { velocity_m_per_s, ..touch::pose(place_m, &palpate_haptics::Tip::default()) };
         of_touch::Posed { sequence, client_time_ns: 1_000_000 * (1 + sequence), pose }
     };
     let poses = |tool: u32, moves: bool| {
@@ -729,7 +729,7 @@ fn journal_seeds() -> Vec<Vec<u8>> {
     let header = |scene: Option<pb::Scene>| journal_pb::Header {
         session_id: "a".to_owned(),
         run: 1,
-        replays: palpate::journal::REPLAYS,
+        replays: palpate_session::journal::REPLAYS,
         rate_hz: 1000.0,
         running: true,
         scene,
@@ -818,7 +818,7 @@ fn snapshot_seeds() -> Vec<Vec<u8>> {
         arrival_ns: 5,
         ..Command::new(tool, Some(sequence), action)
     };
-    let (shape, tip) = (model().shape(), palpate_touch::Tip { radius_m: 0.03, ..Default::default() });
+    let (shape, tip) = (model().shape(), palpate_haptics::Tip { radius_m: 0.03, ..Default::default() });
     let middle_m = shape.rest_m(shape.nearest(shape.extent().middle_m()));
     let poke = Poke {
         point: None,

@@ -11,7 +11,7 @@ use tonic::codec::{BufferSettings, Codec, DecodeBuf, Decoder};
 use tonic_prost::ProstCodec;
 
 use crate::measure::{MULTIPLE, ROOM, Shape};
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_refusal::{Reason, Refusal, Result};
 
 /// Largest number of fields at a request's top level: a batch of as many commands as may wait, and some more.
 const MAX_FIELDS: usize = 4096 + 256;
@@ -111,7 +111,7 @@ impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
     }
 }
 
-/// Whether the codec decodes the bytes of a message of this type: what it refuses before.
+/// Returns whether the codec decodes the bytes of a message of this type: what it refuses before.
 ///
 /// # Errors
 /// Refuses a message that takes more memory than any valid one, and a request with more fields.

@@ -31,7 +31,7 @@ const WAITING_BYTES: usize = 4 * MAX_BYTES;
 /// pauses double, would find out that the network is back.
 const IDLE: Duration = Duration::from_secs(10);
 
-/// A session's settings of QUIC.
+/// Returns a session's settings of QUIC.
 pub fn transport() -> TransportConfig {
     let mut transport = TransportConfig::default();
     transport
@@ -91,8 +91,9 @@ pub struct Posed {
     pub pose: pb::Pose,
 }
 
-/// The message of the newest pose of `tool`, and of the poses before it, newest first. Those of another tip, or so far away that
-/// their difference has no place in the message, are left out: nothing but a gap of some milliseconds is lost.
+/// Returns the message of the newest pose of `tool`, and of the poses before it, newest first. Those of another tip, or
+/// so far away that their difference has no place in the message, are left out: nothing but a gap of some milliseconds
+/// is lost.
 pub fn tool_poses<'a>(tool: u32, newest: &Posed, earlier: impl Iterator<Item = &'a Posed>) -> pb::ToolPoses {
     let place_m = from_vector(newest.pose.position_m.as_ref());
     let difference = |before: &Posed| {
@@ -117,7 +118,7 @@ pub fn tool_poses<'a>(tool: u32, newest: &Posed, earlier: impl Iterator<Item = &
     }
 }
 
-/// The commands in that message, oldest first. What makes no sense is left out.
+/// Returns the commands in that message, oldest first. What makes no sense is left out.
 pub fn commands(message: &pb::ToolPoses) -> impl Iterator<Item = pb::Command> {
     let pb::ToolPoses { tool, sequence, client_time_ns, pose, earlier } = message;
     let command = |sequence: u64, client_time_ns: u64, pose: pb::Pose| pb::Command {
@@ -142,7 +143,7 @@ pub fn commands(message: &pb::ToolPoses) -> impl Iterator<Item = pb::Command> {
 mod tests {
     use super::*;
     use crate::touch;
-    use palpate_touch::Tip;
+    use palpate_haptics::Tip;
 
     fn posed(sequence: u64, place_m: DVec3, tip: &Tip) -> Posed {
         Posed { sequence, client_time_ns: 5 + 1_000_000 * sequence, pose: touch::pose(place_m, tip) }

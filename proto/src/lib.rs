@@ -5,21 +5,17 @@
 //!   the crate `palpate-client`.
 //! - [`journal`]: the messages of journals, from `palpate/journal/v1/*.proto`.
 //! - `agones` (feature `agones`): the calls of the SDK of Agones that servers of a fleet use, from `agones/*.proto`.
-//! - [`refusal`]: the reasons for which inputs are refused, and [`error`]: refusals as gRPC statuses.
+//! - Refusals as gRPC statuses are in the crate `palpate-refusal`, with its feature `status`.
 //! - `etcd` (feature `etcd`): messages and clients of etcd, from `etcd/*.proto`, which have what a fleet of servers uses.
 //! - [`measure`]: how much memory a message takes, before it is decoded; [`codec`]: decodes what comes within that bound.
 //! - `datagram` (feature `datagrams`): what both ends of datagrams agree on.
-//! - [`printable`]: text of others on a terminal and in a log.
-//! - [`geometry`] and [`touch`]: conversion of vectors, and of the types of the crate `palpate-touch`.
+//! - [`geometry`] and [`touch`]: conversion of vectors, and of the types of the crate `palpate-haptics`.
 
 pub mod codec;
 #[cfg(feature = "datagrams")]
 pub mod datagram;
-pub mod error;
 pub mod geometry;
 pub mod measure;
-pub mod printable;
-pub mod refusal;
 pub mod touch;
 
 /// The generated code: messages, clients and servers of package `palpate.v1`.

@@ -6,7 +6,7 @@
 
 use prost::{Message, Name};
 
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_refusal::{Reason, Refusal, Result};
 
 /// A message may take so many bytes of memory for each byte that came, and [`ROOM`] beside.
 pub const MULTIPLE: usize = 32;
@@ -65,23 +65,23 @@ pub struct Measure {
 }
 
 impl Shape {
-    /// That of a type of message. `None` if it is none of this crate's own.
+    /// Returns the shape of a type of message. `None` if it is none of this crate's own.
     pub fn of<M: Name>() -> Option<&'static Shape> {
         let name = M::full_name();
         SHAPES.iter().find(|shape| shape.name == name)
     }
 
-    /// Of every type of message: of the protocol, of journals and, with the feature `etcd`, of etcd.
+    /// Returns the shapes of every type of message: of the protocol, of journals and, with the feature `etcd`, of etcd.
     pub fn all() -> &'static [Shape] {
         SHAPES
     }
 
-    /// The full name of its type.
+    /// Returns the full name of its type.
     pub fn name(&self) -> &'static str {
         self.name
     }
 
-    /// Whether bytes can be decoded as such a message, whatever that takes.
+    /// Returns whether bytes can be decoded as such a message, whatever that takes.
     pub fn decodes(&self, bytes: &[u8]) -> bool {
         (self.decode)(bytes)
     }
@@ -176,7 +176,7 @@ pub fn varint(bytes: &mut &[u8]) -> Option<u64> {
     None
 }
 
-/// Memory that the message in `bytes` takes when it is decoded.
+/// Returns the memory that the message in `bytes` takes when it is decoded.
 ///
 /// # Errors
 /// Refuses one that would take more than [`MULTIPLE`] times its bytes and `room`.

@@ -1,14 +1,14 @@
 //! Conversion of devices, tips, force laws and local models.
 
 use glam::{DMat3, DVec3};
-use palpate_touch::law::{Law, Row};
-use palpate_touch::{ContactState, Coupling, Device, LocalModel, Tip};
+use palpate_haptics::law::{Law, Row};
+use palpate_haptics::{ContactState, Coupling, Device, LocalModel, Tip};
 
 use crate::geometry::{from_vector, point, vector};
 use crate::pb;
-use crate::refusal::{self, Reason, Refusal, Result, number};
+use palpate_refusal::{self as refusal, Reason, Refusal, Result, number};
 
-/// The device in a message.
+/// Returns the device in a message.
 ///
 /// # Errors
 /// Returns an error if the name is not fit for a log, or if a limit of the device is out of range.
@@ -28,7 +28,7 @@ pub fn from_device(message: &pb::Device) -> Result<Device> {
     })
 }
 
-/// A device as a message.
+/// Returns a device as a message.
 pub fn device(device: &Device) -> pb::Device {
     pb::Device {
         name: device.name.to_owned(),
@@ -40,7 +40,7 @@ pub fn device(device: &Device) -> pb::Device {
     }
 }
 
-/// The tip in a message; the default tip if it is absent, and the default friction if that is.
+/// Returns the tip in a message; the default tip if it is absent, and the default friction if that is.
 pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
     tip.map_or_else(Tip::default, |tip| Tip {
         radius_m: tip.radius_m,
@@ -53,7 +53,7 @@ pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
     })
 }
 
-/// A tip as a message.
+/// Returns a tip as a message.
 pub fn tip(tip: &Tip) -> pb::Tip {
     pb::Tip {
         radius_m: tip.radius_m,
@@ -68,7 +68,7 @@ pub fn tip(tip: &Tip) -> pb::Tip {
     }
 }
 
-/// The pose of a tool whose tip is at `place_m`, m.
+/// Returns the pose of a tool whose tip is at `place_m`, m.
 pub fn pose(place_m: DVec3, tip: &Tip) -> pb::Pose {
     pb::Pose {
         position_m: vector(place_m),
@@ -79,7 +79,7 @@ pub fn pose(place_m: DVec3, tip: &Tip) -> pb::Pose {
     }
 }
 
-/// A force law with its number in the stream, as a message.
+/// Returns a force law with its number in the stream, as a message.
 pub fn law(law: &Law, number: u32) -> pb::ForceLaw {
     let row = |row: &Row| pb::ForceLawRow {
         force_n: row.force_n,
@@ -92,7 +92,7 @@ pub fn law(law: &Law, number: u32) -> pb::ForceLaw {
     pb::ForceLaw { step_m: law.step_m, rows: law.rows.iter().map(row).collect(), coarse: law.is_coarse, number }
 }
 
-/// The force law in a message.
+/// Returns the force law in a message.
 ///
 /// # Errors
 /// Returns an error if a client can't use the law ([`Law::is_sound`]).
@@ -112,8 +112,8 @@ pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
     if law.is_sound() { Ok(law) } else { Err(wrong()) }
 }
 
-/// The law that takes the place of law `before`, with its number; or the reason and the message why there is none.
-/// `tissue_step`: the step from whose beginning on another tissue acts, if that is the cause.
+/// Returns the law that takes the place of law `before`, with its number; or the reason and the message why there is
+/// none. `tissue_step`: the step from whose beginning on another tissue acts, if that is the cause.
 pub fn law_update(
     before: u32,
     tissue_step: Option<u64>,
@@ -139,7 +139,7 @@ fn from_symmetric(m: Option<&pb::Symmetric3>) -> DMat3 {
     })
 }
 
-/// A local model as a message.
+/// Returns a local model as a message.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn local_model(model: &LocalModel) -> pb::LocalModel {
     let contact = match model.contact_state {
@@ -166,7 +166,7 @@ pub fn local_model(model: &LocalModel) -> pb::LocalModel {
     }
 }
 
-/// The local model in a message. The renderer refuses models that it can't render.
+/// Returns the local model in a message. The renderer refuses models that it can't render.
 pub fn from_local_model(message: &pb::LocalModel, step: u64) -> LocalModel {
     let contact_state = match message.contact() {
         pb::Contact::Unspecified | pb::Contact::Free => ContactState::Free,
@@ -197,12 +197,12 @@ pub fn from_local_model(message: &pb::LocalModel, step: u64) -> LocalModel {
 /// Bytes of the headers around a message of a stream: gRPC, HTTP/2, TCP and IP.
 const HEADER_BYTES: u64 = 5 + 9 + 32 + 20;
 
-/// The size of a sample on the wire, bytes.
+/// Returns the size of a sample on the wire, bytes.
 pub fn wire_bytes(sample: &pb::Sample) -> u64 {
     prost::Message::encoded_len(sample) as u64 + HEADER_BYTES
 }
 
-/// The size on the wire of a sample of one tool with this model, bytes.
+/// Returns the size on the wire of a sample of one tool with this model, bytes.
 pub fn sample_bytes(model: &LocalModel) -> u64 {
     let tool = pb::ToolSample {
         acknowledged_sequence: model.sequence,

@@ -3,11 +3,11 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use palpate::printable::printable_lines;
-use palpate::scene::Body;
-use palpate::scene::collection::find_script;
-use palpate::session::check;
-use palpate::tissue::Model;
+use palpate_refusal::printable::printable_lines;
+use palpate_session::check;
+use palpate_tissue::Model;
+use palpate_tissue::scene::Body;
+use palpate_tissue::scene::collection::find_script;
 
 use super::scene::{SceneArguments, compile, compile_with};
 use super::{Failure, clock_s, say};

@@ -2,7 +2,7 @@
 
 use std::io::{Result, Write};
 
-use palpate::printable::{printable, printable_json};
+use palpate_refusal::printable::{printable, printable_json};
 use tracing_subscriber::field::MakeExt;
 use tracing_subscriber::fmt::format::{FormatFields, debug_fn};
 

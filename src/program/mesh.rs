@@ -4,13 +4,13 @@ use std::fmt::{self, Display};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-use palpate::files;
-use palpate::printable::{printable, printable_json};
-use palpate_mesh::decimate::{MIN_VERTICES, decimate};
-use palpate_mesh::repair::{Repair, SurfaceMeasure, repair};
-use palpate_mesh::report::{Finding, LISTED, MeshReport, Spread};
-use palpate_mesh::write::{Format, write};
-use palpate_mesh::{Group, MeshError, ReadLimits, TriangleMesh, Unit, prepare, read, report};
+use palpate_geometry::decimate::{MIN_VERTICES, decimate};
+use palpate_geometry::repair::{Repair, SurfaceMeasure, repair};
+use palpate_geometry::report::{Finding, LISTED, MeshReport, Spread};
+use palpate_geometry::write::{Format, write};
+use palpate_geometry::{Group, MeshError, ReadLimits, TriangleMesh, Unit, prepare, read, report};
+use palpate_refusal::printable::{printable, printable_json};
+use palpate_tissue::files;
 use serde::Serialize;
 
 use super::{Failure, write_file};
@@ -79,7 +79,7 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     let output = arguments.output.as_ref().map(|path| Ok((path, Format::of(&path.display().to_string())?)));
     let output = output
         .transpose()
-        .map_err(|problem: palpate_mesh::Problem| Failure::Refused(format!("--output: {problem}")))?;
+        .map_err(|problem: palpate_geometry::Problem| Failure::Refused(format!("--output: {problem}")))?;
     let limits = ReadLimits::default();
     let bytes = files::read(&arguments.file, limits.bytes as u64)?;
     let folder = arguments.file.parent().unwrap_or(Path::new(""));

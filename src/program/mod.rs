@@ -17,16 +17,16 @@ pub(crate) mod token;
 use std::io::IsTerminal;
 use std::path::Path;
 
-use palpate::realtime::clock::now_ns;
-use palpate::refusal::Refusal;
 use palpate::server::ServeError;
 use palpate::server::config::Config;
+use palpate_realtime::clock::now_ns;
+use palpate_refusal::Refusal;
 
 /// Writes a line to the standard error, whatever names and messages of others are in it. A closed standard error does not end the
 /// program.
 macro_rules! say {
     ($($text:tt)*) => {{
-        let text = palpate::printable::printable(format_args!($($text)*));
+        let text = palpate_refusal::printable::printable(format_args!($($text)*));
         let _ = std::io::Write::write_all(&mut std::io::stderr(), (text + "\n").as_bytes());
     }};
 }
@@ -59,7 +59,7 @@ impl From<ServeError> for Failure {
 
 /// Does something that may need more memory than there is.
 pub(crate) fn within_memory(work: impl FnOnce() -> Result<(), Failure>) -> Result<(), Failure> {
-    palpate::memory::attempt("", || Ok(work()))?
+    palpate_tissue::memory::attempt("", || Ok(work()))?
 }
 
 /// The configuration of a file, or the default one.

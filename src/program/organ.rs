@@ -3,8 +3,8 @@
 use std::io::Write as _;
 use std::path::PathBuf;
 
-use palpate_mesh::organ::{self, Organ, OrganError};
-use palpate_mesh::write::{Format, write};
+use palpate_geometry::organ::{self, Organ, OrganError};
+use palpate_geometry::write::{Format, write};
 
 use super::{Failure, say, write_file};
 

@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 
 use palpate::render::{self, Film, View};
-use palpate::scene::collection::find_script;
-use palpate::surface::Refinement;
-use palpate::texture;
+use palpate_session::surface::Refinement;
+use palpate_tissue::scene::collection::find_script;
+use palpate_tissue::texture;
 
 use super::scene::{SceneArguments, compile};
 use super::{Failure, say, with_progress, write_file};

@@ -3,9 +3,9 @@
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 
-use palpate::scene::collection::find_script;
-use palpate::scene::record::{self, Summary};
-use palpate::session::run;
+use palpate_session::run;
+use palpate_tissue::scene::collection::find_script;
+use palpate_tissue::scene::record::{self, Summary};
 
 use super::scene::{SceneArguments, compile};
 use super::{Failure, clock_s, say, with_progress};

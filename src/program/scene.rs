@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use palpate::limits::Limits;
-use palpate::refusal::Refusal;
-use palpate::scene::collection::find_scene;
-use palpate::tissue::Model;
+use palpate_refusal::Refusal;
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::collection::find_scene;
 
 use super::{Failure, load_config};
 

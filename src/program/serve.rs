@@ -4,10 +4,10 @@ use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use palpate::budget;
-use palpate::priority::{NETWORK_TURN, take_short_turns};
 use palpate::server::{self, Listeners, signals};
-use palpate::tissue::check_processor;
+use palpate_realtime::priority::{NETWORK_TURN, take_short_turns};
+use palpate_session::budget;
+use palpate_tissue::check_processor;
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::fmt::format::FmtSpan;
 
@@ -213,7 +213,7 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let filter = tracing_subscriber::EnvFilter::try_new(&config.log)
         .map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
     let detailed = filter.max_level_hint().is_none_or(|level| level >= tracing::Level::DEBUG);
-    budget::save_addresses();
+    budget::set_up_allocator();
     // Logging never blocks: lines that do not fit into the queue are dropped.
     let (writer, _flush) = tracing_appender::non_blocking(std::io::stderr());
     let subscriber = tracing_subscriber::fmt()
@@ -243,13 +243,13 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
         signals::outlive();
         signals::cancel_on(shutdown.clone());
         let (url, metrics) = (listeners.url(), listeners.metrics_url());
-        let ready = move || {
+        let ready = Box::new(move || {
             // The standard output may be closed; that does not stop the server.
             let _ = writeln!(std::io::stdout(), "palpate listens on {url}");
             if let Some(url) = metrics {
                 let _ = writeln!(std::io::stdout(), "metrics are at {url}");
             }
-        };
+        });
         Ok(server::serve(listeners, config, shutdown, ready).await?)
     });
     runtime.shutdown_background();

@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
-use palpate::limits::Limits;
-use palpate::scene::{Named, PaintedSurface};
-use palpate::texture;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{Named, PaintedSurface};
+use palpate_tissue::texture;
 
 use super::{Failure, write_file};
 

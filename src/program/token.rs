@@ -3,8 +3,8 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use palpate::files;
 use palpate::server::identity::{self, Role};
+use palpate_tissue::files;
 
 use super::Failure;
 

@@ -5,15 +5,15 @@ use std::io::Write;
 use std::sync::Arc;
 
 use super::picture::{Arrow, View, picture};
-use crate::limits::Limits;
-use crate::refusal::Refusal;
-use crate::scene::profile::{Moment, Poke};
-use crate::scene::script::Script;
-use crate::session::Session;
-use crate::session::run::{self, Player};
-use crate::surface::{Skin, Snapshot};
-use crate::texture::Image;
-use crate::tissue::Model;
+use palpate_refusal::Refusal;
+use palpate_session::Session;
+use palpate_session::run::{self, Player};
+use palpate_session::surface::{Skin, Snapshot};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::{Moment, Poke};
+use palpate_tissue::scene::script::Script;
+use palpate_tissue::texture::Image;
 
 /// The reason why there is no picture.
 #[derive(Debug, thiserror::Error)]
@@ -72,7 +72,7 @@ impl<'a> Film<'a> {
         Ok(())
     }
 
-    /// The tissue when `step` steps are done.
+    /// Returns the tissue when `step` steps are done.
     ///
     /// # Errors
     /// Returns a failure if the guard stops the run or a change of the tissue is refused.
@@ -88,7 +88,7 @@ impl<'a> Film<'a> {
         Ok(Still::of(&self.session, self.shown.as_ref(), arrows))
     }
 
-    /// The tissue at the script's sample time with the largest displacement.
+    /// Returns the tissue at the script's sample time with the largest displacement.
     ///
     /// # Errors
     /// As for [`Film::at`].
@@ -109,7 +109,7 @@ impl<'a> Film<'a> {
 }
 
 impl Still {
-    /// The tissue of a session as it stands; `shown` is what is shown of a mesh.
+    /// Returns the tissue of a session as it stands; `shown` is what is shown of a mesh.
     pub fn of(session: &Session, shown: Option<&Arc<Skin>>, arrows: Vec<Arrow>) -> Self {
         let mut displacement_m = std::array::from_fn(|_| Vec::new());
         session.tissue().shown_displacements_m(&mut displacement_m);
@@ -118,7 +118,7 @@ impl Still {
         Still { snapshot, shown: shown.cloned(), arrows }
     }
 
-    /// Simulated time, s.
+    /// Returns the simulated time, s.
     pub fn time_s(&self) -> f64 {
         self.snapshot.simulation_time_s
     }
@@ -155,7 +155,7 @@ impl<W: Write> Gif<W> {
         Ok(Gif { encoder, size, delay, steps_a_frame: 0.01 * delay * rate_hz })
     }
 
-    /// The step of a frame, from the step of the first one.
+    /// Returns the step of a frame, from the step of the first one.
     pub fn step(&self, frame: u64) -> u64 {
         (frame as f64 * self.steps_a_frame).round() as u64
     }

@@ -4,10 +4,10 @@ use glam::{DVec2, DVec3, Vec3Swizzles};
 
 use super::canvas::{Canvas, Corner, SAMPLES, colour, linear};
 use super::surface::{DrawnSurface, Vertex};
-use crate::refusal::{Reason, Refusal, Result, number};
-use crate::shape::{PointId, PointName, RestShape};
-use crate::surface::{Refinement, Skin as Shown, Snapshot};
-use crate::texture::Image;
+use palpate_refusal::{Reason, Refusal, Result, number};
+use palpate_session::surface::{Refinement, Skin as Shown, Snapshot};
+use palpate_tissue::shape::{PointId, PointName, RestShape};
+use palpate_tissue::texture::Image;
 
 /// The camera. It always looks at the middle of the tissue.
 #[derive(Debug, Clone, Copy, PartialEq)]

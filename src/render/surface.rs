@@ -2,8 +2,8 @@
 
 use glam::{DVec2, DVec3};
 
-use crate::shape::RestShape;
-use crate::surface::{Encoding, Refinement, Skin, Snapshot, encode};
+use palpate_session::surface::{Encoding, Refinement, Skin, Snapshot, encode};
+use palpate_tissue::shape::RestShape;
 
 /// A triangle that shows so many times as much of the texture along its sides as half of all do is across a seam.
 const SEAM: f64 = 6.0;

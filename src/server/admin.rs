@@ -9,12 +9,12 @@ use tracing::info;
 
 use super::connections::Register;
 use super::services::Services;
-use crate::budget::{Account, Purpose, Resource, Work};
-use crate::realtime::StreamKind;
-use crate::realtime::clock::now_ns;
-use crate::refusal::{Reason, Refusal, excerpt};
 use palpate_proto::pb;
 use palpate_proto::pb::admin_service_server::AdminService;
+use palpate_realtime::StreamKind;
+use palpate_realtime::clock::now_ns;
+use palpate_refusal::{Reason, Refusal, excerpt};
+use palpate_session::budget::{Account, Purpose, Resource, Work};
 
 /// Sessions of a fleet in one message.
 const FLEET_SESSIONS_PER_PART: usize = 1000;

@@ -21,9 +21,9 @@ use super::reload::Reloaded;
 use super::request::{RequestBody, TimeLimit, paid_for};
 use super::revocation::Calls;
 use super::traffic::Traffic;
-use crate::budget::Budget;
-use crate::realtime::fence::Fence;
-use crate::refusal::{Reason, Refusal, Result, excerpt};
+use palpate_realtime::fence::Fence;
+use palpate_refusal::{Reason, Refusal, Result, excerpt};
+use palpate_session::budget::Budget;
 
 /// Puts a [`CallAuthorizer`] in front of a service.
 #[derive(Clone)]

@@ -3,14 +3,14 @@
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 
-use crate::limits::Limits;
-use crate::lock::lock;
-use crate::refusal::{Refusal, Result};
-use crate::scene::collection::Collection;
-use crate::scene::kind::TextKind;
-use crate::scene::reader::fits;
-use crate::scene::script::Script;
-use crate::scene::{BUILT_IN, Scene};
+use palpate_refusal::{Refusal, Result};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::lock::lock;
+use palpate_tissue::scene::collection::Collection;
+use palpate_tissue::scene::kind::TextKind;
+use palpate_tissue::scene::reader::fits;
+use palpate_tissue::scene::script::Script;
+use palpate_tissue::scene::{BUILT_IN, Scene};
 
 /// Scenes and scripts by name.
 #[derive(Debug, Clone)]
@@ -22,7 +22,7 @@ pub struct Catalog {
 }
 
 impl Catalog {
-    /// The scenes and scripts of two folders, either of which may be missing, and the built-in ones.
+    /// Returns the scenes and scripts of two folders, either of which may be missing, and the built-in ones.
     pub fn new(scenes: &Path, scripts: &Path) -> Self {
         Catalog {
             scenes: Collection::new(TextKind::Scene, scenes),
@@ -31,27 +31,29 @@ impl Catalog {
         }
     }
 
-    /// The names of all scenes, sorted.
+    /// Returns the names of all scenes, sorted.
     pub fn names(&self, limits: &Limits) -> Vec<String> {
         self.scenes.names(limits)
     }
 
-    /// The refusals of scripts in the folder of scenes and of scenes in that of scripts, which have no name here.
+    /// Returns the refusals of scripts in the folder of scenes and of scenes in that of scripts, which have no name
+    /// here.
     pub fn misplaced(&self, limits: &Limits) -> Vec<Refusal> {
         [&self.scenes, &self.scripts].into_iter().flat_map(|all| all.all_misplaced(limits)).collect()
     }
 
-    /// The names of the scenes that are not built in word for word: nobody has looked yet whether they are valid.
+    /// Returns the names of the scenes that are not built in word for word: nobody has looked yet whether they are
+    /// valid.
     pub fn foreign_names(&self, limits: &Limits) -> Vec<String> {
         self.scenes.names_where(&self.scripts, limits, |name, text| !is_built_in(name, text))
     }
 
-    /// The names of all scripts, sorted.
+    /// Returns the names of all scripts, sorted.
     pub fn script_names(&self, limits: &Limits) -> Vec<String> {
         self.scripts.names(limits)
     }
 
-    /// The names of the scripts that are made for the scene of that name, sorted.
+    /// Returns the names of the scripts that are made for the scene of that name, sorted.
     pub fn script_names_for(&self, scene: &str, limits: &Limits) -> Vec<String> {
         self.scripts.names_where(&self.scenes, limits, |_, text| fits(text, scene))
     }

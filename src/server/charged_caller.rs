@@ -6,7 +6,7 @@ use tonic::Extensions;
 
 use super::address::address_name;
 use super::connections::Peer;
-use crate::budget::Account;
+use palpate_session::budget::Account;
 
 /// The caller. `authorize` puts it into the extensions of every call that it lets through.
 #[derive(Debug, Clone)]

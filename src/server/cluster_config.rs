@@ -4,8 +4,8 @@ use std::path::PathBuf;
 
 use serde::Deserialize;
 
-use crate::cluster::key::{Keys, check_name};
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_cluster::key::{Keys, check_name};
+use palpate_refusal::{Reason, Refusal, Result};
 
 /// The section `[cluster]`.
 #[derive(Debug, Clone, Deserialize)]
@@ -79,7 +79,7 @@ impl Default for ClusterConfig {
 }
 
 impl ClusterConfig {
-    /// Whether the server is of a fleet.
+    /// Returns whether the server is of a fleet.
     pub fn is_on(&self) -> bool {
         !self.etcd.is_empty()
     }
@@ -103,6 +103,10 @@ impl ClusterConfig {
     /// # Errors
     /// Names the first key that is missing or wrong.
     pub(super) fn check(&self, beside: Beside) -> Result<()> {
+        if self.agones && !cfg!(feature = "agones") {
+            let message = "is set, but this program was built without the feature `agones`";
+            return Err(Refusal::new(Reason::NotAvailable, "cluster.agones", message));
+        }
         if !self.is_on() {
             if self.advertise.is_some() || !self.node.is_empty() || self.agones {
                 let message = "is missing: without the URLs of etcd the server belongs to no fleet";

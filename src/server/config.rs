@@ -7,10 +7,10 @@ use serde::Deserialize;
 use super::address::host_and_port;
 use super::cluster_config::{Beside, ClusterConfig};
 use super::journals::retention::Keep;
-use crate::files;
-use crate::limits::Limits;
-use crate::refusal::{Reason, Refusal, Result, number, positive};
-use crate::scene::document::nearest_name;
+use palpate_refusal::{Reason, Refusal, Result, number, positive};
+use palpate_tissue::files;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::document::nearest_name;
 
 /// Everything that you can configure. Absent keys keep their defaults.
 #[derive(Debug, Clone, Deserialize)]
@@ -212,12 +212,12 @@ impl Config {
         Ok(())
     }
 
-    /// The number of stepping threads, at least 1.
+    /// Returns the number of stepping threads, at least 1.
     pub fn stepping_threads(&self) -> usize {
         if self.threads > 0 { self.threads } else { cores().saturating_sub(1).max(1) }
     }
 
-    /// The number of network threads, at least 1.
+    /// Returns the number of network threads, at least 1.
     pub fn serving_threads(&self) -> usize {
         let left = cores().saturating_sub(self.stepping_threads()).max(1);
         if self.network_threads > 0 { self.network_threads } else { left }

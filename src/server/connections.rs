@@ -28,9 +28,9 @@ use super::reload::Reloaded;
 use super::tls::{self, Tls};
 use super::traffic::{Open, Traffic};
 use super::transport::{FrameParser, Gate, ReadPause};
-use crate::budget::{Budget, Purpose, Resource, Taken};
-use crate::limits::Limits;
-use crate::lock::lock;
+use palpate_session::budget::{Budget, Purpose, Resource, Taken};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::lock::lock;
 
 /// Time before accepting again after an error: file descriptors that have run out become free again.
 const ACCEPT_RETRY: Duration = Duration::from_millis(100);

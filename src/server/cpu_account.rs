@@ -13,9 +13,9 @@ use tokio::time::Sleep;
 use tonic::Status;
 use tonic::body::Body;
 
-use crate::budget::{Account, Work};
-use crate::realtime::clock::{now_ns, thread_time_ns};
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_realtime::clock::{now_ns, thread_time_ns};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::budget::{Account, Work};
 
 /// Calls whose paths begin with these are not charged and never wait.
 const NEVER_WAIT: [&str; 4] = [
@@ -133,8 +133,8 @@ impl http_body::Body for Charged {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::Budget;
-    use crate::limits::Limits;
+    use palpate_session::budget::Budget;
+    use palpate_tissue::limits::Limits;
 
     #[test]
     fn a_caller_that_has_used_up_its_share_waits_and_others_do_not() {

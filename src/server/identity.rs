@@ -14,9 +14,9 @@ use ring::digest::{SHA256, digest};
 use serde::Deserialize;
 use subtle::ConstantTimeEq;
 
-use crate::ids::random_bits;
-use crate::refusal::{Reason, Refusal, Result, label};
-use crate::scene::document::nearest_name;
+use palpate_realtime::ids::random_bits;
+use palpate_refusal::{Reason, Refusal, Result, label};
+use palpate_tissue::scene::document::nearest_name;
 
 /// What a caller may do. Every role includes `Watch`, and `Administer` includes every role but `Node`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
@@ -38,7 +38,7 @@ impl Role {
     /// All roles.
     pub const ALL: [Role; 5] = [Role::Watch, Role::Touch, Role::Create, Role::Administer, Role::Node];
 
-    /// The role's name in files and on the command line.
+    /// Returns the role's name in files and on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Role::Watch => "watch",
@@ -49,7 +49,7 @@ impl Role {
         }
     }
 
-    /// The role of that name.
+    /// Returns the role of that name.
     ///
     /// # Errors
     /// Returns an error if there is no such role.
@@ -123,7 +123,7 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.ViewService/WatchFrames", Access::Role(Role::Watch)),
 ];
 
-/// What the call with that path requires; `None` if it is not in the table.
+/// Returns what the call with that path requires; `None` if it is not in the table.
 pub fn access(path: &str) -> Option<Access> {
     CALLS.iter().find(|call| call.0 == path).map(|call| call.1)
 }
@@ -184,7 +184,7 @@ fn owner(field: &str, name: &str) -> Result<()> {
     label(field, name)
 }
 
-/// The entry of a token for the token file. It holds the token's hash, not the token.
+/// Returns the entry of a token for the token file. It holds the token's hash, not the token.
 ///
 /// # Errors
 /// Returns an error if the name is not fit for a log.
@@ -238,17 +238,17 @@ pub struct KnownCallers {
 }
 
 impl KnownCallers {
-    /// Authentication is disabled: every caller may do everything.
+    /// Returns the identities of a server whose authentication is disabled: every caller may do everything.
     pub fn open() -> Self {
         KnownCallers { open: true, any_certificate: false, tokens: Vec::new(), certificates: Vec::new() }
     }
 
-    /// Every caller with a valid client certificate may do everything.
+    /// Returns the identities of a server on which every caller with a valid client certificate may do everything.
     pub fn certified() -> Self {
         KnownCallers { open: false, any_certificate: true, ..KnownCallers::open() }
     }
 
-    /// Whether authentication is disabled.
+    /// Returns whether authentication is disabled.
     pub fn is_open(&self) -> bool {
         self.open
     }

@@ -12,17 +12,17 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::Duration;
 
-use palpate_mesh::work::{self, GivenUp};
+use palpate_geometry::work::{self, GivenUp};
 use tokio::sync::oneshot;
 use tonic::Status;
 
-use crate::budget::{Account, Turns};
-use crate::limits::Limits;
-use crate::lock::lock;
-use crate::priority::{give_way, thread};
-use crate::realtime::clock::now_ns;
-use crate::refusal::{Reason, Refusal};
-use crate::tissue::scheme_selection::given_up;
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::priority::{give_way, thread};
+use palpate_refusal::{Reason, Refusal};
+use palpate_session::budget::{Account, Turns};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::lock::lock;
+use palpate_tissue::scheme_selection::given_up;
 
 /// Number of threads of a job pool.
 const THREADS: usize = 2;
@@ -293,7 +293,7 @@ impl JobPool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::Budget;
+    use palpate_session::budget::Budget;
     use std::sync::mpsc;
 
     fn job_pool(limits: Limits) -> JobPool {

@@ -3,8 +3,8 @@
 use tokio_rustls::rustls::pki_types::pem::PemObject;
 use tokio_rustls::rustls::pki_types::{PrivatePkcs8KeyDer, SubjectPublicKeyInfoDer};
 
-use crate::journal::signature::{Key, PublicKey};
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::journal::signature::{Key, PublicKey};
 
 fn refuse(why: &str) -> Refusal {
     Refusal::new(Reason::Unreadable, "", why)
@@ -15,7 +15,7 @@ fn other_kind() -> Refusal {
     refuse("is a key of another kind: signatures of journals are Ed25519")
 }
 
-/// The private key in a text (`PRIVATE KEY`, PKCS#8).
+/// Returns the private key in a text (`PRIVATE KEY`, PKCS#8).
 ///
 /// # Errors
 /// Refuses any other text, and a key of another kind. The message does not quote it.
@@ -25,7 +25,7 @@ pub fn private(text: &str) -> Result<Key> {
     Key::of(key.secret_pkcs8_der()).ok_or_else(other_kind)
 }
 
-/// The public key in a text (`PUBLIC KEY`).
+/// Returns the public key in a text (`PUBLIC KEY`).
 ///
 /// # Errors
 /// Refuses any other text, and a key of another kind.

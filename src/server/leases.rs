@@ -4,9 +4,9 @@
 use std::sync::{Arc, Mutex, Weak};
 
 use super::identity::PresentedCredentials;
-use crate::lock::lock;
-use crate::realtime::SessionHandle;
-use crate::session::lease::LeaseId;
+use palpate_realtime::SessionHandle;
+use palpate_session::lease::LeaseId;
+use palpate_tissue::lock::lock;
 
 struct LastingLease {
     handle: Weak<SessionHandle>,

@@ -8,7 +8,7 @@ use tracing::warn;
 use super::config::Config;
 use super::datagrams::Socket;
 use super::protection::Protection;
-use crate::refusal::{Reason, Refusal};
+use palpate_refusal::{Reason, Refusal};
 
 /// Why a server can't run.
 #[derive(Debug, thiserror::Error)]
@@ -93,12 +93,12 @@ impl Listeners {
         Ok(Listeners { listener, metrics, datagrams, protection })
     }
 
-    /// The server's URL.
+    /// Returns the server's URL.
     pub fn url(&self) -> String {
         url(self.protection.scheme(), &self.listener)
     }
 
-    /// The URL of the metrics, if they are served.
+    /// Returns the URL of the metrics, if they are served.
     pub fn metrics_url(&self) -> Option<String> {
         self.metrics.as_ref().map(|listener| url("http", listener) + "/metrics")
     }

@@ -1,9 +1,9 @@
 //! The vertices and triangles of a tissue at rest, in parts, as viewers get them.
 
-use palpate_mesh::Group;
+use palpate_geometry::Group;
 use palpate_proto::pb;
 
-use crate::surface::{MESH_ROW, Refinement, Skin};
+use palpate_session::surface::{MESH_ROW, Refinement, Skin};
 
 /// Vertices of one message: with positions and texture coordinates 40 KiB.
 const VERTICES_PER_PART: usize = 2048;

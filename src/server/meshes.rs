@@ -3,21 +3,21 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use palpate_mesh::prepare::prepare;
-use palpate_mesh::repair::{Repair, repair};
-use palpate_mesh::report::{Border, Finding};
-use palpate_mesh::{Element, MeshError, ReadLimits, TriangleMesh, Unit};
+use palpate_geometry::prepare::prepare;
+use palpate_geometry::repair::{Repair, repair};
+use palpate_geometry::report::{Border, Finding};
+use palpate_geometry::{Element, MeshError, ReadLimits, TriangleMesh, Unit};
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
 
 use super::uploads::{FilePart, Received, UploadKind, Uploads};
-use crate::budget::{Account, Purpose};
-use crate::limits::Limits;
-use crate::memory;
-use crate::refusal::{Reason, Refusal, Result, excerpt};
-use crate::shape::Extent;
-use crate::tissue::scheme_selection::given_up;
-use crate::wire;
+use palpate_refusal::{Reason, Refusal, Result, excerpt};
+use palpate_session::budget::{Account, Purpose};
+use palpate_session::wire;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::memory;
+use palpate_tissue::scheme_selection::given_up;
+use palpate_tissue::shape::Extent;
 
 /// Triangles for each vertex that a mesh may have: a closed surface has two.
 const TRIANGLES_PER_VERTEX: usize = 4;
@@ -146,7 +146,7 @@ impl UploadReading {
             paid = self.received.charge(kept.saturating_add(reading));
             paid.is_ok()
         };
-        let read = palpate_mesh::read_paid(&self.name, &bytes, unit, &|_| None, limits, &mut pay);
+        let read = palpate_geometry::read_paid(&self.name, &bytes, unit, &|_| None, limits, &mut pay);
         paid?;
         let read = read.map_err(refuse)?;
         drop(bytes);
@@ -228,8 +228,8 @@ fn refuse(error: MeshError) -> Refusal {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::budget::{Budget, Resource};
-    use crate::realtime::clock::now_ns;
+    use palpate_realtime::clock::now_ns;
+    use palpate_session::budget::{Budget, Resource};
 
     const TETRAHEDRON: &str = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n";
 

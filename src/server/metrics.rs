@@ -25,12 +25,12 @@ use super::fleet::{Fleet, Standing};
 use super::job_pool::JobPool;
 use super::journals::{Journals, KeeperTally};
 use super::traffic::Traffic;
-use crate::budget::{Budget, Purpose, Resource};
-use crate::limits::Limits;
-use crate::lock::lock;
-use crate::realtime::thread_counters::{Count, ThreadCounters, Times};
-use crate::realtime::{Pacer, RunState};
-use crate::scene::record::AuditedError;
+use palpate_realtime::thread_counters::{Count, ThreadCounters, Times};
+use palpate_realtime::{Pacer, RunState};
+use palpate_session::budget::{Budget, Purpose, Resource};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::lock::lock;
+use palpate_tissue::scene::record::AuditedError;
 
 /// Everything, as it is when it is asked for.
 pub(super) fn registry(
@@ -258,7 +258,8 @@ impl Collector for Stepping {
         for (name, is) in [
             (
                 "running",
-                (|status| status.state == RunState::Running && !status.resting) as fn(&crate::realtime::Status) -> bool,
+                (|status| status.state == RunState::Running && !status.resting)
+                    as fn(&palpate_realtime::Status) -> bool,
             ),
             ("resting", |status| status.state == RunState::Running && status.resting),
             ("paused", |status| status.state == RunState::Paused),

@@ -1,4 +1,4 @@
-//! The server: gRPC and gRPC-web services over `pace`, the page, health, reflection, metrics, and a shutdown with a
+//! The server: gRPC and gRPC-web services over `realtime`, the page, health, reflection, metrics, and a shutdown with a
 //! deadline.
 
 mod address;
@@ -14,6 +14,7 @@ mod datagrams;
 mod descriptors;
 mod fleet;
 mod force_law;
+pub mod frame_message;
 mod haptics;
 mod health;
 pub mod identity;

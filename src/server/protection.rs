@@ -8,7 +8,7 @@ use super::config::Config;
 use super::identity::KnownCallers;
 use super::reload::{Reloaded, of_file, warn_if_readable};
 use super::tls::{self, Tls};
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_refusal::{Reason, Refusal, Result};
 
 /// Time between two checks of when certificates expire.
 const MINUTE: Duration = Duration::from_secs(60);

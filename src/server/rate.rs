@@ -7,9 +7,9 @@
 use std::sync::Mutex;
 use std::time::Duration;
 
-use crate::lock::lock;
-use crate::realtime::clock::now_ns;
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_realtime::clock::now_ns;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::lock::lock;
 
 /// A token bucket.
 #[derive(Debug, Clone)]

@@ -2,10 +2,10 @@
 
 use palpate_proto::pb;
 
-use crate::refusal::{Reason, Refusal};
-use crate::session::Sample;
-use crate::session::recovery::describe;
-use crate::wire;
+use palpate_refusal::{Reason, Refusal};
+use palpate_session::Sample;
+use palpate_session::recovery::describe;
+use palpate_session::wire;
 
 /// What one stream has been told so far.
 #[derive(Debug)]
@@ -42,8 +42,8 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::scene::record::Recovery;
-    use crate::session::recovery::{Ended, Recovered};
+    use palpate_session::recovery::{Ended, Recovered};
+    use palpate_tissue::scene::record::Recovery;
 
     fn sample(recoveries: u64, step: u64) -> Sample {
         let (state_of_step, reason) = (step - 9, "it grew".to_owned());

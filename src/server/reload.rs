@@ -9,10 +9,10 @@ use tokio::time::MissedTickBehavior;
 use tracing::{info, warn};
 use xxhash_rust::xxh3::xxh3_128;
 
-use crate::files;
-use crate::lock::lock;
-use crate::realtime::clock::now_ns;
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_realtime::clock::now_ns;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::files;
+use palpate_tissue::lock::lock;
 
 /// Time between two checks. They compare contents, not times: so a changed symbolic link counts too.
 const INTERVAL: Duration = Duration::from_millis(500);

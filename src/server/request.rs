@@ -16,9 +16,9 @@ use tonic::body::Body;
 
 use super::revocation::Call;
 use super::transport::Gate;
-use crate::budget::{Account, Purpose, Resource, Taken};
-use crate::lock::lock;
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::budget::{Account, Purpose, Resource, Taken};
+use palpate_tissue::lock::lock;
 
 /// How long the messages of a call may take to arrive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -129,8 +129,8 @@ mod tests {
     use prost::Message;
 
     use super::*;
-    use crate::budget::Budget;
-    use crate::limits::Limits;
+    use palpate_session::budget::Budget;
+    use palpate_tissue::limits::Limits;
 
     #[tokio::test]
     async fn a_large_message_is_its_callers_until_the_call_is_answered() {

@@ -20,10 +20,10 @@ use super::connections::Peer;
 use super::identity::{KnownCallers, PresentedCredentials};
 use super::leases::LastingLeases;
 use super::reload::Reloaded;
-use crate::lock::lock;
-use crate::realtime::SessionHandle;
-use crate::refusal::{Refusal, Result};
-use crate::session::lease::LeaseId;
+use palpate_realtime::SessionHandle;
+use palpate_refusal::{Refusal, Result};
+use palpate_session::lease::LeaseId;
+use palpate_tissue::lock::lock;
 
 /// So long a client may take to read that its call is over; then its connection is closed.
 const GRACE: Duration = Duration::from_secs(1);

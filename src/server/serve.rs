@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures_util::future::LocalBoxFuture;
 use http::{HeaderName, HeaderValue, Method, header};
 use tokio_util::sync::CancellationToken;
 use tonic::service::Routes;
@@ -29,15 +30,15 @@ use super::services::Services;
 use super::textures::Textures;
 use super::traffic::Traffic;
 use super::{admin, connections, descriptors, haptics, metrics, nodes, page, sessions, textures, views};
-use crate::budget::{Budget, give_back_to_the_system};
-use crate::realtime::Pacer;
-use crate::realtime::clock::now_ns;
 use palpate_proto::pb;
 use palpate_proto::pb::admin_service_server::AdminServiceServer;
 use palpate_proto::pb::haptic_service_server::HapticServiceServer;
 use palpate_proto::pb::node_service_server::NodeServiceServer;
 use palpate_proto::pb::session_service_server::SessionServiceServer;
 use palpate_proto::pb::view_service_server::ViewServiceServer;
+use palpate_realtime::Pacer;
+use palpate_realtime::clock::now_ns;
+use palpate_session::budget::{Budget, give_back_to_the_system};
 
 /// The headers that pages of these origins may send and read in gRPC-web calls.
 fn cors(origins: &[HeaderValue]) -> CorsLayer {
@@ -65,11 +66,21 @@ const WORTH_GIVING_BACK: u64 = 16 << 20;
 ///
 /// # Errors
 /// Returns an error if a thread can't be started, if the journals or the fleet can't be used, or if the transport fails.
-pub async fn serve(
+pub fn serve(
     listeners: Listeners,
     config: Config,
     shutdown: CancellationToken,
-    ready: impl FnOnce(),
+    ready: Box<dyn FnOnce()>,
+) -> LocalBoxFuture<'static, Result<(), ServeError>> {
+    // Boxed, so that all services are compiled in this crate: a program that polled the future as it is would compile them again.
+    Box::pin(run(listeners, config, shutdown, ready))
+}
+
+async fn run(
+    listeners: Listeners,
+    config: Config,
+    shutdown: CancellationToken,
+    ready: Box<dyn FnOnce()>,
 ) -> Result<(), ServeError> {
     let Listeners { listener, metrics, datagrams: socket, protection } = listeners;
     let budget = Budget::new(&config.limits, config.stepping_threads(), config.serving_threads());

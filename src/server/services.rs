@@ -12,9 +12,9 @@ use super::meshes::Meshes;
 use super::status;
 use super::textures::Textures;
 use super::traffic::Traffic;
-use crate::realtime::{Pacer, SessionHandle};
-use crate::refusal::{Reason, Refusal, Result};
 use palpate_proto::pb;
+use palpate_realtime::{Pacer, SessionHandle};
+use palpate_refusal::{Reason, Refusal, Result};
 
 /// What every service needs.
 #[derive(Clone)]

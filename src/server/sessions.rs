@@ -18,12 +18,12 @@ use super::meshes;
 use super::services::Services;
 use super::status;
 use super::stream_termination::until_cut;
-use crate::budget::{Account, Purpose, Resource, Work};
-use crate::realtime::clock::now_ns;
-use crate::realtime::{SessionReservation, StreamKind};
-use crate::refusal::{Reason, Refusal, number};
-use crate::scene::script::Script;
-use crate::wire;
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::{SessionReservation, StreamKind};
+use palpate_refusal::{Reason, Refusal, number};
+use palpate_session::budget::{Account, Purpose, Resource, Work};
+use palpate_session::wire;
+use palpate_tissue::scene::script::Script;
 
 pub(super) struct Sessions(pub(super) Services);
 

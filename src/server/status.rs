@@ -1,15 +1,15 @@
 //! A session as a message: its state, counts, audits and tissue.
 
-use crate::realtime::event_log::EventLog;
-use crate::realtime::playback::Playback;
-use crate::realtime::{RunState, SessionHandle};
-use crate::scene::Named;
-use crate::scene::record::AuditedError;
-use crate::tissue::Model;
-use crate::tissue::audit::Origin;
-use crate::wire;
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
+use palpate_realtime::event_log::EventLog;
+use palpate_realtime::playback::Playback;
+use palpate_realtime::{RunState, SessionHandle};
+use palpate_session::wire;
+use palpate_tissue::Model;
+use palpate_tissue::audit::Origin;
+use palpate_tissue::scene::Named;
+use palpate_tissue::scene::record::AuditedError;
 
 /// The current state of a session as a message.
 pub(super) fn session(handle: &SessionHandle) -> pb::Session {

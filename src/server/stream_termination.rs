@@ -12,6 +12,6 @@ pub(super) fn until_cut<T: Send + 'static>(
     cut: CancellationToken,
 ) -> Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>> {
     let why = cut.clone();
-    let told = stream::once(async move { why.is_cancelled().then(|| Err(crate::realtime::streams::cut().into())) });
+    let told = stream::once(async move { why.is_cancelled().then(|| Err(palpate_realtime::streams::cut().into())) });
     out.take_until(cut.cancelled_owned()).chain(told.filter_map(std::future::ready)).boxed()
 }

@@ -12,8 +12,8 @@ use tracing::warn;
 
 use super::reload::{Reloaded, of_file, warn_if_readable};
 use super::validity::{self, DAY_S};
-use crate::lock::lock;
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::lock::lock;
 
 /// The TLS configuration of new connections.
 pub(super) struct Tls {

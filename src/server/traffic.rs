@@ -9,7 +9,7 @@ use tracing::{info, warn};
 
 use super::identity::CALLS;
 use super::transport::Cut;
-use crate::refusal::Reason;
+use palpate_refusal::Reason;
 
 /// One label.
 type Label = [(&'static str, &'static str); 1];

@@ -2,11 +2,11 @@
 
 use std::sync::{Arc, Mutex};
 
-use crate::budget::{Account, Purpose, Resource, Taken};
-use crate::ids::random_id;
-use crate::lock::lock;
-use crate::realtime::clock::now_ns;
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::ids::random_id;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::budget::{Account, Purpose, Resource, Taken};
+use palpate_tissue::lock::lock;
 
 /// What is sent: how refusals name it, and its bounds.
 pub(super) struct UploadKind {

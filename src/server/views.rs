@@ -11,16 +11,17 @@ use tonic::{Request, Response, Status};
 use tracing::info;
 
 use super::charged_caller::ChargedCaller;
+use super::frame_message::frame_messages;
 use super::mesh_parts::mesh_part;
 use super::services::Services;
 use super::stream_termination::until_cut;
-use crate::ids::random_id;
-use crate::realtime::frames::Viewer;
-use crate::realtime::{FrameReader, StreamGuard, StreamKind};
-use crate::refusal::number;
-use crate::surface::Refinement;
-use crate::texture::Texture;
-use crate::wire;
+use palpate_realtime::frames::Viewer;
+use palpate_realtime::ids::random_id;
+use palpate_realtime::{FrameReader, StreamGuard, StreamKind};
+use palpate_refusal::number;
+use palpate_session::surface::Refinement;
+use palpate_session::wire;
+use palpate_tissue::texture::Texture;
 
 pub(super) struct Views(pub(super) Services);
 
@@ -50,7 +51,7 @@ impl ViewStream {
                         frame_id.saturating_sub(last.0 + 1).saturating_sub(unchanged.saturating_sub(last.1))
                     });
                     self.last = Some((frame_id, unchanged));
-                    self.messages.extend(wire::sample::frame(&self.viewer_id, &delivery, self.skipped));
+                    self.messages.extend(frame_messages(&self.viewer_id, &delivery, self.skipped));
                 }
                 Err(refusal) => return Some((Err(refusal.into()), None)),
             }

@@ -146,9 +146,9 @@ pub const MIDDLE: [u32; 2] = [SIDE / 2; 2];
 
 /// A sheet of the paper's tissue with so many points.
 pub fn sheet(points_x: u32, points_y: u32) -> pb::Scene {
-    let limits = palpate::limits::Limits::default();
-    let paper = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[], &limits).unwrap();
-    let mut scene = palpate::wire::scene::scene(&paper);
+    let limits = palpate_tissue::limits::Limits::default();
+    let paper = palpate_tissue::scene::Scene::parse("paper", palpate_tissue::scene::PAPER, &[], &limits).unwrap();
+    let mut scene = palpate_session::wire::scene::scene(&paper);
     let sheet = scene.sheet.as_mut().unwrap();
     (sheet.points_x, sheet.points_y) = (Some(points_x), Some(points_y));
     scene

@@ -8,7 +8,7 @@ thread_local! {
     /// Bytes that this thread has, and the most that it has had; what other threads free for it is not known.
     static NOW: Cell<isize> = const { Cell::new(0) };
     static PEAK: Cell<isize> = const { Cell::new(0) };
-    /// A large piece that was asked for last. If it goes back at once, it was a question (`palpate::memory`) and never had a page.
+    /// A large piece that was asked for last. If it goes back at once, it was a question (`palpate_tissue::memory`) and never had a page.
     static ASKED: Cell<isize> = const { Cell::new(0) };
 }
 

@@ -13,9 +13,9 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use palpate::journal::{JournalReader, file, replay};
-use palpate::limits::Limits;
 use palpate_proto::pb;
+use palpate_session::journal::{JournalReader, file, replay};
+use palpate_tissue::limits::Limits;
 use pb::admin_service_client::AdminServiceClient;
 use rustix::process::{Pid, Signal, kill_process};
 use tonic::Status;

@@ -3,8 +3,8 @@
 
 use std::sync::Arc;
 
-use palpate::journal::Opening;
-use palpate::tissue::Model;
+use palpate_session::journal::Opening;
+use palpate_tissue::Model;
 
 /// A running session of ann's that begins with the tissue of `first`.
 pub fn opening(first: &Arc<Model>) -> Opening<'_> {

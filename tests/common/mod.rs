@@ -11,12 +11,12 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use palpate::limits::Limits;
-use palpate::scene::profile::Poke;
-use palpate::scene::script::Script;
-use palpate::scene::{Integrator, Named, Scene};
-use palpate::session::Session;
-use palpate::tissue::{Model, Push};
+use palpate_session::Session;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::script::Script;
+use palpate_tissue::scene::{Integrator, Named, Scene};
+use palpate_tissue::{Model, Push};
 
 pub fn scene(text: &str) -> Scene {
     Scene::parse("test scene", text, &[], &Limits::default()).unwrap()

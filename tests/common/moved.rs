@@ -7,14 +7,14 @@ mod journal_opening;
 use std::io::Cursor;
 use std::sync::Arc;
 
-use palpate::budget::{Budget, Purpose, Resource};
-use palpate::journal::{JournalReader, JournalWriter, Opening, pb as kept, replay};
-use palpate::limits::Limits;
-use palpate::refusal::Result;
-use palpate::session::Session;
-use palpate::tissue::Model;
 use palpate_proto::codec::accepts;
 use palpate_proto::pb;
+use palpate_refusal::Result;
+use palpate_session::Session;
+use palpate_session::budget::{Budget, Purpose, Resource};
+use palpate_session::journal::{JournalReader, JournalWriter, Opening, pb as kept, replay};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
 use prost::Message;
 
 /// Bytes in one message.

@@ -5,11 +5,11 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use palpate::limits::Limits;
-use palpate::scene::Scene;
-use palpate::scene::script::Script;
-use palpate::session::{Session, run};
-use palpate::tissue::Model;
+use palpate_session::{Session, run};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Scene;
+use palpate_tissue::scene::script::Script;
 
 #[path = "closed_mesh.rs"]
 mod closed_mesh;
@@ -163,7 +163,7 @@ pub struct Played {
 
 /// A case's scene with assignments over it.
 pub fn scene(case: &RandomScene, assignments: &[String], limits: &Limits) -> Result<Scene, String> {
-    let text = |refusal: palpate::refusal::Refusal| refusal.to_string();
+    let text = |refusal: palpate_refusal::Refusal| refusal.to_string();
     match &case.mesh {
         None => Scene::parse("random", &case.scene, assignments, limits).map_err(text),
         Some(mesh) => {
@@ -181,7 +181,7 @@ pub fn scene(case: &RandomScene, assignments: &[String], limits: &Limits) -> Res
 pub fn compile(case: &RandomScene, assignments: &[String]) -> Result<(Arc<Model>, Script), String> {
     // Offline, as `palpate run`: the truth takes more than a server would do.
     let limits = Limits { rehearsal_work: 1 << 32, ..Limits::default() };
-    let text = |refusal: palpate::refusal::Refusal| refusal.to_string();
+    let text = |refusal: palpate_refusal::Refusal| refusal.to_string();
     let scene = scene(case, assignments, &limits)?;
     let script = Script::parse("random", &case.script, Path::new("."), &scene, &limits).map_err(text)?;
     Ok((Model::compile(&scene, &limits).map_err(text)?, script))

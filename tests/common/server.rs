@@ -14,8 +14,8 @@ use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::sync::OnceLock;
 use std::time::Duration;
 
+use palpate_haptics::Law;
 use palpate_proto::{pb, touch};
-use palpate_touch::Law;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
 use pb::touch_request::Message as Say;
@@ -337,15 +337,16 @@ pub fn position(tool: u32, sequence: u64, z_m: f64) -> pb::Command {
 
 /// The paper's scene with so many points.
 pub fn sheet(nx: u32, ny: u32) -> pb::create_session_request::Source {
-    let limits = palpate::limits::Limits { points: 1 << 40, ..Default::default() };
+    let limits = palpate_tissue::limits::Limits { points: 1 << 40, ..Default::default() };
     let points = format!("sheet.points=[{nx}, {ny}]");
-    let scene = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[points], &limits).unwrap();
-    pb::create_session_request::Source::Scene(palpate::wire::scene::scene(&scene))
+    let scene = palpate_tissue::scene::Scene::parse("paper", palpate_tissue::scene::PAPER, &[points], &limits).unwrap();
+    pb::create_session_request::Source::Scene(palpate_session::wire::scene::scene(&scene))
 }
 
 /// The steps of the changes of the tissue that wait, as a journal has them. `None`: it can't be read yet.
 pub fn waiting(journal: &Path) -> Option<Vec<u64>> {
-    let survey = palpate::journal::JournalReader::open(journal).and_then(|mut reader| reader.survey(&mut |_| {}));
+    let survey =
+        palpate_session::journal::JournalReader::open(journal).and_then(|mut reader| reader.survey(&mut |_| {}));
     Some(survey.ok()?.waiting.iter().map(|input| input.step).collect())
 }
 

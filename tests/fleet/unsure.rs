@@ -3,8 +3,8 @@
 use std::path::Path;
 use std::time::Duration;
 
-use palpate::journal::file;
 use palpate_proto::pb;
+use palpate_session::journal::file;
 use tonic::Code;
 
 use crate::alone;

@@ -7,8 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use palpate_proto::error::elsewhere;
 use palpate_proto::pb;
+use palpate_refusal::status::elsewhere;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
 use pb::touch_request::Message as Say;

@@ -4,13 +4,13 @@
 use std::path::PathBuf;
 
 use glam::DVec3;
-use palpate::journal::{JournalReader, Vector3, message, pb};
-use palpate::limits::Limits;
-use palpate::scene::profile::Poke;
-use palpate::scene::script::Action;
-use palpate::session::Session;
-use palpate::session::command::{Command, Due};
-use palpate::shape::PointId;
+use palpate_session::Session;
+use palpate_session::command::{Command, Due};
+use palpate_session::journal::{JournalReader, Vector3, message, pb};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::script::Action;
+use palpate_tissue::shape::PointId;
 
 fn vector(vector: Option<Vector3>) -> DVec3 {
     vector.map_or(DVec3::ZERO, |v| DVec3::new(v.x, v.y, v.z))

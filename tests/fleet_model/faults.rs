@@ -1,7 +1,7 @@
 //! What goes wrong, and when; and what must hold some time after it has stopped.
 
-use palpate::cluster::key::{SessionValue, decode};
-use palpate::cluster::placement;
+use palpate_cluster::key::{SessionValue, decode};
+use palpate_cluster::placement;
 
 use crate::broken::Broken;
 use crate::node::{Memory, WHOLE};
@@ -246,7 +246,7 @@ impl World {
 
     fn owners(&self) -> Vec<(S, SessionValue)> {
         let prefix = self.keys.sessions();
-        let of = |found: &palpate::cluster::etcd::KeyValue| {
+        let of = |found: &palpate_cluster::etcd::KeyValue| {
             let sid = self.ids.iter().position(|id| found.key.strip_prefix(&prefix) == Some(id))?;
             Some((sid, decode(&found.value)?))
         };

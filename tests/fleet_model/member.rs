@@ -1,8 +1,8 @@
 //! A node's lease and fence, who else is there, and what it takes back: as `src/server/fleet/member.rs` does it.
 
-use palpate::cluster::etcd::{Compare, Op, Txn};
-use palpate::cluster::key::{NodeValue, decode, encode};
-use palpate::cluster::rules;
+use palpate_cluster::etcd::{Compare, Op, Txn};
+use palpate_cluster::key::{NodeValue, decode, encode};
+use palpate_cluster::rules;
 
 use crate::broken::Broken;
 use crate::node::Memory;

@@ -1,6 +1,6 @@
 //! Journals on their way to the nodes that stand by, as `src/server/fleet/{mirror,stand_by}.rs` do it.
 
-use palpate::cluster::placement;
+use palpate_cluster::placement;
 
 use crate::broken::Broken;
 use crate::node::{ReplicaJournal, ReplicationStream, WHOLE};

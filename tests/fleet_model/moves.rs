@@ -1,7 +1,7 @@
 //! Sessions that move while they go on, as `src/server/fleet/{hand_over,service}.rs` do it.
 
-use palpate::cluster::key::{SessionValue, decode};
-use palpate::cluster::rules;
+use palpate_cluster::key::{SessionValue, decode};
+use palpate_cluster::rules;
 
 use crate::broken::Broken;
 use crate::node::{Coming, Moving, Owned};

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use palpate::cluster::key::NodeValue;
+use palpate_cluster::key::NodeValue;
 
 use crate::world::{ModelEvent, Then};
 use crate::{N, Ns, S};

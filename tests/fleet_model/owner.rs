@@ -1,8 +1,8 @@
 //! Who owns a session: made, kept, claimed, deleted, as `src/server/fleet/{mod,take_over}.rs` do it.
 
-use palpate::cluster::etcd::{Compare, Txn};
-use palpate::cluster::key::{SessionValue, decode};
-use palpate::cluster::rules;
+use palpate_cluster::etcd::{Compare, Txn};
+use palpate_cluster::key::{SessionValue, decode};
+use palpate_cluster::rules;
 
 use crate::broken::Broken;
 use crate::node::{Growth, Owned, OwnedSession, WHOLE};

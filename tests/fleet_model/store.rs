@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use palpate::cluster::etcd::{Compare, KeyValue, Op, TransactionOutcome, Txn};
+use palpate_cluster::etcd::{Compare, KeyValue, Op, TransactionOutcome, Txn};
 
 use crate::Ns;
 

@@ -3,8 +3,8 @@
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet, BinaryHeap, VecDeque};
 
-use palpate::cluster::etcd::{KeyValue, TransactionOutcome, Txn};
-use palpate::cluster::key::Keys;
+use palpate_cluster::etcd::{KeyValue, TransactionOutcome, Txn};
+use palpate_cluster::key::Keys;
 
 use crate::broken::Broken;
 use crate::check::Check;

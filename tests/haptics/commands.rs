@@ -670,9 +670,9 @@ async fn a_record_of_all_points_comes_in_parts() {
 }
 
 fn paper_scene() -> pb::Scene {
-    let limits = palpate::limits::Limits::default();
-    let paper = palpate::scene::Scene::parse("paper", palpate::scene::PAPER, &[], &limits).unwrap();
-    palpate::wire::scene::scene(&paper)
+    let limits = palpate_tissue::limits::Limits::default();
+    let paper = palpate_tissue::scene::Scene::parse("paper", palpate_tissue::scene::PAPER, &[], &limits).unwrap();
+    palpate_session::wire::scene::scene(&paper)
 }
 
 #[tokio::test]

@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 use crate::common::{model, scene_with};
 use crate::server::{TEST_TIMEOUT, TestServer, TestTouch, open};
 use glam::DVec3;
-use palpate::force_law::{self, Disc};
-use palpate::scene::BUILT_IN;
-use palpate::tissue::Model;
-use palpate::wire;
+use palpate_haptics::law::{Law, Row};
+use palpate_haptics::{ContactState, Device, Touching};
 use palpate_proto::{pb, touch};
-use palpate_touch::law::{Law, Row};
-use palpate_touch::{ContactState, Device, Touching};
+use palpate_session::wire;
+use palpate_tissue::Model;
+use palpate_tissue::force_law::{self, Disc};
+use palpate_tissue::scene::BUILT_IN;
 use pb::touch_response::Message as Heard;
 
 /// The number of the law that a sample's local model names, if it has a model. Server and client mean the same: under a
@@ -138,7 +138,7 @@ fn limited(limits: &str) -> TestServer {
 
 /// A session of `paper`, whose exact law takes twice the work of a first one.
 async fn session(server: &TestServer) -> String {
-    let scene = scene_with(palpate::scene::PAPER, &["stepping.integrator=\"lagged\"", "stepping.substeps=1"]);
+    let scene = scene_with(palpate_tissue::scene::PAPER, &["stepping.integrator=\"lagged\"", "stepping.substeps=1"]);
     let source = pb::create_session_request::Source::Scene(wire::scene::scene(&scene));
     server.create(source, false).await.unwrap().session_id
 }

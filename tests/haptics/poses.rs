@@ -1,9 +1,9 @@
 //! Tools controlled by poses over a real server: local models, the force law, deadbands, and refusals.
 
 use crate::server::{TestServer, TestTouch, open, told};
+use palpate_haptics::device::DEVICES;
+use palpate_haptics::{Device, Touching};
 use palpate_proto::{pb, touch};
-use palpate_touch::device::DEVICES;
-use palpate_touch::{Device, Touching};
 use tonic::Code;
 
 fn device() -> pb::Device {

@@ -5,15 +5,15 @@ use std::sync::Arc;
 use crate::common::{advance, scene_with};
 use crate::server::{TEST_TIMEOUT, TestServer, TestTouch, force, open, told};
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::refusal::Reason;
-use palpate::scene::{Change, PAPER};
-use palpate::session::Session;
-use palpate::session::command::{Command, Due};
-use palpate::session::intake::Intake;
-use palpate::session::schedule::Schedule;
-use palpate::tissue::{Grasp, Model, Push, Tissue, at_rest};
 use palpate_proto::pb;
+use palpate_refusal::Reason;
+use palpate_session::Session;
+use palpate_session::command::{Command, Due};
+use palpate_session::intake::Intake;
+use palpate_session::schedule::Schedule;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{Change, PAPER};
+use palpate_tissue::{Grasp, Model, Push, Tissue, at_rest};
 use tonic::Code;
 
 const SCHEMES: [&[&str]; 7] = [
@@ -327,7 +327,7 @@ async fn the_same_bits_on_any_number_of_threads_and_offline() {
     let model = compile(&[]);
     let mut session = Session::new(&model);
     let message = pb::Command { at_step: Some(5), ..force(0, 1, -2.0) };
-    let command: Command = palpate::wire::command::from_command(&message, model.shape(), 0).unwrap();
+    let command: Command = palpate_session::wire::command::from_command(&message, model.shape(), 0).unwrap();
     advance(&mut session, 5);
     session.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
     advance(&mut session, 44);
@@ -354,7 +354,7 @@ async fn a_running_session_changes_at_once_and_logs_it() {
     let softer = Change { anchor_stiffness_n_per_m: Some(1.0), ..Change::default() };
     let answer = sessions.update_tissue(update(&session_id, softer, None)).await.unwrap().into_inner();
     let mut fresh = Session::new(&changed(&compile(&[]), softer));
-    let command = palpate::wire::command::from_command(&force(0, 1, -2.0), fresh.model().shape(), 0).unwrap();
+    let command = palpate_session::wire::command::from_command(&force(0, 1, -2.0), fresh.model().shape(), 0).unwrap();
     fresh.advance(&mut vec![Due { command, late: false, late_commands: 0, ends_lease: false }], |_| {});
     advance(&mut fresh, 20_000);
     let fresh_m = -fresh.sample(None).tools[0].contact.unwrap().displacement_m.z;

@@ -2,11 +2,11 @@
 
 use crate::common::{SMALL, advance, model, playing, push_on, scene, scene_with, schemes, script};
 use glam::DVec3;
-use palpate::scene::Scene;
-use palpate::scene::profile::{LoadProfile, Moment};
-use palpate::session::Session;
-use palpate::shape::PointId;
-use palpate::tissue::{self, Energy, Grasp, Tissue};
+use palpate_session::Session;
+use palpate_tissue::scene::Scene;
+use palpate_tissue::scene::profile::{LoadProfile, Moment};
+use palpate_tissue::shape::PointId;
+use palpate_tissue::{self as tissue, Energy, Grasp, Tissue};
 
 /// A tissue in motion: pushed at a point for some steps, then released.
 fn shaken(scene: &Scene, steps: u64) -> Box<dyn Tissue> {
@@ -629,7 +629,7 @@ fn a_vibration_without_damping_keeps_its_phase() {
 
 #[test]
 fn substeps_follow_the_bound_and_a_bound_is_never_below_a_vibration() {
-    use palpate::tissue::stability::largest_stiffness_of_a_sheet_n_per_m;
+    use palpate_tissue::stability::largest_stiffness_of_a_sheet_n_per_m;
     // λ over the whole infinite grid, by brute force.
     for (k1, k2, bending) in
         [(1.0, 1.0, false), (1.0, 1.0, true), (1.0, 0.3, true), (0.2, 1.0, false), (1.0, 0.0, true)]

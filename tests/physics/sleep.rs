@@ -1,10 +1,10 @@
 //! Sleep: the cost in accuracy of not computing what rests, and that every force wakes the tiles it reaches.
 
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::profile::{CentreProfile, LoadProfile, Profile, StrengthProfile};
-use palpate::scene::{PAPER, Scene};
-use palpate::tissue::{Grasp, Model, Push, Tissue, at_rest};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::profile::{CentreProfile, LoadProfile, Profile, StrengthProfile};
+use palpate_tissue::scene::{PAPER, Scene};
+use palpate_tissue::{Grasp, Model, Push, Tissue, at_rest};
 
 fn sheet(settings: &[&str]) -> Box<dyn Tissue> {
     let settings: Vec<String> = settings.iter().map(|text| (*text).to_owned()).collect();

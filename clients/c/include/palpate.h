@@ -605,12 +605,12 @@ extern "C" {
 #endif // __cplusplus
 
 /**
- * The version of the interface that this library has: `PALPATE_ABI` of the header it goes with. Any thread.
+ * Returns the version of the interface that this library has: `PALPATE_ABI` of the header it goes with. Any thread.
  */
 uint32_t palpate_abi(void);
 
 /**
- * The version of the library, such as "0.1.0". The text is there for ever. Any thread.
+ * Returns the version of the library, such as "0.1.0". The text is there for ever. Any thread.
  */
 const char *palpate_version(void);
 
@@ -644,7 +644,8 @@ enum palpate_result palpate_bridge_end(struct palpate_bridge *bridge,
                                        struct palpate_bridge_report *report);
 
 /**
- * The words of this thread's last error; empty before the first. They stay until another call of this thread fails.
+ * Returns the words of this thread's last error; empty before the first. They stay until another call of this thread
+ * fails.
  */
 const char *palpate_last_error(void);
 
@@ -664,10 +665,10 @@ enum palpate_result palpate_touch_options_init(struct palpate_touch_options *opt
 enum palpate_result palpate_surface_options_init(struct palpate_surface_options *options, size_t size);
 
 /**
- * The limits of a device by its name: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3. Any thread.
+ * Returns the limits of a device by its name: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3.
+ * Any thread.
  */
-enum palpate_result palpate_limits_of(const char *name,
-                                      struct palpate_limits *limits);
+enum palpate_result palpate_limits_of(const char *name, struct palpate_limits *limits);
 
 /**
  * Connects to the server at `url`, such as "http://127.0.0.1:7117". `options` may be null. Waits for its first answer, for 10 s
@@ -700,16 +701,17 @@ enum palpate_result palpate_session_create(const struct palpate_server *server,
                                            struct palpate_session **session);
 
 /**
- * The same of a scene file of your own (TOML), by its path. The file of its mesh, if it names one, is read where the scene file
- * says, and sent to the server. Any thread; waits for the server.
+ * Returns the same of a scene file of your own (TOML), by its path. The file of its mesh, if it names one, is read
+ * where the scene file says, and sent to the server. Any thread; waits for the server.
  */
 enum palpate_result palpate_session_create_from_file(const struct palpate_server *server,
                                                      const char *scene_file,
                                                      struct palpate_session **session);
 
 /**
- * The same of the text of a scene file and of a mesh in memory: the `byte_count` bytes of a file (OBJ, STL, PLY, glTF, Gmsh or
- * VTK) that `[mesh]` of the text calls `mesh_name`. The mesh is sent to the server. Any thread; waits for the server.
+ * Returns the same of the text of a scene file and of a mesh in memory: the `byte_count` bytes of a file (OBJ, STL,
+ * PLY, glTF, Gmsh or VTK) that `[mesh]` of the text calls `mesh_name`. The mesh is sent to the server. Any thread;
+ * waits for the server.
  */
 enum palpate_result palpate_session_create_from_mesh(const struct palpate_server *server,
                                                      const char *scene_text,
@@ -719,15 +721,16 @@ enum palpate_result palpate_session_create_from_mesh(const struct palpate_server
                                                      struct palpate_session **session);
 
 /**
- * The same of the text of a scene file that names no other file: of a sheet, or of an organ that is generated. Any thread; waits
- * for the server.
+ * Returns the same of the text of a scene file that names no other file: of a sheet, or of an organ that is generated.
+ * Any thread; waits for the server.
  */
 enum palpate_result palpate_session_create_from_text(const struct palpate_server *server,
                                                      const char *scene_text,
                                                      struct palpate_session **session);
 
 /**
- * A session that is there already, by its id. Writes a handle for `palpate_session_free`. Any thread; waits for the server.
+ * Returns a session that is there already, by its id. Writes a handle for `palpate_session_free`. Any thread; waits
+ * for the server.
  */
 enum palpate_result palpate_session_join(const struct palpate_server *server,
                                          const char *session_id,
@@ -747,7 +750,7 @@ enum palpate_result palpate_session_id(const struct palpate_session *session,
 enum palpate_result palpate_session_extent(const struct palpate_session *session, struct palpate_extent *extent);
 
 /**
- * A change that changes nothing. Any thread.
+ * Returns a change that changes nothing. Any thread.
  */
 enum palpate_result palpate_change_init(struct palpate_change *change);
 
@@ -820,7 +823,7 @@ enum palpate_result palpate_touch_begin(const struct palpate_session *session,
                                         struct palpate_touch **touch);
 
 /**
- * A loop over what was recorded, without a server: the same messages, positions and times give the same forces, bit by bit.
+ * Returns a loop over what was recorded, without a server: the same messages, positions and times give the same forces, bit by bit.
  * It has no copy of the tissue, whatever `prediction` says. `options` may be null; `middle_m` is where the middle of the
  * workspace is laid in the tissue (`palpate_extent.top_m`), in Palpate's own axes. Writes a handle for `palpate_touch_end`. Any thread.
  */
@@ -829,8 +832,8 @@ enum palpate_result palpate_touch_begin_offline(const struct palpate_touch_optio
                                                 struct palpate_touch **touch);
 
 /**
- * A recorded message arrives now: the bytes of a `palpate.v1.TouchResponse`. The next tick knows it. Only of a handle of
- * `palpate_touch_begin_offline`. One thread at a time; it may be another than that of the ticks.
+ * Takes a recorded message, which arrives now: the bytes of a `palpate.v1.TouchResponse`. The next tick knows it. Only of a
+ * handle of `palpate_touch_begin_offline`. One thread at a time; it may be another than that of the ticks.
  */
 enum palpate_result palpate_touch_arrive(const struct palpate_touch *touch,
                                          const uint8_t *bytes,

@@ -9,7 +9,7 @@ use glam::DVec3;
 use palpate_client::bridge::{BridgeReport, Disable, Options, PositionOrigin, Tick, run_told};
 use palpate_client::os::Priority;
 use palpate_client::{Error, HapticDevice, Reading};
-use palpate_touch::Device;
+use palpate_haptics::Device;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
@@ -186,7 +186,7 @@ pub unsafe extern "C" fn palpate_bridge_begin(
         let (Some(descriptor), Some(_), Some(_)) = (device.descriptor, device.read, device.write) else {
             return Err(CodedError::argument("device: all three functions must be there"));
         };
-        let mut limits = palpate_limits::from(palpate_touch::device::UNDECLARED);
+        let mut limits = palpate_limits::from(palpate_haptics::device::UNDECLARED);
         // SAFETY: the caller's promise.
         checked("descriptor", unsafe { descriptor(device.user, &mut limits) }).map_err(Error::Device)?;
         let seen = Arc::new(Mutex::new(LoopObservation::default()));

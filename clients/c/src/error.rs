@@ -53,7 +53,8 @@ fn keep(text: &str) {
     });
 }
 
-/// The words of this thread's last error; empty before the first. They stay until another call of this thread fails.
+/// Returns the words of this thread's last error; empty before the first. They stay until another call of this thread
+/// fails.
 #[unsafe(no_mangle)]
 pub extern "C" fn palpate_last_error() -> *const c_char {
     WORDS.try_with(|words| words.as_ptr().cast_const().cast()).unwrap_or(c"".as_ptr())

@@ -29,13 +29,13 @@ pub use touch::*;
 /// The version of the interface. A change that breaks programs raises it, and the number in the library's file name.
 pub const PALPATE_ABI: u32 = 0;
 
-/// The version of the interface that this library has: `PALPATE_ABI` of the header it goes with. Any thread.
+/// Returns the version of the interface that this library has: `PALPATE_ABI` of the header it goes with. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn palpate_abi() -> u32 {
     PALPATE_ABI
 }
 
-/// The version of the library, such as "0.1.0". The text is there for ever. Any thread.
+/// Returns the version of the library, such as "0.1.0". The text is there for ever. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn palpate_version() -> *const c_char {
     const VERSION: &CStr = match CStr::from_bytes_with_nul(concat!(env!("CARGO_PKG_VERSION"), "\0").as_bytes()) {

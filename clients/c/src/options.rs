@@ -3,10 +3,10 @@
 use std::ffi::{c_char, c_void};
 use std::sync::Arc;
 
-use palpate::journal;
 use palpate_client::bridge::{Copies, PositionOrigin, Warn};
+use palpate_haptics::{Device, Tip};
 use palpate_proto::{pb, touch};
-use palpate_touch::{Device, Tip};
+use palpate_session::journal;
 
 use crate::axes::palpate_axes;
 use crate::error::{CodedError, guard, optional_text, palpate_result, text};
@@ -136,7 +136,8 @@ pub unsafe extern "C" fn palpate_surface_options_init(
     unsafe { init(options, size) }
 }
 
-/// The limits of a device by its name: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3. Any thread.
+/// Returns the limits of a device by its name: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3.
+/// Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_limits_of(name: *const c_char, limits: *mut palpate_limits) -> palpate_result {
     guard(|| {
@@ -214,7 +215,7 @@ unsafe impl Versioned for palpate_touch_options {
             grasps: 0,
             tip_radius_m: tip.radius_m,
             friction: tip.friction,
-            limits: palpate_touch::device::UNDECLARED.into(),
+            limits: palpate_haptics::device::UNDECLARED.into(),
             deadband: 0.0,
             up_deadband: 0.0,
             datagrams: 1,

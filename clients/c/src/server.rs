@@ -5,15 +5,15 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use palpate::limits::Limits;
-use palpate::refusal::Refusal;
-use palpate::scene::sent::{self, MeshFile, mesh_file};
-use palpate::scene::{Body, Scene};
 use palpate_client::bridge::{SessionChoice, Target};
 use palpate_client::upload::upload_mesh;
 use palpate_client::{Channel, Credentials, Server, Token, fleet};
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
+use palpate_refusal::Refusal;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::sent::{self, MeshFile, mesh_file};
+use palpate_tissue::scene::{Body, Scene};
 use pb::create_session_request::Source;
 use pb::session_service_client::SessionServiceClient;
 
@@ -262,7 +262,7 @@ fn create_own(
     scene: &Scene,
     said: Option<MeshFile>,
 ) -> Result<*mut palpate_session, CodedError> {
-    let mut message = palpate::wire::scene::sent(scene);
+    let mut message = ::palpate_session::wire::scene::sent(scene);
     if let (Body::Mesh(mesh), Some(of_scene)) = (&scene.body, &mut message.mesh) {
         // As many vertices as were asked for, of which there may be some fewer here.
         let vertices = said.and_then(|said| said.vertices);
@@ -283,8 +283,8 @@ fn refused(refusal: Refusal) -> CodedError {
     CodedError::argument(refusal.to_string())
 }
 
-/// The same of a scene file of your own (TOML), by its path. The file of its mesh, if it names one, is read where the scene file
-/// says, and sent to the server. Any thread; waits for the server.
+/// Returns the same of a scene file of your own (TOML), by its path. The file of its mesh, if it names one, is read
+/// where the scene file says, and sent to the server. Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_create_from_file(
     server: *const palpate_server,
@@ -308,8 +308,9 @@ pub unsafe extern "C" fn palpate_session_create_from_file(
     })
 }
 
-/// The same of the text of a scene file and of a mesh in memory: the `byte_count` bytes of a file (OBJ, STL, PLY, glTF, Gmsh or
-/// VTK) that `[mesh]` of the text calls `mesh_name`. The mesh is sent to the server. Any thread; waits for the server.
+/// Returns the same of the text of a scene file and of a mesh in memory: the `byte_count` bytes of a file (OBJ, STL,
+/// PLY, glTF, Gmsh or VTK) that `[mesh]` of the text calls `mesh_name`. The mesh is sent to the server. Any thread;
+/// waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_create_from_mesh(
     server: *const palpate_server,
@@ -341,8 +342,8 @@ pub unsafe extern "C" fn palpate_session_create_from_mesh(
     })
 }
 
-/// The same of the text of a scene file that names no other file: of a sheet, or of an organ that is generated. Any thread; waits
-/// for the server.
+/// Returns the same of the text of a scene file that names no other file: of a sheet, or of an organ that is generated.
+/// Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_create_from_text(
     server: *const palpate_server,
@@ -365,7 +366,8 @@ pub unsafe extern "C" fn palpate_session_create_from_text(
     })
 }
 
-/// A session that is there already, by its id. Writes a handle for `palpate_session_free`. Any thread; waits for the server.
+/// Returns a session that is there already, by its id. Writes a handle for `palpate_session_free`. Any thread; waits
+/// for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_join(
     server: *const palpate_server,
@@ -420,7 +422,7 @@ pub unsafe extern "C" fn palpate_session_extent(
     })
 }
 
-/// A change that changes nothing. Any thread.
+/// Returns a change that changes nothing. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_change_init(change: *mut palpate_change) -> palpate_result {
     guard(|| {

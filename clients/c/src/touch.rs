@@ -4,7 +4,7 @@ use std::cell::UnsafeCell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use ::palpate_touch::RenderingState;
+use ::palpate_haptics::RenderingState;
 use palpate_client::bridge::{self, Connection, Offline, OfflineNetwork, Options, Ticker};
 use palpate_client::{Error, Reading};
 
@@ -155,7 +155,7 @@ pub unsafe extern "C" fn palpate_touch_begin(
     })
 }
 
-/// A loop over what was recorded, without a server: the same messages, positions and times give the same forces, bit by bit.
+/// Returns a loop over what was recorded, without a server: the same messages, positions and times give the same forces, bit by bit.
 /// It has no copy of the tissue, whatever `prediction` says. `options` may be null; `middle_m` is where the middle of the
 /// workspace is laid in the tissue (`palpate_extent.top_m`), in Palpate's own axes. Writes a handle for `palpate_touch_end`. Any thread.
 #[unsafe(no_mangle)]
@@ -179,8 +179,8 @@ pub unsafe extern "C" fn palpate_touch_begin_offline(
     })
 }
 
-/// A recorded message arrives now: the bytes of a `palpate.v1.TouchResponse`. The next tick knows it. Only of a handle of
-/// `palpate_touch_begin_offline`. One thread at a time; it may be another than that of the ticks.
+/// Takes a recorded message, which arrives now: the bytes of a `palpate.v1.TouchResponse`. The next tick knows it. Only of a
+/// handle of `palpate_touch_begin_offline`. One thread at a time; it may be another than that of the ticks.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_arrive(
     touch: *const palpate_touch,

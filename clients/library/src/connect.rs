@@ -4,8 +4,8 @@ use std::error::Error as _;
 use std::net::IpAddr;
 use std::time::Duration;
 
-use palpate_proto::error;
-use palpate_proto::printable::printable;
+use palpate_refusal::printable::printable;
+use palpate_refusal::status as error;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
@@ -56,7 +56,7 @@ impl Credentials {
 pub struct Token(MetadataValue<Ascii>);
 
 impl Token {
-    /// The token in a text; space around it does not count.
+    /// Returns the token in a text; space around it does not count.
     ///
     /// # Errors
     /// Returns an error if the text can't be a token. The message does not quote it: it would appear in a log.
@@ -127,7 +127,7 @@ impl std::fmt::Debug for Server {
 }
 
 impl Server {
-    /// The server at `url`; you may omit http://.
+    /// Returns the server at `url`; you may omit http://.
     ///
     /// # Errors
     /// Returns an error if the URL is not valid, if a token would be sent in the clear, or if the credentials are not those
@@ -172,7 +172,7 @@ impl Server {
         })
     }
 
-    /// Another server of its fleet, with the same credentials and time limit.
+    /// Creates another server of its fleet, with the same credentials and time limit.
     ///
     /// # Errors
     /// Returns an error as [`Server::new`] does; and if this server is reached by TLS, but the other is not to be.
@@ -188,7 +188,7 @@ impl Server {
         Ok(other.within(self.patience))
     }
 
-    /// Its URL.
+    /// Returns its URL.
     pub fn url(&self) -> &str {
         &self.url
     }
@@ -198,7 +198,7 @@ impl Server {
         self.patience
     }
 
-    /// Its host, as in the URL, without brackets.
+    /// Returns its host, as in the URL, without brackets.
     pub fn host(&self) -> &str {
         &self.host.0
     }
@@ -262,7 +262,7 @@ async fn speaks_tls((host, port): &(String, u16)) -> bool {
     matches!(tokio::time::timeout(TLS_PROBE_TIMEOUT, asked).await, Ok(Ok(true)))
 }
 
-/// The text that a program shows for a status: the server's message, or how the connection broke.
+/// Returns the text that a program shows for a status: the server's message, or how the connection broke.
 pub fn describe(status: &Status) -> String {
     if status.source().is_some() { broken(status) } else { error::describe(status) }
 }

@@ -25,11 +25,11 @@ use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use palpate_haptics::datagram_health::{Carried, Carrier, LIFE_S};
+use palpate_haptics::dead_reckoning::{FASTEST_S, SendInterval};
+use palpate_haptics::deadband::HEARTBEAT_S;
 use palpate_proto::datagram::{self, MAX_BYTES, MAX_EARLIER, Posed};
 use palpate_proto::pb;
-use palpate_touch::datagram_health::{Carried, Carrier, LIFE_S};
-use palpate_touch::dead_reckoning::{FASTEST_S, SendInterval};
-use palpate_touch::deadband::HEARTBEAT_S;
 use prost::Message;
 use tokio::task::JoinSet;
 use tokio::time::{Interval, MissedTickBehavior, interval};
@@ -108,8 +108,8 @@ impl Datagrams {
         });
     }
 
-    /// Whether the session is over, so that it is time to ask the server for another: by `renew` with `datagrams`, which it
-    /// answers with an offer ([`Datagrams::take_offer`]). True once in four seconds.
+    /// Returns whether the session is over, so that it is time to ask the server for another: by `renew` with
+    /// `datagrams`, which it answers with an offer ([`Datagrams::take_offer`]). True once in four seconds.
     pub fn asks(&mut self) -> bool {
         let now_s = self.now_s();
         let is_over = self.host.is_some() && self.connection.is_none() && self.opening.is_empty();
@@ -154,8 +154,8 @@ impl Datagrams {
         message.encoded_len() <= most && connection.send_datagram(message.encode_to_vec()).is_ok()
     }
 
-    /// The next sample that comes by datagram. Samples that were overtaken are left out. Waits for ever when there is no session.
-    /// Call it all the time: it keeps the session alive. Nothing is lost if you drop the future.
+    /// Returns the next sample that comes by datagram. Samples that were overtaken are left out. Waits for ever when
+    /// there is no session. Call it all the time: it keeps the session alive. Nothing is lost if you drop the future.
     pub async fn next(&mut self) -> pb::Sample {
         loop {
             let connection = self.connection.clone();
@@ -199,7 +199,8 @@ impl Datagrams {
         message.sample.filter(|sample| self.is_newer(sample))
     }
 
-    /// Whether a sample is newer than all that came by here and that were shown to this before: by whichever way they come.
+    /// Returns whether a sample is newer than all that came by here and that were shown to this before: by whichever
+    /// way they come.
     pub fn is_newer(&mut self, sample: &pb::Sample) -> bool {
         // Whoever took a session over may continue it at an earlier step; who had it before has no say.
         let this = (sample.ownership_revision, sample.step);
@@ -210,12 +211,12 @@ impl Datagrams {
         is_newer
     }
 
-    /// The longest time between two poses that the server wants, s.
+    /// Returns the longest time between two poses that the server wants, s.
     pub fn wanted_s(&self) -> f64 {
         self.wanted_s
     }
 
-    /// What was carried so far.
+    /// Returns what was carried so far.
     pub fn carried(&self) -> Carried {
         self.carrier.carried()
     }

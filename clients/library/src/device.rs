@@ -7,7 +7,7 @@
 //! [`crate::devices`] has adapters for the devices of some makers, and lays a workspace over the tissue elsewhere.
 
 use glam::DVec3;
-use palpate_touch::Device;
+use palpate_haptics::Device;
 
 use crate::bridge::Tick;
 
@@ -32,7 +32,7 @@ pub struct Reading {
 /// ```
 /// use glam::DVec3;
 /// use palpate_client::{HapticDevice, Reading};
-/// use palpate_touch::Device;
+/// use palpate_haptics::Device;
 /// # mod maker {
 /// #     pub struct Handle;
 /// #     impl Handle {

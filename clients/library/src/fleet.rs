@@ -5,9 +5,9 @@
 
 use std::time::Duration;
 
-use palpate_proto::error::elsewhere;
 use palpate_proto::pb;
-use palpate_proto::refusal::Reason;
+use palpate_refusal::Reason;
+use palpate_refusal::status::elsewhere;
 use pb::session_service_client::SessionServiceClient;
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -38,13 +38,14 @@ const MAX_SERVERS: usize = 16;
 /// The largest number of servers that a call is sent on by, one after the other.
 const MAX_HOPS: u32 = 8;
 
-/// Whether a server of a fleet asks for patience: another is about to have the session, or it has lost touch with the fleet.
+/// Returns whether a server of a fleet asks for patience: another is about to have the session, or it has lost touch
+/// with the fleet.
 pub fn is_fenced(status: &Status) -> bool {
     status.get_details_error_info().is_some_and(|info| info.reason == Reason::Fenced.as_str())
 }
 
-/// The server that has a session, and what it tells of it. `server` may be any of the fleet. Waits while another server takes the
-/// session over, as long as it may take to connect ([`Server::within`]).
+/// Returns the server that has a session, and what it tells of it. `server` may be any of the fleet. Waits while
+/// another server takes the session over, as long as it may take to connect ([`Server::within`]).
 ///
 /// # Errors
 /// Returns the refusal of whoever has the session, or why nobody can be reached.
@@ -76,7 +77,7 @@ where
     follow_from(server, server.connect().await?, call).await
 }
 
-/// As [`follow`], with a connection to `server`.
+/// Does what [`follow`] does, with a connection to `server`.
 ///
 /// # Errors
 /// Returns an error as [`follow`] does.
@@ -103,7 +104,7 @@ where
     }
 }
 
-/// The server that has a session that `server` has created: a fleet may have made it at another.
+/// Returns the server that has a session that `server` has created: a fleet may have made it at another.
 ///
 /// # Errors
 /// Returns an error if the credentials can't be used there.

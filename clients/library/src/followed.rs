@@ -2,9 +2,9 @@
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use palpate_proto::error::elsewhere;
 use palpate_proto::pb;
-use palpate_proto::refusal::Reason;
+use palpate_refusal::Reason;
+use palpate_refusal::status::elsewhere;
 use tonic::Status;
 use tonic_types::StatusExt;
 
@@ -35,7 +35,8 @@ struct LastOwner {
     revision: u64,
 }
 
-/// Whether the call may find the session at another server: it has moved, or its server is gone, or is about to be.
+/// Returns whether the call may find the session at another server: it has moved, or its server is gone, or is about to
+/// be.
 pub fn is_away(status: &Status) -> bool {
     let is_broken = std::error::Error::source(status).is_some() || status.code() == tonic::Code::Unavailable;
     elsewhere(status).is_some() || is_broken
@@ -47,13 +48,13 @@ fn is_ending(status: &Status) -> bool {
 }
 
 impl Followed {
-    /// A session that `server` has, or had at last, with a connection to it.
+    /// Creates a session that `server` has, or had at last, with a connection to it.
     pub fn new(server: Server, channel: Channel, session_id: String) -> Self {
         let place = LastOwner { server: server.clone(), channel, number: 0, revision: 0 };
         Followed { session_id, place: Mutex::new(place), seeking: Trail::new(server).into() }
     }
 
-    /// A session that `server` knows of, or has made: another of its fleet may have it.
+    /// Returns a session that `server` knows of, or has made: another of its fleet may have it.
     ///
     /// # Errors
     /// Returns the refusal of whoever has the session, or why nobody can be reached.
@@ -63,12 +64,12 @@ impl Followed {
         Ok((followed, session))
     }
 
-    /// The session's ID.
+    /// Returns the session's ID.
     pub fn session_id(&self) -> &str {
         &self.session_id
     }
 
-    /// The server that had the session at last.
+    /// Returns the server that had the session at last.
     pub fn server(&self) -> Server {
         self.place().server.clone()
     }
@@ -77,7 +78,7 @@ impl Followed {
         self.place.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Whether who says this revision still speaks for the session.
+    /// Returns whether who says this revision still speaks for the session.
     pub fn is_current(&self, revision: u64) -> bool {
         let mut place = self.place();
         place.revision = place.revision.max(revision);
@@ -142,7 +143,7 @@ impl Followed {
 
 #[cfg(test)]
 mod tests {
-    use palpate_proto::refusal::Refusal;
+    use palpate_refusal::Refusal;
 
     use super::*;
 

@@ -13,7 +13,7 @@
 //! - [`view`]: the frames of a session: how its surface moves.
 //!
 //! The messages are those of the crate `palpate-proto`, which also has clients for the calls that need no help: they take a
-//! [`Channel`]. What is rendered, and its safety limits, is in the crate `palpate-touch`.
+//! [`Channel`]. What is rendered, and its safety limits, is in the crate `palpate-haptics`.
 //!
 //! # Example
 //!
@@ -22,7 +22,7 @@
 //! ```no_run
 //! use palpate_client::bridge::{Options, SessionChoice, Target};
 //! use palpate_client::{Credentials, HapticDevice, Server};
-//! use palpate_touch::Tip;
+//! use palpate_haptics::Tip;
 //!
 //! async fn touch(device: impl HapticDevice + 'static) -> Result<(), palpate_client::Error> {
 //!     let target = Target {
@@ -65,7 +65,7 @@ pub use device::{HapticDevice, Reading};
 pub use followed::Followed;
 pub use touch::Touch;
 
-use palpate_proto::printable::printable;
+use palpate_refusal::printable::printable;
 
 /// An error of this library. Its text is one line that acts on no terminal, whatever a server has put into it.
 #[derive(Debug, thiserror::Error)]
@@ -94,7 +94,7 @@ impl Error {
         matches!(self, Error::Call(status) if [Unauthenticated, PermissionDenied].contains(&status.code()))
     }
 
-    /// Whether an input was refused, by this library or by the server: the same call would be refused again.
+    /// Returns whether an input was refused, by this library or by the server: the same call would be refused again.
     pub fn is_refusal(&self) -> bool {
         match self {
             Error::Argument(_) => true,

@@ -86,12 +86,12 @@ impl ShownSurface {
         Ok(ShownSurface { mesh, newest, lost, _watching: watching })
     }
 
-    /// What of it stays.
+    /// Returns what of it stays.
     pub fn mesh(&self) -> &ShownMesh {
         &self.mesh
     }
 
-    /// Whether there is a newer moment than before. Never waits.
+    /// Returns whether there is a newer moment than before. Never waits.
     pub fn refresh(&mut self) -> bool {
         self.newest.refresh()
     }
@@ -101,7 +101,7 @@ impl ShownSurface {
         read(self.newest.read())
     }
 
-    /// Why no newer moment comes any more.
+    /// Returns why no newer moment comes any more.
     pub fn lost(&self) -> Option<&str> {
         self.lost.get().map(String::as_str)
     }
@@ -161,7 +161,7 @@ fn write_normals(position_m: &[[f32; 3]], triangles: &[[u32; 3]], normals: &mut 
     }
 }
 
-/// The mesh of a session, refined.
+/// Returns the mesh of a session, refined.
 ///
 /// # Errors
 /// Returns the server's refusal, how the connection broke, or that the mesh can't be used.

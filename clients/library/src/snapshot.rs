@@ -6,7 +6,7 @@ use tonic::{Status, Streaming};
 /// No snapshot is larger, bytes: more would fill the memory.
 const MAX_BYTES: usize = 1 << 31;
 
-/// The bytes of a snapshot (`SaveSnapshot`): a journal of one moment.
+/// Returns the bytes of a snapshot (`SaveSnapshot`): a journal of one moment.
 ///
 /// # Errors
 /// Returns the server's refusal, or how the connection broke; refuses a snapshot of more than 2 GiB.

@@ -54,12 +54,12 @@ impl Touch {
         }
     }
 
-    /// The server's answer: the force law, the next step, warnings.
+    /// Returns the server's answer: the force law, the next step, warnings.
     pub fn opened(&self) -> &pb::TouchOpened {
         &self.opened
     }
 
-    /// The next message of the server; `None` after the last. A message is not lost if you drop the future.
+    /// Returns the next message of the server; `None` after the last. A message is not lost if you drop the future.
     ///
     /// # Errors
     /// Returns why the server ended the stream, or how the connection broke.

@@ -36,7 +36,8 @@ impl Frames {
         Ok(Frames { parts, surface: SurfaceState::default() })
     }
 
-    /// The next part of a frame, without reading its displacements; `None` after the last. Use it to count frames.
+    /// Returns the next part of a frame, without reading its displacements; `None` after the last. Use it to count
+    /// frames.
     ///
     /// # Errors
     /// Returns why the server ended the stream, or how the connection broke.
@@ -44,8 +45,8 @@ impl Frames {
         self.parts.message().await
     }
 
-    /// The last part of the next frame, and the whole surface as it is then; `None` after the last frame. If you drop the
-    /// future, the parts that it has read stay in the surface.
+    /// Returns the last part of the next frame, and the whole surface as it is then; `None` after the last frame. If
+    /// you drop the future, the parts that it has read stay in the surface.
     ///
     /// # Errors
     /// Returns why the server ended the stream, how the connection broke, or that a frame can't be read.

@@ -24,7 +24,8 @@ impl Samples {
         Ok(Samples { samples, revision: 0 })
     }
 
-    /// The next sample; `None` after the last. Samples of who does not serve the session any more are left out. A sample is not lost if you drop the future.
+    /// Returns the next sample; `None` after the last. Samples of who does not serve the session any more are left out.
+    /// A sample is not lost if you drop the future.
     ///
     /// # Errors
     /// Returns why the server ended the stream, or how the connection broke.

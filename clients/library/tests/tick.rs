@@ -7,8 +7,8 @@ use std::cell::Cell;
 use glam::{DMat3, DVec3};
 use palpate_client::Reading;
 use palpate_client::bridge::{Offline, PositionOrigin};
+use palpate_haptics::{ContactState, Device, Law, LocalModel, Predicted, Predictor, RenderingState};
 use palpate_proto::{pb, touch};
-use palpate_touch::{ContactState, Device, Law, LocalModel, Predicted, Predictor, RenderingState};
 use pb::touch_response::Message as Heard;
 use prost::Message;
 

@@ -2,7 +2,7 @@
 
 use palpate_client::{Channel, fleet};
 use palpate_proto::pb;
-use palpate_proto::printable::printable;
+use palpate_refusal::printable::printable;
 use pb::admin_service_client::AdminServiceClient;
 use pb::session_service_client::SessionServiceClient;
 

@@ -6,10 +6,10 @@ use glam::DVec3;
 use palpate_client::HapticDevice;
 use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, Tick, Traffic, Warn, run};
 use palpate_client::devices::{self, DeviceKind, Placed};
-use palpate_proto::printable::printable_json;
+use palpate_haptics::{LimitCause, RenderingState, Tip};
+use palpate_refusal::printable::printable_json;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{LEAD_S, Task};
-use palpate_touch::{LimitCause, RenderingState, Tip};
 use serde_json::json;
 
 use crate::credentials::CredentialOptions;

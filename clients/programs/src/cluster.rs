@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use palpate_client::{Channel, Error, Server, fleet};
 use palpate_proto::pb;
-use palpate_proto::printable::{printable, printable_json};
+use palpate_refusal::printable::{printable, printable_json};
 use pb::admin_service_client::AdminServiceClient;
 use serde_json::{Value, json};
 use tonic::Status;

@@ -2,8 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use palpate::files;
 use palpate_client::{Credentials, Server, Token};
+use palpate_tissue::files;
 
 use crate::ClientFailure;
 

@@ -5,8 +5,8 @@ use std::time::Duration;
 
 use palpate_client::devices::{DeviceReport, Found, check, list, open};
 use palpate_client::{Error, HapticDevice};
-use palpate_proto::printable::{printable, printable_json};
-use palpate_touch::Device;
+use palpate_haptics::Device;
+use palpate_refusal::printable::{printable, printable_json};
 use serde_json::{Value, json};
 
 use crate::{ClientFailure, table, within};

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use palpate_client::{Error, Server};
 use palpate_proto::pb::create_session_request::Source;
-use palpate_proto::printable::{printable_json, printable_lines};
+use palpate_refusal::printable::{printable_json, printable_lines};
 use palpate_simulated::load::{
     Deadbands, LoadOutcome, LoadPlan, LoadTrial, Objective, PreparedPlan, Second, TrialProgress, trial,
 };

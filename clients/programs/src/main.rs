@@ -7,7 +7,7 @@
 /// program.
 macro_rules! say {
     ($($text:tt)*) => {{
-        let text = palpate_proto::printable::printable(format_args!($($text)*));
+        let text = palpate_refusal::printable::printable(format_args!($($text)*));
         let _ = std::io::Write::write_all(&mut std::io::stderr(), (text + "\n").as_bytes());
     }};
 }
@@ -16,7 +16,7 @@ macro_rules! say {
 /// closed standard output does not end the program.
 macro_rules! tell {
     ($($text:tt)*) => {{
-        let text = palpate_proto::printable::printable_lines(format_args!($($text)*));
+        let text = palpate_refusal::printable::printable_lines(format_args!($($text)*));
         let _ = std::io::Write::write_all(&mut std::io::stdout(), (text + "\n").as_bytes());
     }};
 }
@@ -44,7 +44,7 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use palpate_client::Error;
-use palpate_proto::refusal::{Reason, Refusal};
+use palpate_refusal::{Reason, Refusal};
 
 /// Programs that talk to a Palpate server.
 #[derive(Parser)]
@@ -219,7 +219,7 @@ pub(crate) async fn interrupted() {
 // Two threads for the network; a device runs on its own thread.
 #[tokio::main(worker_threads = 2)]
 async fn main() -> ExitCode {
-    let ended = match palpate::arguments::parse::<ClientArguments>().command {
+    let ended = match palpate_arguments::parse::<ClientArguments>().command {
         ClientCommand::Replay(arguments) => replay::replay(&arguments).await,
         ClientCommand::Play(arguments) => play::play(&arguments).await,
         ClientCommand::Link(arguments) => link::link(&arguments).await,

@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 
 use glam::DVec3;
-use palpate::files::read_text;
-use palpate::scene::document::{Document, Fields};
 use palpate_client::devices::{Enables, Placement};
-use palpate_proto::refusal::{Reason, Result};
+use palpate_refusal::{Reason, Result};
+use palpate_tissue::files::read_text;
+use palpate_tissue::scene::document::{Document, Fields};
 
 /// Largest placement file, bytes.
 const MAX_BYTES: u64 = 1 << 16;

@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use palpate::journal;
 use palpate_client::bridge::Copies;
+use palpate_session::journal;
 
 /// Of which tissues a device's loop keeps a copy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]

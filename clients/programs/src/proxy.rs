@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use palpate_proto::refusal::{Refusal, number};
+use palpate_refusal::{Refusal, number};
 use palpate_simulated::network::Conditions;
 use palpate_simulated::relay::{MAX_FLOWS, Passed, RelayNetwork};
 use serde_json::json;

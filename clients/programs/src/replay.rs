@@ -8,17 +8,19 @@ use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use palpate::limits::Limits;
-use palpate::scene::collection::{find_script, scenes_of};
-use palpate::scene::record::{Line, Network, Percentiles, Record, Run, Summary, far_warning, output, write_line};
-use palpate::scene::script::Script;
-use palpate::shape;
-use palpate::wire;
 use palpate_client::{Channel, Error, Touch, describe, fleet};
 use palpate_proto::pb;
-use palpate_proto::printable::printable;
-use palpate_proto::refusal::Reason;
+use palpate_refusal::Reason;
+use palpate_refusal::printable::printable;
+use palpate_session::wire;
 use palpate_simulated::scene_file::SceneFile;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::collection::{find_script, scenes_of};
+use palpate_tissue::scene::record::{
+    Line, Network, Percentiles, Record, Run, Summary, far_warning, output, write_line,
+};
+use palpate_tissue::scene::script::Script;
+use palpate_tissue::shape;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
 use pb::touch_request::Message as Say;

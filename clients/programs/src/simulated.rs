@@ -4,11 +4,11 @@ use std::time::Instant;
 
 use glam::DVec3;
 use palpate_client::{HapticDevice, Reading};
-use palpate_proto::refusal::{Reason, Refusal, did_you_mean};
+use palpate_haptics::Device;
+use palpate_haptics::device::{DEVICES, UNDECLARED};
+use palpate_haptics::hand::{HANDS, Hand, HandState};
+use palpate_refusal::{Reason, Refusal, did_you_mean};
 use palpate_simulated::task::Task;
-use palpate_touch::Device;
-use palpate_touch::device::{DEVICES, UNDECLARED};
-use palpate_touch::hand::{HANDS, Hand, HandState};
 
 /// The value found for a name, or an error that lists the names.
 fn named<T>(field: &str, name: &str, found: Option<T>, names: &[&str]) -> Result<T, Refusal> {

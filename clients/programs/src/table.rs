@@ -3,7 +3,7 @@
 use std::io::IsTerminal;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use palpate_proto::printable::printable;
+use palpate_refusal::printable::printable;
 
 /// A bar on the terminal, in indicatif's words; hidden if there is none or it is not wanted.
 pub(crate) fn progress_bar(template: &str, length: u64, quiet: bool) -> ProgressBar {

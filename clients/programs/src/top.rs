@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use palpate_client::{Channel, describe};
 use palpate_proto::pb::session_service_client::SessionServiceClient;
 use palpate_proto::pb::{Audit, AuditedError, ListSessionsRequest, Session, SessionState};
-use palpate_proto::printable::{printable, printable_json};
+use palpate_refusal::printable::{printable, printable_json};
 use serde_json::{Value, json};
 
 use crate::ClientFailure;

@@ -4,7 +4,7 @@
 //! crate nor its users need to be compiled against NumPy.
 
 use glam::DVec3;
-use palpate::scene::record::Point;
+use palpate_tissue::scene::record::Point;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyTuple};
 

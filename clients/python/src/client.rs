@@ -6,13 +6,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use glam::DVec3;
-use palpate::journal;
-use palpate::refusal::{Reason, Refusal};
-use palpate::scene;
-use palpate::shape::PointName;
 use palpate_client::bridge::{self, Copies, Options, Target};
 use palpate_client::{Channel, Credentials, Followed, Token, snapshot};
 use palpate_proto::{pb, touch};
+use palpate_refusal::{Reason, Refusal};
+use palpate_session::journal;
+use palpate_tissue::scene;
+use palpate_tissue::shape::PointName;
 use pb::command::Action;
 use pb::session_service_client::SessionServiceClient;
 use pb::view_service_client::ViewServiceClient;

@@ -5,9 +5,9 @@ use std::time::Instant;
 
 use glam::DVec3;
 use palpate_client::{HapticDevice, Reading};
-use palpate_proto::refusal::did_you_mean;
-use palpate_touch::Device;
-use palpate_touch::device::{DEVICES, UNDECLARED};
+use palpate_haptics::Device;
+use palpate_haptics::device::{DEVICES, UNDECLARED};
+use palpate_refusal::did_you_mean;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -51,7 +51,7 @@ pub(crate) fn descriptor(value: Option<Bound<'_, PyAny>>) -> PyResult<Device> {
     Device::named(&name).ok_or_else(|| {
         let message =
             format!("must be one of {}, but is `{name}`{}", devices().join(", "), did_you_mean(&name, devices()));
-        refused(palpate::refusal::Refusal::new(palpate::refusal::Reason::WrongKind, "limits", message))
+        refused(palpate_refusal::Refusal::new(palpate_refusal::Reason::WrongKind, "limits", message))
     })
 }
 

@@ -1,8 +1,8 @@
 //! Refusals and failures as the exceptions of `palpate._errors`.
 
-use palpate::printable::printable;
-use palpate::refusal::Refusal;
-use palpate::session::run::RunFailure;
+use palpate_refusal::Refusal;
+use palpate_refusal::printable::printable;
+use palpate_session::run::RunFailure;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyOSError};
 use pyo3::prelude::*;
 use pyo3::types::PyType;
@@ -28,7 +28,7 @@ pub(crate) fn refused(refusal: Refusal) -> PyErr {
 
 /// `palpate.Refused` for an argument of the wrong kind.
 pub(crate) fn wrong(field: &str, message: impl Into<String>) -> PyErr {
-    refused(Refusal::new(palpate::refusal::Reason::WrongKind, field, message))
+    refused(Refusal::new(palpate_refusal::Reason::WrongKind, field, message))
 }
 
 /// `palpate.Failed`: the tissue could not go on.
@@ -67,7 +67,7 @@ pub(crate) fn of_client(error: palpate_client::Error) -> PyErr {
     let text = error.to_string();
     match error {
         Error::Call(status) => of_status(status),
-        Error::Argument(message) => refused(Refusal::new(palpate::refusal::Reason::OutOfRange, "", message)),
+        Error::Argument(message) => refused(Refusal::new(palpate_refusal::Reason::OutOfRange, "", message)),
         Error::Connection(_) => raised("Disconnected", (text,)),
         // What a device in Python raised comes back as itself.
         Error::Device(error) => match error.downcast::<PyErr>() {

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use palpate_client::{Channel, Error, Followed};
 use palpate_proto::pb;
-use palpate_proto::refusal::Reason;
+use palpate_refusal::Reason;
 use pb::command::Action;
 use pb::haptic_service_client::HapticServiceClient;
 use tokio::sync::Mutex;

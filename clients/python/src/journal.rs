@@ -6,10 +6,10 @@ use std::io::BufReader;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
-use palpate::journal::{self, JournalReader, Survey, pb, replay};
-use palpate::refusal::Refusal;
-use palpate::tissue::scheme_selection::given_up;
 use palpate_proto::geometry::from_vector;
+use palpate_refusal::Refusal;
+use palpate_session::journal::{self, JournalReader, Survey, pb, replay};
+use palpate_tissue::scheme_selection::given_up;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 

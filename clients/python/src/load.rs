@@ -4,8 +4,8 @@ use std::fs::File;
 use std::io::Write;
 use std::path::PathBuf;
 
-use palpate::refusal::Refusal;
 use palpate_client::Server;
+use palpate_refusal::Refusal;
 use palpate_simulated::load::{LoadPlan, PreparedPlan};
 use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;

@@ -3,10 +3,10 @@
 use std::sync::{Mutex, PoisonError};
 
 use glam::DVec3;
-use palpate::refusal::finite_vector;
 use palpate_client::Reading;
 use palpate_client::bridge::{self, PositionOrigin};
-use palpate_touch::RenderingState;
+use palpate_haptics::RenderingState;
+use palpate_refusal::finite_vector;
 use pyo3::prelude::*;
 
 use crate::arrays::vector;

@@ -4,13 +4,13 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use palpate::scene;
-use palpate::scene::plot::Curves;
-use palpate::scene::record::{Record, Run, Summary};
-use palpate::shape;
-use palpate::wire;
 use palpate_client::Followed;
 use palpate_proto::pb;
+use palpate_session::wire;
+use palpate_tissue::scene;
+use palpate_tissue::scene::plot::Curves;
+use palpate_tissue::scene::record::{Record, Run, Summary};
+use palpate_tissue::shape;
 use pb::haptic_service_client::HapticServiceClient;
 use pb::session_service_client::SessionServiceClient;
 use pyo3::prelude::*;

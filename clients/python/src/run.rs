@@ -6,13 +6,13 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::channel;
 use std::time::Instant;
 
-use palpate::refusal::{Reason, Refusal};
-use palpate::scene;
-use palpate::scene::record::{Record, Run, Summary};
-use palpate::session::run::{RunEvent, RunFailure, told};
-use palpate::shape::PointName;
-use palpate::tissue::Model;
-use palpate::tissue::scheme_selection::given_up;
+use palpate_refusal::{Reason, Refusal};
+use palpate_session::run::{RunEvent, RunFailure, told};
+use palpate_tissue::Model;
+use palpate_tissue::scene;
+use palpate_tissue::scene::record::{Record, Run, Summary};
+use palpate_tissue::scheme_selection::given_up;
+use palpate_tissue::shape::PointName;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 

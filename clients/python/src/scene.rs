@@ -4,14 +4,14 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use palpate::limits::Limits;
-use palpate::refusal::{Reason, Refusal};
-use palpate::scene::collection::{Collection, find_scene, find_script};
-use palpate::scene::kind::TextKind;
-use palpate::scene::{self, Body, Named};
-use palpate::shape::{PointId, PointName};
-use palpate::tissue::Model;
-use palpate::tissue::saved::TissueState;
+use palpate_refusal::{Reason, Refusal};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::saved::TissueState;
+use palpate_tissue::scene::collection::{Collection, find_scene, find_script};
+use palpate_tissue::scene::kind::TextKind;
+use palpate_tissue::scene::{self, Body, Named};
+use palpate_tissue::shape::{PointId, PointName};
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyDict, PyFloat, PyInt, PyString};
 
@@ -413,7 +413,7 @@ impl Tissue {
     /// The row of the point that rests nearest to a place.
     fn nearest(&self, place_m: &Bound<'_, PyAny>) -> PyResult<usize> {
         let place_m = vector("place_m", place_m)?;
-        palpate::refusal::finite_vector("place_m", place_m).map_err(refused)?;
+        palpate_refusal::finite_vector("place_m", place_m).map_err(refused)?;
         Ok(self.model.shape().nearest(place_m).index())
     }
 

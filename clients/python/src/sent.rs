@@ -2,13 +2,13 @@
 
 use std::path::Path;
 
-use palpate::refusal::{Reason, Refusal};
-use palpate::scene::Body;
-use palpate::scene::sent::{self, mesh_file};
-use palpate::wire;
 use palpate_client::Channel;
 use palpate_client::upload::upload_mesh;
 use palpate_proto::pb;
+use palpate_refusal::{Reason, Refusal};
+use palpate_session::wire;
+use palpate_tissue::scene::Body;
+use palpate_tissue::scene::sent::{self, mesh_file};
 use pb::create_session_request::Source;
 use pyo3::PyResult;
 

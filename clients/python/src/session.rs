@@ -5,16 +5,16 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use glam::DVec3;
-use palpate::refusal::Refusal;
-use palpate::scene::profile::Poke;
-use palpate::scene::script::Action;
-use palpate::scene::{self, Change};
-use palpate::session::command::{Command, Due};
-use palpate::session::intake::Intake;
-use palpate::session::saved::Saved;
-use palpate::session::{self, run};
-use palpate::shape::PointId;
-use palpate::tissue::Model;
+use palpate_refusal::Refusal;
+use palpate_session::command::{Command, Due};
+use palpate_session::intake::Intake;
+use palpate_session::saved::Saved;
+use palpate_session::{self as session, run};
+use palpate_tissue::Model;
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::script::Action;
+use palpate_tissue::scene::{self, Change};
+use palpate_tissue::shape::PointId;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 
@@ -28,7 +28,7 @@ use crate::waiting::LOOK;
 #[derive(Debug, Clone, Copy)]
 struct PoseTarget {
     place_m: DVec3,
-    tip: palpate_touch::Tip,
+    tip: palpate_haptics::Tip,
 }
 
 /// A session and what a client has beside it.
@@ -39,7 +39,7 @@ pub(crate) struct SessionState {
     intake: Intake,
     held: BTreeSet<u32>,
     /// Tips of the tools that were in the tissue when the session went on, until they are told something.
-    tips: BTreeMap<u32, palpate_touch::Tip>,
+    tips: BTreeMap<u32, palpate_haptics::Tip>,
     led: BTreeMap<u32, PoseTarget>,
     due: Vec<Due>,
 }

@@ -1,12 +1,12 @@
 //! The tip of a tool, as Python sees it.
 
-use palpate_touch::Coupling;
+use palpate_haptics::Coupling;
 use pyo3::prelude::*;
 
 /// The tip of a tool: a disc that touches, or with `grasps` holds. With a stiffness it is coupled by a spring.
 #[pyclass(frozen, module = "palpate", from_py_object)]
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Tip(pub(crate) palpate_touch::Tip);
+pub(crate) struct Tip(pub(crate) palpate_haptics::Tip);
 
 #[pymethods]
 impl Tip {
@@ -17,7 +17,7 @@ impl Tip {
             stiffness_n_per_m,
             damping_n_s_per_m,
         });
-        Tip(palpate_touch::Tip { radius_m, friction, grasps, coupling })
+        Tip(palpate_haptics::Tip { radius_m, friction, grasps, coupling })
     }
 
     /// The radius of the disc.
@@ -39,7 +39,7 @@ impl Tip {
     }
 
     fn __repr__(&self) -> String {
-        let palpate_touch::Tip { radius_m, friction, grasps, .. } = self.0;
+        let palpate_haptics::Tip { radius_m, friction, grasps, .. } = self.0;
         format!("Tip({radius_m}, friction={friction}, grasps={})", if grasps { "True" } else { "False" })
     }
 }

@@ -1,9 +1,9 @@
 //! What a server tells of a session, as Python sees it.
 
 use palpate_client::bridge::BridgeReport;
+use palpate_haptics::{LimitCause, RenderingState};
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
-use palpate_touch::{LimitCause, RenderingState};
 use pyo3::exceptions::PyRuntimeWarning;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
@@ -150,7 +150,7 @@ impl<'py> IntoPyObject<'py> for Touched {
             limits.set_item(*name, envelope.as_ref().map_or(0, |envelope| envelope.count(*cause).0))?;
         }
         found.set_item("limits", limits)?;
-        found.set_item("energy_j", envelope.as_ref().map_or(0.0, palpate_touch::Envelope::energy_j))?;
+        found.set_item("energy_j", envelope.as_ref().map_or(0.0, palpate_haptics::Envelope::energy_j))?;
         found.set_item("lost", lost.map(|error| error.to_string()))?;
         py.import("palpate._touch")?.getattr("Touched")?.call((), Some(&found))
     }

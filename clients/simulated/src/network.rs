@@ -27,7 +27,7 @@ pub enum Transport {
 }
 
 impl Transport {
-    /// Its name, as options have it.
+    /// Returns its name, as options have it.
     pub fn name(self) -> &'static str {
         match self {
             Transport::Stream => "stream",
@@ -112,13 +112,13 @@ pub struct Stalls {
 }
 
 impl Stalls {
-    /// Each of `stall_s`, the first not before `from_s`.
+    /// Creates stalls of `stall_s` each, the first not before `from_s`.
     pub fn new(stall_s: f64, from_s: f64, mut random: Random) -> Self {
         let begin_s = from_s + random.between(0.0, 1.0);
         Stalls { stall_s, random, begin_s }
     }
 
-    /// The end of the stall at `now_s`, s, if there is one.
+    /// Returns the end of the stall at `now_s`, s, if there is one.
     pub fn at(&mut self, now_s: f64) -> Option<f64> {
         while now_s >= self.begin_s + self.stall_s {
             self.begin_s = self.begin_s.ceil() + self.random.between(0.0, 1.0);
@@ -134,13 +134,13 @@ pub struct Outages {
 }
 
 impl Outages {
-    /// Those of a seed, the first not before `from_s`.
+    /// Creates the outages of a seed, the first not before `from_s`.
     pub fn new(conditions: &Conditions, seed: u64, from_s: f64) -> Self {
         let stalls = Stalls::new(conditions.outage_s, from_s, Random::new(seed, 5));
         Outages { stalls, ended_s: f64::NEG_INFINITY }
     }
 
-    /// Whether there are any.
+    /// Returns whether there are any.
     pub fn are_any(&self) -> bool {
         self.stalls.stall_s > 0.0
     }
@@ -150,7 +150,7 @@ impl Outages {
         self.stalls.at(now_s)
     }
 
-    /// How long ago the last outage ended, s; 0 in one.
+    /// Returns how long ago the last outage ended, s; 0 in one.
     pub fn since_s(&mut self, now_s: f64) -> f64 {
         if let Some(end_s) = self.at(now_s) {
             self.ended_s = end_s;
@@ -174,7 +174,8 @@ pub struct Direction<T> {
 }
 
 impl<T> Direction<T> {
-    /// One of the directions of a seed, which have their outages together; the first of these not before `from_s`.
+    /// Creates one direction of the network of a seed. Both have their outages together, the first of these not before
+    /// `from_s`.
     pub fn new(conditions: Conditions, seed: u64, direction: u64, from_s: f64) -> Self {
         Direction {
             conditions,
@@ -233,7 +234,7 @@ impl<T> Direction<T> {
         self.under_way.insert(at, (arrives_s, message));
     }
 
-    /// The next message that has arrived.
+    /// Returns the next message that has arrived.
     pub fn receive(&mut self, now_s: f64) -> Option<T> {
         // The nanosecond allows for rounding: times are sums of milliseconds.
         if self.under_way.front()?.0 > now_s + 1e-9 {
@@ -242,22 +243,22 @@ impl<T> Direction<T> {
         self.under_way.pop_front().map(|entry| entry.1)
     }
 
-    /// When the next message arrives, s.
+    /// Returns when the next message arrives, s.
     pub fn next_s(&self) -> Option<f64> {
         self.under_way.front().map(|entry| entry.0)
     }
 
-    /// Messages that are under way.
+    /// Returns the messages that are under way.
     pub fn under_way(&self) -> usize {
         self.under_way.len()
     }
 
-    /// Messages so far.
+    /// Returns the messages so far.
     pub fn sent(&self) -> u64 {
         self.sent
     }
 
-    /// Messages that found the queue full.
+    /// Returns the messages that found the queue full.
     pub fn overflowed(&self) -> u64 {
         self.overflowed
     }

@@ -4,24 +4,24 @@
 pub struct Random(fastrand::Rng);
 
 impl Random {
-    /// One of the independent streams of a seed.
+    /// Creates one of the independent streams of random numbers of a seed.
     pub fn new(seed: u64, stream: u64) -> Self {
         // The odd factor spreads neighbouring seeds and streams.
         Random(fastrand::Rng::with_seed((seed ^ stream.rotate_left(32)).wrapping_mul(0x9e37_79b9_7f4a_7c15)))
     }
 
-    /// A uniformly distributed number from `low` to `high`.
+    /// Returns a uniformly distributed number from `low` to `high`.
     pub fn between(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * self.0.f64()
     }
 
-    /// A number of the standard normal distribution (Box and Muller).
+    /// Returns a number of the standard normal distribution (Box and Muller).
     pub fn normal(&mut self) -> f64 {
         let radius = (-2.0 * (1.0 - self.between(0.0, 1.0)).ln()).sqrt();
         radius * (std::f64::consts::TAU * self.between(0.0, 1.0)).cos()
     }
 
-    /// A random element of a list.
+    /// Returns a random element of a list.
     pub fn one_of<'t, T>(&mut self, list: &'t [T]) -> &'t T {
         &list[self.0.usize(..list.len())]
     }

@@ -51,7 +51,7 @@ pub struct RelayNetwork {
 }
 
 impl RelayNetwork {
-    /// A network under these conditions, whatever the transport in them, for so many flows at a time. `warn`
+    /// Creates a network under these conditions, whatever the transport in them, for so many flows at a time. `warn`
     /// shows people what is not relayed.
     pub fn new(conditions: Conditions, seed: u64, most_flows: u64, warn: Arc<Warn>) -> Arc<Self> {
         let of = |transport| Conditions { transport, ..conditions };
@@ -79,7 +79,7 @@ impl RelayNetwork {
         Ok(bound)
     }
 
-    /// The same for datagrams.
+    /// Does the same for datagrams.
     ///
     /// # Errors
     /// Returns an error if the address is not free.
@@ -92,7 +92,7 @@ impl RelayNetwork {
         Ok(bound)
     }
 
-    /// What went through so far.
+    /// Returns what went through so far.
     pub fn passed(&self) -> Passed {
         let PacketCounts { flows, packets, bytes, .. } = &self.counts;
         let read = |counts: &[AtomicU64; 2]| [0, 1].map(|way| counts[way].load(Ordering::Relaxed));

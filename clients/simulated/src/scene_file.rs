@@ -3,16 +3,16 @@
 use std::path::Path;
 
 use glam::DVec3;
-use palpate::files;
-use palpate::limits::Limits;
-use palpate::scene::sent::{self, mesh_file};
-use palpate::scene::{Body, Scene};
-use palpate::wire;
 use palpate_client::upload::upload_mesh;
 use palpate_client::{Channel, Error};
-use palpate_mesh::{Group, TriangleMesh};
+use palpate_geometry::{Group, TriangleMesh};
 use palpate_proto::pb;
-use palpate_proto::refusal::Refusal;
+use palpate_refusal::Refusal;
+use palpate_session::wire;
+use palpate_tissue::files;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::sent::{self, mesh_file};
+use palpate_tissue::scene::{Body, Scene};
 use pb::create_session_request::Source;
 use pb::view_service_client::ViewServiceClient;
 use tonic::Status;
@@ -33,7 +33,7 @@ struct MeshToSend {
 }
 
 impl SceneFile {
-    /// One of the server's by its name, or the contents of a file that ends in .toml.
+    /// Reads a scene: one of the server's by its name, or the contents of a file that ends in .toml.
     ///
     /// # Errors
     /// Returns an error if the file can't be read, or if its scene is invalid.
@@ -70,7 +70,7 @@ impl SceneFile {
         Ok(SceneFile { source: Source::Scene(message), own: Some(own), mesh })
     }
 
-    /// What a session is to be made of; sends the mesh, if there is one.
+    /// Returns what a session is to be made of; sends the mesh, if there is one.
     ///
     /// # Errors
     /// Returns the server's refusal, or how the connection broke.
@@ -89,8 +89,8 @@ impl SceneFile {
         Ok(source)
     }
 
-    /// The scene of a session that the server has made of this. Of a mesh of the server's own, places at rest are known to
-    /// seven digits only, it is as fine as its file, and all points and springs are those of reference.
+    /// Returns the scene of a session that the server has made of this. Of a mesh of the server's own, places at rest
+    /// are known to seven digits only, it is as fine as its file, and all points and springs are those of reference.
     ///
     /// # Errors
     /// Returns an error if the server's scene or mesh can't be read.

@@ -2,8 +2,8 @@
 //! movements are smooth, like those of hands (minimum jerk), and drawn by a seed.
 
 use glam::DVec3;
-use palpate_touch::Law;
-use palpate_touch::hand::Hand;
+use palpate_haptics::Law;
+use palpate_haptics::hand::Hand;
 
 use crate::random::Random;
 
@@ -81,12 +81,12 @@ impl Task {
         Task { start_m, legs, amplitude_m }
     }
 
-    /// The target's position at the start, m.
+    /// Returns the target's position at the start, m.
     pub fn start_m(&self) -> DVec3 {
         self.start_m
     }
 
-    /// The target's position at `time_s`, m.
+    /// Returns the target's position at `time_s`, m.
     pub fn at(&self, time_s: f64) -> DVec3 {
         self.legs.iter().take_while(|leg| leg.from_s < time_s).fold(self.start_m, |place_m, leg| {
             let x = ((time_s - leg.from_s) / (leg.to_s - leg.from_s)).min(1.0);
@@ -95,8 +95,8 @@ impl Task {
     }
 }
 
-/// The scale of depths at which the deepest press of a hand at rest meets [`FORCE_SHARE`] of the largest force: there the
-/// hand's spring and the tissue are in balance.
+/// Returns the scale of depths at which the deepest press of a hand at rest meets [`FORCE_SHARE`] of the largest force:
+/// there the hand's spring and the tissue are in balance.
 pub fn scale(hand: &Hand, law: &Law, most_n: f64) -> f64 {
     let force_n = FORCE_SHARE * MARGIN * most_n;
     let yields_m = if hand.stiffness_n_per_m > 0.0 { force_n / hand.stiffness_n_per_m } else { f64::INFINITY };

@@ -15,7 +15,7 @@ const BLOCK = 8;
 const SLICE_MS = 8;
 /** How much darker a dent is, for each length that a push falls off over. */
 const DENT = 0.28;
-/** The server tells the mean force within so many lengths of a push, at least and at most so many edges (src/tissue/interpolate.rs). */
+/** The server tells the mean force within so many lengths of a push, at least and at most so many edges (crates/tissue/src/interpolate.rs). */
 const TOLD_WITHIN = { lengths: 7, least: 1.5, most: 4 };
 /** A texture whose scale differs by more than this from the usual, on more than this part of the triangles, has seams. */
 const SEAM = { times: 6, part: 0.001 };

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use palpate::journal::recover;
+use palpate_session::journal::recover;
 
 use super::super::Failure;
 use super::JournalSource;

@@ -2,11 +2,11 @@
 
 use std::path::PathBuf;
 
-use palpate::journal::{Replay, ReplayEvent};
 use palpate::render::{self, Arrow, Gif, Still, View};
-use palpate::session::Session;
-use palpate::surface::{Refinement, Skin};
-use palpate::texture;
+use palpate_session::Session;
+use palpate_session::journal::{Replay, ReplayEvent};
+use palpate_session::surface::{Refinement, Skin};
+use palpate_tissue::texture;
 
 use super::super::{Failure, with_progress, write_file};
 use super::JournalSource;
@@ -52,7 +52,7 @@ fn failed(failure: render::FilmFailure) -> Failure {
 fn still(session: &Session, shown: Option<&std::sync::Arc<Skin>>) -> Still {
     let felt = session.felt().into_iter().filter(|felt| felt.force_n.length() > 0.0);
     let shape = session.model().shape();
-    let arrow = |felt: palpate::session::input::Felt| Arrow {
+    let arrow = |felt: palpate_session::input::Felt| Arrow {
         point: shape.nearest(felt.place_m - felt.displacement_m),
         towards: -felt.force_n,
     };

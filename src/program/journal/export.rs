@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use palpate::journal::pb;
+use palpate_session::journal::pb;
 use serde_json::json;
 
 use super::super::{Failure, with_progress};

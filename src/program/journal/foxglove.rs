@@ -3,8 +3,8 @@
 use std::io::BufWriter;
 use std::path::Path;
 
-use palpate::journal::ReplayEvent;
-use palpate::journal::foxglove::Export;
+use palpate_session::journal::ReplayEvent;
+use palpate_session::journal::foxglove::Export;
 
 use super::super::{Failure, with_progress};
 use super::JournalSource;

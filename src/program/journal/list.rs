@@ -3,9 +3,9 @@
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
-use palpate::journal::file::{self, JournalFile};
-use palpate::journal::{JournalReader, Survey, pb};
-use palpate::printable::{printable, printable_json};
+use palpate_refusal::printable::{printable, printable_json};
+use palpate_session::journal::file::{self, JournalFile};
+use palpate_session::journal::{JournalReader, Survey, pb};
 use serde::Serialize;
 
 use super::super::Failure;

@@ -16,8 +16,8 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
-use palpate::journal::{JournalReader, Replay};
-use palpate::limits::Limits;
+use palpate_session::journal::{JournalReader, Replay};
+use palpate_tissue::limits::Limits;
 
 use super::{Failure, load_config, say, with_progress};
 

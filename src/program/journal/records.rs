@@ -3,12 +3,12 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use palpate::journal::{Replay, ReplayEvent};
-use palpate::refusal::{Reason, Refusal};
-use palpate::scene::record::{Line, Record, Run, Summary, write_line};
-use palpate::session::Session;
-use palpate::session::run::{header, summary};
-use palpate::shape::{PointId, PointName};
+use palpate_refusal::{Reason, Refusal};
+use palpate_session::Session;
+use palpate_session::journal::{Replay, ReplayEvent};
+use palpate_session::run::{header, summary};
+use palpate_tissue::scene::record::{Line, Record, Run, Summary, write_line};
+use palpate_tissue::shape::{PointId, PointName};
 
 use super::super::client::client;
 use super::super::{Failure, clock_s, say, with_progress};

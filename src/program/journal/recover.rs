@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use palpate::journal::{JournalReader, Survey, recover};
+use palpate_session::journal::{JournalReader, Survey, recover};
 
 use super::super::{Failure, say, with_progress};
 use super::output::{new_file, unwritten};

@@ -4,9 +4,9 @@ use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::PathBuf;
 
-use palpate::journal::replay::{JournalItem, items};
-use palpate::journal::{JournalReader, pb};
-use palpate::printable::{printable, printable_json};
+use palpate_refusal::printable::{printable, printable_json};
+use palpate_session::journal::replay::{JournalItem, items};
+use palpate_session::journal::{JournalReader, pb};
 use serde_json::{Value, json};
 
 use super::super::Failure;
@@ -92,8 +92,9 @@ fn kind(command: &pb::Command) -> &'static str {
 
 fn told(command: &pb::Command) -> String {
     use pb::command::Action;
-    let vector =
-        |v: Option<palpate::journal::Vector3>| v.map(|v| format!("({}, {}, {})", v.x, v.y, v.z)).unwrap_or_default();
+    let vector = |v: Option<palpate_session::journal::Vector3>| {
+        v.map(|v| format!("({}, {}, {})", v.x, v.y, v.z)).unwrap_or_default()
+    };
     let kind = kind(command);
     match &command.action {
         Some(Action::Push(push)) => format!("{kind} with {} N at {} m", vector(push.force_n), vector(push.centre_m)),
@@ -147,7 +148,7 @@ fn name(input: &pb::Input) -> &'static str {
     }
 }
 
-fn vector(v: Option<palpate::journal::Vector3>) -> Value {
+fn vector(v: Option<palpate_session::journal::Vector3>) -> Value {
     v.map_or(Value::Null, |v| json!([v.x, v.y, v.z]))
 }
 

@@ -4,11 +4,11 @@ use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
-use palpate::files;
-use palpate::journal::signature::{PublicKey, Signatures, Signed};
-use palpate::journal::{JournalReader, Replay, Verdict};
-use palpate::refusal::Refusal;
 use palpate::server::journal_key;
+use palpate_refusal::Refusal;
+use palpate_session::journal::signature::{PublicKey, Signatures, Signed};
+use palpate_session::journal::{JournalReader, Replay, Verdict};
+use palpate_tissue::files;
 
 use super::super::{Failure, clock_s, say, with_progress};
 use super::limits;

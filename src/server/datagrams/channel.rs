@@ -2,19 +2,19 @@
 
 use std::sync::{Arc, Mutex};
 
+use palpate_haptics::datagram_health::Carrier;
+use palpate_haptics::dead_reckoning::SendInterval;
 use palpate_proto::datagram::MAX_BYTES;
 use palpate_proto::pb;
-use palpate_touch::datagram_health::Carrier;
-use palpate_touch::dead_reckoning::SendInterval;
 use prost::Message;
 use wtransport::{Connection, VarInt};
 
 use super::tickets::Arrival;
-use crate::lock::lock;
-use crate::realtime::clock::now_ns;
-use crate::refusal::{Reason, Refusal, Result};
 use crate::server::rate::Bucket;
-use crate::session::sampling::WantedHeartbeat;
+use palpate_realtime::clock::now_ns;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::sampling::WantedHeartbeat;
+use palpate_tissue::lock::lock;
 
 /// The datagrams of a stream, in both directions. Who listens and who tells share it.
 #[derive(Debug)]

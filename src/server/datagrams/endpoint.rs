@@ -16,14 +16,14 @@ use wtransport::{Endpoint, ServerConfig, VarInt};
 
 use super::certificate::{self, ROTATED};
 use super::offers::{Datagrams, Offers, Socket};
-use crate::lock::lock;
-use crate::priority::{give_way_a_little, thread};
-use crate::realtime::clock::now_ns;
 use crate::server::address::network;
 use crate::server::authorize::is_own_or_among;
 use crate::server::rate::Bucket;
 use crate::server::traffic::Traffic;
 use palpate_proto::datagram;
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::priority::{give_way_a_little, thread};
+use palpate_tissue::lock::lock;
 
 /// Handshakes at a time; more are ignored, and their clients try again.
 const HANDSHAKES: usize = 64;

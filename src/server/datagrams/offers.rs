@@ -6,11 +6,11 @@ use std::sync::{Arc, Mutex};
 use palpate_proto::pb;
 
 use super::tickets::{Arrival, Tickets};
-use crate::lock::lock;
-use crate::realtime::clock::now_ns;
-use crate::refusal::{Reason, Refusal, Result};
 use crate::server::address::host_and_port;
 use crate::server::config::Config;
+use palpate_realtime::clock::now_ns;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::lock::lock;
 
 /// Where datagrams are received, if at all.
 pub(in crate::server) struct Socket {

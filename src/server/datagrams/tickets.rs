@@ -6,8 +6,8 @@ use std::time::Duration;
 use tokio::sync::oneshot;
 use wtransport::Connection;
 
-use crate::ids::random_bits;
-use crate::refusal::Result;
+use palpate_realtime::ids::random_bits;
+use palpate_refusal::Result;
 
 /// The session that presents a ticket, once it does.
 pub(in crate::server) type Arrival = oneshot::Receiver<Connection>;

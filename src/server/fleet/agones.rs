@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use super::Fleet;
-use crate::cluster::agones::{self, ServerStatus};
+use palpate_cluster::agones::{self, ServerStatus};
 
 impl Fleet {
     /// Tells Agones for ever; without `cluster.agones` nothing at all.

@@ -10,10 +10,10 @@ use tokio::time::{Instant, sleep, timeout};
 use tracing::{error, info, warn};
 
 use super::{Fleet, Owned};
-use crate::cluster::rules;
-use crate::journal::file::JournalFile;
-use crate::lock::lock;
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_cluster::rules;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::journal::file::JournalFile;
+use palpate_tissue::lock::lock;
 
 /// It is looked for such sessions so often, and whenever a server comes or goes.
 const LOOK: Duration = Duration::from_millis(500);
@@ -147,7 +147,8 @@ impl Fleet {
                 let newest = files.iter().rfind(|file| file.session_id == id);
                 // One from before the server was of a fleet. One that was of it, and is not in etcd, is deleted.
                 let is_new = newest.is_some_and(|file| {
-                    crate::journal::JournalReader::open(&file.path).is_ok_and(|r| r.header().ownership_revision == 0)
+                    palpate_session::journal::JournalReader::open(&file.path)
+                        .is_ok_and(|r| r.header().ownership_revision == 0)
                 });
                 if is_new {
                     let made =
@@ -191,7 +192,7 @@ impl Fleet {
 
 /// The journals of a folder.
 fn list(folder: &Path) -> Result<Vec<JournalFile>> {
-    crate::journal::file::list(folder).map_err(|error| {
+    palpate_session::journal::file::list(folder).map_err(|error| {
         let message = format!("{}: can't be read: {error}", folder.display());
         Refusal::new(Reason::Unreadable, "journal", message)
     })

@@ -11,8 +11,8 @@ use http_body::Frame;
 use tonic::Status;
 use tonic::body::Body;
 
-use crate::realtime::fence::Fence;
-use crate::realtime::fenced;
+use palpate_realtime::fence::Fence;
+use palpate_realtime::fenced;
 
 /// The body of an answer, until the fence is passed.
 pub(in crate::server) struct FencedBody {

@@ -9,10 +9,10 @@ use tracing::warn;
 
 use super::Fleet;
 use super::owned::Found;
-use crate::cluster::etcd::{WatchError, WatchEvent};
-use crate::cluster::key::{SessionValue, decode};
-use crate::lock::lock;
-use crate::refusal::Result;
+use palpate_cluster::etcd::{WatchError, WatchEvent};
+use palpate_cluster::key::{SessionValue, decode};
+use palpate_refusal::Result;
+use palpate_tissue::lock::lock;
 
 /// After a failure it is tried again so soon.
 const PAUSE: Duration = Duration::from_millis(500);

@@ -12,13 +12,13 @@ use tracing::{error, info, warn};
 use super::counters::Standing;
 use super::owned::Found;
 use super::{Fleet, HeldLease, Nodes, elsewhere};
-use crate::cluster::etcd::{Compare, EtcdError, Op, Txn, WatchError, WatchEvent};
-use crate::cluster::key::{NodeValue, decode, encode};
-use crate::cluster::rules;
-use crate::lock::lock;
-use crate::realtime::fence::boot_ns;
-use crate::refusal::{Reason, Refusal, Result};
 use crate::server::journals::Journals;
+use palpate_cluster::etcd::{Compare, EtcdError, Op, Txn, WatchError, WatchEvent};
+use palpate_cluster::key::{NodeValue, decode, encode};
+use palpate_cluster::rules;
+use palpate_realtime::fence::boot_ns;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::lock::lock;
 
 /// After a failure it is tried again so soon.
 const PAUSE: Duration = Duration::from_millis(100);
@@ -118,6 +118,7 @@ impl Fleet {
         self.spawn(self.clone().take_over());
         self.spawn(self.clone().settle());
         self.spawn(self.clone().follow_owned());
+        #[cfg(feature = "agones")]
         self.spawn(self.clone().tell_agones());
     }
 

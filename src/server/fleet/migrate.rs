@@ -8,9 +8,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::stream::{self, Stream};
+use palpate_haptics::Law;
 use palpate_proto::geometry::vector;
 use palpate_proto::{pb, touch};
-use palpate_touch::Law;
 use pb::take_session_request::Message as Say;
 use tokio::sync::mpsc;
 use tokio::time::timeout;
@@ -20,17 +20,17 @@ use tracing::{info, warn};
 
 use super::owned::Found;
 use super::{Fleet, elsewhere};
-use crate::cluster::key::SessionValue;
-use crate::cluster::{placement, rules};
-use crate::force_law::Disc;
-use crate::journal::inputs;
-use crate::lock::lock;
-use crate::realtime::clock::now_ns;
-use crate::realtime::{Present, SessionHandle};
-use crate::refusal::{Reason, Refusal, Result, excerpt};
 use crate::server::journals::recorded;
-use crate::session::intake_transfer::Handed;
-use crate::session::lease::HandedLease;
+use palpate_cluster::key::SessionValue;
+use palpate_cluster::{placement, rules};
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::{Present, SessionHandle};
+use palpate_refusal::{Reason, Refusal, Result, excerpt};
+use palpate_session::intake_transfer::Handed;
+use palpate_session::journal::inputs;
+use palpate_session::lease::HandedLease;
+use palpate_tissue::force_law::Disc;
+use palpate_tissue::lock::lock;
 
 /// The other server makes the tissue within this time, or the session stays.
 const PREPARATION: Duration = Duration::from_secs(30);

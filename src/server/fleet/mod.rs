@@ -5,6 +5,7 @@
 //!
 //! Clients connect to the owner of a session. No call is passed on but the creation of a session.
 
+#[cfg(feature = "agones")]
 mod agones;
 mod counters;
 mod failover;
@@ -35,14 +36,14 @@ pub(super) use peers::MAX_MESSAGE_BYTES;
 use super::config::Config;
 use super::journals::Journals;
 use super::journals::progress::Growth;
-use crate::budget::Account;
-use crate::cluster::etcd::{Etcd, EtcdError, EtcdOptions, KeyValue};
-use crate::cluster::key::{Keys, NodeValue, SessionValue, decode};
-use crate::cluster::placement;
-use crate::lock::lock;
-use crate::realtime::clock::now_ns;
-use crate::realtime::{Pacer, SessionHandle};
-use crate::refusal::{Reason, Refusal, Result, excerpt};
+use palpate_cluster::etcd::{Etcd, EtcdError, EtcdOptions, KeyValue};
+use palpate_cluster::key::{Keys, NodeValue, SessionValue, decode};
+use palpate_cluster::placement;
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::{Pacer, SessionHandle};
+use palpate_refusal::{Reason, Refusal, Result, excerpt};
+use palpate_session::budget::Account;
+use palpate_tissue::lock::lock;
 use peers::Peers;
 use replica::StandBy;
 
@@ -167,7 +168,7 @@ impl Fleet {
             endpoint: cluster.endpoint().to_owned(),
             instance: replica::instance(&folder)?,
             version: env!("CARGO_PKG_VERSION").to_owned(),
-            replays: crate::journal::format::REPLAYS,
+            replays: palpate_session::journal::format::REPLAYS,
             threads: u32::try_from(config.stepping_threads()).unwrap_or(u32::MAX),
             load: 0.0,
             sessions: 0,

@@ -8,14 +8,14 @@ use tokio::time::{Instant, sleep};
 use tracing::warn;
 
 use super::{Fleet, Owned, of_etcd};
-use crate::cluster::etcd::{Compare, EtcdError, TransactionOutcome, Txn};
-use crate::cluster::key::{SessionValue, decode};
-use crate::cluster::rules;
-use crate::ids::random_id;
-use crate::lock::lock;
-use crate::realtime::SessionReservation;
-use crate::realtime::clock::now_ns;
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_cluster::etcd::{Compare, EtcdError, TransactionOutcome, Txn};
+use palpate_cluster::key::{SessionValue, decode};
+use palpate_cluster::rules;
+use palpate_realtime::SessionReservation;
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::ids::random_id;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::lock::lock;
 
 /// A session that does not come within this time, ns, was given up by who wanted it.
 const COMES_NS: u64 = 300_000_000_000;
@@ -133,7 +133,7 @@ impl Fleet {
     pub(in crate::server) async fn birth(&self) -> Result<SessionReservation> {
         let id = random_id()?;
         let made = self.transact(rules::create(&self.keys, &id, &self.node), &id, |found| found.is_some()).await?;
-        let revision = made.map_err(|_| crate::realtime::fenced())?;
+        let revision = made.map_err(|_| palpate_realtime::fenced())?;
         lock(&self.owned).insert(id.clone(), Owned::since(revision));
         Ok(SessionReservation { id, revision, recorded: true })
     }
@@ -236,7 +236,7 @@ fn not_deleted(why: &str) -> Refusal {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cluster::key::Keys;
+    use palpate_cluster::key::Keys;
 
     #[test]
     fn a_transaction_tells_the_revision_that_it_builds_on() {

@@ -12,9 +12,9 @@ use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity
 
 use super::super::config::Config;
 use super::super::reload::Reloaded;
-use crate::cluster::etcd::root;
-use crate::lock::lock;
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_cluster::etcd::root;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::lock::lock;
 
 /// A server that is silent for so long is given up.
 const SILENCE: Duration = Duration::from_secs(1);

@@ -5,10 +5,10 @@ use std::io::Cursor;
 use std::sync::Arc;
 use std::time::Duration;
 
+use palpate_haptics::Law;
 use palpate_proto::geometry::from_vector;
 use palpate_proto::measure::MULTIPLE;
 use palpate_proto::{pb, touch};
-use palpate_touch::Law;
 use pb::take_session_request::Message;
 use tokio::sync::mpsc;
 use tokio::time::{sleep, timeout};
@@ -16,21 +16,21 @@ use tonic::{Status, Streaming};
 use tracing::{info, warn};
 
 use super::{Fleet, Owned};
-use crate::budget::{Purpose, Resource, Taken};
-use crate::cluster::rules;
-use crate::force_law::Disc;
-use crate::journal::replay::{self, Known, Resumed};
-use crate::journal::{JournalReader, inputs};
-use crate::lock::lock;
-use crate::memory;
-use crate::realtime::{Begin, SessionHandle, fenced};
-use crate::refusal::{Reason, Refusal};
 use crate::server::journals::{until_complete, until_on_disk};
-use crate::session::input::Input;
-use crate::session::intake_transfer::Handed;
-use crate::session::lease::{HandedLease, LeaseId};
-use crate::tissue::Model;
-use crate::tissue::scheme_selection::NEVER;
+use palpate_cluster::rules;
+use palpate_realtime::{Begin, SessionHandle, fenced};
+use palpate_refusal::{Reason, Refusal};
+use palpate_session::budget::{Purpose, Resource, Taken};
+use palpate_session::input::Input;
+use palpate_session::intake_transfer::Handed;
+use palpate_session::journal::replay::{self, Known, Resumed};
+use palpate_session::journal::{JournalReader, inputs};
+use palpate_session::lease::{HandedLease, LeaseId};
+use palpate_tissue::Model;
+use palpate_tissue::force_law::Disc;
+use palpate_tissue::lock::lock;
+use palpate_tissue::memory;
+use palpate_tissue::scheme_selection::NEVER;
 
 /// Bytes of a session's state, at most.
 const MAX_STATE_BYTES: usize = 1 << 30;
@@ -132,7 +132,7 @@ impl Fleet {
     }
 
     /// Takes nothing yet, and grows.
-    fn paid(&self) -> crate::refusal::Result<Taken> {
+    fn paid(&self) -> palpate_refusal::Result<Taken> {
         self.account(PAYER).take(Resource::Memory(Purpose::Journals), 0, "part")
     }
 
@@ -196,7 +196,7 @@ impl Fleet {
     /// The inputs that wait. What can't be read is left out: the session is this server's, and goes on.
     async fn waiting(&self, id: &str, pieces: Vec<Vec<u8>>, first: Arc<Model>) -> Vec<(u64, Input)> {
         let limits = self.config.limits.clone();
-        let read = move || -> crate::refusal::Result<Vec<(u64, Input)>> {
+        let read = move || -> palpate_refusal::Result<Vec<(u64, Input)>> {
             let mut waiting = Vec::new();
             for piece in pieces {
                 waiting.extend(inputs::decoded(&piece, &first, &limits)?);

@@ -9,10 +9,10 @@ use tokio::time::{Instant, sleep, timeout};
 use tracing::warn;
 
 use super::Fleet;
-use crate::cluster::key::{SessionValue, decode};
-use crate::cluster::rules;
-use crate::lock::lock;
-use crate::refusal::Result;
+use palpate_cluster::key::{SessionValue, decode};
+use palpate_cluster::rules;
+use palpate_refusal::Result;
+use palpate_tissue::lock::lock;
 
 /// What was so this long before, and is so still, is settled: a session that is just being made or taken is not meant.
 const AGAIN: Duration = Duration::from_secs(3);

@@ -9,12 +9,12 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use palpate_proto::pb;
 
-use crate::files;
-use crate::ids::random_id;
-use crate::journal;
-use crate::lock::lock;
-use crate::realtime::clock::now_ns;
-use crate::refusal::{Reason, Refusal, Result};
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::ids::random_id;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::journal;
+use palpate_tissue::files;
+use palpate_tissue::lock::lock;
 
 /// Where they are, in the folder of journals.
 const FOLDER: &str = "standby";

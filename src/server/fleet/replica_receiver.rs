@@ -8,7 +8,7 @@ use tokio::sync::mpsc;
 use tonic::{Status, Streaming};
 
 use super::Fleet;
-use crate::refusal::{Reason, Refusal};
+use palpate_refusal::{Reason, Refusal};
 
 type Tell = mpsc::Sender<Result<pb::MirrorResponse, Status>>;
 

@@ -19,10 +19,10 @@ use tracing::{info, warn};
 
 use super::peers::why;
 use super::{Fleet, Standby};
-use crate::cluster::{placement, rules};
-use crate::lock::lock;
-use crate::realtime::event_log::EventLog;
 use crate::server::journals::progress::Grown;
+use palpate_cluster::{placement, rules};
+use palpate_realtime::event_log::EventLog;
+use palpate_tissue::lock::lock;
 
 /// A server that can't be reached is tried again so soon.
 const PAUSE: Duration = Duration::from_millis(250);

@@ -3,23 +3,23 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use palpate_haptics::datagram_health::ReceiveWindow;
+use palpate_haptics::device::Device;
 use palpate_proto::{datagram, pb};
-use palpate_touch::datagram_health::ReceiveWindow;
-use palpate_touch::device::Device;
 use tracing::{debug, info};
 
 use super::event::StreamEvent;
-use crate::limits::Limits;
-use crate::realtime::SessionHandle;
-use crate::realtime::clock::now_ns;
-use crate::realtime::queue::Writer;
-use crate::refusal::{Refusal, Result, number};
-use crate::scene::script::Action;
 use crate::server::rate::Bucket;
 use crate::server::traffic::Traffic;
-use crate::session::command::Command;
-use crate::session::lease::LeaseId;
-use crate::wire;
+use palpate_realtime::SessionHandle;
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::queue::Writer;
+use palpate_refusal::{Refusal, Result, number};
+use palpate_session::command::Command;
+use palpate_session::lease::LeaseId;
+use palpate_session::wire;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::script::Action;
 
 /// Whoever holds the tools of a lease.
 pub(super) struct LeaseController {

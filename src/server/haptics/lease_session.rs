@@ -12,14 +12,14 @@ use super::lease_controller::LeaseController;
 use super::response_stream::ResponseStream;
 use super::stream::KeepaliveTimer;
 use super::tools::lease_id;
-use crate::budget::Account;
-use crate::realtime::StreamKind;
-use crate::realtime::queue::{Writer, queue};
-use crate::refusal::{Refusal, Result};
 use crate::server::datagrams::{Arrival, DatagramChannel, GOOD, not_available};
 use crate::server::recovered::Notices;
 use crate::server::services::Services;
-use crate::wire;
+use palpate_realtime::StreamKind;
+use palpate_realtime::queue::{Writer, queue};
+use palpate_refusal::{Refusal, Result};
+use palpate_session::budget::Account;
+use palpate_session::wire;
 
 /// A session that was offered for a lease.
 struct LeaseSession {

@@ -21,15 +21,15 @@ use super::connections::Peer;
 use super::revocation::Tenure;
 use super::services::Services;
 use super::stream_termination::until_cut;
-use crate::ids::random_bits;
-use crate::realtime::StreamKind;
-use crate::realtime::clock::now_ns;
-use crate::refusal::{Reason, Refusal};
-use crate::session::command::Command;
-use crate::shape::{PointId, PointName, RestShape};
-use crate::wire;
 use palpate_proto::pb;
 use palpate_proto::pb::haptic_service_server::HapticService;
+use palpate_realtime::StreamKind;
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::ids::random_bits;
+use palpate_refusal::{Reason, Refusal};
+use palpate_session::command::Command;
+use palpate_session::wire;
+use palpate_tissue::shape::{PointId, PointName, RestShape};
 
 #[derive(Clone)]
 pub(super) struct Haptics(pub(super) Services);
@@ -189,7 +189,7 @@ impl HapticService for Haptics {
                     Err(refusal) => return Some((Err(refusal.into()), None)),
                 },
             };
-            let message = wire::sample::record(&record, dropped, part)?;
+            let message = wire::sample::record(record.step, &record.record, dropped, part)?;
             let begun = (!message.last).then_some((record, dropped, part + 1));
             Some((Ok(message), Some((records, guard, begun))))
         });

@@ -8,13 +8,14 @@ use palpate_proto::pb;
 use tonic::Status;
 
 use super::event::StreamEvent;
-use crate::realtime::clock::now_ns;
-use crate::realtime::queue::Reader;
-use crate::realtime::{PacedSample, StreamGuard};
 use crate::server::datagrams::DatagramChannel;
 use crate::server::force_law::Updates;
 use crate::server::recovered::Notices;
-use crate::wire;
+use palpate_realtime::StreamGuard;
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::queue::Reader;
+use palpate_session::sampling::PacedSample;
+use palpate_session::wire;
 
 /// While samples go by datagram, one goes by the stream as well after so long.
 const HEARTBEAT_NS: u64 = 1_000_000_000;

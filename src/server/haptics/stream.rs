@@ -6,9 +6,9 @@ use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use futures_util::stream::Stream;
+use palpate_haptics::datagram_health::LIFE_S;
+use palpate_haptics::device::UNDECLARED_FORCE_N;
 use palpate_proto::{pb, touch};
-use palpate_touch::datagram_health::LIFE_S;
-use palpate_touch::device::UNDECLARED_FORCE_N;
 use tokio::sync::oneshot;
 use tokio::time::{Interval, MissedTickBehavior};
 use tokio_util::task::AbortOnDropHandle;
@@ -20,19 +20,20 @@ use super::lease_controller::LeaseController;
 use super::pending_messages::PendingMessages;
 use super::response_stream::ResponseStream;
 use super::tools::charges;
-use crate::budget::Account;
-use crate::ids::random_bits;
-use crate::realtime::clock::now_ns;
-use crate::realtime::queue::{Reader, Writer, queue};
-use crate::realtime::{PacedSample, StreamGuard, StreamKind};
-use crate::refusal::{Reason, Refusal};
-use crate::scene::check::check_tip;
 use crate::server::datagrams::{Arrival, DatagramChannel};
 use crate::server::force_law::{Computing, Updates};
 use crate::server::recovered::Notices;
 use crate::server::services::Services;
-use crate::session::laws::{FIRST, Laws};
-use crate::wire;
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::ids::random_bits;
+use palpate_realtime::queue::{Reader, Writer, queue};
+use palpate_realtime::{StreamGuard, StreamKind};
+use palpate_refusal::{Reason, Refusal};
+use palpate_session::budget::Account;
+use palpate_session::laws::{FIRST, Laws};
+use palpate_session::sampling::PacedSample;
+use palpate_session::wire;
+use palpate_tissue::scene::check::check_tip;
 
 /// What the output of a haptic stream begins with.
 struct Opened {
@@ -248,7 +249,7 @@ async fn listen(
                 channel.stay_alive();
                 continue;
             }
-            () = cut.cancelled() => return events.close(crate::realtime::streams::cut()),
+            () = cut.cancelled() => return events.close(palpate_realtime::streams::cut()),
         };
         match message {
             Ok(Some(pb::TouchRequest { message: Some(Message::Command(command)) })) => {

@@ -1,8 +1,8 @@
 //! What calls that hold tools share.
 
-use crate::budget::{Account, Resource, Taken};
-use crate::refusal::{Reason, Refusal};
-use crate::session::lease::LeaseId;
+use palpate_refusal::{Reason, Refusal};
+use palpate_session::budget::{Account, Resource, Taken};
+use palpate_session::lease::LeaseId;
 
 /// Charges `account` for so many tools.
 pub(super) fn charges(account: &Account, tools: usize) -> Result<Vec<Taken>, Refusal> {

@@ -12,11 +12,11 @@ use super::folder::{Folder, Grown};
 use super::progress::Growth;
 use super::purge;
 use super::retention::Keep;
-use crate::journal::signature::Key;
-use crate::journal::{self, JournalWriter, Opening, pb};
-use crate::realtime::Leaving;
-use crate::realtime::clock::now_ns;
-use crate::realtime::event_log::{About, Beginning, Event, EventLog, Noted, TapeQueue};
+use palpate_realtime::Leaving;
+use palpate_realtime::clock::now_ns;
+use palpate_realtime::event_log::{About, Beginning, Event, EventLog, Noted, TapeQueue};
+use palpate_session::journal::signature::Key;
+use palpate_session::journal::{self, JournalWriter, Opening, pb};
 
 /// A round of syncs begins so long after the one before at the earliest: what happens meanwhile goes with it.
 const ROUND: Duration = Duration::from_millis(20);

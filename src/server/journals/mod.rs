@@ -19,17 +19,17 @@ pub use retention::Keep;
 
 use super::config::Config;
 use super::{journal_key, reload};
-use crate::files;
-use crate::journal::signature::Key;
-use crate::limits::Limits;
-use crate::lock::lock;
-use crate::priority::{give_way_a_little, thread};
-use crate::realtime::event_log::{JournalProgress, TapeQueue};
-use crate::realtime::{Pacer, SessionHandle};
-use crate::refusal::{Reason, Refusal, Result};
 use folder::Folder;
 use keeper::Keeper;
 pub(crate) use keeper::KeeperTally;
+use palpate_realtime::event_log::{JournalProgress, TapeQueue};
+use palpate_realtime::priority::{give_way_a_little, thread};
+use palpate_realtime::{Pacer, SessionHandle};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::journal::signature::Key;
+use palpate_tissue::files;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::lock::lock;
 use progress::Growth;
 
 /// So long a call waits until a session is on the disk, or all of it.
@@ -65,7 +65,7 @@ impl Journals {
         let folder = Arc::new(Folder::open(path)?);
         let (queue, tally) = (pacer.keep_tapes(), Arc::new(KeeperTally::default()));
         let found = resume::all(folder.path(), own.as_ref(), pacer, &config.limits)?;
-        let name = |path: &PathBuf| crate::journal::file::parse(path.file_name()?.to_str()?);
+        let name = |path: &PathBuf| palpate_session::journal::file::parse(path.file_name()?.to_str()?);
         let left_alone = found.left_alone.iter().filter_map(|path| Some(name(path)?.0)).collect();
         let keeper =
             Keeper::new(folder.clone(), (config.journal_keep, key), queue.clone(), tally.clone(), found, growth);
@@ -112,7 +112,7 @@ impl Journals {
 
     /// Removes the journals of a session, which is not here, from a run on.
     pub(super) fn remove_from(&self, id: &str, run: u64) {
-        for file in crate::journal::file::list(self.folder.path()).unwrap_or_default() {
+        for file in palpate_session::journal::file::list(self.folder.path()).unwrap_or_default() {
             if file.session_id == id && file.run >= run {
                 purge::remove(&file.path);
             }

@@ -4,11 +4,11 @@ use std::io::{Read, Seek};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
-use crate::journal::inputs::Inputs;
-use crate::lock::lock;
-use crate::realtime::SessionHandle;
-use crate::realtime::playback::PlaybackSource;
-use crate::refusal::Result;
+use palpate_realtime::SessionHandle;
+use palpate_realtime::playback::PlaybackSource;
+use palpate_refusal::Result;
+use palpate_session::journal::inputs::Inputs;
+use palpate_tissue::lock::lock;
 
 /// It looks so often whether a session has played much of what was read.
 const LOOK: Duration = Duration::from_millis(100);

@@ -8,8 +8,8 @@ use std::sync::{Arc, Mutex};
 use tokio::sync::Notify;
 
 use super::folder::Grown as Growing;
-use crate::lock::lock;
-use crate::realtime::event_log::EventLog;
+use palpate_realtime::event_log::EventLog;
+use palpate_tissue::lock::lock;
 
 /// Positions of a journal whose steps are remembered. Who is further behind is told of when it has caught up.
 const MAX_POSITIONS: usize = 256;

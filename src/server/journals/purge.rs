@@ -4,8 +4,8 @@ use std::path::Path;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use super::retention::Keep;
-use crate::journal;
-use crate::realtime::fence::boot_ns;
+use palpate_realtime::fence::boot_ns;
+use palpate_session::journal;
 
 /// Removes a journal. What can't be removed is told, and tried again.
 pub(super) fn remove(path: &Path) {

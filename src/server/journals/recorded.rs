@@ -16,17 +16,17 @@ use super::folder::Folder;
 use super::keeper::unix_ns;
 use super::player::{JournalBytes, Player, read_ahead};
 use super::{Journals, Keep};
-use crate::budget::{Account, Purpose, Resource, Taken};
-use crate::journal::file::{self, JournalFile};
-use crate::journal::inputs::Inputs;
-use crate::journal::{self, JournalReader, JournalWriter, Opening, Replay, pb as kept, seal};
-use crate::limits::Limits;
-use crate::lock::lock;
-use crate::priority::thread;
-use crate::realtime::playback::{Playback, PlaybackSource};
-use crate::realtime::{Begin, Pacer, Present, SessionHandle, SessionReservation};
-use crate::refusal::{Reason, Refusal, Result, number};
-use crate::tissue::scheme_selection::{NEVER, given_up};
+use palpate_realtime::playback::{Playback, PlaybackSource};
+use palpate_realtime::priority::thread;
+use palpate_realtime::{Begin, Pacer, Present, SessionHandle, SessionReservation};
+use palpate_refusal::{Reason, Refusal, Result, number};
+use palpate_session::budget::{Account, Purpose, Resource, Taken};
+use palpate_session::journal::file::{self, JournalFile};
+use palpate_session::journal::inputs::Inputs;
+use palpate_session::journal::{self, JournalReader, JournalWriter, Opening, Replay, pb as kept, seal};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::lock::lock;
+use palpate_tissue::scheme_selection::{NEVER, given_up};
 
 /// Moments of a curve of forces.
 const MAX_MOMENTS: usize = 2000;

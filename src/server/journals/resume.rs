@@ -6,13 +6,13 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::keeper::FolderContent;
-use crate::journal::file::JournalFile;
-use crate::journal::{self, JournalReader, Replay, Survey, pb};
-use crate::limits::Limits;
-use crate::lock::lock;
-use crate::realtime::{Begin, Pacer};
-use crate::refusal::{Reason, Refusal, Result};
-use crate::tissue::scheme_selection::NEVER;
+use palpate_realtime::{Begin, Pacer};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::journal::file::JournalFile;
+use palpate_session::journal::{self, JournalReader, Replay, Survey, pb};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::lock::lock;
+use palpate_tissue::scheme_selection::NEVER;
 
 /// What became of a session's journals.
 enum ResumeOutcome {
@@ -63,7 +63,7 @@ pub(super) fn all(
     let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get).min(sessions.len());
     std::thread::scope(|scope| {
         for index in 0..threads {
-            let builder = crate::priority::thread(format!("resume-{index}"));
+            let builder = palpate_realtime::priority::thread(format!("resume-{index}"));
             if builder.spawn_scoped(scope, work).is_err() {
                 break;
             }

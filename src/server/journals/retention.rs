@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use serde::Deserialize;
 
-use crate::budget::parse_bytes;
+use palpate_session::budget::parse_bytes;
 
 /// How long the journals of sessions that have ended are kept, and how many bytes all journals may take before the oldest of these
 /// are removed. The newest of a session that goes on, and those that nobody has continued, are never removed.

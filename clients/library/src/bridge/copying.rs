@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
+use palpate_haptics::{Predictor, Tip};
 use palpate_proto::pb;
-use palpate_touch::{Predictor, Tip};
 use pb::session_service_client::SessionServiceClient;
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;

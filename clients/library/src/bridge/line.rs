@@ -5,13 +5,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use glam::DVec3;
-use palpate_proto::error::elsewhere;
+use palpate_haptics::Device;
+use palpate_haptics::datagram_health::Carried;
+use palpate_haptics::deadband::HEARTBEAT_S;
 use palpate_proto::geometry::{from_vector, vector};
-use palpate_proto::refusal::Reason;
 use palpate_proto::{pb, touch};
-use palpate_touch::Device;
-use palpate_touch::datagram_health::Carried;
-use palpate_touch::deadband::HEARTBEAT_S;
+use palpate_refusal::Reason;
+use palpate_refusal::status::elsewhere;
 use pb::command::Action;
 use pb::session_service_client::SessionServiceClient;
 use pb::touch_request::Message as Say;

@@ -18,8 +18,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use palpate_proto::printable::printable;
-use palpate_touch::{Device, Envelope, Predictor, Tip};
+use palpate_haptics::{Device, Envelope, Predictor, Tip};
+use palpate_refusal::printable::printable;
 use tokio::sync::{Notify, oneshot};
 use tokio::task::JoinSet;
 
@@ -76,7 +76,7 @@ pub type Begun = Box<dyn FnOnce(&Priority) + Send>;
 /// Makes a copy of a tissue for a tool with this tip, out of the bytes of a snapshot (`SaveSnapshot`); or says why it can't.
 pub type MakeCopy = Arc<dyn Fn(&[u8], Tip) -> Result<Box<dyn Predictor>, String> + Send + Sync>;
 
-/// Of which tissues a loop keeps a copy, from which it renders without the delay of the network ([`palpate_touch::prediction`]).
+/// Of which tissues a loop keeps a copy, from which it renders without the delay of the network ([`palpate_haptics::prediction`]).
 #[derive(Clone)]
 pub struct Copies {
     /// Makes it.
@@ -170,7 +170,7 @@ const MIN_FELT_N: f64 = 1e-3;
 const MIN_MOVED_M: f64 = 1e-5;
 
 impl BridgeReport {
-    /// Why no force was felt at all, in words; `None` if one was.
+    /// Returns why no force was felt at all, in words; `None` if one was.
     pub fn unfelt(&self) -> Option<&'static str> {
         if self.most_force_n >= MIN_FELT_N {
             return None;
@@ -199,7 +199,7 @@ pub async fn run<D: HapticDevice + 'static>(
     report.failure.take().map_or(Ok((device, report)), Err)
 }
 
-/// Like [`run`], but of a device that fails it tells what was done until then: [`BridgeReport::failure`].
+/// Does what [`run`] does, but of a device that fails it tells what was done until then: [`BridgeReport::failure`].
 ///
 /// # Errors
 /// Returns an error if the server refuses the session or the tool at first, or if no connection succeeds.
@@ -352,12 +352,12 @@ pub struct Connection {
 }
 
 impl Connection {
-    /// What went over the network.
+    /// Returns what went over the network.
     pub fn traffic(&self) -> Traffic {
         self.shared.inbound().traffic
     }
 
-    /// Why there is no connection now; `None` while one stands.
+    /// Returns why there is no connection now; `None` while one stands.
     pub fn lost(&self) -> Option<String> {
         self.shared.inbound().failure.as_ref().map(ToString::to_string)
     }

@@ -1,8 +1,8 @@
 //! Rendering of what was recorded, without a network: the same laws, samples and places give the same forces, bit by bit.
 
 use glam::DVec3;
+use palpate_haptics::{Device, Predictor};
 use palpate_proto::pb;
-use palpate_touch::{Device, Predictor};
 use pb::touch_response::Message as Heard;
 use prost::Message;
 
@@ -33,8 +33,8 @@ impl std::fmt::Debug for OfflineNetwork {
 }
 
 impl Offline {
-    /// A loop of a device whose forces stay within its limits, with the middle of its workspace on `origin_m` of the tissue.
-    /// `up_deadband` as in [`super::Target`]: it changes no force.
+    /// Creates a loop of a device whose forces stay within its limits, with the middle of its workspace on `origin_m`
+    /// of the tissue. `up_deadband` as in [`super::Target`]: it changes no force.
     pub fn new(device: Device, origin: PositionOrigin, origin_m: DVec3, up_deadband: f64) -> Self {
         let (ticker, feed, commands) = ticker::ticker(device, origin, up_deadband);
         Offline { ticker, record: OfflineNetwork { feed, commands, origin_m } }
@@ -42,13 +42,13 @@ impl Offline {
 }
 
 impl OfflineNetwork {
-    /// A copy of the tissue arrives now, until another connection begins.
+    /// Takes a copy of the tissue, which arrives now, until another connection begins.
     pub fn predict(&mut self, copy: Box<dyn Predictor>) {
         self.feed.predict(Some(copy));
     }
 
-    /// What a server has sent on a haptic stream arrives now: the bytes of a `TouchResponse`. The next tick knows it. An
-    /// `opened` begins another connection. What the ticks had to send until now goes nowhere.
+    /// Returns what a server has sent on a haptic stream arrives now: the bytes of a `TouchResponse`. The next tick
+    /// knows it. An `opened` begins another connection. What the ticks had to send until now goes nowhere.
     ///
     /// # Errors
     /// Returns an error if the bytes are not a message, or if a force law can't be used.

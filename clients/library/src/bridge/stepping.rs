@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use glam::DVec3;
-use palpate_touch::{Predicted, Predictor};
+use palpate_haptics::{Predicted, Predictor};
 use tokio::sync::{OwnedSemaphorePermit, oneshot};
 
 use crate::exchange::{NewestReader, NewestWriter, newest};
@@ -133,7 +133,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use std::sync::mpsc;
 
-    use palpate_touch::ContactState;
+    use palpate_haptics::ContactState;
     use tokio::sync::Semaphore;
 
     use super::*;

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use palpate_touch::{Envelope, RenderingState};
+use palpate_haptics::{Envelope, RenderingState};
 use tokio::sync::Notify;
 
 use super::Disable;
@@ -144,8 +144,8 @@ fn wait_until(due: Instant) {
 
 #[cfg(test)]
 mod tests {
-    use palpate_touch::Law;
-    use palpate_touch::device::{Device, UNDECLARED};
+    use palpate_haptics::Law;
+    use palpate_haptics::device::{Device, UNDECLARED};
 
     use super::*;
     use crate::bridge::ticker::{PositionOrigin, ticker};

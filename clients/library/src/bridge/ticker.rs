@@ -4,11 +4,11 @@
 //! (`exchange`). It asks for no memory and gives none back: laws that are not needed any more go back to the network's side.
 
 use glam::DVec3;
+use palpate_haptics::dead_reckoning::News;
+use palpate_haptics::deadband::HEARTBEAT_S;
+use palpate_haptics::renderer::MAX_LAWS;
+use palpate_haptics::{Device, Envelope, Law, LocalModel, Prediction, Predictor, Renderer, RenderingState};
 use palpate_proto::{pb, touch};
-use palpate_touch::dead_reckoning::News;
-use palpate_touch::deadband::HEARTBEAT_S;
-use palpate_touch::renderer::MAX_LAWS;
-use palpate_touch::{Device, Envelope, Law, LocalModel, Prediction, Predictor, Renderer, RenderingState};
 use std::collections::VecDeque;
 
 use crate::Error;
@@ -176,8 +176,8 @@ impl Clock {
 }
 
 impl Ticker {
-    /// The force to render from now on, N, for a device that reports `reading` at `time_s`, a time of any origin that goes on
-    /// between ticks. Returns zero before the first connection.
+    /// Returns the force to render from now on, N, for a device that reports `reading` at `time_s`, a time of any
+    /// origin that goes on between ticks. Returns zero before the first connection.
     ///
     /// It takes a bounded time: no lock, no call of the system, no memory asked for or given back. Another thread steps a copy of
     /// the tissue. Ticks may be late, early or left out: the envelope knows how long ago the last one was.
@@ -254,7 +254,7 @@ impl Ticker {
         }
     }
 
-    /// How many ticks were rendered from a copy of the tissue ([`super::Options::copies`]).
+    /// Returns how many ticks were rendered from a copy of the tissue ([`super::Options::copies`]).
     pub fn predicted(&self) -> u64 {
         self.renderer.predicted()
     }
@@ -264,27 +264,29 @@ impl Ticker {
         self.renderer.envelope.disable();
     }
 
-    /// Whether forces are rendered; `None` before the first connection.
+    /// Returns whether forces are rendered; `None` before the first connection.
     pub fn state(&self) -> Option<RenderingState> {
         (self.connection > 0).then(|| self.renderer.state())
     }
 
-    /// Where the tool was at the last tick, in the tissue's frame, m; before the first connection in the device's.
+    /// Returns where the tool was at the last tick, in the tissue's frame, m; before the first connection in the
+    /// device's.
     pub fn place_m(&self) -> DVec3 {
         self.place_m
     }
 
-    /// How old the newest local model was at the last tick, s: how long ago the tool was at the place that it tells of.
+    /// Returns how old the newest local model was at the last tick, s: how long ago the tool was at the place that it
+    /// tells of.
     pub fn model_age_s(&self) -> Option<f64> {
         self.renderer.model_time_s().filter(|_| self.connection > 0).map(|time_s| self.clock.now_s - time_s)
     }
 
-    /// The limits that act on the forces; `None` before the first connection.
+    /// Returns the limits that act on the forces; `None` before the first connection.
     pub fn envelope(&self) -> Option<&Envelope> {
         (self.connection > 0).then_some(&self.renderer.envelope)
     }
 
-    /// Whether the network's side has ended for good. Forces then fade.
+    /// Returns whether the network's side has ended for good. Forces then fade.
     pub fn is_over(&self) -> bool {
         self.commands.is_over()
     }

@@ -83,8 +83,8 @@ fn quantiles(values: &mut [f64]) -> [f64; 3] {
 
 #[cfg(test)]
 mod tests {
-    use palpate_touch::Device;
-    use palpate_touch::device::UNDECLARED;
+    use palpate_haptics::Device;
+    use palpate_haptics::device::UNDECLARED;
 
     use super::*;
     use crate::device::Reading;

@@ -12,8 +12,8 @@ use std::io;
 use std::path::Path;
 
 use glam::DVec3;
-use palpate_touch::Device;
-use palpate_touch::device::UNDECLARED;
+use palpate_haptics::Device;
+use palpate_haptics::device::UNDECLARED;
 
 use super::loaded::{Loaded, text_of};
 use crate::device::{HapticDevice, Reading};

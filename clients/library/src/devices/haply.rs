@@ -9,8 +9,8 @@ use std::net::{TcpStream, ToSocketAddrs};
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use palpate_touch::Device;
-use palpate_touch::device::UNDECLARED;
+use palpate_haptics::Device;
+use palpate_haptics::device::UNDECLARED;
 use serde_json::{Map, Value, json};
 use tungstenite::protocol::WebSocketConfig;
 use tungstenite::{Message, WebSocket};

@@ -12,8 +12,8 @@ use std::time::{Duration, Instant};
 
 use evdev::{AbsoluteAxisCode, FFEffect, FFEffectCode, FFEffectData, FFEffectKind, FFReplay, FFTrigger, KeyCode};
 use glam::DVec3;
-use palpate_touch::Device;
-use palpate_touch::device::UNDECLARED;
+use palpate_haptics::Device;
+use palpate_haptics::device::UNDECLARED;
 
 use crate::device::{HapticDevice, Reading};
 

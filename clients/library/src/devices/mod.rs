@@ -55,7 +55,7 @@ impl DeviceKind {
         (DeviceKind::Gamepad, "gamepad"),
     ];
 
-    /// The kind that a name begins with, and what follows its `:`.
+    /// Returns the kind that a name begins with, and what follows its `:`.
     pub fn of(name: &str) -> Option<(DeviceKind, Option<&str>)> {
         let (kind, which) = name.split_once(':').map_or((name, None), |(kind, which)| (kind, Some(which)));
         DeviceKind::ALL.iter().find(|entry| entry.1 == kind).map(|entry| (entry.0, which))
@@ -99,7 +99,8 @@ pub struct Found {
     pub about: String,
 }
 
-/// What devices of all kinds are there. Opens none of them. `library` is tried as the library of each kind that needs one.
+/// Returns what devices of all kinds are there. Opens none of them. `library` is tried as the library of each kind that
+/// needs one.
 pub fn list(library: Option<&Path>) -> Vec<Found> {
     let told = |name: &str, told: std::io::Result<(bool, String)>| {
         let (is_there, about) = told.unwrap_or_else(|error| (false, error.to_string()));

@@ -14,7 +14,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use glam::DVec3;
-use palpate_touch::Device;
+use palpate_haptics::Device;
 
 use super::loaded::{Loaded, text_of};
 use crate::device::{HapticDevice, Reading};
@@ -335,7 +335,7 @@ fn describe(calls: &OpenHapticsCalls) -> (Device, DVec3) {
     } else {
         "touch"
     };
-    let table = Device::named(name).unwrap_or(palpate_touch::device::UNDECLARED);
+    let table = Device::named(name).unwrap_or(palpate_haptics::device::UNDECLARED);
     let told = |parameter, factor: f64, instead: f64| {
         let [number] = calls.numbers(parameter);
         if number.is_finite() && number > 0.0 { factor * number } else { instead }

@@ -9,8 +9,8 @@
 use std::time::Instant;
 
 use glam::{DQuat, DVec3, EulerRot};
-use palpate_proto::refusal::{Reason, Refusal, Result, finite_vector, legible, number};
-use palpate_touch::Device;
+use palpate_haptics::Device;
+use palpate_refusal::{Reason, Refusal, Result, finite_vector, legible, number};
 
 use crate::bridge::Tick;
 use crate::device::{HapticDevice, Reading};
@@ -138,7 +138,7 @@ impl<D: HapticDevice> Placed<D> {
         Ok(Placed { device, placement, rotation, shift_m, held_m, is_shut, begun })
     }
 
-    /// The device itself.
+    /// Returns the device itself.
     pub fn device(&self) -> &D {
         &self.device
     }
@@ -216,7 +216,7 @@ impl<D: HapticDevice> HapticDevice for Placed<D> {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
-    use palpate_touch::device::UNDECLARED;
+    use palpate_haptics::device::UNDECLARED;
 
     use super::*;
 

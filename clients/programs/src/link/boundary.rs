@@ -2,8 +2,8 @@
 //! and a spring in place of the tissue, and predicted by theory. This validates the loop.
 
 use glam::DVec3;
+use palpate_haptics::hand::{HANDS, Hand, HandState};
 use palpate_simulated::network::{Conditions, Direction};
-use palpate_touch::hand::{HANDS, Hand, HandState};
 use serde_json::{Value, json};
 
 use super::setup::TICK_S;

@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate::session::prediction::TissueCopy;
-use palpate::tissue::Model;
-use palpate_touch::envelope::{Envelope, Wanted};
-use palpate_touch::{Law, LocalModel, Predicted, Prediction, Predictor, Renderer};
+use palpate_haptics::envelope::{Envelope, Wanted};
+use palpate_haptics::{Law, LocalModel, Predicted, Prediction, Predictor, Renderer};
+use palpate_session::prediction::TissueCopy;
+use palpate_tissue::Model;
 
 use super::setup::{Rendering, Setup, TICK_S};
 use super::spot::Spot;

@@ -1,7 +1,7 @@
 //! A hand that feels the tissue itself: the same hand and task, and no network, client or device between them. Where it gets is
 //! where a touch over a network should get.
 
-use palpate_touch::hand::HandState;
+use palpate_haptics::hand::HandState;
 
 use super::setup::{Setup, TICK_S, ticks};
 use super::tissue::LinkTissue;

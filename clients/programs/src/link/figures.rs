@@ -1,7 +1,7 @@
 //! The figures of a run as they are printed: a table for people, and JSON.
 
+use palpate_haptics::datagram_health::Carried;
 use palpate_simulated::network::Conditions;
-use palpate_touch::datagram_health::Carried;
 use serde_json::{Value, json};
 
 use super::measure::LinkOutcome;

@@ -3,9 +3,9 @@
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use palpate::force_law::{self, Disc};
-use palpate::tissue::Model;
-use palpate_touch::Law;
+use palpate_haptics::Law;
+use palpate_tissue::Model;
+use palpate_tissue::force_law::{self, Disc};
 
 /// Those of one tissue.
 #[derive(Debug)]

@@ -7,10 +7,10 @@ use std::time::Duration;
 use glam::DVec3;
 use palpate_client::bridge::{self, Options, SessionChoice, Target, Warn};
 use palpate_client::{HapticDevice, Reading, Server};
+use palpate_haptics::Device;
 use palpate_simulated::network::Transport;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::Task;
-use palpate_touch::Device;
 
 use super::direct::Direct;
 use super::measure::{LinkOutcome, LinkTick, Totals};

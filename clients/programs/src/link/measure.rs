@@ -5,10 +5,10 @@
 //! network.
 
 use glam::DVec3;
+use palpate_haptics::datagram_health::Carried;
+use palpate_haptics::envelope::Envelope;
+use palpate_haptics::{LimitCause, RenderingState};
 use palpate_simulated::network::Outages;
-use palpate_touch::datagram_health::Carried;
-use palpate_touch::envelope::Envelope;
-use palpate_touch::{LimitCause, RenderingState};
 
 /// A run is unstable if the energy that the port has received falls below this, J.
 const UNSTABLE_J: f64 = -0.1;

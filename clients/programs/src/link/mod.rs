@@ -21,16 +21,16 @@ use std::sync::Arc;
 
 use clap::{Args, ValueEnum};
 use glam::DVec3;
-use palpate::force_law::Disc;
-use palpate::limits::Limits;
-use palpate::memory;
-use palpate::scene::Change;
-use palpate::scene::check::check_tip;
-use palpate::scene::collection::find_scene;
-use palpate::tissue::Model;
-use palpate_proto::refusal::{Reason, Refusal, number};
+use palpate_haptics::{Law, Tip};
+use palpate_refusal::{Reason, Refusal, number};
 use palpate_simulated::network::{Conditions, Transport};
-use palpate_touch::{Law, Tip};
+use palpate_tissue::Model;
+use palpate_tissue::force_law::Disc;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::memory;
+use palpate_tissue::scene::Change;
+use palpate_tissue::scene::check::check_tip;
+use palpate_tissue::scene::collection::find_scene;
 
 use crate::ClientFailure;
 use crate::credentials::CredentialOptions;

@@ -4,9 +4,9 @@
 use std::collections::VecDeque;
 
 use glam::DVec3;
+use palpate_haptics::deadband::HEARTBEAT_S;
+use palpate_haptics::{LocalModel, MotionState, News, SendInterval};
 use palpate_simulated::network::{Direction, Transport};
-use palpate_touch::deadband::HEARTBEAT_S;
-use palpate_touch::{LocalModel, MotionState, News, SendInterval};
 
 use super::client::LinkClient;
 

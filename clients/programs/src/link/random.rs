@@ -4,16 +4,16 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate::force_law::Disc;
-use palpate::limits::Limits;
-use palpate::scene::{BUILT_IN, Scene};
-use palpate::tissue::Model;
-use palpate_proto::refusal::Refusal;
+use palpate_haptics::device::DEVICES;
+use palpate_haptics::hand::HANDS;
+use palpate_haptics::{Law, Tip};
+use palpate_refusal::Refusal;
 use palpate_simulated::network::{Conditions, Transport};
 use palpate_simulated::random::Random;
-use palpate_touch::device::DEVICES;
-use palpate_touch::hand::HANDS;
-use palpate_touch::{Law, Tip};
+use palpate_tissue::Model;
+use palpate_tissue::force_law::Disc;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::{BUILT_IN, Scene};
 use serde_json::{Value, json};
 
 use super::figures::figures;

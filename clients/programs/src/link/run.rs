@@ -1,13 +1,13 @@
 //! One run in virtual time, tick by tick: hand, device, network, tissue, and the tissue's twin without a network.
 
 use glam::DVec3;
+use palpate_haptics::RenderingState;
+use palpate_haptics::envelope::Envelope;
+use palpate_haptics::hand::HandState;
 use palpate_proto::touch::sample_bytes;
 use palpate_simulated::network::{Conditions, Direction, Outages, Stalls, Transport};
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{self, Task};
-use palpate_touch::RenderingState;
-use palpate_touch::envelope::Envelope;
-use palpate_touch::hand::HandState;
 
 use super::client::LinkClient;
 use super::direct::Direct;

@@ -3,16 +3,16 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate::force_law::Disc;
-use palpate::scene::script::Action;
-use palpate::session::command::Command;
-use palpate::session::laws::{FIRST, Laws};
-use palpate::session::sampling::{Deadband, Sampler, Sampling, WantedHeartbeat};
-use palpate::tissue::Model;
+use palpate_haptics::datagram_health::ReceiveWindow;
+use palpate_haptics::deadband::HEARTBEAT_S;
+use palpate_haptics::{Law, LocalModel, MotionState, SendInterval};
+use palpate_session::command::Command;
+use palpate_session::laws::{FIRST, Laws};
+use palpate_session::sampling::{Deadband, Sampler, Sampling, WantedHeartbeat};
 use palpate_simulated::network::Transport;
-use palpate_touch::datagram_health::ReceiveWindow;
-use palpate_touch::deadband::HEARTBEAT_S;
-use palpate_touch::{Law, LocalModel, MotionState, SendInterval};
+use palpate_tissue::Model;
+use palpate_tissue::force_law::Disc;
+use palpate_tissue::scene::script::Action;
 
 use super::laws::PlaceLaws;
 use super::poses::Up;

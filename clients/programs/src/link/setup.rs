@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use palpate::force_law::Disc;
-use palpate::tissue::Model;
+use palpate_haptics::hand::Hand;
+use palpate_haptics::{Device, Law, Tip};
 use palpate_simulated::network::Conditions;
-use palpate_touch::hand::Hand;
-use palpate_touch::{Device, Law, Tip};
+use palpate_tissue::Model;
+use palpate_tissue::force_law::Disc;
 
 use super::laws::PlaceLaws;
 use super::spot::Spot;

@@ -1,8 +1,8 @@
 //! The place at which a task is done.
 
 use glam::{DMat3, DQuat, DVec3};
-use palpate::tissue::{Footprint, Model};
-use palpate_touch::LocalModel;
+use palpate_haptics::LocalModel;
+use palpate_tissue::{Footprint, Model};
 
 /// The place of a surface at which a task is done, seen by the hand: the task's own place is there, and z is out of the
 /// tissue.

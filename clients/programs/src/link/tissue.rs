@@ -5,16 +5,16 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use palpate::limits::Limits;
-use palpate::scene::script::Action;
-use palpate::session::Session;
-use palpate::session::command::{Command, Due};
-use palpate::session::intake::Intake;
-use palpate::session::lease::LeaseId;
-use palpate::tissue::Model;
+use palpate_haptics::{ContactState, Tip};
+use palpate_session::Session;
+use palpate_session::command::{Command, Due};
+use palpate_session::intake::Intake;
+use palpate_session::lease::LeaseId;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{self, Task};
-use palpate_touch::{ContactState, Tip};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::script::Action;
 
 use super::setup::{Setup, TICK_S};
 use super::spot::Spot;

@@ -3,10 +3,10 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::io::Cursor;
 
-use palpate::journal::JournalReader;
 use palpate_client::Channel;
 use palpate_proto::pb;
-use palpate_proto::refusal::Refusal;
+use palpate_refusal::Refusal;
+use palpate_session::journal::JournalReader;
 use pb::session_service_client::SessionServiceClient;
 use tonic::Code;
 

@@ -1,11 +1,11 @@
 //! What a replay measures: delays, samples, the largest displacement and force.
 
 use hdrhistogram::Histogram;
-use palpate::scene::plot::Curves;
-use palpate::scene::record::{Percentiles, Record};
-use palpate::scene::script::Script;
 use palpate_proto::geometry::from_vector;
 use palpate_proto::pb;
+use palpate_tissue::scene::plot::Curves;
+use palpate_tissue::scene::record::{Percentiles, Record};
+use palpate_tissue::scene::script::Script;
 
 use crate::ClientFailure;
 

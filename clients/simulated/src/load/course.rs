@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use palpate_client::bridge::Warn;
 use palpate_client::{Channel, Error, Server, describe, fleet};
 use palpate_proto::pb;
-use palpate_proto::refusal::Refusal;
+use palpate_refusal::Refusal;
 use pb::create_session_request::Source;
 use pb::session_service_client::SessionServiceClient;
 use tokio::sync::watch;

@@ -73,7 +73,7 @@ impl FromStr for ObjectiveBound {
 }
 
 impl Objective {
-    /// The bounds that a run does not meet.
+    /// Returns the bounds that a run does not meet.
     pub fn missed(&self, outcome: &LoadOutcome) -> Vec<&str> {
         let misses = |bound: &&ObjectiveBound| {
             let value = (bound.quantity)(outcome);

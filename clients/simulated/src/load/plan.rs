@@ -2,12 +2,12 @@
 
 use std::path::Path;
 
-use palpate::files::read_text;
-use palpate::scene::document::{Document, Fields, Item};
-use palpate_proto::refusal::{Reason, Refusal, Result, number};
-use palpate_touch::Device;
-use palpate_touch::device::{DEVICES, UNDECLARED};
-use palpate_touch::hand::{HANDS, Hand};
+use palpate_haptics::Device;
+use palpate_haptics::device::{DEVICES, UNDECLARED};
+use palpate_haptics::hand::{HANDS, Hand};
+use palpate_refusal::{Reason, Refusal, Result, number};
+use palpate_tissue::files::read_text;
+use palpate_tissue::scene::document::{Document, Fields, Item};
 
 use super::objective::Objective;
 use super::tip::Deadbands;

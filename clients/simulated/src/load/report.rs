@@ -21,7 +21,7 @@ pub struct Second {
 }
 
 impl Second {
-    /// For people who watch.
+    /// Returns a line for people who watch.
     pub fn line(&self) -> String {
         let outcome = outcome(&self.tally, 0);
         format!(
@@ -187,7 +187,7 @@ impl LoadReport {
         self.phases.iter().chain([&self.whole])
     }
 
-    /// Why the load failed; `None` if it did not.
+    /// Returns why the load failed; `None` if it did not.
     pub fn verdict(&self) -> Option<String> {
         let whole = self.whole.outcome();
         if self.is_interrupted {
@@ -210,7 +210,7 @@ impl LoadReport {
         (!whys.is_empty()).then(|| whys.join("; "))
     }
 
-    /// As JSON: the whole, its phases and seconds; what was not measured is `null`.
+    /// Returns JSON: the whole, its phases and seconds; what was not measured is `null`.
     pub fn json(&self) -> Value {
         let finite = |value: f64| if value.is_finite() { json!(value) } else { Value::Null };
         let points = self.points.iter().map(|Point { at_s, users, outcome }| {
@@ -228,12 +228,12 @@ impl LoadReport {
         })
     }
 
-    /// As a page with plots (HTML) that needs nothing else.
+    /// Returns a page with plots (HTML) that needs nothing else.
     pub fn page(&self) -> String {
         page(self)
     }
 
-    /// As a table for a terminal.
+    /// Returns it as a table for a terminal.
     pub fn table(&self) -> String {
         let head = "phase               users  arrived  turned away  round trip p50 / p99      start p99    dilation   objective\n";
         let rows = self.stretches().map(|stretch| {

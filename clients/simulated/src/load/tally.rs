@@ -197,7 +197,7 @@ pub struct LoadOutcome {
 }
 
 impl LoadOutcome {
-    /// As one JSON object; what was not measured is `null`.
+    /// Returns it as one JSON object; what was not measured is `null`.
     pub fn json(&self, limit_sessions: Option<usize>) -> Value {
         let mut object = json!({
             "sessions": self.sessions,
@@ -224,7 +224,7 @@ impl LoadOutcome {
         object
     }
 
-    /// As a table for a terminal.
+    /// Returns it as a table for a terminal.
     pub fn table(&self, limit_sessions: Option<usize>) -> String {
         let mut rows = vec![
             ("sessions", self.sessions.to_string()),

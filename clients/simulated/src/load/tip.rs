@@ -2,12 +2,12 @@
 //! what the server would not guess.
 
 use glam::DVec3;
+use palpate_haptics::dead_reckoning::News;
+use palpate_haptics::deadband::HEARTBEAT_S;
+use palpate_haptics::hand::{Hand, HandState};
+use palpate_haptics::{Device, Envelope, Renderer, RenderingState, Tip};
 use palpate_proto::geometry::vector;
 use palpate_proto::{pb, touch};
-use palpate_touch::dead_reckoning::News;
-use palpate_touch::deadband::HEARTBEAT_S;
-use palpate_touch::hand::{Hand, HandState};
-use palpate_touch::{Device, Envelope, Renderer, RenderingState, Tip};
 use pb::command::Action;
 
 use super::stroke::Stroke;

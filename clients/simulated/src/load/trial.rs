@@ -4,8 +4,8 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use palpate_client::{Error, Server};
+use palpate_haptics::Device;
 use palpate_proto::pb::create_session_request::Source;
-use palpate_touch::Device;
 use tokio::sync::watch;
 
 use super::client::{Common, Stage, lock};

@@ -1,0 +1,122 @@
+//! Command lines of both programs: negative numbers are values, and a number that is none is refused in our words.
+
+use std::error::Error as _;
+use std::ffi::OsString;
+use std::num::{IntErrorKind, ParseFloatError, ParseIntError};
+
+use clap::error::{ContextKind, ContextValue, Error, ErrorKind};
+use clap::{Command, Parser};
+
+use palpate_refusal::excerpt;
+use palpate_refusal::printable::printable;
+
+/// Parses the command line of this process. Ends the process with what is to be said if that is help, a version or a refusal.
+pub fn parse<A: Parser>() -> A {
+    match read(std::env::args_os()) {
+        Ok(arguments) => arguments,
+        Err(error) => match number(&error) {
+            Some(message) => {
+                let program = A::command().get_name().to_owned();
+                let text = printable(format_args!("{program}: {message}"));
+                let _ = std::io::Write::write_all(&mut std::io::stderr(), (text + "\n").as_bytes());
+                std::process::exit(2)
+            }
+            None => error.exit(),
+        },
+    }
+}
+
+fn read<A: Parser>(arguments: impl IntoIterator<Item = OsString>) -> Result<A, Error> {
+    let mut command = with_negative_numbers(A::command());
+    let matches = command.try_get_matches_from_mut(arguments.into_iter().map(without_exponent))?;
+    A::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
+}
+
+/// `-1e-3` as `-0.001`: clap takes the former for an option.
+fn without_exponent(argument: OsString) -> OsString {
+    let number = argument.to_str().filter(|text| text.starts_with('-') && text.contains("e-"));
+    number.and_then(|text| text.parse::<f64>().ok()).map_or(argument, |number| number.to_string().into())
+}
+
+/// The same command, of which each option and argument takes a value such as `-1`: it is refused for its reason, if it is, and not
+/// as an option that nobody knows.
+fn with_negative_numbers(command: Command) -> Command {
+    let command = command.mut_args(|argument| {
+        let takes_values = argument.get_action().takes_values();
+        if takes_values { argument.allow_negative_numbers(true) } else { argument }
+    });
+    command.mut_subcommands(with_negative_numbers)
+}
+
+/// What to say of an error, if that is an option's number that is none.
+fn number(error: &Error) -> Option<String> {
+    if error.kind() != ErrorKind::ValueValidation {
+        return None;
+    }
+    let text = |kind| match error.get(kind) {
+        Some(ContextValue::String(text)) => Some(text.as_str()),
+        _ => None,
+    };
+    let (option, value) = (text(ContextKind::InvalidArg)?, text(ContextKind::InvalidValue)?);
+    let source = error.source()?;
+    let wants = if let Some(problem) = source.downcast_ref::<ParseIntError>() {
+        match problem.kind() {
+            IntErrorKind::PosOverflow => "a smaller whole number",
+            _ => "a whole number from 0",
+        }
+    } else if source.is::<ParseFloatError>() {
+        "a number"
+    } else {
+        return None;
+    };
+    // `--threads <N>` is told as `--threads`.
+    let option = option.split_once(" <").map_or(option, |(option, _)| option);
+    Some(format!("{option}: must be {wants}, but is `{}`", excerpt(value)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Parser, Debug)]
+    struct TestArguments {
+        #[arg(long)]
+        unit: Option<String>,
+        #[arg(long)]
+        threads: Option<usize>,
+        #[arg(long)]
+        edge_mm: Option<f64>,
+        #[arg(long)]
+        json: bool,
+        name: Option<String>,
+    }
+
+    fn read_of(arguments: &[&str]) -> Result<TestArguments, Error> {
+        read(std::iter::once("program").chain(arguments.iter().copied()).map(OsString::from))
+    }
+
+    #[test]
+    fn a_negative_number_is_a_value_and_another_option_is_none() {
+        assert_eq!(read_of(&["--unit", "-1"]).unwrap().unit.as_deref(), Some("-1"));
+        assert_eq!(read_of(&["--edge-mm", "-2.5e-1", "--json"]).unwrap().edge_mm, Some(-0.25));
+        assert_eq!(read_of(&["-3"]).unwrap().name.as_deref(), Some("-3"));
+        assert!(read_of(&["--unit", "--json"]).is_err());
+    }
+
+    #[test]
+    fn a_number_that_is_none_is_refused_with_what_would_be_one() {
+        for (arguments, told) in [
+            (["--threads", "-1"], Some("--threads: must be a whole number from 0, but is `-1`")),
+            (["--threads", "two"], Some("--threads: must be a whole number from 0, but is `two`")),
+            (["--threads", "1.5"], Some("--threads: must be a whole number from 0, but is `1.5`")),
+            (
+                ["--threads", "99999999999999999999"],
+                Some("--threads: must be a smaller whole number, but is `99999999999999999999`"),
+            ),
+            (["--edge-mm", "wide"], Some("--edge-mm: must be a number, but is `wide`")),
+            (["--edges", "3"], None),
+        ] {
+            assert_eq!(number(&read_of(&arguments).unwrap_err()).as_deref(), told, "{arguments:?}");
+        }
+    }
+}

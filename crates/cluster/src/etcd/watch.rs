@@ -1,0 +1,315 @@
+//! Changes of keys as they come, each once and in order, also over a member's death.
+
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use palpate_proto::etcd::etcdserverpb::watch_client::WatchClient;
+use palpate_proto::etcd::etcdserverpb::watch_request::RequestUnion;
+use palpate_proto::etcd::etcdserverpb::{WatchCreateRequest, WatchProgressRequest, WatchRequest, WatchResponse};
+use palpate_proto::etcd::mvccpb;
+use palpate_proto::etcd::mvccpb::event::EventType;
+use tokio::sync::mpsc;
+use tokio::time::{sleep, timeout};
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::Channel;
+use tonic::{Status, Streaming};
+
+use super::calls::{MemberCall, MemberCalls, Repeat};
+use super::error::{EtcdError, text};
+use super::member::BACK_OFF;
+use super::store::{KeyValue, key_value, prefix_range, revision, signed, unsigned};
+
+/// Largest message that is taken: etcd parts larger ones at about 2 MB.
+const LARGEST_BYTES: usize = 16 << 20;
+
+/// The number in answers that are for no watch.
+const NO_WATCH: i64 = -1;
+
+/// A change of a key.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum WatchEvent {
+    /// It was written; its `mod_revision` tells when.
+    Put(KeyValue),
+    /// It was deleted, or its lease has ended.
+    Delete {
+        /// The key.
+        key: String,
+        /// When.
+        revision: u64,
+    },
+}
+
+/// Why a watch has ended.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum WatchError {
+    /// etcd no longer has the changes since the last one seen: list the keys, and watch from the revision after that list's.
+    #[error("etcd no longer has the changes since revision {since}: list the keys again")]
+    Compacted {
+        /// The first revision that was missed.
+        since: u64,
+    },
+    /// etcd refuses it: it would again.
+    #[error("{0}")]
+    Refused(String),
+}
+
+/// Changes of the keys that begin with a prefix. It works only while [`Watch::next`] is waited for, and takes no more from etcd
+/// than fits the connection's window. It has a connection of its own, so that what waits there delays nothing else.
+pub struct Watch {
+    calls: Arc<MemberCalls>,
+    /// The member that it was last open at; `usize::MAX` before the first.
+    member: Arc<AtomicUsize>,
+    /// What the next batch comes from. Who gives up waiting leaves it to who waits next, so that nothing is lost.
+    next: Pin<Box<dyn Future<Output = (Following, WatchEvents)> + Send>>,
+}
+
+type WatchEvents = Result<Vec<WatchEvent>, WatchError>;
+
+impl std::fmt::Debug for Watch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Watch").field("endpoint", &self.endpoint()).finish_non_exhaustive()
+    }
+}
+
+impl Watch {
+    pub(super) fn new(calls: Arc<MemberCalls>, prefix: &str, from: u64) -> Self {
+        let member = Arc::new(AtomicUsize::new(usize::MAX));
+        let place = WatchPosition { from, seen: 0 };
+        let prefix = prefix.to_owned();
+        let following =
+            Following { calls: calls.clone(), member: member.clone(), prefix, place, open: None, ended: None };
+        Watch { calls, member, next: Box::pin(following.next()) }
+    }
+
+    /// Returns the next changes, at least one, in their order. Those of one transaction come together, unless they are
+    /// more than a megabyte. You may give up waiting at any time: nothing is lost.
+    ///
+    /// While etcd can't be reached this waits: a keep-alive of a lease tells that sooner.
+    ///
+    /// # Errors
+    /// Returns an error if it can't go on; then every call returns that.
+    pub async fn next(&mut self) -> Result<Vec<WatchEvent>, WatchError> {
+        let (following, batch) = self.next.as_mut().await;
+        self.next = Box::pin(following.next());
+        batch
+    }
+
+    /// Returns the member that it is open at, or was last.
+    pub fn endpoint(&self) -> Option<&str> {
+        self.calls.members.get(self.member.load(Ordering::Relaxed)).map(super::member::Member::url)
+    }
+}
+
+/// Where a watch has got to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct WatchPosition {
+    /// The first revision that is not wholly seen; 0 before the watch was opened from now on.
+    from: u64,
+    /// Events of that revision that were seen.
+    seen: usize,
+}
+
+impl WatchPosition {
+    /// The place after events of these revisions, of which more may come if `parted`.
+    fn after(self, revisions: impl Iterator<Item = u64>, parted: bool) -> WatchPosition {
+        let mut place = self;
+        for revision in revisions {
+            let seen = if revision == place.from { place.seen + 1 } else { 1 };
+            place = WatchPosition { from: revision, seen };
+        }
+        if parted { place } else { WatchPosition { from: place.from + 1, seen: 0 } }
+    }
+}
+
+/// A watch at work.
+struct Following {
+    calls: Arc<MemberCalls>,
+    member: Arc<AtomicUsize>,
+    prefix: String,
+    place: WatchPosition,
+    open: Option<WatchStream>,
+    ended: Option<WatchError>,
+}
+
+/// An open stream.
+struct WatchStream {
+    member: usize,
+    questions: mpsc::Sender<WatchRequest>,
+    answers: Streaming<WatchResponse>,
+    /// Whether we have asked whether it lives, and have had no answer.
+    asked: bool,
+    /// Events of the first revision that were seen before the break.
+    again: usize,
+}
+
+/// Why a stream goes on no longer.
+enum Break {
+    Ended(WatchError),
+    Broken,
+}
+
+impl Following {
+    async fn next(mut self) -> (Self, WatchEvents) {
+        loop {
+            if let Some(ended) = &self.ended {
+                let ended = ended.clone();
+                return (self, Err(ended));
+            }
+            let Some(open) = &mut self.open else {
+                match self.open().await {
+                    Ok(open) => {
+                        self.member.store(open.member, Ordering::Relaxed);
+                        self.open = Some(open);
+                    }
+                    Err(EtcdError::Refused(why)) => self.ended = Some(WatchError::Refused(why)),
+                    Err(EtcdError::Unreachable(_) | EtcdError::Unknown(_)) => sleep(BACK_OFF).await,
+                }
+                continue;
+            };
+            match open.receive(&mut self.place, self.calls.limit).await {
+                Ok(events) if events.is_empty() => {}
+                Ok(events) => return (self, Ok(events)),
+                Err(end) => {
+                    self.calls.pass_over(open.member);
+                    self.open = None;
+                    if let Break::Ended(why) = end {
+                        self.ended = Some(why);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Opens it at a member, from its place on.
+    async fn open(&mut self) -> Result<WatchStream, EtcdError> {
+        let (key, range_end) = prefix_range(&self.prefix);
+        let create = WatchCreateRequest {
+            key,
+            range_end,
+            start_revision: signed(self.place.from),
+            progress_notify: true,
+            fragment: true,
+        };
+        let what = format!("watch the keys `{}…`", self.prefix);
+        let calls = &self.calls;
+        let attempt = |way: MemberCall| {
+            let create = create.clone();
+            async move {
+                let channel = calls.members[way.member].connect().await.map_err(Status::unavailable)?;
+                opened(way, channel, create).await
+            }
+        };
+        let (mut open, now) = calls.call(&what, Repeat::Freely, attempt).await?;
+        if self.place.from == 0 {
+            self.place.from = now + 1;
+        }
+        open.again = self.place.seen;
+        Ok(open)
+    }
+}
+
+/// Opens a stream; the revision at which etcd has taken it.
+async fn opened(way: MemberCall, channel: Channel, create: WatchCreateRequest) -> Result<(WatchStream, u64), Status> {
+    let (questions, asked) = mpsc::channel(2);
+    let create = WatchRequest { request_union: Some(RequestUnion::CreateRequest(create)) };
+    questions.try_send(create).map_err(|_| ended())?;
+    let mut client = WatchClient::new(channel).max_decoding_message_size(LARGEST_BYTES);
+    let mut answers = client.watch(way.request(ReceiverStream::new(asked))).await?.into_inner();
+    let first = answers.message().await?.ok_or_else(ended)?;
+    if !first.created {
+        return Err(Status::unavailable("has not opened the watch"));
+    }
+    if first.canceled && first.compact_revision == 0 {
+        // etcd says so of a token that is no longer valid, too.
+        return Err(Status::unauthenticated(first.cancel_reason));
+    }
+    let open = WatchStream { member: way.member, questions, answers, asked: false, again: 0 };
+    Ok((open, revision(first.header.as_ref())))
+}
+
+impl WatchStream {
+    /// What etcd sends next, and the place after it. Nothing if that is no change.
+    async fn receive(
+        &mut self,
+        place: &mut WatchPosition,
+        limit: std::time::Duration,
+    ) -> Result<Vec<WatchEvent>, Break> {
+        let Ok(answer) = timeout(limit, self.answers.message()).await else {
+            // A member that lives answers this at once.
+            let progress = WatchRequest { request_union: Some(RequestUnion::ProgressRequest(WatchProgressRequest {})) };
+            let silent = std::mem::replace(&mut self.asked, true) || self.questions.try_send(progress).is_err();
+            return if silent { Err(Break::Broken) } else { Ok(Vec::new()) };
+        };
+        let answer = match answer {
+            Ok(Some(answer)) => answer,
+            Ok(None) => return Err(Break::Broken),
+            Err(status) => {
+                tracing::debug!("a watch of etcd broke: {}", text(&status));
+                return Err(Break::Broken);
+            }
+        };
+        self.asked = false;
+        if answer.compact_revision > 0 {
+            return Err(Break::Ended(WatchError::Compacted { since: place.from }));
+        }
+        if answer.canceled {
+            return Err(Break::Broken);
+        }
+        // Answers to our own questions say nothing of which changes have been sent: etcd before 3.4.25 overtakes these.
+        if answer.watch_id == NO_WATCH || answer.created {
+            return Ok(Vec::new());
+        }
+        if answer.events.is_empty() {
+            let next = revision(answer.header.as_ref()) + 1;
+            if next > place.from {
+                *place = WatchPosition { from: next, seen: 0 };
+            }
+            return Ok(Vec::new());
+        }
+        let first = *place;
+        let mut events = answer.events;
+        events.retain(|event| {
+            let revision = written(event);
+            let seen = revision == first.from && self.again > 0;
+            self.again -= usize::from(seen);
+            revision >= first.from && !seen
+        });
+        if events.is_empty() {
+            return Ok(Vec::new());
+        }
+        *place = place.after(events.iter().map(written), answer.fragment);
+        Ok(events.into_iter().filter_map(watch_event).collect())
+    }
+}
+
+/// The revision of an event.
+fn written(event: &mvccpb::Event) -> u64 {
+    event.kv.as_ref().map_or(0, |kv| unsigned(kv.mod_revision))
+}
+
+/// `None` if the key is no text: it is none of ours.
+fn watch_event(event: mvccpb::Event) -> Option<WatchEvent> {
+    let deleted = event.r#type() == EventType::Delete;
+    let kv = key_value(event.kv?)?;
+    Some(if deleted { WatchEvent::Delete { key: kv.key, revision: kv.mod_revision } } else { WatchEvent::Put(kv) })
+}
+
+fn ended() -> Status {
+    Status::unavailable("has ended the watch")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_place_is_within_a_revision_while_parts_of_it_come() {
+        let place = WatchPosition { from: 7, seen: 0 };
+        assert_eq!(place.after([7, 9].into_iter(), false), WatchPosition { from: 10, seen: 0 });
+        let within = place.after([8, 9, 9].into_iter(), true);
+        assert_eq!(within, WatchPosition { from: 9, seen: 2 });
+        assert_eq!(within.after([9].into_iter(), true), WatchPosition { from: 9, seen: 3 });
+        assert_eq!(within.after([9, 9, 11].into_iter(), false), WatchPosition { from: 12, seen: 0 });
+    }
+}

@@ -1,0 +1,244 @@
+//! Organs without a scan: shapes blended from simple solids, varied by a seed, and meshed evenly with an edge length.
+//!
+//! A shape is a signed distance (`field`). Surface nets of a coarse grid give its first mesh (`net`), which decides how the
+//! surface is connected; `remesh` then makes it as fine and even as asked. Each organ is a file with one function; they are
+//! listed in [`Organ`]. The same organ, edge length and seed give the same bits on every machine.
+
+mod colon;
+mod dice;
+mod field;
+mod gallbladder;
+mod halfedges;
+mod kidney;
+mod liver;
+mod net;
+mod patch;
+mod remesh;
+mod shape;
+mod stomach;
+
+use std::fmt;
+use std::str::FromStr;
+
+use dice::Dice;
+use net::Net;
+use remesh::Remesh;
+use shape::Shape;
+
+use crate::{Group, TriangleMesh};
+
+/// The most vertices of an organ.
+pub const MAX_VERTICES: usize = 500_000;
+
+/// The area of an equilateral triangle, and so half the area a vertex, with edges of length 1: √3/4.
+const EQUILATERAL: f64 = 0.433_012_701_892_219_3;
+
+/// An organ, or a part of one, that [`generate`] makes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Organ {
+    /// A gallbladder with its neck and the beginning of the cystic duct, 80 mm long. Groups: `bed` (the side at the liver),
+    /// `neck`.
+    Gallbladder,
+    /// A liver with both lobes, 180 mm wide: domed above, hollow beneath, with a rim between. Groups: `rim`, `visceral` (the
+    /// underside), `bare-area` (where the diaphragm holds it).
+    Liver,
+    /// A kidney, 110 mm long, with the beginnings of its vein and ureter. Group: `hilum`.
+    Kidney,
+    /// A stomach, 250 mm long, with the ends of the oesophagus and the duodenum. Groups: `cardia`, `pylorus`.
+    Stomach,
+    /// A segment of colon, 200 mm long and 50 mm wide, open at both ends: one wall with folds, which faces inward, so that
+    /// it is touched from inside. Groups: `rim`, `folds`.
+    Colon,
+    /// A slightly curved square of tissue, 100 mm wide, open at its border, raised by lumps beneath. Groups: `rim`, `lumps`.
+    Patch,
+}
+
+impl Organ {
+    /// Every organ.
+    pub const ALL: [Organ; 6] =
+        [Organ::Gallbladder, Organ::Liver, Organ::Kidney, Organ::Stomach, Organ::Colon, Organ::Patch];
+
+    /// Returns its name, as [`FromStr`] reads it.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Organ::Gallbladder => "gallbladder",
+            Organ::Liver => "liver",
+            Organ::Kidney => "kidney",
+            Organ::Stomach => "stomach",
+            Organ::Colon => "colon",
+            Organ::Patch => "patch",
+        }
+    }
+
+    /// Returns what it is, in a line.
+    #[must_use]
+    pub fn description(self) -> &'static str {
+        match self {
+            Organ::Gallbladder => "80 mm, with its neck and the beginning of the cystic duct",
+            Organ::Liver => "180 mm, both lobes, with the rim, the fissure and the bed of the gallbladder",
+            Organ::Kidney => "110 mm, with the beginnings of its vein and ureter",
+            Organ::Stomach => "250 mm, with the ends of the oesophagus and the duodenum",
+            Organ::Colon => "a segment of 200 mm with its folds, open at both ends, touched from inside",
+            Organ::Patch => "100 mm square, slightly curved, with lumps beneath, open at its border",
+        }
+    }
+
+    /// The shape of a seed.
+    fn shape(self, seed: u64) -> Shape {
+        let dice = &mut Dice::new(seed);
+        match self {
+            Organ::Gallbladder => gallbladder::shape(dice),
+            Organ::Liver => liver::shape(dice),
+            Organ::Kidney => kidney::shape(dice),
+            Organ::Stomach => stomach::shape(dice),
+            Organ::Colon => colon::shape(dice),
+            Organ::Patch => patch::shape(dice),
+        }
+    }
+}
+
+impl fmt::Display for Organ {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+impl FromStr for Organ {
+    type Err = OrganError;
+
+    fn from_str(name: &str) -> Result<Organ, OrganError> {
+        let known = Organ::ALL.into_iter().find(|organ| organ.name() == name);
+        known.ok_or_else(|| OrganError::Unknown { name: name.to_owned() })
+    }
+}
+
+/// Why an organ is not made.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum OrganError {
+    /// There is no organ of this name.
+    #[error("there is no organ `{name}`; there are {}", Organ::ALL.map(Organ::name).join(", "))]
+    Unknown {
+        /// The name that was asked for.
+        name: String,
+    },
+    /// The edge length is not a number above 0.
+    #[error("the edge length must be a number of metres above 0, but is {edge_m}")]
+    NotALength {
+        /// The edge length that was asked for, m.
+        edge_m: f64,
+    },
+    /// The mesh would have more vertices than it may.
+    #[error(
+        "with edges of {} mm the {organ} would have about {vertices} vertices, more than {most}: edges of {} mm fit",
+        in_mm(*edge_m),
+        in_mm(*fits_m)
+    )]
+    TooFine {
+        /// The organ.
+        organ: Organ,
+        /// The edge length that was asked for, m.
+        edge_m: f64,
+        /// How many vertices it would give.
+        vertices: u64,
+        /// How many it may have.
+        most: usize,
+        /// The least edge length that is accepted, m.
+        fits_m: f64,
+    },
+    /// The edges are too long for the thinnest part of the organ.
+    #[error(
+        "edges of {} mm are too long for the thinnest parts of the {organ}: edges of {} mm fit",
+        in_mm(*edge_m),
+        in_mm(*fits_m)
+    )]
+    TooCoarse {
+        /// The organ.
+        organ: Organ,
+        /// The edge length that was asked for, m.
+        edge_m: f64,
+        /// The greatest edge length that is accepted, m.
+        fits_m: f64,
+    },
+    /// The shape of this seed can't be meshed.
+    #[error("the {organ} of seed {seed} touches itself and can't be meshed: take another seed")]
+    NotAManifold {
+        /// The organ.
+        organ: Organ,
+        /// The seed.
+        seed: u64,
+    },
+}
+
+/// A length in millimetres, without the digits that rounding adds.
+fn in_mm(length_m: f64) -> f64 {
+    (length_m * 1e6).round() / 1e3
+}
+
+/// Makes the mesh of an organ, in metres. Its edges are about `edge_m` long; `seed` varies its shape within what is usual in
+/// an adult. The mesh is in one part, a manifold, and, except for the colon and the patch, closed. Each group is the set of
+/// vertices of whole triangles, so that formats which group triangles can keep it.
+///
+/// # Errors
+/// Refuses an edge length that is not a number above 0, that would give more than [`MAX_VERTICES`], or that is too long for
+/// the thinnest part of the organ; the refusal tells the nearest one that fits.
+pub fn generate(organ: Organ, edge_m: f64, seed: u64) -> Result<TriangleMesh, OrganError> {
+    generate_within(organ, edge_m, seed, MAX_VERTICES)
+}
+
+/// Does the same with another bound of the number of vertices, if it is less than [`MAX_VERTICES`].
+///
+/// # Errors
+/// As for [`generate`].
+pub fn generate_within(organ: Organ, edge_m: f64, seed: u64, most: usize) -> Result<TriangleMesh, OrganError> {
+    let most = most.min(MAX_VERTICES);
+    if !(edge_m.is_finite() && edge_m > 0.0) {
+        return Err(OrganError::NotALength { edge_m });
+    }
+    let shape = organ.shape(seed);
+    let edge = edge_m * 1e3;
+    // A tenth of a nanometre allows for how a length in metres is rounded.
+    if edge > shape.coarsest + 1e-7 {
+        return Err(OrganError::TooCoarse { organ, edge_m, fits_m: shape.coarsest * 1e-3 });
+    }
+    let net = Net::new(&shape);
+    let vertices = |edge: f64| net.area() / (2.0 * EQUILATERAL * edge * edge);
+    // A tenth more than counted, because a mesh has some more or less; rounded up to what the message shows.
+    let fits = (vertices(1.0) * 1.1 / most.max(1) as f64).sqrt();
+    let fits = (fits * 1e3).ceil() / 1e3;
+    if edge < fits - 1e-7 {
+        return Err(OrganError::TooFine { organ, edge_m, vertices: vertices(edge) as u64, most, fits_m: fits * 1e-3 });
+    }
+    let mesh = Remesh::new(&shape, &net, edge).ok_or(OrganError::NotAManifold { organ, seed })?.even();
+
+    let is_open = mesh.at_boundary.contains(&true);
+    let rim = is_open.then(|| group("rim", &around(&mesh.at_boundary, &mesh.triangles), &mesh.triangles));
+    let parts = shape.parts.iter().map(|(name, is_in)| {
+        let within: Vec<bool> = mesh.places.iter().map(|&place| is_in(place)).collect();
+        group(name, &within, &mesh.triangles)
+    });
+    Ok(TriangleMesh {
+        groups: rim.into_iter().chain(parts).collect(),
+        uv: Some(mesh.triangles.iter().map(|t| (shape.chart)(t.map(|v| mesh.places[v as usize]))).collect()),
+        vertices_m: mesh.places.iter().map(|&place| place * 1e-3).collect(),
+        triangles: mesh.triangles,
+    })
+}
+
+/// The vertices of all triangles that have one of the marked vertices.
+fn around(marked: &[bool], triangles: &[[u32; 3]]) -> Vec<bool> {
+    let mut within = vec![false; marked.len()];
+    for triangle in triangles.iter().filter(|triangle| triangle.iter().any(|&v| marked[v as usize])) {
+        triangle.iter().for_each(|&v| within[v as usize] = true);
+    }
+    within
+}
+
+/// A group of the triangles that are wholly within.
+fn group(name: &str, within: &[bool], triangles: &[[u32; 3]]) -> Group {
+    let whole = triangles.iter().filter(|triangle| triangle.iter().all(|&v| within[v as usize]));
+    let mut vertices: Vec<u32> = whole.flatten().copied().collect();
+    vertices.sort_unstable();
+    vertices.dedup();
+    Group { name: name.to_owned(), vertices }
+}

@@ -1,0 +1,340 @@
+//! What can be wrong with a mesh file or a mesh, where, and what the user can do about it.
+
+use std::fmt;
+
+use crate::Unit;
+use crate::format::{length, place, rounded};
+
+/// What is wrong. Its text says what to do.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Problem {
+    /// Text that is no unit of length.
+    Unit {
+        /// What was given.
+        text: String,
+    },
+    /// Neither the content nor the extension tells the format.
+    UnknownFormat,
+    /// The file breaks its format.
+    Syntax {
+        /// What was expected, or what is wrong.
+        message: String,
+    },
+    /// A variant of a format that no reader here knows.
+    Unsupported {
+        /// The variant, and what to do.
+        message: String,
+    },
+    /// The file ends early.
+    Truncated {
+        /// What is missing.
+        missing: String,
+    },
+    /// A file that this file names can't be had.
+    NeighbourMissing {
+        /// As this file names it.
+        name: String,
+    },
+    /// More than the limit.
+    TooLarge {
+        /// Of what: bytes, vertices, triangles, …
+        what: &'static str,
+        /// The limit.
+        limit: usize,
+    },
+    /// A coordinate is not a number, or infinite.
+    NotFinite,
+    /// A triangle names a vertex that does not exist.
+    IndexOutOfRange {
+        /// The vertex as the file gives it.
+        index: i64,
+        /// How many there are.
+        vertices: usize,
+    },
+    /// Fewer vertices than a tissue needs.
+    TooFewVertices {
+        /// How many there are.
+        vertices: usize,
+    },
+    /// No triangle has an area.
+    OnlyDegenerate,
+    /// More than two triangles share an edge.
+    NonManifoldEdge {
+        /// How many share it.
+        triangles: usize,
+    },
+    /// Surfaces touch at a vertex and share no edge there.
+    NonManifoldVertex {
+        /// How many surfaces.
+        fans: usize,
+    },
+    /// Two triangles at an edge face opposite sides.
+    Orientation,
+    /// A closed surface whose triangles face inwards.
+    FacesInward,
+    /// The wall of a cavity, inside of another closed surface, whose triangles face the tissue.
+    CavityFacesTissue,
+    /// An open surface whose triangles face its middle.
+    OpenFacesInward,
+    /// A triangle without area.
+    Degenerate,
+    /// The vertices of an earlier triangle.
+    DuplicateTriangle,
+    /// The position of an earlier vertex.
+    DuplicateVertex {
+        /// The earlier one.
+        of: u32,
+    },
+    /// In no triangle.
+    UnusedVertex,
+    /// Edge lengths that differ much.
+    EdgeSpread {
+        /// Longest over shortest.
+        ratio: f64,
+    },
+    /// Areas that differ much.
+    AreaSpread {
+        /// Largest over smallest.
+        ratio: f64,
+    },
+    /// A size that suggests another unit.
+    Size {
+        /// The longest side of the bounding box, m.
+        longest_m: f64,
+        /// Which other unit would fit, if one does.
+        instead: Option<&'static str>,
+    },
+    /// Triangles that cut through each other.
+    SelfIntersection {
+        /// The triangle that is cut.
+        by: u32,
+    },
+    /// The check for triangles that cut each other ended early.
+    SelfIntersectionUnknown,
+    /// Several surfaces that share no vertex.
+    Components {
+        /// How many.
+        count: usize,
+    },
+}
+
+impl Problem {
+    /// Returns a stable name for programs.
+    #[must_use]
+    pub fn name(&self) -> &'static str {
+        match self {
+            Problem::Unit { .. } => "unit",
+            Problem::UnknownFormat => "unknown_format",
+            Problem::Syntax { .. } => "syntax",
+            Problem::Unsupported { .. } => "unsupported",
+            Problem::Truncated { .. } => "truncated",
+            Problem::NeighbourMissing { .. } => "neighbour_missing",
+            Problem::TooLarge { .. } => "too_large",
+            Problem::NotFinite => "not_finite",
+            Problem::IndexOutOfRange { .. } => "index_out_of_range",
+            Problem::TooFewVertices { .. } => "too_few_vertices",
+            Problem::OnlyDegenerate => "only_degenerate",
+            Problem::NonManifoldEdge { .. } => "non_manifold_edge",
+            Problem::NonManifoldVertex { .. } => "non_manifold_vertex",
+            Problem::Orientation => "orientation",
+            Problem::FacesInward => "faces_inward",
+            Problem::CavityFacesTissue => "cavity_faces_tissue",
+            Problem::OpenFacesInward => "open_faces_inward",
+            Problem::Degenerate => "degenerate",
+            Problem::DuplicateTriangle => "duplicate_triangle",
+            Problem::DuplicateVertex { .. } => "duplicate_vertex",
+            Problem::UnusedVertex => "unused_vertex",
+            Problem::EdgeSpread { .. } => "edge_spread",
+            Problem::AreaSpread { .. } => "area_spread",
+            Problem::Size { .. } => "size",
+            Problem::SelfIntersection { .. } => "self_intersection",
+            Problem::SelfIntersectionUnknown => "self_intersection_unknown",
+            Problem::Components { .. } => "components",
+        }
+    }
+
+    /// Returns whether a mesh with it is refused; else the user is warned.
+    #[must_use]
+    pub fn is_refused(&self) -> bool {
+        !matches!(
+            self,
+            Problem::FacesInward
+                | Problem::CavityFacesTissue
+                | Problem::OpenFacesInward
+                | Problem::Degenerate
+                | Problem::DuplicateTriangle
+                | Problem::DuplicateVertex { .. }
+                | Problem::UnusedVertex
+                | Problem::EdgeSpread { .. }
+                | Problem::AreaSpread { .. }
+                | Problem::Size { .. }
+                | Problem::SelfIntersection { .. }
+                | Problem::SelfIntersectionUnknown
+                | Problem::Components { .. }
+        )
+    }
+}
+
+impl fmt::Display for Problem {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Problem::Unit { text } => write!(
+                f,
+                "`{text}` is not a unit: give m, cm, mm, or the metres of one unit as a number above 0 (for inches: 0.0254)"
+            ),
+            Problem::UnknownFormat => write!(
+                f,
+                "the format is not known: give a file that ends in .obj, .stl, .ply, .gltf, .glb, .msh, .vtk, .vtp or .vtu"
+            ),
+            Problem::Syntax { message } | Problem::Unsupported { message } => f.write_str(message),
+            Problem::Truncated { missing } => {
+                write!(f, "the file ends early: {missing} is missing; copy or export it again")
+            }
+            Problem::NeighbourMissing { name } => write!(
+                f,
+                "the file `{name}`, which this one names, can't be read: put it into the same folder, or export one file \
+                 that contains everything"
+            ),
+            Problem::TooLarge { what, limit } => write!(f, "more than {limit} {what}: give a smaller mesh"),
+            Problem::NotFinite => write!(f, "a coordinate is not a finite number"),
+            Problem::IndexOutOfRange { index, vertices } => {
+                write!(f, "vertex {index} does not exist (vertices here: {vertices})")
+            }
+            Problem::TooFewVertices { vertices } => {
+                write!(f, "too few vertices ({vertices}): a tissue needs at least 4")
+            }
+            Problem::OnlyDegenerate => write!(f, "no triangle has an area: there is no surface to touch"),
+            Problem::NonManifoldEdge { triangles } => {
+                write!(f, "{triangles} triangles share this edge, at most 2 can: --repair pairs them")
+            }
+            Problem::NonManifoldVertex { fans } => {
+                write!(f, "{fans} surfaces touch at this vertex alone: --repair gives each its own vertex")
+            }
+            Problem::Orientation => {
+                write!(f, "the triangles at this edge face opposite sides: --repair turns all to one side")
+            }
+            Problem::FacesInward => write!(f, "the closed surface faces inwards: --repair turns it outwards"),
+            Problem::CavityFacesTissue => {
+                write!(f, "the wall of a cavity faces the tissue around it: --repair turns it into the cavity")
+            }
+            Problem::OpenFacesInward => write!(
+                f,
+                "the open surface faces inwards, as the lining of a tube does: a tool outside of it touches its back; if that \
+                 is not meant, turn its triangles, or close it (--repair fills small holes)"
+            ),
+            Problem::Degenerate => write!(f, "the triangle has no area: --repair drops it"),
+            Problem::DuplicateTriangle => {
+                write!(f, "an earlier triangle has the same vertices: --repair drops this one")
+            }
+            Problem::DuplicateVertex { of } => {
+                write!(f, "at the position of vertex {of}, but not joined with it")
+            }
+            Problem::UnusedVertex => write!(f, "no triangle has this vertex: --repair drops it"),
+            Problem::EdgeSpread { ratio } => write!(
+                f,
+                "the longest edge is {} times the shortest, here: short edges need short time steps; \
+                 --vertices N makes edges more even",
+                rounded(*ratio)
+            ),
+            Problem::AreaSpread { ratio } => write!(
+                f,
+                "the largest triangle is {} times the smallest, here: small masses need short time \
+                 steps; --vertices N makes triangles more even",
+                rounded(*ratio)
+            ),
+            Problem::Size { longest_m, instead } => {
+                write!(
+                    f,
+                    "the longest side is {}, organs are 0.005 to 5 m long: check the unit",
+                    length(*longest_m, Unit::METRE)
+                )?;
+                instead.map_or(Ok(()), |instead| write!(f, " ({instead})"))
+            }
+            Problem::SelfIntersection { by } => write!(f, "triangle {by} cuts through this one"),
+            Problem::SelfIntersectionUnknown => {
+                write!(f, "too many triangles overlap to find which cut each other")
+            }
+            Problem::Components { count } => {
+                write!(f, "{count} separate surfaces: --repair keeps the largest and what is inside of it")
+            }
+        }
+    }
+}
+
+/// A part of a file or of a mesh. Vertices, faces and triangles are numbered from 0, lines from 1.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Element {
+    /// All of it.
+    Whole,
+    /// A line of a text file.
+    Line(u64),
+    /// A byte of a binary file.
+    Byte(u64),
+    /// A vertex.
+    Vertex(u32),
+    /// A face of the file, before it is split into triangles.
+    Face(u64),
+    /// A triangle.
+    Triangle(u32),
+    /// The edge between two vertices.
+    Edge([u32; 2]),
+    /// A part that the format names: accessor 3, node 5.
+    Part(&'static str, u64),
+}
+
+impl Element {
+    /// Gives its vertices and triangles other numbers.
+    pub(crate) fn rename(&mut self, vertex: impl Fn(u32) -> u32, triangle: impl Fn(u32) -> u32) {
+        match self {
+            Element::Vertex(number) => *number = vertex(*number),
+            Element::Triangle(number) => *number = triangle(*number),
+            Element::Edge(both) => {
+                *both = both.map(vertex);
+                both.sort_unstable();
+            }
+            Element::Whole | Element::Line(_) | Element::Byte(_) | Element::Face(_) | Element::Part(..) => {}
+        }
+    }
+}
+
+impl fmt::Display for Element {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Element::Whole => write!(f, "the whole"),
+            Element::Line(line) => write!(f, "line {line}"),
+            Element::Byte(byte) => write!(f, "byte {byte}"),
+            Element::Vertex(vertex) => write!(f, "vertex {vertex}"),
+            Element::Face(face) => write!(f, "face {face}"),
+            Element::Triangle(triangle) => write!(f, "triangle {triangle}"),
+            Element::Edge([a, b]) => write!(f, "edge {a}-{b}"),
+            Element::Part(name, number) => write!(f, "{name} {number}"),
+        }
+    }
+}
+
+/// Why a mesh is refused: file, element, place in space, and what is wrong.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub struct MeshError {
+    /// The file's name as the caller gave it.
+    pub file: String,
+    /// The part of the file or mesh.
+    pub element: Element,
+    /// Where it is, m, if it has a place.
+    pub place_m: Option<[f64; 3]>,
+    /// What is wrong.
+    pub problem: Problem,
+}
+
+impl fmt::Display for MeshError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: ", self.file)?;
+        if self.element != Element::Whole {
+            write!(f, "{}", self.element)?;
+            if let Some(place_m) = self.place_m {
+                write!(f, " at {}", place(place_m, Unit::METRE))?;
+            }
+            write!(f, ": ")?;
+        }
+        write!(f, "{}", self.problem)
+    }
+}

@@ -1,0 +1,175 @@
+//! Mesh files: OBJ, STL, PLY, glTF, Gmsh and VTK, read within bounds; whatever the bytes are, nothing here panics.
+
+mod allowance;
+mod draft;
+mod gltf;
+mod gmsh;
+mod obj;
+mod ply;
+mod polygon;
+mod source;
+mod stl;
+mod volume;
+mod vtk;
+mod vtk_xml;
+
+use crate::{Element, MeshError, Problem, TriangleMesh, Unit};
+use allowance::MemoryAllowance;
+use draft::Draft;
+use source::Source;
+
+/// Reading takes so many bytes of memory for each byte of a file, and [`ROOM`] beside; what would take more is refused. Meshes of
+/// programs take less than half of it.
+pub const MULTIPLE: usize = 32;
+
+/// What reading may take whatever the length of a file, bytes.
+pub const ROOM: usize = 2 << 20;
+
+/// The upper bounds of what is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ReadLimits {
+    /// Bytes of the file, and of all that it contains when unpacked.
+    pub bytes: usize,
+    /// Vertices of the file.
+    pub vertices: usize,
+    /// Triangles, and volume elements as well.
+    pub triangles: usize,
+}
+
+impl Default for ReadLimits {
+    fn default() -> Self {
+        Self { bytes: 64 << 20, vertices: 500_000, triangles: 1_000_000 }
+    }
+}
+
+/// A mesh from a file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ReadMesh {
+    /// The mesh: coordinates are finite, indices in range.
+    pub mesh: TriangleMesh,
+    /// What was done to it, and what was left out; one sentence each.
+    pub notes: Vec<String>,
+}
+
+/// The formats that are read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Format {
+    Obj,
+    Stl,
+    Ply,
+    Gltf,
+    Gmsh,
+    Vtk,
+    VtkXml,
+}
+
+impl Format {
+    /// By how the file begins; OBJ has no such mark, and STL only a weak one.
+    fn of_content(bytes: &[u8]) -> Option<Self> {
+        let text = bytes.trim_ascii_start();
+        let starts =
+            |mark: &str| text.get(..mark.len()).is_some_and(|start| start.eq_ignore_ascii_case(mark.as_bytes()));
+        if bytes.starts_with(b"glTF") || text.starts_with(b"{") {
+            Some(Format::Gltf)
+        } else if starts("ply\n") || starts("ply\r") || starts("ply ") {
+            Some(Format::Ply)
+        } else if starts("# vtk DataFile") {
+            Some(Format::Vtk)
+        } else if starts("<?xml") || starts("<VTKFile") {
+            Some(Format::VtkXml)
+        } else if starts("$MeshFormat") || starts("$NOD") || starts("$Comments") || starts("$PhysicalNames") {
+            Some(Format::Gmsh)
+        } else if stl::is_binary(bytes) || starts("solid") {
+            Some(Format::Stl)
+        } else {
+            None
+        }
+    }
+
+    fn of_extension(name: &str) -> Option<Self> {
+        let (_, extension) = name.rsplit_once('.')?;
+        match extension.to_ascii_lowercase().as_str() {
+            "obj" => Some(Format::Obj),
+            "stl" => Some(Format::Stl),
+            "ply" => Some(Format::Ply),
+            "gltf" | "glb" => Some(Format::Gltf),
+            "msh" => Some(Format::Gmsh),
+            "vtk" => Some(Format::Vtk),
+            "vtp" | "vtu" => Some(Format::VtkXml),
+            _ => None,
+        }
+    }
+}
+
+/// The bytes after a byte order mark, which says that a text is UTF-8.
+fn without_mark(bytes: &[u8]) -> &[u8] {
+    bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)
+}
+
+/// Whether a file is UTF-16: it has the byte order mark of that, or begins with Latin letters of two bytes each.
+fn is_utf16(bytes: &[u8]) -> bool {
+    let is_wide = |zero: usize| {
+        let pairs = bytes.get(..16).map(|bytes| bytes.chunks_exact(2));
+        pairs.is_some_and(|mut pairs| pairs.all(|pair| pair[zero] == 0 && matches!(pair[1 - zero], 9..=13 | 32..=126)))
+    };
+    bytes.starts_with(b"\xff\xfe") || bytes.starts_with(b"\xfe\xff") || is_wide(0) || is_wide(1)
+}
+
+/// Reads a mesh file. The content decides the format, then the extension of `name`. Vertices keep the numbers of the file,
+/// from 0, unless a note tells otherwise. `neighbours` gives the content of a file in the same folder by its bare name.
+///
+/// # Errors
+/// Refuses what breaks its format, ends early, is above the limits, or has coordinates that are not finite or indices out
+/// of range, and says at which element.
+pub fn read(
+    name: &str,
+    bytes: &[u8],
+    unit: Unit,
+    neighbours: &dyn Fn(&str) -> Option<Vec<u8>>,
+    limits: &ReadLimits,
+) -> Result<ReadMesh, MeshError> {
+    read_paid(name, bytes, unit, neighbours, limits, &mut |_| true)
+}
+
+/// Does the same, with `pay` for its memory: it is told how many bytes that is so far, before they are allocated, and
+/// returns `false` if they are too many.
+///
+/// # Errors
+/// As for [`read`], and if `pay` does not pay.
+pub fn read_paid(
+    name: &str,
+    bytes: &[u8],
+    unit: Unit,
+    neighbours: &dyn Fn(&str) -> Option<Vec<u8>>,
+    limits: &ReadLimits,
+    pay: &mut dyn FnMut(u64) -> bool,
+) -> Result<ReadMesh, MeshError> {
+    let fail = |problem| MeshError { file: name.to_owned(), element: Element::Whole, place_m: None, problem };
+    if bytes.len() > limits.bytes {
+        return Err(fail(Problem::TooLarge { what: "bytes", limit: limits.bytes }));
+    }
+    // A binary STL file may begin with anything.
+    let is_free = stl::is_binary(bytes);
+    if !is_free && is_utf16(bytes) {
+        let message = "the text is UTF-16, which no mesh format is: save it as ASCII or UTF-8".to_owned();
+        return Err(fail(Problem::Unsupported { message }));
+    }
+    let bytes = if is_free { bytes } else { without_mark(bytes) };
+    let by_name = Format::of_extension(name);
+    let format = Format::of_content(bytes).or(by_name).ok_or_else(|| fail(Problem::UnknownFormat))?;
+    let mut draft = Draft::new(limits, MemoryAllowance::new(bytes.len(), pay));
+    if by_name.is_some_and(|by_name| by_name != format) {
+        draft.notes.push(format!("The file's content is {format:?}, not what its extension says."));
+    }
+    let source = Source::new(name, bytes);
+    match format {
+        Format::Obj => obj::read(source, &mut draft)?,
+        Format::Stl => stl::read(source, &mut draft)?,
+        Format::Ply => ply::read(source, &mut draft)?,
+        Format::Gltf => gltf::read(name, bytes, neighbours, &mut draft)?,
+        Format::Gmsh => gmsh::read(source, &mut draft)?,
+        Format::Vtk => vtk::read(source, &mut draft)?,
+        Format::VtkXml => vtk_xml::read(name, bytes, &mut draft)?,
+    }
+    draft.finish(name, unit)
+}

@@ -1,0 +1,60 @@
+//! The unit of a file's lengths. Mesh files don't state it, so the user does.
+
+use std::fmt;
+use std::str::FromStr;
+
+use crate::Problem;
+
+/// Units that have a name, and their metres.
+const UNITS: [(&str, f64); 3] = [("m", 1.0), ("cm", 1e-2), ("mm", 1e-3)];
+
+/// How many metres one unit of a file is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Unit {
+    metres: f64,
+}
+
+impl Default for Unit {
+    /// Metres.
+    fn default() -> Self {
+        Unit::METRE
+    }
+}
+
+impl Unit {
+    /// Metres.
+    pub const METRE: Unit = Unit { metres: 1.0 };
+
+    /// Returns metres in one unit: above 0 and finite.
+    #[must_use]
+    pub fn metres(self) -> f64 {
+        self.metres
+    }
+}
+
+impl fmt::Display for Unit {
+    /// What stands after a number: the unit's name, or what the number is multiplied with.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let known = UNITS.iter().find(|(_, metres)| *metres == self.metres);
+        match known {
+            Some((name, _)) => f.write_str(name),
+            None => write!(f, "× {} m", self.metres),
+        }
+    }
+}
+
+impl FromStr for Unit {
+    type Err = Problem;
+
+    /// Reads "m", "cm", "mm" or the metres of one unit, such as "0.0254".
+    fn from_str(text: &str) -> Result<Self, Problem> {
+        let text = text.trim();
+        let known = UNITS.iter().find(|(name, _)| *name == text).map(|(_, metres)| *metres);
+        let metres = known.unwrap_or_else(|| text.parse().unwrap_or(f64::NAN));
+        if metres > 0.0 && f64::is_finite(metres) {
+            Ok(Self { metres })
+        } else {
+            Err(Problem::Unit { text: text.chars().take(40).collect() })
+        }
+    }
+}

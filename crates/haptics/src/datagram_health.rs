@@ -1,0 +1,177 @@
+//! Whether datagrams get through. Each end counts its own, and says which of the other's was the newest that came. So each
+//! knows whether it is heard, and what it says goes by datagram while it is; else by the reliable stream beside it.
+//!
+//! A network that blocks datagrams, or lets them pass one way only, is thus no error: datagrams are still tried
+//! ([`Carrier::is_silent`]), and carry again once they are confirmed.
+
+/// Datagrams carry while the other end has confirmed something new within this time, s: twice what each end waits before it
+/// holds what it does, so that a burst of losses does not change the way.
+pub const CONFIRMED_S: f64 = 0.1;
+
+/// Each end sends a datagram at least this often, s.
+pub const LIFE_S: f64 = 0.04;
+
+/// One end's account of the datagrams between two ends.
+#[derive(Debug, Clone, Default)]
+pub struct Carrier {
+    sent: u64,
+    sent_s: Option<f64>,
+    came: u64,
+    newest: u64,
+    confirmed: u64,
+    confirmed_s: Option<f64>,
+    carries: bool,
+    fell_back: u64,
+}
+
+/// What an end has counted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Carried {
+    /// Datagrams that were sent.
+    pub sent: u64,
+    /// Datagrams that came.
+    pub came: u64,
+    /// How often the stream took over because datagrams did not get through any more.
+    pub fell_back: u64,
+}
+
+impl Carrier {
+    /// Returns the number of a datagram that is sent at `now_s`, and the newest of the other end's, which it
+    /// acknowledges.
+    pub fn send(&mut self, now_s: f64) -> (u64, u64) {
+        self.sent += 1;
+        self.sent_s = Some(now_s);
+        (self.sent, self.newest)
+    }
+
+    /// Takes the arrival at `now_s` of datagram `number`, which acknowledges one of this end's.
+    pub fn arrive(&mut self, number: u64, acknowledges: u64, now_s: f64) {
+        self.came += 1;
+        self.newest = self.newest.max(number);
+        // Nobody can have seen what was not sent.
+        if (self.confirmed + 1..=self.sent).contains(&acknowledges) {
+            self.confirmed = acknowledges;
+            self.confirmed_s = Some(now_s);
+        }
+    }
+
+    /// Returns whether what is to be said at `now_s` goes by datagram.
+    pub fn carries(&mut self, now_s: f64) -> bool {
+        let carries = self.confirmed_s.is_some_and(|confirmed_s| now_s - confirmed_s <= CONFIRMED_S);
+        if self.carries && !carries {
+            self.fell_back += 1;
+        }
+        self.carries = carries;
+        carries
+    }
+
+    /// Returns whether a datagram is due because this end has sent none for [`LIFE_S`].
+    pub fn is_silent(&self, now_s: f64) -> bool {
+        self.sent_s.is_none_or(|sent_s| now_s - sent_s >= LIFE_S - 1e-9)
+    }
+
+    /// Returns the counts so far.
+    pub fn carried(&self) -> Carried {
+        Carried { sent: self.sent, came: self.came, fell_back: self.fell_back }
+    }
+}
+
+/// Which of the newest 64 numbers have come: a pose is sent several times, and counts once.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct ReceiveWindow {
+    newest: u64,
+    /// Bit k: `newest − k` has come.
+    bits: u64,
+}
+
+impl ReceiveWindow {
+    /// Returns whether `number` has not come before. What is older than the newest 64 counts as known.
+    pub fn take(&mut self, number: u64) -> bool {
+        if self.bits == 0 || number > self.newest {
+            let ahead = if self.bits == 0 { 64 } else { number - self.newest };
+            self.bits = if ahead < 64 { self.bits << ahead } else { 0 } | 1;
+            self.newest = number;
+            return true;
+        }
+        let bit = 1_u64.checked_shl(u32::try_from(self.newest - number).unwrap_or(64)).unwrap_or(0);
+        let is_new = bit != 0 && self.bits & bit == 0;
+        self.bits |= bit;
+        is_new
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two ends that send each other a datagram every `every_ms`, which take 25 ms; `passes` tells whether one gets through, by
+    /// its way and the time, ms. Returns when each end's datagrams carry, one entry a millisecond.
+    fn play(every_ms: u32, passes: impl Fn(usize, u32) -> bool) -> [Vec<bool>; 2] {
+        let (mut ends, mut carries) = ([Carrier::default(), Carrier::default()], [Vec::new(), Vec::new()]);
+        let mut under_way: Vec<(u32, usize, (u64, u64))> = Vec::new();
+        for now_ms in 0..3000_u32 {
+            let now_s = f64::from(now_ms) * 1e-3;
+            under_way.retain(|(due_ms, to, (number, acknowledges))| {
+                if *due_ms == now_ms {
+                    ends[*to].arrive(*number, *acknowledges, now_s);
+                }
+                *due_ms > now_ms
+            });
+            for from in 0..2 {
+                if now_ms % every_ms == 0 || ends[from].is_silent(now_s) {
+                    let datagram = ends[from].send(now_s);
+                    if passes(from, now_ms) {
+                        under_way.push((now_ms + 25, 1 - from, datagram));
+                    }
+                }
+                carries[from].push(ends[from].carries(now_s));
+            }
+        }
+        carries
+    }
+
+    #[test]
+    fn datagrams_carry_once_both_ways_are_confirmed() {
+        for carries in play(10, |_, _| true) {
+            assert!(carries[..50].iter().all(|carries| !carries) && carries[90..].iter().all(|carries| *carries));
+        }
+    }
+
+    #[test]
+    fn scattered_losses_change_nothing_and_a_way_that_is_cut_does_for_both_until_it_is_mended() {
+        // Every second and third.
+        for carries in play(10, |from, now_ms| now_ms / 10 % (2 + from as u32) == 0) {
+            assert!(carries[150..].iter().all(|carries| *carries));
+        }
+        // One way is cut for a second: both ends notice, each because it is not confirmed.
+        for carries in play(10, |from, now_ms| from == 1 || !(1000..2000).contains(&now_ms)) {
+            assert!(carries[100..1000].iter().all(|carries| *carries));
+            assert!(carries[1160..2000].iter().all(|carries| !carries));
+            assert!(carries[2150..].iter().all(|carries| *carries));
+        }
+        // What is blocked never carries.
+        for carries in play(10, |_, _| false) {
+            assert!(carries.iter().all(|carries| !carries));
+        }
+    }
+
+    #[test]
+    fn nobody_confirms_what_was_not_sent() {
+        let mut end = Carrier::default();
+        end.arrive(1, 7, 0.0);
+        assert!(!end.carries(0.0));
+        assert_eq!(end.send(0.0), (1, 1));
+        end.arrive(2, 1, 0.01);
+        assert!(end.carries(0.1) && !end.carries(0.2));
+        assert_eq!(end.carried(), Carried { sent: 1, came: 2, fell_back: 1 });
+    }
+
+    #[test]
+    fn a_number_counts_once_also_when_it_was_overtaken() {
+        let mut seen = ReceiveWindow::default();
+        let taken: Vec<bool> = [5, 5, 3, 3, 6, 4, 80, 17, 16, 79, 79, 0].map(|number| seen.take(number)).into();
+        assert_eq!(taken, [true, false, true, false, true, true, true, true, false, true, false, false]);
+        let mut seen = ReceiveWindow::default();
+        assert!(seen.take(0) && !seen.take(0) && seen.take(u64::MAX) && !seen.take(u64::MAX) && !seen.take(1));
+    }
+}

@@ -1,0 +1,119 @@
+//! Haptic devices: the limits that a client declares for its device, so that it gets no larger forces.
+
+use crate::law::{Law, Row};
+
+/// A device's descriptor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Device {
+    /// The name, for selection.
+    pub name: &'static str,
+    /// Largest force, N.
+    pub force_n: f64,
+    /// Largest force for longer than [`CONTINUOUS_S`], N.
+    pub continuous_n: f64,
+    /// Largest stiffness that its own loop renders stably, N/m.
+    pub stiffness_n_per_m: f64,
+    /// Largest damping, N·s/m.
+    pub damping_n_s_per_m: f64,
+    /// Radius of its workspace, m.
+    pub workspace_m: f64,
+}
+
+/// Limit of the force on a person, whatever the device can do, N.
+pub const SAFE_FORCE_N: f64 = 3.3;
+
+/// Limit for a device without a declaration, N.
+pub const UNDECLARED_FORCE_N: f64 = 2.0;
+
+/// How long a device may exceed its continuous force, s.
+pub const CONTINUOUS_S: f64 = 2.0;
+
+const fn device(
+    name: &'static str,
+    force_n: f64,
+    continuous_n: f64,
+    stiffness_n_per_m: f64,
+    damping_n_s_per_m: f64,
+    workspace_m: f64,
+) -> Device {
+    Device { name, force_n, continuous_n, stiffness_n_per_m, damping_n_s_per_m, workspace_m }
+}
+
+/// Devices by their makers' data. Where no continuous force is given, it is the largest. Inverse3: unverified.
+pub const DEVICES: [Device; 9] = [
+    device("touch", 3.3, 3.3, 400.0, 4.0, 0.075),
+    device("omni", 3.3, 0.88, 700.0, 5.0, 0.10),
+    device("desktop", 7.9, 7.9, 1000.0, 5.0, 0.10),
+    device("falcon", 8.0, 8.0, 3000.0, 20.0, 0.04),
+    device("omega3", 12.0, 12.0, 5000.0, 30.0, 0.075),
+    device("delta3", 20.0, 20.0, 5000.0, 30.0, 0.15),
+    device("sigma7", 12.0, 12.0, 4000.0, 30.0, 0.075),
+    device("lambda7", 12.0, 12.0, 8000.0, 30.0, 0.1125),
+    device("inverse3", 10.0, 10.0, 1000.0, 6.0, 0.15),
+];
+
+/// A device without a declaration.
+pub const UNDECLARED: Device = device("undeclared", UNDECLARED_FORCE_N, UNDECLARED_FORCE_N, 400.0, 4.0, 0.075);
+
+impl Device {
+    /// Returns the device of that name.
+    pub fn named(name: &str) -> Option<Self> {
+        DEVICES.iter().find(|device| device.name == name).copied()
+    }
+
+    /// Returns the largest force requested from it, N.
+    pub fn most_n(&self) -> f64 {
+        self.force_n.min(SAFE_FORCE_N)
+    }
+
+    /// Describes in what the tissue exceeds the limits of stable rendering, up to the largest force requested. The
+    /// tissue is rendered all the same: a softer one would be another tissue. An unstable loop gives energy, and the
+    /// envelope removes that.
+    pub fn warnings(&self, law: &Law) -> Vec<String> {
+        let reached = law.rows.iter().position(|row| row.force_n >= self.most_n()).unwrap_or(law.rows.len() - 1);
+        let most = |of: fn(&Row) -> f64| law.rows[..=reached].iter().map(of).fold(0.0, f64::max);
+        let stiffness = ("stiffness", "N/m", most(|row| row.stiffness_n_per_m), self.stiffness_n_per_m);
+        let damping = ("damping", "N·s/m", most(|row| row.damping_n_s_per_m), self.damping_n_s_per_m);
+        let beyond = [stiffness, damping].into_iter().filter(|(_, _, tissue, device)| tissue > device);
+        let words = |(name, unit, tissue, device): (&str, &str, f64, f64)| {
+            format!(
+                "the tissue's {name} reaches {tissue:.0} {unit}, above the device's {device:.0} {unit}: it may shake"
+            )
+        };
+        beyond.map(words).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Row k is met with k/2 N and has a stiffness of 100·k N/m.
+    fn hardening(rows: u32) -> Law {
+        let row = |k: u32| Row {
+            force_n: 0.5 * f64::from(k),
+            stiffness_n_per_m: 100.0 * f64::from(k),
+            damping_n_s_per_m: 1.0,
+            ..Row::default()
+        };
+        Law { step_m: 1e-3, rows: (0..rows).map(row).collect(), is_coarse: false }
+    }
+
+    #[test]
+    fn warnings_name_what_a_device_is_asked_for_beyond_its_limits() {
+        // The largest force is met in the row of 400 N/m. The harder rows are never rendered.
+        let device = Device { force_n: 2.0, stiffness_n_per_m: 400.0, ..UNDECLARED };
+        assert!(device.warnings(&hardening(10)).is_empty());
+        let softer = Device { stiffness_n_per_m: 300.0, ..device };
+        let said = softer.warnings(&hardening(10));
+        assert!(
+            said.len() == 1 && said[0].contains("stiffness reaches 400 N/m, above the device's 300 N/m"),
+            "{said:?}"
+        );
+        // A law that ends below the largest force counts up to its last row.
+        assert!(softer.warnings(&hardening(4)).is_empty());
+        assert_eq!(Device { stiffness_n_per_m: 200.0, ..device }.warnings(&hardening(4)).len(), 1);
+        let said = Device { stiffness_n_per_m: 10.0, damping_n_s_per_m: 0.5, ..device }.warnings(&hardening(10));
+        assert!(said.len() == 2 && said[1].contains("damping reaches 1 N·s/m"), "{said:?}");
+    }
+}

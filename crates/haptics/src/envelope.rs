@@ -1,0 +1,546 @@
+//! The safety envelope: the limits between a wanted force and a device. Every force passes them, in this order:
+//!
+//! 1. the age of the model, counted from when the newest *arrived* (a constant delay is not staleness): up to [`FRESH_S`]
+//!    no change; up to [`STALE_S`] the force fades to a half; beyond, it decays with [`DECAY_S`]; beyond [`PAUSE_S`] the
+//!    state is PAUSED, as it is after a gap of more than [`PAUSE_S`] between two ticks. A model that arrives before brings
+//!    the force back within `RETURN_S`;
+//! 2. soft engage: after `enable` nothing is rendered until a model is known and the force by it is below
+//!    [`ENGAGE_BELOW_N`]; then the force ramps in over [`ENGAGE_S`];
+//! 3. the norm of the force (clamping its components would turn it), and the device's continuous force;
+//! 4. passivity: no more energy leaves the port than has entered it;
+//! 5. slew: at most [`SLEW_N_PER_S`], up and down, in every state.
+//!
+//! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick. A force f that moves with the
+//! hand at v, and that slew lets fall no faster than S, still gives f²·v/2S before it is zero. So it is limited to
+//! f ≤ √(2·S·E/v): a spring of K, pressed in and released at v, is not limited as long as its force falls no faster than
+//! the slew allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least `MIN_SPEED_M_PER_S`. A device
+//! that nobody holds gets faster while the force falls: with an acceleration a, which falls with the force, it gets
+//! f²/2S · a·f/4S more, so a·f/4S is added to v. A hand hardly gets faster within a few hundredths of a second, so for a hand
+//! nothing changes.
+//! To allow a first force before any energy has entered, the tank begins with `CREDIT_J`, and `FIRST_N` against a
+//! hand that presses on is always allowed.
+
+use glam::DVec3;
+
+use crate::device::{CONTINUOUS_S, Device};
+
+/// A model up to this age counts as fresh, s.
+pub const FRESH_S: f64 = 0.05;
+/// From this age on the force decays to zero, s.
+pub const STALE_S: f64 = 0.15;
+/// Beyond this age, or this gap between two ticks, rendering pauses until it is enabled, s. At this age a twentieth of half
+/// the force is left.
+pub const PAUSE_S: f64 = 0.3;
+/// A faded force returns within this time, s: from 50 ms after an outage of 100 ms on the error is some tenths of a per cent.
+const RETURN_S: f64 = 0.04;
+/// Time constant of the decay beyond [`STALE_S`], s.
+pub const DECAY_S: f64 = 0.05;
+/// The fraction of the force that is left at [`STALE_S`].
+const STALE_SHARE: f64 = 0.5;
+/// Rendering begins only when the wanted force is smaller, N.
+pub const ENGAGE_BELOW_N: f64 = 0.2;
+/// Duration of the ramp that follows, s.
+pub const ENGAGE_S: f64 = 0.5;
+/// Largest rate of change of the force, N/s.
+pub const SLEW_N_PER_S: f64 = 100.0;
+/// Least speed that passivity assumes for the hand, m/s.
+const MIN_SPEED_M_PER_S: f64 = 0.08;
+/// Margin for a hand that speeds up while a force falls, and for a turning force, which falls slower along its old
+/// direction.
+const SPEED_MARGIN: f64 = 1.5;
+/// The acceleration is measured over this time, s.
+const ACCELERATION_S: f64 = 0.003;
+/// Largest energy in the tank, J: friction from long ago must not pay for energy given later.
+const TANK_J: f64 = 0.05;
+
+/// Initial energy in the tank, J: less than any hand notices.
+const CREDIT_J: f64 = 2.5e-4;
+/// Force that is always allowed against a hand that presses on, N.
+const FIRST_N: f64 = 0.2;
+
+/// Whether forces are rendered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RenderingState {
+    /// Nothing is rendered until `enable`.
+    Disabled,
+    /// Rendering, or ramping in.
+    Enabled,
+    /// No model arrived for too long, or no tick came. Nothing is rendered until `enable`.
+    Paused,
+    /// An error. Nothing is rendered until `reset` and then `enable`.
+    Fault,
+}
+
+/// The reason why a force differs from the wanted one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LimitCause {
+    /// The newest model is old, or the last tick was long ago.
+    Stale,
+    /// Rendering is not enabled, or ramping in.
+    Engage,
+    /// Limit of the largest force.
+    Force,
+    /// Limit of the continuous force.
+    Continuous,
+    /// The force would have given energy.
+    Passivity,
+    /// The force would have changed too fast.
+    Slew,
+    /// The tool is outside the device's workspace.
+    Workspace,
+    /// A place, a speed or a force was not finite.
+    NotFinite,
+}
+
+impl LimitCause {
+    /// All reasons, in the order of their counters.
+    pub const ALL: [(LimitCause, &'static str); 8] = [
+        (LimitCause::Stale, "stale"),
+        (LimitCause::Engage, "engage"),
+        (LimitCause::Force, "force"),
+        (LimitCause::Continuous, "continuous"),
+        (LimitCause::Passivity, "passivity"),
+        (LimitCause::Slew, "slew"),
+        (LimitCause::Workspace, "workspace"),
+        (LimitCause::NotFinite, "not_finite"),
+    ];
+}
+
+/// The input of one tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Wanted {
+    /// Present time, s.
+    pub now_s: f64,
+    /// Place of the device in its own frame, m.
+    pub place_m: DVec3,
+    /// Velocity of the device, m/s.
+    pub velocity_m_per_s: DVec3,
+    /// Wanted force, N.
+    pub force_n: DVec3,
+    /// Time since the newest model arrived, s. `None`: no model of the tissue is known.
+    pub age_s: Option<f64>,
+}
+
+/// One device's envelope.
+#[derive(Debug, Clone)]
+pub struct Envelope {
+    device: Device,
+    /// Middle of the device's workspace, m.
+    middle_m: DVec3,
+    state: RenderingState,
+    /// When the ramp began; `None` while it waits for a small force.
+    engaged_s: Option<f64>,
+    /// The force rendered now, N.
+    force_n: DVec3,
+    before: Option<(f64, DVec3)>,
+    /// The velocity, m/s, behind by [`ACCELERATION_S`], and how much it changes.
+    slow_m_per_s: DVec3,
+    acceleration_m_per_s2: DVec3,
+    /// Energy in the tank, J.
+    tank_j: f64,
+    /// Total energy that the hand has given to the port, J.
+    energy_j: f64,
+    over_s: f64,
+    /// The fraction of the force that the model's age leaves.
+    share: f64,
+    counts: [u64; LimitCause::ALL.len()],
+    ticks: u64,
+}
+
+impl Envelope {
+    /// Creates an envelope in state DISABLED. The device's workspace is around `middle_m`.
+    pub fn new(device: Device, middle_m: DVec3) -> Self {
+        Envelope {
+            device,
+            middle_m,
+            state: RenderingState::Disabled,
+            engaged_s: None,
+            force_n: DVec3::ZERO,
+            before: None,
+            slow_m_per_s: DVec3::ZERO,
+            acceleration_m_per_s2: DVec3::ZERO,
+            tank_j: CREDIT_J,
+            energy_j: 0.0,
+            over_s: 0.0,
+            share: 1.0,
+            counts: [0; LimitCause::ALL.len()],
+            ticks: 0,
+        }
+    }
+
+    /// Returns whether forces are rendered.
+    pub fn state(&self) -> RenderingState {
+        self.state
+    }
+
+    /// Returns the energy that the hand has given to the port minus the energy it got back, J.
+    pub fn energy_j(&self) -> f64 {
+        self.energy_j
+    }
+
+    /// Returns the number of ticks in which `reason` changed the force, and of all ticks.
+    pub fn count(&self, reason: LimitCause) -> (u64, u64) {
+        (self.counts[reason as usize], self.ticks)
+    }
+
+    /// Returns whether the ramp after `enable` has begun.
+    pub fn is_engaged(&self) -> bool {
+        self.engaged_s.is_some()
+    }
+
+    /// Leaves DISABLED or PAUSED. A FAULT must be reset first.
+    pub fn enable(&mut self) {
+        if matches!(self.state, RenderingState::Disabled | RenderingState::Paused) {
+            (self.state, self.engaged_s) = (RenderingState::Enabled, None);
+        }
+    }
+
+    /// Stops rendering until it is enabled.
+    pub fn disable(&mut self) {
+        if self.state != RenderingState::Fault {
+            self.state = RenderingState::Disabled;
+        }
+    }
+
+    /// Stops rendering until it is reset and enabled.
+    pub fn fail(&mut self) {
+        self.state = RenderingState::Fault;
+    }
+
+    /// Leaves FAULT for DISABLED.
+    pub fn reset(&mut self) {
+        if self.state == RenderingState::Fault {
+            self.state = RenderingState::Disabled;
+        }
+    }
+
+    fn acted(&mut self, reason: LimitCause) {
+        self.counts[reason as usize] += 1;
+    }
+
+    /// Returns the force to render until the next tick, N.
+    pub fn render(&mut self, wanted: &Wanted) -> DVec3 {
+        self.ticks += 1;
+        let finite = wanted.place_m.is_finite() && wanted.velocity_m_per_s.is_finite() && wanted.now_s.is_finite();
+        if !finite {
+            // The place of the device is unknown, so there is no work to account for; let go.
+            self.acted(LimitCause::NotFinite);
+            self.fail();
+            let step_n = SLEW_N_PER_S * NOMINAL_S;
+            self.force_n -= self.force_n.clamp_length_max(step_n);
+            return self.force_n;
+        }
+        let elapsed_s = match self.before.replace((wanted.now_s, wanted.place_m)) {
+            Some((then_s, place_m)) => {
+                let given_j = -self.force_n.dot(wanted.place_m - place_m);
+                self.energy_j += given_j;
+                self.tank_j = (self.tank_j + given_j).min(TANK_J);
+                if wanted.now_s - then_s > PAUSE_S && self.state == RenderingState::Enabled {
+                    // The client's own loop stood still: the hand is elsewhere and does not expect a force.
+                    self.acted(LimitCause::Stale);
+                    self.state = RenderingState::Paused;
+                }
+                (wanted.now_s - then_s).clamp(0.0, 10.0 * NOMINAL_S)
+            }
+            None => NOMINAL_S,
+        };
+        self.slow_m_per_s += (wanted.velocity_m_per_s - self.slow_m_per_s) * (elapsed_s / (elapsed_s + ACCELERATION_S));
+        self.acceleration_m_per_s2 = (wanted.velocity_m_per_s - self.slow_m_per_s) / ACCELERATION_S;
+        let mut force_n = wanted.force_n;
+        if !force_n.is_finite() {
+            self.acted(LimitCause::NotFinite);
+            self.fail();
+            force_n = DVec3::ZERO;
+        }
+        if (wanted.place_m - self.middle_m).length() > self.device.workspace_m {
+            self.acted(LimitCause::Workspace);
+            self.fail();
+        }
+        force_n = self.fade(wanted, elapsed_s, force_n);
+        force_n = self.engage(wanted, force_n);
+        force_n = self.clamp(elapsed_s, force_n);
+        force_n = self.keep_passive(wanted.velocity_m_per_s, force_n);
+        force_n = self.slew(elapsed_s, wanted.velocity_m_per_s, force_n);
+        self.force_n = force_n;
+        force_n
+    }
+
+    /// Reduces the force by the model's age.
+    fn fade(&mut self, wanted: &Wanted, elapsed_s: f64, force_n: DVec3) -> DVec3 {
+        // Without a model there is no force, and so nothing is stale.
+        let age_s = wanted.age_s.unwrap_or(0.0);
+        if age_s > PAUSE_S && self.state == RenderingState::Enabled {
+            self.state = RenderingState::Paused;
+        }
+        let share = match age_s {
+            age_s if age_s <= FRESH_S => 1.0,
+            age_s if age_s <= STALE_S => 1.0 - (1.0 - STALE_SHARE) * (age_s - FRESH_S) / (STALE_S - FRESH_S),
+            age_s => STALE_SHARE * ((STALE_S - age_s) / DECAY_S).exp(),
+        };
+        self.share = share.min(self.share + elapsed_s / RETURN_S);
+        if self.share < 1.0 {
+            self.acted(LimitCause::Stale);
+        }
+        self.share * force_n
+    }
+
+    fn engage(&mut self, wanted: &Wanted, force_n: DVec3) -> DVec3 {
+        match self.state {
+            RenderingState::Enabled => {}
+            // While no model arrives, `fade` reduces the force. Here the rest of it is released.
+            RenderingState::Disabled | RenderingState::Paused | RenderingState::Fault => {
+                self.engaged_s = None;
+                self.acted(LimitCause::Engage);
+                let decay = (-NOMINAL_S / DECAY_S).exp();
+                return self.force_n.clamp_length_max(force_n.length()) * decay;
+            }
+        }
+        // That there is no force before the first model says nothing about the tissue: the tip may be deep in it.
+        if self.engaged_s.is_none() && wanted.age_s.is_some() && force_n.length() < ENGAGE_BELOW_N {
+            self.engaged_s = Some(wanted.now_s);
+        }
+        let share = self.engaged_s.map_or(0.0, |since_s| ((wanted.now_s - since_s) / ENGAGE_S).clamp(0.0, 1.0));
+        if share < 1.0 {
+            self.acted(LimitCause::Engage);
+        }
+        share * force_n
+    }
+
+    fn clamp(&mut self, elapsed_s: f64, force_n: DVec3) -> DVec3 {
+        let wanted_n = force_n.length();
+        let mut most_n = self.device.most_n();
+        if wanted_n > most_n {
+            self.acted(LimitCause::Force);
+        }
+        // A motor cools down as fast as it heats up.
+        let over = wanted_n.min(most_n) > self.device.continuous_n;
+        self.over_s = (self.over_s + if over { elapsed_s } else { -elapsed_s }).clamp(0.0, CONTINUOUS_S);
+        if over && self.over_s >= CONTINUOUS_S {
+            self.acted(LimitCause::Continuous);
+            most_n = self.device.continuous_n;
+        }
+        force_n.clamp_length_max(most_n)
+    }
+
+    fn keep_passive(&mut self, velocity_m_per_s: DVec3, force_n: DVec3) -> DVec3 {
+        let (length_n, most_n) = (force_n.length(), self.bearable_n(velocity_m_per_s, force_n));
+        if length_n <= most_n {
+            return force_n;
+        }
+        self.acted(LimitCause::Passivity);
+        force_n * (most_n / length_n)
+    }
+
+    /// The largest force along `force_n` whose energy the tank can cover until slew has reduced it to zero, N.
+    fn bearable_n(&self, velocity_m_per_s: DVec3, force_n: DVec3) -> f64 {
+        let along = force_n.normalize_or_zero();
+        let along_m_per_s = velocity_m_per_s.dot(along);
+        let faster_m_per_s2 = self.acceleration_m_per_s2.dot(along).max(0.0);
+        let gained_m_per_s = faster_m_per_s2 * force_n.length() / (4.0 * SLEW_N_PER_S);
+        let speed = (SPEED_MARGIN * along_m_per_s).max(MIN_SPEED_M_PER_S) + gained_m_per_s;
+        let most_n = (2.0 * SLEW_N_PER_S * self.tank_j.max(0.0) / speed).sqrt();
+        if along_m_per_s < 0.0 { most_n.max(FIRST_N) } else { most_n }
+    }
+
+    /// Changes the last force towards the wanted one as fast as slew allows. A turning force passes through directions
+    /// between the two: where the tank can't cover such a force, it goes straight to zero.
+    fn slew(&mut self, elapsed_s: f64, velocity_m_per_s: DVec3, force_n: DVec3) -> DVec3 {
+        let step_n = SLEW_N_PER_S * elapsed_s;
+        let change_n = force_n - self.force_n;
+        if change_n.length() <= step_n {
+            return force_n;
+        }
+        self.acted(LimitCause::Slew);
+        let next_n = self.force_n + change_n.clamp_length_max(step_n);
+        if next_n.length() <= self.bearable_n(velocity_m_per_s, next_n) {
+            return next_n;
+        }
+        self.acted(LimitCause::Passivity);
+        self.force_n - self.force_n.clamp_length_max(step_n)
+    }
+}
+
+/// Duration of a tick if unknown, s.
+const NOMINAL_S: f64 = 1e-3;
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    /// A device that a hand pushes along −z, tick by tick.
+    struct Port {
+        envelope: Envelope,
+        tick: u32,
+        height_m: f64,
+    }
+
+    impl Port {
+        fn new(name: &str) -> Self {
+            let mut envelope = Envelope::new(Device::named(name).unwrap(), DVec3::ZERO);
+            envelope.enable();
+            Port { envelope, tick: 0, height_m: 0.0 }
+        }
+
+        /// One tick at a velocity with a wanted force, both along z. Returns the rendered force.
+        fn tick(&mut self, velocity_m_per_s: f64, force_n: f64) -> f64 {
+            let wanted = Wanted {
+                now_s: f64::from(self.tick) * 1e-3,
+                place_m: self.height_m * DVec3::Z,
+                velocity_m_per_s: velocity_m_per_s * DVec3::Z,
+                force_n: force_n * DVec3::Z,
+                age_s: Some(0.0),
+            };
+            self.tick += 1;
+            self.height_m += velocity_m_per_s * 1e-3;
+            self.envelope.render(&wanted).z
+        }
+
+        /// The same for many ticks. Returns the last force.
+        fn ticks(&mut self, count: u32, velocity_m_per_s: f64, force_n: f64) -> f64 {
+            (0..count).map(|_| self.tick(velocity_m_per_s, force_n)).last().unwrap()
+        }
+    }
+
+    #[test]
+    fn a_device_that_nobody_holds_gets_no_more_than_was_put_in() {
+        for (mass_kg, stiffness_n_per_m) in [(0.045, 600.0), (0.05, 1500.0), (0.1, 4000.0)] {
+            let mut port = Port::new("omega3");
+            port.ticks(600, 0.0, 0.0);
+            // Pressed 5 mm into a soft spring; then a stiff one takes its place, as after an outage, and a weak string is all that
+            // holds the device.
+            for _ in 0..250 {
+                let force_n = -300.0 * port.height_m;
+                port.tick(-0.02, force_n);
+            }
+            let mut velocity_m_per_s = 0.0;
+            for _ in 0..300 {
+                let force_n = port.tick(velocity_m_per_s, stiffness_n_per_m * (-port.height_m).max(0.0));
+                velocity_m_per_s += (force_n - 0.5) / mass_kg * 1e-3;
+            }
+            let energy_j = port.envelope.energy_j();
+            assert!(energy_j > -1.1 * CREDIT_J, "{mass_kg} kg, {stiffness_n_per_m} N/m: {energy_j} J");
+        }
+    }
+
+    #[test]
+    fn a_force_ramps_in_linearly_and_each_tick_of_the_ramp_is_counted() {
+        let mut port = Port::new("omega3");
+        // It engages at once, because the force is small. A hand that presses on pays for what follows.
+        port.tick(-0.05, 0.0);
+        let half_n = port.ticks(250, -0.05, 1.0);
+        assert!((half_n - 0.5).abs() < 1e-9, "{half_n}");
+        let whole_n = port.ticks(250, -0.05, 1.0);
+        assert!((whole_n - 1.0).abs() < 1e-9, "{whole_n}");
+        assert_eq!(port.envelope.count(LimitCause::Engage), (500, 501));
+        assert_eq!(port.ticks(100, -0.05, 1.0), 1.0);
+        assert_eq!(port.envelope.count(LimitCause::Engage), (500, 601));
+        for reason in
+            [LimitCause::Stale, LimitCause::Force, LimitCause::Slew, LimitCause::Passivity, LimitCause::NotFinite]
+        {
+            assert_eq!(port.envelope.count(reason).0, 0, "{reason:?}");
+        }
+    }
+
+    #[test]
+    fn what_is_disabled_lets_go_until_it_is_enabled_and_a_fault_stays_a_fault() {
+        let mut port = Port::new("omega3");
+        port.tick(-0.05, 0.0);
+        assert_eq!(port.ticks(600, -0.05, 1.0), 1.0);
+        port.envelope.disable();
+        assert_eq!(port.envelope.state(), RenderingState::Disabled);
+        assert!(port.ticks(300, 0.0, 1.0) < 0.01);
+        port.envelope.enable();
+        assert_eq!(port.envelope.state(), RenderingState::Enabled);
+        port.envelope.fail();
+        port.envelope.disable();
+        assert_eq!(port.envelope.state(), RenderingState::Fault);
+    }
+
+    #[test]
+    fn a_motor_exceeds_its_continuous_force_for_two_seconds_and_then_has_to_cool() {
+        let mut port = Port::new("omni");
+        port.tick(-0.01, 0.0);
+        // The ramp passes 0.88 N after 0.22 s.
+        assert_eq!(port.ticks(2200, -0.01, 2.0), 2.0);
+        assert_eq!(port.envelope.count(LimitCause::Continuous).0, 0);
+        assert!((port.ticks(60, -0.01, 2.0) - 0.88).abs() < 1e-12);
+        assert!(port.envelope.count(LimitCause::Continuous).0 > 0);
+        // A second of rest is good for a second of force.
+        assert_eq!(port.ticks(1000, -0.01, 0.5), 0.5);
+        assert_eq!(port.ticks(950, -0.01, 2.0), 2.0);
+        assert!((port.ticks(120, -0.01, 2.0) - 0.88).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_spring_that_falls_no_faster_than_the_slew_is_never_limited() {
+        let mut port = Port::new("omega3");
+        let spring_n = |port: &Port| 400.0 * (-port.height_m).max(0.0);
+        port.ticks(600, 0.0, 0.0);
+        for _ in 0..2 {
+            for velocity_m_per_s in [-0.05, 0.0, 0.05] {
+                for _ in 0..100 {
+                    let wanted_n = spring_n(&port);
+                    assert_eq!(port.tick(velocity_m_per_s, wanted_n), wanted_n, "at {} m", port.height_m);
+                }
+            }
+        }
+        assert_eq!([LimitCause::Passivity, LimitCause::Slew].map(|reason| port.envelope.count(reason).0), [0; 2]);
+    }
+
+    /// A force that is rendered as it is wanted, and so faint that no other limit acts on it, N.
+    const FAINT_N: f64 = 0.1;
+
+    /// What is rendered of `FAINT_N`, told at a moment by a model of an age: a share of it.
+    fn share(envelope: &mut Envelope, now_s: f64, age_s: f64) -> f64 {
+        let (place_m, velocity_m_per_s, force_n) = (DVec3::ZERO, DVec3::ZERO, FAINT_N * DVec3::Z);
+        envelope.render(&Wanted { now_s, place_m, velocity_m_per_s, force_n, age_s: Some(age_s) }).z / FAINT_N
+    }
+
+    #[test]
+    fn a_force_fades_in_a_straight_line_to_its_half_and_then_decays_and_returns_as_time_passes() {
+        let faded = |age_s: f64| {
+            let mut port = Port::new("omega3");
+            assert_eq!(port.ticks(600, 0.0, FAINT_N), FAINT_N);
+            let now_s = f64::from(port.tick) * 1e-3;
+            let share = share(&mut port.envelope, now_s, age_s);
+            (port.envelope, now_s, share)
+        };
+        let middle_s = 0.5 * (FRESH_S + STALE_S);
+        let decayed = 0.5 / std::f64::consts::E;
+        for (age_s, expected) in [(FRESH_S, 1.0), (middle_s, 0.75), (STALE_S, 0.5), (STALE_S + DECAY_S, decayed)] {
+            let (envelope, _, share) = faded(age_s);
+            assert!((share - expected).abs() < 1e-9, "{share} of the force at an age of {age_s} s");
+            assert_eq!(envelope.count(LimitCause::Stale).0, u64::from(expected < 1.0));
+        }
+        // Half the force comes back in half the time of all of it.
+        let (mut envelope, mut now_s, mut found) = faded(STALE_S);
+        for _ in 0..(250.0 * RETURN_S) as u32 {
+            now_s += 1e-3;
+            found = share(&mut envelope, now_s, 0.0);
+        }
+        assert!((found - 0.75).abs() < 0.01, "{found}");
+        // A gap between two ticks counts as ten of them at most.
+        let (mut envelope, now_s, _) = faded(STALE_S);
+        let after_gap = share(&mut envelope, now_s + 0.04, 0.0);
+        assert!((after_gap - (0.5 + 0.01 / RETURN_S)).abs() < 1e-9, "{after_gap}");
+    }
+
+    #[test]
+    fn a_force_falls_at_every_tick_in_which_a_hand_is_pushed_faster_than_its_energy_bears() {
+        let mut port = Port::new("omega3");
+        port.ticks(600, 0.0, 0.0);
+        for tick in 0..100 {
+            port.tick(-0.05, 0.03 * f64::from(tick));
+        }
+        let mut last_n = port.ticks(500, -0.05, 3.0);
+        assert_eq!(last_n, 3.0);
+        // The law goes on wanting all of it.
+        for tick in 0..25 {
+            let force_n = port.tick(1.0, 3.0);
+            assert!((0.0..last_n).contains(&force_n), "tick {tick}: {last_n}, then {force_n} N");
+            last_n = force_n;
+        }
+        assert!(port.envelope.count(LimitCause::Passivity).0 >= 25 && port.envelope.energy_j() > 0.0);
+    }
+}

@@ -1,0 +1,214 @@
+//! The force law of a tissue under a disc that is pressed straight in quasi-statically: what the server sends ahead, once,
+//! so that a client knows before it gets there how the force will rise.
+//!
+//! A stiffness at one place says nothing of the next millimetre, and tissue hardens: with 50 ms of delay and 50 mm/s a
+//! hand is 2.5 mm further than what it last felt. A polynomial through past samples extrapolates badly there; the
+//! tissue's own law, which the server computes from its model, does not.
+
+/// The law at one depth.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Row {
+    /// Outward, N.
+    pub force_n: f64,
+    /// Along the normal, N/m.
+    pub stiffness_n_per_m: f64,
+    /// Across it, of a disc that sticks, N/m.
+    pub across_n_per_m: f64,
+    /// Along the normal, N·s/m.
+    pub damping_n_s_per_m: f64,
+    /// Across it, of a disc that sticks, N·s/m.
+    pub across_n_s_per_m: f64,
+    /// Across it, of a disc that slides, N·s/m.
+    pub drag_n_s_per_m: f64,
+}
+
+/// Rows at equal distances of depth, from 0 on.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Law {
+    /// From a row to the next, m.
+    pub step_m: f64,
+    /// At least two.
+    pub rows: Vec<Row>,
+    /// Put together from coarser sheets, because the tissue's own law takes too much work to be given at once: within a
+    /// tenth of it.
+    pub is_coarse: bool,
+}
+
+impl Law {
+    /// Returns the law of a linear spring and damper, which feel the same in every direction.
+    pub fn linear(stiffness_n_per_m: f64, damping_n_s_per_m: f64) -> Self {
+        let step_m = 0.1;
+        let row = |force_n: f64| Row {
+            force_n,
+            stiffness_n_per_m,
+            across_n_per_m: stiffness_n_per_m,
+            damping_n_s_per_m,
+            across_n_s_per_m: damping_n_s_per_m,
+            drag_n_s_per_m: 0.0,
+        };
+        Law { step_m, rows: vec![row(0.0), row(stiffness_n_per_m * step_m)], is_coarse: false }
+    }
+
+    /// Returns whether a client can use it: finite, rising, at least two rows.
+    pub fn is_sound(&self) -> bool {
+        let finite = |row: &Row| {
+            [row.force_n, row.stiffness_n_per_m, row.across_n_per_m, row.damping_n_s_per_m, row.across_n_s_per_m]
+                .iter()
+                .chain([&row.drag_n_s_per_m])
+                .all(|value| value.is_finite() && *value >= 0.0)
+        };
+        self.rows.len() >= 2
+            && self.step_m > 0.0
+            && self.step_m.is_finite()
+            && self.rows.iter().all(finite)
+            && self.rows.windows(2).all(|pair| pair[1].force_n >= pair[0].force_n)
+    }
+
+    /// Returns the law at a depth, m. Forces are cubic between rows, with the rows' stiffness as slopes; beyond the
+    /// last row they go on as straight lines.
+    pub fn at_depth(&self, depth_m: f64) -> Row {
+        let last = self.rows.len() - 1;
+        let place = (depth_m / self.step_m).max(0.0);
+        if place >= last as f64 {
+            let row = self.rows[last];
+            let beyond_m = depth_m - last as f64 * self.step_m;
+            return Row { force_n: row.force_n + row.stiffness_n_per_m * beyond_m, ..row };
+        }
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let below = place as usize;
+        let t = place - below as f64;
+        let (a, b) = (self.rows[below], self.rows[below + 1]);
+        let mix = |a: f64, b: f64| a + t * (b - a);
+        let rise = b.force_n - a.force_n;
+        let (sa, sb) = (a.stiffness_n_per_m * self.step_m - rise, rise - b.stiffness_n_per_m * self.step_m);
+        let bend = t * (1.0 - t);
+        Row {
+            force_n: a.force_n + t * rise + bend * ((1.0 - t) * sa + t * sb),
+            stiffness_n_per_m: (rise + (1.0 - 2.0 * t) * ((1.0 - t) * sa + t * sb) + bend * (sb - sa)) / self.step_m,
+            across_n_per_m: mix(a.across_n_per_m, b.across_n_per_m),
+            damping_n_s_per_m: mix(a.damping_n_s_per_m, b.damping_n_s_per_m),
+            across_n_s_per_m: mix(a.across_n_s_per_m, b.across_n_s_per_m),
+            drag_n_s_per_m: mix(a.drag_n_s_per_m, b.drag_n_s_per_m),
+        }
+    }
+
+    /// Returns the depth at which a force is met, m.
+    pub fn depth_of(&self, force_n: f64) -> f64 {
+        if force_n <= 0.0 {
+            return 0.0;
+        }
+        let last = self.rows.len() - 1;
+        let above = self.rows.partition_point(|row| row.force_n < force_n);
+        if above > last {
+            let row = self.rows[last];
+            return last as f64 * self.step_m + (force_n - row.force_n) / row.stiffness_n_per_m.max(f64::MIN_POSITIVE);
+        }
+        let (mut low, mut high) = ((above.max(1) - 1) as f64 * self.step_m, above.max(1) as f64 * self.step_m);
+        for _ in 0..50 {
+            let middle = 0.5 * (low + high);
+            if self.at_depth(middle).force_n < force_n { low = middle } else { high = middle }
+        }
+        0.5 * (low + high)
+    }
+
+    /// Returns the depth that it reaches, m.
+    pub fn reach_m(&self) -> f64 {
+        (self.rows.len() - 1) as f64 * self.step_m
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One that hardens, with rows 0.5 mm apart; each value differs from the others.
+    fn hardening() -> Law {
+        let rows = (0..5).map(|row| {
+            let x = f64::from(row);
+            Row {
+                force_n: 0.1 * x + 0.02 * x * x,
+                stiffness_n_per_m: (0.1 + 0.04 * x) / 5e-4,
+                across_n_per_m: 50.0 + 3.0 * x,
+                damping_n_s_per_m: 0.5 + 0.1 * x,
+                across_n_s_per_m: 0.3 + 0.07 * x,
+                drag_n_s_per_m: 0.2 + 0.01 * x * x,
+            }
+        });
+        Law { step_m: 5e-4, rows: rows.collect(), is_coarse: false }
+    }
+
+    #[test]
+    fn a_law_meets_its_rows_and_is_smooth_between_them() {
+        let law = hardening();
+        assert!(law.is_sound());
+        assert!((law.reach_m() - 2e-3).abs() < 1e-15);
+        for (index, row) in law.rows.iter().enumerate() {
+            let at = law.at_depth(index as f64 * law.step_m);
+            assert!((at.force_n - row.force_n).abs() < 1e-12 && (at.drag_n_s_per_m - row.drag_n_s_per_m).abs() < 1e-12);
+            assert!((at.stiffness_n_per_m - row.stiffness_n_per_m).abs() < 1e-6, "{index}: {at:?}");
+        }
+        // The force is a parabola here, which cubics follow exactly; beyond the last row it is a straight line.
+        for depth_m in [1e-4, 3e-4, 7e-4, 1.21e-3, 1.9e-3, 2.2e-3, 4e-3] {
+            let x = depth_m / law.step_m;
+            let end = x.min(4.0);
+            let force_n = 0.1 * end + 0.02 * end * end + (x - end) * (0.1 + 0.04 * end);
+            let at = law.at_depth(depth_m);
+            assert!((at.force_n - force_n).abs() < 1e-12, "{depth_m}: {at:?}");
+            let slope = (law.at_depth(depth_m + 1e-8).force_n - law.at_depth(depth_m - 1e-8).force_n) / 2e-8;
+            assert!((at.stiffness_n_per_m - slope).abs() < 1e-4 * slope, "{depth_m}: {at:?} {slope}");
+            assert!((law.depth_of(force_n) - depth_m).abs() < 1e-12, "{depth_m}: {}", law.depth_of(force_n));
+            if x < 4.0 {
+                let near = [at.across_n_per_m - (50.0 + 3.0 * x), at.damping_n_s_per_m - (0.5 + 0.1 * x)];
+                assert!(near.iter().chain([&(at.across_n_s_per_m - (0.3 + 0.07 * x))]).all(|v| v.abs() < 1e-12));
+            }
+        }
+        // A cubic whose slopes differ from the chord has the slope that it says.
+        let bent = Law {
+            is_coarse: false,
+            step_m: 1.0,
+            rows: vec![
+                Row { stiffness_n_per_m: 3.0, ..Row::default() },
+                Row { force_n: 1.0, stiffness_n_per_m: 0.5, ..Row::default() },
+            ],
+        };
+        for depth_m in [0.1, 0.4, 0.85] {
+            let slope = (bent.at_depth(depth_m + 1e-7).force_n - bent.at_depth(depth_m - 1e-7).force_n) / 2e-7;
+            assert!((bent.at_depth(depth_m).stiffness_n_per_m - slope).abs() < 1e-6, "{depth_m}");
+        }
+        assert_eq!(law.at_depth(-1.0), law.rows[0]);
+        assert_eq!([law.depth_of(0.0), law.depth_of(-1.0)], [0.0; 2]);
+    }
+
+    #[test]
+    fn a_law_that_no_client_can_use_is_not_sound() {
+        let sound = hardening();
+        let broken: [fn(&mut Law); 7] = [
+            |law| law.rows.truncate(1),
+            |law| law.step_m = 0.0,
+            |law| law.step_m = f64::INFINITY,
+            |law| law.rows[2].force_n = 0.0,
+            |law| law.rows[1].drag_n_s_per_m = f64::NAN,
+            |law| law.rows[1].across_n_per_m = -1.0,
+            |law| law.rows[4].damping_n_s_per_m = f64::INFINITY,
+        ];
+        for spoil in broken {
+            let mut law = sound.clone();
+            spoil(&mut law);
+            assert!(!law.is_sound(), "{law:?}");
+        }
+        let two = Law { rows: sound.rows[..2].to_vec(), ..sound };
+        assert!(two.is_sound());
+    }
+
+    #[test]
+    fn a_linear_law_is_a_spring_at_every_depth() {
+        let law = Law::linear(400.0, 0.5);
+        for depth_m in [0.0, 1e-3, 0.05, 0.1, 0.3] {
+            let row = law.at_depth(depth_m);
+            assert!((row.force_n - 400.0 * depth_m).abs() < 1e-9 && (row.stiffness_n_per_m - 400.0).abs() < 1e-9);
+            let others = [row.across_n_per_m, row.damping_n_s_per_m, row.across_n_s_per_m, row.drag_n_s_per_m];
+            assert_eq!(others, [400.0, 0.5, 0.5, 0.0]);
+            assert!((law.depth_of(row.force_n) - depth_m).abs() < 1e-9);
+        }
+    }
+}

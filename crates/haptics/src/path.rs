@@ -1,0 +1,403 @@
+//! The server's side of a tool's path: how commands that arrive in bursts and gaps become a movement.
+//!
+//! A client reports a thousand times a second where its tool is, and when. Played on arrival, a burst would make the
+//! tool stop and then leap, and the tissue would respond to the leaps. So commands are played by their own times: the
+//! played moment advances with the steps, stops when there is nothing newer, and catches up by a tenth while something
+//! newer has always been available. With a constant delay this adds no latency.
+//!
+//! Old commands are never replayed: of a backlog of more than [`BACKLOG_S`] only the newest place counts, and the tool
+//! goes there no faster than [`SPEED_M_PER_S`]. After [`RELEASE_S`] without a command the tool lets go. A command
+//! without a time, or stamped with its step, takes effect at once and the path does not wait for a successor; but no
+//! tool ever leaps.
+//!
+//! **News alone.** A command may say how fast the tool moves. Then its client sends the next one only when the tool is not
+//! where this movement leads ([`crate::dead_reckoning`]), and over a gap the tool goes on along it, for [`EXTRAPOLATE_S`] at most. So the
+//! played moment need not stop when nothing newer is there. It keeps to the arrivals instead: it falls back by a tenth while
+//! commands come too late for it, and catches up as above.
+//!
+//! **Datagrams** may overtake each other and be lost. A place that comes late fills its gap if it has not been played; else
+//! nothing needs it any more ([`Path::fill`]).
+
+use std::collections::VecDeque;
+
+use glam::DVec3;
+
+/// Largest speed of a tool, m/s.
+pub const SPEED_M_PER_S: f64 = 0.5;
+/// A longer queue is a backlog, s.
+pub const BACKLOG_S: f64 = 0.1;
+/// Without a command for this long the tool is held in place, and the client is told, s.
+pub const HOLD_S: f64 = 0.05;
+/// Without a command for this long the tool lets go, s.
+pub const RELEASE_S: f64 = 0.25;
+/// Longest time over which a movement is extrapolated, s: as long as a tool moves that is not held.
+pub const EXTRAPOLATE_S: f64 = HOLD_S;
+/// The played moment falls back while commands with a velocity come later than this for it, s.
+const LATE_S: f64 = 0.002;
+/// The played moment catches up by this fraction of a step.
+const CATCH_UP: f64 = 0.1;
+/// Before it catches up, something newer must have been available for this long, s.
+const WATCHED_S: f64 = 0.25;
+/// No time of a path is longer, s.
+const LONGEST_S: f64 = 1e12;
+/// Most places in the queue.
+const MAX_POINTS: usize = 1024;
+
+/// The action of a tool in a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Play {
+    /// Reach this place by the step's end; the client's time there, s.
+    Pose(DVec3, f64),
+    /// Let go.
+    Release,
+}
+
+/// The commands of one tool.
+#[derive(Debug, Clone, Default)]
+pub struct Path {
+    /// Whether the tool begins at its first place, not above it.
+    at_once: bool,
+    /// Where it begins, if neither there nor above it.
+    begins_m: Option<DVec3>,
+    waiting: VecDeque<(f64, DVec3)>,
+    /// The newest command, if it says how fast the tool moves, m/s.
+    heading: Option<(f64, DVec3, DVec3)>,
+    played: Option<(f64, DVec3)>,
+    place_m: Option<DVec3>,
+    arrived_s: f64,
+    /// Least time available beyond the played moment, and since when it is measured.
+    spare_s: f64,
+    watched_s: f64,
+    limited: u64,
+    dropped: u64,
+    released: u64,
+}
+
+/// All that the course of a path depends on, as numbers: of a path that goes on elsewhere.
+#[derive(Debug, Clone, PartialEq)]
+#[allow(missing_docs)]
+pub struct PathState {
+    pub at_once: bool,
+    pub begins_m: Option<DVec3>,
+    /// Client times, s, and places, m.
+    pub waiting: Vec<(f64, DVec3)>,
+    pub heading: Option<(f64, DVec3, DVec3)>,
+    pub played: Option<(f64, DVec3)>,
+    pub place_m: Option<DVec3>,
+    pub arrived_s: f64,
+    pub spare_s: f64,
+    pub watched_s: f64,
+    /// [`Path::counts`].
+    pub counts: [u64; 3],
+}
+
+impl PathState {
+    /// Whether a path may have these.
+    fn is_sound(&self) -> bool {
+        let is_time = |time_s: f64| time_s.abs() < LONGEST_S;
+        let is_passed = |(time_s, place_m): &(f64, DVec3)| is_time(*time_s) && place_m.is_finite();
+        let is_heading = |(time_s, place_m, velocity): &(f64, DVec3, DVec3)| {
+            is_passed(&(*time_s, *place_m)) && velocity.length() <= 2.0 * SPEED_M_PER_S
+        };
+        self.waiting.len() <= MAX_POINTS
+            && self.waiting.iter().chain(&self.played).all(is_passed)
+            && self.waiting.is_sorted_by(|a, b| a.0 < b.0)
+            && self.heading.iter().all(is_heading)
+            && self.begins_m.iter().chain(&self.place_m).all(|place_m| place_m.is_finite())
+            // A tool that went to its place at once has arrived for good, and what was never measured is without end.
+            && (is_time(self.arrived_s) || self.arrived_s == f64::INFINITY)
+            && (is_time(self.spare_s) || self.spare_s == f64::INFINITY)
+            && is_time(self.watched_s)
+            && self.counts.iter().all(|count| *count < 1 << 48)
+    }
+}
+
+impl Path {
+    /// Returns all that its course depends on.
+    pub fn state(&self) -> PathState {
+        let Path { at_once, begins_m, waiting, heading, played, place_m, arrived_s, spare_s, watched_s, .. } = self;
+        PathState {
+            at_once: *at_once,
+            begins_m: *begins_m,
+            waiting: waiting.iter().copied().collect(),
+            heading: *heading,
+            played: *played,
+            place_m: *place_m,
+            arrived_s: *arrived_s,
+            spare_s: *spare_s,
+            watched_s: *watched_s,
+            counts: self.counts(),
+        }
+    }
+
+    /// Creates a path that goes on from there; none from what no path has.
+    pub fn restored(state: PathState) -> Option<Self> {
+        if !state.is_sound() {
+            return None;
+        }
+        let PathState { at_once, begins_m, waiting, heading, played, place_m, arrived_s, spare_s, watched_s, counts } =
+            state;
+        let (waiting, [limited, dropped, released]) = (waiting.into(), counts);
+        Some(Path {
+            at_once,
+            begins_m,
+            waiting,
+            heading,
+            played,
+            place_m,
+            arrived_s,
+            spare_s,
+            watched_s,
+            limited,
+            dropped,
+            released,
+        })
+    }
+
+    /// Creates the path of a grasp, which takes hold where its first place is. (The tool of another path comes from above: it meets the
+    /// tissue as a hand does, not from within.)
+    pub fn of_grasp() -> Self {
+        Path { at_once: true, ..Path::default() }
+    }
+
+    /// Creates the path of a tool that begins at a place of its own: where the tissue is not below it.
+    pub fn beginning_at(place_m: DVec3) -> Self {
+        Path { begins_m: Some(place_m), ..Path::default() }
+    }
+
+    /// Takes a command that has arrived: the tool's place at client time `time_s`. Returns false if it refuses one that
+    /// is not newer or not finite.
+    pub fn receive(&mut self, time_s: f64, place_m: DVec3, now_s: f64) -> bool {
+        let newest_s = self.waiting.back().or(self.played.as_ref()).map_or(f64::NEG_INFINITY, |place| place.0);
+        if !place_m.is_finite() || !time_s.is_finite() || time_s <= newest_s {
+            self.dropped += 1;
+            return false;
+        }
+        self.wait(self.waiting.len(), time_s, place_m);
+        (self.heading, self.arrived_s) = (None, now_s);
+        true
+    }
+
+    /// Does the same of a tool that moves at `velocity_m_per_s` then: until something newer comes, it goes on so.
+    pub fn receive_moving(&mut self, time_s: f64, place_m: DVec3, velocity_m_per_s: DVec3, now_s: f64) -> bool {
+        let newest_s = self.newest_s().unwrap_or(f64::NEG_INFINITY);
+        let is_finite = place_m.is_finite() && velocity_m_per_s.is_finite() && time_s.is_finite();
+        if !is_finite || time_s <= newest_s {
+            self.dropped += 1;
+            return false;
+        }
+        if let Some((played_s, _)) = self.played {
+            self.spare_s = self.spare_s.min(time_s - played_s);
+        }
+        // It may have been played past already, along what was known.
+        if self.played.is_none_or(|played| time_s > played.0) {
+            self.wait(self.waiting.len(), time_s, place_m);
+        }
+        let velocity_m_per_s = velocity_m_per_s.clamp_length_max(SPEED_M_PER_S);
+        (self.heading, self.arrived_s) = (Some((time_s, place_m, velocity_m_per_s)), now_s);
+        true
+    }
+
+    /// Fills a gap with a place that comes late. Returns false if it has been played past, is known, or is not finite.
+    pub fn fill(&mut self, time_s: f64, place_m: DVec3) -> bool {
+        let is_due = time_s.is_finite() && self.played.is_some_and(|played| time_s > played.0);
+        let at = self.waiting.partition_point(|waiting| waiting.0 < time_s);
+        // What is newer than all is no gap; and each fills it once.
+        let fills = is_due && place_m.is_finite() && self.waiting.get(at).is_some_and(|after| after.0 > time_s);
+        if fills {
+            self.wait(at, time_s, place_m);
+        } else {
+            self.dropped += 1;
+        }
+        fills
+    }
+
+    /// Returns the client's time of the newest command, s.
+    pub fn newest_s(&self) -> Option<f64> {
+        let known = [self.heading.map(|heading| heading.0), self.waiting.back().map(|waiting| waiting.0)];
+        known.into_iter().flatten().reduce(f64::max).or(self.played.map(|played| played.0))
+    }
+
+    fn wait(&mut self, at: usize, time_s: f64, place_m: DVec3) {
+        self.waiting.insert(at, (time_s, place_m));
+        if self.waiting.len() > MAX_POINTS {
+            self.waiting.pop_front();
+        }
+    }
+
+    /// Takes a command that takes effect at once, whatever its time: the tool's place at client time `time_s`.
+    pub fn go_to(&mut self, time_s: f64, place_m: DVec3) {
+        self.waiting.clear();
+        (self.played, self.heading, self.arrived_s) = (Some((time_s, place_m)), None, f64::INFINITY);
+    }
+
+    /// Steps in which the speed limit acted; commands that were refused or skipped; releases.
+    pub fn counts(&self) -> [u64; 3] {
+        [self.limited, self.dropped, self.released]
+    }
+
+    /// Returns whether the newest command is so old at `now_s` that the tool is held.
+    pub fn is_held(&self, now_s: f64) -> bool {
+        now_s - self.arrived_s > HOLD_S
+    }
+
+    /// Returns the action of the tool in the step of `step_s` that ends at `now_s`; `None` before the first command.
+    pub fn step(&mut self, now_s: f64, step_s: f64) -> Option<Play> {
+        let newest = self.waiting.back().copied();
+        if let Some(heading) = self.heading {
+            self.go_on(heading, now_s, step_s);
+        } else if let Some(newest) = newest {
+            self.play(newest, now_s, step_s);
+        } else {
+            self.spare_s = 0.0;
+            self.watched_s = now_s;
+        }
+        let (time_s, target_m) = self.played?;
+        if now_s - self.arrived_s > RELEASE_S {
+            if self.place_m.take().is_some() {
+                self.released += 1;
+            }
+            return Some(Play::Release);
+        }
+        let above_m = DVec3::new(target_m.x, target_m.y, target_m.z.max(ABOVE_M));
+        let begins_m = if self.at_once { target_m } else { self.begins_m.unwrap_or(above_m) };
+        let from_m = self.place_m.unwrap_or(begins_m);
+        let way_m = target_m - from_m;
+        let most_m = SPEED_M_PER_S * step_s;
+        if way_m.length() > most_m {
+            self.limited += 1;
+        }
+        let place_m = from_m + way_m.clamp_length_max(most_m);
+        self.place_m = Some(place_m);
+        Some(Play::Pose(place_m, time_s))
+    }
+
+    fn play(&mut self, newest: (f64, DVec3), now_s: f64, step_s: f64) {
+        let Some((played_s, _)) = self.played.filter(|played| newest.0 - played.0 <= BACKLOG_S) else {
+            self.dropped += self.waiting.len() as u64 - 1;
+            self.waiting.clear();
+            (self.played, self.spare_s, self.watched_s) = (Some(newest), f64::INFINITY, now_s);
+            return;
+        };
+        self.spare_s = self.spare_s.min(newest.0 - played_s - step_s);
+        let mut next_s = played_s + step_s;
+        if now_s - self.watched_s >= WATCHED_S {
+            if self.spare_s > 0.5 * step_s {
+                next_s += (CATCH_UP * step_s).min(self.spare_s);
+                // Measure anew after catching up.
+                self.spare_s -= CATCH_UP * step_s;
+            } else {
+                (self.spare_s, self.watched_s) = (f64::INFINITY, now_s);
+            }
+        }
+        let next_s = next_s.min(newest.0);
+        let before = self.pass(next_s).unwrap_or(newest);
+        self.played = Some(match self.waiting.front() {
+            Some(after) if next_s > before.0 => (next_s, between(before, *after, next_s)),
+            _ => before,
+        });
+    }
+
+    /// Plays commands that say how fast the tool moves, the newest of which is `heading`.
+    fn go_on(&mut self, heading: (f64, DVec3, DVec3), now_s: f64, step_s: f64) {
+        let (newest_s, newest_m, velocity_m_per_s) = heading;
+        let Some((played_s, _)) = self.played.filter(|played| newest_s - played.0 <= BACKLOG_S) else {
+            self.waiting.clear();
+            (self.played, self.spare_s, self.watched_s) = (Some((newest_s, newest_m)), f64::INFINITY, now_s);
+            return;
+        };
+        let mut pace = 1.0;
+        if self.spare_s < -LATE_S {
+            pace -= CATCH_UP;
+        } else if now_s - self.watched_s >= WATCHED_S && self.spare_s.is_finite() && self.spare_s > 0.5 * step_s {
+            pace += CATCH_UP;
+        }
+        if pace != 1.0 {
+            self.spare_s += (1.0 - pace) * step_s;
+        } else if now_s - self.watched_s >= WATCHED_S {
+            (self.spare_s, self.watched_s) = (f64::INFINITY, now_s);
+        }
+        let next_s = (played_s + pace * step_s).min((newest_s + EXTRAPOLATE_S).max(played_s));
+        let before = self.pass(next_s);
+        self.played = Some(match (before, self.waiting.front()) {
+            (Some(before), Some(after)) => (next_s, between(before, *after, next_s)),
+            // Beyond all that is known.
+            _ => (next_s, newest_m + velocity_m_per_s * (next_s - newest_s)),
+        });
+    }
+
+    /// What was played last by a moment, and leaves the queue.
+    fn pass(&mut self, until_s: f64) -> Option<(f64, DVec3)> {
+        let mut before = self.played;
+        while let Some(place) = self.waiting.front().copied().filter(|place| place.0 <= until_s + 1e-9) {
+            before = Some(place);
+            self.waiting.pop_front();
+        }
+        before
+    }
+}
+
+/// The place between two at a moment between them.
+fn between(before: (f64, DVec3), after: (f64, DVec3), at_s: f64) -> DVec3 {
+    before.1.lerp(after.1, (at_s - before.0) / (after.0 - before.0))
+}
+
+/// A new tool that touches begins at least this high above the sheet at rest, m.
+const ABOVE_M: f64 = 0.002;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const STEP_S: f64 = 1e-3;
+
+    /// Plays commands, one a millisecond, which arrive as `arrival` says: at step k come those before `arrival(k)`. Returns
+    /// the client's time of the tool at each step.
+    fn played(steps: u32, arrival: impl Fn(u32) -> u32) -> Vec<f64> {
+        let (mut path, mut sent, mut times) = (Path::default(), 0, Vec::new());
+        for step in 0..steps {
+            let now_s = f64::from(step) * STEP_S;
+            while sent < arrival(step) {
+                path.receive(f64::from(sent) * STEP_S, DVec3::ZERO, now_s);
+                sent += 1;
+            }
+            if let Some(Play::Pose(_, time_s)) = path.step(now_s, STEP_S) {
+                times.push(time_s);
+            }
+        }
+        times
+    }
+
+    #[test]
+    fn bursts_that_leave_nothing_to_spare_are_played_at_the_clients_own_pace() {
+        // Bursts of ten: the last command of each is played as the next arrives.
+        let times = played(1500, |step| step / 10 * 10);
+        for pair in times[20..].windows(2) {
+            assert!((pair[1] - pair[0] - STEP_S).abs() < 1e-9, "{pair:?}");
+        }
+    }
+
+    #[test]
+    fn a_tool_catches_up_with_commands_that_are_always_there_and_no_faster_than_by_a_tenth() {
+        // The first commands are late by 40 ms, the others by 5 ms.
+        let times = played(3000, |step| if step < 41 { u32::from(step == 40) } else { step - 5 });
+        let last = times.last().map_or(0.0, |time_s| 2999.0 * STEP_S - time_s);
+        assert!(last < 0.008, "{last} s late");
+        for pair in times.windows(2) {
+            let passed_s = pair[1] - pair[0];
+            assert!((0.0..=1.1 * STEP_S + 1e-9).contains(&passed_s), "{pair:?}");
+        }
+    }
+
+    #[test]
+    fn a_place_within_a_nanosecond_of_the_played_moment_is_played_as_it_is() {
+        let mut path = Path::of_grasp();
+        let places = [(0.0, 0.0), (0.001 + 5e-10, 0.0003), (0.0025, 0.0007)].map(|(time_s, x)| (time_s, x * DVec3::X));
+        path.receive(places[0].0, places[0].1, 0.0);
+        assert_eq!(path.step(0.0, STEP_S), Some(Play::Pose(places[0].1, 0.0)));
+        for (time_s, place_m) in &places[1..] {
+            path.receive(*time_s, *place_m, 0.0);
+        }
+        assert_eq!(path.step(0.001, STEP_S), Some(Play::Pose(places[1].1, places[1].0)));
+    }
+}

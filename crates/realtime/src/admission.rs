@@ -1,0 +1,407 @@
+//! Admission: sessions are created, started and changed if their thread has time for their steps.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
+
+use tokio::sync::watch;
+
+use super::audited::Audited;
+use super::clock::{Dilation, now_ns};
+use super::cost::{Cost, check_asked, check_work};
+use super::event_log::{About, EventLog};
+use super::laws::KeptLaws;
+use super::pacer::Pacer;
+use super::playback::Playback;
+use super::session_handle::SessionHandle;
+use super::session_task::{SessionTask, beat_ns};
+use super::slots::StreamSlots;
+use super::status::{RunState, Status};
+use crate::ids::random_id;
+use palpate_refusal::{Reason, Refusal, Result, number};
+use palpate_session::Session;
+use palpate_session::budget::{Account, Purpose, Resource, Taken};
+use palpate_session::input::Input;
+use palpate_session::intake::Intake;
+use palpate_session::schedule::Schedule;
+use palpate_session::surface::Skin;
+use palpate_tissue::lock::lock;
+use palpate_tissue::memory;
+use palpate_tissue::scene::{Body, Change, Scene};
+use palpate_tissue::{Model, scheme_selection};
+
+/// How a session begins.
+pub struct Begin {
+    /// Its ID.
+    pub id: String,
+    /// The tissue that it began with.
+    pub first: Arc<Model>,
+    /// Whether its time goes on.
+    pub running: bool,
+    /// The step at which it pauses.
+    pub until: Option<u64>,
+    /// Time without use after which it is deleted, s.
+    pub idle_timeout_s: f64,
+    /// What it plays, in place of what clients tell it.
+    pub playback: Option<Playback>,
+    /// The run of the journal that it continues; 0 if there is none.
+    pub after_run: u64,
+    /// The revision at which this server became its owner; 0 without a fleet.
+    pub revision: u64,
+    /// Changes of the tissue that wait for a later step, each with that step.
+    pub waiting: Vec<(u64, Input)>,
+    /// It begins frozen, and is not served till [`SessionHandle::arrive`].
+    pub frozen: bool,
+    /// Its tape is told what happens to it, if the server keeps tapes.
+    pub recorded: bool,
+}
+
+/// The name of a new session.
+#[derive(Debug, Clone)]
+pub struct SessionReservation {
+    /// Its ID.
+    pub id: String,
+    /// The revision at which this server became its owner; 0 without a fleet.
+    pub revision: u64,
+    /// Its tape is told what happens to it, if the server keeps tapes.
+    pub recorded: bool,
+}
+
+impl SessionReservation {
+    /// Reserves a session without a fleet.
+    ///
+    /// # Errors
+    /// Refuses if the system has no random numbers.
+    pub fn new() -> Result<Self> {
+        Ok(SessionReservation { id: random_id()?, revision: 0, recorded: true })
+    }
+}
+
+impl Pacer {
+    /// Makes a session for `owner`, unless `stop` is set before it is there.
+    ///
+    /// # Errors
+    /// Refuses a scene that is not valid or whose steps are too heavy, memory and sessions beyond the caller's part, a thread
+    /// that has no time left, and when `stop` is set.
+    pub fn create(
+        &self,
+        scene: &Scene,
+        paused: bool,
+        idle_timeout_s: f64,
+        owner: &Account,
+        stop: &AtomicBool,
+    ) -> Result<Arc<SessionHandle>> {
+        self.create_as(SessionReservation::new()?, scene, (paused, idle_timeout_s), owner, stop)
+    }
+
+    /// Does the same, under a name that was made before.
+    ///
+    /// # Errors
+    /// As for [`Pacer::create`].
+    pub fn create_as(
+        &self,
+        SessionReservation { id, revision, recorded }: SessionReservation,
+        scene: &Scene,
+        (paused, idle_timeout_s): (bool, f64),
+        owner: &Account,
+        stop: &AtomicBool,
+    ) -> Result<Arc<SessionHandle>> {
+        // Before anything is done for it.
+        let slot = owner.take(Resource::Sessions, 1, "")?;
+        let most_hz = self.limits.session_rate_hz;
+        number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
+        check_asked(scene, &self.limits)?;
+        let model = memory::attempt("sheet.points", || self.compile(scene, stop))?;
+        let begin = Begin {
+            id,
+            first: model.clone(),
+            running: !paused,
+            until: None,
+            idle_timeout_s,
+            playback: None,
+            after_run: 0,
+            revision,
+            waiting: Vec::new(),
+            frozen: false,
+            recorded,
+        };
+        self.admit(begin, owner, slot, || Ok(Session::new(&model)), stop)
+    }
+
+    /// Makes a session that continues one that was kept: `session` gives it, whose tissue at its beginning was `begin.first`.
+    ///
+    /// # Errors
+    /// Refuses an ID that is taken, what `session` refuses, and as [`Pacer::create`] does.
+    pub fn resume(
+        &self,
+        begin: Begin,
+        owner: &Account,
+        session: impl FnOnce() -> Result<Session>,
+        stop: &AtomicBool,
+    ) -> Result<Arc<SessionHandle>> {
+        let slot = owner.take(Resource::Sessions, 1, "")?;
+        if lock(&self.sessions).contains_key(&begin.id) {
+            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "is that of a session that is there already"));
+        }
+        self.admit(begin, owner, slot, session, stop)
+    }
+
+    fn admit(
+        &self,
+        begin: Begin,
+        owner: &Account,
+        slot: Taken,
+        session: impl FnOnce() -> Result<Session>,
+        stop: &AtomicBool,
+    ) -> Result<Arc<SessionHandle>> {
+        let Begin {
+            id,
+            first,
+            running,
+            until,
+            idle_timeout_s,
+            playback,
+            after_run,
+            revision,
+            waiting,
+            frozen,
+            recorded,
+        } = begin;
+        let speed = playback.as_ref().map_or(1.0, |playback| playback.speed);
+        check_work(&first, &self.limits)?;
+        let skin = memory::attempt("sheet.points", || Ok(Skin::of(&first)))?;
+        if let Body::Mesh(mesh) = &first.scene.body {
+            // Who touches it first does so in a step, which must not wait for this.
+            mesh.shape.surface();
+        }
+        let bytes = first.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes());
+        let memory = owner.take(Resource::Memory(Purpose::Session), bytes, "sheet.points")?;
+        // Laid out before the lock is taken, on which all calls wait.
+        let session = memory::attempt("sheet.points", session)?;
+        let (model, step) = (session.model().clone(), session.step_count());
+        let running = running && session.hold_reason().is_none();
+        let number = {
+            let mut numbers = lock(&self.numbers);
+            *numbers += 1;
+            *numbers
+        };
+        let begin_ns = beat_ns(now_ns());
+        let status = Status {
+            state: if running { RunState::Running } else { RunState::Paused },
+            step,
+            resting: false,
+            rested_steps: 0,
+            overrun_count: 0,
+            dilation: Dilation::new(begin_ns, step),
+            schedule: Schedule::new(step, begin_ns, speed * first.scene.stepping.rate_hz),
+            late_commands: 0,
+            paused_commands: 0,
+            hold_reason: None,
+            guard_events: 0,
+            recovery_count: 0,
+            recoveries: Vec::new(),
+            awake_points: 0,
+            path_counts: [0; 3],
+            lapsed_leases: 0,
+            model: model.clone(),
+        };
+        let (cost, thread) = self.place(&model, !running, owner)?;
+        let stepper = &self.steppers[thread];
+        let changed_to = (!Arc::ptr_eq(&model, &first)).then(|| model.clone());
+        let mut intake = Intake::new(&first.scene, &self.limits)
+            .of_substeps(first.plan.substeps)
+            .charged_to(owner)
+            .continued(&session, changed_to);
+        if let Some(reason) = session.hold_reason() {
+            drop(intake.close(Refusal::new(Reason::SessionHeld, "", reason)));
+        }
+        if playback.is_some() {
+            let message = "this session plays a recording; to touch the tissue, begin a session at one of its moments (CreateSession)";
+            drop(intake.close(Refusal::new(Reason::NotAvailable, "session_id", message)));
+        }
+        let about = || About {
+            id: id.clone(),
+            owner: owner.name().to_owned(),
+            idle_timeout_s,
+            first: first.clone(),
+            begin_step: step,
+            running,
+            until_step: until,
+            after_run,
+            revision,
+        };
+        // What is played is recorded already.
+        let event_log =
+            self.event_logs.get().filter(|_| recorded && playback.is_none()).map(|queue| EventLog::new(queue, about()));
+        let handle = Arc::new(SessionHandle {
+            id: id.clone(),
+            intake: Mutex::new(intake),
+            owner: owner.clone(),
+            idle_timeout_s,
+            revision: AtomicU64::new(revision),
+            is_coming: AtomicBool::new(frozen),
+            asked_ns: AtomicU64::new(now_ns()),
+            number,
+            limits: self.limits.clone(),
+            status: Mutex::new(status),
+            streams: Mutex::new(StreamSlots::new(&self.limits)),
+            refused: AtomicU64::new(0),
+            laws: KeptLaws::default(),
+            tissue: watch::Sender::new((step, model)),
+            audited: Mutex::new(Audited::default()),
+            model: first,
+            skin,
+            cost,
+            thread: AtomicUsize::new(thread),
+            inbox: stepper.inbox.clone(),
+            event_log,
+            playback,
+            slot: Mutex::new(slot),
+            _memory: memory,
+        });
+        // The first that its journal is told.
+        if !waiting.is_empty() {
+            handle.adopt_waiting(waiting);
+        }
+        let mut running =
+            memory::attempt("sheet.points", || Ok(Box::new(SessionTask::new(handle.clone(), session, running))))?;
+        running.until = until;
+        running.frozen = frozen;
+        running.publish_status();
+        if stop.load(Ordering::Relaxed) {
+            return Err(scheme_selection::given_up());
+        }
+        let mut sessions = lock(&self.sessions);
+        let points: usize = sessions.values().map(|handle| handle.model.len()).sum();
+        if points + handle.model.len() > self.limits.points_in_all {
+            let message = format!("the sessions of the server have {points} points already");
+            return Err(Refusal::new(Reason::TooMany, "sheet.points", message));
+        }
+        sessions.insert(id, handle.clone());
+        // Before anybody can name the session: what is asked of it comes after this.
+        stepper.adopt(number, running);
+        Ok(handle)
+    }
+
+    /// What never changes is one in memory for all sessions of a scene, and compiled once.
+    fn compile(&self, scene: &Scene, stop: &AtomicBool) -> Result<Arc<Model>> {
+        let known = lock(&self.sessions)
+            .values()
+            .find(|handle| handle.model.scene == *scene)
+            .map(|handle| handle.model.clone());
+        known.map_or_else(|| Model::compile_until(scene, &self.limits, stop), Ok)
+    }
+
+    /// The thread with the most time to spare for a further session of `owner`, and what that will take.
+    fn place(&self, model: &Model, paused: bool, owner: &Account) -> Result<(Cost, usize)> {
+        let sessions = lock(&self.sessions);
+        // What steps take that are too long for others tells nothing of a new one.
+        let known = sessions.values().filter(|handle| handle.thread() < self.steppers.len());
+        let cost = Cost::guess(model, known.map(|handle| &handle.cost));
+        let mut taken = vec![(0.0, 0_usize); self.steppers.len()];
+        for handle in sessions.values() {
+            // Those apart take nothing of these.
+            if let Some(taken) = taken.get_mut(handle.thread()) {
+                taken.0 += handle.cost.share();
+                taken.1 += 1;
+            }
+        }
+        let spare =
+            |a: &(usize, &(f64, usize)), b: &(usize, &(f64, usize))| a.1.0.total_cmp(&b.1.0).then(a.1.1.cmp(&b.1.1));
+        let thread = taken.iter().enumerate().min_by(spare).map_or(0, |(thread, _)| thread);
+        if !paused {
+            let beside = self.taken_beside(sessions.values().filter(|handle| handle.thread() == thread), owner);
+            self.check_share(beside, cost.awake_share())?;
+        }
+        Ok((cost, thread))
+    }
+
+    /// Returns another tissue for a session ([`SessionHandle::change`]), unless its steps would make others late.
+    ///
+    /// # Errors
+    /// As for [`SessionHandle::change`]; and refuses if the steps would make other sessions late.
+    pub fn change_tissue(
+        &self,
+        handle: &SessionHandle,
+        change: &Change,
+        at_step: Option<u64>,
+        stop: &AtomicBool,
+    ) -> Result<(u64, Arc<Model>)> {
+        handle.change(change, at_step, |needed| self.check_share(self.taken_by_others(handle), needed), stop)
+    }
+
+    /// Of the thread of a session, what the others that are awake take.
+    fn taken_by_others(&self, handle: &SessionHandle) -> f64 {
+        let thread = handle.thread();
+        // Those apart may be late.
+        if thread == self.steppers.len() {
+            return 0.0;
+        }
+        let others = |other: &&Arc<SessionHandle>| other.thread() == thread && other.number != handle.number;
+        self.taken_beside(lock(&self.sessions).values().filter(others), &handle.owner)
+    }
+
+    /// What these sessions of a thread take from a further one of `owner`. Another caller counts with at most its equal
+    /// part, because the thread gives it no more where `owner` wants its own: what is beyond that makes only the other
+    /// caller's sessions late.
+    fn taken_beside<'a>(&self, sessions: impl Iterator<Item = &'a Arc<SessionHandle>>, owner: &Account) -> f64 {
+        let mut by_owner = BTreeMap::from([(owner.number(), 0.0)]);
+        for handle in sessions {
+            *by_owner.entry(handle.owner.number()).or_default() += handle.cost.share();
+        }
+        fairly_taken(&by_owner, owner.number(), self.limits.thread_share)
+    }
+
+    /// Refuses what would make others late. Whoever is alone on its thread delays nobody, however heavy; and what rests
+    /// takes nothing.
+    fn check_share(&self, taken: f64, needed: f64) -> Result<()> {
+        let most = self.limits.thread_share;
+        if taken == 0.0 || taken + needed <= most {
+            return Ok(());
+        }
+        let message = format!(
+            "the other sessions of the stepping thread take {taken:.3} of it, and this one would take \
+             {needed:.3}: above the {most} that sessions may take (limits.thread_share)"
+        );
+        Err(Refusal::new(Reason::Overloaded, "", message))
+    }
+
+    /// Lets a session's time go on ([`SessionHandle::start`]), unless that would make others late.
+    ///
+    /// # Errors
+    /// As for [`SessionHandle::start`]; and refuses if the steps would make other sessions late.
+    pub async fn start_session(&self, handle: &SessionHandle, until: Option<u64>) -> Result<u64> {
+        if lock(&handle.status).state == RunState::Paused {
+            self.check_share(self.taken_by_others(handle), handle.cost.awake_share())?;
+        }
+        handle.start(until).await
+    }
+}
+
+/// The sum of what callers take of a thread, by their numbers, where each but `owner` counts with at most an equal part of
+/// `most`.
+#[allow(clippy::cast_precision_loss)]
+fn fairly_taken(by_owner: &BTreeMap<u64, f64>, owner: u64, most: f64) -> f64 {
+    let callers = by_owner.iter().filter(|(number, taken)| **number == owner || **taken > 0.0).count();
+    let part = most / callers.max(1) as f64;
+    by_owner.iter().map(|(number, taken)| if *number == owner { *taken } else { taken.min(part) }).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn another_caller_counts_with_its_part_at_most() {
+        let taken = |others: &[f64]| {
+            let mut by_owner = BTreeMap::from([(0, 0.1)]);
+            by_owner.extend((1..).zip(others.iter().copied()));
+            fairly_taken(&by_owner, 0, 0.8)
+        };
+        assert!((taken(&[]) - 0.1).abs() < 1e-12);
+        // Who takes less than its part counts in full, and who rests does not divide the thread.
+        assert!((taken(&[0.3, 0.0]) - 0.4).abs() < 1e-12);
+        assert!((taken(&[0.75, 0.0]) - 0.5).abs() < 1e-12);
+        assert!((taken(&[0.75, 0.1]) - (0.1 + 0.8 / 3.0 + 0.1)).abs() < 1e-12);
+    }
+}

@@ -1,0 +1,52 @@
+//! The clock of stepping: monotonic, from an origin of its own; and how sessions keep time by it.
+
+use std::sync::OnceLock;
+use std::time::{Duration, Instant};
+
+/// Nanoseconds since the first call in this process; never 0.
+#[allow(clippy::disallowed_methods, clippy::cast_possible_truncation)]
+pub fn now_ns() -> u64 {
+    static ORIGIN: OnceLock<Instant> = OnceLock::new();
+    let now = Instant::now();
+    let origin = *ORIGIN.get_or_init(|| now.checked_sub(Duration::from_nanos(1)).unwrap_or(now));
+    now.duration_since(origin).as_nanos() as u64
+}
+
+/// Returns the processor time of the calling thread, ns. Where the system does not tell it, the time that passes.
+#[allow(clippy::cast_sign_loss)]
+pub fn thread_time_ns() -> u64 {
+    #[cfg(target_os = "linux")]
+    {
+        let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
+        time.tv_sec as u64 * 1_000_000_000 + time.tv_nsec as u64
+    }
+    #[cfg(not(target_os = "linux"))]
+    now_ns()
+}
+
+/// Over which time dilation is measured.
+const DILATION_WINDOW_NS: u64 = 1_000_000_000;
+
+/// Simulated over real time, of the last second or so.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Dilation {
+    /// 1 when on time.
+    pub value: f64,
+    /// When the window of the next measurement began, and steps done then.
+    since: (u64, u64),
+}
+
+impl Dilation {
+    pub(super) fn new(now_ns: u64, step: u64) -> Self {
+        Dilation { value: 1.0, since: (now_ns, step) }
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn observe(&mut self, now_ns: u64, step: u64, period_ns: f64) {
+        let elapsed_ns = now_ns.saturating_sub(self.since.0);
+        if elapsed_ns >= DILATION_WINDOW_NS {
+            self.value = step.saturating_sub(self.since.1) as f64 * period_ns / elapsed_ns as f64;
+            self.since = (now_ns, step);
+        }
+    }
+}

@@ -1,0 +1,22 @@
+//! Random identifiers: they can't be guessed.
+
+use palpate_refusal::{Reason, Refusal, Result};
+
+/// Returns 128 random bits, in hexadecimal.
+///
+/// # Errors
+/// Refuses if the system has no random numbers.
+pub fn random_id() -> Result<String> {
+    Ok(format!("{:032x}", random_bits()?))
+}
+
+/// Returns 128 random bits.
+///
+/// # Errors
+/// Refuses if the system has no random numbers.
+pub fn random_bits() -> Result<u128> {
+    let mut bytes = [0; 16];
+    getrandom::fill(&mut bytes)
+        .map_err(|e| Refusal::new(Reason::TooMany, "", format!("the system has no random numbers: {e}")))?;
+    Ok(u128::from_le_bytes(bytes))
+}

@@ -1,0 +1,136 @@
+//! A stepping thread's queue of requests; the thread sleeps here until one comes or a step is due.
+
+use std::collections::VecDeque;
+use std::sync::mpsc::SyncSender;
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::time::Duration;
+
+use tokio::sync::oneshot;
+
+use super::clock::now_ns;
+use super::frames::Viewer;
+use super::paced::Present;
+use super::reading::HashReply;
+use super::subscribers::{ProbeTap, SampleTap};
+use super::thread_counters::ThreadCounters;
+use palpate_refusal::{Refusal, Result};
+use palpate_session::budget::Account;
+use palpate_tissue::audit::{Mark, WindowInputs};
+use palpate_tissue::lock::lock;
+
+/// Why a session leaves its server.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Leaving {
+    /// It is deleted.
+    Deleted,
+    /// Another server has it.
+    Moved,
+    /// It was being handed to this server, and does not come.
+    Withdrawn,
+}
+
+/// What a stepping thread is asked for.
+pub(super) enum Request {
+    /// New sessions wait for the thread.
+    Adopt,
+    Start {
+        until: Option<u64>,
+        reply: oneshot::Sender<Result<u64>>,
+    },
+    Revive {
+        reply: oneshot::Sender<Result<u64>>,
+    },
+    Pause {
+        reply: oneshot::Sender<Result<()>>,
+    },
+    /// Something came to a session at rest.
+    Wake,
+    Samples(SampleTap),
+    Probe(ProbeTap),
+    View(Arc<Viewer>),
+    /// A copy of the session as it is.
+    Save(oneshot::Sender<Result<Present>>),
+    /// The same, and then no step until [`Request::Thaw`].
+    Freeze(oneshot::Sender<Result<Present>>),
+    Thaw,
+    /// Every stream ends; the session stays.
+    Silence(Refusal),
+    /// To have a window of steps audited.
+    Audit(WindowInputs, SyncSender<Mark>),
+    Hash {
+        at: Option<u64>,
+        /// Who pays for it.
+        account: Account,
+        reply: HashReply,
+    },
+    /// The session leaves this server: it is deleted, or has another owner.
+    Leave(Refusal, Leaving),
+    /// It goes over to the thread that gives way.
+    #[cfg(test)]
+    GoApart,
+    /// A fault of the program, to see what comes of it.
+    #[cfg(test)]
+    Panic,
+}
+
+/// Where a stepping thread is asked.
+#[derive(Default)]
+pub(super) struct Inbox {
+    state: Mutex<InboxState>,
+    wake: Condvar,
+    /// Written by the thread that reads here.
+    pub(super) tally: ThreadCounters,
+}
+
+#[derive(Default)]
+struct InboxState {
+    requests: Vec<(u64, Request)>,
+    stop: Option<Refusal>,
+}
+
+impl Inbox {
+    pub(super) fn send(&self, session: u64, request: Request) {
+        let mut state = lock(&self.state);
+        if state.stop.is_none() {
+            state.requests.push((session, request));
+        }
+        drop(state);
+        self.wake.notify_one();
+    }
+
+    pub(super) fn stop(&self, why: Refusal) {
+        let mut state = lock(&self.state);
+        state.stop = Some(why);
+        state.requests.clear();
+        drop(state);
+        self.wake.notify_one();
+    }
+
+    /// Waits until `deadline_ns` or until something is asked, which is added to `requests`. Tells why to stop, if so.
+    pub(super) fn wait(
+        &self,
+        deadline_ns: Option<u64>,
+        mut now: u64,
+        requests: &mut VecDeque<(u64, Request)>,
+    ) -> Option<Refusal> {
+        let mut state = lock(&self.state);
+        loop {
+            requests.extend(state.requests.drain(..));
+            if !requests.is_empty() || state.stop.is_some() {
+                return state.stop.clone();
+            }
+            state = match deadline_ns {
+                None => self.wake.wait(state).unwrap_or_else(PoisonError::into_inner),
+                Some(deadline_ns) => {
+                    let rest_ns = deadline_ns.saturating_sub(now);
+                    if rest_ns == 0 {
+                        return None;
+                    }
+                    let waited = self.wake.wait_timeout(state, Duration::from_nanos(rest_ns));
+                    now = now_ns();
+                    waited.unwrap_or_else(PoisonError::into_inner).0
+                }
+            };
+        }
+    }
+}

@@ -1,0 +1,278 @@
+//! All sessions of a server, and the threads that step them.
+
+use std::collections::BTreeMap;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex, OnceLock, Weak};
+use std::thread::JoinHandle;
+
+use super::audited::AuditTally;
+use super::auditor::{Auditor, Sessions};
+use super::clock::now_ns;
+use super::event_log::TapeQueue;
+use super::fence::Fence;
+use super::frames::{Encoder, Viewer};
+use super::inbox::{Leaving, Request};
+use super::reading::{Piece, Reading};
+use super::session_handle::{SessionHandle, deleted};
+use super::thread::{self, Apart, Stepper};
+use super::thread_counters::ThreadCounters;
+use crate::priority::{self, STEPPING_TURN, give_way, give_way_a_little, take_short_turns};
+use palpate_refusal::{Reason, Refusal, Result, excerpt};
+use palpate_session::budget::Budget;
+use palpate_session::local::StiffnessJob;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::lock::lock;
+
+/// Stiffnesses that wait to be computed, of all tools of a server.
+const WAITING_REFINEMENTS: usize = 8;
+
+/// All sessions of a server, and the threads that step them.
+pub struct Pacer {
+    pub(super) limits: Limits,
+    /// What callers share.
+    pub budget: Arc<Budget>,
+    /// One for each stepping thread: where it is asked, and where new sessions wait for it.
+    pub(super) steppers: Vec<Arc<Stepper>>,
+    /// The one that gives way to them, for sessions whose steps take too long.
+    apart: Arc<Stepper>,
+    encoder: Arc<Encoder>,
+    reading: Arc<Reading>,
+    threads: Mutex<Vec<JoinHandle<()>>>,
+    pub(super) sessions: Sessions,
+    auditor: Arc<Auditor>,
+    viewers: Mutex<BTreeMap<String, Weak<Viewer>>>,
+    pub(super) numbers: Mutex<u64>,
+    pub(super) event_logs: OnceLock<Arc<TapeQueue>>,
+    /// Until when the server may step and speak for its sessions.
+    pub fence: Arc<Fence>,
+}
+
+impl Pacer {
+    /// Starts `threads` stepping threads (named `step-0` and so on), and one thread each that steps the sessions whose steps take
+    /// too long for others (`step-apart`), computes the stiffness under tools (`stiffness`), encodes frames (`frames`), reads
+    /// large sheets (`records`), and measures errors with `audit_share` of a core (`audit`; none if that is 0).
+    ///
+    /// # Errors
+    /// Returns an error if a thread can't be started.
+    pub fn start(threads: usize, audit_share: f64, limits: &Limits, budget: Arc<Budget>) -> std::io::Result<Arc<Self>> {
+        let (encoder, reading) = (Arc::new(Encoder::default()), Arc::new(Reading::default()));
+        let (mut handles, fence) = (Vec::new(), Arc::new(Fence::default()));
+        let (mut steppers, apart) = (Vec::new(), Arc::new(Stepper::default()));
+        // It ends when the stepping threads have ended, and nobody sends any more.
+        let (refiner, refinements) = std::sync::mpsc::sync_channel::<StiffnessJob>(WAITING_REFINEMENTS);
+        let worker = move || {
+            give_way();
+            refinements.into_iter().for_each(StiffnessJob::work);
+        };
+        handles.push(priority::thread("stiffness").spawn(worker)?);
+        let threads = threads.max(1);
+        // The one without another to which its sessions may go gives way.
+        let spawn = |name: String, stepper: Arc<Stepper>, apart: Option<Apart>| {
+            let (encoder, refiner, reading, fence) = (encoder.clone(), refiner.clone(), reading.clone(), fence.clone());
+            priority::thread(name).spawn(move || {
+                if apart.is_some() {
+                    take_short_turns(STEPPING_TURN);
+                } else {
+                    give_way();
+                }
+                thread::work(&stepper, apart.as_ref(), &fence, &encoder, &refiner, &reading);
+            })
+        };
+        for index in 0..threads {
+            let stepper = Arc::new(Stepper::default());
+            steppers.push(stepper.clone());
+            let apart = Apart { stepper: apart.clone(), index: threads };
+            handles.push(spawn(format!("step-{index}"), stepper, Some(apart))?);
+        }
+        handles.push(spawn("step-apart".to_owned(), apart.clone(), None)?);
+        let (frames, shared) = (encoder.clone(), budget.clone());
+        // A late frame is seen, a late step is felt.
+        let worker = move || {
+            give_way_a_little();
+            frames.work(&shared);
+        };
+        handles.push(priority::thread("frames").spawn(worker)?);
+        let reader = reading.clone();
+        let worker = move || {
+            give_way();
+            reader.work();
+        };
+        handles.push(priority::thread("records").spawn(worker)?);
+        let (auditor, sessions) = (Arc::new(Auditor::default()), Sessions::default());
+        if audit_share > 0.0 {
+            let (auditor, sessions) = (auditor.clone(), sessions.clone());
+            let worker = move || {
+                give_way();
+                auditor.work(&sessions, audit_share);
+            };
+            handles.push(priority::thread("audit").spawn(worker)?);
+        }
+        Ok(Arc::new(Pacer {
+            limits: limits.clone(),
+            budget,
+            steppers,
+            apart,
+            encoder,
+            reading,
+            threads: Mutex::new(handles),
+            sessions,
+            auditor,
+            viewers: Mutex::new(BTreeMap::new()),
+            numbers: Mutex::new(0),
+            event_logs: OnceLock::new(),
+            fence,
+        }))
+    }
+
+    /// Has new sessions tell a tape what happens to them. Who calls this takes it off.
+    pub fn keep_tapes(&self) -> Arc<TapeQueue> {
+        self.event_logs.get_or_init(Arc::default).clone()
+    }
+
+    /// Returns whether there is a session of that ID, served or not.
+    pub fn has(&self, id: &str) -> bool {
+        lock(&self.sessions).contains_key(id)
+    }
+
+    /// Returns the session of that id.
+    ///
+    /// # Errors
+    /// Refuses an unknown ID, and all while the server may not speak for its sessions.
+    pub fn get(&self, id: &str) -> Result<Arc<SessionHandle>> {
+        let handle = lock(&self.sessions).get(id).cloned();
+        let handle = handle.filter(|handle| !handle.is_coming()).ok_or_else(|| unknown_session(id))?;
+        if !self.fence.may_act() {
+            return Err(fenced());
+        }
+        handle.asked_ns.store(now_ns(), Ordering::Relaxed);
+        Ok(handle)
+    }
+
+    /// Returns whether a session is there, and this run of its journal is being written.
+    pub fn is_recording(&self, id: &str, run: u32) -> bool {
+        let sessions = lock(&self.sessions);
+        let event_log = sessions.get(id).and_then(|handle| handle.event_log.as_ref());
+        event_log.is_some_and(|event_log| event_log.progress().borrow().run == run)
+    }
+
+    /// Returns all sessions, oldest first.
+    pub fn list(&self) -> Vec<Arc<SessionHandle>> {
+        let mut all: Vec<_> = lock(&self.sessions).values().cloned().collect();
+        all.sort_by_key(|handle| handle.number);
+        all
+    }
+
+    /// Returns what each stepping thread counts of itself.
+    pub fn tallies(&self) -> impl Iterator<Item = &ThreadCounters> {
+        self.steppers.iter().chain([&self.apart]).map(|stepper| &stepper.inbox.tally)
+    }
+
+    /// Returns what the auditor counts.
+    pub fn audit_tally(&self) -> &AuditTally {
+        &self.auditor.tally
+    }
+
+    /// Returns those who look at some session.
+    pub fn viewers(&self) -> usize {
+        lock(&self.viewers).values().filter(|viewer| viewer.strong_count() > 0).count()
+    }
+
+    /// Ends a session and all its streams.
+    ///
+    /// # Errors
+    /// Refuses an unknown ID.
+    pub fn delete(&self, id: &str) -> Result<()> {
+        self.part_with(id, deleted(), Leaving::Deleted)
+    }
+
+    /// Gives up a session that has another owner: ends all its streams here with `why`. Its journal says so.
+    ///
+    /// # Errors
+    /// Refuses an unknown ID.
+    pub fn leave(&self, id: &str, why: Refusal) -> Result<()> {
+        self.part_with(id, why, Leaving::Moved)
+    }
+
+    /// Returns a session that was being handed to this server does not come. Nothing of it is kept.
+    ///
+    /// # Errors
+    /// Refuses an unknown ID.
+    pub fn withdraw(&self, id: &str, why: Refusal) -> Result<()> {
+        self.part_with(id, why, Leaving::Withdrawn)
+    }
+
+    fn part_with(&self, id: &str, why: Refusal, leaving: Leaving) -> Result<()> {
+        let handle = lock(&self.sessions).remove(id).ok_or_else(|| unknown_session(id))?;
+        lock(&handle.slot).shrink_to(0);
+        let waited = lock(&handle.intake).close(why.clone());
+        if !waited.is_empty() {
+            // To free many takes longer than other calls may wait.
+            self.reading.post(&handle.owner, Piece::Remains(Box::new(waited)));
+        }
+        handle.inbox.send(handle.number, Request::Leave(why, leaving));
+        Ok(())
+    }
+
+    /// Ends what the server may not do any more. It may not speak for its sessions any more: ends all streams, and lets all tools go at the next step.
+    pub fn fall_silent(&self) {
+        for handle in self.list() {
+            handle.at_intake(|intake, _| intake.free(|_, _| true));
+            handle.inbox.send(handle.number, Request::Silence(fenced()));
+        }
+    }
+
+    /// Deletes the sessions that nobody uses any more; tells which.
+    pub fn delete_idle(&self) -> Vec<String> {
+        let now = now_ns();
+        let all: Vec<_> = lock(&self.sessions).values().cloned().collect();
+        let ids: Vec<String> =
+            all.iter().filter(|handle| handle.is_idle(now)).map(|handle| handle.id.clone()).collect();
+        ids.into_iter().filter(|id| self.delete(id).is_ok()).collect()
+    }
+
+    /// Adds a viewer to a session.
+    pub fn add_viewer(&self, handle: &SessionHandle, viewer: &Arc<Viewer>) {
+        let mut viewers = lock(&self.viewers);
+        viewers.retain(|_, viewer| viewer.strong_count() > 0);
+        viewers.insert(viewer.id.clone(), Arc::downgrade(viewer));
+        drop(viewers);
+        handle.view(viewer.clone());
+    }
+
+    /// Returns the viewer of that id.
+    ///
+    /// # Errors
+    /// Refuses an unknown ID.
+    pub fn viewer(&self, id: &str) -> Result<Arc<Viewer>> {
+        lock(&self.viewers).get(id).and_then(Weak::upgrade).ok_or_else(|| {
+            Refusal::new(Reason::UnknownViewer, "viewer_id", format!("there is no viewer `{}`", excerpt(id)))
+        })
+    }
+
+    /// Ends all sessions and threads.
+    pub fn stop(&self) {
+        let why = Refusal::new(Reason::ShuttingDown, "", "the server is going down");
+        for handle in lock(&self.sessions).values() {
+            drop(lock(&handle.intake).close(why.clone()));
+        }
+        self.steppers.iter().chain([&self.apart]).for_each(|stepper| stepper.inbox.stop(why.clone()));
+        self.encoder.stop();
+        self.reading.stop();
+        self.auditor.stop();
+        for thread in lock(&self.threads).drain(..) {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Returns the refusal of what a server is asked that may not speak for its sessions.
+pub fn fenced() -> Refusal {
+    let message = "the server has not heard from etcd for so long that another server may have this session; it goes on here, or \
+                   there, when they have";
+    Refusal::new(Reason::Fenced, "", message)
+}
+
+fn unknown_session(id: &str) -> Refusal {
+    let message = format!("there is no session `{}`", excerpt(id));
+    Refusal::new(Reason::UnknownSession, "session_id", message)
+}

@@ -1,0 +1,207 @@
+//! A bounded queue from a stepping thread to one reader. When it is full the oldest makes room: the writer never
+//! waits, and the reader gets what is new.
+
+use std::collections::VecDeque;
+use std::future::poll_fn;
+use std::sync::{Arc, Mutex};
+use std::task::{Context, Poll, Waker};
+
+use palpate_refusal::{Reason, Refusal};
+use palpate_tissue::lock::lock;
+
+#[derive(Debug)]
+struct QueueState<T> {
+    items: VecDeque<T>,
+    capacity: usize,
+    dropped: u64,
+    end: Option<Refusal>,
+    abandoned: bool,
+    /// Of the reader, if it waits.
+    waiting: Option<Waker>,
+}
+
+/// The end that a stepping thread writes to.
+#[derive(Debug)]
+pub struct Writer<T>(Arc<Mutex<QueueState<T>>>);
+
+/// The end that a stream reads from. Dropping it tells the writer to stop.
+#[derive(Debug)]
+pub struct Reader<T>(Arc<Mutex<QueueState<T>>>);
+
+/// Readers that are to be woken, together: to wake one may cost more than the step whose sample it gets.
+#[derive(Debug, Default)]
+pub struct Wakes(Vec<Waker>);
+
+impl Wakes {
+    /// Returns how many are to be woken.
+    pub fn len(&self) -> usize {
+        self.0.len()
+    }
+
+    /// Returns whether nobody is to be woken.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Wakes them.
+    pub fn wake(&mut self) {
+        self.0.drain(..).for_each(Waker::wake);
+    }
+}
+
+/// Returns a queue of `capacity` items.
+pub fn queue<T>(capacity: usize) -> (Writer<T>, Reader<T>) {
+    let inner = QueueState {
+        // Grows if it must: a reader that keeps up needs room for one.
+        items: VecDeque::new(),
+        capacity: capacity.max(1),
+        dropped: 0,
+        end: None,
+        abandoned: false,
+        waiting: None,
+    };
+    let shared = Arc::new(Mutex::new(inner));
+    (Writer(shared.clone()), Reader(shared))
+}
+
+impl<T> Writer<T> {
+    /// Adds an item; drops the oldest if there is no room.
+    pub fn push(&self, item: T) {
+        if let Some(waker) = self.place(item) {
+            waker.wake();
+        }
+    }
+
+    /// Does the same, but leaves it to the caller to wake the reader.
+    pub fn push_quietly(&self, item: T, wakes: &mut Wakes) {
+        wakes.0.extend(self.place(item));
+    }
+
+    fn place(&self, item: T) -> Option<Waker> {
+        let mut inner = lock(&self.0);
+        if inner.end.is_some() || inner.abandoned {
+            return None;
+        }
+        if inner.items.len() == inner.capacity {
+            inner.items.pop_front();
+            inner.dropped += 1;
+        }
+        inner.items.push_back(item);
+        inner.waiting.take()
+    }
+
+    /// Notes that one item could not be had: it counts as dropped.
+    pub fn skip(&self) {
+        lock(&self.0).dropped += 1;
+    }
+
+    /// Takes back the newest item, if it has not been read.
+    pub fn withdraw(&self) -> Option<T> {
+        lock(&self.0).items.pop_back()
+    }
+
+    /// Returns whether one more item would cost the oldest.
+    pub fn is_full(&self) -> bool {
+        let inner = lock(&self.0);
+        inner.items.len() == inner.capacity
+    }
+
+    /// Closes the queue; the reader is told why when it has read the rest.
+    pub fn close(&self, why: Refusal) {
+        let mut inner = lock(&self.0);
+        inner.end.get_or_insert(why);
+        let waiting = inner.waiting.take();
+        drop(inner);
+        if let Some(waker) = waiting {
+            waker.wake();
+        }
+    }
+
+    /// Returns whether the reader has gone.
+    pub fn is_abandoned(&self) -> bool {
+        lock(&self.0).abandoned
+    }
+}
+
+impl<T> Drop for Writer<T> {
+    fn drop(&mut self) {
+        self.close(Refusal::new(Reason::SessionDeleted, "session_id", "the session has ended"));
+    }
+}
+
+impl<T> Reader<T> {
+    /// Returns the oldest item, and how many were dropped so far; the reason when there are no more.
+    ///
+    /// # Errors
+    /// Returns the reason when no more items will come.
+    pub async fn pop(&mut self) -> Result<(T, u64), Refusal> {
+        poll_fn(|context| self.poll_pop(context)).await
+    }
+
+    /// Does the same, if there is one or no more will come; else the task is woken when that is so.
+    pub fn poll_pop(&mut self, context: &mut Context<'_>) -> Poll<Result<(T, u64), Refusal>> {
+        let mut inner = lock(&self.0);
+        if let Some(item) = inner.items.pop_front() {
+            return Poll::Ready(Ok((item, inner.dropped)));
+        }
+        if let Some(why) = &inner.end {
+            return Poll::Ready(Err(why.clone()));
+        }
+        if !inner.waiting.as_ref().is_some_and(|waker| waker.will_wake(context.waker())) {
+            inner.waiting = Some(context.waker().clone());
+        }
+        Poll::Pending
+    }
+}
+
+impl<T> Drop for Reader<T> {
+    fn drop(&mut self) {
+        let mut inner = lock(&self.0);
+        inner.abandoned = true;
+        inner.items.clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_full_queue_keeps_the_newest_and_counts_the_rest() {
+        let (writer, mut reader) = queue(3);
+        for item in 0..10 {
+            writer.push(item);
+        }
+        writer.close(Refusal::new(Reason::SessionDeleted, "", "over"));
+        writer.push(10);
+        for item in 7..10 {
+            assert_eq!(reader.pop().await, Ok((item, 7)));
+        }
+        assert_eq!(reader.pop().await.unwrap_err().reason, Reason::SessionDeleted);
+    }
+
+    #[tokio::test]
+    async fn what_is_not_read_can_be_taken_back() {
+        let (writer, mut reader) = queue(1);
+        assert_eq!(writer.withdraw(), None);
+        writer.push(1);
+        assert!(writer.is_full());
+        assert_eq!(writer.withdraw(), Some(1));
+        assert!(!writer.is_full());
+        writer.push(2);
+        assert_eq!(reader.pop().await, Ok((2, 0)));
+    }
+
+    #[tokio::test]
+    async fn a_reader_that_waits_is_woken_and_one_that_left_is_noticed() {
+        let (writer, mut reader) = queue(1);
+        let thread = std::thread::spawn(move || {
+            writer.push(5);
+            writer
+        });
+        assert_eq!(reader.pop().await, Ok((5, 0)));
+        let writer = thread.join().unwrap();
+        drop(reader);
+        assert!(writer.is_abandoned());
+    }
+}

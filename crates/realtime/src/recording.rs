@@ -1,0 +1,96 @@
+//! What a session tells its tape, from its stepping thread.
+
+use std::sync::Arc;
+
+use super::event_log::{Beginning, Event};
+use super::recorder::Recorder;
+use super::session_task::SessionTask;
+use palpate_session::input::Input;
+use palpate_tissue::Model;
+use palpate_tissue::lock::lock;
+
+impl SessionTask {
+    /// Tells what happens now.
+    pub(super) fn note(&self, event: Event) {
+        if let Some(recorder) = &self.recorder {
+            recorder.event_log.note(self.session.step_count(), event);
+        }
+    }
+
+    /// Tells what acts on the session now.
+    pub(super) fn note_input(&self, input: Input) {
+        self.note(Event::Input(input));
+    }
+
+    /// Tells what acts in the coming step.
+    pub(super) fn note_inputs(&self, change: Option<&Arc<Model>>) {
+        let Some(recorder) = &self.recorder else { return };
+        let step = self.session.step_count();
+        if let Some(model) = change {
+            recorder.event_log.note(step, Event::Input(Input::Tissue(model.clone())));
+        }
+        for due in &self.due {
+            recorder.event_log.note(step, Event::Input(Input::Command(due.clone())));
+        }
+    }
+
+    /// Begins the journal anew, if it is broken and there is room again.
+    fn begin_anew(&mut self) {
+        let Some(recorder) = &mut self.recorder else { return };
+        let (session, running, until_step) = (&self.session, self.running, self.until);
+        let step = session.step_count();
+        if recorder.event_log.begins_anew(|| Beginning { step, running, until_step }) {
+            *recorder = Recorder::new(&recorder.event_log, session);
+            self.handle.note_waiting(&lock(&self.handle.intake));
+        }
+    }
+
+    /// Tells how the tissue is after a step.
+    pub(super) fn note_state(&mut self) {
+        self.begin_anew();
+        let Some(recorder) = &mut self.recorder else { return };
+        let (session, event_log) = (&self.session, &recorder.event_log);
+        let step = session.step_count();
+        if session.hold_reason().is_some() {
+            // The guard has held it, as it does wherever the same inputs act.
+            return event_log.is_told_until(step, true);
+        }
+        let is_at_rest = session.rests_until().is_some();
+        let comes_to_rest = is_at_rest && !std::mem::replace(&mut recorder.was_at_rest, is_at_rest);
+        if recorder.cadence.wants_felt(step) {
+            let felt = session.felt();
+            if !felt.is_empty() {
+                event_log.note(step, Event::Felt(felt));
+            }
+        }
+        if recorder.cadence.wants_hash(step) {
+            event_log.note(step, Event::Hash(session.copy()));
+        }
+        if recorder.cadence.wants_snapshot(step, comes_to_rest) {
+            recorder.snapshot(session);
+        }
+        recorder.event_log.is_told_until(step, is_at_rest);
+    }
+
+    /// Tells that steps were passed over at rest.
+    pub(super) fn note_rest(&mut self) {
+        self.begin_anew();
+        if let Some(recorder) = &self.recorder {
+            recorder.event_log.is_told_until(self.session.step_count(), true);
+        }
+    }
+
+    /// Time stands: what is told so far goes to the disk.
+    pub(super) fn note_standstill(&self) {
+        if let Some(recorder) = &self.recorder {
+            recorder.event_log.hurry();
+        }
+    }
+
+    /// The server ends: its successor continues from the state as it is now.
+    pub(super) fn note_the_end(&mut self) {
+        let Some(recorder) = &self.recorder else { return };
+        recorder.snapshot(&self.session);
+        recorder.event_log.is_told_until(self.session.step_count(), true);
+    }
+}

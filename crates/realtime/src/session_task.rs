@@ -1,0 +1,548 @@
+//! A session on its stepping thread: its schedule, the requests to it, and its steps.
+//!
+//! Rest: while all of a tissue is asleep and no command waits, its steps change nothing but their number. Then only the
+//! steps are done that somebody is to be told of (a heartbeat, a record, a hash); those between are skipped, all at once,
+//! when the next is due. A session of which nobody waits for a step is not in the thread's rota at all, and a thread
+//! whose rota is empty sleeps until it is asked something. What comes in meanwhile is placed where it would be had the
+//! session been stepped ([`Intake::rest`](palpate_session::intake::Intake::rest)), and wakes the thread.
+
+use std::collections::VecDeque;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+use std::sync::mpsc::SyncSender;
+
+use super::clock::{Dilation, now_ns};
+use super::event_log::Event;
+use super::fence::Fence;
+use super::frames::Encoder;
+use super::inbox::{Inbox, Leaving, Request};
+use super::paced::Present;
+use super::playback::Next;
+use super::policy::{Backlog, Longest, StepWatch, Turn};
+use super::queue::Wakes;
+use super::reading::{Copies, Hashed, Reading};
+use super::recorder::Recorder;
+use super::session_handle::SessionHandle;
+use super::subscribers::{Subscribers, ViewTap};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::Session;
+use palpate_session::command::Due;
+use palpate_session::input::Input;
+use palpate_session::local::StiffnessJob;
+use palpate_session::schedule::Schedule;
+use palpate_tissue::Model;
+use palpate_tissue::audit::Mark;
+use palpate_tissue::lock::lock;
+use palpate_tissue::memory;
+
+/// Sessions begin on the same beat, whose length this is, ns: a thread wakes once for all of a rate, and so does who
+/// carries what they tell.
+const BEAT_NS: u64 = 1_000_000;
+
+/// Every so many steps of a session one is a span of the log, at level debug.
+const STEPS_PER_SPAN: u64 = 1024;
+
+/// What the guard repeats for one step may take many times as long as the step. After so long, ns, others of the thread have their turn.
+const MAX_REPETITION_NS: u64 = if cfg!(test) { 0 } else { 500_000 };
+
+/// How often the stiffness under tools is computed anew, Hz.
+const REFINED_HZ: f64 = 50.0;
+
+/// A session that plays waits so long for what has not been read, s.
+const RECORD_WAIT_S: f64 = 0.01;
+
+/// A session and its schedule.
+pub(super) struct SessionTask {
+    pub(super) handle: Arc<SessionHandle>,
+    pub(super) session: Session,
+    pub(super) running: bool,
+    pub(super) until: Option<u64>,
+    pub(super) schedule: Schedule,
+    /// The step to do next. At rest, those before it are skipped; `u64::MAX` if there is none.
+    pub(super) next_step: u64,
+    /// When the newest step was due, before the backlog was dropped.
+    pub(super) due_ns: u64,
+    /// It was late, and takes more than its part: it goes after those that were due by then.
+    not_before_ns: u64,
+    backlog: Backlog,
+    /// Steps done when all was asleep first, if it still is.
+    pub(super) still_since: Option<u64>,
+    pub(super) rested_steps: u64,
+    pub(super) overrun_count: u64,
+    pub(super) lapsed_leases: u64,
+    pub(super) dilation: Dilation,
+    pub(super) due: Vec<Due>,
+    pub(super) hashed: Hashed,
+    pub(super) copies: Copies,
+    pub(super) subscribers: Subscribers,
+    /// Who is to be told of the window that the session was asked for.
+    pub(super) audit: Option<SyncSender<Mark>>,
+    /// Tells the journal, if there is one.
+    pub(super) recorder: Option<Recorder>,
+    /// It is handed over: no step, until that has failed.
+    pub(super) frozen: bool,
+    pub(super) watch: StepWatch,
+    /// The inbox of the thread that has it, which counts what it does.
+    pub(super) inbox: Arc<Inbox>,
+    /// It goes over to another thread.
+    pub(super) goes_apart: bool,
+    left: bool,
+    /// What it is asked while a step is not done: each caller waits for an answer.
+    waiting: VecDeque<Request>,
+}
+
+/// What all sessions of a thread use.
+pub(super) struct ThreadContext<'t> {
+    pub(super) fence: &'t Fence,
+    pub(super) encoder: &'t Encoder,
+    pub(super) refiner: &'t SyncSender<StiffnessJob>,
+    pub(super) reading: &'t Reading,
+    pub(super) wakes: Wakes,
+    pub(super) longest: Longest,
+}
+
+/// The beat at `now_ns`, or the next.
+pub(super) fn beat_ns(now_ns: u64) -> u64 {
+    now_ns.next_multiple_of(BEAT_NS)
+}
+
+impl SessionTask {
+    pub(super) fn new(handle: Arc<SessionHandle>, session: Session, running: bool) -> Self {
+        let (schedule, dilation) = {
+            let status = lock(&handle.status);
+            (status.schedule, status.dilation)
+        };
+        SessionTask {
+            recorder: handle.event_log.as_ref().map(|event_log| Recorder::new(event_log, &session)),
+            running,
+            until: None,
+            schedule,
+            next_step: session.step_count(),
+            due_ns: 0,
+            not_before_ns: 0,
+            backlog: Backlog::default(),
+            still_since: session.rests_until().map(|_| session.step_count()),
+            session,
+            rested_steps: 0,
+            overrun_count: 0,
+            lapsed_leases: 0,
+            dilation,
+            due: Vec::new(),
+            hashed: Hashed::default(),
+            copies: Copies::default(),
+            subscribers: Subscribers::default(),
+            audit: None,
+            frozen: false,
+            watch: StepWatch::default(),
+            inbox: handle.inbox.clone(),
+            goes_apart: false,
+            left: false,
+            waiting: VecDeque::new(),
+            handle,
+        }
+    }
+
+    /// When its next step is due, if time goes on and one is wanted.
+    pub(super) fn due_ns(&self) -> Option<u64> {
+        let due_ns = (self.running && !self.frozen && !self.goes_apart && self.next_step < u64::MAX)
+            .then(|| self.schedule.due_ns(self.next_step))?;
+        Some(due_ns.max(self.not_before_ns))
+    }
+
+    /// Finds its place among the sessions of the thread, after a step, if one of `parts` of its time is its own.
+    pub(super) fn queue_again(&mut self, begun_ns: u64, now_ns: u64, parts: usize, is_alone: bool) {
+        if self.still_since.is_none() {
+            self.handle.cost.observe(now_ns.saturating_sub(begun_ns));
+        }
+        let (due_ns, period_ns) = (self.schedule.due_ns(self.next_step), self.schedule.period_ns());
+        let turn = Turn { due_ns, period_ns, share: self.handle.cost.awake_share(), parts, is_alone };
+        self.not_before_ns = turn.not_before_ns(now_ns);
+    }
+
+    /// How late its next step is at `now_ns`.
+    pub(super) fn late_ns(&self, now_ns: u64) -> u64 {
+        now_ns.saturating_sub(self.schedule.due_ns(self.next_step))
+    }
+
+    /// The number of the account of its owner.
+    pub(super) fn owner(&self) -> u64 {
+        self.handle.owner.number()
+    }
+
+    /// Whether it is to leave the thread: it has left the server, or goes over to another thread.
+    pub(super) fn has_left(&self) -> bool {
+        self.left || self.goes_apart
+    }
+
+    /// Does something with it. A panic ends this session, and no other; so does memory that can't be had.
+    pub(super) fn guarded(&mut self, act: impl FnOnce(&mut Self)) {
+        let Err(panic) = catch_unwind(AssertUnwindSafe(|| act(self))) else { return };
+        let step = self.session.step_count();
+        let reason = if let Some(refusal) = memory::refusal_of(&*panic) {
+            format!("after step {step} {}", refusal.message)
+        } else {
+            let text = panic.downcast_ref::<String>().map(String::as_str);
+            let text = text.or_else(|| panic.downcast_ref::<&str>().copied()).unwrap_or("without a message");
+            format!("a fault of the program ended it after step {step}: {text}")
+        };
+        tracing::error!(session = %self.handle.id, reason, "session held");
+        self.session.hold(reason.clone());
+        self.note_input(Input::Hold(reason.clone()));
+        self.end(&Refusal::new(Reason::SessionHeld, "", reason));
+        self.handle.cost.set_awake(false);
+        self.publish_status();
+    }
+
+    /// Decides which step comes next: the very next one, or at rest the next one that somebody waits for.
+    pub(super) fn plan(&mut self) {
+        if self.session.is_within_step() {
+            return;
+        }
+        let step = self.session.step_count();
+        let wanted = || {
+            let wanted = self.subscribers.next_wanted(step, self.still_since, self.handle.model.scene.stepping.rate_hz);
+            self.until.map_or(wanted, |until| wanted.min(until - 1))
+        };
+        let rests_until = self.session.rests_until().filter(|_| self.running);
+        let played = || self.handle.playback.as_ref().map_or(u64::MAX, |playback| playback.feed.next_step().max(step));
+        let until = rests_until.map_or(step, |until| until.min(wanted()).min(played()));
+        {
+            let mut intake = lock(&self.handle.intake);
+            self.next_step = intake.rest(step, until, &self.schedule);
+            self.lapsed_leases = intake.lapsed();
+        }
+        self.handle.cost.set_awake(self.running && self.next_step == step);
+    }
+
+    /// At rest, time has gone on without a step: brings the session to where it stands now.
+    fn catch_up(&mut self, fence: &Fence) {
+        // Something may have come since that must not be skipped.
+        self.plan();
+        if self.running && !self.frozen && fence.may_act() {
+            self.skip_to(self.schedule.next_step(now_ns()).min(self.next_step));
+        }
+    }
+
+    fn skip_to(&mut self, step: u64) {
+        self.rested_steps += step.saturating_sub(self.session.step_count());
+        self.session.skip_to(step);
+        self.note_rest();
+    }
+
+    pub(super) fn serve(&mut self, request: Request, context: &mut ThreadContext<'_>) {
+        if self.session.is_within_step() {
+            self.waiting.push_back(request);
+            return;
+        }
+        self.catch_up(context.fence);
+        let step = self.session.step_count();
+        // Also while time stands, when no step does it.
+        self.subscribers.forget_the_gone();
+        match request {
+            Request::Adopt | Request::Wake => {}
+            Request::Start { until, reply } => {
+                let started = self.start(until);
+                if started.is_ok() {
+                    self.note_input(Input::Start { until });
+                }
+                self.plan();
+                self.publish_status();
+                let _ = reply.send(started);
+            }
+            Request::Revive { reply } => {
+                let _ = reply.send(self.revive());
+            }
+            Request::Pause { reply } => {
+                self.note_input(Input::Pause);
+                self.stand(context);
+                let _ = reply.send(Ok(()));
+            }
+            Request::Samples(mut tap) => {
+                tap.overrun_count = self.overrun_count;
+                if !self.running {
+                    self.tell(&mut tap, &mut None, true, &mut context.wakes);
+                }
+                if self.session.hold_reason().is_some() {
+                    tap.writer.close(self.passed(0));
+                } else if self.running || !tap.once {
+                    self.subscribers.samples.push(tap);
+                }
+            }
+            Request::Save(reply) => _ = reply.send(self.present()),
+            Request::Freeze(reply) => {
+                let present = self.present();
+                self.frozen = present.is_ok();
+                let _ = reply.send(present);
+            }
+            Request::Thaw => self.frozen = false,
+            Request::Silence(why) => self.silence(&why),
+            Request::Audit(inputs, marks) => {
+                self.session.request_audit(inputs);
+                self.audit = Some(marks);
+            }
+            Request::Probe(tap) if self.session.hold_reason().is_some() => {
+                tap.recipient.writer().close(self.passed(0));
+            }
+            Request::Probe(tap) => self.subscribers.probes.push(tap),
+            Request::View(viewer) => {
+                // Who joins late gets a full frame first.
+                let frame_id = viewer.frame_id(step, self.handle.model.scene.stepping.rate_hz);
+                self.post(context.encoder, vec![(viewer.clone(), frame_id)]);
+                self.subscribers.viewers.push(ViewTap { viewer, shown: step, passed: frame_id });
+            }
+            Request::Hash { at, account, reply } => {
+                let at = at.unwrap_or(step);
+                if at > step && self.session.hold_reason().is_none() {
+                    self.subscribers.hashes.push((at, account, reply));
+                } else if at == step {
+                    self.hash_for(&account, reply, context.reading);
+                } else {
+                    let _ = reply.send(Err(self.passed(at)));
+                }
+            }
+            Request::Leave(why, leaving) => {
+                if leaving == Leaving::Moved {
+                    self.note_the_end();
+                }
+                self.note(Event::Left(leaving));
+                self.end(&why);
+                self.left = true;
+            }
+            #[cfg(test)]
+            Request::GoApart => self.goes_apart = true,
+            #[cfg(test)]
+            #[allow(clippy::panic)]
+            Request::Panic => panic!("a test"),
+        }
+        self.plan();
+        self.publish_status();
+    }
+
+    fn present(&self) -> Result<Present> {
+        let (running, until_step) = (self.running, self.until);
+        memory::attempt("", || {
+            let (saved, copy) = (Box::new(self.session.save()), self.session.copy());
+            Ok(Present { saved, copy, running, until_step })
+        })
+    }
+
+    /// Time stands from now on. Who reads samples gets the present one.
+    fn stand(&mut self, context: &mut ThreadContext<'_>) {
+        self.running = false;
+        self.note_standstill();
+        self.plan();
+        self.publish_status();
+        self.tell_all(true, &mut context.wakes);
+    }
+
+    fn passed(&self, at: u64) -> Refusal {
+        let step = self.session.step_count();
+        match self.session.hold_reason() {
+            Some(reason) => Refusal::new(Reason::SessionHeld, "", reason),
+            None => Refusal::new(Reason::StepPassed, "at_step", format!("is {at}, but {step} steps are done")),
+        }
+    }
+
+    fn start(&mut self, until: Option<u64>) -> Result<u64> {
+        let step = self.session.step_count();
+        if let Some(until) = until.filter(|until| *until <= step) {
+            return Err(Refusal { field: "until_step".into(), ..self.passed(until) });
+        }
+        if let Some(reason) = self.session.hold_reason() {
+            return Err(Refusal::new(Reason::SessionHeld, "", reason));
+        }
+        self.until = until;
+        if !self.running {
+            let now = beat_ns(now_ns());
+            self.running = true;
+            self.schedule = Schedule::new(step, now, self.handle.speed() * self.handle.model.scene.stepping.rate_hz);
+            self.schedule.delay(1.0);
+            self.backlog = Backlog::default();
+            self.dilation = Dilation::new(now, step);
+        }
+        Ok(step)
+    }
+
+    /// The same tissue at rest, at the same step; time stands.
+    fn revive(&mut self) -> Result<u64> {
+        if self.session.hold_reason().is_none() {
+            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "is a session that is not held"));
+        }
+        let step = self.session.step_count();
+        let mut session = memory::attempt("session_id", || Ok(Session::new(self.session.model())))?;
+        session.skip_to(step);
+        (self.session, self.hashed, self.audit) = (session, Hashed::default(), None);
+        self.copies.forget();
+        (self.running, self.until, self.still_since) = (false, None, Some(step));
+        {
+            let mut intake = lock(&self.handle.intake);
+            intake.reopen();
+            self.handle.note_waiting(&intake);
+        }
+        lock(&self.handle.status).forget_hold();
+        self.note_input(Input::Revive);
+        tracing::info!(session = %self.handle.id, step, "session revived");
+        Ok(step)
+    }
+
+    /// Drops from the schedule what the policy does not let it catch up.
+    #[allow(clippy::cast_precision_loss)]
+    fn drop_backlog(&mut self, now_ns: u64, forgiven_ns: u64) {
+        let (late_ns, period_ns) = (self.late_ns(now_ns), self.schedule.period_ns());
+        let dropped = self.backlog.dropped_steps(late_ns, forgiven_ns, period_ns);
+        if dropped > 0 {
+            self.schedule.delay(dropped as f64);
+            self.overrun_count += dropped;
+            self.note_input(Input::DroppedSteps(dropped));
+            tracing::debug!(session = %self.handle.id, dropped, "steps dropped");
+        }
+    }
+
+    /// Does what was asked for while a step was not done.
+    pub(super) fn serve_waiting(&mut self, context: &mut ThreadContext<'_>) {
+        while !self.session.is_within_step()
+            && let Some(request) = self.waiting.pop_front()
+        {
+            self.serve(request, context);
+        }
+    }
+
+    /// Ends a step that is not done, before all ends.
+    pub(super) fn finish_step(&mut self) {
+        if self.session.is_within_step() {
+            self.session.advance(&mut self.due, |_| {});
+            self.note_state();
+        }
+    }
+
+    /// The next step, at its time or after it: all of it, or a part of what the guard repeats for it.
+    pub(super) fn step(&mut self, begun_ns: u64, context: &mut ThreadContext<'_>) {
+        if !self.session.is_within_step() && !self.begin_step(begun_ns, context) {
+            return;
+        }
+        let (SessionTask { session, subscribers, due, copies, .. }, wakes, reading) =
+            (&mut *self, &mut context.wakes, context.reading);
+        copies.forget();
+        let mut may_go_on = || now_ns() < begun_ns + MAX_REPETITION_NS;
+        if session.advance_while(due, &mut may_go_on, |session| subscribers.record(session, copies, reading, wakes)) {
+            self.end_step(begun_ns, context);
+        }
+    }
+
+    /// Whether the next step can be done: what acts in it is known.
+    fn begin_step(&mut self, begun_ns: u64, context: &mut ThreadContext<'_>) -> bool {
+        let sampled = self.next_step.is_multiple_of(STEPS_PER_SPAN);
+        let span = sampled.then(|| tracing::debug_span!("step", session = %self.handle.id, step = self.next_step));
+        let _span = span.map(tracing::Span::entered);
+        self.due_ns = self.schedule.due_ns(self.next_step);
+        if self.next_step == self.session.step_count() {
+            // Only of steps that cost something can a session be behind.
+            self.drop_backlog(begun_ns, context.longest.ns());
+        } else {
+            self.plan();
+            self.skip_to(self.next_step);
+        }
+        let step = self.session.step_count();
+        let Some(change) = self.take_inputs(step, begun_ns) else {
+            self.wait_for_record(context);
+            return false;
+        };
+        self.note_inputs(change.as_ref());
+        if let Some(model) = change {
+            self.session.change(&model);
+            self.handle.tissue.send_replace((step, model));
+        }
+        true
+    }
+
+    /// Tells what has come of a step.
+    fn end_step(&mut self, begun_ns: u64, context: &mut ThreadContext<'_>) {
+        self.tell_auditor();
+        self.log_recovery();
+        self.note_state();
+        if let Some(reason) = self.session.hold_reason() {
+            tracing::warn!(session = %self.handle.id, reason, "session held");
+            self.running = false;
+            drop(lock(&self.handle.intake).close(Refusal::new(Reason::SessionHeld, "", reason)));
+            self.publish_status();
+            for (at, _, reply) in std::mem::take(&mut self.subscribers.hashes) {
+                let _ = reply.send(Err(self.passed(at)));
+            }
+            // No further record will come.
+            let held = self.passed(0);
+            let probes = self.subscribers.probes.drain(..);
+            probes.for_each(|tap| context.reading.close(&tap.account, &tap.recipient, held.clone()));
+        }
+        if self.until.is_some_and(|until| self.session.step_count() >= until) {
+            self.running = false;
+            self.note_standstill();
+        }
+        let step = self.session.step_count();
+        self.still_since = self.session.rests_until().map(|_| self.still_since.unwrap_or(step));
+        self.dilation.observe(begun_ns, step, self.schedule.period_ns());
+        // The status first: who is told of this step may ask for it at once.
+        self.publish_status();
+        self.publish(context);
+        let every = (self.handle.model.scene.stepping.rate_hz / REFINED_HZ).max(1.0) as u64;
+        if self.session.step_count().is_multiple_of(every) {
+            self.refine(context.refiner);
+        }
+        self.plan();
+    }
+
+    /// What acts in the coming step: commands are in `due`, and a change of the tissue is returned. `None` if that can't be played,
+    /// because it has not been read, or was not recorded.
+    fn take_inputs(&mut self, step: u64, now_ns: u64) -> Option<Option<Arc<Model>>> {
+        let mut intake = lock(&self.handle.intake);
+        intake.take_due(step, now_ns, &mut self.due);
+        let change = intake.take_change(step);
+        drop(intake);
+        let Some(playback) = &self.handle.playback else { return Some(change) };
+        let fetched = match playback.feed.take(step, &mut self.due) {
+            Next::Step(fetched) => fetched,
+            Next::Late => return None,
+            Next::Over => {
+                self.running = false;
+                return None;
+            }
+        };
+        if fetched.is_revived
+            && let Ok(mut session) = memory::attempt("", || Ok(Session::new(self.session.model())))
+        {
+            session.skip_to(step);
+            self.session = session;
+        }
+        if let Some(reason) = fetched.hold {
+            self.session.hold(reason);
+        }
+        Some(fetched.change)
+    }
+
+    /// What is to be played is not there: a little later, or never.
+    fn wait_for_record(&mut self, context: &mut ThreadContext<'_>) {
+        self.schedule.delay(RECORD_WAIT_S * self.handle.speed() * self.handle.model.scene.stepping.rate_hz);
+        self.publish_status();
+        if !self.running {
+            self.tell_all(true, &mut context.wakes);
+        }
+        self.plan();
+    }
+
+    /// Ends every stream, and what waits.
+    pub(super) fn end(&mut self, why: &Refusal) {
+        self.running = false;
+        drop(lock(&self.handle.intake).close(why.clone()));
+        self.silence(why);
+    }
+
+    /// Ends every stream, and what waits for a step.
+    fn silence(&mut self, why: &Refusal) {
+        let subscribers = std::mem::take(&mut self.subscribers);
+        subscribers.samples.iter().for_each(|tap| tap.writer.close(why.clone()));
+        subscribers.probes.iter().for_each(|tap| tap.recipient.writer().close(why.clone()));
+        subscribers.viewers.iter().for_each(|tap| tap.viewer.close(why.clone()));
+        for (_, _, reply) in subscribers.hashes {
+            let _ = reply.send(Err(why.clone()));
+        }
+    }
+}

@@ -1,0 +1,55 @@
+//! The slots for streams in a session: how many there are, and who has them.
+
+use std::collections::BTreeMap;
+
+use tokio_util::sync::CancellationToken;
+
+use palpate_session::budget::{Account, Pool, Taken};
+use palpate_tissue::limits::Limits;
+
+/// What a stream is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StreamKind {
+    /// It holds tools: some slots of a session are kept for such.
+    HoldsTools,
+    /// It only reads.
+    ReadsOnly,
+}
+
+/// The slots for streams in one session.
+#[derive(Debug)]
+pub(super) struct StreamSlots {
+    pub(super) most: usize,
+    pub(super) numbers: u64,
+    pub(super) open: BTreeMap<u64, OpenSlot>,
+    /// Slots of those that only read, by who reads.
+    pub(super) readers: Pool,
+}
+
+/// An open stream.
+#[derive(Debug)]
+pub(super) struct OpenSlot {
+    pub(super) what: &'static str,
+    pub(super) kind: StreamKind,
+    pub(super) account: Account,
+    pub(super) since_ns: u64,
+    pub(super) cut: CancellationToken,
+    pub(super) _taken: [Taken; 2],
+}
+
+impl StreamSlots {
+    pub(super) fn new(limits: &Limits) -> Self {
+        let most = limits.streams_per_session;
+        let readers = most - limits.streams_for_holders.min(most / 8);
+        StreamSlots { most, numbers: 0, open: BTreeMap::new(), readers: Pool::new(readers as u64, 16) }
+    }
+
+    /// Gives back the slot of a stream.
+    pub(super) fn close(&mut self, number: u64) -> Option<OpenSlot> {
+        let open = self.open.remove(&number)?;
+        if open.kind == StreamKind::ReadsOnly {
+            self.readers.give_back(open.account.number(), 1);
+        }
+        Some(open)
+    }
+}

@@ -1,0 +1,162 @@
+//! The streams of a session: how one is opened, shown to administrators, and cut.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+
+use tokio_util::sync::CancellationToken;
+
+use super::clock::now_ns;
+use super::session_handle::SessionHandle;
+use super::slots::{OpenSlot, StreamKind, StreamSlots};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::budget::{Account, Purpose, Resource};
+use palpate_tissue::lock::lock;
+use palpate_tissue::shape::RestShape;
+
+/// Bytes of a stream that the client has not taken: the transport (hyper) asks for no more above 400 KiB, and then holds at most one
+/// more message, which is of 64 KiB or little more.
+const UNSENT_BYTES: u64 = (400 + 80) << 10;
+
+/// A stream, as administrators see it.
+#[derive(Debug, Clone)]
+pub struct StreamInfo {
+    /// Names it within its session.
+    pub number: u64,
+    /// The call that opened it.
+    pub what: &'static str,
+    /// What it is for.
+    pub kind: StreamKind,
+    /// Whose it is.
+    pub caller: String,
+    /// For how long it has been open, ns.
+    pub age_ns: u64,
+}
+
+/// Counts a stream of a session until it is dropped or cut.
+pub struct StreamGuard {
+    handle: Arc<SessionHandle>,
+    number: u64,
+    cut: CancellationToken,
+}
+
+impl StreamGuard {
+    /// Returns cancelled when somebody who administers has cut the stream.
+    pub fn cut(&self) -> &CancellationToken {
+        &self.cut
+    }
+
+    /// Returns the rest shape of the session's tissue, by which messages name its points.
+    pub fn shape(&self) -> &dyn RestShape {
+        self.handle.model.shape()
+    }
+}
+
+impl Drop for StreamGuard {
+    fn drop(&mut self) {
+        lock(&self.handle.streams).close(self.number);
+        self.handle.asked_ns.store(now_ns(), Ordering::Relaxed);
+    }
+}
+
+/// Returns what a stream is told that was cut.
+pub fn cut() -> Refusal {
+    Refusal::new(Reason::Cut, "", "whoever administers the server has ended this stream")
+}
+
+impl SessionHandle {
+    /// Returns room for one more stream of `account`, opened by the call `what`.
+    ///
+    /// # Errors
+    /// Refuses if all slots of the session or of the caller are taken, or memory beyond the caller's part.
+    pub fn open_stream(
+        self: &Arc<Self>,
+        what: &'static str,
+        kind: StreamKind,
+        account: &Account,
+    ) -> Result<StreamGuard> {
+        let stream = account.take(Resource::Streams, 1, "")?;
+        let _taken = [stream, account.take(Resource::Memory(Purpose::Connections), UNSENT_BYTES, "")?];
+        let mut streams = lock(&self.streams);
+        let all = streams.open.len();
+        if all >= streams.most || kind == StreamKind::ReadsOnly && !streams.readers.take(account.number(), 1) {
+            let StreamSlots { most, readers, .. } = &*streams;
+            let message = format!(
+                "the session has {all} streams of {most} already, {} of those that only read are this caller's; the others \
+                 are kept for other callers and for those who hold tools",
+                readers.of(account.number())
+            );
+            return Err(Refusal::new(Reason::TooMany, "", message));
+        }
+        streams.numbers += 1;
+        let (number, cut) = (streams.numbers, CancellationToken::new());
+        let open = OpenSlot { what, kind, account: account.clone(), since_ns: now_ns(), cut: cut.clone(), _taken };
+        streams.open.insert(number, open);
+        drop(streams);
+        Ok(StreamGuard { handle: self.clone(), number, cut })
+    }
+
+    /// Streams that read the session.
+    pub fn streams(&self) -> usize {
+        lock(&self.streams).open.len()
+    }
+
+    /// Returns each of them, oldest first.
+    pub fn list_streams(&self) -> Vec<StreamInfo> {
+        let now = now_ns();
+        let show = |(number, open): (&u64, &OpenSlot)| StreamInfo {
+            number: *number,
+            what: open.what,
+            kind: open.kind,
+            caller: open.account.name().to_owned(),
+            age_ns: now.saturating_sub(open.since_ns),
+        };
+        lock(&self.streams).open.iter().map(show).collect()
+    }
+
+    /// Ends the streams for which `chosen` holds, by number and caller: they make room at once, and are told when they read.
+    pub fn cut_streams(&self, chosen: impl Fn(u64, &Account) -> bool) -> usize {
+        let mut streams = lock(&self.streams);
+        let numbers: Vec<u64> =
+            streams.open.iter().filter(|(number, open)| chosen(**number, &open.account)).map(|open| *open.0).collect();
+        let cut: Vec<OpenSlot> = numbers.iter().filter_map(|number| streams.close(*number)).collect();
+        drop(streams);
+        cut.iter().for_each(|open| open.cut.cancel());
+        cut.len()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Pacer;
+    use palpate_session::budget::Budget;
+    use palpate_tissue::limits::Limits;
+    use palpate_tissue::scene::{PAPER, Scene};
+    use palpate_tissue::scheme_selection::NEVER;
+
+    #[test]
+    fn who_reads_leaves_slots_to_others_and_to_who_holds_tools() {
+        let limits = Limits { streams_per_session: 64, streams_for_holders: 4, ..Limits::default() };
+        let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
+        let budget = Budget::new(&limits, 1, 1);
+        let pacer = Pacer::start(1, 0.0, &limits, budget.clone()).unwrap();
+        let handle = pacer.create(&scene, true, 60.0, &budget.account("owner"), &NEVER).unwrap();
+        let [greedy, other] = ["greedy", "other"].map(|name| budget.account(name));
+        let open = |kind, account: &Account| handle.open_stream("Test", kind, account);
+        let mut all: Vec<_> = std::iter::from_fn(|| open(StreamKind::ReadsOnly, &greedy).ok()).collect();
+        assert_eq!(all.len(), 57);
+        all.push(open(StreamKind::ReadsOnly, &other).unwrap());
+        all.extend(std::iter::from_fn(|| open(StreamKind::ReadsOnly, &other).ok()));
+        // Who holds tools always finds the slots that are kept.
+        let holders: Vec<_> = (0..4).map(|_| open(StreamKind::HoldsTools, &other).unwrap()).collect();
+        assert_eq!(handle.streams(), all.len() + 4);
+        assert!(budget.taken(Resource::Streams) == handle.streams() as u64);
+        // Who is cut makes room, whether they notice or not.
+        assert_eq!(handle.cut_streams(|_, account| account.number() == greedy.number()), 57);
+        assert!(all[0].cut().is_cancelled() && !holders[0].cut().is_cancelled());
+        assert!(open(StreamKind::ReadsOnly, &other).is_ok());
+        drop((all, holders));
+        assert_eq!((handle.streams(), budget.taken(Resource::Streams)), (0, 0));
+        pacer.stop();
+    }
+}

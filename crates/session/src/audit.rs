@@ -1,0 +1,115 @@
+//! The audit of a run: a more accurate twin gets the same inputs, and the records of both are compared. The twin runs in
+//! f64 with a quarter of the substep and without sleep. With
+//! `[stepping] correct`, windows of the run are audited one after the other, as in a server, and an error above the
+//! tolerance changes how the tissue is stepped.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use super::Session;
+use super::command::Due;
+use palpate_tissue::Model;
+use palpate_tissue::audit::{AuditFinding, ErrorExtent, FINER, Mark, WindowInputs, WindowOpening};
+use palpate_tissue::scene::Precision;
+use palpate_tissue::scene::record::{AuditedError, Record};
+use palpate_tissue::scene::script::Script;
+
+/// The model of the session to compare with.
+fn twin_of(model: &Model) -> Arc<Model> {
+    model.twin(FINER, Precision::F64)
+}
+
+/// A more accurate session beside another, and the differences between the two.
+pub struct Twin {
+    session: Session,
+    records: VecDeque<Record>,
+    differences: ErrorExtent,
+    largest: ErrorExtent,
+}
+
+impl Twin {
+    /// Creates a twin of a session of `model` that has not begun.
+    pub fn new(model: &Model) -> Self {
+        let session = Session::new(&twin_of(model));
+        Twin { session, records: VecDeque::new(), differences: ErrorExtent::default(), largest: ErrorExtent::default() }
+    }
+
+    /// Returns the twin's session, for inputs equal to those of the other session.
+    pub fn session(&mut self) -> &mut Session {
+        &mut self.session
+    }
+
+    /// Changes the tissue in the same way as the other session's.
+    pub fn change(&mut self, model: &Model) {
+        self.session.change(&twin_of(model));
+    }
+
+    /// Advances one step, before the other session does it.
+    pub fn advance(&mut self, due: &[Due], script: &Script) {
+        let Twin { session, records, .. } = self;
+        session.advance(&mut due.to_vec(), |session| {
+            if session.step_count().is_multiple_of(script.sample_every) {
+                records.push_back(session.record(Some(&script.sample_points)));
+            }
+        });
+    }
+
+    /// Returns why it can't be compared with the other session any more, if it can't.
+    pub fn fault(&self) -> Option<String> {
+        self.session.fault().map(|reason| format!("the audit's twin: {reason}"))
+    }
+
+    /// Compares with the next record of the other session.
+    pub fn compare(&mut self, record: &Record) {
+        let Some(truth) = self.records.pop_front() else { return };
+        for (point, truth) in record.points.iter().zip(&truth.points) {
+            for c in 0..3 {
+                let (displacement_m, force_n) = (truth.displacement_m[c], truth.reaction_n[c]);
+                let found = ErrorExtent {
+                    displacement_m: (point.displacement_m[c] - displacement_m).abs(),
+                    force_n: (point.reaction_n[c] - force_n).abs(),
+                };
+                self.differences = self.differences.max(found);
+                let size = ErrorExtent { displacement_m: displacement_m.abs(), force_n: force_n.abs() };
+                self.largest = self.largest.max(size);
+            }
+        }
+    }
+
+    /// Returns the largest difference in all records so far, relative to the largest value.
+    pub fn error(&self) -> AuditedError {
+        self.differences.relative_to(self.largest)
+    }
+}
+
+/// Audits windows of a session one after the other. The choice of steps depends only on the scene and its inputs.
+#[derive(Default)]
+pub struct Windows {
+    opening: Option<WindowOpening>,
+    largest: ErrorExtent,
+    begun: bool,
+}
+
+impl Windows {
+    /// Returns call after each step, and before the first: audits the window that has ended, if one has.
+    pub fn look(&mut self, session: &mut Session) -> Option<AuditFinding> {
+        if !std::mem::replace(&mut self.begun, true) {
+            session.request_audit(WindowInputs::default());
+        }
+        let mut found = None;
+        match session.take_mark()? {
+            Mark::Begin(begin) => {
+                self.opening = Some(begin.open());
+                return None;
+            }
+            Mark::End(end, inputs) => {
+                let audit = self.opening.take().map(|opening| opening.close(end, inputs));
+                found = audit.and_then(|audit| audit.work(FINER, self.largest, &mut || true));
+            }
+            Mark::Dropped => self.opening = None,
+        }
+        self.largest = found.map_or(self.largest, |finding| finding.largest);
+        session.request_audit(WindowInputs::default());
+        found
+    }
+}

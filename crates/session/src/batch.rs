@@ -1,0 +1,113 @@
+//! Batches of commands: accepted whole or not at all, and put in the queue in slices. So no caller waits long for the
+//! intake.
+
+use std::collections::BTreeMap;
+
+use super::command::Command;
+use super::intake::Intake;
+use super::lease::LeaseId;
+use super::rules::{CheckedCommands, check_contact_work, check_tip, tip_radius_m};
+use palpate_refusal::{Reason, Refusal, Result};
+
+/// Commands that are put in the queue in one turn at the intake.
+pub const SLICE: usize = 256;
+
+/// The rest of a batch that was accepted. [`Intake::go_on`] takes it in.
+#[derive(Debug)]
+#[must_use]
+pub struct AcceptedBatch {
+    id: LeaseId,
+    commands: std::vec::IntoIter<Command>,
+}
+
+impl Intake {
+    /// Accepts all of some commands that were looked at before (`Rules::check`), or none. They are taken in by
+    /// [`Intake::go_on`], and act together: none before the last is in the queue. So others have their turns between
+    /// slices.
+    ///
+    /// # Errors
+    /// As for [`Intake::submit`]; and refuses commands of a lease of which a batch is being taken in.
+    pub fn accept(
+        &mut self,
+        id: LeaseId,
+        CheckedCommands(mut commands): CheckedCommands,
+        now_ns: u64,
+    ) -> Result<AcceptedBatch> {
+        self.check_open()?;
+        self.lapse(now_ns);
+        if commands.is_empty() {
+            self.renew(id, now_ns)?;
+            return Ok(AcceptedBatch { id, commands: commands.into_iter() });
+        }
+        if self.leases.of(id).any(|lease| lease.batch_since.is_some()) {
+            let message = "commands of this lease are being taken in: send them one call after another";
+            return Err(Refusal::new(Reason::OutOfTurn, "", message));
+        }
+        // Of each tool the last sequence number, how many commands come, and the tip after them.
+        let mut last: BTreeMap<u32, (u64, usize, Option<f64>)> = BTreeMap::new();
+        for command in &mut commands {
+            let lease = self.leases.get(command.tool).filter(|lease| lease.id == id);
+            let lease = lease.ok_or_else(|| {
+                Refusal::new(Reason::NotHolder, "tool", format!("{} is not held by this client", command.tool))
+            })?;
+            let coming = last.get(&command.tool).copied();
+            let before = coming.map(|(sequence, ..)| sequence).or(lease.last_sequence);
+            let sequence = command.sequence.unwrap_or_else(|| before.map_or(0, |before| before.saturating_add(1)));
+            if let Some(before) = before.filter(|before| sequence <= *before && !command.by_datagram) {
+                let message = format!("must be above {before}, the last one, but is {sequence}");
+                return Err(Refusal::new(Reason::StaleSequence, "sequence", message));
+            }
+            command.sequence = Some(sequence);
+            let tip_radius_m = tip_radius_m(command);
+            let before_m = coming.map_or(lease.tip_radius_m, |coming| coming.2);
+            check_tip(before_m, tip_radius_m)?;
+            if let (None, Some(now_m)) = (before_m, tip_radius_m) {
+                let of = |(tool, waiting_m)| last.get(&tool).map_or(waiting_m, |coming| coming.2);
+                let others = self.leases.tips_m().filter(|(tool, _)| *tool != command.tool).filter_map(of);
+                check_contact_work(&self.rules, self.substeps(), now_m, others)?;
+            }
+            let newest = before.map_or(sequence, |before| before.max(sequence));
+            last.insert(command.tool, (newest, coming.map_or(0, |coming| coming.1) + 1, tip_radius_m));
+        }
+        // A limit per tool, so that no holder fills the queue for the others.
+        for (tool, (_, coming, _)) in &last {
+            let waiting = self.queue.waiting_of(*tool);
+            if waiting + coming > self.rules.limits.queued_commands_per_tool {
+                let message = format!("{waiting} commands of tool {tool} wait for their step already");
+                return Err(Refusal::new(Reason::QueueFull, "", message));
+            }
+        }
+        self.make_room(commands.len())?;
+        self.counts.accepted += commands.len() as u64;
+        self.coming += commands.len();
+        let arrivals = self.arrivals;
+        for lease in self.leases.of_mut(id) {
+            lease.batch_since = Some(arrivals);
+        }
+        self.renew(id, now_ns)?;
+        Ok(AcceptedBatch { id, commands: commands.into_iter() })
+    }
+
+    /// Puts at most [`SLICE`] commands of a batch in the queue. Returns whether there are more. What is meant for a tool
+    /// that has been released meanwhile is dropped.
+    pub fn go_on(&mut self, batch: &mut AcceptedBatch) -> bool {
+        let slice = batch.commands.len().min(SLICE);
+        self.coming -= slice;
+        for command in batch.commands.by_ref().take(slice) {
+            let is_held = self.leases.get(command.tool).is_some_and(|lease| lease.id == batch.id);
+            if is_held && self.closed.is_none() {
+                self.enqueue(command, false);
+            } else {
+                self.counts.dropped += 1;
+            }
+        }
+        if batch.commands.len() > 0 {
+            return true;
+        }
+        for lease in self.leases.of_mut(batch.id) {
+            lease.batch_since = None;
+        }
+        self.changed |= slice > 0;
+        false
+    }
+}

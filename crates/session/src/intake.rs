@@ -1,0 +1,419 @@
+//! The intake of a session: commands and changes of the tissue wait here for their step. Time is an argument.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+use super::Session;
+use super::command::{Command, Due};
+use super::lease::{LeaseId, Leases, QueueKey, not_held};
+use super::queue::{Discarded, Queue};
+use super::rules::{Rules, tip_radius_m};
+use super::schedule::Schedule;
+use crate::budget::{Account, Purpose, Resource, Taken};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Scene;
+use palpate_tissue::scene::script::Action;
+
+/// Counts of the accepted commands by outcome: `accepted` is the sum of the others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counts {
+    /// Commands accepted.
+    pub accepted: u64,
+    /// Commands that took effect at their step.
+    pub applied: u64,
+    /// Commands replaced by a later position of the same tool before their step.
+    pub superseded: u64,
+    /// Commands whose lease or session ended before their step.
+    pub dropped: u64,
+    /// Commands that wait for their step.
+    pub waiting: u64,
+}
+
+/// Takes in commands and holds them until their step.
+#[derive(Debug)]
+pub struct Intake {
+    pub(super) rules: Arc<Rules>,
+    pub(super) leases: Leases,
+    pub(super) queue: Queue,
+    /// Commands of batches that are not in the queue yet.
+    pub(super) coming: usize,
+    /// Changes of tissue that wait for their step, by ascending step, and the memory of each.
+    pub(super) changes: VecDeque<(u64, Arc<Model>, Option<Taken>)>,
+    /// Who pays for what waits here, and what was taken for commands.
+    pub(super) account: Option<Account>,
+    taken: Option<Taken>,
+    /// The last change accepted, if there was one.
+    pub(super) changed_to: Option<Arc<Model>>,
+    pub(super) arrivals: u64,
+    pub(super) next_step: u64,
+    /// Radii of the tips of tools that nobody holds yet and that a session which goes on has in its tissue, m.
+    tip_radii_m: BTreeMap<u32, f64>,
+    /// The session rests: its steps up to this one are skipped, not computed.
+    resting: Option<(Schedule, u64)>,
+    /// Substeps of a step of the tissue that it began with; 0 where what tips cost is nobody else's.
+    substeps: u32,
+    /// A command or change has arrived that may take effect earlier, and the session's thread was woken for it.
+    pub(super) changed: bool,
+    woken: bool,
+    /// Counts without the waiting commands.
+    pub(super) counts: Counts,
+    pub(super) closed: Option<Refusal>,
+}
+
+impl Intake {
+    /// Creates an intake for a session of `scene` that has not begun.
+    pub fn new(scene: &Scene, limits: &Limits) -> Self {
+        Intake {
+            rules: Arc::new(Rules::new(scene, limits)),
+            leases: Leases::default(),
+            queue: Queue::default(),
+            coming: 0,
+            changes: VecDeque::new(),
+            account: None,
+            taken: None,
+            changed_to: None,
+            arrivals: 0,
+            next_step: 0,
+            tip_radii_m: BTreeMap::new(),
+            resting: None,
+            substeps: 0,
+            changed: false,
+            woken: false,
+            counts: Counts::default(),
+            closed: None,
+        }
+    }
+
+    /// Creates the intake of a tissue that takes so many substeps in a step, on a thread of several sessions: what its tips cost follows them.
+    #[must_use]
+    pub fn of_substeps(self, substeps: u32) -> Self {
+        Intake { substeps, ..self }
+    }
+
+    /// The substeps of a step of the tissue that comes last.
+    pub(super) fn substeps(&self) -> u32 {
+        let changed = self.changed_to.as_ref().filter(|_| self.substeps > 0);
+        changed.map_or(self.substeps, |model| model.plan.substeps)
+    }
+
+    /// Returns the memory of what waits is charged to `account`.
+    #[must_use]
+    pub fn charged_to(self, account: &Account) -> Self {
+        Intake { account: Some(account.clone()), ..self }
+    }
+
+    /// Creates the intake of a session that goes on, whose tissue is `changed_to` unless it is still the first. Who takes a tool that is in the tissue
+    /// already takes it with its tip.
+    #[must_use]
+    pub fn continued(self, session: &Session, changed_to: Option<Arc<Model>>) -> Self {
+        let tip_radii_m = session.tips().map(|(tool, tip)| (tool, tip.radius_m)).collect();
+        Intake { next_step: session.step_count(), changed_to, tip_radii_m, ..self }
+    }
+
+    /// Has the memory of `more` commands beside those that wait, or refuses.
+    pub(super) fn make_room(&mut self, more: usize) -> Result<()> {
+        let bytes = bytes_of(self.queue.len() + self.coming + more);
+        let Some(account) = self.account.as_ref().filter(|_| bytes > 0) else { return Ok(()) };
+        match &mut self.taken {
+            Some(taken) => taken.grow_to(bytes, ""),
+            None => account.take(Resource::Memory(Purpose::Commands), bytes, "").map(|taken| self.taken = Some(taken)),
+        }
+    }
+
+    /// Frees some of what no longer waits, and gives its memory back.
+    fn give_back(&mut self) {
+        self.queue.free_some();
+        let bytes = bytes_of(self.queue.len() + self.coming);
+        if let Some(taken) = self.taken.as_mut().filter(|taken| taken.amount() > bytes) {
+            taken.shrink_to(bytes);
+        }
+    }
+
+    /// Takes all of `tools` or none. The leases lapse after `lease_s` without a command or renewal.
+    ///
+    /// # Errors
+    /// Refuses if the intake is closed, for tools that are unknown, named twice or held, and for a holder name or a lease
+    /// time out of range.
+    pub fn acquire(&mut self, tools: &[u32], holder: &str, lease_s: f64, id: LeaseId, now_ns: u64) -> Result<()> {
+        self.check_open()?;
+        self.lapse(now_ns);
+        self.leases.acquire(tools, holder, lease_s, id, now_ns, &self.rules.limits)?;
+        tools.iter().for_each(|tool| self.take_tip(*tool));
+        self.changed = true;
+        Ok(())
+    }
+
+    /// A tool that was in the tissue when the session went on is held from now on.
+    pub(super) fn take_tip(&mut self, tool: u32) {
+        let radius_m = self.tip_radii_m.remove(&tool);
+        if let Some(lease) = self.leases.get_mut(tool) {
+            lease.tip_radius_m = radius_m;
+        }
+    }
+
+    /// Extends a lease: its holder is alive.
+    ///
+    /// # Errors
+    /// Refuses an unknown or lapsed lease.
+    pub fn renew(&mut self, id: LeaseId, now_ns: u64) -> Result<()> {
+        self.lapse(now_ns);
+        self.leases.renew(id, now_ns)
+    }
+
+    /// Releases every tool of a lease. Their actions end at the next step; waiting commands are dropped.
+    ///
+    /// # Errors
+    /// Refuses an unknown or lapsed lease.
+    pub fn release(&mut self, id: LeaseId) -> Result<()> {
+        let tools: Vec<u32> = self.tools_of(id).collect();
+        if tools.is_empty() {
+            return Err(not_held());
+        }
+        for tool in tools {
+            self.end(tool);
+        }
+        Ok(())
+    }
+
+    fn end(&mut self, tool: u32) {
+        self.leases.remove(tool);
+        self.counts.dropped += self.queue.discard(tool) as u64;
+        self.enqueue(Command::new(tool, None, Action::Release), true);
+    }
+
+    /// Ends the leases that have expired at `now_ns`. In a resting session, time passes without computed steps, but
+    /// never past a step that has something waiting.
+    pub fn lapse(&mut self, now_ns: u64) {
+        if let Some((schedule, until)) = &self.resting {
+            let until = self.first_waiting().map_or(*until, |step| step.min(*until));
+            self.next_step = self.next_step.max(schedule.next_step(now_ns).min(until));
+        }
+        while let Some(tool) = self.leases.take_expired(now_ns) {
+            self.end(tool);
+        }
+        if self.queue.has_left_over() {
+            self.give_back();
+        }
+    }
+
+    /// Returns what commands have to keep to.
+    pub fn rules(&self) -> Arc<Rules> {
+        self.rules.clone()
+    }
+
+    /// Accepts all of `commands`, from the holder of `id`, or none.
+    ///
+    /// # Errors
+    /// Refuses if the intake is closed, too many commands for the queue, tools that this lease does not hold, sequence
+    /// numbers that do not rise, and what the checks of an action refuse.
+    pub fn submit(&mut self, id: LeaseId, commands: Vec<Command>, now_ns: u64) -> Result<()> {
+        self.check_open()?;
+        let checked = self.rules.check(commands)?;
+        let mut batch = self.accept(id, checked, now_ns)?;
+        while self.go_on(&mut batch) {}
+        Ok(())
+    }
+
+    pub(super) fn enqueue(&mut self, command: Command, ends_lease: bool) {
+        let step = command.at_step.map_or(self.next_step, |at| at.max(self.next_step));
+        let late = command.at_step.is_some_and(|at| at < self.next_step);
+        let mut late_commands = u64::from(late);
+        let key = (step, self.arrivals);
+        self.arrivals += 1;
+        if let Some(lease) = self.leases.get_mut(command.tool) {
+            lease.last_sequence = lease.last_sequence.max(command.sequence);
+            lease.tip_radius_m = tip_radius_m(&command);
+            let last = lease.last_key.replace(key);
+            // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply to
+            // poses played by client time (`palpate_haptics::path`), where each one counts.
+            let is_position = |command: &Command| match command.action {
+                Action::Grasp { .. } => true,
+                Action::Pose { .. } => command.at_step.is_some() || command.client_time_ns == 0,
+                Action::Push(_) | Action::Release => false,
+            };
+            if let Some(last) = last.filter(|last| last.0 == step && is_position(&command))
+                && let Some(superseded) = self.queue.remove_if(command.tool, last, |due| is_position(&due.command))
+            {
+                late_commands += superseded.late_commands;
+                self.counts.superseded += 1;
+            }
+        }
+        self.queue.insert(key, Due { command, late, late_commands, ends_lease });
+        self.changed = true;
+    }
+
+    /// The first step for which something waits.
+    fn first_waiting(&self) -> Option<u64> {
+        let commands = self.queue.first_step();
+        let changes = self.changes.front().map(|change| change.0);
+        commands.into_iter().chain(changes).min()
+    }
+
+    /// Returns the tissue after all accepted changes; `None` if there was none.
+    pub fn changed_to(&self) -> Option<Arc<Model>> {
+        self.changed_to.clone()
+    }
+
+    /// Accepts another tissue, made from `base`, for the beginning of step `at_step`, or of the next step. Returns the
+    /// step, or `None` if [`Intake::changed_to`] is no longer `base`. Changes take effect in their order of arrival,
+    /// and each is made from the one before it. Of several for one step the last one applies; it includes the others.
+    ///
+    /// # Errors
+    /// Refuses if the intake is closed, for a step before that of a waiting change, and for too many waiting changes.
+    pub fn change(
+        &mut self,
+        base: Option<&Arc<Model>>,
+        model: &Arc<Model>,
+        at_step: Option<u64>,
+        now_ns: u64,
+    ) -> Result<Option<u64>> {
+        self.check_open()?;
+        self.lapse(now_ns);
+        if self.changed_to.as_ref().map(Arc::as_ptr) != base.map(Arc::as_ptr) {
+            return Ok(None);
+        }
+        let step = at_step.unwrap_or(0).max(self.next_step);
+        let last = self.changes.back().map(|change| change.0);
+        if let Some(last) = last.filter(|last| *last > step) {
+            let message = format!("is {step}, but a change of the tissue waits for step {last}: they act in order");
+            return Err(Refusal::new(Reason::OutOfTurn, "at_step", message));
+        }
+        let replaces = last == Some(step);
+        if !replaces && self.changes.len() >= self.rules.limits.queued_changes {
+            let message = format!("{} changes of the tissue wait for their step already", self.changes.len());
+            return Err(Refusal::new(Reason::QueueFull, "", message));
+        }
+        let account = self.account.as_ref();
+        let taken =
+            account.map(|account| account.take(Resource::Memory(Purpose::Change), model.bytes(), "")).transpose()?;
+        if replaces {
+            self.changes.pop_back();
+        }
+        self.changes.push_back((step, model.clone(), taken));
+        self.changed_to = Some(model.clone());
+        self.changed = true;
+        Ok(Some(step))
+    }
+
+    /// Returns the changes that wait, each with its step, by ascending step.
+    pub fn waiting_changes(&self) -> Vec<(u64, Arc<Model>)> {
+        self.changes.iter().map(|(step, model, _)| (*step, model.clone())).collect()
+    }
+
+    /// Returns the last tissue that is due at the beginning of step `step`, if there is one.
+    pub fn take_change(&mut self, step: u64) -> Option<Arc<Model>> {
+        let due = self.changes.partition_point(|change| change.0 <= step);
+        self.changes.drain(..due).next_back().map(|change| change.1)
+    }
+
+    /// Begins a rest: the session has done `step` steps and could rest until step `until`. Returns the next step that
+    /// must be computed, which is earlier than `until` if something waits here. The session then rests until
+    /// [`Intake::take_due`] takes that step, unless it is the very next one.
+    pub fn rest(&mut self, step: u64, until: u64, schedule: &Schedule) -> u64 {
+        let waiting = self.first_waiting();
+        let lapse = self.leases.first_expiry_ns().map(|ns| schedule.next_step(ns));
+        let next = [waiting, lapse].into_iter().flatten().fold(until, u64::min).max(step);
+        self.resting = (next > step).then_some((*schedule, next));
+        self.next_step = self.next_step.max(step);
+        (self.changed, self.woken) = (false, false);
+        next
+    }
+
+    /// Returns whether the session rests.
+    pub fn is_resting(&self) -> bool {
+        self.resting.is_some()
+    }
+
+    /// Returns whether the thread of a resting session must be woken to call [`Intake::rest`] again. True once per
+    /// wake.
+    pub fn take_wake(&mut self) -> bool {
+        let wake = self.changed && !self.woken && self.is_resting();
+        self.woken |= wake;
+        wake
+    }
+
+    /// Moves what is due at the beginning of step `step` into `due`, in order of effect.
+    pub fn take_due(&mut self, step: u64, now_ns: u64, due: &mut Vec<Due>) {
+        self.lapse(now_ns);
+        self.resting = None;
+        let leases = &self.leases;
+        let is_held_back = |key: &QueueKey, due: &Due| {
+            let lease = leases.get(due.command.tool).filter(|_| !due.ends_lease);
+            lease.and_then(|lease| lease.batch_since).is_some_and(|since| key.1 >= since)
+        };
+        self.counts.applied += self.queue.take_due(step, is_held_back, due) as u64;
+        self.give_back();
+        self.next_step = step + 1;
+    }
+
+    /// Returns the next step.
+    pub fn next_step(&self) -> u64 {
+        self.next_step
+    }
+
+    /// Returns the tools of a lease.
+    pub fn tools_of(&self, id: LeaseId) -> impl Iterator<Item = u32> {
+        self.leases.tools_of(id)
+    }
+
+    /// Returns each held tool and its holder.
+    pub fn holders(&self) -> impl Iterator<Item = (u32, &str)> {
+        self.leases.holders()
+    }
+
+    /// Returns the total number of tools whose lease lapsed.
+    pub fn lapsed(&self) -> u64 {
+        self.leases.lapsed()
+    }
+
+    /// Counts of the commands so far, by outcome.
+    pub fn counts(&self) -> Counts {
+        Counts { waiting: (self.queue.waiting() + self.coming) as u64, ..self.counts }
+    }
+
+    /// Refuses from now on everything with `refusal`. Returns the commands that waited.
+    pub fn close(&mut self, refusal: Refusal) -> Discarded {
+        self.closed = Some(refusal);
+        self.counts.dropped += self.queue.discard_all() as u64;
+        self.changes.clear();
+        self.taken = None;
+        self.queue.take_left_over()
+    }
+
+    /// Opens it again, as it was in the beginning, with the same tissue, and no tool held.
+    pub fn reopen(&mut self) {
+        self.closed = None;
+        self.leases.clear();
+    }
+
+    /// Ends the leases of the tools for which `chosen` holds, by number and by who pays for them; tells how many.
+    pub fn free(&mut self, chosen: impl Fn(u32, Option<&Account>) -> bool) -> usize {
+        let tools = self.leases.chosen(chosen);
+        tools.iter().for_each(|tool| self.end(*tool));
+        tools.len()
+    }
+
+    /// Charges the tools of a lease to who took them, one of `charges` each.
+    pub fn charge(&mut self, id: LeaseId, charges: Vec<Taken>) {
+        self.leases.charge(id, charges);
+    }
+
+    pub(super) fn check_open(&self) -> Result<()> {
+        self.closed.clone().map_or(Ok(()), Err)
+    }
+}
+
+/// Commands are charged in pieces of so many bytes, and the first of a session is its own: who has a few waiting at a
+/// time, as most do, pays nothing.
+const PIECE_BYTES: u64 = 64 << 10;
+
+/// What so many commands are charged: they are in a tree, whose nodes are two thirds full.
+fn bytes_of(commands: usize) -> u64 {
+    let bytes = commands * size_of::<(QueueKey, Due)>() * 3 / 2;
+    (bytes as u64 / PIECE_BYTES) * PIECE_BYTES
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,85 @@
+//! What an intake has, for another server that goes on with its session: who holds tools, and what waits for its step.
+
+use super::command::Due;
+use super::input::Input;
+use super::intake::Intake;
+use super::lease::HandedLease;
+use super::queue::Discarded;
+use super::rules::tip_radius_m;
+use crate::budget::{Purpose, Resource};
+use palpate_refusal::Refusal;
+
+/// What an intake had when it was closed.
+#[derive(Debug, Default)]
+pub struct Handed {
+    /// Each held tool with its lease.
+    pub leases: Vec<HandedLease>,
+    /// Changes of the tissue, then commands, each kind in order of effect, and each with its step.
+    pub waiting: Vec<(u64, Input)>,
+}
+
+impl Intake {
+    /// Closes the intake, which refuses everything with `refusal` from now on, and tells what it had. What waited counts as if it had
+    /// never been accepted: it counts where the session goes on. Of a batch that is being taken in the rest is dropped.
+    pub fn hand_over(&mut self, refusal: Refusal) -> (Handed, Discarded) {
+        let leases = self.leases.handed();
+        let changes = self.waiting_changes().into_iter().map(|(step, model)| (step, Input::Tissue(model)));
+        let commands = self.queue.in_order().into_iter().map(|(key, due)| (key.0, Input::Command(due.clone())));
+        let waiting: Vec<(u64, Input)> = changes.chain(commands).collect();
+        let moved = self.queue.waiting() as u64;
+        let discarded = self.close(refusal);
+        self.counts.dropped -= moved;
+        self.counts.accepted -= moved;
+        (Handed { leases, waiting }, discarded)
+    }
+
+    /// Goes on with what another server's intake had. The leases begin their time anew, and their commands are numbered anew.
+    ///
+    /// What there is no memory for is dropped; tells how many inputs.
+    pub fn adopt(&mut self, handed: Handed, now_ns: u64) -> usize {
+        for lease in handed.leases {
+            let tool = lease.tool;
+            self.leases.adopt(lease, now_ns);
+            self.take_tip(tool);
+        }
+        let commands = handed.waiting.iter().filter(|(_, input)| matches!(input, Input::Command(_))).count();
+        let has_room = self.make_room(commands).is_ok();
+        let mut dropped = 0;
+        for (step, input) in handed.waiting {
+            let step = step.max(self.next_step);
+            match input {
+                Input::Command(due) if has_room || due.ends_lease => self.await_again(step, due, now_ns),
+                Input::Tissue(model) => {
+                    let memory = Resource::Memory(Purpose::Change);
+                    let taken =
+                        self.account.as_ref().map(|account| account.take(memory, model.bytes(), "")).transpose();
+                    match taken {
+                        Ok(taken) => {
+                            self.changes.push_back((step, model.clone(), taken));
+                            self.changed_to = Some(model);
+                        }
+                        Err(_) => dropped += 1,
+                    }
+                }
+                _ => dropped += 1,
+            }
+        }
+        self.changed = true;
+        dropped
+    }
+
+    /// A command that has waited elsewhere waits here.
+    fn await_again(&mut self, step: u64, mut due: Due, now_ns: u64) {
+        due.command.arrival_ns = now_ns;
+        let key = (step, self.arrivals);
+        self.arrivals += 1;
+        if !due.ends_lease {
+            self.counts.accepted += 1;
+            if let Some(lease) = self.leases.get_mut(due.command.tool) {
+                lease.tip_radius_m = tip_radius_m(&due.command);
+                lease.last_key = Some(key);
+            }
+        }
+        self.queue.insert(key, due);
+    }
+}

@@ -1,0 +1,652 @@
+//! Simulates a journal again: from its beginning or from a snapshot, up to a step, comparing every hash on the way.
+
+use std::collections::VecDeque;
+use std::io::{Cursor, Read, Seek};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use palpate_haptics::{Predictor, Tip};
+use palpate_proto::journal as pb;
+
+use super::message::{self, check_replays, from_command, from_hash, from_tissue};
+use super::reader::{JournalBatch, JournalReader, SnapshotAt, Survey};
+use crate::Session;
+use crate::command::Due;
+use crate::input::Input;
+use crate::prediction::{TICK_POINT_SUBSTEPS, TissueCopy};
+use crate::rules::Rules;
+use crate::saved::{self, Saved};
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::Model;
+use palpate_tissue::limits::Limits;
+use palpate_tissue::memory;
+use palpate_tissue::scheme_selection::given_up;
+
+/// What a journal has in its order.
+#[derive(Debug, Clone)]
+pub enum JournalItem {
+    /// An input.
+    Input(pb::Input),
+    /// A hash to compare with.
+    Hash(pb::Hash),
+    /// A snapshot.
+    Snapshot(pb::Snapshot),
+}
+
+impl JournalItem {
+    /// Steps done when it happened.
+    pub fn step(&self) -> u64 {
+        match self {
+            JournalItem::Input(input) => input.step,
+            JournalItem::Hash(hash) => hash.step,
+            JournalItem::Snapshot(snapshot) => snapshot.step,
+        }
+    }
+}
+
+/// Returns what a batch has, in order.
+///
+/// # Errors
+/// Refuses what can't be decoded, and what is not in the order of the inputs.
+pub fn items(batch: &JournalBatch) -> Result<VecDeque<JournalItem>> {
+    let hashes = batch.hashes()?.into_iter().map(|hash| (hash.after_inputs, JournalItem::Hash(hash)));
+    let snapshots =
+        batch.snapshots()?.into_iter().map(|snapshot| (snapshot.after_inputs, JournalItem::Snapshot(snapshot)));
+    let mut compared: Vec<(u64, JournalItem)> = hashes.chain(snapshots).collect();
+    compared.sort_by_key(|(after, item)| (*after, item.step()));
+    let range = batch.first_input..=batch.first_input + batch.input_count;
+    if compared.iter().any(|(after, _)| !range.contains(after)) {
+        return Err(batch.refuse("a hash or a snapshot is not among the inputs of its batch".to_owned()));
+    }
+    let (mut items, mut compared) = (VecDeque::new(), compared.into_iter().peekable());
+    for (number, input) in (batch.first_input..).zip(batch.inputs()?) {
+        while let Some((_, item)) = compared.next_if(|(after, _)| *after <= number) {
+            items.push_back(item);
+        }
+        items.push_back(JournalItem::Input(input));
+    }
+    items.extend(compared.map(|(_, item)| item));
+    Ok(items)
+}
+
+/// Where the recorded session and the one that is simulated again differ.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Difference {
+    /// The first step at which they are known to differ.
+    pub step: u64,
+    /// The last step at which they are known to be equal.
+    pub equal_until: Option<u64>,
+    /// What differs.
+    pub what: String,
+}
+
+/// What a replay tells on its way.
+pub enum ReplayEvent<'s> {
+    /// A step was done, or skipped at rest.
+    Step(&'s Session),
+    /// An input acts now, before the next step.
+    Input(&'s pb::Input),
+}
+
+/// A journal that is simulated again.
+pub struct Replay<R> {
+    reader: JournalReader<R>,
+    survey: Survey,
+    limits: Limits,
+    first: Arc<Model>,
+    rules: Rules,
+    session: Session,
+    items: VecDeque<JournalItem>,
+    /// What acts at the next step.
+    commands: Vec<Due>,
+    change: Option<Arc<Model>>,
+    running: bool,
+    until: Option<u64>,
+    hashes: u64,
+    snapshots: u64,
+    equal_until: Option<u64>,
+    difference: Option<Difference>,
+    /// A multiple of so many steps is not skipped.
+    stops_every: u64,
+}
+
+impl<R: Read + Seek> Replay<R> {
+    /// Begins a replay at the beginning of a journal.
+    ///
+    /// # Errors
+    /// Refuses a journal of another generation, and one whose tissue or first snapshot is not valid.
+    pub fn new(reader: JournalReader<R>, survey: Survey, limits: &Limits) -> Result<Self> {
+        let header = reader.header();
+        let begins = |at: &&SnapshotAt| at.step == header.begin_step && at.batch == 0;
+        let at = survey.snapshots.iter().find(begins).copied();
+        Replay::from_snapshot(reader, survey, limits, at.as_ref(), None)
+    }
+
+    /// Begins a replay at the newest snapshot that is not after `step`.
+    ///
+    /// # Errors
+    /// As for [`Replay::new`]; refuses a step before the beginning of the journal, or after its end.
+    pub fn near(reader: JournalReader<R>, survey: Survey, limits: &Limits, step: u64) -> Result<Self> {
+        Replay::near_with(reader, survey, limits, step, None)
+    }
+
+    /// The same. If `known` is of a journal of the same session, its tissue is not made again.
+    fn near_with(
+        reader: JournalReader<R>,
+        survey: Survey,
+        limits: &Limits,
+        step: u64,
+        known: Option<Known>,
+    ) -> Result<Self> {
+        let begin = reader.header().begin_step;
+        if !(begin..=survey.until_step).contains(&step) {
+            let damage = survey.and_damage();
+            let message =
+                format!("must be from {begin} to {}, which the journal has, but is {step}{damage}", survey.until_step);
+            let refusal = Refusal::new(Reason::OutOfRange, "step", message);
+            return Err(Refusal { place: Some(reader.place().to_owned()), ..refusal });
+        }
+        let before = survey.snapshots.partition_point(|at| at.step <= step);
+        let at = before.checked_sub(1).map(|index| survey.snapshots[index]);
+        Replay::from_snapshot(reader, survey, limits, at.as_ref(), known)
+    }
+
+    fn from_snapshot(
+        mut reader: JournalReader<R>,
+        survey: Survey,
+        given: &Limits,
+        at: Option<&SnapshotAt>,
+        known: Option<Known>,
+    ) -> Result<Self> {
+        let limits = message::limits(given);
+        let place = reader.place().to_owned();
+        let placed = |refusal: Refusal| Refusal { place: Some(place.clone()), ..refusal };
+        check_replays(reader.header()).map_err(placed)?;
+        let known = known.filter(|(header, _)| is_same_tissue(header, reader.header()));
+        let first =
+            known.map_or_else(|| message::model(reader.header(), &limits).map_err(placed), |known| Ok(known.1))?;
+        reader.keep(2 * first.session_bytes()).map_err(placed)?;
+        let rules = Rules::new(&first.scene, &limits);
+        let mut items = VecDeque::new();
+        let begin_step = reader.header().begin_step;
+        let (mut running, mut until) = (reader.header().running, reader.header().until_step);
+        let mut begins_with = None;
+        let session = match at {
+            None => {
+                let mut session = Session::new(&first);
+                session.skip_to(begin_step);
+                reader.rewind();
+                session
+            }
+            Some(at) => {
+                let (batch, snapshot, after) = snapshot(&mut reader, at)?;
+                items = after;
+                (running, until) = (snapshot.running, snapshot.until_step);
+                reader.pay_beside(saved::memory_of(&snapshot.saved)).map_err(|refusal| batch.placed(refusal))?;
+                let session = restored(&snapshot, &first, &limits).map_err(|refusal| batch.placed(refusal))?;
+                begins_with = Some(snapshot.hash);
+                session
+            }
+        };
+        let equal_until = Some(session.step_count()).filter(|_| at.is_some());
+        let mut replay = Replay {
+            reader,
+            survey,
+            limits,
+            first,
+            rules,
+            session,
+            items,
+            commands: Vec::new(),
+            change: None,
+            running,
+            until,
+            hashes: 0,
+            snapshots: u64::from(at.is_some()),
+            equal_until,
+            difference: None,
+            stops_every: u64::MAX,
+        };
+        if let Some(hash) = begins_with {
+            replay.compare(&hash, "snapshot")?;
+        }
+        Ok(replay)
+    }
+
+    /// Returns the steps that are multiples of `every` are seen also where the tissue rests.
+    #[must_use]
+    pub fn stopping_every(self, every: u64) -> Self {
+        Replay { stops_every: every.max(1), ..self }
+    }
+
+    /// Returns the session as it stands.
+    pub fn session(&self) -> &Session {
+        &self.session
+    }
+
+    /// Returns the tissue with which the session began.
+    pub fn first(&self) -> &Arc<Model> {
+        &self.first
+    }
+
+    /// Returns what the journal has.
+    pub fn survey(&self) -> &Survey {
+        &self.survey
+    }
+
+    /// Returns whether time goes on, and until which step.
+    pub fn running(&self) -> (bool, Option<u64>) {
+        let reached = self.until.is_some_and(|until| self.session.step_count() >= until);
+        (self.running && !reached && self.session.hold_reason().is_none(), self.until)
+    }
+
+    /// Hashes and snapshots that were compared so far.
+    pub fn compared(&self) -> [u64; 2] {
+        [self.hashes, self.snapshots]
+    }
+
+    /// Returns the first difference, if there is one: the replay has stopped there.
+    pub fn difference(&self) -> Option<&Difference> {
+        self.difference.as_ref()
+    }
+
+    /// Simulates until so many steps are done, at most as many as the journal has. What acts at that step has not acted then.
+    /// Ends early at a difference.
+    ///
+    /// # Errors
+    /// Refuses a journal that is damaged, or that has what no session accepts.
+    pub fn advance(&mut self, until: u64, see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()>) -> Result<()> {
+        let until = until.min(self.survey.until_step);
+        while self.difference.is_none() {
+            self.fill()?;
+            let next = self.items.front().map(|item| (item.step(), matches!(item, JournalItem::Input(_))));
+            let Some((step, is_input)) = next else { break };
+            if step > until || (step == until && is_input) {
+                break;
+            }
+            if step < self.session.step_count() {
+                let text = format!("something acts at step {step}, when {} are done", self.session.step_count());
+                return Err(self.reader.refuse(&text));
+            }
+            self.run_to(step, see)?;
+            if self.difference.is_none()
+                && let Some(item) = self.items.pop_front()
+            {
+                self.take(&item, see)?;
+            }
+        }
+        self.run_to(until, see)
+    }
+
+    /// Reads the next batch that has something, if all is taken.
+    fn fill(&mut self) -> Result<()> {
+        while self.items.is_empty() {
+            let Some(batch) = self.reader.next_batch()? else { break };
+            self.items = items(&batch)?;
+        }
+        Ok(())
+    }
+
+    fn run_to(&mut self, target: u64, see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()>) -> Result<()> {
+        while self.difference.is_none() && self.session.step_count() < target {
+            let step = self.session.step_count();
+            if let Some(model) = self.change.take() {
+                self.session.change(&model);
+            }
+            if let Some(reason) = self.session.hold_reason() {
+                let what = format!("the session is held here and went on when it was recorded: {reason}");
+                self.differ(step, what);
+                break;
+            }
+            self.check_work()?;
+            let rests = self.session.rests_until().filter(|until| self.commands.is_empty() && *until > step);
+            if let Some(rests) = rests {
+                let stop = (step + 1).checked_next_multiple_of(self.stops_every).unwrap_or(u64::MAX);
+                self.session.skip_to(target.min(rests).min(stop));
+                see(ReplayEvent::Step(&self.session))?;
+                continue;
+            }
+            let mut seen = Ok(());
+            self.session.advance(&mut self.commands, |session| {
+                if seen.is_ok() {
+                    seen = see(ReplayEvent::Step(session));
+                }
+            });
+            seen?;
+        }
+        Ok(())
+    }
+
+    /// Refuses steps that no server would do: the journal may be a stranger's.
+    fn check_work(&self) -> Result<()> {
+        let (model, most) = (self.session.model(), self.limits.point_substeps_per_step);
+        let (points, substeps) = (model.swept_points(), model.plan.substeps);
+        if (points as u64).saturating_mul(u64::from(substeps)) <= most {
+            return Ok(());
+        }
+        let message = format!(
+            "a step would compute {points} points {substeps} times, above the limit of {most} in all \
+             (limits.point_substeps_per_step)"
+        );
+        Err(Refusal { reason: Reason::TooLarge, ..self.reader.refuse(&message) })
+    }
+
+    fn differ(&mut self, step: u64, what: String) {
+        self.difference.get_or_insert(Difference { step, equal_until: self.equal_until, what });
+    }
+
+    fn take(&mut self, item: &JournalItem, see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()>) -> Result<()> {
+        match item {
+            JournalItem::Input(input) => {
+                see(ReplayEvent::Input(input))?;
+                let acted = self.act(input);
+                return acted.map_err(|refusal| {
+                    let field = if refusal.field.is_empty() { String::new() } else { format!("{}: ", refusal.field) };
+                    self.reader.refuse(&format!("the input at step {}: {field}{}", input.step, refusal.message))
+                });
+            }
+            JournalItem::Hash(hash) => {
+                self.hashes += 1;
+                self.compare(&hash.hash, "state")?;
+            }
+            JournalItem::Snapshot(snapshot) => {
+                self.snapshots += 1;
+                self.compare(&snapshot.hash, "state")?;
+                if self.difference.is_none() {
+                    self.reader.pay_beside(saved::memory_of(&snapshot.saved))?;
+                    let restored = restored(snapshot, &self.first, &self.limits);
+                    let restored = restored.map_err(|refusal| self.reader.refuse(&refusal.to_string()))?;
+                    self.compare(&message::hash(restored.tissue().state_hash()), "snapshot")?;
+                }
+            }
+        }
+        if self.difference.is_none() {
+            self.equal_until = Some(item.step());
+        }
+        Ok(())
+    }
+
+    fn compare(&mut self, recorded: &str, what: &str) -> Result<()> {
+        let computed = self.session.tissue().state_hash();
+        if from_hash(recorded)? != computed {
+            let step = self.session.step_count();
+            self.differ(step, format!("the {what} was {recorded} when it was recorded, and is {computed:032x}"));
+        }
+        Ok(())
+    }
+
+    fn act(&mut self, input: &pb::Input) -> Result<()> {
+        use pb::input::What;
+        match input.what.as_ref() {
+            Some(What::Command(command)) => {
+                self.commands.push(from_command(command, &self.rules, self.first.len())?);
+            }
+            Some(What::Tissue(tissue)) => self.change = Some(from_tissue(tissue, &self.first, &self.limits)?),
+            Some(What::Start(start)) => (self.running, self.until) = (true, start.until_step),
+            Some(What::Pause(_)) => self.running = false,
+            Some(What::Revive(_)) => {
+                let step = self.session.step_count();
+                if self.session.hold_reason().is_none() {
+                    self.differ(step, "the session was held when it was recorded, and is not here".to_owned());
+                    return Ok(());
+                }
+                let mut session = Session::new(self.session.model());
+                session.skip_to(step);
+                (self.session, self.running, self.until) = (session, false, None);
+                self.commands.clear();
+            }
+            Some(What::Hold(hold)) => self.session.hold(hold.reason.clone()),
+            Some(What::DroppedSteps(_)) | None => {}
+        }
+        Ok(())
+    }
+
+    /// Goes on to `step`. Gives the session there, the tissue with which it began, and the reader, for what follows.
+    ///
+    /// # Errors
+    /// As for [`Replay::advance`]; refuses a journal whose hashes are others, and when `stop` is set.
+    pub fn reach(mut self, step: u64, stop: &AtomicBool) -> Result<(Session, Arc<Model>, JournalReader<R>)> {
+        self.advance(step, &mut |_| if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) })?;
+        match self.difference {
+            Some(difference) => Err(self.reader.refuse(&difference.to_string())),
+            None => {
+                self.reader.let_go(2 * self.first.session_bytes());
+                Ok((self.session, self.first, self.reader))
+            }
+        }
+    }
+
+    /// Goes on to the end of the journal, and tells what was compared. `progress` gets the steps done and the last one, from time
+    /// to time.
+    ///
+    /// # Errors
+    /// As for [`Replay::advance`].
+    pub fn verify(mut self, progress: &mut dyn FnMut(u64, u64)) -> Result<Verdict> {
+        let (begin, end) = (self.reader.header().begin_step, self.survey.until_step);
+        self.advance(u64::MAX, &mut |seen| {
+            if let ReplayEvent::Step(session) = seen
+                && session.step_count().is_multiple_of(1024)
+            {
+                progress(session.step_count(), end);
+            }
+            Ok(())
+        })?;
+        let proved_until = self.equal_until.unwrap_or(begin).max(begin);
+        Ok(Verdict { steps: [begin, end], proved_until, compared: self.compared(), difference: self.difference })
+    }
+
+    /// Goes on to the end of the journal, for a server that goes on with the session: commands for the step after its end
+    /// have no effect, because their leases are over; what else was written does.
+    ///
+    /// # Errors
+    /// As for [`Replay::advance`]; and refuses a journal whose hashes are others.
+    pub fn resume(mut self) -> Result<Resumed> {
+        let see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()> = &mut |_| Ok(());
+        self.advance(u64::MAX, see)?;
+        loop {
+            self.fill()?;
+            let Some(item) = self.items.pop_front() else { break };
+            let is_command =
+                matches!(&item, JournalItem::Input(pb::Input { what: Some(pb::input::What::Command(_)), .. }));
+            if !is_command && item.step() == self.session.step_count() && self.difference.is_none() {
+                self.take(&item, see)?;
+            }
+        }
+        if let Some(difference) = self.difference {
+            return Err(self.reader.refuse(&difference.to_string()));
+        }
+        let (running, until_step) = self.running();
+        let waiting = self.waiting()?;
+        Ok(Resumed {
+            header: self.reader.header().clone(),
+            first: self.first,
+            session: self.session,
+            pending: self.change,
+            waiting,
+            running,
+            until_step,
+            survey: self.survey,
+        })
+    }
+
+    /// The changes of the tissue that wait for a step after this one; none of a session that is held.
+    fn waiting(&self) -> Result<Vec<(u64, Input)>> {
+        let next = self.session.step_count() + u64::from(self.change.is_some());
+        let is_held = self.session.hold_reason().is_some();
+        let left = self.survey.waiting.iter().filter(|input| !is_held && input.step >= next);
+        let mut waiting = Vec::new();
+        for input in left.take(self.limits.queued_changes) {
+            let Some(pb::input::What::Tissue(tissue)) = &input.what else { continue };
+            let model = from_tissue(tissue, &self.first, &self.limits)
+                .map_err(|refusal| self.reader.refuse(&format!("what waits for step {}: {refusal}", input.step)))?;
+            waiting.push((input.step, Input::Tissue(model)));
+        }
+        waiting.sort_by_key(|(step, _)| *step);
+        Ok(waiting)
+    }
+}
+
+impl std::fmt::Display for Difference {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Difference { step, equal_until, what } = self;
+        write!(f, "differs at step {step}: {what}")?;
+        match equal_until {
+            Some(equal) => write!(f, "; at step {equal} they were equal"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// The snapshot there: its batch, and what comes after it in that.
+fn snapshot<R: Read + Seek>(
+    reader: &mut JournalReader<R>,
+    at: &SnapshotAt,
+) -> Result<(JournalBatch, pb::Snapshot, VecDeque<JournalItem>)> {
+    reader.go_to(at);
+    let Some(batch) = reader.next_batch()? else {
+        return Err(reader.refuse("the batch of a snapshot is missing"));
+    };
+    let mut items = items(&batch)?;
+    loop {
+        match items.pop_front() {
+            Some(JournalItem::Snapshot(snapshot)) if snapshot.step == at.step => return Ok((batch, snapshot, items)),
+            Some(_) => {}
+            None => return Err(batch.refuse("a snapshot is missing".to_owned())),
+        }
+    }
+}
+
+/// What is saved in a snapshot, and the tissue of that.
+fn saved(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Result<(Saved, Arc<Model>)> {
+    let saved = Saved::from_bytes(&snapshot.saved, limits)?;
+    if saved.step() != snapshot.step {
+        let message = format!("is of step {}, where one of step {} should be", saved.step(), snapshot.step);
+        return Err(Refusal::new(Reason::Unreadable, "snapshot", message));
+    }
+    // Most sessions have the tissue that they began with.
+    let is_first = *saved.tissue() == first.tissue_state();
+    let model = if is_first { first.clone() } else { Model::resumed(&first.scene, saved.tissue(), limits)? };
+    Ok((saved, model))
+}
+
+/// The session in a snapshot.
+fn restored(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Result<Session> {
+    let (saved, model) = saved(snapshot, first, limits)?;
+    Session::restore(&model, &saved)
+}
+
+/// A session at the end of its journal.
+pub struct Resumed {
+    /// The journal's header.
+    pub header: pb::Header,
+    /// The tissue with which the session began: of its scene, changes are made.
+    pub first: Arc<Model>,
+    /// The session at the last durable step. Its tools are as they were: who goes on lets go of them.
+    pub session: Session,
+    /// The tissue from this step on, if it changes here: for `Session::change`.
+    pub pending: Option<Arc<Model>>,
+    /// Changes of the tissue that wait for a later step, each with that step.
+    pub waiting: Vec<(u64, Input)>,
+    /// Whether time goes on.
+    pub running: bool,
+    /// The step at which it pauses.
+    pub until_step: Option<u64>,
+    /// What the journal has.
+    pub survey: Survey,
+}
+
+/// Returns the session at the end of a journal, computed from its newest snapshot on, with its hashes compared.
+///
+/// # Errors
+/// Refuses a journal that is damaged in the middle, is of another generation, or gives other hashes.
+pub fn resume<R: Read + Seek>(reader: JournalReader<R>, limits: &Limits) -> Result<Resumed> {
+    resume_as(reader, limits, None)
+}
+
+/// Returns a copy of the tissue in the bytes of a snapshot, as it was then but at rest, for a client's tool with this
+/// tip: such as can be stepped at 1 kHz. Neither steps nor tools of the session are restored, whatever they would cost.
+///
+/// # Errors
+/// Refuses what is no snapshot of one moment, a tissue that is too large or a tip that covers too much of it, and tells that
+/// there is no memory.
+pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predictor>, String> {
+    #[allow(clippy::cast_possible_truncation)]
+    let limits = message::limits(&Limits { points: TICK_POINT_SUBSTEPS as usize, ..Limits::default() });
+    let copy = || {
+        // It came from a server: what it names of the machine there is not for this one.
+        let mut reader = JournalReader::new("the snapshot", Cursor::new(bytes))?.without_files();
+        check_replays(reader.header())?;
+        let survey = reader.survey(&mut |_| {})?;
+        let Some(at) = survey.snapshots.last() else { return Err(reader.refuse("has no snapshot")) };
+        let first = message::model(reader.header(), &limits)?;
+        let (_, snapshot, _) = snapshot(&mut reader, at)?;
+        let (_, model) = saved(&snapshot, &first, &limits)?;
+        TissueCopy::of_stranger(&model, tip)
+    };
+    let copy = memory::attempt("snapshot", copy).map_err(|refusal| refusal.to_string())?;
+    Ok(Box::new(copy))
+}
+
+/// The header of a journal, and the tissue that it begins with.
+pub type Known = (pb::Header, Arc<Model>);
+
+/// Does the same. If `known` is of a journal of the same session, its tissue is not made again.
+///
+/// # Errors
+/// As for [`resume`].
+pub fn resume_as<R: Read + Seek>(
+    mut reader: JournalReader<R>,
+    limits: &Limits,
+    known: Option<Known>,
+) -> Result<Resumed> {
+    let survey = reader.survey(&mut |_| {})?;
+    let until = survey.until_step;
+    Replay::near_with(reader, survey, limits, until, known)?.resume()
+}
+
+fn is_same_tissue(a: &pb::Header, b: &pb::Header) -> bool {
+    a.session_id == b.session_id && a.scene == b.scene && a.mesh == b.mesh && a.tissue == b.tissue
+}
+
+/// Returns the session after `step` steps, computed from the newest snapshot before.
+///
+/// # Errors
+/// Refuses a step that the journal has not, and as [`resume`] does; also when `stop` is set.
+pub fn session_at<R: Read + Seek>(
+    mut reader: JournalReader<R>,
+    limits: &Limits,
+    step: u64,
+    stop: &AtomicBool,
+) -> Result<(Session, Arc<Model>)> {
+    let survey = reader.survey(&mut |_| {})?;
+    let (session, first, _) = Replay::near(reader, survey, limits, step)?.reach(step, stop)?;
+    Ok((session, first))
+}
+
+/// The result of a verification.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Verdict {
+    /// Steps done at the beginning and at the end.
+    pub steps: [u64; 2],
+    /// The last step whose hash is in the journal and was equal: nothing is known of the steps after it. That of the beginning if no
+    /// hash was compared.
+    pub proved_until: u64,
+    /// Hashes and snapshots that were compared.
+    pub compared: [u64; 2],
+    /// The first difference.
+    pub difference: Option<Difference>,
+}
+
+/// Simulates all of a journal, and compares every hash and every snapshot. `progress` gets the steps done and the last one, from
+/// time to time.
+///
+/// # Errors
+/// Refuses a journal that can't be read or simulated.
+pub fn verify<R: Read + Seek>(
+    mut reader: JournalReader<R>,
+    limits: &Limits,
+    progress: &mut dyn FnMut(u64, u64),
+) -> Result<Verdict> {
+    let survey = reader.survey(&mut |_| {})?;
+    Replay::new(reader, survey, limits)?.verify(progress)
+}

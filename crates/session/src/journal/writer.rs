@@ -1,0 +1,291 @@
+//! Writes the journal of a run: takes in what happens, and gives the bytes to append to its file.
+
+use palpate_proto::journal as pb;
+use prost::Message;
+use std::sync::Arc;
+
+use super::format::{self, MAX_INPUTS, REPLAYS, Topic, VERSION};
+use super::message::{self, Tips};
+use super::records::{self, Chunk};
+use super::signature::{Key, Signer};
+use crate::input::{Felt, Input};
+use palpate_tissue::Model;
+
+/// What a journal begins with.
+#[derive(Debug, Clone)]
+pub struct Opening<'a> {
+    /// The session's id.
+    pub session_id: &'a str,
+    /// Number of the run, from 1.
+    pub run: u64,
+    /// Who made the session, for people.
+    pub owner: &'a str,
+    /// Time without use after which it is deleted, s.
+    pub idle_timeout_s: f64,
+    /// The tissue with which the session began, in its first run.
+    pub first: &'a Arc<Model>,
+    /// Steps done.
+    pub begin_step: u64,
+    /// Whether time goes on.
+    pub running: bool,
+    /// The step at which it pauses, if it runs to one.
+    pub until_step: Option<u64>,
+    /// The revision at which the server became the session's owner; 0 without a fleet.
+    pub ownership_revision: u64,
+}
+
+impl Opening<'_> {
+    fn message(&self) -> pb::Header {
+        let (scene, mesh, appearance) = message::scene(&self.first.scene);
+        pb::Header {
+            session_id: self.session_id.to_owned(),
+            run: self.run,
+            version: VERSION.to_owned(),
+            replays: REPLAYS,
+            owner: self.owner.to_owned(),
+            rate_hz: self.first.scene.stepping.rate_hz,
+            idle_timeout_s: self.idle_timeout_s,
+            begin_step: self.begin_step,
+            running: self.running,
+            until_step: self.until_step,
+            scene: Some(scene),
+            mesh,
+            appearance: Some(appearance),
+            tissue: Some(message::tissue(self.first)),
+            ownership_revision: self.ownership_revision,
+        }
+    }
+}
+
+/// A batch is begun anew when its messages have so many bytes.
+const USUAL_BYTES: usize = 4 << 20;
+
+/// The writer of a journal. It holds what waits for the next flush, and nothing else: neither a file nor an index.
+#[derive(Debug)]
+pub struct JournalWriter {
+    /// Batches made so far, and inputs in them.
+    batches: u64,
+    inputs_before: u64,
+    /// Batches that are on the disk for certain.
+    durable: u64,
+    until_step: u64,
+    /// Whether time goes on, and until which step.
+    running: (bool, Option<u64>),
+    /// The time of the last flush.
+    unix_ns: u64,
+    inputs: Vec<pb::Input>,
+    tips: Tips,
+    moments: Vec<pb::Moment>,
+    /// Other messages, in order.
+    messages: Vec<(Topic, Vec<u8>)>,
+    bytes: usize,
+    /// Chunks that are full before their flush.
+    full: Vec<u8>,
+    signer: Option<Signer>,
+    /// Nothing comes after the batch that is written.
+    ends: bool,
+}
+
+impl JournalWriter {
+    /// Begins a journal. The first flush gives its beginning.
+    ///
+    /// A session that does not begin at rest needs a snapshot of its beginning in the first batch ([`JournalWriter::snapshot`]).
+    /// `unix_ns` is the time.
+    pub fn new(opening: &Opening<'_>, unix_ns: u64) -> Self {
+        JournalWriter::with_header(&opening.message(), unix_ns)
+    }
+
+    /// The same with a header that another journal had.
+    pub(super) fn with_header(header: &pb::Header, unix_ns: u64) -> Self {
+        let bytes = header.encode_to_vec();
+        JournalWriter {
+            batches: 0,
+            inputs_before: 0,
+            durable: 0,
+            until_step: header.begin_step,
+            running: (header.running, header.until_step),
+            unix_ns,
+            inputs: Vec::new(),
+            tips: Tips::new(),
+            moments: Vec::new(),
+            bytes: bytes.len(),
+            messages: vec![(Topic::Header, bytes)],
+            full: Vec::new(),
+            signer: None,
+            ends: false,
+        }
+    }
+
+    /// Returns the same, which signs what it writes.
+    #[must_use]
+    pub fn signed(self, key: Option<&Key>) -> Self {
+        JournalWriter { signer: key.map(|key| Signer::new(key.clone())), ..self }
+    }
+
+    /// For what is appended to a journal that has so many batches and inputs, up to a step.
+    pub(super) fn after(batches: u64, inputs: u64, until_step: u64) -> Self {
+        let writer = JournalWriter::with_header(&pb::Header { begin_step: until_step, ..Default::default() }, 0);
+        JournalWriter { batches, inputs_before: inputs, durable: batches, messages: Vec::new(), bytes: 0, ..writer }
+    }
+
+    /// Writes an input that acts at `step`: on the state after so many steps. In the order in which they act.
+    pub fn input(&mut self, step: u64, input: &Input) {
+        let message = message::input(step, input, &mut self.tips);
+        self.add_input(message);
+    }
+
+    /// The same as a message.
+    pub(super) fn add_input(&mut self, message: pb::Input) {
+        match &message.what {
+            Some(pb::input::What::Start(start)) => self.running = (true, start.until_step),
+            Some(pb::input::What::Pause(_) | pb::input::What::Revive(_)) => self.running.0 = false,
+            _ => {}
+        }
+        self.bytes += message.encoded_len();
+        self.inputs.push(message);
+        if self.inputs.len() == MAX_INPUTS || self.bytes > USUAL_BYTES {
+            self.end_batch();
+        }
+    }
+
+    /// Writes the state's hash after `step` steps, before what acts at that step.
+    pub fn hash(&mut self, step: u64, hash: u128) {
+        self.add_hash(pb::Hash { step, hash: message::hash(hash), after_inputs: 0 });
+    }
+
+    pub(super) fn add_hash(&mut self, hash: pb::Hash) {
+        let hash = pb::Hash { after_inputs: self.input_count(), ..hash };
+        self.message(Topic::Hashes, hash.encode_to_vec());
+    }
+
+    /// Writes a snapshot after `step` steps, before what acts at that step: the state's hash, its tissue, and the session's state as
+    /// `Saved::to_bytes` gives it.
+    pub fn snapshot(&mut self, step: u64, hash: u128, model: &Model, saved: Vec<u8>) {
+        let (tissue, hash) = (Some(message::tissue(model)), message::hash(hash));
+        self.add_snapshot(pb::Snapshot { step, hash, tissue, saved, ..Default::default() });
+    }
+
+    pub(super) fn add_snapshot(&mut self, snapshot: pb::Snapshot) {
+        let (running, until_step) = self.running;
+        let snapshot = pb::Snapshot { after_inputs: self.input_count(), running, until_step, ..snapshot };
+        self.message(Topic::Snapshots, snapshot.encode_to_vec());
+    }
+
+    /// Writes all changes of the tissue that wait for their step, each with that step: these instead of those told before.
+    pub fn waiting(&mut self, changes: &[(u64, Arc<Model>)]) {
+        let input =
+            |(step, model): &(u64, Arc<Model>)| message::input(*step, &Input::Tissue(model.clone()), &mut Tips::new());
+        let waiting = pb::Waiting { inputs: changes.iter().map(input).collect() };
+        self.message(Topic::Waiting, waiting.encode_to_vec());
+    }
+
+    /// Writes what the tools feel after `step` steps.
+    pub fn felt(&mut self, step: u64, felt: &[Felt]) {
+        if !felt.is_empty() {
+            self.add_moment(message::moment(step, felt));
+        }
+    }
+
+    pub(super) fn add_moment(&mut self, moment: pb::Moment) {
+        self.bytes += moment.encoded_len();
+        self.moments.push(moment);
+        if self.bytes > USUAL_BYTES {
+            self.end_batch();
+        }
+    }
+
+    fn message(&mut self, topic: Topic, bytes: Vec<u8>) {
+        self.bytes += bytes.len();
+        self.messages.push((topic, bytes));
+    }
+
+    fn input_count(&self) -> u64 {
+        self.inputs_before + self.inputs.len() as u64
+    }
+
+    /// Returns the bytes that wait for a flush, about.
+    pub fn waiting_bytes(&self) -> usize {
+        self.bytes + self.full.len()
+    }
+
+    /// Returns the last step up to which the batches so far are complete.
+    pub fn until_step(&self) -> u64 {
+        self.until_step
+    }
+
+    /// Batches made so far: when what a flush gave is on the disk for certain, [`JournalWriter::durable`] is to be told the number
+    /// that this was after that flush.
+    pub fn batches(&self) -> u64 {
+        self.batches
+    }
+
+    /// Notes that the first `batches` batches are on the disk for certain. Later batches say so, and damage among them is told from
+    /// a torn end.
+    pub fn durable(&mut self, batches: u64) {
+        self.durable = self.durable.max(batches.min(self.batches));
+    }
+
+    /// Ends the batch: everything that acts before `until_step` steps are done has been taken in. The bytes are to be
+    /// appended to the file in one piece; none if nothing has happened, not even steps. `unix_ns` is the time.
+    pub fn flush(&mut self, until_step: u64, unix_ns: u64) -> Vec<u8> {
+        let is_new = self.batches == 0 || until_step > self.until_step;
+        self.until_step = self.until_step.max(until_step);
+        self.unix_ns = unix_ns;
+        if is_new || !self.inputs.is_empty() || !self.messages.is_empty() || !self.moments.is_empty() {
+            self.end_batch();
+        }
+        std::mem::take(&mut self.full)
+    }
+
+    /// Returns the last batch, which says why the journal ends. [`super::seal`] makes an indexed file of what is then
+    /// complete.
+    pub fn finish(mut self, why: pb::Why, message: &str, until_step: u64, unix_ns: u64) -> Vec<u8> {
+        let end = pb::End { why: why.into(), message: message.to_owned() };
+        self.message(Topic::End, end.encode_to_vec());
+        self.ends = true;
+        self.flush(until_step, unix_ns)
+    }
+
+    /// Ends the batch, without a new step up to which the file is complete.
+    #[allow(clippy::cast_possible_truncation)]
+    fn end_batch(&mut self) {
+        let mut channels = Vec::new();
+        if self.batches == 0 {
+            self.full = records::beginning(&format!("palpate {VERSION}"));
+            format::channels(&mut channels, self.signer.is_some());
+        }
+        let mut chunk = Chunk::new(self.unix_ns, self.batches as u32, &channels);
+        let inputs = std::mem::take(&mut self.inputs);
+        let count = inputs.len() as u64;
+        let inputs = pb::Inputs {
+            batch: self.batches,
+            until_step: self.until_step,
+            durable_batches: self.durable,
+            first_input: self.inputs_before,
+            inputs,
+        };
+        let messages = std::mem::take(&mut self.messages);
+        let (first, others) = messages.split_at(messages.iter().filter(|message| message.0 == Topic::Header).count());
+        let mut add = |topic: Topic, bytes: &[u8]| {
+            chunk.add(topic.channel(), bytes);
+            if let Some(signer) = &mut self.signer {
+                signer.add(topic, self.unix_ns, bytes);
+            }
+        };
+        first.iter().for_each(|(topic, bytes)| add(*topic, bytes));
+        add(Topic::Inputs, &inputs.encode_to_vec());
+        if !self.moments.is_empty() {
+            let moments = std::mem::take(&mut self.moments);
+            add(Topic::Felt, &pb::Felt { moments }.encode_to_vec());
+        }
+        others.iter().for_each(|(topic, bytes)| add(*topic, bytes));
+        if let Some(signature) = self.signer.as_mut().and_then(|signer| signer.sign(self.unix_ns, self.ends)) {
+            chunk.add(Topic::Signatures.channel(), &signature);
+        }
+        self.full.extend(chunk.finish());
+        self.batches += 1;
+        self.inputs_before += count;
+        self.bytes = 0;
+        self.tips.clear();
+    }
+}

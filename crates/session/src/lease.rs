@@ -1,0 +1,227 @@
+//! Leases: who holds which tool, and until when. Time is an argument.
+
+use std::collections::BTreeMap;
+
+use crate::budget::{Account, Taken};
+use palpate_refusal::{Reason, Refusal, Result, label, number};
+use palpate_tissue::limits::Limits;
+
+/// Identifies a lease. Random, so that it can't be guessed.
+pub type LeaseId = u128;
+
+/// One tool of a lease.
+#[derive(Debug)]
+pub(super) struct LeasedTool {
+    pub(super) id: LeaseId,
+    holder: String,
+    duration_ns: u64,
+    expires_ns: u64,
+    pub(super) last_sequence: Option<u64>,
+    /// Radius of the tip that the newest command gives the tool, m.
+    pub(super) tip_radius_m: Option<f64>,
+    /// Key of the tool's newest command in the queue.
+    pub(super) last_key: Option<QueueKey>,
+    /// A batch of commands is being taken in: those of the tool that came since this arrival wait for the rest of it.
+    pub(super) batch_since: Option<u64>,
+    /// What the holder's account is charged for this tool.
+    charge: Option<Taken>,
+}
+
+/// A tool that somebody holds, as a server hands it over with its session.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct HandedLease {
+    /// The tool's number.
+    pub tool: u32,
+    /// Its lease.
+    pub id: LeaseId,
+    /// Who holds it, for people.
+    pub holder: String,
+    /// The lease lapses after this time without a command or renewal, ns.
+    pub duration_ns: u64,
+    /// Name of the account that pays for it; empty if none does.
+    pub owner: String,
+}
+
+/// Key of a command in the queue: step, then order of arrival.
+pub(super) type QueueKey = (u64, u64);
+
+/// The leases of a session, by tool.
+#[derive(Debug, Default)]
+pub(super) struct Leases {
+    held: BTreeMap<u32, LeasedTool>,
+    lapsed: u64,
+}
+
+impl Leases {
+    /// Takes all of `tools` or none. The leases lapse after `lease_s` without a command or renewal.
+    ///
+    /// # Errors
+    /// Refuses tools that are unknown, named twice or held, and a holder name or a lease time out of range.
+    pub(super) fn acquire(
+        &mut self,
+        tools: &[u32],
+        holder: &str,
+        lease_s: f64,
+        id: LeaseId,
+        now_ns: u64,
+        limits: &Limits,
+    ) -> Result<()> {
+        let longest_s = limits.lease_s;
+        number("lease_s", lease_s, &format!("from 0.01 to {longest_s}"), |v| v >= 0.01 && v <= longest_s)?;
+        label("holder", holder)?;
+        for (index, tool) in tools.iter().enumerate() {
+            if *tool >= limits.tools {
+                let message = format!("must be below {}, but is {tool}", limits.tools);
+                return Err(Refusal::new(Reason::OutOfRange, "tools", message));
+            }
+            if tools[..index].contains(tool) {
+                return Err(Refusal::new(Reason::OutOfRange, "tools", format!("names tool {tool} twice")));
+            }
+            if let Some(lease) = self.held.get(tool) {
+                let holder = if lease.holder.is_empty() { "somebody" } else { &lease.holder };
+                let message = format!("tool {tool} is held by `{holder}`");
+                return Err(Refusal::new(Reason::ToolHeld, "tools", message));
+            }
+        }
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let duration_ns = (lease_s * 1e9) as u64;
+        for tool in tools {
+            let lease = LeasedTool {
+                id,
+                holder: holder.to_owned(),
+                duration_ns,
+                expires_ns: now_ns.saturating_add(duration_ns),
+                last_sequence: None,
+                tip_radius_m: None,
+                last_key: None,
+                batch_since: None,
+                charge: None,
+            };
+            self.held.insert(*tool, lease);
+        }
+        Ok(())
+    }
+
+    /// The tips that the newest commands give the tools: numbers and radii, m.
+    pub(super) fn tips_m(&self) -> impl Iterator<Item = (u32, Option<f64>)> + '_ {
+        self.held.iter().map(|(tool, lease)| (*tool, lease.tip_radius_m))
+    }
+
+    /// Extends a lease: its holder is alive.
+    ///
+    /// # Errors
+    /// Refuses an unknown or lapsed lease.
+    pub(super) fn renew(&mut self, id: LeaseId, now_ns: u64) -> Result<()> {
+        let mut is_held = false;
+        for lease in self.of_mut(id) {
+            lease.expires_ns = now_ns.saturating_add(lease.duration_ns);
+            is_held = true;
+        }
+        if is_held { Ok(()) } else { Err(not_held()) }
+    }
+
+    /// The tools of a lease.
+    pub(super) fn tools_of(&self, id: LeaseId) -> impl Iterator<Item = u32> {
+        self.held.iter().filter(move |lease| lease.1.id == id).map(|lease| *lease.0)
+    }
+
+    /// The same, with what is known of each.
+    pub(super) fn of(&self, id: LeaseId) -> impl Iterator<Item = &LeasedTool> {
+        self.held.values().filter(move |lease| lease.id == id)
+    }
+
+    /// The same, to change them.
+    pub(super) fn of_mut(&mut self, id: LeaseId) -> impl Iterator<Item = &mut LeasedTool> {
+        self.held.values_mut().filter(move |lease| lease.id == id)
+    }
+
+    /// A tool, if it is held.
+    pub(super) fn get(&self, tool: u32) -> Option<&LeasedTool> {
+        self.held.get(&tool)
+    }
+
+    /// The same, to change it.
+    pub(super) fn get_mut(&mut self, tool: u32) -> Option<&mut LeasedTool> {
+        self.held.get_mut(&tool)
+    }
+
+    /// Takes a tool out of its lease.
+    pub(super) fn remove(&mut self, tool: u32) {
+        self.held.remove(&tool);
+    }
+
+    /// Removes all leases.
+    pub(super) fn clear(&mut self) {
+        self.held.clear();
+    }
+
+    /// A tool whose lease has expired at `now_ns`, if there is one. It is counted as lapsed.
+    pub(super) fn take_expired(&mut self, now_ns: u64) -> Option<u32> {
+        let tool = self.held.iter().find(|lease| lease.1.expires_ns <= now_ns).map(|lease| *lease.0)?;
+        self.held.remove(&tool);
+        self.lapsed += 1;
+        Some(tool)
+    }
+
+    /// When the first lease expires.
+    pub(super) fn first_expiry_ns(&self) -> Option<u64> {
+        self.held.values().map(|lease| lease.expires_ns).min()
+    }
+
+    /// Each held tool and its holder.
+    pub(super) fn holders(&self) -> impl Iterator<Item = (u32, &str)> {
+        self.held.iter().map(|(tool, lease)| (*tool, lease.holder.as_str()))
+    }
+
+    /// Total number of tools whose lease lapsed.
+    pub(super) fn lapsed(&self) -> u64 {
+        self.lapsed
+    }
+
+    /// The tools for which `chosen` holds, by number and by who pays for them.
+    pub(super) fn chosen(&self, chosen: impl Fn(u32, Option<&Account>) -> bool) -> Vec<u32> {
+        let payer = |lease: &LeasedTool| lease.charge.as_ref().map(Taken::account).cloned();
+        let is_chosen = |(tool, lease): &(&u32, &LeasedTool)| chosen(**tool, payer(lease).as_ref());
+        self.held.iter().filter(is_chosen).map(|lease| *lease.0).collect()
+    }
+
+    /// Each held tool with its lease, for a server that goes on with the session.
+    pub(super) fn handed(&self) -> Vec<HandedLease> {
+        let of = |(tool, lease): (&u32, &LeasedTool)| HandedLease {
+            tool: *tool,
+            id: lease.id,
+            holder: lease.holder.clone(),
+            duration_ns: lease.duration_ns,
+            owner: lease.charge.as_ref().map(|charge| charge.account().name().to_owned()).unwrap_or_default(),
+        };
+        self.held.iter().map(of).collect()
+    }
+
+    /// Goes on with a lease of another server. Its commands are numbered anew.
+    pub(super) fn adopt(&mut self, lease: HandedLease, now_ns: u64) {
+        let HandedLease { tool, id, holder, duration_ns, .. } = lease;
+        let leased = LeasedTool {
+            id,
+            holder,
+            duration_ns,
+            expires_ns: now_ns.saturating_add(duration_ns),
+            last_sequence: None,
+            tip_radius_m: None,
+            last_key: None,
+            batch_since: None,
+            charge: None,
+        };
+        self.held.insert(tool, leased);
+    }
+
+    /// Charges the tools of a lease to who took them, one of `charges` each.
+    pub(super) fn charge(&mut self, id: LeaseId, charges: Vec<Taken>) {
+        self.of_mut(id).zip(charges).for_each(|(lease, charge)| lease.charge = Some(charge));
+    }
+}
+
+/// The refusal of a lease that holds nothing.
+pub(super) fn not_held() -> Refusal {
+    let message = "no tool is held by this lease: it lapsed or was given back";
+    Refusal::new(Reason::NotHolder, "lease_id", message)
+}

@@ -1,0 +1,687 @@
+//! One tissue in use: the actions of the tools, the forces on them, and the records. No clock, no socket: a session
+//! with the same commands at the same steps gives the same bits.
+//!
+//! **Held and continuous forces.** `palpate run` takes a script's force as a function of time. Commands, and `run --held`, keep
+//! a force constant over each step. `Script::actions_at` states once what a client tells the tools at each step; runs offline
+//! and replays both send that through the same intake, so their hashes are equal. A grasped point reaches its target at the
+//! *end* of the command's step with constant velocity: its place at each step is exact, and no substep sees a jump.
+//!
+//! **Records.** A record at a jump of force shows the forces just before it; at t = 0, just after.
+//!
+//! **Order.** Commands that are due at one step act in the order of their tools' numbers, not of arrival: two clients that
+//! stamp their commands get the same bits whichever network was faster. A second tool that grasps a point takes it over.
+
+pub mod audit;
+pub mod batch;
+pub mod budget;
+pub mod check;
+pub mod command;
+mod indentation;
+pub mod input;
+pub mod intake;
+pub mod intake_transfer;
+pub mod journal;
+pub mod laws;
+pub mod lease;
+pub mod local;
+pub mod prediction;
+pub mod queue;
+pub mod recovery;
+pub mod rules;
+pub mod run;
+pub mod sampling;
+pub mod saved;
+mod scene_report;
+pub mod schedule;
+pub mod surface;
+mod tool_depth;
+pub mod wire;
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use command::Due;
+use palpate_haptics::LocalModel;
+use palpate_haptics::Tip;
+use palpate_haptics::path::{Path, Play};
+use palpate_tissue::audit::{Mark, WindowInputs};
+use palpate_tissue::memory;
+use palpate_tissue::scene::profile::{LoadProfile, MotionProfile, Poke};
+use palpate_tissue::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
+use palpate_tissue::scene::script::Action;
+use palpate_tissue::shape::{self, PointId, PointName};
+use palpate_tissue::{self as tissue, BlowUp, Energy, Grasp, Model, PointState, Push, ReadCopy, Tissue, ToolContact};
+use recovery::{Ended, Recovered, Recoveries, describe};
+
+/// A small organ whose points are heavy and light.
+#[cfg(test)]
+const GALLBLADDER: &str = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\n[material]\nyoungs_modulus_pa = 2e4\n\
+    thickness_m = 0.003\nfoundation_n_per_m3 = 5e6\n[stepping]\nsubsteps = 8\n";
+
+/// The name of a record in messages.
+const RECORD: &str = "a record";
+
+/// The sample of one tool at the end of a step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ToolSample {
+    /// The tool's number.
+    pub tool: u32,
+    /// Sequence of the newest command that took effect; 0 before the first.
+    pub acknowledged_sequence: u64,
+    /// Time of that command by the client's clock.
+    pub client_time_ns: u64,
+    /// Arrival of that command by the server's clock; 0 before the first.
+    pub arrival_ns: u64,
+    /// Motion and forces at the tool's control point, if it acts.
+    pub contact: Option<Contact>,
+    /// Motion and force of a position-controlled tool itself.
+    pub feel: Option<ToolContact>,
+    /// Client time of the place of such a tool, s.
+    pub place_time_s: f64,
+    /// The local model from which a client renders, for a stream that requests it.
+    pub local: Option<LocalModel>,
+    /// Whether the tool is held in place because no command came for long.
+    pub stale: bool,
+    /// Whether the acknowledged command came too late for its step.
+    pub late: bool,
+    /// Whether the tool's action was ended by its time to live, with its lease, for lack of poses, or by a recovery; or had
+    /// no effect because the tool is paused.
+    pub expired: bool,
+    /// The step before which commands to the tool have no effect, if it was ever paused ([`recovery`]).
+    pub paused_until: Option<u64>,
+}
+
+/// The control point of a tool.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Contact {
+    /// The mass point.
+    pub point: PointId,
+    /// From rest, m. Under the tip of a tool led by poses the mean over its disc.
+    pub displacement_m: DVec3,
+    /// How far the surface is moved just under the control point, m.
+    pub surface_displacement_m: DVec3,
+    /// m/s.
+    pub velocity_m_per_s: DVec3,
+    /// Force of the tissue on the tool: springs + anchor spring + damping, N.
+    pub force_on_tool_n: DVec3,
+    /// Force of all tools on the point, N.
+    pub applied_force_n: DVec3,
+}
+
+/// The samples of all tools at the end of a step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sample {
+    /// Steps done.
+    pub step: u64,
+    /// s.
+    pub simulation_time_s: f64,
+    /// Points computed in the step.
+    pub awake_points: usize,
+    /// Total number of commands that came too late.
+    pub late_commands: u64,
+    /// Whether the guard has ended the session.
+    pub held: bool,
+    /// How often the tissue was taken back to an earlier state ([`recovery`]).
+    pub recoveries: u64,
+    /// The newest of these, with the tools that it released.
+    pub recovered: Option<Arc<Recovered>>,
+    /// By ascending number of the tool.
+    pub tools: Vec<ToolSample>,
+}
+
+#[derive(Debug, Clone, Default)]
+struct Tool {
+    acknowledged_sequence: u64,
+    client_time_ns: u64,
+    arrival_ns: u64,
+    control_point: Option<PointId>,
+    /// The force whose reaction is told, if it was given by a place.
+    around: Option<Poke>,
+    expires_at: Option<u64>,
+    late: bool,
+    expired: bool,
+    posed: Option<Posed>,
+    paused_until: Option<u64>,
+}
+
+/// A position-controlled tool.
+#[derive(Debug, Clone)]
+struct Posed {
+    tip: Tip,
+    path: Path,
+    /// Client time of its place, s.
+    client_time_s: f64,
+}
+
+/// A tissue and its tools.
+pub struct Session {
+    tissue: Box<dyn Tissue>,
+    tools: Vec<Tool>,
+    late_commands: u64,
+    paused_commands: u64,
+    path_counts: [u64; 3],
+    recoveries: Recoveries,
+    hold_reason: Option<String>,
+}
+
+impl Session {
+    /// Creates a session of a tissue at rest.
+    pub fn new(model: &Arc<Model>) -> Self {
+        Session {
+            tissue: tissue::at_rest(model),
+            tools: Vec::new(),
+            late_commands: 0,
+            paused_commands: 0,
+            path_counts: [0; 3],
+            recoveries: Recoveries::default(),
+            hold_reason: None,
+        }
+    }
+
+    /// Returns the model of the tissue.
+    pub fn model(&self) -> &Arc<Model> {
+        self.tissue.model()
+    }
+
+    /// Returns the tissue, read-only.
+    pub fn tissue(&self) -> &dyn Tissue {
+        &*self.tissue
+    }
+
+    /// Steps done.
+    pub fn step_count(&self) -> u64 {
+        self.tissue.step_count()
+    }
+
+    /// Returns the simulated time, s.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn time_s(&self) -> f64 {
+        self.step_count() as f64 / self.model().scene.stepping.rate_hz
+    }
+
+    /// Returns the reason why the guard has ended the session, if it has.
+    pub fn hold_reason(&self) -> Option<&str> {
+        self.hold_reason.as_deref()
+    }
+
+    /// Ends the session, as the guard does.
+    pub fn hold(&mut self, reason: String) {
+        self.hold_reason.get_or_insert(reason);
+    }
+
+    /// Returns the total number of commands that came too late for their step.
+    pub fn late_commands(&self) -> u64 {
+        self.late_commands
+    }
+
+    /// Returns the number of commands that had no effect because their tool was paused ([`recovery`]).
+    pub fn paused_commands(&self) -> u64 {
+        self.paused_commands
+    }
+
+    /// Returns the tools that are led by poses, by ascending number, and their tips.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn tips(&self) -> impl Iterator<Item = (u32, Tip)> {
+        let of = |(tool, state): (usize, &Tool)| Some((tool as u32, state.posed.as_ref()?.tip));
+        self.tools.iter().enumerate().filter_map(of)
+    }
+
+    /// Returns the sum of [`Path::counts`] over all position-controlled tools.
+    pub fn path_counts(&self) -> [u64; 3] {
+        self.path_counts
+    }
+
+    /// Returns the step at whose beginning something happens without a new command; `None` if the tissue moves.
+    pub fn rests_until(&self) -> Option<u64> {
+        let expiry = self.tools.iter().filter_map(|tool| tool.expires_at).min();
+        // A path may move a tool at any time.
+        let still = self.tissue.is_still() && self.tools.iter().all(|tool| tool.posed.is_none());
+        still.then(|| expiry.unwrap_or(u64::MAX))
+    }
+
+    /// Skips to the moment when `step` steps are done, which must not be later than [`Session::rests_until`]. The
+    /// result is the same as that of single steps with nothing due.
+    pub fn skip_to(&mut self, step: u64) {
+        self.tissue.skip_steps(step.saturating_sub(self.step_count()));
+    }
+
+    /// Changes the tissue, from the coming step on, to that of `model`, which comes from [`Model::changed`] or
+    /// [`Model::corrected`] of this session's model.
+    pub fn change(&mut self, model: &Arc<Model>) {
+        match self.tissue.changed(model) {
+            Some(tissue) => self.tissue = tissue,
+            None => self.tissue.change(model),
+        }
+    }
+
+    /// Requests an audit of a window of steps ([`tissue::audit`]).
+    pub fn request_audit(&mut self, inputs: WindowInputs) {
+        self.tissue.request_audit(inputs);
+    }
+
+    /// Takes the report on that window after a step, once.
+    pub fn take_mark(&mut self) -> Option<Mark> {
+        self.tissue.take_mark()
+    }
+
+    /// Advances one step. The commands in `due` take effect at its beginning, by the number of the tool. `observe` is
+    /// called at its end unless the guard has ended the session, and before the first step also at t = 0⁺, when the
+    /// commands act and nothing has moved.
+    pub fn advance(&mut self, due: &mut Vec<Due>, mut observe: impl FnMut(&Session)) {
+        while !self.advance_while(due, &mut || true, &mut observe) {}
+    }
+
+    /// Does the same, but stops in what the guard repeats for the step where it may not go on. Then the result is
+    /// false, and only this may be called, again. What comes of it does not depend on where it stops.
+    pub fn advance_while(
+        &mut self,
+        due: &mut Vec<Due>,
+        may_go_on: &mut dyn FnMut() -> bool,
+        mut observe: impl FnMut(&Session),
+    ) -> bool {
+        if self.hold_reason.is_some() {
+            due.clear();
+            return true;
+        }
+        if !self.is_within_step() {
+            self.begin_step(due, &mut observe);
+        }
+        match self.tissue.step_while(may_go_on) {
+            Ok(true) => {}
+            Ok(false) => return false,
+            Err(blow_up) => {
+                if !self.recover(blow_up) {
+                    return true;
+                }
+            }
+        }
+        self.recoveries.accept_until(self.tissue.checkpoint_step());
+        observe(self);
+        true
+    }
+
+    /// Returns whether a step is not done yet, because [`Session::advance_while`] has stopped.
+    pub fn is_within_step(&self) -> bool {
+        self.tissue.is_within_step() && self.hold_reason.is_none()
+    }
+
+    /// What happens before a step.
+    fn begin_step(&mut self, due: &mut Vec<Due>, observe: &mut impl FnMut(&Session)) {
+        // The network decides the order of arrival between tools, so it must not affect the result.
+        due.sort_by_key(|due| due.command.tool);
+        for due in due.drain(..) {
+            self.act(due);
+        }
+        self.expire();
+        self.play();
+        if self.step_count() == 0 {
+            observe(self);
+        }
+    }
+
+    /// Returns the recoveries so far.
+    pub fn recoveries(&self) -> &Recoveries {
+        &self.recoveries
+    }
+
+    /// Returns why the tissue is not what the commands have made of it: the session is held, or there was a recovery.
+    pub fn fault(&self) -> Option<String> {
+        let recovered = || self.recoveries.newest().map(|newest| describe(&newest.recovery));
+        self.hold_reason().map(str::to_owned).or_else(recovered)
+    }
+
+    /// Recovers from a blow-up if something has acted on the tissue since it was at rest. Otherwise the session is held,
+    /// and the result is false.
+    fn recover(&mut self, blow_up: BlowUp) -> bool {
+        let (step, state_of_step) = (blow_up.step, self.step_count());
+        if !self.recoveries.is_disturbed() {
+            self.hold(format!(
+                "after step {step} {}; shorter substeps did not help, and nothing has acted on the tissue since it was at \
+                 rest; the state is that of step {state_of_step}",
+                blow_up.cause
+            ));
+            return false;
+        }
+        let paused_until_step = self.recoveries.pause_end(step);
+        let released = self.tissue.recover(step, paused_until_step.is_some());
+        // All that took effect since the checkpoint: `accept_until` has forgotten the others.
+        self.recoveries.accept_until(state_of_step);
+        let mut tools = Vec::new();
+        for (index, tool) in self.tools.iter_mut().enumerate() {
+            let undone_commands = self.recoveries.acts_of(index);
+            let acted = undone_commands > 0 || released.tools.binary_search(&index).is_ok() || tool.posed.is_some();
+            (tool.posed, tool.expires_at) = (None, None);
+            tool.expired |= acted;
+            if acted {
+                tool.paused_until = paused_until_step.or(tool.paused_until);
+                #[allow(clippy::cast_possible_truncation)]
+                tools.push(Ended { tool: index as u32, sequence: tool.acknowledged_sequence, undone_commands });
+            }
+        }
+        let undone_commands = tools.iter().map(|ended| ended.undone_commands).sum();
+        let (at_rest, reason) = (released.at_rest, blow_up.cause.to_string());
+        let recovery = Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason };
+        self.recoveries.add(Recovered { recovery, tools });
+        true
+    }
+
+    /// Plays the paths of the tools that have one.
+    fn play(&mut self) {
+        let step_s = self.model().scene.stepping.rate_hz.recip();
+        let end_s = self.time_s() + step_s;
+        for (index, tool) in self.tools.iter_mut().enumerate() {
+            let Some(posed) = &mut tool.posed else { continue };
+            let before = posed.path.counts();
+            let play = posed.path.step(end_s, step_s);
+            for (index, count) in posed.path.counts().into_iter().enumerate() {
+                self.path_counts[index] += count - before[index];
+            }
+            match play {
+                Some(Play::Pose(place_m, client_time_s)) => {
+                    posed.client_time_s = client_time_s;
+                    self.tissue.pose(index, place_m, posed.tip);
+                }
+                Some(Play::Release) => {
+                    (tool.posed, tool.expired) = (None, true);
+                    self.tissue.release(index);
+                }
+                None => {}
+            }
+        }
+    }
+
+    fn tool(&mut self, tool: usize) -> &mut Tool {
+        if self.tools.len() <= tool {
+            self.tools.resize(tool + 1, Tool::default());
+        }
+        &mut self.tools[tool]
+    }
+
+    fn act(&mut self, Due { command, late, late_commands, ends_lease }: Due) {
+        let step = self.step_count();
+        let rate_hz = self.model().scene.stepping.rate_hz;
+        self.late_commands += late_commands;
+        let index = command.tool as usize;
+        let tool = self.tool(index);
+        // A pose that was overtaken fills a gap in a path; it does not begin a touch that something newer has ended.
+        let is_overtaken =
+            command.by_datagram && command.sequence.is_some_and(|sequence| sequence < tool.acknowledged_sequence);
+        if is_overtaken && tool.posed.is_none() {
+            return;
+        }
+        if ends_lease {
+            return self.end_lease(index);
+        }
+        // Commands with a step may take effect in another order than they were sent in.
+        if let Some(sequence) = command.sequence.filter(|sequence| *sequence >= tool.acknowledged_sequence) {
+            tool.acknowledged_sequence = sequence;
+            tool.client_time_ns = command.client_time_ns;
+            tool.arrival_ns = command.arrival_ns;
+        }
+        let releases = command.action == Action::Release;
+        tool.late = late;
+        tool.expired = !releases && tool.paused_until.is_some_and(|end| step < end);
+        if tool.expired {
+            self.paused_commands += 1;
+            return;
+        }
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let lifetime = command.time_to_live_s.map(|seconds| (seconds * rate_hz).ceil().max(1.0) as u64);
+        tool.expires_at = lifetime.map(|steps| step.saturating_add(steps));
+        self.recoveries.note(step, command.tool);
+        if !releases {
+            self.recoveries.disturb();
+        }
+        match command.action.with_unsigned_zeros() {
+            Action::Push(poke) => {
+                self.tool(index).posed = None;
+                let nearest = self.model().shape().nearest(poke.centre_m);
+                self.tool(index).control_point = Some(poke.point.unwrap_or(nearest));
+                self.tool(index).around = poke.point.is_none().then_some(poke);
+                // To the tissue it is all the same.
+                self.tissue.push(index, Some(Push::Constant(Poke { point: None, ..poke })));
+            }
+            Action::Grasp { point, displacement_m } => {
+                self.tool(index).posed = None;
+                self.tool(index).control_point = Some(point);
+                self.tool(index).around = None;
+                self.tissue.grasp(index, point, Grasp::Target(displacement_m));
+            }
+            Action::Pose { place_m, velocity_m_per_s, tip } => {
+                let point = self.model().shape().nearest(place_m);
+                let client_time_s = command.client_time_ns as f64 * 1e-9;
+                let now_s = self.time_s();
+                if self.tool(index).posed.is_none() {
+                    let path = if tip.grasps {
+                        Path::of_grasp()
+                    } else {
+                        let begins_m = self.model().shape().approach_m(place_m, tip.radius_m);
+                        begins_m.map_or_else(Path::default, Path::beginning_at)
+                    };
+                    self.tool(index).posed = Some(Posed { tip, path, client_time_s });
+                }
+                let tool = self.tool(index);
+                (tool.control_point, tool.around) = (Some(point), None);
+                let Some(posed) = &mut tool.posed else { return };
+                posed.tip = tip;
+                // A pose with a step is played at that step; a pose with client time only is played by that time.
+                if command.at_step.is_some() || command.client_time_ns == 0 {
+                    posed.path.go_to(client_time_s, place_m);
+                    return;
+                }
+                let is_overtaken = posed.path.newest_s().is_some_and(|newest_s| client_time_s <= newest_s);
+                let is_taken = match velocity_m_per_s {
+                    _ if command.by_datagram && is_overtaken => posed.path.fill(client_time_s, place_m),
+                    Some(velocity) => posed.path.receive_moving(client_time_s, place_m, velocity, now_s),
+                    None => posed.path.receive(client_time_s, place_m, now_s),
+                };
+                self.path_counts[1] += u64::from(!is_taken);
+            }
+            Action::Release => {
+                let tool = self.tool(index);
+                (tool.expires_at, tool.posed) = (None, None);
+                self.tissue.release(index);
+            }
+        }
+    }
+
+    /// Ends all that the holder of a tool did with it.
+    fn end_lease(&mut self, index: usize) {
+        let tool = self.tool(index);
+        let Tool { control_point, around, paused_until, .. } = *tool;
+        *tool = Tool { control_point, around, paused_until, expired: true, ..Tool::default() };
+        self.tissue.release(index);
+    }
+
+    /// Ends actions whose time to live is over.
+    fn expire(&mut self) {
+        let step = self.step_count();
+        for index in 0..self.tools.len() {
+            if self.tools[index].expires_at.is_some_and(|at| at <= step) {
+                self.tools[index].expires_at = None;
+                self.tools[index].expired = true;
+                self.tools[index].posed = None;
+                self.tissue.release(index);
+            }
+        }
+    }
+
+    /// Applies a force as a function of time, exact within the step. No command can express this.
+    pub fn play_force(&mut self, tool: usize, profile: LoadProfile) {
+        self.recoveries.disturb();
+        self.tissue.push(tool, Some(Push::Profile(profile)));
+    }
+
+    /// Applies a movement as a function of time.
+    pub fn play_move(&mut self, tool: usize, profile: MotionProfile) {
+        self.recoveries.disturb();
+        self.tissue.grasp(tool, profile.point, Grasp::Profile(profile));
+    }
+
+    /// Returns the samples of the tools; only those with a number in `only`, if given.
+    pub fn sample(&self, only: Option<&[u32]>) -> Sample {
+        let sample_of = |number: u32| {
+            let tool = self.tools.get(number as usize).cloned().unwrap_or_default();
+            let feel = self.tissue.tool_contact(number as usize);
+            let contact_of = |feel: ToolContact| Contact {
+                point: self.model().shape().nearest(feel.anchor_m),
+                displacement_m: feel.surface_m - feel.anchor_m,
+                surface_displacement_m: self.tissue.surface_displacement_m(feel.anchor_m),
+                velocity_m_per_s: feel.velocity_m_per_s,
+                force_on_tool_n: feel.force_on_tool_n,
+                applied_force_n: -feel.force_on_tool_n,
+            };
+            let contact = feel.map(contact_of).or_else(|| {
+                tool.control_point.map(|point| {
+                    let state = self.tissue.point(point);
+                    let reaction_n = |poke| self.tissue.reaction_around_n(&poke);
+                    let moved_m = |poke: Poke| self.tissue.surface_displacement_m(poke.centre_m);
+                    Contact {
+                        point,
+                        displacement_m: state.displacement_m,
+                        surface_displacement_m: tool.around.map_or(state.displacement_m, moved_m),
+                        velocity_m_per_s: state.velocity_m_per_s,
+                        force_on_tool_n: tool.around.map_or_else(|| state.reaction_n(), reaction_n),
+                        applied_force_n: state.applied_n,
+                    }
+                })
+            });
+            ToolSample {
+                tool: number,
+                acknowledged_sequence: tool.acknowledged_sequence,
+                client_time_ns: tool.client_time_ns,
+                arrival_ns: tool.arrival_ns,
+                contact,
+                feel,
+                place_time_s: tool.posed.as_ref().map_or(0.0, |posed| posed.client_time_s),
+                local: None,
+                stale: tool.posed.as_ref().is_some_and(|posed| posed.path.is_held(self.time_s())),
+                late: tool.late,
+                expired: tool.expired,
+                paused_until: tool.paused_until,
+            }
+        };
+        let in_use = |number: &u32| self.tools[*number as usize].control_point.is_some();
+        #[allow(clippy::cast_possible_truncation)]
+        let tools = match only {
+            Some(numbers) => numbers.iter().map(|number| sample_of(*number)).collect(),
+            None => (0..self.tools.len() as u32).filter(in_use).map(sample_of).collect(),
+        };
+        Sample {
+            step: self.step_count(),
+            simulation_time_s: self.time_s(),
+            awake_points: self.tissue.awake_points(),
+            late_commands: self.late_commands,
+            held: self.hold_reason.is_some(),
+            recoveries: self.recoveries.count(),
+            recovered: self.recoveries.newest(),
+            tools,
+        }
+    }
+
+    /// Returns a copy of the tissue as it is now, of which [`record_of`] tells the points later.
+    pub fn copy(&self) -> ReadCopy {
+        self.tissue.copy()
+    }
+
+    /// Returns the energies of the whole sheet, for a record: a pass over it.
+    pub fn energy(&self) -> EnergyJ {
+        energy_record(self.tissue.energy())
+    }
+
+    /// Returns the records of the tools with a tip, by ascending number.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn tool_records(&self) -> Vec<ToolRecord> {
+        let of = |number: usize| {
+            let feel = self.tissue.tool_contact(number)?;
+            Some(ToolRecord {
+                tool: number as u32,
+                place_m: array(feel.place_m),
+                displacement_m: array(feel.surface_m - feel.anchor_m),
+                force_on_tool_n: array(feel.force_on_tool_n),
+            })
+        };
+        (0..self.tools.len()).filter_map(of).collect()
+    }
+
+    /// Returns the first tool that presses where less than a quarter of its tip can move, if there is one: its force is
+    /// not that of free tissue.
+    pub fn tool_on_fixed(&self) -> Option<u32> {
+        let presses = |number: &usize| {
+            let feel = self.tissue.tool_contact(*number);
+            feel.is_some_and(|feel| feel.is_on_fixed && (feel.place_m - feel.surface_m).dot(feel.normal) < 0.0)
+        };
+        (0..self.tools.len()).find(presses).map(|number| number as u32)
+    }
+
+    /// Returns a record of `points`, or of all points, without energies and tools.
+    pub fn record(&self, points: Option<&[PointId]>) -> Record {
+        let shape = self.model().shape();
+        let of = |point: PointId| point_record(shape.name(point), &self.tissue.point(point));
+        Record {
+            time_s: self.time_s(),
+            points: match points {
+                Some(points) => memory::collected(points.iter().copied().map(of), RECORD),
+                None => memory::collected(shape::points(shape).map(of), RECORD),
+            },
+            tools: Vec::new(),
+            energy_j: None,
+            awake_points: self.tissue.awake_points(),
+        }
+    }
+}
+
+/// Returns the record of a point of a copy.
+pub fn record_of(copy: &ReadCopy, point: PointId) -> Point {
+    point_record(copy.model().shape().name(point), &copy.point(point))
+}
+
+fn energy_record(energy: Energy) -> EnergyJ {
+    EnergyJ { kinetic: energy.kinetic_j, spring: energy.spring_j, anchor_springs: energy.anchor_j }
+}
+
+/// A vector in a record: −0 is written as 0.
+fn array(v: DVec3) -> [f64; 3] {
+    (v + DVec3::ZERO).to_array()
+}
+
+fn point_record(name: PointName, state: &PointState) -> Point {
+    Point {
+        name,
+        displacement_m: array(state.displacement_m),
+        velocity_m_per_s: array(state.velocity_m_per_s),
+        spring_n: array(state.spring_n),
+        anchor_n: array(state.anchor_n),
+        damping_n: array(state.damping_n),
+        applied_n: array(state.applied_n),
+        reaction_n: array(state.reaction_n()),
+        constraint_n: state.constraint_n.map(array),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::command::Command;
+    use super::*;
+
+    #[test]
+    fn a_sample_of_a_tool_that_presses_has_how_far_the_tissue_under_it_has_moved() {
+        let model = Model::parse("paper", palpate_tissue::scene::PAPER, &["sheet.points=[21, 21]"]).unwrap();
+        let mut session = Session::new(&model);
+        let spacing_m = model.scene.sheet().unwrap().spacing_m;
+        let place_m = DVec3::new(9.3 * spacing_m, 11.2 * spacing_m, -0.1 * spacing_m);
+        let tip = Tip { radius_m: spacing_m, ..Tip::default() };
+        let pose = Action::Pose { place_m, velocity_m_per_s: None, tip };
+        let mut due = vec![Due::in_time(Command::new(0, Some(1), pose))];
+        for _ in 0..100 {
+            session.advance(&mut due, |_| {});
+        }
+        let sample = session.sample(None);
+        let contact = sample.tools[0].contact.unwrap();
+        // It is the mean over the tip of what the surface has moved by: down, and hardly to a side.
+        assert!(contact.displacement_m.z < 0.5 * place_m.z, "{contact:?}");
+        let apart_m = contact.displacement_m.distance(contact.surface_displacement_m);
+        assert!(apart_m < 0.2 * contact.surface_displacement_m.length(), "{apart_m} m: {contact:?}");
+    }
+}

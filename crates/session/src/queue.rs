@@ -1,0 +1,146 @@
+//! The commands that wait for their step, by tool: so that all of a tool's can be put aside at once, however many they are.
+
+use std::collections::BTreeMap;
+
+use super::command::Due;
+use super::lease::QueueKey;
+
+/// Commands by their key: step, then order of arrival.
+type Commands = BTreeMap<QueueKey, Due>;
+
+/// Commands that have no effect any more. To free them takes time.
+#[derive(Debug, Default)]
+pub struct Discarded(Vec<Commands>);
+
+impl Discarded {
+    /// Returns whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+}
+
+/// What waits.
+#[derive(Debug, Default)]
+pub(super) struct Queue {
+    /// The commands of the tools that are held.
+    by_tool: BTreeMap<u32, Commands>,
+    /// The ends of leases.
+    endings: Commands,
+    /// Commands of leases that have ended, by tool. [`Queue::free_some`] frees them bit by bit.
+    discarded: Vec<Commands>,
+    /// Number of commands in `by_tool`, and in `discarded`.
+    waiting: usize,
+    left_over: usize,
+    /// What is due of all tools, before it is in order.
+    due: Vec<(QueueKey, Due)>,
+}
+
+impl Queue {
+    /// Number of entries that take memory.
+    pub(super) fn len(&self) -> usize {
+        self.waiting + self.left_over + self.endings.len()
+    }
+
+    /// Number of commands that wait.
+    pub(super) fn waiting(&self) -> usize {
+        self.waiting
+    }
+
+    /// Number of commands of a tool that wait.
+    pub(super) fn waiting_of(&self, tool: u32) -> usize {
+        self.by_tool.get(&tool).map_or(0, BTreeMap::len)
+    }
+
+    /// Adds an entry.
+    pub(super) fn insert(&mut self, key: QueueKey, due: Due) {
+        if due.ends_lease {
+            self.endings.insert(key, due);
+        } else {
+            self.by_tool.entry(due.command.tool).or_default().insert(key, due);
+            self.waiting += 1;
+        }
+    }
+
+    /// Removes the command of a tool with a key if `is_chosen` says so.
+    pub(super) fn remove_if(&mut self, tool: u32, key: QueueKey, is_chosen: impl Fn(&Due) -> bool) -> Option<Due> {
+        let commands = self.by_tool.get_mut(&tool)?;
+        let removed = commands.get(&key).is_some_and(is_chosen).then(|| commands.remove(&key)).flatten()?;
+        self.waiting -= 1;
+        Some(removed)
+    }
+
+    /// Discards the commands of a tool; tells how many.
+    pub(super) fn discard(&mut self, tool: u32) -> usize {
+        let Some(commands) = self.by_tool.remove(&tool) else { return 0 };
+        let count = commands.len();
+        self.waiting -= count;
+        self.left_over += count;
+        self.discarded.push(commands);
+        count
+    }
+
+    /// Discards everything; tells how many commands that were.
+    pub(super) fn discard_all(&mut self) -> usize {
+        let tools: Vec<u32> = self.by_tool.keys().copied().collect();
+        self.endings.clear();
+        tools.into_iter().map(|tool| self.discard(tool)).sum()
+    }
+
+    /// Frees the memory of one tool's discarded commands; a tool has at most `limits.queued_commands_per_tool`.
+    pub(super) fn free_some(&mut self) {
+        if let Some(commands) = self.discarded.pop() {
+            self.left_over -= commands.len();
+        }
+    }
+
+    /// All discarded commands, to be freed elsewhere.
+    pub(super) fn take_left_over(&mut self) -> Discarded {
+        self.left_over = 0;
+        Discarded(std::mem::take(&mut self.discarded))
+    }
+
+    /// Whether there are discarded commands.
+    pub(super) fn has_left_over(&self) -> bool {
+        !self.discarded.is_empty()
+    }
+
+    /// The first step for which something waits.
+    pub(super) fn first_step(&self) -> Option<u64> {
+        let all = self.by_tool.values().chain([&self.endings]);
+        all.filter_map(|commands| commands.first_key_value()).map(|(key, _)| key.0).min()
+    }
+
+    /// Moves what is due at the beginning of step `step` into `due`, in order of effect, but for what is held back. Tells how
+    /// many commands that were.
+    pub(super) fn take_due(
+        &mut self,
+        step: u64,
+        is_held_back: impl Fn(&QueueKey, &Due) -> bool,
+        due: &mut Vec<Due>,
+    ) -> usize {
+        for commands in self.by_tool.values_mut().chain([&mut self.endings]) {
+            let mut from = (0, 0);
+            while let Some((key, entry)) = commands.range(from..=(step, u64::MAX)).next() {
+                let key = *key;
+                if is_held_back(&key, entry) {
+                    from = (key.0, key.1 + 1);
+                } else if let Some(entry) = commands.remove(&key) {
+                    self.due.push((key, entry));
+                }
+            }
+        }
+        let count = self.due.iter().filter(|(_, entry)| !entry.ends_lease).count();
+        self.waiting -= count;
+        self.due.sort_unstable_by_key(|(key, _)| *key);
+        due.extend(self.due.drain(..).map(|(_, entry)| entry));
+        count
+    }
+
+    /// Everything that waits, in order.
+    pub(super) fn in_order(&self) -> Vec<(QueueKey, &Due)> {
+        let all = self.by_tool.values().chain([&self.endings]);
+        let mut all: Vec<_> = all.flatten().map(|(key, due)| (*key, due)).collect();
+        all.sort_unstable_by_key(|(key, _)| *key);
+        all
+    }
+}

@@ -1,0 +1,140 @@
+//! The rules that a command has to keep to, whenever it comes. So it is checked before its turn at the intake.
+
+use palpate_geometry::surface::SurfaceDisc;
+
+use super::command::Command;
+use palpate_refusal::{Reason, Refusal, Result, legible, positive};
+use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Scene;
+use palpate_tissue::scene::check::{self, check_free, check_poke, check_reach};
+use palpate_tissue::scene::script::Action;
+use palpate_tissue::shape::RestShape;
+
+/// The rules of a session.
+#[derive(Debug)]
+pub struct Rules {
+    pub(super) scene: Scene,
+    pub(super) limits: Limits,
+}
+
+/// Commands that keep to the rules of a session.
+#[derive(Debug)]
+pub struct CheckedCommands(pub(super) Vec<Command>);
+
+impl Rules {
+    /// Creates the rules of a session of `scene`.
+    pub fn new(scene: &Scene, limits: &Limits) -> Self {
+        Rules { scene: scene.clone(), limits: limits.clone() }
+    }
+
+    /// Tools are numbered below this.
+    pub fn most_tools(&self) -> u32 {
+        self.limits.tools
+    }
+
+    /// Returns all of `commands`, if each keeps to the rules.
+    ///
+    /// # Errors
+    /// Refuses too many commands, and the first command that does not keep to the rules.
+    pub fn check(&self, commands: Vec<Command>) -> Result<CheckedCommands> {
+        if commands.len() > self.limits.queued_commands_per_tool {
+            let message = format!("{} commands are more than a tool may have waiting", commands.len());
+            return Err(Refusal::new(Reason::QueueFull, "", message));
+        }
+        commands.iter().try_for_each(|command| self.check_one(command))?;
+        Ok(CheckedCommands(commands))
+    }
+
+    /// Returns whether a command keeps to the rules.
+    ///
+    /// # Errors
+    /// Refuses a command that does not.
+    pub fn check_one(&self, command: &Command) -> Result<()> {
+        if let Some(seconds) = command.time_to_live_s {
+            positive("time_to_live_s", seconds)?;
+        }
+        match &command.action {
+            Action::Push(poke) => check_poke(poke, self.scene.shape(), &self.limits),
+            Action::Grasp { point, displacement_m } => {
+                check_free("position.point", self.scene.shape(), *point)?;
+                // A client gives a displacement or a position.
+                palpate_refusal::finite_vector("position", *displacement_m)?;
+                let far_m = displacement_m.length();
+                check_reach("position", self.scene.shape(), far_m, &self.limits)
+            }
+            Action::Pose { place_m, velocity_m_per_s, tip } => {
+                palpate_refusal::finite_vector("pose.position_m", *place_m)?;
+                if let Some(velocity_m_per_s) = velocity_m_per_s {
+                    palpate_refusal::finite_vector("pose.velocity_m_per_s", *velocity_m_per_s)?;
+                    check_played_by_time(command)?;
+                }
+                let centre_m = self.scene.shape().extent().middle_m();
+                check_reach("pose.position_m", self.scene.shape(), (*place_m - centre_m).length(), &self.limits)?;
+                check::check_tip("pose.tip", self.scene.shape(), tip)
+            }
+            Action::Release => Ok(()),
+        }
+    }
+}
+
+/// A velocity is for poses that are played by the client's time.
+fn check_played_by_time(command: &Command) -> Result<()> {
+    let message = "goes with a pose that is played by the client's time: give client_time_ns, and no at_step";
+    let is_played = command.client_time_ns != 0 && command.at_step.is_none();
+    if is_played { Ok(()) } else { Err(Refusal::new(Reason::Missing, "pose.velocity_m_per_s", message)) }
+}
+
+/// How many triangles a tip makes a session look up in a step of so many substeps: its disc is laid twice in each. A disc on a
+/// sheet is bounded however large it is (`tissue::footprint`), and counts nothing.
+fn contact_work(shape: &dyn RestShape, radius_m: f64, substeps: u32) -> u64 {
+    if shape.dimensions() < 3 {
+        return 0;
+    }
+    SurfaceDisc::crossings(radius_m, shape.edge_m()).saturating_mul(2 * u64::from(substeps))
+}
+
+/// Refuses tips that make a step longer than others of its thread can wait. `tips_m` are the radii of all tips of a session.
+pub(super) fn check_contact_work(
+    rules: &Rules,
+    substeps: u32,
+    now_m: f64,
+    tips_m: impl Iterator<Item = f64>,
+) -> Result<()> {
+    let shape = rules.scene.shape();
+    let most = rules.limits.contact_work;
+    let others = tips_m.fold(0_u64, |sum, radius_m| sum.saturating_add(contact_work(shape, radius_m, substeps)));
+    let all = others.saturating_add(contact_work(shape, now_m, substeps));
+    if all <= most {
+        return Ok(());
+    }
+    // Halved until it fits: the work grows with the radius.
+    let fits = std::iter::successors(Some(0.5 * now_m), |radius_m| Some(0.5 * radius_m))
+        .take(16)
+        .find(|radius_m| others.saturating_add(contact_work(shape, *radius_m, substeps)) <= most);
+    let advice =
+        fits.map_or("release other tools first".to_owned(), |radius_m| format!("{} m fits", legible(radius_m)));
+    let message = format!(
+        "is {} m: with it, a step would look up {all} triangles under the tips of this session, above {most} \
+         (limits.contact_work); {advice}",
+        legible(now_m)
+    );
+    Err(Refusal::new(Reason::TooLarge, "pose.tip.radius_m", message))
+}
+
+/// Radius of the tip that a command gives its tool, m.
+pub(super) fn tip_radius_m(command: &Command) -> Option<f64> {
+    if let Action::Pose { tip, .. } = &command.action { Some(tip.radius_m) } else { None }
+}
+
+/// Refuses another tip in the tissue: the surface under a larger one lies elsewhere, and to meet it at once is a blow that no
+/// instrument gives.
+pub(super) fn check_tip(before_m: Option<f64>, now_m: Option<f64>) -> Result<()> {
+    match (before_m, now_m) {
+        (Some(before_m), Some(now_m)) if before_m.to_bits() != now_m.to_bits() => {
+            let [before_m, now_m] = [before_m, now_m].map(legible);
+            let message = format!("is {now_m} m, but the tool is led with a tip of {before_m} m: release it first");
+            Err(Refusal::new(Reason::OutOfTurn, "pose.tip.radius_m", message))
+        }
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,28 @@
+//! Frames for viewers: the sheet refined by bilinear interpolation, or the vertices of a mesh as they are, encoded, in
+//! patches.
+
+pub mod encode;
+pub mod refine;
+pub mod skin;
+mod snapshot;
+pub mod tiles;
+mod wide;
+
+pub use encode::{Encoding, Frame, encode, encode_over};
+pub use refine::{LARGEST_REFINEMENT, MESH_ROW, Refinement};
+pub use skin::Skin;
+pub use snapshot::Snapshot;
+pub use tiles::FrameTiles;
+
+/// A scene with so many points along x and y, 1 cm apart.
+#[cfg(test)]
+fn scene([nx, ny]: [usize; 2]) -> palpate_tissue::scene::Scene {
+    let sets = [format!("sheet.points=[{nx}, {ny}]"), "sheet.spacing_m=0.01".to_owned()];
+    palpate_tissue::scene::Scene::parse(
+        "test",
+        palpate_tissue::scene::PAPER,
+        &sets,
+        &palpate_tissue::limits::Limits::default(),
+    )
+    .unwrap()
+}

@@ -1,0 +1,144 @@
+//! What frames show of a mesh: its vertices in an order that keeps neighbours together. Where a coarser mesh is simulated than
+//! the file has, each vertex of the file moves with a place on that one.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+use palpate_geometry::Group;
+
+use palpate_tissue::Model;
+use palpate_tissue::memory;
+use palpate_tissue::scene::{Body, BoundPlace, MeshShape};
+use palpate_tissue::shape::RestShape;
+
+/// The name of its tables in messages.
+const TABLES: &str = "what is shown of a mesh";
+
+/// How the vertices of a mesh are in a frame.
+#[derive(Debug, PartialEq)]
+pub struct Skin {
+    shape: Arc<MeshShape>,
+    /// The vertex of each place of a frame, and the place of each vertex.
+    vertices: Vec<u32>,
+    places: Vec<u32>,
+    /// Texture coordinates of each vertex, if the file has them.
+    uv: Option<Vec<[f32; 2]>>,
+    /// Where another mesh is simulated: how each place moves with it.
+    bound: Vec<SkinVertex>,
+    /// Where the vertices of that mesh rest, in the order of memory, m.
+    rest_m: Vec<DVec3>,
+}
+
+/// A vertex that moves with a triangle of the simulated mesh.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct SkinVertex {
+    /// Places of its corners in memory.
+    corners: [u32; 3],
+    weights: [f64; 3],
+    height_m: f64,
+}
+
+impl Skin {
+    /// Creates the skin of a tissue on a mesh; `None` for a sheet.
+    pub fn of(model: &Model) -> Option<Arc<Self>> {
+        let (Body::Mesh(mesh), Some([order, slot_of])) = (&model.scene.body, model.shown_order()) else { return None };
+        let shape = mesh.shape.clone();
+        let Some(shown) = shape.shown() else {
+            let (vertices, places) = (order.to_vec(), slot_of.to_vec());
+            let uv = shape.told().uv.clone();
+            return Some(Arc::new(Skin { vertices, places, uv, bound: Vec::new(), rest_m: Vec::new(), shape }));
+        };
+        let corners =
+            |place: &BoundPlace| shape.triangles()[place.triangle as usize].map(|vertex| slot_of[vertex as usize]);
+        // What moves with neighbours is shown side by side.
+        let count = shown.places.len();
+        #[allow(clippy::cast_possible_truncation)]
+        let mut vertices: Vec<u32> = memory::collected(0..count as u32, TABLES);
+        vertices.sort_by_key(|vertex| (corners(&shown.places[*vertex as usize]).iter().min().copied(), *vertex));
+        let mut places: Vec<u32> = memory::zeroed(count, TABLES);
+        for (place, vertex) in (0..).zip(&vertices) {
+            places[*vertex as usize] = place;
+        }
+        let bound = vertices.iter().map(|vertex| {
+            let place = &shown.places[*vertex as usize];
+            SkinVertex { corners: corners(place), weights: place.barycentric, height_m: place.height_m }
+        });
+        let bound = memory::collected(bound, TABLES);
+        let rest_m = memory::collected(order.iter().map(|vertex| shape.vertices_m()[*vertex as usize]), TABLES);
+        let uv = shown.mesh.uv.as_ref().map(|_| {
+            let mut of_vertex = memory::filled(count, [0.0; 2], TABLES);
+            shown.mesh.write_vertex_uv(&mut of_vertex);
+            of_vertex
+        });
+        Some(Arc::new(Skin { vertices, places, uv, bound, rest_m, shape }))
+    }
+
+    /// Returns the vertices that are shown, numbered as in the file, in their order in a frame.
+    pub fn vertices(&self) -> &[u32] {
+        &self.vertices
+    }
+
+    /// Returns the place of each vertex of the file in a frame.
+    pub fn places(&self) -> &[u32] {
+        &self.places
+    }
+
+    /// Returns where a vertex of the file rests, m.
+    pub fn rest_m(&self, vertex: u32) -> DVec3 {
+        let own = self.shape.shown().map_or(self.shape.vertices_m(), |shown| &shown.mesh.vertices_m);
+        own[vertex as usize]
+    }
+
+    /// Returns three vertices of the file each, counterclockwise seen from outside.
+    pub fn triangles(&self) -> &[[u32; 3]] {
+        self.shape.shown().map_or(self.shape.triangles(), |shown| &shown.mesh.triangles)
+    }
+
+    /// Returns named vertices of the file.
+    pub fn groups(&self) -> &[Group] {
+        self.shape.shown().map_or(&self.shape.told().groups, |shown| &shown.mesh.groups)
+    }
+
+    /// Returns texture coordinates of a vertex of the file, if it has them.
+    pub fn texture_at(&self, vertex: u32) -> Option<[f32; 2]> {
+        self.uv.as_ref().map(|uv| uv[vertex as usize])
+    }
+
+    /// Returns the usual length of an edge of the simulated mesh, m.
+    pub fn edge_m(&self) -> f64 {
+        self.shape.edge_m()
+    }
+
+    /// Returns the bytes that it takes.
+    pub fn bytes(&self) -> u64 {
+        let uv = self.uv.as_deref().map_or(0, size_of_val);
+        let tables = size_of_val(&*self.vertices) + size_of_val(&*self.places);
+        (tables + uv + size_of_val(&*self.bound) + size_of_val(&*self.rest_m)) as u64
+    }
+
+    /// Whether another mesh is simulated than is shown.
+    pub(super) fn is_bound(&self) -> bool {
+        !self.bound.is_empty()
+    }
+
+    /// The displacements of the vertices in the order of a frame of `count` places, given those of the simulated ones in the
+    /// order of memory, m.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(super) fn displacement_m(&self, simulated_m: &[Vec<f32>; 3], count: usize) -> [Vec<f32>; 3] {
+        let mut shown_m = [(); 3].map(|()| memory::zeroed::<f32>(count, TABLES));
+        for (place, bound) in self.bound.iter().enumerate() {
+            let moved_m = bound
+                .corners
+                .map(|slot| DVec3::from_array(std::array::from_fn(|c| f64::from(simulated_m[c][slot as usize]))));
+            let rest_m = bound.corners.map(|slot| self.rest_m[slot as usize]);
+            let normal = |[a, b, c]: [DVec3; 3]| (b - a).cross(c - a).normalize_or_zero();
+            let turned = normal([0, 1, 2].map(|k| rest_m[k] + moved_m[k])) - normal(rest_m);
+            let [u, v, w] = bound.weights;
+            let by_m = u * moved_m[0] + v * moved_m[1] + w * moved_m[2] + bound.height_m * turned;
+            for (shown_m, by_m) in shown_m.iter_mut().zip(by_m.to_array()) {
+                shown_m[place] = by_m as f32;
+            }
+        }
+        shown_m
+    }
+}

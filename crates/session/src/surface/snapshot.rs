@@ -1,0 +1,137 @@
+//! The displacements of a sheet at one moment, from which frames are made.
+// The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
+#![allow(clippy::needless_range_loop)]
+
+use std::sync::{Arc, OnceLock};
+
+use super::refine::{Points, grid};
+use super::skin::Skin;
+use super::wide::{Available, LANES, SixteenLanes, WideWork, Width};
+use palpate_tissue::scene::Scene;
+
+/// The displacements of a sheet at one moment, from which frames are made.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Snapshot {
+    /// Steps done.
+    pub step: u64,
+    /// Simulated time, s.
+    pub simulation_time_s: f64,
+    /// Displacements, m: x, y and z separate, point [i, j] at i·ny + j; of a mesh in the order of memory.
+    displacement_m: [Vec<f32>; 3],
+    /// What moves with those points, if other ones are shown, and by how much, once somebody wants to know.
+    skin: Option<Arc<Skin>>,
+    shown_m: OnceLock<[Vec<f32>; 3]>,
+    /// The least and the greatest of each component, m, once somebody wants to know.
+    box_m: OnceLock<[[f32; 2]; 3]>,
+    /// Points along x and y; of a mesh, rows and places of a row.
+    pub(super) points: [usize; 2],
+    /// Distance between points, m.
+    pub(super) spacing_m: f64,
+}
+
+impl Snapshot {
+    /// Creates a snapshot of the tissue of a scene. `displacement_m` has a value for each place of a frame and component, m
+    /// (`Tissue::shown_displacements_m`).
+    pub fn new(scene: &Scene, step: u64, simulation_time_s: f64, displacement_m: [Vec<f32>; 3]) -> Self {
+        let (points, spacing_m) = grid(scene);
+        Snapshot {
+            step,
+            simulation_time_s,
+            displacement_m,
+            skin: None,
+            shown_m: OnceLock::new(),
+            box_m: OnceLock::new(),
+            points,
+            spacing_m,
+        }
+    }
+
+    /// Returns the same of a tissue on a mesh. If other vertices are shown than are simulated, who encodes finds out
+    /// where they are.
+    #[must_use]
+    pub fn with_skin(self, skin: Option<&Arc<Skin>>) -> Self {
+        Snapshot { skin: skin.filter(|skin| skin.is_bound()).cloned(), ..self }
+    }
+
+    /// The displacements of what is shown, m.
+    pub(super) fn displacement_m(&self) -> &[Vec<f32>; 3] {
+        match &self.skin {
+            None => &self.displacement_m,
+            Some(skin) => {
+                let [rows, columns] = self.points;
+                self.shown_m.get_or_init(|| skin.displacement_m(&self.displacement_m, rows * columns))
+            }
+        }
+    }
+
+    /// The bounding box. Computed once for all encodings, by who encodes: a stepping thread makes the snapshot.
+    pub(super) fn box_m(&self) -> &[[f32; 2]; 3] {
+        self.box_m.get_or_init(|| self.displacement_m().each_ref().map(|values| range(values)))
+    }
+
+    /// All points.
+    pub(super) fn points(&self) -> Points<'_> {
+        let values = self.displacement_m().each_ref().map(Vec::as_slice);
+        Points { values, stride: self.points[1], count: self.points }
+    }
+}
+
+/// The least and the greatest of the values.
+fn range(values: &[f32]) -> [f32; 2] {
+    let mut range = [f32::INFINITY, f32::NEG_INFINITY];
+    Width::widest().run(Range { values, range: &mut range });
+    range
+}
+
+struct Range<'v> {
+    values: &'v [f32],
+    range: &'v mut [f32; 2],
+}
+
+impl WideWork for Range<'_> {
+    #[inline(always)]
+    fn work<L: SixteenLanes>(self, with: Available<L>) {
+        // Enough parallel comparisons to hide their latency.
+        const AT_ONCE: usize = 4;
+        let mut low = [with.splat(f32::INFINITY); AT_ONCE];
+        let mut high = [with.splat(f32::NEG_INFINITY); AT_ONCE];
+        let (chunks, rest) = self.values.as_chunks::<{ AT_ONCE * LANES }>();
+        for chunk in chunks {
+            let (blocks, _) = chunk.as_chunks();
+            for k in 0..AT_ONCE {
+                let values = with.load(&blocks[k]);
+                low[k] = values.smaller(low[k]);
+                high[k] = values.larger(high[k]);
+            }
+        }
+        let mut lanes = [[0.0; LANES]; 2 * AT_ONCE];
+        for k in 0..AT_ONCE {
+            low[k].store(&mut lanes[k]);
+            high[k].store(&mut lanes[AT_ONCE + k]);
+        }
+        let (low, high) = lanes.as_flattened().split_at(AT_ONCE * LANES);
+        *self.range = [
+            low.iter().chain(rest).copied().fold(f32::INFINITY, f32::min),
+            high.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max),
+        ];
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_box_reaches_as_far_as_the_values() {
+        for count in [1, 15, 16, 63, 64, 65, 1000] {
+            let values: Vec<f32> = (0..count).map(|k| (k as f32 * 1.7).sin() + 0.1).collect();
+            let least = values.iter().copied().fold(f32::INFINITY, f32::min);
+            let greatest = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            for width in Width::ALL.into_iter().filter(|width| width.is_available()) {
+                let mut range = [f32::INFINITY, f32::NEG_INFINITY];
+                width.run(Range { values: &values, range: &mut range });
+                assert_eq!(range, [least, greatest], "{width:?}, {count}");
+            }
+        }
+    }
+}

@@ -1,0 +1,144 @@
+//! Conversion of commands.
+
+use glam::{DQuat, DVec2, DVec3};
+use palpate_haptics::Tip;
+use palpate_proto::geometry::{from_place, from_vector, vector};
+use palpate_proto::pb;
+use palpate_proto::touch::{from_tip, pose};
+
+use super::{from_point, point, required};
+use crate::command::Command;
+use palpate_refusal::{Reason, Refusal, Result, number};
+use palpate_tissue::scene::profile::Poke;
+use palpate_tissue::scene::script::Action;
+use palpate_tissue::shape::{PointId, RestShape};
+
+/// Returns the command in a message that arrived at `arrival_ns`.
+///
+/// # Errors
+/// Returns an error if a field is missing, a point or place is not on the tissue, or an orientation is not of length 1.
+pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u64) -> Result<Command> {
+    use pb::command::Action as Message;
+    let action = match required("action", message.action.as_ref())? {
+        Message::Force(force) => {
+            let (point, centre_m) = match required("force.centre", force.centre.as_ref())? {
+                pb::force::Centre::Point(at) => {
+                    let point = shape.find("force.point", required("force.point", from_point(Some(at), None))?)?;
+                    (Some(point), shape.rest_m(point))
+                }
+                pb::force::Centre::Vertex(vertex) => {
+                    let point =
+                        shape.find("force.vertex", required("force.vertex", from_point(None, Some(*vertex)))?)?;
+                    (Some(point), shape.rest_m(point))
+                }
+                pb::force::Centre::CentreM(place) => (None, on_sheet(shape, from_place(place))?),
+                pb::force::Centre::AtM(place) => (None, at(shape, from_vector(Some(place)))?),
+            };
+            let force_n = from_vector(force.force_n.as_ref());
+            let falloff_per_m = force.falloff_per_m.unwrap_or_else(|| Tip::default().radius_m.recip());
+            let falloff_offset = force.falloff_offset.unwrap_or(0.0);
+            Action::Push(Poke { point, centre_m, force_n, falloff_per_m, falloff_offset })
+        }
+        Message::Position(position) => {
+            let point = grasped(shape, position)?;
+            let displacement_m = match required("position.target", position.target.as_ref())? {
+                pb::position::Target::DisplacementM(displacement) => from_vector(Some(displacement)),
+                pb::position::Target::PositionM(place) => from_vector(Some(place)) - shape.rest_m(point),
+            };
+            Action::Grasp { point, displacement_m }
+        }
+        Message::Pose(pose) => Action::Pose {
+            place_m: from_pose(pose)?,
+            velocity_m_per_s: pose.velocity_m_per_s.as_ref().map(|velocity| from_vector(Some(velocity))),
+            tip: from_tip(pose.tip.as_ref()),
+        },
+        Message::Release(_) => Action::Release,
+    };
+    Ok(Command {
+        tool: message.tool,
+        sequence: message.sequence,
+        client_time_ns: message.client_time_ns,
+        by_datagram: false,
+        at_step: message.at_step,
+        time_to_live_s: message.time_to_live_s,
+        action,
+        arrival_ns,
+    })
+}
+
+/// The place of a force in the rest plane of a sheet.
+fn on_sheet(shape: &dyn RestShape, place_m: DVec2) -> Result<DVec3> {
+    if shape.dimensions() > 2 {
+        let message = "is a place in the plane of a sheet; on a mesh give `vertex`, or `at_m`, a place in space";
+        return Err(Refusal::new(Reason::WrongKind, "force.centre_m", message));
+    }
+    Ok(place_m.extend(0.0))
+}
+
+/// The place of a force in space: on a sheet, the nearest one in its rest plane.
+fn at(shape: &dyn RestShape, place_m: DVec3) -> Result<DVec3> {
+    shape.check_place("force.at_m", place_m)?;
+    Ok(if shape.dimensions() == 2 { place_m.truncate().extend(0.0) } else { place_m })
+}
+
+/// The point that a tool has grasped.
+fn grasped(shape: &dyn RestShape, position: &pb::Position) -> Result<PointId> {
+    let (point, vertex) = (position.point.as_ref(), position.vertex);
+    if point.is_some() && vertex.is_some() {
+        let message = "does not go with `position.point`: a tool grasps a point of a sheet or a vertex of a mesh";
+        return Err(Refusal::new(Reason::WrongKind, "position.vertex", message));
+    }
+    let field = match (vertex, shape.dimensions()) {
+        (Some(_), _) => "position.vertex",
+        (None, 3) if point.is_none() => "position.vertex",
+        _ => "position.point",
+    };
+    shape.find(field, required(field, from_point(point, vertex))?)
+}
+
+/// The position of a pose's tip, m.
+fn from_pose(pose: &pb::Pose) -> Result<DVec3> {
+    let position_m = from_vector(required("pose.position_m", pose.position_m.as_ref()).map(Some)?);
+    let offset_m = from_vector(pose.tip_offset_m.as_ref());
+    let Some(pb::Quaternion { w, x, y, z }) = pose.orientation else { return Ok(position_m + offset_m) };
+    let turn = DQuat::from_xyzw(x, y, z, w);
+    number("pose.orientation", turn.length(), "of length 1", |length| (length - 1.0).abs() <= 1e-3)?;
+    Ok(position_m + turn.normalize() * offset_m)
+}
+
+/// Returns the message of a script's command to tool `tool`, which acts at step `at_step`.
+#[allow(clippy::cast_possible_truncation)]
+pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Action, client_time_ns: u64) -> pb::Command {
+    use pb::command::Action as Message;
+    let action = match action {
+        Action::Push(poke) => Message::Force(pb::Force {
+            centre: Some(match poke.point {
+                Some(at) => match point(shape.name(at)) {
+                    (Some(point), _) => pb::force::Centre::Point(point),
+                    (None, vertex) => pb::force::Centre::Vertex(vertex.unwrap_or_default()),
+                },
+                None => {
+                    let DVec3 { x, y, z } = poke.centre_m;
+                    match shape.dimensions() {
+                        2 => pb::force::Centre::CentreM(pb::Vector2 { x, y }),
+                        _ => pb::force::Centre::AtM(pb::Vector3 { x, y, z }),
+                    }
+                }
+            }),
+            force_n: vector(poke.force_n),
+            falloff_per_m: Some(poke.falloff_per_m),
+            falloff_offset: Some(poke.falloff_offset),
+        }),
+        Action::Grasp { point: at, displacement_m: DVec3 { x, y, z } } => {
+            let (point, vertex) = point(shape.name(*at));
+            let target = Some(pb::position::Target::DisplacementM(pb::Vector3 { x: *x, y: *y, z: *z }));
+            Message::Position(pb::Position { point, vertex, target })
+        }
+        Action::Pose { place_m, velocity_m_per_s, tip } => {
+            Message::Pose(pb::Pose { velocity_m_per_s: velocity_m_per_s.and_then(vector), ..pose(*place_m, tip) })
+        }
+        Action::Release => Message::Release(pb::Release {}),
+    };
+    let (tool, sequence, action) = (tool as u32, Some(at_step + 1), Some(action));
+    pb::Command { tool, sequence, client_time_ns, at_step: Some(at_step), time_to_live_s: None, action }
+}

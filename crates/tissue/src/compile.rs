@@ -1,0 +1,387 @@
+//! Compiles a scene to a model: checks it, chooses a scheme, and predicts its error.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use super::integrate::{Oscillator, entry};
+use super::lanes;
+use super::model::{Model, Plan};
+use super::saved::{CorrectedPlan, TissueState};
+use super::scheme_selection::{self, Choice};
+use super::tangent;
+use crate::limits::Limits;
+use crate::scene::{Body, Change, Integrator, Named, Precision, Scene, Stepping};
+use palpate_refusal::{Reason, Refusal, Result, number, unsigned_zero};
+
+/// What sleeping tiles may add to the error, by default, as a part of it.
+const SLEEP_PART: f64 = 0.1;
+
+/// The refusal of a scene that needs more substeps than there may be.
+fn too_many(scene: &Scene, substeps: u32, limits: &Limits) -> Refusal {
+    let message = format!(
+        "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
+         for points so light at this rate{}",
+        limits.substeps,
+        match &scene.body {
+            Body::Mesh(_) if scene.volume_is_fastest() => " (volume.stiffness_pa most of all)".to_owned(),
+            Body::Mesh(mesh) => mesh.fastest_place(),
+            Body::Sheet(_) => String::new(),
+        }
+    );
+    Refusal::new(Reason::TooLarge, "stepping.substeps", message)
+}
+
+/// What begins the warning of an error above the tolerance.
+const TOLERANCE: &str = "stepping.tolerance: ";
+
+/// Checks that the processor has what a step needs.
+///
+/// # Errors
+/// Refuses a processor of x86-64 without fused multiply-add.
+pub fn check_processor() -> Result<()> {
+    if lanes::fuses() {
+        return Ok(());
+    }
+    let message = "this machine's processor has no fused multiply-add (FMA), which every lane width needs: without it a step \
+                   would take ten times as long";
+    Err(Refusal::new(Reason::NotAvailable, "stepping.lanes", message))
+}
+
+impl Model {
+    /// Warns of an error above the tolerance: what is known of it, and what helps. `auto` is named only where the scene does
+    /// without.
+    pub(super) fn warn_of_error(&mut self, limits: &Limits) {
+        self.warnings.retain(|warning| !warning.starts_with(TOLERANCE));
+        let (expected_error, undamped) = (self.expected_error, self.scene.damping_n_s_per_m == 0.0);
+        let Stepping { tolerance, integrator, substeps, precision, .. } = self.scene.stepping;
+        if expected_error <= tolerance {
+            return;
+        }
+        let mut parts = vec![if expected_error.is_finite() {
+            format!("an error of {expected_error:.1e} is expected, above the {tolerance:.1e} asked for")
+        } else {
+            format!("nothing is known of the error, which may be above the {tolerance:.1e} asked for")
+        }];
+        if undamped {
+            parts.push("nothing damps the tissue, and errors grow for as long as it moves".to_owned());
+        }
+        if integrator != Integrator::Auto || substeps.is_some() || precision != Precision::Auto {
+            let given = "`palpate check` tells what `auto` would take for the integrator, substeps and precision given";
+            parts.push(given.to_owned());
+        } else if expected_error.is_finite() {
+            parts.push(format!(
+                "no integrator is expected to keep it with {} times the substeps that keep it stable, or with \
+                 limits.substeps ({}): ask for a larger tolerance, or for more damping",
+                scheme_selection::MAX_TIMES_STABLE,
+                limits.substeps
+            ));
+        } else {
+            parts.push("`palpate run --audit` measures it".to_owned());
+        }
+        self.warnings.push(format!("{TOLERANCE}{}", parts.join("; ")));
+    }
+}
+
+impl Model {
+    /// Reads the text of a scene (TOML), replaces `sets` in it (`"sheet.spacing_m=0.01"`, as `--set` does), and compiles it under
+    /// the default limits.
+    ///
+    /// # Errors
+    /// Refuses a text that is not a valid scene, and what [`Model::compile`] refuses.
+    pub fn parse(name: &str, text: &str, sets: &[&str]) -> Result<Arc<Self>> {
+        let sets: Vec<_> = sets.iter().map(|set| (*set).to_owned()).collect();
+        let limits = Limits::default();
+        Model::compile(&Scene::parse(name, text, &sets, &limits)?, &limits)
+    }
+
+    /// Compiles a scene, after checking it.
+    ///
+    /// # Errors
+    /// Refuses a scene that is not valid, that no scheme can step within the limits, or that this machine can't run.
+    pub fn compile(scene: &Scene, limits: &Limits) -> Result<Arc<Self>> {
+        Model::compile_until(scene, limits, &scheme_selection::NEVER)
+    }
+
+    /// Does the same, given up when `stop` is set.
+    ///
+    /// # Errors
+    /// As for [`Model::compile`]; and refuses when `stop` is set.
+    pub fn compile_until(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
+        scene.check(limits)?;
+        let scene = &scene.clone().with_unsigned_zeros();
+        let sheet = Oscillator::of(scene);
+        let step_s = scene.stepping.rate_hz.recip();
+        // Nothing is rehearsed that no scheme could do.
+        let least = scheme_selection::least_substeps(scene.stepping.integrator, step_s, &sheet);
+        if scene.stepping.substeps.is_none() && least > limits.substeps {
+            return Err(too_many(scene, least, limits));
+        }
+        let (choice, rehearsed) = scheme_selection::choose(scene, limits, stop)?;
+        Model::chosen(scene, choice, rehearsed, limits, stop)
+    }
+
+    /// Compiles a scene with a choice that was made.
+    fn chosen(scene: &Scene, choice: Choice, rehearsed: u64, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
+        let sheet = Oscillator::of(scene);
+        let step_s = scene.stepping.rate_hz.recip();
+        let Choice { integrator, substeps, precision, expected_error } = choice;
+        if precision == Precision::Compensated && !entry(integrator).compensates {
+            let message = format!("is for exponential schemes; `{}` has f32 and f64", integrator.name());
+            return Err(Refusal::new(Reason::WrongKind, "stepping.precision", message));
+        }
+        if substeps > limits.substeps {
+            return Err(too_many(scene, substeps, limits));
+        }
+        let plan = Plan::new(integrator, substeps, step_s, &sheet);
+        let omega_bound_per_s = sheet.omega_bound_per_s();
+        let mut warnings = if let Body::Mesh(mesh) = &scene.body { mesh.warnings() } else { Vec::new() };
+        if !plan.stable {
+            warnings.push(format!(
+                "stepping.substeps: {} is above the stability bound of the scheme; the sheet may blow up \
+                 (substep × fastest vibration = {:.3})",
+                plan.substeps,
+                plan.substep_s * omega_bound_per_s
+            ));
+        }
+        let Some(lanes) = lanes::available(scene.stepping.lanes) else {
+            check_processor()?;
+            let message = format!("this machine's processor has no `{}`", scene.stepping.lanes.name());
+            return Err(Refusal::new(Reason::NotAvailable, "stepping.lanes", message));
+        };
+        let sleep_tolerance = scene.sleep_tolerance.unwrap_or_else(|| {
+            // Who chooses the scheme may want it better than the tolerance.
+            let chosen = scene.stepping.integrator != Integrator::Auto || scene.stepping.substeps.is_some();
+            SLEEP_PART * if chosen { expected_error.min(scene.stepping.tolerance) } else { scene.stepping.tolerance }
+        });
+        let model = Model::planned(scene.clone(), plan, precision, lanes)
+            .map_err(|fault| Refusal::new(Reason::OutOfRange, "mesh.file", fault.to_string()))?;
+        let volume_compliance = tangent::volume_compliance(&model, stop).into();
+        let mut model = Model { expected_error, sleep_tolerance, warnings, rehearsed, volume_compliance, ..model };
+        model.warn_of_error(limits);
+        Ok(Arc::new(model))
+    }
+
+    /// Does the same sheet with another tissue: integrator and substeps as its tolerance asks for, in the number format
+    /// that a state of this model has. `first` is the scene that the session began with.
+    ///
+    /// # Errors
+    /// Refuses a change of nothing, and as [`Model::compile`] does.
+    pub fn changed(&self, change: &Change, first: &Scene, limits: &Limits) -> Result<Arc<Self>> {
+        self.changed_until(change, first, limits, &scheme_selection::NEVER)
+    }
+
+    /// Does the same, given up when `stop` is set.
+    ///
+    /// # Errors
+    /// As for [`Model::changed`]; and refuses when `stop` is set.
+    pub fn changed_until(
+        &self,
+        change: &Change,
+        first: &Scene,
+        limits: &Limits,
+        stop: &AtomicBool,
+    ) -> Result<Arc<Self>> {
+        if *change == Change::default() {
+            return Err(Refusal::new(Reason::Missing, "", Change::NOTHING));
+        }
+        let asked = self.scene.stepping.clone();
+        let mut scene = self.scene.changed(change, first);
+        scene.stepping.precision = self.precision;
+        let mut model = self.compile_corrected(&scene, limits, stop)?;
+        model.scene.stepping = asked;
+        model.warn_of_error(limits);
+        Ok(Arc::new(model))
+    }
+
+    /// Returns how this model is stepped, and its coefficients: all that [`Model::resumed`] needs beside the scene that
+    /// the session began with.
+    pub fn tissue_state(&self) -> TissueState {
+        let Model { scene, plan, precision, expected_error, sleep_tolerance, corrected, .. } = self;
+        TissueState {
+            stiffness_n_per_m: scene.springs.stiffness_n_per_m,
+            shear_stiffness_n_per_m: scene.springs.shear_stiffness_n_per_m,
+            anchor_stiffness_n_per_m: scene.anchor_stiffness_n_per_m,
+            damping_n_s_per_m: scene.damping_n_s_per_m,
+            volume_stiffness_pa: scene.volume_stiffness_pa,
+            integrator: plan.integrator,
+            substeps: plan.substeps,
+            precision: *precision,
+            sleep_tolerance: *sleep_tolerance,
+            sleep_tolerance_of_scene: scene.sleep_tolerance,
+            expected_error: *expected_error,
+            corrected: corrected.map(|(integrator, least_substeps)| CorrectedPlan { integrator, least_substeps }),
+        }
+    }
+
+    /// Returns the model that changes and corrections had made of the scene `first`, with which a session began: the
+    /// same plan and the same bits. Nothing is chosen anew.
+    ///
+    /// # Errors
+    /// Refuses what no model has, and as [`Model::compile`] does.
+    pub fn resumed(first: &Scene, state: &TissueState, limits: &Limits) -> Result<Arc<Self>> {
+        let TissueState { integrator, substeps, precision, sleep_tolerance, expected_error, .. } = *state;
+        let mut scene = first.clone();
+        scene.springs.stiffness_n_per_m = state.stiffness_n_per_m;
+        scene.springs.shear_stiffness_n_per_m = state.shear_stiffness_n_per_m;
+        scene.anchor_stiffness_n_per_m = state.anchor_stiffness_n_per_m;
+        scene.damping_n_s_per_m = state.damping_n_s_per_m;
+        scene.volume_stiffness_pa = state.volume_stiffness_pa;
+        scene.sleep_tolerance = state.sleep_tolerance_of_scene;
+        scene.check(limits)?;
+        let scene = scene.with_unsigned_zeros();
+        let sleep_tolerance = number("sleep.tolerance", sleep_tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+        let is_one = integrator != Integrator::Auto && precision != Precision::Auto && substeps > 0;
+        if !is_one || expected_error.is_nan() || state.corrected.is_some_and(|plan| plan.integrator == Integrator::Auto)
+        {
+            let message = "does not belong to a model: it has no scheme, format, substeps or expected error";
+            return Err(Refusal::new(Reason::OutOfRange, "stepping", message));
+        }
+        let made = Choice { integrator, substeps, precision, expected_error: unsigned_zero(expected_error) };
+        let model = Model::chosen(&scene, made, 0, limits, &scheme_selection::NEVER)?;
+        let corrected = state.corrected.map(|plan| (plan.integrator, plan.least_substeps));
+        Ok(Arc::new(Model { sleep_tolerance, corrected, ..Arc::unwrap_or_clone(model) }))
+    }
+
+    /// Returns what a script's changes make of this, each out of the one before it.
+    ///
+    /// # Errors
+    /// Refuses the first change that [`Model::changed`] refuses.
+    pub fn apply_changes(
+        self: &Arc<Self>,
+        changes: &[(u64, Change)],
+        limits: &Limits,
+    ) -> Result<VecDeque<(u64, Arc<Self>)>> {
+        self.course_of(&self.scene, changes, limits)
+    }
+
+    /// Does the same for a session that began with the scene `first`.
+    ///
+    /// # Errors
+    /// As for [`Model::apply_changes`].
+    pub fn course_of(
+        self: &Arc<Self>,
+        first: &Scene,
+        changes: &[(u64, Change)],
+        limits: &Limits,
+    ) -> Result<VecDeque<(u64, Arc<Self>)>> {
+        let mut newest = self.clone();
+        let compiled = changes.iter().map(|(step, change)| {
+            newest = newest.changed(change, first, limits)?;
+            Ok((*step, newest.clone()))
+        });
+        compiled.collect()
+    }
+
+    /// Returns the processor time that a step is expected to take while all of the sheet moves, s.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn predicted_step_s(&self) -> f64 {
+        let point_ns =
+            scheme_selection::point_substep_ns(&self.scene, self.plan.integrator, self.precision, self.lanes);
+        1e-9 * (scheme_selection::STEP_NS + point_ns * self.swept_points() as f64 * f64::from(self.plan.substeps))
+    }
+
+    /// Compiles another tissue from this one's scene, with the scheme and at least the substeps of the correction in
+    /// force.
+    fn compile_corrected(&self, scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Self> {
+        let Some((integrator, least)) = self.corrected else {
+            return Ok(Arc::unwrap_or_clone(Model::compile_until(scene, limits, stop)?));
+        };
+        let mut scene = scene.clone();
+        (scene.stepping.integrator, scene.stepping.substeps) = (integrator, None);
+        let mut model = Model::compile_until(&scene, limits, stop)?;
+        if model.plan.substeps < least {
+            scene.stepping.substeps = Some(least);
+            model = Model::compile_until(&scene, limits, stop)?;
+        }
+        Ok(Model { corrected: self.corrected, ..Arc::unwrap_or_clone(model) })
+    }
+}
+
+#[cfg(test)]
+impl Model {
+    /// Compiles the paper's scene, with some values set.
+    pub(crate) fn paper(sets: &[&str]) -> Arc<Self> {
+        Model::parse("paper", crate::scene::PAPER, sets).unwrap()
+    }
+
+    /// Compiles a small organ whose points are heavy and light.
+    pub(crate) fn gallbladder(sets: &[&str]) -> Arc<Self> {
+        let text = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\n[material]\nyoungs_modulus_pa = 2e4\n\
+                    thickness_m = 0.003\nfoundation_n_per_m3 = 5e6\n[stepping]\nsubsteps = 8\n";
+        Model::parse("gallbladder", text, sets).unwrap()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_zero_has_no_sign() {
+        let compile = |zero: &str| {
+            let keys = ["damping.coefficient_n_s_per_m", "anchor_springs.stiffness_n_per_m"];
+            Model::paper(&keys.map(|key| format!("{key}={zero}")).each_ref().map(String::as_str))
+        };
+        let (negative, positive) = (compile("-0.0"), compile("0.0"));
+        assert_eq!((&negative.plan, negative.expected_error), (&positive.plan, positive.expected_error));
+        assert!(negative.scene.damping_n_s_per_m.is_sign_positive());
+    }
+
+    #[test]
+    fn an_error_above_the_tolerance_is_warned_of() {
+        let warns = |sets: &[&str]| {
+            let model = Model::paper(&[&["sheet.points=[5, 5]"][..], sets].concat());
+            let is_above = model.expected_error > model.scene.stepping.tolerance;
+            (is_above, model.warnings.iter().any(|warning| warning.starts_with("stepping.tolerance: ")))
+        };
+        assert_eq!(warns(&[]), (false, false));
+        assert_eq!(warns(&["stepping.integrator=lagged", "stepping.substeps=1"]), (true, true));
+    }
+
+    #[test]
+    fn auto_is_advised_only_where_the_scene_does_without() {
+        let advises = |model: &Model| {
+            let of_error = model.warnings.iter().find(|warning| warning.starts_with(TOLERANCE));
+            of_error.map(|warning| warning.contains("auto"))
+        };
+        let small =
+            |sets: &[&str]| Model::paper(&[&["sheet.points=[5, 5]", "stepping.tolerance=1e-14"][..], sets].concat());
+        for given in ["stepping.integrator=central", "stepping.substeps=2", "stepping.precision=f32"] {
+            assert_eq!(advises(&small(&[given])), Some(true), "{given}");
+        }
+        let model = small(&[]);
+        assert_eq!(advises(&model), Some(false), "{:?}", model.warnings);
+        // Another tissue keeps the format of the state, which nobody gave.
+        let change = Change { damping_n_s_per_m: Some(0.0), ..Change::default() };
+        let changed = model.changed(&change, &model.scene, &Limits::default()).unwrap();
+        assert_eq!(advises(&changed), Some(false), "{:?}", changed.warnings);
+        assert_eq!(advises(&small(&["stepping.tolerance=1e-2"])), None);
+    }
+
+    #[test]
+    fn as_many_substeps_as_the_limit_are_taken_and_more_are_refused() {
+        let sets = ["sheet.points=[5, 5]", "springs.stiffness_n_per_m=5000", "stepping.integrator=central"];
+        let sets = sets.map(str::to_owned);
+        let scene = Scene::parse("paper", crate::scene::PAPER, &sets, &Limits::default()).unwrap();
+        let least = scheme_selection::least_substeps(Integrator::Central, 1e-3, &Oscillator::of(&scene));
+        assert!(least > 1);
+        let limited = |substeps: u32| Model::compile(&scene, &Limits { substeps, ..Limits::default() });
+        assert_eq!(limited(least).unwrap().plan.substeps, least);
+        assert_eq!(limited(least - 1).unwrap_err().field, "stepping.substeps");
+    }
+
+    #[test]
+    fn in_compensated_f32_only_schemes_that_compensate_are_chosen_also_for_a_changed_tissue() {
+        let sets = ["sheet.points=[5, 5]", "stepping.tolerance=1e-2", "stepping.precision=compensated"];
+        let damped = Model::paper(&sets);
+        let model = Model::paper(&[&sets[..], &["damping.coefficient_n_s_per_m=0.0"]].concat());
+        // Vibrations that decay leave less of an error: a simpler scheme would do.
+        let change = Change { damping_n_s_per_m: Some(damped.scene.damping_n_s_per_m), ..Change::default() };
+        let changed = model.changed(&change, &model.scene, &Limits::default()).unwrap();
+        for model in [&model, &damped, &changed] {
+            assert_eq!(model.precision, Precision::Compensated);
+            assert_ne!(model.plan.integrator, Integrator::Central);
+        }
+    }
+}

@@ -1,0 +1,32 @@
+//! The properties of a sheet that a scheme is fitted to.
+
+/// The properties of a sheet that a scheme depends on.
+#[derive(Debug, Clone, Copy)]
+pub struct Oscillator {
+    /// Mass of a point, kg.
+    pub mass_kg: f64,
+    /// C, N·s/m.
+    pub damping_n_s_per_m: f64,
+    /// K″, N/m.
+    pub anchor_stiffness_n_per_m: f64,
+    /// The largest eigenvalue of the springs' stiffness under any deformation, N/m.
+    pub spring_stiffness_n_per_m: f64,
+}
+
+impl Oscillator {
+    /// Returns a and g for a substep.
+    pub fn scaled(&self, substep_s: f64) -> (f64, f64) {
+        let a = self.anchor_stiffness_n_per_m * substep_s * substep_s / self.mass_kg;
+        (a, self.damping_n_s_per_m * substep_s / self.mass_kg)
+    }
+
+    /// Returns the springs' largest stiffness in a substep's terms, (ω·dt)².
+    pub fn scaled_spring_stiffness(&self, substep_s: f64) -> f64 {
+        self.spring_stiffness_n_per_m * substep_s * substep_s / self.mass_kg
+    }
+
+    /// Returns ω_b, rad/s: an upper bound of every vibration's frequency, under any deformation.
+    pub fn omega_bound_per_s(&self) -> f64 {
+        ((self.spring_stiffness_n_per_m + self.anchor_stiffness_n_per_m) / self.mass_kg).sqrt()
+    }
+}

@@ -1,0 +1,155 @@
+//! Memory that the system may refuse.
+//!
+//! An allocation that fails ends the process. What grows with a request or a session is therefore laid out here, where a
+//! failure is a [`Refusal`]. Code that returns a `Result` calls `check`. Code deep in a computation calls `zeroed`,
+//! `filled`, `with_room`, `collected` or `require`: these unwind with the refusal, as a fault of the program would, and
+//! [`attempt`] returns it where the call or session is known.
+//!
+//! Allocations below [`LARGE_BYTES`] and those inside libraries can't be refused. So each large one has to leave
+//! [`HEADROOM_BYTES`] for them.
+
+use std::any::Any;
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+
+use bytemuck::Zeroable;
+use bytemuck::allocation::try_zeroed_vec;
+
+use palpate_refusal::{Reason, Refusal, Result};
+
+/// Below this an allocation is not checked.
+pub const LARGE_BYTES: usize = 64 << 10;
+
+/// What a large allocation has to leave to small ones. More than 32 MiB, because the GNU allocator returns such memory to
+/// the system at once and changes none of its thresholds.
+pub const HEADROOM_BYTES: usize = 64 << 20;
+
+fn refused(bytes: usize, what: &str) -> Refusal {
+    let message = format!("the system has no memory for {what}: {bytes} bytes, and {HEADROOM_BYTES} for all else");
+    Refusal::new(Reason::Overloaded, "", message)
+}
+
+/// Whether the system would give so many bytes now.
+fn is_available(bytes: usize) -> bool {
+    let mut memory = Vec::<u8>::new();
+    let reserved = memory.try_reserve_exact(bytes).is_ok();
+    // The compiler may remove an allocation that nothing uses, and assumes that it succeeds.
+    std::hint::black_box(&mut memory);
+    reserved
+}
+
+/// Refuses if the system would not give `bytes` now. Nothing is kept: another may take them first.
+pub fn check(bytes: u64, what: &str) -> Result<()> {
+    let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
+    if bytes < LARGE_BYTES || is_available(bytes.saturating_add(HEADROOM_BYTES)) {
+        Ok(())
+    } else {
+        Err(refused(bytes, what))
+    }
+}
+
+/// Does what [`check`] does where no `Result` is returned: for many small allocations.
+///
+/// Unwinds with the refusal.
+pub fn require(bytes: u64, what: &str) {
+    if let Err(refusal) = check(bytes, what) {
+        resume_unwind(Box::new(refusal));
+    }
+}
+
+/// Returns `values` if they could be had and leave the headroom.
+fn kept<T, E>(values: std::result::Result<Vec<T>, E>, length: usize, what: &str) -> Vec<T> {
+    let bytes = length.saturating_mul(size_of::<T>());
+    match values {
+        Ok(values) if bytes < LARGE_BYTES || is_available(HEADROOM_BYTES) => values,
+        _ => resume_unwind(Box::new(refused(bytes, what))),
+    }
+}
+
+/// Returns so many zeros. The system supplies their pages at the first write.
+///
+/// Unwinds with a refusal if there is no memory for `what`.
+pub fn zeroed<T: Zeroable>(length: usize, what: &str) -> Vec<T> {
+    kept(try_zeroed_vec(length), length, what)
+}
+
+/// Returns so many copies of `value`. Unwinds as [`zeroed`] does.
+pub fn filled<T: Clone>(length: usize, value: T, what: &str) -> Vec<T> {
+    let mut values = with_room(length, what);
+    values.resize(length, value);
+    values
+}
+
+/// Returns an empty vector with room for `capacity` values. Unwinds as [`zeroed`] does.
+pub fn with_room<T>(capacity: usize, what: &str) -> Vec<T> {
+    let mut values = Vec::new();
+    let reserved = values.try_reserve_exact(capacity).map(|()| values);
+    kept(reserved, capacity, what)
+}
+
+/// Returns all of `values`. Unwinds as [`zeroed`] does.
+pub fn collected<T>(values: impl ExactSizeIterator<Item = T>, what: &str) -> Vec<T> {
+    let mut vector = with_room(values.len(), what);
+    vector.extend(values);
+    vector
+}
+
+/// Returns the refusal with which a thread unwound, if it was one of memory.
+pub fn refusal_of(panic: &(dyn Any + Send)) -> Option<&Refusal> {
+    panic.downcast_ref()
+}
+
+/// Does something. If there is no memory for it, refuses in the name of `field`; another panic goes on.
+///
+/// # Errors
+/// Refuses as `work` does, and if there is no memory for it.
+pub fn attempt<T>(field: &str, work: impl FnOnce() -> Result<T>) -> Result<T> {
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| match panic.downcast::<Refusal>() {
+        Ok(refusal) => Err(refusal.within(field)),
+        Err(panic) => resume_unwind(panic),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// No machine has so much.
+    const TOO_MUCH: usize = 1 << 60;
+
+    #[test]
+    fn what_can_not_be_had_is_refused_in_words() {
+        let refused = [
+            attempt("sheet", || Ok(zeroed::<u8>(TOO_MUCH, "a sheet").len())),
+            attempt("sheet", || Ok(filled(TOO_MUCH, 1.0, "a sheet").len())),
+            attempt("sheet", || Ok(with_room::<[f32; 3]>(TOO_MUCH, "a sheet").len())),
+            attempt("sheet", || {
+                require(TOO_MUCH as u64, "a sheet");
+                Ok(0)
+            }),
+        ];
+        for refused in refused {
+            let refusal = refused.unwrap_err();
+            assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::Overloaded, "sheet"));
+            assert!(refusal.message.contains("no memory for a sheet"), "{refusal}");
+        }
+        assert_eq!(check(u64::MAX, "a sheet").unwrap_err().reason, Reason::Overloaded);
+    }
+
+    #[test]
+    fn what_can_be_had_is_as_asked_for() {
+        assert_eq!(zeroed::<f64>(LARGE_BYTES, "zeros"), vec![0.0; LARGE_BYTES]);
+        assert_eq!(filled(3, 7, "sevens"), [7; 3]);
+        assert_eq!(collected((1..4).map(|n| n * n), "squares"), [1, 4, 9]);
+        let room = with_room::<u32>(1000, "numbers");
+        assert!(room.is_empty() && room.capacity() >= 1000);
+        check(1 << 20, "a megabyte").unwrap();
+        assert_eq!(attempt("", || Ok(5)), Ok(5));
+    }
+
+    #[test]
+    fn a_fault_is_no_refusal() {
+        let fault = catch_unwind(|| attempt("", || -> Result<()> { panic!("a test") })).unwrap_err();
+        assert_eq!(fault.downcast_ref(), Some(&"a test"));
+        assert!(refusal_of(&*fault).is_none());
+    }
+}

@@ -1,0 +1,97 @@
+//! Checks of what a tool is asked to do on a tissue, in scripts and in commands.
+
+use glam::DVec3;
+use palpate_haptics::{Coupling, Tip};
+
+use super::profile::Poke;
+use crate::limits::Limits;
+use crate::shape::{PointId, RestShape};
+use palpate_refusal::{Reason, Refusal, Result, finite, finite_vector, legible, not_negative, number};
+
+/// Squares and products of what a scene holds stay within single precision for values in this range.
+pub(super) fn physical(field: &str, value: f64) -> Result<f64> {
+    number(field, value, "from 1e-12 to 1e12", |v| (1e-12..=1e12).contains(&v))
+}
+
+/// Refuses a force whose largest value at a point, |force|·e^{c′}, is above the limit.
+pub(super) fn check_force(field: &str, force_n: DVec3, factor: f64, limit_n: f64) -> Result<()> {
+    finite_vector(field, force_n)?;
+    let largest_n = force_n.length() * factor;
+    // A force of 0 may have any factor; 0·∞ would be NaN.
+    if force_n != DVec3::ZERO && (largest_n.is_nan() || largest_n > limit_n) {
+        let message =
+            format!("is {largest_n:.6e} N on the control point (|force|·e^offset), above the limit of {limit_n} N");
+        return Err(Refusal::new(Reason::ForceTooLarge, field, message));
+    }
+    Ok(())
+}
+
+/// Checks a poke.
+///
+/// # Errors
+/// Refuses a poke that is not finite, too strong, or off the tissue.
+pub fn check_poke(poke: &Poke, shape: &dyn RestShape, limits: &Limits) -> Result<()> {
+    not_negative("force.falloff_per_m", poke.falloff_per_m)?;
+    finite("force.falloff_offset", poke.falloff_offset)?;
+    shape.check_place("force.centre_m", poke.centre_m)?;
+    check_force("force.force_n", poke.force_n, libm::exp(poke.falloff_offset), limits.point_force_n)
+}
+
+/// Checks a displacement of a grasped point.
+///
+/// # Errors
+/// Refuses one beyond the limit.
+pub fn check_reach(field: &str, shape: &dyn RestShape, displacement_m: f64, limits: &Limits) -> Result<()> {
+    let limit_m = shape.longest_side_m() * limits.reach_in_sheets;
+    let range = format!("at most {} m from the rest position", legible(limit_m));
+    number(field, displacement_m, &range, |v| v <= limit_m).map_err(in_millimetres(displacement_m, limit_m))?;
+    Ok(())
+}
+
+/// Asks, behind the refusal of a length, whether it is in millimetres: it would be right if it were.
+fn in_millimetres(length_m: f64, limit_m: f64) -> impl Fn(Refusal) -> Refusal {
+    let might_be = length_m > limit_m && length_m * 1e-3 <= limit_m;
+    move |refusal| {
+        let hint = if might_be { " m; millimetres? All lengths are in metres" } else { "" };
+        Refusal { message: refusal.message + hint, ..refusal }
+    }
+}
+
+/// Checks whether a point can be grasped.
+///
+/// # Errors
+/// Refuses a point that is fixed.
+pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<()> {
+    if shape.is_fixed(point) {
+        let message = format!("{} is fixed, and can't be grasped", shape.name(point));
+        return Err(Refusal::new(Reason::OutOfRange, field, message));
+    }
+    Ok(())
+}
+
+/// The largest radius of a tip on a mesh, in lengths of an edge.
+const MAX_EDGES: f64 = 32.0;
+
+/// Checks whether a tool with this tip fits the tissue.
+///
+/// # Errors
+/// Refuses a value that is not finite or out of range; `field` is the name that the refusal gives.
+pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
+    let longest_m = shape.longest_side_m();
+    let (most_m, what) = match MAX_EDGES * shape.edge_m() {
+        // What a disc covers is looked up at each step.
+        edges_m if shape.dimensions() > 2 && edges_m < longest_m => (edges_m, "32 lengths of an edge"),
+        _ => (longest_m, "the longest side of the tissue"),
+    };
+    let range = format!("above 0 and at most {}, {what}", legible(most_m));
+    number(&format!("{field}.radius_m"), tip.radius_m, &range, |v| v > 0.0 && v <= most_m)
+        .map_err(in_millimetres(tip.radius_m, most_m))?;
+    number(&format!("{field}.friction"), tip.friction, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
+    if let Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } = tip.coupling {
+        let field = format!("{field}.spring");
+        physical(&format!("{field}.stiffness_n_per_m"), stiffness_n_per_m)?;
+        let damps = |v| (0.0..=1e12).contains(&v);
+        number(&format!("{field}.damping_n_s_per_m"), damping_n_s_per_m, "from 0 to 1e12", damps)?;
+    }
+    Ok(())
+}

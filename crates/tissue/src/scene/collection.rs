@@ -1,0 +1,275 @@
+//! Scenes and scripts by name: the files `NAME.toml` of a folder, and the built-in texts.
+
+use std::path::{Path, PathBuf};
+
+use super::document::Document;
+use super::kind::{ORDER, TextKind};
+use super::reader::made_for;
+use super::script::{self, Script};
+use super::{BUILT_IN, Scene};
+use crate::files;
+use crate::limits::Limits;
+use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt};
+
+/// Texts by name.
+#[derive(Debug, Clone)]
+pub struct Collection {
+    folder: PathBuf,
+    built_in: &'static [(&'static str, &'static str)],
+    kind: TextKind,
+    /// Whether refusals may name files of the present folder.
+    names_files: bool,
+}
+
+impl Collection {
+    /// Returns the scenes or scripts of a folder, which may be missing, and the built-in ones.
+    pub fn new(kind: TextKind, folder: &Path) -> Self {
+        let built_in: &'static [_] = match kind {
+            TextKind::Scene => &BUILT_IN,
+            TextKind::Script => &script::BUILT_IN,
+        };
+        Collection { folder: folder.to_owned(), built_in, kind, names_files: false }
+    }
+
+    /// The same for a user of the program in whose folder it runs, not for clients: an unknown name may be meant as a file
+    /// of that folder.
+    #[must_use]
+    fn for_user(self) -> Self {
+        Collection { names_files: true, ..self }
+    }
+
+    /// Returns the folder.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Returns every name, sorted, but for those of files that belong into the folder of the other kind.
+    pub fn names(&self, limits: &Limits) -> Vec<String> {
+        self.files_and_built_in().into_iter().filter(|name| self.misplaced(name, limits).is_none()).collect()
+    }
+
+    /// Returns of these the names whose text is wanted, by name and text, and those that can't be read. Each file is read once.
+    pub fn names_where(
+        &self,
+        others: &Collection,
+        limits: &Limits,
+        is_wanted: impl Fn(&str, &str) -> bool,
+    ) -> Vec<String> {
+        let stays = |name: &String| match self.text(name, others, limits) {
+            Ok((_, text)) => is_wanted(name, &text),
+            // Of the other kind.
+            Err(refusal) => refusal.reason != Reason::WrongKind,
+        };
+        self.files_and_built_in().into_iter().filter(stays).collect()
+    }
+
+    /// Returns the refusals of files that belong into the folder of the other kind, by their names.
+    pub fn all_misplaced(&self, limits: &Limits) -> Vec<Refusal> {
+        self.files_and_built_in().iter().filter_map(|name| self.misplaced(name, limits)).collect()
+    }
+
+    fn misplaced(&self, name: &str, limits: &Limits) -> Option<Refusal> {
+        let text = files::read_regular_text(&self.file(name)?, limits.file_bytes).ok()?;
+        self.refuse_other_kind(&format!("{name}.toml"), &text).err()
+    }
+
+    /// Refuses the text of a file of the folder that is of the other kind.
+    fn refuse_other_kind(&self, file: &str, text: &str) -> Result<()> {
+        if Document::parse(file, text).is_ok_and(|document| self.kind.check(&document).is_err()) {
+            let refusal = Refusal::new(Reason::WrongKind, "", self.kind.misplaced());
+            return Err(Refusal { place: Some(file.to_owned()), ..refusal });
+        }
+        Ok(())
+    }
+
+    fn files_and_built_in(&self) -> Vec<String> {
+        let mut names: Vec<String> = self.built_in.iter().map(|text| text.0.to_owned()).collect();
+        for entry in std::fs::read_dir(&self.folder).into_iter().flatten().flatten() {
+            let path = entry.path();
+            if path.extension().is_some_and(|extension| extension == "toml")
+                && let Some(name) = path.file_stem().and_then(|name| name.to_str())
+                && is_name(name)
+            {
+                names.push(name.to_owned());
+            }
+        }
+        names.sort_unstable();
+        names.dedup();
+        names
+    }
+
+    /// The file of that name in the folder, whatever it is: who reads it tells what is wrong with it.
+    fn file(&self, name: &str) -> Option<PathBuf> {
+        let path = self.folder.join(format!("{name}.toml"));
+        (is_name(name) && path.symlink_metadata().is_ok()).then_some(path)
+    }
+
+    fn has(&self, name: &str) -> bool {
+        self.file(name).is_some() || self.built_in.iter().any(|text| text.0 == name)
+    }
+
+    /// Returns the text of that name, after the name that refusals use for it. A file of the folder overrides a
+    /// built-in text. Refusals name the file without its folder: clients do not learn the server's paths. `others` are
+    /// the texts of the other kind, for the refusal of a name that is one of theirs.
+    ///
+    /// # Errors
+    /// Refuses a name that it does not have, and a file that can't be read.
+    pub fn text(&self, name: &str, others: &Collection, limits: &Limits) -> Result<(String, String)> {
+        if let Some(path) = self.file(name) {
+            let file = format!("{name}.toml");
+            let text = files::read_regular_text(&path, limits.file_bytes)
+                .map_err(|refusal| Refusal { place: Some(file.clone()), ..refusal })?;
+            self.refuse_other_kind(&file, &text)?;
+            return Ok((file, text));
+        }
+        let built_in = self.built_in.iter().find(|text| text.0 == name);
+        built_in
+            .map(|(name, text)| ((*name).to_owned(), (*text).to_owned()))
+            .ok_or_else(|| self.unknown(name, others, limits))
+    }
+
+    fn unknown(&self, name: &str, others: &Collection, limits: &Limits) -> Refusal {
+        let (kind, names) = (self.kind.name(), self.names(limits));
+        let file = format!("{name}.toml");
+        let hint = if self.names_files && is_name(name) && Path::new(&file).is_file() {
+            format!("; did you mean the file `{file}`?")
+        } else if others.has(name) {
+            format!("; `{name}` is a {}: {ORDER}", self.kind.other().name())
+        } else {
+            let meant = did_you_mean(name, names.iter().map(String::as_str));
+            let own =
+                if self.names_files { format!("; give your own {kind} by its path, FILE.toml") } else { String::new() };
+            meant + &own
+        };
+        let message = format!("there is no {kind} `{}`; there are {}{hint}", excerpt(name), names.join(", "));
+        let (reason, field) = match self.kind {
+            TextKind::Scene => (Reason::UnknownScene, "scene_name"),
+            TextKind::Script => (Reason::UnknownScript, "script_name"),
+        };
+        Refusal::new(reason, field, message)
+    }
+}
+
+/// Whether `name` is a plain word, which can't lead out of the folder.
+fn is_name(name: &str) -> bool {
+    !name.is_empty() && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_')
+}
+
+/// The name in a path that a user gave, if it is one: a plain word that is not a file.
+fn name_in(path: &Path) -> Option<&str> {
+    path.to_str().filter(|name| is_name(name) && !path.is_file())
+}
+
+/// Where the scripts are that a user of the programs can give by name.
+const SCRIPTS: &str = "scripts";
+
+/// Reads the scene that a user gave: a file, or the name of one in `folder` or built in. `--set` assignments override its
+/// keys.
+///
+/// # Errors
+/// Refuses what is no scene, and as [`Scene::parse`] does.
+pub fn find_scene(path: &Path, folder: &Path, assignments: &[String], limits: &Limits) -> Result<Scene> {
+    let Some(name) = name_in(path) else { return Scene::load(path, assignments, limits) };
+    let scenes = Collection::new(TextKind::Scene, folder).for_user();
+    let (file, text) = scenes.text(name, &Collection::new(TextKind::Script, Path::new(SCRIPTS)), limits)?;
+    Scene::parse_in(folder, &file, &text, assignments, limits)
+}
+
+/// The text of the script that a user gave, a file or the name of one in ./scripts or built in, after the name that refusals
+/// use for it; and the folder of its traces.
+fn script_text(path: &Path, limits: &Limits) -> Result<(String, String, PathBuf)> {
+    let of_file = |path: &Path| {
+        let folder = path.parent().unwrap_or(Path::new("")).to_owned();
+        Ok((path.display().to_string(), files::read_text(path, limits.file_bytes)?, folder))
+    };
+    let Some(name) = name_in(path) else { return of_file(path) };
+    let scripts = Collection::new(TextKind::Script, Path::new(SCRIPTS)).for_user();
+    if let Some(file) = scripts.file(name) {
+        return of_file(&file);
+    }
+    let (file, text) = scripts.text(name, &Collection::new(TextKind::Scene, Path::new("scenes")), limits)?;
+    Ok((file, text, PathBuf::from(SCRIPTS)))
+}
+
+/// Reads the script that a user gave, and binds it to `scene`.
+///
+/// # Errors
+/// Refuses what is no script, and as [`Script::parse`] does.
+pub fn find_script(path: &Path, scene: &Scene, limits: &Limits) -> Result<Script> {
+    let (name, text, folder) = script_text(path, limits)?;
+    Script::parse(&name, &text, &folder, scene, limits)
+}
+
+/// Returns the scenes that the script that a user gave is made for; none, if it names none.
+///
+/// # Errors
+/// Refuses what can't be read.
+pub fn scenes_of(path: &Path, limits: &Limits) -> Result<Vec<String>> {
+    Ok(made_for(&script_text(path, limits)?.1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_of_the_other_kind_has_no_name_and_is_told() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("poke.toml"), "duration_s = 1.0\n").unwrap();
+        std::fs::write(folder.path().join("mine.toml"), "[sheet]\n").unwrap();
+        let [scenes, scripts] = [TextKind::Scene, TextKind::Script].map(|kind| Collection::new(kind, folder.path()));
+        let limits = Limits::default();
+        let [of_scenes, of_scripts] = [scenes.names(&limits), scripts.names(&limits)];
+        let has = |names: &[String], name: &str| names.iter().any(|other| other == name);
+        assert!(has(&of_scenes, "mine") && !has(&of_scenes, "poke"), "{of_scenes:?}");
+        assert!(has(&of_scripts, "poke") && !has(&of_scripts, "mine"), "{of_scripts:?}");
+        let told = |all: &Collection| all.all_misplaced(&limits).iter().map(ToString::to_string).collect::<Vec<_>>();
+        assert_eq!(told(&scenes), ["poke.toml: is a script in the folder of scenes: move it to the folder of scripts"]);
+        assert_eq!(told(&scripts), ["mine.toml: is a scene in the folder of scripts: move it to the folder of scenes"]);
+    }
+
+    #[test]
+    fn an_unknown_name_is_refused_with_all_names_and_the_nearest() {
+        let folder = Path::new("no-such-folder");
+        let [scenes, scripts] = [TextKind::Scene, TextKind::Script].map(|kind| Collection::new(kind, folder));
+        let limits = Limits::default();
+        let refused = scenes.text("papr", &scripts, &limits).unwrap_err();
+        assert_eq!(refused.reason, Reason::UnknownScene);
+        assert!(
+            refused.message.ends_with(
+                "there are colon, fibrotic, gallbladder, liver, liver-organ, paper, stomach; did you mean `paper`?"
+            ),
+            "{refused}"
+        );
+        let refused = scripts.text("vertical", &scenes, &limits).unwrap_err();
+        assert!(refused.message.ends_with("vertical-60; did you mean `vertical-60`?"), "{refused}");
+        let swapped = scenes.text("vertical-60", &scripts, &limits).unwrap_err();
+        assert!(swapped.message.contains("`vertical-60` is a script: give the scene first"), "{swapped}");
+        assert!(scenes.text("../paper", &scripts, &limits).is_err());
+        assert!(scripts.text("vertical-60", &scenes, &limits).is_ok());
+    }
+    /// Opening a pipe waits for somebody who writes into it: such a file, or one that a scene names, would hold a server's start.
+    #[cfg(unix)]
+    #[test]
+    fn what_is_no_file_is_told_as_that_and_nobody_waits_for_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        for pipe in ["pipe.toml", "pipe.obj"] {
+            assert!(std::process::Command::new("mkfifo").arg(path(pipe)).status().unwrap().success());
+        }
+        std::os::unix::fs::symlink("nowhere", path("dangling.toml")).unwrap();
+        std::os::unix::fs::symlink("/dev/zero", path("zero.toml")).unwrap();
+        std::fs::create_dir(path("folder.toml")).unwrap();
+        std::fs::write(path("mesh.toml"), "[mesh]\nfile = \"pipe.obj\"\nunit = \"m\"\npoint_mass_kg = 1e-3\n").unwrap();
+        for (name, told) in [
+            ("pipe", "pipe.toml: is not a regular file"),
+            ("dangling", "dangling.toml: can't be opened"),
+            ("zero", "zero.toml: is not a regular file"),
+            ("folder", "folder.toml: is a folder"),
+            ("mesh", "mesh.file: pipe.obj: is not a regular file"),
+        ] {
+            let refused = find_scene(Path::new(name), folder.path(), &[], &Limits::default()).unwrap_err().to_string();
+            assert!(refused.contains(told), "{refused}");
+        }
+    }
+}

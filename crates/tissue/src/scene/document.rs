@@ -1,0 +1,483 @@
+//! TOML with line numbers, the source of scenes and scripts, so that every refusal can name the file, the line and the
+//! key. `--set` overrides values before they are read.
+
+use std::collections::BTreeMap;
+
+use glam::{DVec2, DVec3};
+use toml::de::{DeTable, DeValue};
+
+use crate::shape::PointName;
+use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, nearest, unsigned_zero};
+
+/// A parsed text.
+#[derive(Debug)]
+pub struct Document {
+    name: String,
+    root: DocumentNode,
+}
+
+/// A value and its line; no line if it came from `--set`.
+#[derive(Debug, Clone)]
+struct DocumentNode {
+    line: Option<usize>,
+    value: Value,
+}
+
+#[derive(Debug, Clone)]
+enum Value {
+    Text(String),
+    Whole(i64),
+    Number(f64),
+    Flag(bool),
+    List(Vec<DocumentNode>),
+    Table(BTreeMap<String, DocumentNode>),
+    Other,
+}
+
+impl Value {
+    fn kind(&self) -> &'static str {
+        match self {
+            Value::Text(_) => "a string",
+            Value::Whole(_) => "a whole number",
+            Value::Number(_) => "a number",
+            Value::Flag(_) => "true or false",
+            Value::List(_) => "a list",
+            Value::Table(_) => "a table",
+            Value::Other => "a date",
+        }
+    }
+}
+
+impl Document {
+    /// Parses `text`; refusals call it `name`.
+    ///
+    /// # Errors
+    /// Refuses text that is not TOML, with its line.
+    pub fn parse(name: &str, text: &str) -> Result<Self> {
+        // Binary search for lines: a long file is read in nearly linear time.
+        let starts: Vec<usize> =
+            std::iter::once(0).chain(text.bytes().enumerate().filter(|b| b.1 == b'\n').map(|b| b.0 + 1)).collect();
+        let line_of = |offset: usize| starts.partition_point(|&start| start <= offset);
+        let table = DeTable::parse(text).map_err(|e| {
+            let place = e.span().map_or(name.to_owned(), |span| format!("{name}:{}", line_of(span.start)));
+            Refusal { place: Some(place), ..Refusal::new(Reason::Unreadable, "", e.message()) }
+        })?;
+        let root = DocumentNode { line: Some(1), value: table_of(table.get_ref(), &line_of) };
+        Ok(Document { name: name.to_owned(), root })
+    }
+
+    /// Applies `key.path=value`: a TOML value, or a bare string.
+    ///
+    /// # Errors
+    /// Refuses an assignment without `=`, an empty part of the path, and a path through a value that is not a table.
+    pub fn set(&mut self, assignment: &str) -> Result<()> {
+        let refuse = |message: String| Refusal {
+            place: Some("--set".into()),
+            ..Refusal::new(Reason::WrongKind, assignment, message)
+        };
+        let Some((path, text)) = assignment.split_once('=') else {
+            return Err(refuse("must be key=value, as in stepping.integrator=central".into()));
+        };
+        let (path, text) = (path.trim(), text.trim());
+        let value = match DeValue::parse(text) {
+            Ok(value) => value_of(value.get_ref(), &|_| 0),
+            Err(_) => Value::Text(text.to_owned()),
+        };
+        let mut node = &mut self.root;
+        for key in path.split('.') {
+            if key.is_empty() {
+                return Err(refuse("has an empty part in its key".into()));
+            }
+            let Value::Table(entries) = &mut node.value else {
+                return Err(refuse(format!("`{key}` is not within a table")));
+            };
+            let empty = DocumentNode { line: None, value: Value::Table(BTreeMap::new()) };
+            node = entries.entry(key.to_owned()).or_insert(empty);
+        }
+        *node = DocumentNode { line: None, value };
+        node.forget_lines();
+        Ok(())
+    }
+
+    /// Returns whether it has this key.
+    pub fn has(&self, key: &str) -> bool {
+        matches!(&self.root.value, Value::Table(entries) if entries.contains_key(key))
+    }
+
+    /// Returns a refusal of the whole document.
+    pub fn refuse(&self, reason: Reason, message: impl Into<String>) -> Refusal {
+        Refusal { place: Some(self.name.clone()), ..Refusal::new(reason, "", message) }
+    }
+
+    /// Reads the whole document as fields.
+    ///
+    /// # Errors
+    /// Returns the refusal of `read`, with its file and line, and refuses keys that `read` did not ask for.
+    pub fn read<'a, T>(&'a self, read: impl FnOnce(&mut Fields<'a>) -> Result<T>) -> Result<T> {
+        Item { path: String::new(), node: &self.root }.table(read).map_err(|refusal| self.locate(refusal))
+    }
+
+    /// Adds file and line to a refusal that names a field.
+    pub fn locate(&self, mut refusal: Refusal) -> Refusal {
+        if refusal.place.is_none() {
+            let mut node = &self.root;
+            for key in refusal.field.split(['.', '[', ']']).filter(|key| !key.is_empty()) {
+                let inner = match &node.value {
+                    Value::Table(entries) => entries.get(key),
+                    Value::List(items) => key.parse::<usize>().ok().and_then(|index| items.get(index)),
+                    _ => None,
+                };
+                // Report a missing key at the table that should have it.
+                let Some(inner) = inner else { break };
+                node = inner;
+            }
+            refusal.place = Some(match node.line {
+                Some(line) => format!("{}:{line}", self.name),
+                None => "--set".to_owned(),
+            });
+        }
+        refusal
+    }
+}
+
+impl DocumentNode {
+    fn forget_lines(&mut self) {
+        self.line = None;
+        match &mut self.value {
+            Value::List(items) => items.iter_mut().for_each(DocumentNode::forget_lines),
+            Value::Table(entries) => entries.values_mut().for_each(DocumentNode::forget_lines),
+            _ => {}
+        }
+    }
+}
+
+fn table_of(table: &DeTable<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
+    let entry = |(key, value): (&toml::Spanned<_>, &toml::Spanned<DeValue<'_>>)| {
+        let key: &std::borrow::Cow<'_, str> = key.get_ref();
+        let line = Some(line_of(value.span().start));
+        (key.to_string(), DocumentNode { line, value: value_of(value.get_ref(), line_of) })
+    };
+    Value::Table(table.iter().map(entry).collect())
+}
+
+fn number_of(digits: &str) -> Value {
+    digits.parse().map_or(Value::Other, |number| Value::Number(unsigned_zero(number)))
+}
+
+fn value_of(value: &DeValue<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
+    match value {
+        DeValue::String(text) => Value::Text(text.to_string()),
+        DeValue::Integer(whole) => {
+            let digits = whole.as_str().replace('_', "");
+            i64::from_str_radix(&digits, whole.radix()).map_or_else(|_| number_of(&digits), Value::Whole)
+        }
+        DeValue::Float(number) => number_of(&number.as_str().replace('_', "")),
+        DeValue::Boolean(flag) => Value::Flag(*flag),
+        DeValue::Datetime(_) => Value::Other,
+        DeValue::Array(items) => Value::List(
+            items
+                .iter()
+                .map(|item| DocumentNode {
+                    line: Some(line_of(item.span().start)),
+                    value: value_of(item.get_ref(), line_of),
+                })
+                .collect(),
+        ),
+        DeValue::Table(table) => table_of(table, line_of),
+    }
+}
+
+/// The keys of one table. `read` asks for each by name; a key that it never asks for is unknown.
+#[derive(Debug)]
+pub struct Fields<'a> {
+    path: String,
+    entries: &'a BTreeMap<String, DocumentNode>,
+    known: Vec<&'static str>,
+}
+
+/// One value, with its path.
+#[derive(Debug)]
+pub struct Item<'a> {
+    path: String,
+    node: &'a DocumentNode,
+}
+
+impl<'a> Fields<'a> {
+    /// Returns the full path of `key`.
+    pub fn path(&self, key: &str) -> String {
+        if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
+    }
+
+    /// Returns a refusal of `key`.
+    pub fn refuse(&self, reason: Reason, key: &str, message: impl Into<String>) -> Refusal {
+        let path = if key.is_empty() { self.path.clone() } else { self.path(key) };
+        Refusal::new(reason, path, message)
+    }
+
+    /// Returns the value of `key`, if present.
+    pub fn item(&mut self, key: &'static str) -> Option<Item<'a>> {
+        self.known.push(key);
+        self.entries.get(key).map(|node| Item { path: self.path(key), node })
+    }
+
+    /// Returns the value of `key`.
+    ///
+    /// # Errors
+    /// Refuses the table if the key is missing.
+    pub fn required(&mut self, key: &'static str) -> Result<Item<'a>> {
+        let unknown: Vec<&String> = self.entries.keys().filter(|there| !self.known.contains(&there.as_str())).collect();
+        self.item(key).ok_or_else(|| match unknown.into_iter().find(|there| meant(there, [key]).is_some()) {
+            Some(there) => self.misspelt(there, key),
+            None => self.refuse(Reason::Missing, key, "is missing"),
+        })
+    }
+
+    fn misspelt(&self, there: &str, key: &str) -> Refusal {
+        // A table has no unit.
+        let is_value = self.entries.get(there).is_some_and(|node| !matches!(node.value, Value::Table(_)));
+        let message = match key.strip_prefix(there) {
+            Some(unit) if unit.starts_with('_') && is_value => {
+                format!("unknown key: the unit belongs to the name, `{key}`")
+            }
+            _ => format!("unknown key; did you mean `{key}`?"),
+        };
+        self.refuse(Reason::UnknownKey, there, message)
+    }
+
+    /// Returns a finite number, if present.
+    ///
+    /// # Errors
+    /// Refuses any other value.
+    pub fn number(&mut self, key: &'static str) -> Result<Option<f64>> {
+        self.item(key).map(|item| item.number()).transpose()
+    }
+
+    /// Returns a finite number.
+    ///
+    /// # Errors
+    /// Refuses a missing key and any other value.
+    pub fn required_number(&mut self, key: &'static str) -> Result<f64> {
+        self.required(key)?.number()
+    }
+
+    /// Returns a string, if present.
+    ///
+    /// # Errors
+    /// Refuses any other value.
+    pub fn text(&mut self, key: &'static str) -> Result<Option<String>> {
+        self.item(key).map(|item| item.text()).transpose()
+    }
+
+    /// Refuses every key that was not asked for.
+    fn done(&self) -> Result<()> {
+        let Some(key) = self.entries.keys().find(|key| !self.known.contains(&key.as_str())) else { return Ok(()) };
+        let absent = self.known.iter().copied().filter(|known| !self.entries.contains_key(*known));
+        Err(match meant(key, absent) {
+            Some(known) => self.misspelt(key, known),
+            None => {
+                let message = format!("unknown key; known here: {}", self.known.join(", "));
+                self.refuse(Reason::UnknownKey, key, message)
+            }
+        })
+    }
+}
+
+/// Returns what serde says of a name that it does not know, with the nearest of those that it knows in place of all of
+/// them, if one is near.
+pub fn nearest_name(message: &str) -> String {
+    // As in "unknown field `lissen`, expected one of `listen`, `tls_cert`".
+    let mut names = message.split('`').skip(1).step_by(2);
+    match (message.starts_with("unknown field"), names.next()) {
+        // Or one that has all of another, as `max_sessions`.
+        (true, Some(given)) => match meant(given, names.clone()).or_else(|| {
+            names.clone().filter(|name| name.len() > 4 && given.contains(name)).max_by_key(|name| name.len())
+        }) {
+            Some(name) => format!("unknown key; did you mean `{name}`?"),
+            None => format!("unknown key; known here: {}", names.collect::<Vec<_>>().join(", ")),
+        },
+        _ => message.to_owned(),
+    }
+}
+
+/// The key that `there` is without its unit, or misspelt.
+fn meant<'k>(there: &str, keys: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
+    let keys: Vec<&str> = keys.into_iter().collect();
+    let unit_is_missing = |key: &&&str| key.strip_prefix(there).is_some_and(|rest| rest.starts_with('_'));
+    keys.iter().find(unit_is_missing).copied().or_else(|| nearest(there, keys.iter().copied()))
+}
+
+impl<'a> Item<'a> {
+    /// Returns a refusal of this value.
+    pub fn refuse(&self, reason: Reason, message: impl Into<String>) -> Refusal {
+        Refusal::new(reason, &self.path, message)
+    }
+
+    /// Returns a refusal that says what was expected, and what was probably meant. Words that are allowed are in
+    /// quotation marks.
+    pub fn wrong(&self, expected: &str) -> Refusal {
+        let words: Vec<&str> = expected.split('"').skip(1).step_by(2).collect();
+        let is = match &self.node.value {
+            Value::Text(text) if !words.is_empty() => {
+                format!("`{}`{}", excerpt(text), did_you_mean(text, words.iter().copied()))
+            }
+            Value::Text(text) if expected.ends_with("number") && text.trim().parse::<f64>().is_ok() => {
+                format!("a string: write {} without quotation marks", text.trim())
+            }
+            Value::Text(text) if expected == "true or false" && ["true", "false"].contains(&text.as_str()) => {
+                format!("a string: write {text} without quotation marks")
+            }
+            #[allow(clippy::cast_possible_truncation)]
+            Value::Number(number) if expected.ends_with("a whole number") => {
+                let is_whole = number.fract() == 0.0 && number.abs() < 1e15;
+                if is_whole { format!("{number:?}: write {}", *number as i64) } else { format!("{number:?}") }
+            }
+            other => other.kind().to_owned(),
+        };
+        self.refuse(Reason::WrongKind, format!("must be {expected}, but is {is}"))
+    }
+
+    /// Returns a finite number.
+    ///
+    /// # Errors
+    /// Refuses any other value.
+    pub fn number(&self) -> Result<f64> {
+        match self.node.value {
+            Value::Number(number) => finite(&self.path, number),
+            #[allow(clippy::cast_precision_loss)]
+            Value::Whole(whole) => Ok(whole as f64),
+            _ => Err(self.wrong("a number")),
+        }
+    }
+
+    /// Returns an integer, 0 or more.
+    ///
+    /// # Errors
+    /// Refuses any other value.
+    pub fn whole(&self) -> Result<u64> {
+        match self.node.value {
+            Value::Whole(whole) => u64::try_from(whole)
+                .map_err(|_| self.refuse(Reason::OutOfRange, format!("must be 0 or more, but is {whole}"))),
+            _ => Err(self.wrong("a whole number")),
+        }
+    }
+
+    /// Returns a string.
+    ///
+    /// # Errors
+    /// Refuses any other value.
+    pub fn text(&self) -> Result<String> {
+        match &self.node.value {
+            Value::Text(text) => Ok(text.clone()),
+            _ => Err(self.wrong("a string")),
+        }
+    }
+
+    /// Returns the string, if this is one.
+    pub fn as_text(&self) -> Option<&'a str> {
+        match &self.node.value {
+            Value::Text(text) => Some(text),
+            _ => None,
+        }
+    }
+
+    /// Returns true or false.
+    ///
+    /// # Errors
+    /// Refuses any other value.
+    pub fn flag(&self) -> Result<bool> {
+        match self.node.value {
+            Value::Flag(flag) => Ok(flag),
+            _ => Err(self.wrong("true or false")),
+        }
+    }
+
+    /// Returns a list of values.
+    ///
+    /// # Errors
+    /// Refuses any other value.
+    pub fn list(&self) -> Result<Vec<Item<'a>>> {
+        match &self.node.value {
+            Value::List(items) => Ok(items
+                .iter()
+                .enumerate()
+                .map(|(index, node)| Item { path: format!("{}[{index}]", self.path), node })
+                .collect()),
+            _ => Err(self.wrong("a list")),
+        }
+    }
+
+    /// Returns a list of tables.
+    ///
+    /// # Errors
+    /// Refuses any other value. For a single table the message says how to write the list.
+    pub fn tables(&self) -> Result<Vec<Item<'a>>> {
+        self.list().map_err(|refusal| match &self.node.value {
+            Value::Table(_) => Refusal { message: format!("{}: write [[{}]]", refusal.message, self.path), ..refusal },
+            _ => refusal,
+        })
+    }
+
+    fn numbers<const N: usize>(&self, expected: &str) -> Result<[f64; N]> {
+        let items = self.list().map_err(|_| self.wrong(expected))?;
+        let numbers = items.iter().map(Item::number).collect::<Result<Vec<_>>>()?;
+        numbers.try_into().map_err(|_| self.refuse(Reason::WrongKind, format!("must be {expected}")))
+    }
+
+    /// Returns `[x, y, z]`.
+    ///
+    /// # Errors
+    /// Refuses anything but three finite numbers.
+    pub fn vector(&self) -> Result<DVec3> {
+        Ok(DVec3::from_array(self.numbers("a list of three numbers")?))
+    }
+
+    /// Returns `[x, y]`.
+    ///
+    /// # Errors
+    /// Refuses anything but two finite numbers.
+    pub fn place(&self) -> Result<DVec2> {
+        Ok(DVec2::from_array(self.numbers("a list of two numbers")?))
+    }
+
+    /// Returns `[i, j]`, both 0 or more.
+    ///
+    /// # Errors
+    /// Refuses anything but two such integers.
+    pub fn point(&self) -> Result<[usize; 2]> {
+        let expected = "a list of two whole numbers";
+        let items = self.list().map_err(|_| self.wrong(expected))?;
+        let [i, j] = items.as_slice() else {
+            return Err(self.refuse(Reason::WrongKind, format!("must be {expected}")));
+        };
+        let index = |item: &Item<'_>| {
+            usize::try_from(item.whole()?).map_err(|_| item.refuse(Reason::OutOfRange, "is too large"))
+        };
+        Ok([index(i)?, index(j)?])
+    }
+
+    /// Returns the name of a point of a tissue, of whichever kind.
+    ///
+    /// # Errors
+    /// Refuses any other value.
+    pub fn point_name(&self) -> Result<PointName> {
+        match self.node.value {
+            Value::List(_) => Ok(PointName::Point(self.point()?)),
+            _ => match self.whole().ok().and_then(|whole| u32::try_from(whole).ok()) {
+                Some(vertex) => Ok(PointName::Vertex(vertex)),
+                None => Err(self.wrong("[i, j] on a sheet, or on a mesh the number of a vertex, 0 or more")),
+            },
+        }
+    }
+
+    /// Reads this as a table.
+    ///
+    /// # Errors
+    /// Refuses any other value and unknown keys; returns the refusal of `read`.
+    pub fn table<T>(&self, read: impl FnOnce(&mut Fields<'a>) -> Result<T>) -> Result<T> {
+        let Value::Table(entries) = &self.node.value else { return Err(self.wrong("a table")) };
+        let mut fields = Fields { path: self.path.clone(), entries, known: Vec::new() };
+        let value = read(&mut fields)?;
+        fields.done()?;
+        Ok(value)
+    }
+}

@@ -1,0 +1,77 @@
+//! Scenes and scripts are told apart by their keys, because people give one where the other is wanted.
+
+use super::document::Document;
+use palpate_refusal::{Reason, Result};
+
+/// What a text is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TextKind {
+    /// A tissue.
+    Scene,
+    /// What is done to it.
+    Script,
+}
+
+/// How to give both.
+pub(super) const ORDER: &str = "give the scene first, then the script (of `replay`: the script, then --scene)";
+
+impl TextKind {
+    /// Returns what it is called.
+    pub fn name(self) -> &'static str {
+        match self {
+            TextKind::Scene => "scene",
+            TextKind::Script => "script",
+        }
+    }
+
+    /// Returns the other one.
+    #[must_use]
+    pub fn other(self) -> Self {
+        match self {
+            TextKind::Scene => TextKind::Script,
+            TextKind::Script => TextKind::Scene,
+        }
+    }
+
+    /// Keys that the other does not have.
+    fn keys(self) -> &'static [&'static str] {
+        match self {
+            TextKind::Scene => &["sheet", "mesh", "springs", "anchor_springs", "damping", "volume", "stepping"],
+            TextKind::Script => &["scenes", "duration_s", "sample_every_s", "sample_points", "force", "tool", "tissue"],
+        }
+    }
+
+    /// The refusal of a text of the other kind in a folder of this kind, where nobody has mixed up the order of arguments.
+    pub(super) fn misplaced(self) -> String {
+        let other = self.other().name();
+        format!("is a {other} in the folder of {}s: move it to the folder of {other}s", self.name())
+    }
+
+    /// Refuses a document that has keys of the other kind and none of this one.
+    pub(super) fn check(self, document: &Document) -> Result<()> {
+        let has_keys_of = |kind: TextKind| kind.keys().iter().any(|key| document.has(key));
+        if has_keys_of(self) || !has_keys_of(self.other()) {
+            return Ok(());
+        }
+        Err(document.refuse(Reason::WrongKind, format!("is a {}: {ORDER}", self.other().name())))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scene_is_no_script_and_what_is_neither_is_read_on() {
+        let parse = |text: &str| Document::parse("file.toml", text).unwrap();
+        let (scene, script) = (parse("[sheet]\n"), parse("duration_s = 1.0\n"));
+        assert!(TextKind::Scene.check(&scene).is_ok() && TextKind::Script.check(&script).is_ok());
+        let refused = TextKind::Script.check(&scene).unwrap_err().to_string();
+        assert!(refused.starts_with("file.toml: is a scene: give the scene first, then the script"), "{refused}");
+        let refused = TextKind::Scene.check(&script).unwrap_err().to_string();
+        assert!(refused.starts_with("file.toml: is a script: give the scene first"), "{refused}");
+        for neither in ["", "name = \"x\"\n", "[sheet]\n[[force]]\n"] {
+            assert!(TextKind::Scene.check(&parse(neither)).is_ok() && TextKind::Script.check(&parse(neither)).is_ok());
+        }
+    }
+}

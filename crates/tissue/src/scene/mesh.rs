@@ -1,0 +1,1136 @@
+//! The section `[mesh]` of a scene: tissue on the surface of a triangle mesh, and its rest shape.
+
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+use std::sync::{Arc, OnceLock};
+
+use glam::{DQuat, DVec3};
+use palpate_geometry::decimate::MIN_VERTICES;
+use palpate_geometry::surface::Surface;
+use palpate_geometry::work::spend;
+use palpate_geometry::{Group, TriangleMesh};
+
+use super::check::physical;
+use super::document::{Fields, Item};
+use super::eigenvalue::largest_of_laplacian;
+use super::shown::{Shown, Simulated};
+use super::source::{Files, SourceMesh};
+use super::volume::Volume;
+use crate::limits::Limits;
+use crate::shape::{Extent, PointId, PointName, RestShape};
+use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, positive};
+
+/// A triangle mesh with a mass point at each vertex and a spring along each edge.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mesh {
+    /// Mass of each point, or that of reference, kg.
+    pub point_mass_kg: f64,
+    /// k of the springs between the two vertices opposite an edge, as a part of that of an edge; 0 without such springs.
+    pub bending: f64,
+    /// Where the points rest and how they lie together.
+    pub shape: Arc<MeshShape>,
+    /// How its points and springs differ from each other.
+    pub differences: Arc<PerNodeFactors>,
+    /// The largest stiffness of its springs.
+    pub stiffest: StiffnessBound,
+    /// What it encloses, if that resists.
+    pub volume: Option<Arc<Volume>>,
+}
+
+/// How points and springs of a mesh differ from those of reference. A list is empty where none does. C/m is the same at every
+/// point.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PerNodeFactors {
+    /// Mass of each point over that of reference.
+    pub relative_mass: Vec<f64>,
+    /// K″/m of each point over that of reference, minus 1.
+    pub extra_anchor: Vec<f64>,
+    /// k of each edge over that of reference.
+    pub edges: Vec<f64>,
+    /// k of each spring of bending over the part `bending` of that of reference.
+    pub bending: Vec<f64>,
+}
+
+/// The largest eigenvalue of the stiffness of springs under any deformation, and where it comes from.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StiffnessBound {
+    /// The eigenvalue, with the masses of reference, is at most this, over the k of reference.
+    pub bound: f64,
+    /// The vertex that has most of it.
+    pub vertex: u32,
+    /// What the bound would be by half of the springs.
+    pub usual: f64,
+    /// The largest of what K″/m of a point is above that of reference, over that, at least 0.
+    pub extra_anchor: f64,
+}
+
+/// The rest shape of a mesh: point n is vertex n of the file, unless another mesh is shown.
+#[derive(Debug, PartialEq)]
+pub struct MeshShape {
+    vertices_m: Vec<DVec3>,
+    triangles: Vec<[u32; 3]>,
+    normals: Vec<DVec3>,
+    /// The vertices of each edge, ascending; edges ascending.
+    edges: Vec<[u32; 2]>,
+    /// The vertices opposite each edge that has two triangles, ascending, and that edge.
+    opposite: Vec<[u32; 2]>,
+    crossed: Vec<[u32; 2]>,
+    neighbours: Neighbours,
+    is_fixed: Vec<bool>,
+    on_rim: Vec<bool>,
+    edge_m: f64,
+    extent: Extent,
+    top_m: DVec3,
+    cells: Cells,
+    surface: OnceLock<Surface>,
+    told: MeshMetadata,
+    /// The mesh of the file, if the simulated one is coarser or has joined vertices.
+    shown: Option<Shown>,
+}
+
+/// What clients are told of a mesh, and the tissue does not need.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct MeshMetadata {
+    /// How the scene says which vertices never move.
+    pub fixed: FixedVertices,
+    /// Texture coordinates of each vertex, if the file has them; at a seam, those of one side.
+    pub uv: Option<Vec<[f32; 2]>>,
+    /// Vertices with a name.
+    pub groups: Vec<Group>,
+    /// What was done with the mesh of the file, and what is doubtful about it, in words.
+    pub findings: Vec<String>,
+}
+
+impl Mesh {
+    /// Why the mass of a point is refused beside a material.
+    pub const WEIGHED: &str = "does not go with [material], which says what a point weighs";
+
+    /// Reads the section `[mesh]`; with a material, which says what a point weighs, its edges are flipped to Delaunay.
+    pub(super) fn read(fields: &mut Fields<'_>, files: Files<'_>, of_material: bool, limits: &Limits) -> Result<Self> {
+        let (source_mesh, source) = files.mesh(fields, limits)?;
+        let point_mass_kg = match fields.item("point_mass_kg") {
+            Some(mass) if of_material => {
+                return Err(mass.refuse(Reason::WrongKind, Self::WEIGHED));
+            }
+            Some(mass) => mass.number()?,
+            None if of_material => 1.0,
+            None => fields.required_number("point_mass_kg")?,
+        };
+        let vertices = match fields.item("vertices") {
+            Some(item) => {
+                let least = |vertices: &usize| *vertices >= MIN_VERTICES;
+                let vertices = usize::try_from(item.whole()?).ok().filter(least);
+                let message = format!("must be at least {MIN_VERTICES}");
+                Some(vertices.ok_or_else(|| item.refuse(Reason::OutOfRange, message))?)
+            }
+            None => None,
+        };
+        let simulated = match source_mesh {
+            SourceMesh::Made(mesh) => Simulated::made(mesh, vertices, of_material),
+            SourceMesh::Read(mesh) => Simulated::of(mesh, vertices, of_material).map_err(|refusal| {
+                let name = source.as_text().map_or_else(String::new, |file| format!("{file}: "));
+                source.refuse(refusal.reason, format!("{name}{}", refusal.message))
+            })?,
+        };
+        let fixed =
+            fields.item("fixed").map_or(Ok(FixedVertices::None), |item| FixedVertices::read(&item, &simulated.mesh))?;
+        let made = Self::simulating(simulated, point_mass_kg, fixed);
+        made.map_err(|refusal| source.refuse(refusal.reason, refusal.message))
+    }
+
+    /// Returns the stiffness of a mesh without springs of bending.
+    ///
+    /// # Errors
+    /// As for [`MeshShape::new`].
+    pub fn of(mesh: TriangleMesh, point_mass_kg: f64, fixed: FixedVertices) -> Result<Self> {
+        Self::simulating(Simulated { mesh, shown: None, findings: Vec::new() }, point_mass_kg, fixed)
+    }
+
+    /// Does the same of a mesh that another may be shown for.
+    ///
+    /// # Errors
+    /// As for [`MeshShape::new`].
+    pub fn simulating(simulated: Simulated, point_mass_kg: f64, fixed: FixedVertices) -> Result<Self> {
+        let Simulated { mesh, shown, mut findings } = simulated;
+        let balls = if let FixedVertices::Balls(balls) = &fixed { balls.as_slice() } else { &[] };
+        let mut is_empty = vec![true; balls.len()];
+        let uv = mesh.uv.as_ref().map(|_| {
+            let mut of_vertex = vec![[0.0; 2]; mesh.vertices_m.len()];
+            mesh.write_vertex_uv(&mut of_vertex);
+            of_vertex
+        });
+        let mut shape = MeshShape::new(mesh.vertices_m, mesh.triangles, |rim, place_m, vertex| match &fixed {
+            FixedVertices::None => false,
+            FixedVertices::Rim => rim,
+            FixedVertices::Group(group) => group.vertices.binary_search(&vertex).is_ok(),
+            FixedVertices::Balls(balls) => {
+                spend(balls.len());
+                let mut is_within = false;
+                for ((centre_m, radius_m), is_empty) in balls.iter().zip(&mut is_empty) {
+                    let holds = place_m.distance(*centre_m) <= *radius_m;
+                    *is_empty &= !holds;
+                    is_within |= holds;
+                }
+                is_within
+            }
+        })?;
+        let empty = (0..).zip(balls).zip(is_empty).filter(|(_, is_empty)| *is_empty).map(|(ball, _)| ball);
+        findings.extend(empty.clone().take(EMPTY_BALLS_TOLD).map(|(number, ball)| shape.empty_ball(number, *ball)));
+        match empty.count().saturating_sub(EMPTY_BALLS_TOLD) {
+            0 => {}
+            more => findings.push(format!("mesh.fixed: {more} more balls hold no vertex")),
+        }
+        shape.told = MeshMetadata { fixed, uv, groups: mesh.groups, findings };
+        shape.shown = shown;
+        Ok(Mesh::new(point_mass_kg, 0.0, Arc::new(shape)))
+    }
+
+    /// Creates a mesh of a shape, a mass and the stiffness of its springs of bending relative to that of its edges; all points and all edges
+    /// are alike.
+    pub fn new(point_mass_kg: f64, bending: f64, shape: Arc<MeshShape>) -> Self {
+        Self::uneven(point_mass_kg, bending, shape, PerNodeFactors::default())
+    }
+
+    /// Returns the same where points and springs differ.
+    pub fn uneven(point_mass_kg: f64, bending: f64, shape: Arc<MeshShape>, differences: PerNodeFactors) -> Self {
+        let stiffest = StiffnessBound { bound: 0.0, vertex: 0, usual: 0.0, extra_anchor: 0.0 };
+        let differences = Arc::new(differences);
+        let mut mesh = Mesh { point_mass_kg, bending, shape, differences, stiffest, volume: None };
+        mesh.stiffest = mesh.find_stiffest();
+        mesh
+    }
+
+    /// Does the same mesh, closed, with the volume that it encloses.
+    ///
+    /// # Errors
+    /// Refuses a mesh that encloses no volume, or several.
+    pub fn enclosing(mut self) -> Result<Self> {
+        let volume = Volume::of(&self.shape.vertices_m, &self.shape.triangles)?;
+        let volume = volume.among(self.springs(), |vertex| self.relative_mass(PointId::new(vertex)));
+        self.volume = Some(Arc::new(volume));
+        Ok(self)
+    }
+
+    /// Returns the mass of a point over that of reference.
+    pub fn relative_mass(&self, point: PointId) -> f64 {
+        self.differences.relative_mass.get(point.index()).copied().unwrap_or(1.0)
+    }
+
+    /// Returns K″/m of a point over that of reference, minus 1.
+    pub fn extra_anchor(&self, point: PointId) -> f64 {
+        self.differences.extra_anchor.get(point.index()).copied().unwrap_or(0.0)
+    }
+
+    /// Returns the mass of all points that have an edge, kg.
+    pub fn mass_kg(&self) -> f64 {
+        let used = (0..self.shape.vertices_m.len()).filter(|vertex| self.shape.is_used(*vertex));
+        self.point_mass_kg * used.map(|vertex| self.relative_mass(PointId::new(vertex))).sum::<f64>()
+    }
+
+    /// Returns every spring: its ends, and its k over that of reference.
+    pub fn springs(&self) -> impl Iterator<Item = ([u32; 2], f64)> + '_ {
+        let (shape, part) = (&self.shape, self.bending);
+        let PerNodeFactors { edges, bending: bending_factors, .. } = &*self.differences;
+        let of = |factors: &[f64], which: usize| factors.get(which).copied().unwrap_or(1.0);
+        let bending: &[[u32; 2]] = if part > 0.0 { &shape.opposite } else { &[] };
+        let along = shape.edges.iter().enumerate().map(move |(which, ends)| (*ends, of(edges, which)));
+        along.chain(bending.iter().enumerate().map(move |(which, ends)| (*ends, part * of(bending_factors, which))))
+    }
+
+    /// The vertices around the one that the fastest vibration has most of, at most so many, turned so that its normal is
+    /// along z; and three of them: that one, one about half way to the rim of the part, and one at the rim.
+    #[allow(clippy::cast_possible_truncation)]
+    pub(super) fn part(&self, most: usize) -> (Self, [PointId; 3]) {
+        let shape = &self.shape;
+        let (first, count) = (self.stiffest.vertex as usize, shape.vertices_m.len());
+        let mut number_of = vec![u32::MAX; count];
+        let mut found = vec![first];
+        number_of[first] = 0;
+        let mut next = 0;
+        while next < found.len() && found.len() < most {
+            for vertex in shape.neighbours.of(found[next]) {
+                if found.len() < most && number_of[*vertex as usize] == u32::MAX {
+                    number_of[*vertex as usize] = found.len() as u32;
+                    found.push(*vertex as usize);
+                }
+            }
+            next += 1;
+        }
+        let turn = DQuat::from_rotation_arc(shape.normals[first], DVec3::Z);
+        let vertices_m =
+            found.iter().map(|vertex| turn * (shape.vertices_m[*vertex] - shape.vertices_m[first])).collect();
+        let numbered = shape.triangles.iter().map(|triangle| triangle.map(|vertex| number_of[vertex as usize]));
+        let triangles: Vec<_> = numbered.filter(|triangle| triangle.iter().all(|vertex| *vertex != u32::MAX)).collect();
+        let is_fixed = |_: bool, _: DVec3, vertex: u32| vertex != 0 && shape.is_fixed[found[vertex as usize]];
+        let looked_at = [0, found.len() / 4, found.len() - 1].map(PointId::new);
+        match MeshShape::new(vertices_m, triangles, is_fixed) {
+            Ok(part) => {
+                let known = &self.differences;
+                let of_points =
+                    |list: &[f64]| if list.is_empty() { vec![] } else { found.iter().map(|of| list[*of]).collect() };
+                let of_springs = |list: &[f64], all: &[[u32; 2]], ends: &[[u32; 2]]| -> Vec<f64> {
+                    let of = |ends: &[u32; 2]| {
+                        let [a, b] = ends.map(|end| found[end as usize] as u32);
+                        all.binary_search(&[a.min(b), a.max(b)]).map_or(1.0, |at| list[at])
+                    };
+                    if list.is_empty() { vec![] } else { ends.iter().map(of).collect() }
+                };
+                let differences = PerNodeFactors {
+                    relative_mass: of_points(&known.relative_mass),
+                    extra_anchor: of_points(&known.extra_anchor),
+                    edges: of_springs(&known.edges, &shape.edges, &part.edges),
+                    bending: of_springs(&known.bending, &shape.opposite, &part.opposite),
+                };
+                let mut part = Mesh::uneven(self.point_mass_kg, self.bending, Arc::new(part), differences);
+                part.volume = self.volume.as_ref().and_then(|volume| {
+                    let areas_m2 = found.iter().map(|vertex| turn * volume.areas_m2[*vertex]).collect();
+                    volume.part(areas_m2, |vertex| part.relative_mass(PointId::new(vertex))).map(Arc::new)
+                });
+                (part, looked_at)
+            }
+            // Parts of a mesh that is sound are sound.
+            Err(_) => (self.clone(), [PointId::new(first); 3]),
+        }
+    }
+
+    /// A spring along n contributes at most k·I to the stiffness matrix, whatever the deformation (`tissue::stability`), so
+    /// the matrix is at most the weighted Laplacian of the graph. Over the masses, its largest eigenvalue is at most the
+    /// largest of
+    ///
+    /// w_i + w_j − Σ min(k_il/m_i, k_jl/m_j) over the common neighbours l of i and j,  w_i = Σ k_il/m_i,
+    ///
+    /// over all springs i–j (Das and Bapat, A sharp upper bound on the largest Laplacian eigenvalue of weighted graphs,
+    /// 2005, for masses of 1). For of all springs, take the one with the largest difference d = x_i − x_j of an eigenvector:
+    /// λ·d = Σ k_il/m_i·(x_i − x_l) + Σ k_jl/m_j·(x_l − x_j), where no difference is above d, and the two of a common neighbour
+    /// are d together. On a mesh of equal triangles that bound is 10 k/m, where 9 k/m is true and Gershgorin's bound says
+    /// 12 k/m. It tells the vertex; the bound is closer by the method of Lanczos.
+    fn find_stiffest(&self) -> StiffnessBound {
+        let count = self.shape.vertices_m.len();
+        let mass = |vertex: u32| self.relative_mass(PointId::new(vertex as usize));
+        let mut around: Vec<Vec<(u32, f64)>> = vec![Vec::new(); count];
+        for ([a, b], k) in self.springs() {
+            around[a as usize].push((b, k / mass(a)));
+            around[b as usize].push((a, k / mass(b)));
+        }
+        for of_vertex in &mut around {
+            of_vertex.sort_unstable_by_key(|(other, _)| *other);
+            // An edge and a spring of bending may join the same two vertices.
+            of_vertex.dedup_by(|next, kept| {
+                let same = next.0 == kept.0;
+                kept.1 += if same { next.1 } else { 0.0 };
+                same
+            });
+        }
+        let weight: Vec<f64> = around.iter().map(|of_vertex| of_vertex.iter().map(|(_, k)| k).sum()).collect();
+        let extra_anchor = self.differences.extra_anchor.iter().copied().fold(0.0, f64::max);
+        let mut stiffest = StiffnessBound { bound: 0.0, vertex: 0, usual: 0.0, extra_anchor };
+        let mut bounds = Vec::new();
+        for ([a, b], _) in self.springs() {
+            let [mut few, mut many] = [a, b].map(|end| around[end as usize].as_slice());
+            if few.len() > many.len() {
+                (few, many) = (many, few);
+            }
+            // A vertex may have very many neighbours, each of which has it as its own.
+            spend(1 + few.len());
+            let mut common = 0.0;
+            for (other, of_one) in few {
+                if let Ok(found) = many.binary_search_by_key(other, |(other, _)| *other) {
+                    common += of_one.min(many[found].1);
+                }
+            }
+            let [of_a, of_b] = [a, b].map(|end| weight[end as usize]);
+            let bound = of_a + of_b - common;
+            bounds.push(bound);
+            if bound > stiffest.bound {
+                stiffest = StiffnessBound { bound, vertex: if of_a >= of_b { a } else { b }, ..stiffest };
+            }
+        }
+        if !bounds.is_empty() {
+            let half = bounds.len() / 2;
+            let usual = *bounds.select_nth_unstable_by(half, f64::total_cmp).1;
+            stiffest.usual = usual;
+            let closer = largest_of_laplacian(&around, mass);
+            if closer > 0.0 && closer < stiffest.bound {
+                // By as much less as is true of the largest.
+                stiffest.usual *= closer / stiffest.bound;
+                stiffest.bound = closer;
+            }
+        }
+        stiffest
+    }
+
+    /// Returns where the fastest vibration is, in words that end a message.
+    pub fn fastest_place(&self) -> String {
+        let point = PointId::new(self.stiffest.vertex as usize);
+        format!(", most of all at {}, {:.4} m", self.shape.name(point), self.shape.rest_m(point))
+    }
+
+    /// Returns what a user should know of the mesh, in words.
+    pub fn warnings(&self) -> Vec<String> {
+        let shape = &self.shape;
+        let mut warnings = shape.told.findings.clone();
+        if shape.told.fixed == FixedVertices::Rim && shape.is_closed() {
+            warnings.push("mesh.fixed: the mesh is closed and has no rim: \"rim\" fixes nothing".to_owned());
+        }
+        if shape.told.fixed != FixedVertices::None && shape.is_fixed.iter().all(|fixed| *fixed) {
+            warnings.push("mesh.fixed: every vertex is fixed: nothing moves".to_owned());
+        }
+        if self.has_fast_vertex() {
+            let point = PointId::new(self.stiffest.vertex as usize);
+            warnings.push(format!(
+                "mesh: {} at {:.4} m, with its short edges or small triangles, vibrates {:.1} times as fast as half of the mesh: \
+                 without such vertices a step would take fewer substeps; `palpate check` finds out which mesh.vertices leaves \
+                 them out",
+                shape.name(point),
+                shape.rest_m(point),
+                self.fastest_ratio(),
+            ));
+        }
+        warnings
+    }
+
+    /// How many times as fast the fastest vibration is as those of half of the mesh.
+    fn fastest_ratio(&self) -> f64 {
+        (self.stiffest.bound / self.stiffest.usual).sqrt()
+    }
+
+    /// Returns whether a few vertices vibrate so fast that they alone make the substeps many.
+    pub fn has_fast_vertex(&self) -> bool {
+        self.fastest_ratio() > MUCH_FASTER
+    }
+
+    pub(super) fn check(&self, limits: &Limits) -> Result<()> {
+        let count = self.shape.point_count();
+        if count > limits.points {
+            let message = format!("has {count} vertices, above the limit of {} points in all", limits.points);
+            return Err(Refusal::new(Reason::TooLarge, "mesh.file", message));
+        }
+        physical("mesh.point_mass_kg", positive("mesh.point_mass_kg", self.point_mass_kg)?)?;
+        physical("mesh.unit", self.shape.edge_m)?;
+        Ok(())
+    }
+}
+
+/// A new tool begins at least this far off the surface at rest, m.
+const APPROACH_M: f64 = 0.002;
+
+/// So many balls of `mesh.fixed` that hold no vertex are told one by one.
+const EMPTY_BALLS_TOLD: usize = 4;
+
+/// A vertex that vibrates so much faster than half of a mesh is warned of.
+const MUCH_FASTER: f64 = 2.5;
+
+/// Which vertices never move.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub enum FixedVertices {
+    /// None.
+    #[default]
+    None,
+    /// Those of edges with a single triangle.
+    Rim,
+    /// Those of a group of the file.
+    Group(Group),
+    /// Those within balls: centre and radius, m.
+    Balls(Vec<(DVec3, f64)>),
+}
+
+impl FixedVertices {
+    fn read(item: &Item<'_>, mesh: &TriangleMesh) -> Result<Self> {
+        const EXPECTED: &str = "\"none\", \"rim\", { group = \"…\" } or a list of balls { centre_m, radius_m }";
+        match item.as_text() {
+            Some("none") => return Ok(FixedVertices::None),
+            Some("rim") => return Ok(FixedVertices::Rim),
+            Some(_) => return Err(item.wrong(EXPECTED)),
+            None => {}
+        }
+        if let Ok(list) = item.list() {
+            let ball = |item: &Item<'_>| {
+                item.table(|fields| {
+                    let centre_m = fields.required("centre_m")?.vector()?;
+                    Ok((centre_m, positive(&fields.path("radius_m"), fields.required_number("radius_m")?)?))
+                })
+            };
+            return Ok(FixedVertices::Balls(list.iter().map(ball).collect::<Result<_>>()?));
+        }
+        item.table(|fields| {
+            let group = fields.required("group")?;
+            let found = FixedVertices::group("", &group.text()?, mesh);
+            found.map_err(|refusal| group.refuse(refusal.reason, refusal.message))
+        })
+    }
+
+    /// Returns the vertices of the group of that name.
+    ///
+    /// # Errors
+    /// Refuses a name that no group has; `field` is the name that the refusal gives.
+    pub fn group(field: &str, name: &str, mesh: &TriangleMesh) -> Result<Self> {
+        group_named(field, name, &mesh.groups).map(|group| FixedVertices::Group(group.clone()))
+    }
+}
+
+/// The group of that name.
+///
+/// # Errors
+/// Refuses a name that no group has; `field` is the name that the refusal gives.
+pub(super) fn group_named<'g>(field: &str, name: &str, groups: &'g [Group]) -> Result<&'g Group> {
+    groups.iter().find(|group| group.name == name).ok_or_else(|| {
+        let meant = did_you_mean(name, groups.iter().map(|group| group.name.as_str()));
+        let names: Vec<&str> = groups.iter().map(|group| group.name.as_str()).take(8).collect();
+        let all = if names.is_empty() { "it has none".to_owned() } else { format!("it has {}", names.join(", ")) };
+        let message = format!("the mesh has no group `{}`{meant}; {all}", excerpt(name));
+        Refusal::new(Reason::WrongKind, field, message)
+    })
+}
+
+impl MeshShape {
+    /// Creates the shape of vertices and triangles; `is_fixed` says whether a vertex never moves: whether it is on a rim, where it rests, and
+    /// its number.
+    ///
+    /// # Errors
+    /// Refuses a mesh without an edge, with an edge of no length, with an edge of more than two triangles, and with numbers
+    /// of vertices or places that are no good.
+    pub fn new(
+        vertices_m: Vec<DVec3>,
+        triangles: Vec<[u32; 3]>,
+        is_fixed: impl FnMut(bool, DVec3, u32) -> bool,
+    ) -> Result<Self> {
+        Self::braced(vertices_m, triangles, &[], is_fixed)
+    }
+
+    /// Does the same with `braces`: springs like those of edges between other vertices, as along both diagonals of a
+    /// square.
+    ///
+    /// # Errors
+    /// As for [`MeshShape::new`].
+    pub fn braced(
+        vertices_m: Vec<DVec3>,
+        triangles: Vec<[u32; 3]>,
+        braces: &[[u32; 2]],
+        mut is_fixed: impl FnMut(bool, DVec3, u32) -> bool,
+    ) -> Result<Self> {
+        let refuse = |message: String| Refusal::new(Reason::Unreadable, "mesh", message);
+        if let Some(vertex) = vertices_m.iter().position(|place_m| !place_m.is_finite()) {
+            return Err(refuse(format!("vertex {vertex} is not finite")));
+        }
+        let count = vertices_m.len();
+        let is_out = |triangle: &[u32; 3]| triangle.iter().any(|vertex| *vertex as usize >= count);
+        if let Some(which) = triangles.iter().position(is_out) {
+            return Err(refuse(format!("triangle {which} names a vertex beyond the last of {count}")));
+        }
+        spend(32 * triangles.len());
+        // Each side of each triangle, and the vertex opposite it.
+        let mut sides: Vec<([u32; 2], u32)> = triangles
+            .iter()
+            .flat_map(|[a, b, c]| [([*a, *b], *c), ([*b, *c], *a), ([*c, *a], *b)])
+            .map(|([a, b], opposite)| ([a.min(b), a.max(b)], opposite))
+            .collect();
+        sides.sort_unstable();
+        let (mut edges, mut opposite, mut on_rim) = (Vec::new(), Vec::new(), vec![false; count]);
+        for of_edge in sides.chunk_by(|a, b| a.0 == b.0) {
+            let edge @ [a, b] = of_edge[0].0;
+            let [from_m, to_m] = edge.map(|vertex| vertices_m[vertex as usize]);
+            let length_m = from_m.distance(to_m);
+            if length_m == 0.0 {
+                return Err(refuse(format!("the edge between vertices {a} and {b} at {from_m:.6} m has no length")));
+            }
+            match of_edge {
+                [_] => edge.iter().for_each(|vertex| on_rim[*vertex as usize] = true),
+                [(_, c), (_, d)] => opposite.push(([*c.min(d), *c.max(d)], edge)),
+                more => {
+                    let message =
+                        format!("the edge between vertices {a} and {b} at {from_m:.6} m has {} triangles", more.len());
+                    return Err(refuse(message));
+                }
+            }
+            edges.push(edge);
+        }
+        edges.extend(braces.iter().map(|[a, b]| [*a.min(b), *a.max(b)]));
+        edges.sort_unstable();
+        edges.dedup();
+        if edges.is_empty() {
+            return Err(refuse("has no triangle".to_owned()));
+        }
+        opposite.retain(|([c, d], _)| c != d);
+        opposite.sort_unstable();
+        opposite.dedup_by_key(|(ends, _)| *ends);
+        let (opposite, crossed) = opposite.into_iter().unzip();
+        let length_m = |[a, b]: &[u32; 2]| vertices_m[*a as usize].distance(vertices_m[*b as usize]);
+        #[allow(clippy::cast_precision_loss)]
+        let edge_m = edges.iter().map(length_m).sum::<f64>() / edges.len() as f64;
+        finite("mesh", edge_m)?;
+        let mut normals = vec![DVec3::ZERO; count];
+        for triangle in &triangles {
+            let [a, b, c] = triangle.map(|vertex| vertices_m[vertex as usize]);
+            let area = (b - a).cross(c - a);
+            triangle.iter().for_each(|vertex| normals[*vertex as usize] += area);
+        }
+        normals.iter_mut().for_each(|normal| *normal = normal.try_normalize().unwrap_or(DVec3::Z));
+        #[allow(clippy::cast_possible_truncation)]
+        let is_fixed = (0..count).map(|vertex| is_fixed(on_rim[vertex], vertices_m[vertex], vertex as u32)).collect();
+        let neighbours = Neighbours::new(count, &edges);
+        let used = || (0..).zip(&vertices_m).filter(|(vertex, _)| !neighbours.of(*vertex as usize).is_empty());
+        let extent = Extent::around(used().map(|(_, place_m)| *place_m));
+        let cells = Cells::new(used(), extent, edge_m);
+        let top_m = palpate_geometry::top::top_m(&vertices_m, &triangles, &normals, extent.middle_m());
+        Ok(MeshShape {
+            vertices_m,
+            triangles,
+            normals,
+            edges,
+            opposite,
+            crossed,
+            neighbours,
+            is_fixed,
+            on_rim,
+            edge_m,
+            extent,
+            top_m,
+            cells,
+            surface: OnceLock::new(),
+            told: MeshMetadata::default(),
+            shown: None,
+        })
+    }
+
+    /// That a ball of `mesh.fixed` fixes nothing, in words.
+    fn empty_ball(&self, number: usize, (centre_m, radius_m): (DVec3, f64)) -> String {
+        let nearest = self.nearest(centre_m);
+        let off_m = self.rest_m(nearest).distance(centre_m);
+        format!(
+            "mesh.fixed[{number}]: no vertex is within {radius_m} m of {centre_m:.4} m, so this ball fixes nothing; the nearest, {}, \
+             is {off_m:.4} m off",
+            self.name(nearest)
+        )
+    }
+
+    /// Returns what clients are told of it.
+    pub fn told(&self) -> &MeshMetadata {
+        &self.told
+    }
+
+    /// Returns where each vertex rests, m.
+    pub fn vertices_m(&self) -> &[DVec3] {
+        &self.vertices_m
+    }
+
+    /// Returns three vertices each, counterclockwise seen from outside.
+    pub fn triangles(&self) -> &[[u32; 3]] {
+        &self.triangles
+    }
+
+    /// Returns its triangles, to walk on: made when somebody first asks.
+    pub fn surface(&self) -> &Surface {
+        self.surface.get_or_init(|| Surface::new(&self.vertices_m, &self.triangles))
+    }
+
+    /// Returns the two vertices of each edge, ascending.
+    pub fn edges(&self) -> &[[u32; 2]] {
+        &self.edges
+    }
+
+    /// Returns the vertices opposite each edge that has two triangles, ascending.
+    pub fn opposite(&self) -> &[[u32; 2]] {
+        &self.opposite
+    }
+
+    /// Returns the edge that the spring of bending between each two of these crosses.
+    pub fn crossed(&self) -> &[[u32; 2]] {
+        &self.crossed
+    }
+
+    /// Returns the normal at each vertex.
+    pub fn normals(&self) -> &[DVec3] {
+        &self.normals
+    }
+
+    /// Returns whether a vertex has an edge. One that has none is no part of the tissue: it counts neither for its size
+    /// nor for its mass, and is the nearest to no place.
+    pub fn is_used(&self, vertex: usize) -> bool {
+        !self.neighbours.of(vertex).is_empty()
+    }
+
+    /// Returns whether a vertex is at an edge that has a single triangle.
+    pub fn is_on_rim(&self, vertex: usize) -> bool {
+        self.on_rim[vertex]
+    }
+
+    /// How far each vertex is from the nearest of `members`, m; infinite where that is `most_m` or more. Which of them is the
+    /// nearest is handed on along the edges, so that the work is bounded by the size of the mesh; now and then it is another
+    /// that is farther away by a part of an edge.
+    pub(super) fn away_m(&self, members: &[u32], most_m: f64) -> Vec<f64> {
+        let count = self.vertices_m.len();
+        let (mut away_m, mut is_done) = (vec![f64::INFINITY; count], vec![false; count]);
+        // Distances are ordered as their bits.
+        let mut waiting = BinaryHeap::new();
+        for member in members {
+            away_m[*member as usize] = 0.0;
+            waiting.push(Reverse((0, *member, *member)));
+        }
+        while let Some(Reverse((_, vertex, member))) = waiting.pop() {
+            if std::mem::replace(&mut is_done[vertex as usize], true) {
+                continue;
+            }
+            spend(16 * self.neighbours.of(vertex as usize).len());
+            for next in self.neighbours.of(vertex as usize) {
+                let next_m = self.vertices_m[*next as usize].distance(self.vertices_m[member as usize]);
+                let known_m = &mut away_m[*next as usize];
+                if !is_done[*next as usize] && next_m < *known_m && next_m < most_m {
+                    *known_m = next_m;
+                    waiting.push(Reverse((next_m.to_bits(), *next, member)));
+                }
+            }
+        }
+        away_m
+    }
+
+    /// Returns whether no edge has a single triangle.
+    pub fn is_closed(&self) -> bool {
+        !self.on_rim.contains(&true)
+    }
+
+    /// Returns the mesh that is shown, if it is another: that of the file, of which this is a coarser one.
+    pub fn shown(&self) -> Option<&Shown> {
+        self.shown.as_ref()
+    }
+}
+
+impl RestShape for MeshShape {
+    fn describe(&self) -> String {
+        let count = self.vertices_m.len();
+        self.shown.as_ref().map_or_else(
+            || format!("{count} vertices"),
+            |shown| format!("{count} vertices for the {} of the file", shown.mesh.vertices_m.len()),
+        )
+    }
+
+    fn point_count(&self) -> usize {
+        self.vertices_m.len()
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn name(&self, point: PointId) -> PointName {
+        PointName::Vertex(self.shown.as_ref().map_or(point.index() as u32, |shown| shown.names[point.index()]))
+    }
+
+    fn find(&self, field: &str, name: PointName) -> Result<PointId> {
+        let count = self.shown.as_ref().map_or(self.vertices_m.len(), |shown| shown.nearest.len());
+        match name {
+            PointName::Vertex(vertex) if (vertex as usize) < count => {
+                let nearest = self.shown.as_ref().map_or(vertex, |shown| shown.nearest[vertex as usize]);
+                Ok(PointId::new(nearest as usize))
+            }
+            PointName::Vertex(_) => Err(Refusal::new(
+                Reason::OffTissue,
+                field,
+                format!("{name} is not on the mesh, whose vertices are numbered from 0 to {}", count - 1),
+            )),
+            PointName::Point(_) => {
+                let message = format!("{name} is a point of a sheet; a point of a mesh is the number of a vertex");
+                Err(Refusal::new(Reason::WrongKind, field, message))
+            }
+        }
+    }
+
+    fn rest_m(&self, point: PointId) -> DVec3 {
+        self.vertices_m[point.index()]
+    }
+
+    fn normal(&self, point: PointId) -> DVec3 {
+        self.normals[point.index()]
+    }
+
+    fn is_fixed(&self, point: PointId) -> bool {
+        self.is_fixed[point.index()]
+    }
+
+    fn neighbours(&self, point: PointId) -> Vec<PointId> {
+        self.neighbours.of(point.index()).iter().map(|vertex| PointId::new(*vertex as usize)).collect()
+    }
+
+    fn nearest(&self, place_m: DVec3) -> PointId {
+        PointId::new(self.cells.nearest(&self.vertices_m, place_m))
+    }
+
+    fn approach_m(&self, place_m: DVec3, radius_m: f64) -> Option<DVec3> {
+        let surface = self.surface();
+        let nearest = surface.nearest(place_m)?;
+        let (at_m, outward) = (surface.at_m(&nearest), nearest.frame[0].cross(nearest.frame[1]));
+        let side = surface.side((place_m - at_m).dot(outward), radius_m);
+        // One that is beside a rim, or far enough off the surface, begins where it is.
+        let is_off = (place_m - at_m).dot(side * outward) >= APPROACH_M;
+        Some(if is_off { place_m } else { at_m + APPROACH_M * side * outward })
+    }
+
+    fn around(&self, place_m: DVec3, radius_m: f64) -> Vec<PointId> {
+        self.cells.around(&self.vertices_m, place_m, radius_m).into_iter().map(PointId::new).collect()
+    }
+
+    fn extent(&self) -> Extent {
+        self.extent
+    }
+
+    fn edge_m(&self) -> f64 {
+        self.edge_m
+    }
+
+    fn top_m(&self) -> DVec3 {
+        self.top_m
+    }
+}
+
+/// The ends of the edges at each vertex, ascending.
+#[derive(Debug, PartialEq)]
+struct Neighbours {
+    /// Where each vertex's begin; one more for the end.
+    from: Vec<u32>,
+    members: Vec<u32>,
+}
+
+impl Neighbours {
+    #[allow(clippy::cast_possible_truncation)]
+    fn new(count: usize, edges: &[[u32; 2]]) -> Self {
+        let mut both: Vec<[u32; 2]> = edges.iter().flat_map(|[a, b]| [[*a, *b], [*b, *a]]).collect();
+        both.sort_unstable();
+        let mut from = vec![0; count + 1];
+        both.iter().for_each(|[a, _]| from[*a as usize + 1] += 1);
+        (0..count).for_each(|vertex| from[vertex + 1] += from[vertex]);
+        Neighbours { from, members: both.into_iter().map(|[_, b]| b).collect() }
+    }
+
+    fn of(&self, vertex: usize) -> &[u32] {
+        &self.members[self.from[vertex] as usize..self.from[vertex + 1] as usize]
+    }
+}
+
+/// The vertices by cells of space, to find those near a place.
+#[derive(Debug, PartialEq)]
+struct Cells {
+    least_m: DVec3,
+    most_m: DVec3,
+    side_m: f64,
+    counts: [usize; 3],
+    /// Where each cell's members begin; one more for the end.
+    from: Vec<u32>,
+    members: Vec<u32>,
+}
+
+/// Cells at most, for each vertex: a mesh far larger than its edges has larger cells.
+const CELLS_PER_VERTEX: f64 = 4.0;
+
+impl Cells {
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn new<'v>(
+        vertices_m: impl Iterator<Item = (u32, &'v DVec3)> + Clone,
+        Extent { least_m, most_m }: Extent,
+        edge_m: f64,
+    ) -> Self {
+        let size_m = most_m - least_m;
+        let most = CELLS_PER_VERTEX * vertices_m.clone().count() as f64 + 8.0;
+        let mut side_m = edge_m;
+        let cells = |side_m: f64| (size_m / side_m).floor() + 1.0;
+        while cells(side_m).element_product() > most {
+            side_m *= 1.25;
+        }
+        let counts = cells(side_m).to_array().map(|count| count as usize);
+        let mut found = Cells { least_m, most_m, side_m, counts, from: Vec::new(), members: Vec::new() };
+        let mut by_cell: Vec<(usize, u32)> =
+            vertices_m.map(|(vertex, place_m)| (found.index(found.cell(*place_m)), vertex)).collect();
+        by_cell.sort_unstable();
+        found.from = vec![0; counts.iter().product::<usize>() + 1];
+        by_cell.iter().for_each(|(cell, _)| found.from[cell + 1] += 1);
+        (1..found.from.len()).for_each(|cell| found.from[cell] += found.from[cell - 1]);
+        found.members = by_cell.into_iter().map(|(_, vertex)| vertex).collect();
+        found
+    }
+
+    /// The cell of a place within the extent.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn cell(&self, place_m: DVec3) -> [usize; 3] {
+        let at = ((place_m - self.least_m) / self.side_m).to_array();
+        std::array::from_fn(|axis| (at[axis] as usize).min(self.counts[axis] - 1))
+    }
+
+    fn index(&self, [i, j, k]: [usize; 3]) -> usize {
+        (i * self.counts[1] + j) * self.counts[2] + k
+    }
+
+    /// The vertices within a distance of a place, ascending.
+    fn around(&self, vertices_m: &[DVec3], place_m: DVec3, radius_m: f64) -> Vec<usize> {
+        let [from, to] = [place_m - radius_m, place_m + radius_m].map(|corner_m| self.cell(corner_m.max(self.least_m)));
+        let mut found = Vec::new();
+        for i in from[0]..=to[0] {
+            for j in from[1]..=to[1] {
+                for k in from[2]..=to[2] {
+                    let cell = self.index([i, j, k]);
+                    let members = &self.members[self.from[cell] as usize..self.from[cell + 1] as usize];
+                    let is_within = |vertex: &usize| vertices_m[*vertex].distance(place_m) <= radius_m;
+                    found.extend(members.iter().map(|vertex| *vertex as usize).filter(is_within));
+                }
+            }
+        }
+        found.sort_unstable();
+        found
+    }
+
+    /// The vertex nearest to a place; of several, that with the least number.
+    #[allow(clippy::cast_precision_loss)]
+    fn nearest(&self, vertices_m: &[DVec3], place_m: DVec3) -> usize {
+        let inside_m = place_m.clamp(self.least_m, self.most_m);
+        let middle = self.cell(inside_m);
+        let beyond = place_m.distance_squared(inside_m);
+        let mut best = (f64::INFINITY, usize::MAX);
+        let farthest = self.counts.iter().max().copied().unwrap_or(1);
+        for ring in 0..=farthest {
+            // No place of a ring is nearer: the extent is convex.
+            let gap_m = ring.saturating_sub(1) as f64 * self.side_m;
+            if beyond + gap_m * gap_m > best.0 {
+                break;
+            }
+            let span =
+                |axis: usize| middle[axis].saturating_sub(ring)..=(middle[axis] + ring).min(self.counts[axis] - 1);
+            for i in span(0) {
+                for j in span(1) {
+                    for k in span(2) {
+                        let cell = [i, j, k];
+                        if (0..3).all(|axis| cell[axis].abs_diff(middle[axis]) < ring) {
+                            continue;
+                        }
+                        let index = self.index(cell);
+                        for vertex in &self.members[self.from[index] as usize..self.from[index + 1] as usize] {
+                            let vertex = *vertex as usize;
+                            let away = vertices_m[vertex].distance_squared(place_m);
+                            if (away, vertex) < best {
+                                best = (away, vertex);
+                            }
+                        }
+                    }
+                }
+            }
+        }
+        best.1
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shape;
+
+    #[test]
+    fn the_stiffest_vertex_is_found_in_as_many_operations_as_there_are_springs_whatever_they_share() {
+        // Two cones on one circle: each tip is in half of all triangles.
+        let around = 20_000_u32;
+        let mut vertices_m = vec![DVec3::new(0.0, 0.0, 0.05), DVec3::new(0.0, 0.0, -0.05)];
+        vertices_m.extend((0..around).map(|k| {
+            let angle = std::f64::consts::TAU * f64::from(k) / f64::from(around);
+            0.1 * DVec3::new(libm::cos(angle), libm::sin(angle), 0.0)
+        }));
+        let of = |k: u32| {
+            let (a, b) = (2 + k, 2 + (k + 1) % around);
+            [[0, a, b], [1, b, a]]
+        };
+        let mesh =
+            TriangleMesh { vertices_m, triangles: (0..around).flat_map(of).collect(), ..TriangleMesh::default() };
+        let most = 1000 * mesh.triangles.len() as u64;
+        let balls = vec![(DVec3::new(1.0, 1.0, 1.0), 0.1); 100];
+        let made = palpate_geometry::work::within(&Arc::default(), most, || {
+            Mesh::of(mesh.clone(), 1e-3, FixedVertices::Balls(balls))
+        });
+        assert_eq!(made.unwrap().unwrap().stiffest.vertex, 0);
+        // What can't be is given up.
+        let balls = vec![(DVec3::new(1.0, 1.0, 1.0), 0.1); 100_000];
+        let made =
+            palpate_geometry::work::within(&Arc::default(), most, || Mesh::of(mesh, 1e-3, FixedVertices::Balls(balls)));
+        assert_eq!(made.map(|_| ()), Err(palpate_geometry::work::GivenUp::TooMuch(most)));
+    }
+
+    /// A tetrahedron and, apart from it, a square of two triangles.
+    fn shape() -> MeshShape {
+        let vertices_m = [
+            [0.0, 0.0, 0.0],
+            [0.1, 0.0, 0.0],
+            [0.0, 0.1, 0.0],
+            [0.0, 0.0, 0.1],
+            [1.0, 0.0, 0.0],
+            [1.1, 0.0, 0.0],
+            [1.1, 0.1, 0.0],
+            [1.0, 0.1, 0.0],
+        ];
+        let triangles = vec![[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3], [4, 5, 6], [4, 6, 7]];
+        MeshShape::new(vertices_m.map(DVec3::from_array).to_vec(), triangles, |rim, _, _| rim).unwrap()
+    }
+
+    #[test]
+    fn a_mesh_knows_its_edges_its_rim_and_what_lies_opposite() {
+        let shape = shape();
+        assert_eq!(shape.edges().len(), 6 + 5);
+        assert_eq!(shape.opposite().len(), 6 + 1);
+        assert!(shape.opposite().contains(&[5, 7]));
+        let fixed: Vec<bool> = shape::points(&shape).map(|point| shape.is_fixed(point)).collect();
+        assert_eq!(fixed, [false, false, false, false, true, true, true, true]);
+        assert_eq!(shape.neighbours(PointId::new(4)), [5, 6, 7].map(PointId::new));
+        assert!(shape.normal(PointId::new(6)).distance(DVec3::Z) < 1e-12);
+        assert!(shape.normal(PointId::new(0)).dot(DVec3::ONE) < 0.0, "outward");
+    }
+
+    #[test]
+    fn the_nearest_vertex_is_that_of_a_search_through_all() {
+        let mut dice = fastrand::Rng::with_seed(19);
+        let place =
+            |dice: &mut fastrand::Rng, size: f64| DVec3::from_array([(); 3].map(|()| size * (dice.f64() - 0.5)));
+        let vertices_m: Vec<DVec3> = (0..400).map(|_| place(&mut dice, 1.0) * DVec3::new(1.0, 0.3, 0.01)).collect();
+        let triangles = (0..133).map(|k| [3 * k, 3 * k + 1, 3 * k + 2]).chain([[397, 398, 399]]).collect();
+        let shape = MeshShape::new(vertices_m.clone(), triangles, |_, _, _| false).unwrap();
+        for round in 0..500 {
+            let place_m = place(&mut dice, if round % 2 == 0 { 1.0 } else { 9.0 });
+            let away = |vertex: &usize| vertices_m[*vertex].distance_squared(place_m);
+            let expected = (0..400).min_by(|a, b| away(a).total_cmp(&away(b))).unwrap();
+            assert_eq!(shape.nearest(place_m).index(), expected, "{place_m}");
+            let radius_m = 0.2 * dice.f64();
+            let within: Vec<usize> = (0..400).filter(|vertex| away(vertex).sqrt() <= radius_m).collect();
+            let found: Vec<usize> = shape.around(place_m, radius_m).into_iter().map(PointId::index).collect();
+            assert_eq!(found, within, "{place_m} {radius_m}");
+        }
+    }
+
+    #[test]
+    fn a_ball_that_fixes_no_vertex_is_told_with_the_nearest_one() {
+        let vertices_m =
+            [[0.0; 3], [0.04, 0.0, 0.0], [0.04, 0.03, 0.0], [0.0, 0.03, 0.0]].map(DVec3::from_array).to_vec();
+        let mesh = TriangleMesh { vertices_m, triangles: vec![[0, 1, 2], [0, 2, 3]], ..TriangleMesh::default() };
+        let (held, empty) = ((DVec3::ZERO, 0.001), (DVec3::new(0.04, 0.03, 0.005), 0.004));
+        let told = |balls: &[(DVec3, f64)]| {
+            Mesh::of(mesh.clone(), 1e-3, FixedVertices::Balls(balls.to_vec())).unwrap().warnings()
+        };
+        assert_eq!(told(&[held]), [""; 0]);
+        assert_eq!(
+            told(&[held, empty]),
+            [
+                "mesh.fixed[1]: no vertex is within 0.004 m of [0.0400, 0.0300, 0.0050] m, so this ball fixes nothing; the nearest, \
+              vertex 2, is 0.0050 m off"
+            ]
+        );
+        assert_eq!(told(&[empty; 7]).last().unwrap(), "mesh.fixed: 3 more balls hold no vertex");
+    }
+
+    #[test]
+    fn a_vertex_without_a_triangle_changes_neither_size_nor_mass_nor_what_is_nearest() {
+        let places_m = [[0.0; 3], [0.04, 0.0, 0.0], [0.04, 0.03, 0.0], [0.0, 0.03, 0.0]].map(DVec3::from_array);
+        let triangles = vec![[0, 1, 2], [0, 2, 3]];
+        for stray_m in [DVec3::new(0.0, 0.0, 100.0), DVec3::new(0.01, 0.01, 0.0), DVec3::splat(-1e6)] {
+            let with = places_m.into_iter().chain([stray_m]).collect();
+            let [alone, with] =
+                [places_m.to_vec(), with].map(|all| MeshShape::new(all, triangles.clone(), |_, _, _| false).unwrap());
+            assert_eq!(with.extent(), alone.extent(), "{stray_m}");
+            assert_eq!(with.nearest(stray_m), alone.nearest(stray_m), "{stray_m}");
+            assert_eq!(with.around(stray_m, 0.02), alone.around(stray_m, 0.02), "{stray_m}");
+            let [alone, with] = [alone, with].map(|shape| {
+                let mesh = Mesh::uneven(0.01, 0.0, Arc::new(shape), PerNodeFactors::default());
+                (mesh.mass_kg(), mesh.stiffest.bound)
+            });
+            assert_eq!(with, alone, "{stray_m}");
+        }
+    }
+
+    #[test]
+    fn vertices_are_nearly_as_far_from_some_as_a_search_through_all_finds() {
+        let mut dice = fastrand::Rng::with_seed(31);
+        let side = 30;
+        let mut off = || 0.4 * dice.f64();
+        let place = |k: u32| DVec3::new(f64::from(k / side) + off(), f64::from(k % side) + off(), off());
+        let vertices_m: Vec<DVec3> = (0..side * side).map(place).collect();
+        let cells = (0..side * (side - 1)).filter(|k| k % side != side - 1);
+        let triangles = cells.flat_map(|k| [[k, k + side, k + 1], [k + 1, k + side, k + side + 1]]).collect();
+        let shape = MeshShape::new(vertices_m.clone(), triangles, |_, _, _| false).unwrap();
+        for (count, most_m) in [(1, 9.0), (12, 3.0), (200, 2.0), (5, 0.0)] {
+            let members: Vec<u32> = (0..count).map(|_| dice.u32(..side * side)).collect();
+            let mut same = 0;
+            for (vertex, away_m) in shape.away_m(&members, most_m).into_iter().enumerate() {
+                let to = |member: &u32| vertices_m[*member as usize].distance(vertices_m[vertex]);
+                let nearest_m = members.iter().map(to).fold(f64::INFINITY, f64::min);
+                let expected_m = if nearest_m < most_m || nearest_m == 0.0 { nearest_m } else { f64::INFINITY };
+                same += u32::from(away_m == expected_m);
+                // Where a region is cut off by others' for a part of an edge.
+                let is_near = away_m >= nearest_m && away_m.min(most_m) < nearest_m + 0.4;
+                assert!(away_m == expected_m || is_near, "{vertex}: {away_m} {expected_m}");
+            }
+            assert!(same > side * side * 98 / 100, "{same}");
+        }
+    }
+
+    #[test]
+    fn the_bound_of_the_stiffness_holds_and_is_not_far_above_it() {
+        let mut dice = fastrand::Rng::with_seed(7);
+        for round in 0..20 {
+            // A strip of triangles with some left out.
+            let vertices_m = (0..60)
+                .map(|k| DVec3::new(f64::from(k / 6), f64::from(k % 6) + 0.5 * f64::from(k / 6 % 2), 0.1 * dice.f64()))
+                .collect();
+            let cells = (0..54).filter(|k| k % 6 != 5);
+            let triangles: Vec<[u32; 3]> = cells.flat_map(|k| [[k, k + 6, k + 1], [k + 1, k + 6, k + 7]]).collect();
+            let triangles = triangles.into_iter().filter(|_| round == 0 || dice.f64() < 0.8).collect();
+            let shape = MeshShape::new(vertices_m, triangles, |_, _, _| false).unwrap();
+            let shape = Arc::new(shape);
+            for (bending, is_uneven) in [(0.0, false), (0.3, false), (1.0, false), (0.0, true), (0.4, true)] {
+                let mut dice = |count: usize| (0..count).map(|_| 0.3 + dice.f64()).collect::<Vec<f64>>();
+                let differences = PerNodeFactors {
+                    relative_mass: dice(60),
+                    extra_anchor: vec![],
+                    edges: dice(shape.edges.len()),
+                    bending: dice(shape.opposite.len()),
+                };
+                let differences = if is_uneven { differences } else { PerNodeFactors::default() };
+                let mesh = Mesh::uneven(1.0, bending, shape.clone(), differences);
+                let mass = |vertex: usize| mesh.relative_mass(PointId::new(vertex));
+                // Power iteration on the Laplacian over the masses; Rayleigh's quotient is never above an eigenvalue.
+                let (mut x, mut largest) = (dice(60), 0.0);
+                for _ in 0..400 {
+                    let mut y = vec![0.0; 60];
+                    let (mut stored, mut weighed) = (0.0, 0.0);
+                    for ([a, b], k) in mesh.springs() {
+                        let pull = k * (x[a as usize] - x[b as usize]);
+                        stored += pull * (x[a as usize] - x[b as usize]);
+                        y[a as usize] += pull / mass(a as usize);
+                        y[b as usize] -= pull / mass(b as usize);
+                    }
+                    x.iter().enumerate().for_each(|(vertex, x)| weighed += mass(vertex) * x * x);
+                    largest = stored / weighed;
+                    let length = y.iter().map(|y| y * y).sum::<f64>().sqrt();
+                    x = y.into_iter().map(|y| y / length).collect();
+                }
+                let StiffnessBound { bound, .. } = mesh.stiffest;
+                assert!(bound >= largest && bound < 1.03 * largest, "{round} {bending}: {bound} {largest}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_part_of_a_mesh_is_turned_and_has_its_springs() {
+        let mesh = Mesh::new(0.1, 0.5, Arc::new(shape()));
+        let (part, [pushed, ..]) = mesh.part(3);
+        assert_eq!((part.shape.vertices_m.len(), part.shape.edges.len()), (3, 3));
+        assert!(part.shape.rest_m(pushed).length() < 1e-12 && !part.shape.is_fixed(pushed));
+        let (all, _) = mesh.part(100);
+        assert_eq!(all.shape.vertices_m.len(), 4, "what is not joined does not belong to it");
+        assert!(all.shape.normal(pushed).distance(DVec3::Z) < 1e-9);
+    }
+
+    #[test]
+    fn a_mesh_that_is_none_is_refused_by_element_and_place() {
+        let square = || vec![DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::new(1.0, 1.0, 0.0), DVec3::Z];
+        for (vertices_m, triangles, message) in [
+            (square(), vec![], "has no triangle"),
+            (square(), vec![[0, 1, 5]], "triangle 0 names a vertex beyond the last of 5"),
+            (square(), vec![[0, 1, 1]], "the edge between vertices 1 and 1"),
+            (
+                square(),
+                vec![[0, 1, 2], [1, 0, 3], [0, 1, 4]],
+                "the edge between vertices 0 and 1 at [0.000000, 0.000000, 0.000000] m has 3",
+            ),
+            (vec![DVec3::NAN; 3], vec![[0, 1, 2]], "vertex 0 is not finite"),
+        ] {
+            let refused = MeshShape::new(vertices_m, triangles, |_, _, _| false).unwrap_err();
+            assert!(refused.message.contains(message), "{}", refused.message);
+        }
+    }
+}

@@ -1,0 +1,757 @@
+//! What a scene is: the tissue, its springs, and how time advances. Read from TOML (or from a protobuf
+//! message, in `wire`), checked, then never changed.
+
+pub mod action;
+pub mod check;
+pub mod collection;
+pub mod document;
+mod eigenvalue;
+pub mod kind;
+mod material;
+mod membrane;
+mod mesh;
+pub mod plot;
+pub mod profile;
+pub mod reader;
+pub mod record;
+pub mod script;
+pub mod sent;
+mod sheet;
+mod shown;
+mod source;
+mod volume;
+mod zero;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::files;
+use crate::limits::Limits;
+use crate::shape::{PointId, RestShape};
+use check::physical;
+use document::{Document, Fields, Item};
+use kind::TextKind;
+pub use material::{Inclusion, MadeOf, Material, Region};
+pub use mesh::{FixedVertices, Mesh, MeshMetadata, MeshShape, PerNodeFactors, StiffnessBound};
+use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
+pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet};
+pub use shown::{BoundPlace, Shown, Simulated};
+use source::Files;
+pub use volume::{Swelling, Volume};
+
+/// The scene of the paper's figures, built in.
+pub const PAPER: &str = include_str!("../../../../scenes/paper.toml");
+
+/// Every scene that is built in, by its name.
+pub const BUILT_IN: [(&str, &str); 7] = [
+    ("colon", include_str!("../../../../scenes/colon.toml")),
+    ("fibrotic", include_str!("../../../../scenes/fibrotic.toml")),
+    ("gallbladder", include_str!("../../../../scenes/gallbladder.toml")),
+    ("liver", include_str!("../../../../scenes/liver.toml")),
+    ("liver-organ", include_str!("../../../../scenes/liver-organ.toml")),
+    ("paper", PAPER),
+    ("stomach", include_str!("../../../../scenes/stomach.toml")),
+];
+
+/// A tissue and how it is stepped. The fields are those of a scene file; SI units.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scene {
+    /// Any name, for people.
+    pub name: String,
+    /// The mass points, and how they lie together.
+    pub body: Body,
+    /// What gave masses and coefficients at the beginning.
+    pub material: Option<Material>,
+    /// Regions whose springs in `body` differ.
+    pub inclusions: Arc<[Inclusion]>,
+    /// Springs between neighbours.
+    pub springs: Springs,
+    /// K″ of the springs of zero rest length that pull each point to its rest position, N/m (the paper's eq. 4).
+    pub anchor_stiffness_n_per_m: f64,
+    /// C of the damping force −C·v, N·s/m.
+    pub damping_n_s_per_m: f64,
+    /// κ of the pressure −κ·ΔV/V0 on a mesh that encloses a volume, Pa; 0 on any other tissue.
+    pub volume_stiffness_pa: f64,
+    /// How time advances.
+    pub stepping: Stepping,
+    /// Error that leaving out regions at rest may cost, relative to the largest displacement; 0 leaves out nothing. Not
+    /// given, it is a tenth of the error of the rest (`Model`).
+    pub sleep_tolerance: Option<f64>,
+    /// What viewers see.
+    pub appearance: Appearance,
+}
+
+/// What a tissue is made of.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Body {
+    /// A rectangular grid.
+    Sheet(Sheet),
+    /// The surface of a triangle mesh.
+    Mesh(Mesh),
+}
+
+impl Body {
+    /// Returns a part that moves like the whole where vibrations are fastest, of at most `side`² points, not all of
+    /// them fixed; and three of its points, the first of which is free: to be pushed.
+    pub fn part(&self, side: usize) -> (Body, [PointId; 3]) {
+        match self {
+            Body::Sheet(sheet) => {
+                let (part, points) = sheet.part(side);
+                (Body::Sheet(part), points)
+            }
+            Body::Mesh(mesh) => {
+                let (part, points) = mesh.part(side * side);
+                (Body::Mesh(part), points)
+            }
+        }
+    }
+}
+
+/// Smallest side of a texture that is made, pixels.
+pub const SMALLEST_TEXTURE: u32 = 16;
+
+/// What a tissue looks like. Clients cannot set it: the file is on the server.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Appearance {
+    /// A PNG image for the surface; one is made if `None`.
+    pub texture: Option<PathBuf>,
+    /// What the one that is made shows.
+    pub surface: PaintedSurface,
+    /// Which one of these is made.
+    pub texture_seed: u64,
+    /// Pixels along each side of that.
+    pub texture_size: u32,
+}
+
+impl Default for Appearance {
+    fn default() -> Self {
+        Appearance { texture: None, surface: PaintedSurface::Mucosa, texture_seed: 1, texture_size: 1024 }
+    }
+}
+
+impl Appearance {
+    /// With the image's path from `folder`, where the scene's file is.
+    fn within(mut self, folder: &Path) -> Self {
+        self.texture = self.texture.map(|path| folder.join(path));
+        self
+    }
+}
+
+/// Surfaces that can be painted (`texture`).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PaintedSurface {
+    /// The lining of a stomach.
+    Mucosa,
+    /// The capsule of a liver.
+    Liver,
+    /// A fibrotic liver: nodules in a net of scar.
+    Nodular,
+    /// The outside of a gallbladder, grey-green by the bile in it.
+    Serosa,
+}
+
+impl Named for PaintedSurface {
+    const NAMES: &'static [(&'static str, Self)] = &[
+        ("mucosa", PaintedSurface::Mucosa),
+        ("liver", PaintedSurface::Liver),
+        ("nodular", PaintedSurface::Nodular),
+        ("serosa", PaintedSurface::Serosa),
+    ];
+}
+
+/// What of a tissue may change while it is in use. What is `None` stays.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Change {
+    /// k of the structural springs, N/m. Those of shear and bending keep their ratio to it.
+    pub stiffness_n_per_m: Option<f64>,
+    /// C, N·s/m.
+    pub damping_n_s_per_m: Option<f64>,
+    /// K″, N/m.
+    pub anchor_stiffness_n_per_m: Option<f64>,
+    /// κ of a tissue that encloses a volume, Pa.
+    pub volume_stiffness_pa: Option<f64>,
+}
+
+impl Change {
+    /// Why one that changes nothing is refused.
+    pub const NOTHING: &str = "names nothing to change: stiffness_n_per_m, damping_n_s_per_m, anchor_stiffness_n_per_m or \
+                               volume_stiffness_pa";
+}
+
+/// Springs between neighbours: the force on a from a spring a–b is k (L − L0)(x_b − x_a)/L.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Springs {
+    /// k of (1,0) and (0,1), N/m.
+    pub stiffness_n_per_m: f64,
+    /// k of (1,1) and (1,−1), N/m.
+    pub shear_stiffness_n_per_m: f64,
+    /// Whether there are springs (2,0) and (0,2), with the structural k.
+    pub bending: bool,
+}
+
+/// How time advances.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stepping {
+    /// The fixed rate at which commands enter and samples leave, Hz.
+    pub rate_hz: f64,
+    /// Wanted error of displacement and force, relative to their largest.
+    pub tolerance: f64,
+    /// The scheme.
+    pub integrator: Integrator,
+    /// Substeps a step; chosen from the stability bound if `None`.
+    pub substeps: Option<u32>,
+    /// The number format.
+    pub precision: Precision,
+    /// How many numbers are worked on at once.
+    pub lanes: Lanes,
+    /// Where an audit finds an error above the tolerance, the tissue is stepped more accurately from then on.
+    pub correct: bool,
+}
+
+impl Default for Stepping {
+    fn default() -> Self {
+        Stepping {
+            rate_hz: 1000.0,
+            tolerance: 1e-5,
+            integrator: Integrator::Auto,
+            substeps: None,
+            precision: Precision::Auto,
+            lanes: Lanes::Auto,
+            correct: false,
+        }
+    }
+}
+
+/// A value that a scene gives by a name out of a list.
+pub trait Named: Sized + Copy + PartialEq + 'static {
+    /// Every name and what it means.
+    const NAMES: &'static [(&'static str, Self)];
+
+    /// The value of a name.
+    fn named(field: &str, name: &str) -> Result<Self> {
+        Self::NAMES.iter().find(|entry| entry.0 == name).map(|entry| entry.1).ok_or_else(|| {
+            let names: Vec<_> = Self::NAMES.iter().map(|entry| entry.0).collect();
+            let meant = did_you_mean(name, names.iter().copied());
+            let message = format!("must be one of {}, but is `{}`{meant}", names.join(", "), excerpt(name));
+            Refusal::new(Reason::WrongKind, field, message)
+        })
+    }
+
+    /// The name of a value.
+    fn name(self) -> &'static str {
+        Self::NAMES.iter().find(|entry| entry.1 == self).map_or("", |entry| entry.0)
+    }
+}
+
+/// Writes an enum whose values scenes give by names, and its [`Named::NAMES`], from one list.
+macro_rules! named {
+    ($(#[$of_enum:meta])* pub enum $Enum:ident { $($(#[$of_value:meta])* $Value:ident = $name:literal,)+ }) => {
+        $(#[$of_enum])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+        pub enum $Enum {
+            $($(#[$of_value])* $Value,)+
+        }
+
+        impl Named for $Enum {
+            const NAMES: &'static [(&'static str, Self)] = &[$(($name, $Enum::$Value)),+];
+        }
+    };
+}
+
+named! {
+    /// The schemes (`tissue::integrate`).
+    pub enum Integrator {
+        /// Palpate's choice.
+        Auto = "auto",
+        /// Central differences, damping implicit: second order.
+        Central = "central",
+        /// The paper's: damping with the velocity of the last step, first order.
+        Lagged = "lagged",
+        /// The classical scheme of Runge and Kutta: fourth order, four evaluations a substep.
+        Rk4 = "rk4",
+        /// Exponential multistep with the springs' last 2 forces: third order.
+        Exponential2 = "exponential2",
+        /// With the last 3: fourth order.
+        Exponential3 = "exponential3",
+        /// With the last 4: fifth order.
+        Exponential4 = "exponential4",
+    }
+}
+
+named! {
+    /// The number format of the state.
+    pub enum Precision {
+        /// Palpate's choice.
+        Auto = "auto",
+        /// 4 bytes.
+        F32 = "f32",
+        /// 4 bytes, and 4 for what a displacement loses in rounding: for exponential schemes.
+        Compensated = "compensated",
+        /// 8 bytes.
+        F64 = "f64",
+    }
+}
+
+named! {
+    /// How many numbers the processor works on at once. The results have the same bits whichever it is.
+    pub enum Lanes {
+        /// The most that the machine has.
+        Auto = "auto",
+        /// 64 bytes.
+        Avx512 = "avx512",
+        /// 32 bytes.
+        Avx2 = "avx2",
+        /// 16 bytes: on ARM.
+        Neon = "neon",
+        /// One by one: on any machine.
+        Plain = "plain",
+    }
+}
+
+impl Scene {
+    /// Reads a scene file, with `--set` assignments over it.
+    ///
+    /// # Errors
+    /// Refuses a file that can't be read, and as [`Scene::parse`] does.
+    pub fn load(path: &Path, assignments: &[String], limits: &Limits) -> Result<Self> {
+        let text = files::read_text(path, limits.file_bytes)?;
+        let folder = path.parent().unwrap_or(Path::new(""));
+        Self::parse_in(folder, &path.display().to_string(), &text, assignments, limits)
+    }
+
+    /// Reads a scene whose paths of other files are from `folder`; `name` is what refusals call the text.
+    ///
+    /// # Errors
+    /// As for [`Scene::parse`]; refuses a file that can't be read.
+    pub fn parse_in(folder: &Path, name: &str, text: &str, assignments: &[String], limits: &Limits) -> Result<Self> {
+        let scene = Self::parse_with(name, text, assignments, Files::In(folder), limits)?;
+        Ok(Scene { appearance: scene.appearance.within(folder), ..scene })
+    }
+
+    /// Reads a scene that names no other files, except for images; `name` is what refusals call the text.
+    ///
+    /// # Errors
+    /// Refuses a text or an assignment that is not a valid scene.
+    pub fn parse(name: &str, text: &str, assignments: &[String], limits: &Limits) -> Result<Self> {
+        Self::parse_with(name, text, assignments, Files::None, limits)
+    }
+
+    /// Reads a scene whose `[mesh]` names one file, `mesh_name`, of which the bytes are given; it names no other files, except for
+    /// images.
+    ///
+    /// # Errors
+    /// As for [`Scene::parse`]; refuses a mesh that can't be read, and a scene that names another.
+    pub fn parse_given(name: &str, text: &str, (mesh_name, mesh): (&str, &[u8]), limits: &Limits) -> Result<Self> {
+        Self::parse_with(name, text, &[], Files::Given(mesh_name, mesh), limits)
+    }
+
+    fn parse_with(name: &str, text: &str, assignments: &[String], files: Files<'_>, limits: &Limits) -> Result<Self> {
+        let mut document = Document::parse(name, text)?;
+        TextKind::Scene.check(&document)?;
+        for assignment in assignments {
+            document.set(assignment)?;
+        }
+        let scene = document.read(|fields| {
+            let name = fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned());
+            let substance = read_substance(fields, files, limits)?;
+            Ok(Scene {
+                name,
+                body: substance.body,
+                material: substance.material,
+                inclusions: substance.inclusions,
+                springs: substance.springs,
+                anchor_stiffness_n_per_m: substance.anchor_stiffness_n_per_m,
+                damping_n_s_per_m: substance.damping_n_s_per_m,
+                volume_stiffness_pa: substance.volume_stiffness_pa,
+                stepping: fields.item("stepping").map_or(Ok(Stepping::default()), |item| read_stepping(&item))?,
+                sleep_tolerance: match fields.item("sleep") {
+                    Some(item) => item.table(|fields| fields.number("tolerance"))?,
+                    None => None,
+                },
+                appearance: fields
+                    .item("appearance")
+                    .map_or(Ok(Appearance::default()), |item| read_appearance(&item, limits))?,
+            })
+        })?;
+        scene.check(limits).map_err(|refusal| document.locate(refusal))?;
+        Ok(scene)
+    }
+
+    /// Returns the same with another tissue. `first` is the scene that the session began with: it tells the ratio of
+    /// shear to structural springs, which a k of 0 in between would lose.
+    pub fn changed(&self, change: &Change, first: &Scene) -> Self {
+        let mut scene = self.clone();
+        if let Some(k) = change.stiffness_n_per_m {
+            let Springs { stiffness_n_per_m, shear_stiffness_n_per_m, .. } = first.springs;
+            scene.springs.stiffness_n_per_m = k;
+            scene.springs.shear_stiffness_n_per_m = if shear_stiffness_n_per_m == stiffness_n_per_m {
+                k
+            } else if stiffness_n_per_m > 0.0 {
+                k * (shear_stiffness_n_per_m / stiffness_n_per_m)
+            } else {
+                shear_stiffness_n_per_m
+            };
+        }
+        scene.damping_n_s_per_m = change.damping_n_s_per_m.unwrap_or(scene.damping_n_s_per_m);
+        scene.anchor_stiffness_n_per_m = change.anchor_stiffness_n_per_m.unwrap_or(scene.anchor_stiffness_n_per_m);
+        scene.volume_stiffness_pa = change.volume_stiffness_pa.unwrap_or(scene.volume_stiffness_pa);
+        scene
+    }
+
+    /// Returns the rest shape of the tissue.
+    pub fn shape(&self) -> &dyn RestShape {
+        match &self.body {
+            Body::Sheet(sheet) => sheet,
+            Body::Mesh(mesh) => &*mesh.shape,
+        }
+    }
+
+    /// Returns the grid, if the tissue is a sheet.
+    pub fn sheet(&self) -> Option<&Sheet> {
+        match &self.body {
+            Body::Sheet(sheet) => Some(sheet),
+            Body::Mesh(_) => None,
+        }
+    }
+
+    /// Does the same, to change it.
+    pub fn sheet_mut(&mut self) -> Option<&mut Sheet> {
+        match &mut self.body {
+            Body::Sheet(sheet) => Some(sheet),
+            Body::Mesh(_) => None,
+        }
+    }
+
+    /// Returns what the tissue encloses, if that resists.
+    pub fn volume(&self) -> Option<&Volume> {
+        match &self.body {
+            Body::Sheet(_) => None,
+            Body::Mesh(mesh) => mesh.volume.as_deref(),
+        }
+    }
+
+    /// Returns whether nothing vibrates as fast as a volume that swells and shrinks.
+    pub fn volume_is_fastest(&self) -> bool {
+        let Body::Mesh(mesh) = &self.body else { return false };
+        let fastest = |Swelling { by_pressure_m, by_springs, .. }: Swelling| {
+            let k = self.springs.stiffness_n_per_m;
+            self.volume_stiffness_pa * by_pressure_m + k * by_springs > k * mesh.stiffest.bound
+        };
+        mesh.volume.as_ref().is_some_and(|volume| fastest(volume.swelling))
+    }
+
+    /// Returns the mass of each point, or on a mesh that of reference, kg.
+    pub fn point_mass_kg(&self) -> f64 {
+        match &self.body {
+            Body::Sheet(sheet) => sheet.point_mass_kg,
+            Body::Mesh(mesh) => mesh.point_mass_kg,
+        }
+    }
+
+    /// Returns the mass of a point over that of reference, which [`Scene::point_mass_kg`] is. C of a point is
+    /// `damping_n_s_per_m` times this.
+    pub fn relative_mass(&self, point: PointId) -> f64 {
+        match &self.body {
+            Body::Sheet(_) => 1.0,
+            Body::Mesh(mesh) => mesh.relative_mass(point),
+        }
+    }
+
+    /// Returns K″ of a point over that of reference, which is `anchor_stiffness_n_per_m`.
+    pub fn relative_anchor_stiffness(&self, point: PointId) -> f64 {
+        match &self.body {
+            Body::Sheet(_) => 1.0,
+            Body::Mesh(mesh) => mesh.relative_mass(point) * (1.0 + mesh.extra_anchor(point)),
+        }
+    }
+
+    /// Returns the mass of all points, kg.
+    pub fn mass_kg(&self) -> f64 {
+        #[allow(clippy::cast_precision_loss)]
+        match &self.body {
+            Body::Sheet(sheet) => sheet.point_mass_kg * sheet.point_count() as f64,
+            Body::Mesh(mesh) => mesh.mass_kg(),
+        }
+    }
+
+    /// Returns the rest shape, for who keeps it without the scene.
+    pub fn shared_shape(&self) -> Arc<dyn RestShape> {
+        match &self.body {
+            Body::Sheet(sheet) => Arc::new(sheet.clone()),
+            Body::Mesh(mesh) => mesh.shape.clone(),
+        }
+    }
+
+    /// Returns everything that a scene promises, wherever it came from.
+    ///
+    /// # Errors
+    /// Refuses a value out of its range, and what is above the limits.
+    pub fn check(&self, limits: &Limits) -> Result<()> {
+        palpate_refusal::label("name", &self.name)?;
+        match &self.body {
+            Body::Sheet(sheet) => sheet.check(limits)?,
+            Body::Mesh(mesh) => mesh.check(limits)?,
+        }
+        let coefficients = [
+            ("springs.stiffness_n_per_m", self.springs.stiffness_n_per_m),
+            ("springs.shear_stiffness_n_per_m", self.springs.shear_stiffness_n_per_m),
+            ("anchor_springs.stiffness_n_per_m", self.anchor_stiffness_n_per_m),
+            ("damping.coefficient_n_s_per_m", self.damping_n_s_per_m),
+            ("volume.stiffness_pa", self.volume_stiffness_pa),
+        ];
+        for (field, value) in coefficients {
+            if not_negative(field, value)? > 0.0 {
+                physical(field, value)?;
+            }
+        }
+        if self.volume_stiffness_pa > 0.0 && self.volume().is_none() {
+            return Err(Refusal::new(Reason::WrongKind, "volume.stiffness_pa", Volume::FROM_THE_BEGINNING));
+        }
+        let stepping = &self.stepping;
+        number("stepping.rate_hz", stepping.rate_hz, "from 1e-3 to 1e7", |v| (1e-3..=1e7).contains(&v))?;
+        number("stepping.tolerance", stepping.tolerance, "above 0 and at most 1", |v| v > 0.0 && v <= 1.0)?;
+        if let Some(substeps) = stepping.substeps {
+            let range = format!("from 1 to {}", limits.substeps);
+            let holds = |v| v >= 1.0 && v <= f64::from(limits.substeps);
+            number("stepping.substeps", f64::from(substeps), &range, holds)?;
+        }
+        if let Some(tolerance) = self.sleep_tolerance {
+            number("sleep.tolerance", tolerance, "from 0 to 1", |v| (0.0..=1.0).contains(&v))?;
+        }
+        Ok(())
+    }
+}
+
+/// What a tissue consists of: a part of a [`Scene`].
+pub struct Substance {
+    /// The mass points.
+    pub body: Body,
+    /// What gave masses and coefficients.
+    pub material: Option<Material>,
+    /// Regions whose springs in `body` differ.
+    pub inclusions: Arc<[Inclusion]>,
+    /// Springs between neighbours.
+    pub springs: Springs,
+    /// K″, N/m.
+    pub anchor_stiffness_n_per_m: f64,
+    /// C, N·s/m.
+    pub damping_n_s_per_m: f64,
+    /// κ, Pa; 0 without a volume.
+    pub volume_stiffness_pa: f64,
+}
+
+impl Substance {
+    /// Creates a mesh of a material, with springs of bending whose k is the part `bending` of that of the edge they
+    /// cross.
+    ///
+    /// # Errors
+    /// As for [`Material::applied`].
+    pub fn of_material(material: Material, bending: f64, shape: Arc<MeshShape>) -> Result<Self> {
+        let made = material.applied(bending, shape)?;
+        let stiffness_n_per_m = made.stiffness_n_per_m;
+        Ok(Substance {
+            body: Body::Mesh(made.mesh),
+            material: Some(material),
+            inclusions: Arc::default(),
+            springs: Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, bending: false },
+            anchor_stiffness_n_per_m: made.anchor_stiffness_n_per_m,
+            damping_n_s_per_m: made.damping_n_s_per_m,
+            volume_stiffness_pa: 0.0,
+        })
+    }
+
+    /// Does the same with inclusions, if it is a mesh. `field` is what refusals call the list.
+    ///
+    /// # Errors
+    /// As for [`Inclusion::put_into`].
+    pub fn with(mut self, inclusions: Vec<Inclusion>, field: &str) -> Result<Self> {
+        if let Body::Mesh(mesh) = &mut self.body {
+            *mesh = Inclusion::put_into(&inclusions, field, mesh)?;
+            self.inclusions = inclusions.into();
+        }
+        Ok(self)
+    }
+
+    /// Does the same with the volume that it encloses, if it is a mesh.
+    ///
+    /// # Errors
+    /// Refuses a stiffness that is not above 0, and a mesh that encloses no volume, or several.
+    pub fn enclosing(mut self, stiffness_pa: f64) -> Result<Self> {
+        physical("volume.stiffness_pa", positive("volume.stiffness_pa", stiffness_pa)?)?;
+        self.volume_stiffness_pa = stiffness_pa;
+        self.body = match self.body {
+            Body::Mesh(mesh) => Body::Mesh(mesh.enclosing()?),
+            Body::Sheet(_) => return Err(Refusal::new(Reason::WrongKind, "volume", Volume::OF_A_MESH)),
+        };
+        Ok(self)
+    }
+}
+
+/// Reads the section `[sheet]` or `[mesh]`, and what says how stiff, heavy and damped it is.
+fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) -> Result<Substance> {
+    let (sheet, mesh) = (fields.item("sheet"), fields.item("mesh"));
+    let (material, inclusions, volume) = (fields.item("material"), fields.item("inclusion"), fields.item("volume"));
+    match (&sheet, &mesh) {
+        (Some(_), Some(mesh)) => {
+            return Err(mesh.refuse(Reason::WrongKind, "does not go with [sheet]: a tissue is one of them"));
+        }
+        (_, None) => {
+            if let Some(item) = material.or(inclusions) {
+                return Err(item.refuse(Reason::WrongKind, Material::OF_A_MESH));
+            }
+            if let Some(item) = volume {
+                return Err(item.refuse(Reason::WrongKind, Volume::OF_A_MESH));
+            }
+            let body = Body::Sheet(fields.required("sheet")?.table(Sheet::read)?);
+            return read_coefficients(fields, body);
+        }
+        (None, Some(_)) => {}
+    }
+    let of_material = material.is_some();
+    let mesh = fields.required("mesh")?.table(|fields| Mesh::read(fields, files, of_material, limits))?;
+    if mesh.shape.point_count() > limits.points {
+        mesh.check(limits)?;
+    }
+    let substance = match material {
+        None => read_coefficients(fields, Body::Mesh(mesh))?,
+        Some(item) => read_material(fields, &item, &mesh)?,
+    };
+    let substance = match inclusions {
+        Some(inclusions) => {
+            let inclusions = inclusions.tables()?.iter().map(Inclusion::read).collect::<Result<_>>()?;
+            substance.with(inclusions, "inclusion")?
+        }
+        None => substance,
+    };
+    let Some(volume) = volume else { return Ok(substance) };
+    substance.enclosing(volume.table(|fields| fields.required_number("stiffness_pa"))?)
+}
+
+/// Reads the sections that give the coefficients as in the paper.
+fn read_coefficients(fields: &mut Fields<'_>, mut body: Body) -> Result<Substance> {
+    Ok(Substance {
+        springs: fields.required("springs")?.table(|fields| read_springs(fields, &mut body))?,
+        body,
+        material: None,
+        inclusions: Arc::default(),
+        anchor_stiffness_n_per_m: fields
+            .required("anchor_springs")?
+            .table(|fields| fields.required_number("stiffness_n_per_m"))?,
+        damping_n_s_per_m: fields
+            .required("damping")?
+            .table(|fields| fields.required_number("coefficient_n_s_per_m"))?,
+        volume_stiffness_pa: 0.0,
+    })
+}
+
+/// Reads the section `[material]`, and of `[springs]` what it leaves open.
+fn read_material(fields: &mut Fields<'_>, item: &Item<'_>, mesh: &Mesh) -> Result<Substance> {
+    let material = item.table(Material::read)?;
+    let (anchor_springs, damping) = (fields.item("anchor_springs"), fields.item("damping"));
+    if let Some(other) = anchor_springs.or(damping) {
+        return Err(other.refuse(Reason::WrongKind, Material::FOLLOWS));
+    }
+    let bending = match fields.item("springs") {
+        None => 0.0,
+        Some(springs) => springs.table(|fields| {
+            let (stiffness, shear) = (fields.item("stiffness_n_per_m"), fields.item("shear_stiffness_n_per_m"));
+            if let Some(item) = stiffness.or(shear) {
+                return Err(item.refuse(Reason::WrongKind, Material::FOLLOWS));
+            }
+            fields.item("bending").map_or(Ok(0.0), |item| read_bending(&item))
+        })?,
+    };
+    Substance::of_material(material, bending, mesh.shape.clone())
+}
+
+/// k of springs of bending on a mesh, as a part of that of edges.
+fn read_bending(item: &Item<'_>) -> Result<f64> {
+    let part = item.flag().map(|flag| if flag { 1.0 } else { 0.0 }).or_else(|_| item.number())?;
+    number("springs.bending", part, "from 0 to 10", |v| (0.0..=10.0).contains(&v))
+}
+
+/// Reads the section `[springs]`. A mesh has springs along its edges; those of bending may be a part as stiff.
+fn read_springs(fields: &mut Fields<'_>, body: &mut Body) -> Result<Springs> {
+    let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
+    let (shear, bending) = (fields.item("shear_stiffness_n_per_m"), fields.item("bending"));
+    match body {
+        Body::Sheet(_) => Ok(Springs {
+            stiffness_n_per_m,
+            shear_stiffness_n_per_m: shear.map_or(Ok(stiffness_n_per_m), |item| item.number())?,
+            bending: bending.map_or(Ok(false), |item| item.flag())?,
+        }),
+        Body::Mesh(mesh) => {
+            if let Some(shear) = shear {
+                return Err(shear.refuse(Reason::WrongKind, "is for sheets: the edges of a mesh resist shear as well"));
+            }
+            if let Some(item) = bending {
+                *mesh = Mesh::new(mesh.point_mass_kg, read_bending(&item)?, mesh.shape.clone());
+            }
+            Ok(Springs { stiffness_n_per_m, shear_stiffness_n_per_m: stiffness_n_per_m, bending: false })
+        }
+    }
+}
+
+fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {
+    item.table(|fields| {
+        let standard = Appearance::default();
+        let texture = fields.text("texture")?.map(PathBuf::from);
+        let surface = match fields.text("surface")? {
+            Some(name) => Some(PaintedSurface::named(&fields.path("surface"), &name)?),
+            None => None,
+        };
+        let seed = fields.item("texture_seed").map(|item| item.whole()).transpose()?;
+        let size = fields.item("texture_size").map(|item| item.whole()).transpose()?;
+        if texture.is_some() && (surface.is_some() || seed.is_some() || size.is_some()) {
+            let message = "names an image: surface, texture_seed and texture_size are for one that is made";
+            return Err(fields.refuse(Reason::WrongKind, "texture", message));
+        }
+        let texture_size = match size {
+            Some(size) => {
+                let most = limits.texture_side;
+                let fits = u32::try_from(size).ok().filter(|size| (SMALLEST_TEXTURE..=most).contains(size));
+                let message = format!("must be from {SMALLEST_TEXTURE} to {most} pixels, but is {size}");
+                fits.ok_or_else(|| fields.refuse(Reason::OutOfRange, "texture_size", message))?
+            }
+            None => standard.texture_size,
+        };
+        Ok(Appearance {
+            texture,
+            surface: surface.unwrap_or(standard.surface),
+            texture_seed: seed.unwrap_or(standard.texture_seed),
+            texture_size,
+        })
+    })
+}
+
+fn read_stepping(item: &Item<'_>) -> Result<Stepping> {
+    let standard = Stepping::default();
+    item.table(|fields| {
+        Ok(Stepping {
+            rate_hz: fields.number("rate_hz")?.unwrap_or(standard.rate_hz),
+            tolerance: fields.number("tolerance")?.unwrap_or(standard.tolerance),
+            integrator: match fields.text("integrator")? {
+                Some(name) => Integrator::named(&fields.path("integrator"), &name)?,
+                None => standard.integrator,
+            },
+            substeps: match fields.item("substeps") {
+                Some(item) if item.as_text() == Some("auto") => None,
+                Some(item) if item.as_text().is_some() => return Err(item.wrong("\"auto\" or a whole number")),
+                Some(item) => {
+                    let whole = item.whole()?;
+                    Some(u32::try_from(whole).map_err(|_| item.refuse(Reason::OutOfRange, "is too large"))?)
+                }
+                None => None,
+            },
+            precision: match fields.text("precision")? {
+                Some(name) => Precision::named(&fields.path("precision"), &name)?,
+                None => standard.precision,
+            },
+            lanes: match fields.text("lanes")? {
+                Some(name) => Lanes::named(&fields.path("lanes"), &name)?,
+                None => standard.lanes,
+            },
+            correct: fields.item("correct").map_or(Ok(standard.correct), |item| item.flag())?,
+        })
+    })
+}

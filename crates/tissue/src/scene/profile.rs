@@ -1,0 +1,248 @@
+//! Forces and tool movements as functions of time: a script's meaning, bound to a sheet and a step rate.
+//!
+//! Time is counted in whole steps and a fraction of the present step, so that a profile that jumps has a value on either
+//! side: just before the jump at (n − 1, 1), just after it at (n, 0).
+
+use glam::DVec3;
+
+use palpate_haptics::Tip;
+
+use crate::shape::{self, PointId, RestShape};
+
+/// A moment within a step: `fraction` from 0 (its beginning) to 1 (its end).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Moment {
+    /// The present step.
+    pub step: u64,
+    /// The part of it that has passed.
+    pub fraction: f64,
+}
+
+impl Moment {
+    /// Returns the beginning of a step.
+    pub fn start_of(step: u64) -> Self {
+        Moment { step, fraction: 0.0 }
+    }
+
+    /// Returns the time in seconds, at `rate_hz` steps a second.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn time_s(self, rate_hz: f64) -> f64 {
+        (self.step as f64 + self.fraction) / rate_hz
+    }
+}
+
+/// A surgical force at one moment (the paper's exerting force and its falloff): point p gets
+/// `force_n`·exp(−`falloff_per_m`·r + `falloff_offset`), where r is the straight distance from where p rests to `centre_m`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Poke {
+    /// The mass point at the centre, if it is given by one. Then that point's reaction is told, otherwise the mean of the
+    /// reactions around the centre.
+    pub point: Option<PointId>,
+    /// The control point at rest, m. On a sheet z is 0.
+    pub centre_m: DVec3,
+    /// The exerting force, N.
+    pub force_n: DVec3,
+    /// Falloff c, 1/m.
+    pub falloff_per_m: f64,
+    /// Offset c′ of the exponent.
+    pub falloff_offset: f64,
+}
+
+/// A surgical force over time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LoadProfile {
+    /// The control point over time.
+    pub centre: CentreProfile,
+    /// The exerting force over time.
+    pub strength: StrengthProfile,
+    /// Falloff c, 1/m.
+    pub falloff_per_m: f64,
+    /// Offset c′ of the exponent.
+    pub falloff_offset: f64,
+}
+
+/// The control point over time.
+#[derive(Debug, Clone, PartialEq)]
+pub enum CentreProfile {
+    /// The place from each step on. Before the first there is no force.
+    Hops(Vec<(u64, DVec3)>),
+    /// The same for mass points and where they rest.
+    Points(Vec<(u64, (PointId, DVec3))>),
+    /// A straight line.
+    Path {
+        /// Place at time 0, m.
+        from_m: DVec3,
+        /// Velocity, m/s.
+        velocity_m_per_s: DVec3,
+    },
+}
+
+/// The exerting force over time.
+#[derive(Debug, Clone, PartialEq)]
+pub enum StrengthProfile {
+    /// A fixed vector times a profile.
+    Scaled(DVec3, Profile),
+    /// The vector from each step on, N. Before the first there is no force.
+    Recorded(Vec<(u64, DVec3)>),
+}
+
+/// A factor over time.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Profile {
+    /// 1.
+    Constant,
+    /// 1 for `on` ≤ step < `off`.
+    Pulse {
+        /// First step of the pulse.
+        on: u64,
+        /// First step after it.
+        off: u64,
+    },
+    /// 0, then linear to 1, then 1.
+    Ramp {
+        /// Time at which the rise begins, s.
+        from_s: f64,
+        /// Time at which the factor is 1, s.
+        to_s: f64,
+    },
+    /// sin(2πft).
+    Sine {
+        /// f, Hz.
+        frequency_hz: f64,
+    },
+}
+
+/// The last of `entries` that has begun at `step`.
+fn begun<T: Copy>(entries: &[(u64, T)], step: u64) -> Option<T> {
+    let after = entries.partition_point(|entry| entry.0 <= step);
+    after.checked_sub(1).map(|index| entries[index].1)
+}
+
+impl Profile {
+    fn at(self, moment: Moment, rate_hz: f64) -> f64 {
+        match self {
+            Profile::Constant => 1.0,
+            Profile::Pulse { on, off } => f64::from(u8::from((on..off).contains(&moment.step))),
+            Profile::Ramp { from_s, to_s } => ((moment.time_s(rate_hz) - from_s) / (to_s - from_s)).clamp(0.0, 1.0),
+            // `libm` gives the same bits on every machine; the platform's sine does not.
+            Profile::Sine { frequency_hz } => libm::sin(std::f64::consts::TAU * frequency_hz * moment.time_s(rate_hz)),
+        }
+    }
+}
+
+/// Returns Σ exp(−c·r) over all points of a shape: what a force on all of them together is divided by. r is the
+/// distance at rest to `centre_m`, c is `falloff_per_m`.
+pub fn weights(shape: &dyn RestShape, centre_m: DVec3, falloff_per_m: f64) -> f64 {
+    shape::points(shape).map(|point| libm::exp(-falloff_per_m * shape.rest_m(point).distance(centre_m))).sum()
+}
+
+impl CentreProfile {
+    /// Returns the first place, m.
+    pub fn begins_at_m(&self) -> DVec3 {
+        match self {
+            CentreProfile::Hops(hops) => hops.first().map_or(DVec3::ZERO, |hop| hop.1),
+            CentreProfile::Points(hops) => hops.first().map_or(DVec3::ZERO, |hop| hop.1.1),
+            CentreProfile::Path { from_m, .. } => *from_m,
+        }
+    }
+}
+
+impl LoadProfile {
+    /// Returns the force at a moment.
+    pub fn at(&self, moment: Moment, rate_hz: f64) -> Poke {
+        let force_n = match &self.strength {
+            StrengthProfile::Scaled(force, profile) => *force * profile.at(moment, rate_hz),
+            StrengthProfile::Recorded(rows) => begun(rows, moment.step).unwrap_or(DVec3::ZERO),
+        };
+        let point = match &self.centre {
+            CentreProfile::Points(hops) => begun(hops, moment.step),
+            CentreProfile::Hops(_) | CentreProfile::Path { .. } => None,
+        };
+        let centre = match &self.centre {
+            CentreProfile::Hops(hops) => begun(hops, moment.step),
+            CentreProfile::Points(_) => point.map(|point| point.1),
+            CentreProfile::Path { from_m, velocity_m_per_s } => {
+                Some(*from_m + *velocity_m_per_s * moment.time_s(rate_hz))
+            }
+        };
+        Poke {
+            point: point.map(|point| point.0),
+            centre_m: centre.unwrap_or(DVec3::ZERO),
+            force_n: if centre.is_some() { force_n } else { DVec3::ZERO },
+            falloff_per_m: self.falloff_per_m,
+            falloff_offset: self.falloff_offset,
+        }
+    }
+}
+
+/// The movement of a grasped point.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MotionProfile {
+    /// The point.
+    pub point: PointId,
+    /// Displacements, which add up.
+    pub moves: Vec<Move>,
+}
+
+/// A smooth displacement: `by_m`·s((t − from)/(to − from)), s(x) = 10x³ − 15x⁴ + 6x⁵ clamped to 0…1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Move {
+    /// Time at which it begins, s.
+    pub from_s: f64,
+    /// Time at which it ends, s.
+    pub to_s: f64,
+    /// Displacement, m.
+    pub by_m: DVec3,
+}
+
+/// The movement of a tool with a tip, from pose to pose.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PoseProfile {
+    /// How it meets the tissue.
+    pub tip: Tip,
+    /// Times, s, and places of the tip, m, by ascending time; at least one. Between two of them the tip moves on a straight
+    /// line as smoothly as in a [`Move`].
+    pub poses: Vec<(f64, DVec3)>,
+    /// When the tool is taken away, s.
+    pub until_s: f64,
+}
+
+impl PoseProfile {
+    /// Returns the place of the tip at a time, m; none before the first pose and from the end on.
+    pub fn at(&self, time_s: f64) -> Option<DVec3> {
+        let after = self.poses.partition_point(|pose| pose.0 <= time_s);
+        let (begun_s, from_m) = *self.poses.get(after.checked_sub(1)?)?;
+        if time_s >= self.until_s {
+            return None;
+        }
+        let Some((end_s, to_m)) = self.poses.get(after) else { return Some(from_m) };
+        let x = (time_s - begun_s) / (end_s - begun_s);
+        Some(from_m + (*to_m - from_m) * (x * x * x * (10.0 + x * (6.0 * x - 15.0))))
+    }
+}
+
+/// The position and motion of a prescribed point.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Motion {
+    /// Displacement from rest, m.
+    pub displacement_m: DVec3,
+    /// Velocity, m/s.
+    pub velocity_m_per_s: DVec3,
+    /// Acceleration, m/s².
+    pub acceleration_m_per_s2: DVec3,
+}
+
+impl MotionProfile {
+    /// Returns the displacement, velocity and acceleration at a time.
+    pub fn at(&self, time_s: f64) -> Motion {
+        let mut motion = Motion::default();
+        for Move { from_s, to_s, by_m } in &self.moves {
+            let span_s = to_s - from_s;
+            let x = ((time_s - from_s) / span_s).clamp(0.0, 1.0);
+            motion.displacement_m += *by_m * (x * x * x * (10.0 + x * (6.0 * x - 15.0)));
+            motion.velocity_m_per_s += *by_m * (30.0 * x * x * (1.0 - x) * (1.0 - x) / span_s);
+            motion.acceleration_m_per_s2 += *by_m * (60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) / (span_s * span_s));
+        }
+        motion
+    }
+}

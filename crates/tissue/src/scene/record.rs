@@ -1,0 +1,307 @@
+//! The records of `palpate run` and of a replay: JSON Lines, one schema.
+
+use std::io::{BufWriter, IsTerminal, Write};
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::plot::Curves;
+use super::{Integrator, Named, Precision};
+use crate::shape::{PointName, RestShape};
+use palpate_refusal::printable::printable_json;
+use palpate_refusal::{Reason, Refusal};
+
+/// The first line of a file of records.
+#[derive(Debug, Clone, Serialize)]
+pub struct Run {
+    /// Name of the scene.
+    pub scene: String,
+    /// Name of the script.
+    pub script: String,
+    /// The scheme that `auto` selected.
+    pub integrator: String,
+    /// Substeps per step.
+    pub substeps: u32,
+    /// The precision that `auto` selected.
+    pub precision: String,
+    /// Steps per second.
+    pub rate_hz: f64,
+    /// Version of Palpate.
+    pub version: String,
+}
+
+/// One line per sample time. Forces on points are those on the tissue, N.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Record {
+    /// Simulated time.
+    pub time_s: f64,
+    /// The points, in the order requested.
+    pub points: Vec<Point>,
+    /// The tools with a tip, by ascending number.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub tools: Vec<ToolRecord>,
+    /// Energies of the whole sheet.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub energy_j: Option<EnergyJ>,
+    /// Points computed in the step.
+    pub awake_points: usize,
+}
+
+impl Record {
+    /// Returns the displacement, m, and force of the tissue, N, of the script's first tool with a tip; without such
+    /// tools, of the first point. `None` while that tool is away: a point's force is not the tip's.
+    pub fn first(&self, tip: Option<usize>) -> Option<([f64; 3], [f64; 3])> {
+        let Some(tip) = tip else {
+            return self.points.first().map(|point| (point.displacement_m, point.reaction_n));
+        };
+        let tool = self.tools.iter().find(|tool| tool.tool as usize == tip);
+        tool.map(|tool| (tool.displacement_m, tool.force_on_tool_n))
+    }
+
+    /// Returns the largest force of the tissue on a tool with a tip, 0 while all are away; if the script has no such
+    /// tools, at a point. N.
+    pub fn peak_n(&self, has_tips: bool) -> f64 {
+        let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
+        let tools = self.tools.iter().map(|tool| length(tool.force_on_tool_n));
+        let points = self.points.iter().filter(|_| !has_tips).map(|point| length(point.reaction_n));
+        tools.chain(points).fold(0.0, f64::max)
+    }
+}
+
+/// One mass point.
+#[derive(Debug, Clone, Serialize)]
+#[allow(missing_docs)]
+pub struct Point {
+    /// What the point is called: `"point": [i, j]` on a sheet.
+    #[serde(flatten)]
+    pub name: PointName,
+    pub displacement_m: [f64; 3],
+    pub velocity_m_per_s: [f64; 3],
+    pub spring_n: [f64; 3],
+    pub anchor_n: [f64; 3],
+    pub damping_n: [f64; 3],
+    pub applied_n: [f64; 3],
+    /// springs + anchor spring + damping.
+    pub reaction_n: [f64; 3],
+    /// For a prescribed point, the force that holds it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub constraint_n: Option<[f64; 3]>,
+}
+
+/// A tool with a tip, which is led by poses.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct ToolRecord {
+    /// The tool's number: forces come first, then grasped points, then tools with a tip.
+    pub tool: u32,
+    /// Place of the tip in the frame of the sheet at rest, m.
+    pub place_m: [f64; 3],
+    /// Displacement of the tissue under the tip, the mean over its disc, m.
+    pub displacement_m: [f64; 3],
+    /// Force of the tissue on the tool, N: what a device gets. 0 while the tip does not touch.
+    pub force_on_tool_n: [f64; 3],
+}
+
+/// Energies, J.
+#[derive(Debug, Clone, Copy, Serialize)]
+#[allow(missing_docs)]
+pub struct EnergyJ {
+    pub kinetic: f64,
+    pub spring: f64,
+    #[serde(rename = "virtual")]
+    pub anchor_springs: f64,
+}
+
+/// The last line of a record.
+#[derive(Debug, Clone, Serialize)]
+pub struct Summary {
+    /// Steps done.
+    pub steps: u64,
+    /// Substeps done.
+    pub substeps: u64,
+    /// Points of the sheet.
+    pub points: usize,
+    /// Wall time of the stepping alone.
+    pub wall_s: f64,
+    /// `wall_s`/(`substeps`·`points`).
+    pub ns_per_point_substep: f64,
+    /// Point-substeps computed, as a fraction of all.
+    pub computed_fraction: f64,
+    /// How often the guard acted.
+    pub guard_events: u64,
+    /// XXH3-128 of the state, in hexadecimal.
+    pub final_hash: String,
+    /// The result of an audit, over all sample points and times.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub audited_error: Option<AuditedError>,
+    /// Corrections of an audit, by ascending step.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub corrections: Vec<Correction>,
+    /// The newest recoveries, by ascending step.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub recoveries: Vec<Recovery>,
+    /// What a user should know of the run, in words. Not written.
+    #[serde(skip)]
+    pub warnings: Vec<String>,
+    /// Length of the largest displacement, m: of a run, of all points at the times of the records; of a replay, of what the
+    /// server sent. Not written.
+    #[serde(skip)]
+    pub largest_displacement_m: f64,
+    /// The largest force of the tissue in the records, N. Not written.
+    #[serde(skip)]
+    pub peak_reaction_n: f64,
+    /// What the first tool or point felt over time. Not written.
+    #[serde(skip)]
+    pub curves: Curves,
+    /// The additional measurements of a replay.
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    pub network: Option<Network>,
+}
+
+impl Summary {
+    /// Returns why the records are not those of the script, if they are not.
+    pub fn fault(&self) -> Option<String> {
+        let Recovery { step, reason, .. } = self.recoveries.first()?;
+        Some(format!(
+            "the guard released all tools after step {step}, because {reason}: from there on the run differs from the script"
+        ))
+    }
+}
+
+/// Warns if a point moved farther than the tissue is long: then a unit is probably wrong.
+pub fn far_warning(largest_m: f64, shape: &dyn RestShape) -> Option<String> {
+    let longest_m = shape.longest_side_m();
+    (largest_m > longest_m).then(|| {
+        format!(
+            "the largest displacement was {largest_m:.3} m, more than the tissue's longest side, {longest_m:.3} m: look at the \
+             forces and the stiffness (`palpate check SCENE SCRIPT`)"
+        )
+    })
+}
+
+/// A measured error. Each part is relative to the largest component of its kind.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct AuditedError {
+    /// Largest difference of any component of a displacement.
+    pub displacement: f64,
+    /// The same for the tissue's force on a tool: springs, anchor springs and damping.
+    pub force: f64,
+}
+
+impl AuditedError {
+    /// Returns the larger of the two.
+    pub fn largest(&self) -> f64 {
+        self.displacement.max(self.force)
+    }
+
+    /// Returns the larger of each part.
+    pub fn max(self, other: Self) -> Self {
+        AuditedError { displacement: self.displacement.max(other.displacement), force: self.force.max(other.force) }
+    }
+}
+
+/// A correction: from a step on the tissue is stepped more accurately, because an audited error was above the
+/// tolerance.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Correction {
+    /// The step at whose beginning it takes effect.
+    pub step: u64,
+    /// The error that was found.
+    pub audited_error: AuditedError,
+    /// The main source of the error.
+    pub reason: String,
+    /// The scheme from then on.
+    #[serde(serialize_with = "name")]
+    pub integrator: Integrator,
+    /// The substeps from then on.
+    pub substeps: u32,
+    /// The number format from then on.
+    #[serde(serialize_with = "name")]
+    pub precision: Precision,
+    /// The error that sleeping regions may add, from then on.
+    pub sleep_tolerance: f64,
+}
+
+/// A recovery: the guard found the tissue's motion wrong, and shorter substeps did not help. The tissue went back to the
+/// last state that passed the guard's checks, and continued without tools.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Recovery {
+    /// Steps done when it was found. Time continues from there.
+    pub step: u64,
+    /// The step whose state the tissue went back to.
+    pub state_of_step: u64,
+    /// Whether that state had passed no check of the guard, and the tissue continued at rest instead.
+    pub at_rest: bool,
+    /// Commands whose effect was lost: those that had taken effect since that state.
+    pub undone_commands: u64,
+    /// The step before which commands to the tools that acted have no effect, if there were too many recoveries.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub paused_until_step: Option<u64>,
+    /// What the guard found.
+    pub reason: String,
+}
+
+fn name<S: serde::Serializer>(value: &impl Named, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(value.name())
+}
+
+/// The measurements of a replay through a server.
+#[derive(Debug, Clone, Serialize)]
+pub struct Network {
+    /// Commands that arrived after their step.
+    pub late_commands: u64,
+    /// Commands that the server refused.
+    pub rejected_commands: u64,
+    /// Steps that the server dropped.
+    pub overruns: u64,
+    /// Simulated time over real time, from the first sample to the last.
+    pub time_dilation: f64,
+    /// From sending a message to its answer, which does not wait for a step.
+    pub round_trip_us: Percentiles,
+    /// Time that the server held that message.
+    pub server_hold_us: Percentiles,
+}
+
+/// Percentiles of a distribution.
+#[derive(Debug, Clone, Copy, Default, Serialize)]
+#[allow(missing_docs)]
+pub struct Percentiles {
+    pub p50: f64,
+    pub p99: f64,
+    pub max: f64,
+}
+
+/// `{"run": …}` and `{"summary": …}`.
+#[derive(Debug, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Line<'a> {
+    /// The first line.
+    Run(&'a Run),
+    /// The last line.
+    Summary(&'a Summary),
+}
+
+/// Returns the output of the records: `file`, or else the standard output. A terminal that is to show a plot gets no
+/// records.
+///
+/// # Errors
+/// Refuses a file that can't be written.
+pub fn output(file: Option<&Path>, plots: bool) -> Result<Box<dyn Write>, Refusal> {
+    let Some(path) = file else {
+        let out = std::io::stdout();
+        return Ok(if plots && out.is_terminal() { Box::new(std::io::sink()) } else { Box::new(BufWriter::new(out)) });
+    };
+    let file = std::fs::File::create(path).map_err(|e| Refusal {
+        place: Some(path.display().to_string()),
+        ..Refusal::new(Reason::Unreadable, "", format!("can't be written: {e}"))
+    })?;
+    Ok(Box::new(BufWriter::new(file)))
+}
+
+/// Writes one JSON object on one line.
+///
+/// # Errors
+/// Returns the error of `output`.
+pub fn write_line(output: &mut dyn Write, line: &impl Serialize) -> std::io::Result<()> {
+    let line = printable_json(serde_json::to_string(line)?);
+    writeln!(output, "{line}")
+}

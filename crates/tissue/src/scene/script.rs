@@ -1,0 +1,98 @@
+//! Scripts: forces, tool movements and samples over time, bound to a scene: times are whole steps, points are places.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use super::Change;
+pub use super::action::Action;
+use super::profile::{LoadProfile, Moment, MotionProfile, PoseProfile};
+use crate::shape::{PointId, RestShape};
+
+/// The built-in scripts: name and text.
+pub const BUILT_IN: [(&str, &str); 7] = [
+    ("grasp", include_str!("../../../../scripts/grasp.toml")),
+    ("oblique-100", include_str!("../../../../scripts/oblique-100.toml")),
+    ("oblique-60", include_str!("../../../../scripts/oblique-60.toml")),
+    ("press", include_str!("../../../../scripts/press.toml")),
+    ("push", include_str!("../../../../scripts/push.toml")),
+    ("stroke", include_str!("../../../../scripts/stroke.toml")),
+    ("vertical-60", include_str!("../../../../scripts/vertical-60.toml")),
+];
+
+/// A script bound to a scene.
+#[derive(Debug, Clone)]
+pub struct Script {
+    /// Any name, for people.
+    pub name: String,
+    /// Length in steps.
+    pub steps: u64,
+    /// Steps between two records, the first of which is at step 0.
+    pub sample_every: u64,
+    /// Points of the records.
+    pub sample_points: Vec<PointId>,
+    /// Surgical forces.
+    pub forces: Vec<LoadProfile>,
+    /// Grasped points.
+    pub moves: Vec<MotionProfile>,
+    /// Tools with a tip.
+    pub poses: Vec<PoseProfile>,
+    /// Changes of the tissue and the step at whose beginning each takes effect, by ascending step.
+    pub changes: Vec<(u64, Change)>,
+    /// Warnings for the user: rounded values, forces that leave the sheet.
+    pub warnings: Vec<String>,
+    /// Steps per second, from the scene.
+    pub rate_hz: f64,
+    /// The rest shape of the tissue that it is bound to.
+    pub shape: Arc<dyn RestShape>,
+}
+
+impl Script {
+    /// Returns the actions that a client streaming this script commands at step `step`: only differences from the step
+    /// before. Force k is tool k; the grasped points and then the tools with a tip follow. A force is held for the
+    /// step, from its beginning; a grasped point reaches its target at the step's end.
+    pub fn actions_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
+        let poke = move |profile: &LoadProfile, step: u64| {
+            let poke = profile.at(Moment::start_of(step), self.rate_hz);
+            // A force that has left the sheet can no longer be commanded.
+            (poke.force_n != DVec3::ZERO && self.shape.is_near(poke.centre_m)).then_some(poke)
+        };
+        let pushes = self.forces.iter().enumerate().filter_map(move |(tool, profile)| {
+            let (before, now) = (step.checked_sub(1).and_then(|before| poke(profile, before)), poke(profile, step));
+            (before != now).then_some((tool, now.map_or(Action::Release, Action::Push)))
+        });
+        #[allow(clippy::cast_precision_loss)]
+        let target = move |profile: &MotionProfile, end: u64| profile.at(end as f64 / self.rate_hz).displacement_m;
+        let grasps = self.moves.iter().enumerate().filter_map(move |(index, profile)| {
+            let (before, now) = (target(profile, step), target(profile, step + 1));
+            let action = Action::Grasp { point: profile.point, displacement_m: now };
+            (step == 0 || before != now).then_some((self.forces.len() + index, action))
+        });
+        pushes.chain(grasps).chain(self.poses_at(step))
+    }
+
+    /// Returns of these the poses: at every step, because a tool of which nothing is heard is taken away. A tip reaches its place
+    /// at the step's end.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn poses_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
+        let first = self.first_tip().unwrap_or_default();
+        let place_m = move |profile: &PoseProfile, end: u64| profile.at(end as f64 / self.rate_hz);
+        self.poses.iter().enumerate().filter_map(move |(index, profile)| {
+            let action = match place_m(profile, step + 1) {
+                Some(place_m) => Action::Pose { place_m, velocity_m_per_s: None, tip: profile.tip },
+                None => place_m(profile, step).map(|_| Action::Release)?,
+            };
+            Some((first + index, action))
+        })
+    }
+
+    /// Returns the number of the first tool with a tip, if the script has one.
+    pub fn first_tip(&self) -> Option<usize> {
+        (!self.poses.is_empty()).then_some(self.forces.len() + self.moves.len())
+    }
+
+    /// Returns the number of tools that the script uses.
+    pub fn tools(&self) -> usize {
+        self.forces.len() + self.moves.len() + self.poses.len()
+    }
+}

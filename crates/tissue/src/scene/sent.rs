@@ -1,0 +1,97 @@
+//! The file with the mesh of a scene file, as a client sends it to a server.
+
+use std::path::{Path, PathBuf};
+
+use palpate_geometry::TriangleMesh;
+use palpate_geometry::write::{Format, write};
+
+use super::Mesh;
+use super::document::{Document, Fields};
+use super::source::unit_text;
+use crate::files;
+use crate::limits::Limits;
+use palpate_refusal::Result;
+
+/// What the section `[mesh]` of a scene file says of its mesh.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct MeshFile {
+    /// The file; `None` for a mesh that is generated.
+    pub path: Option<PathBuf>,
+    /// The metres of its unit, or the unit's name.
+    pub unit: String,
+    /// So many vertices are simulated, if fewer than the file has.
+    pub vertices: Option<u64>,
+}
+
+/// Returns the mesh file of a scene file that is valid; `None` if its tissue is no mesh.
+///
+/// # Errors
+/// Refuses a file that can't be read.
+pub fn mesh_file(scene: &Path, limits: &Limits) -> Result<Option<MeshFile>> {
+    let text = files::read_text(scene, limits.file_bytes)?;
+    let folder = scene.parent().unwrap_or(Path::new(""));
+    Ok(said(&scene.display().to_string(), &text)?
+        .map(|said| MeshFile { path: said.path.map(|path| folder.join(path)), ..said }))
+}
+
+/// Does the same of the text of a scene, whose files are named as it does.
+///
+/// # Errors
+/// Refuses a text that is not TOML.
+pub fn said(name: &str, text: &str) -> Result<Option<MeshFile>> {
+    let document = Document::parse(name, text)?;
+    let mut found = None;
+    let read = |fields: &mut Fields<'_>| {
+        let unit = fields.item("unit").and_then(|item| unit_text(&item).ok());
+        found = Some(MeshFile {
+            path: fields.text("file")?.map(PathBuf::from),
+            unit: unit.unwrap_or_default(),
+            vertices: fields.item("vertices").map(|item| item.whole()).transpose()?,
+        });
+        Ok(())
+    };
+    // Other keys are no matter of this: who reads the scene checks them.
+    let _ = document.read(|fields| fields.item("mesh").map_or(Ok(()), |item| item.table(read)));
+    Ok(found)
+}
+
+/// Returns the mesh of a scene, before it was made coarser.
+pub fn written(mesh: &Mesh) -> TriangleMesh {
+    if let Some(shown) = mesh.shape.shown() {
+        return shown.mesh.clone();
+    }
+    TriangleMesh {
+        vertices_m: mesh.shape.vertices_m().to_vec(),
+        triangles: mesh.shape.triangles().to_vec(),
+        uv: None,
+        groups: mesh.shape.told().groups.clone(),
+    }
+}
+
+/// Returns the same as a file, to be sent: its name, its bytes and its unit.
+pub fn file(mesh: &Mesh) -> (&'static str, Vec<u8>, &'static str) {
+    ("mesh.obj", write(&written(mesh), Format::Obj), "m")
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use super::*;
+
+    #[test]
+    fn the_file_of_a_mesh_is_beside_its_scene() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = folder.path().join("scene.toml");
+        let read = |text: &str| {
+            std::fs::write(&scene, text).unwrap();
+            mesh_file(&scene, &Limits::default()).unwrap()
+        };
+        assert_eq!(read(super::super::PAPER), None);
+        let text = "[mesh]\nfile = \"a/organ.obj\"\nunit = \"mm\"\nother = 1\n[springs]\n";
+        let found = read(text).unwrap();
+        assert_eq!((found.path, found.vertices), (Some(folder.path().join("a/organ.obj")), None));
+        let found = read("[mesh]\nfile = \"organ.obj\"\nunit = 0.0254\nvertices = 500\n").unwrap();
+        assert_eq!((found.unit.as_str(), found.vertices), ("0.0254", Some(500)));
+        assert_eq!(read("[mesh]\norgan = { name = \"liver\", edge_m = 0.01 }\n").unwrap(), MeshFile::default());
+    }
+}

@@ -1,0 +1,325 @@
+//! The section `[sheet]` of a scene: a rectangular grid of points, and what everything else needs to know of it, which is its
+//! rest shape.
+#![allow(clippy::cast_precision_loss)]
+
+use std::sync::Arc;
+
+use glam::{DVec2, DVec3};
+
+use super::check::physical;
+use super::document::{Fields, Item};
+use crate::limits::Limits;
+use crate::memory;
+use crate::shape::{Extent, PointId, PointName, RestShape};
+use palpate_refusal::{Reason, Refusal, Result, positive};
+
+/// Points of a row that are computed at least: the lanes of the widest vector.
+pub const MIN_WIDTH: usize = 16;
+
+/// The grid: point [i, j] rests at (i·spacing, j·spacing, 0).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sheet {
+    /// Points along x and along y.
+    pub points: [usize; 2],
+    /// Distance of structural neighbours at rest, m.
+    pub spacing_m: f64,
+    /// Mass of each point, kg.
+    pub point_mass_kg: f64,
+    /// Points that never move.
+    pub fixed: FixedPoints,
+}
+
+/// Points that never move.
+#[derive(Debug, Clone, PartialEq)]
+pub enum FixedPoints {
+    /// Every point of the rim.
+    Edges,
+    /// The four corners.
+    Corners,
+    /// Just these; an empty list fixes none.
+    Points(PointSet),
+}
+
+/// Points of a grid, each once, in order. One in memory for all clones: a scene may name many, and is shared by all that
+/// know it.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct PointSet(Arc<[[usize; 2]]>);
+
+impl PointSet {
+    /// Returns whether a point is one of them.
+    pub fn contains(&self, point: [usize; 2]) -> bool {
+        self.0.binary_search(&point).is_ok()
+    }
+
+    /// Returns all of them.
+    pub fn as_slice(&self) -> &[[usize; 2]] {
+        &self.0
+    }
+}
+
+impl FromIterator<[usize; 2]> for PointSet {
+    fn from_iter<I: IntoIterator<Item = [usize; 2]>>(points: I) -> Self {
+        let mut points: Vec<_> = points.into_iter().collect();
+        points.sort_unstable();
+        points.dedup();
+        PointSet(points.into())
+    }
+}
+
+impl FixedPoints {
+    fn read(item: &Item<'_>) -> Result<Self> {
+        match item.as_text() {
+            Some("edges") => Ok(FixedPoints::Edges),
+            Some("corners") => Ok(FixedPoints::Corners),
+            Some(_) => Err(item.wrong("\"edges\", \"corners\" or a list of points")),
+            None if item.list().is_err() => Err(item.wrong("\"edges\", \"corners\" or a list of points")),
+            None => Ok(FixedPoints::Points(item.list()?.iter().map(Item::point).collect::<Result<_>>()?)),
+        }
+    }
+}
+
+impl Sheet {
+    pub(super) fn read(fields: &mut Fields<'_>) -> Result<Self> {
+        Ok(Sheet {
+            points: fields.required("points")?.point()?,
+            spacing_m: fields.required_number("spacing_m")?,
+            point_mass_kg: fields.required_number("point_mass_kg")?,
+            fixed: fields
+                .item("fixed")
+                .map_or(Ok(FixedPoints::Points(PointSet::default())), |item| FixedPoints::read(&item))?,
+        })
+    }
+
+    pub(super) fn check(&self, limits: &Limits) -> Result<()> {
+        let [nx, ny] = self.points;
+        if nx == 0 || ny == 0 {
+            let message = format!("must be at least 1 along each side, but are {nx} × {ny}");
+            return Err(Refusal::new(Reason::OutOfRange, "sheet.points", message));
+        }
+        if nx.checked_mul(ny).is_none_or(|points| points > limits.points) {
+            let message = format!("are {nx} × {ny}, above the limit of {} points in all", limits.points);
+            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
+        }
+        // A narrow sheet takes the memory and the time of one of this width, which may be sixteen times its own.
+        if nx.checked_mul(ny.max(MIN_WIDTH)).is_none_or(|points| points > limits.points) {
+            let message = format!(
+                "are {nx} × {ny}: rows of fewer than {MIN_WIDTH} points are computed as if they had so many, and \
+                 {nx} × {MIN_WIDTH} are above the limit of {} points in all; give the longer side last",
+                limits.points
+            );
+            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
+        }
+        physical("sheet.spacing_m", positive("sheet.spacing_m", self.spacing_m)?)?;
+        physical("sheet.point_mass_kg", positive("sheet.point_mass_kg", self.point_mass_kg)?)?;
+        if let FixedPoints::Points(points) = &self.fixed
+            && let Some(index) = points.as_slice().iter().position(|[i, j]| *i >= nx || *j >= ny)
+        {
+            self.find(&format!("sheet.fixed[{index}]"), PointName::Point(points.as_slice()[index]))?;
+        }
+        Ok(())
+    }
+
+    /// Returns the point [i, j] of the grid, which must have it: [`RestShape::find`] checks that.
+    pub fn point(&self, [i, j]: [usize; 2]) -> PointId {
+        PointId::new(i * self.points[1] + j)
+    }
+
+    /// Returns the row and column [i, j] of a point.
+    pub fn place_of(&self, point: PointId) -> [usize; 2] {
+        [point.index() / self.points[1], point.index() % self.points[1]]
+    }
+
+    /// Returns the length along x and along y, m.
+    pub fn extent_m(&self) -> DVec2 {
+        self.spacing_m * DVec2::new((self.points[0] - 1) as f64, (self.points[1] - 1) as f64)
+    }
+
+    /// A corner of at most `side` points along each side; and three of its points: one that is free, its middle, and one at
+    /// a corner, where springs are fewer.
+    pub(super) fn part(&self, side: usize) -> (Self, [PointId; 3]) {
+        let points @ [nx, ny] = self.points.map(|points| points.min(side));
+        let mut part = Sheet { points, ..self.clone() };
+        if let FixedPoints::Points(points) = &mut part.fixed {
+            *points = points.as_slice().iter().copied().filter(|[i, j]| *i < side && *j < side).collect();
+        }
+        let pushed = part.point([nx / 3, 2 * ny / 5]);
+        if part.is_fixed(pushed) {
+            part.fixed = FixedPoints::Points(PointSet::default());
+        }
+        let others = [[nx / 2, ny / 2], [1.min(nx - 1), 1.min(ny - 1)]].map(|place| part.point(place));
+        (part, [pushed, others[0], others[1]])
+    }
+
+    /// Returns row-major indices of the fixed points, ascending.
+    pub fn fixed_indices(&self) -> Vec<usize> {
+        let [nx, ny] = self.points;
+        let mut indices: Vec<usize> = match &self.fixed {
+            FixedPoints::Points(points) => points.as_slice().iter().map(|[i, j]| i * ny + j).collect(),
+            _ => {
+                // The rim, at most.
+                let mut indices = memory::with_room((2 * (nx + ny)).min(nx * ny), "the fixed points");
+                indices.extend((0..nx * ny).filter(|index| self.is_fixed(PointId::new(*index))));
+                indices
+            }
+        };
+        indices.sort_unstable();
+        indices.dedup();
+        indices
+    }
+}
+
+impl RestShape for Sheet {
+    fn describe(&self) -> String {
+        let [nx, ny] = self.points;
+        format!("{nx} × {ny} points")
+    }
+
+    fn point_count(&self) -> usize {
+        self.points[0] * self.points[1]
+    }
+
+    fn name(&self, point: PointId) -> PointName {
+        PointName::Point(self.place_of(point))
+    }
+
+    fn find(&self, field: &str, name: PointName) -> Result<PointId> {
+        let [nx, ny] = self.points;
+        match name {
+            PointName::Point([i, j]) if i < nx && j < ny => Ok(self.point([i, j])),
+            PointName::Point(_) => {
+                let message = format!("{name} is not on the sheet of {nx} × {ny} points");
+                Err(Refusal::new(Reason::OffTissue, field, message))
+            }
+            PointName::Vertex(_) => {
+                let message = format!("is the number of a vertex; a point of a sheet is [i, j], here of {nx} × {ny}");
+                Err(Refusal::new(Reason::WrongKind, field, message))
+            }
+        }
+    }
+
+    fn rest_m(&self, point: PointId) -> DVec3 {
+        let [i, j] = self.place_of(point);
+        self.spacing_m * DVec3::new(i as f64, j as f64, 0.0)
+    }
+
+    fn normal(&self, _: PointId) -> DVec3 {
+        DVec3::Z
+    }
+
+    fn is_fixed(&self, point: PointId) -> bool {
+        let ([nx, ny], [i, j]) = (self.points, self.place_of(point));
+        let (rim_x, rim_y) = (i == 0 || i + 1 == nx, j == 0 || j + 1 == ny);
+        match &self.fixed {
+            FixedPoints::Edges => rim_x || rim_y,
+            FixedPoints::Corners => rim_x && rim_y,
+            FixedPoints::Points(points) => points.contains([i, j]),
+        }
+    }
+
+    /// Those of the structural and the shear springs.
+    fn neighbours(&self, point: PointId) -> Vec<PointId> {
+        let ([nx, ny], [i, j]) = (self.points, self.place_of(point));
+        let around = |at: usize, count: usize| at.saturating_sub(1)..(at + 2).min(count);
+        let all = around(i, nx).flat_map(|i| around(j, ny).map(move |j| [i, j]));
+        all.filter(|place| *place != [i, j]).map(|place| self.point(place)).collect()
+    }
+
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn nearest(&self, place_m: DVec3) -> PointId {
+        let along =
+            |axis: usize| (place_m[axis] / self.spacing_m).round().clamp(0.0, (self.points[axis] - 1) as f64) as usize;
+        self.point([along(0), along(1)])
+    }
+
+    /// Those of the square around the circle.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn around(&self, place_m: DVec3, radius_m: f64) -> Vec<PointId> {
+        let within = |axis: usize| {
+            let [from, to] = [-radius_m, radius_m].map(|off_m| (place_m[axis] + off_m) / self.spacing_m);
+            let last = self.points[axis] - 1;
+            (from.ceil().max(0.0) as usize).min(last)..=(to.floor().max(0.0) as usize).min(last)
+        };
+        within(0).flat_map(|i| within(1).map(move |j| [i, j])).map(|place| self.point(place)).collect()
+    }
+
+    fn extent(&self) -> Extent {
+        Extent { least_m: DVec3::ZERO, most_m: self.extent_m().extend(0.0) }
+    }
+
+    fn edge_m(&self) -> f64 {
+        self.spacing_m
+    }
+
+    fn dimensions(&self) -> usize {
+        2
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shape;
+
+    const SHEET: fn(FixedPoints) -> Sheet =
+        |fixed| Sheet { points: [3, 7], spacing_m: 0.01, point_mass_kg: 0.1, fixed };
+
+    #[test]
+    fn points_of_a_grid_are_numbered_by_rows_and_found_by_name_and_place() {
+        let sheet = SHEET(FixedPoints::Corners);
+        let places: Vec<[usize; 2]> = (0..3).flat_map(|i| (0..7).map(move |j| [i, j])).collect();
+        assert_eq!(shape::points(&sheet).map(|point| sheet.place_of(point)).collect::<Vec<_>>(), places);
+        for point in shape::points(&sheet) {
+            assert_eq!(sheet.find("", sheet.name(point)), Ok(point));
+            assert_eq!(sheet.nearest(sheet.rest_m(point) + DVec3::new(0.004, -0.004, 9.0)), point);
+            assert_eq!(sheet.is_fixed(point), [0, 6, 14, 20].contains(&point.index()));
+        }
+        let refused = sheet.find("points[3]", PointName::Point([3, 0])).unwrap_err();
+        assert_eq!(refused.to_string(), "points[3]: [3, 0] is not on the sheet of 3 × 7 points");
+    }
+
+    #[test]
+    fn neighbours_know_each_other_and_lie_within_a_diagonal() {
+        let sheet = SHEET(FixedPoints::Edges);
+        let counts: Vec<usize> = shape::points(&sheet).map(|point| sheet.neighbours(point).len()).collect();
+        assert_eq!(&counts[..7], [3, 5, 5, 5, 5, 5, 3]);
+        assert_eq!(&counts[7..14], [5, 8, 8, 8, 8, 8, 5]);
+        for point in shape::points(&sheet) {
+            assert_eq!(sheet.normal(point), DVec3::Z);
+            let neighbours = sheet.neighbours(point);
+            assert!(neighbours.is_sorted());
+            for other in neighbours {
+                assert!(sheet.neighbours(other).contains(&point));
+                let apart_m = sheet.rest_m(point).distance(sheet.rest_m(other));
+                assert!((0.99..1.5).contains(&(apart_m / sheet.edge_m())));
+            }
+        }
+    }
+
+    #[test]
+    fn a_part_of_a_sheet_is_a_corner_and_one_of_its_points_is_its_middle() {
+        for points in [[1, 1], [1, 2], [2, 1], [9, 1], [1, 8], [2, 2], [11, 4], [12, 12], [40, 13]] {
+            let (part, looked_at) = Sheet { points, ..SHEET(FixedPoints::Corners) }.part(12);
+            assert_eq!(part.points, points.map(|count| count.min(12)));
+            assert!(looked_at.iter().all(|point| point.index() < part.point_count()) && !part.is_fixed(looked_at[0]));
+            let middle = part.place_of(looked_at[1]);
+            for axis in 0..2 {
+                // As far from either end, or nearer to the last by one point.
+                let after = part.points[axis] - 1 - middle[axis];
+                assert!(middle[axis] == after || middle[axis] == after + 1, "{points:?}: {middle:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_place_is_near_up_to_a_tenth_of_the_longest_side() {
+        let sheet = SHEET(FixedPoints::Edges);
+        assert_eq!(sheet.extent().middle_m(), DVec3::new(0.01, 0.03, 0.0));
+        for (place_m, is_near) in
+            [([-0.0059, 0.0], true), ([-0.0061, 0.0], false), ([0.01, 0.0659], true), ([0.01, 0.0661], false)]
+        {
+            assert_eq!(sheet.check_place("at", DVec2::from(place_m).extend(0.0)).is_ok(), is_near, "{place_m:?}");
+        }
+        let single = Sheet { points: [1, 1], ..sheet };
+        assert_eq!(single.longest_side_m(), 0.01);
+    }
+}

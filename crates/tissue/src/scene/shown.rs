@@ -1,0 +1,233 @@
+//! From the mesh of a file to the one that is simulated, and the other one that is shown.
+//!
+//! What is shown has the vertices of the file. The simulated mesh is another one if it is coarser, or if vertices of the file are
+//! joined: then each shown vertex moves with a place on it.
+
+use glam::DVec3;
+use palpate_geometry::decimate::{MeshPlace, decimate};
+use palpate_geometry::delaunay::flip_to_delaunay;
+use palpate_geometry::surface::nearest_place;
+use palpate_geometry::work::spend;
+use palpate_geometry::{FileMesh, TriangleMesh, prepare};
+
+use palpate_refusal::{Reason, Refusal, Result};
+
+/// The mesh of the file, and how it is bound to the simulated one.
+#[derive(Debug, PartialEq)]
+pub struct Shown {
+    /// The mesh of the file, with its own numbers of vertices. One that several simulated ones stand for has copies behind the
+    /// last.
+    pub mesh: TriangleMesh,
+    /// For each of its vertices, the place on the simulated mesh.
+    pub places: Vec<BoundPlace>,
+    /// For each of its vertices, the nearest simulated one.
+    pub(super) nearest: Vec<u32>,
+    /// For each simulated vertex, a vertex of the file whose nearest one it is, the closest of them, and of several as close the
+    /// first; if there is none, the closest of all that are bound to a triangle of it.
+    pub(super) names: Vec<u32>,
+}
+
+/// A place at a height over a triangle. It turns with the triangle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BoundPlace {
+    /// The triangle of the simulated mesh.
+    pub triangle: u32,
+    /// Weights of its vertices; their sum is 1.
+    pub barycentric: [f64; 3],
+    /// How far the place is off the triangle, along its normal, m.
+    pub height_m: f64,
+}
+
+/// The mesh of a scene as it is simulated.
+#[derive(Debug, PartialEq)]
+pub struct Simulated {
+    /// The mesh, whose edges are Delaunay if they were flipped.
+    pub mesh: TriangleMesh,
+    /// That of the file, if it has other vertices.
+    pub shown: Option<Shown>,
+    /// What was done with the mesh of the file, and what is doubtful about it, in words.
+    pub findings: Vec<String>,
+}
+
+impl Simulated {
+    /// Prepares the mesh of a file: joins what has the same position, and turns closed parts outward. It has at most so many
+    /// vertices, if it can, and edges flipped to Delaunay if `flips`.
+    ///
+    /// # Errors
+    /// Refuses a mesh that is no surface, by element and place.
+    pub fn of(mesh: TriangleMesh, vertices: Option<usize>, flips: bool) -> Result<Self> {
+        let prepared = prepare(mesh);
+        let report = prepared.report();
+        if let Some(finding) = report.refusal() {
+            let message = format!("{finding}; `palpate mesh FILE --repair` may mend it");
+            return Err(Refusal::new(Reason::Unreadable, "mesh", message));
+        }
+        let mut findings: Vec<String> = prepared.notes.iter().map(|note| format!("mesh: {note}")).collect();
+        // Of each kind the first.
+        for (kind, count) in &report.counts {
+            let of_kind = report.problems.iter().find(|finding| finding.problem.name() == *kind);
+            let more = if *count > 1 { format!(" ({count} of this kind: `palpate mesh FILE`)") } else { String::new() };
+            findings.extend(of_kind.map(|first| format!("mesh: {first}{more}")));
+        }
+        Ok(Self { findings, ..Self::bound(prepared.mesh, prepared.file, vertices, flips) })
+    }
+
+    /// Returns the same of a mesh that was made, and needs no preparation.
+    pub fn made(mesh: TriangleMesh, vertices: Option<usize>, flips: bool) -> Self {
+        Self::bound(mesh, None, vertices, flips)
+    }
+
+    fn bound(mut mesh: TriangleMesh, file: Option<FileMesh>, vertices: Option<usize>, flips: bool) -> Self {
+        let shown = match vertices.filter(|vertices| *vertices < mesh.vertices_m.len()) {
+            Some(vertices) => {
+                let shown;
+                (mesh, shown) = coarser(mesh, file, vertices, flips);
+                Some(shown)
+            }
+            None => {
+                if flips {
+                    flip_to_delaunay(&mut mesh);
+                }
+                file.map(|file| Shown::joined(file, &mesh))
+            }
+        };
+        Self { mesh, shown, findings: Vec::new() }
+    }
+}
+
+/// A mesh of at most so many vertices, if it can be, whose triangles are Delaunay if `flips`; and what is shown in its place.
+fn coarser(mesh: TriangleMesh, file: Option<FileMesh>, vertices: usize, flips: bool) -> (TriangleMesh, Shown) {
+    let decimated = decimate(&mesh, vertices);
+    let (mut coarse, before) = (decimated.mesh.clone(), decimated.mesh.triangles);
+    if flips {
+        flip_to_delaunay(&mut coarse);
+    }
+    let vertices_m = mesh.vertices_m.clone();
+    let file = file.unwrap_or_else(|| FileMesh { vertex_of: (0..).take(vertices_m.len()).collect(), mesh });
+    let shown = Shown::decimated(file, &vertices_m, &coarse, &before, &decimated.places);
+    (coarse, shown)
+}
+
+impl Shown {
+    /// Binds a mesh to one whose vertices stand for some of its own each.
+    #[allow(clippy::cast_possible_truncation)]
+    fn joined(FileMesh { mesh, vertex_of }: FileMesh, simulated: &TriangleMesh) -> Self {
+        let mut corners = vec![(0, 0); simulated.vertices_m.len()];
+        for (triangle, number) in simulated.triangles.iter().zip(0_u32..) {
+            triangle.iter().zip(0..).for_each(|(vertex, corner)| corners[*vertex as usize] = (number, corner));
+        }
+        let bind = |vertex: &u32| {
+            let (triangle, corner) = corners[*vertex as usize];
+            let mut barycentric = [0.0; 3];
+            barycentric[corner] = 1.0;
+            BoundPlace { triangle, barycentric, height_m: 0.0 }
+        };
+        let places = vertex_of.iter().map(bind).collect();
+        let mut names = vec![0; simulated.vertices_m.len()];
+        // Backwards, so that the least is written last.
+        for (number, (vertex, place_m)) in vertex_of.iter().zip(&mesh.vertices_m).enumerate().rev() {
+            if simulated.vertices_m[*vertex as usize] == *place_m {
+                names[*vertex as usize] = number as u32;
+            }
+        }
+        Shown { mesh, places, nearest: vertex_of, names }
+    }
+
+    /// Binds a mesh to a coarser one, given places on its triangles before edges were flipped; `vertices_m` are those that were
+    /// decimated.
+    #[allow(clippy::cast_possible_truncation)]
+    fn decimated(
+        FileMesh { mesh, vertex_of }: FileMesh,
+        vertices_m: &[DVec3],
+        coarse: &TriangleMesh,
+        before: &[[u32; 3]],
+        places: &[MeshPlace],
+    ) -> Self {
+        let mut around: Vec<Vec<u32>> = vec![Vec::new(); coarse.vertices_m.len()];
+        for (number, triangle) in (0..).zip(&coarse.triangles) {
+            triangle.iter().for_each(|vertex| around[*vertex as usize].push(number));
+        }
+        let at = |vertex: u32| coarse.vertices_m[vertex as usize];
+        let bind = |(place_m, place): (&DVec3, &MeshPlace)| {
+            let old = before[place.triangle as usize];
+            let own = [old, coarse.triangles[place.triangle as usize]];
+            let mut candidates: Vec<u32> = vec![place.triangle];
+            if own[0] != own[1] {
+                candidates = old.iter().flat_map(|vertex| &around[*vertex as usize]).copied().collect();
+                spend(16 * candidates.len());
+                candidates.sort_unstable();
+                candidates.dedup();
+            }
+            let on = |triangle: u32| {
+                let [a, b, c] = coarse.triangles[triangle as usize].map(at);
+                let barycentric = if own[0] == own[1] { place.barycentric } else { nearest_place(*place_m, [a, b, c]) };
+                let [u, v, w] = barycentric;
+                (place_m.distance_squared(u * a + v * b + w * c), triangle, barycentric)
+            };
+            let best = candidates.into_iter().map(on).min_by(|a, b| a.0.total_cmp(&b.0));
+            let (_, triangle, barycentric) = best.unwrap_or((0.0, place.triangle, place.barycentric));
+            let [a, b, c] = coarse.triangles[triangle as usize].map(at);
+            let normal = (b - a).cross(c - a).normalize_or_zero();
+            BoundPlace { triangle, barycentric, height_m: normal.dot(*place_m - a) }
+        };
+        let bound: Vec<BoundPlace> = vertices_m.iter().zip(places).map(bind).collect();
+        let places: Vec<BoundPlace> =
+            vertex_of.iter().filter_map(|vertex| bound.get(*vertex as usize).copied()).collect();
+        let mut nearest = Vec::with_capacity(places.len());
+        let mut closest = vec![[(f64::INFINITY, 0_u32); 2]; coarse.vertices_m.len()];
+        for ((vertex, place), number) in vertex_of.iter().zip(&places).zip(0_u32..) {
+            let place_m = vertices_m[*vertex as usize];
+            let corners = coarse.triangles[place.triangle as usize];
+            let away = |vertex: u32| at(vertex).distance_squared(place_m);
+            let mut best = corners[0];
+            for corner in corners {
+                if away(corner) < away(best) {
+                    best = corner;
+                }
+                let any = &mut closest[corner as usize][1];
+                if away(corner) < any.0 {
+                    *any = (away(corner), number);
+                }
+            }
+            let own = &mut closest[best as usize][0];
+            if away(best) < own.0 {
+                *own = (away(best), number);
+            }
+            nearest.push(best);
+        }
+        let names = closest.iter().map(|[own, any]| if own.0.is_finite() { own.1 } else { any.1 }).collect();
+        Shown { mesh, places, nearest, names }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use palpate_geometry::organ::{Organ, generate};
+
+    use super::*;
+
+    #[test]
+    fn a_place_on_the_coarser_mesh_and_its_height_give_the_vertex_back() {
+        let mesh = generate(Organ::Gallbladder, 0.0035, 2).unwrap();
+        let count = mesh.vertices_m.len();
+        for flips in [false, true] {
+            let (coarse, shown) = coarser(mesh.clone(), None, count / 3, flips);
+            assert!(coarse.vertices_m.len() <= count / 3 + 1 && shown.places.len() == count);
+            let mut off_m: Vec<f64> = Vec::new();
+            for (place_m, place) in shown.mesh.vertices_m.iter().zip(&shown.places) {
+                let [a, b, c] = coarse.triangles[place.triangle as usize].map(|v| coarse.vertices_m[v as usize]);
+                let [u, v, w] = place.barycentric;
+                assert!(u + v + w > 1.0 - 1e-9 && u.min(v).min(w) >= -1e-9, "{place:?}");
+                let normal = (b - a).cross(c - a).normalize();
+                off_m.push(place_m.distance(u * a + v * b + w * c + place.height_m * normal));
+            }
+            off_m.sort_by(f64::total_cmp);
+            // Beside an edge or a corner a place is not straight over its triangle.
+            assert!(off_m[count / 2] < 1e-6 && off_m[count - 1] < 1e-3, "{} {}", off_m[count / 2], off_m[count - 1]);
+            for (vertex, name) in shown.names.iter().enumerate() {
+                assert!(coarse.vertices_m[vertex].distance(shown.mesh.vertices_m[*name as usize]) < 0.006, "{vertex}");
+            }
+        }
+    }
+}

@@ -1,0 +1,130 @@
+//! Where the mesh of a scene comes from: a file beside the scene, or an organ that is generated.
+
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+
+use palpate_geometry::organ::{self, Organ, OrganError};
+use palpate_geometry::{ReadLimits, TriangleMesh, Unit};
+
+use super::document::{Fields, Item};
+use crate::files;
+use crate::limits::Limits;
+use crate::lock::lock;
+use palpate_refusal::{Reason, Result, excerpt};
+
+/// What files a scene may name.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Files<'a> {
+    /// None: it came from a client.
+    None,
+    /// Those in a folder.
+    In(&'a Path),
+    /// One mesh, by its name and its bytes.
+    Given(&'a str, &'a [u8]),
+}
+
+/// A mesh, by where it is from.
+pub(super) enum SourceMesh {
+    /// It was generated, without a flaw.
+    Made(TriangleMesh),
+    /// It is that of a file.
+    Read(TriangleMesh),
+}
+
+impl Files<'_> {
+    /// Reads the mesh that a section names by `organ`, or by `file` and `unit`; returns also the key, for refusals.
+    pub(super) fn mesh<'a>(self, fields: &mut Fields<'a>, limits: &Limits) -> Result<(SourceMesh, Item<'a>)> {
+        if let Some(organ) = fields.item("organ") {
+            if let Some(file) = fields.item("file") {
+                return Err(file.refuse(Reason::WrongKind, "does not go with organ: a mesh is read or made"));
+            }
+            return Ok((SourceMesh::Made(made(&organ, limits)?), organ));
+        }
+        let item = fields.required("unit")?;
+        let unit = unit_text(&item)?.parse::<Unit>();
+        let unit = unit.map_err(|_| item.wrong("\"m\", \"cm\", \"mm\" or the metres of a unit"))?;
+        let file = fields.required("file")?;
+        Ok((SourceMesh::Read(self.read(&file, unit, limits)?), file))
+    }
+
+    /// Reads the mesh that an item names. The files that this names in turn have bare names, in the same folder.
+    fn read(self, item: &Item<'_>, unit: Unit, limits: &Limits) -> Result<TriangleMesh> {
+        // Refusals name it as the scene does: clients do not learn where the server's files are.
+        let name = item.text()?;
+        let refuse = |message: String| Err(item.refuse(Reason::WrongKind, message));
+        let (bytes, path) = match self {
+            Files::None => return refuse("names a file: a scene that a client sends can't".to_owned()),
+            Files::Given(given, _) if given != name => {
+                return refuse(format!(
+                    "names `{}`, but the mesh that was given is `{}`",
+                    excerpt(&name),
+                    excerpt(given)
+                ));
+            }
+            Files::Given(_, bytes) => (bytes.to_owned(), None),
+            Files::In(folder) => {
+                let path = folder.join(&name);
+                let bytes = files::read_regular(&path, limits.mesh_bytes)
+                    .map_err(|refusal| item.refuse(refusal.reason, format!("{name}: {}", refusal.message)))?;
+                (bytes, Some(path))
+            }
+        };
+        let beside = |name: &str| files::read_regular(&path.as_ref()?.parent()?.join(name), limits.mesh_bytes).ok();
+        let most = usize::try_from(limits.mesh_bytes).unwrap_or(usize::MAX);
+        let within = ReadLimits { bytes: most, vertices: limits.points, triangles: limits.points.saturating_mul(4) };
+        let found = palpate_geometry::read(&name, &bytes, unit, &beside, &within);
+        Ok(found.map_err(|error| item.refuse(Reason::Unreadable, error.to_string()))?.mesh)
+    }
+}
+
+/// The unit that an item gives: a name, or the metres of it.
+pub(super) fn unit_text(item: &Item<'_>) -> Result<String> {
+    item.as_text().map_or_else(|| item.number().map(|metres| metres.to_string()), |text| Ok(text.to_owned()))
+}
+
+/// An organ: which one, the bits of its edge length, its seed.
+type Recipe = (&'static str, u64, u64);
+
+/// The organs made last, newest last. To make one may take a second, and scenes are read again and again.
+static KEPT: Mutex<Vec<(Recipe, Arc<TriangleMesh>)>> = Mutex::new(Vec::new());
+
+/// Organs that are kept, and their vertices in all, at most.
+const MAX_KEPT: usize = 4;
+const MAX_VERTICES_KEPT: usize = 200_000;
+
+/// Makes the organ of a table.
+fn made(item: &Item<'_>, limits: &Limits) -> Result<TriangleMesh> {
+    item.table(|fields| {
+        let name = fields.required("name")?;
+        let organ: Organ =
+            name.text()?.parse().map_err(|error: OrganError| name.refuse(Reason::WrongKind, error.to_string()))?;
+        let edge_m = fields.required_number("edge_m")?;
+        let seed = fields.item("seed").map_or(Ok(1), |item| item.whole())?;
+        let recipe = (organ.name(), edge_m.to_bits(), seed);
+        let known = lock(&KEPT).iter().find(|(other, _)| *other == recipe).map(|(_, mesh)| mesh.clone());
+        if let Some(mesh) = known {
+            return Ok(TriangleMesh::clone(&mesh));
+        }
+        let mesh = organ::generate_within(organ, edge_m, seed, limits.points).map_err(|error| {
+            let (reason, key) = match error {
+                OrganError::TooFine { .. } => (Reason::TooLarge, "edge_m"),
+                OrganError::NotAManifold { .. } => (Reason::OutOfRange, "seed"),
+                _ => (Reason::OutOfRange, "edge_m"),
+            };
+            fields.refuse(reason, key, error.to_string())
+        })?;
+        if mesh.vertices_m.len() <= MAX_VERTICES_KEPT {
+            let mut kept = lock(&KEPT);
+            kept.retain(|(other, _)| *other != recipe);
+            kept.push((recipe, Arc::new(mesh.clone())));
+            let too_many = |kept: &[(Recipe, Arc<TriangleMesh>)]| {
+                let vertices: usize = kept.iter().map(|(_, mesh)| mesh.vertices_m.len()).sum();
+                kept.len() > MAX_KEPT || vertices > MAX_VERTICES_KEPT
+            };
+            while too_many(&kept) {
+                kept.remove(0);
+            }
+        }
+        Ok(mesh)
+    })
+}

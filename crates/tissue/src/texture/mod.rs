@@ -1,0 +1,139 @@
+//! The appearance of a tissue: an image of its surface, generated from a seed or supplied by the user. The same seed
+//! and size give the same bytes on any machine. A painted image has colour only, no relief and no light: viewers shade the
+//! surface by its true shape.
+
+mod colour;
+mod liver;
+mod mucosa;
+mod nodular;
+mod noise;
+mod serosa;
+mod vessels;
+
+use std::io::Cursor;
+use std::path::Path;
+
+use bytes::Bytes;
+
+use crate::files;
+use crate::limits::Limits;
+use crate::memory;
+use crate::scene::{Appearance, PaintedSurface, SMALLEST_TEXTURE};
+use palpate_refusal::{Reason, Refusal, Result, number};
+
+/// An image: rows of pixels from the top, sRGB.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Image {
+    /// Pixels in a row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Red, green and blue of each pixel: 3·`width`·`height` bytes.
+    pub rgb: Vec<u8>,
+}
+
+/// An image in the form that the server sends.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Texture {
+    /// The file.
+    pub png: Bytes,
+    /// An identifier that differs between different images; a quoted string, for HTTP.
+    pub etag: String,
+}
+
+/// Returns an image of a kind of surface, `size` × `size` pixels.
+///
+/// # Errors
+/// Refuses a size outside the limits.
+pub fn painted(surface: PaintedSurface, seed: u64, size: u32, limits: &Limits) -> Result<Image> {
+    let range = format!("from {SMALLEST_TEXTURE} to {} pixels", limits.texture_side);
+    let holds = |v| v >= f64::from(SMALLEST_TEXTURE) && v <= f64::from(limits.texture_side);
+    number("texture_size", f64::from(size), &range, holds)?;
+    let side = size as usize;
+    let rgb = match surface {
+        PaintedSurface::Mucosa => mucosa::paint(seed, side),
+        PaintedSurface::Liver => liver::paint(seed, side),
+        PaintedSurface::Nodular => nodular::paint(seed, side),
+        PaintedSurface::Serosa => serosa::paint(seed, side),
+    };
+    Ok(Image { width: side, height: side, rgb })
+}
+
+/// Returns the image of a scene's tissue.
+///
+/// # Errors
+/// Refuses a size beyond the limits, and a file that can't be read as a PNG image within the limits.
+pub fn image(appearance: &Appearance, limits: &Limits) -> Result<Image> {
+    match &appearance.texture {
+        Some(path) => Image::decode(path, &read(path, limits)?, limits),
+        None => painted(appearance.surface, appearance.texture_seed, appearance.texture_size, limits),
+    }
+}
+
+/// Does the same as a PNG file. A user's own file is checked and passed on unchanged.
+///
+/// # Errors
+/// As for [`image`].
+pub fn texture(appearance: &Appearance, limits: &Limits) -> Result<Texture> {
+    let png = match &appearance.texture {
+        Some(path) => {
+            let bytes = read(path, limits)?;
+            Image::decode(path, &bytes, limits)?;
+            bytes
+        }
+        None => image(appearance, limits)?.png()?,
+    };
+    let etag = format!("\"{:032x}\"", xxhash_rust::xxh3::xxh3_128(&png));
+    Ok(Texture { png: png.into(), etag })
+}
+
+fn refuse(path: &Path, reason: Reason, message: String) -> Refusal {
+    let place = Some(path.display().to_string());
+    Refusal { place, ..Refusal::new(reason, "appearance.texture", message) }
+}
+
+fn read(path: &Path, limits: &Limits) -> Result<Vec<u8>> {
+    files::read_regular(path, limits.file_bytes).map_err(|found| refuse(path, found.reason, found.message))
+}
+
+impl Image {
+    /// Reads a PNG file of any colour type. Transparency is ignored.
+    fn decode(path: &Path, bytes: &[u8], limits: &Limits) -> Result<Self> {
+        let wrong = |e: png::DecodingError| refuse(path, Reason::Unreadable, format!("is not a PNG image: {e}"));
+        let mut decoder = png::Decoder::new(Cursor::new(bytes));
+        decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::STRIP_16);
+        let mut reader = decoder.read_info().map_err(wrong)?;
+        let (width, height, most) = (reader.info().width, reader.info().height, limits.texture_side);
+        if width.max(height) > most {
+            let message = format!("is {width} × {height} pixels, above the limit of {most} a side");
+            return Err(refuse(path, Reason::TooLarge, message));
+        }
+        // The pixels as they are read, and as RGB.
+        memory::require(u64::from(width) * u64::from(height) * 8, "a texture");
+        let mut pixels = memory::zeroed(reader.output_buffer_size().unwrap_or(0), "a texture");
+        let frame = reader.next_frame(&mut pixels).map_err(wrong)?;
+        pixels.truncate(frame.buffer_size());
+        let rgb = match frame.color_type {
+            png::ColorType::Grayscale => pixels.iter().flat_map(|grey| [*grey; 3]).collect(),
+            png::ColorType::GrayscaleAlpha => pixels.chunks_exact(2).flat_map(|pixel| [pixel[0]; 3]).collect(),
+            png::ColorType::Rgba => pixels.chunks_exact(4).flat_map(|pixel| [pixel[0], pixel[1], pixel[2]]).collect(),
+            png::ColorType::Rgb | png::ColorType::Indexed => pixels,
+        };
+        Ok(Image { width: width as usize, height: height as usize, rgb })
+    }
+
+    /// Returns the image as a PNG file.
+    ///
+    /// # Errors
+    /// Returns an error if the encoder refuses the image.
+    pub fn png(&self) -> Result<Vec<u8>> {
+        let mut file = Vec::new();
+        #[allow(clippy::cast_possible_truncation)]
+        let mut encoder = png::Encoder::new(&mut file, self.width as u32, self.height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_depth(png::BitDepth::Eight);
+        let written = encoder.write_header().and_then(|mut writer| writer.write_image_data(&self.rgb));
+        written.map_err(|e| Refusal::new(Reason::TooLarge, "", format!("can't be written as a PNG image: {e}")))?;
+        Ok(file)
+    }
+}
