@@ -30,7 +30,7 @@ help:
 	@echo 'make header          clients/c/include/palpate.h from its sources'
 	@echo 'make viewer          the page that shows the tissue, clients/viewer/dist (Node.js; make run does it by itself)'
 	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
-	@echo 'make test-long       every test of Rust in its long form, an hour: docs/tests.md tells what is longer'
+	@echo 'make test-long       every test of Rust in its long form: docs/tests.md tells what is longer'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): tests/determinism under qemu-user; says what it needs'

@@ -11,10 +11,10 @@
     clippy::cast_sign_loss
 )]
 
+#[path = "common/cases.rs"]
+mod cases;
 #[path = "common/counting.rs"]
 mod counting;
-#[path = "common/form.rs"]
-mod form;
 #[path = "common/moved.rs"]
 mod moved;
 
@@ -97,8 +97,7 @@ fn random_message(random: &mut Rng, levels: u32) -> Vec<u8> {
 
 #[test]
 fn a_message_takes_no_more_than_was_measured() {
-    let inputs: u64 =
-        std::env::var("PALPATE_FUZZ_INPUTS").map_or_else(|_| form::form(3000, 100_000), |text| text.parse().unwrap());
+    let inputs: u64 = cases::count("PALPATE_FUZZ_INPUTS", 3000, 100_000);
     let mut random = Rng::with_seed(0x3e_a5);
     let mut most: BTreeMap<&str, f64> = BTreeMap::new();
     let (mut decoded, mut refused) = (0, 0);
@@ -248,8 +247,7 @@ fn a_snapshot_takes_no_more_than_its_header_says() {
     let parts = &whole[36..36 + length];
     let mut random = Rng::with_seed(0x5a_7e);
     let mut most: f64 = 0.0;
-    let inputs: u64 =
-        std::env::var("PALPATE_FUZZ_INPUTS").map_or_else(|_| form::form(1000, 20_000), |text| text.parse().unwrap());
+    let inputs: u64 = cases::count("PALPATE_FUZZ_INPUTS", 1000, 20_000);
     let mut try_one = |parts: &[u8]| {
         let bytes = snapshot(parts);
         let (_, took) = counted(|| Saved::from_bytes(&bytes, &Limits::default()).map(drop));

@@ -4,10 +4,10 @@
 //! Twenty thousand for each decoder in every run of the tests; `make fuzz` tries a million (`PALPATE_FUZZ_INPUTS`).
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
 
+#[path = "common/cases.rs"]
+mod cases;
 #[path = "common/counting.rs"]
 mod counting;
-#[path = "common/form.rs"]
-mod form;
 #[path = "../fuzz/src/lib.rs"]
 #[allow(dead_code, clippy::cast_possible_truncation)]
 mod targets;
@@ -158,8 +158,7 @@ fn fuzz(target: &FuzzTarget, inputs: u64) {
 }
 
 fn fuzz_named(name: &str) {
-    let inputs =
-        std::env::var("PALPATE_FUZZ_INPUTS").map_or_else(|_| form::form(6000, 200_000), |text| text.parse().unwrap());
+    let inputs = cases::count("PALPATE_FUZZ_INPUTS", 6000, 200_000);
     fuzz(TARGETS.iter().find(|target| target.name == name).unwrap(), inputs);
 }
 

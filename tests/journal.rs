@@ -1,8 +1,8 @@
 //! Journals: what is written is read again, whatever happens to the file, and gives the same bits.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_possible_truncation)]
 
-#[path = "common/form.rs"]
-mod form;
+#[path = "common/cases.rs"]
+mod cases;
 #[path = "common/journal_opening.rs"]
 mod journal_opening;
 
@@ -187,7 +187,7 @@ fn a_bit_that_is_other_is_found_or_harmless() {
     let all = inputs(&file);
     let (mut refused, mut torn, mut harmless) = (0, 0, 0);
     let mut rng = fastrand::Rng::with_seed(1);
-    let count = form::form(3000, 100_000);
+    let count = cases::short_or_long(3000, 100_000);
     for _ in 0..count {
         let mut bent = file.clone();
         let (at, bit) = (rng.usize(..bent.len()), rng.u8(..8));
@@ -245,7 +245,7 @@ fn a_sealed_file_opens_with_the_reader_of_mcap() {
 #[test]
 #[allow(clippy::disallowed_methods)] // The time is told, and decides nothing.
 fn a_long_touch_verifies() {
-    let steps = form::form(3000, 600_000);
+    let steps = cases::short_or_long(3000, 600_000);
     let (file, _) = written(&model(&["sheet.points=[31, 31]"]), steps, true);
     let begun = std::time::Instant::now();
     let verdict = journal::verify(reader(&file), &Limits::default(), &mut |_, _| {}).unwrap();

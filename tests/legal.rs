@@ -6,8 +6,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 #![allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 
-#[path = "common/form.rs"]
-mod form;
+#[path = "common/cases.rs"]
+mod cases;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -84,8 +84,7 @@ const STEPS: u64 = 10;
 
 #[test]
 fn every_legal_scene_is_bounded_work_or_refused() {
-    let scenes =
-        std::env::var("PALPATE_STRESS_SCENES").map_or_else(|_| form::form(50, 1000), |scenes| scenes.parse().unwrap());
+    let scenes = cases::count("PALPATE_STRESS_SCENES", 50, 1000);
     // An unoptimized build takes a hundred times as long for each.
     let rehearsal_work = if cfg!(debug_assertions) { 1 << 18 } else { Limits::default().rehearsal_work };
     let limits = Limits { rehearsal_work, ..Limits::default() };

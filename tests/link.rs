@@ -1,10 +1,10 @@
 //! `palpate-client link` and `bridge`: what a simulated hand must feel through any network.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/cases.rs"]
+mod cases;
 #[path = "common/course.rs"]
 mod course;
-#[path = "common/form.rs"]
-mod form;
 #[path = "common/proxy.rs"]
 mod proxy;
 #[path = "common/server.rs"]
@@ -51,7 +51,7 @@ fn touch_is_true_passive_and_smooth_up_to_100_ms() {
     for (scene, at_once_percent, delayed_percent) in [("liver", 0.95, 0.68), ("fibrotic", 2.3, 0.44)] {
         for rtt_ms in [0.0, 10.0, 50.0, 100.0] {
             let most_percent = if rtt_ms > 0.0 { delayed_percent } else { at_once_percent };
-            for hand in form::form(&["firm"][..], &["light", "medium", "firm"]) {
+            for hand in cases::short_or_long(&["firm"][..], &["light", "medium", "firm"]) {
                 let found = link(&format!("--scene {scene} --hand {hand} --rtt-ms {rtt_ms} --seconds 6 --seed 3"));
                 let error = number(&found, "force_error_rms_percent");
                 assert!(error < most_percent, "{scene}, {hand}, {rtt_ms} ms: {error} %");
@@ -264,7 +264,7 @@ fn a_deadband_sends_a_twentieth_and_is_not_felt() {
 /// `palpate-client link --random 1000` is the long form.
 #[test]
 fn random_combinations_are_passive() {
-    let runs = form::form(8, 100);
+    let runs = cases::short_or_long(8, 100);
     let found = link(&format!("--random {runs} --seconds 5 --seed 100"));
     assert_eq!((&found["runs"], &found["unstable"]), (&Value::from(runs), &Value::from(0)));
     let worst = |name: &str| found[name]["worst"].as_f64().unwrap();

@@ -2,9 +2,9 @@
 //! input changes nothing.
 #![allow(clippy::unwrap_used)]
 
+#[path = "common/cases.rs"]
+mod cases;
 mod common;
-#[path = "common/form.rs"]
-mod form;
 
 use std::path::Path;
 
@@ -84,7 +84,7 @@ fn command() -> impl Strategy<Value = Command> {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: form::form(100, 4000), failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: cases::short_or_long(100, 4000), failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn no_scene_text_panics(text in spoilt(PAPER)) {

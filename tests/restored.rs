@@ -4,9 +4,9 @@
 //! Some 200 snapshots in every run of the tests; `PALPATE_SNAPSHOTS=5000` takes as many as that.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
 
+#[path = "common/cases.rs"]
+mod cases;
 mod common;
-#[path = "common/form.rs"]
-mod form;
 #[path = "common/moved.rs"]
 mod moved;
 #[path = "common/random_scenes.rs"]
@@ -45,7 +45,7 @@ fn limits() -> Limits {
 
 /// How many snapshots are tried.
 fn wanted() -> usize {
-    std::env::var("PALPATE_SNAPSHOTS").ok().and_then(|text| text.parse().ok()).unwrap_or_else(|| form::form(80, 1000))
+    cases::count("PALPATE_SNAPSHOTS", 80, 1000)
 }
 
 /// What acts before a step.

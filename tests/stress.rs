@@ -5,11 +5,11 @@
 //! meshes of a random material there are 4 for 250 steps each, and 200 for 5,000 (`PALPATE_STRESS_MESHES`).
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
+#[path = "common/cases.rs"]
+mod cases;
 #[path = "common/closed_mesh.rs"]
 mod closed_mesh;
 mod common;
-#[path = "common/form.rs"]
-mod form;
 
 use closed_mesh::closed_mesh;
 use common::{SMALL, model, scene_with};
@@ -164,8 +164,7 @@ fn play(text: &str, acts: &[RandomAction]) -> Result<(), TestCaseError> {
 
 #[test]
 fn random_scenes_stay_finite_and_take_no_energy_from_nowhere() {
-    let cases =
-        std::env::var("PALPATE_STRESS_SCENES").map_or_else(|_| form::form(50, 1000), |scenes| scenes.parse().unwrap());
+    let cases = cases::count("PALPATE_STRESS_SCENES", 50, 1000);
     let mut runner =
         TestRunner::new(Config { cases, failure_persistence: None, max_shrink_iters: 200, ..Config::default() });
     let done = std::cell::Cell::new(0_u32);
@@ -200,8 +199,7 @@ fn energy_that_appears_between_two_looks_of_the_guard_does_not_outlast_the_secon
 
 #[test]
 fn closed_meshes_of_any_material_stay_finite() {
-    let meshes =
-        std::env::var("PALPATE_STRESS_MESHES").map_or_else(|_| form::form(4, 20), |meshes| meshes.parse().unwrap());
+    let meshes = cases::count("PALPATE_STRESS_MESHES", 4, 20);
     let steps: u64 = if meshes > 4 { 5000 } else { 250 };
     let (folder, limits) = (tempfile::tempdir().unwrap(), Limits { substeps: 400, ..Limits::default() });
     let mut played = 0;

@@ -2,8 +2,8 @@
 //! meshes there are 8 here, and more by `PALPATE_TOLERANCE_MESHES`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
-#[path = "common/form.rs"]
-mod form;
+#[path = "common/cases.rs"]
+mod cases;
 #[path = "common/random_scenes.rs"]
 mod random_scenes;
 
@@ -39,8 +39,7 @@ fn every_tolerance_is_kept_on_random_scenes() {
 
 #[test]
 fn every_tolerance_is_kept_on_random_meshes() {
-    let meshes =
-        std::env::var("PALPATE_TOLERANCE_MESHES").map_or_else(|_| form::form(4, 40), |meshes| meshes.parse().unwrap());
+    let meshes = cases::count("PALPATE_TOLERANCE_MESHES", 4, 40);
     (0..meshes).for_each(|seed| keeps_every_tolerance(&mesh_case(seed)));
 }
 

@@ -5,7 +5,7 @@ use std::net::IpAddr;
 use std::time::Duration;
 
 use palpate_refusal::printable::printable;
-use palpate_refusal::status as error;
+use palpate_refusal::status;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tonic::metadata::{Ascii, MetadataValue};
 use tonic::service::Interceptor;
@@ -264,7 +264,7 @@ async fn speaks_tls((host, port): &(String, u16)) -> bool {
 
 /// Returns the text that a program shows for a status: the server's message, or how the connection broke.
 pub fn describe(status: &Status) -> String {
-    if status.source().is_some() { broken(status) } else { error::describe(status) }
+    if status.source().is_some() { broken(status) } else { status::describe(status) }
 }
 
 fn broken(status: &Status) -> String {

@@ -9,14 +9,27 @@ use tokio::sync::oneshot;
 
 use super::clock::now_ns;
 use super::frames::Viewer;
-use super::paced::Present;
 use super::reading::HashReply;
 use super::subscribers::{ProbeTap, SampleTap};
 use super::thread_counters::ThreadCounters;
 use palpate_refusal::{Refusal, Result};
 use palpate_session::budget::Account;
+use palpate_session::saved::Saved;
+use palpate_tissue::ReadCopy;
 use palpate_tissue::audit::{Mark, WindowInputs};
 use palpate_tissue::lock::lock;
+
+/// A session as it is, to continue from.
+pub struct Present {
+    /// Everything that the next step depends on.
+    pub saved: Box<Saved>,
+    /// The state, to be hashed.
+    pub copy: ReadCopy,
+    /// Whether time goes on.
+    pub running: bool,
+    /// The step at which it pauses.
+    pub until_step: Option<u64>,
+}
 
 /// Why a session leaves its server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -8,7 +8,6 @@ use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 
 use tokio::sync::oneshot;
 
-use super::paced::{Recorded, SharedRecord};
 use super::queue::Writer;
 use palpate_refusal::{Refusal, Result};
 use palpate_session::budget::{Account, Purpose, Resource, Taken, Turns};
@@ -18,6 +17,20 @@ use palpate_tissue::memory;
 use palpate_tissue::scene::record::Record;
 use palpate_tissue::shape::PointId;
 use palpate_tissue::{Hashing, ReadCopy};
+
+/// A record, and its step. All who asked for the same share one.
+pub type SharedRecord = Arc<Recorded>;
+
+/// What was measured once, for whoever asked for it.
+#[derive(Debug)]
+pub struct Recorded {
+    /// Steps done.
+    pub step: u64,
+    /// What was measured.
+    pub record: Record,
+    /// Its memory.
+    pub(super) _taken: Taken,
+}
 
 /// So many points are read by the stepping thread itself: some tenths of a millisecond.
 const AT_ONCE_POINTS: usize = 1024;

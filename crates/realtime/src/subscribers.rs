@@ -4,9 +4,8 @@ use std::sync::Arc;
 
 use super::clock::now_ns;
 use super::frames::Viewer;
-use super::paced::{Recorded, SharedRecord};
 use super::queue::{Wakes, Writer};
-use super::reading::{Copied, Copies, HashReply, Piece, Reading, Recipient, is_much};
+use super::reading::{Copied, Copies, HashReply, Piece, Reading, Recipient, Recorded, SharedRecord, is_much};
 use palpate_refusal::Result;
 use palpate_session::Session;
 use palpate_session::budget::{Account, Purpose, Resource, Taken, Work};

@@ -43,8 +43,7 @@ pub fn check_processor() -> Result<()> {
     if lanes::fuses() {
         return Ok(());
     }
-    let message = "this machine's processor has no fused multiply-add (FMA), which every lane width needs: without it a step \
-                   would take ten times as long";
+    let message = "this machine's processor has no fused multiply-add (FMA), which every lane width needs";
     Err(Refusal::new(Reason::NotAvailable, "stepping.lanes", message))
 }
 
@@ -109,6 +108,8 @@ impl Model {
     /// As for [`Model::compile`]; and refuses when `stop` is set.
     pub fn compile_until(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
         scene.check(limits)?;
+        // Before anything is rehearsed: rehearsals run sweeps.
+        check_processor()?;
         let scene = &scene.clone().with_unsigned_zeros();
         let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
@@ -162,7 +163,7 @@ impl Model {
         Ok(Arc::new(model))
     }
 
-    /// Does the same sheet with another tissue: integrator and substeps as its tolerance asks for, in the number format
+    /// Returns the same sheet with another tissue: integrator and substeps as its tolerance asks for, in the number format
     /// that a state of this model has. `first` is the scene that the session began with.
     ///
     /// # Errors

@@ -77,7 +77,7 @@ impl Model {
         (keeps && fits && choice.integrator != self.plan.integrator).then_some(choice)
     }
 
-    /// Does the same tissue, stepped as `correction` says.
+    /// Returns the same tissue, stepped as `correction` says.
     ///
     /// # Errors
     /// Refuses a correction that this model can't be compiled with.

@@ -225,8 +225,8 @@ pub(super) trait Run<T> {
     unsafe fn run<V: Vector<Real = T>>(&self);
 }
 
-/// Returns whether the processor has fused multiply-add, which every width needs. Calls of the C library that emulate it have the
-/// same bits, and take 170 ns for a step of a point in place of 10.
+/// Returns whether the processor has fused multiply-add, which every width needs. Calls of the C library that emulate it
+/// would have the same bits, and take several times as long.
 pub(super) fn fuses() -> bool {
     #[cfg(target_arch = "x86_64")]
     let fuses = is_x86_feature_detected!("fma");

@@ -13,12 +13,6 @@ macro_rules! plain {
         pub(crate) struct $name<$real>($(pub(crate) $t),*);
 
         impl<$real: Real> $name<$real> {
-            /// a·b + c.
-            #[inline(always)]
-            fn fused(a: Self, b: Self, c: Self) -> Self {
-                $name($(a.$lane.fused(b.$lane, c.$lane)),*)
-            }
-
             #[inline(always)]
             fn negative(self) -> Self {
                 $name($(-self.$lane),*)
@@ -67,15 +61,15 @@ macro_rules! plain {
             }
             #[inline(always)]
             fn mul_add(self, b: Self, c: Self) -> Self {
-                Self::fused(self, b, c)
+                $name($(self.$lane.fused(b.$lane, c.$lane)),*)
             }
             #[inline(always)]
             fn mul_sub(self, b: Self, c: Self) -> Self {
-                Self::fused(self, b, c.negative())
+                self.mul_add(b, c.negative())
             }
             #[inline(always)]
             fn minus(self, a: Self, b: Self) -> Self {
-                Self::fused(a.negative(), b, self)
+                a.negative().mul_add(b, self)
             }
             #[inline(always)]
             fn approximate_inverse_root(self) -> Self {

@@ -325,7 +325,7 @@ impl Inclusion {
         parts
     }
 
-    /// Does the same mesh with some inclusions; where several are, their factors multiply. `field` is what refusals
+    /// Returns the same mesh with some inclusions; where several are, their factors multiply. `field` is what refusals
     /// call the list.
     ///
     /// # Errors

@@ -200,7 +200,7 @@ impl Mesh {
         mesh
     }
 
-    /// Does the same mesh, closed, with the volume that it encloses.
+    /// Returns the same mesh, closed, with the volume that it encloses.
     ///
     /// # Errors
     /// Refuses a mesh that encloses no volume, or several.
