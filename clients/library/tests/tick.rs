@@ -205,10 +205,10 @@ fn bytes_that_are_no_message_are_refused() {
 #[test]
 fn a_tick_takes_no_lock() {
     let source = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
-    let touch = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../touch/src");
+    let haptics = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../crates/haptics/src");
     let files = ["bridge/ticker.rs", "exchange.rs"].map(|name| source.join(name));
     let rules = ["renderer.rs", "envelope.rs", "local.rs", "law.rs", "dead_reckoning.rs", "prediction.rs"]
-        .map(|name| touch.join(name));
+        .map(|name| haptics.join(name));
     for file in files.iter().chain(&rules) {
         let text = std::fs::read_to_string(file).unwrap();
         for word in ["Mutex", "RwLock", "Condvar", "OnceLock", "Instant", "SystemTime", "park()", "mpsc"] {
