@@ -21,7 +21,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use glam::DVec3;
-use palpate_tissue::mesh::{MeshGraph, MeshSpring, MeshTrial};
+use palpate_tissue::body::surface::{MeshGraph, MeshSpring, MeshTrial};
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::{Lanes, Named};
 use palpate_tissue::{Push, Tissue, at_rest};

@@ -17,7 +17,7 @@ use glam::DVec3;
 use links::{by_seed, link, links, number};
 use palpate_haptics::{Predictor, Tip};
 use palpate_proto::pb;
-use palpate_session::prediction::TissueCopy;
+use palpate_session::tissue_copy::TissueCopy;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::{BUILT_IN, Scene};
 use palpate_tissue::{Footprint, Model};

@@ -32,7 +32,7 @@ use palpate_session::Session;
 use palpate_session::budget::{Account, Budget, Purpose, Resource};
 use palpate_session::journal::records::{self, Chunk};
 use palpate_session::journal::{JournalReader, REPLAYS, Topic, message, pb as kept};
-use palpate_session::saved::{self, Saved};
+use palpate_session::snapshot::{self, Saved};
 use palpate_session::wire;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;

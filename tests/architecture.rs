@@ -7,7 +7,7 @@ use std::process::Command;
 
 /// The crates of more than a few files, and the order of their modules: each may use those before it. `*` is all others.
 const MODULES: [(&str, &[&str]); 4] = [
-    ("crates/tissue", &["limits", "lock", "memory", "files", "shape", "scene", "texture", "*", "force_law"]),
+    ("crates/tissue", &["limits", "lock", "memory", "files", "shape", "scene", "texture", "kernel", "*"]),
     ("crates/session", &["budget", "*", "surface", "wire", "journal"]),
     ("crates/realtime", &["priority", "ids", "*"]),
     (".", &["server", "render"]),
@@ -189,8 +189,8 @@ fn module_of(inside: &Path) -> Module {
 
 /// The files of vectors and of the number format count as one: each names the other's trait.
 fn merged(module: Module) -> Module {
-    let is_vector = module.starts_with(&["lanes".into()]) || module == ["real"];
-    if is_vector { vec!["lanes".into()] } else { module }
+    let is_vector = module.starts_with(&["kernel".into(), "lanes".into()]) || module == ["kernel", "real"];
+    if is_vector { vec!["kernel".into(), "lanes".into()] } else { module }
 }
 
 /// The paths that a file uses, without those of its tests and of modules within it.

@@ -23,7 +23,7 @@ use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::scene::{Change, PAPER, Scene};
-use palpate_tissue::scheme_selection::NEVER;
+use palpate_tissue::select::scheme_selection::NEVER;
 
 /// 2026-01-01.
 const BEGUN_NS: u64 = 1_767_225_600_000_000_000;

@@ -15,7 +15,7 @@ use std::time::Duration;
 use journal_opening::opening;
 use palpate_proto::pb;
 use palpate_tissue::limits::Limits;
-use palpate_tissue::scheme_selection::NEVER;
+use palpate_tissue::select::scheme_selection::NEVER;
 use server::{TEST_TIMEOUT, TestServer, TestTouch, force, waiting};
 
 fn start(folder: &Path) -> TestServer {

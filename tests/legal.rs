@@ -20,7 +20,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::{
     Body, FixedPoints, Integrator, Lanes, Named, PointSet, Precision, Scene, Sheet, Springs, Stepping,
 };
-use palpate_tissue::scheme_selection::NEVER;
+use palpate_tissue::select::scheme_selection::NEVER;
 
 fn name<T: Named>(random: &mut fastrand::Rng) -> T {
     T::NAMES[random.usize(..T::NAMES.len())].1

@@ -23,7 +23,7 @@ use palpate_session::command::{Command, Due};
 use palpate_session::input::Input;
 use palpate_session::intake::Intake;
 use palpate_session::journal::{self, JournalReader, JournalWriter, Opening};
-use palpate_session::saved::Saved;
+use palpate_session::snapshot::Saved;
 use palpate_session::wire;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;

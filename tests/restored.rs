@@ -21,7 +21,7 @@ use palpate_haptics::{Coupling, Tip};
 use palpate_session::Session;
 use palpate_session::command::{Command, Due};
 use palpate_session::intake::Intake;
-use palpate_session::saved::Saved;
+use palpate_session::snapshot::Saved;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::Poke;

@@ -8,9 +8,9 @@ mod cases;
 mod random_scenes;
 
 use palpate_refusal::Reason;
-use palpate_tissue::integrate::Oscillator;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::{PAPER, Precision, Scene};
+use palpate_tissue::scheme::Oscillator;
 use palpate_tissue::{Model, scheme_selection, stability};
 use random_scenes::{RandomScene, case, errors, mesh_case, play, truth};
 

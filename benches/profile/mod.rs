@@ -24,7 +24,7 @@ const SYSTEM: [(&str, &str); 8] = [
 
 /// Matched against the leaf, outside the system; the first match counts.
 const PROGRAM: [(&str, &str); 17] = [
-    ("palpate_tissue::lanes", "the sweep over the springs"),
+    ("palpate_tissue::kernel::lanes", "the sweep over the springs"),
     ("palpate::tissue", "the sheet beside the sweep: forces, samples, checks"),
     ("libm", "the sheet beside the sweep: forces, samples, checks"),
     ("fma", "the sheet beside the sweep: forces, samples, checks"),

@@ -1,7 +1,7 @@
 //! Conversion of devices, tips, force laws and local models.
 
 use glam::{DMat3, DVec3};
-use palpate_haptics::law::{Law, Row};
+use palpate_haptics::force_law::{Law, Row};
 use palpate_haptics::{ContactState, Coupling, Device, LocalModel, Tip};
 
 use crate::geometry::{from_vector, point, vector};

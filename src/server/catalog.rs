@@ -8,8 +8,8 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::scene::collection::Collection;
 use palpate_tissue::scene::kind::TextKind;
-use palpate_tissue::scene::reader::fits;
 use palpate_tissue::scene::script::Script;
+use palpate_tissue::scene::script_reader::fits;
 use palpate_tissue::scene::{BUILT_IN, Scene};
 
 /// Scenes and scripts by name.

@@ -10,7 +10,7 @@ use super::journals::retention::Keep;
 use palpate_refusal::{Reason, Refusal, Result, number, positive};
 use palpate_tissue::files;
 use palpate_tissue::limits::Limits;
-use palpate_tissue::scene::document::nearest_name;
+use palpate_tissue::scene::toml_document::nearest_name;
 
 /// Everything that you can configure. Absent keys keep their defaults.
 #[derive(Debug, Clone, Deserialize)]

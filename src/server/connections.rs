@@ -22,7 +22,7 @@ use tonic::transport::server::Connected;
 use tracing::{debug, warn};
 
 use super::address::{address_name, network};
-use super::leases::LastingLeases;
+use super::connection_leases::LastingLeases;
 use super::rate::RateLimiter;
 use super::reload::Reloaded;
 use super::tls::{self, Tls};

@@ -18,12 +18,12 @@ use super::job_pool::{CancelFlag, JobPool, Urgency};
 use palpate_haptics::Law;
 use palpate_proto::{pb, touch};
 use palpate_realtime::SessionHandle;
-use palpate_realtime::laws::{SoughtLaw, have_same_laws};
+use palpate_realtime::law_cache::{SoughtLaw, have_same_laws};
 use palpate_session::Sample;
 use palpate_session::budget::Account;
-use palpate_session::laws::{FIRST, Laws};
+use palpate_session::current_laws::{FIRST, Laws};
 use palpate_tissue::Model;
-use palpate_tissue::force_law::Disc;
+use palpate_tissue::response::force_law::Disc;
 
 /// After the laws of a place so many times as long passes until those of another are begun, but not longer than this.
 const PAUSES: u32 = 3;
@@ -248,7 +248,7 @@ mod tests {
     use palpate_session::budget::Budget;
     use palpate_tissue::limits::Limits;
     use palpate_tissue::scene::{Change, PAPER, Scene};
-    use palpate_tissue::scheme_selection::NEVER;
+    use palpate_tissue::select::scheme_selection::NEVER;
 
     /// A session of a tissue whose exact law takes longer than a first one may.
     struct LawSession {
@@ -371,7 +371,10 @@ mod tests {
         assert_eq!((exact.coarse_number, exact.tissue_step), (2, None));
         let exact = exact.law.unwrap();
         assert_eq!((exact.number, exact.coarse), (3, false));
-        assert_eq!(touch::from_law(&exact).unwrap(), palpate_tissue::force_law::exact(&model, course.radius_m()));
+        assert_eq!(
+            touch::from_law(&exact).unwrap(),
+            palpate_tissue::response::force_law::exact(&model, course.radius_m())
+        );
         assert_eq!(laws.newest().0, 3);
         // A stream that opens now begins with it.
         let law = course.begin().await.0;

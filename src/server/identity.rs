@@ -16,7 +16,7 @@ use subtle::ConstantTimeEq;
 
 use palpate_realtime::ids::random_bits;
 use palpate_refusal::{Reason, Refusal, Result, label};
-use palpate_tissue::scene::document::nearest_name;
+use palpate_tissue::scene::toml_document::nearest_name;
 
 /// What a caller may do. Every role includes `Watch`, and `Administer` includes every role but `Node`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]

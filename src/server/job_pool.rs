@@ -22,7 +22,7 @@ use palpate_refusal::{Reason, Refusal};
 use palpate_session::budget::{Account, Turns};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
-use palpate_tissue::scheme_selection::given_up;
+use palpate_tissue::select::scheme_selection::given_up;
 
 /// Number of threads of a job pool.
 const THREADS: usize = 2;

@@ -16,7 +16,7 @@ use palpate_session::budget::{Account, Purpose};
 use palpate_session::wire;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::memory;
-use palpate_tissue::scheme_selection::given_up;
+use palpate_tissue::select::scheme_selection::given_up;
 use palpate_tissue::shape::Extent;
 
 /// Triangles for each vertex that a mesh may have: a closed surface has two.

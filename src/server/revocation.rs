@@ -16,9 +16,9 @@ use tonic::Status;
 use tonic::body::Body;
 use tracing::{info, warn};
 
+use super::connection_leases::LastingLeases;
 use super::connections::Peer;
 use super::identity::{KnownCallers, PresentedCredentials};
-use super::leases::LastingLeases;
 use super::reload::Reloaded;
 use palpate_realtime::SessionHandle;
 use palpate_refusal::{Refusal, Result};

@@ -7,9 +7,9 @@ use palpate_realtime::playback::Playback;
 use palpate_realtime::{RunState, SessionHandle};
 use palpate_session::wire;
 use palpate_tissue::Model;
-use palpate_tissue::audit::Origin;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::record::AuditedError;
+use palpate_tissue::select::audit::Origin;
 
 /// The current state of a session as a message.
 pub(super) fn session(handle: &SessionHandle) -> pb::Session {

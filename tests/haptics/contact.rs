@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::common::{model, scene_with};
 use glam::{DVec2, DVec3};
 use palpate_haptics::{ContactState, Coupling, Tip};
-use palpate_tissue::force_law;
+use palpate_tissue::response::force_law;
 use palpate_tissue::scene::BUILT_IN;
 use palpate_tissue::{self as tissue, Model, Tissue, ToolContact, tangent};
 

@@ -7,12 +7,12 @@ use std::time::{Duration, Instant};
 use crate::common::{model, scene_with};
 use crate::server::{TEST_TIMEOUT, TestServer, TestTouch, open};
 use glam::DVec3;
-use palpate_haptics::law::{Law, Row};
+use palpate_haptics::force_law::{Law, Row};
 use palpate_haptics::{ContactState, Device, Touching};
 use palpate_proto::{pb, touch};
 use palpate_session::wire;
 use palpate_tissue::Model;
-use palpate_tissue::force_law::{self, Disc};
+use palpate_tissue::response::force_law::{self, Disc};
 use palpate_tissue::scene::BUILT_IN;
 use pb::touch_response::Message as Heard;
 

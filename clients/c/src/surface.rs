@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use palpate_client::fleet;
-use palpate_client::shown::ShownSurface;
+use palpate_client::surface_view::ShownSurface;
 use palpate_proto::pb;
 use pb::session_service_client::SessionServiceClient;
 

@@ -8,7 +8,7 @@ use std::time::Instant;
 use glam::{DMat3, DVec3};
 use palpate_client::Reading;
 use palpate_client::bridge::{Offline, PositionOrigin, Ticker};
-use palpate_haptics::law::Row;
+use palpate_haptics::force_law::Row;
 use palpate_haptics::{ContactState, Device, Law, LocalModel};
 use palpate_proto::{pb, touch};
 use pb::touch_response::Message as Heard;

@@ -6,7 +6,7 @@ use glam::DVec3;
 use palpate_client::devices::{Enables, Placement};
 use palpate_refusal::{Reason, Result};
 use palpate_tissue::files::read_text;
-use palpate_tissue::scene::document::{Document, Fields};
+use palpate_tissue::scene::toml_document::{Document, Fields};
 
 /// Largest placement file, bytes.
 const MAX_BYTES: u64 = 1 << 16;

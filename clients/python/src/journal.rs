@@ -9,7 +9,7 @@ use std::sync::atomic::Ordering;
 use palpate_proto::geometry::from_vector;
 use palpate_refusal::Refusal;
 use palpate_session::journal::{self, JournalReader, Survey, pb, replay};
-use palpate_tissue::scheme_selection::given_up;
+use palpate_tissue::select::scheme_selection::given_up;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 

@@ -11,7 +11,7 @@ use palpate_session::run::{RunEvent, RunFailure, told};
 use palpate_tissue::Model;
 use palpate_tissue::scene;
 use palpate_tissue::scene::record::{Record, Run, Summary};
-use palpate_tissue::scheme_selection::given_up;
+use palpate_tissue::select::scheme_selection::given_up;
 use palpate_tissue::shape::PointName;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};

@@ -8,7 +8,7 @@ use glam::DVec3;
 use palpate_refusal::Refusal;
 use palpate_session::command::{Command, Due};
 use palpate_session::intake::Intake;
-use palpate_session::saved::Saved;
+use palpate_session::snapshot::Saved;
 use palpate_session::{self as session, run};
 use palpate_tissue::Model;
 use palpate_tissue::scene::profile::Poke;

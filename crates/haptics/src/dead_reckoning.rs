@@ -1,11 +1,11 @@
 //! Dead reckoning: a client tells its tool's place only when the server would be wrong about it.
 //!
-//! The server plays the movement of the newest command on ([`crate::path`]), and so can the client, which knows it. The next
+//! The server plays the movement of the newest command on ([`crate::pose_playback`]), and so can the client, which knows it. The next
 //! command goes out when the tool is farther from there than a way that the hand would feel: a part of the force, over the
 //! stiffness of the law at this depth ([`crate::Renderer::way_m`]); and in any case so often that the server does not take
 //! the client for gone.
 //!
-//! **Heartbeats.** Each end holds what it does when it hears nothing for 50 ms ([`crate::path::HOLD_S`],
+//! **Heartbeats.** Each end holds what it does when it hears nothing for 50 ms ([`crate::pose_playback::HOLD_S`],
 //! [`crate::envelope::FRESH_S`]). Over a steady network a message every 40 ms is enough; where messages are lost or late it is
 //! not. So each end measures what arrives ([`SendInterval`]) and tells the other how often it wants to hear from it.
 
@@ -14,7 +14,7 @@ use std::collections::VecDeque;
 use glam::DVec3;
 
 use crate::deadband::HEARTBEAT_S;
-use crate::path::EXTRAPOLATE_S;
+use crate::pose_playback::EXTRAPOLATE_S;
 
 /// Shortest time between two heartbeats, s: five of them in the 50 ms after which the other end holds.
 pub const FASTEST_S: f64 = 0.01;

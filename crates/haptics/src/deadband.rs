@@ -6,8 +6,8 @@
 
 use glam::DVec3;
 
-use crate::law::Law;
-use crate::local::{LocalModel, Touching};
+use crate::force_law::Law;
+use crate::local_model::{LocalModel, Touching};
 
 /// Smaller differences are not worth a message, N.
 pub const MIN_N: f64 = 0.01;
@@ -50,7 +50,7 @@ mod tests {
     use glam::DMat3;
 
     use super::*;
-    use crate::local::ContactState;
+    use crate::local_model::ContactState;
 
     /// A spring whose forces at the depths of these tests are without rounding.
     fn law() -> Law {

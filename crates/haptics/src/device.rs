@@ -1,6 +1,6 @@
 //! Haptic devices: the limits that a client declares for its device, so that it gets no larger forces.
 
-use crate::law::{Law, Row};
+use crate::force_law::{Law, Row};
 
 /// A device's descriptor.
 #[derive(Debug, Clone, Copy, PartialEq)]

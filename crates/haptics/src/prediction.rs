@@ -20,7 +20,7 @@ use std::collections::VecDeque;
 
 use glam::DVec3;
 
-use crate::local::{ContactState, is_after};
+use crate::local_model::{ContactState, is_after};
 
 /// Time over which forecasts are compared, s.
 const MEMORY_S: f64 = 0.3;

@@ -24,8 +24,8 @@
 use glam::DVec3;
 
 use crate::envelope::{Envelope, RenderingState, Wanted};
-use crate::law::Law;
-use crate::local::{ContactState, LocalModel, Touching, Track};
+use crate::force_law::Law;
+use crate::local_model::{ContactState, LocalModel, Touching, Track};
 use crate::prediction::Prediction;
 
 /// Time constant with which the error of the last model decays, s.

@@ -4,8 +4,8 @@
 use glam::{DMat3, DVec3};
 use palpate_haptics::device::{DEVICES, Device, SAFE_FORCE_N, UNDECLARED};
 use palpate_haptics::envelope::{ENGAGE_S, FRESH_S, PAUSE_S, SLEW_N_PER_S, STALE_S, Wanted};
-use palpate_haptics::law::Row;
-use palpate_haptics::path::{Path, Play, RELEASE_S, SPEED_M_PER_S};
+use palpate_haptics::force_law::Row;
+use palpate_haptics::pose_playback::{Path, Play, RELEASE_S, SPEED_M_PER_S};
 use palpate_haptics::renderer::{BIAS_S, MAX_LAWS};
 use palpate_haptics::{ContactState, Envelope, Law, LimitCause, LocalModel, Renderer, RenderingState, Touching};
 use proptest::prelude::*;

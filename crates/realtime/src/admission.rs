@@ -10,7 +10,7 @@ use super::audited::Audited;
 use super::clock::{Dilation, now_ns};
 use super::cost::{Cost, check_asked, check_work};
 use super::event_log::{About, EventLog};
-use super::laws::KeptLaws;
+use super::law_cache::KeptLaws;
 use super::pacer::Pacer;
 use super::playback::Playback;
 use super::session_handle::SessionHandle;

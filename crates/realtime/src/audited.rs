@@ -2,8 +2,8 @@
 
 use super::thread_counters::Count;
 use palpate_refusal::Refusal;
-use palpate_tissue::audit::{ErrorExtent, Origin};
 use palpate_tissue::scene::record::{AuditedError, Correction};
+use palpate_tissue::select::audit::{ErrorExtent, Origin};
 
 /// What audits have found of a session.
 #[derive(Debug, Clone, Default)]

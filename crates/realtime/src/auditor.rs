@@ -24,12 +24,12 @@ use super::session_handle::SessionHandle;
 use palpate_refusal::Result;
 use palpate_session::budget::{Purpose, Resource};
 use palpate_tissue::Model;
-use palpate_tissue::audit::{Audit, AuditFinding, FINER, Mark, Origin, WindowInputs};
 use palpate_tissue::guard::INTERVAL_SUBSTEPS;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::record::Correction;
+use palpate_tissue::select::audit::{Audit, AuditFinding, FINER, Mark, Origin, WindowInputs};
 
 /// How long to wait where no session is awake.
 const IDLE: Duration = Duration::from_millis(250);

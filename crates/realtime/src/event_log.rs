@@ -14,7 +14,7 @@ use tokio::sync::watch;
 use super::clock::now_ns;
 use super::inbox::Leaving;
 use palpate_session::input::{Felt, Input};
-use palpate_session::saved::Saved;
+use palpate_session::snapshot::Saved;
 use palpate_tissue::lock::lock;
 use palpate_tissue::{Model, ReadCopy};
 

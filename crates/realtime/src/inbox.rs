@@ -14,10 +14,10 @@ use super::subscribers::{ProbeTap, SampleTap};
 use super::thread_counters::ThreadCounters;
 use palpate_refusal::{Refusal, Result};
 use palpate_session::budget::Account;
-use palpate_session::saved::Saved;
+use palpate_session::snapshot::Saved;
 use palpate_tissue::ReadCopy;
-use palpate_tissue::audit::{Mark, WindowInputs};
 use palpate_tissue::lock::lock;
+use palpate_tissue::select::audit::{Mark, WindowInputs};
 
 /// A session as it is, to continue from.
 pub struct Present {

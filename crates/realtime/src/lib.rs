@@ -18,7 +18,7 @@ pub mod fence;
 pub mod frames;
 pub mod ids;
 mod inbox;
-pub mod laws;
+pub mod law_cache;
 mod pacer;
 pub mod playback;
 mod policy;

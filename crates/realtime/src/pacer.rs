@@ -19,7 +19,7 @@ use super::thread_counters::ThreadCounters;
 use crate::priority::{self, STEPPING_TURN, give_way, give_way_a_little, take_short_turns};
 use palpate_refusal::{Reason, Refusal, Result, excerpt};
 use palpate_session::budget::Budget;
-use palpate_session::local::StiffnessJob;
+use palpate_session::local_model::StiffnessJob;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 

@@ -13,14 +13,14 @@ use super::subscribers::{SampleTap, ViewTap};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::Sample;
 use palpate_session::budget::{Account, Work};
-use palpate_session::local::StiffnessJob;
+use palpate_session::local_model::StiffnessJob;
 use palpate_session::recovery::describe;
-use palpate_session::sampling::PacedSample;
+use palpate_session::sample_selection::PacedSample;
 use palpate_session::surface::{MESH_ROW, Snapshot};
 use palpate_tissue::Hashing;
-use palpate_tissue::audit::Mark;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
+use palpate_tissue::select::audit::Mark;
 
 /// What a hash is read from.
 enum HashSource {

@@ -93,7 +93,7 @@ mod tests {
     use palpate_session::schedule::Schedule;
     use palpate_tissue::limits::Limits;
     use palpate_tissue::scene::{PAPER, Scene};
-    use palpate_tissue::scheme_selection::NEVER;
+    use palpate_tissue::select::scheme_selection::NEVER;
 
     /// In virtual time: 40 sessions of one caller take 2 ms of each millisecond together; one of another keeps its time.
     #[test]

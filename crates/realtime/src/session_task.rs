@@ -27,12 +27,12 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::Session;
 use palpate_session::command::Due;
 use palpate_session::input::Input;
-use palpate_session::local::StiffnessJob;
+use palpate_session::local_model::StiffnessJob;
 use palpate_session::schedule::Schedule;
 use palpate_tissue::Model;
-use palpate_tissue::audit::Mark;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
+use palpate_tissue::select::audit::Mark;
 
 /// Sessions begin on the same beat, whose length this is, ns: a thread wakes once for all of a rate, and so does who
 /// carries what they tell.

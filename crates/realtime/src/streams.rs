@@ -132,7 +132,7 @@ mod tests {
     use palpate_session::budget::Budget;
     use palpate_tissue::limits::Limits;
     use palpate_tissue::scene::{PAPER, Scene};
-    use palpate_tissue::scheme_selection::NEVER;
+    use palpate_tissue::select::scheme_selection::NEVER;
 
     #[test]
     fn who_reads_leaves_slots_to_others_and_to_who_holds_tools() {

@@ -9,8 +9,8 @@ use super::reading::{Copied, Copies, HashReply, Piece, Reading, Recipient, Recor
 use palpate_refusal::Result;
 use palpate_session::Session;
 use palpate_session::budget::{Account, Purpose, Resource, Taken, Work};
-use palpate_session::sampling::PacedSample;
-use palpate_session::sampling::Sampler;
+use palpate_session::sample_selection::PacedSample;
+use palpate_session::sample_selection::Sampler;
 use palpate_tissue::memory;
 use palpate_tissue::scene::record::{Point, Record, ToolRecord};
 use palpate_tissue::shape::PointId;

@@ -10,12 +10,12 @@ use palpate_refusal::Reason;
 use palpate_session::Session;
 use palpate_session::budget::{Account, Budget};
 use palpate_session::command::{Command, Due};
-use palpate_session::sampling::{PacedSample, Sampling};
+use palpate_session::sample_selection::{PacedSample, Sampling};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::scene::{PAPER, Scene};
-use palpate_tissue::scheme_selection::NEVER;
+use palpate_tissue::select::scheme_selection::NEVER;
 
 /// A stream of a sample each step.
 fn all_samples(handle: &SessionHandle) -> Reader<PacedSample> {

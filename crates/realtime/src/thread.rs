@@ -22,7 +22,7 @@ use super::queue::Wakes;
 use super::reading::{Piece, Reading};
 use super::run_queue::RunQueue;
 use super::session_task::{SessionTask, ThreadContext};
-use palpate_session::local::StiffnessJob;
+use palpate_session::local_model::StiffnessJob;
 use palpate_tissue::lock::lock;
 
 /// A stepping thread as others see it: where it is asked, and the new sessions that wait for it.

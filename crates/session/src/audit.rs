@@ -9,10 +9,10 @@ use std::sync::Arc;
 use super::Session;
 use super::command::Due;
 use palpate_tissue::Model;
-use palpate_tissue::audit::{AuditFinding, ErrorExtent, FINER, Mark, WindowInputs, WindowOpening};
 use palpate_tissue::scene::Precision;
 use palpate_tissue::scene::record::{AuditedError, Record};
 use palpate_tissue::scene::script::Script;
+use palpate_tissue::select::audit::{AuditFinding, ErrorExtent, FINER, Mark, WindowInputs, WindowOpening};
 
 /// The model of the session to compare with.
 fn twin_of(model: &Model) -> Arc<Model> {

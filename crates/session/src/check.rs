@@ -8,12 +8,12 @@ use glam::DVec3;
 
 use super::Session;
 use super::scene_report::Prospect;
-use palpate_tissue::integrate::Oscillator;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::scene::{Body, Named, StiffnessBound};
-use palpate_tissue::scheme_selection::{self, Choice};
+use palpate_tissue::scheme::Oscillator;
+use palpate_tissue::select::scheme_selection::{self, Choice};
 use palpate_tissue::shape::PointId;
 use palpate_tissue::{Model, Plan, Push};
 

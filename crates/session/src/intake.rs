@@ -227,7 +227,7 @@ impl Intake {
             lease.tip_radius_m = tip_radius_m(&command);
             let last = lease.last_key.replace(key);
             // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply to
-            // poses played by client time (`palpate_haptics::path`), where each one counts.
+            // poses played by client time (`palpate_haptics::pose_playback`), where each one counts.
             let is_position = |command: &Command| match command.action {
                 Action::Grasp { .. } => true,
                 Action::Pose { .. } => command.at_step.is_some() || command.client_time_ns == 0,

@@ -6,7 +6,7 @@ use super::command::Command;
 use palpate_refusal::{Reason, Refusal, Result, legible, positive};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Scene;
-use palpate_tissue::scene::check::{self, check_free, check_poke, check_reach};
+use palpate_tissue::scene::action_check::{self, check_free, check_poke, check_reach};
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::shape::RestShape;
 
@@ -70,7 +70,7 @@ impl Rules {
                 }
                 let centre_m = self.scene.shape().extent().middle_m();
                 check_reach("pose.position_m", self.scene.shape(), (*place_m - centre_m).length(), &self.limits)?;
-                check::check_tip("pose.tip", self.scene.shape(), tip)
+                action_check::check_tip("pose.tip", self.scene.shape(), tip)
             }
             Action::Release => Ok(()),
         }

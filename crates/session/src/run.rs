@@ -9,12 +9,12 @@ use super::audit::{Twin, Windows};
 use super::command::{Command, Due};
 use super::intake::Intake;
 use palpate_refusal::{Refusal, Result};
-use palpate_tissue::audit::AuditFinding;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Named;
 use palpate_tissue::scene::plot::Curves;
 use palpate_tissue::scene::record::{Correction, Line, Record, Run, Summary, far_warning, write_line};
 use palpate_tissue::scene::script::{Action, Script};
+use palpate_tissue::select::audit::AuditFinding;
 use palpate_tissue::{Model, Tissue};
 
 /// The reason why a run ends early.

@@ -9,11 +9,11 @@ use palpate_haptics::{Coupling, Law, Tip};
 
 use super::{indentation, tool_depth};
 use palpate_tissue::Model;
-use palpate_tissue::force_law::{self, Disc};
-use palpate_tissue::integrate::Oscillator;
+use palpate_tissue::response::force_law::{self, Disc};
 use palpate_tissue::scene::Body;
 use palpate_tissue::scene::profile::{LoadProfile, Poke, PoseProfile, StrengthProfile, weights};
 use palpate_tissue::scene::script::Script;
+use palpate_tissue::scheme::Oscillator;
 use palpate_tissue::shape::{Extent, RestShape};
 
 /// Bounds of what can be meant. Beyond them a unit is probably wrong.

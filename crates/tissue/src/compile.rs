@@ -4,14 +4,14 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use super::integrate::{Oscillator, entry};
-use super::lanes;
 use super::model::{Model, Plan};
-use super::saved::{CorrectedPlan, TissueState};
-use super::scheme_selection::{self, Choice};
-use super::tangent;
+use crate::kernel::lanes;
 use crate::limits::Limits;
+use crate::response::tangent;
 use crate::scene::{Body, Change, Integrator, Named, Precision, Scene, Stepping};
+use crate::scheme::{Oscillator, entry};
+use crate::select::scheme_selection::{self, Choice};
+use crate::state::saved::{CorrectedPlan, TissueState};
 use palpate_refusal::{Reason, Refusal, Result, number, unsigned_zero};
 
 /// What sleeping tiles may add to the error, by default, as a part of it.

@@ -6,16 +6,16 @@ use std::sync::Arc;
 use glam::DVec3;
 use xxhash_rust::xxh3::Xxh3;
 
-use super::applied::Push;
-use super::audit_window::{Mark, WindowInputs};
-use super::checkpoint::CheckFailure;
-use super::contact::{TangentInput, ToolContact};
-use super::field::BLOCK;
 use super::model::{Model, Plan};
-use super::prescribed::Grasp;
-use super::saved::SavedTissue;
+use crate::guard::checkpoint::CheckFailure;
+use crate::kernel::field::BLOCK;
 use crate::scene::profile::Poke;
+use crate::select::audit_window::{Mark, WindowInputs};
 use crate::shape::PointId;
+use crate::state::saved::SavedTissue;
+use crate::tools::applied_force::Push;
+use crate::tools::contact::{TangentInput, ToolContact};
+use crate::tools::prescribed::Grasp;
 use palpate_haptics::Tip;
 
 /// One mass point at the end of a step: displacement, velocity, and the forces on it. Where the applied force jumps,

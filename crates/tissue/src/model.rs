@@ -2,11 +2,11 @@
 
 use std::sync::Arc;
 
-use super::field::{BLOCK, Layout};
-use super::integrate::{Oscillator, QuadratureNode, Scheme};
-use super::mesh::{GraphFault, MeshPlaces};
-use super::stability;
+use crate::body::surface::{GraphFault, MeshPlaces};
+use crate::kernel::field::{BLOCK, Layout};
 use crate::scene::{Body, Integrator, Lanes, Precision, Scene};
+use crate::scheme::stability;
+use crate::scheme::{Oscillator, QuadratureNode, Scheme};
 use crate::shape::{self, PointId, RestShape};
 
 /// The immutable half of a sheet.
@@ -281,7 +281,7 @@ impl Model {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::lanes;
+    use crate::kernel::lanes;
     use crate::limits::Limits;
     use crate::scene::profile::Poke;
 

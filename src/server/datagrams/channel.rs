@@ -13,7 +13,7 @@ use super::tickets::Arrival;
 use crate::server::rate::Bucket;
 use palpate_realtime::clock::now_ns;
 use palpate_refusal::{Reason, Refusal, Result};
-use palpate_session::sampling::WantedHeartbeat;
+use palpate_session::sample_selection::WantedHeartbeat;
 use palpate_tissue::lock::lock;
 
 /// The datagrams of a stream, in both directions. Who listens and who tells share it.

@@ -29,8 +29,8 @@ use palpate_refusal::{Reason, Refusal, Result, excerpt};
 use palpate_session::intake_transfer::Handed;
 use palpate_session::journal::inputs;
 use palpate_session::lease::HandedLease;
-use palpate_tissue::force_law::Disc;
 use palpate_tissue::lock::lock;
+use palpate_tissue::response::force_law::Disc;
 
 /// The other server makes the tissue within this time, or the session stays.
 const PREPARATION: Duration = Duration::from_secs(30);

@@ -27,10 +27,10 @@ use palpate_session::journal::replay::{self, Known, Resumed};
 use palpate_session::journal::{JournalReader, inputs};
 use palpate_session::lease::{HandedLease, LeaseId};
 use palpate_tissue::Model;
-use palpate_tissue::force_law::Disc;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
-use palpate_tissue::scheme_selection::NEVER;
+use palpate_tissue::response::force_law::Disc;
+use palpate_tissue::select::scheme_selection::NEVER;
 
 /// Bytes of a session's state, at most.
 const MAX_STATE_BYTES: usize = 1 << 30;

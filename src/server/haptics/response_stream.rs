@@ -14,7 +14,7 @@ use crate::server::recovered::Notices;
 use palpate_realtime::StreamGuard;
 use palpate_realtime::clock::now_ns;
 use palpate_realtime::queue::Reader;
-use palpate_session::sampling::PacedSample;
+use palpate_session::sample_selection::PacedSample;
 use palpate_session::wire;
 
 /// While samples go by datagram, one goes by the stream as well after so long.

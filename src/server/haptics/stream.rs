@@ -30,10 +30,10 @@ use palpate_realtime::queue::{Reader, Writer, queue};
 use palpate_realtime::{StreamGuard, StreamKind};
 use palpate_refusal::{Reason, Refusal};
 use palpate_session::budget::Account;
-use palpate_session::laws::{FIRST, Laws};
-use palpate_session::sampling::PacedSample;
+use palpate_session::current_laws::{FIRST, Laws};
+use palpate_session::sample_selection::PacedSample;
 use palpate_session::wire;
-use palpate_tissue::scene::check::check_tip;
+use palpate_tissue::scene::action_check::check_tip;
 
 /// What the output of a haptic stream begins with.
 struct Opened {

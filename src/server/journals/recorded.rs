@@ -26,7 +26,7 @@ use palpate_session::journal::inputs::Inputs;
 use palpate_session::journal::{self, JournalReader, JournalWriter, Opening, Replay, pb as kept, seal};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
-use palpate_tissue::scheme_selection::{NEVER, given_up};
+use palpate_tissue::select::scheme_selection::{NEVER, given_up};
 
 /// Moments of a curve of forces.
 const MAX_MOMENTS: usize = 2000;

@@ -12,7 +12,7 @@ use palpate_session::journal::file::JournalFile;
 use palpate_session::journal::{self, JournalReader, Replay, Survey, pb};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
-use palpate_tissue::scheme_selection::NEVER;
+use palpate_tissue::select::scheme_selection::NEVER;
 
 /// What became of a session's journals.
 enum ResumeOutcome {

@@ -20,7 +20,7 @@ use tokio::sync::{Notify, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic_types::StatusExt;
 
-use super::copying::{Copier, Copying};
+use super::copy_fetch::{Copier, Copying};
 use super::ticker::{LoopFeed, ToolPose};
 use super::{Copies, SessionChoice, Target};
 use crate::Error;

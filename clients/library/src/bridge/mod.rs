@@ -6,10 +6,10 @@
 //! When the connection breaks, the network side connects again. Forces return when the operator asks for them. Commands that
 //! were not sent by then are dropped: nothing old is replayed.
 
-mod copying;
+mod copy_fetch;
+mod copy_thread;
 mod line;
 mod offline;
-mod stepping;
 mod tick;
 mod ticker;
 

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate_haptics::envelope::{Envelope, Wanted};
 use palpate_haptics::{Law, LocalModel, Predicted, Prediction, Predictor, Renderer};
-use palpate_session::prediction::TissueCopy;
+use palpate_session::tissue_copy::TissueCopy;
 use palpate_tissue::Model;
 
 use super::setup::{Rendering, Setup, TICK_S};

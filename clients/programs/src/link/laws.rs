@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use palpate_haptics::Law;
 use palpate_tissue::Model;
-use palpate_tissue::force_law::{self, Disc};
+use palpate_tissue::response::force_law::{self, Disc};
 
 /// Those of one tissue.
 #[derive(Debug)]

@@ -25,11 +25,11 @@ use palpate_haptics::{Law, Tip};
 use palpate_refusal::{Reason, Refusal, number};
 use palpate_simulated::network::{Conditions, Transport};
 use palpate_tissue::Model;
-use palpate_tissue::force_law::Disc;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::memory;
+use palpate_tissue::response::force_law::Disc;
 use palpate_tissue::scene::Change;
-use palpate_tissue::scene::check::check_tip;
+use palpate_tissue::scene::action_check::check_tip;
 use palpate_tissue::scene::collection::find_scene;
 
 use crate::ClientFailure;

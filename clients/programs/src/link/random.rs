@@ -11,8 +11,8 @@ use palpate_refusal::Refusal;
 use palpate_simulated::network::{Conditions, Transport};
 use palpate_simulated::random::Random;
 use palpate_tissue::Model;
-use palpate_tissue::force_law::Disc;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::response::force_law::Disc;
 use palpate_tissue::scene::{BUILT_IN, Scene};
 use serde_json::{Value, json};
 

@@ -7,11 +7,11 @@ use palpate_haptics::datagram_health::ReceiveWindow;
 use palpate_haptics::deadband::HEARTBEAT_S;
 use palpate_haptics::{Law, LocalModel, MotionState, SendInterval};
 use palpate_session::command::Command;
-use palpate_session::laws::{FIRST, Laws};
-use palpate_session::sampling::{Deadband, Sampler, Sampling, WantedHeartbeat};
+use palpate_session::current_laws::{FIRST, Laws};
+use palpate_session::sample_selection::{Deadband, Sampler, Sampling, WantedHeartbeat};
 use palpate_simulated::network::Transport;
 use palpate_tissue::Model;
-use palpate_tissue::force_law::Disc;
+use palpate_tissue::response::force_law::Disc;
 use palpate_tissue::scene::script::Action;
 
 use super::laws::PlaceLaws;

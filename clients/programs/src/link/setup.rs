@@ -6,7 +6,7 @@ use palpate_haptics::hand::Hand;
 use palpate_haptics::{Device, Law, Tip};
 use palpate_simulated::network::Conditions;
 use palpate_tissue::Model;
-use palpate_tissue::force_law::Disc;
+use palpate_tissue::response::force_law::Disc;
 
 use super::laws::PlaceLaws;
 use super::spot::Spot;

@@ -7,7 +7,7 @@ use palpate_haptics::device::{DEVICES, UNDECLARED};
 use palpate_haptics::hand::{HANDS, Hand};
 use palpate_refusal::{Reason, Refusal, Result, number};
 use palpate_tissue::files::read_text;
-use palpate_tissue::scene::document::{Document, Fields, Item};
+use palpate_tissue::scene::toml_document::{Document, Fields, Item};
 
 use super::objective::Objective;
 use super::tip::Deadbands;

@@ -19,11 +19,11 @@ use crate::wire::scene::{from_scene, sent};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
-use palpate_tissue::saved::{CorrectedPlan, TissueState};
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::scene::{Appearance, Body, Integrator, MeshShape, Named, PaintedSurface, Precision, Scene};
 use palpate_tissue::shape::PointId;
+use palpate_tissue::state::saved::{CorrectedPlan, TissueState};
 
 /// So many tools a journal is replayed with at least, whatever the limits of the server were.
 const MAX_TOOLS: u32 = 4096;

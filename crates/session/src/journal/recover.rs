@@ -13,7 +13,7 @@ use super::writer::JournalWriter;
 use crate::Session;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::limits::Limits;
-use palpate_tissue::scheme_selection::NEVER;
+use palpate_tissue::select::scheme_selection::NEVER;
 
 fn unwritten(e: &io::Error) -> Refusal {
     Refusal::new(Reason::Unreadable, "", format!("the new journal can't be written: {e}"))

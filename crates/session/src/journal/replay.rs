@@ -13,14 +13,14 @@ use super::reader::{JournalBatch, JournalReader, SnapshotAt, Survey};
 use crate::Session;
 use crate::command::Due;
 use crate::input::Input;
-use crate::prediction::{TICK_POINT_SUBSTEPS, TissueCopy};
 use crate::rules::Rules;
-use crate::saved::{self, Saved};
+use crate::snapshot::{self, Saved};
+use crate::tissue_copy::{TICK_POINT_SUBSTEPS, TissueCopy};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::memory;
-use palpate_tissue::scheme_selection::given_up;
+use palpate_tissue::select::scheme_selection::given_up;
 
 /// What a journal has in its order.
 #[derive(Debug, Clone)]
@@ -182,7 +182,7 @@ impl<R: Read + Seek> Replay<R> {
                 let (batch, snapshot, after) = snapshot(&mut reader, at)?;
                 items = after;
                 (running, until) = (snapshot.running, snapshot.until_step);
-                reader.pay_beside(saved::memory_of(&snapshot.saved)).map_err(|refusal| batch.placed(refusal))?;
+                reader.pay_beside(snapshot::memory_of(&snapshot.saved)).map_err(|refusal| batch.placed(refusal))?;
                 let session = restored(&snapshot, &first, &limits).map_err(|refusal| batch.placed(refusal))?;
                 begins_with = Some(snapshot.hash);
                 session
@@ -353,7 +353,7 @@ impl<R: Read + Seek> Replay<R> {
                 self.snapshots += 1;
                 self.compare(&snapshot.hash, "state")?;
                 if self.difference.is_none() {
-                    self.reader.pay_beside(saved::memory_of(&snapshot.saved))?;
+                    self.reader.pay_beside(snapshot::memory_of(&snapshot.saved))?;
                     let restored = restored(snapshot, &self.first, &self.limits);
                     let restored = restored.map_err(|refusal| self.reader.refuse(&refusal.to_string()))?;
                     self.compare(&message::hash(restored.tissue().state_hash()), "snapshot")?;

@@ -5,9 +5,9 @@
 use bytes::{Bytes, BytesMut};
 use glam::DVec3;
 
+use super::displacements::Snapshot;
 use super::refine::Refinement;
 use super::refine::{COMPONENTS, Points, Rows, Source, Written};
-use super::snapshot::Snapshot;
 use super::wide::{Available, SixteenLanes, WideWork, Width};
 use palpate_tissue::memory;
 

@@ -1,17 +1,17 @@
 //! Frames for viewers: the sheet refined by bilinear interpolation, or the vertices of a mesh as they are, encoded, in
 //! patches.
 
+mod displacements;
 pub mod encode;
 pub mod refine;
 pub mod skin;
-mod snapshot;
 pub mod tiles;
 mod wide;
 
+pub use displacements::Snapshot;
 pub use encode::{Encoding, Frame, encode, encode_over};
 pub use refine::{LARGEST_REFINEMENT, MESH_ROW, Refinement};
 pub use skin::Skin;
-pub use snapshot::Snapshot;
 pub use tiles::FrameTiles;
 
 /// A scene with so many points along x and y, 1 cm apart.

@@ -11,9 +11,9 @@
 
 use std::sync::Arc;
 
+use super::displacements::Snapshot;
 use super::encode::{Encoding, Frame, Patch, Quanta, fill, lay_out};
 use super::refine::{COMPONENTS, Points, Refinement, Rows};
-use super::snapshot::Snapshot;
 use super::wide::{Available, LANES, SixteenLanes, WideWork, Width};
 
 /// Points along a side of a tile.

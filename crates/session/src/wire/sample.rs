@@ -2,7 +2,7 @@
 
 use super::{every, from_record, point};
 use crate::ToolSample;
-use crate::sampling::{Deadband, HEARTBEAT_S, PacedSample, Sampling};
+use crate::sample_selection::{Deadband, HEARTBEAT_S, PacedSample, Sampling};
 use crate::surface::Encoding;
 use palpate_proto::geometry::{from_vector, vector};
 use palpate_proto::{pb, touch};

@@ -2,13 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use super::document::Document;
 use super::kind::{ORDER, TextKind};
-use super::reader::made_for;
 use super::script::{self, Script};
 use super::{BUILT_IN, Scene};
 use crate::files;
 use crate::limits::Limits;
+use crate::scene::script_reader::made_for;
+use crate::scene::toml_document::Document;
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt};
 
 /// Texts by name.

@@ -1,6 +1,6 @@
 //! Scenes and scripts are told apart by their keys, because people give one where the other is wanted.
 
-use super::document::Document;
+use crate::scene::toml_document::Document;
 use palpate_refusal::{Reason, Result};
 
 /// What a text is about.

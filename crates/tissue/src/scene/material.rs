@@ -4,10 +4,10 @@ use std::sync::Arc;
 
 use glam::{DMat3, DVec3};
 
-use super::check::physical;
-use super::document::{Fields, Item};
 use super::membrane::settled_energy_j;
 use super::mesh::{Mesh, MeshShape, PerNodeFactors, group_named};
+use crate::scene::action_check::physical;
+use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{PointId, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, finite_vector, not_negative, number, positive, unsigned_zero};
 

@@ -10,13 +10,13 @@ use palpate_geometry::surface::Surface;
 use palpate_geometry::work::spend;
 use palpate_geometry::{Group, TriangleMesh};
 
-use super::check::physical;
-use super::document::{Fields, Item};
 use super::eigenvalue::largest_of_laplacian;
 use super::shown::{Shown, Simulated};
 use super::source::{Files, SourceMesh};
 use super::volume::Volume;
 use crate::limits::Limits;
+use crate::scene::action_check::physical;
+use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{Extent, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, positive};
 

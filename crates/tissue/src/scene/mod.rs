@@ -2,9 +2,8 @@
 //! message, in `wire`), checked, then never changed.
 
 pub mod action;
-pub mod check;
+pub mod action_check;
 pub mod collection;
-pub mod document;
 mod eigenvalue;
 pub mod kind;
 mod material;
@@ -12,13 +11,14 @@ mod membrane;
 mod mesh;
 pub mod plot;
 pub mod profile;
-pub mod reader;
 pub mod record;
 pub mod script;
+pub mod script_reader;
 pub mod sent;
 mod sheet;
 mod shown;
 mod source;
+pub mod toml_document;
 mod volume;
 mod zero;
 
@@ -28,8 +28,7 @@ use std::sync::Arc;
 use crate::files;
 use crate::limits::Limits;
 use crate::shape::{PointId, RestShape};
-use check::physical;
-use document::{Document, Fields, Item};
+use action_check::physical;
 use kind::TextKind;
 pub use material::{Inclusion, MadeOf, Material, Region};
 pub use mesh::{FixedVertices, Mesh, MeshMetadata, MeshShape, PerNodeFactors, StiffnessBound};
@@ -37,6 +36,7 @@ use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negati
 pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet};
 pub use shown::{BoundPlace, Shown, Simulated};
 use source::Files;
+use toml_document::{Document, Fields, Item};
 pub use volume::{Swelling, Volume};
 
 /// The scene of the paper's figures, built in.

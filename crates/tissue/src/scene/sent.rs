@@ -6,10 +6,10 @@ use palpate_geometry::TriangleMesh;
 use palpate_geometry::write::{Format, write};
 
 use super::Mesh;
-use super::document::{Document, Fields};
 use super::source::unit_text;
 use crate::files;
 use crate::limits::Limits;
+use crate::scene::toml_document::{Document, Fields};
 use palpate_refusal::Result;
 
 /// What the section `[mesh]` of a scene file says of its mesh.

@@ -6,10 +6,10 @@ use std::sync::Arc;
 
 use glam::{DVec2, DVec3};
 
-use super::check::physical;
-use super::document::{Fields, Item};
 use crate::limits::Limits;
 use crate::memory;
+use crate::scene::action_check::physical;
+use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{Extent, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, positive};
 

@@ -6,10 +6,10 @@ use std::sync::{Arc, Mutex};
 use palpate_geometry::organ::{self, Organ, OrganError};
 use palpate_geometry::{ReadLimits, TriangleMesh, Unit};
 
-use super::document::{Fields, Item};
 use crate::files;
 use crate::limits::Limits;
 use crate::lock::lock;
+use crate::scene::toml_document::{Fields, Item};
 use palpate_refusal::{Reason, Result, excerpt};
 
 /// What files a scene may name.

@@ -1,0 +1,238 @@
+//! The force laws of a session's tissue, one for each radius of a tip and place: computed once, whoever asks. With another
+//! tissue they are forgotten.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, OnceLock};
+
+use tokio::sync::MutexGuard;
+
+use palpate_haptics::Law;
+use palpate_refusal::{Reason, Refusal, Result};
+use palpate_session::budget::{Account, Purpose, Resource, Taken};
+use palpate_tissue::Model;
+use palpate_tissue::lock::lock;
+use palpate_tissue::memory;
+use palpate_tissue::response::force_law::{self, Computation, Disc, LawProgress};
+
+/// Laws that a session keeps: of a stroke about a corner of a sheet, and back.
+const MAX_LAWS: usize = 64;
+
+/// What a coarse and an exact law take: some tens of rows of six numbers.
+const LAW_BYTES: u64 = 2 << 10;
+
+/// What a session keeps of laws; the one that was asked for least lately goes when there are too many.
+#[derive(Default)]
+pub struct KeptLaws(Mutex<Option<TissueLaws>>);
+
+/// The laws of one tissue.
+struct TissueLaws {
+    model: Arc<Model>,
+    laws: Vec<Arc<SoughtLaw>>,
+    /// The memory of the laws, and of the tissue, which they need as long as they are computed.
+    taken: Taken,
+}
+
+/// Returns whether two tissues of a session have the same laws. They may have other schemes and substeps.
+pub fn have_same_laws(a: &Model, b: &Model) -> bool {
+    let [a, b] = [a, b].map(|model| &model.scene);
+    a.springs == b.springs
+        && a.anchor_stiffness_n_per_m == b.anchor_stiffness_n_per_m
+        && a.damping_n_s_per_m == b.damping_n_s_per_m
+        && a.volume_stiffness_pa == b.volume_stiffness_pa
+}
+
+impl KeptLaws {
+    /// Returns the law of `model` under a disc, for which at most `most_work` springs times iterations are done. Its
+    /// memory is charged to `payer`.
+    ///
+    /// # Errors
+    /// Refuses if `payer` can't have the memory.
+    pub fn of(&self, disc: Disc, model: &Arc<Model>, most_work: u64, payer: &Account) -> Result<Arc<SoughtLaw>> {
+        let mut kept = lock(&self.0);
+        let kept = match &mut *kept {
+            Some(kept) if have_same_laws(&kept.model, model) => kept,
+            other => {
+                // What was kept is given back first.
+                *other = None;
+                let taken = payer.take(Resource::Memory(Purpose::Laws), model.bytes(), "device")?;
+                other.insert(TissueLaws { model: model.clone(), laws: Vec::new(), taken })
+            }
+        };
+        if let Some(known) = kept.laws.iter().position(|law| law.disc == disc) {
+            // The newest is the last.
+            kept.laws[known..].rotate_left(1);
+            return Ok(kept.laws[kept.laws.len() - 1].clone());
+        }
+        if kept.laws.len() == MAX_LAWS {
+            kept.laws.remove(0);
+        }
+        kept.taken.grow_to(kept.model.bytes() + (kept.laws.len() as u64 + 1) * LAW_BYTES, "device")?;
+        let (coarse, exact, turn) = (OnceLock::new(), OnceLock::new(), tokio::sync::Mutex::default());
+        let law = Arc::new(SoughtLaw { disc, model: kept.model.clone(), most_work, coarse, exact, turn });
+        kept.laws.push(law.clone());
+        Ok(law)
+    }
+}
+
+impl KeptLaws {
+    /// Returns the laws of `model` that are known, exact where they can be; the newest is the last.
+    pub fn known(&self, model: &Model) -> Vec<(Disc, Arc<Law>)> {
+        let kept = lock(&self.0);
+        let kept = kept.as_ref().filter(|kept| have_same_laws(&kept.model, model));
+        let known = |law: &Arc<SoughtLaw>| {
+            let exact = law.exact.get().and_then(|exact| exact.as_ref().ok());
+            Some((law.disc, exact.or(law.coarse.get())?.clone()))
+        };
+        kept.map_or_else(Vec::new, |kept| kept.laws.iter().filter_map(known).collect())
+    }
+}
+
+/// The law of a tissue under a tip: a coarse one at once, the exact one when it is computed.
+#[derive(Debug)]
+pub struct SoughtLaw {
+    disc: Disc,
+    model: Arc<Model>,
+    most_work: u64,
+    coarse: OnceLock<Arc<Law>>,
+    /// Or why there is none.
+    exact: OnceLock<Result<Arc<Law>>>,
+    turn: tokio::sync::Mutex<()>,
+}
+
+impl SoughtLaw {
+    /// Returns the exact law, or why it can't be had, if that is known.
+    pub fn exact(&self) -> Option<Result<Arc<Law>>> {
+        self.exact.get().cloned()
+    }
+
+    /// Sets the law as somebody else has computed it.
+    pub fn is_known(&self, law: Law) {
+        // What is there already is the same.
+        let _ = if law.is_coarse {
+            self.coarse.set(Arc::new(law)).is_ok()
+        } else {
+            self.exact.set(Ok(Arc::new(law))).is_ok()
+        };
+    }
+
+    /// Returns the law to begin with, at most 50 ms of work: the exact one if it is known or takes no longer, else a
+    /// coarse one.
+    ///
+    /// # Errors
+    /// Refuses if no law can be computed with the work that is allowed, or if `stop` is set.
+    pub fn first(&self, stop: &AtomicBool) -> Result<Arc<Law>> {
+        if let Some(Ok(law)) = self.exact.get() {
+            return Ok(law.clone());
+        }
+        if let Some(law) = self.coarse.get() {
+            return Ok(law.clone());
+        }
+        let law = memory::attempt("device", || {
+            let law = force_law::first(&self.model, self.disc, stop);
+            // Hardly any tissue has no coarse law; then the exact one is worth its time.
+            Ok(law.or_else(|| force_law::exact_within(&self.model, self.disc, self.most_work, stop)))
+        });
+        match law?.map(Arc::new) {
+            Some(law) if law.is_coarse => Ok(self.coarse.get_or_init(|| law).clone()),
+            Some(law) => self.exact.get_or_init(|| Ok(law)).clone(),
+            None => {
+                let message = "the force law of this tissue would take too much work: touch without a device";
+                Err(Refusal::new(Reason::NotAvailable, "device", message))
+            }
+        }
+    }
+
+    /// Waits until nobody else computes the exact law. It is computed by one at a time: the others find it then.
+    pub async fn turn(&self) -> MutexGuard<'_, ()> {
+        self.turn.lock().await
+    }
+
+    /// Returns whether nobody computes the exact law.
+    pub fn is_free(&self) -> bool {
+        self.turn.try_lock().is_ok()
+    }
+
+    /// Computes the exact law further, by one depth, or begins it; unless `stop` is set. What is returned goes on with the
+    /// next call. None: [`Self::exact`] tells the result, unless it was stopped.
+    pub fn advance(&self, computation: Option<Computation>, stop: &AtomicBool) -> Option<Computation> {
+        let progress = memory::attempt("law", || {
+            let computation = computation.or_else(|| Computation::new(&self.model, self.disc, self.most_work));
+            Ok(computation.map_or(LawProgress::GivenUp, |computation| computation.advance(&self.model, stop)))
+        });
+        match progress {
+            Ok(LawProgress::UnderWay(computation)) => return Some(computation),
+            Ok(LawProgress::Done(law)) => {
+                let _ = self.exact.set(Ok(Arc::new(law)));
+            }
+            Err(refusal) => {
+                let _ = self.exact.set(Err(refusal));
+            }
+            Ok(LawProgress::GivenUp) if stop.load(Ordering::Relaxed) => {}
+            Ok(LawProgress::GivenUp) => {
+                let message = "the exact force law of this tissue takes more work than limits.law_work allows";
+                let _ = self.exact.set(Err(Refusal::new(Reason::NotAvailable, "law", message)));
+            }
+        }
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+
+    use super::*;
+    use palpate_session::budget::Budget;
+    use palpate_tissue::limits::Limits;
+
+    #[test]
+    fn laws_of_a_tissue_are_kept_charged_and_given_back() {
+        let [soft, hard, finer] =
+            ["damping.coefficient_n_s_per_m=0.3", "damping.coefficient_n_s_per_m=0.6", "stepping.substeps=9"].map(
+                |set| {
+                    Model::parse(
+                        "paper",
+                        palpate_tissue::scene::PAPER,
+                        &["sheet.points=[5, 5]", "stepping.integrator=central", set],
+                    )
+                    .unwrap()
+                },
+            );
+        let budget = Budget::new(&Limits { memory_bytes: 256 << 10, ..Limits::default() }, 1, 1);
+        let (account, kept) = (budget.account("one"), KeptLaws::default());
+        let disc = |radius_m: f64| Disc { radius_m, at_m: DVec3::ZERO };
+        let of = |radius: u32, model: &Arc<Model>| kept.of(disc(f64::from(radius)), model, 1, &account);
+        let taken = || budget.bytes_for(Purpose::Laws);
+        let first = of(1, &soft).unwrap();
+        assert_eq!(taken(), soft.bytes() + LAW_BYTES);
+        // The same, also for a tissue that only steps are finer of.
+        assert!(Arc::ptr_eq(&first, &of(1, &soft).unwrap()));
+        let mut same = Model::clone(&soft);
+        same.plan = finer.plan.clone();
+        assert!(Arc::ptr_eq(&first, &of(1, &Arc::new(same)).unwrap()));
+        (2..100).for_each(|radius| _ = of(radius, &soft).unwrap());
+        assert_eq!(taken(), soft.bytes() + MAX_LAWS as u64 * LAW_BYTES);
+        assert!(!Arc::ptr_eq(&first, &of(1, &soft).unwrap()), "the oldest went");
+        // What is known of a tissue serves another session of the same, and none of another.
+        let law = |is_coarse| Law { is_coarse, ..palpate_tissue::response::force_law::exact(&soft, 0.002) };
+        of(98, &soft).unwrap().is_known(law(true));
+        of(99, &soft).unwrap().is_known(law(true));
+        of(99, &soft).unwrap().is_known(law(false));
+        let known: Vec<_> = kept.known(&soft).into_iter().map(|(disc, law)| (disc, law.is_coarse)).collect();
+        assert_eq!(known, [(disc(98.0), true), (disc(99.0), false)]);
+        assert!(kept.known(&hard).is_empty());
+        // Another tissue.
+        of(1, &hard).unwrap();
+        assert_eq!(taken(), hard.bytes() + LAW_BYTES);
+        // Others have all the rest.
+        let rest = std::iter::from_fn(|| account.take(Resource::Memory(Purpose::Session), 64, "").ok());
+        let rest: Vec<Taken> = rest.collect();
+        let refused = of(2, &hard).unwrap_err();
+        assert_eq!((refused.reason, refused.field.as_str()), (Reason::Overloaded, "device"));
+        assert!(of(1, &hard).is_ok(), "what is kept is there");
+        drop(rest);
+        of(2, &hard).unwrap();
+        drop(kept);
+        assert_eq!(taken(), 0);
+    }
+}

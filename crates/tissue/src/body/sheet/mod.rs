@@ -1,0 +1,6 @@
+//! Sheets: mass points in rows and columns.
+
+pub(crate) mod edge;
+pub(crate) mod footprint;
+pub(crate) mod grid;
+pub(crate) mod sweep;

@@ -1,0 +1,333 @@
+//! The springs of a mesh as the vectors of a width read them.
+//!
+//! A spring has five coefficients: the three components of the rest vector D0, 1/L0², and the stiffness over the relative
+//! mass of its own end. A row holds one spring for each lane, coefficient by coefficient; where a lane has none, all
+//! are 0. There are two arrangements of rows:
+//!
+//! - [`Rows`], for any width: row k of a vector of slots has the k-th spring of each. The neighbours are loaded from
+//!   their records, wherever these are.
+//! - [`Halo`], for vectors as long as a block that can move lanes: the block's outside neighbours, its halo, are loaded
+//!   once, and each row picks its neighbours among these and the block's own points. Points with more springs than most
+//!   of the block would leave many lanes of the last rows empty. So the springs beyond the *plain* rows are *packed*:
+//!   each lane of such a row has a spring of any point of the block, and its force is moved to that point's lane.
+
+use palpate_geometry::work::spend;
+
+use super::order::TABLES;
+use super::slots::{HALO, HalfSpring, MeshSlots, part};
+use crate::kernel::field::{BLOCK, Field};
+use crate::kernel::lanes::{LaneShape, Names, record_place};
+use crate::kernel::real::Real;
+use crate::memory;
+
+/// Coefficients of a spring.
+pub(super) const COEFFICIENTS: usize = 5;
+
+/// The springs of a mesh for a number format and a width. Independent of substep and scheme.
+#[derive(Debug)]
+pub(crate) struct MeshSprings<T> {
+    /// The vectors that they are arranged for.
+    pub(super) shape: LaneShape,
+    /// The number of slots.
+    pub(super) slots: usize,
+    pub(super) arrangement: Arrangement<T>,
+    /// The relative mass of each slot. `None` if all are 1.
+    pub(super) masses: Option<Field<T>>,
+    /// The extra K″/m of each slot over that of reference. `None` if all are 0.
+    pub(super) extra: Option<Field<T>>,
+}
+
+#[derive(Debug)]
+pub(super) enum Arrangement<T> {
+    Rows(Rows<T>),
+    Halo(Halo<T>),
+}
+
+/// The k-th springs of each vector of slots in row k.
+#[derive(Debug)]
+pub(super) struct Rows<T> {
+    /// For each vector of slots, its first row; then the number of all.
+    pub(super) firsts: Vec<u32>,
+    /// For each row and lane, where the record of the other end begins.
+    pub(super) places: Vec<u32>,
+    pub(super) coefficients: Field<T>,
+}
+
+/// The springs of each block in one part or more.
+#[derive(Debug)]
+pub(super) struct Halo<T> {
+    /// For each block, its first part; then the number of all.
+    pub(super) firsts: Vec<u32>,
+    pub(super) parts: Vec<Part>,
+    /// Where the records of the halos begin: each has whole vectors.
+    pub(super) places: Vec<u32>,
+    /// For each row, the other ends: among the block's own points, and then in its halo.
+    pub(super) others: Vec<Names>,
+    pub(super) coefficients: Field<T>,
+    /// For each packed row, the lanes of the springs' own ends, and the number of passes that move its forces.
+    pub(super) owners: Vec<Names>,
+    pub(super) passes: Vec<u8>,
+    /// For each pass, the lane whose force comes to each lane.
+    pub(super) returns: Vec<Names>,
+}
+
+/// Part of a block's springs.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Part {
+    /// The first row.
+    pub(super) row: u32,
+    /// Plain rows, and packed rows after these.
+    pub(super) plain: u32,
+    pub(super) packed: u32,
+    /// The first packed row among all packed rows, and the first pass.
+    pub(super) first_packed: u32,
+    pub(super) first_pass: u32,
+    /// The first place of the halo.
+    pub(super) place: u32,
+    /// Half vectors of the halo: 1 to 6. With [`ONE_AND_A_HALF`], the second has only the lanes of
+    /// [`Vector::half_of_records`](crate::kernel::lanes::Vector::half_of_records).
+    pub(super) halves: u32,
+}
+
+/// The most common size of a halo: 17 to 24 points around a block.
+pub(super) const ONE_AND_A_HALF: u32 = 3;
+
+/// Half vectors that hold a halo.
+fn halves_of(around: &[u32]) -> usize {
+    around.len().div_ceil(BLOCK / 2).max(1)
+}
+
+/// The lane of a point of a halo, counted over its vectors.
+fn halo_lane(number: usize, halves: usize) -> usize {
+    let beyond = number.checked_sub(BLOCK).filter(|_| halves == ONE_AND_A_HALF as usize);
+    beyond.map_or(number, |beyond| BLOCK + beyond / 2 * 4 + beyond % 2)
+}
+
+impl<T: Real> MeshSprings<T> {
+    /// The relative mass of each slot, and the extra K″/m of each; null if all are 1, or 0.
+    pub(crate) fn masses_and_extra(&self) -> [*const T; 2] {
+        [&self.masses, &self.extra].map(|field| field.as_ref().map_or(std::ptr::null(), |field| field.as_ptr()))
+    }
+
+    /// Arranges the springs of a mesh.
+    pub(crate) fn new(slots: &MeshSlots, shape: LaneShape) -> Self {
+        let of_slots = |values: &[f64]| {
+            (!values.is_empty()).then(|| {
+                let mut field = Field::of_length(values.len());
+                field.iter_mut().zip(values).for_each(|(to, value)| *to = T::of(*value));
+                field
+            })
+        };
+        let arrangement = if shape.picks && shape.lanes == BLOCK {
+            Arrangement::Halo(Halo::new(slots))
+        } else {
+            Arrangement::Rows(Rows::new(slots, shape.lanes))
+        };
+        let (masses, extra) = (of_slots(slots.masses()), of_slots(slots.extra()));
+        MeshSprings { shape, slots: slots.vertex_of().len(), arrangement, masses, extra }
+    }
+}
+
+/// The coefficients of a spring.
+pub(super) fn coefficients<T: Real>(half: &HalfSpring) -> [T; COEFFICIENTS] {
+    // A component below the normal range of squares would be slow, and changes nothing.
+    let rest =
+        half.rest.to_array().map(T::of).map(|c| if c.magnitude() < T::of(T::MIN_MAGNITUDE) { T::default() } else { c });
+    let squared: f64 = rest.iter().map(|c| c.wide() * c.wide()).sum();
+    [rest[0], rest[1], rest[2], T::of(squared.recip()), T::of(half.stiffness)]
+}
+
+/// Writes a spring to a lane of a row.
+fn write<T: Real>(row: &mut [T], lane: usize, half: &HalfSpring) {
+    let lanes = row.len() / COEFFICIENTS;
+    for (which, value) in coefficients(half).into_iter().enumerate() {
+        row[which * lanes + lane] = value;
+    }
+}
+
+#[allow(clippy::cast_possible_truncation)]
+impl<T: Real> Rows<T> {
+    fn new(slots: &MeshSlots, lanes: usize) -> Self {
+        let count = slots.vertex_of().len();
+        let mut firsts = memory::with_room(count / lanes + 1, TABLES);
+        let mut rows = 0_usize;
+        for first in (0..count).step_by(lanes) {
+            firsts.push(rows as u32);
+            rows += (first..first + lanes).map(|slot| slots.springs(slot).len()).max().unwrap_or(0);
+        }
+        firsts.push(rows as u32);
+        let mut places: Vec<u32> = memory::zeroed(rows * lanes, TABLES);
+        let mut coefficients = Field::of_length(rows * lanes * COEFFICIENTS);
+        for (vector, rows) in firsts.windows(2).enumerate() {
+            spend(1 + lanes * (rows[1] - rows[0]) as usize);
+            for (k, row) in (rows[0] as usize..rows[1] as usize).enumerate() {
+                let into = &mut coefficients[row * lanes * COEFFICIENTS..][..lanes * COEFFICIENTS];
+                for lane in 0..lanes {
+                    let slot = vector * lanes + lane;
+                    let half = slots.springs(slot).get(k);
+                    half.into_iter().for_each(|half| write(into, lane, half));
+                    places[row * lanes + lane] = record_place(half.map_or(slot, |half| half.to as usize)) as u32;
+                }
+            }
+        }
+        Rows { firsts, places, coefficients }
+    }
+}
+
+/// The springs of a lane in a row, if it has one, and the lane of its own end.
+type Lanes<'a> = [Option<(usize, &'a HalfSpring)>; BLOCK];
+
+/// A halo under construction.
+struct Packing<T> {
+    halo: Halo<T>,
+    coefficients: Vec<T>,
+}
+
+#[allow(clippy::cast_possible_truncation)]
+impl<T: Real> Halo<T> {
+    fn new(slots: &MeshSlots) -> Self {
+        // About as much as it takes. (A third of the lanes may be empty.)
+        let bytes = slots.count() * (COEFFICIENTS * size_of::<T>() + 4) * 3 / 2;
+        memory::require(bytes as u64, TABLES);
+        let halo = Halo {
+            firsts: Vec::new(),
+            parts: Vec::new(),
+            places: Vec::new(),
+            others: Vec::new(),
+            coefficients: Field::of_length(0),
+            owners: Vec::new(),
+            passes: Vec::new(),
+            returns: Vec::new(),
+        };
+        let mut packing = Packing { halo, coefficients: Vec::new() };
+        for block in 0..slots.blocks() {
+            packing.halo.firsts.push(packing.halo.parts.len() as u32);
+            let outside = slots.outside(block);
+            spend(64 + 8 * outside.len());
+            let mut later: [&[HalfSpring]; BLOCK] = std::array::from_fn(|lane| slots.springs(block * BLOCK + lane));
+            for number in 0..outside.len().div_ceil(HALO).max(1) {
+                let springs: [&[HalfSpring]; BLOCK] = std::array::from_fn(|lane| {
+                    let count = later[lane].partition_point(|half| part(&outside, block, half.to) <= number);
+                    let (springs, others) = later[lane].split_at(count);
+                    later[lane] = others;
+                    springs
+                });
+                let from = (number * HALO).min(outside.len());
+                packing.push_part(block, &outside[from..(from + HALO).min(outside.len())], &springs);
+            }
+        }
+        let Packing { mut halo, coefficients } = packing;
+        halo.firsts.push(halo.parts.len() as u32);
+        halo.coefficients = Field::of_length(coefficients.len());
+        halo.coefficients.copy_from_slice(&coefficients);
+        halo
+    }
+}
+
+#[allow(clippy::cast_possible_truncation)]
+impl<T: Real> Packing<T> {
+    /// Adds springs of a block that end in it or in `around`.
+    fn push_part(&mut self, block: usize, around: &[u32], springs: &[&[HalfSpring]; BLOCK]) {
+        let plain = plain_rows(springs);
+        let packed = beyond(springs, plain);
+        let halves = halves_of(around);
+        let halo = &mut self.halo;
+        halo.parts.push(Part {
+            row: halo.others.len() as u32,
+            plain: plain as u32,
+            packed: packed.len().div_ceil(BLOCK) as u32,
+            first_packed: halo.owners.len() as u32,
+            first_pass: halo.returns.len() as u32,
+            place: halo.places.len() as u32,
+            halves: halves as u32,
+        });
+        let from = halo.places.len();
+        halo.places.resize(from + halves.div_ceil(2) * BLOCK, record_place(block * BLOCK) as u32);
+        for (number, slot) in around.iter().enumerate() {
+            halo.places[from + halo_lane(number, halves)] = record_place(*slot as usize) as u32;
+        }
+        for k in 0..plain {
+            self.push_row(block, around, &std::array::from_fn(|lane| Some(lane).zip(springs[lane].get(k))));
+        }
+        for row in packed.chunks(BLOCK) {
+            let lanes: Lanes<'_> = std::array::from_fn(|n| row.get(n).map(|&(lane, k)| (lane, &springs[lane][k])));
+            self.push_row(block, around, &lanes);
+            let halo = &mut self.halo;
+            let owners = std::array::from_fn(|n| row.get(n).map_or(n, |(lane, _)| *lane) as u8);
+            halo.owners.push(Names::of(owners, BLOCK));
+            let passes = passes(row);
+            halo.passes.push(passes as u8);
+            for pass in 0..passes {
+                halo.returns.push(Names::of_some(std::array::from_fn(|lane| {
+                    let mut own = row.iter().enumerate().filter(|(_, spring)| spring.0 == lane);
+                    own.nth(pass).map(|(n, _)| n as u8)
+                })));
+            }
+        }
+    }
+
+    /// Adds a row.
+    fn push_row(&mut self, block: usize, around: &[u32], lanes: &Lanes<'_>) {
+        let halves = halves_of(around);
+        let from = self.coefficients.len();
+        self.coefficients.resize(from + BLOCK * COEFFICIENTS, T::default());
+        let mut others = [0; BLOCK];
+        for (n, spring) in lanes.iter().enumerate() {
+            others[n] = n as u8;
+            if let Some((_, half)) = spring {
+                write(&mut self.coefficients[from..], n, half);
+                let to = half.to as usize;
+                let number = || around.partition_point(|slot| *slot < half.to);
+                let lane = if to / BLOCK == block { to % BLOCK } else { BLOCK + halo_lane(number(), halves) };
+                others[n] = lane as u8;
+            }
+        }
+        self.halo.others.push(Names::of(others, BLOCK));
+    }
+}
+
+/// (lane, number) of the springs beyond the first `plain` ones of each lane, in the order of their numbers.
+fn beyond(springs: &[&[HalfSpring]; BLOCK], plain: usize) -> Vec<(usize, usize)> {
+    let most = springs.iter().map(|springs| springs.len()).max().unwrap_or(0);
+    let of = |k: usize| (0..BLOCK).filter(move |lane| k < springs[*lane].len()).map(move |lane| (lane, k));
+    (plain..most).flat_map(of).collect()
+}
+
+/// Passes that move the forces of a packed row: the most springs that any lane has there.
+fn passes(row: &[(usize, usize)]) -> usize {
+    (0..BLOCK).map(|lane| row.iter().filter(|spring| spring.0 == lane).count()).max().unwrap_or(0)
+}
+
+/// The number of plain rows that costs least, if a packed row takes 1.5 times as long as a plain one and a quarter more
+/// for each pass. (Estimates; with 1.1 or 2.2 a step takes as long.)
+#[allow(clippy::cast_precision_loss)]
+fn plain_rows(springs: &[&[HalfSpring]; BLOCK]) -> usize {
+    let most = springs.iter().map(|springs| springs.len()).max().unwrap_or(0);
+    let of_row = |row: &[(usize, usize)]| 1.5 + 0.25 * passes(row) as f64;
+    let cost = |plain: usize| plain as f64 + beyond(springs, plain).chunks(BLOCK).map(of_row).sum::<f64>();
+    (0..=most).min_by(|a, b| cost(*a).total_cmp(&cost(*b))).unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec3;
+
+    use super::*;
+
+    /// Rows of a block of which so many lanes have a first spring, so many a second, and so on.
+    fn plain_rows_of(filled: &[usize]) -> usize {
+        let half = HalfSpring { to: 0, rest: DVec3::X, stiffness: 1.0 };
+        let lanes: [Vec<HalfSpring>; BLOCK] =
+            std::array::from_fn(|lane| vec![half; filled.iter().filter(|count| lane < **count).count()]);
+        plain_rows(&std::array::from_fn(|lane| &lanes[lane][..]))
+    }
+
+    #[test]
+    fn rows_that_most_lanes_fill_are_plain_and_the_springs_that_one_lane_has_beyond_are_packed() {
+        assert_eq!(plain_rows_of(&[16, 16, 16]), 3);
+        // Two springs more: moving them into other rows costs more than a row for them.
+        assert_eq!(plain_rows_of(&[15, 15, 2]), 3);
+        assert_eq!(plain_rows_of(&[16, 16, 1, 1, 1, 1, 1, 1, 1, 1, 1]), 2);
+        assert_eq!(plain_rows_of(&[]), 0);
+    }
+}

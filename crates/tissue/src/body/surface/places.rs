@@ -1,0 +1,206 @@
+//! Where the points of a mesh rest, by slots, and what its tiles border on: what forces and sleep ask of a mesh.
+
+use std::ops::Range;
+
+use glam::DVec3;
+
+use super::graph::{GraphFault, MeshGraph, MeshSpring};
+use super::order::{TABLES, TILE_SLOTS};
+use super::slots::{MeshSlots, NO_VERTEX};
+use crate::kernel::field::BLOCK;
+use crate::memory;
+use crate::scene::Mesh;
+use crate::shape::{Extent, PointId, RestShape};
+
+/// The slots of a mesh, and where they are in space.
+#[derive(Debug)]
+pub(crate) struct MeshPlaces {
+    pub(crate) slots: MeshSlots,
+    /// Where the point of each slot rests, m; not a number where there is none.
+    rest_m: Vec<DVec3>,
+    /// The middle of each row's points, m, and the radius of the ball around them.
+    balls: Vec<(DVec3, f64)>,
+    /// The ends of the box around each tile's points, m.
+    boxes: Vec<[[f64; 2]; 3]>,
+    /// The slots beyond each tile that its springs lead to, ascending; and where each tile's begin, and the last end.
+    around: Vec<u32>,
+    firsts_around: Vec<usize>,
+    /// For each tile, the least K″ of a point over that of reference. Empty if all are 1.
+    least_pulls: Vec<f64>,
+    /// The least extra K″/m of any point, at most 0; and the largest relative mass.
+    pub(crate) least_extra: f64,
+    pub(crate) largest_mass: f64,
+    /// What the mesh encloses, if that resists.
+    pub(crate) volume: Option<VolumePlaces>,
+}
+
+/// A volume by slots.
+#[derive(Debug)]
+pub(crate) struct VolumePlaces {
+    /// a of each slot, in squares of the unit of length.
+    pub(crate) areas: Vec<DVec3>,
+    /// The fourth power of the unit of length over the volume, m: times κ the stiffness of the growth of the volume.
+    pub(crate) stretch_m: f64,
+    /// For each tile, the largest a of a point that moves over its K″ over that of reference.
+    pub(crate) reaches: Vec<f64>,
+}
+
+impl VolumePlaces {
+    fn of(mesh: &Mesh, slots: &MeshSlots) -> Option<Self> {
+        let volume = mesh.volume.as_deref()?;
+        let unit_m = mesh.shape.edge_m();
+        let vertices = slots.vertex_of();
+        let area = |vertex: &u32| {
+            if *vertex == NO_VERTEX { DVec3::ZERO } else { volume.areas_m2[*vertex as usize] / (unit_m * unit_m) }
+        };
+        let areas: Vec<DVec3> = memory::collected(vertices.iter().map(area), TABLES);
+        let reach = |slot: usize| {
+            let moves = vertices[slot] != NO_VERTEX && !mesh.shape.is_fixed(PointId::new(vertices[slot] as usize));
+            let pull = slots.mass(slot) * (1.0 + slots.extra_at(slot));
+            if moves { areas[slot].length() / pull } else { 0.0 }
+        };
+        let of_tile = |tile: usize| tile * TILE_SLOTS..((tile + 1) * TILE_SLOTS).min(areas.len());
+        let reaches = (0..slots.tiles()).map(|tile| of_tile(tile).map(reach).fold(0.0, f64::max)).collect();
+        Some(VolumePlaces { stretch_m: unit_m.powi(4) / volume.volume_m3, reaches, areas })
+    }
+
+    /// a of a slot over its relative mass, in squares of the unit of length.
+    pub(crate) fn over_mass(&self, slots: &MeshSlots, slot: usize) -> DVec3 {
+        let area = self.areas[slot];
+        if area == DVec3::ZERO { area } else { area / slots.mass(slot) }
+    }
+}
+
+impl MeshPlaces {
+    /// Of the mesh of a scene. The k of a spring is that over the k of an edge.
+    ///
+    /// # Errors
+    /// What is wrong with its springs.
+    pub(crate) fn of(mesh: &Mesh) -> Result<Self, GraphFault> {
+        let springs = mesh.springs();
+        let graph = MeshGraph {
+            rest_m: mesh.shape.vertices_m().to_vec(),
+            springs: springs.map(|(ends, stiffness_n_per_m)| MeshSpring { ends, stiffness_n_per_m }).collect(),
+            spacing_m: mesh.shape.edge_m(),
+            relative_mass: mesh.differences.relative_mass.clone(),
+            extra_anchor: mesh.differences.extra_anchor.clone(),
+        };
+        let slots = MeshSlots::new(&graph)?;
+        let place_m = |vertex: &u32| if *vertex == NO_VERTEX { DVec3::NAN } else { graph.rest_m[*vertex as usize] };
+        let rest_m = memory::collected(slots.vertex_of().iter().map(place_m), TABLES);
+        let within =
+            |range: Range<usize>| rest_m[range.start..range.end.min(rest_m.len())].iter().filter(|m| m.is_finite());
+        #[allow(clippy::cast_precision_loss)]
+        let ball = |row: usize| {
+            let places = || within(row * BLOCK..(row + 1) * BLOCK);
+            let centre_m = places().sum::<DVec3>() / places().count() as f64;
+            (centre_m, places().map(|place_m| place_m.distance(centre_m)).fold(0.0, f64::max))
+        };
+        let box_of = |tile: usize| {
+            let places = || within(tile * TILE_SLOTS..(tile + 1) * TILE_SLOTS).copied();
+            let Extent { least_m, most_m } = Extent::around(places());
+            std::array::from_fn(|axis| [least_m[axis], most_m[axis]])
+        };
+        let (mut around, mut firsts_around) = (Vec::new(), vec![0]);
+        for tile in 0..slots.tiles() {
+            let own = tile * TILE_SLOTS..((tile + 1) * TILE_SLOTS).min(rest_m.len());
+            let ends = own.clone().flat_map(|slot| slots.springs(slot)).map(|half| half.to);
+            let mut beyond: Vec<u32> = ends.filter(|slot| !own.contains(&(*slot as usize))).collect();
+            beyond.sort_unstable();
+            beyond.dedup();
+            around.extend(beyond);
+            firsts_around.push(around.len());
+        }
+        let pulled = |tile: usize| {
+            let own = tile * TILE_SLOTS..((tile + 1) * TILE_SLOTS).min(rest_m.len());
+            let own = own.filter(|slot| slots.vertex_of()[*slot] != NO_VERTEX);
+            own.map(|slot| slots.mass(slot) * (1.0 + slots.extra_at(slot))).fold(f64::INFINITY, f64::min)
+        };
+        let is_even = slots.masses().is_empty() && slots.extra().is_empty();
+        let least_pulls = if is_even { Vec::new() } else { (0..slots.tiles()).map(pulled).collect() };
+        let least_extra = slots.extra().iter().copied().fold(0.0, f64::min);
+        let largest_mass = slots.masses().iter().copied().reduce(f64::max).unwrap_or(1.0);
+        let (balls, boxes) = ((0..slots.blocks()).map(ball).collect(), (0..slots.tiles()).map(box_of).collect());
+        let volume = VolumePlaces::of(mesh, &slots);
+        Ok(MeshPlaces {
+            volume,
+            balls,
+            boxes,
+            around,
+            firsts_around,
+            least_pulls,
+            least_extra,
+            largest_mass,
+            slots,
+            rest_m,
+        })
+    }
+
+    /// Rows of memory.
+    pub(crate) fn rows(&self) -> usize {
+        self.slots.blocks()
+    }
+
+    /// The slot of a point.
+    pub(crate) fn slot_of(&self, point: PointId) -> usize {
+        self.slots.slot_of()[point.index()] as usize
+    }
+
+    /// The point in a slot; in an empty one, the first.
+    pub(crate) fn point_in(&self, slot: usize) -> PointId {
+        let vertex = self.slots.vertex_of()[slot];
+        PointId::new(if vertex == NO_VERTEX { 0 } else { vertex as usize })
+    }
+
+    /// The springs of a slot: the slot of the other end, the vector to it at rest in units of length, and k over that of an
+    /// edge.
+    pub(crate) fn joined(&self, slot: usize) -> impl Iterator<Item = (usize, DVec3, f64)> + '_ {
+        let mass = self.slots.mass(slot);
+        self.slots.springs(slot).iter().map(move |half| (half.to as usize, half.rest, half.stiffness * mass))
+    }
+
+    /// Where the point of a slot rests, m.
+    pub(crate) fn rest_m(&self, slot: usize) -> DVec3 {
+        self.rest_m[slot]
+    }
+
+    /// Where the points of a row rest, m.
+    pub(crate) fn rest_in_row(&self, row: usize) -> &[DVec3] {
+        &self.rest_m[row * BLOCK..(row + 1) * BLOCK]
+    }
+
+    /// The rows from the first to the last that may have a point within a ball.
+    pub(crate) fn rows_within(&self, centre_m: DVec3, radius_m: f64) -> Range<usize> {
+        let is_near = |(middle_m, ball_m): &(DVec3, f64)| middle_m.distance(centre_m) - ball_m <= radius_m;
+        match (self.balls.iter().position(is_near), self.balls.iter().rposition(is_near)) {
+            (Some(first), Some(last)) => first..last + 1,
+            _ => 0..0,
+        }
+    }
+
+    /// The ends of the box around the points of a tile along each axis, m.
+    pub(crate) fn box_of(&self, tile: usize) -> &[[f64; 2]; 3] {
+        &self.boxes[tile]
+    }
+
+    /// The least K″ of a tile's points over that of reference.
+    pub(crate) fn least_pull(&self, tile: usize) -> f64 {
+        self.least_pulls.get(tile).copied().unwrap_or(1.0)
+    }
+
+    /// The tiles that springs join to a tile, ascending.
+    pub(crate) fn beside(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
+        self.slots.neighbours(tile).iter().map(|other| *other as usize)
+    }
+
+    /// The slots beyond a tile that its springs lead to, ascending, and the place of the first in the list of all tiles.
+    pub(crate) fn around(&self, tile: usize) -> (&[u32], usize) {
+        let [from, to] = [self.firsts_around[tile], self.firsts_around[tile + 1]];
+        (&self.around[from..to], from)
+    }
+
+    /// The length of that list.
+    pub(crate) fn watched_slots(&self) -> usize {
+        self.around.len()
+    }
+}

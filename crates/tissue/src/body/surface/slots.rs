@@ -1,0 +1,203 @@
+//! Where the points of a mesh are in the state, and the springs of each place in the order in which forces are summed.
+
+use glam::DVec3;
+
+use super::graph::{GraphFault, MeshGraph};
+use super::order::{Adjacency, TABLES, TILE_SLOTS, order};
+use crate::kernel::field::{BLOCK, Layout};
+use crate::kernel::real::Real;
+use crate::memory;
+
+/// The place of no point.
+pub const NO_VERTEX: u32 = u32::MAX;
+
+/// Outside neighbours that a block takes up at once. If it has more, its springs are in several parts.
+pub(super) const HALO: usize = 3 * BLOCK;
+
+/// A spring, seen from one of its ends.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct HalfSpring {
+    /// The slot of the other end.
+    pub(super) to: u32,
+    /// The vector to it at rest, spacings.
+    pub(super) rest: DVec3,
+    /// k over the relative mass of this end, N/m.
+    pub(super) stiffness: f64,
+}
+
+/// The points of a mesh in slots, and their springs. Independent of substep, scheme, number format and vector width.
+#[derive(Debug)]
+pub struct MeshSlots {
+    slot_of: Vec<u32>,
+    vertex_of: Vec<u32>,
+    /// For each slot, the number of its first spring; then the number of all.
+    firsts: Vec<u32>,
+    halves: Vec<HalfSpring>,
+    /// For each slot, the relative mass; 0 without a point. Empty if all are 1.
+    masses: Vec<f64>,
+    /// For each slot, the extra K″/m over that of reference. Empty if all are 0.
+    extra: Vec<f64>,
+    /// For each tile, the number of its first neighbour; then the number of all.
+    first_neighbours: Vec<u32>,
+    neighbours: Vec<u32>,
+}
+
+impl MeshSlots {
+    /// Places the points of a graph.
+    ///
+    /// # Errors
+    /// What is wrong with the graph.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn new(graph: &MeshGraph) -> Result<Self, GraphFault> {
+        graph.check()?;
+        let count = graph.rest_m.len();
+        let adjacency = Adjacency::of(graph);
+        let mut vertex_of = order(count, &adjacency);
+        let mut slot_of = memory::zeroed(count, TABLES);
+        for (slot, vertex) in vertex_of.iter().enumerate() {
+            slot_of[*vertex as usize] = slot as u32;
+        }
+        vertex_of.resize(count.next_multiple_of(BLOCK), NO_VERTEX);
+        let of_slots = |list: &[f64], value: &dyn Fn(u32) -> f64| {
+            let values = vertex_of.iter().map(|vertex| if *vertex == NO_VERTEX { 0.0 } else { value(*vertex) });
+            if list.is_empty() { Vec::new() } else { memory::collected(values, TABLES) }
+        };
+        let masses = of_slots(&graph.relative_mass, &|vertex| graph.mass(vertex));
+        let extra = of_slots(&graph.extra_anchor, &|vertex| graph.extra(vertex));
+        let mut firsts = memory::with_room(vertex_of.len() + 1, TABLES);
+        let mut halves = memory::with_room(2 * graph.springs.len(), TABLES);
+        for (block, vertices) in vertex_of.chunks(BLOCK).enumerate() {
+            let places = || vertices.iter().filter(|vertex| **vertex != NO_VERTEX);
+            let ends = places().flat_map(|vertex| adjacency.of_point(*vertex));
+            let outside = outside(ends.map(|(other, _)| slot_of[*other as usize]), block);
+            for vertex in vertices {
+                firsts.push(halves.len() as u32);
+                let springs = if *vertex == NO_VERTEX { &[] } else { adjacency.of_point(*vertex) };
+                let from = halves.len();
+                halves.extend(springs.iter().map(|&(other, spring)| HalfSpring {
+                    to: slot_of[other as usize],
+                    rest: graph.rest(*vertex, other),
+                    stiffness: graph.springs[spring as usize].stiffness_n_per_m / graph.mass(*vertex),
+                }));
+                // The sort keeps the order of springs between the same points.
+                halves[from..].sort_by_key(|half: &HalfSpring| (part(&outside, block, half.to), half.to));
+            }
+        }
+        firsts.push(halves.len() as u32);
+        let mut slots = MeshSlots {
+            slot_of,
+            vertex_of,
+            firsts,
+            halves,
+            masses,
+            extra,
+            first_neighbours: vec![0],
+            neighbours: Vec::new(),
+        };
+        slots.find_neighbours();
+        Ok(slots)
+    }
+
+    /// Fills in the neighbours of the tiles.
+    #[allow(clippy::cast_possible_truncation)]
+    fn find_neighbours(&mut self) {
+        for tile in 0..self.tiles() {
+            let slots = tile * TILE_SLOTS..((tile + 1) * TILE_SLOTS).min(self.vertex_of.len());
+            let others = self.halves[self.firsts[slots.start] as usize..self.firsts[slots.end] as usize].iter();
+            let mut others: Vec<u32> = others.map(|half| half.to / TILE_SLOTS as u32).collect();
+            others.sort_unstable();
+            others.dedup();
+            self.neighbours.extend(others.into_iter().filter(|other| *other as usize != tile));
+            self.first_neighbours.push(self.neighbours.len() as u32);
+        }
+    }
+
+    /// Returns the slot of each vertex.
+    pub fn slot_of(&self) -> &[u32] {
+        &self.slot_of
+    }
+
+    /// Returns the vertex of each slot; [`NO_VERTEX`] where there is none.
+    pub fn vertex_of(&self) -> &[u32] {
+        &self.vertex_of
+    }
+
+    /// Returns the blocks of 16 slots: the rows of the layout.
+    pub fn blocks(&self) -> usize {
+        self.vertex_of.len() / BLOCK
+    }
+
+    /// Returns the tiles of 256 slots, the last of which may have fewer.
+    pub fn tiles(&self) -> usize {
+        self.vertex_of.len().div_ceil(TILE_SLOTS)
+    }
+
+    /// Returns the other tiles that springs of a tile reach, ascending.
+    pub fn neighbours(&self, tile: usize) -> &[u32] {
+        let [from, to] = [0, 1].map(|next| self.first_neighbours[tile + next] as usize);
+        &self.neighbours[from..to]
+    }
+
+    /// The layout of a state: 16 columns, and the offset of a slot is its number.
+    pub(crate) fn layout<T: Real>(&self) -> Layout {
+        let layout = Layout::new::<T>([self.blocks(), BLOCK]);
+        debug_assert_eq!(layout.stride, BLOCK);
+        layout
+    }
+
+    /// The springs of a slot, in the order in which their forces are summed.
+    pub(super) fn springs(&self, slot: usize) -> &[HalfSpring] {
+        &self.halves[self.firsts[slot] as usize..self.firsts[slot + 1] as usize]
+    }
+
+    /// The number of all halves of springs.
+    pub(super) fn count(&self) -> usize {
+        self.halves.len()
+    }
+
+    /// The slots outside a block that its springs reach, ascending.
+    pub(super) fn outside(&self, block: usize) -> Vec<u32> {
+        let slots = block * BLOCK..(block + 1) * BLOCK;
+        let halves = &self.halves[self.firsts[slots.start] as usize..self.firsts[slots.end] as usize];
+        outside(halves.iter().map(|half| half.to), block)
+    }
+
+    /// The relative masses of the slots. Empty if all are 1.
+    pub(super) fn masses(&self) -> &[f64] {
+        &self.masses
+    }
+
+    /// Whether masses differ.
+    pub(crate) fn has_masses(&self) -> bool {
+        !self.masses.is_empty()
+    }
+
+    /// The mass of a slot over that of reference; 0 without a point, if not all are 1.
+    pub(crate) fn mass(&self, slot: usize) -> f64 {
+        self.masses.get(slot).copied().unwrap_or(1.0)
+    }
+
+    /// K″/m of a slot over that of reference, minus 1.
+    pub(crate) fn extra_at(&self, slot: usize) -> f64 {
+        self.extra.get(slot).copied().unwrap_or(0.0)
+    }
+
+    /// The extra K″/m of the slots over that of reference. Empty if all are 0.
+    pub(super) fn extra(&self) -> &[f64] {
+        &self.extra
+    }
+}
+
+/// Those of some slots that are outside a block, ascending, each once.
+fn outside(slots: impl Iterator<Item = u32>, block: usize) -> Vec<u32> {
+    let mut outside: Vec<u32> = slots.filter(|slot| *slot as usize / BLOCK != block).collect();
+    outside.sort_unstable();
+    outside.dedup();
+    outside
+}
+
+/// The part of a block's springs to which a spring to slot `to` belongs: those within the block, and those to the first
+/// [`HALO`] slots `outside`, are part 0.
+pub(super) fn part(outside: &[u32], block: usize, to: u32) -> usize {
+    if to as usize / BLOCK == block { 0 } else { outside.partition_point(|slot| *slot < to) / HALO }
+}

@@ -1,0 +1,230 @@
+//! The buffers and tables of a sheet's sweeps, and the calls that run a sweep at the machine's vector width.
+#![allow(unsafe_code)]
+
+use std::cell::RefCell;
+use std::sync::Arc;
+
+use crate::body::sheet::grid::Grid;
+use crate::body::sheet::sweep::Sweep;
+use crate::body::surface::pressure::{Pressure, push_of};
+use crate::body::surface::{self, MeshGrid, MeshPlaces, MeshSprings, MeshSweep, Snapshot};
+use crate::kernel::field::{BLOCK, Field, Layout, State};
+use crate::kernel::lanes::{self, Width};
+use crate::kernel::real::Real;
+use crate::kernel::region::Region;
+use crate::kernel::springs::{SpringCoefficients, Springs};
+use crate::kernel::stage::Stage;
+use crate::model::Model;
+use crate::scheme::advance::AdvanceStage;
+use crate::scheme::arithmetic::{Arithmetic, MAX_KEPT};
+use crate::tools::applied_force::{self, Pull, Term};
+
+/// Number of tool forces that need no heap memory.
+const FEW: usize = 4;
+
+/// The springs of a tissue, their forces in a scheme's terms.
+#[derive(Debug, Clone)]
+pub(crate) enum Elastic<T> {
+    Sheet(Springs<T>),
+    /// The places of a mesh; a spring of length 1 with the k of reference, of which those of the mesh are multiples; and what
+    /// the extra anchor stiffness multiplies; and what the growth of a volume multiplies.
+    Mesh(Arc<MeshPlaces>, SpringCoefficients<T>, T, f64),
+}
+
+impl<T: Real> Elastic<T> {
+    /// The force of all springs, of the extra anchor stiffness and of the pressure on a point, over its relative mass; gathered:
+    /// for the few points that a caller asks about. `volume_change`: by how much the volume has grown.
+    pub(crate) fn gather(&self, layout: &Layout, u: &[T], volume_change: f64, point: [usize; 2]) -> [T; 3] {
+        match self {
+            Elastic::Sheet(springs) => springs.gather(layout, u, point),
+            Elastic::Mesh(places, unit, pull, factor) => {
+                let slot = point[0] * BLOCK + point[1];
+                let pressed = places.volume.as_ref().map(|volume| {
+                    (push_of(*factor, volume_change), volume.over_mass(&places.slots, slot).to_array().map(T::of))
+                });
+                surface::gather(&places.slots, unit, *pull, pressed, u, slot)
+            }
+        }
+    }
+}
+
+/// The springs of a mesh as its sweeps read them, and room for a snapshot.
+#[derive(Debug)]
+struct MeshTables<T> {
+    springs: MeshSprings<T>,
+    snapshot: RefCell<Snapshot<T>>,
+}
+
+/// The buffers and tables that a sweep needs beside the state. One for each sheet, made once.
+#[derive(Debug)]
+pub(crate) struct SweepTables<T> {
+    width: Width,
+    pub(crate) layout: Layout,
+    pub(crate) springs: Elastic<T>,
+    /// None of a sheet.
+    mesh: Option<MeshTables<T>>,
+    /// None without a volume.
+    pub(crate) pressure: Option<Pressure<T>>,
+    /// 1 where a point moves, 0 where it is fixed: one plane. `None` if every point moves.
+    pub(crate) free: Option<Field<T>>,
+    /// Only the first rows of each plane are used. Planes of the layout's length need no extra address registers.
+    carry: RefCell<Field<T>>,
+    probe: [T; BLOCK],
+    work: [T; BLOCK],
+}
+
+impl<T: Real> SweepTables<T> {
+    pub(crate) fn new(model: &Model, layout: Layout, springs: Elastic<T>) -> Self {
+        let free = (!model.fixed.is_empty()).then(|| {
+            let mut free = Field::of_length(layout.plane);
+            free.fill(T::of(1.0));
+            model.fixed.iter().for_each(|index| free[layout.offset(*index)] = T::default());
+            free
+        });
+        let zero = [T::default(); BLOCK];
+        let carry = if model.graph.is_some() { Field::of_length(0) } else { Field::zero(&layout) };
+        SweepTables {
+            width: Width::of(model.lanes),
+            layout,
+            springs,
+            mesh: model.graph.as_ref().map(|graph| MeshTables {
+                springs: MeshSprings::new(&graph.slots, lanes::shape::<T>(Width::of(model.lanes))),
+                snapshot: RefCell::new(Snapshot::of(&graph.slots)),
+            }),
+            pressure: model.graph.as_ref().and_then(|graph| Pressure::new(graph, &layout)),
+            free,
+            carry: RefCell::new(carry),
+            probe: zero,
+            work: zero,
+        }
+    }
+
+    /// Of a copy that stays as it is: without what a sweep needs.
+    pub(crate) fn for_copy(&self) -> Self {
+        SweepTables {
+            width: self.width,
+            layout: self.layout,
+            springs: self.springs.clone(),
+            mesh: None,
+            pressure: None,
+            free: None,
+            carry: RefCell::new(Field::of_length(0)),
+            probe: self.probe,
+            work: self.work,
+        }
+    }
+
+    /// The relative mass of each place, and its extra K″/m; null if all are 1, or 0.
+    pub(crate) fn masses_and_extra(&self) -> [*const T; 2] {
+        self.mesh.as_ref().map_or([std::ptr::null(); 2], |mesh| mesh.springs.masses_and_extra())
+    }
+
+    /// By how much the volume has grown, in cubes of the unit of length, after the points of `tiles` have moved to `u`; 0 without
+    /// a volume.
+    pub(crate) fn volume_change(&self, u: &Field<T>, tiles: &[usize]) -> f64 {
+        self.pressure.as_ref().map_or(0.0, |pressure| pressure.volume_change(self.width, &self.layout, u, tiles))
+    }
+
+    /// Sets the pressure of the coming sweeps by how much the volume has grown.
+    pub(crate) fn apply_volume_pressure(&self, volume_change: f64) {
+        if let (Some(pressure), Elastic::Mesh(.., factor)) = (&self.pressure, &self.springs) {
+            pressure.set(push_of(*factor, volume_change));
+        }
+    }
+
+    /// Advances every point with `scheme`. The tools' force is read from field `field` on.
+    pub(crate) fn advance<C: Arithmetic<T>>(
+        &mut self,
+        scheme: &C,
+        state: &mut State<T>,
+        terms: &[Term<T>],
+        field: usize,
+        over: &Region,
+    ) {
+        let mut kept = [std::ptr::null_mut(); MAX_KEPT];
+        for (pointer, field) in kept.iter_mut().zip(&mut state.kept) {
+            *pointer = Arc::make_mut(field).as_mut_ptr();
+        }
+        assert_eq!(state.kept.len(), C::KEPT);
+        // A few forces need no heap memory.
+        let (mut few, mut many) = ([Pull::none(); FEW], Vec::new());
+        let pulls = terms.iter().map(|term| term.pull(field, self.layout.stride));
+        let pulls: &[Pull<'_, T>] = if terms.len() <= FEW {
+            few.iter_mut().zip(pulls).for_each(|(to, pull)| *to = pull);
+            &few[..terms.len()]
+        } else {
+            many.extend(pulls);
+            &many
+        };
+        let u = state.u.as_mut_ptr();
+        let stage = AdvanceStage {
+            layout: self.layout,
+            scheme,
+            u,
+            d: state.d.as_mut_ptr(),
+            kept,
+            pulls,
+            forced: applied_force::rows(terms),
+            free: self.free.as_ref().map_or(std::ptr::null(), |free| free.as_ptr()),
+            masses: self.masses_and_extra()[0],
+            probe: self.probe.as_mut_ptr(),
+            work: self.work.as_mut_ptr(),
+        };
+        let of_points = |field: &Field<T>| field.len() == 3 * self.layout.plane;
+        debug_assert!(state.fields().all(of_points));
+        debug_assert!(self.free.as_ref().is_none_or(|free| free.len() == self.layout.plane));
+        debug_assert!(over.is_within(&self.layout));
+        // SAFETY: all fields have the layout's three planes, padded by a row and a block, and the tables have this
+        // layout; u is written behind what the sweep still reads, through the same pointer.
+        unsafe { self.run(u.cast_const(), over, stage) };
+    }
+
+    /// Sweeps over the displacements `u`.
+    ///
+    /// # Safety
+    /// `u` and the pointers of the stage belong to fields of this layout.
+    pub(crate) unsafe fn survey<S: Stage<T>>(&self, u: *const T, over: &Region, stage: S) {
+        debug_assert!(over.is_within(&self.layout));
+        // SAFETY: as above.
+        unsafe { self.run(u, over, stage) };
+    }
+
+    /// Runs a sweep over the springs.
+    ///
+    /// # Safety
+    /// As for [`SweepTables::survey`].
+    unsafe fn run<S: Stage<T>>(&self, x: *const T, over: &Region, stage: S) {
+        let layout = self.layout;
+        match (&self.springs, &self.mesh) {
+            (Elastic::Mesh(places, unit, pull, _), Some(MeshTables { springs, snapshot })) => {
+                let push = self.pressure.as_ref().map_or((T::default(), std::ptr::null()), Pressure::at_hand);
+                let grid = MeshGrid { layout, slots: &places.slots, springs, unit, pull: *pull, push, x, snapshot };
+                // SAFETY: the caller's promise; the springs and the snapshot were made for these slots and this width.
+                unsafe { lanes::run(self.width, &MeshSweep { grid, over, stage }) };
+            }
+            (Elastic::Sheet(springs), _) => {
+                let mut carry = self.carry.borrow_mut();
+                debug_assert!(carry.len() == 3 * layout.plane);
+                let grid = Grid { layout, springs, x, carry: carry.as_mut_ptr() };
+                // SAFETY: the caller's promise.
+                unsafe { lanes::run(self.width, &Sweep { grid, over, stage }) };
+            }
+            // A copy that stays as it is has no tables, and is not swept.
+            (Elastic::Mesh(..), None) => {}
+        }
+    }
+
+    /// Whether all increments since the last call were finite and below `farthest`. False may also come from a sum of
+    /// many.
+    pub(crate) fn is_settled(&mut self, farthest: f64) -> bool {
+        std::mem::take(&mut self.probe).iter().all(|sum| sum.wide() < farthest * farthest)
+    }
+
+    /// Σ force · travel of the tools since the last call, in the scheme's terms.
+    pub(crate) fn take_work(&mut self) -> f64 {
+        let work = std::mem::take(&mut self.work);
+        // Four chains of additions at once, in a fixed order.
+        let chains: [f64; 4] = std::array::from_fn(|chain| (0..BLOCK / 4).map(|n| work[4 * n + chain].wide()).sum());
+        (chains[0] + chains[1]) + (chains[2] + chains[3])
+    }
+}

@@ -1,0 +1,218 @@
+//! What the guard goes back to and what it checks by: checkpoints, the tools' inputs, and the account of work.
+
+use std::fmt;
+
+use glam::DVec3;
+
+use crate::kernel::field::State;
+use crate::kernel::real::Real;
+use crate::model::Model;
+use crate::shape::PointName;
+use crate::state::saved::{Checks, SavedInput, SavedTip, SavedWork, ensure};
+use crate::tools::applied_force::{Applied, Push};
+use crate::tools::contact::Contacts;
+use crate::tools::prescribed::{Grasp, Prescribed, restored_index};
+use palpate_haptics::Tip;
+use palpate_refusal::Result;
+
+/// Tolerance of the energy balance, as a fraction of energy and of work: errors of the schemes at the stability bound.
+pub const MARGIN: f64 = 0.05;
+
+/// Why a check of the guard failed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum CheckFailure {
+    /// A point is not finite, or is displaced by a billion times the sheet's size.
+    NotFinite {
+        /// The point.
+        point: PointName,
+    },
+    /// Energy from nowhere.
+    Energy {
+        /// Energy of springs, anchor springs and motion, J.
+        energy_j: f64,
+        /// That energy at the last survey, J.
+        before_j: f64,
+        /// Work of all tools since, J.
+        work_j: f64,
+    },
+    /// The springs' force is far from its prediction.
+    Prediction {
+        /// The resulting difference of a displacement, as a fraction of the largest.
+        part: f64,
+    },
+}
+
+impl fmt::Display for CheckFailure {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            CheckFailure::NotFinite { point } => {
+                write!(f, "point {point} was not finite (or a billion sheets away)")
+            }
+            CheckFailure::Energy { energy_j, before_j, work_j } => {
+                write!(
+                    f,
+                    "the energy rose from {before_j:.3e} J to {energy_j:.3e} J, while the tools did {work_j:.3e} J of work"
+                )
+            }
+            CheckFailure::Prediction { part } => {
+                write!(f, "the springs' force was far from its prediction, by {part:.1e} of the largest displacement")
+            }
+        }
+    }
+}
+
+/// An input of a tool.
+#[derive(Debug, Clone)]
+pub(crate) enum Input {
+    Push(Option<Push>),
+    Grasp(usize, Grasp),
+    Pose(DVec3, Tip),
+}
+
+impl Input {
+    pub(crate) fn saved(&self) -> SavedInput {
+        match self {
+            Input::Push(push) => SavedInput::Push(push.as_ref().map(Push::saved).map(Box::new)),
+            Input::Grasp(index, grasp) => SavedInput::Grasp(*index as u64, grasp.saved()),
+            Input::Pose(place_m, tip) => SavedInput::Pose((*place_m).into(), SavedTip::of(tip)),
+        }
+    }
+
+    pub(crate) fn restored(saved: &SavedInput, model: &Model, checks: &Checks<'_>) -> Result<Self> {
+        Ok(match saved {
+            SavedInput::Push(push) => Input::Push(push.as_ref().map(|push| Push::restored(push, checks)).transpose()?),
+            SavedInput::Grasp(index, grasp) => {
+                Input::Grasp(restored_index(model, *index, checks)?, Grasp::restored(grasp, checks)?)
+            }
+            SavedInput::Pose(place_m, tip) => Input::Pose(checks.vector(*place_m)?, tip.restored(checks)?),
+        })
+    }
+}
+
+/// The complete state that a sheet goes back to.
+#[derive(Debug)]
+pub(crate) struct Checkpoint<T: Real> {
+    pub(crate) steps: u64,
+    pub(crate) halvings: u32,
+    pub(crate) state: State<T>,
+    pub(crate) applied: Applied<T>,
+    pub(crate) prescribed: Prescribed,
+    pub(crate) contacts: Contacts,
+    pub(crate) work: Work,
+    /// The recent largest displacement, spacings. Sleep is relative to it.
+    pub(crate) largest: f64,
+    /// Whether the motion that led here has passed the checks, under the present tissue.
+    pub(crate) passed_checks: bool,
+}
+
+/// Steps that the guard repeats from its checkpoint.
+#[derive(Debug)]
+pub(crate) struct Repetition {
+    /// Where a check failed, steps.
+    pub(crate) target: u64,
+    /// Of these steps, from the checkpoint on.
+    pub(crate) inputs: Vec<(u64, usize, Input)>,
+    pub(crate) next_input: usize,
+    pub(crate) halvings: u32,
+}
+
+/// By how much an energy may rise without a cause.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Noise {
+    /// Part of the largest energy so far.
+    pub(crate) part: f64,
+    pub(crate) energy_j: f64,
+}
+
+/// Work of the tools, J, and energies at the last survey.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct Work {
+    /// Work since the last survey, plus what its `present_j` subtracted.
+    pub(crate) done_j: f64,
+    /// Energy at the last survey.
+    energy_j: f64,
+    /// The largest energy at any survey.
+    largest_j: f64,
+    /// What the energy has risen by beyond the work since the tools touch or hold, less what it has lost since.
+    excess_j: f64,
+}
+
+impl Work {
+    /// Adds work.
+    pub(crate) fn add(&mut self, work_j: f64) {
+        self.done_j += work_j;
+    }
+
+    pub(crate) fn saved(&self) -> SavedWork {
+        let Work { done_j, energy_j, largest_j, excess_j } = *self;
+        SavedWork { done_j, energy_j, largest_j, excess_j }
+    }
+
+    pub(crate) fn restored(saved: &SavedWork) -> Result<Self> {
+        let SavedWork { done_j, energy_j, largest_j, excess_j } = *saved;
+        let is_finite = [done_j, energy_j, largest_j, excess_j].iter().all(|energy_j| energy_j.is_finite());
+        ensure(is_finite, "an energy that is not finite")?;
+        Ok(Work { done_j, energy_j, largest_j, excess_j })
+    }
+
+    /// An account that begins with the given energy.
+    pub(crate) fn begun(energy_j: f64, present_j: f64) -> Self {
+        Work { done_j: present_j, energy_j, largest_j: energy_j, excess_j: 0.0 }
+    }
+
+    /// Checks an energy; a rise by `noise` does not count. `present_j` is subtracted from the work so
+    /// far and belongs to the next interval. The account begins anew, but for what was too much while tools touch or hold
+    /// (`is_touched`): what gains a little in every interval must not go on for ever.
+    pub(crate) fn survey(
+        &mut self,
+        energy_j: f64,
+        present_j: f64,
+        noise: Noise,
+        is_touched: bool,
+    ) -> std::result::Result<(), CheckFailure> {
+        let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
+        let excess_j = if is_touched { self.excess_j } else { 0.0 } + energy_j - before_j - work_j;
+        // What is not a number is not within it.
+        let is_within = excess_j <= MARGIN * (before_j + work_j.abs()) + noise.part * self.largest_j + noise.energy_j;
+        if !is_within {
+            return Err(CheckFailure::Energy { energy_j, before_j, work_j });
+        }
+        let largest_j = self.largest_j.max(energy_j);
+        *self = Work { done_j: present_j, energy_j, largest_j, excess_j: excess_j.max(0.0) };
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn energy_comes_from_work_alone() {
+        const EXACT: Noise = Noise { part: 0.0, energy_j: 0.0 };
+        let begun = Work::begun(1.0, 0.0);
+        // Up to the margin.
+        assert_eq!({ begun }.survey(1.04, 0.0, EXACT, false), Ok(()));
+        let found = CheckFailure::Energy { energy_j: 1.2, before_j: 1.0, work_j: 0.0 };
+        assert_eq!({ begun }.survey(1.2, 0.0, EXACT, false), Err(found));
+        let mut worked = begun;
+        worked.add(0.25);
+        // Work that belongs to the next interval does not count in this one.
+        assert!({ worked }.survey(1.25, 0.2, EXACT, false).is_err());
+        assert_eq!(worked.survey(1.2, 0.05, EXACT, false), Ok(()));
+        assert_eq!(worked, Work { done_j: 0.05, energy_j: 1.2, largest_j: 1.2, excess_j: 0.0 });
+        // A gain within the margin counts against the next while a tool touches, until it is lost again.
+        let mut touched = begun;
+        assert_eq!(touched.survey(1.04, 0.0, EXACT, true), Ok(()));
+        assert!({ touched }.survey(1.06, 0.0, EXACT, true).is_err());
+        assert_eq!({ touched }.survey(1.06, 0.0, EXACT, false), Ok(()));
+        assert_eq!(touched.survey(1.0, 0.0, EXACT, true), Ok(()));
+        assert_eq!(touched.survey(1.04, 0.0, EXACT, true), Ok(()));
+        // What is nothing but rounding is no energy.
+        let rounding = Noise { energy_j: 1e-27, ..EXACT };
+        assert_eq!(Work::default().survey(1e-30, 0.0, rounding, true), Ok(()));
+        assert!(Work::default().survey(1e-24, 0.0, rounding, true).is_err());
+        // It goes as it likes.
+        assert_eq!(worked.survey(0.01, 0.0, EXACT, false), Ok(()));
+    }
+}

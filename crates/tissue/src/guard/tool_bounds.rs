@@ -1,0 +1,43 @@
+//! Whether what tools have done at the end of a step is sound: the part of the guard that is about tools.
+//!
+//! The sums by which the guard sees a point go astray are of sweeps. Tools move points after the last sweep of a step, which those sums
+//! show a step later; a snapshot between would have it. So the points under tools are looked at themselves, as few as they are, and the
+//! tools' own numbers: at the end of each step that the guard lets pass, all that a snapshot has is finite.
+
+use glam::DVec3;
+
+use crate::kernel::real::Real;
+use crate::state::saved::LARGEST;
+use crate::state::tissue_state::TissueState;
+use crate::tools::contact::Tool;
+use palpate_haptics::ContactState;
+
+fn is_sound(tool: &Tool) -> bool {
+    let Tool { from_m, to_m, normal, offset_m, gap_m, force_n, steady_n, velocity_m_per_s, .. } = tool;
+    let vectors = [from_m, to_m, normal, offset_m, gap_m, force_n, steady_n, velocity_m_per_s];
+    // What is not a number is not below it.
+    vectors.into_iter().all(|v: &DVec3| v.to_array().into_iter().all(|part| part.abs() < LARGEST))
+}
+
+impl<T: Real> TissueState<T> {
+    /// The place in memory of a point that a tool has brought `farthest` or farther, in spacings, or where a tool is whose own numbers
+    /// are none; `None` if all is well.
+    pub(crate) fn broken_by_tools(&self, farthest: f64) -> Option<usize> {
+        let layout = &self.tables.layout;
+        let is_good = |index: &usize| {
+            (0..3).all(|c| {
+                let at = c * layout.plane + layout.offset(*index);
+                [self.state.u[at], self.state.d[at]].into_iter().all(|value| value.wide().abs() < farthest)
+            })
+        };
+        let of_tool = |tool: &Tool| -> Option<usize> {
+            let mut points = tool.points().map(|point| self.model.index_of(point));
+            if !is_sound(tool) {
+                return Some(points.next().unwrap_or(0));
+            }
+            if tool.contact_state == ContactState::Free { None } else { points.find(|index| !is_good(index)) }
+        };
+        let grasped = self.prescribed.grasped().map(|(index, _)| index).find(|index| !is_good(index));
+        grasped.or_else(|| self.contacts.tools.iter().find_map(of_tool))
+    }
+}

@@ -1,0 +1,147 @@
+//! The exact force law of a tissue under a disc: the whole sheet is pressed in, depth after depth (`tissue::tangent`).
+
+use std::sync::atomic::AtomicBool;
+
+use palpate_haptics::force_law::{Law, Row};
+
+use super::disc::Disc;
+use crate::Model;
+use crate::response::tangent::{self, Accuracy, Course, Deepened, Press, Pressed};
+
+/// Rows of an exact law.
+pub(super) const ROWS: u32 = 21;
+
+/// How many radii of the disc a law reaches.
+const REACH_IN_RADII: f64 = 4.0;
+
+/// An exact law under way, one depth after another.
+#[derive(Debug)]
+pub struct Computation(Box<Press>);
+
+/// What became of a computation.
+#[derive(Debug)]
+pub enum LawProgress {
+    /// It can go on.
+    UnderWay(Computation),
+    /// The law.
+    Done(Law),
+    /// It would take more work than it may, or it was stopped.
+    GivenUp,
+}
+
+impl Computation {
+    /// Begins the computation of the law under a disc, with at most `most_work` springs times iterations; none if they can't suffice.
+    pub fn new(model: &Model, disc: Disc, most_work: u64) -> Option<Self> {
+        Press::within(model, course(disc, ROWS), Accuracy::EXACT, most_work).map(|press| Computation(Box::new(press)))
+    }
+
+    /// Computes the next depth, unless `stop` is set. `model` is the one that it was begun for.
+    pub fn advance(mut self, model: &Model, stop: &AtomicBool) -> LawProgress {
+        match self.0.deepen(model, stop) {
+            Deepened::Further => LawProgress::UnderWay(self),
+            Deepened::Done => LawProgress::Done(from_pressed(self.0.pressed())),
+            Deepened::GivenUp => LawProgress::GivenUp,
+        }
+    }
+}
+
+pub(super) fn course(Disc { radius_m, at_m }: Disc, rows: u32) -> Course {
+    let step_m = REACH_IN_RADII * radius_m / f64::from(rows - 1);
+    Course { radius_m, centre_m: at_m, step_m, count: rows, points: usize::MAX }
+}
+
+/// Returns the exact law of a disc of `radius_m` in the middle of a sheet: some tenths of a second of work for a
+/// thousand points.
+pub fn exact(model: &Model, radius_m: f64) -> Law {
+    let Course { centre_m, step_m, count, .. } = course(Disc::in_middle(model, radius_m), ROWS);
+    from_pressed(&tangent::press(model, radius_m, centre_m, step_m, count))
+}
+
+/// Returns the same with at most `most_work` springs times iterations; none if they don't suffice, or if `stop` is set.
+pub fn exact_within(model: &Model, disc: Disc, most_work: u64, stop: &AtomicBool) -> Option<Law> {
+    pressed(model, disc, ROWS, Accuracy::EXACT, &mut { most_work }, stop)
+}
+
+/// A law of so many rows, whose work is taken from `work`.
+pub(super) fn pressed(
+    model: &Model,
+    disc: Disc,
+    rows: u32,
+    accuracy: Accuracy,
+    work: &mut u64,
+    stop: &AtomicBool,
+) -> Option<Law> {
+    follow(model, course(disc, rows), accuracy, work, stop)
+}
+
+/// The law of a course.
+pub(super) fn follow(
+    model: &Model,
+    course: Course,
+    accuracy: Accuracy,
+    work: &mut u64,
+    stop: &AtomicBool,
+) -> Option<Law> {
+    let mut press = Press::within(model, course, accuracy, *work)?;
+    let mut deepened = Deepened::Further;
+    while deepened == Deepened::Further {
+        deepened = press.deepen(model, stop);
+    }
+    *work = press.left();
+    (deepened == Deepened::Done).then(|| from_pressed(press.pressed()))
+}
+
+fn from_pressed(pressed: &[Pressed]) -> Law {
+    let row = |pressed: &Pressed| {
+        let tangent::Tangent { stiffness_n_per_m: s, damping_n_s_per_m: b, drag_n_s_per_m, .. } = pressed.tangent;
+        Row {
+            force_n: pressed.force_n,
+            stiffness_n_per_m: s.z_axis.z,
+            across_n_per_m: 0.5 * (s.x_axis.x + s.y_axis.y),
+            damping_n_s_per_m: b.z_axis.z,
+            across_n_s_per_m: 0.5 * (b.x_axis.x + b.y_axis.y),
+            drag_n_s_per_m,
+        }
+    };
+    let step_m = pressed.get(1).map_or(0.0, |pressed| pressed.depth_m);
+    Law { step_m, rows: pressed.iter().map(row).collect(), is_coarse: false }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_law_that_would_take_too_long_or_that_nobody_waits_for_is_none() {
+        let model = Model::paper(&["sheet.points=[9, 9]"]);
+        let radius_m = 2.0 * model.shape().edge_m();
+        let (go_on, stop) = (AtomicBool::new(false), AtomicBool::new(true));
+        let (exact, disc) = (exact(&model, radius_m), Disc::in_middle(&model, radius_m));
+        assert!(!exact.is_coarse && exact.rows.len() == 21);
+        assert_eq!(exact_within(&model, disc, u64::MAX, &go_on).as_ref(), Some(&exact));
+        assert!(exact_within(&model, disc, u64::MAX, &stop).is_none());
+        // Too little for certain, and too little as it turns out.
+        assert!(exact_within(&model, disc, 1000, &go_on).is_none());
+        assert!(Computation::new(&model, disc, 1000).is_none());
+        assert!(Computation::new(&model, disc, 100_000).is_some());
+        assert!(exact_within(&model, disc, 100_000, &go_on).is_none());
+        // Depth by depth it has the same bits, and once stopped it stays given up.
+        let mut computation = Computation::new(&model, disc, u64::MAX).unwrap();
+        for depth in 1.. {
+            match computation.advance(&model, &go_on) {
+                LawProgress::UnderWay(further) => computation = further,
+                LawProgress::Done(law) => {
+                    assert_eq!((law, depth), (exact, 21));
+                    break;
+                }
+                LawProgress::GivenUp => panic!("given up at depth {depth}"),
+            }
+        }
+        let LawProgress::UnderWay(computation) =
+            Computation::new(&model, disc, u64::MAX).unwrap().advance(&model, &go_on)
+        else {
+            panic!("one depth is not all");
+        };
+        assert!(matches!(computation.advance(&model, &stop), LawProgress::GivenUp));
+    }
+}

@@ -1,0 +1,607 @@
+//! How stiff the sheet is under a disc: its tangent stiffness around the present place, and the force law of a slow press.
+//!
+//! With E the weights of the disc (`footprint`), one column a direction, and K the tangent stiffness of the sheet, a
+//! disc that is moved by ds quasi-statically is pushed back by S·ds, S = (Eᵀ K⁻¹ E)⁻¹: three solutions K·φ = E. The shape
+//! φ̂ = φ·S, the displacement of all points for a unit of the disc's, tells the damping and the mass that go with it:
+//! B = C·φ̂ᵀφ̂, the derivative of the disc's impedance at rest, and M = m·φ̂ᵀφ̂. A disc that slides carries its dimple
+//! along, and each point is moved by −∂u/∂x·v: drag D = C·Σ ∂u·∂u.
+//!
+//! K of a spring along n is k[nnᵀ + max(0, 1 − L0/L)(I − nnᵀ)]: without the clamp a pressed spring would make it
+//! indefinite. The pressure of a volume adds κ/V0·a·aᵀ, of all points: those far away are held too, so κ is less by what they
+//! would give way ([`volume_compliance`]). Conjugate gradients, the three systems side by side, preconditioned by the points' own blocks. Points far
+//! enough away not to notice are held: a press reaches √(k/K″) spacings.
+
+use std::cell::Cell;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use glam::{DMat3, DQuat, DVec3};
+
+use crate::memory;
+use crate::model::Model;
+use crate::scene::{Body, FixedPoints, Sheet};
+use crate::shape::RestShape;
+use crate::tools::footprint::{Footprint, WeightedNode};
+
+mod window;
+
+use window::{Spring, Triple};
+pub use window::{Window, half_window_m};
+
+/// When a solution is good enough.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Accuracy {
+    /// Residual of the linear systems of a tangent, relative to the right-hand side.
+    residual: f64,
+    /// The same of those on the way of Newton's method.
+    approximate_residual: f64,
+    /// Newton's method has arrived when no point moves farther, in spacings.
+    arrived: f64,
+}
+
+impl Accuracy {
+    /// Forces to about 1e-5.
+    pub const EXACT: Self = Accuracy { residual: 1e-5, approximate_residual: 1e-3, arrived: 1e-5 };
+    /// Forces to about 1e-3, for a third of the work.
+    pub const COARSE: Self = Accuracy { residual: 1e-2, approximate_residual: 1e-2, arrived: 1e-3 };
+}
+
+/// Most iterations of conjugate gradients.
+const MAX_ITERATIONS: u32 = 400;
+
+/// How much may be computed, and whether it is still wanted.
+#[derive(Debug, Clone)]
+struct Allowance<'a> {
+    /// Springs times iterations that are left.
+    left: Cell<u64>,
+    stop: Option<&'a AtomicBool>,
+}
+
+impl Default for Allowance<'_> {
+    fn default() -> Self {
+        Allowance { left: Cell::new(u64::MAX), stop: None }
+    }
+}
+
+impl<'a> Allowance<'a> {
+    /// So many springs times iterations, as long as `stop` is not set.
+    fn of(work: u64, stop: &'a AtomicBool) -> Self {
+        Allowance { left: Cell::new(work), stop: Some(stop) }
+    }
+
+    /// Takes some of it, if there is so much.
+    fn take(&self, work: usize) -> bool {
+        let is_wanted = self.stop.is_none_or(|stop| !stop.load(Ordering::Relaxed));
+        let left = if is_wanted { self.left.get().checked_sub(work as u64) } else { None };
+        self.left.set(left.unwrap_or(0));
+        left.is_some()
+    }
+
+    /// Something had to be left undone.
+    fn is_spent(&self) -> bool {
+        self.left.get() == 0
+    }
+}
+
+/// The sheet around a disc, linearised where it is.
+#[derive(Debug)]
+pub struct LinearPatch<'m> {
+    model: &'m Model,
+    window: Window,
+    /// From rest, m.
+    displacement_m: Vec<DVec3>,
+    /// Whether a point moves.
+    free: Vec<bool>,
+    /// E, by points.
+    weights: Vec<f64>,
+    /// Mass and K″ of each point over those of reference.
+    masses: Vec<f64>,
+    stiffness: Vec<f64>,
+    springs: Vec<Spring>,
+    pressure: Option<SharedPressure>,
+    inverses: Vec<DMat3>,
+    accuracy: Accuracy,
+    allowance: Allowance<'m>,
+}
+
+/// The pressure of a volume on the points of a patch.
+#[derive(Debug)]
+struct SharedPressure {
+    /// a of each point that moves, m²; 0 of those held.
+    areas_m2: Vec<DVec3>,
+    /// The pressure that goes with a growth of the volume, Pa/m³: κ/V0, less by what the points beyond give way.
+    pa_per_m3: f64,
+}
+
+impl SharedPressure {
+    fn of(model: &Model, window: &Window, free: &[bool], turn: &DMat3) -> Option<Self> {
+        let places = model.graph.as_ref()?.volume.as_ref()?;
+        let volume = model.scene.volume()?;
+        let unit_m2 = model.unit_m * model.unit_m;
+        let pa_per_m3 = model.scene.volume_stiffness_pa / volume.volume_m3;
+        let of_point =
+            |(index, free): (usize, &bool)| if *free { *turn * places.areas[index] * unit_m2 } else { DVec3::ZERO };
+        let within = window.points(model).zip(free).filter(|(_, free)| **free);
+        let within: f64 = within.map(|(index, _)| model.volume_compliance.get(index).copied().unwrap_or(0.0)).sum();
+        let beyond = (model.volume_compliance.iter().sum::<f64>() - within).max(0.0);
+        let areas_m2 = window.points(model).zip(free).map(of_point).collect();
+        Some(SharedPressure { areas_m2, pa_per_m3: pa_per_m3 / (1.0 + pa_per_m3 * beyond) })
+    }
+
+    /// By how much the volume grows, m³.
+    fn growth_m3<'x>(&self, moved_m: impl Iterator<Item = &'x DVec3>) -> f64 {
+        self.areas_m2.iter().zip(moved_m).map(|(area, moved_m)| area.dot(*moved_m)).sum()
+    }
+}
+
+/// What a disc feels of slow and small movements.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tangent {
+    /// S, N/m.
+    pub stiffness_n_per_m: DMat3,
+    /// B of movements with the tissue, N·s/m.
+    pub damping_n_s_per_m: DMat3,
+    /// D of sliding, in the rest plane, N·s/m.
+    pub drag_n_s_per_m: f64,
+    /// M, kg.
+    pub mass_kg: f64,
+    /// Iterations that it took.
+    pub iterations: u32,
+}
+
+/// One depth of a slow press by a disc, straight down into a sheet that is otherwise at rest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pressed {
+    /// m.
+    pub depth_m: f64,
+    /// Of the tissue on the disc, outward, N.
+    pub force_n: f64,
+    /// What goes with it.
+    pub tangent: Tangent,
+}
+
+impl<'m> LinearPatch<'m> {
+    /// A window around a footprint, its points displaced so, in their order. Displacements and all that is found are in
+    /// directions turned by `turn`.
+    fn turned(
+        model: &'m Model,
+        footprint: &Footprint,
+        window: Window,
+        displacement_m: Vec<DVec3>,
+        turn: &DMat3,
+    ) -> Self {
+        let mut weights = vec![0.0; window.len()];
+        for WeightedNode { point, weight, .. } in footprint.reached().iter().copied() {
+            if let Some(at) = window.find(model, point) {
+                weights[at] = weight;
+            }
+        }
+        Self::weighted(model, weights, window, displacement_m, turn)
+    }
+
+    /// The same with the weights of the points.
+    fn weighted(model: &'m Model, weights: Vec<f64>, window: Window, displacement_m: Vec<DVec3>, turn: &DMat3) -> Self {
+        let free = window.free(model);
+        let springs = window.springs(model, &free, turn);
+        let masses = window.points(model).map(|index| model.relative_mass_at(index)).collect();
+        let stiffness = window.points(model).map(|index| model.relative_anchor_stiffness_at(index)).collect();
+        let mut patch = LinearPatch {
+            model,
+            pressure: SharedPressure::of(model, &window, &free, turn),
+            window,
+            displacement_m,
+            free,
+            weights,
+            masses,
+            stiffness,
+            springs,
+            inverses: Vec::new(),
+            accuracy: Accuracy::EXACT,
+            allowance: Allowance::default(),
+        };
+        patch.linearise();
+        patch
+    }
+
+    /// Returns the same, not turned.
+    pub fn new(model: &'m Model, footprint: &Footprint, window: Window, displacement_m: Vec<DVec3>) -> Self {
+        Self::turned(model, footprint, window, displacement_m, &DMat3::IDENTITY)
+    }
+
+    /// Forms the springs' tangents and forces where the points are.
+    fn linearise(&mut self) {
+        let own = self.model.scene.anchor_stiffness_n_per_m;
+        self.inverses.clear();
+        self.inverses.extend(self.stiffness.iter().map(|part| DMat3::from_diagonal(DVec3::splat(own * part))));
+        for spring in &mut self.springs {
+            let [a, b] = spring.ends;
+            let delta = self.displacement_m[b] - self.displacement_m[a];
+            let apart_m = spring.rest_m + delta;
+            let rest_squared = spring.rest_m.length_squared();
+            // 1 − L0/L without cancellation (`springs`).
+            let q = ((2.0 * spring.rest_m + delta).dot(delta) / rest_squared).max(1e-12 - 1.0);
+            let s = (1.0 + q).sqrt();
+            let stretch = q / (s * (1.0 + s));
+            let along = apart_m / (s * rest_squared.sqrt());
+            let outer = DMat3::from_cols(along * along.x, along * along.y, along * along.z);
+            let across = stretch.max(0.0);
+            spring.force_n = spring.stiffness_n_per_m * stretch * apart_m;
+            spring.tangent = spring.stiffness_n_per_m * (outer * (1.0 - across) + DMat3::IDENTITY * across);
+            self.inverses[a] += spring.tangent;
+            self.inverses[b] += spring.tangent;
+        }
+        if let Some(SharedPressure { areas_m2, pa_per_m3 }) = &self.pressure {
+            for (block, area) in self.inverses.iter_mut().zip(areas_m2) {
+                *block += DMat3::from_cols(*area * area.x, *area * area.y, *area * area.z) * *pa_per_m3;
+            }
+        }
+        for block in &mut self.inverses {
+            // A point that nothing holds is left alone.
+            *block = if block.determinant() > 0.0 { block.inverse() } else { DMat3::ZERO };
+        }
+    }
+
+    /// K·x of three vectors at once.
+    fn times(&self, x: &[Triple], product: &mut [Triple]) {
+        let own = self.model.scene.anchor_stiffness_n_per_m;
+        for ((product, x), part) in product.iter_mut().zip(x).zip(&self.stiffness) {
+            *product = x.map(|x| own * part * x);
+        }
+        for Spring { ends: [a, b], tangent, .. } in &self.springs {
+            for system in 0..3 {
+                let pull = *tangent * (x[*b][system] - x[*a][system]);
+                product[*a][system] -= pull;
+                product[*b][system] += pull;
+            }
+        }
+        if let Some(pressure) = &self.pressure {
+            for system in 0..3 {
+                let pushed_pa = pressure.pa_per_m3 * pressure.growth_m3(x.iter().map(|x| &x[system]));
+                for (product, area) in product.iter_mut().zip(&pressure.areas_m2) {
+                    product[system] += pushed_pa * *area;
+                }
+            }
+        }
+        for (product, free) in product.iter_mut().zip(&self.free) {
+            if !free {
+                *product = [DVec3::ZERO; 3];
+            }
+        }
+    }
+
+    /// Solves K·x = `right` for three systems, to a residual of `good` parts. Iterations of the slowest.
+    fn solve(&self, right: &[Triple], good: f64) -> (Vec<Triple>, u32) {
+        let dot = |a: &[Triple], b: &[Triple]| {
+            let mut sum = [0.0; 3];
+            for (a, b) in a.iter().zip(b) {
+                (0..3).for_each(|system| sum[system] += a[system].dot(b[system]));
+            }
+            sum
+        };
+        let masked = |triple: &Triple, free: bool| if free { *triple } else { [DVec3::ZERO; 3] };
+        let mut residual: Vec<Triple> = right.iter().zip(&self.free).map(|(r, free)| masked(r, *free)).collect();
+        let whole = dot(&residual, &residual);
+        let precondition = |residual: &[Triple]| -> Vec<Triple> {
+            residual.iter().zip(&self.inverses).map(|(r, inverse)| r.map(|r| *inverse * r)).collect()
+        };
+        let mut x = vec![[DVec3::ZERO; 3]; residual.len()];
+        let mut z = precondition(&residual);
+        let mut direction = z.clone();
+        let mut product = x.clone();
+        let mut rz = dot(&residual, &z);
+        for iteration in 0..MAX_ITERATIONS {
+            let left = dot(&residual, &residual);
+            if (0..3).all(|system| left[system] <= good * good * whole[system]) {
+                return (x, iteration);
+            }
+            if !self.allowance.take(self.springs.len()) {
+                return (x, iteration);
+            }
+            self.times(&direction, &mut product);
+            let curvature = dot(&direction, &product);
+            let step: [f64; 3] = std::array::from_fn(|s| if curvature[s] > 0.0 { rz[s] / curvature[s] } else { 0.0 });
+            for at in 0..x.len() {
+                for s in 0..3 {
+                    x[at][s] += step[s] * direction[at][s];
+                    residual[at][s] -= step[s] * product[at][s];
+                }
+            }
+            z = precondition(&residual);
+            let next = dot(&residual, &z);
+            for (direction, z) in direction.iter_mut().zip(&z) {
+                for s in 0..3 {
+                    let turn = if rz[s] > 0.0 { next[s] / rz[s] } else { 0.0 };
+                    direction[s] = z[s] + turn * direction[s];
+                }
+            }
+            rz = next;
+        }
+        (x, MAX_ITERATIONS)
+    }
+
+    /// Stiffness, damping, drag and mass under the disc.
+    pub fn tangent(&self) -> Tangent {
+        let axes = [DVec3::X, DVec3::Y, DVec3::Z];
+        let right: Vec<Triple> = self.weights.iter().map(|weight| axes.map(|axis| *weight * axis)).collect();
+        let (shapes, iterations) = self.solve(&right, self.accuracy.residual);
+        let compliance = |a: usize, b: usize| -> f64 {
+            self.weights.iter().zip(&shapes).map(|(weight, shape)| weight * shape[b][a]).sum()
+        };
+        let compliance = symmetric(compliance);
+        let stiffness_n_per_m = if compliance.determinant() > 0.0 { compliance.inverse() } else { DMat3::ZERO };
+        // Damping is in proportion to the mass.
+        let overlap =
+            symmetric(|a, b| shapes.iter().zip(&self.masses).map(|(shape, mass)| mass * shape[a].dot(shape[b])).sum());
+        let unit = stiffness_n_per_m * overlap * stiffness_n_per_m;
+        let scene = &self.model.scene;
+        Tangent {
+            stiffness_n_per_m,
+            damping_n_s_per_m: scene.damping_n_s_per_m * unit,
+            drag_n_s_per_m: scene.damping_n_s_per_m * self.slopes(),
+            mass_kg: scene.point_mass_kg() * unit.z_axis.z,
+            iterations,
+        }
+    }
+
+    /// Σ |∂u/∂x|², the mean of both directions.
+    fn slopes(&self) -> f64 {
+        match &self.window {
+            Window::Grid { size, .. } => self.slopes_of_grid(*size),
+            Window::Ball(_) => self.slopes_along_springs(),
+        }
+    }
+
+    fn slopes_of_grid(&self, size: [usize; 2]) -> f64 {
+        let spacing_m = self.model.unit_m;
+        let mut sum = 0.0;
+        for i in 1..size[0].saturating_sub(1) {
+            for j in 1..size[1].saturating_sub(1) {
+                let at = i * size[1] + j;
+                let slope = |step: usize| self.displacement_m[at + step] - self.displacement_m[at - step];
+                sum += slope(1).length_squared() + slope(size[1]).length_squared();
+            }
+        }
+        sum / (8.0 * spacing_m * spacing_m)
+    }
+
+    /// At each point the mean over its springs.
+    fn slopes_along_springs(&self) -> f64 {
+        let mut of_points = vec![(0.0, 0.0); self.free.len()];
+        for Spring { ends: [a, b], rest_m, .. } in &self.springs {
+            let slope = (self.displacement_m[*b] - self.displacement_m[*a]).length_squared() / rest_m.length_squared();
+            for end in [*a, *b] {
+                of_points[end].0 += slope;
+                of_points[end].1 += 1.0;
+            }
+        }
+        let with_mass = of_points.iter().zip(&self.masses).filter(|((_, count), _)| *count > 0.0);
+        with_mass.map(|((slopes, count), mass)| mass * slopes / count).sum()
+    }
+
+    /// Brings the disc's z to `-depth_m` quasi-statically (Newton's method); the force on the disc, N.
+    fn press(&mut self, depth_m: f64) -> f64 {
+        let own = self.model.scene.anchor_stiffness_n_per_m;
+        let mut force_n = 0.0;
+        for _ in 0..MAX_NEWTON {
+            let mut right: Vec<Triple> = self
+                .displacement_m
+                .iter()
+                .zip(&self.weights)
+                .zip(&self.stiffness)
+                .map(|((u, weight), part)| [-own * part * *u, *weight * DVec3::Z, DVec3::ZERO])
+                .collect();
+            for spring in &self.springs {
+                right[spring.ends[0]][0] += spring.force_n;
+                right[spring.ends[1]][0] -= spring.force_n;
+            }
+            if let Some(pressure) = &self.pressure {
+                let pushed_pa = pressure.pa_per_m3 * pressure.growth_m3(self.displacement_m.iter());
+                for (right, area) in right.iter_mut().zip(&pressure.areas_m2) {
+                    right[0] -= pushed_pa * *area;
+                }
+            }
+            let (x, _) = self.solve(&right, self.accuracy.approximate_residual);
+            let on_disc = |x: &dyn Fn(usize) -> f64| -> f64 {
+                self.weights.iter().enumerate().map(|(at, weight)| weight * x(at)).sum()
+            };
+            let place = on_disc(&|at| self.displacement_m[at].z);
+            let (free, forced) = (on_disc(&|at| x[at][0].z), on_disc(&|at| x[at][1].z));
+            let applied_n = if forced > 0.0 { (-depth_m - place - free) / forced } else { 0.0 };
+            force_n = -applied_n;
+            let mut largest_m: f64 = 0.0;
+            for (u, x) in self.displacement_m.iter_mut().zip(&x) {
+                let change = x[0] + applied_n * x[1];
+                *u += change;
+                largest_m = largest_m.max(change.abs().max_element());
+            }
+            self.linearise();
+            if largest_m < self.accuracy.arrived * self.model.unit_m || self.allowance.is_spent() {
+                break;
+            }
+        }
+        force_n
+    }
+}
+
+/// Springs times iterations that may be spent on what gives way under a pressure: 3 s on the machine of the benchmarks. A mesh
+/// beyond takes what was found by then.
+const YIELDING: u64 = 100_000_000;
+
+/// By how much each place of a mesh that encloses a volume lets it grow under a pressure, at rest, m³/Pa.
+pub(crate) fn volume_compliance(model: &Model, stop: &AtomicBool) -> Vec<f64> {
+    let Some(volume) = model.graph.as_ref().and_then(|graph| graph.volume.as_ref()) else { return Vec::new() };
+    let (window, unit_m2) = (Window::Ball((0..model.len()).collect()), model.unit_m * model.unit_m);
+    let zero = vec![DVec3::ZERO; window.len()];
+    let patch = LinearPatch::weighted(model, vec![0.0; window.len()], window, zero, &DMat3::IDENTITY);
+    let patch = LinearPatch { pressure: None, allowance: Allowance::of(YIELDING, stop), ..patch };
+    let area_m2 = |slot: usize| volume.areas[slot] * unit_m2;
+    let pushed: Vec<Triple> = (0..model.len()).map(|slot| [area_m2(slot), DVec3::ZERO, DVec3::ZERO]).collect();
+    let (moved, _) = patch.solve(&pushed, Accuracy::COARSE.residual);
+    moved.iter().enumerate().map(|(slot, [moved_m, ..])| moved_m.dot(area_m2(slot))).collect()
+}
+
+/// Most steps of Newton's method for one depth.
+const MAX_NEWTON: u32 = 30;
+
+/// A matrix of a symmetric function of two indices.
+fn symmetric(of: impl Fn(usize, usize) -> f64) -> DMat3 {
+    let both = |a: usize, b: usize| 0.5 * (of(a, b) + of(b, a));
+    let column = |b: usize| DVec3::new(both(0, b), both(1, b), both(2, b));
+    DMat3::from_cols(column(0), column(1), column(2))
+}
+
+/// Presses slowly by a disc of `radius_m` at `centre_m` (a place at rest), at `count` depths, `step_m` apart,
+/// from 0 on.
+pub fn press(model: &Model, radius_m: f64, centre_m: DVec3, step_m: f64, count: u32) -> Vec<Pressed> {
+    let course = Course { radius_m, centre_m, step_m, count, points: usize::MAX };
+    let mut press = Press::new(model, course, Accuracy::EXACT);
+    let never = AtomicBool::new(false);
+    while press.deepen(model, &never) == Deepened::Further {}
+    press.pressed
+}
+
+/// What is pressed, where and how deep.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Course {
+    /// Of the disc.
+    pub radius_m: f64,
+    /// The middle of the disc at rest, m: the place of the surface that is nearest to this.
+    pub centre_m: DVec3,
+    /// From one depth to the next; the first is 0.
+    pub step_m: f64,
+    /// Number of depths.
+    pub count: u32,
+    /// About how many points of a mesh are looked at; those beyond are held.
+    pub points: usize,
+}
+
+/// A slow press under way, one depth after another: between two of them whoever computes it may do something else.
+#[derive(Debug)]
+pub struct Press {
+    footprint: Footprint,
+    window: Window,
+    /// Turns the outward normal under the disc to z.
+    turn: DMat3,
+    course: Course,
+    accuracy: Accuracy,
+    /// Springs times iterations that are left.
+    left: u64,
+    displacement_m: Vec<DVec3>,
+    pressed: Vec<Pressed>,
+}
+
+/// What became of a press.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Deepened {
+    /// Further depths are left.
+    Further,
+    /// All depths are computed.
+    Done,
+    /// The work was used up, or it was stopped: the press can't go on.
+    GivenUp,
+}
+
+impl Press {
+    /// Creates a press by a disc with any amount of work.
+    pub fn new(model: &Model, course: Course, accuracy: Accuracy) -> Self {
+        let (footprint, window) = Self::laid(model, &course);
+        Self::begun(footprint, window, course, accuracy)
+    }
+
+    /// The disc at its place, and what notices it.
+    fn laid(model: &Model, course: &Course) -> (Footprint, Window) {
+        let footprint = Footprint::new(model, course.radius_m, course.centre_m);
+        let window = Window::at(model, course.radius_m, footprint.anchor_m(), course.points);
+        (footprint, window)
+    }
+
+    fn begun(footprint: Footprint, window: Window, course: Course, accuracy: Accuracy) -> Self {
+        memory::require(window.bytes(), "a force law");
+        let (_, outward) = footprint.at_rest();
+        let turn = DMat3::from_quat(DQuat::from_rotation_arc(outward, DVec3::Z));
+        let displacement_m = vec![DVec3::ZERO; window.len()];
+        let (left, pressed) = (u64::MAX, Vec::new());
+        Press { footprint, window, turn, course, accuracy, left, displacement_m, pressed }
+    }
+
+    /// Returns the same with at most `work` springs times iterations; none if that can't suffice.
+    pub fn within(model: &Model, course: Course, accuracy: Accuracy, work: u64) -> Option<Self> {
+        // A solution takes as many iterations as there are points from the middle to where nothing is noticed, or nearly
+        // so, and each depth some solutions: what can't be done is not begun, and no memory is taken for it.
+        let (footprint, window) = Self::laid(model, &course);
+        let least = window.len() as u64 * 4 * u64::from(course.count) * (window.across() as u64);
+        (least <= work).then(|| Press { left: work, ..Self::begun(footprint, window, course, accuracy) })
+    }
+
+    /// Returns the springs times iterations that are left.
+    pub fn left(&self) -> u64 {
+        self.left
+    }
+
+    /// Returns what was found at the depths so far.
+    pub fn pressed(&self) -> &[Pressed] {
+        &self.pressed
+    }
+
+    /// Computes the next depth, unless `stop` is set. `model` is the one that the press was made for.
+    pub fn deepen(&mut self, model: &Model, stop: &AtomicBool) -> Deepened {
+        if self.left == 0 {
+            return Deepened::GivenUp;
+        }
+        let Some(depth_m) = self.next_depth_m() else { return Deepened::Done };
+        let displacement_m = std::mem::take(&mut self.displacement_m);
+        let patch = LinearPatch::turned(model, &self.footprint, self.window.clone(), displacement_m, &self.turn);
+        let mut patch = LinearPatch { accuracy: self.accuracy, allowance: Allowance::of(self.left, stop), ..patch };
+        let force_n = if depth_m > 0.0 { patch.press(depth_m) } else { 0.0 };
+        let tangent = patch.tangent();
+        self.left = patch.allowance.left.get();
+        if patch.allowance.is_spent() {
+            // What was computed last is not complete, and nothing follows from it.
+            return Deepened::GivenUp;
+        }
+        self.displacement_m = patch.displacement_m;
+        self.pressed.push(Pressed { depth_m, force_n, tangent });
+        if self.next_depth_m().is_some() { Deepened::Further } else { Deepened::Done }
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn next_depth_m(&self) -> Option<f64> {
+        let next = self.pressed.len();
+        (next < self.course.count as usize).then_some(next as f64 * self.course.step_m)
+    }
+}
+
+/// Returns the same tissue in points `spacing_m` apart, each of which stands for several; as far as `half_m` from the
+/// middle, where it is held, or all of it. What holds a membrane is in the springs whatever their length; mass, damping
+/// and anchor springs are of an area.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+pub fn stand_in(model: &Model, spacing_m: f64, half_m: f64) -> Model {
+    let Some(fine) = model.scene.sheet() else { return model.clone() };
+    let times = spacing_m / fine.spacing_m;
+    let is_cut = fine.longest_side_m() > 2.0 * half_m;
+    // As many on either side of the middle.
+    let points = [0, 1].map(|axis| {
+        let extent_m = fine.extent_m()[axis];
+        2 * (extent_m.min(2.0 * half_m) / (2.0 * spacing_m)).round() as usize + 1
+    });
+    let fixed = match &fine.fixed {
+        _ if is_cut => FixedPoints::Edges,
+        FixedPoints::Points(named) => {
+            let coarse_of = |place: usize, most: usize| ((place as f64 / times).round() as usize).min(most - 1);
+            FixedPoints::Points(
+                named.as_slice().iter().map(|[i, j]| [coarse_of(*i, points[0]), coarse_of(*j, points[1])]).collect(),
+            )
+        }
+        set => set.clone(),
+    };
+    let mut scene = model.scene.clone();
+    let area = times * times;
+    let sheet = Sheet { points, spacing_m, point_mass_kg: area * fine.point_mass_kg, fixed };
+    let fixed = sheet.fixed_indices();
+    scene.body = Body::Sheet(sheet);
+    scene.anchor_stiffness_n_per_m *= area;
+    scene.damping_n_s_per_m *= area;
+    Model { points, fixed, unit_m: spacing_m, scene, ..model.clone() }
+}
+
+#[cfg(test)]
+mod tests;

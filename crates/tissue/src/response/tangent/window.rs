@@ -1,0 +1,228 @@
+//! The part of a tissue around a disc that notices what the disc does: its points and the springs between them.
+
+use glam::{DMat3, DVec2, DVec3};
+
+use crate::body::surface::MeshPlaces;
+use crate::model::Model;
+use crate::tools::footprint::Footprint;
+
+/// How many times its reach around a disc the sheet is looked at: e⁻⁶ is left.
+pub(super) const REACHES: f64 = 6.0;
+
+/// A point of a patch with six springs, and the vectors of a solution. The work of a force law is bounded, and so is its memory:
+/// 20 MB for the 116² points that 2^27 springs times iterations allow.
+const BYTES_PER_POINT: usize =
+    6 * size_of::<Spring>() + size_of::<DMat3>() + size_of::<DVec3>() + 8 * size_of::<Triple>() + 16;
+
+/// Three vectors a point: one of each system.
+pub(super) type Triple = [DVec3; 3];
+
+/// A spring of the part, linearised where it is.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Spring {
+    pub(super) ends: [usize; 2],
+    pub(super) rest_m: DVec3,
+    pub(super) stiffness_n_per_m: f64,
+    pub(super) tangent: DMat3,
+    /// On the first end, N.
+    pub(super) force_n: DVec3,
+}
+
+impl Spring {
+    fn new(ends: [usize; 2], rest_m: DVec3, stiffness_n_per_m: f64) -> Self {
+        Spring { ends, rest_m, stiffness_n_per_m, tangent: DMat3::ZERO, force_n: DVec3::ZERO }
+    }
+}
+
+/// The points around a disc that notice what it does.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Window {
+    /// A rectangle of a sheet.
+    Grid {
+        /// Its first row and column.
+        origin: [usize; 2],
+        /// Rows and columns.
+        size: [usize; 2],
+    },
+    /// A ball of a mesh: slots, ascending.
+    Ball(Vec<usize>),
+}
+
+impl Window {
+    /// Returns the window around a footprint.
+    pub fn around(model: &Model, footprint: &Footprint) -> Self {
+        Self::at(model, footprint.radius_m(), footprint.anchor_m(), usize::MAX)
+    }
+
+    /// Around a place of the rest surface; on a mesh with `most` points or a few more.
+    pub(super) fn at(model: &Model, radius_m: f64, centre_m: DVec3, most: usize) -> Self {
+        match &model.graph {
+            None => Self::of_sheet(model, radius_m, centre_m.truncate()),
+            Some(graph) => {
+                let shape = model.shape();
+                let mut within_m = half_window_m(model, radius_m).min(2.0 * shape.longest_side_m());
+                let mut points = shape.around(centre_m, within_m);
+                while points.len() > most && within_m > radius_m {
+                    within_m *= 0.9;
+                    points = shape.around(centre_m, within_m);
+                }
+                let mut slots: Vec<usize> = points.into_iter().map(|point| graph.slot_of(point)).collect();
+                slots.sort_unstable();
+                Window::Ball(slots)
+            }
+        }
+    }
+
+    fn of_sheet(model: &Model, radius_m: f64, centre_m: DVec2) -> Self {
+        let centre = centre_m / model.unit_m;
+        let half = half_window(model, radius_m);
+        let (mut origin, mut size) = ([0; 2], [0; 2]);
+        for axis in 0..2 {
+            // Saturating casts: no anchor springs, no end.
+            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+            let [low, high] = [centre[axis] - half, centre[axis] + half].map(|edge| edge.round().max(0.0) as usize);
+            origin[axis] = low.min(model.points[axis] - 1);
+            size[axis] = high.min(model.points[axis] - 1) + 1 - origin[axis];
+        }
+        Window::Grid { origin, size }
+    }
+
+    /// Returns the number of its points.
+    pub fn len(&self) -> usize {
+        match self {
+            Window::Grid { size, .. } => size[0] * size[1],
+            Window::Ball(slots) => slots.len(),
+        }
+    }
+
+    /// Returns whether it has no point: a place far from every point of a mesh.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// How many points there are from the middle to where nothing is noticed, or nearly so.
+    pub(super) fn across(&self) -> usize {
+        match self {
+            Window::Grid { size, .. } => size[0].max(size[1]),
+            Window::Ball(slots) => slots.len().isqrt(),
+        }
+    }
+
+    /// What a patch of it and a solution take, bytes.
+    pub(crate) fn bytes(&self) -> u64 {
+        (self.len() * BYTES_PER_POINT) as u64
+    }
+
+    /// Returns the places of its points in memory, ascending.
+    pub fn points(&self, model: &Model) -> impl Iterator<Item = usize> {
+        let columns = model.points[1];
+        (0..self.len()).map(move |at| match self {
+            Window::Grid { origin, size } => (origin[0] + at / size[1]) * columns + origin[1] + at % size[1],
+            Window::Ball(slots) => slots[at],
+        })
+    }
+
+    /// Which of its points is at a row and column of memory.
+    pub(super) fn find(&self, model: &Model, point @ [i, j]: [usize; 2]) -> Option<usize> {
+        match self {
+            Window::Grid { origin, size } => {
+                let place = (i.wrapping_sub(origin[0]), j.wrapping_sub(origin[1]));
+                (place.0 < size[0] && place.1 < size[1]).then_some(place.0 * size[1] + place.1)
+            }
+            Window::Ball(slots) => slots.binary_search(&model.index_of(point)).ok(),
+        }
+    }
+
+    /// Which of its points move. Those at its border, whose springs lead out of it, are held.
+    pub(super) fn free(&self, model: &Model) -> Vec<bool> {
+        let is_fixed = |index: usize| model.fixed.binary_search(&index).is_ok();
+        match (self, &model.graph) {
+            (Window::Ball(slots), Some(graph)) => {
+                let is_within = |slot: usize| slots.binary_search(&slot).is_ok();
+                let is_free =
+                    |slot: &usize| !is_fixed(*slot) && graph.joined(*slot).all(|(other, ..)| is_within(other));
+                slots.iter().map(is_free).collect()
+            }
+            (Window::Grid { origin, size }, _) => {
+                let layers = if model.scene.springs.bending { 2 } else { 1 };
+                let inside = |axis: usize, place: usize| {
+                    (origin[axis] == 0 || place >= layers)
+                        && (origin[axis] + size[axis] == model.points[axis] || place + layers < size[axis])
+                };
+                let is_free = |(at, index)| inside(0, at / size[1]) && inside(1, at % size[1]) && !is_fixed(index);
+                self.points(model).enumerate().map(is_free).collect()
+            }
+            (Window::Ball(_), None) => Vec::new(),
+        }
+    }
+
+    /// The springs that join its points, at least one of which is `free`. Rest lengths are turned by `turn`.
+    pub(super) fn springs(&self, model: &Model, free: &[bool], turn: &DMat3) -> Vec<Spring> {
+        let mut springs = match (self, &model.graph) {
+            (Window::Ball(slots), Some(graph)) => of_mesh(model, graph, slots, free),
+            (Window::Grid { size, .. }, _) => of_grid(model, *size, free),
+            (Window::Ball(_), None) => Vec::new(),
+        };
+        springs.iter_mut().for_each(|spring| spring.rest_m = *turn * spring.rest_m);
+        springs
+    }
+}
+
+fn of_grid(model: &Model, size: [usize; 2], free: &[bool]) -> Vec<Spring> {
+    let springs = &model.scene.springs;
+    let (structural, shear) = (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m);
+    let bending = if springs.bending { structural } else { 0.0 };
+    let kinds = [(structural, [[1, 0], [0, 1]]), (shear, [[1, 1], [1, -1]]), (bending, [[2, 0], [0, 2]])];
+    let mut found = Vec::new();
+    for (stiffness_n_per_m, reach) in kinds.into_iter().filter(|kind| kind.0 > 0.0) {
+        for [di, dj] in reach {
+            for i in 0..size[0] {
+                for j in 0..size[1] {
+                    let (Some(i1), Some(j1)) = (i.checked_add_signed(di), j.checked_add_signed(dj)) else {
+                        continue;
+                    };
+                    if i1 >= size[0] || j1 >= size[1] {
+                        continue;
+                    }
+                    let ends = [i * size[1] + j, i1 * size[1] + j1];
+                    if !(free[ends[0]] || free[ends[1]]) {
+                        continue;
+                    }
+                    #[allow(clippy::cast_precision_loss)]
+                    let rest_m = model.unit_m * DVec3::new(di as f64, dj as f64, 0.0);
+                    found.push(Spring::new(ends, rest_m, stiffness_n_per_m));
+                }
+            }
+        }
+    }
+    found
+}
+
+fn of_mesh(model: &Model, graph: &MeshPlaces, slots: &[usize], free: &[bool]) -> Vec<Spring> {
+    let mut found = Vec::new();
+    for (one, slot) in slots.iter().enumerate() {
+        for (other, rest, stiffness) in graph.joined(*slot).filter(|(other, ..)| other > slot) {
+            let Ok(other) = slots.binary_search(&other) else { continue };
+            if free[one] || free[other] {
+                let stiffness_n_per_m = model.scene.springs.stiffness_n_per_m * stiffness;
+                found.push(Spring::new([one, other], model.unit_m * rest, stiffness_n_per_m));
+            }
+        }
+    }
+    found
+}
+
+/// How far from the middle of a disc of `radius_m` points notice what it does, in spacings; infinite without anchor
+/// springs.
+fn half_window(model: &Model, radius_m: f64) -> f64 {
+    let scene = &model.scene;
+    let springs = &scene.springs;
+    let stiffest = springs.stiffness_n_per_m.max(springs.shear_stiffness_n_per_m);
+    let reach = (stiffest / scene.anchor_stiffness_n_per_m).sqrt().max(1.0);
+    radius_m / model.unit_m + REACHES * reach + 2.0
+}
+
+/// Returns the same in m.
+pub fn half_window_m(model: &Model, radius_m: f64) -> f64 {
+    half_window(model, radius_m) * model.unit_m
+}

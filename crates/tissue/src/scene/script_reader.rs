@@ -1,0 +1,567 @@
+//! Reads a script from TOML and binds it to a scene: converts times to whole steps and points to places.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use glam::{DVec2, DVec3};
+use palpate_haptics::{Coupling, Tip};
+
+use super::kind::TextKind;
+use super::profile::{
+    CentreProfile, LoadProfile, Moment, MotionProfile, Move, PoseProfile, Profile, StrengthProfile, weights,
+};
+use super::script::Script;
+use super::{Change, Scene};
+use crate::files;
+use crate::limits::Limits;
+use crate::scene::action_check::{check_force, check_free, check_reach, check_tip};
+use crate::scene::toml_document::{Document, Fields, Item};
+use crate::shape::{self, PointId};
+use palpate_refusal::{Reason, Refusal, Result, did_you_mean, legible, not_negative, number, positive, unsigned_zero};
+
+impl Script {
+    /// Reads a script's file and binds it to `scene`.
+    ///
+    /// # Errors
+    /// Refuses a script that can't be read, parsed or bound to the scene.
+    pub fn load(path: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
+        let text = files::read_text(path, limits.file_bytes)?;
+        let folder = path.parent().unwrap_or(Path::new(""));
+        Self::parse(&path.display().to_string(), &text, folder, scene, limits)
+    }
+
+    /// Reads a script from TOML. Refusals call the text `name`; its traces are in `folder`.
+    ///
+    /// # Errors
+    /// Refuses a script that can't be parsed or bound to the scene.
+    pub fn parse(name: &str, text: &str, folder: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
+        let document = Document::parse(name, text)?;
+        TextKind::Script.check(&document)?;
+        document.read(|fields| Binding { folder, scene, limits, warnings: Vec::new() }.script(fields))
+    }
+}
+
+/// A shorter move would need accelerations beyond the number range.
+const SHORTEST_MOVE_S: f64 = 1e-6;
+
+/// The least sum of the weights of a force with a radius.
+const MIN_WEIGHT: f64 = 1e-3;
+
+/// Beyond this a phase has no digits left.
+const HIGHEST_HZ: f64 = 1e6;
+
+/// The inputs of reading a script.
+struct Binding<'s> {
+    folder: &'s Path,
+    scene: &'s Scene,
+    limits: &'s Limits,
+    warnings: Vec<String>,
+}
+
+impl Binding<'_> {
+    fn script(mut self, fields: &mut Fields<'_>) -> Result<Script> {
+        let name = fields.text("name")?.unwrap_or_else(|| "unnamed".to_owned());
+        let scenes = read_scenes(fields)?;
+        if !is_made_for(&scenes, &self.scene.name) {
+            let (made_for, is) = (scenes.join(", "), &self.scene.name);
+            self.warnings.push(format!("scenes: made for {made_for}; on `{is}` it may be too strong or too weak"));
+        }
+        let duration_s = positive("duration_s", fields.required_number("duration_s")?)?;
+        let steps = self.steps("duration_s", duration_s)?;
+        let sample_every_s = positive("sample_every_s", fields.required_number("sample_every_s")?)?;
+        let sample_every = self.steps("sample_every_s", sample_every_s)?;
+        for (field, steps) in [("duration_s", steps), ("sample_every_s", sample_every)] {
+            if steps == 0 {
+                return Err(Refusal::new(Reason::OutOfRange, field, "is less than half a step"));
+            }
+        }
+        let mut control_points = Vec::new();
+        let forces = items(fields, "force")?
+            .iter()
+            .map(|item| self.force(item, &mut control_points))
+            .collect::<Result<Vec<_>>>()?;
+        for (index, profile) in forces.iter().enumerate() {
+            let end = profile.at(Moment::start_of(steps), self.scene.stepping.rate_hz);
+            if matches!(profile.centre, CentreProfile::Path { .. }) && !self.scene.shape().is_near(end.centre_m) {
+                let message = "leaves the sheet; where the force is streamed (--held, a replay) it ends there";
+                self.warnings.push(format!("force[{index}].path: {message}"));
+            }
+        }
+        let (mut moves, mut poses) = (Vec::new(), Vec::new());
+        for item in items(fields, "tool")? {
+            match self.tool(&item)? {
+                ToolTable::Moves(profile) => moves.push(profile),
+                ToolTable::Poses(profile) => poses.push(profile),
+            }
+        }
+        control_points.extend(moves.iter().map(|profile| profile.point));
+        let places = poses.iter().flat_map(|profile: &PoseProfile| &profile.poses);
+        control_points.extend(places.map(|(_, place_m)| self.scene.shape().nearest(*place_m)));
+        for (index, profile) in moves.iter().enumerate() {
+            if moves[..index].iter().any(|other| other.point == profile.point) {
+                let message = "is prescribed by two tools";
+                return Err(Refusal::new(Reason::OutOfRange, format!("tool[{index}].point"), message));
+            }
+        }
+        let changes = self.changes(&items(fields, "tissue")?)?;
+        let tools = forces.len() + moves.len() + poses.len();
+        if tools > self.limits.tools as usize {
+            let message = format!(
+                "a script uses {tools} tools (one for each [[force]] and each [[tool]]), above the limit of {}",
+                self.limits.tools
+            );
+            return Err(Refusal::new(Reason::TooLarge, "force", message));
+        }
+        let sample_points = match fields.item("sample_points") {
+            None => control_points,
+            Some(item) if item.as_text() == Some("all") => shape::points(self.scene.shape()).collect(),
+            Some(item) if item.as_text().is_some() => return Err(item.wrong("\"all\" or a list of points")),
+            Some(item) => item.list()?.iter().map(|item| self.point(item)).collect::<Result<Vec<_>>>()?,
+        };
+        let mut seen = BTreeSet::new();
+        Ok(Script {
+            name,
+            steps,
+            sample_every,
+            sample_points: sample_points.into_iter().filter(|point| seen.insert(*point)).collect(),
+            forces,
+            moves,
+            poses,
+            changes,
+            warnings: self.warnings,
+            rate_hz: self.scene.stepping.rate_hz,
+            shape: self.scene.shared_shape(),
+        })
+    }
+
+    /// A time in whole steps, with a warning where rounding moves it by more than a millionth of a step.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn steps(&mut self, field: &str, time_s: f64) -> Result<u64> {
+        let exact = not_negative(field, time_s)? * self.scene.stepping.rate_hz;
+        let whole = exact.round();
+        number(field, whole, "less than 2^52 steps", |v| v < 4.5e15)?;
+        if (exact - whole).abs() > 1e-6 {
+            let rounded_s = whole / self.scene.stepping.rate_hz;
+            self.warnings.push(format!("{field}: {time_s} s is not a whole number of steps; taken as {rounded_s} s"));
+        }
+        Ok(whole as u64)
+    }
+
+    /// A point of the tissue.
+    fn point(&self, item: &Item<'_>) -> Result<PointId> {
+        self.scene.shape().find("", item.point_name()?).map_err(|refusal| item.refuse(refusal.reason, refusal.message))
+    }
+
+    /// The point that a table names: `point` on a sheet, `vertex` on a mesh, or the one nearest to `at_m`.
+    fn point_of(&self, fields: &mut Fields<'_>) -> Result<PointId> {
+        if let Some(at) = fields.item("at_m") {
+            let at_m = self.place(&at)?;
+            self.scene.shape().check_place(&fields.path("at_m"), at_m)?;
+            return Ok(self.scene.shape().nearest(at_m));
+        }
+        match fields.item("vertex") {
+            Some(vertex) => self.point(&vertex),
+            None => self.point(&fields.required("point")?),
+        }
+    }
+
+    /// A place on the tissue: [x, y] on a sheet, [x, y, z] on a mesh, m.
+    fn place(&self, item: &Item<'_>) -> Result<DVec3> {
+        if self.scene.shape().dimensions() == 2 { Ok(item.place()?.extend(0.0)) } else { item.vector() }
+    }
+
+    /// Changes of the tissue. Each is checked with those before it.
+    fn changes(&mut self, list: &[Item<'_>]) -> Result<Vec<(u64, Change)>> {
+        let mut scene = self.scene.clone();
+        let mut changes: Vec<(u64, Change)> = Vec::new();
+        for item in list {
+            let (at, change) = item.table(|fields| {
+                let at = self.steps(&fields.path("at_s"), fields.required_number("at_s")?)?;
+                if changes.last().is_some_and(|last| last.0 >= at) {
+                    return Err(fields.refuse(
+                        Reason::OutOfRange,
+                        "at_s",
+                        "must be later than that of the change before",
+                    ));
+                }
+                let change = Change {
+                    stiffness_n_per_m: fields.number("stiffness_n_per_m")?,
+                    damping_n_s_per_m: fields.number("damping_n_s_per_m")?,
+                    anchor_stiffness_n_per_m: fields.number("anchor_stiffness_n_per_m")?,
+                    volume_stiffness_pa: fields.number("volume_stiffness_pa")?,
+                };
+                Ok((at, change))
+            })?;
+            if change == Change::default() {
+                return Err(item.refuse(Reason::Missing, Change::NOTHING));
+            }
+            scene = scene.changed(&change, self.scene);
+            scene
+                .check(self.limits)
+                .map_err(|refusal| item.refuse(refusal.reason, format!("{}: {}", refusal.field, refusal.message)))?;
+            changes.push((at, change));
+        }
+        Ok(changes)
+    }
+
+    fn force(&mut self, item: &Item<'_>, control_points: &mut Vec<PointId>) -> Result<LoadProfile> {
+        item.table(|fields| {
+            let centre = self.centre(item, fields, control_points)?;
+            let ForceSpread { unit, key, falloff_per_m, falloff_offset } = self.field(fields, &centre)?;
+            let factor = libm::exp(falloff_offset);
+            let limit_n = self.limits.point_force_n;
+            let within_limit = |field: &str, force_n: DVec3| check_force(field, force_n, factor, limit_n);
+            let profile = fields.required("profile")?;
+            let trace = profile.table(|fields| self.profile(fields))?;
+            let strength = match trace {
+                Ok(profile) => {
+                    let force_n = unit * fields.required(key)?.vector()?;
+                    within_limit(&fields.path(key), force_n)?;
+                    StrengthProfile::Scaled(force_n, profile)
+                }
+                Err(rows) => {
+                    // A trace replaces the force, which may be present all the same.
+                    fields.item(key).map(|item| item.vector()).transpose()?;
+                    let rows: Vec<_> = rows.into_iter().map(|(step, force_n)| (step, unit * force_n)).collect();
+                    for (_, force_n) in &rows {
+                        within_limit(&fields.path("profile.file"), *force_n)?;
+                    }
+                    StrengthProfile::Recorded(rows)
+                }
+            };
+            Ok(LoadProfile { centre, strength, falloff_per_m, falloff_offset })
+        })
+    }
+
+    /// How a force spreads: as in the paper by `falloff_per_m` and `falloff_offset`, or by `radius_m`, where the weight is
+    /// 1/e; then what is given is the force on all points together, at the first place.
+    fn field(&self, fields: &mut Fields<'_>, centre: &CentreProfile) -> Result<ForceSpread> {
+        let Some(radius_m) = fields.number("radius_m")? else {
+            let falloff_per_m = not_negative(&fields.path("falloff_per_m"), fields.required_number("falloff_per_m")?)?;
+            let falloff_offset = fields.required_number("falloff_offset")?;
+            return Ok(ForceSpread { unit: 1.0, key: "force_n", falloff_per_m, falloff_offset });
+        };
+        positive(&fields.path("radius_m"), radius_m)?;
+        for key in ["force_n", "falloff_per_m", "falloff_offset"] {
+            if fields.item(key).is_some() {
+                let message = "does not go with radius_m: a force in all (total_n) with a radius, or the paper's force_n with \
+                               falloff_per_m and falloff_offset";
+                return Err(fields.refuse(Reason::WrongKind, key, message));
+            }
+        }
+        let shape = self.scene.shape();
+        let sum = weights(shape, centre.begins_at_m(), radius_m.recip());
+        if sum < MIN_WEIGHT {
+            let message = format!("is so small that no point is reached: points are {} m apart", shape.edge_m());
+            return Err(fields.refuse(Reason::OutOfRange, "radius_m", message));
+        }
+        Ok(ForceSpread { unit: sum.recip(), key: "total_n", falloff_per_m: radius_m.recip(), falloff_offset: 0.0 })
+    }
+
+    fn centre(
+        &mut self,
+        item: &Item<'_>,
+        fields: &mut Fields<'_>,
+        control_points: &mut Vec<PointId>,
+    ) -> Result<CentreProfile> {
+        let point = fields.item("point").or_else(|| fields.item("vertex"));
+        let (hops, path) = (fields.item("hops"), fields.item("path"));
+        let one = "must have just one of `point` (`vertex` on a mesh), `at_m`, `hops` and `path`";
+        if let Some(at) = fields.item("at_m") {
+            if point.is_some() || hops.is_some() || path.is_some() {
+                return Err(item.refuse(Reason::OutOfRange, one));
+            }
+            let at_m = self.place(&at)?;
+            self.scene.shape().check_place(&fields.path("at_m"), at_m)?;
+            control_points.push(self.scene.shape().nearest(at_m));
+            return Ok(CentreProfile::Hops(vec![(0, at_m)]));
+        }
+        match (point, hops, path) {
+            (Some(point), None, None) => {
+                let point = self.point(&point)?;
+                control_points.push(point);
+                Ok(CentreProfile::Points(vec![(0, (point, self.scene.shape().rest_m(point)))]))
+            }
+            (None, Some(hops), None) => {
+                let mut entries = Vec::new();
+                for hop in hops.list()? {
+                    entries.push(hop.table(|fields| {
+                        let at = self.steps(&fields.path("at_s"), fields.required_number("at_s")?)?;
+                        let point = self.point_of(fields)?;
+                        control_points.push(point);
+                        Ok((at, (point, self.scene.shape().rest_m(point))))
+                    })?);
+                }
+                rising(&hops, "at_s", &mut entries)?;
+                Ok(CentreProfile::Points(entries))
+            }
+            (None, None, Some(path)) => path.table(|fields| {
+                let from_m = self.place(&fields.required("from_m")?)?;
+                let velocity_m_per_s = self.place(&fields.required("velocity_m_per_s")?)?;
+                let speed = velocity_m_per_s.abs().max_element();
+                number(&fields.path("velocity_m_per_s"), speed, "at most 1e6", |v| v <= 1e6)?;
+                self.scene.shape().check_place(&fields.path("from_m"), from_m)?;
+                control_points.push(self.scene.shape().nearest(from_m));
+                Ok(CentreProfile::Path { from_m, velocity_m_per_s })
+            }),
+            (None, None, None) => Err(item.refuse(Reason::Missing, one)),
+            _ => Err(item.refuse(Reason::OutOfRange, one)),
+        }
+    }
+
+    /// A profile, or the rows of a trace.
+    #[allow(clippy::type_complexity)]
+    fn profile(&mut self, fields: &mut Fields<'_>) -> Result<std::result::Result<Profile, Vec<(u64, DVec3)>>> {
+        let kind = fields.required("type")?;
+        Ok(Ok(match kind.text()?.as_str() {
+            "constant" => Profile::Constant,
+            "pulse" => {
+                let on = self.steps(&fields.path("on_s"), fields.required_number("on_s")?)?;
+                let off = self.steps(&fields.path("off_s"), fields.required_number("off_s")?)?;
+                if off <= on {
+                    return Err(fields.refuse(Reason::OutOfRange, "off_s", "must be at least a step after on_s"));
+                }
+                Profile::Pulse { on, off }
+            }
+            "ramp" => {
+                let from_s = not_negative(&fields.path("from_s"), fields.required_number("from_s")?)?;
+                let to_s = fields.required_number("to_s")?;
+                if to_s < from_s {
+                    return Err(fields.refuse(Reason::OutOfRange, "to_s", "must not be before from_s"));
+                }
+                if to_s > from_s {
+                    Profile::Ramp { from_s, to_s }
+                } else {
+                    // A ramp of zero length is a jump, and jumps are at whole steps.
+                    Profile::Pulse { on: self.steps(&fields.path("from_s"), from_s)?, off: u64::MAX }
+                }
+            }
+            "sine" => {
+                let frequency_hz = fields.required_number("frequency_hz")?;
+                let range = format!("from 0 to {HIGHEST_HZ}");
+                number(&fields.path("frequency_hz"), frequency_hz, &range, |v| (0.0..=HIGHEST_HZ).contains(&v))?;
+                Profile::Sine { frequency_hz }
+            }
+            "trace" => {
+                let file = fields.required("file")?;
+                let path = self.folder.join(file.text()?);
+                return Ok(Err(self.trace(&file, &path)?));
+            }
+            other => {
+                let meant = did_you_mean(other, ["constant", "pulse", "ramp", "sine", "trace"]);
+                let message = format!("must be one of constant, pulse, ramp, sine, trace, but is `{other}`{meant}");
+                return Err(kind.refuse(Reason::WrongKind, message));
+            }
+        }))
+    }
+
+    fn trace(&mut self, item: &Item<'_>, path: &Path) -> Result<Vec<(u64, DVec3)>> {
+        let text = files::read_regular_text(path, self.limits.trace_bytes)
+            .map_err(|refusal| item.refuse(refusal.reason, format!("{} {}", path.display(), refusal.message)))?;
+        let refuse = |line: usize, message: String| {
+            let place = format!("{}:{line}", path.display());
+            Refusal { place: Some(place), ..Refusal::new(Reason::Unreadable, "", message) }
+        };
+        const HEADER: &str = "time_s,fx_n,fy_n,fz_n";
+        let mut lines = text.lines().enumerate().filter(|line| !line.1.trim().is_empty());
+        let header = lines.next().map_or("", |line| line.1);
+        if header.split(',').map(str::trim).ne(HEADER.split(',')) {
+            return Err(refuse(1, format!("must begin with the line `{HEADER}`")));
+        }
+        let mut rows: Vec<(u64, DVec3)> = Vec::new();
+        let (mut last_s, mut rounded) = (f64::NEG_INFINITY, 0_usize);
+        for (index, line) in lines {
+            let line_number = index + 1;
+            let cells: Vec<&str> = line.split(',').map(str::trim).collect();
+            let [time, x, y, z] = cells.as_slice() else {
+                return Err(refuse(line_number, format!("must have the 4 columns {HEADER}, but has {}", cells.len())));
+            };
+            let mut numbers = [0.0; 4];
+            for (number, cell) in numbers.iter_mut().zip([time, x, y, z]) {
+                *number = cell
+                    .parse()
+                    .ok()
+                    .filter(|number: &f64| number.is_finite())
+                    .map(unsigned_zero)
+                    .ok_or_else(|| refuse(line_number, format!("`{cell}` is not a finite number")))?;
+            }
+            let [time_s, x, y, z] = numbers;
+            if time_s < 0.0 || time_s <= last_s {
+                return Err(refuse(line_number, format!("time_s must rise from 0 on, but is {time_s} after {last_s}")));
+            }
+            last_s = time_s;
+            let warnings = self.warnings.len();
+            let step = self.steps("time_s", time_s).map_err(|refusal| refuse(line_number, refusal.message))?;
+            rounded += self.warnings.len() - warnings;
+            self.warnings.truncate(warnings);
+            // Of several rows for one step, the last one applies.
+            if rows.last().is_some_and(|row| row.0 == step) {
+                rows.pop();
+            }
+            rows.push((step, DVec3::new(x, y, z)));
+        }
+        if rows.is_empty() {
+            return Err(refuse(1, "has no rows".to_owned()));
+        }
+        if rounded > 0 {
+            self.warnings.push(format!("{}: the times of {rounded} rows were rounded to whole steps", path.display()));
+        }
+        Ok(rows)
+    }
+
+    fn tool(&mut self, item: &Item<'_>) -> Result<ToolTable> {
+        item.table(|fields| {
+            if let Some(list) = fields.item("poses") {
+                return self.poses(fields, &list).map(ToolTable::Poses);
+            }
+            let point = self.point_of(fields)?;
+            check_free(&fields.path("point"), self.scene.shape(), point)?;
+            let mut moves = Vec::new();
+            let list = fields.required("moves")?;
+            for entry in list.list()? {
+                moves.push(entry.table(|fields| {
+                    let from_s = not_negative(&fields.path("from_s"), fields.required_number("from_s")?)?;
+                    let to_s = fields.required_number("to_s")?;
+                    if to_s < from_s + SHORTEST_MOVE_S {
+                        let message = format!("must be at least {SHORTEST_MOVE_S} s after from_s");
+                        return Err(fields.refuse(Reason::OutOfRange, "to_s", message));
+                    }
+                    Ok(Move { from_s, to_s, by_m: fields.required("by_m")?.vector()? })
+                })?);
+            }
+            let profile = MotionProfile { point, moves };
+            // The displacement is largest at the end of a move. Where moves overlap, their sum is an upper bound.
+            let farthest: f64 = profile.moves.iter().map(|m| m.by_m.length()).sum();
+            check_reach(&fields.path("moves"), self.scene.shape(), farthest, self.limits)?;
+            Ok(ToolTable::Moves(profile))
+        })
+    }
+
+    /// A tool with a tip.
+    fn poses(&mut self, fields: &mut Fields<'_>, list: &Item<'_>) -> Result<PoseProfile> {
+        let shape = self.scene.shape();
+        let tip = fields.item("tip").map_or(Ok(Tip::default()), |item| item.table(read_tip))?;
+        check_tip(&fields.path("tip"), shape, &tip)?;
+        let mut poses: Vec<(f64, DVec3)> = Vec::new();
+        for entry in list.list()? {
+            poses.push(entry.table(|fields| {
+                let at_s = not_negative(&fields.path("at_s"), fields.required_number("at_s")?)?;
+                if poses.last().is_some_and(|last| at_s < last.0 + SHORTEST_MOVE_S) {
+                    return Err(fields.refuse(
+                        Reason::OutOfRange,
+                        "at_s",
+                        "must be later than that of the pose before",
+                    ));
+                }
+                let place_m = fields.required("place_m")?.vector()?;
+                let far_m = place_m.distance(shape.extent().middle_m());
+                let field = fields.path("place_m");
+                check_reach(&field, shape, far_m, self.limits)?;
+                let extent = shape.extent();
+                let beside_m = (extent.least_m - place_m).max(place_m - extent.most_m).max(DVec3::ZERO).truncate();
+                if shape.dimensions() == 2 && beside_m != DVec2::ZERO {
+                    let off_m = legible(beside_m.length());
+                    self.warnings.push(format!(
+                        "{field}: is {off_m} m beside the tissue: a tip that touches drags the edge along"
+                    ));
+                }
+                let touches = tip.grasps || place_m.z <= 0.0;
+                if beside_m == DVec2::ZERO && touches && shape.is_fixed(shape.nearest(place_m)) {
+                    let message = "is at a fixed point: the tissue does not move there, and the tool feels nothing";
+                    self.warnings.push(format!("{field}: {message}"));
+                }
+                Ok((at_s, place_m))
+            })?);
+        }
+        let Some((begin_s, _)) = poses.first().copied() else {
+            return Err(list.refuse(Reason::Missing, "must have at least one pose"));
+        };
+        let until_s = fields.number("until_s")?.unwrap_or(f64::INFINITY);
+        if until_s <= begin_s {
+            return Err(fields.refuse(Reason::OutOfRange, "until_s", "must be later than the first pose"));
+        }
+        Ok(PoseProfile { tip, poses, until_s })
+    }
+}
+
+/// A `[[tool]]`.
+enum ToolTable {
+    Moves(MotionProfile),
+    Poses(PoseProfile),
+}
+
+/// How a force spreads over the points.
+struct ForceSpread {
+    /// What the given vector is multiplied by.
+    unit: f64,
+    /// The name of that vector.
+    key: &'static str,
+    falloff_per_m: f64,
+    falloff_offset: f64,
+}
+
+fn read_tip(fields: &mut Fields<'_>) -> Result<Tip> {
+    let standard = Tip::default();
+    let coupling = match fields.item("spring") {
+        None => standard.coupling,
+        Some(item) => item.table(|fields| {
+            let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
+            let damping_n_s_per_m = fields.required_number("damping_n_s_per_m")?;
+            Ok(Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m })
+        })?,
+    };
+    Ok(Tip {
+        radius_m: fields.number("radius_m")?.unwrap_or(standard.radius_m),
+        friction: fields.number("friction")?.unwrap_or(standard.friction),
+        grasps: fields.item("grasps").map_or(Ok(standard.grasps), |item| item.flag())?,
+        coupling,
+    })
+}
+
+/// The scenes that a script is made for: all, if it names none.
+fn read_scenes(fields: &mut Fields<'_>) -> Result<Vec<String>> {
+    let Some(item) = fields.item("scenes") else { return Ok(Vec::new()) };
+    item.list()?.iter().map(Item::text).collect()
+}
+
+fn is_made_for(scenes: &[String], name: &str) -> bool {
+    scenes.is_empty() || scenes.iter().any(|scene| scene == name)
+}
+
+/// Returns the scenes that the script of a text is made for. None is named by a script for all of them, and by a text
+/// that can't be read: whoever plays it learns why.
+pub fn made_for(text: &str) -> Vec<String> {
+    let Ok(table) = text.parse::<toml::Table>() else { return Vec::new() };
+    let scenes = table.get("scenes").and_then(|scenes| scenes.as_array());
+    scenes.into_iter().flatten().filter_map(|name| name.as_str().map(str::to_owned)).collect()
+}
+
+/// Returns whether the script of a text is made for the scene of that name.
+pub fn fits(text: &str, scene: &str) -> bool {
+    is_made_for(&made_for(text), scene)
+}
+
+/// The entries of `[[key]]`; empty if the key is absent.
+fn items<'a>(fields: &mut Fields<'a>, key: &'static str) -> Result<Vec<Item<'a>>> {
+    fields.item(key).map_or(Ok(Vec::new()), |item| item.tables())
+}
+
+/// Requires ascending times. Of two that round to one step, the later one applies.
+fn rising<T>(list: &Item<'_>, key: &str, entries: &mut Vec<(u64, T)>) -> Result<()> {
+    if entries.is_empty() {
+        return Err(list.refuse(Reason::Missing, "must have at least one entry"));
+    }
+    if let Some(index) = entries.windows(2).position(|pair| pair[1].0 < pair[0].0) {
+        let message = format!("{key} of entry {} is before that of the entry before it", index + 1);
+        return Err(list.refuse(Reason::OutOfRange, message));
+    }
+    let mut index = 0;
+    while index + 1 < entries.len() {
+        if entries[index].0 == entries[index + 1].0 {
+            entries.remove(index);
+        } else {
+            index += 1;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,144 @@
+//! Central differences with implicit damping: second order, and stable for dt·ω < 2 whatever the damping.
+//!
+//! m(u₊ − 2u + u₋)/dt² = F(u) − C(u₊ − u₋)/2dt, with d₊ = u₊ − u, d = u − u₋ and g = C·dt/m:
+//! (1 + g/2)·d₊ = (1 − g/2)·d + (dt²/m)·F(u).
+
+use super::arithmetic::{Arithmetic, MAX_KEPT};
+use super::family::{Family, QuadratureNode, Release};
+use super::matrix::Matrix;
+use crate::kernel::lanes::Vector;
+use crate::kernel::real::Real;
+
+/// The two-step form d ← p·d + q·(N − a·u + F), u ← u + d, where d is the increment of the last substep.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TwoStep {
+    /// p.
+    pub p: f64,
+    /// q.
+    pub q: f64,
+    /// K″·dt²/m.
+    pub a: f64,
+}
+
+/// Central differences.
+pub(super) fn fit(a: f64, g: f64) -> TwoStep {
+    TwoStep { p: (1.0 - g / 2.0) / (1.0 + g / 2.0), q: 1.0 / (1.0 + g / 2.0), a }
+}
+
+impl Family for TwoStep {
+    type Plain<T: Real> = CentralAdvance<T>;
+    type Compensated<T: Real> = CentralAdvance<T>;
+
+    fn plain<T: Real>(&self, _: usize) -> CentralAdvance<T> {
+        CentralAdvance { p: T::of(self.p), pull: T::of(-self.q * self.a), keeps: self.p > 0.98 }
+    }
+
+    fn compensated<T: Real>(&self, sweep: usize) -> CentralAdvance<T> {
+        self.plain(sweep)
+    }
+
+    fn takes_means(&self) -> bool {
+        true
+    }
+
+    fn last_field(&self) -> usize {
+        0
+    }
+
+    /// The scheme sees the beginning only, and takes the mean of both sides where the force jumps.
+    fn nodes(&self) -> Vec<QuadratureNode> {
+        vec![QuadratureNode { fraction: 0.0, weights: [self.q, 0.0, 0.0] }]
+    }
+
+    fn spring_scale(&self) -> f64 {
+        self.q
+    }
+
+    fn constant(&self) -> [f64; 2] {
+        [self.q; 2]
+    }
+
+    fn kick(&self) -> [f64; 2] {
+        [self.q; 2]
+    }
+
+    fn propagator(&self, z: f64) -> Matrix {
+        let pull = -self.q * (z + self.a);
+        Matrix::of(2, |i, j| [[1.0 + pull, self.p], [pull, self.p]][i][j])
+    }
+
+    /// A release is a jump: before it the whole force on the point without damping was m·a + C·v with the tool's a and
+    /// v; after it, the force is F = spring + applied − K″·u. At a jump the scheme needs the mean of both (see
+    /// `applied`), and it uses F with the mean of the applied force. The tool moved at constant velocity, so a = 0: the
+    /// point gets ½(C·v + F) less that. In terms of the increment, this is q times the difference.
+    fn release(&self, at: Release<'_>) -> Option<[f64; 2]> {
+        let elastic = at.springs[0] - self.q * self.a * at.u;
+        let used = elastic + at.used;
+        let kick = 0.5 * (self.q * at.scale * at.lost_n + elastic) - used;
+        Some([kick, kick])
+    }
+
+    /// d = v·dt − ½·acceleration·dt², at the time of u.
+    fn resample(&self, _: &Self, ratio: f64, [u, d]: [f64; 2], pushed: f64, springs: &mut [f64]) -> [f64; 2] {
+        let acceleration = (self.p - 1.0) * d - self.q * self.a * u + springs[0] + pushed;
+        let velocity = d + 0.5 * acceleration;
+        [u, velocity * ratio - 0.5 * acceleration * ratio * ratio]
+    }
+}
+
+/// The same in the format of the state; q is in the scale of the springs and the tools.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct CentralAdvance<T> {
+    p: T,
+    pull: T,
+    /// Damping is almost zero, so d·d₊ is twice the kinetic energy that the scheme conserves.
+    keeps: bool,
+}
+
+impl<T: Real> Arithmetic<T> for CentralAdvance<T> {
+    const KEPT: usize = 0;
+    const WRITTEN: usize = 0;
+    const FORCES: usize = 1;
+    /// Cuts d only: u is a sum of values that were not cut, and gets smaller only where two of them cancel.
+    const CUTS: bool = true;
+
+    #[inline(always)]
+    fn advance<V: Vector<Real = T>>(&self, x: V, d: V, n: V, _: &mut [V; MAX_KEPT], force: Option<[V; 2]>) -> (V, V) {
+        let n = if let Some(force) = force { n.add(force[0]) } else { n };
+        let d = d.splat(self.p).mul_add(d, d.splat(self.pull).mul_add(x, n));
+        let d = d.keep(d.counts());
+        (x.add(d), d)
+    }
+
+    #[inline(always)]
+    fn travel<V: Vector<Real = T>>(&self, _: [V; 2], [_, next]: [V; 2]) -> V {
+        // The force acts from half a substep before the substep's beginning to half a substep after: the mean of d and
+        // this. The guard subtracts half of the last at each survey.
+        next
+    }
+
+    #[inline(always)]
+    fn observe<V: Vector<Real = T>>(&self, x: V, d: V, n: V, kept: &[V; MAX_KEPT], force: Option<V>) -> (V, V) {
+        // The mean of the increments of the substep just done and of the one that would follow: second order, and at
+        // the time of the displacement.
+        let (_, next) = self.advance(x, d, n, &mut kept.clone(), force.map(|force| [force; 2]));
+        (x, d.splat(T::of(0.5)).mul(d.add(next)))
+    }
+
+    #[inline(always)]
+    fn conserved_speed_squared<V: Vector<Real = T>>(
+        &self,
+        x: V,
+        d: V,
+        n: V,
+        kept: &[V; MAX_KEPT],
+        force: Option<V>,
+    ) -> V {
+        // Without damping and tools, the scheme conserves ½·d·d₊ + the elastic energy to the last bit, however large
+        // the substep; with the square of the velocity instead, the sum oscillates by (dt·ω)²/8. Strong damping hides
+        // that oscillation, and may let d·d₊ rise.
+        let (_, next) = self.advance(x, d, n, &mut kept.clone(), force.map(|force| [force; 2]));
+        let mean = d.splat(T::of(0.5)).mul(d.add(next));
+        if self.keeps { d.mul(next) } else { mean.mul(mean) }
+    }
+}

@@ -1,0 +1,272 @@
+//! The schemes that advance the sheet: one file each, and one line each in the register.
+//!
+//! Units in this module: lengths are in spacings h, time in substeps dt. u is a displacement over h, d is (nearly) the
+//! amount a scheme adds to it in a substep, forces are times dt²/(m·h). The coefficients of the equation of motion are
+//! then a = K″·dt²/m and g = C·dt/m: u̇̇ = N − a·u − g·u̇ + F, with N from the springs and F from the tools. Small
+//! numbers stay small and keep their digits in f32.
+
+pub(crate) mod advance;
+pub(crate) mod arithmetic;
+mod central;
+mod exponential;
+pub(crate) mod family;
+mod lagged_damping;
+mod matrix;
+pub(crate) mod observer;
+mod oscillator;
+mod rk4;
+pub mod stability;
+
+pub use central::TwoStep;
+pub use exponential::Multistep;
+pub use family::QuadratureNode;
+pub use oscillator::Oscillator;
+pub use rk4::Rk4;
+
+use std::any::Any;
+
+use crate::scene::Integrator;
+use family::{Family, Release};
+use matrix::Matrix;
+
+/// A scheme, fitted to a sheet and a substep: one variant for each arithmetic.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Scheme {
+    /// `central` and `lagged`.
+    TwoStep(TwoStep),
+    /// The exponential multistep scheme that keeps 2 values.
+    Exponential2(Multistep<2>),
+    /// The same with 3.
+    Exponential3(Multistep<3>),
+    /// The same with 4.
+    Exponential4(Multistep<4>),
+    /// The classical fourth-order Runge–Kutta scheme.
+    Rk4(Rk4),
+}
+
+/// Compiles an expression once for each variant of [`Scheme`], with `$family` as the fitted scheme, and runs the one of
+/// `$scheme`.
+macro_rules! each {
+    ($scheme:expr, |$family:ident| $body:expr) => {
+        match $scheme {
+            $crate::scheme::Scheme::TwoStep($family) => $body,
+            $crate::scheme::Scheme::Exponential2($family) => $body,
+            $crate::scheme::Scheme::Exponential3($family) => $body,
+            $crate::scheme::Scheme::Exponential4($family) => $body,
+            $crate::scheme::Scheme::Rk4($family) => $body,
+        }
+    };
+}
+pub(crate) use each;
+
+/// What the substep of an integrator must satisfy when its number of substeps is not chosen by rehearsals.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Bound {
+    /// Stability.
+    Stable,
+    /// A small turn of the fastest vibration ([`THETA`](crate::scheme::stability::THETA)).
+    Turn,
+    /// The same, and half of the damping at which it is stable.
+    TurnAndLag,
+}
+
+/// What the register says of an integrator.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Entry {
+    /// The power of the substep with which its error falls.
+    pub(crate) order: f64,
+    /// The cost of a substep, in those of `central`. Measured (`make tables-kernel`).
+    pub(crate) cost: f64,
+    /// What its substep must satisfy.
+    pub(crate) bound: Bound,
+    /// Whether it can compensate the rounding of f32.
+    pub(crate) compensates: bool,
+    /// Fits it to a = K″·dt²/m and g = C·dt/m.
+    fit: fn(f64, f64) -> Scheme,
+}
+
+/// The integrators that `auto` may become, by falling order.
+pub(crate) const CANDIDATES: [Integrator; 4] =
+    [Integrator::Exponential4, Integrator::Exponential3, Integrator::Exponential2, Integrator::Central];
+
+/// The register of integrators.
+pub(crate) fn entry(integrator: Integrator) -> Entry {
+    type Fit = fn(f64, f64) -> Scheme;
+    let exponential =
+        |order: f64, cost: f64, fit: Fit| Entry { order, cost, bound: Bound::Stable, compensates: true, fit };
+    let other = |order: f64, cost: f64, bound: Bound, fit: Fit| Entry { order, cost, bound, compensates: false, fit };
+    let by_central = |bound: Bound| other(2.0, 1.0, bound, |a, g| Scheme::TwoStep(central::fit(a, g)));
+    match integrator {
+        Integrator::Auto => by_central(Bound::Stable),
+        Integrator::Central => by_central(Bound::Turn),
+        Integrator::Lagged => other(1.0, 1.0, Bound::TurnAndLag, |a, g| Scheme::TwoStep(lagged_damping::fit(a, g))),
+        // It evaluates the springs four times.
+        Integrator::Rk4 => other(4.0, 4.0, Bound::Stable, |a, g| Scheme::Rk4(Rk4 { a, g })),
+        Integrator::Exponential2 => exponential(3.0, 1.3, |a, g| Scheme::Exponential2(exponential::fit(a, g))),
+        Integrator::Exponential3 => exponential(4.0, 1.4, |a, g| Scheme::Exponential3(exponential::fit(a, g))),
+        Integrator::Exponential4 => exponential(5.0, 1.6, |a, g| Scheme::Exponential4(exponential::fit(a, g))),
+    }
+}
+
+/// `to`, if it is of the same type as `_from`.
+fn like<'t, F: 'static>(_from: &F, to: &'t dyn Any) -> Option<&'t F> {
+    to.downcast_ref()
+}
+
+/// Returns the power of the substep with which the error of an integrator falls.
+pub fn order(integrator: Integrator) -> f64 {
+    entry(integrator).order
+}
+
+impl Scheme {
+    /// Fits a scheme to a = K″·dt²/m and g = C·dt/m.
+    pub fn fit(integrator: Integrator, a: f64, g: f64) -> Self {
+        (entry(integrator).fit)(a, g)
+    }
+
+    /// Sweeps over the springs in a substep.
+    pub(crate) fn sweeps(&self) -> usize {
+        each!(self, |family| family.sweeps())
+    }
+
+    /// The first field of the tools' force that sweep number `sweep` reads.
+    pub(crate) fn field(&self, sweep: usize) -> usize {
+        each!(self, |family| family.field(sweep))
+    }
+
+    /// The fraction of the substep that the state after sweep number `sweep` belongs to; `None` after the last.
+    pub(crate) fn fraction_after(&self, sweep: usize) -> Option<f64> {
+        each!(self, |family| family.fraction_after(sweep))
+    }
+
+    /// Returns how the tools' force enters a substep: the moments (0 to 1) at which it is evaluated, and the weights
+    /// with which each value adds to the scheme's force fields.
+    pub fn nodes(&self) -> Vec<QuadratureNode> {
+        each!(self, |family| family.nodes())
+    }
+
+    /// Returns whether a force that jumps must be given as the mean of both sides.
+    pub fn takes_means(&self) -> bool {
+        each!(self, |family| family.takes_means())
+    }
+
+    /// Returns the factor that scales the springs' forces beyond dt²/(m·h).
+    pub fn spring_scale(&self) -> f64 {
+        each!(self, |family| family.spring_scale())
+    }
+
+    /// Returns the velocity that a constant force of 1 adds in a substep (nearly), through the last of its fields.
+    pub fn impulse(&self) -> f64 {
+        self.constant()[1]
+    }
+
+    /// Returns the field of the tools' force that adds to the velocity.
+    pub fn last_field(&self) -> usize {
+        each!(self, |family| family.last_field())
+    }
+
+    /// Returns the u and d that a constant force of 1 adds in a substep.
+    pub fn constant(&self) -> [f64; 2] {
+        each!(self, |family| family.constant())
+    }
+
+    /// Returns the u and d that an impulse of 1 at a substep's beginning has added by its end.
+    pub fn kick(&self) -> [f64; 2] {
+        each!(self, |family| family.kick())
+    }
+
+    /// Returns the fields that the scheme keeps beside u and d.
+    pub fn kept(&self, compensated: bool) -> usize {
+        each!(self, |family| family.kept(compensated))
+    }
+
+    /// Returns how many of those, from the first, are the springs' forces of earlier substeps, newest first.
+    pub fn history(&self) -> usize {
+        each!(self, |family| family.history())
+    }
+
+    /// Returns the matrix that advances u, d and the kept values of a single vibration whose springs pull with −z·u.
+    /// Its eigenvalues determine stability and accuracy.
+    pub fn propagator(&self, z: f64) -> Matrix {
+        each!(self, |family| family.propagator(z))
+    }
+
+    /// Returns the largest growth factor of a vibration z in a substep.
+    pub fn growth(&self, z: f64) -> f64 {
+        self.propagator(z).spectral_radius()
+    }
+
+    /// What a point's u and d must change by when a tool releases it ([`Family::release`]).
+    pub(crate) fn release(&self, at: Release<'_>) -> Option<[f64; 2]> {
+        each!(self, |family| family.release(at))
+    }
+
+    /// Converts u and d of one component of a point to the same scheme with another substep ([`Family::resample`]), or to
+    /// another scheme.
+    pub(crate) fn resample(
+        &self,
+        to: &Self,
+        ratio: f64,
+        state: [f64; 2],
+        pushed: f64,
+        springs: &mut [f64],
+    ) -> [f64; 2] {
+        each!(self, |from| each!(to, |to| match like(from, to) {
+            Some(to) => from.resample(to, ratio, state, pushed, springs),
+            // Schemes of two families have only the velocity in common.
+            None => [state[0], state[1] * ratio],
+        }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_and_the_springs_stiffness_make_the_square_of_the_fastest_turn() {
+        let sheet = Oscillator {
+            mass_kg: 0.02,
+            damping_n_s_per_m: 0.3,
+            anchor_stiffness_n_per_m: 7.0,
+            spring_stiffness_n_per_m: 130.0,
+        };
+        for substep_s in [1e-4, 1e-3, 0.02] {
+            let ((a, g), z) = (sheet.scaled(substep_s), sheet.scaled_spring_stiffness(substep_s));
+            let turn = sheet.omega_bound_per_s() * substep_s;
+            assert!((a + z - turn * turn).abs() < 1e-12 * turn * turn);
+            assert!((z / a - 130.0 / 7.0).abs() < 1e-12 && (g - 15.0 * substep_s).abs() < 1e-15);
+        }
+    }
+
+    /// u and u̇ after a substep of u̇̇ = force − a·u − g·u̇, in steps too short to matter.
+    fn moved(a: f64, g: f64, force: f64, velocity: f64) -> [f64; 2] {
+        const STEPS: u32 = 2000;
+        let dt = f64::from(STEPS).recip();
+        let slope = |[u, w]: [f64; 2]| [w, force - a * u - g * w];
+        (0..STEPS).fold([0.0, velocity], |y, _| {
+            let along = |k: [f64; 2], t: f64| [y[0] + t * k[0], y[1] + t * k[1]];
+            let middle = slope(along(slope(y), 0.5 * dt));
+            along(middle, dt)
+        })
+    }
+
+    #[test]
+    fn impulses_and_constant_forces_act_as_on_the_oscillator() {
+        for (a, g) in [(0.04, 0.3), (0.5, 0.0), (0.01, 2.0)] {
+            for integrator in [Integrator::Exponential2, Integrator::Exponential3, Integrator::Exponential4] {
+                let scheme = Scheme::fit(integrator, a, g);
+                for (found, truth) in
+                    [(scheme.kick(), moved(a, g, 0.0, 1.0)), (scheme.constant(), moved(a, g, 1.0, 0.0))]
+                {
+                    let near = (0..2).all(|row| (found[row] - truth[row]).abs() < 1e-6);
+                    assert!(near, "{integrator:?} {a} {g}: {found:?} {truth:?}");
+                }
+                assert_eq!(scheme.impulse(), scheme.constant()[1]);
+            }
+            // Two-step schemes move a point by what they change its increment by.
+            let central = Scheme::fit(Integrator::Central, a, g);
+            assert_eq!((central.kick(), central.constant()), ([1.0 / (1.0 + g / 2.0); 2], central.kick()));
+        }
+    }
+}

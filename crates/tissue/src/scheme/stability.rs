@@ -1,0 +1,268 @@
+//! How fast the sheet can vibrate, and how many substeps that asks for.
+
+use crate::scene::{Body, Integrator, Scene, Springs, StiffnessBound};
+use crate::scheme::{Bound, Oscillator, Scheme, entry};
+
+/// Largest phase of the fastest vibration per substep of central differences, rad: dt·ω_b ≤ θ. The scheme is stable
+/// below 2; its error falls with θ². At 0.25 the force of the stiffest scenes is within 5e-3.
+pub const THETA: f64 = 0.25;
+
+/// Returns by how much smaller than [`THETA`] a turn has to be where vibrations last, from 1 to 8.
+///
+/// A vibration ω of central differences is fast by ω(dt·ω)²/24, and the phase that it loses so adds up for as long as
+/// the vibration lasts, τ = 2m/C: to (ω·τ)(dt·ω)²/24. The same error then asks for a turn smaller by √(ω·τ). Up to
+/// ω_b·τ = 27 the turn of `THETA` itself does; beyond 27·8² one runs for a given time, not until all is still, and no
+/// scheme of second order is the right one. (Measured on scenes with C = 0 and k/K″ from 4 to 100 for 1 to 2 s: errors of
+/// 2e-2 of the largest displacement without this, 3e-4 with it.)
+pub fn endurance(omega_per_s: f64, decay_s: f64) -> f64 {
+    let turns = omega_per_s * decay_s;
+    // Nothing vibrates, and nothing damps it.
+    if turns.is_nan() { 1.0 } else { (turns / 27.0).sqrt().clamp(1.0, 8.0) }
+}
+
+/// Returns the largest eigenvalue of the springs' stiffness matrix under any deformation, with the masses of reference,
+/// N/m.
+pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
+    match &scene.body {
+        Body::Sheet(_) => largest_stiffness_of_a_sheet_n_per_m(&scene.springs),
+        // What pulls back beyond the K″ of reference counts among the springs.
+        Body::Mesh(mesh) => {
+            let StiffnessBound { bound, extra_anchor, .. } = mesh.stiffest;
+            let k = scene.springs.stiffness_n_per_m;
+            let elastic = match &mesh.volume {
+                None => k * bound,
+                Some(volume) => volume.swelling.bound_n_per_m(scene.volume_stiffness_pa, bound, k),
+            };
+            elastic + scene.anchor_stiffness_n_per_m * extra_anchor
+        }
+    }
+}
+
+/// Returns the same without the pressure of a volume, N/m.
+pub fn stiffness_of_springs_n_per_m(scene: &Scene) -> f64 {
+    match &scene.body {
+        Body::Mesh(mesh) if mesh.volume.is_some() => {
+            let StiffnessBound { bound, extra_anchor, .. } = mesh.stiffest;
+            scene.springs.stiffness_n_per_m * bound + scene.anchor_stiffness_n_per_m * extra_anchor
+        }
+        _ => largest_stiffness_n_per_m(scene),
+    }
+}
+
+/// Returns what turns the rounding of displacements into force, N/m. That of many points hardly adds up to a change of
+/// the volume.
+#[allow(clippy::cast_precision_loss)]
+pub fn approximate_stiffness_n_per_m(scene: &Scene) -> f64 {
+    let of_springs = stiffness_of_springs_n_per_m(scene);
+    let points = scene.shape().point_count() as f64;
+    let of_pressure = |swelling_m: f64| scene.volume_stiffness_pa * swelling_m / points.sqrt();
+    of_springs + scene.volume().map_or(0.0, |volume| of_pressure(volume.swelling.by_pressure_m))
+}
+
+/// Returns the same of the springs of a sheet, N/m.
+///
+/// A spring with unit direction n contributes k(nnᵀ + (1 − L0/L)(I − nnᵀ)) to the tangent stiffness, which is at
+/// most k·I: so no deformation makes the matrix larger than the graph Laplacian with weights k. On the unbounded
+/// grid the wave (a, b) has the eigenvalue
+///
+/// λ = k₁(4 − 2x − 2y) + k₂(4 − 4xy) + k₃(8 − 4x² − 4y²),  x = cos a, y = cos b in [−1, 1],
+///
+/// k₁ structural, k₂ shear, k₃ bending; a finite sheet has fewer springs, and smaller eigenvalues. With all k equal
+/// the largest is 12k without and 16⅓·k with bending.
+pub fn largest_stiffness_of_a_sheet_n_per_m(springs: &Springs) -> f64 {
+    let (k1, k2) = (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m);
+    let k3 = if springs.bending { k1 } else { 0.0 };
+    let eigenvalue =
+        |x: f64, y: f64| k1 * (4.0 - 2.0 * x - 2.0 * y) + k2 * (4.0 - 4.0 * x * y) + k3 * (8.0 - 4.0 * (x * x + y * y));
+    // λ is a quadratic form: its maximum is at a corner, where its slope along an edge is 0, or where both slopes are.
+    let mut candidates = vec![(-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)];
+    if k3 > 0.0 {
+        for edge in [-1.0, 1.0] {
+            candidates.push((edge, -(2.0 * k1 + 4.0 * k2 * edge) / (8.0 * k3)));
+        }
+    }
+    if k2 + k3 > 0.0 {
+        let inner = -2.0 * k1 / (4.0 * k2 + 8.0 * k3);
+        candidates.push((inner, inner));
+    }
+    let inside = |&(x, y): &(f64, f64)| x.abs() <= 1.0 && y.abs() <= 1.0;
+    candidates.into_iter().filter(inside).map(|(x, y)| eigenvalue(x, y)).fold(0.0, f64::max)
+}
+
+/// Vibrations between the slowest and the fastest at which stability is looked at: it may fail in between.
+const VIBRATIONS: u32 = 48;
+
+/// Largest growth factor of a vibration per substep that counts as stable: 1 plus rounding error.
+const NO_GROWTH: f64 = 1.0 + 1e-7;
+
+/// Returns whether no vibration grows, of springs up to `stiffness` = (ω·dt)².
+pub fn is_stable(scheme: &Scheme, stiffness: f64) -> bool {
+    (0..=VIBRATIONS).all(|k| {
+        // Dense towards the stiff end, where schemes fail first.
+        let part = f64::from(k) / f64::from(VIBRATIONS);
+        scheme.growth(stiffness * part * part) <= NO_GROWTH
+    })
+}
+
+/// Returns the fewest substeps of `step_s` with which any scheme is stable. Saturates for absurd scenes.
+pub fn least_substeps(step_s: f64, sheet: &Oscillator) -> u32 {
+    substeps_of_turn(step_s, sheet.omega_bound_per_s(), 2.0)
+}
+
+/// Returns the fewest substeps of `step_s` with which a scheme is stable. Saturates for absurd scenes.
+pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
+    let mut substeps = least_substeps(step_s, sheet);
+    let stable = |substeps: u32| {
+        let substep_s = step_s / f64::from(substeps);
+        let (a, g) = sheet.scaled(substep_s);
+        is_stable(&Scheme::fit(integrator, a, g), sheet.scaled_spring_stiffness(substep_s))
+    };
+    // The limit of all is above dt·ω = 0.3 even without damping, and above dt·C/m = 2 (that of `rk4` is 2.785); rounding
+    // may tell otherwise for ever.
+    let fastest_per_s = (sheet.omega_bound_per_s() / 0.1).max(sheet.damping_n_s_per_m / sheet.mass_kg);
+    let most = (step_s * fastest_per_s).min(f64::from(u32::MAX));
+    while !stable(substeps) && f64::from(substeps) < most {
+        substeps = substeps.saturating_add(substeps / 8 + 1);
+    }
+    substeps
+}
+
+/// Returns the fewest substeps of `step_s` with which a yardstick is stable, and as accurate as it promises. Saturates
+/// for absurd scenes.
+pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
+    let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
+    let omega = sheet.omega_bound_per_s();
+    let turn = || substeps_of_turn(step_s, omega, THETA / endurance(omega, decay_s));
+    // Half the stable damping, so that light points do not ring with the substep.
+    let lag = || substeps_of_turn(step_s, sheet.damping_n_s_per_m / sheet.mass_kg, 1.0);
+    match entry(integrator).bound {
+        Bound::Stable => stable_substeps(integrator, step_s, sheet),
+        Bound::Turn => turn(),
+        Bound::TurnAndLag => turn().max(lag()),
+    }
+}
+
+/// Returns the fewest substeps with dt·`omega_per_s` ≤ `theta`, dt = `step_s` / substeps. Saturates for absurd scenes.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub fn substeps_of_turn(step_s: f64, omega_per_s: f64, theta: f64) -> u32 {
+    (step_s * omega_per_s / theta).ceil().clamp(1.0, f64::from(u32::MAX)) as u32
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::cast_precision_loss)]
+    use super::*;
+    use crate::scene::Named;
+
+    /// Every scheme.
+    fn all() -> impl Iterator<Item = Integrator> {
+        Integrator::NAMES.iter().map(|entry| entry.1).filter(|integrator| *integrator != Integrator::Auto)
+    }
+
+    fn springs(k: f64, shear: f64, bending: bool) -> Springs {
+        Springs { stiffness_n_per_m: k, shear_stiffness_n_per_m: shear, bending }
+    }
+
+    #[test]
+    fn the_largest_stiffness_is_that_of_the_fastest_wave() {
+        // With bending and a shear of 2 to 2.5 k, the fastest wave is on an edge between two corners.
+        let cases = [(1.0, 1.0), (1.0, 0.0), (0.0, 2.0), (3.0, 0.2), (0.1, 5.0), (0.0, 0.0), (1.0, 2.2), (2.0, 4.8)];
+        for (k, shear) in cases {
+            for bending in [false, true] {
+                // Force on a point of u = e^{i(aj + bk)}: over all its springs, 1 − cos of the phase between their ends.
+                let wave = |a: f64, b: f64| {
+                    let both_ways = |stiffness: f64, phase: f64| 2.0 * stiffness * (1.0 - phase.cos());
+                    let bending = if bending { both_ways(k, 2.0 * a) + both_ways(k, 2.0 * b) } else { 0.0 };
+                    both_ways(k, a) + both_ways(k, b) + both_ways(shear, a + b) + both_ways(shear, a - b) + bending
+                };
+                let angles = (0..=720).map(|n| f64::from(n) * std::f64::consts::PI / 720.0);
+                let most = angles.clone().flat_map(|a| angles.clone().map(move |b| wave(a, b))).fold(0.0, f64::max);
+                let found = largest_stiffness_of_a_sheet_n_per_m(&springs(k, shear, bending));
+                assert!(found >= most - 1e-12 && found <= most * (1.0 + 1e-4), "{k} {shear} {bending}: {found} {most}");
+            }
+        }
+    }
+
+    #[test]
+    fn vibrations_that_last_ask_for_smaller_turns() {
+        assert_eq!([endurance(10.0, 2.7), endurance(1.0, 1.0), endurance(0.0, f64::INFINITY)], [1.0; 3]);
+        assert!((endurance(100.0, 1.08) - 2.0).abs() < 1e-12);
+        assert_eq!([endurance(1e3, 1e3), endurance(1.0, f64::INFINITY)], [8.0; 2]);
+    }
+
+    #[test]
+    fn stable_is_as_few_substeps_as_do_not_grow() {
+        let omega_per_s = |stiffness: f64| (stiffness / 0.01_f64).sqrt();
+        for spring_stiffness_n_per_m in [0.0, 10.0, 3e3, 4e5] {
+            for damping_n_s_per_m in [0.0, 0.05, 8.0, 400.0] {
+                let sheet = Oscillator {
+                    mass_kg: 0.01,
+                    damping_n_s_per_m,
+                    anchor_stiffness_n_per_m: 5.0,
+                    spring_stiffness_n_per_m,
+                };
+                for integrator in all() {
+                    let grows = |substeps: u32| {
+                        let substep_s = 1e-3 / f64::from(substeps);
+                        let (a, g) = sheet.scaled(substep_s);
+                        !is_stable(&Scheme::fit(integrator, a, g), sheet.scaled_spring_stiffness(substep_s))
+                    };
+                    let found = stable_substeps(integrator, 1e-3, &sheet);
+                    let case = format!("{integrator:?} {spring_stiffness_n_per_m} {damping_n_s_per_m}: {found}");
+                    let turn = omega_per_s(spring_stiffness_n_per_m + 5.0) * 1e-3;
+                    // Without damping some grow by less than rounding tells, however short the substep.
+                    assert!(!grows(found) || damping_n_s_per_m == 0.0 && turn / f64::from(found) <= 0.1, "{case}");
+                    // The search goes by eighths: what is a fifth shorter grows, or turns by more than 2.
+                    let fewer = found * 4 / 5;
+                    assert!(fewer == 0 || grows(fewer) || turn / f64::from(fewer) > 2.0, "{case}");
+                    assert!(turn / f64::from(found) <= 2.0, "{case}");
+                }
+                let turn = |integrator| {
+                    let substeps = f64::from(substeps(integrator, 1e-3, &sheet));
+                    omega_per_s(spring_stiffness_n_per_m + 5.0) * 1e-3 / substeps
+                };
+                // Vibrations that last for 2m/C ask for a smaller turn of the yardsticks.
+                let most = THETA / endurance(sheet.omega_bound_per_s(), 0.02 / damping_n_s_per_m) * (1.0 + 1e-12);
+                assert!(turn(Integrator::Central) <= most && turn(Integrator::Lagged) <= most);
+                let lagged = substeps(Integrator::Lagged, 1e-3, &sheet);
+                assert!(damping_n_s_per_m / 0.01 * 1e-3 / f64::from(lagged) <= 1.0);
+                assert_eq!(substeps(Integrator::Rk4, 1e-3, &sheet), stable_substeps(Integrator::Rk4, 1e-3, &sheet));
+            }
+        }
+    }
+
+    #[test]
+    fn a_vibration_grows_by_what_its_damping_says() {
+        // Of u̇̇ + g·u̇ + (a + z)·u = 0 the slower part of e^{λ}; a scheme of second order errs by its square.
+        for (a, g, z) in [(0.01, 0.02, 0.0), (0.01, 0.02, 0.05), (0.04, 0.5, 0.0), (0.001, 0.1, 0.02)] {
+            let square: f64 = 0.25 * g * g - a - z;
+            let truth = (if square > 0.0 { square.sqrt() } else { 0.0 } - 0.5 * g).exp();
+            for integrator in all() {
+                let within = match integrator {
+                    Integrator::Lagged => 3e-2,
+                    Integrator::Rk4 => 1e-4,
+                    Integrator::Exponential3 | Integrator::Exponential4 => 1e-3,
+                    _ => 2e-3,
+                };
+                let found = Scheme::fit(integrator, a, g).growth(z);
+                assert!((found - truth).abs() < within, "{integrator:?} {a} {g} {z}: {found} {truth}");
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_that_vibrates_needs_one_substep() {
+        let sheet = Oscillator {
+            mass_kg: 1.0,
+            damping_n_s_per_m: 0.0,
+            anchor_stiffness_n_per_m: 0.0,
+            spring_stiffness_n_per_m: 0.0,
+        };
+        for integrator in all() {
+            assert_eq!(substeps(integrator, 1e-3, &sheet), 1, "{integrator:?}");
+        }
+        // An absurd one asks for as many as can be counted, at once.
+        let absurd = Oscillator { spring_stiffness_n_per_m: 1e40, ..sheet };
+        assert_eq!(least_substeps(1e-3, &absurd), u32::MAX);
+    }
+}

@@ -1,0 +1,430 @@
+//! The audit: it repeats a window of steps in f64 with a quarter of the substep and compares the two results.
+//!
+//! The sheet marks where a window begins and ends. Both are checkpoints of the guard, which are shared for this, not
+//! copied. Between them the sheet records its tools' inputs. The slow work happens on copies, in any thread:
+//! [`SharedCheckpoint::open`] copies the beginning and releases the checkpoint, [`WindowOpening::close`] does the same with
+//! the end, and [`Audit::work`] repeats the window in slices.
+//!
+//! The result is the error that the window added. Two errors stay unseen: that of the state in which the window began,
+//! and the error that the twin shares with the sheet, which for a scheme of order p is 4^−p of the error.
+//!
+//! An error is relative to the largest displacement and force of the window, or of earlier windows if those were
+//! larger: in a sheet that comes to rest, what is left of a poke is measured relative to the poke.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use crate::guard::checkpoint::Checkpoint;
+use crate::guard::convert;
+use crate::interface::Tissue;
+use crate::kernel::field::State;
+use crate::kernel::real::Real;
+use crate::memory;
+use crate::model::Model;
+use crate::scene::Precision;
+pub use crate::scene::record::AuditedError;
+use crate::scheme::Oscillator;
+use crate::select::audit_window::{AuditWindow, Replay, Resume};
+pub use crate::select::audit_window::{Mark, SharedCheckpoint, WindowInputs};
+use crate::state::tissue_state::{TissueState, springs_of};
+use crate::tools::applied_force::Applied;
+
+/// The twin's substep is 1/`FINER` of the sheet's.
+pub const FINER: u32 = 4;
+
+/// Longest window, s, before it is rounded up to the next checkpoint.
+const LONGEST_S: f64 = 0.25;
+
+/// Points times substeps in a slice of an audit: some milliseconds.
+const SLICE: u64 = 1 << 20;
+
+/// The main source of an error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Origin {
+    /// The scheme with this substep.
+    Substep,
+    /// The rounding of the number format.
+    Rounding,
+    /// Tiles at rest, which are not computed.
+    Sleep,
+}
+
+impl Origin {
+    /// Returns a description for messages.
+    pub fn describe(self) -> &'static str {
+        match self {
+            Origin::Substep => "the length of the substep",
+            Origin::Rounding => "the rounding of the number format",
+            Origin::Sleep => "regions at rest that are not computed",
+        }
+    }
+}
+
+/// The result of an audit of a window.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AuditFinding {
+    /// Steps done at the end of the window.
+    pub step: u64,
+    /// The error that the window added.
+    pub error: AuditedError,
+    /// The main source of the error, if it is above the scene's tolerance.
+    pub origin: Option<Origin>,
+    /// Substeps per step in the window, after the guard's halvings.
+    pub substeps: u32,
+    /// The largest extent of this and earlier windows, to which the next window's error is relative.
+    pub largest: ErrorExtent,
+}
+
+/// Largest components over the points of a sheet.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct ErrorExtent {
+    /// Displacements, m.
+    pub displacement_m: f64,
+    /// Forces of the tissue on tools, N.
+    pub force_n: f64,
+}
+
+impl ErrorExtent {
+    /// Returns the larger of each component.
+    pub fn max(self, other: Self) -> Self {
+        ErrorExtent {
+            displacement_m: self.displacement_m.max(other.displacement_m),
+            force_n: self.force_n.max(other.force_n),
+        }
+    }
+}
+
+impl ErrorExtent {
+    /// Returns these as differences, relative to the largest values; 0 where nothing differs.
+    pub fn relative_to(self, largest: ErrorExtent) -> AuditedError {
+        let part = |difference: f64, largest: f64| if difference == 0.0 { 0.0 } else { difference / largest };
+        AuditedError {
+            displacement: part(self.displacement_m, largest.displacement_m),
+            force: part(self.force_n, largest.force_n),
+        }
+    }
+}
+
+/// A copy of a window's beginning.
+#[derive(Debug)]
+pub struct WindowOpening(Box<dyn Replay>);
+
+/// A complete window: everything needed to repeat it.
+#[derive(Debug)]
+pub struct Audit {
+    begin: Box<dyn Replay>,
+    inputs: WindowInputs,
+    end: Observed,
+    until: u64,
+}
+
+/// The compared values: for each point the displacement, m, and the tissue's force on a tool, N.
+#[derive(Debug)]
+struct Observed(Vec<[DVec3; 2]>);
+
+impl Observed {
+    fn of(sheet: &dyn Replay) -> Self {
+        Observed(sheet.observed())
+    }
+
+    fn extent(&self) -> ErrorExtent {
+        self.over(|point| *point)
+    }
+
+    fn differences(&self, other: &Self) -> ErrorExtent {
+        let mut others = other.0.iter();
+        self.over(|point| others.next().map_or([DVec3::ZERO; 2], |other| [point[0] - other[0], point[1] - other[1]]))
+    }
+
+    fn over(&self, mut of: impl FnMut(&[DVec3; 2]) -> [DVec3; 2]) -> ErrorExtent {
+        self.0.iter().fold(ErrorExtent::default(), |extent, point| {
+            let [displacement_m, force_n] = of(point).map(|vector| vector.abs().max_element());
+            extent.max(ErrorExtent { displacement_m, force_n })
+        })
+    }
+
+    fn is_finite(&self) -> bool {
+        self.0.iter().flatten().all(|vector| vector.is_finite())
+    }
+}
+
+impl Model {
+    /// Returns the same tissue in another format, with `by` times the substeps and without sleep.
+    pub fn twin(&self, by: u32, precision: Precision) -> Arc<Self> {
+        let mut model = self.clone();
+        model.plan = self.plan.divided(&self.scene, by);
+        model.precision = precision;
+        (model.sleep_tolerance, model.scene.sleep_tolerance) = (0.0, Some(0.0));
+        Arc::new(model)
+    }
+
+    /// Steps in a window: until the slowest vibration has lost half its amplitude, at most `LONGEST_S` s.
+    ///
+    /// The amplitude of m·ü + C·u̇ + K·u = 0 falls as e^(−γt), with γ = C/2m, or in the overdamped case
+    /// γ = (C − √(C² − 4mK))/2m for the slower part. K is that of the anchor springs alone: the slowest vibration of a
+    /// sheet bends it least.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub fn window_steps(&self) -> u64 {
+        let Oscillator { mass_kg, damping_n_s_per_m: c, anchor_stiffness_n_per_m: k, .. } = Oscillator::of(&self.scene);
+        // The difference without cancellation.
+        let root = (c * c - 4.0 * mass_kg * k).max(0.0).sqrt();
+        let decay_per_s = if root > 0.0 { 2.0 * k / (c + root) } else { c / (2.0 * mass_kg) };
+        let window_s = (std::f64::consts::LN_2 / decay_per_s).min(LONGEST_S);
+        (window_s * self.scene.stepping.rate_hz).ceil().max(1.0) as u64
+    }
+}
+
+impl<T: Real> TissueState<T> {
+    /// Requests a window, which begins at the next checkpoint.
+    pub(crate) fn request_audit(&mut self, mut inputs: WindowInputs) {
+        inputs.0.clear();
+        (self.audit_window, self.is_marked) = (AuditWindow::Wanted(inputs), false);
+    }
+
+    /// Handles a new checkpoint, at which a window may begin or end.
+    pub(crate) fn mark(&mut self) {
+        self.audit_window = match std::mem::take(&mut self.audit_window) {
+            AuditWindow::Wanted(inputs) => {
+                self.is_marked = true;
+                AuditWindow::Open(self.steps + self.model.window_steps(), inputs)
+            }
+            // The beginning has not been reported yet, and its checkpoint is gone.
+            AuditWindow::Open(_, mut inputs) if self.is_marked => {
+                inputs.0.clear();
+                AuditWindow::Open(self.steps + self.model.window_steps(), inputs)
+            }
+            AuditWindow::Open(until, inputs) if self.steps >= until => AuditWindow::Closed(inputs),
+            AuditWindow::Closed(_) => AuditWindow::Dropped,
+            other => other,
+        };
+    }
+
+    /// Takes the report on the window, once.
+    pub(crate) fn take_mark(&mut self) -> Option<Mark> {
+        let share = |sheet: &Self| {
+            let checkpoint = sheet.checkpoint.clone()?;
+            Some(SharedCheckpoint { model: sheet.model.clone(), checkpoint })
+        };
+        match &self.audit_window {
+            AuditWindow::Open(..) if std::mem::take(&mut self.is_marked) => share(self).map(Mark::Begin),
+            AuditWindow::Closed(_) => {
+                let end = share(self);
+                let AuditWindow::Closed(inputs) = std::mem::take(&mut self.audit_window) else { return None };
+                Some(end.map_or(Mark::Dropped, |end| Mark::End(end, inputs)))
+            }
+            AuditWindow::Dropped => {
+                self.audit_window = AuditWindow::Off;
+                Some(Mark::Dropped)
+            }
+            _ => None,
+        }
+    }
+
+    /// A sheet in the state of a checkpoint of a sheet with `model`.
+    fn resumed(model: &Model, checkpoint: &Checkpoint<T>) -> Box<Self> {
+        let mut sheet = Box::new(TissueState::new(&model.twin(1 << checkpoint.halvings, model.precision)));
+        sheet.steps = checkpoint.steps;
+        sheet.state.copy_from(&checkpoint.state);
+        sheet.applied.clone_from(&checkpoint.applied);
+        sheet.prescribed.clone_from(&checkpoint.prescribed);
+        sheet.contacts.clone_from(&checkpoint.contacts);
+        sheet.tiles.largest = checkpoint.largest;
+        sheet
+    }
+
+    /// The same state in f64. `model` differs from this sheet's only in the format and in what may sleep.
+    pub(crate) fn widened(&self, model: &Arc<Model>) -> TissueState<f64> {
+        let mut sheet = TissueState::<f64>::new(model);
+        sheet.steps = self.steps;
+        let lost = (self.model.precision == Precision::Compensated).then(|| self.state.kept.last()).flatten();
+        let State { u, d, kept } = &mut sheet.state;
+        let pairs = [(u, &self.state.u), (d, &self.state.d)].into_iter();
+        let kept = kept.iter_mut().zip(&self.state.kept).map(|(to, from)| (Arc::make_mut(to), &**from));
+        let (from, to) = (self.tables.layout, sheet.tables.layout);
+        for (number, (wide, narrow)) in pairs.chain(kept).enumerate() {
+            for index in 0..self.model.places() {
+                for c in 0..3 {
+                    let at = c * from.plane + from.offset(index);
+                    // The rounding loss of a compensated displacement belongs to it.
+                    let lost = lost.filter(|_| number == 0).map_or(0.0, |lost| lost[at].wide());
+                    wide[c * to.plane + to.offset(index)] = narrow[at].wide() + lost;
+                }
+            }
+        }
+        sheet.applied = Applied::like(&self.applied);
+        sheet.prescribed.clone_from(&self.prescribed);
+        sheet.contacts.clone_from(&self.contacts);
+        sheet
+    }
+
+    /// The same sheet under `model`, if that is in f64 and this one is not.
+    pub(crate) fn changed(&self, model: &Arc<Model>) -> Option<Box<TissueState<f64>>> {
+        if self.model.precision == Precision::F64 || model.precision != Precision::F64 {
+            return None;
+        }
+        let mut same = Model::clone(&self.model);
+        (same.plan, same.precision) = (self.plan.clone(), Precision::F64);
+        let mut sheet = Box::new(self.widened(&Arc::new(same)));
+        sheet.tiles.largest = self.tiles.largest;
+        sheet.guard_events = self.guard_events;
+        (sheet.substeps_done, sheet.points_done) = (self.substeps_done, self.points_done);
+        if !matches!(self.audit_window, AuditWindow::Off) {
+            sheet.audit_window = AuditWindow::Dropped;
+        }
+        sheet.change(model);
+        Some(sheet)
+    }
+
+    /// Continues with another substep of the same scheme. The tissue and the scheme's history stay.
+    pub(crate) fn resample(&mut self, model: &Arc<Model>) {
+        let (was, plan) = (self.plan.clone(), model.plan.clone());
+        // The present force as an acceleration; the scheme's own terms may be the mean of both sides of a jump.
+        self.applied.terms = self.present_terms();
+        let springs = springs_of(&self.model, &was);
+        let volume_change = self.volume_change();
+        convert(&self.tables.layout, &springs, [&was, &plan], &self.applied, volume_change, &mut self.state);
+        self.known_volume_change.set(None);
+        self.applied.forget();
+        self.model = model.clone();
+        self.tables.springs = springs_of(model, &plan);
+        self.plan = plan;
+    }
+}
+
+impl<T: Real> Resume for Checkpoint<T> {
+    fn resume(&self, model: &Model) -> Box<dyn Replay> {
+        TissueState::resumed(model, self)
+    }
+}
+
+impl<T: Real> Replay for TissueState<T> {
+    fn model(&self) -> &Arc<Model> {
+        &self.model
+    }
+
+    fn steps(&self) -> u64 {
+        self.steps
+    }
+
+    fn largest(&self) -> f64 {
+        self.tiles.largest
+    }
+
+    fn observed(&self) -> Vec<[DVec3; 2]> {
+        let points = self.model.points().map(|point| {
+            let point = self.point(point);
+            [point.displacement_m, point.reaction_n()]
+        });
+        memory::collected(points, "an audit")
+    }
+
+    fn twin(&self, by: u32) -> Box<dyn Replay> {
+        let mut wide = self.widened(&self.model.twin(1, Precision::F64));
+        if by > 1 {
+            let model = wide.model.twin(by, Precision::F64);
+            wide.resample(&model);
+        }
+        Box::new(wide)
+    }
+
+    fn repeat(&mut self, inputs: &WindowInputs, until: u64, go_on: &mut dyn FnMut() -> bool) -> bool {
+        let work = self.model.len() as u64 * u64::from(self.plan.substeps);
+        let slice = (SLICE / work).max(1);
+        let mut waiting = inputs.0.iter().peekable();
+        while self.steps < until {
+            while let Some((_, tool, input)) = waiting.next_if(|(step, ..)| *step <= self.steps) {
+                self.tell(*tool, input.clone());
+            }
+            self.do_step();
+            if self.steps.is_multiple_of(slice) && !go_on() {
+                return false;
+            }
+        }
+        true
+    }
+}
+
+impl SharedCheckpoint {
+    /// Copies the beginning and releases the shared checkpoint.
+    pub fn open(self) -> WindowOpening {
+        WindowOpening(self.checkpoint.resume(&self.model))
+    }
+}
+
+/// An extent at least as large as the one that the sleep of `sheet` is relative to: the recent largest displacement, and
+/// a force in proportion.
+fn since_rest(sheet: &dyn Replay, extent: ErrorExtent) -> ErrorExtent {
+    let ratio = (sheet.largest() * sheet.model().unit_m / extent.displacement_m).max(1.0);
+    let ratio = if ratio.is_finite() { ratio } else { 1.0 };
+    ErrorExtent { displacement_m: ratio * extent.displacement_m, force_n: ratio * extent.force_n }
+}
+
+impl WindowOpening {
+    /// Ends the window at `end` and releases its shared checkpoint.
+    pub fn close(self, end: SharedCheckpoint, inputs: WindowInputs) -> Audit {
+        let WindowOpening(end) = end.open();
+        Audit { begin: self.0, inputs, end: Observed::of(&*end), until: end.steps() }
+    }
+}
+
+impl Audit {
+    /// Returns what an audit of a sheet takes beside the copy of its beginning ([`Model::session_bytes`]), bytes: two
+    /// twins in f64, and what is observed of at most six states.
+    pub fn bytes(model: &Model) -> u64 {
+        let observed = 6 * model.len() * size_of::<[DVec3; 2]>();
+        2 * model.twin(1, Precision::F64).state_bytes() + observed as u64
+    }
+
+    /// Repeats the window with `finer` times the substeps ([`FINER`]). `largest` is the result of earlier windows;
+    /// `go_on` is called between slices of some milliseconds. `None` if it returned false, if nothing moved, or if the
+    /// twin did not stay finite.
+    pub fn work(self, finer: u32, largest: ErrorExtent, go_on: &mut dyn FnMut() -> bool) -> Option<AuditFinding> {
+        let Audit { mut begin, inputs, end, until } = self;
+        let first = Observed::of(&*begin);
+        if first.differences(&end) == ErrorExtent::default() {
+            return None;
+        }
+        let mut twin = begin.twin(finer);
+        // A movement may begin and end within the window.
+        let middle = begin.steps().midpoint(until);
+        if !twin.repeat(&inputs, middle, go_on) {
+            return None;
+        }
+        let extent = Observed::of(&*twin).extent();
+        let rest = WindowInputs(inputs.0.iter().filter(|(step, ..)| *step >= middle).cloned().collect());
+        if !twin.repeat(&rest, until, go_on) {
+            return None;
+        }
+        let truth = Observed::of(&*twin);
+        if !truth.is_finite() {
+            return None;
+        }
+        let largest = [first.extent(), extent, truth.extent()].into_iter().fold(largest, ErrorExtent::max);
+        let largest = since_rest(&*begin, largest);
+        let error = |a: &Observed, b: &Observed| a.differences(b).relative_to(largest);
+        let found = error(&end, &truth);
+        let (tolerance, substeps) = (begin.model().scene.stepping.tolerance, begin.model().plan.substeps);
+        let mut finding = AuditFinding { step: until, error: found, origin: None, substeps, largest };
+        if found.largest() <= tolerance {
+            return Some(finding);
+        }
+        // From the sheet to the twin, one change at a time: awake, then f64, then the shorter substep.
+        let mut wide = begin.twin(1);
+        if !begin.repeat(&inputs, until, go_on) || !wide.repeat(&inputs, until, go_on) {
+            return None;
+        }
+        let (same, wide) = (Observed::of(&*begin), Observed::of(&*wide));
+        let parts = [
+            (Origin::Substep, error(&wide, &truth)),
+            (Origin::Rounding, error(&same, &wide)),
+            (Origin::Sleep, error(&end, &same)),
+        ];
+        let most = parts.into_iter().max_by(|a, b| a.1.largest().total_cmp(&b.1.largest()));
+        finding.origin = most.map(|part| part.0);
+        Some(finding)
+    }
+}
+
+#[cfg(test)]
+mod tests;

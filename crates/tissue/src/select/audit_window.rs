@@ -1,0 +1,107 @@
+//! What a sheet records of a window of steps that is to be audited.
+
+use std::fmt;
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use crate::guard::checkpoint::Input;
+use crate::model::Model;
+
+/// Most inputs in a window. With more it ends without a result.
+const MAX_INPUTS: usize = 4096;
+
+/// The tools' inputs in a window: step they precede, tool, input. Its memory is allocated at the beginning, so that the
+/// sheet need not allocate.
+#[derive(Debug)]
+pub struct WindowInputs(pub(crate) Vec<(u64, usize, Input)>);
+
+impl Default for WindowInputs {
+    fn default() -> Self {
+        WindowInputs(Vec::with_capacity(MAX_INPUTS))
+    }
+}
+
+/// What a sheet reports about the requested window.
+#[derive(Debug)]
+pub enum Mark {
+    /// The window has begun.
+    Begin(SharedCheckpoint),
+    /// The window has ended.
+    End(SharedCheckpoint, WindowInputs),
+    /// The window can't be audited: the guard went back, the tissue changed, everything came to rest, or there were too
+    /// many inputs.
+    Dropped,
+}
+
+/// A sheet's state at a checkpoint, shared with the sheet.
+#[derive(Debug)]
+pub struct SharedCheckpoint {
+    pub(crate) model: Arc<Model>,
+    pub(crate) checkpoint: Arc<dyn Resume>,
+}
+
+impl SharedCheckpoint {
+    /// Returns the tissue in the window.
+    pub fn model(&self) -> &Arc<Model> {
+        &self.model
+    }
+}
+
+/// A checkpoint in any number format, from which a sheet can be made.
+pub(crate) trait Resume: fmt::Debug + Send + Sync {
+    /// A sheet in the state of the checkpoint, of a sheet with `model`. None of it sleeps.
+    fn resume(&self, model: &Model) -> Box<dyn Replay>;
+}
+
+/// A sheet in any number format that repeats a window.
+pub(crate) trait Replay: fmt::Debug + Send {
+    /// The model.
+    fn model(&self) -> &Arc<Model>;
+    /// Steps done.
+    fn steps(&self) -> u64;
+    /// The recent largest displacement, spacings, to which sleep is relative.
+    fn largest(&self) -> f64;
+    /// For each point the displacement, m, and the tissue's force on a tool, N.
+    fn observed(&self) -> Vec<[DVec3; 2]>;
+    /// The same state in f64, with 1/`by` of the substep.
+    fn twin(&self, by: u32) -> Box<dyn Replay>;
+    /// Repeats the recorded inputs up to step `until`, in slices. Calls `go_on` between slices; returns false if that
+    /// did.
+    fn repeat(&mut self, inputs: &WindowInputs, until: u64, go_on: &mut dyn FnMut() -> bool) -> bool;
+}
+
+/// How far a sheet is with a requested window.
+#[derive(Debug, Default)]
+pub(crate) enum AuditWindow {
+    /// No window is requested.
+    #[default]
+    Off,
+    /// The window begins at the next checkpoint.
+    Wanted(WindowInputs),
+    /// The window ends at the first checkpoint from this step on.
+    Open(u64, WindowInputs),
+    /// The end is still to be reported.
+    Closed(WindowInputs),
+    /// The failure is still to be reported.
+    Dropped,
+}
+
+impl AuditWindow {
+    /// Records an input of a tool.
+    pub(crate) fn input(&mut self, step: u64, tool: usize, input: &Input) {
+        let AuditWindow::Open(_, inputs) = self else { return };
+        if inputs.0.len() < MAX_INPUTS {
+            inputs.0.push((step, tool, input.clone()));
+        } else {
+            self.give_up();
+        }
+    }
+
+    /// Drops the window after an event that a twin can't repeat.
+    pub(crate) fn give_up(&mut self) {
+        if matches!(self, AuditWindow::Open(..) | AuditWindow::Closed(_)) {
+            *self = AuditWindow::Dropped;
+        }
+    }
+}

@@ -1,0 +1,7 @@
+//! Which scheme a tissue is stepped with: calibration, selection, audit, and correction.
+
+pub mod audit;
+pub(crate) mod audit_window;
+pub(crate) mod calibration;
+pub(crate) mod correction;
+pub mod scheme_selection;

@@ -1,0 +1,465 @@
+//! What a tolerance asks for: integrator, substeps and number format, the cheapest that keep to it in a rehearsal.
+
+use std::cell::RefCell;
+use std::sync::atomic::AtomicBool;
+
+use crate::limits::Limits;
+use crate::scene::{Integrator, Lanes, Precision, Scene, Stepping};
+use crate::scheme::stability;
+use crate::scheme::{CANDIDATES, Oscillator, entry};
+use crate::select::calibration::{self, Rehearsal};
+use palpate_refusal::{Reason, Refusal, Result};
+
+/// Time over which undamped, growing errors are predicted, s.
+pub const LASTING_S: f64 = calibration::LASTING_S;
+
+/// The number formats and what each costs, in f32.
+const FORMATS: [(Precision, f64); 3] = [(Precision::F32, 1.0), (Precision::Compensated, 1.1), (Precision::F64, 2.6)];
+
+/// A point in a substep of `central` in f32 with the widest lanes, and a step beside its points, ns: measured.
+const POINT_SUBSTEP_NS: f64 = 1.7;
+pub(crate) const STEP_NS: f64 = 2000.0;
+
+/// What a vertex of a mesh takes over a point of a sheet: measured.
+const VERTEX: f64 = 2.8;
+
+/// The processor time that a point of a scene is expected to take in a substep, ns.
+pub(crate) fn point_substep_ns(scene: &Scene, integrator: Integrator, precision: Precision, lanes: Lanes) -> f64 {
+    let scheme = entry(integrator).cost;
+    let format = FORMATS.iter().find(|format| format.0 == precision).map_or(1.0, |found| found.1);
+    let width = match lanes {
+        Lanes::Auto | Lanes::Avx512 => 1.0,
+        Lanes::Avx2 => 1.6,
+        Lanes::Neon => 3.0,
+        // Fused multiply-adds are calls.
+        Lanes::Plain => 200.0,
+    };
+    let kind = if scene.sheet().is_some() { 1.0 } else { VERTEX };
+    POINT_SUBSTEP_NS * scheme * format * width * kind
+}
+
+/// What rounding may add to a sheet that is at rest, as a part of the tolerance: a rehearsal is over before that shows.
+const RESTING_PART: f64 = 0.5;
+
+/// The flag of a caller who waits to the end.
+pub static NEVER: AtomicBool = AtomicBool::new(false);
+
+/// Returns the refusal of work whose caller's flag is set.
+pub fn given_up() -> Refusal {
+    Refusal::new(Reason::TimedOut, "", "was given up, because nobody waits for it")
+}
+
+/// Rehearsals of one integrator in one format at most.
+const MAX_ROUNDS: u32 = 6;
+
+/// `auto` takes at most so many times the substeps with which an integrator is stable. `central` is stable while the fastest
+/// vibration turns by less than 2 in a substep, and follows it for as long as it lasts while that turns by
+/// [`stability::THETA`] over at most 8 ([`stability::endurance`]): this is the quotient. (Of 700 random scenes at tolerances from
+/// 1e-14 to 1e-2, the choices that keep them have at most 32 times as many.)
+pub const MAX_TIMES_STABLE: u32 = 64;
+
+/// An error that says nothing: courses that have nothing in common differ by so much or more.
+const SATURATED: f64 = 0.1;
+
+/// An integrator, how often it is used in a step, in which format, and what to expect of that.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Choice {
+    /// The integrator.
+    pub integrator: Integrator,
+    /// Substeps a step.
+    pub substeps: u32,
+    /// The format.
+    pub precision: Precision,
+    /// Expected error of displacement and force, the larger, relative to the largest of each.
+    pub expected_error: f64,
+}
+
+/// What rounding adds to the state of a sheet that has come to rest, relative to its displacement: measured.
+fn rounding(precision: Precision, sheet: &Oscillator, substep_s: f64) -> f64 {
+    let unit = f64::from(f32::EPSILON) / 2.0;
+    // A displacement that creeps by less than half its last digit in a substep stands still: short by so many digits as
+    // the damping takes substeps to let go of one.
+    let stiffness = sheet.anchor_stiffness_n_per_m + 0.05 * sheet.spring_stiffness_n_per_m;
+    if stiffness == 0.0 {
+        return if precision == Precision::F64 { 1e-12 } else { 4.0 * unit };
+    }
+    let creep = 0.5 * sheet.damping_n_s_per_m / (stiffness * substep_s);
+    // The stiffest vibrations' forces are differences of nearly equal displacements.
+    let stiff = (sheet.spring_stiffness_n_per_m / stiffness).sqrt();
+    match precision {
+        Precision::F64 => 1e-12,
+        Precision::Compensated => unit * (4.0 + stiff),
+        Precision::Auto | Precision::F32 => unit * (4.0 + stiff + creep),
+    }
+}
+
+/// An integrator that the scene leaves open, and how many substeps a step of it may have.
+#[derive(Debug, Clone, Copy)]
+struct OpenChoice {
+    integrator: Integrator,
+    /// With fewer it is not stable, or is not what the scene gives.
+    least: u32,
+    /// With more it is chosen only if the scene names it, and if it then keeps the tolerance.
+    most: u32,
+}
+
+/// The choice for a scene, and what it is made from.
+struct Chooser<'a> {
+    stepping: &'a Stepping,
+    sheet: Oscillator,
+    /// The same without the pressure of a volume, which lets nothing creep less.
+    unpressed: Oscillator,
+    rehearsal: Rehearsal<'a>,
+    /// The error to keep: the tolerance or, where that can't be found out or no format keeps it, what can be.
+    aim: f64,
+    most_substeps: u32,
+    open: Vec<OpenChoice>,
+    /// All that was tried, in this order.
+    tried: RefCell<Vec<Choice>>,
+}
+
+/// How the search for the fewest substeps of an integrator in a format ended.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Search {
+    /// These are few and keep what is aimed at.
+    Keeps(Choice),
+    /// More substeps did not help: the rounding of the format errs, or the truth itself.
+    Stalls,
+    /// It would take more than there may be.
+    Beyond,
+}
+
+/// Whether a search takes a hint for a proof.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Effort {
+    /// Where one integrator stalls, so do all in its format; an error that does not fall will not.
+    Quick,
+    /// Each integrator is tried in each format, from the most exact on; there it goes on from errors that say nothing.
+    Thorough,
+}
+
+impl Chooser<'_> {
+    fn new<'a>(scene: &'a Scene, limits: &Limits, stop: &'a AtomicBool) -> Chooser<'a> {
+        let rehearsal = Rehearsal::new(scene, scene.stepping.tolerance, limits.rehearsal_work, stop);
+        let sheet = Oscillator::of(scene);
+        let spring_stiffness_n_per_m = stability::stiffness_of_springs_n_per_m(scene);
+        let unpressed = Oscillator { spring_stiffness_n_per_m, ..sheet };
+        let (stepping, most_substeps) = (&scene.stepping, limits.substeps);
+        // What comes near to the least error that can be told from none is as good as any.
+        let aim = stepping.tolerance.max(2.0 * rehearsal.least_error());
+        let mut chooser = Chooser {
+            stepping,
+            sheet,
+            unpressed,
+            rehearsal,
+            aim,
+            most_substeps,
+            open: Vec::new(),
+            tried: RefCell::default(),
+        };
+        chooser.aim = aim.max(chooser.resting_error(Precision::F64, 1));
+        chooser.open = chooser.integrators().map(|integrator| chooser.opened(integrator)).collect();
+        chooser
+    }
+
+    /// A choice is never less accurate for want of work: it is refused. Whoever gives the number of substeps answers for
+    /// it, and is warned of an error that is not known.
+    fn check_work(&self, limits: &Limits) -> Result<()> {
+        if self.rehearsal.is_stopped() {
+            return Err(given_up());
+        }
+        if self.stepping.substeps.is_some() || !self.rehearsal.is_cut() {
+            return Ok(());
+        }
+        let message = format!(
+            "to find out what keeps an error of {:e} here would take more than {} points × substeps of rehearsals \
+             (limits.rehearsal_work): a larger tolerance takes less, and a given number of substeps none",
+            self.stepping.tolerance, limits.rehearsal_work
+        );
+        Err(Refusal::new(Reason::TooLarge, "stepping.tolerance", message))
+    }
+
+    /// Integrators that the scene leaves open.
+    fn integrators(&self) -> impl Iterator<Item = Integrator> + use<> {
+        let (asked, compensates) = (self.stepping.integrator, self.stepping.precision == Precision::Compensated);
+        let candidates =
+            CANDIDATES.into_iter().filter(move |integrator| !compensates || entry(*integrator).compensates);
+        let (named, candidates) =
+            if asked == Integrator::Auto { (None, Some(candidates)) } else { (Some(asked), None) };
+        named.into_iter().chain(candidates.into_iter().flatten())
+    }
+
+    fn opened(&self, integrator: Integrator) -> OpenChoice {
+        let step_s = self.stepping.rate_hz.recip();
+        // A yardstick has as many substeps as it has to have.
+        let needed =
+            || (!CANDIDATES.contains(&integrator)).then(|| stability::substeps(integrator, step_s, &self.sheet));
+        if let Some(substeps) = self.stepping.substeps.or_else(needed) {
+            return OpenChoice { integrator, least: substeps, most: substeps };
+        }
+        let stable = stability::stable_substeps(integrator, step_s, &self.sheet);
+        let least = Some(self.rehearsal.whole(stable)).filter(|least| *least <= self.most_substeps).unwrap_or(stable);
+        let most = stable.saturating_mul(MAX_TIMES_STABLE).min(self.most_substeps);
+        OpenChoice { integrator, least, most: self.rehearsal.whole_within(most).max(least) }
+    }
+
+    /// What to expect of an integrator with so many substeps in a format. Of what keeps the tolerance while it moves and
+    /// not at rest, it is the error at rest.
+    fn tried(&self, integrator: Integrator, substeps: u32, precision: Precision) -> Choice {
+        let is_this =
+            |tried: &&Choice| (tried.integrator, tried.substeps, tried.precision) == (integrator, substeps, precision);
+        if let Some(tried) = self.tried.borrow().iter().find(is_this) {
+            return *tried;
+        }
+        let (moving, resting) =
+            (self.rehearsal.error(integrator, substeps, precision), self.resting_error(precision, substeps));
+        let expected_error = if resting > self.aim { moving.max(resting) } else { moving };
+        let tried = Choice { integrator, substeps, precision, expected_error };
+        self.tried.borrow_mut().push(tried);
+        tried
+    }
+
+    fn keeps(&self, choice: &Choice) -> bool {
+        choice.expected_error <= self.aim
+    }
+
+    /// What to expect at rest of a format that the scene does not give: rounding alone, which may be [`RESTING_PART`] of the
+    /// tolerance.
+    fn resting_error(&self, precision: Precision, substeps: u32) -> f64 {
+        if self.stepping.precision != Precision::Auto {
+            return 0.0;
+        }
+        let substep_s = (self.stepping.rate_hz * f64::from(substeps)).recip();
+        rounding(precision, &self.unpressed, substep_s) / RESTING_PART
+    }
+
+    /// Formats that the scene leaves open to an integrator, by rising cost.
+    fn formats(&self, integrator: Integrator) -> Vec<(Precision, f64)> {
+        let is_open = |format: &(Precision, f64)| match self.stepping.precision {
+            Precision::Auto => format.0 != Precision::Compensated || entry(integrator).compensates,
+            asked => format.0 == asked,
+        };
+        FORMATS.into_iter().filter(is_open).collect()
+    }
+
+    /// The fewest substeps, at most `most`, with which an integrator keeps what is aimed at in a format. The search goes up as
+    /// the order of the integrator says, at most to 3^[`MAX_ROUNDS`] times the stable number.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn fewest(&self, open: &OpenChoice, precision: Precision, most: u32, effort: Effort) -> Search {
+        let OpenChoice { integrator, least, .. } = *open;
+        if least > most || self.resting_error(precision, least) > self.aim {
+            return Search::Beyond;
+        }
+        let or_beyond = |choice: Choice| if self.keeps(&choice) { Search::Keeps(choice) } else { Search::Beyond };
+        let mut now = self.tried(integrator, least, precision);
+        if self.is_given(open) {
+            return or_beyond(now);
+        }
+        let order = entry(integrator).order;
+        let mut before: Option<Choice> = None;
+        for _ in 0..MAX_ROUNDS {
+            if self.keeps(&now) {
+                break;
+            }
+            // As many more as the order says; an infinite error says nothing.
+            let excess = now.expected_error / self.aim;
+            let ratio = libm::pow(excess, order.recip()).min(3.0);
+            let more = (f64::from(now.substeps) * ratio).ceil().max(f64::from(now.substeps + 1));
+            let more = self.rehearsal.whole(more.min(f64::from(u32::MAX / 2)) as u32);
+            if more > most {
+                return Search::Beyond;
+            }
+            let next = self.tried(integrator, more, precision);
+            let shorter = f64::from(now.substeps) / f64::from(more);
+            let least_fall = libm::pow(shorter, 0.3 * order);
+            let says_much = effort == Effort::Quick || now.expected_error < SATURATED;
+            if says_much && next.expected_error > now.expected_error * least_fall {
+                return if self.keeps(&next) { Search::Keeps(next) } else { Search::Stalls };
+            }
+            (before, now) = (Some(now), next);
+        }
+        // The last leap may have gone too far: fewer, by the slope between the two.
+        if let Some(before) =
+            before.filter(|before| self.keeps(&now) && self.rehearsal.whole(before.substeps + 1) < now.substeps)
+        {
+            let ratio = libm::log(f64::from(now.substeps) / f64::from(before.substeps));
+            let slope = libm::log(before.expected_error / now.expected_error) / ratio;
+            let needed = libm::log(before.expected_error / self.aim) / slope;
+            let fewer = self.rehearsal.whole((f64::from(before.substeps) * libm::exp(needed)).ceil() as u32);
+            if fewer > before.substeps && fewer < now.substeps {
+                let tried = self.tried(integrator, fewer, precision);
+                if self.keeps(&tried) {
+                    now = tried;
+                }
+            }
+        }
+        or_beyond(now)
+    }
+
+    /// Whether the number of substeps is no choice.
+    fn is_given(&self, open: &OpenChoice) -> bool {
+        self.stepping.substeps.is_some() || !CANDIDATES.contains(&open.integrator)
+    }
+}
+
+/// The fewest substeps of `step_s` with which an integrator can do, or the best of those that `auto` may become. Saturates
+/// for absurd scenes.
+pub(crate) fn least_substeps(asked: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
+    let is_open = |integrator: Integrator| asked == Integrator::Auto || asked == integrator;
+    let open = CANDIDATES.into_iter().filter(|integrator| is_open(*integrator));
+    let least = open.map(|integrator| stability::stable_substeps(integrator, step_s, sheet)).min();
+    least.unwrap_or_else(|| stability::substeps(asked, step_s, sheet))
+}
+
+/// Returns the fewest substeps that a scene can do with, or those that it gives, and the time that a step of the
+/// cheapest kind takes with them while all of the sheet moves, s.
+#[allow(clippy::cast_precision_loss)]
+pub fn least_step(scene: &Scene) -> (u32, f64) {
+    let Stepping { integrator, substeps, precision, rate_hz, lanes, .. } = scene.stepping;
+    let least = || least_substeps(integrator, rate_hz.recip(), &Oscillator::of(scene));
+    let substeps = substeps.unwrap_or_else(least);
+    let point_ns =
+        point_substep_ns(scene, integrator, precision, crate::kernel::lanes::available(lanes).unwrap_or(lanes));
+    let points = scene.shape().point_count();
+    (substeps, 1e-9 * (STEP_NS + point_ns * points as f64 * f64::from(substeps)))
+}
+
+/// Returns every integrator that the scene leaves open, each with what would be chosen if it were the only one.
+pub fn candidates(scene: &Scene, limits: &Limits) -> Vec<Choice> {
+    let chooser = Chooser::new(scene, limits, &NEVER);
+    let possible = chooser.open.iter().filter(|open| open.least <= limits.substeps);
+    possible.map(|open| chooser.best(std::slice::from_ref(open))).collect()
+}
+
+/// Returns what would be chosen for a scene if it gave no integrator, no substeps and no precision. `None` if it gives
+/// none, or if no such choice can be made within the limits.
+pub fn by_auto(scene: &Scene, limits: &Limits) -> Option<Choice> {
+    let given = &scene.stepping;
+    let auto = Stepping { integrator: Integrator::Auto, substeps: None, precision: Precision::Auto, ..given.clone() };
+    let least = least_substeps(Integrator::Auto, auto.rate_hz.recip(), &Oscillator::of(scene));
+    if auto == *given || least > limits.substeps {
+        return None;
+    }
+    choose(&Scene { stepping: auto, ..scene.clone() }, limits, &NEVER).ok().map(|(choice, _)| choice)
+}
+
+/// Returns what a scene's tolerance asks for, of what the scene leaves open:
+///
+/// 1. The cheapest that is expected to keep the tolerance.
+/// 2. If none is: the cheapest whose error is at most twice the least that could be told from none or, if there is none either,
+///    what is expected to err least.
+/// 3. If nothing can be expected of any, what is stable at the least cost, with as many substeps as let the fastest vibration
+///    turn by at most [`stability::THETA`] in each: at most 8 times those.
+///
+/// None has more than [`MAX_TIMES_STABLE`] times the substeps with which it is stable, but for an integrator that the scene
+/// names, and that keeps the tolerance with more.
+///
+/// Also returns the work: points × substeps of rehearsals.
+///
+/// # Errors
+/// Refuses a scene for which that would take more work than the limits allow, and when `stop` is set.
+pub fn choose(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<(Choice, u64)> {
+    let chooser = Chooser::new(scene, limits, stop);
+    let choice = chooser.best(&chooser.open);
+    chooser.check_work(limits).map(|()| (choice, limits.rehearsal_work - chooser.rehearsal.left()))
+}
+
+/// What an integrator costs in a format for each substep, in substeps of `central` in f32.
+fn cost(integrator: Integrator, format_cost: f64) -> f64 {
+    entry(integrator).cost * format_cost
+}
+
+impl Chooser<'_> {
+    /// What [`choose`] tells, of some integrators. Where one of them alone keeps the tolerance, what is chosen of all does: a
+    /// thorough search leaves out none.
+    fn best(&self, open: &[OpenChoice]) -> Choice {
+        let cheapest = self.cheapest(open, Effort::Quick).or_else(|| self.cheapest(open, Effort::Thorough));
+        cheapest.or_else(|| self.nearest(open)).unwrap_or_else(|| self.unpredicted(open))
+    }
+
+    /// The cheapest that keeps what is aimed at.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn cheapest(&self, open: &[OpenChoice], effort: Effort) -> Option<Choice> {
+        if self.aim.is_infinite() {
+            return None;
+        }
+        let mut formats = FORMATS;
+        if effort == Effort::Thorough {
+            formats.reverse();
+        }
+        let is_kept = effort == Effort::Quick && self.aim <= self.stepping.tolerance;
+        let may_go_beyond = is_kept && self.stepping.integrator != Integrator::Auto;
+        let mut best = None::<(f64, Choice)>;
+        for (format, format_cost) in formats {
+            for open in open {
+                let of_this = self.formats(open.integrator);
+                if !of_this.iter().any(|open| open.0 == format) {
+                    continue;
+                }
+                let cost = cost(open.integrator, format_cost);
+                // What is not cheaper than the best so far need not be tried.
+                let most = best.as_ref().map_or(u32::MAX, |(least, _)| (least / cost - 1e-9).floor() as u32);
+                let bound = if may_go_beyond { self.most_substeps } else { open.most.min(self.most_substeps) };
+                let is_exact = of_this.last().is_some_and(|last| last.0 == format);
+                let of_search = if is_exact { effort } else { Effort::Quick };
+                match self.fewest(open, format, most.min(bound), of_search) {
+                    Search::Keeps(choice) => {
+                        let cost = cost * f64::from(choice.substeps);
+                        if best.as_ref().is_none_or(|(least, _)| cost < *least) {
+                            best = Some((cost, choice));
+                        }
+                    }
+                    Search::Stalls if effort == Effort::Quick => break,
+                    Search::Stalls | Search::Beyond => {}
+                }
+            }
+            // What rounds more hardly keeps what this one does.
+            if effort == Effort::Thorough && best.is_some() {
+                break;
+            }
+        }
+        best.map(|(_, choice)| choice)
+    }
+
+    /// What errs least, of what was tried with at most [`OpenChoice::most`] substeps, and of the most exact format with the fewest
+    /// substeps. `None` if nothing is known of any.
+    fn nearest(&self, open: &[OpenChoice]) -> Option<Choice> {
+        if self.aim.is_infinite() {
+            return None;
+        }
+        let possible = open.iter().filter(|open| open.least <= self.most_substeps);
+        for open in possible.clone() {
+            let formats = self.formats(open.integrator);
+            let skipped = if self.is_given(open) { 0 } else { formats.len().saturating_sub(1) };
+            for (format, _) in formats.into_iter().skip(skipped) {
+                self.tried(open.integrator, open.least, format);
+            }
+        }
+        let tried = self.tried.borrow();
+        let is_near = |tried: &&Choice| {
+            possible.clone().any(|open| open.integrator == tried.integrator && tried.substeps <= open.most)
+        };
+        let finite = tried.iter().filter(|tried| tried.expected_error.is_finite()).filter(is_near);
+        finite.min_by(|a, b| a.expected_error.total_cmp(&b.expected_error)).copied()
+    }
+
+    /// What to do where nothing is known of the error.
+    fn unpredicted(&self, open: &[OpenChoice]) -> Choice {
+        let step_s = self.stepping.rate_hz.recip();
+        let stable_cost = |integrator: Integrator| {
+            cost(integrator, f64::from(stability::stable_substeps(integrator, step_s, &self.sheet)))
+        };
+        let cheapest = open.iter().min_by(|a, b| stable_cost(a.integrator).total_cmp(&stable_cost(b.integrator)));
+        // A scene leaves one open at least.
+        let open = cheapest.copied().unwrap_or_else(|| self.opened(Integrator::Central));
+        let turn = stability::substeps_of_turn(step_s, self.sheet.omega_bound_per_s(), stability::THETA);
+        let substeps = turn.clamp(open.least, open.most);
+        let formats = self.formats(open.integrator);
+        let rests = |format: &&(Precision, f64)| self.resting_error(format.0, substeps) <= self.stepping.tolerance;
+        let precision = formats.iter().find(rests).or(formats.last()).map_or(Precision::F64, |format| format.0);
+        Choice { integrator: open.integrator, substeps, precision, expected_error: f64::INFINITY }
+    }
+}
+
+#[cfg(test)]
+mod tests;

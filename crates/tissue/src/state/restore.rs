@@ -1,0 +1,330 @@
+//! Takes the whole state of a sheet for a snapshot, and makes a sheet of it again that goes on with the same bits.
+//!
+//! Taking copies memory and no more, as a copy for readers does (`copy`). Restoring believes nothing: lengths, indices,
+//! numbers and what belongs together are checked, and tables are made anew.
+
+use std::sync::Arc;
+
+use xxhash_rust::xxh3::Xxh3;
+
+use crate::guard::checkpoint::{Checkpoint, Input, Work};
+use crate::guard::{INTERVAL_SUBSTEPS, MAX_HALVINGS};
+use crate::interface::Tissue;
+use crate::kernel::field::{Layout, State};
+use crate::kernel::real::Real;
+use crate::limits::Limits;
+use crate::memory;
+use crate::model::{Model, Plan};
+use crate::scene::{Body, Named, Precision};
+use crate::sleep::tiles::{TakenTiles, sides_of};
+use crate::state::saved::{
+    Checks, PlainTissue, SNAPSHOT, SavedCheckpoint, SavedContact, SavedForces, SavedPrescribed, SavedState,
+    SavedTissue, TissueParts, ensure, unsound,
+};
+use crate::state::tissue_state::{TissueState, springs_of};
+use crate::tools::applied_force::Applied;
+use crate::tools::contact::Contacts;
+use crate::tools::prescribed::Prescribed;
+use palpate_refusal::{Reason, Refusal, Result};
+
+/// Restores a tissue under its model, from its parts and the values at its points ([`PlainTissue`]).
+///
+/// # Errors
+/// Refuses a tissue of another model, and what no session has.
+pub fn restored(model: &Arc<Model>, parts: &TissueParts, values: &[u8], limits: &Limits) -> Result<Box<dyn Tissue>> {
+    fits(model, parts)?;
+    memory::attempt(SNAPSHOT, || {
+        Ok(match model.precision {
+            Precision::F64 => Box::new(TissueState::<f64>::restored(model, parts, values, limits)?) as Box<dyn Tissue>,
+            Precision::Auto | Precision::F32 | Precision::Compensated => {
+                Box::new(TissueState::<f32>::restored(model, parts, values, limits)?)
+            }
+        })
+    })
+}
+
+/// Refuses what was saved under another model.
+fn fits(model: &Model, saved: &TissueParts) -> Result<()> {
+    let refuse = |what: String| Err(Refusal::new(Reason::WrongKind, SNAPSHOT, what));
+    if saved.points != model.len() as u64 {
+        return refuse(format!("is of a tissue of {} points, but this one has {}", saved.points, model.len()));
+    }
+    let (own, other) = (model.tissue_state(), saved.tissue);
+    if own.precision != other.precision {
+        let (own, other) = (own.precision.name(), other.precision.name());
+        return refuse(format!("is of a tissue in {other}, but this one is in {own}"));
+    }
+    if (own.integrator, own.substeps) != (other.integrator, other.substeps) {
+        return refuse(format!(
+            "is of a tissue stepped by {}, {} substeps a step, but this one is stepped by {}, {}",
+            other.integrator.name(),
+            other.substeps,
+            own.integrator.name(),
+            own.substeps
+        ));
+    }
+    if own != other {
+        return refuse(format!("is of a tissue with other coefficients: {other:?}, but this one has {own:?}"));
+    }
+    if saved.fingerprint != model.fingerprint() {
+        return refuse("is of another scene: its points, masses, springs or step rate differ".to_owned());
+    }
+    Ok(())
+}
+
+impl Model {
+    /// Returns XXH3-128 of all that a step depends on: the points and their order in memory, masses, springs,
+    /// coefficients, scheme, substeps and format. The width of vectors is not part of it, nor is what is only shown.
+    pub fn fingerprint(&self) -> u128 {
+        let mut hasher = Xxh3::new();
+        let mut add = |bytes: &[u8]| hasher.update(bytes);
+        add(b"palpate tissue 1");
+        let scene = &self.scene;
+        for number in [self.points[0], self.points[1], self.len(), self.fixed.len()] {
+            add(&(number as u64).to_le_bytes());
+        }
+        self.fixed.iter().for_each(|index| add(&(*index as u64).to_le_bytes()));
+        for value in [
+            self.unit_m,
+            scene.point_mass_kg(),
+            scene.springs.stiffness_n_per_m,
+            scene.springs.shear_stiffness_n_per_m,
+            scene.anchor_stiffness_n_per_m,
+            scene.damping_n_s_per_m,
+            scene.stepping.rate_hz,
+            self.plan.substep_s,
+            self.sleep_tolerance,
+        ] {
+            add(&value.to_bits().to_le_bytes());
+        }
+        add(&[u8::from(scene.springs.bending)]);
+        add(self.plan.integrator.name().as_bytes());
+        add(&self.plan.substeps.to_le_bytes());
+        add(self.precision.name().as_bytes());
+        match (&scene.body, &self.graph) {
+            (Body::Mesh(mesh), Some(graph)) => {
+                add(b"mesh");
+                let mut numbers = |values: &[f64]| {
+                    add(&(values.len() as u64).to_le_bytes());
+                    values.iter().for_each(|value| add(&value.to_bits().to_le_bytes()));
+                };
+                numbers(&[mesh.stiffest.bound, mesh.stiffest.usual]);
+                numbers(&mesh.differences.relative_mass);
+                numbers(&mesh.differences.extra_anchor);
+                mesh.shape.vertices_m().iter().for_each(|vertex_m| numbers(&vertex_m.to_array()));
+                for corner in mesh.shape.triangles().iter().flatten().chain(graph.slots.vertex_of()) {
+                    add(&corner.to_le_bytes());
+                }
+                for (ends, stiffness_n_per_m) in mesh.springs() {
+                    ends.iter().for_each(|end| add(&end.to_le_bytes()));
+                    add(&stiffness_n_per_m.to_bits().to_le_bytes());
+                }
+            }
+            _ => add(b"sheet"),
+        }
+        hasher.digest128()
+    }
+}
+
+/// A copy of a sheet.
+#[derive(Debug)]
+struct TypedState<T: Real> {
+    model: Arc<Model>,
+    layout: Layout,
+    steps: u64,
+    halvings: u32,
+    state: State<T>,
+    forces: SavedForces,
+    prescribed: SavedPrescribed,
+    contacts: Vec<SavedContact>,
+    work: Work,
+    checkpoint: Option<Arc<Checkpoint<T>>>,
+    inputs: Vec<(u64, usize, Input)>,
+    tiles: TakenTiles<T>,
+    guard_events: u64,
+    substeps_done: u64,
+    points_done: u64,
+}
+
+impl<T: Real> SavedState for TypedState<T> {
+    fn plain(&self) -> PlainTissue {
+        let checkpoint = self.checkpoint.as_ref().map(|checkpoint| SavedCheckpoint {
+            steps: checkpoint.steps,
+            halvings: checkpoint.halvings,
+            forces: checkpoint.applied.saved(),
+            prescribed: checkpoint.prescribed.saved(),
+            contacts: checkpoint.contacts.saved(),
+            work: checkpoint.work.saved(),
+            largest: checkpoint.largest,
+            passed_checks: checkpoint.passed_checks,
+        });
+        let mut values = Vec::new();
+        let mut put = |field: &[T]| {
+            let from = values.len();
+            values.resize(from + size_of_val(field), 0);
+            values[from..].chunks_exact_mut(size_of::<T>()).zip(field).for_each(|(bytes, value)| value.write(bytes));
+        };
+        let states = [Some(&self.state), self.checkpoint.as_ref().map(|checkpoint| &checkpoint.state)];
+        for state in states.into_iter().flatten() {
+            for tile in &self.tiles.moved {
+                state.fields().for_each(|field| rows_of(&self.layout, *tile).for_each(|row| put(&field[row])));
+            }
+        }
+        put(&self.tiles.remembered);
+        let inputs = self.inputs.iter().map(|(step, tool, input)| (*step, *tool as u64, input.saved()));
+        let parts = TissueParts {
+            points: self.model.len() as u64,
+            tissue: self.model.tissue_state(),
+            fingerprint: self.model.fingerprint(),
+            steps: self.steps,
+            halvings: self.halvings,
+            forces: self.forces.clone(),
+            prescribed: self.prescribed.clone(),
+            contacts: self.contacts.clone(),
+            work: self.work.saved(),
+            checkpoint,
+            inputs: inputs.collect(),
+            tiles: self.tiles.plain(),
+            guard_events: self.guard_events,
+            substeps_done: self.substeps_done,
+            points_done: self.points_done,
+        };
+        PlainTissue { parts, values }
+    }
+}
+
+/// Where the values of a tile are in a field, row by row: those of x, then of y and z.
+fn rows_of(layout: &Layout, tile: usize) -> impl Iterator<Item = std::ops::Range<usize>> + use<> {
+    let Layout { stride, plane, .. } = *layout;
+    let [rows, columns] = sides_of(layout, tile);
+    (0..3).flat_map(move |c| {
+        let columns = columns.clone();
+        rows.clone().map(move |i| {
+            let row = c * plane + i * stride;
+            row + columns.start..row + columns.end
+        })
+    })
+}
+
+/// The model's plan after some halvings of the substep.
+fn halved(model: &Model, halvings: u32) -> Plan {
+    if halvings == 0 { model.plan.clone() } else { model.plan.divided(&model.scene, 1 << halvings) }
+}
+
+impl<T: Real> TissueState<T> {
+    /// A copy of all that the next steps depend on. Shares the checkpoint, so that the next one takes new memory.
+    pub(crate) fn save(&self) -> SavedTissue {
+        let TissueState { model, tables, state, tiles, .. } = self;
+        let mut state_copy = State::zero(&tables.layout, state.kept.len());
+        state_copy.fields_mut().zip(state.fields()).for_each(|(to, from)| tiles.copy_moved(to, from));
+        SavedTissue(Arc::new(TypedState {
+            model: model.clone(),
+            layout: tables.layout,
+            steps: self.steps,
+            halvings: self.halvings,
+            state: state_copy,
+            forces: self.applied.saved(),
+            prescribed: self.prescribed.saved(),
+            contacts: self.contacts.saved(),
+            work: self.work,
+            checkpoint: self.checkpoint.clone(),
+            inputs: self.inputs.clone(),
+            tiles: tiles.taken(),
+            guard_events: self.guard_events,
+            substeps_done: self.substeps_done,
+            points_done: self.points_done,
+        }))
+    }
+
+    fn restored(model: &Arc<Model>, parts: &TissueParts, values: &[u8], limits: &Limits) -> Result<Self> {
+        let checks = Checks { shape: model.shape(), limits };
+        let mut sheet = TissueState::new(model);
+        sheet.steps = checks.count(parts.steps)?;
+        ensure(parts.halvings <= MAX_HALVINGS, "a substep shorter than the guard makes")?;
+        sheet.halvings = parts.halvings;
+        sheet.plan = halved(model, parts.halvings);
+        sheet.tables.springs = springs_of(model, &sheet.plan);
+        sheet.guard_events = checks.count(parts.guard_events)?;
+        // Points times substeps: more than steps are.
+        ensure(parts.substeps_done.max(parts.points_done) < u64::MAX / 4, "a count beyond what any session has")?;
+        (sheet.substeps_done, sheet.points_done) = (parts.substeps_done, parts.points_done);
+
+        let layout = sheet.tables.layout;
+        let scale = sheet.plan.force_scale(&model.scene);
+        sheet.applied = Applied::restored(&parts.forces, model, &layout, scale, &checks)?;
+        sheet.prescribed = Prescribed::restored(&parts.prescribed, model, T::LARGEST * model.unit_m, &checks)?;
+        sheet.contacts = Contacts::restored(&parts.contacts, model, &checks)?;
+        sheet.work = Work::restored(&parts.work)?;
+        sheet.tiles.restore(&parts.tiles)?;
+
+        let size = size_of::<T>();
+        ensure(values.len().is_multiple_of(size), "part of a value")?;
+        let mut values = values.chunks_exact(size).map(T::read);
+        let moved: Vec<usize> = parts.tiles.moved.iter().map(|tile| *tile as usize).collect();
+        // Far beyond what the guard lets a point do in an interval; what is not bearable, it finds at the next step.
+        let most = T::of(T::LARGEST);
+        let mut fill = |state: &mut State<T>| -> Result<bool> {
+            let mut any = false;
+            for tile in &moved {
+                for field in state.fields_mut() {
+                    for row in rows_of(&layout, *tile) {
+                        for value in &mut field[row] {
+                            *value = values.next().ok_or_else(|| unsound("too few values"))?;
+                            ensure(value.magnitude() < most, "a value that is not finite or out of range")?;
+                            any |= *value != T::default();
+                        }
+                    }
+                }
+            }
+            Ok(any)
+        };
+        let mut state = State::zero(&layout, sheet.state.kept.len());
+        let is_moved = fill(&mut state)?;
+        sheet.state = state;
+        // What each tile adds to a volume; those asleep are not added up again.
+        let tiles: Vec<usize> = (0..sheet.tiles.tile_count()).collect();
+        sheet.tables.volume_change(&sheet.state.u, &tiles);
+        let checkpoint = parts.checkpoint.as_ref().map(|saved| {
+            let mut state = State::zero(&layout, sheet.state.kept.len());
+            fill(&mut state)?;
+            sheet.checkpoint_of(saved, state, &checks)
+        });
+        sheet.checkpoint = checkpoint.transpose()?.map(Arc::new);
+        sheet.tiles.remember_again(&mut values)?;
+        ensure(values.next().is_none(), "too many values")?;
+
+        let from = sheet.checkpoint.as_ref().map_or(sheet.steps, |checkpoint| checkpoint.steps);
+        for (step, tool, input) in &parts.inputs {
+            ensure((from..=sheet.steps).contains(step), "an input at a step that is over")?;
+            sheet.inputs.push((*step, checks.tool(*tool)?, Input::restored(input, model, &checks)?));
+        }
+        ensure(sheet.inputs.is_sorted_by_key(|input| input.0), "inputs out of order")?;
+        if sheet.checkpoint.is_none() {
+            // What moves has a state to go back to, from its first input on.
+            let is_idle = sheet.is_still() || !is_moved && sheet.applied.is_settled() && sheet.contacts.is_empty();
+            ensure(is_idle && sheet.prescribed.is_empty() && sheet.inputs.is_empty(), "no state to go back to")?;
+            sheet.state.share_equal_history(sheet.plan.scheme.history());
+        }
+        Ok(sheet)
+    }
+
+    fn checkpoint_of(&self, saved: &SavedCheckpoint, state: State<T>, checks: &Checks<'_>) -> Result<Checkpoint<T>> {
+        let (model, layout) = (&self.model, &self.tables.layout);
+        let is_recent = saved.steps <= self.steps && self.steps - saved.steps <= INTERVAL_SUBSTEPS;
+        ensure(is_recent, "a state to go back to that is too old")?;
+        ensure(saved.halvings <= MAX_HALVINGS, "a substep shorter than the guard makes")?;
+        ensure((0.0..f64::INFINITY).contains(&saved.largest), "a displacement that is not finite")?;
+        let scale = halved(model, saved.halvings).force_scale(&model.scene);
+        Ok(Checkpoint {
+            steps: saved.steps,
+            halvings: saved.halvings,
+            state,
+            applied: Applied::restored(&saved.forces, model, layout, scale, checks)?,
+            prescribed: Prescribed::restored(&saved.prescribed, model, T::LARGEST * model.unit_m, checks)?,
+            contacts: Contacts::restored(&saved.contacts, model, checks)?,
+            work: Work::restored(&saved.work)?,
+            largest: saved.largest,
+            passed_checks: saved.passed_checks,
+        })
+    }
+}

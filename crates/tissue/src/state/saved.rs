@@ -1,0 +1,589 @@
+//! A saved tissue as plain data: what a snapshot has of a sheet, in a form that does not follow the program's own types.
+//!
+//! Each type that has a part of the state turns itself into these and back, beside its private fields: `applied`,
+//! `prescribed`, `contact`, `tiles`. `restore` puts them together. A change of any type here is another format of snapshots
+//! (`session::saved`).
+//!
+//! **What is saved** is all that the next steps depend on, and nothing that follows from it. Tables (of falloffs, discs, strips
+//! of a sweep) are made again from what they were made of. The large part, the values at the points, is apart from these
+//! types, as little-endian bytes: only tiles that have ever moved have any, in the order of memory. That order is the same on
+//! every machine; the padding of rows is left out.
+//!
+//! **What lists take**: who sends a snapshot says how long its lists are. What an entry may leave out is a box in it, so that no entry
+//! takes many times its bytes in memory (`session::saved::memory_of`).
+
+use std::fmt;
+use std::sync::Arc;
+
+use glam::DVec3;
+use palpate_haptics::{Coupling, Tip};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+use crate::limits::Limits;
+use crate::scene::action_check::check_tip;
+use crate::scene::profile::{CentreProfile, LoadProfile, Motion, MotionProfile, Move, Poke, Profile, StrengthProfile};
+use crate::scene::{Integrator, Named, Precision};
+use crate::shape::{PointId, RestShape};
+use palpate_refusal::{Reason, Refusal, Result};
+
+/// A vector.
+pub(crate) type Vector = [f64; 3];
+
+/// Numbers in a snapshot are below this, so that their squares are numbers. No tissue goes so far: the guard ends its motion long before.
+pub(crate) const LARGEST: f64 = 1e150;
+
+/// Steps and counts in a snapshot are below this. Sums of many are numbers, and all are exact as f64.
+const MAX_COUNT: u64 = 1 << 48;
+
+/// How a tissue is stepped, and its coefficients: what [`Model::resumed`] makes the same model from, with the scene that the
+/// session began with. Changes and corrections of the tissue have led to it; nothing is chosen or rehearsed again, so that it
+/// gives the same bits on every machine, under any limits and with any later version that has the scheme.
+///
+/// [`Model::resumed`]: crate::Model::resumed
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct TissueState {
+    /// k of the structural springs, N/m.
+    pub stiffness_n_per_m: f64,
+    /// k of the springs of shear, N/m.
+    pub shear_stiffness_n_per_m: f64,
+    /// K″, N/m.
+    pub anchor_stiffness_n_per_m: f64,
+    /// C, N·s/m.
+    pub damping_n_s_per_m: f64,
+    /// κ of the pressure, Pa; 0 without a volume.
+    pub volume_stiffness_pa: f64,
+    /// The scheme.
+    #[serde(serialize_with = "name", deserialize_with = "named")]
+    pub integrator: Integrator,
+    /// Substeps of a step, without the halvings of the guard.
+    pub substeps: u32,
+    /// The number format.
+    #[serde(serialize_with = "name", deserialize_with = "named")]
+    pub precision: Precision,
+    /// Error that leaving out tiles at rest may cost.
+    pub sleep_tolerance: f64,
+    /// That of the scene, of which another tissue is made.
+    pub sleep_tolerance_of_scene: Option<f64>,
+    /// Expected error of displacement and force.
+    pub expected_error: f64,
+    /// What a correction asked for, also of another tissue.
+    pub corrected: Option<CorrectedPlan>,
+}
+
+/// What a correction asked for: a scheme, and no fewer substeps than this.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct CorrectedPlan {
+    /// The scheme.
+    #[serde(serialize_with = "name", deserialize_with = "named")]
+    pub integrator: Integrator,
+    /// The fewest substeps of a step.
+    pub least_substeps: u32,
+}
+
+fn name<S: Serializer>(value: &impl Named, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+    serializer.serialize_str(value.name())
+}
+
+fn named<'d, N: Named, D: Deserializer<'d>>(deserializer: D) -> std::result::Result<N, D::Error> {
+    let name = String::deserialize(deserializer)?;
+    N::named("", &name).map_err(serde::de::Error::custom)
+}
+
+/// A tissue that was copied, and may be turned into plain data in any thread.
+#[derive(Debug, Clone)]
+pub struct SavedTissue(pub(crate) Arc<dyn SavedState>);
+
+impl SavedTissue {
+    /// Returns the tissue as plain data: takes as long as to read all of it several times.
+    pub fn plain(&self) -> PlainTissue {
+        self.0.plain()
+    }
+}
+
+/// A copy of a sheet in any number format.
+pub(crate) trait SavedState: fmt::Debug + Send + Sync {
+    fn plain(&self) -> PlainTissue;
+}
+
+/// A saved tissue.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PlainTissue {
+    /// All but the values at the points.
+    pub parts: TissueParts,
+    /// The values at the points, little-endian: of each tile that has moved, then the same of the checkpoint, then what
+    /// sleeping tiles remember.
+    pub values: Vec<u8>,
+}
+
+/// A saved tissue without the values at its points.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TissueParts {
+    /// Points of the tissue.
+    pub points: u64,
+    /// How it is stepped.
+    pub tissue: TissueState,
+    /// XXH3-128 of all of the model that a step depends on (`Model::fingerprint`).
+    pub fingerprint: u128,
+    /// Steps done.
+    pub steps: u64,
+    pub(crate) halvings: u32,
+    pub(crate) forces: SavedForces,
+    pub(crate) prescribed: SavedPrescribed,
+    pub(crate) contacts: Vec<SavedContact>,
+    pub(crate) work: SavedWork,
+    pub(crate) checkpoint: Option<SavedCheckpoint>,
+    pub(crate) inputs: Vec<(u64, u64, SavedInput)>,
+    pub(crate) tiles: SavedTiles,
+    pub(crate) guard_events: u64,
+    pub(crate) substeps_done: u64,
+    pub(crate) points_done: u64,
+}
+
+/// What the guard goes back to.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedCheckpoint {
+    pub(crate) steps: u64,
+    pub(crate) halvings: u32,
+    pub(crate) forces: SavedForces,
+    pub(crate) prescribed: SavedPrescribed,
+    pub(crate) contacts: Vec<SavedContact>,
+    pub(crate) work: SavedWork,
+    pub(crate) largest: f64,
+    pub(crate) passed_checks: bool,
+}
+
+/// The guard's account.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedWork {
+    pub(crate) done_j: f64,
+    pub(crate) energy_j: f64,
+    pub(crate) largest_j: f64,
+    pub(crate) excess_j: f64,
+}
+
+/// Which tiles sleep, and what is kept for waking them.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedTiles {
+    /// Tiles that may have values other than 0, in the order in which their energies are added.
+    pub(crate) moved: Vec<u32>,
+    /// What is not 0 of each tile, ascending.
+    pub(crate) each: Vec<SavedTile>,
+    pub(crate) asleep_j: f64,
+    pub(crate) largest: f64,
+}
+
+/// A tile.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedTile {
+    pub(crate) tile: u32,
+    pub(crate) awake: bool,
+    pub(crate) settled: u8,
+    pub(crate) drift_n: f64,
+    pub(crate) energy_j: f64,
+    /// By how much the volume had grown when it fell asleep.
+    pub(crate) volume_change: f64,
+}
+
+/// An input of a tool.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) enum SavedInput {
+    Push(Option<Box<SavedPush>>),
+    Grasp(u64, SavedGrasp),
+    Pose(Vector, SavedTip),
+}
+
+/// The forces of all tools.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedForces {
+    pub(crate) slots: Vec<SavedSlot>,
+    pub(crate) terms: Vec<SavedTerm>,
+    pub(crate) settled: bool,
+}
+
+/// The force of a tool.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedSlot {
+    pub(crate) push: Option<Box<SavedPush>>,
+    pub(crate) before: Option<Box<SavedPoke>>,
+    pub(crate) compared: Option<Box<SavedPoke>>,
+}
+
+/// Forces of equal falloff.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedTerm {
+    pub(crate) poke: SavedPoke,
+    pub(crate) forces_n: [Vector; 3],
+}
+
+/// Grasped points.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedPrescribed {
+    pub(crate) grasped: Vec<SavedGrasped>,
+    pub(crate) released: Vec<(u64, Vector)>,
+}
+
+/// A grasped point. Its index is a place in memory.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedGrasped {
+    pub(crate) tool: u64,
+    pub(crate) index: u64,
+    pub(crate) grasp: SavedGrasp,
+    /// Displacement, velocity and acceleration.
+    pub(crate) now: [Vector; 3],
+    pub(crate) held: bool,
+}
+
+/// A position-controlled tool.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedContact {
+    pub(crate) number: u64,
+    pub(crate) tip: SavedTip,
+    pub(crate) ground: SavedGeometry,
+    pub(crate) from_m: Vector,
+    pub(crate) to_m: Vector,
+    /// 0 free, 1 sticking, 2 sliding, 3 holding.
+    pub(crate) contact_state: u8,
+    pub(crate) normal: Vector,
+    pub(crate) side: Option<f64>,
+    pub(crate) offset_m: Vector,
+    pub(crate) gap_m: Vector,
+    pub(crate) is_new: bool,
+    pub(crate) force_n: Vector,
+    pub(crate) steady_n: Vector,
+    pub(crate) velocity_m_per_s: Vector,
+}
+
+/// The place of a disc.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub(crate) enum SavedGeometry {
+    Grid([f64; 2]),
+    Mesh { triangle: u32, barycentric: Vector, frame: [Vector; 2] },
+}
+
+/// [`Poke`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct SavedPoke {
+    point: Option<u64>,
+    centre_m: Vector,
+    force_n: Vector,
+    falloff_per_m: f64,
+    falloff_offset: f64,
+}
+
+/// [`Push`](crate::Push).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) enum SavedPush {
+    Constant(SavedPoke),
+    Profile(SavedLoad),
+}
+
+/// [`LoadProfile`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) struct SavedLoad {
+    centre: SavedCentre,
+    strength: SavedStrength,
+    falloff_per_m: f64,
+    falloff_offset: f64,
+}
+
+/// [`CentreProfile`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+enum SavedCentre {
+    Hops(Vec<(u64, Vector)>),
+    Points(Vec<(u64, u64, Vector)>),
+    Path { from_m: Vector, velocity_m_per_s: Vector },
+}
+
+/// [`StrengthProfile`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+enum SavedStrength {
+    Scaled(Vector, SavedProfile),
+    Recorded(Vec<(u64, Vector)>),
+}
+
+/// [`Profile`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+enum SavedProfile {
+    Constant,
+    Pulse { on: u64, off: u64 },
+    Ramp { from_s: f64, to_s: f64 },
+    Sine { frequency_hz: f64 },
+}
+
+/// [`Grasp`](crate::Grasp).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(crate) enum SavedGrasp {
+    Target(Vector),
+    Profile { point: u64, moves: Vec<(f64, f64, Vector)> },
+}
+
+/// [`Tip`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct SavedTip {
+    radius_m: f64,
+    friction: f64,
+    grasps: bool,
+    /// Stiffness, N/m, and damping, N·s/m.
+    spring: Option<(f64, f64)>,
+}
+
+/// What a part of a snapshot is checked by when it is restored.
+#[derive(Clone, Copy)]
+pub struct Checks<'a> {
+    /// The rest shape of the tissue.
+    pub shape: &'a dyn RestShape,
+    /// The limits.
+    pub limits: &'a Limits,
+}
+
+/// The name of a snapshot in refusals.
+pub const SNAPSHOT: &str = "snapshot";
+
+/// Returns a refusal of what no session has.
+pub fn unsound(what: &str) -> Refusal {
+    let message = format!("has {what}: it is damaged, or was not written by Palpate");
+    Refusal::new(Reason::OutOfRange, SNAPSHOT, message)
+}
+
+/// Returns a refusal of a tool above the limit.
+pub fn tool_above(tool: u64, limits: &Limits) -> Refusal {
+    let message = format!("has tool {tool}, but tools are numbered below {} (limits.tools)", limits.tools);
+    Refusal::new(Reason::TooLarge, SNAPSHOT, message)
+}
+
+/// Refuses unless it holds.
+///
+/// # Errors
+/// Refuses a snapshot that has `what`.
+pub fn ensure(holds: bool, what: &str) -> Result<()> {
+    if holds { Ok(()) } else { Err(unsound(what)) }
+}
+
+impl Checks<'_> {
+    /// Returns a length, time, speed or force: any that a session may have come to, however unlikely it is. Whether it
+    /// is bearable, the guard finds out at the next step, as it does in the session that was saved.
+    ///
+    /// # Errors
+    /// Refuses a number that is not finite, or whose square is not.
+    pub fn number(&self, value: f64) -> Result<f64> {
+        ensure(value.abs() < LARGEST, "a number that is not finite or out of range").map(|()| value)
+    }
+
+    /// Returns a vector of lengths, speeds or forces.
+    ///
+    /// # Errors
+    /// As for [`Checks::number`].
+    pub fn vector(&self, value: Vector) -> Result<DVec3> {
+        value.into_iter().try_for_each(|part| self.number(part).map(drop))?;
+        Ok(DVec3::from(value))
+    }
+
+    /// Returns a time of a script, which may be as late as it likes.
+    ///
+    /// # Errors
+    /// Refuses a number that is not finite.
+    pub fn time(&self, value: f64) -> Result<f64> {
+        ensure(value.is_finite(), "a time that is not finite").map(|()| value)
+    }
+
+    /// Returns a step, or a number of steps or of anything.
+    ///
+    /// # Errors
+    /// Refuses one beyond what any session has.
+    pub fn count(&self, count: u64) -> Result<u64> {
+        ensure(count < MAX_COUNT, "a count beyond what any session has").map(|()| count)
+    }
+
+    /// Returns a number of a tool.
+    ///
+    /// # Errors
+    /// Refuses one above the limit.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn tool(&self, tool: u64) -> Result<usize> {
+        if tool < u64::from(self.limits.tools) {
+            return Ok(tool as usize);
+        }
+        Err(tool_above(tool, self.limits))
+    }
+
+    /// Returns a point.
+    ///
+    /// # Errors
+    /// Refuses one that the tissue has not.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn point(&self, point: u64) -> Result<PointId> {
+        ensure(point < self.shape.point_count() as u64, "a point that the tissue has not")?;
+        Ok(PointId::new(point as usize))
+    }
+
+    /// A force over the points.
+    fn force(&self, force_n: Vector, falloff_per_m: f64, falloff_offset: f64) -> Result<DVec3> {
+        let is_falloff = (0.0..f64::INFINITY).contains(&falloff_per_m) && falloff_offset.is_finite();
+        ensure(is_falloff, "a falloff that is not finite or below 0")?;
+        let force_n = DVec3::from(force_n);
+        let most_n = force_n.length() * libm::exp(falloff_offset);
+        // A force of 0 may have any factor.
+        if force_n != DVec3::ZERO && !(force_n.is_finite() && most_n <= self.limits.point_force_n) {
+            let message = format!("has a force of {most_n:.6e} N, above the limit of {} N", self.limits.point_force_n);
+            return Err(Refusal::new(Reason::ForceTooLarge, SNAPSHOT, message));
+        }
+        Ok(force_n)
+    }
+}
+
+impl SavedPoke {
+    /// Returns it as plain data.
+    pub fn of(poke: &Poke) -> Self {
+        let Poke { point, centre_m, force_n, falloff_per_m, falloff_offset } = *poke;
+        SavedPoke {
+            point: point.map(|point| point.index() as u64),
+            centre_m: centre_m.into(),
+            force_n: force_n.into(),
+            falloff_per_m,
+            falloff_offset,
+        }
+    }
+
+    /// Returns the poke.
+    ///
+    /// # Errors
+    /// Refuses what no tool exerts.
+    pub fn restored(&self, checks: &Checks<'_>) -> Result<Poke> {
+        let SavedPoke { point, centre_m, force_n, falloff_per_m, falloff_offset } = *self;
+        Ok(Poke {
+            point: point.map(|point| checks.point(point)).transpose()?,
+            centre_m: checks.vector(centre_m)?,
+            force_n: checks.force(force_n, falloff_per_m, falloff_offset)?,
+            falloff_per_m,
+            falloff_offset,
+        })
+    }
+}
+
+impl SavedLoad {
+    pub(crate) fn of(profile: &LoadProfile) -> Self {
+        let centre = match &profile.centre {
+            CentreProfile::Hops(hops) => SavedCentre::Hops(hops.iter().map(|hop| (hop.0, hop.1.into())).collect()),
+            CentreProfile::Points(hops) => SavedCentre::Points(
+                hops.iter().map(|(step, (point, at_m))| (*step, point.index() as u64, (*at_m).into())).collect(),
+            ),
+            CentreProfile::Path { from_m, velocity_m_per_s } => {
+                SavedCentre::Path { from_m: (*from_m).into(), velocity_m_per_s: (*velocity_m_per_s).into() }
+            }
+        };
+        let strength = match &profile.strength {
+            StrengthProfile::Scaled(force_n, profile) => {
+                let profile = match *profile {
+                    Profile::Constant => SavedProfile::Constant,
+                    Profile::Pulse { on, off } => SavedProfile::Pulse { on, off },
+                    Profile::Ramp { from_s, to_s } => SavedProfile::Ramp { from_s, to_s },
+                    Profile::Sine { frequency_hz } => SavedProfile::Sine { frequency_hz },
+                };
+                SavedStrength::Scaled((*force_n).into(), profile)
+            }
+            StrengthProfile::Recorded(rows) => {
+                SavedStrength::Recorded(rows.iter().map(|row| (row.0, row.1.into())).collect())
+            }
+        };
+        let LoadProfile { falloff_per_m, falloff_offset, .. } = *profile;
+        SavedLoad { centre, strength, falloff_per_m, falloff_offset }
+    }
+
+    pub(crate) fn restored(&self, checks: &Checks<'_>) -> Result<LoadProfile> {
+        let SavedLoad { centre, strength, falloff_per_m, falloff_offset } = self;
+        let force = |force_n: Vector| checks.force(force_n, *falloff_per_m, *falloff_offset);
+        let centre = match centre {
+            SavedCentre::Hops(hops) => {
+                let hops = hops.iter().map(|hop| Ok((hop.0, checks.vector(hop.1)?)));
+                CentreProfile::Hops(hops.collect::<Result<_>>()?)
+            }
+            SavedCentre::Points(hops) => {
+                let hops = hops.iter().map(|hop| Ok((hop.0, (checks.point(hop.1)?, checks.vector(hop.2)?))));
+                CentreProfile::Points(hops.collect::<Result<_>>()?)
+            }
+            SavedCentre::Path { from_m, velocity_m_per_s } => CentreProfile::Path {
+                from_m: checks.vector(*from_m)?,
+                velocity_m_per_s: checks.vector(*velocity_m_per_s)?,
+            },
+        };
+        let strength = match strength {
+            SavedStrength::Scaled(force_n, profile) => {
+                let profile = match *profile {
+                    SavedProfile::Constant => Profile::Constant,
+                    SavedProfile::Pulse { on, off } => Profile::Pulse { on, off },
+                    SavedProfile::Ramp { from_s, to_s } => {
+                        let (from_s, to_s) = (checks.time(from_s)?, checks.time(to_s)?);
+                        ensure(from_s < to_s, "a ramp that does not rise")?;
+                        Profile::Ramp { from_s, to_s }
+                    }
+                    SavedProfile::Sine { frequency_hz } => Profile::Sine { frequency_hz: checks.number(frequency_hz)? },
+                };
+                StrengthProfile::Scaled(force(*force_n)?, profile)
+            }
+            SavedStrength::Recorded(rows) => {
+                let rows = rows.iter().map(|row| Ok((row.0, force(row.1)?)));
+                StrengthProfile::Recorded(rows.collect::<Result<_>>()?)
+            }
+        };
+        Ok(LoadProfile { centre, strength, falloff_per_m: *falloff_per_m, falloff_offset: *falloff_offset })
+    }
+}
+
+/// A movement of a point.
+pub(crate) fn saved_moves(profile: &MotionProfile) -> SavedGrasp {
+    let moves = profile.moves.iter().map(|Move { from_s, to_s, by_m }| (*from_s, *to_s, (*by_m).into()));
+    SavedGrasp::Profile { point: profile.point.index() as u64, moves: moves.collect() }
+}
+
+/// A movement of a point.
+pub(crate) fn restored_moves(checks: &Checks<'_>, point: u64, moves: &[(f64, f64, Vector)]) -> Result<MotionProfile> {
+    let moves = moves.iter().map(|(from_s, to_s, by_m)| {
+        let (from_s, to_s) = (checks.time(*from_s)?, checks.time(*to_s)?);
+        // Accelerations are over its square.
+        ensure(to_s - from_s > 1e-9, "a movement that takes no time")?;
+        Ok(Move { from_s, to_s, by_m: checks.vector(*by_m)? })
+    });
+    Ok(MotionProfile { point: checks.point(point)?, moves: moves.collect::<Result<_>>()? })
+}
+
+/// A motion.
+pub(crate) fn saved_motion(motion: &Motion) -> [Vector; 3] {
+    [motion.displacement_m, motion.velocity_m_per_s, motion.acceleration_m_per_s2].map(Into::into)
+}
+
+/// A motion.
+pub(crate) fn restored_motion(checks: &Checks<'_>, motion: &[Vector; 3]) -> Result<Motion> {
+    let [displacement_m, velocity_m_per_s, acceleration_m_per_s2] = motion.map(|v| checks.vector(v));
+    Ok(Motion {
+        displacement_m: displacement_m?,
+        velocity_m_per_s: velocity_m_per_s?,
+        acceleration_m_per_s2: acceleration_m_per_s2?,
+    })
+}
+
+impl SavedTip {
+    /// Returns it as plain data.
+    pub fn of(tip: &Tip) -> Self {
+        let Tip { radius_m, friction, grasps, coupling } = *tip;
+        let spring = match coupling {
+            Coupling::Constraint => None,
+            Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => Some((stiffness_n_per_m, damping_n_s_per_m)),
+        };
+        SavedTip { radius_m, friction, grasps, spring }
+    }
+
+    /// Returns the tip.
+    ///
+    /// # Errors
+    /// Refuses one that does not fit the tissue.
+    pub fn restored(&self, checks: &Checks<'_>) -> Result<Tip> {
+        let SavedTip { radius_m, friction, grasps, spring } = *self;
+        let coupling = spring.map_or(Coupling::Constraint, |(stiffness_n_per_m, damping_n_s_per_m)| Coupling::Spring {
+            stiffness_n_per_m,
+            damping_n_s_per_m,
+        });
+        let tip = Tip { radius_m, friction, grasps, coupling };
+        check_tip("snapshot.tip", checks.shape, &tip)?;
+        Ok(tip)
+    }
+}

@@ -1,0 +1,718 @@
+//! Surgical forces: how the forces of all tools act on the points.
+//!
+//! A scheme says at which moments of a substep it evaluates a force, and with which weights the values add to its fields.
+//! A two-step scheme sees the substep's beginning only. Where the force jumps there, it must see the mean of the values
+//! just before and just after (as if the substep before had ended, and this one begun, with a half kick each): with the
+//! new value alone the error is first order, with the mean second. The other schemes take the new value.
+//!
+//! A force is a vector times a falloff over the points. The falloff is a table, made when a poke is placed, and only
+//! where it counts; the sweep multiplies. So a changing force costs as little as a constant one, and only a moving
+//! force needs new tables.
+#![allow(unsafe_code)]
+// The compiler does not always inline iterators over vectors. They then run without the caller's instructions, ten
+// times slower.
+#![allow(clippy::needless_range_loop)]
+
+use std::ops::Range;
+
+use glam::DVec3;
+
+use crate::body::surface::MeshPlaces;
+use crate::kernel::field::{BLOCK, Field, Layout};
+use crate::kernel::lanes::{self, Run, Vector, Width};
+use crate::kernel::real::Real;
+use crate::model::{Model, Plan};
+use crate::scene::profile::{LoadProfile, Moment, Poke};
+use crate::state::saved::{
+    Checks, SavedForces, SavedLoad, SavedPoke, SavedPush, SavedSlot, SavedTerm, Vector as SavedVector, ensure,
+};
+use palpate_refusal::Result;
+
+/// The force of a tool.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Push {
+    /// Constant until the next command.
+    Constant(Poke),
+    /// A function of time, exact within the step.
+    Profile(LoadProfile),
+}
+
+impl Push {
+    pub(crate) fn saved(&self) -> SavedPush {
+        match self {
+            Push::Constant(poke) => SavedPush::Constant(SavedPoke::of(poke)),
+            Push::Profile(profile) => SavedPush::Profile(SavedLoad::of(profile)),
+        }
+    }
+
+    pub(crate) fn restored(saved: &SavedPush, checks: &Checks<'_>) -> Result<Self> {
+        Ok(match saved {
+            SavedPush::Constant(poke) => Push::Constant(poke.restored(checks)?),
+            SavedPush::Profile(profile) => Push::Profile(profile.restored(checks)?),
+        })
+    }
+
+    fn at(&self, moment: Moment, rate_hz: f64) -> Poke {
+        match self {
+            Push::Constant(poke) => *poke,
+            Push::Profile(profile) => profile.at(moment, rate_hz),
+        }
+    }
+}
+
+/// One tool's force: what it is now, and what it was at the end of the last step.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Slot {
+    pub(crate) push: Option<Push>,
+    before: Option<Poke>,
+    /// The force that the sleeping tiles were last compared with.
+    compared: Option<Poke>,
+}
+
+/// The steepest falloff of a table, over a spacing: what is steeper reaches no second point either. In any format it is a number, so
+/// that its product with the distance 0 is 0.
+const STEEPEST: f64 = 1e30;
+
+/// Most terms that the force of one tool becomes: two at each moment at which a scheme asks for it.
+const MAX_TERMS: usize = 8;
+
+/// A change of a tool's force.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct ForceChange {
+    old: Option<Poke>,
+    new: Option<Poke>,
+    reached: [[[usize; 2]; 2]; 2],
+}
+
+impl ForceChange {
+    /// Upper bound of the change of force on any point of a rectangle or box, N; `sides`: its ends along each axis, m.
+    pub(crate) fn most_n(&self, sides: &[[f64; 2]]) -> f64 {
+        let nearest = |poke: &Poke| {
+            let away = sides.iter().enumerate().map(|(axis, [from, to])| {
+                let centre = poke.centre_m[axis];
+                (from - centre).max(centre - to).max(0.0)
+            });
+            let away_m = away.map(|away| away * away).sum::<f64>().sqrt();
+            factor_of(poke.falloff_offset - poke.falloff_per_m * away_m)
+        };
+        let [p, q] = [&self.old, &self.new].map(|poke| poke.as_ref().map_or(0.0, nearest));
+        let each = |poke: &Option<Poke>, factor: f64| poke.map_or(0.0, |poke| poke.force_n.length() * factor);
+        let both = each(&self.old, p) + each(&self.new, q);
+        let Some((old, new)) = self.old.as_ref().zip(self.new.as_ref()) else { return both };
+        if !same_falloff(&Poke { centre_m: new.centre_m, ..*old }, new) {
+            return both;
+        }
+        // A moving centre changes the exponent by at most the falloff times the distance.
+        let moved = new.falloff_per_m * old.centre_m.distance(new.centre_m);
+        both.min((new.force_n - old.force_n).length() * q + old.force_n.length() * moved * p.max(q))
+    }
+
+    /// The points that the old force reaches, and those that the new one reaches: along x and along y.
+    pub(crate) fn reached(&self) -> [[Range<usize>; 2]; 2] {
+        self.reached.map(|sides| sides.map(|[from, to]| from..to))
+    }
+
+    /// The new force at its centre, N.
+    pub(crate) fn peak_n(&self) -> f64 {
+        self.new.map_or(0.0, |poke| poke.force_n.length() * factor_of(poke.falloff_offset))
+    }
+}
+
+/// The forces of all tools.
+#[derive(Debug, Clone)]
+pub(crate) struct Applied<T: Real> {
+    pub(crate) slots: Vec<Slot>,
+    /// The terms that act in the present substep.
+    pub(crate) terms: Vec<Term<T>>,
+    /// The terms before they have tables. Kept, so that a step allocates nothing.
+    wanted: Vec<Wanted>,
+    /// Whether the terms hold for the coming steps as well.
+    settled: bool,
+}
+
+/// Forces of equal falloff: for each of the scheme's fields a weighted sum, N.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Wanted {
+    /// Defines the falloff; its force is not used.
+    poke: Poke,
+    forces_n: [DVec3; 3],
+}
+
+/// A force over the points: a vector times e^{−c·r}.
+#[derive(Debug, Clone)]
+pub(crate) struct Term<T: Real> {
+    wanted: Wanted,
+    /// e^{c′}.
+    gain: f64,
+    /// For each of the scheme's fields, in its terms.
+    forces: [[T; 3]; 3],
+    /// The rows where the force counts.
+    rows: Range<usize>,
+    columns: Range<usize>,
+    /// The columns in each of those rows, in whole blocks.
+    spans: Vec<Range<usize>>,
+    /// e^{−c·r} over the relative mass for those rows, each as long as a row of the sheet; 0 elsewhere.
+    factors: Field<T>,
+}
+
+/// e^x, or the largest number: a force of 0 may have any factor, and 0 times what is infinite is no number.
+fn factor_of(exponent: f64) -> f64 {
+    libm::exp(exponent).min(f64::MAX)
+}
+
+/// Whether two pokes differ only in the force.
+fn same_falloff(a: &Poke, b: &Poke) -> bool {
+    Poke { force_n: b.force_n, point: b.point, ..*a } == *b
+}
+
+/// The points that a force reaches, along x and along y. Beyond them its factor is 0.
+fn reached<T: Real>(poke: &Poke, model: &Model) -> [[usize; 2]; 2] {
+    let spacing_m = model.unit_m;
+    let reach_m = -T::NEGLIGIBLE_EXPONENT / poke.falloff_per_m;
+    if let Some(graph) = &model.graph {
+        let rows = graph.rows_within(poke.centre_m, reach_m);
+        return [[rows.start, rows.end], [0, if rows.is_empty() { 0 } else { BLOCK }]];
+    }
+    std::array::from_fn(|axis| {
+        let (centre_m, points) = (poke.centre_m[axis], model.points[axis]);
+        // Saturating casts: an infinite reach covers the whole sheet.
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let [from, to] = [((centre_m - reach_m) / spacing_m).ceil(), ((centre_m + reach_m) / spacing_m).floor() + 1.0]
+            .map(|edge| (edge.max(0.0) as usize).min(points));
+        [from, to.max(from)]
+    })
+}
+
+impl<T: Real> Term<T> {
+    fn new() -> Self {
+        let poke =
+            Poke { point: None, centre_m: DVec3::ZERO, force_n: DVec3::ZERO, falloff_per_m: 0.0, falloff_offset: 0.0 };
+        Term {
+            wanted: Wanted { poke, forces_n: [DVec3::ZERO; 3] },
+            gain: 1.0,
+            forces: [[T::default(); 3]; 3],
+            rows: 0..0,
+            columns: 0..0,
+            spans: Vec::new(),
+            factors: Field::of_length(0),
+        }
+    }
+
+    /// Writes the falloff of `poke` to the table. Costs as much as the points that the old falloff and the new one reach.
+    fn place(&mut self, poke: &Poke, model: &Model, layout: &Layout) {
+        let spacing_m = model.unit_m;
+        // Beyond its spans the table is 0, also where it was longer before.
+        for (row, span) in self.factors.chunks_exact_mut(layout.stride).zip(&self.spans) {
+            row[span.clone()].fill(T::default());
+        }
+        [self.rows, self.columns] = reached::<T>(poke, model).map(|[from, to]| from..to);
+        // `libm` gives the same bits on every machine; the platform's exponential does not.
+        self.gain = libm::exp(poke.falloff_offset);
+        self.factors.resize(self.rows.len() * layout.stride);
+        if let Some(graph) = &model.graph {
+            return self.place_on_mesh(poke, graph, layout);
+        }
+        let falloff = Falloff {
+            centre: (poke.centre_m.truncate() / spacing_m).to_array(),
+            per_spacing: (poke.falloff_per_m * spacing_m).min(STEEPEST),
+            rows: self.rows.clone(),
+            columns: self.columns.clone(),
+            stride: layout.stride,
+            factors: self.factors.as_mut_ptr(),
+        };
+        // SAFETY: `factors` has as many rows, each of whole blocks.
+        unsafe { lanes::run(Width::of(model.lanes), &falloff) };
+        let written = falloff.written(BLOCK);
+        self.spans.clear();
+        self.spans.extend(self.factors.chunks_exact(layout.stride).map(|row| {
+            let counts = |block: &[T]| block.iter().any(|factor| *factor != T::default());
+            let mut blocks = row[written.clone()].chunks(BLOCK);
+            let place = |block: usize| written.start + block * BLOCK;
+            match (blocks.clone().position(counts), blocks.rposition(counts)) {
+                (Some(first), Some(last)) => place(first)..place(last + 1),
+                _ => 0..0,
+            }
+        }));
+    }
+
+    /// The same for points anywhere in space: a row is a block of slots.
+    fn place_on_mesh(&mut self, poke: &Poke, graph: &MeshPlaces, layout: &Layout) {
+        self.spans.clear();
+        for (factors, row) in self.factors.chunks_exact_mut(layout.stride).zip(self.rows.clone()) {
+            let mut any = false;
+            for ((factor, place_m), slot) in factors.iter_mut().zip(graph.rest_in_row(row)).zip(row * BLOCK..) {
+                let exponent = -poke.falloff_per_m * place_m.distance(poke.centre_m);
+                // An empty slot is nowhere.
+                let reaches = exponent >= T::NEGLIGIBLE_EXPONENT && place_m.is_finite();
+                let moves = || libm::exp(exponent) / graph.slots.mass(slot);
+                *factor = if reaches { T::of(moves()) } else { T::default() };
+                any |= *factor != T::default();
+            }
+            self.spans.push(if any { 0..BLOCK } else { 0..0 });
+        }
+    }
+
+    fn set(&mut self, wanted: Wanted, scale: f64) {
+        self.forces = wanted.forces_n.map(|force_n| (self.gain * scale * force_n).to_array().map(T::of));
+        self.wanted = wanted;
+    }
+
+    /// e^{−c·r} over the relative mass at a point.
+    fn factor(&self, layout: &Layout, [i, j]: [usize; 2]) -> T {
+        if self.rows.contains(&i) { self.factors[(i - self.rows.start) * layout.stride + j] } else { T::default() }
+    }
+}
+
+/// Fills a table.
+struct Falloff<T> {
+    /// In spacings, from the first point.
+    centre: [f64; 2],
+    per_spacing: f64,
+    rows: Range<usize>,
+    columns: Range<usize>,
+    stride: usize,
+    factors: *mut T,
+}
+
+impl<T> Falloff<T> {
+    /// The places of a row that are written, in blocks of `length`.
+    #[inline(always)]
+    fn written(&self, length: usize) -> Range<usize> {
+        self.columns.start / length * length..self.columns.end.next_multiple_of(length)
+    }
+}
+
+impl<T: Real> Run<T> for Falloff<T> {
+    #[inline(always)]
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    unsafe fn run<V: Vector<Real = T>>(&self) {
+        // SAFETY: the caller's promise.
+        unsafe {
+            let zero = V::of(T::default());
+            let slope = V::of(T::of(-self.per_spacing));
+            let farthest = V::of(T::of(-T::NEGLIGIBLE_EXPONENT));
+            let [_, centre] = self.centre;
+            // Column numbers and the integer part of the centre are exact in any format; only the fraction is rounded.
+            let (whole, rest) = (V::of(T::of(centre.floor())), V::of(T::of(centre - centre.floor())));
+            for i in self.rows.clone() {
+                let x = T::of(i as f64 - self.centre[0]);
+                let x = V::of(x * x);
+                for at in self.written(V::LANES).step_by(V::LANES) {
+                    let y = zero.count(at).sub(whole).sub(rest);
+                    let exponent = slope.mul(y.mul_add(y, x).root());
+                    let far = exponent.beyond(farthest);
+                    let factor = V::select(far, zero, exponential(exponent)).keep(zero.first(self.columns.end - at));
+                    // The columns bound the reach more exactly than this format can.
+                    let factor = V::select(zero.first(self.columns.start.saturating_sub(at)), zero, factor);
+                    debug_assert!(at + V::LANES <= self.stride);
+                    factor.store(self.factors.add((i - self.rows.start) * self.stride + at));
+                }
+            }
+        }
+    }
+}
+
+/// e^x for x from [`Real::NEGLIGIBLE_EXPONENT`] to 0, within two units of the last place: 2^k·e^r, |r| ≤ ½ln 2. Unlike
+/// the platform's function, it has the same bits on every machine.
+#[inline(always)]
+fn exponential<V: Vector>(x: V) -> V {
+    let of = |value: f64| x.splat(V::Real::of(value));
+    // Adding and subtracting a number whose last digit is 1 rounds to an integer.
+    let unit = of(V::Real::UNIT);
+    let k = x.mul_add(of(std::f64::consts::LOG2_E), unit).sub(unit);
+    let [high, low] = V::Real::LN_2;
+    let r = x.minus(k, of(high)).minus(k, of(low));
+    let mut sum = of(INVERSE_FACTORIALS[V::Real::EXPONENTIAL_DEGREE]);
+    for n in (0..V::Real::EXPONENTIAL_DEGREE).rev() {
+        sum = sum.mul_add(r, of(INVERSE_FACTORIALS[n]));
+    }
+    sum.mul(k.power_of_two())
+}
+
+/// 1/n!.
+const INVERSE_FACTORIALS: [f64; 14] = {
+    let mut series = [1.0; 14];
+    let mut n = 1;
+    while n < series.len() {
+        #[allow(clippy::cast_precision_loss)]
+        let next = series[n - 1] / n as f64;
+        series[n] = next;
+        n += 1;
+    }
+    series
+};
+
+/// A term in the form that a sweep uses: pointers and numbers that need no checks.
+#[derive(Clone, Copy)]
+pub(crate) struct Pull<'a, T> {
+    /// Where the factors of row 0 would be.
+    factors: *const T,
+    from: usize,
+    to: usize,
+    /// First and last place of the table, for debug checks.
+    places: [usize; 2],
+    spans: &'a [Range<usize>],
+    /// Forces of one field and, if there is another, the next.
+    forces: [[T; 3]; 2],
+}
+
+impl<T: Real> Pull<'_, T> {
+    pub(crate) fn none() -> Self {
+        Pull { factors: std::ptr::null(), from: 0, to: 0, places: [0; 2], spans: &[], forces: [[T::default(); 3]; 2] }
+    }
+
+    /// The factors of a block of one of its rows.
+    ///
+    /// # Safety
+    /// The table belongs to the same sheet as the block and is still alive.
+    #[inline(always)]
+    unsafe fn factor<V: Vector<Real = T>>(&self, at: usize) -> V {
+        debug_assert!(self.places[0] <= at && at + V::LANES <= self.places[1]);
+        // SAFETY: the caller's promise.
+        unsafe { V::load(self.factors.wrapping_add(at)) }
+    }
+}
+
+impl<T: Real> Term<T> {
+    /// The fields from `field` on.
+    pub(crate) fn pull(&self, field: usize, stride: usize) -> Pull<'_, T> {
+        let factors = self.factors.as_ptr().wrapping_sub(self.rows.start * stride);
+        let forces = [self.forces[field], self.forces[(field + 1).min(2)]];
+        Pull {
+            factors,
+            from: self.rows.start,
+            to: self.rows.end,
+            places: [self.rows.start, self.rows.end].map(|row| row * stride),
+            spans: &self.spans,
+            forces,
+        }
+    }
+}
+
+/// Whether any force acts on a block of a row that has a force.
+#[inline(always)]
+pub(crate) fn reaches<T>(pulls: &[Pull<'_, T>], row: usize, column: usize) -> bool {
+    match pulls {
+        [pull] => pull.spans.get(row.wrapping_sub(pull.from)).is_some_and(|span| span.contains(&column)),
+        _ => true,
+    }
+}
+
+/// The force of one term on a block that it reaches, by component, for `FIELDS` fields; a single field is given twice.
+///
+/// # Safety
+/// The table belongs to the same sheet as the block and is still alive.
+#[inline(always)]
+pub(crate) unsafe fn force_of<V: Vector, const FIELDS: usize>(pull: &Pull<'_, V::Real>, at: usize) -> [[V; 2]; 3] {
+    // SAFETY: the caller's promise.
+    let factor = unsafe { pull.factor::<V>(at) };
+    let mut forces = [[factor; 2]; 3];
+    for c in 0..3 {
+        for f in 0..FIELDS {
+            forces[c][f] = factor.splat(pull.forces[f][c]).mul(factor);
+        }
+        if FIELDS == 1 {
+            forces[c][1] = forces[c][0];
+        }
+    }
+    forces
+}
+
+/// The forces of all terms on a block, by component, for `FIELDS` fields; a single field is given twice.
+///
+/// # Safety
+/// The tables belong to the same sheet as the block and are still alive.
+#[inline(always)]
+pub(crate) unsafe fn force_on<V: Vector, const FIELDS: usize>(
+    pulls: &[Pull<'_, V::Real>],
+    row: usize,
+    at: usize,
+) -> [[V; 2]; 3] {
+    // SAFETY: the caller's promise.
+    let mut sum = [[unsafe { V::of(V::Real::default()) }; 2]; 3];
+    if let [pull] = pulls
+        && row >= pull.from
+        && row < pull.to
+    {
+        // SAFETY: the caller's promise.
+        return unsafe { force_of::<V, FIELDS>(pull, at) };
+    }
+    for pull in pulls {
+        if row >= pull.from && row < pull.to {
+            // SAFETY: the caller's promise.
+            let factor = unsafe { pull.factor::<V>(at) };
+            for c in 0..3 {
+                for f in 0..FIELDS {
+                    sum[c][f] = factor.splat(pull.forces[f][c]).mul_add(factor, sum[c][f]);
+                }
+            }
+        }
+    }
+    if FIELDS == 1 {
+        for c in 0..3 {
+            sum[c][1] = sum[c][0];
+        }
+    }
+    sum
+}
+
+/// The rows on which any force acts.
+pub(crate) fn rows<T: Real>(terms: &[Term<T>]) -> Range<usize> {
+    let rows = terms.iter().map(|term| term.rows.clone());
+    rows.reduce(|a, b| a.start.min(b.start)..a.end.max(b.end)).unwrap_or(0..0)
+}
+
+/// How far the point in a place in memory rests from a control point, m.
+#[allow(clippy::cast_precision_loss)]
+fn away_m(model: &Model, index: usize, centre_m: DVec3) -> f64 {
+    match &model.graph {
+        Some(graph) => graph.rest_m(index).distance(centre_m),
+        None => {
+            let ([i, j], spacing_m) = (model.point_of(index), model.unit_m);
+            let (x, y) = (i as f64 * spacing_m - centre_m.x, j as f64 * spacing_m - centre_m.y);
+            (x * x + y * y).sqrt()
+        }
+    }
+}
+
+/// e^{−c·r + c′} at a distance, 0 where it is negligible.
+fn factor(poke: &Poke, away_m: f64, negligible: f64) -> f64 {
+    let exponent = -poke.falloff_per_m * away_m;
+    if exponent < negligible { 0.0 } else { libm::exp(exponent + poke.falloff_offset) }
+}
+
+impl<T: Real> Applied<T> {
+    pub(crate) fn new() -> Self {
+        Applied { slots: Vec::new(), terms: Vec::new(), wanted: Vec::new(), settled: true }
+    }
+
+    /// The same forces, taken from a sheet of either format.
+    pub(crate) fn like<S: Real>(other: &Applied<S>) -> Self {
+        Applied { slots: other.slots.clone(), settled: false, ..Applied::new() }
+    }
+
+    /// As plain data, without tables.
+    pub(crate) fn saved(&self) -> SavedForces {
+        let slot = |Slot { push, before, compared }: &Slot| SavedSlot {
+            push: push.as_ref().map(Push::saved).map(Box::new),
+            before: before.as_ref().map(SavedPoke::of).map(Box::new),
+            compared: compared.as_ref().map(SavedPoke::of).map(Box::new),
+        };
+        let term = |term: &Term<T>| SavedTerm {
+            poke: SavedPoke::of(&term.wanted.poke),
+            forces_n: term.wanted.forces_n.map(SavedVector::from),
+        };
+        SavedForces {
+            slots: self.slots.iter().map(slot).collect(),
+            terms: self.terms.iter().map(term).collect(),
+            settled: self.settled,
+        }
+    }
+
+    /// The forces of a sheet whose plan has the scale of forces `scale`, with their tables.
+    pub(crate) fn restored(
+        saved: &SavedForces,
+        model: &Model,
+        layout: &Layout,
+        scale: f64,
+        checks: &Checks<'_>,
+    ) -> Result<Self> {
+        if let Some(last) = saved.slots.len().checked_sub(1) {
+            checks.tool(last as u64)?;
+        }
+        ensure(saved.terms.len() <= MAX_TERMS * saved.slots.len(), "more forces than its tools exert")?;
+        // In the scheme's terms it is a number of this format, as far as it acts.
+        let is_sound = |poke: &Poke, forces_n: &[DVec3]| {
+            let gain = libm::exp(poke.falloff_offset) * scale;
+            let in_terms = |force_n: &DVec3| T::of(gain * force_n.length()).is_finite();
+            let acts = |force_n: &&DVec3| **force_n != DVec3::ZERO;
+            ensure(forces_n.iter().filter(acts).all(in_terms), "a force that is not finite")
+        };
+        let poke = |poke: &Option<Box<SavedPoke>>| poke.as_ref().map(|poke| poke.restored(checks)).transpose();
+        let slot = |slot: &SavedSlot| {
+            let push = slot.push.as_ref().map(|push| Push::restored(push, checks)).transpose()?;
+            let (before, compared) = (poke(&slot.before)?, poke(&slot.compared)?);
+            if let Some(before) = &before {
+                is_sound(before, &[before.force_n])?;
+            }
+            Ok(Slot { push, before, compared })
+        };
+        let slots = saved.slots.iter().map(slot).collect::<Result<_>>()?;
+        let mut terms = Vec::new();
+        for saved in &saved.terms {
+            let wanted = Wanted { poke: saved.poke.restored(checks)?, forces_n: saved.forces_n.map(DVec3::from) };
+            // One of 0 has no factor that is not finite: the sweep multiplies.
+            ensure(libm::exp(wanted.poke.falloff_offset).is_finite(), "a force that is not finite")?;
+            is_sound(&wanted.poke, &wanted.forces_n)?;
+            let mut term = Term::new();
+            term.place(&wanted.poke, model, layout);
+            term.set(wanted, scale);
+            terms.push(term);
+        }
+        Ok(Applied { slots, terms, wanted: Vec::new(), settled: saved.settled })
+    }
+
+    /// From the coming step on `tool` exerts `push`.
+    pub(crate) fn set(&mut self, tool: usize, push: Option<Push>) {
+        if self.slots.len() <= tool {
+            self.slots.resize(tool + 1, Slot::default());
+        }
+        self.slots[tool].push = push;
+        self.settled = false;
+    }
+
+    /// Whether the forces stay constant until a tool gets another command.
+    pub(crate) fn is_settled(&self) -> bool {
+        self.settled
+    }
+
+    /// The changes of force since the last call, up to the end of step `step`.
+    pub(crate) fn changes(&mut self, model: &Model, step: u64) -> impl Iterator<Item = ForceChange> {
+        let end = Moment { step, fraction: 1.0 };
+        let change = move |slot: &mut Slot| {
+            let new = slot.push.as_ref().map(|push| push.at(end, model.scene.stepping.rate_hz));
+            let old = std::mem::replace(&mut slot.compared, new);
+            let reached = |poke: Option<Poke>| poke.map_or_else(Default::default, |poke| reached::<T>(&poke, model));
+            (old != new).then(|| ForceChange { old, new, reached: [old, new].map(reached) })
+        };
+        let slots = if self.settled { 0 } else { self.slots.len() };
+        self.slots[..slots].iter_mut().filter_map(change)
+    }
+
+    /// Updates the forces for the substep that begins at `moment` and takes `share` of the step.
+    pub(crate) fn prepare(&mut self, model: &Model, plan: &Plan, layout: &Layout, moment: Moment, share: f64) {
+        if self.settled {
+            return;
+        }
+        let rate_hz = model.scene.stepping.rate_hz;
+        self.wanted.clear();
+        self.settled = true;
+        for slot in &self.slots {
+            self.settled &= match (&slot.before, &slot.push) {
+                (None, None) => true,
+                (Some(before), Some(Push::Constant(poke))) => before == poke,
+                _ => false,
+            };
+            // Forces of one tool that differ only in the vector are merged.
+            let own = self.wanted.len();
+            let mut add = |weights: [f64; 3], poke: Option<Poke>| {
+                let Some(poke) = poke.filter(|poke| poke.force_n != DVec3::ZERO) else { return };
+                let forces_n = weights.map(|weight| weight * poke.force_n);
+                match self.wanted[own..].last_mut() {
+                    Some(wanted) if same_falloff(&wanted.poke, &poke) => {
+                        wanted.forces_n.iter_mut().zip(forces_n).for_each(|(sum, force)| *sum += force);
+                    }
+                    _ => self.wanted.push(Wanted { poke: Poke { force_n: DVec3::ZERO, ..poke }, forces_n }),
+                }
+            };
+            for node in &plan.nodes {
+                let at = Moment { fraction: moment.fraction + node.fraction * share, ..moment };
+                let now = slot.push.as_ref().map(|push| push.at(at, rate_hz));
+                if plan.scheme.takes_means() && moment.fraction == 0.0 && slot.before != now {
+                    add(node.weights.map(|weight| 0.5 * weight), slot.before);
+                    add(node.weights.map(|weight| 0.5 * weight), now);
+                } else {
+                    add(node.weights, now);
+                }
+            }
+        }
+        if !self.wanted.iter().eq(self.terms.iter().map(|term| &term.wanted)) {
+            self.put(model, layout, plan.force_scale(&model.scene));
+        }
+    }
+
+    /// Makes `terms` equal `wanted`. Keeps each table whose falloff is wanted again and reuses the memory of the
+    /// others.
+    fn put(&mut self, model: &Model, layout: &Layout, scale: f64) {
+        for place in 0..self.wanted.len() {
+            let wanted = self.wanted[place];
+            let known = self.terms[place..].iter().position(|term| same_falloff(&term.wanted.poke, &wanted.poke));
+            let needless = |term: &Term<T>| {
+                !self.wanted[place..].iter().any(|wanted| same_falloff(&wanted.poke, &term.wanted.poke))
+            };
+            let found = known.or_else(|| self.terms[place..].iter().position(needless)).unwrap_or_else(|| {
+                self.terms.push(Term::new());
+                self.terms.len() - 1 - place
+            });
+            self.terms.swap(place, place + found);
+            if known.is_none() {
+                self.terms[place].place(&wanted.poke, model, layout);
+            }
+            self.terms[place].set(wanted, scale);
+        }
+        self.terms.truncate(self.wanted.len());
+    }
+
+    /// The forces at the end of the last step, in the scale of a scheme, as a field of its own.
+    pub(crate) fn until_now(&self, model: &Model, layout: &Layout, scale: f64) -> Vec<Term<T>> {
+        let pokes = self.slots.iter().filter_map(|slot| slot.before).filter(|poke| poke.force_n != DVec3::ZERO);
+        let term = |poke: Poke| {
+            let mut term = Term::new();
+            term.place(&poke, model, layout);
+            term.set(Wanted { poke, forces_n: [poke.force_n; 3] }, scale);
+            term
+        };
+        pokes.map(term).collect()
+    }
+
+    /// The force that the present substep adds to a point in one field, over its relative mass.
+    pub(crate) fn force_at(&self, layout: &Layout, field: usize, point: [usize; 2]) -> [f64; 3] {
+        let mut sum = [0.0; 3];
+        for term in &self.terms {
+            let factor = term.factor(layout, point).wide();
+            sum.iter_mut().zip(term.forces[field]).for_each(|(sum, force)| *sum += force.wide() * factor);
+        }
+        sum
+    }
+
+    /// The work of the forces where something else than a sweep moves a point, in `Sheet::unit_of_work_j`. A sweep counts only
+    /// how it would have moved.
+    pub(crate) fn work_along(
+        &self,
+        model: &Model,
+        plan: &Plan,
+        layout: &Layout,
+        point: [usize; 2],
+        movement: [f64; 3],
+    ) -> f64 {
+        if self.terms.is_empty() {
+            return 0.0;
+        }
+        let force = self.force_at(layout, plan.scheme.last_field(), point);
+        let product: f64 = force.iter().zip(movement).map(|(force, moved)| force * moved).sum();
+        product * model.relative_mass_at(model.index_of(point))
+    }
+
+    /// Forgets the terms and their scale.
+    pub(crate) fn forget(&mut self) {
+        self.terms.clear();
+        self.settled = false;
+    }
+
+    /// Ends a step: the present force becomes the force before the next step.
+    pub(crate) fn finish(&mut self, model: &Model, step: u64) {
+        let end = Moment { step, fraction: 1.0 };
+        for slot in &mut self.slots {
+            slot.before = slot.push.as_ref().map(|push| push.at(end, model.scene.stepping.rate_hz));
+        }
+    }
+
+    /// The force on a point just after a moment.
+    pub(crate) fn from(&self, model: &Model, index: usize, moment: Moment) -> DVec3 {
+        let rate_hz = model.scene.stepping.rate_hz;
+        let pokes = self.slots.iter().filter_map(|slot| slot.push.as_ref().map(|push| push.at(moment, rate_hz)));
+        sum_at(model, index, pokes, T::NEGLIGIBLE_EXPONENT)
+    }
+
+    /// The force on a point at the end of the last step.
+    pub(crate) fn until(&self, model: &Model, index: usize) -> DVec3 {
+        sum_at(model, index, self.slots.iter().filter_map(|slot| slot.before), T::NEGLIGIBLE_EXPONENT)
+    }
+}
+
+fn sum_at(model: &Model, index: usize, pokes: impl Iterator<Item = Poke>, negligible: f64) -> DVec3 {
+    pokes.map(|poke| poke.force_n * factor(&poke, away_m(model, index, poke.centre_m), negligible)).sum()
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,727 @@
+//! Position-controlled tools of finite size: a touch, which only pushes, and a grasp, which holds.
+//!
+//! A tool meets the sheet with a disc (`footprint`), whose place s(c) = Σ w·x follows from the material place c under
+//! the tool. In each substep the sheet first moves under the force F₀ of the last. Then the step finds an impulse P at the
+//! substep's beginning and a force F over it that take s to the tool, as fast as the tool: two unknowns for place and speed,
+//! with what a kick and a constant force do to both (`Scheme::kick`, `Scheme::constant`) and Σ w²·dt²/m. So this is a
+//! division, not an iteration, and stable however stiff the coupling. (A force alone rings: a disc that must be at its place
+//! at the end of each substep oscillates within them. Its speed, and with it the damping that is felt, then err by what
+//! the tool's speed changes in a step.)
+//!
+//! With a spring as coupling, F is its force at the substep's end, F = (Kc·g + Bc·(v_tool − ṡ))/(1 + A·(Kc + Bc/dt)), with the
+//! gap g = x_tool − s + A·F₀, and F − F₀ is an impulse. A two-step scheme moves a point by what it changes its speed by: under a
+//! constraint it has one unknown, F = g/A.
+//!
+//! Between steps the tool's speed jumps, since its path is known at their ends alone. Such a jump is an impulse m·Δv where
+//! the disc then is. Whether a tool lets go, and how much friction it has, is judged as if it lasted for the step: else
+//! shorter substeps would see a tool that jumps off at every step ([`ToolSubstep`]).
+//!
+//! A touch is unilateral: with n the outward normal of the surface under the disc, N = −F·n must be positive, or the
+//! tool is free; |F_t| may be at most μN, or the disc slides: F_t is shortened, and c follows the tool. With μ = 0 it
+//! always follows. While it slides, the force acts half where the disc was and half where it is, along the mean of both
+//! normals: with either alone the error would fall with the first power of the substep. So c is the proxy: the place of the
+//! tool on the surface. n = ∂s/∂c_x × ∂s/∂c_y is the only choice whose work equals what the sheet gets when the disc slides
+//! over a slope.
+//!
+//! **No energy from nowhere.** The tool's work is F·ẋ of the tool alone, and the guard counts that (`touch`). So what a disc
+//! does must agree with it, whatever the surface is like:
+//! - While it slides from w₀ to w₁, the points move by x̄ in the mean and the tool by Δs = Σ w̄·Δx + Δs̄ with
+//!   Δs̄ = Σ (w₁ − w₀)·x̄. What pushes must not do work along Δs̄, else the tissue gets F·Δs̄ more than the tool gives. So the
+//!   mean normal is taken perpendicular to Δs̄. On a smooth surface it is nearly so already; on one that is coarse, folded or
+//!   thin it is not. Friction may only take.
+//! - A tool that meets the tissue presses it as deep as both have come together in this substep. If it is deeper, because its
+//!   disc has come over to another part of the tissue in which it already is, the rest stays as an offset. A new tool has no
+//!   way yet: it presses as deep as it is put. In that substep it does not ask whether the tissue pulls on it: what moves a
+//!   surface at rest and what stops it again cancel, and rounding would decide.
+//! - A disc that lags behind its tool is pressed by no more than what the tool moves along the normal ([`Tool::balance`]), and
+//!   it moves by no more than half its radius at once.
+//! - A disc that lags behind and stops sliding sticks where it is: the impulses that would draw it to its tool and stop it there cancel,
+//!   so that the tool would do no work.
+//! - Where the disc would come over an edge so that its way leads along its normal, it stays, and pushes along its normal alone.
+//!   Where friction would drive it against the tool's way, and farther, it stays, and friction acts: so what slid and stops is held.
+//!
+//! The force felt under a constraint is that of springs, anchor springs and damping on the disc, Σ w·f/Σ w²: F without
+//! the points' own inertia, which a hand would feel as a knock at each command.
+
+use std::sync::Arc;
+
+use glam::DVec3;
+
+use crate::kernel::field::{Layout, State};
+use crate::kernel::real::Real;
+use crate::model::{Model, Plan};
+use crate::response::tangent::{LinearPatch, Tangent, Window};
+use crate::state::saved::{Checks, SavedContact, SavedTip, ensure};
+use crate::tools::footprint::{Footprint, RestSurface, WeightedNode};
+use palpate_haptics::{ContactState, Coupling, Tip};
+use palpate_refusal::Result;
+
+/// Below this determinant of its kick and its constant force a scheme has one unknown, not two.
+const MIN_DETERMINANT: f64 = 1e-6;
+
+/// The offset of a disc that slides vanishes by this part of the tool's way.
+const RELAXATION: f64 = 1.0 / 64.0;
+
+/// What a disc lags behind its tool counts from this part of its radius on. On a smooth surface none does.
+const MIN_LAG: f64 = 1.0 / 64.0;
+
+/// A disc slides on while its mean normal, taken perpendicular to its way, has at least this part along the normal where it is.
+const MIN_STRAIGHTNESS: f64 = 0.9;
+
+/// The motion of a tool and the force on it at the end of a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ToolContact {
+    /// Place of the tool, m; z points up, out of the tissue.
+    pub place_m: DVec3,
+    /// Velocity in the last step, m/s.
+    pub velocity_m_per_s: DVec3,
+    /// The state of contact.
+    pub contact_state: ContactState,
+    /// Force of the tissue on the tool, N.
+    pub force_on_tool_n: DVec3,
+    /// Place of the surface under the tool, m.
+    pub surface_m: DVec3,
+    /// Where the material point there rests, m.
+    pub anchor_m: DVec3,
+    /// Unit normal out of the tissue.
+    pub normal: DVec3,
+    /// The surface at rest there; none of a sheet, which is a plane at rest.
+    pub rest: Option<RestSurface>,
+    /// μ of the tool's tip.
+    pub friction: f64,
+    /// Whether the disc is almost wholly on fixed points ([`Footprint::is_on_fixed`]): its force is not that of free tissue.
+    pub is_on_fixed: bool,
+}
+
+/// A copy of the data from which the stiffness under a tool is computed, for another thread.
+#[derive(Debug)]
+pub struct TangentInput {
+    pub(crate) model: Arc<Model>,
+    pub(crate) footprint: Footprint,
+    pub(crate) window: Window,
+    pub(crate) displacement_m: Vec<DVec3>,
+}
+
+impl TangentInput {
+    /// Computes the stiffness. Takes some milliseconds for a thousand points.
+    pub fn tangent(self) -> Tangent {
+        LinearPatch::new(&self.model, &self.footprint, self.window, self.displacement_m).tangent()
+    }
+}
+
+/// A tool and its disc.
+#[derive(Debug, Clone)]
+pub(crate) struct Tool {
+    pub(crate) number: usize,
+    pub(crate) tip: Tip,
+    pub(crate) footprint: Footprint,
+    /// Place at the step's beginning and at its end, m.
+    pub(crate) from_m: DVec3,
+    pub(crate) to_m: DVec3,
+    pub(crate) contact_state: ContactState,
+    /// Out of the tissue, on the side where the tool is.
+    pub(crate) normal: DVec3,
+    /// That side: 1 outside, -1 inside; none while the tool is beside the tissue.
+    pub(crate) side: Option<f64>,
+    /// The offset that a grasp, or a touch that began within the tissue, keeps between the tool and the surface, m.
+    pub(crate) offset_m: DVec3,
+    /// The gap between the tool and its disc at the end of a substep in which that slid, m: a disc may lag behind.
+    pub(crate) gap_m: DVec3,
+    /// Whether it has not yet been compared with the surface, with this tip.
+    pub(crate) is_new: bool,
+    /// Force on the sheet in the last substep, N.
+    pub(crate) force_n: DVec3,
+    /// The part of that force that continues in the next substep, without the impulse of meeting.
+    pub(crate) steady_n: DVec3,
+    pub(crate) velocity_m_per_s: DVec3,
+}
+
+/// The states of contact, in the order of their numbers in snapshots.
+const CONTACT_STATES: [ContactState; 4] =
+    [ContactState::Free, ContactState::Sticking, ContactState::Sliding, ContactState::Holding];
+
+/// All position-controlled tools.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Contacts {
+    /// By ascending number.
+    pub(crate) tools: Vec<Tool>,
+}
+
+impl Contacts {
+    /// From the coming step on the tool is at `to_m` at the step's end. A new tool begins there.
+    pub(crate) fn pose(&mut self, model: &Model, number: usize, to_m: DVec3, tip: Tip) {
+        if let Some(tool) = self.tools.iter_mut().find(|tool| tool.number == number) {
+            let is_other = tool.tip.radius_m != tip.radius_m;
+            if is_other {
+                tool.footprint = Footprint::new(model, tip.radius_m, tool.footprint.anchor_m());
+            }
+            if is_other || tool.tip.grasps != tip.grasps {
+                (tool.contact_state, tool.steady_n, tool.is_new) = (ContactState::Free, DVec3::ZERO, true);
+            }
+            (tool.to_m, tool.tip) = (to_m, tip);
+            return;
+        }
+        let index = self.tools.partition_point(|tool| tool.number < number);
+        let tool = Tool {
+            number,
+            tip,
+            footprint: Footprint::new(model, tip.radius_m, to_m),
+            from_m: to_m,
+            to_m,
+            contact_state: ContactState::Free,
+            normal: DVec3::Z,
+            side: None,
+            offset_m: DVec3::ZERO,
+            gap_m: DVec3::ZERO,
+            is_new: true,
+            force_n: DVec3::ZERO,
+            steady_n: DVec3::ZERO,
+            velocity_m_per_s: DVec3::ZERO,
+        };
+        self.tools.insert(index, tool);
+    }
+
+    pub(crate) fn saved(&self) -> Vec<SavedContact> {
+        self.tools.iter().map(Tool::saved).collect()
+    }
+
+    pub(crate) fn restored(saved: &[SavedContact], model: &Model, checks: &Checks<'_>) -> Result<Self> {
+        let tools: Vec<Tool> = saved.iter().map(|tool| Tool::restored(tool, model, checks)).collect::<Result<_>>()?;
+        ensure(tools.is_sorted_by(|a, b| a.number < b.number), "tools out of order")?;
+        Ok(Contacts { tools })
+    }
+
+    pub(crate) fn is_empty(&self) -> bool {
+        self.tools.is_empty()
+    }
+
+    /// The numbers of these tools.
+    pub(crate) fn tools(&self) -> impl Iterator<Item = usize> {
+        self.tools.iter().map(|tool| tool.number)
+    }
+
+    /// The points under tools that touch or hold. Some occur more than once.
+    pub(crate) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
+        self.tools.iter().filter(|tool| tool.contact_state != ContactState::Free).flat_map(Tool::points)
+    }
+
+    /// The force that goes on on a point, N.
+    pub(crate) fn steady_on(&self, model: &Model, index: usize) -> DVec3 {
+        let pressing = self.tools.iter().filter(|tool| tool.steady_n != DVec3::ZERO);
+        pressing.map(|tool| tool.footprint.weight_of(model, index) * tool.steady_n).sum()
+    }
+
+    pub(crate) fn release(&mut self, number: usize) {
+        self.tools.retain(|tool| tool.number != number);
+    }
+
+    /// Ends a step.
+    pub(crate) fn finish(&mut self, rate_hz: f64) {
+        for tool in &mut self.tools {
+            tool.velocity_m_per_s = (tool.to_m - tool.from_m) * rate_hz;
+            tool.from_m = tool.to_m;
+        }
+    }
+}
+
+/// The displacement of a point from rest, m. For a multistep scheme, as predicted.
+pub(crate) fn displacement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, [i, j]: [usize; 2]) -> DVec3 {
+    let at = i * layout.stride + j;
+    let component = |c: usize| state.u[c * layout.plane + at].wide() * model.unit_m;
+    DVec3::new(component(0), component(1), component(2))
+}
+
+/// Adds to u and d of the disc's points the effect of `force_n` with `[of_u, of_d]` (`Scheme::kick`,
+/// `Scheme::constant`).
+pub(crate) fn push<T: Real>(
+    model: &Model,
+    plan: &Plan,
+    layout: &Layout,
+    state: &mut State<T>,
+    footprint: &Footprint,
+    force_n: DVec3,
+    [of_u, of_d]: [f64; 2],
+) {
+    let scale = plan.force_scale(&model.scene);
+    for WeightedNode { point: [i, j], mass, weight, .. } in
+        footprint.reached().iter().copied().filter(|point| point.free)
+    {
+        for c in 0..3 {
+            let at = c * layout.plane + i * layout.stride + j;
+            let change = scale * weight * force_n[c] / mass;
+            state.u[at] += T::of(of_u * change);
+            state.d[at] += T::of(of_d * change);
+        }
+    }
+}
+
+/// The movement of the disc in a substep, Σ w·d, m.
+pub(crate) fn movement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, footprint: &Footprint) -> DVec3 {
+    let mut moved = DVec3::ZERO;
+    for WeightedNode { point: [i, j], weight, .. } in footprint.reached().iter().copied() {
+        let at = i * layout.stride + j;
+        for c in 0..3 {
+            moved[c] += weight * state.d[c * layout.plane + at].wide();
+        }
+    }
+    moved * model.unit_m
+}
+
+impl Tool {
+    #[allow(clippy::cast_possible_truncation)]
+    fn saved(&self) -> SavedContact {
+        SavedContact {
+            number: self.number as u64,
+            tip: SavedTip::of(&self.tip),
+            ground: self.footprint.saved(),
+            from_m: self.from_m.into(),
+            to_m: self.to_m.into(),
+            contact_state: CONTACT_STATES.iter().position(|state| *state == self.contact_state).unwrap_or(0) as u8,
+            normal: self.normal.into(),
+            side: self.side,
+            offset_m: self.offset_m.into(),
+            gap_m: self.gap_m.into(),
+            is_new: self.is_new,
+            force_n: self.force_n.into(),
+            steady_n: self.steady_n.into(),
+            velocity_m_per_s: self.velocity_m_per_s.into(),
+        }
+    }
+
+    fn restored(saved: &SavedContact, model: &Model, checks: &Checks<'_>) -> Result<Self> {
+        let tip = saved.tip.restored(checks)?;
+        let contact_state = CONTACT_STATES.get(usize::from(saved.contact_state)).copied();
+        ensure(contact_state.is_some(), "a state of contact that there is not")?;
+        ensure(saved.side.is_none_or(|side| side.abs() == 1.0), "a side of the tissue that there is not")?;
+        Ok(Tool {
+            number: checks.tool(saved.number)?,
+            tip,
+            footprint: Footprint::restored(model, tip.radius_m, &saved.ground)?,
+            from_m: checks.vector(saved.from_m)?,
+            to_m: checks.vector(saved.to_m)?,
+            contact_state: contact_state.unwrap_or(ContactState::Free),
+            normal: checks.vector(saved.normal)?,
+            side: saved.side,
+            offset_m: checks.vector(saved.offset_m)?,
+            gap_m: checks.vector(saved.gap_m)?,
+            is_new: saved.is_new,
+            force_n: checks.vector(saved.force_n)?,
+            steady_n: checks.vector(saved.steady_n)?,
+            velocity_m_per_s: checks.vector(saved.velocity_m_per_s)?,
+        })
+    }
+
+    /// The points of the disc.
+    pub(crate) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
+        self.footprint.reached().iter().map(|reached| reached.point)
+    }
+
+    pub(crate) fn place_m(&self, fraction: f64) -> DVec3 {
+        if fraction >= 1.0 { self.to_m } else { self.from_m.lerp(self.to_m, fraction) }
+    }
+
+    /// Finds the state of contact, and the force of the tool on the sheet, N. `state` already has the effect of the steady
+    /// force; where the disc slides, half of that goes with it.
+    pub(crate) fn solve_contact<T: Real>(
+        &mut self,
+        model: &Model,
+        plan: &Plan,
+        layout: &Layout,
+        state: &mut State<T>,
+        leg: ToolSubstep,
+    ) -> ContactForce {
+        let ToolSubstep { mut place_m, spread_n, .. } = leg;
+        let before = self.contact_state;
+        if self.contact_state == ContactState::Free {
+            self.footprint.seek(model, place_m, |point| displacement_m(model, layout, state, point));
+        }
+        let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        let outward = self.footprint.outward(&along);
+        let mut gap_m = place_m - surface_m;
+        let side = self.side.unwrap_or_else(|| self.footprint.side(gap_m.dot(outward)));
+        self.normal = side * outward;
+        match self.contact_state {
+            ContactState::Free => {
+                // Beside the tissue it may go over to the other side.
+                let is_beside = self.footprint.is_beside(gap_m, outward);
+                self.side = (!is_beside).then_some(side);
+                if is_beside {
+                    return ContactForce::default();
+                }
+                let depth_m = -gap_m.dot(self.normal);
+                if self.tip.grasps {
+                    (self.contact_state, self.offset_m) = (ContactState::Holding, gap_m);
+                } else if depth_m <= 0.0 {
+                    return ContactForce::default();
+                } else {
+                    self.contact_state = ContactState::Sticking;
+                    let approach_m =
+                        movement_m(model, layout, state, &self.footprint) - self.own_movement_m(model, plan);
+                    let within_m = if self.is_new { 0.0 } else { depth_m - approach_m.dot(self.normal).max(0.0) };
+                    self.offset_m = -within_m.max(0.0) * self.normal;
+                }
+            }
+            ContactState::Holding | ContactState::Sticking | ContactState::Sliding => {}
+        }
+        // A lag is across the normal that the surface had when the tool was there: that it has turned since moves nothing.
+        let normal_before = leg.normal.unwrap_or(self.normal);
+        let lag_m = match before {
+            ContactState::Free => self.lag_m(gap_m, normal_before),
+            ContactState::Sliding => self.lag_m(self.gap_m, normal_before),
+            ContactState::Holding | ContactState::Sticking => DVec3::ZERO,
+        };
+        gap_m -= self.offset_m;
+        place_m -= self.offset_m;
+        // What sticks goes with the tool from where it is.
+        let thrust = self.thrust(model, plan, layout, state, gap_m - lag_m);
+        if self.contact_state == ContactState::Holding {
+            return thrust;
+        }
+        if before == ContactState::Free
+            && self.is_new
+            && self.tip.coupling == Coupling::Constraint
+            && self.footprint.relative_inverse_mass() > 0.0
+        {
+            return thrust.along(self.normal);
+        }
+        let felt_n = thrust.force_n() + spread_n;
+        let pressure_n = -felt_n.dot(self.normal);
+        if pressure_n <= 0.0 || self.footprint.relative_inverse_mass() == 0.0 {
+            self.contact_state = ContactState::Free;
+            return ContactForce::default();
+        }
+        let (inside, felt_n) = within_cone(felt_n, self.normal, self.tip.friction);
+        if inside {
+            self.contact_state = ContactState::Sticking;
+            self.offset_m += lag_m;
+            return thrust;
+        }
+        if before == ContactState::Sticking {
+            // What it lagged behind when it began to stick, it lags behind again.
+            let lag_m = self.lag_m(self.offset_m, normal_before);
+            self.offset_m -= lag_m;
+            self.gap_m += lag_m;
+            gap_m += lag_m;
+            place_m += lag_m;
+        }
+        self.contact_state = ContactState::Sliding;
+        // What its normal was when the gap was what it is kept as.
+        let reference = if self.is_new { None } else { leg.normal.or(Some(self.normal)) };
+        if leg.normal.is_none() {
+            self.gap_m = gap_m;
+        }
+        let leg = ToolSubstep { place_m, reference, ..leg };
+        let thrust = match self.slide(model, plan, layout, state, leg, felt_n) {
+            Slide::Went(thrust) => return thrust,
+            Slide::Stays(across) => {
+                self.balance(&mut gap_m, self.normal, reference, self.own_movement_m(model, plan));
+                let thrust = self.thrust(model, plan, layout, state, gap_m).along(self.normal);
+                let pressing_n = -(thrust.force_n() + spread_n).dot(self.normal);
+                thrust.with(self.tip.friction * pressing_n.max(0.0) * across)
+            }
+            Slide::Leaves => ContactForce::default(),
+        };
+        if (thrust.force_n() + spread_n).dot(self.normal) >= 0.0 {
+            self.contact_state = ContactState::Free;
+            return ContactForce::default();
+        }
+        thrust
+    }
+
+    /// What of a gap is across a normal, if a constraint would close it and it is too much for a disc that follows its tool, m.
+    fn lag_m(&self, gap_m: DVec3, normal: DVec3) -> DVec3 {
+        let across_m = gap_m - gap_m.dot(normal) * normal;
+        let lags = across_m.length() > MIN_LAG * self.footprint.radius_m();
+        if lags && self.tip.coupling == Coupling::Constraint && !self.tip.grasps { across_m } else { DVec3::ZERO }
+    }
+
+    /// The movement of the tool in a substep, m.
+    pub(crate) fn own_movement_m(&self, model: &Model, plan: &Plan) -> DVec3 {
+        (self.to_m - self.from_m) * (model.scene.stepping.rate_hz * plan.substep_s)
+    }
+
+    /// The tool's way in the substep that ends at `fraction` of the step.
+    pub(crate) fn leg(&self, model: &Model, plan: &Plan, fraction: f64) -> ToolSubstep {
+        let moves_m_per_n = self.moves_m_per_n(model, plan);
+        let met = self.contact_state != ContactState::Free;
+        let mut leg = ToolSubstep {
+            place_m: self.place_m(fraction),
+            normal: met.then_some(self.normal),
+            reference: None,
+            jump_n: DVec3::ZERO,
+            spread_n: DVec3::ZERO,
+        };
+        if self.tip.coupling != Coupling::Constraint || moves_m_per_n == 0.0 {
+            return leg;
+        }
+        let [of_u, of_d] = plan.scheme.kick();
+        let own_m_per_s = (self.to_m - self.from_m) * model.scene.stepping.rate_hz;
+        let jump_m = (own_m_per_s - self.velocity_m_per_s) * plan.substep_s;
+        let jump_n = of_u / (of_d * moves_m_per_n) * jump_m;
+        let pressing_n = jump_n.dot(self.normal) * self.normal;
+        let (across_n, substeps) = (jump_n - pressing_n, f64::from(plan.substeps));
+        let is_first = fraction * substeps < 1.5;
+        leg.spread_n = pressing_n / substeps;
+        // A disc that slides takes no more of the part along the surface than friction gives it.
+        if self.contact_state == ContactState::Sticking {
+            leg.spread_n += if is_first { across_n / substeps - across_n } else { across_n / substeps };
+        }
+        if is_first && matches!(self.contact_state, ContactState::Sticking | ContactState::Sliding) {
+            leg.jump_n = pressing_n;
+        }
+        leg
+    }
+
+    /// Moves the disc to where it is under the tool once `force_n` has acted, and finds the force there.
+    fn slide<T: Real>(
+        &mut self,
+        model: &Model,
+        plan: &Plan,
+        layout: &Layout,
+        state: &mut State<T>,
+        ToolSubstep { place_m, normal: before, reference, spread_n, .. }: ToolSubstep,
+        force_n: DVec3,
+    ) -> Slide {
+        let moves_m_per_n = self.moves_m_per_n(model, plan);
+        let (surface_m, along) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        let mut beside_m = place_m - surface_m - moves_m_per_n * (force_n - self.steady_n);
+        let across_n = force_n - force_n.dot(self.normal) * self.normal;
+        if let Coupling::Spring { stiffness_n_per_m, .. } = self.tip.coupling {
+            beside_m -= across_n / stiffness_n_per_m;
+        }
+        beside_m -= beside_m.dot(self.normal) * self.normal;
+        let beside_m = beside_m.clamp_length_max(self.footprint.stride_m());
+        // Of a force that travels, half acts where it was, and half where it is.
+        let half = plan.scheme.constant().map(|of| 0.5 * of);
+        let mean_place = |footprint: &Footprint, state: &State<T>| {
+            let (surface_m, along) = footprint.surface(|point| displacement_m(model, layout, state, point));
+            (surface_m - 0.5 * movement_m(model, layout, state, footprint), along)
+        };
+        push(model, plan, layout, state, &self.footprint, -self.steady_n, half);
+        let ((stayed_m, _), ground) = (mean_place(&self.footprint, state), self.footprint.saved());
+        self.footprint.shift(model, beside_m, &along);
+        let (went_m, along) = mean_place(&self.footprint, state);
+        let travelled_m = went_m - stayed_m;
+        let normal = self.side.unwrap_or(1.0) * self.footprint.outward(&along);
+        // What acts over the substep is along the mean normal, and does no work along the way of the disc; a spring's force is that
+        // at its end.
+        let mean = match (self.tip.coupling, before) {
+            (Coupling::Constraint, Some(before)) => before + normal,
+            _ => normal,
+        };
+        let way = travelled_m.normalize_or_zero();
+        let mean = (mean - mean.dot(way) * way).normalize_or_zero();
+        let is_straight = mean.dot(normal) >= MIN_STRAIGHTNESS;
+        let mean = if self.tip.coupling == Coupling::Constraint { mean } else { normal };
+        let across = (across_n - across_n.dot(mean) * mean).normalize_or_zero();
+        // Friction takes energy from a disc that moves: it does not drive one against the tool's way, farther than that.
+        let is_driven = across.dot(travelled_m) < -self.own_movement_m(model, plan).length();
+        if !is_straight || is_driven {
+            self.footprint.return_to(model, &ground);
+            push(model, plan, layout, state, &self.footprint, self.steady_n, half);
+            return Slide::Stays(if is_straight { across_n.normalize_or_zero() } else { DVec3::ZERO });
+        }
+        let straightness = mean.dot(normal);
+        push(model, plan, layout, state, &self.footprint, self.steady_n, half);
+        let stays = (self.normal, self.offset_m);
+        self.normal = normal;
+        let (surface_m, _) = self.footprint.surface(|point| displacement_m(model, layout, state, point));
+        let mut gap_m = place_m - surface_m;
+        self.balance(&mut gap_m, mean, reference, self.own_movement_m(model, plan));
+        let thrust = self.thrust(model, plan, layout, state, gap_m);
+        let pressing_n = -(thrust.force_n() + spread_n).dot(self.normal);
+        if pressing_n <= 0.0 {
+            // There is nothing to press where it would come to. What acts in this substep is all where it was.
+            push(model, plan, layout, state, &self.footprint, -self.steady_n, half);
+            self.footprint.return_to(model, &ground);
+            (self.normal, self.offset_m) = stays;
+            push(model, plan, layout, state, &self.footprint, self.steady_n, half);
+            return Slide::Leaves;
+        }
+        let friction_n = self.tip.friction * pressing_n * across;
+        let along_mean = |normal_n: f64| normal_n / straightness * mean;
+        let kick_n = along_mean(thrust.kick_n.dot(self.normal));
+        let steady_n = along_mean((thrust.steady_n - friction_n).dot(self.normal)) + friction_n;
+        let goes_on_n = if thrust.goes_on_n == thrust.steady_n { steady_n } else { kick_n + steady_n };
+        Slide::Went(ContactForce { kick_n, steady_n, goes_on_n })
+    }
+
+    /// Keeps the offset such that closing the gap along the mean normal moves the surface as far as the tool has moved along it,
+    /// `own_m` in this substep.
+    ///
+    /// With q the gap along the normal (0 under a constraint), a disc that follows its tool closes q₀ + n̄·(g₁ − g₀). Where it lags
+    /// behind, or the surface is not smooth, the turning of the normal alone changes what is to be closed, as if the tool had moved.
+    /// That goes into the offset, which vanishes again by a small part of the tool's way: so what a smooth surface leaves of second
+    /// order never counts, and a tool at rest gives nothing.
+    fn balance(&mut self, gap_m: &mut DVec3, mean: DVec3, reference: Option<DVec3>, own_m: DVec3) {
+        let Some(before) = reference else { return };
+        let along_m = gap_m.dot(self.normal) / mean.dot(self.normal);
+        let explained_m = self.gap_m.dot(before) + mean.dot(*gap_m - self.gap_m);
+        let offset_m = -self.offset_m.dot(mean);
+        let balanced_m = offset_m + explained_m - along_m;
+        let kept_m = balanced_m - balanced_m.clamp(-RELAXATION * own_m.length(), RELAXATION * own_m.length());
+        self.offset_m -= (kept_m - offset_m) * mean;
+        *gap_m += (kept_m - offset_m) * mean;
+    }
+
+    /// Whether a spring couples it to the tissue at present.
+    pub(crate) fn is_coupled(&self) -> bool {
+        self.contact_state != ContactState::Free && matches!(self.tip.coupling, Coupling::Spring { .. })
+    }
+
+    /// The energy of that spring while the disc is at `surface_m` and the tool at `place_m`, J.
+    pub(crate) fn stored_j(&self, surface_m: DVec3, place_m: DVec3) -> f64 {
+        match self.tip.coupling {
+            Coupling::Spring { stiffness_n_per_m, .. } if self.is_coupled() => {
+                let stretched_j = 0.5 * stiffness_n_per_m * (place_m - self.offset_m - surface_m).length_squared();
+                // A disc that lags behind stretches nothing along its way.
+                stretched_j.min(0.5 * self.force_n.length_squared() / stiffness_n_per_m)
+            }
+            _ => 0.0,
+        }
+    }
+
+    /// How far the disc moves in the substep under an impulse of 1 N times the substep.
+    fn moves_m_per_n(&self, model: &Model, plan: &Plan) -> f64 {
+        plan.scheme.kick()[0] * plan.force_scale(&model.scene) * model.unit_m * self.footprint.relative_inverse_mass()
+    }
+
+    /// The steady force, and an impulse for what `force_n` is beyond it; the next substep begins with that force.
+    fn kicked_to(&self, force_n: DVec3) -> ContactForce {
+        ContactForce { kick_n: force_n - self.steady_n, steady_n: self.steady_n, goes_on_n: force_n }
+    }
+
+    /// What closes a gap, and makes the disc as fast as the tool, if the scheme can do both.
+    fn thrust<T: Real>(
+        &self,
+        model: &Model,
+        plan: &Plan,
+        layout: &Layout,
+        state: &State<T>,
+        gap_m: DVec3,
+    ) -> ContactForce {
+        let moves_m_per_n = self.moves_m_per_n(model, plan);
+        if moves_m_per_n == 0.0 {
+            return ContactForce::default();
+        }
+        let own_m = self.own_movement_m(model, plan);
+        let moved_m = movement_m(model, layout, state, &self.footprint);
+        let ([kick_u, kick_d], [of_u, of_d]) = (plan.scheme.kick(), plan.scheme.constant());
+        match self.tip.coupling {
+            Coupling::Constraint => {
+                let determinant = kick_u * of_d - kick_d * of_u;
+                // A two-step scheme moves a point by what it changes its speed by: it can only close the gap.
+                if determinant.abs() < MIN_DETERMINANT {
+                    return self.kicked_to(self.steady_n + gap_m / moves_m_per_n);
+                }
+                let unit = kick_u / (moves_m_per_n * determinant);
+                let faster_m = own_m - moved_m;
+                let steady_n = self.steady_n + unit * (kick_u * faster_m - kick_d * gap_m);
+                let kick_n = unit * (of_d * gap_m - of_u * faster_m);
+                ContactForce { kick_n, steady_n, goes_on_n: steady_n }
+            }
+            Coupling::Spring { stiffness_n_per_m, damping_n_s_per_m } => {
+                let gap_m = gap_m + moves_m_per_n * self.steady_n;
+                let apart_m_per_s = (own_m - (moved_m - moves_m_per_n * self.steady_n)) / plan.substep_s;
+                let held = stiffness_n_per_m + damping_n_s_per_m / plan.substep_s;
+                let sought_n = stiffness_n_per_m * gap_m + damping_n_s_per_m * apart_m_per_s;
+                self.kicked_to(sought_n / (1.0 + moves_m_per_n * held))
+            }
+        }
+    }
+}
+
+/// A tool's way in a substep. Its speed jumps at the beginning of a step, because its path is known at the ends of steps alone.
+/// Forces are impulses over the substep.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct ToolSubstep {
+    /// Where it ends, m.
+    place_m: DVec3,
+    /// The normal of the surface where it begins, if the tool touches there.
+    normal: Option<DVec3>,
+    /// What the normal was when the gap was what the tool keeps; none of a new tool.
+    reference: Option<DVec3>,
+    /// What the jump of speed takes across the surface, in the first substep: it acts where the disc is then, N.
+    pub(crate) jump_n: DVec3,
+    /// What to add to the force of the substep, so that a jump counts as spread over the step. Then whether the tool lets go or
+    /// slides does not depend on the length of a substep, N.
+    spread_n: DVec3,
+}
+
+/// What becomes of a disc that friction does not hold.
+enum Slide {
+    /// It follows the tool.
+    Went(ContactForce),
+    /// It stays: its way would lead along its normal, or friction would drive it. Friction acts this way, with length 1 or 0.
+    Stays(DVec3),
+    /// It stays, and the tool lets go: where it would come to, nothing presses.
+    Leaves,
+}
+
+/// What a tool does to its disc in a substep, N.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct ContactForce {
+    /// An impulse at the substep's beginning, over the substep.
+    pub(crate) kick_n: DVec3,
+    /// A force throughout.
+    pub(crate) steady_n: DVec3,
+    /// The force with which the next substep begins.
+    pub(crate) goes_on_n: DVec3,
+}
+
+impl ContactForce {
+    /// What of it is along a normal.
+    fn along(&self, normal: DVec3) -> Self {
+        let along = |force_n: DVec3| force_n.dot(normal) * normal;
+        ContactForce { kick_n: along(self.kick_n), steady_n: along(self.steady_n), goes_on_n: along(self.goes_on_n) }
+    }
+
+    /// The same, and a steady force.
+    fn with(&self, steady_n: DVec3) -> Self {
+        ContactForce { kick_n: self.kick_n, steady_n: self.steady_n + steady_n, goes_on_n: self.goes_on_n + steady_n }
+    }
+
+    /// Both together.
+    pub(crate) fn force_n(&self) -> DVec3 {
+        self.kick_n + self.steady_n
+    }
+}
+
+/// A force on the sheet within the friction cone about −`normal`, and whether it was already inside.
+pub(crate) fn within_cone(force_n: DVec3, normal: DVec3, friction: f64) -> (bool, DVec3) {
+    let pressing_n = force_n.dot(normal) * normal;
+    let across_n = force_n - pressing_n;
+    let most_n = friction * pressing_n.length();
+    let length_n = across_n.length();
+    if length_n <= most_n { (true, force_n) } else { (false, pressing_n + across_n * (most_n / length_n)) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn within_a_step_a_tool_moves_straight_and_ends_where_it_is_told_to() {
+        let (model, mut contacts) = (Model::paper(&["sheet.points=[9, 9]"]), Contacts::default());
+        let [from_m, to_m] = [DVec3::new(0.1, 0.12, 0.01), DVec3::new(0.1007, 0.1193, 0.0087)];
+        contacts.pose(&model, 3, from_m, Tip::default());
+        contacts.finish(1000.0);
+        contacts.pose(&model, 3, to_m, Tip::default());
+        for fraction in [0.0, 0.25, 0.8] {
+            let expected_m = from_m + fraction * (to_m - from_m);
+            assert!(contacts.tools[0].place_m(fraction).distance(expected_m) < 1e-15, "{fraction}");
+        }
+        assert_eq!(contacts.tools[0].place_m(1.0), to_m);
+    }
+
+    #[test]
+    fn tools_come_by_their_number_and_one_that_is_released_goes_alone() {
+        let (model, mut contacts) = (Model::paper(&["sheet.points=[9, 9]"]), Contacts::default());
+        for number in [5, 1, 3, 1] {
+            contacts.pose(&model, number, DVec3::new(0.1, 0.1, 0.01), Tip::default());
+        }
+        assert_eq!(contacts.tools().collect::<Vec<_>>(), [1, 3, 5]);
+        contacts.release(3);
+        assert_eq!(contacts.tools().collect::<Vec<_>>(), [1, 5]);
+    }
+}

@@ -1,0 +1,535 @@
+//! Where a tool of finite size meets the tissue: a disc of stated radius, spread over the mass points around it.
+//!
+//! The surface between points is given by hats N_p: the material place c is at Σ N_p(c)·x_p. A disc of radius a about c
+//! averages that over its area, s(c) = Σ w_p·x_p with w_p = ⨍ N_p; the weights add up to 1. A tool moves s, and its force
+//! goes to the points with the same weights, so its work is force · ds. With a single point instead, the stiffness would
+//! fall without limit as the grid gets finer; with the disc it converges.
+//!
+//! The hats blur the disc: under even pressure it would act as if larger, by much where the points are far apart. The area
+//! that matters is the A = 1/Σ(w²/A_p) that shares a force, A_p the area of a point: a foundation of k″ N/m³ has the
+//! stiffness k″·A under the disc. So the hats are averaged over a smaller disc, chosen so that A is that of the requested
+//! disc: on a sheet in the mean over places (`grid`), on a mesh at each place (`palpate_geometry::surface`).
+
+use glam::{DMat3, DVec2, DVec3};
+
+use crate::body::sheet::footprint::GridDisc;
+use crate::body::surface::footprint::MeshDisc;
+use crate::model::Model;
+use crate::scene::Body;
+use crate::state::saved::{SavedGeometry, ensure, unsound};
+use palpate_refusal::Result;
+
+/// A disc on a mesh does not move by a smaller part of its radius: to lay it takes as long as to step some thousand points,
+/// and the tool is off its place by no more than this.
+const MIN_PART: f64 = 1e-6;
+
+/// The points that can move bear at least this part of a disc. Where fewer do, near what is fixed, they would have to move
+/// farther than the tool by one over their part, and the stiffness would grow with its square.
+const MIN_FREE_PART: f64 = 0.25;
+
+/// A disc of which the points that can move bear less than this part lies on what is fixed, and moves nothing.
+const FIXED_PART: f64 = 0.02;
+
+/// A disc on a tissue, at a place. Lengths in m.
+#[derive(Debug, Clone)]
+pub struct Footprint {
+    radius_m: f64,
+    ground: FootprintGeometry,
+    reached: Vec<WeightedNode>,
+    /// What the weights of points that can move were multiplied with ([`MIN_FREE_PART`]).
+    free_factor: f64,
+    /// Where the disc rests: Σ w·X, and how that changes with the place.
+    rest_m: DVec3,
+    along: [DVec3; 2],
+    /// Σ w²/mass over the points that can move.
+    relative_inverse_mass: f64,
+}
+
+/// What the disc lies on.
+#[derive(Debug, Clone)]
+enum FootprintGeometry {
+    Grid(GridDisc),
+    Mesh(Box<MeshDisc>),
+}
+
+/// A mass point that a disc covers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WeightedNode {
+    /// Its row and column in memory; of a sheet, its indices in the grid.
+    pub point: [usize; 2],
+    /// Whether it is not fixed.
+    pub free: bool,
+    /// Its mass, over that of the scene's points.
+    pub mass: f64,
+    /// w.
+    pub weight: f64,
+    /// ∂w/∂c, 1/m, in two perpendicular directions of the surface: of a sheet x and y.
+    pub gradient: DVec2,
+}
+
+impl Footprint {
+    /// Creates a disc of `radius_m` about the place of the rest surface that is nearest to `at_m`; of a sheet, above or
+    /// below it.
+    pub fn new(model: &Model, radius_m: f64, at_m: DVec3) -> Self {
+        let ground = match &model.scene.body {
+            Body::Sheet(sheet) => FootprintGeometry::Grid(GridDisc::new(sheet, radius_m)),
+            Body::Mesh(mesh) => FootprintGeometry::Mesh(Box::new(MeshDisc::new(&mesh.shape, radius_m))),
+        };
+        let mut footprint = Footprint {
+            radius_m,
+            ground,
+            reached: Vec::new(),
+            free_factor: 1.0,
+            rest_m: DVec3::ZERO,
+            along: [DVec3::X, DVec3::Y],
+            relative_inverse_mass: 0.0,
+        };
+        footprint.move_to(model, at_m);
+        footprint
+    }
+
+    /// Its place.
+    pub(crate) fn saved(&self) -> SavedGeometry {
+        match &self.ground {
+            FootprintGeometry::Grid(disc) => SavedGeometry::Grid(disc.centre_m.to_array()),
+            FootprintGeometry::Mesh(disc) => disc.saved(),
+        }
+    }
+
+    /// A disc at a place of another.
+    pub(crate) fn restored(model: &Model, radius_m: f64, saved: &SavedGeometry) -> Result<Self> {
+        match (saved, &model.scene.body) {
+            (SavedGeometry::Grid(centre_m), Body::Sheet(sheet)) => {
+                let centre_m = DVec2::from(*centre_m);
+                let is_on_it = centre_m.cmpge(DVec2::ZERO).all() && centre_m.cmple(sheet.extent_m()).all();
+                ensure(is_on_it, "a tool that is not on the tissue")?;
+                Ok(Footprint::new(model, radius_m, centre_m.extend(0.0)))
+            }
+            (SavedGeometry::Mesh { .. }, Body::Mesh(mesh)) => {
+                let mut disc = MeshDisc::new(&mesh.shape, radius_m);
+                disc.restore(saved)?;
+                let mut footprint = Footprint {
+                    radius_m,
+                    ground: FootprintGeometry::Mesh(Box::new(disc)),
+                    reached: Vec::new(),
+                    free_factor: 1.0,
+                    rest_m: DVec3::ZERO,
+                    along: [DVec3::X, DVec3::Y],
+                    relative_inverse_mass: 0.0,
+                };
+                footprint.lay(model);
+                ensure(footprint.is_sound(), "a tool that is nowhere on the tissue")?;
+                Ok(footprint)
+            }
+            _ => Err(unsound("a tool on a tissue of another kind")),
+        }
+    }
+
+    /// Goes back to a place where it was ([`Footprint::saved`]).
+    pub(crate) fn return_to(&mut self, model: &Model, place: &SavedGeometry) {
+        match (&mut self.ground, place) {
+            (FootprintGeometry::Grid(_), SavedGeometry::Grid(centre_m)) => {
+                self.move_on_grid(model, DVec2::from(*centre_m));
+            }
+            (FootprintGeometry::Mesh(disc), SavedGeometry::Mesh { .. }) => {
+                disc.go_to(place);
+                self.lay(model);
+            }
+            _ => {}
+        }
+    }
+
+    /// Whether all of it is finite.
+    fn is_sound(&self) -> bool {
+        let is_sound = |point: &WeightedNode| point.weight.is_finite() && point.gradient.is_finite();
+        self.rest_m.is_finite() && self.relative_inverse_mass.is_finite() && self.reached.iter().all(is_sound)
+    }
+
+    /// Returns the radius, m.
+    pub fn radius_m(&self) -> f64 {
+        self.radius_m
+    }
+
+    /// Returns where the material place of the centre rests, m.
+    pub fn anchor_m(&self) -> DVec3 {
+        match &self.ground {
+            FootprintGeometry::Grid(disc) => disc.centre_m.extend(0.0),
+            FootprintGeometry::Mesh(disc) => disc.anchor_m(),
+        }
+    }
+
+    /// Moves the disc to another material place: the nearest of the rest surface.
+    pub fn move_to(&mut self, model: &Model, at_m: DVec3) {
+        match &mut self.ground {
+            FootprintGeometry::Grid(_) => self.move_on_grid(model, at_m.truncate()),
+            FootprintGeometry::Mesh(disc) => {
+                disc.put(at_m);
+                self.lay(model);
+            }
+        }
+    }
+
+    /// Moves the disc by `beside_m`, a vector along the moved surface, where `along` is how that changes with the place
+    /// ([`Footprint::surface`]).
+    pub(crate) fn shift(&mut self, model: &Model, beside_m: DVec3, along: &[DVec3; 2]) {
+        match &mut self.ground {
+            FootprintGeometry::Grid(disc) => {
+                let centre_m = disc.centre_m + within(beside_m, along);
+                self.move_on_grid(model, centre_m);
+            }
+            FootprintGeometry::Mesh(disc) => {
+                let by_m = within(beside_m, along);
+                if by_m.length() > MIN_PART * self.radius_m {
+                    disc.walk(by_m);
+                    self.lay(model);
+                }
+            }
+        }
+    }
+
+    /// How far a disc that touches may move at once, m. A sheet is a plane at rest.
+    pub(crate) fn stride_m(&self) -> f64 {
+        match &self.ground {
+            FootprintGeometry::Grid(_) => f64::INFINITY,
+            FootprintGeometry::Mesh(disc) => disc.stride_m(),
+        }
+    }
+
+    /// Moves the disc of a tool that touches nothing to the place of the moved surface nearest to `place_m`, or towards it.
+    /// A contraction, as long as the surface is not folded.
+    pub(crate) fn seek(&mut self, model: &Model, place_m: DVec3, displacement_m: impl Fn([usize; 2]) -> DVec3) {
+        if let FootprintGeometry::Mesh(disc) = &mut self.ground
+            && disc.leap(model, place_m, &displacement_m)
+        {
+            self.lay(model);
+        }
+        for _ in 0..2 {
+            let (surface_m, along) = self.surface(&displacement_m);
+            let mut beside_m = place_m - surface_m;
+            if matches!(self.ground, FootprintGeometry::Mesh(_)) {
+                let outward = self.outward(&along);
+                let away_m = beside_m.dot(outward).abs();
+                beside_m -= beside_m.dot(outward) * outward;
+                // Far from a curved surface a whole step would lead past the place.
+                beside_m *= self.radius_m / (self.radius_m + away_m + beside_m.length());
+            }
+            self.shift(model, beside_m, &along);
+        }
+    }
+
+    fn move_on_grid(&mut self, model: &Model, centre_m: DVec2) {
+        let Footprint { ground: FootprintGeometry::Grid(disc), reached, rest_m, along, .. } = self else { return };
+        let Some(sheet) = model.scene.sheet() else { return };
+        let Some(covered) = disc.move_to(sheet, centre_m) else { return };
+        reached.clear();
+        reached.extend(covered.map(|(point, weight, gradient)| {
+            let free = is_free(model, model.index_of(point));
+            WeightedNode { point, free, mass: 1.0, weight, gradient }
+        }));
+        (*rest_m, *along) = (disc.centre_m.extend(0.0), [DVec3::X, DVec3::Y]);
+        self.weigh(model);
+    }
+
+    /// Takes what the disc covers on a mesh.
+    fn lay(&mut self, model: &Model) {
+        let (FootprintGeometry::Mesh(disc), Some(graph)) = (&mut self.ground, &model.graph) else { return };
+        self.reached.clear();
+        (self.rest_m, self.along) = (DVec3::ZERO, [DVec3::ZERO; 2]);
+        for (vertex, weight, gradient, at_m) in disc.cover() {
+            let index = graph.slot_of(vertex);
+            let (free, mass) = (is_free(model, index), model.relative_mass_at(index));
+            self.reached.push(WeightedNode { point: model.point_of(index), free, mass, weight, gradient });
+            self.rest_m += weight * at_m;
+            self.along[0] += gradient.x * at_m;
+            self.along[1] += gradient.y * at_m;
+        }
+        self.weigh(model);
+    }
+
+    /// Finds how the disc moves under a force, and makes it lean on the points that can move if these are few.
+    fn weigh(&mut self, model: &Model) {
+        self.lean(model);
+        let of = |point: &WeightedNode| point.weight * point.weight / point.mass;
+        let moves = self.free_factor > 0.0;
+        self.relative_inverse_mass =
+            if moves { self.reached.iter().filter(|point| point.free).map(of).sum() } else { 0.0 };
+    }
+
+    /// Gives the points that can move at least [`MIN_FREE_PART`] of the disc: with p their part and q that which they get,
+    /// w becomes w·q/p for them and w·(1 − q)/(1 − p) for the others, and ∂w what that changes by.
+    fn lean(&mut self, model: &Model) {
+        let (mut part, mut change) = (0.0, DVec2::ZERO);
+        for point in self.reached.iter().filter(|point| point.free) {
+            part += point.weight;
+            change += point.gradient;
+        }
+        self.free_factor = match part {
+            MIN_FREE_PART.. => 1.0,
+            FIXED_PART.. => MIN_FREE_PART / part,
+            _ => 0.0,
+        };
+        if self.free_factor == 1.0 || self.free_factor == 0.0 {
+            return;
+        }
+        let of_fixed = (1.0 - MIN_FREE_PART) / (1.0 - part);
+        (self.rest_m, self.along) = (DVec3::ZERO, [DVec3::ZERO; 2]);
+        for point in &mut self.reached {
+            let (factor, by) = if point.free {
+                (self.free_factor, -self.free_factor / part * change)
+            } else {
+                (of_fixed, of_fixed / (1.0 - part) * change)
+            };
+            point.gradient = factor * point.gradient + point.weight * by;
+            point.weight *= factor;
+            let rest_m = model.shape().rest_m(model.point_at(model.index_of(point.point)));
+            self.rest_m += point.weight * rest_m;
+            self.along[0] += point.gradient.x * rest_m;
+            self.along[1] += point.gradient.y * rest_m;
+        }
+    }
+
+    /// Returns whether the disc lies so much on what is fixed that it leans on the few points that can move, or moves
+    /// nothing.
+    pub fn is_on_fixed(&self) -> bool {
+        self.free_factor != 1.0
+    }
+
+    /// Returns the points that the disc covers.
+    pub fn reached(&self) -> &[WeightedNode] {
+        &self.reached
+    }
+
+    /// w of a point: 0 of one that the disc does not cover. Does not go through all that it covers: a tip may be as large as
+    /// the tissue, and this is asked of each of its points.
+    pub(crate) fn weight_of(&self, model: &Model, index: usize) -> f64 {
+        match &self.ground {
+            FootprintGeometry::Grid(_) => {
+                // They are by rows.
+                let found = self.reached.binary_search_by_key(&model.point_of(index), |reached| reached.point);
+                found.map_or(0.0, |place| self.reached[place].weight)
+            }
+            // Asked of points that can move.
+            FootprintGeometry::Mesh(disc) => self.free_factor * disc.weight_of(model.point_at(index)),
+        }
+    }
+
+    /// Returns Σ w²/mass over the points that can move: the movement of s per unit force, relative to that of one free
+    /// point.
+    pub fn relative_inverse_mass(&self) -> f64 {
+        self.relative_inverse_mass
+    }
+
+    /// Returns s, the place of the disc, in m, and ∂s/∂c, for points displaced by `displacement_m`.
+    pub fn surface(&self, displacement_m: impl Fn([usize; 2]) -> DVec3) -> (DVec3, [DVec3; 2]) {
+        let (mut place, mut along) = (self.rest_m, self.along);
+        for WeightedNode { point, weight, gradient, .. } in &self.reached {
+            let u = displacement_m(*point);
+            place += *weight * u;
+            along[0] += gradient.x * u;
+            along[1] += gradient.y * u;
+        }
+        (place, along)
+    }
+
+    /// Returns where the disc is on the tissue at rest, m, and the unit normal out of the tissue there.
+    pub fn at_rest(&self) -> (DVec3, DVec3) {
+        (self.rest_m, self.outward(&self.along))
+    }
+
+    /// The surface at rest about the disc, as a tool sees it that is on this side of it (1 outside, -1 inside); `None` on a
+    /// sheet, which is a plane.
+    pub(crate) fn rest_surface(&self, side: f64) -> Option<RestSurface> {
+        let FootprintGeometry::Mesh(disc) = &self.ground else { return None };
+        let (normal, curvature_per_m) = (side * self.outward(&self.along), side * disc.curvature_per_m());
+        Some(RestSurface { place_m: self.rest_m, normal, curvature_per_m })
+    }
+
+    /// The unit normal out of the tissue: ∂s/∂c₁ × ∂s/∂c₂ is the only choice whose work equals what the tissue gets when
+    /// the disc slides over a slope.
+    pub(crate) fn outward(&self, along: &[DVec3; 2]) -> DVec3 {
+        along[0].cross(along[1]).try_normalize().unwrap_or_else(|| match &self.ground {
+            FootprintGeometry::Grid(_) => DVec3::Z,
+            FootprintGeometry::Mesh(disc) => disc.outward(),
+        })
+    }
+
+    /// Whether a tool whose gap from the disc is `gap_m` is beside the tissue: farther off its edge than the radius.
+    pub(crate) fn is_beside(&self, gap_m: DVec3, outward: DVec3) -> bool {
+        let across_m = match &self.ground {
+            FootprintGeometry::Grid(_) => gap_m.truncate().length(),
+            FootprintGeometry::Mesh(_) => (gap_m - gap_m.dot(outward) * outward).length(),
+        };
+        across_m > self.radius_m
+    }
+
+    /// The side of the surface on which a tool is that comes new, `height_m` above the surface: 1 outside, -1 inside. One
+    /// that is below a sheet presses on it from above.
+    pub(crate) fn side(&self, height_m: f64) -> f64 {
+        match &self.ground {
+            FootprintGeometry::Grid(_) => 1.0,
+            FootprintGeometry::Mesh(disc) => disc.side(height_m),
+        }
+    }
+}
+
+/// The surface at rest about a tool's place.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RestSurface {
+    /// The place where the disc is, m.
+    pub place_m: DVec3,
+    /// The unit normal there, towards the tool.
+    pub normal: DVec3,
+    /// How the normal changes per metre along the surface, 1/m: symmetric, 1/R on a sphere of radius R. Valid for ways
+    /// across the normal.
+    pub curvature_per_m: DMat3,
+}
+
+fn is_free(model: &Model, index: usize) -> bool {
+    model.fixed.is_empty() || model.fixed.binary_search(&index).is_err()
+}
+
+/// The change of place that moves a surface by `beside_m`, as far as it can: least squares.
+fn within(beside_m: DVec3, [one, other]: &[DVec3; 2]) -> DVec2 {
+    let [a, b, d] = [one.dot(*one), one.dot(*other), other.dot(*other)];
+    let right = DVec2::new(one.dot(beside_m), other.dot(beside_m));
+    let determinant = a * d - b * b;
+    if determinant <= 1e-12 * a * d {
+        return DVec2::ZERO;
+    }
+    DVec2::new(d * right.x - b * right.y, a * right.y - b * right.x) / determinant
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn model(sets: &[&str]) -> std::sync::Arc<Model> {
+        let always = ["sheet.spacing_m=0.02", "stepping.integrator=central", "stepping.substeps=1"];
+        Model::paper(&[&always[..], sets].concat())
+    }
+
+    /// Radii, in spacings.
+    const RADII: [f64; 4] = [0.2, 1.0, 1.7, 3.2];
+
+    #[test]
+    fn a_point_has_the_weight_with_which_the_disc_covers_it() {
+        for (model, at_m, radius_m) in [
+            (model(&["sheet.points=[13, 17]"]), DVec3::new(0.11, 0.17, 0.0), 0.05),
+            (model(&["sheet.points=[13, 17]"]), DVec3::ZERO, 0.3),
+            (Model::gallbladder(&[]), DVec3::new(0.02, 0.0, -0.05), 0.006),
+        ] {
+            let footprint = Footprint::new(&model, radius_m, at_m);
+            let mut weights = vec![0.0; model.places()];
+            for reached in footprint.reached() {
+                weights[model.index_of(reached.point)] = reached.weight;
+            }
+            assert!(footprint.reached().len() > 9, "{}", footprint.reached().len());
+            for point in model.points() {
+                let index = model.place_of(point);
+                assert_eq!(footprint.weight_of(&model, index), weights[index], "{index}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_disc_gives_way_like_its_own_area_of_a_foundation() {
+        let model = model(&["sheet.points=[21, 21]"]);
+        let spacing_m = model.unit_m;
+        for radius in RADII.into_iter().filter(|radius| *radius >= 1.0) {
+            // h²/Σ w² is the area, in the mean over places in a cell.
+            let places = (0..16).map(|place| DVec2::new(f64::from(place / 4), f64::from(place % 4)) / 4.0);
+            let relative_inverse_mass = places.map(|place| {
+                Footprint::new(&model, radius * spacing_m, ((place + 10.0) * spacing_m).extend(0.0))
+                    .relative_inverse_mass()
+            });
+            let area = 16.0 / relative_inverse_mass.sum::<f64>();
+            let expected = std::f64::consts::PI * radius * radius;
+            assert!((area - expected).abs() < 2e-3 * expected, "{radius}: {area} {expected}");
+        }
+    }
+
+    #[test]
+    fn weights_add_up_to_1_about_the_centre_and_follow_a_plane_exactly() {
+        let model = model(&["sheet.points=[13, 17]"]);
+        let spacing_m = model.unit_m;
+        for radius in RADII {
+            let centre_m = DVec2::new(6.13, 8.71) * spacing_m;
+            let footprint = Footprint::new(&model, radius * spacing_m, centre_m.extend(0.0));
+            let rest_m = |[i, j]: [usize; 2]| DVec2::new(i as f64, j as f64) * spacing_m;
+            let whole: f64 = footprint.reached().iter().map(|point| point.weight).sum();
+            let middle_m: DVec2 = footprint.reached().iter().map(|point| point.weight * rest_m(point.point)).sum();
+            assert!((whole - 1.0).abs() < 1e-12 && middle_m.distance(centre_m) < 1e-12, "{radius}: {whole} {middle_m}");
+            let (slopes, level_m) = (DVec2::new(0.3, -0.2), 0.01);
+            let (place_m, along) = footprint.surface(|point| DVec3::new(0.0, 0.0, level_m + slopes.dot(rest_m(point))));
+            assert!((place_m - centre_m.extend(level_m + slopes.dot(centre_m))).length() < 1e-12, "{place_m}");
+            let tilted = [DVec3::new(1.0, 0.0, slopes.x), DVec3::new(0.0, 1.0, slopes.y)];
+            assert!((0..2).all(|axis| along[axis].distance(tilted[axis]) < 1e-9), "{radius}: {along:?}");
+        }
+    }
+
+    #[test]
+    fn the_slopes_are_the_change_of_place_also_where_the_disc_leaves_the_sheet() {
+        let model = model(&["sheet.points=[7, 9]"]);
+        let spacing_m = model.unit_m;
+        let displacement_m = |[i, j]: [usize; 2]| {
+            let (x, y) = (i as f64, j as f64);
+            1e-3 * DVec3::new((1.3 * x + y).sin(), (x - 0.7 * y).cos(), (0.9 * x * y).sin())
+        };
+        for radius in RADII {
+            for centre in [[0.31, 0.17], [2.87, 0.05], [5.96, 7.93], [3.11, 4.07]] {
+                let mut footprint =
+                    Footprint::new(&model, radius * spacing_m, (DVec2::from(centre) * spacing_m).extend(0.0));
+                let (centre_m, step_m) = (footprint.anchor_m(), 1e-8 * spacing_m);
+                let (_, along) = footprint.surface(displacement_m);
+                for axis in 0..2 {
+                    let mut step = DVec3::ZERO;
+                    step[axis] = step_m;
+                    let [ahead_m, behind_m] = [centre_m + step, centre_m - step].map(|place_m| {
+                        footprint.move_to(&model, place_m);
+                        footprint.surface(displacement_m).0
+                    });
+                    let slope = (ahead_m - behind_m) / (2.0 * step_m);
+                    assert!(slope.distance(along[axis]) < 1e-5, "{radius} {centre:?}: {slope} {}", along[axis]);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_disc_is_shifted_along_a_curved_surface_as_far_as_it_is_told() {
+        let model = Model::gallbladder(&[]);
+        let crate::scene::Body::Mesh(mesh) = &model.scene.body else { panic!("of another kind") };
+        let (shape, radius_m, way_m) = (model.shape(), 0.006, 0.003);
+        let first_m = shape.rest_m(shape.nearest(DVec3::new(0.02, 0.0, -0.05)));
+        for turn in 0..8 {
+            let mut footprint = Footprint::new(&model, radius_m, first_m);
+            let (from_m, outward) = (footprint.anchor_m(), footprint.at_rest().1);
+            let (one, other) = outward.any_orthonormal_pair();
+            let angle = f64::from(turn) * std::f64::consts::FRAC_PI_4;
+            let along = angle.cos() * one + angle.sin() * other;
+            let (_, slopes) = footprint.surface(|_| DVec3::ZERO);
+            footprint.shift(&model, way_m * along, &slopes);
+            let moved_m = footprint.anchor_m() - from_m;
+            assert!((0.8 * way_m..1.2 * way_m).contains(&moved_m.dot(along)), "{angle}: {moved_m} m");
+            let surface = mesh.shape.surface();
+            let nearest_m = surface.at_m(&surface.nearest(footprint.anchor_m()).unwrap());
+            assert!(nearest_m.distance(footprint.anchor_m()) < 1e-9, "{angle}: off the surface");
+        }
+    }
+
+    #[test]
+    fn a_surface_is_followed_however_much_it_is_stretched_or_compressed() {
+        let along = [DVec3::new(0.9, 0.1, 0.3), DVec3::new(-0.2, 1.1, 0.2)];
+        let by = DVec2::new(0.3, -0.7);
+        for scale in [1e-4, 1.0, 1e4] {
+            let slopes = along.map(|slope| scale * slope);
+            let beside_m = by.x * slopes[0] + by.y * slopes[1];
+            assert!(within(beside_m, &slopes).distance(by) < 1e-9, "{scale}");
+            // What points out of the surface leads nowhere.
+            let outward_m = slopes[0].cross(slopes[1]);
+            assert!(within(beside_m + outward_m, &slopes).distance(by) < 1e-9, "{scale}");
+        }
+        // Folded into a line, it has no way to go.
+        assert_eq!(within(along[0], &[along[0], -2.0 * along[0]]), DVec2::ZERO);
+    }
+}

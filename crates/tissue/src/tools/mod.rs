@@ -1,0 +1,7 @@
+//! What tools do to a tissue: forces, prescribed displacements, and contact of discs.
+
+pub(crate) mod applied_force;
+pub(crate) mod contact;
+pub(crate) mod footprint;
+pub(crate) mod position_control;
+pub(crate) mod prescribed;
