@@ -20,7 +20,7 @@ pub(crate) struct LoadArguments {
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
-    /// Number of sessions; with --find-limit, where the search begins
+    /// Number of sessions; with --find-limit, the first number of the search
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
     sessions: u32,
     /// Haptic clients of each session, with one tool each. With 0, commands sent beforehand keep each session awake
