@@ -1,4 +1,4 @@
-//! What a fleet costs beside one server, how it spreads sessions, and what etcd etcd_capacity of it. Writes
+//! The cost of a fleet compared with one server, its placement of sessions, and the capacity of etcd. Writes
 //! docs/benchmarks/fleet.{md,svg}; `-- calls`, `-- spread`, `-- steps` and `-- etcd` print one part alone, `-- --quick` does all
 //! with small numbers. Linux only: times are read from /proc. Needs etcd.
 
