@@ -179,7 +179,7 @@ impl Pacer {
         lock(&self.viewers).values().filter(|viewer| viewer.strong_count() > 0).count()
     }
 
-    /// Deletes a session: ends all its streams and refuses its waiting commands.
+    /// Deletes a session: ends all its streams, and discards its waiting commands.
     ///
     /// # Errors
     /// Refuses an unknown ID.
