@@ -72,8 +72,8 @@ struct Sdk {
     counters: Counters<Channel>,
     state: AgonesState,
     /// Value that the counter was last set to.
-    /// Capacity of the counter, as read from Agones.
     counted: Option<i64>,
+    /// Capacity of the counter, as read from Agones.
     capacity: Option<i64>,
     /// Whether the log already says that Agones does not answer.
     is_away: bool,

@@ -97,7 +97,8 @@ mod tests {
     use palpate_tissue::scene::{PAPER, Scene};
     use palpate_tissue::scheme_selection::NEVER;
 
-    /// In virtual time: 40 sessions of one caller take 2 ms of each millisecond together; one of another keeps its time.
+    /// In virtual time: 40 sessions of one caller take 2 ms of each millisecond together; one of another caller stays
+    /// on time.
     #[test]
     fn a_thread_is_divided_among_callers_first() {
         let limits = Limits::default();
