@@ -36,23 +36,23 @@ pub struct Begin {
     pub id: String,
     /// The first tissue of the session, in its first run.
     pub first: Arc<Model>,
-    /// Whether its time advances.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step count at which it pauses, if any.
+    /// The step count at which the session pauses, if any.
     pub until: Option<u64>,
-    /// Time without use after which it is deleted, s.
+    /// Time without use after which the session is deleted, s.
     pub idle_timeout_s: f64,
-    /// The recording that it plays instead of commands of clients.
+    /// The recording that the session plays instead of commands of clients.
     pub playback: Option<Playback>,
-    /// Number of the journal's run that it continues; 0 if there is none.
+    /// Number of the journal's run that the session continues; 0 if there is none.
     pub after_run: u64,
     /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub revision: u64,
     /// Changes of the tissue that wait for a later step, each with that step.
     pub waiting: Vec<(u64, Input)>,
-    /// Whether it begins frozen, and is not served until [`SessionHandle::arrive`].
+    /// Whether the session begins frozen, and is not served until [`SessionHandle::arrive`].
     pub frozen: bool,
-    /// Whether its events are written to an event log, if the server keeps journals.
+    /// Whether the session's events are written to an event log, if the server keeps journals.
     pub recorded: bool,
 }
 
@@ -63,7 +63,7 @@ pub struct SessionReservation {
     pub id: String,
     /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub revision: u64,
-    /// Whether its events are written to an event log, if the server keeps journals.
+    /// Whether the session's events are written to an event log, if the server keeps journals.
     pub recorded: bool,
 }
 

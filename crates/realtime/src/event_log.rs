@@ -3,7 +3,7 @@
 //!
 //! An event log is bounded. If the writer of journals does not keep up, the log breaks: it discards its events,
 //! keeps the reason, and the session continues without a journal. When the writer reports that there is room again,
-//! the stepping thread begins anew with a snapshot; that is another run of the journal.
+//! the stepping thread restarts the log with a snapshot; that begins another run of the journal.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -54,9 +54,9 @@ pub enum Event {
 
 /// An event with its step and time.
 pub struct Noted {
-    /// Number of steps done before it.
+    /// Number of steps done before the event.
     pub step: u64,
-    /// Time at which it was added, ns of the clock of stepping ([`now_ns`](super::clock::now_ns)).
+    /// Time at which the event was added, ns of the clock of stepping ([`now_ns`](super::clock::now_ns)).
     pub at_ns: u64,
     /// The event.
     pub event: Event,
@@ -81,9 +81,9 @@ pub struct TakenEvents {
 pub struct Beginning {
     /// Number of steps done.
     pub step: u64,
-    /// Whether time advances.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step count at which it pauses, if any.
+    /// The step count at which the session pauses, if any.
     pub until_step: Option<u64>,
 }
 
@@ -124,17 +124,17 @@ pub struct JournalProgress {
 pub struct About {
     /// The session's ID.
     pub id: String,
-    /// Name of the account that created it.
+    /// Name of the account that created the session.
     pub owner: String,
-    /// Time without use after which it is deleted, s.
+    /// Time without use after which the session is deleted, s.
     pub idle_timeout_s: f64,
     /// The first tissue of the session, in its first run.
     pub first: Arc<Model>,
     /// Number of steps done.
     pub begin_step: u64,
-    /// Whether time advances.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step count at which it pauses, if any.
+    /// The step count at which the session pauses, if any.
     pub until_step: Option<u64>,
     /// Number of the run that this one continues; 0 if there is none.
     pub after_run: u64,
@@ -150,7 +150,7 @@ pub struct EventLog {
     queue: Arc<TapeQueue>,
     /// Whether only mirrored events are durable.
     needs_mirror: bool,
-    /// Whether a broken log may begin anew because there is room again.
+    /// Whether a broken log may restart because there is room again.
     may_begin_anew: AtomicBool,
     /// The durable step plus one, so that 0 stands for none.
     durable: AtomicU64,
@@ -237,19 +237,20 @@ impl EventLog {
             *held = HeldEvents { broken: Some(reason.clone()), ..HeldEvents::default() };
         }
         self.progress.send_modify(|progress| {
-            // Logged once, and not at every attempt to begin anew.
+            // Logged once, and not at every attempt to restart.
             if progress.broken.replace(reason.clone()).is_none() {
                 tracing::error!(session = %self.about.id, %reason, "the journal of a session is broken");
             }
         });
     }
 
-    /// Lets a broken log begin anew, because there may be room again. The stepping thread does so.
+    /// Lets a broken log restart, because there may be room again. The stepping thread restarts it.
     pub fn may_begin_anew(&self) {
         self.may_begin_anew.store(true, Ordering::Release);
     }
 
-    /// Begins anew if the log is broken and may. Returns whether it did: then the caller must add a snapshot.
+    /// Restarts the log if it is broken and may restart. Returns whether it did: then the caller must add a
+    /// snapshot.
     pub(super) fn begins_anew(&self, beginning: impl FnOnce() -> Beginning) -> bool {
         if !self.may_begin_anew.load(Ordering::Relaxed) || !self.may_begin_anew.swap(false, Ordering::AcqRel) {
             return false;

@@ -25,7 +25,8 @@ impl Fence {
         until_ns == u64::MAX || boot_ns() < until_ns
     }
 
-    /// Returns the time for which it still may, s: 0 if the moment has passed, infinity without a fleet.
+    /// Returns the time for which the server may still act, s: 0 if the moment has passed, infinity without a
+    /// fleet.
     #[allow(clippy::cast_precision_loss)]
     pub fn left_s(&self) -> f64 {
         match self.until_ns.load(Ordering::Acquire) {

@@ -25,20 +25,20 @@ pub struct Present {
     pub saved: Box<Saved>,
     /// A copy of the state, to be hashed.
     pub copy: ReadCopy,
-    /// Whether time advances.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step count at which it pauses, if any.
+    /// The step count at which the session pauses, if any.
     pub until_step: Option<u64>,
 }
 
 /// Why a session leaves its server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Leaving {
-    /// It is deleted.
+    /// The session is deleted.
     Deleted,
     /// Another server has become its owner.
     Moved,
-    /// It was being handed to this server, and the handover was cancelled.
+    /// The session was being handed to this server, and the handover was cancelled.
     Withdrawn,
 }
 

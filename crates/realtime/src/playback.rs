@@ -37,9 +37,9 @@ pub(super) struct Fetched {
 pub(super) enum Next {
     /// Yes, with these inputs.
     Step(Fetched),
-    /// Not yet: its inputs have not been read.
+    /// Not yet: the inputs of the step have not been read.
     Late,
-    /// No: the recording ends before it.
+    /// No: the recording ends before the step.
     Over,
 }
 

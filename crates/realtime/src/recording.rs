@@ -34,7 +34,7 @@ impl SessionTask {
         }
     }
 
-    /// Begins the journal anew, if its event log is broken and there is room again.
+    /// Restarts the event log, if it is broken and there is room again.
     fn begin_anew(&mut self) {
         let Some(recorder) = &mut self.recorder else { return };
         let (session, running, until_step) = (&self.session, self.running, self.until);
@@ -80,7 +80,7 @@ impl SessionTask {
         }
     }
 
-    /// Hands what is written so far to the journal's thread, because time stands.
+    /// Hands what is written so far to the journal's thread, because time is paused.
     pub(super) fn note_standstill(&self) {
         if let Some(recorder) = &self.recorder {
             recorder.event_log.hurry();

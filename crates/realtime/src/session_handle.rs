@@ -49,7 +49,7 @@ pub struct SessionHandle {
     pub model: Arc<Model>,
     /// Surface by which frames show the tissue, if it is a mesh.
     pub skin: Option<Arc<Skin>>,
-    /// Account of the caller that created the session and is charged for it.
+    /// Account of the caller that created the session, which is charged for it.
     pub owner: Account,
     pub(super) intake: Mutex<Intake>,
     /// Time without calls, held tools or streams after which the session is deleted, s.
@@ -72,9 +72,9 @@ pub struct SessionHandle {
     pub(super) thread: AtomicUsize,
     /// Inbox of the thread that it began on, which passes requests on if the session has moved.
     pub(super) inbox: Arc<Inbox>,
-    /// The recording that it plays, if any.
+    /// The recording that the session plays, if any.
     pub playback: Option<Playback>,
-    /// Event log for its journal, if the server keeps journals and records this session.
+    /// Event log for the session's journal, if the server keeps journals and records this session.
     pub event_log: Option<Arc<EventLog>>,
     /// Its place in the limit on sessions, freed when it is deleted, even if readers remain.
     pub(super) slot: Mutex<Taken>,
@@ -283,12 +283,12 @@ impl SessionHandle {
         self.thaw();
     }
 
-    /// Returns whether it is being handed over to this server, which is not its owner yet.
+    /// Returns whether the session is being handed over to this server, which is not its owner yet.
     pub fn is_coming(&self) -> bool {
         self.is_coming.load(Ordering::Acquire)
     }
 
-    /// Returns the measured fraction of a core that its steps take; 0 at rest.
+    /// Returns the measured fraction of a core that the session's steps take; 0 at rest.
     pub fn share(&self) -> f64 {
         self.cost.share()
     }

@@ -10,9 +10,9 @@ use palpate_tissue::limits::Limits;
 /// Purpose of a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StreamKind {
-    /// It holds tools. Some slots of a session are reserved for such streams.
+    /// The stream holds tools. Some slots of a session are reserved for such streams.
     HoldsTools,
-    /// It only reads.
+    /// The stream only reads.
     ReadsOnly,
 }
 

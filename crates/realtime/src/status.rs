@@ -10,11 +10,11 @@ use palpate_tissue::scene::record::Recovery;
 /// Whether a session's simulated time advances.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RunState {
-    /// It advances in real time.
+    /// Time advances in real time.
     Running,
-    /// It waits to be started.
+    /// The session waits to be started.
     Paused,
-    /// It has been stopped by a blow-up, a fault of the program or missing memory, until the session is revived.
+    /// The session has been stopped by a blow-up, a fault of the program or missing memory, until it is revived.
     Held,
 }
 

@@ -22,13 +22,13 @@ const UNSENT_BYTES: u64 = (400 + 80) << 10;
 pub struct StreamInfo {
     /// Number of the stream within its session.
     pub number: u64,
-    /// The call that opened it.
+    /// Name of the call that opened the stream.
     pub what: &'static str,
     /// Purpose of the stream.
     pub kind: StreamKind,
-    /// Name of the account of its caller.
+    /// Name of the account of the caller that opened the stream.
     pub caller: String,
-    /// Time since it was opened, ns.
+    /// Time since the stream was opened, ns.
     pub age_ns: u64,
 }
 

@@ -15,9 +15,9 @@ pub struct Command {
     /// Whether it came by datagram, so that later poses may have overtaken it: its sequence number need not rise.
     /// Only for poses that are played by client time.
     pub by_datagram: bool,
-    /// The step at whose beginning it takes effect; `None` for the next step.
+    /// The step at whose beginning the command takes effect; `None` for the next step.
     pub at_step: Option<u64>,
-    /// Simulated time after which its action ends, s; `None` for no limit.
+    /// Simulated time after which the command's action ends, s; `None` for no limit.
     pub time_to_live_s: Option<f64>,
     /// The action.
     pub action: Action,
@@ -46,7 +46,7 @@ impl Command {
 pub struct Due {
     /// The command itself.
     pub command: Command,
-    /// Whether it was meant for an earlier step.
+    /// Whether the command was meant for an earlier step.
     pub late: bool,
     /// Number of late commands that it represents: itself if it is late, and late ones that it has superseded.
     pub late_commands: u64,

@@ -12,7 +12,7 @@ use palpate_tissue::Model;
 /// bits.
 #[derive(Debug, Clone)]
 pub enum Input {
-    /// A command whose step has come, or the end of a lease ([`Session::advance`]).
+    /// A command that is due, or the end of a lease ([`Session::advance`]).
     Command(Due),
     /// A change of the tissue from this step on ([`Session::change`]).
     Tissue(Arc<Model>),
@@ -36,9 +36,9 @@ pub enum Input {
 pub struct Felt {
     /// The tool's number.
     pub tool: u32,
-    /// Place of its tip or, without a tip, of its control point, m.
+    /// Place of the tool's tip or, without a tip, of its control point, m.
     pub place_m: DVec3,
-    /// Displacement of the tissue under it, m.
+    /// Displacement of the tissue under the tool, m.
     pub displacement_m: DVec3,
     /// Force of the tissue on the tool, N.
     pub force_n: DVec3,

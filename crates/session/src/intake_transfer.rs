@@ -34,8 +34,8 @@ impl Intake {
         (Handed { leases, waiting }, discarded)
     }
 
-    /// Adds the content of another server's intake. The leases last their full duration from `now_ns`, and their
-    /// commands are numbered anew.
+    /// Adds the content of another server's intake. The leases last their full duration from `now_ns`, and sequence
+    /// numbers of their commands start again.
     ///
     /// Inputs for which there is no memory are dropped. Returns how many.
     pub fn adopt(&mut self, handed: Handed, now_ns: u64) -> usize {

@@ -33,13 +33,13 @@ pub(super) struct LeasedTool {
 pub struct HandedLease {
     /// The tool's number.
     pub tool: u32,
-    /// ID of its lease.
+    /// ID of the lease that holds the tool.
     pub id: LeaseId,
     /// Name of the holder, for people.
     pub holder: String,
     /// Time without a command or renewal after which the lease expires, ns.
     pub duration_ns: u64,
-    /// Name of the account that is charged for it; empty if none is.
+    /// Name of the account that is charged for the tool; empty if none is.
     pub owner: String,
 }
 
@@ -199,7 +199,7 @@ impl Leases {
         self.held.iter().map(of).collect()
     }
 
-    /// Adds a tool with the lease that another server gave it. Its commands are numbered anew.
+    /// Adds a tool with the lease that another server gave it. Sequence numbers of its commands start again.
     pub(super) fn adopt(&mut self, lease: HandedLease, now_ns: u64) {
         let HandedLease { tool, id, holder, duration_ns, .. } = lease;
         let leased = LeasedTool {

@@ -27,7 +27,7 @@ impl Rules {
         Rules { scene: scene.clone(), limits: limits.clone() }
     }
 
-    /// Returns the number of tools: tools are numbered below it.
+    /// Returns the number of tools: each tool has a number below it.
     pub fn most_tools(&self) -> u32 {
         self.limits.tools
     }

@@ -72,7 +72,7 @@ pub struct Player<'s> {
 }
 
 impl<'s> Player<'s> {
-    /// Creates a player of `script` at its beginning.
+    /// Creates a player that begins `script`.
     ///
     /// # Errors
     /// Refuses a script with more tools than `limits` allow.

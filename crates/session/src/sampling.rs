@@ -23,7 +23,7 @@ use palpate_refusal::{Reason, Refusal, Result, number};
 pub struct PacedSample {
     /// State of the tools.
     pub sample: Sample,
-    /// Time at which its step was due, ns of the server's clock.
+    /// Time at which the sample's step was due, ns of the server's clock.
     pub due_ns: u64,
     /// Number of steps dropped so far.
     pub overrun_count: u64,

@@ -590,11 +590,11 @@ mod tests {
         assert!(gentle.to_string().contains("force[0]"), "{gentle}");
         let [warning] = rough.warnings.as_slice() else { panic!("{:?}", rough.warnings) };
         assert!(warning.starts_with("force[0]: ") && warning.ends_with("it goes through"), "{warning}");
-        // The linear model of the same: depth and force have the stiffness of the disc between them.
+        // A linear model of that press: depth and force have the stiffness of the disc between them.
         let Force { total_n, depth_m, .. } = gentle.forces[0];
         let stiffness = total_n / depth_m.unwrap();
         assert!((30.0..120.0).contains(&stiffness), "{stiffness} N/m");
-        // Of a mesh it is a bound; of a sheet it is an estimate.
+        // On a mesh the depth is a bound; on a sheet it is an estimate.
         let told = format!("depth: about {}", length(depth_m.unwrap()));
         assert!(gentle.to_string().contains(&told), "{told}: {gentle}");
     }

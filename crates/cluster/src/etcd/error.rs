@@ -27,13 +27,13 @@ pub type EtcdResult<T> = std::result::Result<T, EtcdError>;
 /// What an error in an answer implies for the request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ErrorVerdict {
-    /// Every member would refuse it.
+    /// Every member would refuse the request.
     Refused,
-    /// It was not executed here; another member may execute it.
+    /// The request was not executed here; another member may execute it.
     Elsewhere,
-    /// It was not executed because the token is not valid, or no longer.
+    /// The request was not executed because the token is not valid, or no longer.
     Stale,
-    /// It may have been executed.
+    /// The request may have been executed.
     Lost,
 }
 

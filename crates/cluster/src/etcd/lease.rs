@@ -13,7 +13,7 @@ use super::calls::{MemberCall, MemberCalls};
 pub struct Lease {
     /// Number of the lease.
     pub id: i64,
-    /// Seconds that it lasts after each renewal, as etcd granted: at least the requested time.
+    /// Seconds that the lease lasts after each renewal, as etcd granted: at least the requested time.
     pub ttl_s: u64,
 }
 

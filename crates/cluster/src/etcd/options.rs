@@ -22,7 +22,7 @@ pub struct EtcdOptions {
     pub ca: Option<PathBuf>,
     /// File of our own certificate (PEM), if etcd requires one.
     pub certificate: Option<PathBuf>,
-    /// File of its private key (PEM).
+    /// File of the private key (PEM) of our own certificate.
     pub key: Option<PathBuf>,
     /// Our user name, if etcd requires passwords.
     pub user: Option<String>,

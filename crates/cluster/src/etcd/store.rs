@@ -13,11 +13,11 @@ use palpate_proto::etcd::mvccpb;
 pub struct KeyValue {
     /// The key.
     pub key: String,
-    /// Its value.
+    /// The value of the key.
     pub value: Vec<u8>,
     /// Revision at which the key was created, after its last deletion.
     pub create_revision: u64,
-    /// Revision at which it was last written.
+    /// Revision at which the key was last written.
     pub mod_revision: u64,
     /// Lease at whose end the key is deleted; 0 for none.
     pub lease: i64,
@@ -69,7 +69,7 @@ pub struct Txn {
 pub struct TransactionOutcome {
     /// Whether the conditions held.
     pub succeeded: bool,
-    /// Revision of the store after it, which is the revision of its writes if it wrote.
+    /// Revision of the store after the transaction, which is that of its writes if it wrote.
     pub revision: u64,
     /// Results of the executed [`Op::Get`]s, in their order; `None` for a key that does not exist.
     pub got: Vec<Option<KeyValue>>,

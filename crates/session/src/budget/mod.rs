@@ -307,17 +307,17 @@ impl Account {
         &self.0.name
     }
 
-    /// Returns its number, which no other account of the budget has.
+    /// Returns the number of the account, which no other account of the budget has.
     pub fn number(&self) -> u64 {
         self.0.number
     }
 
-    /// Returns the budget that it belongs to.
+    /// Returns the budget to which the account belongs.
     pub fn budget(&self) -> &Arc<Budget> {
         &self.0.budget
     }
 
-    /// Returns the amount of a resource that it has.
+    /// Returns the amount of a resource that the account has.
     pub fn has(&self, resource: Resource) -> u64 {
         lock(&self.0.budget.pools[resource.index()]).of(self.0.number)
     }
@@ -344,7 +344,8 @@ impl Account {
         self.0.turn.lock().await
     }
 
-    /// Returns how long it must wait until its part of such work is free again, ns; 0 if it need not wait.
+    /// Returns how long the account must wait until its part of such work is free again, ns; 0 if it need not
+    /// wait.
     pub fn must_wait_ns(&self, work: Work, now_ns: u64) -> u64 {
         lock(&self.0.budget.times)[work as usize].wait_ns(self.0.number, now_ns)
     }

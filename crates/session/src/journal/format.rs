@@ -83,7 +83,7 @@ impl Topic {
         }
     }
 
-    /// Returns the number of its channel, which is also that of its schema.
+    /// Returns the number of the topic's channel, which is also that of its schema.
     pub fn channel(self) -> u16 {
         self as u16
     }

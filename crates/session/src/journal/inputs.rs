@@ -173,7 +173,7 @@ mod tests {
         assert_eq!(other.changed_to().unwrap().tissue_state(), changed.tissue_state());
         assert_eq!(due(&mut other, 8).iter().map(of).collect::<Vec<_>>(), [(0, Some(2), false)]);
         assert_eq!(due(&mut other, 9).iter().map(of).collect::<Vec<_>>(), [(0, Some(3), false)]);
-        // The lease continues, and its commands are numbered anew.
+        // The lease continues, and sequence numbers of its commands start again.
         other.submit(LEASE, vec![release(0, None)], 5 * MS).unwrap();
         assert!(other.submit(LEASE + 1, vec![release(0, None)], 5 * MS).is_err());
         assert!(decoded(&[1, 2, 3], &first, &limits).is_err());

@@ -33,17 +33,17 @@ use palpate_tissue::memory;
 pub struct JournalBatch {
     /// Number of the batch, from 0.
     pub number: u64,
-    /// Position of its chunk in the file, bytes.
+    /// Position of the batch's chunk in the file, bytes.
     pub offset: u64,
     /// The file is complete up to this step.
     pub until_step: u64,
-    /// Number of batches that were certainly on the disk when it was written.
+    /// Number of batches that were certainly on the disk when this one was written.
     pub durable_batches: u64,
     /// Number of inputs in the batches before.
     pub first_input: u64,
-    /// Number of its inputs.
+    /// Number of inputs in this batch.
     pub input_count: u64,
-    /// Time at which it was written, ns since the Unix epoch.
+    /// Time at which the batch was written, ns since the Unix epoch.
     pub unix_ns: u64,
     place: String,
     data: Vec<u8>,
@@ -120,7 +120,7 @@ impl JournalBatch {
         Refusal { place: Some(self.place.clone()), message, field: String::new(), ..refusal }
     }
 
-    /// Returns its inputs, in order.
+    /// Returns the inputs of the batch, in order.
     ///
     /// # Errors
     /// Refuses messages that can't be decoded.
@@ -133,7 +133,7 @@ impl JournalBatch {
         Ok(inputs)
     }
 
-    /// Returns its hashes, in order.
+    /// Returns the hashes of the batch, in order.
     ///
     /// # Errors
     /// Refuses messages that can't be decoded.
@@ -141,7 +141,7 @@ impl JournalBatch {
         self.all(Topic::Hashes).collect()
     }
 
-    /// Returns its snapshots, in order.
+    /// Returns the snapshots of the batch, in order.
     ///
     /// # Errors
     /// Refuses messages that can't be decoded.
@@ -158,7 +158,7 @@ impl JournalBatch {
         Ok(messages?.into_iter().flat_map(|felt| felt.moments).collect())
     }
 
-    /// Returns its last list of the changes of the tissue that wait for their step, if it has one.
+    /// Returns the batch's last list of the changes of the tissue that wait for their step, if it has one.
     ///
     /// # Errors
     /// Refuses messages that can't be decoded.
@@ -179,7 +179,7 @@ impl JournalBatch {
         self.all(Topic::Header).next().unwrap_or_else(|| Err(self.refuse("the header is missing".to_owned())))
     }
 
-    /// Returns whether it has messages of a topic.
+    /// Returns whether the batch has messages of a topic.
     pub fn has(&self, topic: Topic) -> bool {
         self.messages.iter().any(|message| message.0 == topic)
     }
@@ -190,9 +190,9 @@ impl JournalBatch {
 pub struct SnapshotAt {
     /// Number of steps done.
     pub step: u64,
-    /// Position of its chunk in the file, bytes.
+    /// Position of the snapshot's chunk in the file, bytes.
     pub offset: u64,
-    /// Number of its batch.
+    /// Number of the batch that has the snapshot.
     pub batch: u64,
 }
 

@@ -35,7 +35,7 @@ pub enum JournalItem {
 }
 
 impl JournalItem {
-    /// Returns the number of steps done before it.
+    /// Returns the number of steps done before the entry.
     pub fn step(&self) -> u64 {
         match self {
             JournalItem::Input(input) => input.step,
@@ -73,9 +73,9 @@ pub fn items(batch: &JournalBatch) -> Result<VecDeque<JournalItem>> {
 /// First difference between the recorded session and the replay.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Difference {
-    /// The first step at which they are known to differ.
+    /// The first step at which the recording and the replay are known to differ.
     pub step: u64,
-    /// The last step at which they are known to be equal; `None` if no hash was compared before.
+    /// The last step at which the two are known to be equal; `None` if no hash was compared before.
     pub equal_until: Option<u64>,
     /// Description of the difference, for people.
     pub what: String,
@@ -551,9 +551,9 @@ pub struct Resumed {
     pub pending: Option<Arc<Model>>,
     /// Changes of the tissue that wait for a later step, each with that step.
     pub waiting: Vec<(u64, Input)>,
-    /// Whether time advances.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step count at which it pauses, if any.
+    /// The step count at which the session pauses, if any.
     pub until_step: Option<u64>,
     /// Survey of the journal.
     pub survey: Survey,

@@ -49,7 +49,7 @@ impl Key {
         Some(Key(Arc::new(Ed25519KeyPair::from_pkcs8_maybe_unchecked(der).ok()?)))
     }
 
-    /// Returns its public part.
+    /// Returns the public part of the key.
     pub fn public(&self) -> PublicKey {
         PublicKey(self.0.public_key().as_ref().try_into().unwrap_or_default())
     }

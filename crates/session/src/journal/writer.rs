@@ -20,15 +20,15 @@ pub struct Opening<'a> {
     pub run: u64,
     /// Name of the account that created the session, for people.
     pub owner: &'a str,
-    /// Time without use after which it is deleted, s.
+    /// Time without use after which the session is deleted, s.
     pub idle_timeout_s: f64,
     /// The tissue with which the session began, in its first run.
     pub first: &'a Arc<Model>,
     /// Number of steps done.
     pub begin_step: u64,
-    /// Whether time advances.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step count at which it pauses, if any.
+    /// The step count at which the session pauses, if any.
     pub until_step: Option<u64>,
     /// Revision at which the server became the session's owner; 0 without a fleet.
     pub ownership_revision: u64,
