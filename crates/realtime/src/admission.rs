@@ -145,7 +145,7 @@ impl Pacer {
     ) -> Result<Arc<SessionHandle>> {
         let slot = owner.take(Resource::Sessions, 1, "")?;
         if lock(&self.sessions).contains_key(&begin.id) {
-            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "is that of a session that is there already"));
+            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "already belongs to a session"));
         }
         self.admit(begin, owner, slot, session, stop)
     }
@@ -278,7 +278,7 @@ impl Pacer {
         let mut sessions = lock(&self.sessions);
         let points: usize = sessions.values().map(|handle| handle.model.len()).sum();
         if points + handle.model.len() > self.limits.points_in_all {
-            let message = format!("the sessions of the server have {points} points already");
+            let message = format!("the sessions of the server already have {points} points");
             return Err(Refusal::new(Reason::TooMany, "sheet.points", message));
         }
         sessions.insert(id, handle.clone());

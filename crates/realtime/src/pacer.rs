@@ -256,7 +256,7 @@ impl Pacer {
 
     /// Ends all sessions and threads, and waits for the threads.
     pub fn stop(&self) {
-        let why = Refusal::new(Reason::ShuttingDown, "", "the server is going down");
+        let why = Refusal::new(Reason::ShuttingDown, "", "the server is shutting down");
         for handle in lock(&self.sessions).values() {
             drop(lock(&handle.intake).close(why.clone()));
         }

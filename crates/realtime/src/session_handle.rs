@@ -238,7 +238,7 @@ impl SessionHandle {
             dropped
         });
         if dropped > 0 {
-            tracing::warn!(session = %self.id, dropped, "no memory for all that waited");
+            tracing::warn!(session = %self.id, dropped, "no memory for some waiting changes of the tissue");
         }
     }
 

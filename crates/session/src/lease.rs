@@ -80,7 +80,7 @@ impl Leases {
                 return Err(Refusal::new(Reason::OutOfRange, "tools", format!("names tool {tool} twice")));
             }
             if let Some(lease) = self.held.get(tool) {
-                let holder = if lease.holder.is_empty() { "somebody" } else { &lease.holder };
+                let holder = if lease.holder.is_empty() { "another client" } else { &lease.holder };
                 let message = format!("tool {tool} is held by `{holder}`");
                 return Err(Refusal::new(Reason::ToolHeld, "tools", message));
             }
@@ -224,6 +224,6 @@ impl Leases {
 
 /// Returns the refusal of a lease that holds nothing.
 pub(super) fn not_held() -> Refusal {
-    let message = "no tool is held by this lease: it lapsed or was given back";
+    let message = "this lease holds no tool: it has expired or was released";
     Refusal::new(Reason::NotHolder, "lease_id", message)
 }

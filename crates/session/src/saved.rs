@@ -407,7 +407,7 @@ impl SavedPath {
             watched_s: self.watched_s,
             counts: self.counts,
         });
-        path.ok_or_else(|| unsound("a path that no tool takes"))
+        path.ok_or_else(|| unsound("an invalid path of a tool"))
     }
 }
 

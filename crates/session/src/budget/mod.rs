@@ -388,7 +388,7 @@ impl Taken {
             return Ok(());
         }
         if self.resource.is_laid_out() && more <= self.account.0.budget.bytes() {
-            memory::check(more, "what was asked for").map_err(|refusal| refusal.within(field))?;
+            memory::check(more, "this request").map_err(|refusal| refusal.within(field))?;
         }
         let (budget, number) = (&self.account.0.budget, self.account.0.number);
         let mut pool = lock(&budget.pools[self.resource.index()]);

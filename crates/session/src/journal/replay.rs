@@ -267,7 +267,7 @@ impl<R: Read + Seek> Replay<R> {
                 break;
             }
             if step < self.session.step_count() {
-                let text = format!("something acts at step {step}, when {} are done", self.session.step_count());
+                let text = format!("an input acts at step {step}, but {} steps are done", self.session.step_count());
                 return Err(self.reader.refuse(&text));
             }
             self.run_to(step, see)?;
@@ -372,7 +372,7 @@ impl<R: Read + Seek> Replay<R> {
         let computed = self.session.tissue().state_hash();
         if from_hash(recorded)? != computed {
             let step = self.session.step_count();
-            self.differ(step, format!("the {what} was {recorded} when it was recorded, and is {computed:032x}"));
+            self.differ(step, format!("the recorded hash of the {what} is {recorded}, but here it is {computed:032x}"));
         }
         Ok(())
     }
@@ -523,7 +523,7 @@ fn snapshot<R: Read + Seek>(
 fn saved(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Result<(Saved, Arc<Model>)> {
     let saved = Saved::from_bytes(&snapshot.saved, limits)?;
     if saved.step() != snapshot.step {
-        let message = format!("is of step {}, where one of step {} should be", saved.step(), snapshot.step);
+        let message = format!("is of step {}, but should be of step {}", saved.step(), snapshot.step);
         return Err(Refusal::new(Reason::Unreadable, "snapshot", message));
     }
     // Most sessions have the tissue with which they began.

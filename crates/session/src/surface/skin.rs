@@ -12,7 +12,7 @@ use palpate_tissue::scene::{Body, BoundPlace, MeshShape};
 use palpate_tissue::shape::RestShape;
 
 /// Name of the skin's tables in messages.
-const TABLES: &str = "what is shown of a mesh";
+const TABLES: &str = "the shown surface of a mesh";
 
 /// Skin of a tissue on a mesh: the order of its vertices in a frame, and how they move with the simulated ones.
 #[derive(Debug, PartialEq)]
