@@ -9,9 +9,9 @@ use palpate_tissue::scene::record::{AuditedError, Correction};
 /// Results of the audits of one session.
 #[derive(Debug, Clone, Default)]
 pub struct Audited {
-    /// Number of windows that were audited.
+    /// Number of windows of steps that were audited.
     pub windows: u64,
-    /// The step count at the end of the newest window, and the error that the window added.
+    /// The step count at the end of the newest audited window, and the error that the window added.
     pub newest: Option<(u64, AuditedError)>,
     /// The largest value of each part of the error in any window.
     pub largest: AuditedError,
@@ -32,7 +32,7 @@ pub struct Audited {
 /// Counts of the auditor over all sessions, since it began.
 #[derive(Debug, Default)]
 pub struct AuditTally {
-    /// Number of windows that were audited.
+    /// Number of windows of steps that were audited.
     pub windows: Count,
     /// Number of windows whose error was above the tolerance.
     pub above: Count,

@@ -1,9 +1,10 @@
 //! The event log of a session: what its journal records. The stepping thread adds events and never waits for the
 //! reader; the thread that writes journals takes all events at once.
 //!
-//! An event log is bounded. If the writer of journals does not keep up, the log breaks: it discards its events,
-//! keeps the reason, and the session continues without a journal. When the writer reports that there is room again,
-//! the stepping thread restarts the log with a snapshot; that begins another run of the journal.
+//! An event log is bounded. If the writer of journals does not keep up or can't write, the log breaks: it discards
+//! its events, keeps the reason, and the session continues without a journal. If the disk was full and the writer
+//! reports that there is room again, the stepping thread restarts the log with a snapshot; that begins another run of
+//! the journal.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -387,7 +388,7 @@ impl TapeQueue {
         }
     }
 
-    /// Takes the event logs that hold events now.
+    /// Takes the event logs that hold events now, without waiting.
     pub fn take(&self) -> Vec<Arc<EventLog>> {
         std::mem::take(&mut lock(&self.state).event_logs)
     }

@@ -10,7 +10,7 @@ use palpate_tissue::scene::record::Recovery;
 /// Whether a session's simulated time advances.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RunState {
-    /// Time advances in real time.
+    /// The session's time advances in real time.
     Running,
     /// The session waits to be started.
     Paused,
@@ -41,7 +41,7 @@ pub struct Status {
     pub paused_commands: u64,
     /// Why the session is held; `None` if it is not.
     pub hold_reason: Option<String>,
-    /// Number of times that the guard went back to a checkpoint.
+    /// Number of times that the guard, the check of stability after steps, went back to a checkpoint.
     pub guard_events: u64,
     /// Number of recoveries: the tissue was taken back to an earlier state.
     pub recovery_count: u64,

@@ -124,7 +124,7 @@ pub struct Sampling {
     /// Whether stiffness and damping are computed from the tissue around the tool under a touch too, not only under
     /// a grasp.
     pub touch_stiffness: bool,
-    /// A shorter heartbeat that the reader requests at times, if it may.
+    /// Shorter heartbeat that the reader may request at any time; `None`: only `heartbeat_s` applies.
     pub wanted: Option<Arc<WantedHeartbeat>>,
 }
 
