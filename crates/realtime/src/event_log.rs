@@ -265,8 +265,8 @@ impl EventLog {
         is_broken
     }
 
-    /// Adds an event of the moment at which `step` steps are done. A broken log ignores it; a log with too many
-    /// events breaks.
+    /// Adds an event of the moment at which `step` steps are done. A broken log ignores it; a log that already
+    /// holds 32,768 events breaks.
     pub(super) fn note(self: &Arc<Self>, step: u64, event: Event) {
         let bytes = match &event {
             Event::Hash(copy) => copy.model().state_bytes(),

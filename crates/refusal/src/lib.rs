@@ -45,7 +45,7 @@ reasons! {
     TooLarge = "TOO_LARGE",
     /// A force is above the limit for one point.
     ForceTooLarge = "FORCE_TOO_LARGE",
-    /// A point or a control point does not lie on the sheet.
+    /// A point, a control point or a place does not lie on the tissue.
     OffTissue = "OFF_TISSUE",
     /// No scene has this name.
     UnknownScene = "UNKNOWN_SCENE",
