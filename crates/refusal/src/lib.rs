@@ -104,6 +104,16 @@ reasons! {
 }
 
 /// A refusal of an input: what was refused and why. A refused input has changed nothing.
+///
+/// A refusal has a reason for programs, and a field and a message for people:
+///
+/// ```
+/// use palpate_refusal::{Reason, positive};
+///
+/// let refusal = positive("spacing_m", -0.01).expect_err("no sheet has points -10 mm apart").within("sheet");
+/// assert_eq!((refusal.reason, refusal.reason.as_str()), (Reason::OutOfRange, "OUT_OF_RANGE"));
+/// assert_eq!(refusal.to_string(), "sheet.spacing_m: must be above 0, but is -0.01");
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Refusal {
     /// The reason, for programs.

@@ -32,6 +32,33 @@ pub struct Counts {
 }
 
 /// Queue of a session's commands and changes of the tissue, with the leases of its tools.
+///
+/// Who holds a tool commands it. A command waits for its step; one from somebody else is refused, and changes nothing:
+///
+/// ```
+/// use palpate_refusal::Reason;
+/// use palpate_session::command::Command;
+/// use palpate_session::intake::Intake;
+/// use palpate_tissue::limits::Limits;
+/// use palpate_tissue::scene::script::Action;
+/// use palpate_tissue::scene::{PAPER, Scene};
+///
+/// let limits = Limits::default();
+/// let mut intake = Intake::new(&Scene::parse("paper", PAPER, &[], &limits)?, &limits);
+/// // For 2 s from now on, or until the next command.
+/// let (lease, other) = (1, 2);
+/// intake.acquire(&[0], "a surgeon", 2.0, lease, 0)?;
+/// let release = Command { at_step: Some(10), ..Command::new(0, Some(1), Action::Release) };
+/// intake.submit(lease, vec![release.clone()], 0)?;
+/// let refusal = intake.submit(other, vec![release], 0).expect_err("another holds the tool");
+/// assert_eq!(refusal.reason, Reason::NotHolder);
+/// let mut due = Vec::new();
+/// intake.take_due(9, 0, &mut due);
+/// assert!(due.is_empty());
+/// intake.take_due(10, 0, &mut due);
+/// assert!(due.len() == 1 && !due[0].late);
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
 #[derive(Debug)]
 pub struct Intake {
     pub(super) rules: Arc<Rules>,

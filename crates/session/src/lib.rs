@@ -157,6 +157,34 @@ struct Posed {
 }
 
 /// A tissue with its tools and their commands' effects: what a server, a run or a replay advances step by step.
+///
+/// A fingertip presses 3 mm into the middle of a sheet at rest. Half a second later the surface under it is as deep, and pushes back:
+///
+/// ```
+/// use glam::DVec3;
+/// use palpate_haptics::Tip;
+/// use palpate_session::Session;
+/// use palpate_session::command::{Command, Due};
+/// use palpate_tissue::Model;
+/// use palpate_tissue::scene::PAPER;
+/// use palpate_tissue::scene::script::Action;
+///
+/// let model = Model::parse("paper", PAPER, &["sheet.points=[9, 9]"])?;
+/// let place_m = model.shape().extent().middle_m() - 0.003 * DVec3::Z;
+/// let tip = Tip { radius_m: 0.04, ..Tip::default() };
+/// let press = Action::Pose { place_m, velocity_m_per_s: None, tip };
+/// let mut session = Session::new(&model);
+/// let mut due = vec![Due::in_time(Command::new(0, Some(1), press))];
+/// for _ in 0..500 {
+///     session.advance(&mut due, |_| {});
+/// }
+/// assert_eq!((session.step_count(), session.time_s()), (500, 0.5));
+/// let sample = session.sample(None);
+/// let contact = sample.tools[0].contact.expect("the tool acts");
+/// assert!((contact.displacement_m.z + 0.003).abs() < 1e-5, "{} m", contact.displacement_m);
+/// assert!(contact.force_on_tool_n.z > 0.0, "{} N", contact.force_on_tool_n);
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
 pub struct Session {
     tissue: Box<dyn Tissue>,
     tools: Vec<Tool>,

@@ -647,6 +647,56 @@ pub struct Verdict {
 /// Simulates a whole journal, and compares every hash and every snapshot. `progress` gets the number of steps done
 /// and the last step, every 1024 steps.
 ///
+/// A journal is recorded while a session runs. Then it is simulated again, and both hashes are the same:
+///
+/// ```
+/// use std::io::Cursor;
+///
+/// use palpate_session::Session;
+/// use palpate_session::command::{Command, Due};
+/// use palpate_session::input::Input;
+/// use palpate_session::journal::{JournalReader, JournalWriter, Opening, pb, verify};
+/// use palpate_tissue::Model;
+/// use palpate_tissue::limits::Limits;
+/// use palpate_tissue::scene::PAPER;
+/// use palpate_tissue::scene::profile::Poke;
+/// use palpate_tissue::scene::script::Action;
+///
+/// let model = Model::parse("paper", PAPER, &["sheet.points=[5, 5]"])?;
+/// let opening = Opening {
+///     session_id: "example",
+///     run: 1,
+///     owner: "",
+///     idle_timeout_s: 900.0,
+///     first: &model,
+///     begin_step: 0,
+///     running: true,
+///     until_step: None,
+///     ownership_revision: 0,
+/// };
+/// // Times are in nanoseconds since 1970; a step is a millisecond.
+/// let mut writer = JournalWriter::new(&opening, 0);
+/// let mut session = Session::new(&model);
+/// writer.snapshot(0, session.tissue().state_hash(), &model, session.save().to_bytes());
+/// // 0.1 N down on the middle, from the first step on.
+/// let centre_m = model.shape().extent().middle_m();
+/// let force_n = glam::DVec3::new(0.0, 0.0, -0.1);
+/// let poke = Poke { point: None, centre_m, force_n, falloff_per_m: 100.0, falloff_offset: 0.0 };
+/// let mut due = vec![Due::in_time(Command::new(0, Some(1), Action::Push(poke)))];
+/// writer.input(0, &Input::Command(due[0].clone()));
+/// for _ in 0..100 {
+///     session.advance(&mut due, |_| {});
+/// }
+/// writer.hash(100, session.tissue().state_hash());
+/// let journal = writer.finish(pb::Why::Drained, "the example ended", 100, 100_000_000);
+///
+/// let reader = JournalReader::new("example.mcap", Cursor::new(journal))?;
+/// let verdict = verify(reader, &Limits::default(), &mut |_, _| {})?;
+/// assert_eq!((verdict.steps, verdict.proved_until), ([0, 100], 100));
+/// assert_eq!(verdict.difference, None);
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
+///
 /// # Errors
 /// Refuses a journal that can't be read or simulated.
 pub fn verify<R: Read + Seek>(

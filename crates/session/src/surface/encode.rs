@@ -152,6 +152,29 @@ pub(super) fn lay_out(first: [usize; 2], [count_x, count_y]: [usize; 2], encodin
 }
 
 /// Refines and encodes `snapshot`, whose points must be those of `refinement`. Returns a full frame.
+///
+/// A sheet of 3 × 3 points, whose middle is 2 mm deep, with a vertex between neighbours: 5 × 5 vertices, of which the one beside the
+/// middle is 1 mm deep.
+///
+/// ```
+/// use palpate_session::surface::{Encoding, Refinement, Snapshot, encode};
+/// use palpate_tissue::limits::Limits;
+/// use palpate_tissue::scene::{PAPER, Scene};
+///
+/// let limits = Limits::default();
+/// let scene = Scene::parse("paper", PAPER, &["sheet.points=[3, 3]".to_owned()], &limits)?;
+/// let mut z_m = vec![0.0; 9];
+/// z_m[4] = -0.002;
+/// let snapshot = Snapshot::new(&scene, 100, 0.1, [vec![0.0; 9], vec![0.0; 9], z_m]);
+/// let frame = encode(&snapshot, Refinement::new(&scene, 1, &limits)?, Encoding::F32);
+/// assert!(frame.full && frame.refinement.vertices() == [5, 5]);
+/// let bytes = &frame.patches[0].bytes;
+/// // Vertex [1, 2]: x, y and z as floats of 4 bytes.
+/// let z = &bytes[12 * (5 + 2) + 8..][..4];
+/// let depth_m = -f32::from_le_bytes([z[0], z[1], z[2], z[3]]);
+/// assert!((depth_m - 0.001).abs() < 1e-9, "{depth_m} m");
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
 pub fn encode(snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -> Frame {
     encode_over(snapshot, Frame::blank(refinement, encoding))
 }
