@@ -293,22 +293,26 @@ fn main() {
 
     let mut report = BenchReport::new("error", "Run time against error", "make bench-error");
     report.say(
-        "Errors are the largest over all sample times and points, relative to the largest value: of the displacement, \
-         and of the force on a tool there (springs, anchor spring and damping). `error` is the larger of the two. The \
-         truth is central differences in f64 at two small steps, extrapolated to none. Time is that of the stepping \
-         alone on one thread, the least of some runs in turn. ● marks what no other run beats: none takes less time for an error as small, or within 2 % of it.",
+        "Errors are the largest over all sample times and points, relative to the largest value: of the displacement, and of \
+         the force on a tool there (springs, anchor spring and damping). `error` is the larger of the two. The reference is \
+         central differences in f64 at two small steps, extrapolated to a step of zero. Time is that of the stepping alone on \
+         one thread, the shortest of some runs in turn. ● marks the best runs: no other run takes less time for an error as \
+         small, or within 2 % of it.",
     );
     report.heading("How many times cheaper than the paper's scheme, at equal error");
     report.say(
-        "The run time of `lagged` over that of the cheapest, between measured steps by their logarithms. Where `lagged` \
-         does not reach an error within the steps tried, its last one is carried on by its first order (halving the \
-         error doubles the time): *extrapolated*. A dash: the best does not reach it either.",
+        "The run time of `lagged` divided by that of the cheapest scheme, interpolated logarithmically between measured \
+         steps. If `lagged` does not reach an error within the steps tried, its last run is extrapolated by its first order \
+         (halving the error doubles the time): *extrapolated*. A dash means that the best scheme does not reach the error \
+         either.",
     );
     tell_ratios(&mut report, "lagged", &[1e-3, 1e-6], &results);
     if knows_rk4 {
         report.heading("How many times cheaper than Runge–Kutta, at equal error");
-        report
-            .say("1 where Runge–Kutta is the cheapest itself; a dash where it, or the best, does not reach the error.");
+        report.say(
+            "1 means that Runge–Kutta itself is the cheapest; a dash means that it, or the best scheme, does not reach \
+                 the error.",
+        );
         tell_ratios(&mut report, "rk4", &[1e-3, 1e-4, 1e-5, 1e-6, 1e-7], &results);
     }
     let absent: Vec<String> = schemes
@@ -318,8 +322,8 @@ fn main() {
         .map(|(integrator, precision)| format!("`{integrator}` in {precision}"))
         .collect();
     report.say(&match absent.as_slice() {
-        [] => "Every scheme is the cheapest somewhere.".to_owned(),
-        absent => format!("Nowhere the cheapest at any error: {}.", absent.join(", ")),
+        [] => "Every scheme is the cheapest at some error.".to_owned(),
+        absent => format!("Never the cheapest, at any error: {}.", absent.join(", ")),
     });
     report.figure("nowhere_cheapest", json!(absent));
     let figures = |((case, curves), (_, agreement)): (&(&Case, Vec<Curve>), &(String, f64))| {

@@ -1,4 +1,4 @@
-//! What a fleet costs beside one server, how it spreads sessions, and what etcd etcd_capacity of it. Writes
+//! The cost of a fleet compared with one server, its placement of sessions, and the capacity of etcd. Writes
 //! docs/benchmarks/fleet.{md,svg}; `-- calls`, `-- spread`, `-- steps` and `-- etcd` print one part alone, `-- --quick` does all
 //! with small numbers. Linux only: times are read from /proc. Needs etcd.
 
@@ -85,8 +85,8 @@ fn main() {
         return report.print();
     }
     report.say(
-        "Three servers of a fleet, one server without, etcd and their clients are on the same machine: etcd's answers come over the \
-         loopback, and from its disk. Sessions are of the paper's 31 × 31 points.",
+        "Three servers of a fleet, one server without a fleet, etcd and their clients are on the same machine: etcd's \
+         answers come over the loopback interface, after a write to its disk. Sessions have the paper's 31 × 31 points.",
     );
     let panels: Vec<Panel> = PARTS.iter().filter_map(|part| part.1(&mut report)).collect();
     report.write(2, &panels);

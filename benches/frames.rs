@@ -268,10 +268,10 @@ fn main() {
         }
     }
     report.say(&format!(
-        "A whole frame refined and encoded into the buffers of the one before, beside a plain copy of its bytes (memcpy \
-         into a buffer written before), in turn on one core; the least time of many turns. The goal for 331 × 331 \
-         points is at most {GOAL}. The box around the displacements, over which integers are spread, is found once a \
-         snapshot, when it has just been taken; `with box` counts that as if one viewer alone looked."
+        "The time to refine a whole frame and encode it into the buffers of the previous one, compared with a plain copy of \
+         its bytes (memcpy into a buffer written before), in turn on one core; the shortest of many turns. The goal for 331 × \
+         331 points is a ratio of at most {GOAL}. The box around the displacements, which defines the range of the integers, \
+         is computed once per snapshot; `with box` adds its time, as for a single viewer."
     ));
     table(&mut report, &cases);
     let rows = cases.iter().map(|case| {
@@ -287,12 +287,13 @@ fn main() {
             "ratio": case.ratio(),
         })
     });
-    report.heading("What changed");
+    report.heading("Frames of changes");
     report.say(&format!(
-        "A sheet of 331 × 331 points, poked at its centre for a second (falloff 150/m), and one viewer who takes {RATE_HZ} \
-         i16 frames a second of what changed: bytes with all that the protocol adds, beside whole frames at that rate. \
-         A full frame is in the first phase, because the viewer joins, and one in the third, because five seconds have \
-         passed. The error is the largest between a vertex and where it should be, in quanta, of every eighth frame."
+        "A sheet of 331 × 331 points, poked at its centre for a second (falloff 150/m), and one viewer that receives \
+         {RATE_HZ} i16 frames a second of the changes: bytes with the overhead of the protocol, relative to whole frames at \
+         that rate. The first phase has a full frame because the viewer joins, and the third because five seconds have \
+         passed. The error is the largest difference between a vertex and its true position, in quanta, of every eighth \
+         frame."
     ));
     let mut sent = Vec::new();
     for refinement in if quick() { &[0][..] } else { &[0, 10] } {

@@ -181,10 +181,10 @@ fn main() {
 
     let mut report = BenchReport::new("kernel", "The time of a step", "make bench-kernel");
     report.say(
-        "ns a point and substep, one substep a step, one thread, with all that a step does (applied force, checks, \
-         checkpoints): the least of many windows of about 3 ms in several rounds, and in brackets their median. The \
-         sheet is the paper's tissue, pushed at its centre so that all of it moves. The peers do the same arithmetic on \
-         the same tissue (benches/peers), without checks.",
+        "Time per point and substep, ns, with one substep per step, on one thread, for whole steps (applied force, checks, \
+         checkpoints): the shortest of many windows of about 3 ms in several rounds, and in brackets the median of the \
+         rounds. The sheet is the paper's tissue, pushed at its centre so that all of it moves. The peers do the same \
+         arithmetic on the same tissue (benches/peers), without checks.",
     );
     let mut header = vec!["points".to_owned()];
     header.extend(sides.iter().map(|side| format!("{side}²")));
@@ -200,15 +200,15 @@ fn main() {
     rows.push(row("memory limit, f32", &|side| memory_ns(side).map(digits)));
     report.table(&header, &rows);
     report.say(&format!(
-        "The limits, from the same run: arithmetic is {OPERATIONS_PER_POINT:.1} sums and products of 16 lanes a point (counted \
-         in benches/kernel.rs; comparisons and masks are not, some processors have other units for them) at the rate at which \
-         the machine multiplies and adds; memory is to read and write back 6 arrays of f32. Clock, from a chain of \
-         multiplications: {} GHz.",
+        "The limits, from the same run: the arithmetic limit is {OPERATIONS_PER_POINT:.1} sums and products of 16 lanes per \
+         point (counted in benches/kernel.rs, without comparisons and masks, for which some processors have other units) at \
+         the machine's rate of multiplications and additions; the memory limit is the time to read and write back 6 arrays of \
+         f32. Clock, from a chain of multiplications: {} GHz.",
         clock_ghz.map_or("?".to_owned(), digits)
     ));
     if !peers.is_empty() {
         report.heading("How many times faster");
-        report.say("The peer's least time over that of the fastest `central f32`.");
+        report.say("The peer's shortest time divided by that of the fastest `central f32`.");
         let ratio = |peer: &str, side: usize| of(peer, side).map(|rounds| digits(least(rounds) / product_ns(side)));
         let rows: Vec<_> = peers.iter().map(|peer| row(peer, &|side| ratio(peer, side))).collect();
         report.table(&header, &rows);

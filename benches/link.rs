@@ -69,17 +69,18 @@ fn main() {
     let seeds: u64 = if quick() { 1 } else { 3 };
     let mut report = BenchReport::new("link", "Touch over a network", "make bench-link");
     report.say(
-        "Simulated hands, devices and networks, in virtual time (`palpate-client link --help`); runs of 20 s, means over \
-         the seeds 1 to 3, of energies, jumps, peaks and ages the worst. `raw` renders the newest force as it came, `hold` \
-         the same within the safety envelope, `model` the local model along the tool's own way within the envelope. \
-         Energy below 0 was given by the device's port. The depths of a task are scaled, once and for all schemes, until a \
-         hand that feels the tissue itself (no network, no client) meets at most 0.8 of the device's force: the column \
-         `scale`. Figures of a run that became unstable are those until then.",
+        "Simulated hands, devices and networks, in virtual time (`palpate-client link --help`). Runs last 20 s; the figures \
+         are means over the seeds 1 to 3, but the worst of the three for energies, jumps, peaks and ages. `raw` renders the \
+         newest force unchanged, `hold` renders it within the safety envelope, and `model` renders the local model along the \
+         tool's own path within the envelope. Negative energy was given off by the device's port. The depths of a task are \
+         scaled, with the same factor for all schemes, so that a hand that touches the tissue directly (no network, no \
+         client) meets at most 0.8 of the device's force: the column `scale`. The figures of a run that became unstable cover \
+         the time until then.",
     );
     report.say(
-        "**Where it is measured.** Tasks stay within 1 cm of the middle of the sheet but where a table says otherwise. The force \
-         law follows the tool, but near a fixed rim the force also changes along the tool's way, and the rim draws a pressed \
-         tip aside; models do not tell that, and errors are larger ([at a rim](rim.md)).",
+        "**The place.** Tasks stay within 1 cm of the middle of the sheet, unless a table says otherwise. The force law \
+         follows the tool, but near a fixed rim the force also changes along the tool's path, and the rim pulls a pressed tip \
+         aside. Models do not include this, so errors are larger there ([at a rim](rim.md)).",
     );
     boundary(&mut report);
     stiffness(&mut report);
@@ -101,8 +102,8 @@ fn boundary(report: &mut BenchReport) {
     let most = rows.iter().map(apart).fold(0.0, f64::max);
     report.heading("The delay at which hand and spring become unstable");
     report.say(&format!(
-        "m·s² + b·s + k + K·e^(−s·t) = 0 beside the loop of `link` with a spring for a tissue: {} combinations, at most {} \
-         ms apart.",
+        "The prediction is the solution of m·s² + b·s + k + K·e^(−s·t) = 0. The observation is from the loop of `link` with \
+         a spring in place of the tissue: {} combinations, which differ by at most {} ms.",
         rows.len(),
         digits(most)
     ));
@@ -122,9 +123,9 @@ fn boundary(report: &mut BenchReport) {
 fn stiffness(report: &mut BenchReport) {
     report.heading("Stiffness under a disc, by spacing");
     report.say(
-        "A slow press by a disc of 5 mm radius, force over depth, N/m; the same tissue on finer grids, the disc at three \
-         places of a cell (on a point, at a quarter, in the middle). The last column is a flat punch on a half-space of the \
-         same material, 2aE/(1 − ν²), where nothing hardens.",
+        "Force divided by depth, N/m, in a slow press by a disc of 5 mm radius. The same tissue on finer grids, with the \
+         disc at three places of a cell (on a point, at a quarter, in the middle). The last column is a flat punch on a \
+         half-space of the same material without hardening, 2aE/(1 − ν²).",
     );
     let punches = [("liver", 5400.0), ("stomach", 1920.0), ("fibrotic", 26_900.0)];
     let (mut rows, mut figures) = (Vec::new(), Vec::new());
@@ -225,7 +226,8 @@ fn others(report: &mut BenchReport, seeds: u64) {
     table(report, "devices", &["device"], devices.iter().map(run).collect());
 
     report.heading("Deadband: 2 ms, medium hand, omega3");
-    report.say("Samples are sent when the force that the client renders is off by more than δ, or after 40 ms.");
+    report
+        .say("The server sends a sample if the error of the force that the client renders exceeds δ, or after 40 ms.");
     let mut runs = Vec::new();
     for scene in ["liver", "fibrotic", "stomach"] {
         for (scheme, delta) in [("model", 0.0), ("model", 0.1), ("model", 0.2)] {
@@ -235,12 +237,12 @@ fn others(report: &mut BenchReport, seeds: u64) {
     }
     table(report, "deadband", &["tissue", "scheme", "δ"], runs);
 
-    report.heading("A client that stands still: 10 ms, medium hand, omega3");
+    report.heading("A client that stops: 10 ms, medium hand, omega3");
     report.say(
-        "Once a second, at a random moment, the client stands still (a busy machine, a pause of the program), and samples and \
-         the device's places wait. The device holds its last force, as real ones do, and the hand moves on under it: energy \
-         is counted with the force that was really held. No envelope can act meanwhile; what the port gave is bounded by \
-         the held force times how far the hand moved.",
+        "Once a second, at a random moment, the client stops (a busy machine, a pause of the program), and samples and the \
+         device's places wait. The device holds its last force, as real devices do, and the hand continues to move under it: \
+         the energy is computed with the force that the device really held. No envelope can act meanwhile; the energy that \
+         the port gives off is bounded by the held force times the movement of the hand.",
     );
     let mut runs = Vec::new();
     for scene in ["liver", "fibrotic"] {
@@ -249,16 +251,16 @@ fn others(report: &mut BenchReport, seeds: u64) {
             runs.push((cells([scene.to_owned(), stall_ms.to_string()]), run));
         }
     }
-    table(report, "stalls", &["tissue", "stands still for, ms"], runs);
+    table(report, "stalls", &["tissue", "stops for, ms"], runs);
 }
 
 /// The same hand and task in real time, over gRPC with a delay, to validate virtual time.
 fn live(report: &mut BenchReport) {
     report.heading("In real time: medium hand, omega3");
     report.say(
-        "`palpate-client link --server URL` through a proxy that delays by half the round trip each way, beside the same \
-         seed in virtual time. In real time the ticks of the simulated device are late now and then, and so is the server; \
-         the hand goes on by time, whoever is late, and the device holds its last force.",
+        "`palpate-client link --server URL` through a proxy that delays by half the round trip each way, compared with the \
+         same seed in virtual time. In real time, ticks of the simulated device and steps of the server are sometimes late. \
+         The hand follows the clock even if device or server is late, and the device then holds its last force.",
     );
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let server = server::TestServer::start(&["--log", "warn"]);
@@ -290,7 +292,7 @@ fn live(report: &mut BenchReport) {
 const BOTH: [(&str, &str); 11] = [
     ("force error, % RMS", "force_error_rms_percent"),
     ("after outages, % RMS", "force_error_after_outages_percent"),
-    ("over this part of the contact", "after_outages_share"),
+    ("share of the contact", "after_outages_share"),
     ("p99, N", "force_error_p99_n"),
     ("bias, N", "force_bias_n"),
     ("gain", "force_gain"),
@@ -340,13 +342,14 @@ fn beside(report: &mut BenchReport, name: &str, label: &str, runs: &[(String, St
 
 /// Loss, jitter and outages.
 fn lossy(report: &mut BenchReport, seeds: u64) {
-    report.heading("Stream beside datagrams: 50 ms, medium hand, omega3");
+    report.heading("Stream and datagrams: 50 ms, medium hand, omega3");
     report.say(
-        "Over a stream a lost packet holds up all that follow it. Over datagrams it is lost alone; each repeats up to eight \
-         places that the server may not have yet. Outages are once a second, at a random moment. *After outages* leaves out \
-         each outage and the 50 ms after its end, and pauses until rendering has engaged again. The *depth error* is how far \
-         the tool is from where the same hand would be that feels the tissue itself, with no network; it depends on what the \
-         hand was given before, so it is not that of a force at this moment.",
+        "In a stream a lost packet delays all that follow it. A lost datagram delays no other; each repeats up to eight \
+         places that the server may not have yet. Outages occur once a second, at a random moment. *After outages* excludes \
+         each outage and the 50 ms after its end, and pauses until rendering has engaged again; *share of the contact* is the \
+         part of the contact that this figure covers. The *depth error* is the distance between the tool and the place where \
+         the hand's tool would be without a network. It depends on all earlier forces, so it is not the error of a force at \
+         one moment.",
     );
     let named = |(label, run): (&str, &str)| (label.to_owned(), format!("--rtt-ms 50 {run}"));
     let mut runs: Vec<_> = [
@@ -377,11 +380,12 @@ fn lossy(report: &mut BenchReport, seeds: u64) {
 
 /// Places of a sheet of 75 mm, a second tool, and a tissue that changes.
 fn places(report: &mut BenchReport, seeds: u64) {
-    report.heading("Elsewhere, and not alone: 50 ms, medium hand, omega3");
+    report.heading("Other places, a second tool, a changing tissue: 50 ms, medium hand, omega3");
     report.say(
-        "*Half-way* is between the middle and the rim, *at the rim* one radius of the tip (5 mm) from it; the rim is fixed. The \
-         second tool presses by a task of its own, 15 mm from the middle of the first one's, to half the depths. The tissue \
-         changes after 10 s to springs of half as much stiffness again; its law reaches the client 100 ms and one way later.",
+        "*Half-way* is between the middle and the rim, *at the rim* one radius of the tip (5 mm) from it; the rim is fixed. \
+         The second tool presses with its own task, 15 mm from the middle of the first tool's, to half the depths. After 10 s \
+         the springs of the tissue become 1.5 times as stiff; the new law reaches the client after 100 ms plus the one-way \
+         delay.",
     );
     let runs = [
         ("half-way", "--place 0.01875,0.0375"),
@@ -390,16 +394,16 @@ fn places(report: &mut BenchReport, seeds: u64) {
         ("changing tissue", "--tissue-change-s 10 --tissue-change-factor 1.5"),
     ]
     .map(|(label, run)| (label.to_owned(), format!("--rtt-ms 50 {run}")));
-    beside(report, "places", "where, or with what", &runs, seeds);
+    beside(report, "places", "place or condition", &runs, seeds);
 }
 
 /// Organs, whose surfaces are curved.
 fn organs(report: &mut BenchReport, seeds: u64) {
     report.heading("Organs: 50 ms, medium hand, omega3, datagrams");
     report.say(
-        "A model tells the surface under the tip with its curvature; a tip that strokes over a rim, a fold or a lump meets another \
-         within the round trip. A wall that is touched from inside (`colon`) has folds on all sides. These are of local models alone: \
-         prediction.md has them beside a copy of the tissue.",
+        "A model describes the surface under the tip with its curvature; a tip that strokes over a rim, a fold or a lump \
+         meets another surface within the round trip. A wall that is touched from inside (`colon`) has folds on all sides. \
+         These figures are for local models alone: prediction.md compares them with a copy of the tissue.",
     );
     let runs = [
         ("liver-organ, away from lumps", "liver-organ", ""),
@@ -443,8 +447,9 @@ fn random(report: &mut BenchReport) {
     report.heading("Random combinations");
     let found = link(&format!("--random {runs} --seconds 5"));
     report.say(&format!(
-        "`palpate-client link --random {runs} --seconds 5`: scene, hand, device, task and place, network and transport, deadbands, \
-         a second tool and a change of the tissue drawn by seed, {} unstable. Worst of each figure, and whose it is:",
+        "`palpate-client link --random {runs} --seconds 5`: scene, hand, device, task and place, network and transport, \
+         deadbands, a second tool and a change of the tissue, drawn by seed; {} runs were unstable. The worst value of each \
+         figure, and its run:",
         found["unstable"]
     ));
     let mut rows = Vec::new();

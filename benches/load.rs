@@ -236,8 +236,8 @@ fn crowds(report: &mut BenchReport, figures: &mut Vec<Value>, seconds: f64) -> V
         let found = load(&server, trial, &wanted);
         let limit = found.number("/limit_sessions");
         report.say(&format!(
-            "The most that keep to `{objective}` in two of three trials of {trial} s: **{limit}** sessions, refused above or \
-             found by halving. By the kernel alone it would be {:.0}.",
+            "The largest number of sessions that meets `{objective}` in two of three trials of {trial} s: **{limit}** (the \
+             server refused more, or bisection found the limit). The kernel alone would allow {:.0}.",
             most_by(&alone_line)
         ));
         kernel_line = alone_line;
@@ -252,7 +252,7 @@ const PROFILED: usize = 50;
 
 /// Where the time goes beside the kernel.
 fn profile(report: &mut BenchReport) {
-    report.heading("Where it goes");
+    report.heading("Distribution of the time");
     eprintln!("a profile of {PROFILED} sessions");
     let server = start(&[]);
     let id = server.child.id();
@@ -263,13 +263,13 @@ fn profile(report: &mut BenchReport) {
     });
     let found = load(&server, 12.0, &["--sessions", &PROFILED.to_string()]);
     let Some(parts) = sampling.join().unwrap() else {
-        return report.say("Left out: there is no `perf` here, or it may not look.");
+        return report.say("Not measured: `perf` is missing, or lacks permission.");
     };
     let each_us = found.cores() * 1e3 / (PROFILED as f64 * found.number("/dilation_min"));
     report.say(&format!(
-        "Of {PROFILED} sessions with a client each: {} µs a session and step, divided as `perf` found the threads at work \
-         (which slows them a little itself). Of what the system does, receiving is the other end's: with clients on other \
-         machines their cores do it.",
+        "With {PROFILED} sessions and one client each: {} µs per session and step, divided by the samples of `perf` (which \
+         slows the threads a little). Of the system's work, receiving belongs to the clients: on other machines their cores \
+         do it.",
         digits(each_us)
     ));
     let row = |((thread, doing), part): &(profile::Activity, f64)| {
@@ -283,8 +283,8 @@ fn profile(report: &mut BenchReport) {
     };
     let (system_us, sweep_us) = (of(|doing| doing.starts_with("system")), of(|doing| doing.starts_with("the sweep")));
     report.say(&format!(
-        "So the sweep ({} µs) and what the system does for a connection a client ({} µs) leave room for {:.0} sessions on a \
-         core, whatever a server does beside.",
+        "So with the sweep ({} µs) and the system's work for one connection per client ({} µs), a core has room for at most \
+         {:.0} sessions, even if the rest of the server took no time.",
         digits(sweep_us),
         digits(system_us),
         1e3 / (sweep_us + system_us)
@@ -305,12 +305,13 @@ fn runs() -> usize {
 fn attacks(report: &mut BenchReport, name: Option<&str>) -> Panel {
     let runs = runs().max(1);
     report.say(&format!(
-        "One client at 1 kHz in a session of its own, on a server that is kept to one core (one stepping thread, one of the \
-         network), while somebody else, with a token of its own unless the row says otherwise, attacks for 7 s from the other \
-         cores. Quiet is the 2 s before, and 2 s that end 8 s after; \"p99 × quiet\" is relative to the mean of both. \
-         Meanwhile newcomers, one after the other, make a session, feel a command in it and one in the client's session, and \
-         leave; a newcomer that waits for 5 s gives up. Lost commands were never answered. Memory is resident: before, at \
-         most, and 10 s after, when all have left. Each attack is run {runs} times; the row is the run with the median p99."
+        "One client runs at 1 kHz in its own session, on a server that is limited to one core (one stepping thread, one \
+         network thread). An attacker, with its own token unless the row says otherwise, attacks for 7 s from the other \
+         cores. *Quiet* is the 2 s before the attack, and 2 s that end 8 s after it; \"p99 × quiet\" is relative to the mean \
+         of both. Meanwhile newcomers, one after the other, make a session, wait for the effect of a command in it and of one \
+         in the client's session, and leave; a newcomer gives up after 5 s. Lost commands are those without an answer. Memory \
+         is the resident memory: before, maximum, and 10 s after, when all have left. Each attack runs {runs} times; the row \
+         is the run with the median p99."
     ));
     let kinds: Vec<Option<&'static AttackKind>> = match name {
         Some(name) => vec![Some(attack::named(name).unwrap_or_else(|| unknown_attack(name)))],
@@ -376,17 +377,17 @@ fn main() {
         None => {
             let mut report = BenchReport::new("load", "Many sessions on one core", "make bench-load");
             report.say(
-                "Sessions of the paper's 31 × 31 points at 1 kHz, all of them awake: each is stroked without rest. The server \
-                 (one stepping thread, one of the network) is kept to one core; `palpate-client load` has the others, and \
-                 sends each client's commands at 1 kHz by its own clock, over a connection of its own. What an attack does \
-                 to a client is on [a page of its own](attacks.md).",
+                "Sessions of the paper's 31 × 31 points at 1 kHz, all of them awake: a tool strokes each without a pause. \
+                 The server (one stepping thread, one network thread) is limited to one core; `palpate-client load` uses the \
+                 other cores, and sends each client's commands at 1 kHz by its own clock, over a separate connection. The \
+                 effect of attacks on a client is on [another page](attacks.md).",
             );
             let mut figures = Vec::new();
             let series = crowds(&mut report, &mut figures, if quick() { 3.0 } else { 10.0 });
             profile(&mut report);
             report.figure("runs", figures.into());
             let panel = Panel::Lines {
-                title: "What a session costs".to_owned(),
+                title: "Cost of a session".to_owned(),
                 x: "sessions",
                 y: "µs of the core, a session and step",
                 series,

@@ -335,12 +335,13 @@ fn main() {
 
     let mut report = BenchReport::new("mesh", "The time of a step on a mesh", "make bench-mesh");
     report.say(
-        "ns a vertex and step of `central` in f32, one thread, all awake, without the checks of a session: the least of \
-         many timings in which the widths take turns. Spheres with three springs a vertex: regular (divided \
-         icosahedra), and jittered by 0.3 edges with some (mild) or many (irregular) edges flipped at random. Beside the \
-         widths of the kernel: the plain loop of a compiled program (benches/mesh.rs), and the same arithmetic in numba and \
-         Taichi (benches/peers), all three with springs in compressed rows. Last, a step of a square sheet of as many \
-         points, ns a point, which has four springs a point and the checks of a session.",
+        "Time per vertex and step of `central` in f32, ns, on one thread, all awake, without the checks of a session: the \
+         shortest of many timings in which the widths take turns. The meshes are spheres with three springs per vertex: \
+         regular (divided icosahedra), and jittered by 0.3 edges with some (mild) or many (irregular) edges flipped at \
+         random. The table compares the lane widths of the kernel with the plain loop of a compiled program \
+         (benches/mesh.rs), and with the same arithmetic in numba and Taichi (benches/peers), all three with springs in \
+         compressed rows. The last column is a step of a square sheet with as many points, ns per point, which has four \
+         springs per point and the checks of a session.",
     );
     let header: Vec<&str> = ["mesh", "vertices"].into_iter().chain(names.iter().copied()).chain([SHEET]).collect();
     let row = |of: &Measured| {
@@ -349,7 +350,7 @@ fn main() {
     };
     report.table(&report::cells(&header), &measured.iter().map(row).collect::<Vec<_>>());
     report.heading("How many times faster");
-    report.say("The time of the others over that of the fastest width.");
+    report.say("The time of the others divided by that of the fastest width.");
     let others: Vec<&str> = names.iter().copied().filter(|name| !widths.contains(name)).collect();
     let header: Vec<&str> = ["mesh", "vertices"].into_iter().chain(others.iter().copied()).collect();
     let ratios = |of: &Measured| {

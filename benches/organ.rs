@@ -56,7 +56,9 @@ fn step_s(rounds: usize, tissues: &[std::cell::RefCell<Box<dyn Tissue>>]) -> Vec
 fn main() {
     let rounds = if quick() { 10 } else { 100 };
     let mut report = BenchReport::new("organ", "Organs", "make bench-organ");
-    report.say("Release build, one thread; times are the least of many, in which the rows of a table take turns.");
+    report.say(
+        "Release build, one thread. Times are the shortest of many runs, in which the rows of a table take turns.",
+    );
     speed(&mut report, rounds);
     let model = organ("liver-organ", 0.002, &[]);
     let across = across_a_lump(&mut report, &model);
@@ -68,10 +70,10 @@ fn main() {
 fn speed(report: &mut BenchReport, rounds: usize) {
     report.heading("Time of a step");
     report.say(
-        "`liver-organ` at its default tolerance and 1 kHz. All awake: a force reaches every vertex. A poke: a force of 0.3 N that \
-         falls off by e in 5 mm, on the organ at rest; a tip: 5 mm radius, pressed 2 mm deep. Both are timed 0.4 s \
-         later: a force that does not change lets all of it sleep by then, a tip keeps what is around it awake. Asleep: nothing \
-         touches it.",
+        "`liver-organ` at its default tolerance and 1 kHz. All awake: a force reaches every vertex. A poke: a force of 0.3 N \
+         that decreases by a factor of e in 5 mm, on the organ at rest. A tip: 5 mm radius, pressed 2 mm deep. Both are timed \
+         0.4 s later: under a constant force the whole organ is asleep at that time, while a tip keeps the tissue around it \
+         awake. Asleep: nothing touches the organ.",
     );
     let sizes: &[f64] = if quick() { &[0.002] } else { &[0.002, 0.00167, 0.00124] };
     let mut rows = Vec::new();
@@ -133,7 +135,7 @@ const NEAR_M: f64 = 0.005;
 
 /// Stiffness of a slow press of 2 mm along a line over the larger lump.
 fn across_a_lump(report: &mut BenchReport, model: &Arc<Model>) -> Panel {
-    report.heading("A lump is felt where it is");
+    report.heading("Only the lumps are stiffer: a press across a lump");
     report.say("Force of a slow press of `liver-organ`, 1 and 2 mm deep, along a line across its larger lump.");
     let lump_m = LUMPS_M[0].0;
     let places: Vec<f64> = (-12..=12).map(|k| 2.5e-3 * f64::from(k)).collect();
@@ -168,7 +170,7 @@ fn across_a_lump(report: &mut BenchReport, model: &Arc<Model>) -> Panel {
 
 /// Stiffness of a slow press of 1 mm all over the organ, seen from above. Places are `apart_m` or more from each other.
 fn map(report: &mut BenchReport, model: &Arc<Model>) -> Panel {
-    report.heading("And nowhere else");
+    report.heading("Only the lumps are stiffer: the whole organ");
     let apart_m: f64 = if quick() { 0.012 } else { 0.004 };
     let shape = model.shape();
     let mut chosen: Vec<DVec3> = Vec::new();
@@ -202,9 +204,9 @@ fn map(report: &mut BenchReport, model: &Arc<Model>) -> Panel {
         })
         .collect();
     report.say(
-        "Force of a slow press of 1 mm over its depth, N/m, wherever the organ faces up and is not held: least, 5 %, median, 95 %, \
-         most. A place is over a lump if the disc reaches it or its soft edge, and near where the organ is held if vertices that never \
-         move are within 5 mm of the disc.",
+        "Stiffness of a slow press of 1 mm (force divided by depth), N/m, at all places where the organ faces up and is not \
+         fixed: minimum, 5 %, median, 95 %, maximum. A place is over a lump if the disc reaches the lump or its soft edge. It \
+         is near the fixed part if vertices that never move are within 5 mm of the disc.",
     );
     let header = ["where", "places", "least", "5 %", "median", "95 %", "most"];
     report.table(&header.map(str::to_owned), &rows);
@@ -274,12 +276,12 @@ fn spread(values: &[f64]) -> (f64, f64) {
 
 /// The same press at many places between the vertices, and a tip that slides.
 fn evenness(report: &mut BenchReport) {
-    report.heading("The same wherever it lies between the vertices");
+    report.heading("The force does not depend on the place between vertices");
     report.say(
-        "Flat tissue of the liver's material on a mesh whose vertices are moved by up to a quarter of an edge. A disc of 5 mm \
-         radius, pressed slowly at 20 places: the mean force, and its standard deviation over the mean. The same disc slid over 100 mm \
-         at a constant depth of 1 mm and 50 mm/s: the standard deviation over the mean, and the largest change from one step to \
-         the next.",
+        "Flat tissue of the liver's material on a mesh whose vertices are moved by up to a quarter of an edge. A disc of 5 \
+         mm radius is pressed slowly at 20 places: the mean force, and its standard deviation relative to the mean. The same \
+         disc slides over 100 mm at a constant depth of 1 mm and 50 mm/s: the standard deviation relative to the mean \
+         (ripple), and the largest change from one step to the next.",
     );
     let mut rows = Vec::new();
     let edges: &[f64] = if quick() { &[0.0025] } else { &[0.005, 0.0025, 0.00125] };

@@ -79,15 +79,16 @@ fn main() {
     let mut report =
         BenchReport::new("prediction", "Touch on organs from a copy of the tissue", "make bench-prediction");
     report.say(
-        "`model` renders the local model along the tool's own way. `prediction` renders from a copy of the tissue that the client \
-         simulates, corrected by samples, or from the local model while that has been nearer to them. Medium hand, omega3, runs of \
-         20 s in virtual time, means over the seeds 1 to 3, of energies and jumps the worst (`palpate-client link --help`).",
+        "`model` renders the local model along the tool's own path. `prediction` renders from a copy of the tissue that the \
+         client simulates and corrects by samples, or from the local model while it recently matched the samples better. \
+         Medium hand, omega3, runs of 20 s in virtual time; means over the seeds 1 to 3, but the worst for energies and jumps \
+         (`palpate-client link --help`).",
     );
     report.say(
-        "**What virtual time shows.** The truth is a twin of the tissue at the tool's own place. The copy has the same tissue and the \
-         same places, so without anybody else it is the twin, bit by bit: what is left there is of the corrections, not what a \
-         network costs. What is left shows where something is not the same: places that the server got late or not at all, \
-         a second tool, a tissue that changes, real time.",
+        "**Virtual time.** The true force comes from a second tissue without a delay, at the tool's own place. The client's \
+         copy has the same tissue and the same places, so without other users it equals that tissue bit by bit: the remaining \
+         error comes from the corrections, not from the network. The tables show the error when the copy differs: if the \
+         server gets places late or not at all, with a second tool, with a tissue that changes, and in real time.",
     );
     // Before anything else is busy.
     cost(&mut report);
@@ -119,10 +120,10 @@ fn places(report: &mut BenchReport, seeds: u64) {
 
 /// What makes the copy another tissue than the server's.
 fn disturbed(report: &mut BenchReport, seeds: u64) {
-    report.heading("Where the copy is not the whole truth: liver-organ");
+    report.heading("When the copy is incomplete: liver-organ");
     report.say(
-        "A second tool presses by a task of its own. The tissue changes after 10 s to springs of half as much stiffness again; its \
-         law and a copy of it reach the client 100 ms and one way later.",
+        "A second tool presses with its own task. After 10 s the springs of the tissue become 1.5 times as stiff; the new \
+         law and a new copy reach the client after 100 ms plus the one-way delay.",
     );
     let conditions = [
         ("± 40 ms, datagrams", "--rtt-ms 50 --jitter-ms 40 --transport datagram"),
@@ -135,7 +136,7 @@ fn disturbed(report: &mut BenchReport, seeds: u64) {
         ("changing tissue", "--rtt-ms 50 --tissue-change-s 10 --tissue-change-factor 1.5"),
     ];
     let runs = conditions.map(|(title, condition)| (title, format!("--scene liver-organ {condition}")));
-    table(report, "network, or what else", "disturbed", &runs, seeds);
+    table(report, "network or condition", "disturbed", &runs, seeds);
 }
 
 /// True and rendered force around the moment at which local models are farthest off.
@@ -176,8 +177,9 @@ fn panel(title: &str, scene: &str, place: &str) -> Panel {
 fn live(report: &mut BenchReport) {
     report.heading("In real time, 50 ms");
     report.say(
-        "The same hand and task over gRPC to a real server through a proxy that delays by 25 ms each way. The copy is made of a \
-         snapshot that the server sends. Ticks and steps are late now and then, each by the clock of its own end.",
+        "The same hand and task over gRPC to a real server through a proxy that delays by 25 ms each way. The client makes \
+         the copy from a snapshot that the server sends. Ticks and steps are sometimes late; client and server use their own \
+         clocks.",
     );
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let server = server::TestServer::start(&["--log", "warn"]);
@@ -204,10 +206,10 @@ fn live(report: &mut BenchReport) {
 
 /// What a copy takes of a tick, in memory, and to be made.
 fn cost(report: &mut BenchReport) {
-    report.heading("What a copy costs");
+    report.heading("The cost of a copy");
     report.say(
-        "A tip of 5 mm strokes over the tissue, 3 mm deep, at 1 kHz: the time of a tick's step of the copy, one thread. The snapshot is \
-         what the server sends; to make a copy of it takes the time of the last column, beside the loop.",
+        "A tip of 5 mm strokes over the tissue, 3 mm deep, at 1 kHz: the time of one step of the copy, on one thread. The \
+         server sends the snapshot; the last column is the time to make a copy from it, on another thread than the loop.",
     );
     let runtime = tokio::runtime::Runtime::new().unwrap();
     let server = server::TestServer::start(&["--log", "warn"]);

@@ -45,7 +45,7 @@ fn poke(centre_m: DVec3, force_n: DVec3) -> LoadProfile {
 const KINDS: [LoadCase; 4] = [
     LoadCase {
         name: "local",
-        about: "3 N straight down at the centre for 1 s, then let go",
+        about: "3 N straight down at the centre for 1 s, then released",
         pushes: |length_m| vec![poke(at(length_m, 0.5), DVec3::new(0.0, 0.0, -3.0))],
     },
     LoadCase {
@@ -136,15 +136,15 @@ fn compare(truth: &SkipRun, other: &SkipRun) -> [f64; 2] {
 
 fn main() {
     let sides: &[usize] = if quick() { &[31, 121] } else { &[31, 121, 331, 1001] };
-    let mut report = BenchReport::new("skip", "What it saves to leave out what is at rest", "make bench-skip");
+    let mut report = BenchReport::new("skip", "Time saved by skipping tissue at rest", "make bench-skip");
     report.say(
-        "Two seconds at 1 kHz of the paper's tissue (K″ = 5 N/m) with more points and stiffer springs. How many times \
-         faster the steps are than with everything awake, and the error: the largest difference from that run of any \
-         point at any of 40 moments, relative to the largest displacement.",
+        "Two seconds at 1 kHz of the paper's tissue (K″ = 5 N/m) with more points and stiffer springs. Each cell contains \
+         the speed-up of the steps over a run with everything awake, and the error: the largest difference from that run of \
+         any point at any of 40 moments, relative to the largest displacement.",
     );
     report.say(
-        "The last figure of each cell is what a step costs, as a part of what it may: 1.1 × the points computed × what a \
-         point costs with everything awake, and 1 µs. Beyond 1, something costs time that is not for points that move.",
+        "The last figure of each cell is cost ÷ bound, where the bound is 1.1 × the number of computed points × the cost of \
+         a point with everything awake, plus 1 µs. Above 1, part of the time is not spent on moving points.",
     );
     for kind in &KINDS {
         report.say(&format!("*{}*: {}.", kind.name, kind.about));

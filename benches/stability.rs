@@ -501,14 +501,14 @@ fn main() {
 
     let mut report = BenchReport::new("stability", "The largest stable step", "make bench-stability");
     report.say(&format!(
-        "The sheet: 9 × 9 points of 10 g, K″ = {VIRTUAL_N_PER_M} N/m, f64, one substep a step. ω is its fastest vibration at \
-         rest: the largest eigenvalue of its stiffness, by the power method. *Predicted* is the largest dt·ω that the \
-         scheme's plan calls stable for a sheet whose bound ω_b is that ω; *observed* the largest at which a kick of 1e-9 \
-         spacings grows by less than {GROWTH:.0e} in {STEPS} steps and the guard does not act, both by bisection; *textbook* is 2 for central \
-         differences, and the root of (dt·ω)² + 2·C·dt/m = 4 for the paper's scheme. A positive difference is on the safe \
-         side; strong damping makes what lies just beyond the limit grow too slowly to be seen. *Beyond* is what goes \
-         wrong just above the observed limit: a guard that acts on a motion that does not grow makes a negative \
-         difference."
+        "The sheet: 9 × 9 points of 10 g, K″ = {VIRTUAL_N_PER_M} N/m, f64, one substep per step. ω is the angular frequency \
+         of its fastest vibration at rest, from the largest eigenvalue of its stiffness by the power method. *Predicted* is \
+         the largest dt·ω that the scheme's stability limit allows for a sheet whose bound ω_b is this ω. *Observed* is the \
+         largest dt·ω at which a perturbation of 1e-9 spacings grows by less than {GROWTH:.0e} in {STEPS} steps and the guard \
+         does not act. Both come from bisection; *textbook* is 2 for central differences, and the root of (dt·ω)² + 2·C·dt/m \
+         = 4 for the paper's scheme. A positive difference is on the safe side. With strong damping, a motion just beyond the \
+         limit grows too slowly to be detected. *Beyond* is the failure just above the observed limit. A guard that acts on a \
+         motion that does not grow causes a negative difference."
     ));
     let header = [
         "scheme",
@@ -524,9 +524,10 @@ fn main() {
     report.table(&cells(header), &limits.iter().map(Limit::row).collect::<Vec<_>>());
     report.heading("Organs");
     report.say(
-        "The built-in organs with longer edges, in f64, one substep a step. ω_b is the bound by the graph of their springs, under any \
-         deformation, and ω the fastest vibration at rest, by the power method. The plan goes by ω_b, so *predicted* is its \
-         largest stable step; *observed* is as above, after a kick at the vertex that decides the bound.",
+        "The built-in organs with longer edges, in f64, one substep per step. ω_b is the upper bound for any deformation, \
+         from the graph of their springs, and ω the fastest vibration at rest, by the power method. The stability limit uses \
+         ω_b, so *predicted* is the largest step that is stable with it. *Observed* is defined as above, with a perturbation \
+         at the vertex that decides the bound.",
     );
     let organ_header = [
         "organ",
@@ -551,10 +552,10 @@ fn main() {
         })
         .collect();
     report.say(&format!(
-        "k = 10 N/m, C = 0.5 N·s/m, a force at a slant on the centre at once, for a second and at least 1000 steps. ω_b \
-         bounds the fastest vibration under any deformation. *Mended* is what the guard took on with a shorter \
-         substep; *astray* is finite, yet more than three times as far as with \
-         a small step; *held* is what the guard ended. Of {} runs within the predicted limit, {} were not stable. {}",
+        "k = 10 N/m, C = 0.5 N·s/m, a sudden oblique force on the centre, for a second and at least 1000 steps. ω_b bounds \
+         the fastest vibration under any deformation. *Mended*: the guard continued the run with a shorter substep. *Astray*: \
+         the result is finite, but more than three times as far as with a small step. *Held*: the guard ended the run. Of {} \
+         runs within the predicted limit, {} were not stable. {}",
         promised.count(),
         broken.len(),
         broken.join("; ")

@@ -105,10 +105,10 @@ fn main() -> ExitCode {
 
     let mut report = BenchReport::new("tolerance", "Is the tolerance kept?", "make bench-tolerance");
     report.say(&format!(
-        "{scenes} random scenes with random scripts (seed {seed}; tests/common/random_scenes.rs says which), each against itself in \
-         f64 at 1e-10. The error is the largest difference of any component of displacement or force at any watched point \
-         and sample time, relative to the largest. *Dear* are those scenes for which more than one substep or f64 was \
-         chosen: something cheaper might have done."
+        "{scenes} random scenes with random scripts (seed {seed}; tests/common/random_scenes.rs generates them), each \
+         compared with itself in f64 at 1e-10. The error is the largest difference of any component of displacement or force \
+         at any watched point and sample time, relative to the largest. *Expensive* are the scenes for which Palpate chose \
+         more than one substep, or f64: a cheaper scheme might have been enough."
     ));
     let header = [
         "tolerance",

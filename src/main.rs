@@ -26,14 +26,14 @@ enum ServerCommand {
         palpate run my-scene.toml my-script.toml --output poke.jsonl --set stepping.integrator=lagged\n\n\
         Exit status: 0; 1 when the run failed; 2 when an input was refused.")]
     Run(run::RunArguments),
-    /// Report what a scene needs and what to expect of it: size, mass, stiffness under a fingertip, time to rest, integrator,
-    /// expected error, time per step, sessions per core; warn about unlikely values
+    /// Report the properties and the cost of a scene: size, mass, stiffness under a fingertip, time to rest,
+    /// integrator, expected error, time per step, sessions per core; warn about unlikely values
     #[command(after_help = "Examples:\n  \
         palpate check paper\n  \
         palpate check my-scene.toml my-script.toml\n  \
         palpate check my-scene.toml --set stepping.tolerance=1e-8\n\n\
-        The deepest sensible force presses a disc of 5 mm radius in by half the shorter side, or as far as the force law \
-        reaches.\n\n\
+        The row `deepest` is the force that presses a disc of 5 mm radius in by half the shorter side, or as far as \
+        the force law reaches.\n\n\
         Exit status: 0, with warnings too; 2 when an input was refused.")]
     Check(check::CheckArguments),
     /// Draw a tissue while a script acts on it, without a screen: a PNG image of one moment, or a GIF of the whole script
@@ -48,41 +48,44 @@ enum ServerCommand {
     #[command(after_help = "Examples:\n  \
         palpate texture --output mucosa.png\n  \
         palpate texture --seed 7 --size 4096 --output mucosa.png\n\n\
-        The same seed and size give the same bytes; another size gives the same tissue at another resolution. To use a \
-        texture in a scene, set texture_seed and texture_size in its section [appearance], or texture = \"FILE.png\".\n\n\
+        The same seed and size give the same bytes; another size gives the same tissue at another resolution. To use \
+        a texture in a scene, set texture_seed and texture_size in its section [appearance], or texture = \
+        \"FILE.png\".\n\n\
         Exit status: 0; 1 when the file can't be written; 2 when an input was refused.")]
     Texture(texture::TextureArguments),
-    /// Check a mesh of an organ: size, holes, volume, how even it is, and what is wrong with it; mend it, make it coarser,
-    /// write it to another file
+    /// Check a mesh of an organ: size, holes, volume, evenness and flaws; repair it, make it coarser, write it to
+    /// another file
     #[command(after_help = "Examples:\n  \
         palpate mesh liver.obj --unit mm\n  \
         palpate mesh scan.stl --unit mm --repair --vertices 5000 --output liver.obj\n  \
         palpate mesh organ.msh --unit 0.0254 --json\n\n\
-        Reads OBJ, STL, PLY, glTF (.gltf and .glb), Gmsh 1, 2 and 4.1 (.msh) and VTK (.vtk, .vtp and .vtu). A volume mesh \
-        gives its outer surface. Mesh files do not state their unit, so you do: m, cm, mm, or the metres of one unit. \
-        The report gives places in that unit.\n\n\
-        As for a scene, vertices at one position are joined along the edges of their triangles, closed surfaces are turned \
-        outward, and duplicate triangles are removed; the report says so. Vertices are numbered from 0 in the order \
-        of the file.\n\n\
-        A tissue needs a surface in which each edge has one or two triangles. --repair also welds vertices that are nearly \
-        at one position, drops triangles without area, pairs triangles at edges of more than two, keeps the largest \
-        surface with what is inside of it, fills small holes and drops unused vertices. It tells what it did, and area and \
-        volume before and after.\n\n\
-        With --json: vertices, triangles, components, holes, area_m2, volume_m3, before, faults, extent_m, problems with \
-        what, element and place_m, and more.\n\n\
-        Exit status: 0 when the mesh is usable, with warnings too; 1 when a file can't be written, or what --repair or \
-        --vertices made is not what was asked for: more than 1 % of area or volume lost, a closed surface open, still \
-        refused, too many vertices; 2 when it was refused.")]
+        Reads OBJ, STL, PLY, glTF (.gltf and .glb), Gmsh 1, 2 and 4.1 (.msh) and VTK (.vtk, .vtp and .vtu). A volume \
+        mesh gives its outer surface. Mesh files do not state their unit, so you do: m, cm, mm, or the metres of one \
+        unit. Places in the report are in that unit.\n\n\
+        As for a scene, vertices at one position are joined along the edges of their triangles, closed surfaces are \
+        turned outward, and duplicate triangles are removed; the report lists these changes. Vertices are numbered \
+        from 0 in the order of the file.\n\n\
+        A tissue needs a surface in which each edge has one or two triangles. --repair also welds vertices that are \
+        nearly at one position, drops triangles without area, pairs triangles at edges of more than two, keeps the \
+        largest surface with the surfaces inside it, fills small holes and drops unused vertices. It reports the \
+        repairs, and area and volume before and after.\n\n\
+        With --json: vertices, triangles, components, holes, area_m2, volume_m3, before, faults, extent_m, problems \
+        with what, element and place_m, and more.\n\n\
+        Exit status: 0 when the mesh is usable, with warnings too; 1 when a file can't be written, or when the \
+        result of --repair or --vertices is not as requested: more than 1 % of area or volume lost, a closed surface \
+        open, still refused, too many vertices; 2 when the mesh was refused.")]
     Mesh(mesh::MeshArguments),
     /// Make the mesh of an organ: gallbladder, liver, kidney, stomach, a segment of colon, or a patch with lumps
     #[command(after_help = "Examples:\n  \
         palpate organ --list\n  \
         palpate organ gallbladder --output gallbladder.obj\n  \
         palpate organ liver --edge-mm 1.5 --seed 7 --output liver.obj\n\n\
-        The file is in metres (unit = \"m\"). It has texture coordinates, and named groups of vertices such as `rim`, for what \
-        is fixed or stiffer. The same name, edge length and seed give the same bytes; another seed gives another patient.\n\n\
-        An organ has about 1.15·area/edge² vertices, at most 500,000. The colon and the patch are open, with one layer of \
-        triangles; the colon faces inward, because it is touched from inside. The other organs are closed and face outward.\n\n\
+        The file is in metres (unit = \"m\"). It has texture coordinates, and named groups of vertices such as \
+        `rim`, which a scene can fix or make stiffer. The same name, edge length and seed give the same bytes; \
+        another seed gives another shape.\n\n\
+        An organ has about 1.15·area/edge² vertices, at most 500,000. The colon and the patch are open, with one \
+        layer of triangles; the colon faces inward, because it is touched from inside. The other organs are closed \
+        and face outward.\n\n\
         Exit status: 0; 1 when the file can't be written; 2 when an input was refused.")]
     Organ(organ::OrganArguments),
     /// Serve tissue over gRPC and to browsers: sessions in real time, commands in, forces and frames out
@@ -92,18 +95,19 @@ enum ServerCommand {
         (umask 077; palpate token --name ann --role create,touch --tokens tokens.toml > ann.token)\n  \
         palpate serve --listen 0.0.0.0:7117 --tls-cert server.pem --tls-key server.key --tokens tokens.toml\n  \
         palpate-client replay vertical-60 --server https://server:7117 --token-file ann.token\n\n\
-        The server prints its address to the standard output when it is ready. Ctrl-C or SIGTERM ends it: all streams end \
-        with the reason, and what remains after the deadline is cut.\n\n\
-        On a loopback address every caller may do everything. At any other address the server starts only with TLS and \
-        with tokens or client certificates, or with --insecure. A client sends its token with every call, as \
+        The server prints its address to the standard output when it is ready. Ctrl-C or SIGTERM ends it: all \
+        streams end with the reason, and the server cuts those that remain after the deadline.\n\n\
+        On a loopback address every caller may do everything. At any other address the server starts only with TLS \
+        and with tokens or client certificates, or with --insecure. A client sends its token with every call, as \
         `authorization: Bearer TOKEN`. Roles are watch, touch (hold a tool, change the tissue), create (create, \
-        start, pause and delete sessions) and administer (everything, including the list of sessions). Health, reflection \
-        and the page's files need no token; give the page one as in https://server:7117/#token=TOKEN.\n\n\
-        The server checks certificates, keys and tokens twice a second, and at once on SIGHUP. Valid changes apply at once \
-        to new connections and calls. Invalid files are logged and the old ones stay in use; for tokens, the health \
-        service `palpate.tokens` reports it.")]
+        start, pause and delete sessions) and administer (everything, including the list of sessions). Health, \
+        reflection and the page's files need no token; to give the page a token, open \
+        https://server:7117/#token=TOKEN.\n\n\
+        The server checks certificates, keys and tokens twice a second, and at once on SIGHUP. Valid changes take \
+        effect at once for new connections and calls. Invalid files are logged and the old ones stay in use; for \
+        tokens, the health service `palpate.tokens` reports it.")]
     Serve(Box<serve::ServeArguments>),
-    /// Work with the journals of sessions that `palpate serve --journal DIR` writes: list, show, verify, replay, draw, export,
+    /// Work with the journals that `palpate serve --journal DIR` writes: list, show, verify, replay, draw, export,
     /// cut and recover them
     #[command(after_help = "Examples:\n  \
         palpate journal list journals\n  \
@@ -116,24 +120,27 @@ enum ServerCommand {
         palpate journal cut journals/SESSION.1.mcap --from 20000 --to 30000 --output case.mcap\n  \
         palpate journal recover journals/SESSION.1.mcap\n  \
         palpate journal key journal.key\n\n\
-        A journal is an MCAP file, SESSION.RUN.mcap, one for each run of the server. It has the scene, every input with the step \
-        at which it acted, hashes, snapshots, and what the tools felt. The same inputs give the same bits, so `verify` tells \
-        whether they still do, and for how many steps a hash proves it. Only a signature proves that nobody has changed a file: `palpate journal key` and `palpate serve --journal-key` sign, `verify --signed-by` checks.\n\n\
+        A journal is an MCAP file, SESSION.RUN.mcap, one for each run of the server. It contains the scene, every \
+        input with the step at which it took effect, hashes, snapshots, and the places of the tools and the forces \
+        on them. The same inputs give the same bits; `verify` checks this, and reports the number of steps for which \
+        a hash proves it. Only a signature proves that nobody has changed a file: `palpate journal key` and `palpate \
+        serve --journal-key` sign, `verify --signed-by` checks.\n\n\
         Exit status: 0; 1 when a journal differs or a file can't be written; 2 when an input was refused.")]
     Journal(journal::JournalArguments),
     /// Create a token for clients of a server; prints the token once and stores only its hash
     #[command(after_help = "Examples:\n  \
         (umask 077; palpate token --name ann --role create,touch --tokens tokens.toml > ann.token)\n  \
         palpate token --name screen --role watch\n\n\
-        Roles: watch (every role includes it), touch (hold a tool, change the tissue), create (create, start, pause and \
-        delete sessions), administer (everything). `umask 077` keeps the file of a token from others who use this machine. To revoke a token, delete its entry; the server notices within 1 s.")]
+        Roles: watch (every role includes it), touch (hold a tool, change the tissue), create (create, start, pause \
+        and delete sessions), administer (everything). `umask 077` makes the file of a token unreadable for other \
+        users of this machine. To revoke a token, delete its entry; the server notices within 1 s.")]
     Token(token::TokenArguments),
-    /// Make a certificate and its key for trials with TLS: cert.pem and key.pem
+    /// Make a self-signed certificate and its key to try TLS: cert.pem and key.pem
     #[command(after_help = "Examples:\n  \
         palpate certificate\n  \
         palpate certificate server.example 192.0.2.7 --days 30\n\n\
-        The certificate signs itself: clients trust it by --ca cert.pem. For more than trials, use one of your own \
-        authority; docs/security.md has a recipe with openssl. Only the owner can read key.pem.\n\n\
+        The certificate is self-signed: clients trust it by --ca cert.pem. In production, use a certificate of your \
+        own authority; docs/security.md has a recipe with openssl. Only the owner can read key.pem.\n\n\
         Exit status: 0; 1 when a file can't be written; 2 when an input was refused, or a file exists already.")]
     Certificate(certificate::CertificateArguments),
     /// Show the sessions of a server once a second (`palpate-client top`)
@@ -143,7 +150,7 @@ enum ServerCommand {
         #[arg(trailing_var_arg = true, allow_hyphen_values = true)]
         arguments: Vec<std::ffi::OsString>,
     },
-    /// Show what each caller uses of a server, and free it (`palpate-client admin`)
+    /// Show the resources that each caller uses on a server, and release them (`palpate-client admin`)
     #[command(disable_help_flag = true, disable_help_subcommand = true)]
     Admin {
         /// See `palpate-client admin --help`

@@ -231,12 +231,12 @@ fn a_journal_of_empty_entries_takes_no_more_than_its_reader_pays_for() {
 
 /// A snapshot with other parts.
 fn snapshot(parts: &[u8]) -> Vec<u8> {
-    let mut bytes = saved::MAGIC.to_vec();
-    bytes.extend(saved::VERSION.to_le_bytes());
+    let mut bytes = snapshot::MAGIC.to_vec();
+    bytes.extend(snapshot::VERSION.to_le_bytes());
     bytes.extend((parts.len() as u64).to_le_bytes());
     bytes.extend([0; 16]);
     bytes.extend(parts);
-    saved::seal(&mut bytes);
+    snapshot::seal(&mut bytes);
     bytes
 }
 
@@ -251,7 +251,7 @@ fn a_snapshot_takes_no_more_than_its_header_says() {
     let mut try_one = |parts: &[u8]| {
         let bytes = snapshot(parts);
         let (_, took) = counted(|| Saved::from_bytes(&bytes, &Limits::default()).map(drop));
-        assert!(took as u64 <= saved::memory_of(&bytes) + SLACK as u64, "{} bytes took {took}", bytes.len());
+        assert!(took as u64 <= snapshot::memory_of(&bytes) + SLACK as u64, "{} bytes took {took}", bytes.len());
         most = most.max(took.saturating_sub(4 << 20) as f64 / bytes.len() as f64);
     };
     // A list in the place of each byte, as long as there are bytes; a million tools are the first.

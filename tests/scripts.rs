@@ -45,7 +45,7 @@ fn range_mm(records: &[serde_json::Value]) -> [f64; 2] {
 fn every_shipped_script_fits_the_scenes_that_it_is_made_for_and_says_so_elsewhere() {
     for (name, text) in BUILT_IN {
         let made_for: Vec<&str> =
-            scene::BUILT_IN.iter().map(|scene| scene.0).filter(|scene| reader::fits(text, scene)).collect();
+            scene::BUILT_IN.iter().map(|scene| scene.0).filter(|scene| script_reader::fits(text, scene)).collect();
         assert!(!made_for.is_empty() && made_for.len() < scene::BUILT_IN.len(), "{name}: {made_for:?}");
         // Those of sheets name points by row and column.
         for (scene, _) in scene::BUILT_IN.into_iter().filter(|scene| scene.1.contains("[sheet]")) {
@@ -54,7 +54,7 @@ fn every_shipped_script_fits_the_scenes_that_it_is_made_for_and_says_so_elsewher
             assert_eq!(warned, !made_for.contains(&scene), "{name} on {scene}: {warnings:?}");
         }
     }
-    assert!(reader::fits("no TOML [", "liver") && reader::fits("duration_s = 1.0", "liver"));
+    assert!(script_reader::fits("no TOML [", "liver") && reader::fits("duration_s = 1.0", "liver"));
 }
 
 #[test]

@@ -112,32 +112,30 @@ pub const KINDS: &[AttackKind] = &[
     kind("endless-scene", "scenes of four points that ask for 1 substep and need 2³²", |g| {
         Box::pin(cpu::endless_scene(g))
     }),
-    kind("big-law", "force laws of a sheet of 331² that hardly anything holds back", |g| Box::pin(cpu::big_law(g))),
+    kind("big-law", "force laws of a sheet of 331² with very weak anchor springs", |g| Box::pin(cpu::big_law(g))),
     // Somebody stands still.
-    kind("stall-server", "the server stands still for 5 s", |g| Box::pin(bytes::stall_server(g, 5.0))),
+    kind("stall-server", "the server stops for 5 s", |g| Box::pin(bytes::stall_server(g, 5.0))),
     AttackKind {
         round_trip_ms: 50,
         ..kind("stall-server-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_server(g, 5.0)))
     },
     AttackKind {
         tools: 16,
-        ..kind("stall-server-16", "the server stands still for 1 s, under 16 tools", |g| {
-            Box::pin(bytes::stall_server(g, 1.0))
-        })
+        ..kind("stall-server-16", "the server stops for 1 s, with 16 tools", |g| Box::pin(bytes::stall_server(g, 1.0)))
     },
     AttackKind {
         tools: 16,
         round_trip_ms: 50,
         ..kind("stall-server-16-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_server(g, 1.0)))
     },
-    kind("stall-client", "the honest client stands still for 5 s", |g| Box::pin(bytes::stall_client(g, 5.0))),
+    kind("stall-client", "the honest client stops for 5 s", |g| Box::pin(bytes::stall_client(g, 5.0))),
     AttackKind {
         round_trip_ms: 50,
         ..kind("stall-client-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_client(g, 5.0)))
     },
     AttackKind {
         tools: 16,
-        ..kind("stall-client-16", "the honest client stands still for 1 s, with 16 tools", |g| {
+        ..kind("stall-client-16", "the honest client stops for 1 s, with 16 tools", |g| {
             Box::pin(bytes::stall_client(g, 1.0))
         })
     },
@@ -147,27 +145,25 @@ pub const KINDS: &[AttackKind] = &[
         ..kind("stall-client-16-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_client(g, 1.0)))
     },
     // What one call makes the server do.
-    kind("fixed-positions", "4096 positions a call to a sheet with 500,000 fixed points", |g| {
+    kind("fixed-positions", "4096 positions per call to a sheet with 500,000 fixed points", |g| {
         Box::pin(cpu::fixed_positions(g))
     }),
-    kind("empty-commands", "500,000 empty commands a call", |g| Box::pin(cpu::empty_commands(g))),
+    kind("empty-commands", "500,000 empty commands per call", |g| Box::pin(cpu::empty_commands(g))),
     // A token that is not one any more.
     kind(
         "revoked-unread",
-        "commands by a token that was struck out, reading nothing (counted: taken 2 s after)",
+        "commands with a revoked token, without reading (counted: accepted more than 2 s after the revocation)",
         |g| Box::pin(slots::revoked_unread(g)),
     ),
     // Memory.
-    kind(
-        "tissue-changes",
-        "changes of a tissue with 500,000 fixed points, that wait for a step that never comes",
-        |g| Box::pin(memory::tissue_changes(g)),
-    ),
+    kind("tissue-changes", "changes of a tissue with 500,000 fixed points, for a step that never comes", |g| {
+        Box::pin(memory::tissue_changes(g))
+    }),
     kind("fixed-sessions", "sessions with 500,000 fixed points each", |g| Box::pin(memory::fixed_sessions(g))),
     kind("unread-viewers", "139 viewers of 186² at refinement 10 that read nothing", |g| {
         Box::pin(memory::unread_viewers(g))
     }),
-    kind("waiting-commands", "64 tools with 4096 commands each that wait, in one session after the other", |g| {
+    kind("waiting-commands", "64 tools with 4096 waiting commands each, in one session after the other", |g| {
         Box::pin(memory::waiting_commands(g))
     }),
     kind("thin-sheet", "a sheet of 4,194,304 × 1, all of it awake", |g| Box::pin(memory::thin_sheet(g))),
@@ -189,22 +185,22 @@ pub const KINDS: &[AttackKind] = &[
     kind("polling", "GetSession again and again while 262,144 commands wait", |g| Box::pin(cpu::polling(g))),
     kind("hash-1024", "the hash of a sheet of 1024², eight times a second", |g| Box::pin(cpu::hashes(g))),
     kind("page-gets", "GETs of the page without waiting for answers", |g| Box::pin(bytes::page_gets(g))),
-    kind("flood-window-update", "WINDOW_UPDATE frames as fast as they go", |g| {
+    kind("flood-window-update", "WINDOW_UPDATE frames as fast as possible", |g| {
         Box::pin(bytes::frames(g, &bytes::WINDOW_UPDATE))
     }),
-    kind("flood-priority", "PRIORITY frames as fast as they go", |g| Box::pin(bytes::frames(g, &bytes::PRIORITY))),
-    kind("flood-ping", "PING frames as fast as they go", |g| Box::pin(bytes::frames(g, &bytes::PING))),
-    kind("flood-settings", "SETTINGS frames as fast as they go", |g| Box::pin(bytes::frames(g, &bytes::SETTINGS))),
-    kind("datagram-noise", "UDP packets of random bytes as fast as they go", |g| {
+    kind("flood-priority", "PRIORITY frames as fast as possible", |g| Box::pin(bytes::frames(g, &bytes::PRIORITY))),
+    kind("flood-ping", "PING frames as fast as possible", |g| Box::pin(bytes::frames(g, &bytes::PING))),
+    kind("flood-settings", "SETTINGS frames as fast as possible", |g| Box::pin(bytes::frames(g, &bytes::SETTINGS))),
+    kind("datagram-noise", "UDP packets of random bytes as fast as possible", |g| {
         Box::pin(datagrams::packets(g, false))
     }),
-    kind("datagram-beginnings", "UDP packets that look like the first of a handshake, as fast as they go", |g| {
+    kind("datagram-beginnings", "UDP packets that look like the first of a handshake, as fast as possible", |g| {
         Box::pin(datagrams::packets(g, true))
     }),
     kind("datagram-tickets", "datagram sessions with forged tickets, 32 at a time", |g| {
         Box::pin(datagrams::forged_tickets(g))
     }),
-    kind("datagram-chatter", "a datagram session that says a hundred times what it may", |g| {
+    kind("datagram-chatter", "a datagram session that sends a hundred times the allowed rate", |g| {
         Box::pin(datagrams::chatter(g))
     }),
     kind("stalled-viewer", "a viewer that asks for 1000 full frames a second and reads none", |g| {
@@ -216,13 +212,15 @@ pub const KINDS: &[AttackKind] = &[
     // What tools and meshes cost.
     kind("tip-strip", "64 tips of half of a sheet of 2000 × 1, again and again", |g| Box::pin(tools::strip(g, 2000))),
     kind("tip-strip-60000", "the same on 60,000 × 1", |g| Box::pin(tools::strip(g, 60_000))),
-    kind("tips-organ", "64 tips of 25 mm that press a gallbladder and go", |g| {
+    kind("tips-organ", "64 tips of 25 mm that press a gallbladder and are released", |g| {
         Box::pin(tools::organ(g, "gallbladder", 0.025, false))
     }),
-    kind("tips-organ-small", "64 tips of 5 mm that do so", |g| Box::pin(tools::organ(g, "gallbladder", 0.005, false))),
+    kind("tips-organ-small", "64 tips of 5 mm that press a gallbladder and are released", |g| {
+        Box::pin(tools::organ(g, "gallbladder", 0.005, false))
+    }),
     kind("grasps-organ", "64 grasps of 5 mm that pull a liver", |g| Box::pin(tools::organ(g, "liver", 0.005, true))),
     kind("grasps-sheet", "64 grasps of 10 mm that pull at the same points of 60²", |g| Box::pin(tools::grasps(g, 60))),
-    kind("touch-again", "64 tools that let go of a sheet and touch it again with another tip", |g| {
+    kind("touch-again", "64 tools that release a sheet and touch it again with another tip", |g| {
         Box::pin(tools::touch_again(g))
     }),
     kind("wide-pushes", "64 forces on all points of 100²", |g| Box::pin(tools::wide_pushes(g))),
@@ -232,7 +230,7 @@ pub const KINDS: &[AttackKind] = &[
     kind("mesh-hub-coarse", "the same with mesh.vertices = 500", |g| Box::pin(meshes::hub(g, Some(500)))),
     kind("mesh-nested", "4000 tetrahedra, each within the next", |g| Box::pin(meshes::nested(g, true))),
     kind("mesh-overlaid", "4000 tetrahedra in one place", |g| Box::pin(meshes::nested(g, false))),
-    kind("mesh-unused", "20,000 vertices that no triangle has", |g| Box::pin(meshes::unused_vertices(g))),
+    kind("mesh-unused", "20,000 vertices that no triangle uses", |g| Box::pin(meshes::unused_vertices(g))),
     kind("mesh-empty-accessor", "a glTF file of 300 bytes with 10,000,000 vertices", |g| {
         Box::pin(meshes::empty_accessor(g))
     }),
@@ -241,14 +239,14 @@ pub const KINDS: &[AttackKind] = &[
     kind("kept-leases", "every other tool of the honest client's session taken for 600 s, then hung up", |g| {
         Box::pin(slots::kept_leases(g))
     }),
-    kind("all-slots", "as many sessions as there may be", |g| Box::pin(slots::all_slots(g))),
+    kind("all-slots", "as many sessions as allowed", |g| Box::pin(slots::all_slots(g))),
     AttackKind {
         descriptors: Some(1024),
         ..kind("descriptors", "1500 connections without a token, to a server that may open 1024 files", |g| {
             Box::pin(slots::connections(g, bytes::GREETING))
         })
     },
-    kind("half-open", "1000 connections that say nothing", |g| Box::pin(slots::connections(g, b""))),
+    kind("half-open", "1000 connections that send nothing", |g| Box::pin(slots::connections(g, b""))),
 ];
 
 /// The attack of that name.

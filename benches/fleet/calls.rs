@@ -84,9 +84,9 @@ async fn measured(report: &mut BenchReport) {
     }
     report.heading("Calls");
     report.say(&format!(
-        "{rounds} of each, through three servers in turn, and in between to one server without a fleet that also keeps journals. A \
-         creation at a server that has less room than another goes on to that. `LocateSession` is beside `GetSession` of the server \
-         without a fleet: it asks etcd."
+        "{rounds} calls of each kind, to three servers in turn, and in between to one server without a fleet that also keeps \
+         journals. A server with less room forwards a creation to one with more. `LocateSession` asks etcd; the table \
+         compares it with `GetSession` of the server without a fleet."
     ));
     let header = cells([
         "call",

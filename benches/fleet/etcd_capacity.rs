@@ -125,9 +125,9 @@ async fn measured(report: &mut BenchReport) -> Panel {
     let etcd = EtcdMembers::start_with(1, crate::etcd::DEFAULT_TIMES, &["--quota-backend-bytes=8589934592"], |_| None);
     let keys = Keys::of("default").unwrap();
     let own = client(&etcd);
-    report.heading("What etcd bears");
+    report.heading("The capacity of etcd");
     report.say(&format!(
-        "One member of etcd, as it comes, on this machine's disk, which it waits for at each write: {AT_ONCE} calls at once by \
+        "One etcd member with default settings, syncing each write to this machine's disk: {AT_ONCE} calls at once by \
          {CLIENTS} clients."
     ));
     // The nodes that the transactions ask for.
@@ -170,9 +170,9 @@ async fn measured(report: &mut BenchReport) -> Panel {
         }
     }
     report.say(&format!(
-        "A session is one key: {} bytes of the database, so {} MB for 10⁵ sessions, and as much again for each change until etcd \
-         compacts. After three changes of {sessions} sessions etcd has {} MiB in memory. All {nodes} nodes are listed in {} ms, all \
-         {sessions} sessions in {} ms.",
+        "A session is one key: {} bytes of the database, so {} MB for 10⁵ sessions, and as much again for each change until \
+         etcd compacts. After three changes of {sessions} sessions etcd uses {} MiB of memory. Listing all {nodes} nodes \
+         takes {} ms, listing all {sessions} sessions {} ms.",
         digits(bytes_each),
         digits(bytes_each * 0.1),
         digits(resident_mib),
@@ -180,9 +180,9 @@ async fn measured(report: &mut BenchReport) -> Panel {
         digits(listing[1].median()),
     ));
     let followed = follow(&etcd, &keys, if quick() { &[1, 5, 20] } else { &[1, 10, 100, 300, 1000] }).await;
-    report.say("A node tells what it has to do, and all others that watch get it:");
+    report.say("A node publishes its load; the table has the time until every watching node has received it:");
     let header =
-        cells(["nodes that watch", "till the last has it: p50, ms", "p99, ms", "etcd, µs for each that gets it"]);
+        cells(["nodes that watch", "time until the last has it: p50, ms", "p99, ms", "etcd, µs for each receiver"]);
     let rows: Vec<_> = followed
         .iter()
         .map(|(count, times, each_us)| {
@@ -206,9 +206,9 @@ async fn measured(report: &mut BenchReport) -> Panel {
         points: followed.iter().map(|(count, times, _)| (*count as f64, times.quantile(quantile))).collect(),
     };
     Panel::Lines {
-        title: "Till all nodes know".to_owned(),
+        title: "Time until all nodes know".to_owned(),
         x: "nodes that watch",
-        y: "ms after a node has told",
+        y: "ms after a node has published",
         series: vec![line("p50", 3, 0.5), line("p99", 4, 0.99)],
     }
 }

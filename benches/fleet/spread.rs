@@ -54,9 +54,9 @@ async fn measured(report: &mut BenchReport) {
         eprintln!("{} of {count} sessions", made.load(Ordering::Relaxed).min(count));
     }
     let took_s = begun.elapsed().as_secs_f64();
-    report.heading("Where sessions go");
+    report.heading("Placement of sessions");
     report.say(&format!(
-        "{count} sessions that nobody touches, by {AT_ONCE} clients at once, two at each of three servers: {} a second.",
+        "{AT_ONCE} clients, two at each of three servers, create {count} sessions that nobody touches: {} a second.",
         digits(count as f64 / took_s)
     ));
     let (mut rows, mut most) = (Vec::new(), 0.0_f64);
@@ -71,8 +71,8 @@ async fn measured(report: &mut BenchReport) {
         rows.push(cells([node.name.clone(), sessions.to_string(), format!("{off_percent:+.1} %"), digits(kib)]));
     }
     assert_eq!(has.iter().sum::<usize>(), count, "none is lost");
-    report.table(&cells(["server", "sessions", "off even", "memory for each, KiB"]), &rows);
-    report.say(&format!("The largest deviation from even is {most:.1} %."));
+    report.table(&cells(["server", "sessions", "deviation from equal", "memory for each, KiB"]), &rows);
+    report.say(&format!("The largest deviation from equal shares is {most:.1} %."));
     report
         .figure("spread", json!({ "sessions": has, "off_even_percent": most, "created_per_s": count as f64 / took_s }));
 }

@@ -49,9 +49,9 @@ pub fn measure(report: &mut BenchReport) -> Option<Panel> {
     }
     report.heading("Steps");
     report.say(&format!(
-        "{clients} haptic clients, each at 1 kHz in a session of its own, at one server (one stepping thread) that is kept to one core; \
-         the clients, etcd and the server that stands by are on the others. The median of {rounds} runs of {seconds} s, the ways in \
-         turn."
+        "{clients} haptic clients, each at 1 kHz in its own session, at one server (one stepping thread) that is limited to \
+         one core; the clients, etcd and the stand-by server use the other cores. Medians of {rounds} runs of {seconds} s, \
+         with the three setups in turn."
     ));
     let median = |runs: &[WayRun], of: fn(&WayRun) -> f64| FleetTimes(runs.iter().map(of).collect()).median();
     let header = cells([
@@ -62,7 +62,7 @@ pub fn measure(report: &mut BenchReport) -> Option<Panel> {
         "round trip p50, ms",
         "p99, ms",
         "p99 × one server",
-        "server that stands by, cores",
+        "stand-by server, cores",
         "etcd, cores",
     ]);
     let (mut rows, mut series) = (Vec::new(), Vec::new());
@@ -86,7 +86,7 @@ pub fn measure(report: &mut BenchReport) -> Option<Panel> {
     }
     report.table(&header, &rows);
     let most = series.iter().flat_map(|line| line.points.iter().map(|at| at.1)).fold(0.0, f64::max);
-    let (title, x, y) = ("What a step costs".to_owned(), "run", "µs of a stepping thread");
+    let (title, x, y) = ("Cost of a step".to_owned(), "run", "µs of a stepping thread");
     Some(Panel::Curves { title, x, y, up: 0.0..1.2 * most, series })
 }
 

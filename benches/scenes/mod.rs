@@ -34,7 +34,7 @@ impl Case {
 pub const CASES: [Case; 9] = [
     Case {
         name: "gentle",
-        about: "the paper's sheet, 0.3 N over several points, swelling and staying",
+        about: "the paper's sheet, 0.3 N over several points, which grow and then stay",
         scene: "paper",
         assignments: &[],
         sample_points: "[[15, 15], [16, 15], [17, 17], [20, 15]]",
@@ -49,7 +49,7 @@ pub const CASES: [Case; 9] = [
     },
     Case {
         name: "paper",
-        about: "the paper's sheet, 3 N straight down on its centre at once, let go after 0.4 s",
+        about: "the paper's sheet, a sudden force of 3 N straight down on its centre, released after 0.4 s",
         scene: "paper",
         assignments: &[],
         sample_points: "[[15, 15], [16, 15], [17, 17], [20, 15]]",
@@ -64,7 +64,7 @@ pub const CASES: [Case; 9] = [
     },
     Case {
         name: "stiff",
-        about: "k = 1e4 N/m on 15 × 15 points, 0.5 N at a slant, at once and staying",
+        about: "k = 1e4 N/m on 15 × 15 points, a sudden oblique force of 0.5 N that stays",
         scene: "paper",
         assignments: &["sheet.points=[15, 15]", "springs.stiffness_n_per_m=1e4"],
         sample_points: "[[7, 7], [8, 7], [9, 9], [3, 7]]",
@@ -79,7 +79,7 @@ pub const CASES: [Case; 9] = [
     },
     Case {
         name: "overdamped",
-        about: "points of 0.1 g, so that C·dt/m = 5 at 1 ms; 0.5 N at a slant, let go after 0.4 s",
+        about: "points of 0.1 g, so that C·dt/m = 5 at 1 ms; an oblique force of 0.5 N, released after 0.4 s",
         scene: "paper",
         assignments: &["sheet.points=[19, 19]", "sheet.point_mass_kg=1e-4"],
         sample_points: "[[9, 9], [10, 9], [11, 11], [14, 9]]",
@@ -94,7 +94,7 @@ pub const CASES: [Case; 9] = [
     },
     Case {
         name: "undamped",
-        about: "C = 0 on 15 × 15 points: what a push of 0.08 s leaves swings on (the paper's scheme is then central differences)",
+        about: "C = 0 on 15 × 15 points: the sheet swings after a push of 0.08 s (the paper's scheme is then central differences)",
         scene: "paper",
         assignments: &["sheet.points=[15, 15]", "damping.coefficient_n_s_per_m=0"],
         sample_points: "[[7, 7], [8, 7], [9, 9], [3, 7]]",
@@ -146,7 +146,7 @@ pub const CASES: [Case; 9] = [
     },
     Case {
         name: "gallbladder",
-        about: "`gallbladder` with edges of 3 mm; 0.5 N at a slant over several vertices at once, let go after 0.4 s",
+        about: "`gallbladder` with edges of 3 mm; a sudden oblique force of 0.5 N over several vertices, released after 0.4 s",
         scene: "gallbladder",
         assignments: &["mesh.organ.edge_m=0.003"],
         sample_points: "[739, 626, 656, 738]",
@@ -161,7 +161,7 @@ pub const CASES: [Case; 9] = [
     },
     Case {
         name: "liver-organ",
-        about: "`liver-organ` with edges of 6 mm; 1 N on a vertex of its larger lump, swelling and staying",
+        about: "`liver-organ` with edges of 6 mm; 1 N on a vertex of its larger lump, which grows and then stays",
         scene: "liver-organ",
         assignments: &["mesh.organ.edge_m=0.006"],
         sample_points: "[1425, 1359, 1394, 1426]",

@@ -17,7 +17,7 @@ pub(crate) struct CertificateArguments {
     /// Folder for cert.pem and key.pem
     #[arg(long, value_name = "DIR", default_value = ".")]
     dir: PathBuf,
-    /// Days until it expires
+    /// Days until the certificate expires
     #[arg(long, value_name = "N", default_value_t = 90, value_parser = clap::value_parser!(u16).range(1..=825))]
     days: u16,
     /// Overwrite cert.pem and key.pem

@@ -25,10 +25,10 @@ pub(crate) struct MeshArguments {
     /// Write the report as JSON
     #[arg(long)]
     json: bool,
-    /// Repair what can be repaired, and report what was done
+    /// Repair the mesh as far as possible, and report the repairs
     #[arg(long)]
     repair: bool,
-    /// Make it coarser: at most so many vertices, 4 or more
+    /// Make it coarser: at most this many vertices, 4 or more
     #[arg(long, value_name = "N")]
     vertices: Option<usize>,
     /// Write the mesh to a file that ends in .obj, .stl or .ply; its lengths are metres

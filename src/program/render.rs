@@ -22,7 +22,7 @@ pub(crate) struct RenderArguments {
     /// The moment to draw, s, rounded to a step [default: the sample time with the largest displacement]
     #[arg(long, value_name = "SECONDS")]
     at_s: Option<f64>,
-    /// The moment to draw, steps done
+    /// The moment to draw, as the number of steps done
     #[arg(long, value_name = "STEP", conflicts_with = "at_s")]
     at: Option<u64>,
     /// Show the mesh instead of the texture

@@ -15,7 +15,7 @@ use super::{Failure, load_config, log};
 
 #[derive(clap::Args)]
 pub(crate) struct ServeArguments {
-    /// Where to listen; port 0 takes a free one [default: 127.0.0.1:7117]
+    /// Address to listen on; port 0 takes a free one [default: 127.0.0.1:7117]
     #[arg(long, value_name = "ADDRESS:PORT")]
     listen: Option<String>,
     /// The server's certificate chain (PEM); enables TLS
@@ -48,7 +48,7 @@ pub(crate) struct ServeArguments {
     /// Folder of the scenes that clients can create sessions from by name [default: scenes]
     #[arg(long, value_name = "DIR")]
     scenes: Option<PathBuf>,
-    /// Folder of the scripts that clients can ask for by name [default: scripts]
+    /// Folder of the scripts that clients can read by name [default: scripts]
     #[arg(long, value_name = "DIR")]
     scripts: Option<PathBuf>,
     /// Folder of the page that `/` serves, built by `npm run build` in clients/viewer [default: clients/viewer/dist]
@@ -63,19 +63,19 @@ pub(crate) struct ServeArguments {
     /// Fraction of a core for measuring the errors of live sessions; 0 disables that [default: 0.02]
     #[arg(long, value_name = "FRACTION")]
     audit_share: Option<f64>,
-    /// Keep a journal of each session in this folder: after a crash or an upgrade the server continues them [default: off]
+    /// Keep a journal of each session in this folder: after a crash or an upgrade the server continues the sessions
+    /// [default: off]
     #[arg(long, value_name = "DIR")]
     journal: Option<PathBuf>,
-    /// How long to keep the journals of sessions that have ended, and how many bytes all journals may take before the oldest of
-    /// these are removed: 30d, 12h, 10GiB, both, or 0 to keep none [default: 30d,10GiB]
+    /// Time to keep the journals of ended sessions, and the size of all journals beyond which the server removes the
+    /// oldest of these: 30d, 12h, 10GiB, both, or 0 to keep none [default: 30d,10GiB]
     #[arg(long, value_name = "AGE,BYTES", requires = "journal")]
     journal_keep: Option<palpate::server::Keep>,
-    /// Whether sessions have journals if a client has sent their mesh: a journal contains it. Without one, such a session ends with
-    /// the server [default: true]
+    /// Whether sessions on a mesh from a client have journals, which contain the mesh; without a journal such a
+    /// session ends with the server [default: true]
     #[arg(long, value_name = "true|false", requires = "journal", action = clap::ArgAction::Set)]
     journal_meshes: Option<bool>,
-    /// Sign the journals with this key (PEM), which `palpate journal key` makes: `verify --signed-by` then tells whether somebody has
-    /// changed one
+    /// Sign the journals with this key (PEM) from `palpate journal key`: `verify --signed-by` then detects changes
     #[arg(long, value_name = "FILE")]
     journal_key: Option<PathBuf>,
     /// Join a fleet: URLs of the members of etcd, such as http://etcd:2379. Needs --journal and --advertise
@@ -90,23 +90,26 @@ pub(crate) struct ServeArguments {
     /// Name of the fleet [default: default]
     #[arg(long, value_name = "NAME")]
     cluster_name: Option<String>,
-    /// Certificate authorities (PEM) of the servers of the fleet, which show each other --tls-cert; other clients need none
+    /// Certificate authorities (PEM) of the servers of the fleet, which present --tls-cert to each other; other
+    /// clients need no certificate
     #[arg(long, value_name = "FILE")]
     cluster_ca: Option<PathBuf>,
-    /// What `durable_step` means in a fleet: on the disk of the server, or also on its standby's [default: one]
+    /// Meaning of `durable_step` in a fleet: on the disk of the server (one), or also on that of its stand-by server
+    /// (two) [default: one]
     #[arg(long, value_name = "SERVERS")]
     durable: Option<palpate::server::Durable>,
     /// Report the server's state to Agones: ready, its sessions, drained. For a server of a fleet in a pod of Agones
     #[arg(long)]
     agones: bool,
-    /// Time that streams get to end at shutdown before they are cut, s [default: 5]
+    /// Time for streams to end at shutdown before the server cuts them, s [default: 5]
     #[arg(long, value_name = "SECONDS")]
     shutdown_deadline_s: Option<f64>,
     /// Memory that the server may use for all callers together, such as 512MiB or 2GiB [default: half of the machine's, or
     /// of its control group's]
     #[arg(long, value_name = "BYTES", value_parser = budget::parse_bytes)]
     memory: Option<u64>,
-    /// What to log to the standard error: error, warn, info, debug, or palpate=debug,tonic=warn, … [default: info]
+    /// Level of the log on the standard error: error, warn, info, debug, or palpate=debug,tonic=warn, … [default:
+    /// info]
     #[arg(long, value_name = "FILTER")]
     log: Option<String>,
     /// Log as JSON Lines

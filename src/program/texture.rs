@@ -10,7 +10,7 @@ use super::{Failure, write_file};
 
 #[derive(clap::Args)]
 pub(crate) struct TextureArguments {
-    /// What it shows: mucosa, liver, nodular or serosa (a gallbladder)
+    /// Kind of surface: mucosa, liver, nodular or serosa (a gallbladder)
     #[arg(long, value_name = "NAME", default_value = "mucosa")]
     surface: String,
     /// Seed of the texture, an integer

@@ -64,6 +64,39 @@ const WORTH_GIVING_BACK: u64 = 16 << 20;
 /// deadline. `ready` is called when all that can be refused at the beginning is there: the journals, the sessions of the server
 /// before this one, the fleet. The caller must end its runtime without waiting (`shutdown_background`).
 ///
+/// A server on any free port, and a client that asks what it serves. Both end within the example:
+///
+/// ```
+/// use palpate::server::config::Config;
+/// use palpate::server::{Listeners, serve};
+/// use palpate_client::{Credentials, Server};
+/// use palpate_proto::pb;
+/// use pb::session_service_client::SessionServiceClient;
+/// use tokio_util::sync::CancellationToken;
+///
+/// let config = Config { listen: "127.0.0.1:0".to_owned(), threads: 1, datagrams: false, ..Config::default() };
+/// let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+/// let created = runtime.block_on(async {
+///     let listeners = Listeners::open(&config).await?;
+///     let (url, shutdown) = (listeners.url(), CancellationToken::new());
+///     let client = async {
+///         let channel = Server::new(&url, &Credentials::default())?.connect().await?;
+///         let source = pb::create_session_request::Source::SceneName("paper".to_owned());
+///         let request = pb::CreateSessionRequest { source: Some(source), ..Default::default() };
+///         let answer = SessionServiceClient::new(channel).create_session(request).await;
+///         shutdown.cancel();
+///         Ok::<_, Box<dyn std::error::Error>>(answer?.into_inner().session)
+///     };
+///     let (served, created) = tokio::join!(serve(listeners, config, shutdown.clone(), Box::new(|| {})), client);
+///     served?;
+///     created
+/// })?;
+/// runtime.shutdown_background();
+/// let session = created.expect("a session of the built-in scene");
+/// assert_eq!((session.scene_name.as_str(), session.idle_timeout_s), ("paper", 900.0));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+///
 /// # Errors
 /// Returns an error if a thread can't be started, if the journals or the fleet can't be used, or if the transport fails.
 pub fn serve(

@@ -95,6 +95,23 @@ impl Interceptor for Bearer {
 }
 
 /// A server's address and how to connect to it.
+///
+/// The URL tells how to connect, and nothing is sent yet. A token is not sent in the clear to another machine:
+///
+/// ```
+/// use palpate_client::{Credentials, Server, Token};
+///
+/// let here = Server::new("127.0.0.1:7117", &Credentials::default())?;
+/// assert_eq!((here.url(), here.host()), ("http://127.0.0.1:7117", "127.0.0.1"));
+///
+/// let credentials = Credentials { token: Some(Token::new("of-a-surgeon")?), ..Credentials::default() };
+/// let error = Server::new("http://server.example:7117", &credentials).expect_err("it has no TLS");
+/// assert!(error.is_refusal());
+/// println!("{error}");
+/// # Ok::<(), palpate_client::Error>(())
+/// ```
+///
+/// With a server there, `here.connect().await?` is a channel for the clients of `palpate_proto::pb`.
 #[derive(Clone)]
 pub struct Server {
     url: String,

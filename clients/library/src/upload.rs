@@ -21,6 +21,15 @@ fn parts(file: &[u8]) -> impl Iterator<Item = (u64, Vec<u8>, bool)> {
 /// Sends the file of a mesh; `unit` is what a length of 1 in it is: "m", "cm", "mm" or so many metres. The answer has the
 /// `mesh_id` for `Scene.mesh`, and a report that tells whether the mesh can be used.
 ///
+/// ```no_run
+/// # async fn example(channel: palpate_client::Channel) -> Result<(), Box<dyn std::error::Error>> {
+/// let file = std::fs::read("kidney.stl")?;
+/// let sent = palpate_client::upload::upload_mesh(channel, "kidney.stl", &file, "mm", true).await?;
+/// println!("mesh {}: {:?}", sent.mesh_id, sent.report);
+/// # Ok(())
+/// # }
+/// ```
+///
 /// # Errors
 /// Returns the server's refusal, or how the connection broke.
 pub async fn upload_mesh(

@@ -15,6 +15,22 @@ pub struct Frames {
 }
 
 /// The displacement of a surface from rest. A frame changes parts of it.
+///
+/// A part of a frame says where two vertices of a surface of 1 × 2 are; the second is 2 mm deep:
+///
+/// ```
+/// use palpate_client::view::SurfaceState;
+/// use palpate_proto::pb;
+///
+/// let floats = [0.0_f32, 0.0, 0.0, 0.0, 0.0, -0.002];
+/// let displacement: Vec<u8> = floats.iter().flat_map(|value| value.to_le_bytes()).collect();
+/// let patch = pb::Patch { first_x: 0, first_y: 0, count_x: 1, count_y: 2, displacement: displacement.into() };
+/// let part = pb::WatchFramesResponse { vertices_x: 1, vertices_y: 2, patches: vec![patch], ..Default::default() };
+/// let mut surface = SurfaceState::default();
+/// surface.write(&part)?;
+/// assert_eq!(surface.displacement_m, [[0.0, 0.0, 0.0], [0.0, 0.0, -0.002]]);
+/// # Ok::<(), String>(())
+/// ```
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SurfaceState {
     /// Vertices along x and along y.

@@ -7,6 +7,21 @@ use tonic::{Status, Streaming};
 use crate::connect::Channel;
 
 /// The samples of a session. The stream ends when this is dropped.
+///
+/// ```no_run
+/// use palpate_client::watch::Samples;
+/// use palpate_proto::pb;
+///
+/// # async fn example(channel: palpate_client::Channel, session_id: String) -> Result<(), tonic::Status> {
+/// // A sample of every tenth step: 100 a second of a session at 1 kHz.
+/// let request = pb::WatchSamplesRequest { session_id, sample_every_steps: Some(10), ..Default::default() };
+/// let mut samples = Samples::open(channel, request).await?;
+/// while let Some(sample) = samples.next().await? {
+///     println!("{:.3} s: {} tools", sample.simulation_time_s, sample.tools.len());
+/// }
+/// # Ok(())
+/// # }
+/// ```
 #[derive(Debug)]
 pub struct Samples {
     samples: Streaming<pb::WatchSamplesResponse>,

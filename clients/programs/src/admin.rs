@@ -23,30 +23,30 @@ pub(crate) struct AdminArguments {
 
 #[derive(clap::Subcommand)]
 enum AdminAction {
-    /// Show what each caller uses: memory, sessions, streams, tools, recent processor time
+    /// Show the resources that each caller uses: memory, sessions, streams, tools, recent processor time
     Callers,
     /// Show the streams of a session: number, caller, age
     Streams {
-        /// As `palpate-client top` shows it
+        /// The session's ID, from `palpate-client top`
         session: String,
     },
-    /// Release a tool whoever holds it; its action ends at the next step
+    /// Release a tool, no matter which caller holds it; its effect ends at the next step
     FreeTool {
-        /// As `palpate-client top` shows it
+        /// The session's ID, from `palpate-client top`
         session: String,
         /// The tool's number
         tool: u32,
     },
     /// End a stream and release the tools that it holds
     CutStream {
-        /// As `palpate-client top` shows it
+        /// The session's ID, from `palpate-client top`
         session: String,
-        /// As `streams` shows it
+        /// The stream's number, from `streams`
         number: u64,
     },
     /// End all streams of a caller, release its tools and close its connections; it can come back while its token is valid
     CutCaller {
-        /// As `callers` shows it: token:NAME or address:IP
+        /// The caller's name, from `callers`: token:NAME or address:IP
         caller: String,
         /// Also delete the sessions that it created
         #[arg(long)]
@@ -54,17 +54,17 @@ enum AdminAction {
     },
     /// Recover a session in state HELD: paused at its step, the tissue at rest, all tools released
     Revive {
-        /// As `palpate-client top` shows it
+        /// The session's ID, from `palpate-client top`
         session: String,
     },
-    /// Remove the journals of a session that has ended, and with them its mesh and all that was done to it
+    /// Remove the journals of a session that has ended, with its mesh and all its inputs
     DeleteJournal {
-        /// As `palpate journal list` shows it
+        /// The session's ID, from `palpate journal list`
         session: String,
     },
     /// Delete a session and end all its streams
     Delete {
-        /// As `palpate-client top` shows it
+        /// The session's ID, from `palpate-client top`
         session: String,
     },
 }

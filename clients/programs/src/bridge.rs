@@ -33,8 +33,9 @@ pub(crate) struct BridgeArguments {
     /// The tool's number
     #[arg(long, default_value_t = 0)]
     tool: u32,
-    /// The device: force-dimension, openhaptics, haply, spacemouse or gamepad (`palpate-client devices` tells which are there);
-    /// or a simulated one: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3 or undeclared
+    /// The device: force-dimension, openhaptics, haply, spacemouse or gamepad (`palpate-client devices` lists the
+    /// available ones); or a simulated one: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3
+    /// or undeclared
     #[arg(long, value_name = "NAME", default_value = "omega3")]
     device: String,
     /// The library of the device's maker, if it is not where the system looks for libraries
@@ -45,17 +46,18 @@ pub(crate) struct BridgeArguments {
     /// The simulated hand that holds a simulated device: light, medium, firm or none
     #[arg(long, default_value = "medium")]
     hand: String,
-    /// Receive a sample only when the rendered force would be off by more than this fraction; 0: one per step
+    /// Receive a sample only if the error of the rendered force would exceed this fraction; 0: one per step
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
     deadband: f64,
-    /// Send a pose only when the server would be wrong about the tool by more than this fraction of the force; 0: one per tick
+    /// Send a pose only if the server's prediction of the tool would be wrong by more than this fraction of the
+    /// force; 0: one per tick
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
     up_deadband: f64,
-    /// When to keep a copy of the tissue, which the device's loop simulates: forces then come without the delay of the network,
-    /// and samples correct them
+    /// When to keep a copy of the tissue, which the client simulates: forces then have no network delay, and samples
+    /// correct them
     #[arg(long, value_name = "WHEN", default_value = "auto")]
     prediction: When,
-    /// Touch by the stream alone, also where the server has datagrams
+    /// Touch by the stream alone, even if the server offers datagrams
     #[arg(long)]
     no_datagrams: bool,
     /// End after this time, s [default: at Ctrl-C]
@@ -64,7 +66,8 @@ pub(crate) struct BridgeArguments {
     /// Seed of the simulated hand's movements
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Keep the session that it made, and print its ID: the server deletes it when nobody has used it for long
+    /// Keep the new session at the end, and print its ID: the server deletes it when nobody has used it for a quarter
+    /// of an hour (idle_session_s)
     #[arg(long)]
     keep_session: bool,
     /// Print one JSON object instead of a table

@@ -33,20 +33,20 @@ pub(crate) struct ClusterArguments {
 enum ClusterAction {
     /// Show the servers: name, URL, release, threads, load, sessions, whether they take new sessions
     Nodes,
-    /// Show the sessions: which server has each, since which revision, and which is its standby
+    /// Show the sessions: for each its server, the revision of that ownership, and its stand-by server
     Sessions,
-    /// Move a session to another server while it goes on; prints its new server, and for how long it did no step
+    /// Move a running session to another server; print the new server, and the time without steps
     Move {
-        /// As `sessions` shows it
+        /// The session's ID, from `sessions`
         session: String,
-        /// Name of the server, as `nodes` shows it [default: the one with the most room]
+        /// Name of the new server, from `nodes` [default: the one with the most room]
         node: Option<String>,
     },
-    /// Move all sessions of a server to others; it takes no new ones from then on
+    /// Move all sessions of a server to others; it then accepts no new sessions
     Drain {
-        /// As `nodes` shows it
+        /// The server's name, from `nodes`
         node: String,
-        /// Let it take new sessions again; nothing is moved
+        /// Accept new sessions again; no session is moved
         #[arg(long)]
         stop: bool,
     },

@@ -20,7 +20,7 @@ pub(crate) struct DevicesArguments {
     /// The maker's library, if it is not where the system looks for libraries
     #[arg(long, value_name = "FILE")]
     library: Option<PathBuf>,
-    /// How long the test lasts
+    /// Duration of the test, s
     #[arg(long, value_name = "SECONDS", default_value_t = 5.0, value_parser = seconds)]
     seconds: f64,
     /// Print one JSON object instead of a table

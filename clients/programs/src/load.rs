@@ -20,10 +20,10 @@ pub(crate) struct LoadArguments {
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
-    /// Number of sessions; with --find-limit, where the search begins
+    /// Number of sessions; with --find-limit, the first number of the search
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..))]
     sessions: u32,
-    /// Haptic clients of each session, with one tool each. With 0, commands sent beforehand keep each session awake
+    /// Haptic clients of each session, with one tool each. With 0, commands sent in advance keep each session awake
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(0..=64))]
     clients_per_session: u32,
     /// Viewers of each session
@@ -44,17 +44,19 @@ pub(crate) struct LoadArguments {
     /// Frames per second of each viewer
     #[arg(long, value_name = "HZ", default_value_t = 60.0, value_parser = rate)]
     frame_rate_hz: f64,
-    /// Clients lead tools with a tip and render forces, as devices do, in place of pushing. The round trip then excludes the wait
-    /// for the step of the sample, because a deadband makes samples wait. Sheets only, such as --scene liver
+    /// Clients move tools with a tip and render forces, like devices, instead of pushing. The round trip then
+    /// excludes the wait for the step of the sample, because a deadband delays samples. Sheets only, such as --scene
+    /// liver
     #[arg(long)]
     touch: bool,
-    /// With --touch: clients get a sample only when the rendered force would be off by more than this fraction
+    /// With --touch: clients get a sample only if the error of the rendered force would exceed this fraction
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0, requires = "touch", value_parser = fraction)]
     deadband: f64,
-    /// With --touch: clients send a pose only when the server would be wrong about the tool by more than this fraction of the force
+    /// With --touch: clients send a pose only if the server's prediction would be wrong by more than this fraction of
+    /// the force
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0, requires = "touch", value_parser = fraction)]
     up_deadband: f64,
-    /// Clients that share a connection. With 1 each client has its own, like clients on separate machines
+    /// Number of clients per connection. With 1 each client has its own, like clients on separate machines
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     clients_per_connection: u32,
     /// Threads of this generator

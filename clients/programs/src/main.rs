@@ -60,18 +60,22 @@ enum ClientCommand {
     #[command(after_help = "Examples:\n  \
         palpate-client replay vertical-60 --server http://127.0.0.1:7117\n  \
         palpate-client replay my-script.toml --scene my-scene.toml --output poke.jsonl --plot\n\n\
-        The session is created paused. Each command carries the step at which it acts and is sent ahead of time. So the \
-        final hash equals that of `palpate run --held`, whatever the network did, unless late commands are reported.\n\n\
+        The session is created paused. Each command contains the step at which it takes effect, and is sent ahead of \
+        time. So the final hash equals that of `palpate run --held` over any network, unless late commands are \
+        reported.\n\n\
         Exit status: 0; 1 when the replay failed; 2 when an input was refused.")]
     Replay(replay::ReplayArguments),
-    /// Send a journal or a snapshot to a server, and play it there for others to see, or go on live from one of its moments
+    /// Send a journal or a snapshot to a server, and play it there for viewers, or continue live from one of its
+    /// moments
     #[command(after_help = "Examples:\n  \
         palpate-client play 3f0c….1.mcap --speed 2\n  \
         palpate-client play training.mcap --live --from 12000\n\n\
-        Viewers see the session like any other; its ID is printed at the beginning. Nobody can hold a tool of a session that \
-        plays. Anybody may touch a live one, and it stays after the end. Each hash of the journal is compared with the \
-        session's. `palpate journal replay` without a server writes records as fast as it goes.\n\n\
-        Exit status: 0; 1 when a hash differs, the connection broke or the session was held; 2 when an input was refused.")]
+        Viewers see the session like any other; its ID is printed at the beginning. Nobody can hold a tool of a \
+        session that plays. Anybody may touch a live session, and it stays after the end. The program compares each \
+        hash of the journal with the session's. `palpate journal replay` without a server writes records as fast as \
+        possible.\n\n\
+        Exit status: 0; 1 when a hash differs, the connection broke or the session was held; 2 when an input was \
+        refused.")]
     Play(play::PlayArguments),
     /// Simulate hand, device, network and tissue in one loop in virtual time; report how accurate and safe the touch is
     #[command(after_help = "Examples:\n  \
@@ -80,13 +84,15 @@ enum ClientCommand {
         palpate-client link --rtt-ms 2 --deadband 0.1\n  \
         palpate-client link --boundary\n  \
         palpate-client link --random 1000\n\n\
-        A simulated hand presses and strokes the tissue (minimum jerk, 5 to 15 mm, drawn by the seed; less deep where the \
-        true force would exceed 0.8 of the device's). `true` is the same tissue without a delay at the tool's own place. \
-        Errors are taken over the ticks in which either is in contact. Energies are measured at the device's port: below 0 \
-        the port has given energy. A run is unstable, and ends, when the port gave 0.1 J or the tool left three times the \
-        task's amplitude. The loop runs the code of the server and of `bridge` itself.\n\n\
-        With `prediction` the client's copy is that same tissue. Where nothing else acts and nothing is lost, it hardly errs \
-        by that; loss, jitter, a second tool, a change of the tissue and --server show what it is worth.\n\n\
+        A simulated hand presses and strokes the tissue (minimum jerk, 5 to 15 mm, drawn by the seed; less deep if \
+        the true force would exceed 0.8 of the device's). `true` is the same tissue without a delay at the tool's \
+        own place. Errors are computed over the ticks in which either is in contact. Energies are measured at the \
+        device's port: below 0 the port has given off energy. A run is unstable, and ends, when the port has given \
+        off 0.1 J or the tool is farther away than three times the task's amplitude. The loop runs the same code as \
+        the server and `bridge`.\n\n\
+        With `prediction` the client's copy is that same tissue, so its error is small if nothing else acts and \
+        nothing is lost. Use loss, jitter, a second tool, a change of the tissue or --server to measure a realistic \
+        error.\n\n\
         Exit status: 0; 1 when a run failed; 2 when an input was refused, or the system has no memory for the sheet.")]
     Link(Box<link::LinkArguments>),
     /// Connect a haptic device to a server at 1 kHz: one of your own, or a simulated one in a simulated hand
@@ -96,28 +102,28 @@ enum ClientCommand {
         palpate-client bridge --device force-dimension --scale 0.5 --rotation-deg 0,0,90\n  \
         palpate-client bridge --device gamepad --placement my-desk.toml\n\n\
         A name may select one of several: force-dimension:1, openhaptics:'Left Device', haply:ws://localhost:10001, \
-        gamepad:/dev/input/event5. It reconnects by itself when the connection breaks; forces return when the operator asks \
-        for them, by the device's first button. It deletes the session that it made when it ends. For another device, \
-        implement `HapticDevice` of the crate palpate-client (clients/library).\n\n\
-        Exit status: 0; 1 when the device is missing or fails, when no connection succeeded or none stood at the end; 2 when \
-        an input was refused.")]
+        gamepad:/dev/input/event5. It reconnects by itself when the connection breaks; forces return when the \
+        operator presses the device's first button. It deletes the session that it made when it ends. For another \
+        device, implement `HapticDevice` of the crate palpate-client (clients/library).\n\n\
+        Exit status: 0; 1 when the device is missing or fails, or when there was no connection at all or at the end; \
+        2 when an input was refused.")]
     Bridge(Box<bridge::BridgeArguments>),
     /// List haptic devices; read one for some seconds, and report how well it keeps time
     #[command(after_help = "Examples:\n  \
         palpate-client devices\n  \
         palpate-client devices --test force-dimension\n  \
         palpate-client devices --test haply --seconds 20 --json\n\n\
-        The test sets no force. Move the device while it runs: positions that changed tell how often the device itself \
-        measures.\n\n\
+        The test sets no force. Move the device while it runs: the number of changed positions shows how often the \
+        device itself measures.\n\n\
         Exit status: 0; 1 when the device to test is missing or fails; 2 when an input was refused.")]
     Devices(devices::DevicesArguments),
-    /// A bad network on this machine: relay TCP and UDP to a server with delay, jitter, loss and outages
+    /// Simulate a bad network on this machine: relay TCP and UDP to a server with delay, jitter, loss and outages
     #[command(after_help = "Examples:\n  \
         palpate-client proxy 127.0.0.1:7200 127.0.0.1:7117 --delay-ms 25 --loss 0.01\n  \
         palpate-client proxy 127.0.0.1:7200 127.0.0.1:7117 --udp --jitter-ms 10 --seed 7\n\n\
-        Start the server with --datagrams-advertise 127.0.0.1:7200, so that clients send their datagrams through the proxy \
-        as well. Lost TCP packets are sent again by the rule of RFC 6298, which delays everything behind them. Ctrl-C ends the \
-        proxy, which then prints what went through.\n\n\
+        Start the server with --datagrams-advertise 127.0.0.1:7200, so that clients send their datagrams through the \
+        proxy as well. Lost TCP packets are sent again by the rule of RFC 6298, which delays everything after them. \
+        Ctrl-C ends the proxy, which then prints the amounts of data.\n\n\
         Exit status: 0; 1 when it can't listen; 2 when an input was refused.")]
     Proxy(proxy::ProxyArguments),
     /// Load a server with many sessions, haptic clients and viewers; report delays, losses and dilation
@@ -125,13 +131,12 @@ enum ClientCommand {
         palpate-client load --sessions 50 --seconds 10\n  \
         palpate-client load --sessions 20 --clients-per-session 2 --viewers 3 --scene liver --json\n  \
         palpate-client load --find-limit 'p99<2ms,dilation>0.999'\n\n\
-        Each client strokes the tissue with a command every tick of its own clock, without waiting for answers: no tissue \
-        rests, and a late answer delays no later command. The round trip lasts from a command to the first sample that \
-        acknowledges it \
-        and includes the wait for the step. A command that nothing acknowledged within 2 s of the end counts as lost, and so \
-        does a sample that the server dropped. The age of a frame is measured against the sample of the same step. On the \
-        server's \
-        machine the generator takes processor time from it; the report says how much.\n\n\
+        Each client strokes the tissue with a command at every tick of its own clock, without waiting for answers: \
+        no tissue rests, and a late answer delays no later command. The round trip lasts from a command to the first \
+        sample that acknowledges it, and includes the wait for the step. A command without an acknowledgement until \
+        2 s after the end counts as lost, and so does a sample that the server dropped. The age of a frame is \
+        measured against the sample of the same step. On the server's machine the generator takes processor time \
+        from the server; the report states how much.\n\n\
         Exit status: 0; 1 when streams broke or the server could not be reached; 2 when an input was refused.")]
     Load(load::LoadArguments),
     /// Check that a server is serving; for scripts and containers
@@ -148,14 +153,15 @@ enum ClientCommand {
         If the server authenticates clients, your token needs the role `administer`.\n\n\
         Exit status: 0; 1 when the server can't be reached or refuses; 2 when an input was refused.")]
     Top(top::TopArguments),
-    /// Show what each caller uses of a server; release a tool, cut a stream or a caller, revive or delete a session
+    /// Show the resources that each caller uses; release a tool, cut a stream or a caller, revive or delete a session
     #[command(after_help = "Examples:\n  \
         palpate-client admin callers\n  \
         palpate-client admin streams 0123456789abcdef0123456789abcdef\n  \
-        palpate-client admin cut-caller token:ann --delete-sessions --server https://server:7117 --token-file admin.token\n\n\
-        If the server authenticates clients, your token needs the role `administer`. Callers are named by their token or \
-        certificate, without authentication by their address. A caller that you cut can come back: remove its entry from \
-        the token file first.\n\n\
+        palpate-client admin cut-caller token:ann --delete-sessions --server https://server:7117 --token-file \
+        admin.token\n\n\
+        If the server authenticates clients, your token needs the role `administer`. The name of a caller is that of \
+        its token or certificate; without authentication it is its address. A caller that you cut can come back: \
+        remove its entry from the token file first.\n\n\
         Exit status: 0; 1 when the server can't be reached or refuses; 2 when an input was refused.")]
     Admin(admin::AdminArguments),
     /// Show the servers and sessions of a fleet; move sessions between servers, and drain a server for an upgrade
@@ -165,11 +171,12 @@ enum ClientCommand {
         palpate-client cluster move 0123456789abcdef0123456789abcdef node-b\n  \
         palpate-client cluster drain node-a --server https://node-b:7117 --token-file admin.token\n  \
         palpate-client cluster drain node-a --stop\n\n\
-        Ask any server of the fleet; a call that another must answer goes there with the same credentials. If the servers \
-        authenticate clients, your token needs the role `administer`. A session that moves goes on at once, and its clients \
-        follow by themselves. A server that is drained takes no new sessions until you say --stop, or start it again.\n\n\
-        Exit status: 0; 1 when a server can't be reached or refuses, or when sessions could not be moved; 2 when an input was \
-        refused.")]
+        Ask any server of the fleet; a call for another server goes there with the same credentials. If the servers \
+        authenticate clients, your token needs the role `administer`. A moved session continues at once, and its \
+        clients follow by themselves. A drained server accepts no new sessions until you use --stop, or start it \
+        again.\n\n\
+        Exit status: 0; 1 when a server can't be reached or refuses, or when sessions could not be moved; 2 when an \
+        input was refused.")]
     Cluster(cluster::ClusterArguments),
 }
 

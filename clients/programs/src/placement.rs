@@ -14,10 +14,10 @@ const MAX_BYTES: u64 = 1 << 16;
 /// The options; they override the file.
 #[derive(clap::Args)]
 pub(crate) struct PlacementOptions {
-    /// Where the device is laid over the tissue, and its clutch (TOML); the options below override it
+    /// File (TOML) with the placement of the device over the tissue, and its clutch; the options below override it
     #[arg(long, value_name = "FILE")]
     placement: Option<PathBuf>,
-    /// The middle of the device's workspace, from the top of the tissue at its middle, m [default: 0,0,0]
+    /// Offset of the middle of the device's workspace from the top of the tissue, m [default: 0,0,0]
     #[arg(long, value_name = "X,Y,Z", value_parser = vector, allow_hyphen_values = true)]
     offset_m: Option<DVec3>,
     /// Turn the device about the tissue's x, then y, then z axis, degrees [default: 0,0,0]

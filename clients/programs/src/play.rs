@@ -39,28 +39,29 @@ pub(crate) struct PlayArguments {
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
-    /// The step to begin at [default: the first of the journal; its last with --live]
+    /// The first step [default: the first of the journal; its last with --live]
     #[arg(long, value_name = "STEP")]
     from: Option<u64>,
-    /// The step to end at [default: the last of the journal]
+    /// The last step [default: the last of the journal]
     #[arg(long, value_name = "STEP", conflicts_with = "live")]
     to: Option<u64>,
-    /// Play so many times as fast as it was recorded, from 0.1 to 8
+    /// Multiple of the recorded speed, from 0.1 to 8
     #[arg(long, value_name = "FACTOR", default_value_t = 1.0, conflicts_with = "live")]
     speed: f64,
-    /// Begin a live session there, for anybody to touch, and leave it to the server
+    /// Begin a live session at that step, which anybody may touch, and keep it at the end
     #[arg(long)]
     live: bool,
-    /// Write what is played to this file, as `palpate run` does: records of the steps after the first, as JSON Lines
+    /// Write the records of the steps after the first to this file, as JSON Lines like `palpate run`
     #[arg(short, long, value_name = "FILE", conflicts_with = "live")]
     output: Option<PathBuf>,
-    /// A record every so many steps
+    /// Number of steps between records
     #[arg(long, value_name = "STEPS", default_value_t = 10, value_parser = clap::value_parser!(u32).range(1..), requires = "output")]
     every: u32,
     /// A point in the records: X,Y of a sheet, or the number of a vertex; may be repeated. Tools are always in them
     #[arg(long, value_name = "POINT", requires = "output")]
     point: Vec<PointName>,
-    /// Keep the session at the end, for others: the server deletes it when nobody has used it for long
+    /// Keep the session at the end: the server deletes it when nobody has used it for a quarter of an hour
+    /// (idle_session_s)
     #[arg(long)]
     keep_session: bool,
     /// Print one JSON object instead of a table

@@ -8,11 +8,11 @@ use palpate_session::journal;
 /// Of which tissues a device's loop keeps a copy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum When {
-    /// For meshes: a local model does not know the rim, fold or lump that comes next
+    /// For meshes: a local model does not describe a rim, fold or lump outside its place
     Auto,
     /// For every tissue
     Always,
-    /// For none: forces come from local models alone, which take the least time and no memory
+    /// For no tissue: forces come from local models alone, which need the least time and no memory
     Never,
 }
 

@@ -13,28 +13,28 @@ use crate::{ClientFailure, interrupted, table};
 /// Arguments of `proxy`.
 #[derive(clap::Args)]
 pub(crate) struct ProxyArguments {
-    /// Where it listens; port 0 takes a free one
+    /// Address to listen on; port 0 takes a free one
     #[arg(value_name = "LISTEN")]
     listen: SocketAddr,
     /// The server
     #[arg(value_name = "TO")]
     to: SocketAddr,
-    /// UDP alone [default: UDP and TCP, at the same port]
+    /// Relay only UDP [default: UDP and TCP, at the same port]
     #[arg(long, conflicts_with = "tcp")]
     udp: bool,
-    /// TCP alone
+    /// Relay only TCP
     #[arg(long)]
     tcp: bool,
     /// Delay each way, ms
     #[arg(long, value_name = "MS", default_value_t = 0.0)]
     delay_ms: f64,
-    /// Standard deviation of the delay each way, ms. Datagrams overtake each other; what goes by TCP stays in order
+    /// Standard deviation of the delay each way, ms. Datagrams overtake each other; TCP data stays in order
     #[arg(long, value_name = "MS", default_value_t = 0.0)]
     jitter_ms: f64,
-    /// Fraction of the packets that are lost. By TCP each is sent again, which delays all later ones
+    /// Fraction of the packets that are lost. Lost TCP packets are sent again, which delays all later ones
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0)]
     loss: f64,
-    /// Mean number of packets that are lost in a row; 1: each by itself
+    /// Mean number of packets lost in a row; 1: losses are independent
     #[arg(long, value_name = "PACKETS", default_value_t = 1.0)]
     loss_burst: f64,
     /// Once a second nothing gets through for this long, ms

@@ -58,8 +58,8 @@ pub(crate) struct ReplayArguments {
     /// The server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117")]
     server: String,
-    /// Name of a scene of the server, or a scene file of your own (ends in .toml) [default: the first that the script is made
-    /// for, or paper]
+    /// Name of a scene of the server, or a scene file of your own (ends in .toml) [default: the script's first scene,
+    /// or paper]
     #[arg(long, value_name = "NAME")]
     scene: Option<String>,
     /// Write the records here instead of to the standard output
@@ -88,7 +88,8 @@ struct Sampling {
     /// Skip samples whose force on the tool differs from the last sample's by at most this, N
     #[arg(long, value_name = "N")]
     deadband_force_n: Option<f64>,
-    /// The same as a fraction of the force, 0 to 1; the larger of both applies. People notice about a tenth
+    /// Skip samples whose force differs by at most this fraction, 0 to 1; the larger of both bounds applies. People
+    /// notice about 0.1
     #[arg(long, value_name = "FRACTION")]
     deadband_force_fraction: Option<f64>,
     /// Skip samples whose control point has moved by at most this, m. With a force deadband too, a sample is sent when

@@ -160,6 +160,20 @@ impl Outages {
 }
 
 /// One direction of a connection.
+///
+/// A message takes half of the round trip of 100 ms:
+///
+/// ```
+/// use palpate_simulated::network::{Conditions, Direction};
+///
+/// let conditions = Conditions { round_trip_s: 0.1, ..Conditions::default() };
+/// let (seed, direction) = (1, 0);
+/// let mut up = Direction::new(conditions, seed, direction, 0.0);
+/// up.send(0.000, 200, "a command of 200 bytes");
+/// assert_eq!(up.next_s(), Some(0.05));
+/// assert_eq!(up.receive(0.049), None);
+/// assert_eq!(up.receive(0.050), Some("a command of 200 bytes"));
+/// ```
 pub struct Direction<T> {
     conditions: Conditions,
     random: Random,

@@ -1,4 +1,5 @@
-//! Command lines of both programs: negative numbers are values, and a number that is none is refused in our words.
+//! Command lines of both programs. Negative numbers are accepted as values, and an invalid number is refused in our
+//! words.
 
 use std::error::Error as _;
 use std::ffi::OsString;
@@ -10,7 +11,8 @@ use clap::{Command, Parser};
 use palpate_refusal::excerpt;
 use palpate_refusal::printable::printable;
 
-/// Parses the command line of this process. Ends the process with what is to be said if that is help, a version or a refusal.
+/// Parses the command line of this process. Prints the text and ends the process if the arguments ask for help or
+/// the version, or if they are refused (exit code 2).
 pub fn parse<A: Parser>() -> A {
     match read(std::env::args_os()) {
         Ok(arguments) => arguments,
@@ -32,14 +34,14 @@ fn read<A: Parser>(arguments: impl IntoIterator<Item = OsString>) -> Result<A, E
     A::from_arg_matches(&matches).map_err(|error| error.format(&mut command))
 }
 
-/// `-1e-3` as `-0.001`: clap takes the former for an option.
+/// Rewrites `-1e-3` as `-0.001`: clap would take the former for an option.
 fn without_exponent(argument: OsString) -> OsString {
     let number = argument.to_str().filter(|text| text.starts_with('-') && text.contains("e-"));
     number.and_then(|text| text.parse::<f64>().ok()).map_or(argument, |number| number.to_string().into())
 }
 
-/// The same command, of which each option and argument takes a value such as `-1`: it is refused for its reason, if it is, and not
-/// as an option that nobody knows.
+/// Makes each option and argument accept a value such as `-1`. An invalid value is then refused for its own reason,
+/// and not as an unknown option.
 fn with_negative_numbers(command: Command) -> Command {
     let command = command.mut_args(|argument| {
         let takes_values = argument.get_action().takes_values();
@@ -48,7 +50,7 @@ fn with_negative_numbers(command: Command) -> Command {
     command.mut_subcommands(with_negative_numbers)
 }
 
-/// What to say of an error, if that is an option's number that is none.
+/// Returns the message for an option's value that is not a valid number; `None` for any other error.
 fn number(error: &Error) -> Option<String> {
     if error.kind() != ErrorKind::ValueValidation {
         return None;
@@ -69,7 +71,7 @@ fn number(error: &Error) -> Option<String> {
     } else {
         return None;
     };
-    // `--threads <N>` is told as `--threads`.
+    // `--threads <N>` is shown as `--threads`.
     let option = option.split_once(" <").map_or(option, |(option, _)| option);
     Some(format!("{option}: must be {wants}, but is `{}`", excerpt(value)))
 }

@@ -1,8 +1,8 @@
-//! Tells Agones how a server stands, by the SDK beside it in the pod. Agones may be slow, hang or not be there: then it is told later,
-//! and the server notices nothing.
+//! Reports the state of a server to Agones, through the SDK beside it in the pod. Agones may be slow, hang or be
+//! absent: then the report comes later, and the server is not affected.
 //!
-//! Where sessions go, the servers decide. Agones decides how many servers there are: it ends only those that are `Ready`, so a server
-//! with sessions says `Allocate`, and `Ready` again when the last has gone.
+//! The servers decide where sessions go; Agones decides how many servers there are. Agones ends only servers that
+//! are `Ready`, so a server with sessions reports `Allocate`, and `Ready` again when the last session has gone.
 
 use std::time::Duration;
 
@@ -17,33 +17,33 @@ use tonic::Status;
 use tonic::transport::{Channel, Endpoint};
 use tracing::{info, warn};
 
-/// Agones hears so often that the server is well.
+/// Interval between health reports to Agones.
 const HEALTH: Duration = Duration::from_secs(2);
 
-/// How the server stands is told so often at most.
+/// Interval between reports of the server's state.
 const LOOK: Duration = Duration::from_secs(1);
 
-/// An SDK that takes longer for one call counts as away.
+/// Time limit of one call to the SDK.
 const SDK_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// The counter of the game server that has the sessions.
+/// Name of the game server's counter that holds the number of sessions.
 const COUNTER: &str = "sessions";
 
-/// The SDK's port unless Agones says another.
+/// Port of the SDK if the environment names no other.
 const PORT: u16 = 9357;
 
-/// How a server stands.
+/// State of a server that is reported to Agones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ServerStatus {
-    /// It may step and speak for sessions.
+    /// Whether the server may step its sessions and answer for them.
     pub acts: bool,
-    /// Its sessions.
+    /// Number of sessions.
     pub sessions: usize,
-    /// It takes no new ones.
+    /// Whether the server takes no new sessions.
     pub draining: bool,
 }
 
-/// What Agones knows of the server.
+/// State of the server that Agones has been sent last.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum AgonesState {
     Starting,
@@ -53,7 +53,7 @@ enum AgonesState {
 }
 
 impl AgonesState {
-    /// The next that is to be told, if any. Agones hears `Ready` before anything else.
+    /// Returns the next state to report, if any. The first report is always `Ready`.
     fn next(self, seen: ServerStatus) -> Option<AgonesState> {
         let wanted = match (self, seen) {
             (AgonesState::Shutdown, _) | (AgonesState::Starting, ServerStatus { acts: false, .. }) => return None,
@@ -66,25 +66,26 @@ impl AgonesState {
     }
 }
 
-/// The SDK in this pod.
+/// Client of the SDK in this pod, and what it has reported.
 struct Sdk {
     sdk: SdkClient<Channel>,
     counters: Counters<Channel>,
     state: AgonesState,
-    /// What the counter was told, and how far it goes.
+    /// Value that the counter was last set to.
     counted: Option<i64>,
+    /// Capacity of the counter, as read from Agones.
     capacity: Option<i64>,
-    /// Whether the log has it that Agones does not answer.
+    /// Whether the log already says that Agones does not answer.
     is_away: bool,
 }
 
-/// One call, with patience.
+/// Runs one call with the time limit [`SDK_TIMEOUT`].
 async fn within<T>(call: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
     timeout(SDK_TIMEOUT, call).await.unwrap_or_else(|_| Err(Status::deadline_exceeded("no answer")))
 }
 
 impl Sdk {
-    /// Tells what has changed.
+    /// Reports what has changed since the last report, and keeps it in `self` if the call succeeded.
     async fn tell(&mut self, seen: ServerStatus) -> Result<(), Status> {
         if let Some(next) = self.state.next(seen) {
             match next {
@@ -92,7 +93,7 @@ impl Sdk {
                 AgonesState::Shutdown => within(self.sdk.shutdown(Empty {})).await?,
                 AgonesState::Starting | AgonesState::Ready => within(self.sdk.ready(Empty {})).await?,
             };
-            info!(state = ?next, "Agones is told");
+            info!(state = ?next, "reported the server's state to Agones");
             self.state = next;
         }
         if self.state == AgonesState::Starting || self.state == AgonesState::Shutdown {
@@ -103,7 +104,7 @@ impl Sdk {
             return Ok(());
         }
         let told = self.count(sessions).await;
-        // If it was refused, somebody may have changed the capacity.
+        // A refusal may mean that the capacity has been changed.
         match told {
             Ok(()) => self.counted = Some(sessions),
             Err(_) => self.capacity = None,
@@ -111,7 +112,7 @@ impl Sdk {
         told
     }
 
-    /// Sets the counter, no higher than it goes: a server may take more sessions than Agones reckons with.
+    /// Sets the counter, limited to its capacity: a server may have more sessions than Agones allows for.
     async fn count(&mut self, sessions: i64) -> Result<(), Status> {
         let capacity = match self.capacity {
             Some(capacity) => capacity,
@@ -127,8 +128,8 @@ impl Sdk {
     }
 }
 
-/// Tells for ever how the server stands, which `seen` tells: whether it is ready, has sessions, how many, and at last that it was
-/// drained.
+/// Reports the server's state, as `seen` returns it, once a second until the task is dropped: whether it is ready,
+/// the number of its sessions, and at the end that it was drained.
 async fn tell_standing(channel: Channel, seen: impl Fn() -> ServerStatus) {
     let mut sdk = Sdk {
         sdk: SdkClient::new(channel.clone()),
@@ -154,20 +155,21 @@ async fn tell_standing(channel: Channel, seen: impl Fn() -> ServerStatus) {
     }
 }
 
-/// Says for ever that the server is well.
+/// Reports every 2 s that the server is healthy, until the task is dropped.
 async fn tell_health(channel: Channel) {
     let mut sdk = SdkClient::new(channel);
     loop {
         let mut ticks = interval(HEALTH);
-        // A server that was frozen says once that it is well.
+        // A server that was frozen sends one report, not one for each missed tick.
         ticks.set_missed_tick_behavior(MissedTickBehavior::Skip);
-        // Ends when the SDK does.
+        // Returns when the SDK ends the stream.
         let _ = sdk.health(IntervalStream::new(ticks).map(|_| Empty {})).await;
         sleep(HEALTH).await;
     }
 }
 
-/// Returns the port at which Agones has put the SDK of this pod.
+/// Returns the port of this pod's Agones SDK: the environment variable `AGONES_SDK_GRPC_PORT`, or 9357 if that is
+/// absent or not a port.
 pub fn port() -> u16 {
     const NAME: &str = "AGONES_SDK_GRPC_PORT";
     let Ok(text) = std::env::var(NAME) else { return PORT };
@@ -177,7 +179,8 @@ pub fn port() -> u16 {
     })
 }
 
-/// Tells the SDK at `port` of this machine how a server stands, for ever. `seen` is called once a second and must not wait.
+/// Reports the state of a server to the SDK at `port` of this machine, until the future is dropped. Calls `seen`
+/// once a second; it must not block.
 pub async fn tell(port: u16, seen: impl Fn() -> ServerStatus) {
     let Ok(endpoint) = Endpoint::from_shared(format!("http://localhost:{port}")) else { return };
     let channel = endpoint.connect_timeout(SDK_TIMEOUT).connect_lazy();
@@ -197,7 +200,7 @@ mod tests {
             (AgonesState::Starting, seen(3, false), Some(AgonesState::Ready)),
             (AgonesState::Ready, seen(0, false), None),
             (AgonesState::Ready, seen(3, false), Some(AgonesState::Allocated)),
-            // It is still there.
+            // The server still exists.
             (AgonesState::Allocated, ServerStatus { acts: false, ..seen(3, false) }, None),
             (AgonesState::Allocated, seen(0, false), Some(AgonesState::Ready)),
             (AgonesState::Allocated, seen(1, true), None),

@@ -1,53 +1,54 @@
-//! The keys of a fleet in etcd, and their values.
+//! Keys of a fleet in etcd, and their values.
 
 use serde::{Deserialize, Serialize};
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Longest name of a fleet or a node.
+/// Length limit of the name of a fleet or a node, bytes (its characters are ASCII).
 const MAX_LETTERS: usize = 64;
 
-/// Where the keys of a fleet are: `/palpate/FLEET/nodes/NODE` and `/palpate/FLEET/sessions/ID`.
+/// Key names of one fleet: `/palpate/FLEET/nodes/NODE` and `/palpate/FLEET/sessions/ID`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Keys {
     root: String,
 }
 
 impl Keys {
-    /// Creates the keys of the fleet of that name.
+    /// Creates the key names of the fleet `fleet`.
     ///
     /// # Errors
-    /// Refuses a name that is none.
+    /// Refuses a name that [`check_name`] refuses.
     pub fn of(fleet: &str) -> Result<Self> {
         check_name("cluster_name", fleet)?;
         Ok(Keys { root: format!("/palpate/{fleet}/") })
     }
 
-    /// Returns what the keys of all nodes begin with.
+    /// Returns the prefix of the keys of all nodes.
     pub fn nodes(&self) -> String {
         format!("{}nodes/", self.root)
     }
 
-    /// Returns what the keys of all sessions begin with.
+    /// Returns the prefix of the keys of all sessions.
     pub fn sessions(&self) -> String {
         format!("{}sessions/", self.root)
     }
 
-    /// Returns the key of a node, which is there while its lease is.
+    /// Returns the key of a node. It exists while the node's lease lasts.
     pub fn node(&self, name: &str) -> String {
         self.nodes() + name
     }
 
-    /// Returns the key of a session, which is there until the session is deleted.
+    /// Returns the key of a session. It exists until the session is deleted.
     pub fn session(&self, id: &str) -> String {
         self.sessions() + id
     }
 }
 
-/// Checks the name of a fleet or a node: letters, digits, and `.`, `-`, `_`, `:` between them.
+/// Checks the name of a fleet or a node: 1 to 64 ASCII letters, digits, `.`, `-`, `_` or `:`, the first a letter or
+/// digit.
 ///
 /// # Errors
-/// Refuses any other name.
+/// Refuses any other name, as a value of `field`.
 pub fn check_name(field: &str, name: &str) -> Result<()> {
     let is_letter = |c: char| c.is_ascii_alphanumeric() || ".-_:".contains(c);
     let is_name = name.starts_with(|c: char| c.is_ascii_alphanumeric()) && name.chars().all(is_letter);
@@ -58,45 +59,47 @@ pub fn check_name(field: &str, name: &str) -> Result<()> {
     Err(Refusal::new(Reason::OutOfRange, field, message))
 }
 
-/// A node, as it says itself.
+/// Value of a node's key: the node's own description.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct NodeValue {
-    /// URL for clients and for other nodes.
+    /// URL of the node for clients and other nodes.
     pub endpoint: String,
-    /// Random, and kept in the node's folder of journals: two servers must not have one name.
+    /// Random ID, kept in the node's folder of journals. It shows when two servers use one name.
     pub instance: String,
-    /// Its release.
+    /// Release of the node's program.
     pub version: String,
-    /// [`palpate_session::journal::format::REPLAYS`] of its release.
+    /// [`palpate_session::journal::format::REPLAYS`] of that release: nodes with equal values replay with equal
+    /// bits.
     pub replays: u32,
-    /// Stepping threads.
+    /// Number of stepping threads.
     pub threads: u32,
-    /// What its sessions take of these, 0 to 1, measured.
+    /// Measured part of the stepping threads' time that sessions use, 0 to 1.
     pub load: f64,
-    /// Its sessions.
+    /// Number of sessions.
     pub sessions: u32,
-    /// It takes no new sessions.
+    /// Whether the node takes no new sessions.
     #[serde(default)]
     pub draining: bool,
 }
 
-/// Who owns a session. The revision of the key is that of the ownership.
+/// Value of a session's key: its owner and standby. The key's revision identifies the ownership.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct SessionValue {
-    /// The owner; empty if the owner has given it up.
+    /// The node that owns the session; empty if the owner has given it up.
     pub node: String,
-    /// Who has all of its journal that the owner calls durable, and may claim it; empty if none.
+    /// The standby: the node that has every part of the journal that the owner calls durable, and may claim the
+    /// session. Empty if there is none.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub standby: String,
 }
 
-/// Returns the value of a key as JSON.
+/// Encodes the value of a key as JSON.
 pub fn encode<T: Serialize>(value: &T) -> Vec<u8> {
-    // Maps of text and numbers can always be written.
+    // Serialization of text and numbers can't fail.
     serde_json::to_vec(value).unwrap_or_default()
 }
 
-/// Returns the value of a key; `None` if it is not one of ours.
+/// Decodes the JSON value of a key; `None` if it does not have the form of `T`.
 pub fn decode<'v, T: Deserialize<'v>>(value: &'v [u8]) -> Option<T> {
     serde_json::from_slice(value).ok()
 }

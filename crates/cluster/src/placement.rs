@@ -1,4 +1,4 @@
-//! Where a session goes: to the node with the most room; and which node stands by for it.
+//! Placement of a session: the node with the most room takes it, and another node stands by for it.
 
 use std::collections::BTreeMap;
 
@@ -6,11 +6,11 @@ use xxhash_rust::xxh3::xxh3_64;
 
 use super::key::NodeValue;
 
-/// Returns the node that takes the next session: the one whose threads are taken least; of equals the one with the
-/// fewest sessions a thread, as between the threads of a server. `None` if all are draining.
+/// Returns the node that takes the next session: the one with the least load in whole percent and, among equals,
+/// the fewest sessions per thread. Draining nodes are skipped; `None` if no node is left.
 #[allow(clippy::cast_precision_loss)]
 pub fn roomiest(nodes: &BTreeMap<String, NodeValue>) -> Option<&str> {
-    // Loads that differ by less are equal: they are measured.
+    // Loads are measured: smaller differences do not count.
     let load = |node: &NodeValue| (node.load * 100.0).round();
     let sessions = |node: &NodeValue| f64::from(node.sessions) / f64::from(node.threads.max(1));
     let taking = nodes.iter().filter(|(_, node)| !node.draining);
@@ -19,9 +19,9 @@ pub fn roomiest(nodes: &BTreeMap<String, NodeValue>) -> Option<&str> {
         .map(|(name, _)| name.as_str())
 }
 
-/// Returns the node that stands by for a session of `owner`: by rendezvous hashing (Thaler and Ravishankar 1998) over
-/// those that replay with the same bits and are not draining. When a node comes or goes, only the sessions that it
-/// stands by for get another.
+/// Returns the node that stands by for a session of `owner`, by rendezvous hashing (Thaler and Ravishankar 1998)
+/// over the other nodes that replay with the same bits and are not draining. When a node joins or leaves, only the
+/// sessions that it stands by for change their standby. `None` if `owner` is unknown or no node qualifies.
 pub fn standby<'n>(session_id: &str, owner: &str, nodes: &'n BTreeMap<String, NodeValue>) -> Option<&'n str> {
     let replays = nodes.get(owner)?.replays;
     let others = nodes.iter().filter(|(name, node)| *name != owner && node.replays == replays && !node.draining);

@@ -1,21 +1,23 @@
-//! The rules by which a session has one owner at a time: what is asked of etcd, and until when a node may act. No I/O and no clock
-//! here, so that a simulation of the fleet uses the very rules that the server does.
+//! The rules by which a session has one owner at a time: the transactions sent to etcd, and how long a node may
+//! act. This module has no I/O and no clock, so a simulation of the fleet uses the rules of the server.
 //!
-//! **Why there is one owner.** A node's key is under its lease. etcd lets a lease end no earlier than its time to live after it got
-//! the newest keepalive, so no earlier than that after the node *sent* it. The node acts only until [`fence_ns`], which is before
-//! that. Others claim a session only in a transaction that finds the owner's key gone, and the session's key as they have read it.
-//! When a node's lease has ended and it comes back, it acts for a session only after a transaction that finds the session's key as
-//! this node left it. So of a claim and a return, one fails.
+//! **Why there is one owner.** A node's key is under its lease. etcd ends a lease no earlier than its time to live
+//! after it received the newest keepalive, so no earlier than that after the node *sent* it. The node acts only
+//! until [`fence_ns`], which is before that. Other nodes claim a session only in a transaction that finds the
+//! owner's key gone and the session's key as they have read it. When a node's lease has ended and the node comes
+//! back, it acts for a session only after a transaction that finds the session's key as this node left it. So of a
+//! claim and a return, one fails.
 
 use super::etcd::{Compare, Op, Txn};
 use super::key::{Keys, SessionValue, encode};
 
-/// The part of the time to live by which a node stops early: clocks of two machines may differ by that much in their rates, and a
-/// step or a message that has begun ends within it.
+/// Fraction of the lease's time to live by which a node stops early. It covers the difference in rate between two
+/// machines' clocks, and a step or a message that has begun.
 pub const MARGIN: f64 = 0.1;
 
-/// Returns until when a node may step and speak for its sessions, by its own clock: it sent a keepalive at `sent_ns`,
-/// and etcd has granted `ttl_s` from when it got that.
+/// Returns the time until which a node may step its sessions and answer for them, ns of its own clock. The node
+/// sent a keepalive at `sent_ns`, and etcd granted `ttl_s` seconds from when it received that. The limit is
+/// `sent_ns` + 0.9 `ttl_s`.
 #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::cast_sign_loss)]
 pub fn fence_ns(sent_ns: u64, ttl_s: u64) -> u64 {
     sent_ns + ((1.0 - MARGIN) * ttl_s as f64 * 1e9) as u64
@@ -25,7 +27,8 @@ fn put(key: String, value: &SessionValue) -> Op {
     Op::Put { key, value: encode(value), lease: None }
 }
 
-/// Makes `node` the owner of a new session. Fails if there is one of that ID, or the node's lease has ended.
+/// Returns the transaction that makes `node` the owner of a new session. Its conditions fail if a session has this
+/// ID, or the node's lease has ended.
 pub fn create(keys: &Keys, id: &str, node: &str) -> Txn {
     let key = keys.session(id);
     Txn {
@@ -35,8 +38,9 @@ pub fn create(keys: &Keys, id: &str, node: &str) -> Txn {
     }
 }
 
-/// Returns the transaction by which `node`, which owned the session at `revision`, says that it still does, and which node stands by. Fails if
-/// another has claimed it.
+/// Returns the transaction by which `node` confirms that it still owns the session, with the standby `standby`
+/// (empty for none). `revision` is that of the key as `node` left it. Its conditions fail if another node has
+/// claimed the session, or the node's lease has ended.
 pub fn keep(keys: &Keys, id: &str, revision: u64, node: &str, standby: &str) -> Txn {
     let key = keys.session(id);
     Txn {
@@ -46,8 +50,9 @@ pub fn keep(keys: &Keys, id: &str, revision: u64, node: &str, standby: &str) -> 
     }
 }
 
-/// Returns the transaction by which `node`, which stands by, makes itself the owner of a session whose owner is gone. `seen` was read at
-/// `revision`. Fails if the owner is there, or anybody has changed the key since.
+/// Returns the transaction by which the standby `node` makes itself the owner of a session whose owner is gone.
+/// `seen` is the key's value at `revision`. Its conditions fail if the owner is present, the key has changed since,
+/// or the lease of `node` has ended.
 pub fn claim(keys: &Keys, id: &str, (seen, revision): (&SessionValue, u64), node: &str) -> Txn {
     let key = keys.session(id);
     let mut if_all = vec![Compare::ModRevision(key.clone(), revision), Compare::Present(keys.node(node))];
@@ -58,13 +63,15 @@ pub fn claim(keys: &Keys, id: &str, (seen, revision): (&SessionValue, u64), node
     Txn { if_all, then: vec![put(key, &value)], otherwise: vec![] }
 }
 
-/// Returns whether `node` may try a [`claim`], by what it has read.
+/// Returns whether `node` may try a [`claim`]: `seen` names it as the standby, and the owner is absent by
+/// `is_there` or has given the session up.
 pub fn may_claim(seen: &SessionValue, node: &str, is_there: impl Fn(&str) -> bool) -> bool {
     seen.standby == node && seen.node != node && (seen.node.is_empty() || !is_there(&seen.node))
 }
 
-/// Returns the transaction by which the owner at `revision` makes another node the owner. It has stopped stepping and speaking for the session
-/// before.
+/// Returns the transaction by which the owner `from`, at `revision`, makes `to` the owner. `from` must already have
+/// stopped stepping the session and answering for it. Its conditions fail if the key has changed or either node is
+/// gone.
 pub fn hand_over(keys: &Keys, id: &str, revision: u64, [from, to]: [&str; 2]) -> Txn {
     let key = keys.session(id);
     Txn {
@@ -78,7 +85,8 @@ pub fn hand_over(keys: &Keys, id: &str, revision: u64, [from, to]: [&str; 2]) ->
     }
 }
 
-/// Returns the transaction by which the owner at `revision` gives the session up: it has nothing of it any more, and who stands by may claim it.
+/// Returns the transaction by which the owner at `revision` gives the session up: the owner has kept nothing of it,
+/// and `standby` may claim it.
 pub fn give_up(keys: &Keys, id: &str, revision: u64, standby: &str) -> Txn {
     let key = keys.session(id);
     Txn {
@@ -88,7 +96,7 @@ pub fn give_up(keys: &Keys, id: &str, revision: u64, standby: &str) -> Txn {
     }
 }
 
-/// Returns the transaction by which the owner at `revision` deletes the session.
+/// Returns the transaction by which the owner at `revision` deletes the session's key.
 pub fn delete(keys: &Keys, id: &str, revision: u64) -> Txn {
     let key = keys.session(id);
     Txn { if_all: vec![Compare::ModRevision(key.clone(), revision)], then: vec![Op::Delete(key)], otherwise: vec![] }

@@ -25,6 +25,9 @@ struct Diamond {
 
 /// Flips edges between two triangles until the angles opposite of each are at most π together. Edges of the border, folds of
 /// more than 60° and seams of the texture stay. Vertices and groups stay as they are. Returns the number of flips.
+///
+/// With α and β these angles, α + β ≤ π is cot α + cot β = sin(α + β)/(sin α·sin β) ≥ 0, and cot α = u·v/|u × v| for the sides u
+/// and v from the corner to the ends of the edge.
 pub fn flip_to_delaunay(mesh: &mut TriangleMesh) -> usize {
     flip(mesh, |vertices, edge| {
         let at = |vertex: u32| vertices[vertex as usize];

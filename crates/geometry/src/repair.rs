@@ -85,9 +85,9 @@ pub struct Repaired {
 /// How large a surface is.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct SurfaceMeasure {
-    /// The area of all triangles, m².
+    /// The area of all triangles, m²: Σ |(b − a) × (c − a)|/2.
     pub area_m2: f64,
-    /// The volume inside, m³, if the surface is closed and its triangles face the same side at each edge; with several at an
+    /// The volume inside, m³, |Σ a·(b × c)|/6, if the surface is closed and its triangles face the same side at each edge; with several at an
     /// edge, if as many run one way along it as the other. Before, it is measured without copies of triangles, and with those
     /// turned that must be.
     pub volume_m3: Option<f64>,

@@ -157,9 +157,10 @@ pub struct MeshReport {
     pub holes: usize,
     /// The borders, the longest first; at most [`LISTED`].
     pub borders: Vec<Border>,
-    /// The volume inside, m³, if the surface is closed and consistently oriented; negative if it faces inwards.
+    /// The volume inside, m³, if the surface is closed and consistently oriented; negative if it faces inwards: Σ a·(b × c)/6 over
+    /// the triangles (a, b, c), by the theorem of Gauss with the field x/3.
     pub volume_m3: Option<f64>,
-    /// The area, m².
+    /// The area, m²: Σ |(b − a) × (c − a)|/2.
     pub area_m2: f64,
     /// The sides of the box around all triangles, m: x, y, z.
     pub extent_m: [f64; 3],
@@ -245,7 +246,7 @@ pub fn report_within(mesh: &TriangleMesh, limits: &ReadLimits) -> MeshReport {
     report
 }
 
-/// The area of a triangle, and whether it has one: its height is above rounding.
+/// The area of a triangle, |(b − a) × (c − a)|/2, and whether it has one: its height is above rounding.
 pub(crate) fn area([a, b, c]: [DVec3; 3]) -> (f64, bool) {
     let double = (b - a).cross(c - a).length();
     let longest = (b - a).length_squared().max((c - b).length_squared()).max((a - c).length_squared());
@@ -258,7 +259,8 @@ pub(crate) fn has_area(vertices: &[DVec3], triangle: [u32; 3]) -> bool {
     is_proper(&triangle) && area(corners(vertices, triangle)).1
 }
 
-/// The volume that oriented triangles enclose, m³, with a sign.
+/// The volume that oriented triangles enclose, m³, with a sign: Σ a·(b × c)/6, the tetrahedra between each triangle and one
+/// point, which is near them, so that no digits are lost.
 pub(crate) fn volume(vertices: &[DVec3], triangles: &[[u32; 3]]) -> f64 {
     let middle = triangles.first().map(|triangle| vertices[triangle[0] as usize]).unwrap_or_default();
     let of = |triangle: &[u32; 3]| {

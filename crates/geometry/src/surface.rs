@@ -127,19 +127,24 @@ impl Surface {
         self.triangles[place.triangle as usize]
     }
 
-    /// Returns the area of each vertex: a third of that of the triangles around it, m².
+    /// Returns the area of each vertex: a third of that of the triangles around it, m². That is the integral of its hat over the
+    /// surface, so a mass lumped by it is the sum of its row of the consistent mass matrix.
     pub fn areas_m2(&self) -> &[f64] {
         &self.areas_m2
     }
 
     /// Returns how the outward normal changes per metre along the surface at a vertex, 1/m: symmetric, 1/R along a
     /// sphere. Its mean over a disc is that of the surface there.
+    ///
+    /// In a triangle of area A and normal N, whose corners have the normals n_k, the change of the interpolated normal is
+    /// Σ n_k ⊗ ∇h_k, with ∇h_k = N × e_k/2A the gradient of the hat of corner k and e_k the side opposite to it. n_k is the mean of the
+    /// normals of the triangles around, by area. A vertex has the symmetric part of Σ A·(Σ n_k ⊗ ∇h_k)/Σ A over its triangles.
     pub fn curvature_per_m(&self, vertex: usize) -> DMat3 {
         let [xx, yy, zz, xy, xz, yz] = self.curvatures_per_m[vertex].map(f64::from);
         DMat3::from_cols(DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz))
     }
 
-    /// Returns the usual length of an edge, m.
+    /// Returns the usual length of an edge, m: √(4A/√3), that of triangles with equal sides whose area A is the mean of all.
     pub fn edge_m(&self) -> f64 {
         self.edge_m
     }
@@ -151,7 +156,7 @@ impl Surface {
         if height_m >= -below_m { 1.0 } else { -1.0 }
     }
 
-    /// Returns where a place is in space, m.
+    /// Returns where a place is in space, m: Σ b_k·x_k over the corners of its triangle, b the barycentric coordinates.
     pub fn at_m(&self, place: &Place) -> DVec3 {
         let at_m = corners(&self.vertices_m, self.triangle(place));
         (0..3).map(|corner| at_m[corner] * place.barycentric[corner]).sum()
@@ -463,7 +468,7 @@ impl SurfaceDisc {
     }
 
     /// Estimates how many triangles the ways of a disc of `radius_m` cross, on a surface whose edges are about `edge_m` long: the work
-    /// of laying it.
+    /// of laying it. A way crosses about 1 + 2·`radius_m`/`edge_m`, two for each length of an edge.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn crossings(radius_m: f64, edge_m: f64) -> u64 {
         ways_of(radius_m, edge_m) as u64 * (1.0 + 2.0 * radius_m / edge_m) as u64
@@ -489,12 +494,13 @@ impl SurfaceDisc {
     }
 
     /// Returns how far it may move at once, so that its normal turns little on the way, m: half the radius of the disc
-    /// that hats are averaged over, or a quarter of an edge.
+    /// that hats are averaged over, or a quarter of an edge if that is more.
     pub fn stride_m(&self) -> f64 {
         0.5 * self.drawn_m.max(0.5 * self.edge_m)
     }
 
-    /// Lays the disc on a place.
+    /// Lays the disc on a place: finds the radius ρ over which hats are averaged with Σ(w²/A)·πa² = 1, a the disc's radius and A the
+    /// areas of the vertices, by Newton's method between two bounds.
     pub fn lay(&mut self, surface: &Surface, place: &Place) {
         // Around a thin part ways go on and on: a large disc is tried from a small one on.
         let mut stages = 0;

@@ -12,7 +12,7 @@ fn height_m(place_m: DVec3, [a, b, c]: [DVec3; 3]) -> Option<f64> {
 }
 
 /// Returns the highest place of a surface at the x and y of `middle_m`, m; where the surface is nowhere in line with
-/// that, at those of the nearest vertex that faces up.
+/// that, at those of the nearest vertex that faces up. Within a triangle z is linear in x and y.
 pub fn top_m(vertices_m: &[DVec3], triangles: &[[u32; 3]], normals: &[DVec3], middle_m: DVec3) -> DVec3 {
     let above = |place_m: DVec3| {
         let corners = triangles.iter().map(|triangle| triangle.map(|vertex| vertices_m[vertex as usize]));

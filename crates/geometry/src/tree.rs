@@ -204,7 +204,8 @@ pub(crate) fn cut(a: [DVec3; 3], b: [DVec3; 3]) -> bool {
     edges(a).into_iter().any(|edge| pierces(edge, b)) || edges(b).into_iter().any(|edge| pierces(edge, a))
 }
 
-/// Whether a segment goes through a triangle (Möller and Trumbore 1997).
+/// Whether a segment goes through a triangle (Möller and Trumbore, Fast, minimum storage ray/triangle intersection, Journal of Graphics
+/// Tools 2(1), 1997, doi:10.1080/10867651.1997.10487468).
 fn pierces([from, to]: [DVec3; 2], [a, b, c]: [DVec3; 3]) -> bool {
     let (way, ab, ac, at) = (to - from, b - a, c - a, from - a);
     let across = way.cross(ac);

@@ -29,7 +29,8 @@ impl ForceDeadband {
         ForceDeadband { fraction, sent: None }
     }
 
-    /// Returns whether the client's force is off by too much at the tool's present place, of which `model` is. Call it
+    /// Returns whether the client's force is off by too much at the tool's present place, of which `model` is:
+    /// |f − f_r| > max(δ·|f|, [`MIN_N`]), with f the tissue's force and f_r what the client renders there. Call it
     /// at each step: it follows the client along its path.
     pub fn is_exceeded(&mut self, model: &LocalModel, law: &Law) -> bool {
         let Some((sent, touching)) = &mut self.sent else { return true };

@@ -10,7 +10,9 @@
 //! 4. passivity: no more energy leaves the port than has entered it;
 //! 5. slew: at most [`SLEW_N_PER_S`], up and down, in every state.
 //!
-//! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick. A force f that moves with the
+//! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick, as in the passivity observer of Hannaford
+//! and Ryu (Time-domain passivity control of haptic interfaces, IEEE Transactions on Robotics and Automation 18(1), 2002,
+//! doi:10.1109/70.988969). A force f that moves with the
 //! hand at v, and that slew lets fall no faster than S, still gives f²·v/2S before it is zero. So it is limited to
 //! f ≤ √(2·S·E/v): a spring of K, pressed in and released at v, is not limited as long as its force falls no faster than
 //! the slew allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least `MIN_SPEED_M_PER_S`. A device
@@ -122,6 +124,36 @@ pub struct Wanted {
 }
 
 /// One device's envelope.
+///
+/// A hand presses 4 mm deep into a tissue of 1000 N/m, which asks for 4 N. A device without a declaration gets no more than 2 N:
+///
+/// ```
+/// use glam::DVec3;
+/// use palpate_haptics::device::UNDECLARED;
+/// use palpate_haptics::envelope::Wanted;
+/// use palpate_haptics::{Envelope, LimitCause};
+///
+/// let mut envelope = Envelope::new(UNDECLARED, DVec3::ZERO);
+/// envelope.enable();
+/// let (mut rendered_n, mut before_m) = (DVec3::ZERO, 0.0);
+/// for tick in 0..1200_u32 {
+///     let now_s = f64::from(tick) * 1e-3;
+///     // The hand stays on the surface until forces have ramped in. Then it goes down with 20 mm/s.
+///     let depth_m = (0.02 * (now_s - 0.6)).clamp(0.0, 0.004);
+///     let velocity_m_per_s = -(depth_m - before_m) / 1e-3 * DVec3::Z;
+///     before_m = depth_m;
+///     rendered_n = envelope.render(&Wanted {
+///         now_s,
+///         place_m: -depth_m * DVec3::Z,
+///         velocity_m_per_s,
+///         force_n: 1000.0 * depth_m * DVec3::Z,
+///         age_s: Some(0.0),
+///     });
+/// }
+/// assert!((rendered_n - 2.0 * DVec3::Z).length() < 1e-9, "{rendered_n} N");
+/// let (limited, ticks) = envelope.count(LimitCause::Force);
+/// println!("the force was limited in {limited} of {ticks} ticks");
+/// ```
 #[derive(Debug, Clone)]
 pub struct Envelope {
     device: Device,
@@ -173,7 +205,8 @@ impl Envelope {
         self.state
     }
 
-    /// Returns the energy that the hand has given to the port minus the energy it got back, J.
+    /// Returns the energy that the hand has given to the port minus the energy it got back, J: −Σ f·Δx over all ticks, with f
+    /// the force that was held during Δx.
     pub fn energy_j(&self) -> f64 {
         self.energy_j
     }
@@ -218,7 +251,10 @@ impl Envelope {
         self.counts[reason as usize] += 1;
     }
 
-    /// Returns the force to render until the next tick, N.
+    /// Returns the force to render until the next tick, N: the wanted one after the limits at the top of this module, in their
+    /// order. Of a model of age a, the share that is left is 1 up to [`FRESH_S`], falls linearly to a half at [`STALE_S`], and
+    /// is ½·e^{−(a − STALE_S)/DECAY_S} beyond. After `enable` it rises by t/[`ENGAGE_S`]. Passivity bounds it by √(2·S·E/v), and
+    /// slew its change in a tick of length h by S·h, S = [`SLEW_N_PER_S`].
     pub fn render(&mut self, wanted: &Wanted) -> DVec3 {
         self.ticks += 1;
         let finite = wanted.place_m.is_finite() && wanted.velocity_m_per_s.is_finite() && wanted.now_s.is_finite();
@@ -331,7 +367,8 @@ impl Envelope {
         force_n * (most_n / length_n)
     }
 
-    /// The largest force along `force_n` whose energy the tank can cover until slew has reduced it to zero, N.
+    /// The largest force along `force_n` whose energy the tank can cover until slew has reduced it to zero, N: √(2·S·E/v), from
+    /// ∫ (f − S·t)·v dt = f²·v/2S ≤ E. Here v is 1.5 times the speed along the force, at least 0.08 m/s, plus a·f/4S.
     fn bearable_n(&self, velocity_m_per_s: DVec3, force_n: DVec3) -> f64 {
         let along = force_n.normalize_or_zero();
         let along_m_per_s = velocity_m_per_s.dot(along);

@@ -35,7 +35,8 @@ pub struct Law {
 }
 
 impl Law {
-    /// Returns the law of a linear spring and damper, which feel the same in every direction.
+    /// Returns the law of a linear spring and damper, F = K·d and B·v, which feel the same in every direction. A disc that
+    /// slides has no drag.
     pub fn linear(stiffness_n_per_m: f64, damping_n_s_per_m: f64) -> Self {
         let step_m = 0.1;
         let row = |force_n: f64| Row {
@@ -66,6 +67,13 @@ impl Law {
 
     /// Returns the law at a depth, m. Forces are cubic between rows, with the rows' stiffness as slopes; beyond the
     /// last row they go on as straight lines.
+    ///
+    /// With F₀ and F₁ the forces of two rows a step h apart, k₀ and k₁ their stiffness, Δ = F₁ − F₀ and t from 0 to 1 between
+    /// them, that is the cubic of Hermite:
+    ///
+    /// F(t) = F₀ + t·Δ + t·(1 − t)·[(1 − t)·(h·k₀ − Δ) + t·(Δ − h·k₁)],  k = F′(t)/h.
+    ///
+    /// All other values are linear between rows. Beyond the last row, at depth D, F = F(D) + k(D)·(d − D).
     pub fn at_depth(&self, depth_m: f64) -> Row {
         let last = self.rows.len() - 1;
         let place = (depth_m / self.step_m).max(0.0);
@@ -92,7 +100,8 @@ impl Law {
         }
     }
 
-    /// Returns the depth at which a force is met, m.
+    /// Returns the depth at which a force is met, m: d with F(d) = `force_n`, by bisection between the two rows around it; beyond
+    /// the last row, at depth D, d = D + (`force_n` − F(D))/k(D).
     pub fn depth_of(&self, force_n: f64) -> f64 {
         if force_n <= 0.0 {
             return 0.0;
@@ -111,7 +120,7 @@ impl Law {
         0.5 * (low + high)
     }
 
-    /// Returns the depth that it reaches, m.
+    /// Returns the depth that it reaches, m: that of the last row.
     pub fn reach_m(&self) -> f64 {
         (self.rows.len() - 1) as f64 * self.step_m
     }

@@ -47,7 +47,8 @@ impl Hand {
         HANDS.iter().find(|hand| hand.name == name).copied()
     }
 
-    /// Returns the force of the string that pulls a device that is not held to its target, N; 0 for hands.
+    /// Returns the force of the string that pulls a device that is not held to its target, N: k·(target − x) with k = 60 N/m,
+    /// but at most 0.5 N; 0 for hands.
     pub fn string_n(&self, target_m: DVec3, place_m: DVec3) -> DVec3 {
         if self.stiffness_n_per_m > 0.0 {
             return DVec3::ZERO;
@@ -56,7 +57,14 @@ impl Hand {
     }
 
     /// Returns the state after `time_s` under a constant force, with a target that moves straight from `from_m` to
-    /// `to_m`. Exact except for the target, which is taken at its mean.
+    /// `to_m`. Exact except for the target, which is taken at its mean in each quarter of the time.
+    ///
+    /// With γ = b/2m, ω² = k/m − γ², x_r = target + F/k where the hand would rest, and a = x₀ − x_r:
+    ///
+    /// x(t) = x_r + e^{−γt}·(a·cos ωt + (v₀ + γ·a)·sin(ωt)/ω),
+    /// v(t) = e^{−γt}·(v₀·cos ωt − (γ·v₀ + (k/m)·a)·sin(ωt)/ω),
+    ///
+    /// with hyperbolic functions of |ω| where ω² < 0. Without a spring, v(t) = F/b + (v₀ − F/b)·e^{−bt/m}.
     pub fn advance(&self, held: HandState, from_m: DVec3, to_m: DVec3, force_n: DVec3, time_s: f64) -> HandState {
         const PARTS: u32 = 4;
         let part_s = time_s / f64::from(PARTS);
@@ -97,6 +105,12 @@ impl Hand {
 
     /// Returns the delay at which the loop with a spring of `stiffness` becomes unstable, s; infinite if it never does:
     /// the least t with m·s² + b·s + k + K·e^{−s·t} = 0 on the imaginary axis. A held sample counts as half a period.
+    ///
+    /// With s = iω both sides of K·e^{−iωt} = mω² − k − ibω have the same size, so (mω² − k)² + b²ω² = K²:
+    ///
+    /// ω² = [(2mk − b²) ± √((2mk − b²)² − 4m²·(k² − K²))]/2m²,
+    ///
+    /// and the same angle: ω·t = −arg(mω² − k − ibω), from 0 to 2π.
     pub fn critical_delay_s(&self, stiffness_n_per_m: f64) -> f64 {
         let (m, b, k, stiffness) = (self.mass_kg, self.damping_n_s_per_m, self.stiffness_n_per_m, stiffness_n_per_m);
         let sum = 2.0 * m * k - b * b;

@@ -78,6 +78,9 @@ impl LocalModel {
 
 /// Returns the distance within which K is valid: where half its change along the path is a tenth of the force, or of
 /// `least_n` if that is larger. `change` is ‖∂K/∂x‖, N/m².
+///
+/// Over a way r the force of the model is off by ½·‖∂K/∂x‖·r², the next term of its Taylor series. So
+/// r = √(2·max(f/10, `least_n`)/‖∂K/∂x‖).
 pub fn valid_m(force_n: f64, least_n: f64, change_n_per_m2: f64) -> f64 {
     (2.0 * (0.1 * force_n).max(least_n) / change_n_per_m2.max(1e-9)).sqrt()
 }
@@ -129,6 +132,37 @@ pub(crate) fn is_after(time_s: f64, other_s: f64) -> bool {
 const TICK_S: f64 = 1e-3;
 
 /// The state of a touch along a tool's path.
+///
+/// A sample tells of a tool 2 mm deep in a tissue of 400 N/m. Since then the client's tool has gone 1 mm deeper, so it feels 1.2 N:
+///
+/// ```
+/// use glam::{DMat3, DVec3};
+/// use palpate_haptics::{ContactState, Law, LocalModel, Touching};
+///
+/// let law = Law::linear(400.0, 0.5);
+/// let model = LocalModel {
+///     sequence: 1,
+///     client_time_s: 0.0,
+///     step: 1,
+///     place_m: DVec3::new(0.0, 0.0, -0.002),
+///     velocity_m_per_s: DVec3::ZERO,
+///     force_n: 0.8 * DVec3::Z,
+///     stiffness_n_per_m: 400.0 * DMat3::IDENTITY,
+///     damping_n_s_per_m: 0.5 * DMat3::IDENTITY,
+///     surface_m: DVec3::ZERO,
+///     normal: DVec3::Z,
+///     curvature_per_m: DMat3::ZERO,
+///     valid_m: 0.01,
+///     friction: 0.2,
+///     contact_state: ContactState::Sticking,
+///     law: 0,
+/// };
+/// assert!(model.is_sound());
+/// let mut touching = Touching::at_sample(&model, &law);
+/// touching.move_to(&model, &law, DVec3::new(0.0, 0.0, -0.003));
+/// let force_n = touching.force_n(&model, &law, DVec3::ZERO);
+/// assert!((force_n - 1.2 * DVec3::Z).length() < 1e-9, "{force_n} N");
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Touching {
     /// How far the tissue under the disc is displaced tangentially from where it would not pull, m.
@@ -145,7 +179,9 @@ pub struct Touching {
 const MAX_TURN: f64 = 1.0;
 
 impl Touching {
-    /// Returns the state when the sample was taken.
+    /// Returns the state when the sample was taken: the stretch s = −(f_t + B_t·v_t)/K_t that explains what of the sample's
+    /// force is across the surface (D in place of B_t while it slides), within the friction cone, |s| ≤ μ·F(d)/K_t; and the rest r
+    /// of the force, which the law does not explain ([`Touching::force_n`]).
     pub fn at_sample(model: &LocalModel, law: &Law) -> Self {
         let mut touching = Touching {
             stretch_m: DVec3::ZERO,
@@ -204,7 +240,8 @@ impl Touching {
         (depth_m, law.at_depth(depth_m))
     }
 
-    /// Advances to the tool's next place.
+    /// Advances to the tool's next place, Δx away: s becomes what of s + Δx is across the surface, shortened to μ·F(d)/K_t
+    /// (Coulomb's law: the disc slides where its spring would pull with more than μ times the pressure).
     pub fn move_to(&mut self, model: &LocalModel, law: &Law, place_m: DVec3) {
         let moved_m = place_m - self.place_m;
         self.place_m = place_m;
@@ -221,6 +258,16 @@ impl Touching {
     }
 
     /// Returns the force on the tool at its present place, N.
+    ///
+    /// With d the depth, n the normal, s the stretch, v the velocity and v_t what of it is across n; F(d), K_t, B, B_t and D the
+    /// law at that depth ([`Row`]); and r the rest of the sample's force:
+    ///
+    /// f = p·n + t + r,  p = max(0, F(d) − B·v·n),
+    /// t = −K_t·s − B_t·v_t where the disc sticks,  t = −K_t·s where it slides, each shortened to μ·p; then −D·v_t as well where
+    /// it slides.
+    ///
+    /// What of f points into the tissue is left out. A tool that holds the tissue feels f₀ − K·Δx − B·Δv, with Δx and Δv the
+    /// differences from the sample's place and velocity, and Δx shortened to [`LocalModel::valid_m`].
     pub fn force_n(&self, model: &LocalModel, law: &Law, velocity_m_per_s: DVec3) -> DVec3 {
         if model.contact_state == ContactState::Holding {
             let away_m = within(self.place_m - model.place_m, model.valid_m);

@@ -241,7 +241,9 @@ impl Path {
         now_s - self.arrived_s > HOLD_S
     }
 
-    /// Returns the action of the tool in the step of `step_s` that ends at `now_s`; `None` before the first command.
+    /// Returns the action of the tool in the step of `step_s` that ends at `now_s`; `None` before the first command. The tool goes
+    /// at most [`SPEED_M_PER_S`]·`step_s` towards where it is to be. Between two commands that is a point of the straight line,
+    /// x₀ + (x₁ − x₀)·(t − t₀)/(t₁ − t₀); beyond the newest of those that tell a velocity, x + v·(t − t₀) for [`EXTRAPOLATE_S`].
     pub fn step(&mut self, now_s: f64, step_s: f64) -> Option<Play> {
         let newest = self.waiting.back().copied();
         if let Some(heading) = self.heading {

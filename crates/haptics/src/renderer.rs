@@ -39,6 +39,48 @@ const MIN_WAY_M: f64 = 2e-5;
 const MAX_WAY_M: f64 = 1e-3;
 
 /// One tool's renderer.
+///
+/// Samples come every 20 ms; between them the force follows the hand a thousand times a second. A tissue of 400 N/m pushes back
+/// with 1 N where the hand is 2.5 mm deep:
+///
+/// ```
+/// use glam::{DMat3, DVec3};
+/// use palpate_haptics::device::UNDECLARED;
+/// use palpate_haptics::{ContactState, Envelope, Law, LocalModel, Renderer};
+///
+/// let sample = |sequence: u64, client_time_s: f64, place_m: DVec3| LocalModel {
+///     sequence,
+///     client_time_s,
+///     step: sequence,
+///     place_m,
+///     velocity_m_per_s: DVec3::ZERO,
+///     force_n: 400.0 * (-place_m.z).max(0.0) * DVec3::Z,
+///     stiffness_n_per_m: 400.0 * DMat3::IDENTITY,
+///     damping_n_s_per_m: DMat3::ZERO,
+///     surface_m: DVec3::ZERO,
+///     normal: DVec3::Z,
+///     curvature_per_m: DMat3::ZERO,
+///     valid_m: 0.01,
+///     friction: 0.2,
+///     contact_state: if place_m.z < 0.0 { ContactState::Sticking } else { ContactState::Free },
+///     law: 0,
+/// };
+/// let mut renderer = Renderer::new(Law::linear(400.0, 0.0), Envelope::new(UNDECLARED, DVec3::ZERO));
+/// renderer.envelope.enable();
+/// let (mut force_n, mut changes) = (DVec3::ZERO, 0);
+/// for tick in 0..1000_u32 {
+///     let now_s = f64::from(tick) * 1e-3;
+///     // On the surface while rendering ramps in; then 25 mm/s down, to 2.5 mm.
+///     let place_m = -(0.025 * (now_s - 0.7)).clamp(0.0, 0.0025) * DVec3::Z;
+///     if tick.is_multiple_of(20) {
+///         renderer.receive(sample(1 + u64::from(tick), now_s, place_m), now_s);
+///     }
+///     let before_n = std::mem::replace(&mut force_n, renderer.tick(now_s, place_m));
+///     changes += u32::from(force_n != before_n);
+/// }
+/// assert!((force_n - 1.0 * DVec3::Z).length() < 1e-3, "{force_n} N");
+/// assert!(changes > 90, "the force changed in each tick of the 100 ms of the way: {changes}");
+/// ```
 #[derive(Debug)]
 pub struct Renderer {
     /// With their numbers, the oldest first.
@@ -218,7 +260,10 @@ impl Renderer {
     }
 
     /// Returns the way by which a server may be wrong about the tool so that the force is off by no more than `share`
-    /// of itself, m. Above the tissue half the way to it counts, as far as a hand would notice.
+    /// of itself, m. Above the tissue the same share of the way to it counts.
+    ///
+    /// A way w changes the force by at most max(k, k_t)·w, so w = `share`·F(d)/max(k, k_t) at a depth d; at a height h it is
+    /// `share`·h. It is kept between 0.02 and 1 mm.
     pub fn way_m(&self, share: f64) -> f64 {
         let Some((model, touching)) = &self.newest else { return MIN_WAY_M };
         let (depth_m, row) = touching.at_law(model, law_of(&self.laws, model));
@@ -230,7 +275,8 @@ impl Renderer {
         way_m.clamp(MIN_WAY_M, MAX_WAY_M)
     }
 
-    /// Returns the force to render until the next tick, for a tool at `place_m` now, N.
+    /// Returns the force to render until the next tick, for a tool at `place_m` now, N: F(t) + b·e^{−(t − t0)/τ} as at the top of
+    /// this module, within the limits of the envelope.
     pub fn tick(&mut self, now_s: f64, place_m: DVec3) -> DVec3 {
         let known = place_m.is_finite() && now_s.is_finite();
         if let Some((then_s, from_m)) = self.before.filter(|_| known)

@@ -5,7 +5,8 @@
 pub enum Coupling {
     /// The surface follows the tool exactly: the stiffness felt is the tissue's.
     Constraint,
-    /// A spring of Kc and a damper of Bc: the stiffness felt is K·Kc/(K + Kc).
+    /// A spring of Kc and a damper of Bc: the stiffness felt is K·Kc/(K + Kc), that of two springs in a row, which bear the same
+    /// force and add their lengths.
     Spring {
         /// Kc, N/m.
         stiffness_n_per_m: f64,

@@ -1,4 +1,4 @@
-//! Admission: sessions are created, started and changed if their thread has time for their steps.
+//! Admission: a session is created, started or changed only if its thread has time for its steps.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
@@ -30,45 +30,45 @@ use palpate_tissue::memory;
 use palpate_tissue::scene::{Body, Change, Scene};
 use palpate_tissue::{Model, scheme_selection};
 
-/// How a session begins.
+/// The state with which a session begins on this server.
 pub struct Begin {
-    /// Its ID.
+    /// ID of the session.
     pub id: String,
-    /// The tissue that it began with.
+    /// The first tissue of the session, in its first run.
     pub first: Arc<Model>,
-    /// Whether its time goes on.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step at which it pauses.
+    /// The step count at which the session pauses, if any.
     pub until: Option<u64>,
-    /// Time without use after which it is deleted, s.
+    /// Time without use after which the session is deleted, s.
     pub idle_timeout_s: f64,
-    /// What it plays, in place of what clients tell it.
+    /// The recording that the session plays instead of commands of clients.
     pub playback: Option<Playback>,
-    /// The run of the journal that it continues; 0 if there is none.
+    /// Number of the journal's run that the session continues; 0 if there is none.
     pub after_run: u64,
-    /// The revision at which this server became its owner; 0 without a fleet.
+    /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub revision: u64,
     /// Changes of the tissue that wait for a later step, each with that step.
     pub waiting: Vec<(u64, Input)>,
-    /// It begins frozen, and is not served till [`SessionHandle::arrive`].
+    /// Whether the session begins frozen, and is not served until [`SessionHandle::arrive`].
     pub frozen: bool,
-    /// Its tape is told what happens to it, if the server keeps tapes.
+    /// Whether the session's events are written to an event log, if the server keeps journals.
     pub recorded: bool,
 }
 
-/// The name of a new session.
+/// A reserved ID for a new session.
 #[derive(Debug, Clone)]
 pub struct SessionReservation {
-    /// Its ID.
+    /// ID of the session.
     pub id: String,
-    /// The revision at which this server became its owner; 0 without a fleet.
+    /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub revision: u64,
-    /// Its tape is told what happens to it, if the server keeps tapes.
+    /// Whether the session's events are written to an event log, if the server keeps journals.
     pub recorded: bool,
 }
 
 impl SessionReservation {
-    /// Reserves a session without a fleet.
+    /// Reserves a new random ID without a fleet, for a session that is recorded.
     ///
     /// # Errors
     /// Refuses if the system has no random numbers.
@@ -78,11 +78,12 @@ impl SessionReservation {
 }
 
 impl Pacer {
-    /// Makes a session for `owner`, unless `stop` is set before it is there.
+    /// Creates a session for `owner` with a new random ID. `idle_timeout_s` is the time without use after which it
+    /// is deleted, s. Setting `stop` cancels the call.
     ///
     /// # Errors
-    /// Refuses a scene that is not valid or whose steps are too heavy, memory and sessions beyond the caller's part, a thread
-    /// that has no time left, and when `stop` is set.
+    /// Refuses a scene that is invalid or whose steps are too heavy, memory and sessions beyond the caller's part,
+    /// a thread that has no time left, and when `stop` is set.
     pub fn create(
         &self,
         scene: &Scene,
@@ -94,10 +95,12 @@ impl Pacer {
         self.create_as(SessionReservation::new()?, scene, (paused, idle_timeout_s), owner, stop)
     }
 
-    /// Does the same, under a name that was made before.
+    /// Creates a session for `owner` with a reserved ID. The pair is whether time is paused, and the time without
+    /// use after which the session is deleted, s. Setting `stop` cancels the call.
     ///
     /// # Errors
-    /// As for [`Pacer::create`].
+    /// Refuses a scene that is invalid or whose steps are too heavy, memory and sessions beyond the caller's part,
+    /// a thread that has no time left, and when `stop` is set.
     pub fn create_as(
         &self,
         SessionReservation { id, revision, recorded }: SessionReservation,
@@ -106,7 +109,7 @@ impl Pacer {
         owner: &Account,
         stop: &AtomicBool,
     ) -> Result<Arc<SessionHandle>> {
-        // Before anything is done for it.
+        // Taken before any work is done for it.
         let slot = owner.take(Resource::Sessions, 1, "")?;
         let most_hz = self.limits.session_rate_hz;
         number("stepping.rate_hz", scene.stepping.rate_hz, &format!("at most {most_hz}"), |v| v <= most_hz)?;
@@ -128,10 +131,11 @@ impl Pacer {
         self.admit(begin, owner, slot, || Ok(Session::new(&model)), stop)
     }
 
-    /// Makes a session that continues one that was kept: `session` gives it, whose tissue at its beginning was `begin.first`.
+    /// Creates a session that continues a saved one. `session` returns the saved session; `begin.first` is the
+    /// tissue with which it first began.
     ///
     /// # Errors
-    /// Refuses an ID that is taken, what `session` refuses, and as [`Pacer::create`] does.
+    /// Refuses an ID that is in use, whatever `session` refuses, and whatever [`Pacer::create`] refuses.
     pub fn resume(
         &self,
         begin: Begin,
@@ -141,7 +145,7 @@ impl Pacer {
     ) -> Result<Arc<SessionHandle>> {
         let slot = owner.take(Resource::Sessions, 1, "")?;
         if lock(&self.sessions).contains_key(&begin.id) {
-            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "is that of a session that is there already"));
+            return Err(Refusal::new(Reason::OutOfTurn, "session_id", "already belongs to a session"));
         }
         self.admit(begin, owner, slot, session, stop)
     }
@@ -171,12 +175,12 @@ impl Pacer {
         check_work(&first, &self.limits)?;
         let skin = memory::attempt("sheet.points", || Ok(Skin::of(&first)))?;
         if let Body::Mesh(mesh) = &first.scene.body {
-            // Who touches it first does so in a step, which must not wait for this.
+            // The first use computes it, and that must not happen in a step.
             mesh.shape.surface();
         }
         let bytes = first.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes());
         let memory = owner.take(Resource::Memory(Purpose::Session), bytes, "sheet.points")?;
-        // Laid out before the lock is taken, on which all calls wait.
+        // Allocated before the lock is taken, which every call needs.
         let session = memory::attempt("sheet.points", session)?;
         let (model, step) = (session.model().clone(), session.step_count());
         let running = running && session.hold_reason().is_none();
@@ -230,7 +234,7 @@ impl Pacer {
             after_run,
             revision,
         };
-        // What is played is recorded already.
+        // A playback is already recorded.
         let event_log =
             self.event_logs.get().filter(|_| recorded && playback.is_none()).map(|queue| EventLog::new(queue, about()));
         let handle = Arc::new(SessionHandle {
@@ -259,7 +263,7 @@ impl Pacer {
             slot: Mutex::new(slot),
             _memory: memory,
         });
-        // The first that its journal is told.
+        // This is the first event of its journal.
         if !waiting.is_empty() {
             handle.adopt_waiting(waiting);
         }
@@ -274,16 +278,16 @@ impl Pacer {
         let mut sessions = lock(&self.sessions);
         let points: usize = sessions.values().map(|handle| handle.model.len()).sum();
         if points + handle.model.len() > self.limits.points_in_all {
-            let message = format!("the sessions of the server have {points} points already");
+            let message = format!("the sessions of the server already have {points} points");
             return Err(Refusal::new(Reason::TooMany, "sheet.points", message));
         }
         sessions.insert(id, handle.clone());
-        // Before anybody can name the session: what is asked of it comes after this.
+        // No caller can name the session before this, so every request to it comes after this.
         stepper.adopt(number, running);
         Ok(handle)
     }
 
-    /// What never changes is one in memory for all sessions of a scene, and compiled once.
+    /// Returns the compiled model of a scene. Sessions of equal scenes share one in memory, which is compiled once.
     fn compile(&self, scene: &Scene, stop: &AtomicBool) -> Result<Arc<Model>> {
         let known = lock(&self.sessions)
             .values()
@@ -292,15 +296,16 @@ impl Pacer {
         known.map_or_else(|| Model::compile_until(scene, &self.limits, stop), Ok)
     }
 
-    /// The thread with the most time to spare for a further session of `owner`, and what that will take.
+    /// Returns the estimated cost of a further session of `owner`, and the index of the thread with the most time
+    /// left.
     fn place(&self, model: &Model, paused: bool, owner: &Account) -> Result<(Cost, usize)> {
         let sessions = lock(&self.sessions);
-        // What steps take that are too long for others tells nothing of a new one.
+        // Sessions on `step-apart` are not typical for a new one.
         let known = sessions.values().filter(|handle| handle.thread() < self.steppers.len());
         let cost = Cost::guess(model, known.map(|handle| &handle.cost));
         let mut taken = vec![(0.0, 0_usize); self.steppers.len()];
         for handle in sessions.values() {
-            // Those apart take nothing of these.
+            // Sessions on `step-apart` take no time of these threads.
             if let Some(taken) = taken.get_mut(handle.thread()) {
                 taken.0 += handle.cost.share();
                 taken.1 += 1;
@@ -316,10 +321,11 @@ impl Pacer {
         Ok((cost, thread))
     }
 
-    /// Returns another tissue for a session ([`SessionHandle::change`]), unless its steps would make others late.
+    /// Changes the tissue of a session as [`SessionHandle::change`] does, if its thread has the time for the new
+    /// steps. Returns the step from which it acts, and the new tissue.
     ///
     /// # Errors
-    /// As for [`SessionHandle::change`]; and refuses if the steps would make other sessions late.
+    /// Refuses whatever [`SessionHandle::change`] refuses, and a change that would make other sessions late.
     pub fn change_tissue(
         &self,
         handle: &SessionHandle,
@@ -330,10 +336,10 @@ impl Pacer {
         handle.change(change, at_step, |needed| self.check_share(self.taken_by_others(handle), needed), stop)
     }
 
-    /// Of the thread of a session, what the others that are awake take.
+    /// Returns the fraction of a session's thread that other awake sessions take.
     fn taken_by_others(&self, handle: &SessionHandle) -> f64 {
         let thread = handle.thread();
-        // Those apart may be late.
+        // Sessions on `step-apart` may be late.
         if thread == self.steppers.len() {
             return 0.0;
         }
@@ -341,9 +347,9 @@ impl Pacer {
         self.taken_beside(lock(&self.sessions).values().filter(others), &handle.owner)
     }
 
-    /// What these sessions of a thread take from a further one of `owner`. Another caller counts with at most its equal
-    /// part, because the thread gives it no more where `owner` wants its own: what is beyond that makes only the other
-    /// caller's sessions late.
+    /// Returns the fraction of a thread that these sessions take from a further one of `owner`. Another caller
+    /// counts with at most its equal part, because the thread gives it no more if `owner` needs its own; what it
+    /// takes beyond that delays only that caller's sessions.
     fn taken_beside<'a>(&self, sessions: impl Iterator<Item = &'a Arc<SessionHandle>>, owner: &Account) -> f64 {
         let mut by_owner = BTreeMap::from([(owner.number(), 0.0)]);
         for handle in sessions {
@@ -352,8 +358,8 @@ impl Pacer {
         fairly_taken(&by_owner, owner.number(), self.limits.thread_share)
     }
 
-    /// Refuses what would make others late. Whoever is alone on its thread delays nobody, however heavy; and what rests
-    /// takes nothing.
+    /// Refuses a session that would make others late. A session alone on its thread delays no other, however heavy;
+    /// and a session at rest takes nothing.
     fn check_share(&self, taken: f64, needed: f64) -> Result<()> {
         let most = self.limits.thread_share;
         if taken == 0.0 || taken + needed <= most {
@@ -366,10 +372,11 @@ impl Pacer {
         Err(Refusal::new(Reason::Overloaded, "", message))
     }
 
-    /// Lets a session's time go on ([`SessionHandle::start`]), unless that would make others late.
+    /// Starts a session's time as [`SessionHandle::start`] does, unless its steps would make other sessions late.
+    /// Returns the number of the next step.
     ///
     /// # Errors
-    /// As for [`SessionHandle::start`]; and refuses if the steps would make other sessions late.
+    /// Refuses whatever [`SessionHandle::start`] refuses, and steps that would make other sessions late.
     pub async fn start_session(&self, handle: &SessionHandle, until: Option<u64>) -> Result<u64> {
         if lock(&handle.status).state == RunState::Paused {
             self.check_share(self.taken_by_others(handle), handle.cost.awake_share())?;
@@ -378,8 +385,8 @@ impl Pacer {
     }
 }
 
-/// The sum of what callers take of a thread, by their numbers, where each but `owner` counts with at most an equal part of
-/// `most`.
+/// Returns the sum of the fractions that callers, by their numbers, take of a thread. Each caller but `owner`
+/// counts with at most an equal part of `most`.
 #[allow(clippy::cast_precision_loss)]
 fn fairly_taken(by_owner: &BTreeMap<u64, f64>, owner: u64, most: f64) -> f64 {
     let callers = by_owner.iter().filter(|(number, taken)| **number == owner || **taken > 0.0).count();
@@ -399,7 +406,7 @@ mod tests {
             fairly_taken(&by_owner, 0, 0.8)
         };
         assert!((taken(&[]) - 0.1).abs() < 1e-12);
-        // Who takes less than its part counts in full, and who rests does not divide the thread.
+        // A caller that takes less than its part counts in full, and one at rest does not divide the thread.
         assert!((taken(&[0.3, 0.0]) - 0.4).abs() < 1e-12);
         assert!((taken(&[0.75, 0.0]) - 0.5).abs() < 1e-12);
         assert!((taken(&[0.75, 0.1]) - (0.1 + 0.8 / 3.0 + 0.1)).abs() < 1e-12);

@@ -1,26 +1,27 @@
-//! What audits have found: of one session, and counts of all.
+//! Results of audits: those of one session, and counts over all sessions. An audit repeats a window of steps more
+//! accurately to measure its error.
 
 use super::thread_counters::Count;
 use palpate_refusal::Refusal;
 use palpate_tissue::scene::record::{AuditedError, Correction};
 use palpate_tissue::select::audit::{ErrorExtent, Origin};
 
-/// What audits have found of a session.
+/// Results of the audits of one session.
 #[derive(Debug, Clone, Default)]
 pub struct Audited {
-    /// Windows that were audited.
+    /// Number of windows of steps that were audited.
     pub windows: u64,
-    /// The steps done at the end of the newest window, and the error that it added.
+    /// The step count at the end of the newest audited window, and the error that the window added.
     pub newest: Option<(u64, AuditedError)>,
-    /// The largest of each part in any window.
+    /// The largest value of each part of the error in any window.
     pub largest: AuditedError,
-    /// Windows whose error was above the tolerance.
+    /// Number of windows whose error was above the tolerance.
     pub above: u64,
-    /// Where most of the newest of those errors came from.
+    /// Main source of the newest error above the tolerance.
     pub origin: Option<Origin>,
-    /// How often the tissue was corrected.
+    /// Number of corrections of the tissue.
     pub corrections: u64,
-    /// The newest of these.
+    /// The newest correction.
     pub correction: Option<Correction>,
     /// Why the newest correction that was needed could not be made.
     pub refused_correction: Option<Refusal>,
@@ -28,15 +29,15 @@ pub struct Audited {
     pub(super) warned_ns: Option<u64>,
 }
 
-/// What the auditor counts, of all sessions, since it began.
+/// Counts of the auditor over all sessions, since it began.
 #[derive(Debug, Default)]
 pub struct AuditTally {
-    /// Windows that were audited.
+    /// Number of windows of steps that were audited.
     pub windows: Count,
-    /// Windows whose error was above the tolerance.
+    /// Number of windows whose error was above the tolerance.
     pub above: Count,
-    /// Corrections.
+    /// Number of corrections.
     pub corrections: Count,
-    /// Processor time, ns.
+    /// Processor time of the auditor, ns.
     pub busy_ns: Count,
 }

@@ -1,13 +1,14 @@
-//! The auditor: one thread, named `audit`, that measures errors of live sessions, with little time and a lower priority than
-//! stepping.
+//! The auditor: one thread, named `audit`, that measures errors of live sessions. It uses a small fraction of a
+//! core, at a lower priority than stepping.
 //!
-//! It asks the awake sessions in turns for a window of steps (`tissue::audit`), and repeats that at a quarter of the substep
-//! in f64. The stepping thread shares two checkpoints and writes down what the tools are told; it waits for nothing and
-//! copies nothing, unless the auditor has not taken its copy of a checkpoint before the next one is made. After each slice
-//! of work the auditor rests until its processor time is within its share of a core.
+//! It asks the awake sessions in turn for a window of steps (`palpate_tissue::select::audit`), and repeats that window in
+//! f64 with a quarter of the substep. The stepping thread shares two checkpoints and records the tools' inputs. It
+//! waits for nothing and copies nothing, unless the auditor has not taken its copy of a checkpoint before the next
+//! one is made. After each slice of work the auditor rests until its processor time is within its share of a core.
 //!
-//! What it finds is told in the session's status, in the metrics, and in the log if it is above the tolerance. Where the
-//! scene says `correct`, a more accurate model enters as another tissue does: through the intake, at a step that is told.
+//! The results appear in the session's status, in the metrics and, if an error is above the tolerance, in the log.
+//! If the scene sets `correct`, a more accurate model replaces the tissue as any change does: through the intake,
+//! at a step that the log and the status name.
 
 use std::collections::BTreeMap;
 use std::ops::Bound;
@@ -31,19 +32,19 @@ use palpate_tissue::scene::Named;
 use palpate_tissue::scene::record::Correction;
 use palpate_tissue::select::audit::{Audit, AuditFinding, FINER, Mark, Origin, WindowInputs};
 
-/// How long to wait where no session is awake.
+/// Wait between looks for an awake session.
 const IDLE: Duration = Duration::from_millis(250);
 
-/// A session whose window takes more than so many times what it should is passed over: it was paused, say.
+/// A session whose window takes more than this multiple of its nominal time is skipped: for example, it was paused.
 const MAX_WINDOW_FACTOR: f64 = 2.0;
 
-/// Between two warnings about one session, ns.
+/// Least time between two warnings about one session, ns.
 const WARN_EVERY_NS: u64 = 10_000_000_000;
 
-/// All sessions of a server.
+/// All sessions of a server, by their ID.
 pub(super) type Sessions = Arc<Mutex<BTreeMap<String, Arc<SessionHandle>>>>;
 
-/// The thread, as others see it.
+/// The auditor, as other threads see it.
 #[derive(Debug, Default)]
 pub(super) struct Auditor {
     stopped: Mutex<bool>,
@@ -57,14 +58,14 @@ impl Auditor {
         self.wake.notify_all();
     }
 
-    /// Waits so long, or until it is to stop. False if it is.
+    /// Waits for `time`, or until the auditor is stopped. Returns false if it is stopped.
     fn wait(&self, time: Duration) -> bool {
         let stopped = lock(&self.stopped);
         let waited = self.wake.wait_timeout_while(stopped, time, |stopped| !*stopped);
         !*waited.unwrap_or_else(PoisonError::into_inner).0
     }
 
-    /// The thread's work, with `share` of a core.
+    /// Runs the thread, with `share` of a core, until it is stopped.
     pub(super) fn work(&self, sessions: &Sessions, share: f64) {
         let mut duty = Duty { auditor: self, share, since_ns: thread_time_ns() };
         let mut last = String::new();
@@ -80,7 +81,7 @@ impl Auditor {
                             None => tracing::error!(session = %handle.id, "a fault of the program ended an audit"),
                         }
                     }
-                    // Also where nothing came of it: to ask is work too.
+                    // Also after an audit without result, because asking takes time too.
                     duty.rest() && self.wait(Duration::from_millis(1))
                 }
                 None => self.wait(IDLE),
@@ -92,8 +93,9 @@ impl Auditor {
     }
 }
 
-/// The next session after the one with the id `last` that is awake, in the order of ids, the first after the last. This thread
-/// gives way, and may be stopped for long while it holds the lock that every call needs: so it holds it for one session at a time.
+/// Returns the next awake session after the one with the ID `last`, in the order of IDs; the first follows the
+/// last. This thread has a low priority, and may be preempted for long while it holds the lock that every call
+/// needs: so it takes the lock for one session at a time.
 fn next_awake(sessions: &Sessions, last: &str) -> Option<Arc<SessionHandle>> {
     let after = |id: &str| {
         let sessions = lock(sessions);
@@ -106,7 +108,7 @@ fn next_awake(sessions: &Sessions, last: &str) -> Option<Arc<SessionHandle>> {
     rest.chain(beginning).find(is_awake)
 }
 
-/// Keeps the thread to its share of a core.
+/// Limits the thread to its share of a core.
 struct Duty<'a> {
     auditor: &'a Auditor,
     share: f64,
@@ -114,7 +116,7 @@ struct Duty<'a> {
 }
 
 impl Duty<'_> {
-    /// Rests for what was done since the last rest. False if it is time to stop.
+    /// Rests for the work since the last rest. Returns false if the auditor is stopped.
     #[allow(clippy::cast_precision_loss)]
     fn rest(&mut self) -> bool {
         let now_ns = thread_time_ns();
@@ -126,7 +128,7 @@ impl Duty<'_> {
     }
 }
 
-/// Audits one window of a session, if one comes, and if there is memory for it.
+/// Audits one window of a session, if the window arrives in time and there is memory for it.
 fn audit(handle: &SessionHandle, sessions: &Sessions, duty: &mut Duty<'_>, tally: &AuditTally) {
     let bytes = Audit::bytes(&handle.model);
     let _taken = match handle.owner.take(Resource::Memory(Purpose::Session), bytes, "") {
@@ -144,7 +146,7 @@ fn audit(handle: &SessionHandle, sessions: &Sessions, duty: &mut Duty<'_>, tally
     let Some(Mark::End(end, inputs)) = next(&told, longest(&model)) else { return };
     let audit = opening.close(end, inputs);
     let extent = lock(&handle.audited).extent;
-    // Nobody wants to know of a session that is deleted, and its memory is to be freed.
+    // A deleted session needs no audit, and its memory must be freed.
     let mut goes_on = || duty.rest() && lock(sessions).contains_key(&handle.id);
     let Some(finding) = audit.work(FINER, extent, &mut goes_on) else { return };
     note(handle, &finding, tally);
@@ -160,7 +162,8 @@ fn next(told: &Receiver<Mark>, within: Duration) -> Option<Mark> {
     told.recv_timeout(within).ok()
 }
 
-/// How long to wait for the beginning or the end of a window: with one interval of checkpoints before each.
+/// Returns the time to wait for the beginning or the end of a window, each with one interval of checkpoints before
+/// it.
 #[allow(clippy::cast_precision_loss)]
 fn longest(model: &Model) -> Duration {
     let interval = (INTERVAL_SUBSTEPS / u64::from(model.plan.substeps)).max(1);
@@ -182,7 +185,8 @@ fn note(handle: &SessionHandle, finding: &AuditFinding, tally: &AuditTally) {
     audited.origin = origin.or(audited.origin);
 }
 
-/// Logs an error above the tolerance, and why no correction was made of it if that was asked for. Not too often.
+/// Logs an error above the tolerance, and why a requested correction was refused; at most every 10 s for one
+/// session.
 fn warn(handle: &SessionHandle, finding: &AuditFinding, origin: Origin) {
     let AuditFinding { step, error, .. } = *finding;
     let now = now_ns();
@@ -201,7 +205,8 @@ fn warn(handle: &SessionHandle, finding: &AuditFinding, origin: Origin) {
     );
 }
 
-/// Steps the tissue more accurately from the next step on. Nothing happens if meanwhile it is another.
+/// Makes the steps of the tissue more accurate from the next step on. `None` if the tissue has changed meanwhile,
+/// or if there is no suitable correction.
 ///
 /// # Errors
 /// Refuses a correction whose steps would take longer than a scene's may.

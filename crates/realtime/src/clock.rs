@@ -1,9 +1,9 @@
-//! The clock of stepping: monotonic, from an origin of its own; and how sessions keep time by it.
+//! The clock of stepping, which is monotonic with its own origin; and the time dilation of sessions.
 
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-/// Nanoseconds since the first call in this process; never 0.
+/// Returns the nanoseconds since the first call in this process; never 0.
 #[allow(clippy::disallowed_methods, clippy::cast_possible_truncation)]
 pub fn now_ns() -> u64 {
     static ORIGIN: OnceLock<Instant> = OnceLock::new();
@@ -12,7 +12,8 @@ pub fn now_ns() -> u64 {
     now.duration_since(origin).as_nanos() as u64
 }
 
-/// Returns the processor time of the calling thread, ns. Where the system does not tell it, the time that passes.
+/// Returns the processor time of the calling thread, ns. Outside Linux it returns the elapsed time, as [`now_ns`]
+/// does.
 #[allow(clippy::cast_sign_loss)]
 pub fn thread_time_ns() -> u64 {
     #[cfg(target_os = "linux")]
@@ -24,15 +25,15 @@ pub fn thread_time_ns() -> u64 {
     now_ns()
 }
 
-/// Over which time dilation is measured.
+/// Length of the window over which time dilation is measured, ns.
 const DILATION_WINDOW_NS: u64 = 1_000_000_000;
 
-/// Simulated over real time, of the last second or so.
+/// Time dilation of a session: simulated over real time, measured over about the last second.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Dilation {
-    /// 1 when on time.
+    /// The newest measurement; 1 when the session is on time.
     pub value: f64,
-    /// When the window of the next measurement began, and steps done then.
+    /// Time at which the window of the next measurement began, ns, and the step count then.
     since: (u64, u64),
 }
 

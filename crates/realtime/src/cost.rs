@@ -1,7 +1,7 @@
-//! What the steps of a session cost: estimated before it begins, then measured; and the largest step that is allowed.
+//! The cost of a session's steps: estimated before it begins, then measured; and the largest step that is allowed.
 //!
-//! A new session's step is estimated from its points and substeps and from what awake sessions take for theirs. Sessions at rest
-//! do not count: a thousand of them are a valid use, and `limits.sessions` bounds them.
+//! The step of a new session is estimated from its points and substeps, and from the times of awake sessions.
+//! Sessions at rest do not count: a thousand of them are a valid use, and `limits.sessions` bounds them.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -10,23 +10,23 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Scene;
 use palpate_tissue::{Model, scheme_selection};
 
-/// Before anything was measured: of a point and substep, and of a step beside its points, ns.
+/// Estimates before anything was measured: time of one point and substep, and of a step beside its points, ns.
 const GUESS_NS: f64 = 2.0;
 const GUESS_STEP_NS: f64 = 2000.0;
 
-/// Steps over which the mean goes.
+/// Number of steps over which the running mean is taken.
 const MEMORY: f64 = 64.0;
 
-/// A step that took longer than so many times the mean counts as so many: one in which the thread was not running tells
-/// nothing of the session.
+/// Limit of one step's time as a multiple of the mean; a longer step counts as this. A step in which the thread was
+/// preempted does not characterize the session.
 const OUTLIER: f64 = 8.0;
 
-/// What a session takes of its thread.
+/// Time that a session takes of its thread.
 #[derive(Debug)]
 pub(super) struct Cost {
     /// Mean time of a step, ns, as bits of an f64.
     step_ns: AtomicU64,
-    /// The same of a core, while steps are computed; 0 at rest.
+    /// Fraction of a core, as bits of an f64, while steps are computed; 0 at rest.
     share: AtomicU64,
     rate_hz: f64,
     point_substeps: f64,
@@ -42,7 +42,7 @@ fn set(bits: &AtomicU64, value: f64) {
 
 #[allow(clippy::cast_precision_loss)]
 impl Cost {
-    /// Of a session that has not begun: by what others take for their points, of `known`.
+    /// Estimates the cost of a session that has not begun, from the times per point of the sessions `known`.
     pub(super) fn guess<'c>(model: &Model, known: impl Iterator<Item = &'c Cost>) -> Self {
         let point_substeps = model.swept_points() as f64 * f64::from(model.plan.substeps);
         let (taken_ns, worked) = known.filter(|cost| cost.share() > 0.0).fold((0.0, 0.0), |(ns, work), cost| {
@@ -54,37 +54,37 @@ impl Cost {
         Cost { step_ns: AtomicU64::new(step_ns.to_bits()), share: AtomicU64::new(0), rate_hz, point_substeps }
     }
 
-    /// Of a core, if it is awake.
+    /// Returns the fraction of a core that the session takes when it is awake.
     pub(super) fn awake_share(&self) -> f64 {
         get(&self.step_ns) * 1e-9 * self.rate_hz
     }
 
-    /// Of a core, now.
+    /// Returns the fraction of a core that it takes now; 0 at rest.
     pub(super) fn share(&self) -> f64 {
         get(&self.share)
     }
 
-    /// A step took so long. By the thread that steps it alone.
+    /// Adds the time of a step to the running mean. Only the thread that steps the session may call this.
     pub(super) fn observe(&self, took_ns: u64) {
         let mean_ns = get(&self.step_ns);
         let took_ns = (took_ns as f64).min(OUTLIER * mean_ns.max(1.0));
         set(&self.step_ns, mean_ns + (took_ns - mean_ns) / MEMORY);
     }
 
-    /// Whether steps are computed now.
+    /// Sets whether steps are computed now.
     pub(super) fn set_awake(&self, is_awake: bool) {
         set(&self.share, if is_awake { self.awake_share() } else { 0.0 });
     }
 }
 
-/// Refuses a scene whose step is too much whatever is chosen for it, before that takes any time.
+/// Refuses a scene whose step would be too heavy with any scheme, before any work is done for it.
 pub(super) fn check_asked(scene: &Scene, limits: &Limits) -> Result<()> {
     scene.check(limits)?;
     let (substeps, step_s) = scheme_selection::least_step(scene);
     check_step(scene.shape().point_count(), substeps, step_s, scene.stepping.rate_hz, limits)
 }
 
-/// Refuses steps that would keep the server from all others.
+/// Refuses a model whose steps would leave no time for other sessions.
 pub(super) fn check_work(model: &Model, limits: &Limits) -> Result<()> {
     let (step_s, rate_hz) = (model.predicted_step_s(), model.scene.stepping.rate_hz);
     check_step(model.swept_points(), model.plan.substeps, step_s, rate_hz, limits)
@@ -126,7 +126,7 @@ mod tests {
         assert!((small.share() - 0.01).abs() < 1e-4);
         let large = Cost::guess(&model("[310, 310]"), std::iter::once(&small));
         assert!((0.1..1.0).contains(&large.awake_share()), "{large:?}");
-        // One step in which the thread did not run says little.
+        // One step in which the thread was preempted changes little.
         small.observe(1_000_000_000);
         assert!(small.awake_share() < 0.012);
         small.set_awake(false);

@@ -1,9 +1,10 @@
-//! What a journal is told of a session. The stepping thread adds events, and never waits for whoever takes them off; a thread
-//! that writes journals takes all that there are at once.
+//! The event log of a session: what its journal records. The stepping thread adds events and never waits for the
+//! reader; the thread that writes journals takes all events at once.
 //!
-//! A tape that nobody empties is full one day. Then it breaks: what it holds is forgotten, the reason stays, and the session
-//! goes on without a journal. When who writes journals says that there is room again, the stepping thread begins anew, with a
-//! snapshot: that is another run of the journal.
+//! An event log is bounded. If the writer of journals does not keep up or can't write, the log breaks: it discards
+//! its events, keeps the reason, and the session continues without a journal. If the disk was full and the writer
+//! reports that there is room again, the stepping thread restarts the log with a snapshot; that begins another run of
+//! the journal.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -18,70 +19,72 @@ use palpate_session::snapshot::Saved;
 use palpate_tissue::lock::lock;
 use palpate_tissue::{Model, ReadCopy};
 
-/// Events that a tape holds at most: half a minute of a tool at 1 kHz.
+/// Limit of events that an event log holds: half a minute of a tool at 1 kHz.
 const MAX_EVENTS: usize = 1 << 15;
 
-/// Bytes of copies of the tissue that a tape holds at most, beside the first: further ones are left out while the disk is slow.
+/// Limit of bytes of tissue copies that an event log holds, beside the first copy. Further copies are left out
+/// while the disk is slow.
 const MAX_COPIED_BYTES: u64 = 64 << 20;
 
-/// A copy of the tissue is made for a journal so often, s: of its state, to continue from, and to be hashed.
+/// Intervals between copies of the tissue for a journal, s: snapshots, from which a session can continue, and
+/// hashes.
 const SNAPSHOT_S: f64 = 10.0;
 const HASH_S: f64 = 1.0;
 
-/// Bytes that are copied a second, at most. Of a large tissue copies are made less often than told above.
+/// Limit of the bytes copied per second. A large tissue is copied less often than the intervals above say.
 const COPIED_BYTES_PER_S: f64 = 16e6;
 
-/// Poses and forces of tools are kept so often, Hz.
+/// Rate at which the poses and forces of tools are recorded, Hz.
 const FELT_HZ: f64 = 100.0;
 
-/// What is told of a session.
+/// An event of a session that its journal records.
 pub enum Event {
-    /// Something acts on it.
+    /// An input acted on the session.
     Input(Input),
-    /// The state, to be hashed.
+    /// A copy of the state, to be hashed.
     Hash(ReadCopy),
-    /// Everything that the next step depends on, and the state, to be hashed.
+    /// Everything that the next step depends on, and a copy of the state, to be hashed.
     Snapshot(Box<Saved>, ReadCopy),
-    /// What tools feel.
+    /// Poses of the tools, and the forces on them.
     Felt(Vec<Felt>),
-    /// All changes of the tissue that wait for their step, each with that step.
+    /// All changes of the tissue that wait for their step, each with that step. The list replaces the previous one.
     Waiting(Vec<(u64, Arc<Model>)>),
-    /// The session leaves this server: nothing follows.
+    /// The session has left this server: no event follows.
     Left(Leaving),
 }
 
-/// An event, the steps that were done before it, and when it was noted by the clock of stepping.
+/// An event with its step and time.
 pub struct Noted {
-    /// Steps done.
+    /// Number of steps done before the event.
     pub step: u64,
-    /// ns.
+    /// Time at which the event was added, ns of the clock of stepping ([`now_ns`](super::clock::now_ns)).
     pub at_ns: u64,
     /// The event.
     pub event: Event,
 }
 
-/// What is taken off a tape.
+/// The content of an event log, taken by the writer of journals.
 pub struct TakenEvents {
-    /// In the order in which they happened.
+    /// Events in the order in which they happened.
     pub events: Vec<Noted>,
-    /// All that happened before this step is in `events`, or was taken before.
+    /// All events before this step are in `events`, or were taken earlier.
     pub until_step: u64,
-    /// The session is at rest, or stands: nothing more comes for now.
+    /// Whether the session is at rest or paused, so that no event follows for now.
     pub is_still: bool,
-    /// Where the events begin, if they do not go on from what was taken before.
+    /// Where the events begin, if they do not follow on what was taken earlier.
     pub anew: Option<Beginning>,
-    /// Nothing is kept any more.
+    /// Whether the log is broken, so that no events are kept.
     pub is_broken: bool,
 }
 
-/// How a session stands where a journal of it begins.
+/// State of a session at the beginning of its journal or of a further run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Beginning {
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
-    /// Whether time goes on.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step at which it pauses.
+    /// The step count at which the session pauses, if any.
     pub until_step: Option<u64>,
 }
 
@@ -92,64 +95,65 @@ struct HeldEvents {
     copied_bytes: u64,
     until_step: u64,
     is_still: bool,
-    /// Whether it waits to be taken.
+    /// Whether the log waits in the queue to be taken.
     is_queued: bool,
     broken: Option<Arc<str>>,
 }
 
-/// How far a journal has come.
+/// Progress of a journal: which steps are on disk.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct JournalProgress {
-    /// What happened before this step is durable: on disk, or on two if that is asked for; `None` if nothing is yet.
+    /// Everything before this step is durable: on disk, or on the disks of two servers if that is required. `None`
+    /// before anything is.
     pub durable_step: Option<u64>,
-    /// What happened before this step is on the disk of this server.
+    /// Everything before this step is on the disk of this server; `None` before anything is.
     pub local_step: Option<u64>,
-    /// How long ago the newest of that happened when it was on disk, s.
+    /// Age of the newest written event when it reached the disk, s.
     pub lag_s: f64,
-    /// The run of the server that writes; 0 before it has begun.
+    /// Number of the run that is being written; 0 before it has begun.
     pub run: u32,
-    /// Why nothing more is written.
+    /// Why no more events are written; `None` while the journal works.
     pub broken: Option<Arc<str>>,
-    /// What happened before this step is on the disk of the server that stands by too.
+    /// Everything before this step is on the disk of the standby server; `None` before anything is.
     pub mirrored_step: Option<u64>,
-    /// Notes that all is on disk, and nothing follows: the session has left.
+    /// Whether everything is on disk and no event follows, because the session has left.
     pub is_complete: bool,
 }
 
-/// The session of a tape, at the tape's beginning.
+/// Description of the session that an event log belongs to, at the beginning of the log.
 #[derive(Debug, Clone)]
 pub struct About {
     /// The session's ID.
     pub id: String,
-    /// Who made it.
+    /// Name of the account that created the session.
     pub owner: String,
-    /// Time without use after which it is deleted, s.
+    /// Time without use after which the session is deleted, s.
     pub idle_timeout_s: f64,
-    /// The tissue that it began with, in its first run.
+    /// The first tissue of the session, in its first run.
     pub first: Arc<Model>,
-    /// Steps done.
+    /// Number of steps done.
     pub begin_step: u64,
-    /// Whether time goes on.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step at which it pauses.
+    /// The step count at which the session pauses, if any.
     pub until_step: Option<u64>,
-    /// The run of the journal that this one continues; 0 if there is none.
+    /// Number of the run that this one continues; 0 if there is none.
     pub after_run: u64,
-    /// [`Begin::revision`](super::Begin).
+    /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub revision: u64,
 }
 
-/// The events of one session, and how far they are on disk.
+/// Event log of one session: its events, and which of them are on disk.
 pub struct EventLog {
-    /// Of what it tells.
+    /// The session that the log belongs to.
     pub about: About,
     held: Mutex<HeldEvents>,
     queue: Arc<TapeQueue>,
-    /// Only what is mirrored is durable.
+    /// Whether only mirrored events are durable.
     needs_mirror: bool,
-    /// It is broken, and there is room again.
+    /// Whether a broken log may restart because there is room again.
     may_begin_anew: AtomicBool,
-    /// One more than the durable step, so that 0 is none.
+    /// The durable step plus one, so that 0 stands for none.
     durable: AtomicU64,
     progress: watch::Sender<JournalProgress>,
 }
@@ -167,17 +171,18 @@ impl EventLog {
         })
     }
 
-    /// Returns what happened before this step is on disk.
+    /// Returns the step before which everything is durable; `None` before anything is.
     pub fn durable_step(&self) -> Option<u64> {
         self.durable.load(Ordering::Acquire).checked_sub(1)
     }
 
-    /// Returns how far it is on disk.
+    /// Returns a receiver of the journal's progress.
     pub fn progress(&self) -> watch::Receiver<JournalProgress> {
         self.progress.subscribe()
     }
 
-    /// Tells that everything before `step` is on disk since now; the newest of it is `lag_s` old.
+    /// Sets that everything before `step` is on the disk of this server, and clears the reason of a break. `lag_s`
+    /// is the age of the newest of it, s.
     pub fn is_durable(&self, step: u64, lag_s: f64) {
         self.progress.send_modify(|progress| {
             (progress.local_step, progress.lag_s) = (Some(step), lag_s);
@@ -186,7 +191,8 @@ impl EventLog {
         });
     }
 
-    /// Tells that everything before `step` is on the disk of the server that stands by.
+    /// Sets that everything before `step` is on the disk of the standby server. A lower step than before is
+    /// ignored.
     pub fn is_mirrored(&self, step: u64) {
         self.progress.send_modify(|progress| {
             progress.mirrored_step = progress.mirrored_step.max(Some(step));
@@ -200,27 +206,28 @@ impl EventLog {
         self.durable.store(progress.durable_step.map_or(0, |step| step + 1), Ordering::Release);
     }
 
-    /// Returns what happened before this step is on the disk of the server that stands by too.
+    /// Returns the step before which everything is on the disk of the standby server; `None` before anything is.
     pub fn mirrored_step(&self) -> Option<u64> {
         self.progress.borrow().mirrored_step
     }
 
-    /// Notes that the step is written here: what happened before this step is on the disk of this server.
+    /// Returns the step before which everything is on the disk of this server; `None` before anything is.
     pub fn local_step(&self) -> Option<u64> {
         self.progress.borrow().local_step
     }
 
-    /// Notes that the tape is written in this run of the server.
+    /// Sets the number of the run in which the log is written.
     pub fn begins(&self, run: u32) {
         self.progress.send_modify(|progress| progress.run = run);
     }
 
-    /// Notes that all is on disk, and nothing follows.
+    /// Marks the journal as complete: everything is on disk, and no event follows.
     pub fn is_complete(&self) {
         self.progress.send_modify(|progress| progress.is_complete = true);
     }
 
-    /// Breaks the tape off: nothing more is kept, and nothing more is taken.
+    /// Breaks the log: discards its events, ignores further ones, and logs `reason` once. A broken log stays as it
+    /// is.
     pub fn break_off(&self, reason: &str) {
         let reason: Arc<str> = reason.into();
         {
@@ -231,19 +238,20 @@ impl EventLog {
             *held = HeldEvents { broken: Some(reason.clone()), ..HeldEvents::default() };
         }
         self.progress.send_modify(|progress| {
-            // Not at every attempt to begin anew.
+            // Logged once, and not at every attempt to restart.
             if progress.broken.replace(reason.clone()).is_none() {
                 tracing::error!(session = %self.about.id, %reason, "the journal of a session is broken");
             }
         });
     }
 
-    /// Notes that there may be room again: the stepping thread begins anew, if it is broken.
+    /// Lets a broken log restart, because there may be room again. The stepping thread restarts it.
     pub fn may_begin_anew(&self) {
         self.may_begin_anew.store(true, Ordering::Release);
     }
 
-    /// Begins anew, if it is broken and may. A snapshot has to follow.
+    /// Restarts the log if it is broken and may restart. Returns whether it did: then the caller must add a
+    /// snapshot.
     pub(super) fn begins_anew(&self, beginning: impl FnOnce() -> Beginning) -> bool {
         if !self.may_begin_anew.load(Ordering::Relaxed) || !self.may_begin_anew.swap(false, Ordering::AcqRel) {
             return false;
@@ -257,7 +265,8 @@ impl EventLog {
         is_broken
     }
 
-    /// Adds what happened when `step` steps were done.
+    /// Adds an event of the moment at which `step` steps are done. A broken log ignores it; a log that already
+    /// holds 32,768 events breaks.
     pub(super) fn note(self: &Arc<Self>, step: u64, event: Event) {
         let bytes = match &event {
             Event::Hash(copy) => copy.model().state_bytes(),
@@ -269,7 +278,8 @@ impl EventLog {
         if held.broken.is_some() {
             return;
         }
-        // A journal is whole without a copy, and tells less often how the tissue was. The first it needs to begin with.
+        // The journal is complete without a copy; it only records the state less often. It needs the first copy to
+        // begin with.
         if bytes > 0 && held.copied_bytes > 0 && held.copied_bytes + bytes > MAX_COPIED_BYTES {
             return;
         }
@@ -282,18 +292,18 @@ impl EventLog {
         self.queue_up(held);
     }
 
-    /// All that happened before `step` has been told. `is_still`: nothing more comes for now.
+    /// Sets that all events before `step` have been added. `is_still`: no event follows for now.
     pub(super) fn is_told_until(self: &Arc<Self>, step: u64, is_still: bool) {
         let mut held = lock(&self.held);
         let was_still = std::mem::replace(&mut held.is_still, is_still);
         held.until_step = step;
-        // What happens next may be far away: what has happened till then must not wait for it.
+        // The next event may be far away: the events until now must not wait for it.
         if is_still && !was_still {
             self.queue_up(held);
         }
     }
 
-    /// What is told so far is written now, also if nothing has happened but steps.
+    /// Queues the log to be written now, even if it holds no event but only steps.
     pub(super) fn hurry(self: &Arc<Self>) {
         self.queue_up(lock(&self.held));
     }
@@ -305,9 +315,9 @@ impl EventLog {
         }
     }
 
-    /// Takes everything off it.
+    /// Takes all events, and where they begin.
     pub fn take(&self) -> TakenEvents {
-        // Room for as many again, made here: the stepping thread only writes into it.
+        // The new buffer has room for as many events, so that the stepping thread does not allocate.
         let room = lock(&self.held).events.len();
         let mut events = Vec::with_capacity(room);
         let mut held = lock(&self.held);
@@ -324,7 +334,7 @@ impl EventLog {
     }
 }
 
-/// The tapes that hold something.
+/// Queue of the event logs that hold events.
 #[derive(Default)]
 pub struct TapeQueue {
     state: Mutex<Queued>,
@@ -339,7 +349,7 @@ struct Queued {
 }
 
 impl TapeQueue {
-    /// Sets that from now on only what is mirrored counts as durable, of new tapes.
+    /// Makes only mirrored events durable, in event logs that are created from now on.
     pub fn needs_mirror(&self) {
         self.needs_mirror.store(true, Ordering::Relaxed);
     }
@@ -354,8 +364,8 @@ impl TapeQueue {
         }
     }
 
-    /// Waits until a tape holds something, at most for `longest`, and takes all that do. `None` when it is time to stop, and
-    /// nothing is left.
+    /// Waits until an event log holds events, at most for `longest` if given, and takes all that do; the list is
+    /// empty after a timeout. `None` if the queue is stopped and empty.
     pub fn wait(&self, longest: Option<Duration>) -> Option<Vec<Arc<EventLog>>> {
         let mut state = lock(&self.state);
         let mut waited = false;
@@ -378,24 +388,24 @@ impl TapeQueue {
         }
     }
 
-    /// Takes the tapes that hold something now.
+    /// Takes the event logs that hold events now, without waiting.
     pub fn take(&self) -> Vec<Arc<EventLog>> {
         std::mem::take(&mut lock(&self.state).event_logs)
     }
 
-    /// Returns whether nothing more comes.
+    /// Returns whether the queue has been stopped.
     pub fn is_stopped(&self) -> bool {
         lock(&self.state).stop
     }
 
-    /// Ends the tape: nothing more comes.
+    /// Stops the queue: [`TapeQueue::wait`] returns `None` once it is empty.
     pub fn stop(&self) {
         lock(&self.state).stop = true;
         self.wake.notify_all();
     }
 }
 
-/// When a stepping thread tells a tape of the state.
+/// Schedule by which a stepping thread writes the state to an event log.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Cadence {
     snapshot_steps: u64,
@@ -405,7 +415,7 @@ pub(super) struct Cadence {
 }
 
 impl Cadence {
-    /// Of a session of `model` that has done `step` steps.
+    /// Creates the schedule of a session of `model` that has done `step` steps.
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn new(model: &Model, step: u64) -> Self {
         let rate_hz = model.scene.stepping.rate_hz;
@@ -420,7 +430,8 @@ impl Cadence {
         }
     }
 
-    /// Whether a snapshot is due at `step`; `is_new_rest`: the tissue has come to rest there.
+    /// Returns whether a snapshot is due at `step`, and then plans the next. `is_new_rest`: the tissue has come to
+    /// rest there.
     pub(super) fn wants_snapshot(&mut self, step: u64, is_new_rest: bool) -> bool {
         let least = self.next_snapshot.saturating_sub(self.snapshot_steps) + self.hash_steps;
         let is_due = step >= self.next_snapshot || (is_new_rest && step >= least);
@@ -430,12 +441,12 @@ impl Cadence {
         is_due
     }
 
-    /// Whether a hash is due at `step`.
+    /// Returns whether a hash is due at `step`.
     pub(super) fn wants_hash(&self, step: u64) -> bool {
         step.is_multiple_of(self.hash_steps)
     }
 
-    /// Whether poses and forces are kept at `step`.
+    /// Returns whether poses and forces are recorded at `step`.
     pub(super) fn wants_felt(&self, step: u64) -> bool {
         step.is_multiple_of(self.felt_steps)
     }

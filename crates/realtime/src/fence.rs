@@ -1,11 +1,12 @@
-//! The fence of a server in a fleet: it steps and speaks for its sessions only until a moment, which is moved on while it may.
+//! The fence of a server in a fleet: the server may step its sessions and answer for them only until a moment,
+//! which each renewal of its lease in etcd extends.
 //!
-//! The moment is of a clock that also goes on while the machine is suspended. So a server that was frozen finds, before its next
-//! step and its next message, that its time is over.
+//! The clock of that moment also runs while the machine is suspended. So a server that was frozen finds, before its
+//! next step and its next message, that the moment has passed.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Until when a server may act. Without a fleet: for ever.
+/// The moment until which a server may act. Without a fleet there is no such limit.
 #[derive(Debug)]
 pub struct Fence {
     until_ns: AtomicU64,
@@ -18,13 +19,14 @@ impl Default for Fence {
 }
 
 impl Fence {
-    /// Returns whether the server may step and speak for its sessions now.
+    /// Returns whether the server may step its sessions and answer for them now.
     pub fn may_act(&self) -> bool {
         let until_ns = self.until_ns.load(Ordering::Acquire);
         until_ns == u64::MAX || boot_ns() < until_ns
     }
 
-    /// Returns for how long it may, s; 0 if its time is over.
+    /// Returns the time for which the server may still act, s: 0 if the moment has passed, infinity without a
+    /// fleet.
     #[allow(clippy::cast_precision_loss)]
     pub fn left_s(&self) -> f64 {
         match self.until_ns.load(Ordering::Acquire) {
@@ -33,13 +35,14 @@ impl Fence {
         }
     }
 
-    /// Lets it until that moment of [`boot_ns`].
+    /// Sets the moment until which the server may act, ns of [`boot_ns`].
     pub fn set(&self, until_ns: u64) {
         self.until_ns.store(until_ns.min(u64::MAX - 1), Ordering::Release);
     }
 }
 
-/// Returns the time since the machine was started, ns; also that in which it was suspended.
+/// Returns the time since the machine was started, ns, including the time in which it was suspended. Outside Linux
+/// it returns [`now_ns`](super::clock::now_ns).
 #[allow(clippy::cast_sign_loss)]
 pub fn boot_ns() -> u64 {
     #[cfg(target_os = "linux")]
@@ -63,7 +66,7 @@ mod tests {
         assert!(fence.may_act() && (0.0..=60.0).contains(&fence.left_s()));
         fence.set(boot_ns() - 1);
         assert!(!fence.may_act() && fence.left_s() == 0.0);
-        // No moment means "for ever" by chance.
+        // No settable moment is the value without a limit.
         fence.set(u64::MAX);
         assert_ne!(fence.until_ns.load(Ordering::Relaxed), u64::MAX);
     }

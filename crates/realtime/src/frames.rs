@@ -1,5 +1,5 @@
-//! Frames of viewers: a thread, named `frames`, refines and encodes the newest snapshot of each session.
-//! A frame is encoded once for all viewers that ask for the same, and goes to those that have credit.
+//! Frames for viewers. A thread named `frames` refines and encodes the newest snapshot of each session. Viewers
+//! with equal settings share one encoded frame, which is sent to those that have credit.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
@@ -12,33 +12,33 @@ use palpate_session::surface::{Encoding, Frame, FrameTiles, Refinement, Snapshot
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 
-/// One who looks at a session.
+/// A stream of frames of a session, with the settings of its client.
 #[derive(Debug)]
 pub struct Viewer {
-    /// Random, not to be guessed.
+    /// Random ID, which can't be guessed.
     pub id: String,
-    /// How far refined.
+    /// Refinement of the surface.
     pub refinement: Refinement,
-    /// How written.
+    /// Encoding of the vertices.
     pub encoding: Encoding,
-    /// Frames a second of simulated time.
+    /// Frames per second of simulated time.
     pub rate_hz: f64,
-    /// Is sent every vertex in each frame, not just what changed.
+    /// Whether each frame has every vertex, and not only the changed tiles.
     pub always_full: bool,
     progress: Mutex<ViewerProgress>,
-    /// Frames sent and not yet acknowledged, if acknowledgements are asked for.
+    /// Frames that were sent and not yet acknowledged; `None` if the client does not acknowledge.
     credit: Option<Mutex<Credit>>,
     writer: Writer<Delivery>,
-    /// The memory of what it is shown.
+    /// Memory of the viewer's frames.
     _taken: Taken,
 }
 
-/// How far a viewer has come.
+/// Progress of a viewer.
 #[derive(Debug, Default, Clone, Copy)]
 struct ViewerProgress {
-    /// The update of the tiles of which it has, or will read, everything.
+    /// Version of the tiles that the viewer has or has been sent.
     version: Option<u64>,
-    /// Frames that were due and in which nothing had changed.
+    /// Number of frames that were due and in which nothing had changed.
     unchanged: u64,
 }
 
@@ -51,35 +51,37 @@ struct Credit {
 /// A frame on its way to one viewer.
 #[derive(Debug, Clone)]
 pub struct Delivery {
-    /// Counts the frames that were due to the viewer.
+    /// Number of the frame, among those that were due to the viewer.
     pub frame_id: u64,
-    /// Shared with others.
+    /// The frame, which other viewers may share.
     pub frame: Arc<Frame>,
-    /// It holds the tiles that are newer than this update.
+    /// The frame has the tiles that changed after this version. `None`: it has all tiles.
     pub since: Option<u64>,
-    /// Frames that were due to the viewer so far, and in which nothing had changed.
+    /// Number of frames so far that were due to the viewer and in which nothing had changed.
     pub unchanged: u64,
-    /// Steps dropped by the session so far.
+    /// Number of steps that the session has dropped so far.
     pub overrun_count: u64,
-    /// Of the last second or so.
+    /// Simulated over real time, measured over about the last second.
     pub time_dilation: f64,
 }
 
-/// Bytes of a frame with every vertex.
+/// Returns the bytes of a frame with every vertex.
 fn frame_bytes(refinement: Refinement, encoding: Encoding) -> usize {
     refinement.vertex_count() * encoding.bytes_per_vertex()
 }
 
-/// Bytes of the displacements of all points at one moment.
+/// Returns the bytes of the displacements of all points at one moment.
 fn moment_bytes(refinement: Refinement) -> usize {
     refinement.point_count() * size_of::<[f32; 3]>()
 }
 
 impl Viewer {
-    /// Creates a viewer, and where it reads its frames. Their memory is charged to `account`.
+    /// Creates a viewer and the reader of its frames. Their memory is charged to `account`. At most `max_in_flight`
+    /// frames may be unacknowledged, limited to those that fit `queued_bytes`; `None` stands for a client that does
+    /// not acknowledge.
     ///
     /// # Errors
-    /// Refuses memory beyond the part of `account`.
+    /// Refuses if the memory exceeds the account's part.
     #[allow(clippy::too_many_arguments)]
     pub fn new(
         id: String,
@@ -94,7 +96,8 @@ impl Viewer {
         let frame_bytes = frame_bytes(refinement, encoding);
         let room = (queued_bytes / frame_bytes).max(1);
         let most = max_in_flight.map(|most| (most as usize).min(room));
-        // What waits, what is being sent, and what the tiles keep: the frame last written, and the points of three moments.
+        // Frames that wait, the frame being sent, and what the tiles keep: the last frame, and the points at three
+        // moments.
         let bytes = (most.unwrap_or(1) + 2) * frame_bytes + 3 * moment_bytes(refinement);
         let _taken = account.take(Resource::Memory(Purpose::Frames), bytes as u64, "refinement")?;
         // Without credit only the newest frame waits.
@@ -105,25 +108,25 @@ impl Viewer {
         Ok((Arc::new(viewer), reader))
     }
 
-    /// Returns the number of the frame that belongs to step `step` of a session that steps at `rate_hz`.
+    /// Returns the number of the frame that belongs to step `step` of a session with `rate_hz` steps per second.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn frame_id(&self, step: u64, rate_hz: f64) -> u64 {
-        // A little more, so that 60 Hz of 1 kHz is not late by a rounding error.
+        // The small addition keeps 60 Hz of 1 kHz from being late by a rounding error.
         ((step as f64 + 1e-6) * self.rate_hz / rate_hz) as u64
     }
 
-    /// Acknowledges all frames up to this one.
+    /// Acknowledges all frames up to this one, which frees their credit.
     pub fn acknowledge(&self, frame_id: u64) {
         if let Some(credit) = &self.credit {
             lock(credit).in_flight.retain(|id| *id > frame_id);
         }
     }
 
-    /// Whether a frame may be sent to it now.
+    /// Returns whether a frame may be sent to it now.
     pub(super) fn has_credit(&self) -> bool {
         self.credit.as_ref().is_none_or(|credit| {
             let credit = lock(credit);
-            // Who acknowledges what it has not read gets no more than fits.
+            // A client that acknowledges frames it has not read gets no more than fits.
             credit.in_flight.len() < credit.most && !self.writer.is_full()
         })
     }
@@ -137,7 +140,7 @@ impl Viewer {
         self.writer.push(Delivery { frame_id, frame, since, unchanged, overrun_count, time_dilation });
     }
 
-    /// Sends the tiles that are newer than what it has, if there are any.
+    /// Sends the tiles that are newer than the viewer's, or counts an unchanged frame.
     fn deliver_newer(&self, job: &Job, frame_id: u64, tiles: &mut FrameTiles) {
         let mut since = {
             let mut progress = lock(&self.progress);
@@ -147,7 +150,7 @@ impl Viewer {
             }
             progress.version.replace(tiles.version())
         };
-        // One that it has not read yet gives way to one with all that is in it and more.
+        // An unread frame is replaced by one that has all its tiles and the newer ones.
         if self.credit.is_none()
             && let Some(unread) = self.writer.withdraw()
         {
@@ -156,46 +159,47 @@ impl Viewer {
         self.deliver(job, frame_id, Arc::new(tiles.newer_than(since)), since);
     }
 
-    /// So many frames were due in which nothing had changed.
+    /// Counts frames that were due and in which nothing had changed.
     pub(super) fn count_unchanged(&self, frames: u64) {
         lock(&self.progress).unchanged += frames;
     }
 
-    /// Returns whether the stream has gone.
+    /// Returns whether the stream has ended.
     pub fn is_gone(&self) -> bool {
         self.writer.is_abandoned()
     }
 
-    /// Ends the stream.
+    /// Ends the stream, with the reason `why`.
     pub fn close(&self, why: Refusal) {
         self.writer.close(why);
     }
 }
 
-/// What is to be encoded of one session: only the newest, for everybody who waits.
+/// A request to encode the newest snapshot of one session for all viewers that wait.
 #[derive(Debug)]
 pub struct Job {
-    /// The displacements.
+    /// Displacements of the points.
     pub snapshot: Arc<Snapshot>,
-    /// To whom, as which frame.
+    /// The viewers, each with the number of its frame.
     pub viewers: Vec<(Arc<Viewer>, u64)>,
-    /// Of the session.
+    /// Number of steps that the session has dropped.
     pub overrun_count: u64,
-    /// Of the session.
+    /// Time dilation of the session.
     pub time_dilation: f64,
 }
 
 #[derive(Debug, Default)]
 struct JobQueue {
-    /// By the number of the session, oldest request first: nobody is served twice before another once.
+    /// Jobs by the number of their session, oldest first, so that each session is served once before another is
+    /// served twice.
     jobs: VecDeque<(u64, Job)>,
     stop: bool,
 }
 
-/// When nothing was encoded for so long, what viewers left behind that have gone is given back, and buffers.
+/// Idle time after which buffers and the tiles of ended viewers are freed.
 const IDLE: Duration = Duration::from_millis(500);
 
-/// The thread that encodes.
+/// The thread that encodes frames, and its queue.
 #[derive(Debug, Default)]
 pub struct Encoder {
     board: Mutex<JobQueue>,
@@ -203,7 +207,8 @@ pub struct Encoder {
 }
 
 impl Encoder {
-    /// Replaces what waits for session `number`. Never blocks for long.
+    /// Queues a job. It replaces the waiting job of session `number`, whose other viewers it takes over. It blocks
+    /// only for a queue operation.
     pub fn post(&self, number: u64, mut job: Job) {
         let mut board = lock(&self.board);
         match board.jobs.iter_mut().find(|waiting| waiting.0 == number) {
@@ -219,13 +224,13 @@ impl Encoder {
         self.posted.notify_one();
     }
 
-    /// Ends the thread.
+    /// Makes the thread end.
     pub fn stop(&self) {
         lock(&self.board).stop = true;
         self.posted.notify_one();
     }
 
-    /// Does the thread's work. The memory of frames that are kept for their buffers is taken from `budget`.
+    /// Runs the thread until [`Encoder::stop`]. Frames that are kept for their buffers take memory from `budget`.
     pub fn work(&self, budget: &Arc<Budget>) {
         let (mut spent, mut watched) = (RecycledFrames::of(budget), Watched::default());
         loop {
@@ -265,18 +270,19 @@ impl Encoder {
     }
 }
 
-/// Bytes of full frames kept for their buffers, one of each kind that was asked for lately.
+/// Limit of the bytes of full frames that are kept for their buffers, one per recently requested kind.
 const SPENT_BYTES: usize = 64 << 20;
 
-/// The account on which they are kept: they serve whoever looks next.
+/// Account that is charged for them: they serve whichever viewer is next.
 const EVERYBODY: &str = "frames";
 
-/// The last frames of a few kinds, newest first. When the next of a kind is due, the viewers are mostly done with it.
+/// The last frames of a few kinds, newest first. Viewers have mostly finished with a frame when the next of its
+/// kind is due.
 #[derive(Debug)]
 struct RecycledFrames {
     frames: Vec<Arc<Frame>>,
     account: Account,
-    /// Their memory.
+    /// Memory of the frames.
     taken: Option<Taken>,
 }
 
@@ -289,7 +295,7 @@ impl RecycledFrames {
         (self.frames, self.taken) = (Vec::new(), None);
     }
 
-    /// Takes the memory of the frames that are kept, or keeps none.
+    /// Charges the memory of the kept frames, or frees the frames if there is none.
     fn charge(&mut self, bytes: usize) {
         self.taken = None;
         match self.account.take(Resource::Memory(Purpose::Frames), bytes as u64, "") {
@@ -298,7 +304,7 @@ impl RecycledFrames {
         }
     }
 
-    /// The next frame of a kind, in the buffers of the last one as far as they are free.
+    /// Encodes a full frame, in the buffers of the last frame of its kind if no viewer uses them.
     fn encode(&mut self, snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -> Arc<Frame> {
         let same = |frame: &Arc<Frame>| frame.refinement == refinement && frame.encoding == encoding;
         let last = self.frames.iter().position(same).and_then(|index| Arc::into_inner(self.frames.remove(index)));
@@ -321,11 +327,11 @@ impl RecycledFrames {
     }
 }
 
-/// What is known of those who want changes only.
+/// Tiles for the viewers that get only changes.
 #[derive(Debug, Default)]
 struct Watched(Vec<ViewerGroup>);
 
-/// Viewers of one session who asked for the same.
+/// Viewers of one session with equal settings.
 #[derive(Debug)]
 struct ViewerGroup {
     session: u64,
@@ -334,21 +340,21 @@ struct ViewerGroup {
 }
 
 impl Watched {
-    /// Forgets what nobody looks at any more.
+    /// Removes viewers that have ended, and groups without viewers.
     fn forget_the_gone(&mut self) {
         let stays = |viewer: &Weak<Viewer>| viewer.upgrade().is_some_and(|viewer| !viewer.is_gone());
         self.0.iter_mut().for_each(|kind| kind.viewers.retain(stays));
         self.0.retain(|kind| !kind.viewers.is_empty());
     }
 
-    /// Ends the streams of those who look at a session, and forgets what they have: it is not up to date.
+    /// Ends the streams of a session's viewers, and removes their tiles, which are not up to date.
     fn give_up(&mut self, session: u64, refusal: &Refusal) {
         let kinds = self.0.extract_if(.., |kind| kind.session == session);
         let viewers = kinds.flat_map(|kind| kind.viewers).filter_map(|viewer| viewer.upgrade());
         viewers.for_each(|viewer| viewer.close(refusal.clone()));
     }
 
-    /// The tiles for a viewer, up to date.
+    /// Returns the tiles for a viewer, updated to the job's snapshot.
     fn tiles(&mut self, session: u64, job: &Job, viewer: &Arc<Viewer>) -> &mut FrameTiles {
         let (refinement, encoding) = (viewer.refinement, viewer.encoding);
         memory::require((frame_bytes(refinement, encoding) + moment_bytes(refinement)) as u64, "the tiles of a frame");
@@ -390,7 +396,7 @@ fn serve(session: u64, job: &Job, spent: &mut RecycledFrames, watched: &mut Watc
     }
 }
 
-/// Frames as a stream reads them.
+/// Reader of a viewer's frames, used by its stream.
 pub type FrameReader = Reader<Delivery>;
 
 #[cfg(test)]
@@ -416,7 +422,7 @@ mod tests {
         let (c, mut read_c) = viewer(2, Encoding::F32, None);
         let mut spent = RecycledFrames::of(&Budget::new(&Limits::default(), 1, 1));
         serve(1, &job(vec![(a, 7), (b, 9), (c, 7)]), &mut spent, &mut Watched::default());
-        // Of the two kinds one frame each is kept, and counted.
+        // One frame of each kind is kept and charged.
         let account = spent.account.clone();
         assert_eq!(account.has(Resource::Memory(Purpose::Frames)), 49 * 6 + 49 * 12);
         spent.clear();
@@ -440,7 +446,7 @@ mod tests {
             serve(1, &Job { snapshot: Arc::new(snapshot), ..job(viewers) }, &mut spent, &mut watched);
         };
         (0..4).for_each(|frame_id| show(frame_id, frame_id as f32));
-        // Who has not read yet is given all since then; who has no credit, nothing.
+        // A viewer that has not read yet gets all changes since then; one without credit gets nothing.
         let (newest, first) = (read_slow.pop().await.unwrap().0, read_thrifty.pop().await.unwrap().0);
         assert_eq!((newest.frame_id, newest.since, newest.frame.full), (3, None, true));
         assert_eq!((first.frame_id, first.since, first.frame.step), (0, None, 0));

@@ -1,8 +1,8 @@
-//! Random identifiers: they can't be guessed.
+//! Random identifiers, which can't be guessed.
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Returns 128 random bits, in hexadecimal.
+/// Returns 128 random bits as 32 hexadecimal digits.
 ///
 /// # Errors
 /// Refuses if the system has no random numbers.

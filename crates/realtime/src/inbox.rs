@@ -1,4 +1,4 @@
-//! A stepping thread's queue of requests; the thread sleeps here until one comes or a step is due.
+//! A stepping thread's queue of requests. The thread sleeps here until a request arrives or a step is due.
 
 use std::collections::VecDeque;
 use std::sync::mpsc::SyncSender;
@@ -19,30 +19,30 @@ use palpate_tissue::ReadCopy;
 use palpate_tissue::lock::lock;
 use palpate_tissue::select::audit::{Mark, WindowInputs};
 
-/// A session as it is, to continue from.
+/// The present state of a session, from which another can continue.
 pub struct Present {
     /// Everything that the next step depends on.
     pub saved: Box<Saved>,
-    /// The state, to be hashed.
+    /// A copy of the state, to be hashed.
     pub copy: ReadCopy,
-    /// Whether time goes on.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step at which it pauses.
+    /// The step count at which the session pauses, if any.
     pub until_step: Option<u64>,
 }
 
 /// Why a session leaves its server.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Leaving {
-    /// It is deleted.
+    /// The session is deleted.
     Deleted,
-    /// Another server has it.
+    /// Another server has become its owner.
     Moved,
-    /// It was being handed to this server, and does not come.
+    /// The session was being handed to this server, and the handover was cancelled.
     Withdrawn,
 }
 
-/// What a stepping thread is asked for.
+/// A request to a session or its stepping thread.
 pub(super) enum Request {
     /// New sessions wait for the thread.
     Adopt,
@@ -56,42 +56,42 @@ pub(super) enum Request {
     Pause {
         reply: oneshot::Sender<Result<()>>,
     },
-    /// Something came to a session at rest.
+    /// A command or a change has arrived for a session at rest.
     Wake,
     Samples(SampleTap),
     Probe(ProbeTap),
     View(Arc<Viewer>),
     /// A copy of the session as it is.
     Save(oneshot::Sender<Result<Present>>),
-    /// The same, and then no step until [`Request::Thaw`].
+    /// A copy of the session as it is; then no step until [`Request::Thaw`].
     Freeze(oneshot::Sender<Result<Present>>),
     Thaw,
-    /// Every stream ends; the session stays.
+    /// Ends every stream; the session stays.
     Silence(Refusal),
-    /// To have a window of steps audited.
+    /// Asks for the audit of a window of steps.
     Audit(WindowInputs, SyncSender<Mark>),
     Hash {
         at: Option<u64>,
-        /// Who pays for it.
+        /// The caller who is charged for it.
         account: Account,
         reply: HashReply,
     },
-    /// The session leaves this server: it is deleted, or has another owner.
+    /// Removes the session from this server: it is deleted, or has another owner.
     Leave(Refusal, Leaving),
-    /// It goes over to the thread that gives way.
+    /// Moves the session to the thread of lower priority.
     #[cfg(test)]
     GoApart,
-    /// A fault of the program, to see what comes of it.
+    /// Causes a fault of the program.
     #[cfg(test)]
     Panic,
 }
 
-/// Where a stepping thread is asked.
+/// Inbox of a stepping thread.
 #[derive(Default)]
 pub(super) struct Inbox {
     state: Mutex<InboxState>,
     wake: Condvar,
-    /// Written by the thread that reads here.
+    /// Written only by the thread that reads this inbox.
     pub(super) tally: ThreadCounters,
 }
 
@@ -119,7 +119,8 @@ impl Inbox {
         self.wake.notify_one();
     }
 
-    /// Waits until `deadline_ns` or until something is asked, which is added to `requests`. Tells why to stop, if so.
+    /// Waits until `deadline_ns` or until a request arrives, and appends all requests to `requests`. Returns the
+    /// reason to stop, if the thread is to stop.
     pub(super) fn wait(
         &self,
         deadline_ns: Option<u64>,

@@ -1,5 +1,5 @@
-//! The force laws of a session's tissue, one for each radius of a tip and place: computed once, whoever asks. With another
-//! tissue they are forgotten.
+//! The force laws of a session's tissue, one per radius and place of a tip. A force law is the curve of force over
+//! depth under a tip. Each is computed once for all callers. A change of the tissue's material discards them.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
@@ -14,13 +14,14 @@ use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 use palpate_tissue::response::force_law::{self, Computation, Disc, LawProgress};
 
-/// Laws that a session keeps: of a stroke about a corner of a sheet, and back.
+/// Limit of the laws that a session keeps: enough for a stroke about a corner of a sheet, and back.
 const MAX_LAWS: usize = 64;
 
-/// What a coarse and an exact law take: some tens of rows of six numbers.
+/// Memory of a coarse and an exact law, bytes: some tens of rows of six numbers.
 const LAW_BYTES: u64 = 2 << 10;
 
-/// What a session keeps of laws; the one that was asked for least lately goes when there are too many.
+/// The force laws that a session keeps, at most 64. The least recently requested is removed when there are too
+/// many.
 #[derive(Default)]
 pub struct KeptLaws(Mutex<Option<TissueLaws>>);
 
@@ -28,11 +29,11 @@ pub struct KeptLaws(Mutex<Option<TissueLaws>>);
 struct TissueLaws {
     model: Arc<Model>,
     laws: Vec<Arc<SoughtLaw>>,
-    /// The memory of the laws, and of the tissue, which they need as long as they are computed.
+    /// Memory of the laws, and of the tissue, which their computation needs.
     taken: Taken,
 }
 
-/// Returns whether two tissues of a session have the same laws. They may have other schemes and substeps.
+/// Returns whether two tissues of a session have equal force laws. Their schemes and substeps may differ.
 pub fn have_same_laws(a: &Model, b: &Model) -> bool {
     let [a, b] = [a, b].map(|model| &model.scene);
     a.springs == b.springs
@@ -42,17 +43,18 @@ pub fn have_same_laws(a: &Model, b: &Model) -> bool {
 }
 
 impl KeptLaws {
-    /// Returns the law of `model` under a disc, for which at most `most_work` springs times iterations are done. Its
-    /// memory is charged to `payer`.
+    /// Returns the law of `model` under a disc, and creates it if it is not kept; nothing is computed. At most
+    /// `most_work` springs times iterations may be spent on it. The laws of a different tissue are discarded first.
+    /// The memory is charged to `payer`.
     ///
     /// # Errors
-    /// Refuses if `payer` can't have the memory.
+    /// Refuses if the memory exceeds the part of `payer`.
     pub fn of(&self, disc: Disc, model: &Arc<Model>, most_work: u64, payer: &Account) -> Result<Arc<SoughtLaw>> {
         let mut kept = lock(&self.0);
         let kept = match &mut *kept {
             Some(kept) if have_same_laws(&kept.model, model) => kept,
             other => {
-                // What was kept is given back first.
+                // The memory of the old laws is freed first.
                 *other = None;
                 let taken = payer.take(Resource::Memory(Purpose::Laws), model.bytes(), "device")?;
                 other.insert(TissueLaws { model: model.clone(), laws: Vec::new(), taken })
@@ -75,7 +77,8 @@ impl KeptLaws {
 }
 
 impl KeptLaws {
-    /// Returns the laws of `model` that are known, exact where they can be; the newest is the last.
+    /// Returns the laws of `model` that have been computed so far, exact ones where available; the most recently
+    /// requested is the last.
     pub fn known(&self, model: &Model) -> Vec<(Disc, Arc<Law>)> {
         let kept = lock(&self.0);
         let kept = kept.as_ref().filter(|kept| have_same_laws(&kept.model, model));
@@ -87,27 +90,27 @@ impl KeptLaws {
     }
 }
 
-/// The law of a tissue under a tip: a coarse one at once, the exact one when it is computed.
+/// Force law of a tissue under a tip, which is computed on demand: a coarse one at once, the exact one later.
 #[derive(Debug)]
 pub struct SoughtLaw {
     disc: Disc,
     model: Arc<Model>,
     most_work: u64,
     coarse: OnceLock<Arc<Law>>,
-    /// Or why there is none.
+    /// The exact law, or why it can't be computed.
     exact: OnceLock<Result<Arc<Law>>>,
     turn: tokio::sync::Mutex<()>,
 }
 
 impl SoughtLaw {
-    /// Returns the exact law, or why it can't be had, if that is known.
+    /// Returns the exact law, or why it can't be computed; `None` if that is not known yet.
     pub fn exact(&self) -> Option<Result<Arc<Law>>> {
         self.exact.get().cloned()
     }
 
-    /// Sets the law as somebody else has computed it.
+    /// Adds a law that was computed elsewhere. It is ignored if this one is already there.
     pub fn is_known(&self, law: Law) {
-        // What is there already is the same.
+        // A law that is there already is equal.
         let _ = if law.is_coarse {
             self.coarse.set(Arc::new(law)).is_ok()
         } else {
@@ -115,11 +118,11 @@ impl SoughtLaw {
         };
     }
 
-    /// Returns the law to begin with, at most 50 ms of work: the exact one if it is known or takes no longer, else a
-    /// coarse one.
+    /// Returns a law to begin with, after at most 50 ms of work: the exact one if it is known or takes no longer,
+    /// else a coarse one.
     ///
     /// # Errors
-    /// Refuses if no law can be computed with the work that is allowed, or if `stop` is set.
+    /// Refuses if no law can be computed with the allowed work, or if `stop` is set.
     pub fn first(&self, stop: &AtomicBool) -> Result<Arc<Law>> {
         if let Some(Ok(law)) = self.exact.get() {
             return Ok(law.clone());
@@ -129,7 +132,7 @@ impl SoughtLaw {
         }
         let law = memory::attempt("device", || {
             let law = force_law::first(&self.model, self.disc, stop);
-            // Hardly any tissue has no coarse law; then the exact one is worth its time.
+            // Hardly any tissue lacks a coarse law; then the exact one is worth its time.
             Ok(law.or_else(|| force_law::exact_within(&self.model, self.disc, self.most_work, stop)))
         });
         match law?.map(Arc::new) {
@@ -142,18 +145,20 @@ impl SoughtLaw {
         }
     }
 
-    /// Waits until nobody else computes the exact law. It is computed by one at a time: the others find it then.
+    /// Waits until no other task computes the exact law, and reserves the computation until the guard is dropped.
+    /// Then [`Self::exact`] may already have the result.
     pub async fn turn(&self) -> MutexGuard<'_, ()> {
         self.turn.lock().await
     }
 
-    /// Returns whether nobody computes the exact law.
+    /// Returns whether no task computes the exact law now.
     pub fn is_free(&self) -> bool {
         self.turn.try_lock().is_ok()
     }
 
-    /// Computes the exact law further, by one depth, or begins it; unless `stop` is set. What is returned goes on with the
-    /// next call. None: [`Self::exact`] tells the result, unless it was stopped.
+    /// Continues the computation of the exact law by one depth, or begins it if `computation` is `None`. Returns
+    /// the computation for the next call, or `None` when it has ended: then [`Self::exact`] has the result, unless
+    /// `stop` was set.
     pub fn advance(&self, computation: Option<Computation>, stop: &AtomicBool) -> Option<Computation> {
         let progress = memory::attempt("law", || {
             let computation = computation.or_else(|| Computation::new(&self.model, self.disc, self.most_work));
@@ -205,7 +210,7 @@ mod tests {
         let taken = || budget.bytes_for(Purpose::Laws);
         let first = of(1, &soft).unwrap();
         assert_eq!(taken(), soft.bytes() + LAW_BYTES);
-        // The same, also for a tissue that only steps are finer of.
+        // The same law, also for a tissue that differs only in its substeps.
         assert!(Arc::ptr_eq(&first, &of(1, &soft).unwrap()));
         let mut same = Model::clone(&soft);
         same.plan = finer.plan.clone();
@@ -213,7 +218,7 @@ mod tests {
         (2..100).for_each(|radius| _ = of(radius, &soft).unwrap());
         assert_eq!(taken(), soft.bytes() + MAX_LAWS as u64 * LAW_BYTES);
         assert!(!Arc::ptr_eq(&first, &of(1, &soft).unwrap()), "the oldest went");
-        // What is known of a tissue serves another session of the same, and none of another.
+        // A known law serves another session of the same tissue, and no other tissue.
         let law = |is_coarse| Law { is_coarse, ..palpate_tissue::response::force_law::exact(&soft, 0.002) };
         of(98, &soft).unwrap().is_known(law(true));
         of(99, &soft).unwrap().is_known(law(true));
@@ -224,7 +229,7 @@ mod tests {
         // Another tissue.
         of(1, &hard).unwrap();
         assert_eq!(taken(), hard.bytes() + LAW_BYTES);
-        // Others have all the rest.
+        // Others take all the remaining memory.
         let rest = std::iter::from_fn(|| account.take(Resource::Memory(Purpose::Session), 64, "").ok());
         let rest: Vec<Taken> = rest.collect();
         let refused = of(2, &hard).unwrap_err();

@@ -1,12 +1,14 @@
-//! Sessions in real time, and the clock of stepping. Stepping threads own the sessions; what servers call here
-//! posts a request to one, or goes through the session's intake, and never waits for a step.
+//! Sessions in real time, and the clock of stepping. Stepping threads own the sessions. A server's call posts a
+//! request to a session's thread, or goes through the session's intake, the queue of its commands; no call blocks
+//! until a step is done.
 //!
-//! **Stepping threads wait for nobody.** Commands wait in the intake, whose lock is held for a queue operation and never for a
-//! step. Samples and records wait in queues with bounds in items and bytes that drop the oldest and count it, snapshots for
-//! frames in a slot that keeps the newest, the log in a buffer that drops. Requests to a session are messages to its thread,
-//! which serves one of them before each step that is due.
+//! **Stepping threads do not wait.** Commands wait in the intake, whose lock is held for a queue operation and
+//! never for a step. Samples and records wait in queues that are bounded in items and bytes; when a queue is full,
+//! the oldest item is dropped and counted. Snapshots for frames wait in a slot that keeps the newest, and log
+//! messages in a buffer that drops. A request to a session is a message to its thread, which serves one before each
+//! step that is due.
 //!
-//! **Overruns.** `policy` decides what a session that is behind catches up, and what is dropped and counted.
+//! **Overruns.** `policy.rs` decides what a session that is late catches up, and what is dropped and counted.
 
 mod admission;
 pub mod audited;

@@ -1,4 +1,4 @@
-//! All sessions of a server, and the threads that step them.
+//! The sessions of a server, and the threads that step them.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::Ordering;
@@ -23,17 +23,17 @@ use palpate_session::local_model::StiffnessJob;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 
-/// Stiffnesses that wait to be computed, of all tools of a server.
+/// Limit of waiting computations of stiffness, over all tools of a server.
 const WAITING_REFINEMENTS: usize = 8;
 
-/// All sessions of a server, and the threads that step them.
+/// All sessions of a server, with the threads that step, show, read and audit them.
 pub struct Pacer {
     pub(super) limits: Limits,
-    /// What callers share.
+    /// Memory, processor time and other resources, divided among the callers.
     pub budget: Arc<Budget>,
-    /// One for each stepping thread: where it is asked, and where new sessions wait for it.
+    /// One for each stepping thread: its inbox and its new sessions.
     pub(super) steppers: Vec<Arc<Stepper>>,
-    /// The one that gives way to them, for sessions whose steps take too long.
+    /// The thread of lower priority, for sessions whose steps take too long.
     apart: Arc<Stepper>,
     encoder: Arc<Encoder>,
     reading: Arc<Reading>,
@@ -43,14 +43,15 @@ pub struct Pacer {
     viewers: Mutex<BTreeMap<String, Weak<Viewer>>>,
     pub(super) numbers: Mutex<u64>,
     pub(super) event_logs: OnceLock<Arc<TapeQueue>>,
-    /// Until when the server may step and speak for its sessions.
+    /// The moment until which the server may step its sessions and answer for them.
     pub fence: Arc<Fence>,
 }
 
 impl Pacer {
-    /// Starts `threads` stepping threads (named `step-0` and so on), and one thread each that steps the sessions whose steps take
-    /// too long for others (`step-apart`), computes the stiffness under tools (`stiffness`), encodes frames (`frames`), reads
-    /// large sheets (`records`), and measures errors with `audit_share` of a core (`audit`; none if that is 0).
+    /// Starts `threads` stepping threads (at least one, named `step-0` and so on) and one thread each for: sessions
+    /// whose steps take too long for others (`step-apart`), the stiffness under tools (`stiffness`), frames
+    /// (`frames`), reading large sheets (`records`), and audits with `audit_share` of a core (`audit`; none if that
+    /// is 0).
     ///
     /// # Errors
     /// Returns an error if a thread can't be started.
@@ -58,7 +59,7 @@ impl Pacer {
         let (encoder, reading) = (Arc::new(Encoder::default()), Arc::new(Reading::default()));
         let (mut handles, fence) = (Vec::new(), Arc::new(Fence::default()));
         let (mut steppers, apart) = (Vec::new(), Arc::new(Stepper::default()));
-        // It ends when the stepping threads have ended, and nobody sends any more.
+        // It ends when the stepping threads have ended and the channel has no senders.
         let (refiner, refinements) = std::sync::mpsc::sync_channel::<StiffnessJob>(WAITING_REFINEMENTS);
         let worker = move || {
             give_way();
@@ -66,7 +67,7 @@ impl Pacer {
         };
         handles.push(priority::thread("stiffness").spawn(worker)?);
         let threads = threads.max(1);
-        // The one without another to which its sessions may go gives way.
+        // The thread without `apart`, to which other threads' sessions move, has a lower priority.
         let spawn = |name: String, stepper: Arc<Stepper>, apart: Option<Apart>| {
             let (encoder, refiner, reading, fence) = (encoder.clone(), refiner.clone(), reading.clone(), fence.clone());
             priority::thread(name).spawn(move || {
@@ -86,7 +87,7 @@ impl Pacer {
         }
         handles.push(spawn("step-apart".to_owned(), apart.clone(), None)?);
         let (frames, shared) = (encoder.clone(), budget.clone());
-        // A late frame is seen, a late step is felt.
+        // A late frame is visible, a late step is felt: so frames yield to steps.
         let worker = move || {
             give_way_a_little();
             frames.work(&shared);
@@ -124,20 +125,21 @@ impl Pacer {
         }))
     }
 
-    /// Has new sessions tell a tape what happens to them. Who calls this takes it off.
+    /// Makes each session that is created from now on write an event log. Returns the queue of the logs, which the
+    /// caller must empty; a further call returns the same queue.
     pub fn keep_tapes(&self) -> Arc<TapeQueue> {
         self.event_logs.get_or_init(Arc::default).clone()
     }
 
-    /// Returns whether there is a session of that ID, served or not.
+    /// Returns whether a session has this ID, including one that is still being handed to this server.
     pub fn has(&self, id: &str) -> bool {
         lock(&self.sessions).contains_key(id)
     }
 
-    /// Returns the session of that id.
+    /// Returns the session of that ID, and counts the call as a use of it.
     ///
     /// # Errors
-    /// Refuses an unknown ID, and all while the server may not speak for its sessions.
+    /// Refuses an unknown ID, and every ID while the server may not answer for its sessions.
     pub fn get(&self, id: &str) -> Result<Arc<SessionHandle>> {
         let handle = lock(&self.sessions).get(id).cloned();
         let handle = handle.filter(|handle| !handle.is_coming()).ok_or_else(|| unknown_session(id))?;
@@ -148,36 +150,36 @@ impl Pacer {
         Ok(handle)
     }
 
-    /// Returns whether a session is there, and this run of its journal is being written.
+    /// Returns whether the session exists and its journal is being written as run `run`.
     pub fn is_recording(&self, id: &str, run: u32) -> bool {
         let sessions = lock(&self.sessions);
         let event_log = sessions.get(id).and_then(|handle| handle.event_log.as_ref());
         event_log.is_some_and(|event_log| event_log.progress().borrow().run == run)
     }
 
-    /// Returns all sessions, oldest first.
+    /// Returns all sessions, oldest first, including those that are still being handed to this server.
     pub fn list(&self) -> Vec<Arc<SessionHandle>> {
         let mut all: Vec<_> = lock(&self.sessions).values().cloned().collect();
         all.sort_by_key(|handle| handle.number);
         all
     }
 
-    /// Returns what each stepping thread counts of itself.
+    /// Returns the counters of each stepping thread; the last are those of `step-apart`.
     pub fn tallies(&self) -> impl Iterator<Item = &ThreadCounters> {
         self.steppers.iter().chain([&self.apart]).map(|stepper| &stepper.inbox.tally)
     }
 
-    /// Returns what the auditor counts.
+    /// Returns the counters of the auditor.
     pub fn audit_tally(&self) -> &AuditTally {
         &self.auditor.tally
     }
 
-    /// Returns those who look at some session.
+    /// Returns the number of viewers, over all sessions.
     pub fn viewers(&self) -> usize {
         lock(&self.viewers).values().filter(|viewer| viewer.strong_count() > 0).count()
     }
 
-    /// Ends a session and all its streams.
+    /// Deletes a session: ends all its streams, and discards its waiting commands.
     ///
     /// # Errors
     /// Refuses an unknown ID.
@@ -185,7 +187,8 @@ impl Pacer {
         self.part_with(id, deleted(), Leaving::Deleted)
     }
 
-    /// Gives up a session that has another owner: ends all its streams here with `why`. Its journal says so.
+    /// Removes a session that has another owner: ends all its streams on this server with `why`, and records that
+    /// it left in its journal.
     ///
     /// # Errors
     /// Refuses an unknown ID.
@@ -193,7 +196,8 @@ impl Pacer {
         self.part_with(id, why, Leaving::Moved)
     }
 
-    /// Returns a session that was being handed to this server does not come. Nothing of it is kept.
+    /// Cancels a session that was being handed to this server: discards what has arrived, and ends its streams with
+    /// `why`.
     ///
     /// # Errors
     /// Refuses an unknown ID.
@@ -206,14 +210,15 @@ impl Pacer {
         lock(&handle.slot).shrink_to(0);
         let waited = lock(&handle.intake).close(why.clone());
         if !waited.is_empty() {
-            // To free many takes longer than other calls may wait.
+            // Freeing many commands takes longer than other calls may wait.
             self.reading.post(&handle.owner, Piece::Remains(Box::new(waited)));
         }
         handle.inbox.send(handle.number, Request::Leave(why, leaving));
         Ok(())
     }
 
-    /// Ends what the server may not do any more. It may not speak for its sessions any more: ends all streams, and lets all tools go at the next step.
+    /// Ends all streams and releases all tools at the next step, because the server may no longer answer for its
+    /// sessions.
     pub fn fall_silent(&self) {
         for handle in self.list() {
             handle.at_intake(|intake, _| intake.free(|_, _| true));
@@ -221,7 +226,7 @@ impl Pacer {
         }
     }
 
-    /// Deletes the sessions that nobody uses any more; tells which.
+    /// Deletes the sessions that were not used for longer than their idle timeout. Returns their IDs.
     pub fn delete_idle(&self) -> Vec<String> {
         let now = now_ns();
         let all: Vec<_> = lock(&self.sessions).values().cloned().collect();
@@ -230,7 +235,7 @@ impl Pacer {
         ids.into_iter().filter(|id| self.delete(id).is_ok()).collect()
     }
 
-    /// Adds a viewer to a session.
+    /// Adds a viewer to a session: it is sent frames from now on.
     pub fn add_viewer(&self, handle: &SessionHandle, viewer: &Arc<Viewer>) {
         let mut viewers = lock(&self.viewers);
         viewers.retain(|_, viewer| viewer.strong_count() > 0);
@@ -239,7 +244,7 @@ impl Pacer {
         handle.view(viewer.clone());
     }
 
-    /// Returns the viewer of that id.
+    /// Returns the viewer of that ID.
     ///
     /// # Errors
     /// Refuses an unknown ID.
@@ -249,9 +254,9 @@ impl Pacer {
         })
     }
 
-    /// Ends all sessions and threads.
+    /// Ends all sessions and threads, and waits for the threads.
     pub fn stop(&self) {
-        let why = Refusal::new(Reason::ShuttingDown, "", "the server is going down");
+        let why = Refusal::new(Reason::ShuttingDown, "", "the server is shutting down");
         for handle in lock(&self.sessions).values() {
             drop(lock(&handle.intake).close(why.clone()));
         }
@@ -265,9 +270,9 @@ impl Pacer {
     }
 }
 
-/// Returns the refusal of what a server is asked that may not speak for its sessions.
+/// Returns the refusal of a call while the server may not answer for its sessions.
 pub fn fenced() -> Refusal {
-    let message = "the server has not heard from etcd for so long that another server may have this session; it goes on here, or \
+    let message = "the server has not heard from etcd for so long that another server may have this session; it continues here, or \
                    there, when they have";
     Refusal::new(Reason::Fenced, "", message)
 }

@@ -1,4 +1,5 @@
-//! What a session plays that was recorded: somebody reads ahead, and its stepping thread takes what is due, without waiting.
+//! Playback of a recorded session. Another thread reads the recording ahead, and the stepping thread takes what is
+//! due without waiting.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
@@ -8,23 +9,23 @@ use palpate_session::input::Input;
 use palpate_tissue::Model;
 use palpate_tissue::lock::lock;
 
-/// Inputs that are read ahead.
+/// Limit of inputs, and of steps, that are read ahead.
 const AHEAD: usize = 4096;
 
-/// What is to be played.
+/// Recorded inputs that have been read and not yet played.
 #[derive(Default)]
 pub struct PlaybackSource(Mutex<Fed>);
 
 #[derive(Default)]
 struct Fed {
-    /// With the steps done before each acts.
+    /// Each input with the number of steps done before it acts.
     inputs: VecDeque<(u64, Input)>,
-    /// All that act before this step are in, or were taken.
+    /// All inputs that act before this step are in `inputs`, or have been taken.
     until_step: u64,
     is_complete: bool,
 }
 
-/// What acts at a step.
+/// Inputs of one step, without its commands.
 #[derive(Default)]
 pub(super) struct Fetched {
     pub(super) change: Option<Arc<Model>>,
@@ -34,40 +35,41 @@ pub(super) struct Fetched {
 
 /// Whether a step can be played.
 pub(super) enum Next {
-    /// With this.
+    /// Yes, with these inputs.
     Step(Fetched),
-    /// Not yet: what acts at it has not been read.
+    /// Not yet: the inputs of the step have not been read.
     Late,
-    /// It was not recorded.
+    /// No: the recording ends before the step.
     Over,
 }
 
 impl PlaybackSource {
-    /// Adds what was read: inputs in order, all that act before `until_step`.
+    /// Adds inputs that were read, in order. They complete all inputs that act before `until_step`.
     pub fn add(&self, inputs: VecDeque<(u64, Input)>, until_step: u64) {
         let mut fed = lock(&self.0);
         fed.inputs.extend(inputs);
         fed.until_step = fed.until_step.max(until_step);
     }
 
-    /// Notes that nothing more was recorded.
+    /// Marks the recording as read to its end.
     pub fn complete(&self) {
         lock(&self.0).is_complete = true;
     }
 
-    /// Returns whether more is to be read; `None` if there is no more.
+    /// Returns whether more inputs should be read for a session that has done `step` steps (fewer than 4096 inputs
+    /// and steps are ahead); `None` at the end of the recording.
     pub fn wants_more(&self, step: u64) -> Option<bool> {
         let fed = lock(&self.0);
         (!fed.is_complete).then(|| fed.inputs.len() < AHEAD && fed.until_step < step + AHEAD as u64)
     }
 
-    /// The step that a session at rest must not skip.
+    /// Returns the first step that a session at rest must not skip.
     pub(super) fn next_step(&self) -> u64 {
         let fed = lock(&self.0);
         fed.inputs.front().map_or(fed.until_step, |input| input.0)
     }
 
-    /// Takes what acts when `step` steps are done; commands go to `due`.
+    /// Takes the inputs that act when `step` steps are done. Commands are appended to `due`.
     pub(super) fn take(&self, step: u64, due: &mut Vec<Due>) -> Next {
         let mut fed = lock(&self.0);
         if step >= fed.until_step {
@@ -87,18 +89,18 @@ impl PlaybackSource {
     }
 }
 
-/// A session that plays what another has recorded.
+/// What a session plays: the recording of another session.
 #[derive(Clone)]
 pub struct Playback {
-    /// The session that was recorded.
+    /// ID of the recorded session.
     pub session_id: String,
-    /// The run of the server that recorded it.
+    /// Number of the recorded run of the server.
     pub run: u64,
-    /// Steps done at the beginning and at the end of what was recorded.
+    /// Step counts at the beginning and at the end of the recording.
     pub steps: [u64; 2],
-    /// How fast it is played.
+    /// Speed of the playback; 1 is real time.
     pub speed: f64,
-    /// What acts.
+    /// The recorded inputs.
     pub feed: Arc<PlaybackSource>,
 }
 

@@ -1,35 +1,36 @@
-//! The overrun policy: what a session may catch up, what is dropped, and which session waits when a thread is too slow
-//! for all. Pure: time is an argument.
+//! The overrun policy: how much a late session catches up, what is dropped, and which session waits when a thread
+//! is too slow for all. The code is pure: time is an argument.
 //!
-//! **Overruns.** Time steps are fixed. A session that is behind catches up at most [`CATCH_UP_STEPS`] steps, and what the
-//! longest recent step of its thread has made it late. What it is behind beyond that is dropped from its schedule and
-//! counted. Simulated time then runs slower than real time.
+//! **Overruns.** Time steps are fixed. A session that is late catches up at most [`CATCH_UP_STEPS`] steps, and the
+//! delay that the longest recent step of its thread has caused. Steps beyond that are dropped from its schedule and
+//! counted; simulated time then runs slower than real time.
 //!
-//! **Fair parts.** The session that is due first is stepped first, so sessions of any rates are all on time while there
-//! is time for all. If there is not, a session that takes no more than its part of the thread is still stepped when it is
-//! due. A session that takes more and is late goes after all that are due. The thread is divided among the callers whose
-//! sessions are awake, and each caller's part among its sessions: a caller who wakes four hundred sessions at once slows
-//! those. So between two steps of a session that is too heavy all others get theirs, and it gets what they leave. A step
-//! can't be interrupted: the longest recent one may have made every session late, and each catches that up however many
-//! steps it is.
+//! **Fair parts.** The session that is due first is stepped first, so sessions of any rates are all on time while
+//! there is time for all. If there is not, a session that takes no more than its part of the thread is still
+//! stepped when it is due. A session that takes more and is late goes after all that are due. The thread is divided
+//! equally among the callers whose sessions are awake, and each caller's part among its sessions: a caller that
+//! wakes four hundred sessions at once slows only those. So between two steps of a session that is too heavy all
+//! others are stepped, and it gets the remaining time. A step can't be interrupted: the longest recent one may have
+//! made every session late, and each catches that up, however many steps it is.
 //!
-//! **Turns.** What was not late before is stepped when it is due, also if it is one of four hundred that a caller has woken at once. After
-//! [`MAX_TURN_NS`] of steps of one caller, a session of another that is due comes first.
+//! **Turns.** A session that was on time is stepped when it is due, even if its caller has woken four hundred at
+//! once. After [`MAX_TURN_NS`] of steps of one caller, a due session of another caller comes first.
 //!
-//! **Apart.** A step that takes longer than its period, and than [`MAX_STEP_NS`], makes all others of the thread late, however the
-//! rest is divided: a scene may be light and its tools not. A session that has such steps beside others goes over to a thread that
-//! gives way, and stays there. So who is late is late alone.
+//! **Apart.** A step that takes longer than its period, and longer than [`MAX_STEP_NS`], makes all other sessions
+//! of the thread late, however the time is divided: a scene may be light and its tools heavy. A session with such
+//! steps moves from a shared thread to one of lower priority, and stays there. So such sessions are late without
+//! delaying others.
 
-/// Steps that a session may be behind before the rest is dropped.
+/// Number of steps that a session may be late before further ones are dropped.
 const CATCH_UP_STEPS: f64 = 2.0;
 
-/// What the rule on overruns remembers of a session since it was started: so far, nothing.
+/// State of the overrun rule for a session since it was started. So far the rule needs none.
 #[derive(Debug, Default)]
 pub(super) struct Backlog {}
 
 impl Backlog {
-    /// The number of steps to drop from the schedule of a session whose next step was due `late_ns` ago. Of that,
-    /// `forgiven_ns` is not the session's fault. Called before each step.
+    /// Returns the number of steps to drop from the schedule of a session whose next step was due `late_ns` ago.
+    /// `forgiven_ns` of that was caused by other sessions. It is called before each step.
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn dropped_steps(&mut self, late_ns: u64, forgiven_ns: u64, period_ns: f64) -> u64 {
         let behind = (late_ns.saturating_sub(forgiven_ns) as f64 / period_ns).floor();
@@ -38,16 +39,16 @@ impl Backlog {
     }
 }
 
-/// The number of equal parts that a thread is divided into for one session: `callers` have awake sessions, and the
-/// session's caller has `siblings` of them, itself included.
+/// Returns the number of equal parts that a thread is divided into for one session: `callers` have awake sessions,
+/// and the session's caller has `siblings` of them, including this one.
 pub(super) fn parts(callers: usize, siblings: usize) -> usize {
     callers * siblings
 }
 
-/// Steps of one caller may follow each other for so long, ns, while a session of another is due.
+/// Limit of consecutive time for one caller's steps while a session of another caller is due, ns.
 const MAX_TURN_NS: u64 = 500_000;
 
-/// Whose steps a thread does at present, one after the other.
+/// The caller whose steps a thread does at present, one after the other.
 #[derive(Debug, Default)]
 pub(super) struct CallerTurn {
     caller: u64,
@@ -55,40 +56,41 @@ pub(super) struct CallerTurn {
 }
 
 impl CallerTurn {
-    /// Notes that a step of a caller begins. If that is the one whose turn was over, no other had one that was due.
+    /// Notes that a step of a caller begins. If that caller's turn was over, no other caller had a due step.
     pub(super) fn step(&mut self, caller: u64, begun_ns: u64) {
         if caller != self.caller || self.is_over_for(begun_ns).is_some() {
             *self = CallerTurn { caller, begun_ns };
         }
     }
 
-    /// The caller for whom others have waited long enough.
+    /// Returns the caller whose turn is over, if it is.
     pub(super) fn is_over_for(&self, now_ns: u64) -> Option<u64> {
         (now_ns > self.begun_ns + MAX_TURN_NS).then_some(self.caller)
     }
 }
 
-/// A step may take so long, ns, whatever its period is.
+/// Duration of a step that never counts as too long, ns.
 const MAX_STEP_NS: u64 = 2_000_000;
 
-/// After a step that took too long, the processor time of so many is measured: it took too long if that says so as well.
+/// Number of steps whose processor time is measured after a step that took too long. Only the processor time shows
+/// that the steps are too long.
 const MEASURED_STEPS: u32 = 64;
 
-/// Watches whether the steps of a session take too long for others beside it. A step may also have waited for the processor, which is no
-/// fault of its own; to measure that each time would take a part of each step.
+/// Detects a session whose steps take too long for the others of its thread. A long step may also have waited for
+/// the processor, and measuring the processor time of every step would cost too much.
 #[derive(Debug, Default)]
 pub(super) struct StepWatch {
     to_measure: u32,
 }
 
 impl StepWatch {
-    /// Whether the processor time of the coming step is to be measured.
+    /// Returns whether the processor time of the coming step is to be measured.
     pub(super) fn measures(&self) -> bool {
         self.to_measure > 0
     }
 
-    /// Notes a step that took `took_ns`, of which the processor was busy for `worked_ns` if that was measured. Tells whether such
-    /// steps take too long.
+    /// Notes a step that took `took_ns`, with `worked_ns` of processor time if that was measured. Returns whether
+    /// its measured time is too long.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn is_too_long(&mut self, took_ns: u64, worked_ns: Option<u64>, period_ns: f64) -> bool {
         let is_long = |ns: u64| ns > MAX_STEP_NS && ns as f64 > period_ns;
@@ -100,24 +102,24 @@ impl StepWatch {
     }
 }
 
-/// A session that looks for its place among the others of its thread, after a step.
+/// A session that is queued among the others of its thread, after a step.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Turn {
-    /// When its next step is due.
+    /// Time at which its next step is due, ns.
     pub(super) due_ns: u64,
-    /// The time between two steps.
+    /// Time between two steps, ns.
     pub(super) period_ns: f64,
-    /// The fraction of the thread that its steps take.
+    /// Fraction of the thread that its steps take.
     pub(super) share: f64,
-    /// The number of equal parts of the thread of which one is its own ([`parts`]).
+    /// Number of equal parts of the thread of which one is its own ([`parts`]).
     pub(super) parts: usize,
-    /// Whether no other session of the thread is due some time.
+    /// Whether no other session of the thread has a due time.
     pub(super) is_alone: bool,
 }
 
 impl Turn {
-    /// The time before which the session is not stepped: `now_ns` if it is late and takes more than its part, so that it
-    /// goes after all that are due by then; else 0.
+    /// Returns the time before which the session is not stepped, ns: `now_ns` if it is late and takes more than its
+    /// part, so that it goes after all that are due by then; else 0.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn not_before_ns(&self, now_ns: u64) -> u64 {
         let is_late = now_ns.saturating_sub(self.due_ns) as f64 > self.period_ns;
@@ -129,16 +131,16 @@ impl Turn {
 /// The longest recent step of a thread: no session is to blame for being late by as much.
 #[derive(Debug, Default)]
 pub(super) struct Longest {
-    /// Of this window, and of the last.
+    /// The longest step of the present window and of the last one, ns.
     now_ns: u64,
     before_ns: u64,
     since_ns: u64,
 }
 
-/// Length of the windows.
+/// Length of the windows, ns.
 const WINDOW_NS: u64 = 250_000_000;
 
-/// Most that is forgiven of a step.
+/// Limit of the step length that is forgiven, ns.
 const MAX_NS: u64 = 100_000_000;
 
 impl Longest {
@@ -150,7 +152,7 @@ impl Longest {
         self.now_ns = self.now_ns.max(took_ns.min(MAX_NS));
     }
 
-    /// The length of that step.
+    /// Returns the length of the longest recent step, ns.
     pub(super) fn ns(&self) -> u64 {
         self.now_ns.max(self.before_ns)
     }
@@ -226,7 +228,7 @@ mod tests {
             assert!(watch.measures() && !watch.is_too_long(MS, Some(MS), period_ns));
         }
         assert!(!watch.measures());
-        // The second such step tells.
+        // The second such step decides.
         assert!(!watch.is_too_long(3 * MS, None, period_ns) && watch.measures());
         assert!(!watch.is_too_long(9 * MS, Some(MS / 2), period_ns) && watch.measures());
         assert!(watch.is_too_long(3 * MS, Some(3 * MS), period_ns));

@@ -1,37 +1,40 @@
-//! Threads: heavy work, and what strangers send by UDP, give way to stepping and to the network, which ask for short turns; all have
-//! a stack that the kernel fits on.
+//! Priorities of threads. Heavy work and the processing of unauthenticated UDP packets yield to stepping and to the
+//! network, which ask for short time slices. Every thread has a stack that is large enough for the stepping code.
 
 use std::thread::Builder;
 use std::time::Duration;
 
-/// The stack of a thread that steps a tissue, bytes. The kernel is inlined into one function for each scheme and width. Without
-/// optimization each of its thousands of intermediate vectors has a place of its own there: 2 MB in all.
+/// Stack size of a thread that steps a tissue, bytes. The stepping code is inlined into one function for each
+/// scheme and width. Without optimization each of its thousands of intermediate vectors has its own place on the
+/// stack: 2 MB in all.
 const STACK_BYTES: usize = if cfg!(debug_assertions) { 32 << 20 } else { 2 << 20 };
 
-/// The turn of a network thread: a message takes some tens of microseconds.
+/// Time slice of a network thread: a message takes some tens of microseconds.
 pub const NETWORK_TURN: Duration = Duration::from_micros(100);
-/// The turn of a stepping thread: some steps of sessions at 1 kHz.
+/// Time slice of a stepping thread: some steps of sessions at 1 kHz.
 pub const STEPPING_TURN: Duration = Duration::from_millis(1);
 
-/// Returns a thread of that name, to be spawned.
+/// Returns a builder of a thread of that name, with a stack that is large enough to step a tissue.
 pub fn thread(name: impl Into<String>) -> Builder {
     Builder::new().name(name.into()).stack_size(STACK_BYTES)
 }
 
-/// Makes the calling thread give way to those of the process that step, and to the network's: where there is not enough for all
-/// it gets about a tenth of what they get. No thread is ever shut out.
+/// Lowers the priority of the calling thread (niceness 10). If the processors are busy, it gets about a tenth of
+/// the time of a stepping or network thread, and never none. Outside Linux nothing changes.
 pub fn give_way() {
     be_nice(10);
 }
 
-/// Makes the calling thread give way, but less: it gets about a third.
+/// Lowers the priority of the calling thread a little (niceness 5): it gets about a third of the time of a stepping
+/// thread if the processors are busy. Outside Linux nothing changes.
 pub fn give_way_a_little() {
     be_nice(5);
 }
 
-/// Asks the system to run the calling thread for no longer than `turn` (0.1 to 100 ms) at a time. On a busy core it then waits less
-/// after it wakes, and its share of the core stays the same. (EEVDF: the virtual deadline of a thread is its turn after it became
-/// eligible, and the earliest deadline runs.) Linux 6.12 and later; elsewhere nothing changes.
+/// Asks the system to run the calling thread for no longer than `turn` (0.1 to 100 ms) at a time. On a busy core
+/// the thread then waits less after it wakes, and its share of the core stays the same. (EEVDF: the virtual
+/// deadline of a thread is its time slice after it became eligible, and the earliest deadline runs.) It needs Linux
+/// 6.12 or later; elsewhere nothing changes.
 #[allow(unsafe_code)]
 pub fn take_short_turns(turn: Duration) {
     #[cfg(target_os = "linux")]
@@ -41,22 +44,24 @@ pub fn take_short_turns(turn: Duration) {
             size: std::mem::size_of::<libc::sched_attr>() as u32,
             sched_policy: libc::SCHED_OTHER as u32,
             sched_flags: 0,
-            // The call sets all of them, so the niceness must be repeated.
+            // The call sets all attributes, so the niceness must be repeated.
             sched_nice: rustix::process::getpriority_process(None).unwrap_or_default(),
             sched_priority: 0,
             sched_runtime: nanoseconds,
             sched_deadline: 0,
             sched_period: 0,
         };
-        // SAFETY: `attributes` lives through the call, which reads `size` bytes of it and keeps no pointer (sched_setattr(2)).
-        // Best effort: older kernels ignore the turn, and a sandbox may refuse the call.
+        // SAFETY: `attributes` lives through the call, which reads `size` bytes of it and keeps no pointer
+        // (sched_setattr(2)). A failure is ignored: older kernels ignore the time slice, and a sandbox may refuse
+        // the call.
         unsafe { libc::syscall(libc::SYS_sched_setattr, 0, &raw const attributes, 0) };
     }
     #[cfg(not(target_os = "linux"))]
     let _ = turn;
 }
 
-/// Of this thread alone, on Linux; elsewhere it would be the whole process. Best effort.
+/// Sets the niceness of the calling thread, on Linux; elsewhere it would be that of the whole process. A failure is
+/// ignored.
 fn be_nice(niceness: i32) {
     #[cfg(target_os = "linux")]
     let _ = rustix::process::setpriority_process(None, niceness);

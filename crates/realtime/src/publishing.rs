@@ -1,4 +1,4 @@
-//! What a session publishes after a step: samples, frames, hashes, its status, the auditor's marks.
+//! What a session publishes after a step: samples, frames, hashes, its status, and marks for the auditor.
 
 use std::sync::Arc;
 use std::sync::mpsc::SyncSender;
@@ -22,14 +22,14 @@ use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 use palpate_tissue::select::audit::Mark;
 
-/// What a hash is read from.
+/// The hash of a state, or the copy to compute it from.
 enum HashSource {
     Hash(u64, u128),
     Copy(Arc<Copied>),
 }
 
 impl SessionTask {
-    /// Tells the auditor where the window begins or ends, without waiting: there is room for both.
+    /// Sends the auditor the mark of a window's beginning or end, without waiting: the channel has room for both.
     pub(super) fn tell_auditor(&mut self) {
         let Some(auditor) = &self.audit else { return };
         let ended = self.session.hold_reason().is_some();
@@ -40,16 +40,16 @@ impl SessionTask {
         }
     }
 
-    /// Has the stiffness computed anew under the tools of which it is told.
+    /// Requests new stiffnesses under the tools that streams are sent.
     pub(super) fn refine(&self, refiner: &SyncSender<StiffnessJob>) {
         for refinement in self.subscribers.samples.iter().flat_map(|tap| tap.sampler.refinements(&self.session)) {
-            // What finds the refiner busy is left: the next is newer.
+            // A request that finds the worker busy is dropped: the next one is newer.
             let _ = refiner.try_send(refinement);
         }
     }
 
-    /// Gives a stream the present sample, if it is to get it, or if no other follows for now. `all` is the sample of all
-    /// tools, once a stream has asked for it.
+    /// Sends a stream the present sample, if the stream is due one or if `last` says that no other follows for now.
+    /// `all` keeps the sample of all tools for other streams, once one has needed it.
     pub(super) fn tell(&self, tap: &mut SampleTap, all: &mut Option<Sample>, last: bool, wakes: &mut Wakes) {
         let Some(sample) = tap.sampler.pick_from(&self.session, all, last || tap.once) else { return };
         let overrun = self.overrun_count > tap.overrun_count;
@@ -70,7 +70,8 @@ impl SessionTask {
                 continue;
             };
             let now = now_ns();
-            // The last sample for now is not left out: the stream would miss the state in which the session stands.
+            // The last sample for now is never left out: otherwise the stream would miss the state in which the
+            // session pauses.
             if last || watcher.must_wait_ns(Work::Reading, now) == 0 {
                 self.tell(tap, &mut all, last, wakes);
                 let ended = now_ns();
@@ -81,7 +82,7 @@ impl SessionTask {
         self.subscribers.samples = subscribers;
     }
 
-    /// Tells everybody who wants to know of this step.
+    /// Sends the results of this step to all subscribers that are due.
     pub(super) fn publish(&mut self, context: &mut ThreadContext<'_>) {
         let step = self.session.step_count();
         self.tell_all(!self.running, &mut context.wakes);
@@ -151,10 +152,11 @@ impl SessionTask {
         }
     }
 
-    /// Has the present state shown to `viewers`. Without memory for it their streams end.
+    /// Posts the present state to be encoded as frames for `viewers`. If there is no memory for it, their streams
+    /// end.
     ///
-    /// The displacements are copied in one go: they are half of what a substep reads and half of what it writes. All
-    /// else is done by the encoder.
+    /// The displacements are copied in one go: that is half of what a substep reads and half of what it writes. The
+    /// encoder does everything else.
     pub(super) fn post(&self, encoder: &Encoder, viewers: Vec<(Arc<Viewer>, u64)>) {
         let model = &self.handle.model;
         // A frame of a mesh has whole rows.
@@ -174,8 +176,8 @@ impl SessionTask {
         encoder.post(self.handle.number, Job { snapshot, viewers, overrun_count, time_dilation });
     }
 
-    /// Answers with the step and the state's hash; whoever has used up their part of the time is refused. Of a large
-    /// sheet the hash is computed by the thread of `reading`, from a copy.
+    /// Sends the step and the hash of the state to `reply`, or a refusal if the caller has used up its part of the
+    /// reading time. For a large sheet the thread of `reading` computes the hash from a copy.
     pub(super) fn hash_for(&mut self, account: &Account, reply: HashReply, reading: &Reading) {
         let begun_ns = now_ns();
         match self.hash_now(account, begun_ns) {
@@ -190,7 +192,7 @@ impl SessionTask {
         account.spend(Work::Reading, ended_ns, ended_ns.saturating_sub(begun_ns));
     }
 
-    /// The hash, which is computed once a step, or the copy to compute it from.
+    /// Returns the hash, which is computed once per step, or the copy to compute it from.
     fn hash_now(&mut self, account: &Account, now_ns: u64) -> Result<HashSource> {
         let step = self.session.step_count();
         if let Some((_, hash)) = lock(&self.hashed).filter(|hashed| hashed.0 == step) {
@@ -198,7 +200,7 @@ impl SessionTask {
         }
         if account.must_wait_ns(Work::Reading, now_ns) > 0 {
             let message =
-                "what this caller has read of late took more than its part of the time of the stepping threads";
+                "what this caller has read recently took more than its part of the time of the stepping threads";
             return Err(Refusal::new(Reason::Overloaded, "", message));
         }
         let points = self.session.model().len();
@@ -210,7 +212,7 @@ impl SessionTask {
         Ok(HashSource::Hash(step, hash))
     }
 
-    /// Logs the recovery in the step that was just done, if there was one.
+    /// Logs the recovery of the last step, if there was one.
     pub(super) fn log_recovery(&self) {
         let step = self.session.step_count();
         if let Some(newest) = self.session.recoveries().newest().filter(|newest| newest.recovery.step == step) {

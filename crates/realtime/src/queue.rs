@@ -1,5 +1,5 @@
-//! A bounded queue from a stepping thread to one reader. When it is full the oldest makes room: the writer never
-//! waits, and the reader gets what is new.
+//! A bounded queue from a stepping thread to one reader. A full queue drops its oldest item: the writer never
+//! waits, and the reader gets the newest items.
 
 use std::collections::VecDeque;
 use std::future::poll_fn;
@@ -16,43 +16,43 @@ struct QueueState<T> {
     dropped: u64,
     end: Option<Refusal>,
     abandoned: bool,
-    /// Of the reader, if it waits.
+    /// Waker of the reader, if it waits.
     waiting: Option<Waker>,
 }
 
-/// The end that a stepping thread writes to.
+/// Writing end of a queue, used by a stepping thread. Dropping it closes the queue.
 #[derive(Debug)]
 pub struct Writer<T>(Arc<Mutex<QueueState<T>>>);
 
-/// The end that a stream reads from. Dropping it tells the writer to stop.
+/// Reading end of a queue, used by a stream. Dropping it makes the writer stop.
 #[derive(Debug)]
 pub struct Reader<T>(Arc<Mutex<QueueState<T>>>);
 
-/// Readers that are to be woken, together: to wake one may cost more than the step whose sample it gets.
+/// Readers to be woken together: waking one may cost more than the step whose sample it gets.
 #[derive(Debug, Default)]
 pub struct Wakes(Vec<Waker>);
 
 impl Wakes {
-    /// Returns how many are to be woken.
+    /// Returns the number of readers to be woken.
     pub fn len(&self) -> usize {
         self.0.len()
     }
 
-    /// Returns whether nobody is to be woken.
+    /// Returns whether there are no readers to be woken.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// Wakes them.
+    /// Wakes the readers, and clears the list.
     pub fn wake(&mut self) {
         self.0.drain(..).for_each(Waker::wake);
     }
 }
 
-/// Returns a queue of `capacity` items.
+/// Creates a queue of `capacity` items, at least 1. Returns its two ends.
 pub fn queue<T>(capacity: usize) -> (Writer<T>, Reader<T>) {
     let inner = QueueState {
-        // Grows if it must: a reader that keeps up needs room for one.
+        // It grows when needed: a reader that keeps up needs room for one item.
         items: VecDeque::new(),
         capacity: capacity.max(1),
         dropped: 0,
@@ -65,14 +65,15 @@ pub fn queue<T>(capacity: usize) -> (Writer<T>, Reader<T>) {
 }
 
 impl<T> Writer<T> {
-    /// Adds an item; drops the oldest if there is no room.
+    /// Adds an item and wakes the reader. A full queue drops its oldest item; a closed queue ignores the new one.
     pub fn push(&self, item: T) {
         if let Some(waker) = self.place(item) {
             waker.wake();
         }
     }
 
-    /// Does the same, but leaves it to the caller to wake the reader.
+    /// Adds an item, and appends the waiting reader to `wakes` for the caller to wake. A full queue drops its
+    /// oldest item; a closed queue ignores the new one.
     pub fn push_quietly(&self, item: T, wakes: &mut Wakes) {
         wakes.0.extend(self.place(item));
     }
@@ -90,23 +91,23 @@ impl<T> Writer<T> {
         inner.waiting.take()
     }
 
-    /// Notes that one item could not be had: it counts as dropped.
+    /// Counts one item as dropped that could not be produced.
     pub fn skip(&self) {
         lock(&self.0).dropped += 1;
     }
 
-    /// Takes back the newest item, if it has not been read.
+    /// Removes and returns the newest item; `None` if all have been read.
     pub fn withdraw(&self) -> Option<T> {
         lock(&self.0).items.pop_back()
     }
 
-    /// Returns whether one more item would cost the oldest.
+    /// Returns whether a further item would displace the oldest.
     pub fn is_full(&self) -> bool {
         let inner = lock(&self.0);
         inner.items.len() == inner.capacity
     }
 
-    /// Closes the queue; the reader is told why when it has read the rest.
+    /// Closes the queue. The reader gets the remaining items and then `why`. A closed queue keeps its first reason.
     pub fn close(&self, why: Refusal) {
         let mut inner = lock(&self.0);
         inner.end.get_or_insert(why);
@@ -117,7 +118,7 @@ impl<T> Writer<T> {
         }
     }
 
-    /// Returns whether the reader has gone.
+    /// Returns whether the reader has been dropped.
     pub fn is_abandoned(&self) -> bool {
         lock(&self.0).abandoned
     }
@@ -130,15 +131,16 @@ impl<T> Drop for Writer<T> {
 }
 
 impl<T> Reader<T> {
-    /// Returns the oldest item, and how many were dropped so far; the reason when there are no more.
+    /// Waits for an item. Returns the oldest one, and the number of items that were dropped so far.
     ///
     /// # Errors
-    /// Returns the reason when no more items will come.
+    /// Returns the reason for which the queue was closed, after the last item.
     pub async fn pop(&mut self) -> Result<(T, u64), Refusal> {
         poll_fn(|context| self.poll_pop(context)).await
     }
 
-    /// Does the same, if there is one or no more will come; else the task is woken when that is so.
+    /// Polls for an item. Returns the oldest one with the number of dropped items, or the reason if the queue is
+    /// closed and empty. Otherwise it is pending, and the task is woken when one of these is there.
     pub fn poll_pop(&mut self, context: &mut Context<'_>) -> Poll<Result<(T, u64), Refusal>> {
         let mut inner = lock(&self.0);
         if let Some(item) = inner.items.pop_front() {

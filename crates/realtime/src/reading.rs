@@ -1,6 +1,6 @@
-//! What is read of large sheets: records of many points and hashes. A stepping thread copies the sheet
-//! ([`ReadCopy`]); a thread with a lower priority, named `records`, reads the copies in slices,
-//! callers in turns. What one caller reads is read in order. The same thread frees what deleted sessions leave behind.
+//! Reading of large sheets: hashes, and records of many points. A stepping thread copies the sheet ([`ReadCopy`]).
+//! A thread with a lower priority, named `records`, reads the copies in slices, with turns among the callers; what
+//! one caller requests is read in order. The same thread frees the memory of deleted sessions.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -18,41 +18,41 @@ use palpate_tissue::scene::record::Record;
 use palpate_tissue::shape::PointId;
 use palpate_tissue::{Hashing, ReadCopy};
 
-/// A record, and its step. All who asked for the same share one.
+/// A record and its step. All streams that asked for equal records share one.
 pub type SharedRecord = Arc<Recorded>;
 
-/// What was measured once, for whoever asked for it.
+/// A record that was measured at one step.
 #[derive(Debug)]
 pub struct Recorded {
-    /// Steps done.
+    /// Number of steps done before the measurement.
     pub step: u64,
-    /// What was measured.
+    /// The measured points and tools.
     pub record: Record,
-    /// Its memory.
+    /// Memory of the record.
     pub(super) _taken: Taken,
 }
 
-/// So many points are read by the stepping thread itself: some tenths of a millisecond.
+/// Number of points that the stepping thread always reads itself: it takes some tenths of a millisecond.
 const AT_ONCE_POINTS: usize = 1024;
 
-/// To copy so many points costs as much as to read one.
+/// Number of points that can be copied in the time of reading one.
 const COPIED_PER_READ: usize = 64;
 
-/// Points of a slice: below a millisecond.
+/// Number of points in a slice, which takes less than a millisecond.
 const SLICE_POINTS: usize = 1024;
 
-/// Whether it costs the stepping thread less to copy a sheet of `all` points than to read `points` of them.
+/// Returns whether the stepping thread copies a sheet of `all` points rather than read `points` of them itself.
 pub(super) fn is_much(points: usize, all: usize) -> bool {
     points > AT_ONCE_POINTS.max(all / COPIED_PER_READ)
 }
 
-/// A copy of a sheet, and its memory.
+/// A copy of a sheet, with its memory.
 pub(super) struct Copied {
     copy: Mutex<ReadCopy>,
     _taken: Taken,
 }
 
-/// The newest copy of a session's sheet, while somebody still reads it.
+/// The newest copy of a session's sheet, while it is still being read.
 #[derive(Default)]
 pub(super) struct Copies {
     newest: Weak<Copied>,
@@ -60,7 +60,8 @@ pub(super) struct Copies {
 }
 
 impl Copies {
-    /// A copy of the session as it is, shared by all who read of this moment. Its memory is charged to who is first.
+    /// Returns a copy of the present state, which all readers of this moment share. The first reader's account is
+    /// charged for its memory.
     pub(super) fn of(&mut self, session: &Session, account: &Account) -> Result<Arc<Copied>> {
         let step = session.step_count();
         if let Some(copied) = self.newest.upgrade().filter(|_| self.step == step) {
@@ -73,19 +74,20 @@ impl Copies {
         Ok(copied)
     }
 
-    /// The session goes on: commands and changes may act before a step has been counted.
+    /// Forgets the copy, because the session continues: commands and changes may act before a step has been
+    /// counted.
     pub(super) fn forget(&mut self) {
         self.newest = Weak::new();
     }
 }
 
-/// The step and the hash of the state that was hashed last.
+/// The newest hash, with its step.
 pub(super) type Hashed = Arc<Mutex<Option<(u64, u128)>>>;
 
-/// Who waits for the step and the hash of a state.
+/// Receiver of a state's step and hash.
 pub(super) type HashReply = oneshot::Sender<Result<(u64, u128)>>;
 
-/// Who gets a record, and how many are on their way there.
+/// A stream of records, with the number of records on their way to it.
 #[derive(Debug)]
 pub(super) struct Recipient {
     writer: Writer<SharedRecord>,
@@ -94,23 +96,23 @@ pub(super) struct Recipient {
 }
 
 impl Recipient {
-    /// Of at most so many records that are not read yet.
+    /// Creates a recipient of at most `most` unfinished records.
     pub(super) fn new(writer: Writer<SharedRecord>, most: usize) -> Arc<Self> {
         Arc::new(Recipient { writer, most, pending: AtomicUsize::new(0) })
     }
 
-    /// Where its records go.
+    /// Returns the writing end of its queue.
     pub(super) fn writer(&self) -> &Writer<SharedRecord> {
         &self.writer
     }
 
-    /// Whether so many are on their way that one more would find no room.
+    /// Returns whether the limit of unfinished records is reached.
     pub(super) fn is_behind(&self) -> bool {
         self.pending.load(Ordering::Acquire) >= self.most
     }
 }
 
-/// What is to be read of a copy.
+/// Work for the reading thread.
 pub(super) enum Piece {
     Hash {
         copied: Arc<Copied>,
@@ -121,17 +123,17 @@ pub(super) enum Piece {
     },
     Record {
         copied: Arc<Copied>,
-        /// All, if none are named.
+        /// All points, if `None`.
         points: Option<Arc<[PointId]>>,
         step: u64,
-        /// With the points that were read so far.
+        /// The record, with the points that were read so far.
         record: Record,
         taken: Taken,
         to: Vec<Arc<Recipient>>,
     },
-    /// What a deleted session leaves behind: nobody waits for its memory to be freed.
+    /// Memory of a deleted session, to be freed.
     Remains(Box<dyn Send>),
-    /// No further record will come.
+    /// Closes a stream after its last record.
     Close {
         to: Arc<Recipient>,
         why: Refusal,
@@ -139,7 +141,7 @@ pub(super) enum Piece {
 }
 
 impl Piece {
-    /// Reads a slice. Returns the rest, if there is one that somebody waits for.
+    /// Reads a slice. Returns the rest, if there is one and someone waits for it.
     fn read(self) -> Option<Self> {
         match self {
             Piece::Hash { copied, mut hashing, step, hashed, reply } => {
@@ -194,7 +196,7 @@ struct PieceQueue {
     stop: bool,
 }
 
-/// The thread that reads.
+/// The thread that reads, and its queue.
 #[derive(Default)]
 pub(super) struct Reading {
     board: Mutex<PieceQueue>,
@@ -202,8 +204,8 @@ pub(super) struct Reading {
 }
 
 impl Reading {
-    /// Has a piece read for `account`. What waits is bounded by the memory of the copies, which is charged, and for each
-    /// stream by [`Recipient::is_behind`].
+    /// Queues a piece to be read for `account`. The queue is bounded by the memory of the copies, which is charged,
+    /// and for each stream by [`Recipient::is_behind`].
     pub(super) fn post(&self, account: &Account, piece: Piece) {
         if let Piece::Record { to, .. } = &piece {
             to.iter().for_each(|recipient| _ = recipient.pending.fetch_add(1, Ordering::AcqRel));
@@ -212,7 +214,7 @@ impl Reading {
         self.posted.notify_one();
     }
 
-    /// Ends a stream of records of `account`, after those that are on their way.
+    /// Closes a stream of records of `account`, after the records that are on their way.
     pub(super) fn close(&self, account: &Account, to: &Arc<Recipient>, why: Refusal) {
         if to.pending.load(Ordering::Acquire) == 0 {
             to.writer.close(why);
@@ -221,13 +223,13 @@ impl Reading {
         }
     }
 
-    /// Ends the thread.
+    /// Makes the thread end.
     pub(super) fn stop(&self) {
         lock(&self.board).stop = true;
         self.posted.notify_one();
     }
 
-    /// The thread's work.
+    /// Runs the thread until [`Reading::stop`].
     pub(super) fn work(&self) {
         loop {
             let idle = |board: &mut PieceQueue| board.waiting.is_empty() && !board.stop;
@@ -249,11 +251,11 @@ impl Reading {
         };
         match catch_unwind(AssertUnwindSafe(|| piece.read())) {
             Ok(None) => {}
-            // Before the caller's next, which may have come meanwhile.
+            // It goes before the caller's next piece, which may have come meanwhile.
             Ok(Some(rest)) => lock(&self.board).waiting.push_front(account, rest),
             Err(panic) => {
                 if memory::refusal_of(&*panic).is_none() {
-                    tracing::error!("a fault of the program ended what was read of a sheet");
+                    tracing::error!("a fault of the program ended the reading of a sheet");
                 }
                 for recipient in recipients {
                     recipient.writer.skip();
@@ -314,7 +316,7 @@ mod tests {
                 break answered.unwrap();
             }
         };
-        // Whoever has five records under way delays another by one slice of each turn.
+        // A caller with five records under way delays another by one slice in each turn.
         assert_eq!(slices, 2 * SLICES);
         assert_eq!(answered, (7, session.tissue().state_hash()));
         assert_eq!(*lock(&hashed), Some(answered));

@@ -1,11 +1,12 @@
-//! Who tells the tape of a session, and when.
+//! The part of a session's task that writes to the event log, and its schedule of snapshots, hashes and felt
+//! forces.
 
 use std::sync::Arc;
 
 use super::event_log::{Cadence, Event, EventLog};
 use palpate_session::Session;
 
-/// Tells the tape of a session.
+/// Writer of a session's event log, on the stepping thread.
 pub(super) struct Recorder {
     pub(super) event_log: Arc<EventLog>,
     pub(super) cadence: Cadence,
@@ -13,7 +14,7 @@ pub(super) struct Recorder {
 }
 
 impl Recorder {
-    /// Begins with the state of `session`: a journal continues from there.
+    /// Writes the state of `session` to the event log: the journal continues from there.
     pub(super) fn new(event_log: &Arc<EventLog>, session: &Session) -> Self {
         let step = session.step_count();
         let mut recorder = Recorder {

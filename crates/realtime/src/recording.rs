@@ -1,4 +1,4 @@
-//! What a session tells its tape, from its stepping thread.
+//! The events that a session writes to its event log, from its stepping thread.
 
 use std::sync::Arc;
 
@@ -10,19 +10,19 @@ use palpate_tissue::Model;
 use palpate_tissue::lock::lock;
 
 impl SessionTask {
-    /// Tells what happens now.
+    /// Writes an event of the present step.
     pub(super) fn note(&self, event: Event) {
         if let Some(recorder) = &self.recorder {
             recorder.event_log.note(self.session.step_count(), event);
         }
     }
 
-    /// Tells what acts on the session now.
+    /// Writes an input that acts on the session at the present step.
     pub(super) fn note_input(&self, input: Input) {
         self.note(Event::Input(input));
     }
 
-    /// Tells what acts in the coming step.
+    /// Writes the inputs that act in the coming step.
     pub(super) fn note_inputs(&self, change: Option<&Arc<Model>>) {
         let Some(recorder) = &self.recorder else { return };
         let step = self.session.step_count();
@@ -34,7 +34,7 @@ impl SessionTask {
         }
     }
 
-    /// Begins the journal anew, if it is broken and there is room again.
+    /// Restarts the event log, if it is broken and there is room again.
     fn begin_anew(&mut self) {
         let Some(recorder) = &mut self.recorder else { return };
         let (session, running, until_step) = (&self.session, self.running, self.until);
@@ -45,14 +45,14 @@ impl SessionTask {
         }
     }
 
-    /// Tells how the tissue is after a step.
+    /// Writes the state of the tissue after a step, as far as it is due.
     pub(super) fn note_state(&mut self) {
         self.begin_anew();
         let Some(recorder) = &mut self.recorder else { return };
         let (session, event_log) = (&self.session, &recorder.event_log);
         let step = session.step_count();
         if session.hold_reason().is_some() {
-            // The guard has held it, as it does wherever the same inputs act.
+            // The guard has held it; a replay of the same inputs is held at the same step.
             return event_log.is_told_until(step, true);
         }
         let is_at_rest = session.rests_until().is_some();
@@ -72,7 +72,7 @@ impl SessionTask {
         recorder.event_log.is_told_until(step, is_at_rest);
     }
 
-    /// Tells that steps were passed over at rest.
+    /// Writes that steps were skipped at rest.
     pub(super) fn note_rest(&mut self) {
         self.begin_anew();
         if let Some(recorder) = &self.recorder {
@@ -80,14 +80,14 @@ impl SessionTask {
         }
     }
 
-    /// Time stands: what is told so far goes to the disk.
+    /// Hands what is written so far to the journal's thread, because time is paused.
     pub(super) fn note_standstill(&self) {
         if let Some(recorder) = &self.recorder {
             recorder.event_log.hurry();
         }
     }
 
-    /// The server ends: its successor continues from the state as it is now.
+    /// Writes a snapshot for the server's successor, because the server ends.
     pub(super) fn note_the_end(&mut self) {
         let Some(recorder) = &self.recorder else { return };
         recorder.snapshot(&self.session);

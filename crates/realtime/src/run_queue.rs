@@ -1,4 +1,4 @@
-//! The rota of a stepping thread: its sessions, when each is due, and each one's part of the thread.
+//! The run queue of a stepping thread: its sessions, when each is due, and each one's part of the thread.
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
@@ -7,12 +7,12 @@ use super::policy;
 use super::session_task::SessionTask;
 use palpate_refusal::Refusal;
 
-/// The sessions of a thread, by number, and when each needs it next. One at rest may need it never.
+/// Sessions of a thread, by number, with the time at which each is due. A session at rest may never be due.
 #[derive(Default)]
 pub(super) struct RunQueue {
     sessions: BTreeMap<u64, Box<SessionTask>>,
     due: BTreeSet<(u64, u64)>,
-    /// Sessions that are due some time, by the account of who made them.
+    /// Number of sessions that have a due time, by the account of their owner.
     awake: BTreeMap<u64, usize>,
 }
 
@@ -23,8 +23,8 @@ impl RunQueue {
         self.with(number, SessionTask::plan);
     }
 
-    /// Does something with session `number`, if it is there still, which may change when it is due. Returns the session if
-    /// it has left the server.
+    /// Runs `act` on session `number`, if it is still there, and then updates its due time. If the session leaves the
+    /// thread, this removes and returns it.
     pub(super) fn with(&mut self, number: u64, act: impl FnOnce(&mut SessionTask)) -> Option<Box<SessionTask>> {
         let Entry::Occupied(mut session) = self.sessions.entry(number) else { return None };
         let running = session.get_mut();
@@ -46,30 +46,32 @@ impl RunQueue {
         running.has_left().then(|| session.remove())
     }
 
-    /// The number of equal parts of the thread of which one belongs to session `number` ([`policy::parts`]).
+    /// Returns the number of equal parts of the thread of which one belongs to session `number`
+    /// ([`policy::parts`]).
     pub(super) fn parts(&self, number: u64) -> usize {
         let owner = self.owner(number);
         policy::parts(self.awake.len(), owner.and_then(|owner| self.awake.get(&owner)).copied().unwrap_or(1))
     }
 
-    /// The session to be stepped now: that which is due first, of other callers than `weary` if one of theirs is due.
+    /// Returns the session to step now: the one that is due first. Sessions of callers other than `weary` come
+    /// first.
     pub(super) fn next(&self, now_ns: u64, weary: Option<u64>) -> Option<u64> {
         let due = || self.due.iter().take_while(|(due_ns, _)| *due_ns <= now_ns).map(|(_, number)| *number);
         let is_others = |number: &u64| self.owner(*number) != weary;
         weary.and_then(|_| due().find(is_others)).or_else(|| due().next())
     }
 
-    /// Who has made a session.
+    /// Returns the account number of the caller who created a session.
     pub(super) fn owner(&self, number: u64) -> Option<u64> {
         self.sessions.get(&number).map(|running| running.owner())
     }
 
-    /// Whether only one session is due some time.
+    /// Returns whether exactly one session has a due time.
     pub(super) fn is_alone(&self) -> bool {
         self.due.len() == 1
     }
 
-    /// Ends all sessions.
+    /// Ends all sessions, for the reason `why`.
     pub(super) fn end(&mut self, why: &Refusal) {
         for running in self.sessions.values_mut() {
             running.guarded(SessionTask::finish_step);
@@ -78,7 +80,7 @@ impl RunQueue {
         }
     }
 
-    /// The session that is due first, and when.
+    /// Returns the time at which a session is due first, ns, and its number.
     pub(super) fn first(&self) -> Option<(u64, u64)> {
         self.due.first().copied()
     }
@@ -95,7 +97,8 @@ mod tests {
     use palpate_tissue::scene::{PAPER, Scene};
     use palpate_tissue::select::scheme_selection::NEVER;
 
-    /// In virtual time: 40 sessions of one caller take 2 ms of each millisecond together; one of another keeps its time.
+    /// In virtual time: 40 sessions of one caller take 2 ms of each millisecond together; one of another caller stays
+    /// on time.
     #[test]
     fn a_thread_is_divided_among_callers_first() {
         let limits = Limits::default();
@@ -126,7 +129,7 @@ mod tests {
             run_queue.with(number, |running| running.queue_again(now_ns, now_ns, parts, false));
             assert_eq!(run_queue.sessions[&number].due_ns(), Some(expected), "{number}");
         }
-        // Who rests is not counted.
+        // A session at rest is not counted.
         (0..40).for_each(|number| drop(run_queue.with(number, |running| running.running = false)));
         assert_eq!((run_queue.parts(40), run_queue.awake.len()), (1, 1));
         pacer.stop();

@@ -1,4 +1,4 @@
-//! A session as the server sees it: requests to its stepping thread, and its intake.
+//! A session as the server's calls use it: requests to its stepping thread, and its intake.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
@@ -39,23 +39,24 @@ use palpate_tissue::scene::Change;
 use palpate_tissue::scene::record::{Point, ToolRecord};
 use palpate_tissue::shape::PointId;
 
-/// A session as the server sees it.
+/// Handle of a session for the server's calls, which any thread may use. Its stepping thread owns the session
+/// itself.
 pub struct SessionHandle {
-    /// Random, not to be guessed.
+    /// Random ID, which can't be guessed.
     pub id: String,
-    /// The tissue as the session began with it. Points and rate stay; coefficients, scheme and substeps may be others by
-    /// now ([`Status::model`]).
+    /// The first tissue of the session. Its points and its rate stay; coefficients, scheme and substeps may have
+    /// changed since ([`Status::model`]).
     pub model: Arc<Model>,
-    /// How frames show the tissue, if it is a mesh.
+    /// Surface by which frames show the tissue, if it is a mesh.
     pub skin: Option<Arc<Skin>>,
-    /// Who made it, and pays for it.
+    /// Account of the caller that created the session, which is charged for it.
     pub owner: Account,
     pub(super) intake: Mutex<Intake>,
     /// Time without calls, held tools or streams after which the session is deleted, s.
     pub idle_timeout_s: f64,
-    /// The revision at which this server became its owner; 0 without a fleet.
+    /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub(super) revision: AtomicU64,
-    /// It is handed over to this server, which is not its owner yet.
+    /// Whether it is being handed over to this server, which is not its owner yet.
     pub(super) is_coming: AtomicBool,
     pub(super) asked_ns: AtomicU64,
     pub(super) number: u64,
@@ -67,23 +68,23 @@ pub struct SessionHandle {
     pub(super) tissue: watch::Sender<(u64, Arc<Model>)>,
     pub(super) cost: Cost,
     pub(super) audited: Mutex<Audited>,
-    /// Index of its stepping thread; that of the one that gives way comes after the last.
+    /// Index of its stepping thread; `step-apart` comes after the last.
     pub(super) thread: AtomicUsize,
-    /// The inbox of the thread that it began on, which passes on what it is asked.
+    /// Inbox of the thread that it began on, which passes requests on if the session has moved.
     pub(super) inbox: Arc<Inbox>,
-    /// What it plays, if it plays what was recorded.
+    /// The recording that the session plays, if any.
     pub playback: Option<Playback>,
-    /// What a journal is told of it, if the server keeps journals.
+    /// Event log for the session's journal, if the server keeps journals and records this session.
     pub event_log: Option<Arc<EventLog>>,
-    /// Its place among the sessions: given back when it is deleted, while others may still read it.
+    /// Its place in the limit on sessions, freed when it is deleted, even if readers remain.
     pub(super) slot: Mutex<Taken>,
-    /// Its memory, until nobody reads it any more.
+    /// Its memory, charged until the last reader is gone.
     pub(super) _memory: Taken,
 }
 
 impl SessionHandle {
-    /// Returns how the session stands now: at rest, the steps that would have been done by now are counted without
-    /// computing them.
+    /// Returns the present status. For a session at rest it counts the steps that are due by now, without computing
+    /// them.
     pub fn status(&self) -> Status {
         let now = now_ns();
         let resting = self.at_intake(|intake, _| intake.is_resting().then(|| intake.next_step()));
@@ -96,12 +97,12 @@ impl SessionHandle {
         status
     }
 
-    /// Index of its stepping thread.
+    /// Returns the index of its stepping thread.
     pub(super) fn thread(&self) -> usize {
         self.thread.load(Ordering::Relaxed)
     }
 
-    /// How fast time goes on: other than 1 only of what is played.
+    /// Returns the speed of its time: other than 1 only for a playback.
     pub(super) fn speed(&self) -> f64 {
         self.playback.as_ref().map_or(1.0, |playback| playback.speed)
     }
@@ -114,8 +115,9 @@ impl SessionHandle {
             && self.at_intake(|intake, _| intake.holders().next().is_none())
     }
 
-    /// Returns where commands come in, as it stands now, and the time: also while no step is done that would end the
-    /// leases that have run out. A session at rest wakes if need be.
+    /// Runs `act` on the session's intake, with the time in ns of the clock of stepping, and returns its result.
+    /// First it ends the leases that have expired, and afterwards it wakes a session at rest if `act` requires
+    /// that. `act` runs under the intake's lock and must be short.
     pub fn at_intake<T>(&self, act: impl FnOnce(&mut Intake, u64) -> T) -> T {
         let mut intake = lock(&self.intake);
         let now = now_ns();
@@ -129,10 +131,11 @@ impl SessionHandle {
         answer
     }
 
-    /// Accepts all of `commands` from the holder of `lease`, or none. The first slice of them is put in the queue.
+    /// Accepts all of `commands` from the holder of `lease`, or none, and puts the first slice of them in the
+    /// queue.
     ///
     /// # Errors
-    /// Refuses commands that do not keep to the rules, and as [`Intake::accept`] does.
+    /// Refuses commands that break the session's rules, and whatever [`Intake::accept`] refuses.
     pub fn submit(&self, lease: LeaseId, commands: Vec<Command>) -> Result<Accepted<'_>> {
         let rules = lock(&self.intake).rules();
         let checked = rules.check(commands)?;
@@ -143,27 +146,29 @@ impl SessionHandle {
         })
     }
 
-    /// Returns the revision at which this server became the session's owner, or last said so; 0 without a fleet.
+    /// Returns the revision at which this server became the session's owner, or last confirmed that it is; 0
+    /// without a fleet.
     pub fn revision(&self) -> u64 {
         self.revision.load(Ordering::Acquire)
     }
 
-    /// Notes that this server has become the session's owner, or has said so, at that revision.
+    /// Sets the revision at which this server became the session's owner or confirmed that it is. A lower revision
+    /// is ignored.
     pub fn is_owned_since(&self, revision: u64) {
         self.revision.fetch_max(revision, Ordering::AcqRel);
     }
 
-    /// Counts commands that were refused.
+    /// Adds to the count of refused commands.
     pub fn count_refused(&self, commands: usize) {
         self.refused.fetch_add(commands as u64, Ordering::Relaxed);
     }
 
-    /// Returns what audits have found so far.
+    /// Returns the results of audits so far.
     pub fn audited(&self) -> Audited {
         lock(&self.audited).clone()
     }
 
-    /// Commands that were refused, in all.
+    /// Returns the number of refused commands.
     pub fn refused(&self) -> u64 {
         self.refused.load(Ordering::Relaxed)
     }
@@ -174,22 +179,23 @@ impl SessionHandle {
         answer.await.unwrap_or_else(|_| Err(deleted()))
     }
 
-    /// Lets time go on, for ever or until so many steps are done; tells the step that comes next.
+    /// Starts time, without end or until `until` steps are done. Returns the number of the next step.
     ///
     /// # Errors
-    /// Refuses a session that is held or deleted, and a step that is done already.
+    /// Refuses a session that is held or deleted, and an `until` that is not above the steps done.
     pub async fn start(&self, until: Option<u64>) -> Result<u64> {
         self.ask(|reply| Request::Start { until, reply }).await
     }
 
-    /// Changes the tissue from the beginning of step `at_step` on, or of the next. Tells the step, and the tissue from then
-    /// on. It is compiled here, by who asks, some milliseconds: no step waits for that.
+    /// Changes the tissue from the beginning of step `at_step` on, or of the next step. Returns that step and the
+    /// new tissue. The tissue is compiled in the calling thread, which takes some milliseconds; no step waits for
+    /// that.
     ///
-    /// `admit` is asked whether the thread has the time that the tissue will take of it, as a part of all. It is given up
-    /// when `stop` is set.
+    /// If the change needs more substeps, `admit` decides whether the stepping thread has that fraction of its time
+    /// left.
     ///
     /// # Errors
-    /// Refuses a change that is not valid or whose steps are too heavy, what `admit` refuses, and when `stop` is set.
+    /// Refuses a change that is invalid or whose steps are too heavy, what `admit` refuses, and when `stop` is set.
     pub fn change(
         &self,
         change: &Change,
@@ -202,13 +208,13 @@ impl SessionHandle {
             let now = base.as_ref().unwrap_or(&self.model);
             let model = memory::attempt("", || now.changed_until(change, &self.model.scene, &self.limits, stop))?;
             check_work(&model, &self.limits)?;
-            // The stepping thread lays out what the new scheme keeps, and a checkpoint.
+            // The stepping thread allocates the fields of the new scheme, and a checkpoint.
             memory::check(2 * model.state_bytes(), "another tissue")?;
             let (before, after) = (lock(&self.status).model.plan.substeps, model.plan.substeps);
             if after > before {
                 admit(self.cost.awake_share() * f64::from(after) / f64::from(before))?;
             }
-            // Somebody may have been quicker; then it is made out of theirs.
+            // If another change came first, this one is applied to its result.
             let accepted = self.at_intake(|intake, now| {
                 let accepted = intake.change(base.as_ref(), &model, at_step, now)?;
                 if accepted.is_some() {
@@ -222,7 +228,8 @@ impl SessionHandle {
         }
     }
 
-    /// Adopts what waited for its step where the session was before waits here.
+    /// Adopts the changes of the tissue that waited for their step on the server that had the session before.
+    /// Changes for which there is no memory are dropped, with a warning.
     pub fn adopt_waiting(&self, waiting: Vec<(u64, Input)>) {
         let handed = Handed { leases: Vec::new(), waiting };
         let dropped = self.at_intake(|intake, now| {
@@ -231,19 +238,19 @@ impl SessionHandle {
             dropped
         });
         if dropped > 0 {
-            tracing::warn!(session = %self.id, dropped, "no memory for all that waited");
+            tracing::warn!(session = %self.id, dropped, "no memory for some waiting changes of the tissue");
         }
     }
 
-    /// Tells the journal which changes of the tissue wait: a session that goes on after a crash still has them.
+    /// Writes the waiting changes of the tissue to the event log, so that a session keeps them after a crash.
     pub(super) fn note_waiting(&self, intake: &Intake) {
         if let Some(event_log) = &self.event_log {
             event_log.note(intake.next_step(), Event::Waiting(intake.waiting_changes()));
         }
     }
 
-    /// Has a session that is held go on: from the step that it was held at, paused, with its tissue at rest, and no tool
-    /// held. What made the tissue fail may make it fail again.
+    /// Revives a held session: it continues at the step at which it was held, paused, with its tissue at rest and
+    /// all tools released. Returns that step. The cause of the failure may occur again.
     ///
     /// # Errors
     /// Refuses a session that is not held, or that is deleted.
@@ -251,45 +258,47 @@ impl SessionHandle {
         self.ask(|reply| Request::Revive { reply }).await
     }
 
-    /// Returns the session as it is, to continue from.
+    /// Returns a copy of the present state, from which a session can continue.
     ///
     /// # Errors
-    /// Refuses a session that is deleted, and if the system has no memory for it.
+    /// Refuses a session that is deleted, and if the system has no memory for the copy.
     pub async fn save(&self) -> Result<Present> {
         self.ask(Request::Save).await
     }
 
-    /// Returns the session as it is, after which no step is done until [`SessionHandle::thaw`]. It changes no bits.
+    /// Stops stepping until [`SessionHandle::thaw`], and returns a copy of the present state. Freezing changes no
+    /// bits of the session.
     ///
     /// # Errors
-    /// As for [`SessionHandle::save`].
+    /// Refuses a session that is deleted, and if the system has no memory for the copy.
     pub async fn freeze(&self) -> Result<Present> {
         self.ask(Request::Freeze).await
     }
 
-    /// Makes this server its owner since that revision: a session that began frozen goes on, and is served.
+    /// Makes this server the owner of a session that was handed over frozen: `revision` is that of its key. The
+    /// session is stepped and served from now on.
     pub fn arrive(&self, revision: u64) {
         self.is_owned_since(revision);
         self.is_coming.store(false, Ordering::Release);
         self.thaw();
     }
 
-    /// Returns whether it is being handed over to this server, which is not its owner yet.
+    /// Returns whether the session is being handed over to this server, which is not its owner yet.
     pub fn is_coming(&self) -> bool {
         self.is_coming.load(Ordering::Acquire)
     }
 
-    /// Returns its share of its stepping thread, measured.
+    /// Returns the measured fraction of a core that the session's steps take; 0 at rest.
     pub fn share(&self) -> f64 {
         self.cost.share()
     }
 
-    /// Steps are done again.
+    /// Resumes stepping after [`SessionHandle::freeze`].
     pub fn thaw(&self) {
         self.inbox.send(self.number, Request::Thaw);
     }
 
-    /// Stops time.
+    /// Pauses the session's time.
     ///
     /// # Errors
     /// Refuses a session that is deleted.
@@ -297,26 +306,27 @@ impl SessionHandle {
         self.ask(|reply| Request::Pause { reply }).await
     }
 
-    /// Waits until `at` steps are done (now, if `None`), and tells the step and the state's hash there.
-    /// `account` is charged for it.
+    /// Waits until `at` steps are done; `None` stands for now. Returns the step count and the hash of the state
+    /// there. `account` is charged for the time of reading.
     ///
-    /// # Errors
-    /// Refuses a step that has passed, a session that is held or deleted, and a caller who has used up their part of the
+    /// Refuses a step that has passed, a session that is held or deleted, and a caller that has used up its part of
+    /// the reading time.
     /// reading time.
     pub async fn hash_at(&self, at: Option<u64>, account: &Account) -> Result<(u64, u128)> {
         let account = account.clone();
         self.ask(|reply| Request::Hash { at, account, reply }).await
     }
 
-    /// Returns the samples that are asked for.
+    /// Opens a stream of samples and returns its reader. A full queue (`limits.queued_samples`) drops its oldest
+    /// sample.
     ///
-    /// What it takes on the stepping thread is charged to `watcher`, who gets no sample while its share of that time is used
-    /// up; `None` for the stream of who holds a tool.
+    /// The stepping thread's time is charged to `watcher`, which gets no sample while its part of that time is used
+    /// up; `None` stands for the stream of a client that holds a tool.
     pub fn samples(&self, sampling: Sampling, watcher: Option<&Account>) -> Reader<PacedSample> {
         self.tap(sampling, watcher, false)
     }
 
-    /// Returns the next sample; the present one if time stands.
+    /// Returns the next sample of the tools `only`; the present sample if time is paused.
     ///
     /// # Errors
     /// Refuses a session that is held or deleted.
@@ -342,8 +352,9 @@ impl SessionHandle {
         reader
     }
 
-    /// Records of some points, or of all, every so many steps, with energies and with tools if asked for; refused if there
-    /// is no memory for one.
+    /// Opens a stream of records and returns its reader: of `points`, or of all, whenever the step count is a
+    /// multiple of `every`, with the tissue's energies if `energy` and with the tools' states if `tools`. The work
+    /// is charged to `account`.
     ///
     /// # Errors
     /// Refuses if the system has no memory for a record.
@@ -367,27 +378,29 @@ impl SessionHandle {
         Ok(reader)
     }
 
-    /// Returns the tissue, and the step from whose beginning on it acts. A change of it is noticed when it acts.
+    /// Returns a receiver of the tissue and the step from whose beginning it acts. It is updated when a change
+    /// takes effect.
     pub fn tissue(&self) -> watch::Receiver<(u64, Arc<Model>)> {
         self.tissue.subscribe()
     }
 
-    /// Returns the force law of `model`, a tissue of this session, under a disc. Nothing is computed here.
+    /// Returns the force law of `model`, a tissue of this session, under a disc. It computes nothing; see
+    /// [`SoughtLaw`].
     ///
     /// # Errors
-    /// Refuses if the session's owner can't have the memory of a further law.
+    /// Refuses if the memory of a further law exceeds the part of the session's owner.
     pub fn law(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<SoughtLaw>> {
         self.laws.of(disc, model, self.limits.law_work, &self.owner)
     }
 
-    /// Returns the force laws of the session's tissue that are known.
+    /// Returns the force laws of the present tissue that have been computed so far, by their disc.
     pub fn known_laws(&self) -> Vec<(Disc, Arc<Law>)> {
         let model = self.tissue.borrow().1.clone();
         self.laws.known(&model)
     }
 
-    /// Adopts laws of the session's tissue that another server has computed. Those for which there is no memory are computed anew when they
-    /// are wanted.
+    /// Adds force laws of the present tissue that another server has computed. A law for which there is no memory
+    /// is left out; it is computed when it is needed.
     pub fn adopt_laws(&self, known: Vec<(Disc, Law)>) {
         let model = self.tissue.borrow().1.clone();
         for (disc, law) in known {
@@ -397,13 +410,13 @@ impl SessionHandle {
         }
     }
 
-    /// Begins frames for a viewer.
+    /// Adds a viewer: it is sent a full frame and then further frames.
     pub fn view(&self, viewer: Arc<Viewer>) {
         self.inbox.send(self.number, Request::View(viewer));
     }
 }
 
-/// Commands that were accepted. Those that are not in the queue yet are put there when this is dropped.
+/// Commands that were accepted. Dropping this puts those that remain in the queue.
 pub struct Accepted<'l> {
     handle: &'l SessionHandle,
     batch: AcceptedBatch,
@@ -416,7 +429,8 @@ impl Accepted<'_> {
         self.goes_on = self.handle.at_intake(|intake, _| intake.go_on(batch));
     }
 
-    /// Puts them in the queue slice by slice. Between slices other tasks and the stepping thread have their turns.
+    /// Puts the remaining commands in the queue, slice by slice. It yields between slices to other tasks and the
+    /// stepping thread.
     pub async fn taken_in(mut self) {
         while self.goes_on {
             tokio::task::yield_now().await;
@@ -433,7 +447,7 @@ impl Drop for Accepted<'_> {
     }
 }
 
-/// The refusal of what a deleted session is asked.
+/// Returns the refusal of a request to a deleted session.
 pub(super) fn deleted() -> Refusal {
     Refusal::new(Reason::SessionDeleted, "session_id", "the session has been deleted")
 }

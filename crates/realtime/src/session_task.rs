@@ -1,10 +1,10 @@
 //! A session on its stepping thread: its schedule, the requests to it, and its steps.
 //!
-//! Rest: while all of a tissue is asleep and no command waits, its steps change nothing but their number. Then only the
-//! steps are done that somebody is to be told of (a heartbeat, a record, a hash); those between are skipped, all at once,
-//! when the next is due. A session of which nobody waits for a step is not in the thread's rota at all, and a thread
-//! whose rota is empty sleeps until it is asked something. What comes in meanwhile is placed where it would be had the
-//! session been stepped ([`Intake::rest`](palpate_session::intake::Intake::rest)), and wakes the thread.
+//! Rest: while a whole tissue is asleep and no command waits, its steps change nothing but their number. Then only
+//! the steps are done that a reader waits for (a heartbeat, a record, a hash). The steps between are skipped, all
+//! at once, when the next is due. A session without such a step has no due time in the run queue, and a thread
+//! whose sessions are all so sleeps until a request arrives. Commands that arrive meanwhile get the step that they
+//! would have had without the rest ([`Intake::rest`](palpate_session::intake::Intake::rest)), and wake the thread.
 
 use std::collections::VecDeque;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -34,37 +34,38 @@ use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 use palpate_tissue::select::audit::Mark;
 
-/// Sessions begin on the same beat, whose length this is, ns: a thread wakes once for all of a rate, and so does who
-/// carries what they tell.
+/// Sessions begin at a multiple of this time, ns: so a thread wakes once for all sessions of one rate, and so do
+/// the network threads for their samples.
 const BEAT_NS: u64 = 1_000_000;
 
-/// Every so many steps of a session one is a span of the log, at level debug.
+/// One step in this number is a span in the log, at level debug.
 const STEPS_PER_SPAN: u64 = 1024;
 
-/// What the guard repeats for one step may take many times as long as the step. After so long, ns, others of the thread have their turn.
+/// Time limit of a repetition by the guard, ns, after which other sessions of the thread have their turn. A
+/// repetition may take many times as long as a step.
 const MAX_REPETITION_NS: u64 = if cfg!(test) { 0 } else { 500_000 };
 
-/// How often the stiffness under tools is computed anew, Hz.
+/// Rate at which the stiffness under tools is recomputed, Hz.
 const REFINED_HZ: f64 = 50.0;
 
-/// A session that plays waits so long for what has not been read, s.
+/// Time that a playback waits for inputs that have not been read yet, s.
 const RECORD_WAIT_S: f64 = 0.01;
 
-/// A session and its schedule.
+/// A session with its schedule and its readers, as its stepping thread owns it.
 pub(super) struct SessionTask {
     pub(super) handle: Arc<SessionHandle>,
     pub(super) session: Session,
     pub(super) running: bool,
     pub(super) until: Option<u64>,
     pub(super) schedule: Schedule,
-    /// The step to do next. At rest, those before it are skipped; `u64::MAX` if there is none.
+    /// The next step to do. At rest, the steps before it are skipped; `u64::MAX` if there is none.
     pub(super) next_step: u64,
-    /// When the newest step was due, before the backlog was dropped.
+    /// Time at which the newest step was due, before a backlog was dropped, ns.
     pub(super) due_ns: u64,
-    /// It was late, and takes more than its part: it goes after those that were due by then.
+    /// Time before which it is not stepped, ns, because it was late and takes more than its part.
     not_before_ns: u64,
     backlog: Backlog,
-    /// Steps done when all was asleep first, if it still is.
+    /// Step count at which all points fell asleep, if they still are.
     pub(super) still_since: Option<u64>,
     pub(super) rested_steps: u64,
     pub(super) overrun_count: u64,
@@ -74,23 +75,23 @@ pub(super) struct SessionTask {
     pub(super) hashed: Hashed,
     pub(super) copies: Copies,
     pub(super) subscribers: Subscribers,
-    /// Who is to be told of the window that the session was asked for.
+    /// Receiver of the marks of the audit that was requested.
     pub(super) audit: Option<SyncSender<Mark>>,
-    /// Tells the journal, if there is one.
+    /// Writer of the event log, if there is one.
     pub(super) recorder: Option<Recorder>,
-    /// It is handed over: no step, until that has failed.
+    /// Whether it is being handed over: then no step is done unless the handover fails.
     pub(super) frozen: bool,
     pub(super) watch: StepWatch,
-    /// The inbox of the thread that has it, which counts what it does.
+    /// Inbox of the thread that has the session; it holds the thread's counters.
     pub(super) inbox: Arc<Inbox>,
-    /// It goes over to another thread.
+    /// Whether the session is to move to the thread of lower priority.
     pub(super) goes_apart: bool,
     left: bool,
-    /// What it is asked while a step is not done: each caller waits for an answer.
+    /// Requests that arrived within an unfinished step, oldest first.
     waiting: VecDeque<Request>,
 }
 
-/// What all sessions of a thread use.
+/// Resources that all sessions of a thread use.
 pub(super) struct ThreadContext<'t> {
     pub(super) fence: &'t Fence,
     pub(super) encoder: &'t Encoder,
@@ -100,7 +101,7 @@ pub(super) struct ThreadContext<'t> {
     pub(super) longest: Longest,
 }
 
-/// The beat at `now_ns`, or the next.
+/// Returns the next multiple of the beat, at or after `now_ns`.
 pub(super) fn beat_ns(now_ns: u64) -> u64 {
     now_ns.next_multiple_of(BEAT_NS)
 }
@@ -141,14 +142,15 @@ impl SessionTask {
         }
     }
 
-    /// When its next step is due, if time goes on and one is wanted.
+    /// Returns the time at which its next step is due, ns; `None` if time is paused or no step is wanted.
     pub(super) fn due_ns(&self) -> Option<u64> {
         let due_ns = (self.running && !self.frozen && !self.goes_apart && self.next_step < u64::MAX)
             .then(|| self.schedule.due_ns(self.next_step))?;
         Some(due_ns.max(self.not_before_ns))
     }
 
-    /// Finds its place among the sessions of the thread, after a step, if one of `parts` of its time is its own.
+    /// Updates when it is stepped next, after a step, so that it keeps its place among the thread's sessions. One
+    /// of `parts` equal parts of the thread's time is its own.
     pub(super) fn queue_again(&mut self, begun_ns: u64, now_ns: u64, parts: usize, is_alone: bool) {
         if self.still_since.is_none() {
             self.handle.cost.observe(now_ns.saturating_sub(begun_ns));
@@ -158,22 +160,22 @@ impl SessionTask {
         self.not_before_ns = turn.not_before_ns(now_ns);
     }
 
-    /// How late its next step is at `now_ns`.
+    /// Returns how late its next step is at `now_ns`, ns.
     pub(super) fn late_ns(&self, now_ns: u64) -> u64 {
         now_ns.saturating_sub(self.schedule.due_ns(self.next_step))
     }
 
-    /// The number of the account of its owner.
+    /// Returns the number of its owner's account.
     pub(super) fn owner(&self) -> u64 {
         self.handle.owner.number()
     }
 
-    /// Whether it is to leave the thread: it has left the server, or goes over to another thread.
+    /// Returns whether it must leave the thread: it has left the server, or moves to another thread.
     pub(super) fn has_left(&self) -> bool {
         self.left || self.goes_apart
     }
 
-    /// Does something with it. A panic ends this session, and no other; so does memory that can't be had.
+    /// Runs `act`. A panic, or memory that can't be allocated, holds this session and no other.
     pub(super) fn guarded(&mut self, act: impl FnOnce(&mut Self)) {
         let Err(panic) = catch_unwind(AssertUnwindSafe(|| act(self))) else { return };
         let step = self.session.step_count();
@@ -192,7 +194,7 @@ impl SessionTask {
         self.publish_status();
     }
 
-    /// Decides which step comes next: the very next one, or at rest the next one that somebody waits for.
+    /// Decides which step comes next: the very next one or, at rest, the next one that a reader waits for.
     pub(super) fn plan(&mut self) {
         if self.session.is_within_step() {
             return;
@@ -213,9 +215,9 @@ impl SessionTask {
         self.handle.cost.set_awake(self.running && self.next_step == step);
     }
 
-    /// At rest, time has gone on without a step: brings the session to where it stands now.
+    /// Advances a session at rest to the step that it has reached by now.
     fn catch_up(&mut self, fence: &Fence) {
-        // Something may have come since that must not be skipped.
+        // A command may have arrived that must not be skipped.
         self.plan();
         if self.running && !self.frozen && fence.may_act() {
             self.skip_to(self.schedule.next_step(now_ns()).min(self.next_step));
@@ -235,7 +237,7 @@ impl SessionTask {
         }
         self.catch_up(context.fence);
         let step = self.session.step_count();
-        // Also while time stands, when no step does it.
+        // Here too, because no step does it while time is paused.
         self.subscribers.forget_the_gone();
         match request {
             Request::Adopt | Request::Wake => {}
@@ -284,7 +286,7 @@ impl SessionTask {
             }
             Request::Probe(tap) => self.subscribers.probes.push(tap),
             Request::View(viewer) => {
-                // Who joins late gets a full frame first.
+                // A new viewer gets a full frame first.
                 let frame_id = viewer.frame_id(step, self.handle.model.scene.stepping.rate_hz);
                 self.post(context.encoder, vec![(viewer.clone(), frame_id)]);
                 self.subscribers.viewers.push(ViewTap { viewer, shown: step, passed: frame_id });
@@ -325,7 +327,7 @@ impl SessionTask {
         })
     }
 
-    /// Time stands from now on. Who reads samples gets the present one.
+    /// Pauses time. Readers of samples get the present one.
     fn stand(&mut self, context: &mut ThreadContext<'_>) {
         self.running = false;
         self.note_standstill();
@@ -362,7 +364,7 @@ impl SessionTask {
         Ok(step)
     }
 
-    /// The same tissue at rest, at the same step; time stands.
+    /// Replaces the session by its tissue at rest, at the same step, paused. Returns the step.
     fn revive(&mut self) -> Result<u64> {
         if self.session.hold_reason().is_none() {
             return Err(Refusal::new(Reason::OutOfTurn, "session_id", "is a session that is not held"));
@@ -384,7 +386,7 @@ impl SessionTask {
         Ok(step)
     }
 
-    /// Drops from the schedule what the policy does not let it catch up.
+    /// Drops the steps from the schedule that the policy does not let the session catch up.
     #[allow(clippy::cast_precision_loss)]
     fn drop_backlog(&mut self, now_ns: u64, forgiven_ns: u64) {
         let (late_ns, period_ns) = (self.late_ns(now_ns), self.schedule.period_ns());
@@ -397,7 +399,7 @@ impl SessionTask {
         }
     }
 
-    /// Does what was asked for while a step was not done.
+    /// Serves the requests that arrived within the step that has ended.
     pub(super) fn serve_waiting(&mut self, context: &mut ThreadContext<'_>) {
         while !self.session.is_within_step()
             && let Some(request) = self.waiting.pop_front()
@@ -406,7 +408,7 @@ impl SessionTask {
         }
     }
 
-    /// Ends a step that is not done, before all ends.
+    /// Completes an unfinished step, before the session ends.
     pub(super) fn finish_step(&mut self) {
         if self.session.is_within_step() {
             self.session.advance(&mut self.due, |_| {});
@@ -414,7 +416,7 @@ impl SessionTask {
         }
     }
 
-    /// The next step, at its time or after it: all of it, or a part of what the guard repeats for it.
+    /// Does the next step: all of it, or a part of what the guard repeats for it.
     pub(super) fn step(&mut self, begun_ns: u64, context: &mut ThreadContext<'_>) {
         if !self.session.is_within_step() && !self.begin_step(begun_ns, context) {
             return;
@@ -428,14 +430,14 @@ impl SessionTask {
         }
     }
 
-    /// Whether the next step can be done: what acts in it is known.
+    /// Returns whether the next step can be done, because its inputs are known. It takes them.
     fn begin_step(&mut self, begun_ns: u64, context: &mut ThreadContext<'_>) -> bool {
         let sampled = self.next_step.is_multiple_of(STEPS_PER_SPAN);
         let span = sampled.then(|| tracing::debug_span!("step", session = %self.handle.id, step = self.next_step));
         let _span = span.map(tracing::Span::entered);
         self.due_ns = self.schedule.due_ns(self.next_step);
         if self.next_step == self.session.step_count() {
-            // Only of steps that cost something can a session be behind.
+            // Only steps that are computed can be late.
             self.drop_backlog(begun_ns, context.longest.ns());
         } else {
             self.plan();
@@ -454,7 +456,7 @@ impl SessionTask {
         true
     }
 
-    /// Tells what has come of a step.
+    /// Publishes the results of a step.
     fn end_step(&mut self, begun_ns: u64, context: &mut ThreadContext<'_>) {
         self.tell_auditor();
         self.log_recovery();
@@ -467,7 +469,7 @@ impl SessionTask {
             for (at, _, reply) in std::mem::take(&mut self.subscribers.hashes) {
                 let _ = reply.send(Err(self.passed(at)));
             }
-            // No further record will come.
+            // No further record will be made.
             let held = self.passed(0);
             let probes = self.subscribers.probes.drain(..);
             probes.for_each(|tap| context.reading.close(&tap.account, &tap.recipient, held.clone()));
@@ -479,7 +481,7 @@ impl SessionTask {
         let step = self.session.step_count();
         self.still_since = self.session.rests_until().map(|_| self.still_since.unwrap_or(step));
         self.dilation.observe(begun_ns, step, self.schedule.period_ns());
-        // The status first: who is told of this step may ask for it at once.
+        // The status first: a reader of this step may ask for it at once.
         self.publish_status();
         self.publish(context);
         let every = (self.handle.model.scene.stepping.rate_hz / REFINED_HZ).max(1.0) as u64;
@@ -489,8 +491,8 @@ impl SessionTask {
         self.plan();
     }
 
-    /// What acts in the coming step: commands are in `due`, and a change of the tissue is returned. `None` if that can't be played,
-    /// because it has not been read, or was not recorded.
+    /// Takes the inputs of the coming step: commands are appended to `due`, and a change of the tissue is returned.
+    /// `None` if a playback can't continue, because the inputs have not been read or were not recorded.
     fn take_inputs(&mut self, step: u64, now_ns: u64) -> Option<Option<Arc<Model>>> {
         let mut intake = lock(&self.handle.intake);
         intake.take_due(step, now_ns, &mut self.due);
@@ -517,7 +519,7 @@ impl SessionTask {
         Some(fetched.change)
     }
 
-    /// What is to be played is not there: a little later, or never.
+    /// Delays a playback whose inputs are not available, or publishes its last state if it is over.
     fn wait_for_record(&mut self, context: &mut ThreadContext<'_>) {
         self.schedule.delay(RECORD_WAIT_S * self.handle.speed() * self.handle.model.scene.stepping.rate_hz);
         self.publish_status();
@@ -527,14 +529,14 @@ impl SessionTask {
         self.plan();
     }
 
-    /// Ends every stream, and what waits.
+    /// Ends every stream, and refuses waiting commands.
     pub(super) fn end(&mut self, why: &Refusal) {
         self.running = false;
         drop(lock(&self.handle.intake).close(why.clone()));
         self.silence(why);
     }
 
-    /// Ends every stream, and what waits for a step.
+    /// Ends every stream, and refuses the requests that wait for a step.
     fn silence(&mut self, why: &Refusal) {
         let subscribers = std::mem::take(&mut self.subscribers);
         subscribers.samples.iter().for_each(|tap| tap.writer.close(why.clone()));

@@ -1,4 +1,4 @@
-//! The slots for streams in a session: how many there are, and who has them.
+//! The slots for streams in a session: how many there are, and which stream has each.
 
 use std::collections::BTreeMap;
 
@@ -7,22 +7,22 @@ use tokio_util::sync::CancellationToken;
 use palpate_session::budget::{Account, Pool, Taken};
 use palpate_tissue::limits::Limits;
 
-/// What a stream is for.
+/// Purpose of a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StreamKind {
-    /// It holds tools: some slots of a session are kept for such.
+    /// The stream holds tools. Some slots of a session are reserved for such streams.
     HoldsTools,
-    /// It only reads.
+    /// The stream only reads.
     ReadsOnly,
 }
 
-/// The slots for streams in one session.
+/// Slots for the streams of one session.
 #[derive(Debug)]
 pub(super) struct StreamSlots {
     pub(super) most: usize,
     pub(super) numbers: u64,
     pub(super) open: BTreeMap<u64, OpenSlot>,
-    /// Slots of those that only read, by who reads.
+    /// Slots of streams that only read, by account.
     pub(super) readers: Pool,
 }
 
@@ -44,7 +44,7 @@ impl StreamSlots {
         StreamSlots { most, numbers: 0, open: BTreeMap::new(), readers: Pool::new(readers as u64, 16) }
     }
 
-    /// Gives back the slot of a stream.
+    /// Frees the slot of a stream. Returns what it held; `None` if the stream has no slot.
     pub(super) fn close(&mut self, number: u64) -> Option<OpenSlot> {
         let open = self.open.remove(&number)?;
         if open.kind == StreamKind::ReadsOnly {

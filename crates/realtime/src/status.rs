@@ -1,4 +1,4 @@
-//! How a session stands, for whoever asks: written by its stepping thread.
+//! The status of a session for other threads, written by its stepping thread.
 
 use std::sync::Arc;
 
@@ -7,58 +7,59 @@ use palpate_session::schedule::Schedule;
 use palpate_tissue::Model;
 use palpate_tissue::scene::record::Recovery;
 
-/// Whether a session's time goes on.
+/// Whether a session's simulated time advances.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RunState {
-    /// In real time.
+    /// The session's time advances in real time.
     Running,
-    /// Waits to be started.
+    /// The session waits to be started.
     Paused,
-    /// Stopped by a blow-up, a fault of the program or missing memory, until it is revived.
+    /// The session has been stopped by a blow-up, a fault of the program or missing memory, until it is revived.
     Held,
 }
 
-/// How a session stands.
+/// Status of a session: its state, its time, and its counts.
 #[derive(Debug, Clone)]
 pub struct Status {
-    /// Whether time goes on.
+    /// Whether time advances.
     pub state: RunState,
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
-    /// Nothing moves and no command waits: the session is not stepped.
+    /// Whether nothing moves and no command waits, so that no step is computed.
     pub resting: bool,
-    /// Steps skipped at rest.
+    /// Number of steps skipped at rest.
     pub rested_steps: u64,
-    /// Steps dropped.
+    /// Number of steps dropped because the session was late.
     pub overrun_count: u64,
     /// Simulated over real time.
     pub dilation: Dilation,
-    /// When steps are due while time goes on.
+    /// Times at which steps are due while time advances.
     pub schedule: Schedule,
-    /// Commands that came too late for their step.
+    /// Number of commands that came too late for their step.
     pub late_commands: u64,
-    /// Commands that had no effect because their tool was paused ([`palpate_session::recovery`]).
+    /// Number of commands without effect because their tool was paused ([`palpate_session::recovery`]).
     pub paused_commands: u64,
-    /// Why it is held.
+    /// Why the session is held; `None` if it is not.
     pub hold_reason: Option<String>,
-    /// How often the guard went back to a checkpoint.
+    /// Number of times that the guard, the check of stability after steps, went back to a checkpoint.
     pub guard_events: u64,
-    /// How often the tissue was taken back to an earlier state.
+    /// Number of recoveries: the tissue was taken back to an earlier state.
     pub recovery_count: u64,
-    /// The newest of these, by ascending step.
+    /// The newest recoveries, by ascending step.
     pub recoveries: Vec<Recovery>,
-    /// Points that the last step computed.
+    /// Number of points that the last step computed.
     pub awake_points: usize,
-    /// As [`palpate_session::Session::path_counts`].
+    /// Counts of limited steps, dropped poses and releases: see [`palpate_session::Session::path_counts`].
     pub path_counts: [u64; 3],
-    /// Tools whose lease lapsed.
+    /// Number of tools whose lease expired.
     pub lapsed_leases: u64,
-    /// The tissue as it is: [`SessionHandle::change`](super::SessionHandle::change) may have made another of it.
+    /// The present tissue. It differs from the first one after a
+    /// [`SessionHandle::change`](super::SessionHandle::change).
     pub model: Arc<Model>,
 }
 
 impl Status {
-    /// The session goes on, and what it counts of itself begins anew.
+    /// Sets the state to paused after a hold, and resets the counts of the session.
     pub(super) fn forget_hold(&mut self) {
         (self.hold_reason, self.state) = (None, RunState::Paused);
         (self.late_commands, self.guard_events, self.path_counts) = (0, 0, [0; 3]);

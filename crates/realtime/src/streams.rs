@@ -1,4 +1,4 @@
-//! The streams of a session: how one is opened, shown to administrators, and cut.
+//! The streams of a session: opening, listing and cutting them.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -13,26 +13,26 @@ use palpate_session::budget::{Account, Purpose, Resource};
 use palpate_tissue::lock::lock;
 use palpate_tissue::shape::RestShape;
 
-/// Bytes of a stream that the client has not taken: the transport (hyper) asks for no more above 400 KiB, and then holds at most one
-/// more message, which is of 64 KiB or little more.
+/// Bytes of a stream that the client has not read: the transport (hyper) takes no more above 400 KiB, and then
+/// holds at most one more message of 64 KiB or a little more.
 const UNSENT_BYTES: u64 = (400 + 80) << 10;
 
-/// A stream, as administrators see it.
+/// Description of a stream, for administrators.
 #[derive(Debug, Clone)]
 pub struct StreamInfo {
-    /// Names it within its session.
+    /// Number of the stream within its session.
     pub number: u64,
-    /// The call that opened it.
+    /// Name of the call that opened the stream.
     pub what: &'static str,
-    /// What it is for.
+    /// Purpose of the stream.
     pub kind: StreamKind,
-    /// Whose it is.
+    /// Name of the account of the caller that opened the stream.
     pub caller: String,
-    /// For how long it has been open, ns.
+    /// Time since the stream was opened, ns.
     pub age_ns: u64,
 }
 
-/// Counts a stream of a session until it is dropped or cut.
+/// Slot of a stream in its session. Dropping it frees the slot.
 pub struct StreamGuard {
     handle: Arc<SessionHandle>,
     number: u64,
@@ -40,12 +40,12 @@ pub struct StreamGuard {
 }
 
 impl StreamGuard {
-    /// Returns cancelled when somebody who administers has cut the stream.
+    /// Returns the token that is cancelled when an administrator cuts the stream.
     pub fn cut(&self) -> &CancellationToken {
         &self.cut
     }
 
-    /// Returns the rest shape of the session's tissue, by which messages name its points.
+    /// Returns the rest shape of the session's tissue, by which messages number its points.
     pub fn shape(&self) -> &dyn RestShape {
         self.handle.model.shape()
     }
@@ -58,16 +58,17 @@ impl Drop for StreamGuard {
     }
 }
 
-/// Returns what a stream is told that was cut.
+/// Returns the refusal that a cut stream ends with.
 pub fn cut() -> Refusal {
-    Refusal::new(Reason::Cut, "", "whoever administers the server has ended this stream")
+    Refusal::new(Reason::Cut, "", "an administrator of the server has ended this stream")
 }
 
 impl SessionHandle {
-    /// Returns room for one more stream of `account`, opened by the call `what`.
+    /// Takes a slot for a further stream of `account`, opened by the call `what`. The stream's memory is charged
+    /// too.
     ///
     /// # Errors
-    /// Refuses if all slots of the session or of the caller are taken, or memory beyond the caller's part.
+    /// Refuses if all slots of the session or of the caller are taken, or if the memory exceeds the caller's part.
     pub fn open_stream(
         self: &Arc<Self>,
         what: &'static str,
@@ -82,7 +83,7 @@ impl SessionHandle {
             let StreamSlots { most, readers, .. } = &*streams;
             let message = format!(
                 "the session has {all} streams of {most} already, {} of those that only read are this caller's; the others \
-                 are kept for other callers and for those who hold tools",
+                 are kept for other callers and for streams that hold tools",
                 readers.of(account.number())
             );
             return Err(Refusal::new(Reason::TooMany, "", message));
@@ -95,12 +96,12 @@ impl SessionHandle {
         Ok(StreamGuard { handle: self.clone(), number, cut })
     }
 
-    /// Streams that read the session.
+    /// Returns the number of open streams.
     pub fn streams(&self) -> usize {
         lock(&self.streams).open.len()
     }
 
-    /// Returns each of them, oldest first.
+    /// Describes the open streams, oldest first.
     pub fn list_streams(&self) -> Vec<StreamInfo> {
         let now = now_ns();
         let show = |(number, open): (&u64, &OpenSlot)| StreamInfo {
@@ -113,7 +114,8 @@ impl SessionHandle {
         lock(&self.streams).open.iter().map(show).collect()
     }
 
-    /// Ends the streams for which `chosen` holds, by number and caller: they make room at once, and are told when they read.
+    /// Cuts the streams for which `chosen` holds, by number and account, and returns how many. Their slots are free
+    /// at once; their [`StreamGuard::cut`] tokens are cancelled.
     pub fn cut_streams(&self, chosen: impl Fn(u64, &Account) -> bool) -> usize {
         let mut streams = lock(&self.streams);
         let numbers: Vec<u64> =
@@ -147,11 +149,11 @@ mod tests {
         assert_eq!(all.len(), 57);
         all.push(open(StreamKind::ReadsOnly, &other).unwrap());
         all.extend(std::iter::from_fn(|| open(StreamKind::ReadsOnly, &other).ok()));
-        // Who holds tools always finds the slots that are kept.
+        // A stream that holds tools always finds the reserved slots.
         let holders: Vec<_> = (0..4).map(|_| open(StreamKind::HoldsTools, &other).unwrap()).collect();
         assert_eq!(handle.streams(), all.len() + 4);
         assert!(budget.taken(Resource::Streams) == handle.streams() as u64);
-        // Who is cut makes room, whether they notice or not.
+        // A cut stream frees its slot, even before its client notices.
         assert_eq!(handle.cut_streams(|_, account| account.number() == greedy.number()), 57);
         assert!(all[0].cut().is_cancelled() && !holders[0].cut().is_cancelled());
         assert!(open(StreamKind::ReadsOnly, &other).is_ok());

@@ -1,4 +1,4 @@
-//! Taps: who gets samples, records, frames and hashes of a session, and at which steps.
+//! Subscribers of a session: which streams get samples, records, frames and hashes, and at which steps.
 
 use std::sync::Arc;
 
@@ -20,33 +20,34 @@ pub(super) struct SampleTap {
     pub(super) sampler: Sampler,
     pub(super) once: bool,
     pub(super) writer: Writer<PacedSample>,
-    /// Who pays, unless it holds a tool.
+    /// Account that is charged, unless the stream holds a tool.
     pub(super) watcher: Option<Account>,
-    /// Dropped steps that it knows of.
+    /// Number of dropped steps that the stream has been sent.
     pub(super) overrun_count: u64,
 }
 
 /// A stream of records.
 pub(super) struct ProbeTap {
     pub(super) every: u64,
-    /// All, if none are named.
+    /// All points, if `None`.
     pub(super) points: Option<Arc<[PointId]>>,
     pub(super) energy: bool,
-    /// Also the tools with a tip.
+    /// Whether to include the tools with a tip.
     pub(super) tools: bool,
     pub(super) recipient: Arc<Recipient>,
-    /// Who reads, and pays.
+    /// Account that is charged.
     pub(super) account: Account,
 }
 
-/// A record of a moment, or what is to be read for one.
+/// A finished record of a moment, or the work of reading it.
 enum ProbeAnswer {
     Record(SharedRecord),
     Piece(Piece),
 }
 
 impl ProbeTap {
-    /// A record without energies, and its memory; of many points one without points, and the copy to read them from.
+    /// Returns a record without energies, and its memory. For many points the record is empty, and the copy is
+    /// returned that they are to be read from.
     fn read(&self, session: &Session, copies: &mut Copies) -> Result<(Record, Taken, Option<Arc<Copied>>)> {
         let all = session.model().len();
         let points = self.points.as_ref().map_or(all, |points| points.len());
@@ -65,29 +66,30 @@ impl ProbeTap {
 /// A stream of frames.
 pub(super) struct ViewTap {
     pub(super) viewer: Arc<Viewer>,
-    /// Steps done at the newest frame that was posted for it.
+    /// Step count at the newest frame that was posted for it.
     pub(super) shown: u64,
-    /// The newest frame whose time has passed.
+    /// Number of the newest frame whose time has passed.
     pub(super) passed: u64,
 }
 
 impl ViewTap {
-    /// The frame that belongs to step `step`, if one is due there. `still_since`: nothing has moved since that step.
+    /// Returns the number of the frame that belongs to step `step`, if one is due there. `still_since`: nothing has
+    /// moved since that step.
     pub(super) fn due(&self, step: u64, still_since: Option<u64>, rate_hz: f64) -> Option<u64> {
         let number = |step| self.viewer.frame_id(step, rate_hz);
         let is_due = step >= self.earliest(still_since, rate_hz) && number(step) != number(step.saturating_sub(1));
         is_due.then(|| number(step))
     }
 
-    /// Step `step` is done: what frames had their time since the last call, at rest, were of what had been shown. `is_due`:
-    /// that of this step is not one of them.
+    /// Counts the frames up to step `step` that were due since the last call and were not sent, because nothing had
+    /// changed. `is_due`: a frame of this step is sent, so it is not counted.
     pub(super) fn pass(&mut self, step: u64, is_due: bool, rate_hz: f64) {
         let newest = self.viewer.frame_id(step, rate_hz);
         self.viewer.count_unchanged(newest.saturating_sub(self.passed + u64::from(is_due)));
         self.passed = self.passed.max(newest);
     }
 
-    /// A still tissue is shown once, at the next frame's time, and then every second: a viewer may have missed it.
+    /// A still tissue is shown once, at the next frame's time, and then every second in case a viewer missed it.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn earliest(&self, still_since: Option<u64>, rate_hz: f64) -> u64 {
         match still_since {
@@ -96,7 +98,7 @@ impl ViewTap {
         }
     }
 
-    /// The next step after `step` that a frame is due at, if nothing moves from now on.
+    /// Returns the next step after `step` at which a frame is due, if nothing moves from now on.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     fn next_due(&self, step: u64, still_since: Option<u64>, rate_hz: f64) -> u64 {
         let from = self.earliest(still_since, rate_hz).max(step + 1);
@@ -108,7 +110,7 @@ impl ViewTap {
     }
 }
 
-/// Everybody.
+/// All subscribers of a session.
 #[derive(Default)]
 pub(super) struct Subscribers {
     pub(super) samples: Vec<SampleTap>,
@@ -118,11 +120,11 @@ pub(super) struct Subscribers {
 }
 
 impl Subscribers {
-    /// Tells who probes of this moment: a record each for those who ask for different things. Records of many points are
-    /// read from a copy, by the thread of `reading`.
+    /// Sends each stream of records that is due the record of this moment; streams with equal settings share one.
+    /// Records of many points are read from a copy, by the thread of `reading`.
     pub(super) fn record(&self, session: &Session, copies: &mut Copies, reading: &Reading, wakes: &mut Wakes) {
         let step = session.step_count();
-        // A pass over the sheet, once for all who want it.
+        // A pass over the sheet, once for all streams that include the energies.
         let mut energy = None;
         let mut told: Vec<(&ProbeTap, ProbeAnswer)> = Vec::new();
         for tap in self.probes.iter().filter(|tap| step.is_multiple_of(tap.every)) {
@@ -179,8 +181,8 @@ impl Subscribers {
         self.hashes.retain(|waiting| !waiting.2.is_closed());
     }
 
-    /// Of a session at rest that has done `step` steps: the step to do next, that somebody may be told of its end;
-    /// `u64::MAX` if nobody waits for any.
+    /// Returns the step that a session at rest must do next because a subscriber waits for its result; `u64::MAX`
+    /// if there is none. The session has done `step` steps.
     pub(super) fn next_wanted(&self, step: u64, still_since: Option<u64>, rate_hz: f64) -> u64 {
         // The first record is of the beginning of step 0.
         let record = |tap: &ProbeTap| if step == 0 { 1 } else { (step + 1).next_multiple_of(tap.every) };

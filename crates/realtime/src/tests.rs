@@ -1,4 +1,4 @@
-//! Tests of the threads that step, and of who may have a session.
+//! Tests of the stepping threads, and of the limits on sessions.
 #![allow(clippy::unwrap_used)]
 
 use glam::DVec3;
@@ -17,7 +17,7 @@ use palpate_tissue::scene::script::Action;
 use palpate_tissue::scene::{PAPER, Scene};
 use palpate_tissue::select::scheme_selection::NEVER;
 
-/// A stream of a sample each step.
+/// Opens a stream with a sample of each step.
 fn all_samples(handle: &SessionHandle) -> Reader<PacedSample> {
     let (laws, touch_stiffness) = (None, false);
     let sampling =
@@ -61,12 +61,12 @@ async fn a_session_that_goes_apart_does_what_it_is_asked_and_leaves_its_thread_t
     let mut samples = all_samples(&heavy);
     samples.pop().await.unwrap();
     heavy.inbox.send(heavy.number, Request::GoApart);
-    // Asked in this order, and done in this order, on the other thread.
+    // Requested in this order, and done in this order, on the other thread.
     heavy.pause().await.unwrap();
     assert_eq!((heavy.thread(), light.thread()), (1, 0));
     let step = heavy.status().step;
     assert_eq!(heavy.hash_at(None, &account).await.unwrap().0, step);
-    // What it takes there is nobody's concern here.
+    // The time that it takes there does not count here.
     (0..1000).for_each(|_| heavy.cost.observe(100_000_000));
     assert_eq!(pacer.start_session(&heavy, None).await.unwrap(), step);
     assert_eq!(heavy.hash_at(Some(step + 20), &account).await.unwrap().0, step + 20);

@@ -1,11 +1,12 @@
-//! A stepping thread (named `step-0` and so on): it owns its sessions, and steps each when its time has come.
+//! A stepping thread (named `step-0` and so on): it owns its sessions, and steps each one when the step is due.
 //!
-//! One beat: sessions begin at a whole millisecond, so those of one rate are due together. The thread wakes once for all of
-//! them, and wakes their readers together at the end of the round, after 32 of them, or after 0.2 ms (`queue::Wakes`). So the
-//! samples of a round leave in few turns of the network threads.
+//! Sessions begin at a whole millisecond, so those of one rate are due together. The thread wakes once for all of
+//! them, and wakes their readers together: at the end of the round, after 32 readers, or after 0.2 ms
+//! (`queue::Wakes`). So the samples of a round leave in few turns of the network threads.
 //!
-//! A session whose steps take too long for the others goes over to a thread that gives way (`step-apart`), by the rule of `policy`. The
-//! thread that it began on stays the one that is asked, and passes on what that is: so nothing overtakes anything.
+//! A session whose steps take too long for the others moves to a thread of lower priority (`step-apart`), by the
+//! rule in `policy.rs`. Requests still go to the thread that the session began on, which passes them on; so
+//! requests keep their order.
 
 use std::collections::{BTreeSet, VecDeque};
 use std::sync::atomic::Ordering;
@@ -25,7 +26,7 @@ use super::session_task::{SessionTask, ThreadContext};
 use palpate_session::local_model::StiffnessJob;
 use palpate_tissue::lock::lock;
 
-/// A stepping thread as others see it: where it is asked, and the new sessions that wait for it.
+/// A stepping thread as other threads see it: its inbox, and the new sessions that it has not taken yet.
 #[derive(Default)]
 pub(super) struct Stepper {
     pub(super) inbox: Arc<Inbox>,
@@ -33,38 +34,38 @@ pub(super) struct Stepper {
 }
 
 impl Stepper {
-    /// Gives a new session to the thread. What it is asked from now on comes after this.
+    /// Hands a new session to the thread. Requests that are sent later are served later.
     pub(super) fn adopt(&self, number: u64, running: Box<SessionTask>) {
         lock(&self.newcomers).push((number, running));
         self.inbox.send(number, Request::Adopt);
     }
 }
 
-/// The thread that gives way.
+/// The thread of lower priority for sessions whose steps take too long (`step-apart`).
 pub(super) struct Apart {
     pub(super) stepper: Arc<Stepper>,
-    /// What sessions call it.
+    /// Index of this thread, as [`SessionHandle::thread`](super::session_handle::SessionHandle) has it.
     pub(super) index: usize,
 }
 
 impl Apart {
-    /// Takes over a session.
+    /// Moves a session to this thread.
     fn adopt(&self, number: u64, mut running: Box<SessionTask>) {
-        tracing::info!(session = %running.handle.id, "steps take too long for other sessions: on a thread that gives way");
+        tracing::info!(session = %running.handle.id, "steps take too long for other sessions: moved to a thread of lower priority");
         (running.goes_apart, running.inbox) = (false, self.stepper.inbox.clone());
         running.handle.thread.store(self.index, Ordering::Relaxed);
         self.stepper.adopt(number, running);
     }
 }
 
-/// So many readers wait at most, and so long, ns, for the end of a round of steps before they are woken.
+/// Limits of a round: the number of readers that wait to be woken, and its duration, ns.
 const MAX_WAKES: usize = 32;
 const MAX_ROUND_NS: u64 = 200_000;
 
-/// A thread that may not step looks so often whether it may again, ns.
+/// Interval at which a fenced thread checks whether it may step again, ns.
 const FENCED_NS: u64 = 5_000_000;
 
-/// The thread's work.
+/// Runs the thread until its inbox is stopped.
 pub(super) fn work(
     stepper: &Stepper,
     apart: Option<&Apart>,
@@ -73,7 +74,7 @@ pub(super) fn work(
     refiner: &SyncSender<StiffnessJob>,
     reading: &Reading,
 ) {
-    // The default slack of 50 µs would be the larger part of each step's lateness. Best effort.
+    // The default timer slack of 50 µs would be the larger part of each step's lateness. A failure is ignored.
     #[cfg(target_os = "linux")]
     let _ = rustix::thread::set_current_timer_slack(std::num::NonZeroU64::new(1));
     let inbox = &*stepper.inbox;
@@ -88,14 +89,14 @@ pub(super) fn work(
             apart.adopt(number, running);
         }
         _ => {
-            // To free what a session has takes longer than a step may wait.
+            // Freeing a session's memory takes longer than a step may wait.
             let owner = running.handle.owner.clone();
             reading.post(&owner, Piece::Remains(running));
         }
     };
     loop {
         let now = now_ns();
-        // Behind the fence no session is stepped, however late it is.
+        // While the server is fenced no session is stepped, however late it is.
         let not_before_ns = if fence.may_act() { 0 } else { now + FENCED_NS };
         let next_ns = run_queue.first().map(|first| first.0.max(not_before_ns));
         let is_round_over = next_ns.is_none_or(|next_ns| next_ns > now) || now > begun_round_ns + MAX_ROUND_NS;
@@ -107,7 +108,7 @@ pub(super) fn work(
             run_queue.end(&why);
             return;
         }
-        // One at a time where a step is due: to answer many must not make a step wait.
+        // One request at a time while a step is due: answering many must not delay a step.
         while let Some((number, request)) = requests.pop_front() {
             if matches!(request, Request::Adopt) {
                 let newcomers = std::mem::take(&mut *lock(&stepper.newcomers));

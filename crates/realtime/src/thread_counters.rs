@@ -1,9 +1,9 @@
-//! What a stepping thread counts of itself. Only that thread writes, anybody may read: a count is a load, an addition and
-//! a store, without a lock and without a locked bus.
+//! Counters of a stepping thread. Only that thread writes them, and any thread may read them: an increment is a
+//! load, an addition and a store, without a lock and without an atomic read-modify-write.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// A number that only one thread adds to.
+/// A counter that only one thread increments.
 #[derive(Debug, Default)]
 pub struct Count(AtomicU64);
 
@@ -14,16 +14,16 @@ impl Count {
         }
     }
 
-    /// Returns so far.
+    /// Returns the present count.
     pub fn get(&self) -> u64 {
         self.0.load(Ordering::Relaxed)
     }
 }
 
-/// Bounds of a histogram: 1 µs, 2 µs, … , and beyond the last.
+/// Number of bounds of a histogram: 1 µs, 2 µs, 4 µs, … One more bucket has no bound.
 const BOUNDS: usize = 18;
 
-/// How often a time was within each power of two of microseconds.
+/// Histogram of times, with a bucket for each power of two of microseconds.
 #[derive(Debug, Default)]
 pub struct Times {
     buckets: [Count; BOUNDS + 1],
@@ -39,48 +39,48 @@ impl Times {
         self.sum_ns.add(ns);
     }
 
-    /// Returns upper bound, s, and times up to it, of each bucket; the last has no bound.
+    /// Returns the upper bound, s, and the count of each bucket, by ascending bound; that of the last is infinite.
     #[allow(clippy::cast_precision_loss)]
     pub fn buckets(&self) -> Vec<(f64, u64)> {
         let bound_s = |bucket: usize| if bucket < BOUNDS { (1_u64 << bucket) as f64 * 1e-6 } else { f64::INFINITY };
         self.buckets.iter().enumerate().map(|(bucket, count)| (bound_s(bucket), count.get())).collect()
     }
 
-    /// Returns the sum over all threads, s.
+    /// Returns the sum of all times, s.
     #[allow(clippy::cast_precision_loss)]
     pub fn sum_s(&self) -> f64 {
         self.sum_ns.get() as f64 * 1e-9
     }
 }
 
-/// Of one stepping thread, since it began. Sessions that are gone count as well.
+/// Counters of one stepping thread since it began. They include sessions that have ended.
 #[derive(Debug, Default)]
 pub struct ThreadCounters {
-    /// What a step took, with all that it told.
+    /// Times of steps, including the publication of samples.
     pub step_time: Times,
-    /// How long after it was due a step began.
+    /// Times by which steps began after they were due.
     pub lateness: Times,
-    /// Steps that were passed over at rest.
+    /// Steps that were skipped at rest.
     pub rested_steps: Count,
-    /// Steps that were due and dropped.
+    /// Steps that were due and were dropped.
     pub overruns: Count,
     /// Commands that came too late for their step.
     pub late_commands: Count,
-    /// Commands that had no effect because their tool was paused.
+    /// Commands without effect because their tool was paused.
     pub paused_commands: Count,
-    /// Tools whose lease lapsed.
+    /// Tools whose lease expired.
     pub lapsed_leases: Count,
-    /// How often the guard went back to a checkpoint.
+    /// Returns of the guard to a checkpoint.
     pub guard_events: Count,
-    /// How often a tissue was taken back to an earlier state.
+    /// Returns of a tissue to an earlier state.
     pub recoveries: Count,
-    /// Sessions that the guard has ended.
+    /// Sessions that the guard has stopped.
     pub held_sessions: Count,
     /// Steps in which a tool was held to the speed limit.
     pub limited_steps: Count,
     /// Poses that were refused or passed over.
     pub dropped_poses: Count,
-    /// Tools that were let go because nothing came any more.
+    /// Tools that were released because no pose arrived any more.
     pub stale_releases: Count,
 }
 

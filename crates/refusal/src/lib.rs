@@ -1,5 +1,6 @@
-//! The refusal of an input: one type for files, commands and requests. So an input is refused in the same words wherever
-//! it enters. [`printable`] shows text of others; `status` (a feature of the crate) has refusals as gRPC statuses.
+//! The refusal of an input. Files, commands and requests share one type, so an input is refused in the same words
+//! wherever it enters. [`printable`] makes text of other parties safe to show; `status` (a feature of this crate)
+//! turns refusals into gRPC statuses.
 
 pub mod printable;
 #[cfg(feature = "status")]
@@ -11,12 +12,12 @@ use crate::printable::{acts, printable};
 
 macro_rules! reasons {
     ($($(#[$doc:meta])* $variant:ident = $name:literal,)*) => {
-        /// Why an input was refused: stable names, for programs.
+        /// Reason for which an input was refused. Programs may rely on these names: they are stable.
         #[derive(Debug, Clone, Copy, PartialEq, Eq)]
         pub enum Reason { $($(#[$doc])* $variant,)* }
 
         impl Reason {
-            /// All of them.
+            /// Every reason, in the order of declaration.
             pub const ALL: &[Reason] = &[$(Reason::$variant,)*];
 
             /// Returns the name that clients see (`google.rpc.ErrorInfo.reason`).
@@ -28,103 +29,116 @@ macro_rules! reasons {
 }
 
 reasons! {
-    /// A file that can't be read or a text that is not TOML, CSV or UTF-8.
+    /// A file that can't be read, or a text that is not valid TOML, CSV or UTF-8.
     Unreadable = "UNREADABLE",
     /// A key that no scene, script or configuration has.
     UnknownKey = "UNKNOWN_KEY",
-    /// A required field that is not there.
+    /// A required field is absent.
     Missing = "MISSING",
-    /// A value of the wrong kind, or a name that is none of those allowed.
+    /// A value of the wrong type, or a name that is not among those allowed.
     WrongKind = "WRONG_KIND",
-    /// NaN or infinite.
+    /// A number is NaN or infinite.
     NotFinite = "NOT_FINITE",
-    /// Outside the range that makes sense.
+    /// A value lies outside the range in which it is meaningful.
     OutOfRange = "OUT_OF_RANGE",
-    /// Sensible, but above a limit of the configuration.
+    /// A value is meaningful, but above a limit of the configuration.
     TooLarge = "TOO_LARGE",
-    /// A force above the limit on a point.
+    /// A force is above the limit for one point.
     ForceTooLarge = "FORCE_TOO_LARGE",
-    /// A point or a control point that is not on the sheet.
+    /// A point, a control point or a place does not lie on the tissue.
     OffTissue = "OFF_TISSUE",
-    /// No scene of that name.
+    /// No scene has this name.
     UnknownScene = "UNKNOWN_SCENE",
-    /// No script of that name.
+    /// No script has this name.
     UnknownScript = "UNKNOWN_SCRIPT",
-    /// No session of that id.
+    /// No session has this ID.
     UnknownSession = "UNKNOWN_SESSION",
-    /// The session was there, and has been deleted.
+    /// The session existed and has been deleted.
     SessionDeleted = "SESSION_DELETED",
-    /// The guard has ended the session.
+    /// The guard, which checks each step for blow-ups and faults, has stopped the session.
     SessionHeld = "SESSION_HELD",
     /// The guard took the tissue back to an earlier state, and the effect of the command was lost.
     Recovered = "RECOVERED",
-    /// No mesh of that id, of this caller; or it has expired.
+    /// This caller has no mesh of this ID, or the mesh has expired.
     UnknownMesh = "UNKNOWN_MESH",
-    /// No journal of that id was sent by this caller; or it has expired.
+    /// This caller has sent no journal of this ID, or the journal has expired.
     UnknownJournal = "UNKNOWN_JOURNAL",
-    /// No viewer of that id.
+    /// No viewer has this ID.
     UnknownViewer = "UNKNOWN_VIEWER",
-    /// Another holds the tool.
+    /// Another stream holds the tool.
     ToolHeld = "TOOL_HELD",
-    /// The tool is not held by who commands it, or no longer.
+    /// The caller does not hold the tool that it commands, or no longer holds it.
     NotHolder = "NOT_HOLDER",
-    /// A call by nobody that the server knows.
+    /// The call carries no credentials that the server knows.
     Unauthenticated = "UNAUTHENTICATED",
-    /// Who calls has not got the role that the call asks for.
+    /// The caller lacks the role that the call requires.
     RoleMissing = "ROLE_MISSING",
-    /// A page of another site.
+    /// The request comes from a web page of an origin that is not allowed.
     OriginNotAllowed = "ORIGIN_NOT_ALLOWED",
-    /// The sequence number is not above the last one.
+    /// The sequence number is not above the previous one.
     StaleSequence = "STALE_SEQUENCE",
-    /// More commands are waiting than the session keeps.
+    /// The session's queue of waiting commands is full.
     QueueFull = "QUEUE_FULL",
-    /// The moment asked for is over.
+    /// The requested step has already been computed.
     StepPassed = "STEP_PASSED",
     /// More sessions, streams or tools than the configuration allows.
     TooMany = "TOO_MANY",
-    /// A further session would make the steps of others late.
+    /// One more session would make the steps of others late.
     Overloaded = "OVERLOADED",
-    /// Commands or calls come faster than the configuration allows.
+    /// Commands or calls arrive faster than the configuration allows.
     RateLimited = "RATE_LIMITED",
-    /// Whoever administers the server has ended it.
+    /// An administrator of the server has ended the session, stream or call.
     Cut = "CUT",
-    /// What was waited for did not come in time.
+    /// The awaited answer or event did not arrive in time.
     TimedOut = "TIMED_OUT",
-    /// The first message of a stream must open it, and only the first.
+    /// A stream must begin with exactly one opening message, and no later message may be one.
     OutOfTurn = "OUT_OF_TURN",
-    /// Something that this machine has not got.
+    /// This machine lacks a required feature.
     NotAvailable = "NOT_AVAILABLE",
-    /// The server is going down.
+    /// The server is shutting down.
     ShuttingDown = "SHUTTING_DOWN",
     /// Another server of the fleet has the session; [`Refusal::place`] is its endpoint.
     Elsewhere = "ELSEWHERE",
-    /// The server may not speak for its sessions: it has not heard from etcd for too long.
+    /// The server may not step its sessions or answer for them: it has not heard from etcd for too long.
     Fenced = "FENCED",
 }
 
-/// What was refused and why. It changed nothing.
+/// A refusal of an input: what was refused and why. A refused input has changed nothing.
+///
+/// A refusal has a reason for programs, and a field and a message for people:
+///
+/// ```
+/// use palpate_refusal::{Reason, positive};
+///
+/// let refusal = positive("spacing_m", -0.01).expect_err("no sheet has points -10 mm apart").within("sheet");
+/// assert_eq!((refusal.reason, refusal.reason.as_str()), (Reason::OutOfRange, "OUT_OF_RANGE"));
+/// assert_eq!(refusal.to_string(), "sheet.spacing_m: must be above 0, but is -0.01");
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Refusal {
-    /// For programs.
+    /// The reason, for programs.
     pub reason: Reason,
-    /// The offending field, as a path: `sheet.spacing_m`, `force[0].profile.on_s`. Empty if none is.
+    /// The offending field, as a path such as `sheet.spacing_m` or `force[0].profile.on_s`. Empty if no field is at
+    /// fault.
     pub field: String,
-    /// For people: what is wrong, and what would be right.
+    /// The problem and what would be right, for people.
     pub message: String,
-    /// Where it was written: `scenes/paper.toml:5`, `--set`. Absent for what came over the network.
+    /// Where the input was written, such as `scenes/paper.toml:5` or `--set`. `None` for input that came over the
+    /// network.
     pub place: Option<String>,
 }
 
-/// What most functions here return.
+/// Result of a function that may refuse its input.
 pub type Result<T> = std::result::Result<T, Refusal>;
 
 impl Refusal {
-    /// Creates a refusal of `field`.
+    /// Creates a refusal of `field` without a place.
     pub fn new(reason: Reason, field: impl Into<String>, message: impl Into<String>) -> Self {
         Refusal { reason, field: field.into(), message: message.into(), place: None }
     }
 
-    /// Returns the same, of a field of `parent`.
+    /// Puts `parent` and a dot before the refused field's path. An empty `parent` leaves the path as it is; an
+    /// empty path becomes `parent`.
     #[must_use]
     pub fn within(mut self, parent: &str) -> Self {
         self.field = match (parent, self.field.as_str()) {
@@ -137,7 +151,8 @@ impl Refusal {
 }
 
 impl Refusal {
-    /// Returns it for others than who runs the server: of the place only the file's name, and not in which folder of this machine it is.
+    /// Reduces the place to the name of its file, for callers other than the server's operator: they must not learn
+    /// the folders of this machine. An endpoint ([`Reason::Elsewhere`]) stays whole.
     #[must_use]
     pub fn without_folder(self) -> Self {
         let name = |place: String| match place.rsplit_once(['/', '\\']) {
@@ -150,7 +165,7 @@ impl Refusal {
 
 impl fmt::Display for Refusal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // Each part may quote what others have written.
+        // Each part may quote text of other parties.
         if let Some(place) = &self.place {
             write!(f, "{}: ", printable(place))?;
         }
@@ -163,20 +178,21 @@ impl fmt::Display for Refusal {
 
 impl std::error::Error for Refusal {}
 
-/// Returns a number with 0 in place of −0. They are equal in all that a number here means, but not in their bits, which
-/// hashes compare; and protobuf leaves out a field that equals 0, so that −0 comes back as 0. What enters a tissue or a
-/// session goes through this.
+/// Returns `value` with 0 in place of −0. The two are equal in every meaning here but differ in their bits, which
+/// hashes compare; and protobuf omits a field that equals 0, so −0 would come back as 0. All input of a tissue or a
+/// session passes through this function.
 pub fn unsigned_zero(value: f64) -> f64 {
     value + 0.0
 }
 
-/// Returns the value with at most ten digits, to show to people: what was computed, or was a f32, has up to 17, and
-/// most are rounding.
+/// Rounds a value to ten significant digits, to show it to people. A computed value, or one that was a f32, has up
+/// to 17 digits, most of which are rounding errors.
 pub fn legible(value: f64) -> f64 {
     format!("{value:.9e}").parse().unwrap_or(value)
 }
 
-/// Returns `value`, if it is finite and `holds` is true for it; `range` describes those values. −0 comes back as 0.
+/// Returns `value` if it is finite and `holds` is true for it; −0 becomes 0. `range` describes the accepted values
+/// in the message ("must be {range}").
 ///
 /// # Errors
 /// Refuses a number that is not finite, or for which `holds` is false.
@@ -185,7 +201,7 @@ pub fn number(field: &str, value: f64, range: &str, holds: impl Fn(f64) -> bool)
         return Err(Refusal::new(Reason::NotFinite, field, format!("must be a finite number, but is {value}")));
     }
     if !holds(value) {
-        // All digits where fewer would seem to be in range.
+        // All digits, if the rounded value would seem to be in range.
         let value = Some(legible(value)).filter(|value| !holds(*value)).unwrap_or(value);
         return Err(Refusal::new(Reason::OutOfRange, field, format!("must be {range}, but is {value}")));
     }
@@ -227,10 +243,11 @@ pub fn finite_vector(field: &str, value: glam::DVec3) -> Result<glam::DVec3> {
     Ok(value + glam::DVec3::ZERO)
 }
 
-/// Checks a text for people: it is short, on one line, and without what acts on a terminal.
+/// Checks a text for people: at most 128 bytes, without characters that act on a terminal (control characters, line
+/// breaks, text direction).
 ///
 /// # Errors
-/// Refuses a text that is too long or has control characters.
+/// Refuses a text that is too long or has such a character.
 pub fn label(field: &str, label: &str) -> Result<()> {
     const MAX_BYTES: usize = 128;
     if label.len() > MAX_BYTES || label.chars().any(acts) {
@@ -240,10 +257,11 @@ pub fn label(field: &str, label: &str) -> Result<()> {
     Ok(())
 }
 
-/// Returns the name that `given` is probably meant to be: one that begins with it, or the nearest by its letters, of
-/// which the last may be left out. None if no name is near.
+/// Returns the name that `given` was probably meant to be: a name that begins with it (from 3 letters), or the name
+/// with the fewest misspelt letters, at most a third of those given and 1 to 3. From 5 letters, the end of a name
+/// may be missing. `None` if no name is near.
 pub fn nearest<'n>(given: &str, names: impl IntoIterator<Item = &'n str>) -> Option<&'n str> {
-    // A shorter beginning could be that of anything.
+    // A shorter text could begin too many names.
     const MIN_BEGINNING: usize = 3;
     const MIN_MISSPELT: usize = 5;
     let given = given.trim().to_lowercase();
@@ -267,12 +285,12 @@ pub fn nearest<'n>(given: &str, names: impl IntoIterator<Item = &'n str>) -> Opt
     near.min_by_key(|(apart, _)| *apart).map(|(_, name)| name)
 }
 
-/// Returns "; did you mean `NAME`?", to be put behind a refusal of `given`; empty if no name is near.
+/// Returns "; did you mean `NAME`?", to append to a refusal of `given`; empty if no name is near.
 pub fn did_you_mean<'n>(given: &str, names: impl IntoIterator<Item = &'n str>) -> String {
     nearest(given, names).map_or(String::new(), |name| format!("; did you mean `{name}`?"))
 }
 
-/// Returns the beginning of what a client sent: a message is no place for megabytes.
+/// Returns the first 64 characters of a client's text, to quote in a message.
 pub fn excerpt(text: &str) -> String {
     text.chars().take(64).collect()
 }

@@ -1,10 +1,11 @@
-//! Text of others on a terminal and in a log: names, addresses, keys of etcd, messages of servers. It must not move the cursor,
-//! begin a line, or reorder what stands beside it.
+//! Text of other parties in a terminal and in a log: names, addresses, keys of etcd, messages of servers. It must
+//! not move the cursor, begin a line, or reorder the text beside it.
 
 use std::fmt::Display;
 
-/// Whether a character does something other than to show itself: control characters (C0, DEL, C1), separators of lines, controls
-/// of direction, and what has no width. The joiners U+200C and U+200D are not among them: some scripts need them.
+/// Returns whether a character does something other than show itself: control characters (C0, DEL, C1), line
+/// separators, direction marks, and characters without width. The joiners U+200C and U+200D are not among them,
+/// because some scripts need them.
 pub(crate) fn acts(c: char) -> bool {
     c.is_control()
         || matches!(
@@ -18,18 +19,19 @@ pub(crate) fn acts(c: char) -> bool {
         )
 }
 
-/// Returns `text` as a part of a line: each character that acts on a terminal is `?`.
+/// Returns `text` for use within a line: replaces each character that acts on a terminal, line breaks included, by
+/// `?`.
 pub fn printable(text: impl Display) -> String {
     text.to_string().replace(acts, "?")
 }
 
-/// Returns the same, but the ends of lines stay: for text whose lines are our own.
+/// Replaces each character that acts on a terminal by `?`, except `\n`: for text whose line breaks are our own.
 pub fn printable_lines(text: impl Display) -> String {
     text.to_string().replace(|c| acts(c) && c != '\n', "?")
 }
 
-/// Returns JSON in which such characters are written as `\uXXXX`, so that a reader still gets them. In `json` they
-/// stand in strings only; the ends of its own lines stay.
+/// Escapes each character that acts on a terminal, except `\n`, as `\uXXXX`, so that a JSON parser still reads it.
+/// `json` must be valid JSON, where such characters occur only in strings.
 pub fn printable_json(json: impl Display) -> String {
     let json = json.to_string();
     let is_rare = |c: char| acts(c) && c != '\n';

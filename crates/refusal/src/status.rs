@@ -1,4 +1,4 @@
-//! Refusals as gRPC statuses with google.rpc.ErrorInfo.
+//! Refusals as gRPC statuses with `google.rpc.ErrorInfo`.
 
 use std::collections::HashMap;
 
@@ -8,19 +8,21 @@ use tonic_types::{ErrorDetails, StatusExt};
 use crate::printable::printable;
 use crate::{Reason, Refusal};
 
-/// The domain of every `ErrorInfo`.
+/// `domain` of every `google.rpc.ErrorInfo` that a server sends.
 pub const DOMAIN: &str = "palpate";
 
-/// Key of the metadata of `ErrorInfo` under which a refusal as ELSEWHERE has the URL of the server that has the session.
+/// Metadata key of `ErrorInfo` for the URL of the server that has the session, in a refusal with reason
+/// `ELSEWHERE`.
 pub const ENDPOINT: &str = "endpoint";
 
-/// Returns the server that has the session, if a call was refused because it is not the one that was called.
+/// Returns the URL of the server that has the session, if `status` refuses a call because another server has it.
+/// `None` for every other status.
 pub fn elsewhere(status: &Status) -> Option<String> {
     let info = status.get_details_error_info()?;
     (info.reason == Reason::Elsewhere.as_str()).then(|| info.metadata.get(ENDPOINT).cloned())?
 }
 
-/// Returns the status code of a reason.
+/// Returns the gRPC status code of a reason.
 pub fn code(reason: Reason) -> Code {
     match reason {
         Reason::Unreadable
@@ -73,7 +75,8 @@ impl From<Refusal> for Status {
     }
 }
 
-/// Returns the text that a client shows for a status: its message, with the reason or, if there is none, the code.
+/// Returns the text that a client shows for a status: its message, followed by the reason in brackets or, if there
+/// is none, the code. Characters that act on a terminal become `?`.
 pub fn describe(status: &Status) -> String {
     match status.get_details_error_info() {
         Some(info) => printable(format_args!("{} ({})", status.message(), info.reason)),

@@ -1,7 +1,7 @@
-//! The audit of a run: a more accurate twin gets the same inputs, and the records of both are compared. The twin runs in
-//! f64 with a quarter of the substep and without sleep. With
-//! `[stepping] correct`, windows of the run are audited one after the other, as in a server, and an error above the
-//! tolerance changes how the tissue is stepped.
+//! The audit of a run: a more accurate twin gets the inputs of the session, and the records of both are compared.
+//! The twin runs in f64 with a quarter of the substep and without sleep. With `[stepping] correct`, windows of the
+//! run are audited one after the other, as in a server, and an error above the tolerance changes how the tissue is
+//! stepped.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -14,12 +14,12 @@ use palpate_tissue::scene::record::{AuditedError, Record};
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::select::audit::{AuditFinding, ErrorExtent, FINER, Mark, WindowInputs, WindowOpening};
 
-/// The model of the session to compare with.
+/// Returns the more accurate model to compare with.
 fn twin_of(model: &Model) -> Arc<Model> {
     model.twin(FINER, Precision::F64)
 }
 
-/// A more accurate session beside another, and the differences between the two.
+/// A twin: a more accurate session that gets another session's inputs, with the differences between the two.
 pub struct Twin {
     session: Session,
     records: VecDeque<Record>,
@@ -34,17 +34,17 @@ impl Twin {
         Twin { session, records: VecDeque::new(), differences: ErrorExtent::default(), largest: ErrorExtent::default() }
     }
 
-    /// Returns the twin's session, for inputs equal to those of the other session.
+    /// Returns the twin's session, to give it the inputs of the other session.
     pub fn session(&mut self) -> &mut Session {
         &mut self.session
     }
 
-    /// Changes the tissue in the same way as the other session's.
+    /// Changes the twin's tissue to a more accurate form of `model`, the other session's new tissue.
     pub fn change(&mut self, model: &Model) {
         self.session.change(&twin_of(model));
     }
 
-    /// Advances one step, before the other session does it.
+    /// Advances the twin by one step, before the other session does that step, and keeps its record if one is due.
     pub fn advance(&mut self, due: &[Due], script: &Script) {
         let Twin { session, records, .. } = self;
         session.advance(&mut due.to_vec(), |session| {
@@ -54,12 +54,12 @@ impl Twin {
         });
     }
 
-    /// Returns why it can't be compared with the other session any more, if it can't.
+    /// Returns why the twin can no longer be compared with the other session; `None` if it can.
     pub fn fault(&self) -> Option<String> {
         self.session.fault().map(|reason| format!("the audit's twin: {reason}"))
     }
 
-    /// Compares with the next record of the other session.
+    /// Compares the twin's oldest record with `record`, the next one of the other session.
     pub fn compare(&mut self, record: &Record) {
         let Some(truth) = self.records.pop_front() else { return };
         for (point, truth) in record.points.iter().zip(&truth.points) {
@@ -82,7 +82,8 @@ impl Twin {
     }
 }
 
-/// Audits windows of a session one after the other. The choice of steps depends only on the scene and its inputs.
+/// Audits of the windows of a session, one after the other. Which steps they cover depends only on the scene and
+/// its inputs.
 #[derive(Default)]
 pub struct Windows {
     opening: Option<WindowOpening>,
@@ -91,7 +92,8 @@ pub struct Windows {
 }
 
 impl Windows {
-    /// Returns call after each step, and before the first: audits the window that has ended, if one has.
+    /// Audits the window that has ended, if one has, and requests the next. Call it after each step, and before the
+    /// first. Returns the finding of the audit.
     pub fn look(&mut self, session: &mut Session) -> Option<AuditFinding> {
         if !std::mem::replace(&mut self.begun, true) {
             session.request_audit(WindowInputs::default());

@@ -1,5 +1,5 @@
-//! Batches of commands: accepted whole or not at all, and put in the queue in slices. So no caller waits long for the
-//! intake.
+//! Batches of commands. A batch is accepted whole or not at all, and put in the queue in slices, so that no caller
+//! waits long for the intake.
 
 use std::collections::BTreeMap;
 
@@ -9,10 +9,10 @@ use super::lease::LeaseId;
 use super::rules::{CheckedCommands, check_contact_work, check_tip, tip_radius_m};
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Commands that are put in the queue in one turn at the intake.
+/// Number of commands that are put in the queue while the intake is locked once.
 pub const SLICE: usize = 256;
 
-/// The rest of a batch that was accepted. [`Intake::go_on`] takes it in.
+/// The commands of an accepted batch that are not in the queue yet. [`Intake::go_on`] puts them there.
 #[derive(Debug)]
 #[must_use]
 pub struct AcceptedBatch {
@@ -21,12 +21,14 @@ pub struct AcceptedBatch {
 }
 
 impl Intake {
-    /// Accepts all of some commands that were looked at before (`Rules::check`), or none. They are taken in by
-    /// [`Intake::go_on`], and act together: none before the last is in the queue. So others have their turns between
-    /// slices.
+    /// Accepts all of the commands, which `Rules::check` has checked, or none, and renews the lease.
+    /// [`Intake::go_on`] puts them in the queue in slices, between which other callers may use the intake. No
+    /// command of the batch takes effect before the last is in the queue.
     ///
     /// # Errors
-    /// As for [`Intake::submit`]; and refuses commands of a lease of which a batch is being taken in.
+    /// Refuses if the intake is closed, tools that this lease does not hold, sequence numbers that do not rise,
+    /// another tip on a tool in the tissue, tips with too much contact work, too many commands, and a lease with an
+    /// unfinished batch.
     pub fn accept(
         &mut self,
         id: LeaseId,
@@ -43,7 +45,7 @@ impl Intake {
             let message = "commands of this lease are being taken in: send them one call after another";
             return Err(Refusal::new(Reason::OutOfTurn, "", message));
         }
-        // Of each tool the last sequence number, how many commands come, and the tip after them.
+        // For each tool: the last sequence number, the number of commands, and the tip after them.
         let mut last: BTreeMap<u32, (u64, usize, Option<f64>)> = BTreeMap::new();
         for command in &mut commands {
             let lease = self.leases.get(command.tool).filter(|lease| lease.id == id);
@@ -88,8 +90,8 @@ impl Intake {
         Ok(AcceptedBatch { id, commands: commands.into_iter() })
     }
 
-    /// Puts at most [`SLICE`] commands of a batch in the queue. Returns whether there are more. What is meant for a tool
-    /// that has been released meanwhile is dropped.
+    /// Puts at most [`SLICE`] commands of a batch in the queue. Returns whether there are more. Commands to a tool
+    /// that has been released meanwhile are dropped.
     pub fn go_on(&mut self, batch: &mut AcceptedBatch) -> bool {
         let slice = batch.commands.len().min(SLICE);
         self.coming -= slice;

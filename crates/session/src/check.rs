@@ -17,30 +17,31 @@ use palpate_tissue::select::scheme_selection::{self, Choice};
 use palpate_tissue::shape::PointId;
 use palpate_tissue::{Model, Plan, Push};
 
-/// The report on a scene.
+/// Report on a scene. Its `Display` is the output of `palpate check`.
 #[derive(Debug)]
 pub struct CheckReport {
     model: Arc<Model>,
-    /// What was chosen, and what would have been of each other integrator alone.
+    /// The chosen scheme, and the best one with each other integrator.
     candidates: Vec<Choice>,
-    /// What would have been chosen if the scene gave nothing of it.
+    /// The scheme that would have been chosen if the scene prescribed none; `None` if it prescribes none.
     by_auto: Option<Choice>,
     prospect: Prospect,
     /// Least and median time of a step, s; `None` if the step failed or would take too long.
     step_s: Option<[f64; 2]>,
 }
 
-/// A step that is predicted to take longer is not timed, s.
+/// Predicted time of a step above which it is not timed, s.
 const LONGEST_STEP_S: f64 = 0.2;
 
 /// Number of windows in which the step is timed, and the length of each, s.
 const WINDOWS: usize = 50;
 const WINDOW_S: f64 = 0.004;
 
-/// Reports on a scene and on a script for it, and times a step under a poke. `clock_s` returns the time.
+/// Reports on a scene, and on a script for it if one is given, and times a step under a poke. `clock_s` returns the
+/// time, s.
 pub fn check(model: &Arc<Model>, script: Option<&Script>, limits: &Limits, clock_s: &dyn Fn() -> f64) -> CheckReport {
     let mut candidates = scheme_selection::candidates(&model.scene, limits);
-    // What was chosen did not try what would be dearer; another format of it alone is none.
+    // The choice did not try dearer schemes, and another number format alone is no candidate.
     let Plan { integrator, substeps, .. } = model.plan;
     let chosen = Choice { integrator, substeps, precision: model.precision, expected_error: model.expected_error };
     match candidates.iter_mut().find(|candidate| candidate.integrator == integrator) {
@@ -56,9 +57,10 @@ pub fn check(model: &Arc<Model>, script: Option<&Script>, limits: &Limits, clock
     }
 }
 
-/// Times the step under a poke that moves the middle by about a tenth of a spacing, so that values have usual sizes.
+/// Times the step under a poke that moves the middle by about a tenth of a spacing, so that values have usual
+/// sizes. Returns the least and the median time, s; `None` if the session fails.
 fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
-    // Measure the cost of a step while the whole sheet moves.
+    // All tiles are kept awake, to measure the cost of a step while the whole sheet moves.
     let mut awake = Model::clone(model);
     awake.sleep_tolerance = 0.0;
     let mut session = Session::new(&Arc::new(awake));
@@ -91,12 +93,12 @@ fn time(model: &Arc<Model>, clock_s: &dyn Fn() -> f64) -> Option<[f64; 2]> {
     Some([times[0], times[WINDOWS / 2]])
 }
 
-/// An expected error, in words.
+/// Returns an expected error in words.
 fn error(expected: f64) -> String {
     if expected.is_finite() { format!("{expected:.1e}") } else { "unknown".to_owned() }
 }
 
-/// A choice as a row of the table.
+/// Writes a choice as a row of the table.
 fn row(f: &mut fmt::Formatter<'_>, choice: &Choice) -> fmt::Result {
     let Choice { integrator, substeps, precision, expected_error } = choice;
     let (integrator, precision) = (integrator.name(), precision.name());

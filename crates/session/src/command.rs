@@ -1,31 +1,32 @@
-//! Commands to tools, before and after their step has come.
+//! Commands to tools, before and after their step is due.
 
 use palpate_tissue::scene::script::Action;
 
-/// One command to one tool.
+/// A command to one tool: an action, with its order, its step and its lifetime.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Command {
     /// The tool's number.
     pub tool: u32,
-    /// Must rise with each command to the tool. `None`: one more than that of the command before; the intake fills it in.
+    /// Sequence number, which must rise with each command to the tool. `None`: the previous number plus 1, which
+    /// the intake fills in.
     pub sequence: Option<u64>,
-    /// Time by the client's clock, returned with the sample that acknowledges the command.
+    /// Client time, ns, returned with the sample that acknowledges the command; 0 for none.
     pub client_time_ns: u64,
-    /// It came by datagram, so that later poses may have overtaken it: its sequence number need not rise. Of poses by client
-    /// time only.
+    /// Whether it came by datagram, so that later poses may have overtaken it: its sequence number need not rise.
+    /// Only for poses that are played by client time.
     pub by_datagram: bool,
-    /// The step at whose beginning it takes effect; the next one if `None`.
+    /// The step at whose beginning the command takes effect; `None` for the next step.
     pub at_step: Option<u64>,
-    /// Simulated time after which its action ends.
+    /// Simulated time after which the command's action ends, s; `None` for no limit.
     pub time_to_live_s: Option<f64>,
     /// The action.
     pub action: Action,
-    /// Arrival time by the server's clock.
+    /// Arrival time, ns of the server's clock.
     pub arrival_ns: u64,
 }
 
 impl Command {
-    /// Creates a command that takes effect at once, and until the next one.
+    /// Creates a command that takes effect at the next step and lasts until the tool's next command.
     pub fn new(tool: u32, sequence: Option<u64>, action: Action) -> Self {
         Command {
             tool,
@@ -40,16 +41,17 @@ impl Command {
     }
 }
 
-/// A command whose step has come.
+/// A command whose step is due.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Due {
-    /// The command.
+    /// The command itself.
     pub command: Command,
-    /// Whether it was meant for an earlier step.
+    /// Whether the command was meant for an earlier step.
     pub late: bool,
-    /// Number of late commands that it represents: itself, and those that it has superseded.
+    /// Number of late commands that it represents: itself if it is late, and late ones that it has superseded.
     pub late_commands: u64,
-    /// Not a client's command: it ends a lease and all actions of its holder with the tool.
+    /// Whether it is not a client's command but the end of a lease, which ends all actions of the holder with the
+    /// tool.
     pub ends_lease: bool,
 }
 

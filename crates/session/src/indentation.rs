@@ -6,12 +6,13 @@ use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::{Body, Mesh, Scene};
 use palpate_tissue::shape::{self, PointId, RestShape};
 
-/// Steps of the conjugate gradients at most, and the part of the first residual at which they end.
+/// Limit of the steps of the conjugate gradients, and the part of the first residual at which they end.
 const MAX_STEPS: usize = 200;
 const RESIDUAL: f64 = 1e-8;
 
-/// How far a force moves any point of a mesh in the end, m, if springs went on as they begin: a lower bound of the stiffness,
-/// because springs that a dent stretches resist it more and more. `None` for a sheet, and where nothing pulls back.
+/// Returns the largest displacement of a mesh under a constant force, m, if springs kept their initial stiffness.
+/// That is an upper bound, because a dent stretches springs, which then resist more. `None` for a sheet, and for a
+/// mesh without anchor springs.
 pub(super) fn depth_m(scene: &Scene, poke: &Poke) -> Option<f64> {
     let Body::Mesh(mesh) = &scene.body else { return None };
     if scene.anchor_stiffness_n_per_m <= 0.0 {
@@ -77,8 +78,8 @@ pub(super) fn depth_m(scene: &Scene, poke: &Poke) -> Option<f64> {
     most_m.is_finite().then_some(most_m)
 }
 
-/// How thick a mesh is under a point: as far as straight in, against its normal, until another part of it; `None` if there is
-/// none.
+/// Returns the thickness of a mesh under a point, m: the distance straight inward, against its normal, to another
+/// part of the mesh. `None` if there is none.
 pub(super) fn thickness_m(mesh: &Mesh, point: PointId) -> Option<f64> {
     let shape = &mesh.shape;
     let (from_m, inward) = (shape.rest_m(point), -shape.normal(point));
@@ -122,7 +123,7 @@ mod tests {
         let point = mesh.shape.nearest(DVec3::new(0.02, 0.0, -0.05));
         let thick_m = thickness_m(mesh, point).unwrap();
         assert!((0.02..0.05).contains(&thick_m), "{thick_m}");
-        // All of it pushed alike moves as its foundation says.
+        // The depth is proportional to the force.
         let poke = |force_n: DVec3, falloff_per_m: f64| Poke {
             point: None,
             centre_m: mesh.shape.rest_m(point),
@@ -134,7 +135,7 @@ mod tests {
         let inward = -mesh.shape.normal(point);
         let (near_m, twice_m) = (depth_m(&poke(0.01 * inward, 200.0)), depth_m(&poke(0.02 * inward, 200.0)));
         assert!((twice_m / near_m - 2.0).abs() < 1e-6 && near_m > 1e-4, "{near_m} {twice_m}");
-        // Less than the foundation alone would let the point go, which shares the force with its neighbours.
+        // Less than the foundation alone would give, because neighbours share the force.
         let alone_m = 0.01 / scene.anchor_stiffness_n_per_m / scene.relative_anchor_stiffness(point);
         assert!(near_m < 1.5 * alone_m, "{near_m} {alone_m}");
     }
@@ -153,7 +154,7 @@ mod tests {
             assert!(nearest_m.distance(at_m) < 1e-9, "{point:?}: {thick_m} m, {} m off", nearest_m.distance(at_m));
             found += 1;
         }
-        // A way may leave between two triangles that meet in an edge, by rounding.
+        // A ray may pass between two triangles that meet in an edge, by rounding.
         assert!(found * 10 >= points.len() * 9, "{found} of {}", points.len());
     }
 
@@ -165,7 +166,7 @@ mod tests {
         let point = shape.nearest(DVec3::new(0.02, 0.0, -0.05));
         let (centre_m, force_n) = (shape.rest_m(point), DVec3::new(0.02, 0.01, 0.03));
         let poke = Poke { point: None, centre_m, force_n, falloff_per_m: 100.0, falloff_offset: 0.2 };
-        // Point by point, each to where the forces on it balance, until none moves any more.
+        // Point by point: each is moved to where the forces on it balance, until none moves any more.
         let mut joined: Vec<Vec<(usize, DMat3)>> = vec![Vec::new(); shape.vertices_m().len()];
         for ([a, b], k) in mesh.springs() {
             let [a, b] = [a, b].map(|end| end as usize);

@@ -1,4 +1,4 @@
-//! What acts on a session from outside, and what its tools feel: what a journal of it holds.
+//! Inputs that act on a session from outside, and the forces that its tools feel: the content of a journal.
 
 use std::sync::Arc;
 
@@ -8,43 +8,44 @@ use super::command::Due;
 use super::{Session, ToolSample};
 use palpate_tissue::Model;
 
-/// One input. With the inputs of a session in their order, each at its step, a session gives the same bits again.
+/// One input to a session. A session that gets the inputs of another in their order, each at its step, gives equal
+/// bits.
 #[derive(Debug, Clone)]
 pub enum Input {
-    /// A command whose step has come, or the end of a lease ([`Session::advance`]).
+    /// A command that is due, or the end of a lease ([`Session::advance`]).
     Command(Due),
-    /// Another tissue from this step on ([`Session::change`]).
+    /// A change of the tissue from this step on ([`Session::change`]).
     Tissue(Arc<Model>),
-    /// Time goes on, for ever or until so many steps are done. It changes no bits.
+    /// Time starts, without end or until a step. It changes no bits.
     Start {
-        /// The step at which the session pauses.
+        /// The step count at which the session pauses, if any.
         until: Option<u64>,
     },
-    /// Time stands. It changes no bits.
+    /// Time pauses. It changes no bits.
     Pause,
-    /// So many steps were due, and not done in time: the schedule was moved. It changes no bits.
+    /// This number of steps was due and not done in time, so the schedule was moved. It changes no bits.
     DroppedSteps(u64),
-    /// A session that was held goes on, paused, with its tissue at rest: [`Session::new`], brought to this step.
+    /// A held session continues, paused, with its tissue at rest: [`Session::new`], skipped to this step.
     Revive,
     /// The session is held for a reason other than the guard's ([`Session::hold`]).
     Hold(String),
 }
 
-/// What a tool feels at one moment.
+/// Pose of a tool and force on it at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Felt {
     /// The tool's number.
     pub tool: u32,
-    /// Place of its tip; of a tool without one, of its control point, m.
+    /// Place of the tool's tip or, without a tip, of its control point, m.
     pub place_m: DVec3,
-    /// How far the tissue under it is moved, m.
+    /// Displacement of the tissue under the tool, m.
     pub displacement_m: DVec3,
     /// Force of the tissue on the tool, N.
     pub force_n: DVec3,
 }
 
 impl Session {
-    /// Returns what the tools feel that touch, grasp or push, by ascending number.
+    /// Returns the poses and forces of the tools that touch, grasp or push, by ascending number.
     pub fn felt(&self) -> Vec<Felt> {
         let of = |sample: &ToolSample| {
             let contact = sample.contact?;

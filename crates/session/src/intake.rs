@@ -19,42 +19,71 @@ use palpate_tissue::scene::script::Action;
 /// Counts of the accepted commands by outcome: `accepted` is the sum of the others.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counts {
-    /// Commands accepted.
+    /// Number of commands accepted.
     pub accepted: u64,
-    /// Commands that took effect at their step.
+    /// Number that took effect at their step.
     pub applied: u64,
-    /// Commands replaced by a later position of the same tool before their step.
+    /// Number that a later position of the same tool replaced before their step.
     pub superseded: u64,
-    /// Commands whose lease or session ended before their step.
+    /// Number whose lease or session ended before their step.
     pub dropped: u64,
-    /// Commands that wait for their step.
+    /// Number that wait for their step.
     pub waiting: u64,
 }
 
-/// Takes in commands and holds them until their step.
+/// Queue of a session's commands and changes of the tissue, with the leases of its tools.
+///
+/// Who holds a tool commands it. A command waits for its step; one from somebody else is refused, and changes nothing:
+///
+/// ```
+/// use palpate_refusal::Reason;
+/// use palpate_session::command::Command;
+/// use palpate_session::intake::Intake;
+/// use palpate_tissue::limits::Limits;
+/// use palpate_tissue::scene::script::Action;
+/// use palpate_tissue::scene::{PAPER, Scene};
+///
+/// let limits = Limits::default();
+/// let mut intake = Intake::new(&Scene::parse("paper", PAPER, &[], &limits)?, &limits);
+/// // For 2 s from now on, or until the next command.
+/// let (lease, other) = (1, 2);
+/// intake.acquire(&[0], "a surgeon", 2.0, lease, 0)?;
+/// let release = Command { at_step: Some(10), ..Command::new(0, Some(1), Action::Release) };
+/// intake.submit(lease, vec![release.clone()], 0)?;
+/// let refusal = intake.submit(other, vec![release], 0).expect_err("another holds the tool");
+/// assert_eq!(refusal.reason, Reason::NotHolder);
+/// let mut due = Vec::new();
+/// intake.take_due(9, 0, &mut due);
+/// assert!(due.is_empty());
+/// intake.take_due(10, 0, &mut due);
+/// assert!(due.len() == 1 && !due[0].late);
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
 #[derive(Debug)]
 pub struct Intake {
     pub(super) rules: Arc<Rules>,
     pub(super) leases: Leases,
     pub(super) queue: Queue,
-    /// Commands of batches that are not in the queue yet.
+    /// Number of commands of accepted batches that are not in the queue yet.
     pub(super) coming: usize,
-    /// Changes of tissue that wait for their step, by ascending step, and the memory of each.
+    /// Changes of the tissue that wait for their step, by ascending step, with the memory of each.
     pub(super) changes: VecDeque<(u64, Arc<Model>, Option<Taken>)>,
-    /// Who pays for what waits here, and what was taken for commands.
+    /// Account that is charged for what waits, and the memory that was taken for commands.
     pub(super) account: Option<Account>,
     taken: Option<Taken>,
-    /// The last change accepted, if there was one.
+    /// The tissue after the last accepted change, if there was one.
     pub(super) changed_to: Option<Arc<Model>>,
     pub(super) arrivals: u64,
     pub(super) next_step: u64,
-    /// Radii of the tips of tools that nobody holds yet and that a session which goes on has in its tissue, m.
+    /// Radii of the tips, m, of tools that a continued session has in its tissue and that no client holds yet.
     tip_radii_m: BTreeMap<u32, f64>,
-    /// The session rests: its steps up to this one are skipped, not computed.
+    /// The schedule of a resting session, and the step up to which steps are skipped and not computed.
     resting: Option<(Schedule, u64)>,
-    /// Substeps of a step of the tissue that it began with; 0 where what tips cost is nobody else's.
+    /// Substeps per step of the first tissue; 0 if the session shares its thread with no other, so that the cost of
+    /// tips is not limited.
     substeps: u32,
-    /// A command or change has arrived that may take effect earlier, and the session's thread was woken for it.
+    /// Whether a command or change has arrived that may take effect earlier, and whether the session's thread was
+    /// woken for it.
     pub(super) changed: bool,
     woken: bool,
     /// Counts without the waiting commands.
@@ -86,33 +115,34 @@ impl Intake {
         }
     }
 
-    /// Creates the intake of a tissue that takes so many substeps in a step, on a thread of several sessions: what its tips cost follows them.
+    /// Returns this intake for a tissue with `substeps` substeps per step, on a thread of several sessions: the
+    /// cost of tips, which grows with the substeps, is limited from now on.
     #[must_use]
     pub fn of_substeps(self, substeps: u32) -> Self {
         Intake { substeps, ..self }
     }
 
-    /// The substeps of a step of the tissue that comes last.
+    /// Returns the substeps per step of the newest tissue; 0 if the cost of tips is not limited.
     pub(super) fn substeps(&self) -> u32 {
         let changed = self.changed_to.as_ref().filter(|_| self.substeps > 0);
         changed.map_or(self.substeps, |model| model.plan.substeps)
     }
 
-    /// Returns the memory of what waits is charged to `account`.
+    /// Returns this intake with an account: the memory of what waits is charged to `account` from now on.
     #[must_use]
     pub fn charged_to(self, account: &Account) -> Self {
         Intake { account: Some(account.clone()), ..self }
     }
 
-    /// Creates the intake of a session that goes on, whose tissue is `changed_to` unless it is still the first. Who takes a tool that is in the tissue
-    /// already takes it with its tip.
+    /// Returns this intake for a continued session, whose tissue is `changed_to` unless it is still the first. A
+    /// client that acquires a tool which is in the tissue already must lead it with the tip that it has.
     #[must_use]
     pub fn continued(self, session: &Session, changed_to: Option<Arc<Model>>) -> Self {
         let tip_radii_m = session.tips().map(|(tool, tip)| (tool, tip.radius_m)).collect();
         Intake { next_step: session.step_count(), changed_to, tip_radii_m, ..self }
     }
 
-    /// Has the memory of `more` commands beside those that wait, or refuses.
+    /// Takes the memory of `more` commands beside those that wait, or refuses.
     pub(super) fn make_room(&mut self, more: usize) -> Result<()> {
         let bytes = bytes_of(self.queue.len() + self.coming + more);
         let Some(account) = self.account.as_ref().filter(|_| bytes > 0) else { return Ok(()) };
@@ -122,7 +152,7 @@ impl Intake {
         }
     }
 
-    /// Frees some of what no longer waits, and gives its memory back.
+    /// Frees some of the discarded commands, and gives their memory back.
     fn give_back(&mut self) {
         self.queue.free_some();
         let bytes = bytes_of(self.queue.len() + self.coming);
@@ -131,10 +161,11 @@ impl Intake {
         }
     }
 
-    /// Takes all of `tools` or none. The leases lapse after `lease_s` without a command or renewal.
+    /// Gives all of `tools` to the lease `id`, or none. The lease expires after `lease_s` seconds without a command
+    /// or renewal.
     ///
     /// # Errors
-    /// Refuses if the intake is closed, for tools that are unknown, named twice or held, and for a holder name or a lease
+    /// Refuses if the intake is closed, tools that are unknown, named twice or held, and a holder name or a lease
     /// time out of range.
     pub fn acquire(&mut self, tools: &[u32], holder: &str, lease_s: f64, id: LeaseId, now_ns: u64) -> Result<()> {
         self.check_open()?;
@@ -145,7 +176,7 @@ impl Intake {
         Ok(())
     }
 
-    /// A tool that was in the tissue when the session went on is held from now on.
+    /// Sets the tip of a tool that is acquired: the one that the tool has in the tissue of a continued session.
     pub(super) fn take_tip(&mut self, tool: u32) {
         let radius_m = self.tip_radii_m.remove(&tool);
         if let Some(lease) = self.leases.get_mut(tool) {
@@ -153,19 +184,19 @@ impl Intake {
         }
     }
 
-    /// Extends a lease: its holder is alive.
+    /// Extends a lease by its duration from `now_ns`.
     ///
     /// # Errors
-    /// Refuses an unknown or lapsed lease.
+    /// Refuses an unknown or expired lease.
     pub fn renew(&mut self, id: LeaseId, now_ns: u64) -> Result<()> {
         self.lapse(now_ns);
         self.leases.renew(id, now_ns)
     }
 
-    /// Releases every tool of a lease. Their actions end at the next step; waiting commands are dropped.
+    /// Releases every tool of a lease. Their actions end at the next step, and their waiting commands are dropped.
     ///
     /// # Errors
-    /// Refuses an unknown or lapsed lease.
+    /// Refuses an unknown or expired lease.
     pub fn release(&mut self, id: LeaseId) -> Result<()> {
         let tools: Vec<u32> = self.tools_of(id).collect();
         if tools.is_empty() {
@@ -183,8 +214,8 @@ impl Intake {
         self.enqueue(Command::new(tool, None, Action::Release), true);
     }
 
-    /// Ends the leases that have expired at `now_ns`. In a resting session, time passes without computed steps, but
-    /// never past a step that has something waiting.
+    /// Ends the leases that have expired at `now_ns`, and frees some discarded commands. In a resting session it
+    /// also advances the next step to that time, but never past a step for which something waits.
     pub fn lapse(&mut self, now_ns: u64) {
         if let Some((schedule, until)) = &self.resting {
             let until = self.first_waiting().map_or(*until, |step| step.min(*until));
@@ -198,16 +229,16 @@ impl Intake {
         }
     }
 
-    /// Returns what commands have to keep to.
+    /// Returns the rules that commands must keep to.
     pub fn rules(&self) -> Arc<Rules> {
         self.rules.clone()
     }
 
-    /// Accepts all of `commands`, from the holder of `id`, or none.
+    /// Accepts all of `commands`, from the holder of the lease `id`, or none, and renews the lease.
     ///
     /// # Errors
-    /// Refuses if the intake is closed, too many commands for the queue, tools that this lease does not hold, sequence
-    /// numbers that do not rise, and what the checks of an action refuse.
+    /// Refuses if the intake is closed, too many commands for the queue, tools that this lease does not hold,
+    /// sequence numbers that do not rise, and actions that break a rule.
     pub fn submit(&mut self, id: LeaseId, commands: Vec<Command>, now_ns: u64) -> Result<()> {
         self.check_open()?;
         let checked = self.rules.check(commands)?;
@@ -226,8 +257,8 @@ impl Intake {
             lease.last_sequence = lease.last_sequence.max(command.sequence);
             lease.tip_radius_m = tip_radius_m(&command);
             let last = lease.last_key.replace(key);
-            // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply to
-            // poses played by client time (`palpate_haptics::pose_playback`), where each one counts.
+            // The latest position wins: it supersedes an earlier one that has not taken effect. This does not apply
+            // to poses that are played by client time (`palpate_haptics::pose_playback`), where each one counts.
             let is_position = |command: &Command| match command.action {
                 Action::Grasp { .. } => true,
                 Action::Pose { .. } => command.at_step.is_some() || command.client_time_ns == 0,
@@ -244,7 +275,7 @@ impl Intake {
         self.changed = true;
     }
 
-    /// The first step for which something waits.
+    /// Returns the first step for which something waits.
     fn first_waiting(&self) -> Option<u64> {
         let commands = self.queue.first_step();
         let changes = self.changes.front().map(|change| change.0);
@@ -256,12 +287,13 @@ impl Intake {
         self.changed_to.clone()
     }
 
-    /// Accepts another tissue, made from `base`, for the beginning of step `at_step`, or of the next step. Returns the
-    /// step, or `None` if [`Intake::changed_to`] is no longer `base`. Changes take effect in their order of arrival,
-    /// and each is made from the one before it. Of several for one step the last one applies; it includes the others.
+    /// Accepts another tissue, made from `base`, for the beginning of step `at_step` or of the next step. Returns
+    /// the step, or `None` if [`Intake::changed_to`] is no longer `base`. Changes take effect in their order of
+    /// arrival, and each is made from the previous one. If several are for one step, the last one applies, which
+    /// includes the others.
     ///
     /// # Errors
-    /// Refuses if the intake is closed, for a step before that of a waiting change, and for too many waiting changes.
+    /// Refuses if the intake is closed, a step before that of a waiting change, and too many waiting changes.
     pub fn change(
         &mut self,
         base: Option<&Arc<Model>>,
@@ -302,14 +334,14 @@ impl Intake {
         self.changes.iter().map(|(step, model, _)| (*step, model.clone())).collect()
     }
 
-    /// Returns the last tissue that is due at the beginning of step `step`, if there is one.
+    /// Removes the changes that are due at the beginning of step `step`, and returns the last one.
     pub fn take_change(&mut self, step: u64) -> Option<Arc<Model>> {
         let due = self.changes.partition_point(|change| change.0 <= step);
         self.changes.drain(..due).next_back().map(|change| change.1)
     }
 
-    /// Begins a rest: the session has done `step` steps and could rest until step `until`. Returns the next step that
-    /// must be computed, which is earlier than `until` if something waits here. The session then rests until
+    /// Begins a rest: the session has done `step` steps and could rest until step `until`. Returns the next step
+    /// that must be computed, which is earlier than `until` if something waits here. The session then rests until
     /// [`Intake::take_due`] takes that step, unless it is the very next one.
     pub fn rest(&mut self, step: u64, until: u64, schedule: &Schedule) -> u64 {
         let waiting = self.first_waiting();
@@ -326,15 +358,16 @@ impl Intake {
         self.resting.is_some()
     }
 
-    /// Returns whether the thread of a resting session must be woken to call [`Intake::rest`] again. True once per
-    /// wake.
+    /// Returns whether the thread of a resting session must be woken to call [`Intake::rest`] again. It returns
+    /// true once for each rest.
     pub fn take_wake(&mut self) -> bool {
         let wake = self.changed && !self.woken && self.is_resting();
         self.woken |= wake;
         wake
     }
 
-    /// Moves what is due at the beginning of step `step` into `due`, in order of effect.
+    /// Appends the commands that are due at the beginning of step `step` to `due`, in order of effect; step `step`
+    /// + 1 comes next.
     pub fn take_due(&mut self, step: u64, now_ns: u64, due: &mut Vec<Due>) {
         self.lapse(now_ns);
         self.resting = None;
@@ -348,32 +381,32 @@ impl Intake {
         self.next_step = step + 1;
     }
 
-    /// Returns the next step.
+    /// Returns the number of the next step.
     pub fn next_step(&self) -> u64 {
         self.next_step
     }
 
-    /// Returns the tools of a lease.
+    /// Returns the tools of a lease, by ascending number.
     pub fn tools_of(&self, id: LeaseId) -> impl Iterator<Item = u32> {
         self.leases.tools_of(id)
     }
 
-    /// Returns each held tool and its holder.
+    /// Returns each held tool with the name of its holder.
     pub fn holders(&self) -> impl Iterator<Item = (u32, &str)> {
         self.leases.holders()
     }
 
-    /// Returns the total number of tools whose lease lapsed.
+    /// Returns the number of tools so far whose lease expired.
     pub fn lapsed(&self) -> u64 {
         self.leases.lapsed()
     }
 
-    /// Counts of the commands so far, by outcome.
+    /// Returns the counts of the commands so far, by outcome.
     pub fn counts(&self) -> Counts {
         Counts { waiting: (self.queue.waiting() + self.coming) as u64, ..self.counts }
     }
 
-    /// Refuses from now on everything with `refusal`. Returns the commands that waited.
+    /// Refuses everything with `refusal` from now on. Returns the discarded commands, to be freed without the lock.
     pub fn close(&mut self, refusal: Refusal) -> Discarded {
         self.closed = Some(refusal);
         self.counts.dropped += self.queue.discard_all() as u64;
@@ -382,20 +415,21 @@ impl Intake {
         self.queue.take_left_over()
     }
 
-    /// Opens it again, as it was in the beginning, with the same tissue, and no tool held.
+    /// Opens a closed intake again, with its tissue and without held tools.
     pub fn reopen(&mut self) {
         self.closed = None;
         self.leases.clear();
     }
 
-    /// Ends the leases of the tools for which `chosen` holds, by number and by who pays for them; tells how many.
+    /// Ends the leases of the tools for which `chosen` holds, by number and by the account that is charged. Returns
+    /// how many.
     pub fn free(&mut self, chosen: impl Fn(u32, Option<&Account>) -> bool) -> usize {
         let tools = self.leases.chosen(chosen);
         tools.iter().for_each(|tool| self.end(*tool));
         tools.len()
     }
 
-    /// Charges the tools of a lease to who took them, one of `charges` each.
+    /// Charges the tools of a lease to the account that took them: one of `charges` for each tool.
     pub fn charge(&mut self, id: LeaseId, charges: Vec<Taken>) {
         self.leases.charge(id, charges);
     }
@@ -405,11 +439,12 @@ impl Intake {
     }
 }
 
-/// Commands are charged in pieces of so many bytes, and the first of a session is its own: who has a few waiting at a
-/// time, as most do, pays nothing.
+/// Memory for commands is charged in pieces of this size, bytes; the first piece of a session is free, so a client
+/// with few waiting commands pays nothing.
 const PIECE_BYTES: u64 = 64 << 10;
 
-/// What so many commands are charged: they are in a tree, whose nodes are two thirds full.
+/// Returns the bytes that are charged for this number of commands: they are in a tree, whose nodes are two thirds
+/// full.
 fn bytes_of(commands: usize) -> u64 {
     let bytes = commands * size_of::<(QueueKey, Due)>() * 3 / 2;
     (bytes as u64 / PIECE_BYTES) * PIECE_BYTES

@@ -1,4 +1,4 @@
-//! What an intake has, for another server that goes on with its session: who holds tools, and what waits for its step.
+//! Transfer of an intake to another server that continues its session: the leases, and what waits for its step.
 
 use super::command::Due;
 use super::input::Input;
@@ -9,18 +9,19 @@ use super::rules::tip_radius_m;
 use crate::budget::{Purpose, Resource};
 use palpate_refusal::Refusal;
 
-/// What an intake had when it was closed.
+/// Content of an intake when it was closed.
 #[derive(Debug, Default)]
 pub struct Handed {
     /// Each held tool with its lease.
     pub leases: Vec<HandedLease>,
-    /// Changes of the tissue, then commands, each kind in order of effect, and each with its step.
+    /// Changes of the tissue, then commands; each kind in order of effect, and each entry with its step.
     pub waiting: Vec<(u64, Input)>,
 }
 
 impl Intake {
-    /// Closes the intake, which refuses everything with `refusal` from now on, and tells what it had. What waited counts as if it had
-    /// never been accepted: it counts where the session goes on. Of a batch that is being taken in the rest is dropped.
+    /// Closes the intake, which refuses everything with `refusal` from now on, and returns its content. What waited
+    /// no longer counts as accepted here: it counts where the session continues. The rest of an unfinished batch is
+    /// dropped.
     pub fn hand_over(&mut self, refusal: Refusal) -> (Handed, Discarded) {
         let leases = self.leases.handed();
         let changes = self.waiting_changes().into_iter().map(|(step, model)| (step, Input::Tissue(model)));
@@ -33,9 +34,10 @@ impl Intake {
         (Handed { leases, waiting }, discarded)
     }
 
-    /// Goes on with what another server's intake had. The leases begin their time anew, and their commands are numbered anew.
+    /// Adds the content of another server's intake. The leases last their full duration from `now_ns`, and sequence
+    /// numbers of their commands start again.
     ///
-    /// What there is no memory for is dropped; tells how many inputs.
+    /// Inputs for which there is no memory are dropped. Returns how many.
     pub fn adopt(&mut self, handed: Handed, now_ns: u64) -> usize {
         for lease in handed.leases {
             let tool = lease.tool;
@@ -68,7 +70,7 @@ impl Intake {
         dropped
     }
 
-    /// A command that has waited elsewhere waits here.
+    /// Queues a command that has waited on another server.
     fn await_again(&mut self, step: u64, mut due: Due, now_ns: u64) {
         due.command.arrival_ns = now_ns;
         let key = (step, self.arrivals);

@@ -1,4 +1,4 @@
-//! Leases: who holds which tool, and until when. Time is an argument.
+//! Leases: which client holds which tool, and until when. Time is an argument.
 
 use std::collections::BTreeMap;
 
@@ -6,7 +6,7 @@ use crate::budget::{Account, Taken};
 use palpate_refusal::{Reason, Refusal, Result, label, number};
 use palpate_tissue::limits::Limits;
 
-/// Identifies a lease. Random, so that it can't be guessed.
+/// ID of a lease. It is random, so that it can't be guessed.
 pub type LeaseId = u128;
 
 /// One tool of a lease.
@@ -21,24 +21,25 @@ pub(super) struct LeasedTool {
     pub(super) tip_radius_m: Option<f64>,
     /// Key of the tool's newest command in the queue.
     pub(super) last_key: Option<QueueKey>,
-    /// A batch of commands is being taken in: those of the tool that came since this arrival wait for the rest of it.
+    /// Set while a batch of commands is put in the queue: the tool's commands from this arrival on wait for the
+    /// rest of it.
     pub(super) batch_since: Option<u64>,
     /// What the holder's account is charged for this tool.
     charge: Option<Taken>,
 }
 
-/// A tool that somebody holds, as a server hands it over with its session.
+/// A held tool with its lease, as a server hands it over with its session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HandedLease {
     /// The tool's number.
     pub tool: u32,
-    /// Its lease.
+    /// ID of the lease that holds the tool.
     pub id: LeaseId,
-    /// Who holds it, for people.
+    /// Name of the holder, for people.
     pub holder: String,
-    /// The lease lapses after this time without a command or renewal, ns.
+    /// Time without a command or renewal after which the lease expires, ns.
     pub duration_ns: u64,
-    /// Name of the account that pays for it; empty if none does.
+    /// Name of the account that is charged for the tool; empty if none is.
     pub owner: String,
 }
 
@@ -53,7 +54,8 @@ pub(super) struct Leases {
 }
 
 impl Leases {
-    /// Takes all of `tools` or none. The leases lapse after `lease_s` without a command or renewal.
+    /// Gives all of `tools` to the lease `id`, or none. The lease expires after `lease_s` seconds without a command
+    /// or renewal.
     ///
     /// # Errors
     /// Refuses tools that are unknown, named twice or held, and a holder name or a lease time out of range.
@@ -78,7 +80,7 @@ impl Leases {
                 return Err(Refusal::new(Reason::OutOfRange, "tools", format!("names tool {tool} twice")));
             }
             if let Some(lease) = self.held.get(tool) {
-                let holder = if lease.holder.is_empty() { "somebody" } else { &lease.holder };
+                let holder = if lease.holder.is_empty() { "another client" } else { &lease.holder };
                 let message = format!("tool {tool} is held by `{holder}`");
                 return Err(Refusal::new(Reason::ToolHeld, "tools", message));
             }
@@ -102,15 +104,15 @@ impl Leases {
         Ok(())
     }
 
-    /// The tips that the newest commands give the tools: numbers and radii, m.
+    /// Returns the tools with the radii of the tips that their newest commands give them, m.
     pub(super) fn tips_m(&self) -> impl Iterator<Item = (u32, Option<f64>)> + '_ {
         self.held.iter().map(|(tool, lease)| (*tool, lease.tip_radius_m))
     }
 
-    /// Extends a lease: its holder is alive.
+    /// Extends a lease by its duration from `now_ns`.
     ///
     /// # Errors
-    /// Refuses an unknown or lapsed lease.
+    /// Refuses an unknown or expired lease.
     pub(super) fn renew(&mut self, id: LeaseId, now_ns: u64) -> Result<()> {
         let mut is_held = false;
         for lease in self.of_mut(id) {
@@ -120,32 +122,32 @@ impl Leases {
         if is_held { Ok(()) } else { Err(not_held()) }
     }
 
-    /// The tools of a lease.
+    /// Returns the tools of a lease.
     pub(super) fn tools_of(&self, id: LeaseId) -> impl Iterator<Item = u32> {
         self.held.iter().filter(move |lease| lease.1.id == id).map(|lease| *lease.0)
     }
 
-    /// The same, with what is known of each.
+    /// Returns the entries of a lease's tools.
     pub(super) fn of(&self, id: LeaseId) -> impl Iterator<Item = &LeasedTool> {
         self.held.values().filter(move |lease| lease.id == id)
     }
 
-    /// The same, to change them.
+    /// Returns the entries of a lease's tools, to change them.
     pub(super) fn of_mut(&mut self, id: LeaseId) -> impl Iterator<Item = &mut LeasedTool> {
         self.held.values_mut().filter(move |lease| lease.id == id)
     }
 
-    /// A tool, if it is held.
+    /// Returns the entry of a tool, if it is held.
     pub(super) fn get(&self, tool: u32) -> Option<&LeasedTool> {
         self.held.get(&tool)
     }
 
-    /// The same, to change it.
+    /// Returns the entry of a tool, if it is held, to change it.
     pub(super) fn get_mut(&mut self, tool: u32) -> Option<&mut LeasedTool> {
         self.held.get_mut(&tool)
     }
 
-    /// Takes a tool out of its lease.
+    /// Removes a tool from its lease.
     pub(super) fn remove(&mut self, tool: u32) {
         self.held.remove(&tool);
     }
@@ -155,7 +157,7 @@ impl Leases {
         self.held.clear();
     }
 
-    /// A tool whose lease has expired at `now_ns`, if there is one. It is counted as lapsed.
+    /// Removes and returns a tool whose lease has expired at `now_ns`, if there is one, and counts it.
     pub(super) fn take_expired(&mut self, now_ns: u64) -> Option<u32> {
         let tool = self.held.iter().find(|lease| lease.1.expires_ns <= now_ns).map(|lease| *lease.0)?;
         self.held.remove(&tool);
@@ -163,29 +165,29 @@ impl Leases {
         Some(tool)
     }
 
-    /// When the first lease expires.
+    /// Returns the time at which the first lease expires, ns.
     pub(super) fn first_expiry_ns(&self) -> Option<u64> {
         self.held.values().map(|lease| lease.expires_ns).min()
     }
 
-    /// Each held tool and its holder.
+    /// Returns each held tool with the name of its holder.
     pub(super) fn holders(&self) -> impl Iterator<Item = (u32, &str)> {
         self.held.iter().map(|(tool, lease)| (*tool, lease.holder.as_str()))
     }
 
-    /// Total number of tools whose lease lapsed.
+    /// Returns the number of tools so far whose lease expired.
     pub(super) fn lapsed(&self) -> u64 {
         self.lapsed
     }
 
-    /// The tools for which `chosen` holds, by number and by who pays for them.
+    /// Returns the tools for which `chosen` holds, by number and by the account that is charged.
     pub(super) fn chosen(&self, chosen: impl Fn(u32, Option<&Account>) -> bool) -> Vec<u32> {
         let payer = |lease: &LeasedTool| lease.charge.as_ref().map(Taken::account).cloned();
         let is_chosen = |(tool, lease): &(&u32, &LeasedTool)| chosen(**tool, payer(lease).as_ref());
         self.held.iter().filter(is_chosen).map(|lease| *lease.0).collect()
     }
 
-    /// Each held tool with its lease, for a server that goes on with the session.
+    /// Returns each held tool with its lease, for a server that continues the session.
     pub(super) fn handed(&self) -> Vec<HandedLease> {
         let of = |(tool, lease): (&u32, &LeasedTool)| HandedLease {
             tool: *tool,
@@ -197,7 +199,7 @@ impl Leases {
         self.held.iter().map(of).collect()
     }
 
-    /// Goes on with a lease of another server. Its commands are numbered anew.
+    /// Adds a tool with the lease that another server gave it. Sequence numbers of its commands start again.
     pub(super) fn adopt(&mut self, lease: HandedLease, now_ns: u64) {
         let HandedLease { tool, id, holder, duration_ns, .. } = lease;
         let leased = LeasedTool {
@@ -214,14 +216,14 @@ impl Leases {
         self.held.insert(tool, leased);
     }
 
-    /// Charges the tools of a lease to who took them, one of `charges` each.
+    /// Charges the tools of a lease to the account that took them: one of `charges` for each tool.
     pub(super) fn charge(&mut self, id: LeaseId, charges: Vec<Taken>) {
         self.of_mut(id).zip(charges).for_each(|(lease, charge)| lease.charge = Some(charge));
     }
 }
 
-/// The refusal of a lease that holds nothing.
+/// Returns the refusal of a lease that holds nothing.
 pub(super) fn not_held() -> Refusal {
-    let message = "no tool is held by this lease: it lapsed or was given back";
+    let message = "this lease holds no tool: it has expired or was released";
     Refusal::new(Reason::NotHolder, "lease_id", message)
 }

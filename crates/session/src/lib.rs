@@ -1,15 +1,17 @@
-//! One tissue in use: the actions of the tools, the forces on them, and the records. No clock, no socket: a session
-//! with the same commands at the same steps gives the same bits.
+//! One tissue in use: the actions of the tools, the forces on them, and the records. It has no clock and no socket:
+//! a session with equal commands at equal steps gives equal bits.
 //!
-//! **Held and continuous forces.** `palpate run` takes a script's force as a function of time. Commands, and `run --held`, keep
-//! a force constant over each step. `Script::actions_at` states once what a client tells the tools at each step; runs offline
-//! and replays both send that through the same intake, so their hashes are equal. A grasped point reaches its target at the
-//! *end* of the command's step with constant velocity: its place at each step is exact, and no substep sees a jump.
+//! **Held and continuous forces.** `palpate run` takes a script's force as a function of time. Commands, and `run
+//! --held`, keep a force constant over each step. `Script::actions_at` defines once what a client commands at each
+//! step; offline runs and replays send that through the intake that a server uses, so their hashes are equal. A
+//! grasped point reaches its target at the *end* of the command's step with constant velocity: its place at each
+//! step is exact, and no substep sees a jump.
 //!
-//! **Records.** A record at a jump of force shows the forces just before it; at t = 0, just after.
+//! **Records.** A record at a jump of force has the forces just before it; at t = 0, just after.
 //!
-//! **Order.** Commands that are due at one step act in the order of their tools' numbers, not of arrival: two clients that
-//! stamp their commands get the same bits whichever network was faster. A second tool that grasps a point takes it over.
+//! **Order.** Commands that are due at one step act in the order of their tools' numbers, not of arrival: two
+//! clients that stamp their commands get equal bits whichever network was faster. A second tool that grasps a point
+//! takes it over.
 
 pub mod audit;
 pub mod batch;
@@ -54,79 +56,79 @@ use palpate_tissue::shape::{self, PointId, PointName};
 use palpate_tissue::{self as tissue, BlowUp, Energy, Grasp, Model, PointState, Push, ReadCopy, Tissue, ToolContact};
 use recovery::{Ended, Recovered, Recoveries, describe};
 
-/// A small organ whose points are heavy and light.
+/// A small organ whose points differ in mass.
 #[cfg(test)]
 const GALLBLADDER: &str = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\n[material]\nyoungs_modulus_pa = 2e4\n\
     thickness_m = 0.003\nfoundation_n_per_m3 = 5e6\n[stepping]\nsubsteps = 8\n";
 
-/// The name of a record in messages.
+/// The name of a record in messages about missing memory.
 const RECORD: &str = "a record";
 
-/// The sample of one tool at the end of a step.
+/// Sample of one tool at the end of a step: its state, the forces on it, and the newest command that took effect.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ToolSample {
     /// The tool's number.
     pub tool: u32,
-    /// Sequence of the newest command that took effect; 0 before the first.
+    /// Sequence number of the newest command that took effect; 0 before the first.
     pub acknowledged_sequence: u64,
-    /// Time of that command by the client's clock.
+    /// Time of that command, ns of the client's clock.
     pub client_time_ns: u64,
-    /// Arrival of that command by the server's clock; 0 before the first.
+    /// Arrival of that command, ns of the server's clock; 0 before the first.
     pub arrival_ns: u64,
-    /// Motion and forces at the tool's control point, if it acts.
+    /// Motion and forces at the tool's control point, if the tool has one.
     pub contact: Option<Contact>,
-    /// Motion and force of a position-controlled tool itself.
+    /// Motion and force of the tip itself, for a tool that is led by poses.
     pub feel: Option<ToolContact>,
-    /// Client time of the place of such a tool, s.
+    /// Client time of the place of such a tool, s; 0 for any other tool.
     pub place_time_s: f64,
-    /// The local model from which a client renders, for a stream that requests it.
+    /// Local model for the client's rendering, if the stream requests it.
     pub local: Option<LocalModel>,
-    /// Whether the tool is held in place because no command came for long.
+    /// Whether the tool is held in place because no pose has arrived for a while.
     pub stale: bool,
-    /// Whether the acknowledged command came too late for its step.
+    /// Whether the newest command came too late for its step.
     pub late: bool,
-    /// Whether the tool's action was ended by its time to live, with its lease, for lack of poses, or by a recovery; or had
-    /// no effect because the tool is paused.
+    /// Whether the tool's action was ended by its time to live, with its lease, for lack of poses, or by a
+    /// recovery; or the newest command had no effect because the tool is paused.
     pub expired: bool,
     /// The step before which commands to the tool have no effect, if it was ever paused ([`recovery`]).
     pub paused_until: Option<u64>,
 }
 
-/// The control point of a tool.
+/// Motion and forces at a tool's control point: the mass point that it acts on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Contact {
     /// The mass point.
     pub point: PointId,
-    /// From rest, m. Under the tip of a tool led by poses the mean over its disc.
+    /// Displacement from rest, m; under a tip the mean over its disc.
     pub displacement_m: DVec3,
-    /// How far the surface is moved just under the control point, m.
+    /// Displacement of the surface exactly under the control point, m.
     pub surface_displacement_m: DVec3,
-    /// m/s.
+    /// Velocity, m/s.
     pub velocity_m_per_s: DVec3,
-    /// Force of the tissue on the tool: springs + anchor spring + damping, N.
+    /// Force of the tissue on the tool, N: springs, anchor spring and damping.
     pub force_on_tool_n: DVec3,
     /// Force of all tools on the point, N.
     pub applied_force_n: DVec3,
 }
 
-/// The samples of all tools at the end of a step.
+/// Samples of the tools at the end of a step, with the state of the session.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
-    /// s.
+    /// Simulated time, s.
     pub simulation_time_s: f64,
-    /// Points computed in the step.
+    /// Number of points that the step computed.
     pub awake_points: usize,
-    /// Total number of commands that came too late.
+    /// Number of commands so far that came too late.
     pub late_commands: u64,
-    /// Whether the guard has ended the session.
+    /// Whether the session is held: stopped by the guard or by a fault.
     pub held: bool,
-    /// How often the tissue was taken back to an earlier state ([`recovery`]).
+    /// Number of recoveries so far: returns of the tissue to an earlier state ([`recovery`]).
     pub recoveries: u64,
-    /// The newest of these, with the tools that it released.
+    /// The newest recovery, with the tools that it released.
     pub recovered: Option<Arc<Recovered>>,
-    /// By ascending number of the tool.
+    /// Samples of the tools, by ascending number, or in the order in which they were requested.
     pub tools: Vec<ToolSample>,
 }
 
@@ -136,7 +138,7 @@ struct Tool {
     client_time_ns: u64,
     arrival_ns: u64,
     control_point: Option<PointId>,
-    /// The force whose reaction is told, if it was given by a place.
+    /// The push whose reaction is measured around its centre, if it was given by a place and not by a point.
     around: Option<Poke>,
     expires_at: Option<u64>,
     late: bool,
@@ -145,7 +147,7 @@ struct Tool {
     paused_until: Option<u64>,
 }
 
-/// A position-controlled tool.
+/// A tool that is led by poses.
 #[derive(Debug, Clone)]
 struct Posed {
     tip: Tip,
@@ -154,7 +156,35 @@ struct Posed {
     client_time_s: f64,
 }
 
-/// A tissue and its tools.
+/// A tissue with its tools and their commands' effects: what a server, a run or a replay advances step by step.
+///
+/// A fingertip presses 3 mm into the middle of a sheet at rest. Half a second later the surface under it is as deep, and pushes back:
+///
+/// ```
+/// use glam::DVec3;
+/// use palpate_haptics::Tip;
+/// use palpate_session::Session;
+/// use palpate_session::command::{Command, Due};
+/// use palpate_tissue::Model;
+/// use palpate_tissue::scene::PAPER;
+/// use palpate_tissue::scene::script::Action;
+///
+/// let model = Model::parse("paper", PAPER, &["sheet.points=[9, 9]"])?;
+/// let place_m = model.shape().extent().middle_m() - 0.003 * DVec3::Z;
+/// let tip = Tip { radius_m: 0.04, ..Tip::default() };
+/// let press = Action::Pose { place_m, velocity_m_per_s: None, tip };
+/// let mut session = Session::new(&model);
+/// let mut due = vec![Due::in_time(Command::new(0, Some(1), press))];
+/// for _ in 0..500 {
+///     session.advance(&mut due, |_| {});
+/// }
+/// assert_eq!((session.step_count(), session.time_s()), (500, 0.5));
+/// let sample = session.sample(None);
+/// let contact = sample.tools[0].contact.expect("the tool acts");
+/// assert!((contact.displacement_m.z + 0.003).abs() < 1e-5, "{} m", contact.displacement_m);
+/// assert!(contact.force_on_tool_n.z > 0.0, "{} N", contact.force_on_tool_n);
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
 pub struct Session {
     tissue: Box<dyn Tissue>,
     tools: Vec<Tool>,
@@ -166,7 +196,7 @@ pub struct Session {
 }
 
 impl Session {
-    /// Creates a session of a tissue at rest.
+    /// Creates a session of a tissue at rest, at step 0.
     pub fn new(model: &Arc<Model>) -> Self {
         Session {
             tissue: tissue::at_rest(model),
@@ -189,7 +219,7 @@ impl Session {
         &*self.tissue
     }
 
-    /// Steps done.
+    /// Returns the number of steps done.
     pub fn step_count(&self) -> u64 {
         self.tissue.step_count()
     }
@@ -200,39 +230,41 @@ impl Session {
         self.step_count() as f64 / self.model().scene.stepping.rate_hz
     }
 
-    /// Returns the reason why the guard has ended the session, if it has.
+    /// Returns why the session is held; `None` if it is not.
     pub fn hold_reason(&self) -> Option<&str> {
         self.hold_reason.as_deref()
     }
 
-    /// Ends the session, as the guard does.
+    /// Holds the session, as the guard does: it is not stepped any more. The first reason is kept.
     pub fn hold(&mut self, reason: String) {
         self.hold_reason.get_or_insert(reason);
     }
 
-    /// Returns the total number of commands that came too late for their step.
+    /// Returns the number of commands so far that came too late for their step.
     pub fn late_commands(&self) -> u64 {
         self.late_commands
     }
 
-    /// Returns the number of commands that had no effect because their tool was paused ([`recovery`]).
+    /// Returns the number of commands so far without effect because their tool was paused ([`recovery`]).
     pub fn paused_commands(&self) -> u64 {
         self.paused_commands
     }
 
-    /// Returns the tools that are led by poses, by ascending number, and their tips.
+    /// Returns the tools that are led by poses, by ascending number, with their tips.
     #[allow(clippy::cast_possible_truncation)]
     pub fn tips(&self) -> impl Iterator<Item = (u32, Tip)> {
         let of = |(tool, state): (usize, &Tool)| Some((tool as u32, state.posed.as_ref()?.tip));
         self.tools.iter().enumerate().filter_map(of)
     }
 
-    /// Returns the sum of [`Path::counts`] over all position-controlled tools.
+    /// Returns the number of steps in which a tool was held to the speed limit, of dropped poses, and of tools that
+    /// were released for lack of poses: the sum of [`Path::counts`] over all tools.
     pub fn path_counts(&self) -> [u64; 3] {
         self.path_counts
     }
 
-    /// Returns the step at whose beginning something happens without a new command; `None` if the tissue moves.
+    /// Returns the step at whose beginning something happens without a new command: `u64::MAX` if nothing ever
+    /// does, and `None` if the tissue moves or a tool is led by poses.
     pub fn rests_until(&self) -> Option<u64> {
         let expiry = self.tools.iter().filter_map(|tool| tool.expires_at).min();
         // A path may move a tool at any time.
@@ -241,7 +273,7 @@ impl Session {
     }
 
     /// Skips to the moment when `step` steps are done, which must not be later than [`Session::rests_until`]. The
-    /// result is the same as that of single steps with nothing due.
+    /// result equals that of single steps without commands.
     pub fn skip_to(&mut self, step: u64) {
         self.tissue.skip_steps(step.saturating_sub(self.step_count()));
     }
@@ -260,20 +292,21 @@ impl Session {
         self.tissue.request_audit(inputs);
     }
 
-    /// Takes the report on that window after a step, once.
+    /// Takes the mark that begins, ends or drops that window, if the last step made one; each is returned once.
     pub fn take_mark(&mut self) -> Option<Mark> {
         self.tissue.take_mark()
     }
 
-    /// Advances one step. The commands in `due` take effect at its beginning, by the number of the tool. `observe` is
-    /// called at its end unless the guard has ended the session, and before the first step also at t = 0⁺, when the
-    /// commands act and nothing has moved.
+    /// Advances one step. The commands in `due` take effect at its beginning, by the number of the tool, and are
+    /// removed from it. `observe` is called at the step's end unless the session is held, and before the first step
+    /// also at t = 0⁺, when the commands act and nothing has moved. A held session only discards `due`.
     pub fn advance(&mut self, due: &mut Vec<Due>, mut observe: impl FnMut(&Session)) {
         while !self.advance_while(due, &mut || true, &mut observe) {}
     }
 
-    /// Does the same, but stops in what the guard repeats for the step where it may not go on. Then the result is
-    /// false, and only this may be called, again. What comes of it does not depend on where it stops.
+    /// Advances one step as [`Session::advance`] does, but stops within the guard's repetition of the step when
+    /// `may_go_on` returns false. Then it returns false, and only this function may be called until it returns
+    /// true. The result does not depend on where it stops.
     pub fn advance_while(
         &mut self,
         due: &mut Vec<Due>,
@@ -301,14 +334,14 @@ impl Session {
         true
     }
 
-    /// Returns whether a step is not done yet, because [`Session::advance_while`] has stopped.
+    /// Returns whether a step is unfinished, because [`Session::advance_while`] has stopped within it.
     pub fn is_within_step(&self) -> bool {
         self.tissue.is_within_step() && self.hold_reason.is_none()
     }
 
-    /// What happens before a step.
+    /// Applies the commands and paths that act at the beginning of a step.
     fn begin_step(&mut self, due: &mut Vec<Due>, observe: &mut impl FnMut(&Session)) {
-        // The network decides the order of arrival between tools, so it must not affect the result.
+        // The order of arrival depends on the network, so it must not affect the result.
         due.sort_by_key(|due| due.command.tool);
         for due in due.drain(..) {
             self.act(due);
@@ -325,14 +358,15 @@ impl Session {
         &self.recoveries
     }
 
-    /// Returns why the tissue is not what the commands have made of it: the session is held, or there was a recovery.
+    /// Returns why the tissue is not what its commands have made of it: the session is held, or there was a
+    /// recovery. `None` if it is.
     pub fn fault(&self) -> Option<String> {
         let recovered = || self.recoveries.newest().map(|newest| describe(&newest.recovery));
         self.hold_reason().map(str::to_owned).or_else(recovered)
     }
 
-    /// Recovers from a blow-up if something has acted on the tissue since it was at rest. Otherwise the session is held,
-    /// and the result is false.
+    /// Recovers from a blow-up if something has acted on the tissue since it was at rest. Otherwise it holds the
+    /// session and returns false.
     fn recover(&mut self, blow_up: BlowUp) -> bool {
         let (step, state_of_step) = (blow_up.step, self.step_count());
         if !self.recoveries.is_disturbed() {
@@ -345,7 +379,7 @@ impl Session {
         }
         let paused_until_step = self.recoveries.pause_end(step);
         let released = self.tissue.recover(step, paused_until_step.is_some());
-        // All that took effect since the checkpoint: `accept_until` has forgotten the others.
+        // All that took effect since the checkpoint: `accept_until` has removed earlier ones.
         self.recoveries.accept_until(state_of_step);
         let mut tools = Vec::new();
         for (index, tool) in self.tools.iter_mut().enumerate() {
@@ -366,7 +400,7 @@ impl Session {
         true
     }
 
-    /// Plays the paths of the tools that have one.
+    /// Moves the tools that have a path.
     fn play(&mut self) {
         let step_s = self.model().scene.stepping.rate_hz.recip();
         let end_s = self.time_s() + step_s;
@@ -404,7 +438,8 @@ impl Session {
         self.late_commands += late_commands;
         let index = command.tool as usize;
         let tool = self.tool(index);
-        // A pose that was overtaken fills a gap in a path; it does not begin a touch that something newer has ended.
+        // A pose that was overtaken fills a gap in a path; it does not begin a touch that a newer command has
+        // ended.
         let is_overtaken =
             command.by_datagram && command.sequence.is_some_and(|sequence| sequence < tool.acknowledged_sequence);
         if is_overtaken && tool.posed.is_none() {
@@ -413,7 +448,7 @@ impl Session {
         if ends_lease {
             return self.end_lease(index);
         }
-        // Commands with a step may take effect in another order than they were sent in.
+        // Commands with a step may take effect in another order than that in which they were sent.
         if let Some(sequence) = command.sequence.filter(|sequence| *sequence >= tool.acknowledged_sequence) {
             tool.acknowledged_sequence = sequence;
             tool.client_time_ns = command.client_time_ns;
@@ -439,7 +474,7 @@ impl Session {
                 let nearest = self.model().shape().nearest(poke.centre_m);
                 self.tool(index).control_point = Some(poke.point.unwrap_or(nearest));
                 self.tool(index).around = poke.point.is_none().then_some(poke);
-                // To the tissue it is all the same.
+                // To the tissue a point and its place are the same.
                 self.tissue.push(index, Some(Push::Constant(Poke { point: None, ..poke })));
             }
             Action::Grasp { point, displacement_m } => {
@@ -486,7 +521,7 @@ impl Session {
         }
     }
 
-    /// Ends all that the holder of a tool did with it.
+    /// Ends all actions of a tool's holder.
     fn end_lease(&mut self, index: usize) {
         let tool = self.tool(index);
         let Tool { control_point, around, paused_until, .. } = *tool;
@@ -494,7 +529,7 @@ impl Session {
         self.tissue.release(index);
     }
 
-    /// Ends actions whose time to live is over.
+    /// Ends the actions whose time to live is over.
     fn expire(&mut self) {
         let step = self.step_count();
         for index in 0..self.tools.len() {
@@ -507,19 +542,19 @@ impl Session {
         }
     }
 
-    /// Applies a force as a function of time, exact within the step. No command can express this.
+    /// Makes `tool` apply a force as a function of time, exact within the step. No command can express this.
     pub fn play_force(&mut self, tool: usize, profile: LoadProfile) {
         self.recoveries.disturb();
         self.tissue.push(tool, Some(Push::Profile(profile)));
     }
 
-    /// Applies a movement as a function of time.
+    /// Makes `tool` move a point as a function of time.
     pub fn play_move(&mut self, tool: usize, profile: MotionProfile) {
         self.recoveries.disturb();
         self.tissue.grasp(tool, profile.point, Grasp::Profile(profile));
     }
 
-    /// Returns the samples of the tools; only those with a number in `only`, if given.
+    /// Returns the sample of the present step: of all tools in use, or of the tools whose numbers are in `only`.
     pub fn sample(&self, only: Option<&[u32]>) -> Sample {
         let sample_of = |number: u32| {
             let tool = self.tools.get(number as usize).cloned().unwrap_or_default();
@@ -580,12 +615,12 @@ impl Session {
         }
     }
 
-    /// Returns a copy of the tissue as it is now, of which [`record_of`] tells the points later.
+    /// Returns a copy of the present tissue, which [`record_of`] reads later.
     pub fn copy(&self) -> ReadCopy {
         self.tissue.copy()
     }
 
-    /// Returns the energies of the whole sheet, for a record: a pass over it.
+    /// Returns the energies of the whole tissue, J, for a record. It reads every point.
     pub fn energy(&self) -> EnergyJ {
         energy_record(self.tissue.energy())
     }
@@ -605,8 +640,8 @@ impl Session {
         (0..self.tools.len()).filter_map(of).collect()
     }
 
-    /// Returns the first tool that presses where less than a quarter of its tip can move, if there is one: its force is
-    /// not that of free tissue.
+    /// Returns the first tool that presses where less than a quarter of its tip can move, if there is one: its
+    /// force is not that of free tissue.
     pub fn tool_on_fixed(&self) -> Option<u32> {
         let presses = |number: &usize| {
             let feel = self.tissue.tool_contact(*number);
@@ -632,7 +667,7 @@ impl Session {
     }
 }
 
-/// Returns the record of a point of a copy.
+/// Returns the record of one point of a copied tissue.
 pub fn record_of(copy: &ReadCopy, point: PointId) -> Point {
     point_record(copy.model().shape().name(point), &copy.point(point))
 }
@@ -641,7 +676,7 @@ fn energy_record(energy: Energy) -> EnergyJ {
     EnergyJ { kinetic: energy.kinetic_j, spring: energy.spring_j, anchor_springs: energy.anchor_j }
 }
 
-/// A vector in a record: −0 is written as 0.
+/// Returns a vector for a record, with 0 in place of −0.
 fn array(v: DVec3) -> [f64; 3] {
     (v + DVec3::ZERO).to_array()
 }
@@ -679,7 +714,7 @@ mod tests {
         }
         let sample = session.sample(None);
         let contact = sample.tools[0].contact.unwrap();
-        // It is the mean over the tip of what the surface has moved by: down, and hardly to a side.
+        // It is the mean over the tip of the surface's displacement: down, and hardly to a side.
         assert!(contact.displacement_m.z < 0.5 * place_m.z, "{contact:?}");
         let apart_m = contact.displacement_m.distance(contact.surface_displacement_m);
         assert!(apart_m < 0.2 * contact.surface_displacement_m.length(), "{apart_m} m: {contact:?}");

@@ -1,4 +1,4 @@
-//! Local models of one tool: the content of a sample about the tissue around it (`palpate_haptics::local_model`).
+//! Local models of one tool: what a sample contains about the tissue around it (`palpate_haptics::local_model`).
 
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -9,32 +9,33 @@ use palpate_haptics::local_model::{self, ContactState, LocalModel};
 use palpate_tissue::response::tangent::Tangent;
 use palpate_tissue::{TangentInput, ToolContact};
 
-/// Smaller forces do not limit the valid distance, N.
+/// Forces below this do not limit the distance in which a model is valid, N.
 const MIN_N: f64 = 0.05;
 
-/// After first contact the tissue may bounce off the tool for this many samples.
+/// Number of samples after first contact in which the tissue may bounce off the tool.
 const BOUNCE_SAMPLES: u32 = 5;
 
-/// Makes the local models of one tool.
+/// Maker of the local models of one tool.
 #[derive(Debug, Clone)]
 pub struct Modeller {
     law: Arc<Law>,
-    /// The law's number in the stream.
+    /// Number of the law in the stream.
     number: u32,
-    /// Whether K and B are those of the sheet around the tool also under a touch.
+    /// Whether stiffness K and damping B are computed from the tissue around the tool under a touch too, not only
+    /// under a grasp.
     touches_too: bool,
-    /// The state of contact in the newest model.
+    /// Contact state in the newest model.
     contact_state: ContactState,
-    /// The surface and its normal when the tool last did not touch it.
+    /// Place and normal of the surface when the tool last did not touch it.
     surface: Option<(DVec3, DVec3)>,
-    /// Consecutive samples in which the tool was below the surface and did not touch it.
+    /// Number of consecutive samples in which the tool was below the surface and did not touch it.
     bounced: u32,
     sequence: u64,
-    /// The newest stiffness computed at the tool.
+    /// The newest stiffness that was computed at the tool.
     tangent: Arc<Mutex<Option<Tangent>>>,
 }
 
-/// A pending computation of the stiffness under a tool, for a thread where no step waits for it.
+/// A pending computation of the stiffness under a tool, for a thread other than the stepping threads.
 #[derive(Debug)]
 pub struct StiffnessJob {
     surroundings: TangentInput,
@@ -50,22 +51,22 @@ impl StiffnessJob {
 }
 
 impl Modeller {
-    /// Creates a modeller for a tool on a tissue with this law, whose number in the stream is `number`. A grasp is
-    /// rendered with K and B of the sheet around it, which are recomputed continually; a touch is rendered with the
-    /// law, and K and B are computed only if `touches_too`.
+    /// Creates a modeller for a tool on a tissue with `law`, whose number in the stream is `number`. A grasp is
+    /// rendered with the stiffness K and damping B of the tissue around the tool, which are recomputed continually;
+    /// a touch is rendered with the law, and K and B are computed only if `touches_too`.
     pub fn new(number: u32, law: Arc<Law>, touches_too: bool) -> Self {
         let (contact_state, tangent) = (ContactState::Free, Arc::default());
         Modeller { law, number, touches_too, contact_state, surface: None, bounced: 0, sequence: 0, tangent }
     }
 
-    /// Notes that the tool has let go: what follows is another touch. Its models go on counting, because a client refuses one that is not
-    /// newer than the last.
+    /// Resets the modeller after the tool has let go: a further touch is a new one. Its models keep counting,
+    /// because a client refuses a model that is not newer than the last.
     pub fn let_go(&mut self) {
         let first = Modeller::new(self.number, self.law.clone(), self.touches_too);
         *self = Modeller { sequence: self.sequence, ..first };
     }
 
-    /// Has the models from the next one on refer to another law.
+    /// Makes the models from the next one on refer to another law.
     pub fn change_law(&mut self, number: u32, law: Arc<Law>) {
         (self.number, self.law) = (number, law);
     }
@@ -79,7 +80,7 @@ impl Modeller {
         }
     }
 
-    /// Returns a computation of the stiffness from the sheet around the tool.
+    /// Returns a computation of the stiffness from the tissue around the tool.
     pub fn refinement(&self, surroundings: TangentInput) -> StiffnessJob {
         StiffnessJob { surroundings, tangent: self.tangent.clone() }
     }
@@ -90,11 +91,11 @@ impl Modeller {
         self.contact_state = feel.contact_state;
         let touches = matches!(feel.contact_state, ContactState::Sticking | ContactState::Sliding);
         let below = self.surface.is_some_and(|(surface_m, normal)| (surface_m - feel.place_m).dot(normal) > 0.0);
-        // On contact, the tissue moves away from the tool for a moment. Its place then is not where the tool will meet
-        // it.
+        // On contact, the tissue moves away from the tool for a moment. Its place then is not where the tool will
+        // meet it.
         self.bounced = if below && feel.contact_state == ContactState::Free { self.bounced + 1 } else { 0 };
         if touches {
-            // A dent turns the surface under a tool; the law is about the surface at rest.
+            // A dent tilts the surface under a tool; the law refers to the surface at rest.
             self.surface = feel.rest.map(|rest| (rest.place_m, rest.normal)).or(self.surface);
         } else if !(1..=BOUNCE_SAMPLES).contains(&self.bounced) {
             self.surface = Some((feel.surface_m, feel.normal));
@@ -102,7 +103,7 @@ impl Modeller {
         let (mut surface_m, normal) = self.surface.unwrap_or((feel.surface_m, DVec3::Z));
         let mut depth_m = (surface_m - feel.place_m).dot(normal);
         if touches {
-            // Put the surface where the law gives this force, so that the law goes through this sample.
+            // Put the surface where the law gives this force, so that the law passes through this sample.
             let damping = self.law.at_depth(depth_m).damping_n_s_per_m;
             let pressure_n = feel.force_on_tool_n.dot(normal) + damping * feel.velocity_m_per_s.dot(normal);
             if pressure_n > 0.0 {
@@ -143,14 +144,14 @@ impl Modeller {
         }
     }
 
-    /// The change of stiffness with depth, N/m².
+    /// Returns the change of stiffness with depth, N/m².
     fn hardening(&self, depth_m: f64, row: &Row) -> f64 {
         let further = self.law.at_depth(depth_m + self.law.step_m);
         (further.stiffness_n_per_m - row.stiffness_n_per_m).abs() / self.law.step_m
     }
 }
 
-/// A matrix with one value along a direction and another across it.
+/// Returns a matrix with one value along a direction and another across it.
 fn around(normal: DVec3, along: f64, across: f64) -> DMat3 {
     let outer = DMat3::from_cols(normal * normal.x, normal * normal.y, normal * normal.z);
     outer * (along - across) + DMat3::IDENTITY * across
@@ -161,7 +162,7 @@ mod tests {
 
     use super::*;
 
-    /// Of a tool at a height, over a surface that is level at `surface_m`.
+    /// Returns the contact of a tool at a height, over a surface that is level at `surface_m`.
     fn tool_contact(height_m: f64, surface_m: f64, contact_state: ContactState) -> ToolContact {
         ToolContact {
             place_m: height_m * DVec3::Z,
@@ -195,14 +196,14 @@ mod tests {
     fn a_surface_that_the_tool_knocks_away_stays_in_the_model_for_some_samples() {
         let mut modeller = modeller();
         assert_eq!(modeller.model(&tool_contact(0.001, 0.0, ContactState::Free), 0, 0.0).surface_m, DVec3::ZERO);
-        // Above the surface it is where it is.
+        // A surface below the tool is used as it is.
         assert_eq!(modeller.model(&tool_contact(0.001, -0.0005, ContactState::Free), 1, 0.0).surface_m.z, -0.0005);
-        // Knocked: the tool is below where the surface was, and does not touch it.
+        // Knocked away: the tool is below the former surface, and does not touch it.
         for step in 0..BOUNCE_SAMPLES {
             let model = modeller.model(&tool_contact(-0.001, -0.002, ContactState::Free), 2 + u64::from(step), 0.0);
             assert_eq!(model.surface_m.z, -0.0005, "sample {step}");
         }
-        // It did not come back: that is where it is now.
+        // It did not come back: the model has its present place.
         assert_eq!(modeller.model(&tool_contact(-0.001, -0.002, ContactState::Free), 20, 0.0).surface_m.z, -0.002);
     }
 
@@ -232,7 +233,7 @@ mod tests {
     fn a_stiffness_is_valid_as_far_as_half_its_change_is_a_tenth_of_the_force() {
         let holding =
             ToolContact { force_on_tool_n: DVec3::new(0.0, 1.2, 1.6), ..tool_contact(0.0, 0.0, ContactState::Holding) };
-        // That of a spring does not change.
+        // The stiffness of a spring does not change.
         assert!(modeller().model(&holding, 0, 0.0).valid_m > 1.0);
         // This one gets 3 N/m stiffer with each millimetre.
         let row = |depth_m: f64| Row {

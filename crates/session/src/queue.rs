@@ -1,4 +1,4 @@
-//! The commands that wait for their step, by tool: so that all of a tool's can be put aside at once, however many they are.
+//! The commands that wait for their step, by tool, so that all commands of a tool can be discarded at once.
 
 use std::collections::BTreeMap;
 
@@ -8,45 +8,45 @@ use super::lease::QueueKey;
 /// Commands by their key: step, then order of arrival.
 type Commands = BTreeMap<QueueKey, Due>;
 
-/// Commands that have no effect any more. To free them takes time.
+/// Commands without further effect. Dropping this frees them, which takes time.
 #[derive(Debug, Default)]
 pub struct Discarded(Vec<Commands>);
 
 impl Discarded {
-    /// Returns whether there are none.
+    /// Returns whether there are no commands.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 }
 
-/// What waits.
+/// The queue of waiting commands and ends of leases.
 #[derive(Debug, Default)]
 pub(super) struct Queue {
-    /// The commands of the tools that are held.
+    /// Commands to the tools that are held.
     by_tool: BTreeMap<u32, Commands>,
-    /// The ends of leases.
+    /// Ends of leases.
     endings: Commands,
-    /// Commands of leases that have ended, by tool. [`Queue::free_some`] frees them bit by bit.
+    /// Commands of leases that have ended, by tool. [`Queue::free_some`] frees them piece by piece.
     discarded: Vec<Commands>,
-    /// Number of commands in `by_tool`, and in `discarded`.
+    /// Number of commands in `by_tool`, and of those in `discarded`.
     waiting: usize,
     left_over: usize,
-    /// What is due of all tools, before it is in order.
+    /// Commands of all tools that are due, before they are sorted; kept for its buffer.
     due: Vec<(QueueKey, Due)>,
 }
 
 impl Queue {
-    /// Number of entries that take memory.
+    /// Returns the number of entries that take memory.
     pub(super) fn len(&self) -> usize {
         self.waiting + self.left_over + self.endings.len()
     }
 
-    /// Number of commands that wait.
+    /// Returns the number of commands that wait.
     pub(super) fn waiting(&self) -> usize {
         self.waiting
     }
 
-    /// Number of commands of a tool that wait.
+    /// Returns the number of commands of a tool that wait.
     pub(super) fn waiting_of(&self, tool: u32) -> usize {
         self.by_tool.get(&tool).map_or(0, BTreeMap::len)
     }
@@ -61,7 +61,7 @@ impl Queue {
         }
     }
 
-    /// Removes the command of a tool with a key if `is_chosen` says so.
+    /// Removes the command of a tool with a key, if `is_chosen` holds for it. Returns it.
     pub(super) fn remove_if(&mut self, tool: u32, key: QueueKey, is_chosen: impl Fn(&Due) -> bool) -> Option<Due> {
         let commands = self.by_tool.get_mut(&tool)?;
         let removed = commands.get(&key).is_some_and(is_chosen).then(|| commands.remove(&key)).flatten()?;
@@ -69,7 +69,7 @@ impl Queue {
         Some(removed)
     }
 
-    /// Discards the commands of a tool; tells how many.
+    /// Discards the commands of a tool, to be freed later. Returns how many.
     pub(super) fn discard(&mut self, tool: u32) -> usize {
         let Some(commands) = self.by_tool.remove(&tool) else { return 0 };
         let count = commands.len();
@@ -79,39 +79,40 @@ impl Queue {
         count
     }
 
-    /// Discards everything; tells how many commands that were.
+    /// Discards everything, to be freed later. Returns the number of commands.
     pub(super) fn discard_all(&mut self) -> usize {
         let tools: Vec<u32> = self.by_tool.keys().copied().collect();
         self.endings.clear();
         tools.into_iter().map(|tool| self.discard(tool)).sum()
     }
 
-    /// Frees the memory of one tool's discarded commands; a tool has at most `limits.queued_commands_per_tool`.
+    /// Frees the memory of one tool's discarded commands, of which there are at most
+    /// `limits.queued_commands_per_tool`.
     pub(super) fn free_some(&mut self) {
         if let Some(commands) = self.discarded.pop() {
             self.left_over -= commands.len();
         }
     }
 
-    /// All discarded commands, to be freed elsewhere.
+    /// Returns all discarded commands, to be freed elsewhere.
     pub(super) fn take_left_over(&mut self) -> Discarded {
         self.left_over = 0;
         Discarded(std::mem::take(&mut self.discarded))
     }
 
-    /// Whether there are discarded commands.
+    /// Returns whether there are discarded commands.
     pub(super) fn has_left_over(&self) -> bool {
         !self.discarded.is_empty()
     }
 
-    /// The first step for which something waits.
+    /// Returns the first step for which something waits.
     pub(super) fn first_step(&self) -> Option<u64> {
         let all = self.by_tool.values().chain([&self.endings]);
         all.filter_map(|commands| commands.first_key_value()).map(|(key, _)| key.0).min()
     }
 
-    /// Moves what is due at the beginning of step `step` into `due`, in order of effect, but for what is held back. Tells how
-    /// many commands that were.
+    /// Appends everything that is due at the beginning of step `step` to `due`, in order of effect, except entries
+    /// for which `is_held_back` holds. Returns the number of commands.
     pub(super) fn take_due(
         &mut self,
         step: u64,
@@ -136,7 +137,7 @@ impl Queue {
         count
     }
 
-    /// Everything that waits, in order.
+    /// Returns everything that waits, in order of effect.
     pub(super) fn in_order(&self) -> Vec<(QueueKey, &Due)> {
         let all = self.by_tool.values().chain([&self.endings]);
         let mut all: Vec<_> = all.flatten().map(|(key, due)| (*key, due)).collect();

@@ -1,17 +1,17 @@
-//! Recovery: a session goes on after a blow-up that the guard could not repair.
+//! Recovery: a session continues after a blow-up that the guard could not repair.
 //!
-//! The tissue goes back to the last state that passed the guard's checks, and all tools are released. Time does not go back.
-//! The commands that took effect since that state are lost; they are counted, and whoever holds a tool is told. A
-//! recovery depends on steps and commands alone, so the same commands give the same bits.
+//! The tissue goes back to the last state that passed the guard's checks, and all tools are released. Time does not
+//! go back. The commands that took effect since that state are lost; they are counted, and reported to the holders
+//! of tools. A recovery depends on steps and commands alone, so equal commands give equal bits.
 //!
-//! A recovery is expensive: the guard has repeated up to [`INTERVAL_SUBSTEPS`] substeps with shorter and shorter ones.
-//! So at the [`MAX_RECOVERIES`]th recovery within [`WINDOW_STEPS`] steps the tissue is brought to rest, and the tools that acted are
-//! paused: until the window is over their commands have no effect, except releases. Other tools can still cause a
-//! recovery, which pauses them as well.
+//! A recovery is expensive: the guard has repeated up to [`INTERVAL_SUBSTEPS`] substeps with shorter and shorter
+//! ones. So at the [`MAX_RECOVERIES`]th recovery within [`WINDOW_STEPS`] steps the tissue is brought to rest, and
+//! the tools that acted are paused: until the window is over their commands have no effect, except releases. Other
+//! tools can still cause a recovery, which pauses them as well.
 //!
-//! After a blow-up, the session is held only if nothing has acted on the tissue since it was at rest. Then no command has
-//! caused the fault, and another recovery would not help. (A fault of the program, or memory that the system refuses,
-//! holds a session too: `realtime::running`.)
+//! After a blow-up, the session is held only if nothing has acted on the tissue since it was at rest. Then no
+//! command has caused the fault, and another recovery would not help. (A fault of the program, or memory that the
+//! system refuses, also holds a session: `palpate_realtime`, `session_task.rs`.)
 //!
 //! [`INTERVAL_SUBSTEPS`]: palpate_tissue::guard::INTERVAL_SUBSTEPS
 
@@ -20,33 +20,33 @@ use std::sync::Arc;
 
 use palpate_tissue::scene::record::Recovery;
 
-/// As many recoveries within [`WINDOW_STEPS`] pause the tools that acted.
+/// Number of recoveries within [`WINDOW_STEPS`] that pauses the tools that acted.
 pub const MAX_RECOVERIES: usize = 4;
 
-/// Length of the window, steps.
+/// Length of the window in which recoveries are counted, steps.
 pub const WINDOW_STEPS: u64 = 10_000;
 
-/// What a recovery did to a tool.
+/// Effect of a recovery on one tool.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Ended {
     /// The tool's number.
     pub tool: u32,
-    /// Sequence of the newest command of the tool that had taken effect; 0 if there was none.
+    /// Sequence number of the newest command of the tool that had taken effect; 0 if there was none.
     pub sequence: u64,
-    /// Commands of the tool whose effect was lost.
+    /// Number of commands of the tool whose effect was lost.
     pub undone_commands: u64,
 }
 
-/// A recovery, and the tools that it released.
+/// A recovery, with the tools that it released.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recovered {
     /// The recovery.
     pub recovery: Recovery,
-    /// The tools, ascending.
+    /// The tools, by ascending number.
     pub tools: Vec<Ended>,
 }
 
-/// Commands of one tool that took effect at one step.
+/// Number of commands of one tool that took effect at one step.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Acts {
     pub(super) step: u64,
@@ -60,29 +60,29 @@ pub struct Recoveries {
     pub(super) count: u64,
     /// The newest, at most [`MAX_RECOVERIES`], by ascending step.
     pub(super) newest: VecDeque<Arc<Recovered>>,
-    /// The commands since the guard's checkpoint, by step. The guard brings the checkpoint forward when there are many.
+    /// The commands since the guard's checkpoint, by step. If there are many, the guard makes a new checkpoint.
     pub(super) acts: VecDeque<Acts>,
     /// Whether anything has acted on the tissue since it was at rest. A session begins at rest.
     pub(super) disturbed: bool,
 }
 
 impl Recoveries {
-    /// Returns how many there were.
+    /// Returns the number of recoveries so far.
     pub fn count(&self) -> u64 {
         self.count
     }
 
-    /// Returns the newest.
+    /// Returns the newest recovery; `None` before the first.
     pub fn newest(&self) -> Option<Arc<Recovered>> {
         self.newest.back().cloned()
     }
 
-    /// Returns the newest, at most [`MAX_RECOVERIES`], by ascending step.
+    /// Returns the newest recoveries, at most [`MAX_RECOVERIES`], by ascending step.
     pub fn list(&self) -> Vec<Recovery> {
         self.newest.iter().map(|recovered| recovered.recovery.clone()).collect()
     }
 
-    /// Notes that a command takes effect at `step`.
+    /// Counts a command that takes effect at `step`.
     pub(super) fn note(&mut self, step: u64, tool: u32) {
         match self.acts.back_mut().filter(|acts| (acts.step, acts.tool) == (step, tool)) {
             Some(acts) => acts.count += 1,
@@ -95,25 +95,25 @@ impl Recoveries {
         self.disturbed = true;
     }
 
-    /// Whether anything has acted on the tissue since it was at rest.
+    /// Returns whether anything has acted on the tissue since it was at rest.
     pub(super) fn is_disturbed(&self) -> bool {
         self.disturbed
     }
 
-    /// Forgets the commands before `step`: the state after them has passed the guard's checks.
+    /// Removes the commands before `step`, because the state after them has passed the guard's checks.
     pub(super) fn accept_until(&mut self, step: u64) {
         while self.acts.front().is_some_and(|acts| acts.step < step) {
             self.acts.pop_front();
         }
     }
 
-    /// Commands of a tool since the guard's checkpoint.
+    /// Returns the number of commands of a tool since the guard's checkpoint.
     pub(super) fn acts_of(&self, tool: usize) -> u64 {
         self.acts.iter().filter(|acts| acts.tool as usize == tool).map(|acts| acts.count).sum()
     }
 
-    /// The step until which a recovery at `step` pauses the tools that acted: the end of the window, if there are too
-    /// many in it.
+    /// Returns the step until which a recovery at `step` pauses the tools that acted: the end of the window, if
+    /// there are too many recoveries in it.
     pub(super) fn pause_end(&self, step: u64) -> Option<u64> {
         // The first of the newest [`MAX_RECOVERIES`], of which the one at `step` is the last.
         let first = self.newest.iter().rev().nth(MAX_RECOVERIES - 2)?;
@@ -121,7 +121,7 @@ impl Recoveries {
         (end > step).then_some(end)
     }
 
-    /// Counts a recovery, and forgets the commands that it has undone.
+    /// Adds a recovery, and removes the commands that it has undone.
     pub(super) fn add(&mut self, recovered: Recovered) {
         self.count += 1;
         self.disturbed = !recovered.recovery.at_rest;
@@ -133,7 +133,7 @@ impl Recoveries {
     }
 }
 
-/// Returns a description for people.
+/// Returns a description of a recovery for people.
 pub fn describe(recovery: &Recovery) -> String {
     let Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason } = recovery;
     let rest = if *at_rest { ", brought to rest" } else { "" };
@@ -173,7 +173,7 @@ mod tests {
         let mut session =
             Session::new(&Model::parse("paper", palpate_tissue::scene::PAPER, &["sheet.points=[5, 5]"]).unwrap());
         session.advance(&mut vec![grasp(0, 1)], |_| {});
-        // The first goes back to a state that is not at rest. Nothing acts after it.
+        // The first one goes back to a state that is not at rest. Nothing acts after it.
         for at_rest in [false, true] {
             assert!(session.recover(blow_up(session.step_count())));
             assert_eq!(session.recoveries().newest().unwrap().recovery.at_rest, at_rest);

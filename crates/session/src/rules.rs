@@ -1,4 +1,4 @@
-//! The rules that a command has to keep to, whenever it comes. So it is checked before its turn at the intake.
+//! The rules for a command that do not depend on when it comes, so it can be checked without locking the intake.
 
 use palpate_geometry::surface::SurfaceDisc;
 
@@ -10,14 +10,14 @@ use palpate_tissue::scene::action_check::{self, check_free, check_poke, check_re
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::shape::RestShape;
 
-/// The rules of a session.
+/// Rules for the commands of one session: its scene and its limits.
 #[derive(Debug)]
 pub struct Rules {
     pub(super) scene: Scene,
     pub(super) limits: Limits,
 }
 
-/// Commands that keep to the rules of a session.
+/// Commands that [`Rules::check`] has accepted.
 #[derive(Debug)]
 pub struct CheckedCommands(pub(super) Vec<Command>);
 
@@ -27,15 +27,15 @@ impl Rules {
         Rules { scene: scene.clone(), limits: limits.clone() }
     }
 
-    /// Tools are numbered below this.
+    /// Returns the number of tools: each tool has a number below it.
     pub fn most_tools(&self) -> u32 {
         self.limits.tools
     }
 
-    /// Returns all of `commands`, if each keeps to the rules.
+    /// Checks all of `commands`, and returns them if each keeps to the rules.
     ///
     /// # Errors
-    /// Refuses too many commands, and the first command that does not keep to the rules.
+    /// Refuses more commands than one tool may have waiting, and the first command that breaks a rule.
     pub fn check(&self, commands: Vec<Command>) -> Result<CheckedCommands> {
         if commands.len() > self.limits.queued_commands_per_tool {
             let message = format!("{} commands are more than a tool may have waiting", commands.len());
@@ -45,10 +45,10 @@ impl Rules {
         Ok(CheckedCommands(commands))
     }
 
-    /// Returns whether a command keeps to the rules.
+    /// Checks one command: its time to live, its place on the tissue, its force or reach, and its tip.
     ///
     /// # Errors
-    /// Refuses a command that does not.
+    /// Refuses a command that breaks a rule.
     pub fn check_one(&self, command: &Command) -> Result<()> {
         if let Some(seconds) = command.time_to_live_s {
             positive("time_to_live_s", seconds)?;
@@ -77,15 +77,16 @@ impl Rules {
     }
 }
 
-/// A velocity is for poses that are played by the client's time.
+/// Refuses a velocity with a pose that is not played by client time.
 fn check_played_by_time(command: &Command) -> Result<()> {
     let message = "goes with a pose that is played by the client's time: give client_time_ns, and no at_step";
     let is_played = command.client_time_ns != 0 && command.at_step.is_none();
     if is_played { Ok(()) } else { Err(Refusal::new(Reason::Missing, "pose.velocity_m_per_s", message)) }
 }
 
-/// How many triangles a tip makes a session look up in a step of so many substeps: its disc is laid twice in each. A disc on a
-/// sheet is bounded however large it is (`tissue::footprint`), and counts nothing.
+/// Returns how many triangles a tip makes a session look up in a step of `substeps` substeps: its disc is laid out
+/// twice in each. A disc on a sheet has bounded cost however large it is (`palpate_tissue::footprint`), and counts
+/// as 0.
 fn contact_work(shape: &dyn RestShape, radius_m: f64, substeps: u32) -> u64 {
     if shape.dimensions() < 3 {
         return 0;
@@ -93,7 +94,8 @@ fn contact_work(shape: &dyn RestShape, radius_m: f64, substeps: u32) -> u64 {
     SurfaceDisc::crossings(radius_m, shape.edge_m()).saturating_mul(2 * u64::from(substeps))
 }
 
-/// Refuses tips that make a step longer than others of its thread can wait. `tips_m` are the radii of all tips of a session.
+/// Refuses a tip of radius `now_m` that would make a step too long for the other sessions of its thread. `tips_m`
+/// are the radii of the session's other tips, m.
 pub(super) fn check_contact_work(
     rules: &Rules,
     substeps: u32,
@@ -121,13 +123,13 @@ pub(super) fn check_contact_work(
     Err(Refusal::new(Reason::TooLarge, "pose.tip.radius_m", message))
 }
 
-/// Radius of the tip that a command gives its tool, m.
+/// Returns the radius of the tip that a command gives its tool, m; `None` if it gives none.
 pub(super) fn tip_radius_m(command: &Command) -> Option<f64> {
     if let Action::Pose { tip, .. } = &command.action { Some(tip.radius_m) } else { None }
 }
 
-/// Refuses another tip in the tissue: the surface under a larger one lies elsewhere, and to meet it at once is a blow that no
-/// instrument gives.
+/// Refuses a change of the tip while it is in the tissue: the surface under a larger tip lies elsewhere, and
+/// meeting it at once would be a blow that no instrument gives.
 pub(super) fn check_tip(before_m: Option<f64>, now_m: Option<f64>) -> Result<()> {
     match (before_m, now_m) {
         (Some(before_m), Some(now_m)) if before_m.to_bits() != now_m.to_bits() => {

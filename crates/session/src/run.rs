@@ -17,13 +17,13 @@ use palpate_tissue::scene::script::{Action, Script};
 use palpate_tissue::select::audit::AuditFinding;
 use palpate_tissue::{Model, Tissue};
 
-/// The reason why a run ends early.
+/// Why a run ends early.
 #[derive(Debug, thiserror::Error)]
 pub enum RunFailure {
-    /// The guard has ended the session.
+    /// The session is held, or the audit's twin has failed.
     #[error("the run was stopped: {0}")]
     Held(String),
-    /// The input is refused, for the same reasons as a command.
+    /// An input is refused, for the reasons for which a server would refuse it.
     #[error("{0}")]
     Refused(#[from] Refusal),
     /// The output can't be written.
@@ -31,7 +31,7 @@ pub enum RunFailure {
     Output(#[from] std::io::Error),
 }
 
-/// Returns the first line of a run.
+/// Returns the first line of a run: the scene, the script and how the scene is stepped.
 pub fn header(model: &Model, script: &str) -> Run {
     Run {
         scene: model.scene.name.clone(),
@@ -44,15 +44,15 @@ pub fn header(model: &Model, script: &str) -> Run {
     }
 }
 
-/// Returns the command of a script's action, as a client streams it.
+/// Returns the command for a script's action at `step`, as a client streams it. Its sequence number is `step` + 1.
 pub fn command(tool: usize, step: u64, action: Action) -> Command {
     #[allow(clippy::cast_possible_truncation)]
     let tool = tool as u32;
-    // At most one command per step, so steps serve as sequence numbers.
+    // A tool has at most one command per step, so steps serve as sequence numbers.
     Command { at_step: Some(step), ..Command::new(tool, Some(step + 1), action) }
 }
 
-/// Sets the forces and moves of a script in a session that has not begun, as continuous profiles.
+/// Sets the forces and moves of a script, as continuous profiles, in a session that has not begun.
 pub fn play(session: &mut Session, script: &Script) {
     for (tool, profile) in script.forces.iter().enumerate() {
         session.play_force(tool, profile.clone());
@@ -62,37 +62,37 @@ pub fn play(session: &mut Session, script: &Script) {
     }
 }
 
-/// Plays a script into sessions: forces and moves as continuous profiles, set once, or everything as the commands that a
-/// client streams (`held`). Poses are commands in both cases.
+/// Player of a script into sessions. Forces and moves are continuous profiles that are set once or, if `held`,
+/// commands as a client streams them. Poses are commands in both cases.
 pub struct Player<'s> {
     script: &'s Script,
-    /// For commands: the same intake as in a server.
+    /// The intake for commands, as a server has one.
     intake: Option<Intake>,
     held: bool,
 }
 
 impl<'s> Player<'s> {
-    /// Creates a player of `script` that has not begun.
+    /// Creates a player that begins `script`.
     ///
     /// # Errors
-    /// Refuses a script with more tools than there may be.
+    /// Refuses a script with more tools than `limits` allow.
     pub fn new(model: &Model, script: &'s Script, held: bool, limits: &Limits) -> Result<Self> {
         let commands = held || !script.poses.is_empty();
         let intake = commands.then(|| intake(model, script, limits)).transpose()?;
         Ok(Player { script, intake, held })
     }
 
-    /// Sets the profiles in a session that has not begun.
+    /// Sets the profiles in a session that has not begun; does nothing if `held`.
     pub fn begin(&self, session: &mut Session) {
         if !self.held {
             play(session, self.script);
         }
     }
 
-    /// Adds the commands that act at `step`.
+    /// Appends the commands that act at `step` to `due`.
     ///
     /// # Errors
-    /// Refuses what a server would.
+    /// Refuses commands that a server would refuse.
     pub fn commands(&mut self, step: u64, due: &mut Vec<Due>) -> Result<()> {
         let Some(intake) = &mut self.intake else { return Ok(()) };
         let actions: Vec<_> =
@@ -105,7 +105,8 @@ impl<'s> Player<'s> {
     }
 }
 
-/// Changes the tissue to the one due at the coming step.
+/// Changes the tissue of `session` to the newest one that is due at the coming step, and removes the due changes
+/// from `changes`.
 pub fn change(session: &mut Session, changes: &mut VecDeque<(u64, Arc<Model>)>) {
     while changes.front().is_some_and(|change| change.0 <= session.step_count()) {
         if let Some((_, model)) = changes.pop_front() {
@@ -114,23 +115,24 @@ pub fn change(session: &mut Session, changes: &mut VecDeque<(u64, Arc<Model>)>) 
     }
 }
 
-/// What a run tells on its way.
+/// An event of a run, in the order of the output.
 pub enum RunEvent<'t> {
-    /// It begins.
+    /// The run begins.
     Run(&'t Run),
-    /// A record.
+    /// A record is due.
     Record(Record),
-    /// So many steps are done: told after each.
+    /// The number of steps done, after each step.
     Steps(u64),
-    /// It is over.
+    /// The run is over.
     Summary(&'t Summary),
 }
 
-/// Plays `script` and writes its records, as JSON Lines, to `output`. `clock_s` returns the time, for the summary;
-/// `progress` gets the number of steps done from time to time.
+/// Plays `script` and writes its records, as JSON Lines, to `output`. `held` plays forces and moves as commands
+/// that keep them constant over each step. `clock_s` returns the time, s, for the summary; `progress` gets the
+/// number of steps done every 1024 steps. Returns the summary, which is also the last line.
 ///
 /// # Errors
-/// Returns an error if the guard stops the run, a command or change is refused, or the output can't be written.
+/// Returns an error if the session is held, a command or change is refused, or the output can't be written.
 pub fn run(
     model: &Arc<Model>,
     script: &Script,
@@ -143,11 +145,11 @@ pub fn run(
     self::told(model, script, [held, false], limits, clock_s, &mut |told| write(output, progress, told))
 }
 
-/// Does the same, with a twin in f64 with a quarter of the substep beside it: the summary has the differences. With
-/// `[stepping] correct`, the run corrects errors above the tolerance as it goes.
+/// Plays `script` as [`run`] does, beside a twin in f64 with a quarter of the substep: the summary has the
+/// differences between the two. With `[stepping] correct`, the run corrects errors above the tolerance on its way.
 ///
 /// # Errors
-/// As for [`run`].
+/// Returns an error for the reasons of [`run`], and if a recovery makes the comparison with the twin impossible.
 pub fn audited(
     model: &Arc<Model>,
     script: &Script,
@@ -160,10 +162,12 @@ pub fn audited(
     self::told(model, script, [held, true], limits, clock_s, &mut |told| write(output, progress, told))
 }
 
-/// Does the same for a program that takes the records as they are. `tell` ends the run by an error.
+/// Plays `script` for a program that takes the records as values: `tell` gets each event and may end the run with
+/// an error. The pair is whether forces and moves are commands ([`run`]), and whether a twin audits the run
+/// ([`audited`]).
 ///
 /// # Errors
-/// As for [`run`]; an error of `tell` is one of the output.
+/// Returns an error for the reasons of [`run`] and [`audited`]; an error of `tell` is [`RunFailure::Output`].
 pub fn told(
     model: &Arc<Model>,
     script: &Script,
@@ -176,14 +180,14 @@ pub fn told(
     Playing { model, script, held, limits, twin, corrections: Vec::new() }.play(clock_s, tell)
 }
 
-/// Writes what a run tells, as JSON Lines.
+/// Writes an event of a run as a JSON line, or reports progress.
 fn write(output: &mut dyn Write, progress: &mut dyn FnMut(u64), told: RunEvent<'_>) -> std::io::Result<()> {
     match told {
         RunEvent::Run(run) => write_line(output, &Line::Run(run)),
         RunEvent::Record(record) => write_line(output, &record),
         RunEvent::Summary(summary) => write_line(output, &Line::Summary(summary)),
         RunEvent::Steps(steps) => {
-            // The first of so many.
+            // Every 1024 steps, beginning with the first.
             if steps % 1024 == 1 {
                 progress(steps - 1);
             }
@@ -192,7 +196,7 @@ fn write(output: &mut dyn Write, progress: &mut dyn FnMut(u64), told: RunEvent<'
     }
 }
 
-/// A script being played.
+/// A script that is being played.
 struct Playing<'p> {
     model: &'p Arc<Model>,
     script: &'p Script,
@@ -264,7 +268,7 @@ impl Playing<'_> {
                 }
             });
             std::mem::replace(&mut written, Ok(()))?;
-            // A tissue that went back can't be compared with a twin that did not.
+            // A tissue that has recovered can't be compared with a twin that has not.
             let ended = if self.twin.is_some() { session.fault() } else { session.hold_reason().map(str::to_owned) };
             if let Some(reason) = ended {
                 return Err(RunFailure::Held(reason));
@@ -295,7 +299,7 @@ impl Playing<'_> {
         Ok(summary)
     }
 
-    /// Applies the finding's correction, if it needs one, from now on, and to the script's later changes.
+    /// Applies the finding's correction from now on, if it needs one, and also to the script's later changes.
     fn correct(
         &mut self,
         session: &mut Session,
@@ -314,7 +318,7 @@ impl Playing<'_> {
     }
 }
 
-/// Any number will do: there is no other client in the process.
+/// Any number serves: no other client uses this intake.
 const LEASE: u128 = 1;
 
 fn intake(model: &Model, script: &Script, limits: &Limits) -> Result<Intake> {
@@ -327,7 +331,8 @@ fn intake(model: &Model, script: &Script, limits: &Limits) -> Result<Intake> {
     Ok(intake)
 }
 
-/// Returns the last line of a run that ends here.
+/// Returns the last line of a run with this tissue at its end, without what only the run itself knows. `wall_s` is
+/// the time of stepping, s.
 #[allow(clippy::cast_precision_loss)]
 pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
     let (model, steps) = (tissue.model(), tissue.step_count());
@@ -416,11 +421,11 @@ mod tests {
         let changed = run_with("[[tissue]]\nat_s = 0.01\nanchor_stiffness_n_per_m = 50.0\n");
         assert_eq!((plain.steps, changed.steps), (20, 20));
         assert_ne!(plain.final_hash, changed.final_hash);
-        // While a clock stands still, nothing takes time.
+        // While a clock stands still, no time is counted.
         let script = script(&model, "");
         let summary = run(&model, &script, false, &Limits::default(), &mut Vec::new(), &|| 1e6, &mut |_| {}).unwrap();
         assert_eq!(summary.wall_s, 0.0);
-        // At the very end it changes nothing any more.
+        // At the very end it changes nothing.
         let late = run_with("[[tissue]]\nat_s = 0.02\nanchor_stiffness_n_per_m = 50.0\n");
         assert_eq!(plain.final_hash, late.final_hash);
     }

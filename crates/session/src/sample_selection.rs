@@ -1,8 +1,10 @@
-//! Selects the samples of a stream: every Nth, changes beyond a deadband, and heartbeats while nothing changes.
+//! Selection of a stream's samples: every Nth step, changes beyond a deadband, and heartbeats while nothing
+//! changes.
 //!
-//! One rule for all streams: of the steps that are multiples of N, those whose sample differs from the stream's last one, beyond
-//! the deadband if there is one, and those at which a heartbeat is due. Without a deadband every change counts. The stepping
-//! thread asks the same rule for the next step that would be due if nothing changed: so a session at rest skips to it.
+//! One rule holds for all streams. Of the steps that are multiples of N, a stream gets those whose sample differs
+//! from its last one, beyond the deadband if there is one, and those at which a heartbeat is due. Without a
+//! deadband every change counts. The stepping thread asks the same rule for the next step that is due if nothing
+//! changes, so a session at rest can skip to it.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -16,38 +18,39 @@ use super::local_model::{Modeller, StiffnessJob};
 use super::{Sample, Session, ToolSample};
 use palpate_refusal::{Reason, Refusal, Result, number};
 
-/// A sample, and how the session keeps time.
+/// A sample, with the timing of the session.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PacedSample {
-    /// What the tools felt.
+    /// State of the tools.
     pub sample: Sample,
-    /// When its step was due, by the server's clock.
+    /// Time at which the sample's step was due, ns of the server's clock.
     pub due_ns: u64,
-    /// Steps dropped so far.
+    /// Number of steps dropped so far.
     pub overrun_count: u64,
-    /// Of the last second or so.
+    /// Simulated over real time, measured over about the last second.
     pub time_dilation: f64,
-    /// What happened before this step is on disk; `None` if no journal is kept.
+    /// Everything before this step is on disk; `None` if no journal is kept, or before anything is.
     pub durable_step: Option<u64>,
-    /// The revision at which this server became the session's owner; 0 without a fleet.
+    /// Revision at which this server became the session's owner; 0 without a fleet.
     pub ownership_revision: u64,
-    /// Steps were dropped since the stream's last sample.
+    /// Whether steps were dropped since the stream's last sample.
     pub overrun: bool,
 }
 
 /// Default interval between samples while nothing changes, s: 20 a second, so that a client can tell stillness from
-/// silence within the 50 ms after which it should no longer trust its model.
+/// a lost connection within the 50 ms after which it should no longer trust its model.
 pub const HEARTBEAT_S: f64 = 0.05;
 
-/// The longest heartbeat, s: clients take a longer silence for the end of the stream.
+/// Longest heartbeat, s: clients take a longer silence for the end of the stream.
 pub const MAX_HEARTBEAT_S: f64 = 10.0;
 
-/// The changes that are not worth a sample. A quantity without a bound is not compared.
+/// Bounds of changes that need no sample. A quantity without a bound is not compared.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Deadband {
     /// Change of the force on the tool, N.
     pub force_n: Option<f64>,
-    /// The same as a fraction of the force. If both are given, the larger bound applies.
+    /// Change of the force on the tool, as a fraction of the force. If `force_n` is also given, the larger bound
+    /// applies.
     pub force_fraction: Option<f64>,
     /// Change of the control point's displacement, m.
     pub displacement_m: Option<f64>,
@@ -56,7 +59,7 @@ pub struct Deadband {
 }
 
 impl Deadband {
-    /// Checks the bounds; 0 means any change.
+    /// Checks the bounds. 0 stands for any change.
     ///
     /// # Errors
     /// Refuses a deadband without a bound, and a bound out of range.
@@ -81,7 +84,7 @@ impl Deadband {
         Ok(())
     }
 
-    /// Whether samples are compared with each other, or only with the rendered force.
+    /// Returns whether samples are compared with each other, and not only with the rendered force.
     fn looks_at_samples(&self) -> bool {
         self.force_n.or(self.force_fraction).or(self.displacement_m).is_some()
     }
@@ -105,31 +108,33 @@ impl Deadband {
     }
 }
 
-/// The request of a stream.
+/// Settings of a stream of samples.
 #[derive(Debug, Clone)]
 pub struct Sampling {
-    /// Samples of steps that are multiples of this.
+    /// Only steps that are multiples of this are sampled.
     pub every: u64,
     /// The tools to sample; `None` for all in use.
     pub only: Option<Vec<u32>>,
-    /// Send only changes beyond it, and heartbeats. `None`: send each sample.
+    /// Bounds within which changes are not sent. `None`: each change is sent.
     pub deadband: Option<Deadband>,
-    /// Interval between samples while nothing changes, s.
+    /// Longest interval between samples, s: a heartbeat is sent while nothing changes.
     pub heartbeat_s: f64,
-    /// The laws for the local models of the samples. `None`: no local models.
+    /// Force laws for the local models of the samples. `None`: no local models.
     pub laws: Option<Arc<Laws>>,
-    /// Whether stiffness and damping are those of the sheet around the tool also under a touch, not only under a grasp.
+    /// Whether stiffness and damping are computed from the tissue around the tool under a touch too, not only under
+    /// a grasp.
     pub touch_stiffness: bool,
-    /// Samples come more often than by `heartbeat_s` while the reader wants them so.
+    /// Shorter heartbeat that the reader may request at any time; `None`: only `heartbeat_s` applies.
     pub wanted: Option<Arc<WantedHeartbeat>>,
 }
 
-/// The interval between samples that a reader wants at present, by what it measures of the network.
+/// Heartbeat that a reader requests at present, by its measurements of the network.
 #[derive(Debug, Default)]
 pub struct WantedHeartbeat(AtomicU64);
 
 impl WantedHeartbeat {
-    /// Sets what the reader wants from now on, s; anything not above 0: nothing of its own.
+    /// Sets the requested heartbeat, s, which is limited to at least 0.01 s. A value that is not above 0 withdraws
+    /// the request.
     pub fn set(&self, heartbeat_s: f64) {
         let bits = if heartbeat_s > 0.0 { heartbeat_s.max(FASTEST_S).to_bits() } else { 0 };
         self.0.store(bits, Ordering::Relaxed);
@@ -142,7 +147,7 @@ impl WantedHeartbeat {
 }
 
 impl Sampling {
-    /// Checks the request.
+    /// Checks the deadband and the heartbeat.
     ///
     /// # Errors
     /// Refuses a value out of range.
@@ -155,19 +160,19 @@ impl Sampling {
     }
 }
 
-/// Selects the samples of one stream.
+/// Selector of the samples of one stream, which compares each with the last one sent.
 #[derive(Debug)]
 pub struct Sampler {
     sampling: Sampling,
     rate_hz: f64,
-    /// The last sample sent, without its local models.
+    /// The last sample that was sent, without its local models.
     told: Option<Sample>,
     followed: BTreeMap<u32, FollowedTool>,
-    /// The number of the law that the last local models refer to.
+    /// Number of the law that the last local models refer to.
     law: u32,
 }
 
-/// The local models of one tool, and the deadband that follows how the client renders them.
+/// Local models of one tool, and a deadband by the force that the client renders from them.
 #[derive(Debug)]
 struct FollowedTool {
     modeller: Modeller,
@@ -187,13 +192,14 @@ impl Sampler {
         (wanted_s.map_or(asked_s, |wanted_s| wanted_s.min(asked_s)) * self.rate_hz).round().max(1.0) as u64
     }
 
-    /// Returns the sample of the last step, if the stream should get it. `last`: the stream gets it in any case,
-    /// because no other follows for now.
+    /// Returns the sample of the last step, if the stream is due one. `last`: the stream gets it in any case,
+    /// because no other follows for now. A step is returned once.
     pub fn pick(&mut self, session: &Session, last: bool) -> Option<Sample> {
         self.pick_from(session, &mut None, last)
     }
 
-    /// Does the same for one of many streams: `all` is the sample of all tools, once a stream has asked for it.
+    /// Returns the sample of the last step as [`Sampler::pick`] does, for one of many streams: `all` keeps the
+    /// sample of all tools for the others, once a stream has needed it.
     pub fn pick_from(&mut self, session: &Session, all: &mut Option<Sample>, last: bool) -> Option<Sample> {
         let (step, told) = (session.step_count(), self.told.as_ref());
         let is_told = told.is_some_and(|told| told.step == step && told.held == session.hold_reason().is_some());
@@ -219,7 +225,7 @@ impl Sampler {
             self.followed.values_mut().for_each(|followed| followed.modeller.change_law(number, law.clone()));
         }
         let (models, is_exceeded) = self.look_ahead(&sample, &law);
-        // Another law is news: the client renders by the other one until a model names it.
+        // Another law counts as a change: the client renders by the old one until a model refers to the new one.
         if !(is_due || is_exceeded || is_other && !models.is_empty()) {
             return None;
         }
@@ -233,7 +239,8 @@ impl Sampler {
         Some(sample)
     }
 
-    /// The local models of the position-controlled tools, and whether a client's force is off by too much.
+    /// Returns the local models of the tools led by poses, and whether the force that a client renders is beyond
+    /// the deadband.
     fn look_ahead(&mut self, sample: &Sample, law: &Arc<Law>) -> (Vec<(u32, LocalModel)>, bool) {
         let fraction = self.sampling.deadband.as_ref().and_then(|deadband| deadband.rendered_fraction);
         let (mut models, mut is_exceeded) = (Vec::new(), false);
@@ -243,7 +250,7 @@ impl Sampler {
                     followed.modeller.let_go();
                     followed.deadband = palpate_haptics::ForceDeadband::new(fraction.unwrap_or(0.0));
                 }
-                // A client can't predict a tool without a model.
+                // A client can't render a tool without a model.
                 is_exceeded |= fraction.is_some() && tool.contact.is_some();
                 continue;
             };
@@ -272,7 +279,7 @@ impl Sampler {
             return true;
         }
         match &self.sampling.deadband {
-            // A sleeping tissue is still, but a command may have taken effect that changes nothing else.
+            // A sleeping tissue is still, but a command without other effects may have taken effect.
             None => !asleep || told.tools != now.tools,
             Some(deadband) => {
                 let mut pairs = told.tools.iter().zip(&now.tools);
@@ -362,7 +369,7 @@ mod tests {
                 refinements.into_iter().for_each(StiffnessJob::work);
             }
             assert!(touched, "grasps {grasps}, asked {touch_stiffness}");
-            // Without it they are the law's: one stiffness along the normal, and one across.
+            // Otherwise they are the law's: one stiffness along the normal, and one across.
             let k = model.unwrap().stiffness_n_per_m;
             let by_law = (0..3).all(|c| (0..c).all(|row| k.col(c)[row].abs() < 1e-9)) && k.x_axis.x == k.y_axis.y;
             let along = law.rows.iter().map(|row| row.stiffness_n_per_m);
@@ -372,7 +379,7 @@ mod tests {
         }
     }
 
-    /// Steps at which a stream gets a sample while the session gets no command.
+    /// Returns the steps at which a stream gets a sample while the session gets no command.
     fn picked(session: &mut Session, sampler: &mut Sampler, steps: u64) -> Vec<u64> {
         let pick = |_| {
             session.advance(&mut Vec::new(), |_| {});
@@ -408,7 +415,7 @@ mod tests {
         let mut sampler = sampler(1, Some(deadband));
         let mut steps = Vec::new();
         for step in 1..=60 {
-            // A millimetre a step up to 10 mm, then held.
+            // One millimetre per step up to 10 mm, then held.
             grasp(&mut session, step, -0.001 * step.min(10) as f64);
             steps.extend(sampler.pick(&session, false).map(|sample| sample.step));
         }
@@ -442,7 +449,7 @@ mod tests {
         let mut sampler = Sampler::new(sampling, 1000.0);
         grasp(&mut session, 1, -0.01);
         assert_eq!(picked(&mut session, &mut sampler, 41), [2, 22, 42]);
-        // Not more often than a hundred times a second.
+        // At most a hundred times a second.
         wanted.set(0.005);
         assert_eq!(picked(&mut session, &mut sampler, 20), [52, 62]);
         wanted.set(0.0);

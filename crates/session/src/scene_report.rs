@@ -1,5 +1,5 @@
-//! What a user should know of a tissue before anybody touches it: its size and mass, how a fingertip meets it, when it comes
-//! to rest, and which values of a scene or a script are unlikely.
+//! Properties of a tissue that a user should know before touching it: its size and mass, the stiffness under a
+//! fingertip, the time to rest, and unlikely values of a scene or a script.
 
 use std::fmt;
 use std::sync::atomic::AtomicBool;
@@ -16,48 +16,49 @@ use palpate_tissue::scene::script::Script;
 use palpate_tissue::scheme::Oscillator;
 use palpate_tissue::shape::{Extent, RestShape};
 
-/// Bounds of what can be meant. Beyond them a unit is probably wrong.
+/// Bounds of plausible values. Beyond them a unit is probably wrong.
 const LONGEST_SIDE_M: f64 = 10.0;
 const HEAVIEST_POINT_KG: f64 = 0.1;
 const LONGEST_REST_S: f64 = 60.0;
-/// Under a fingertip, N/m: from what nobody feels to bone.
+/// Stiffness under a fingertip, N/m: from imperceptible to bone.
 const STIFFNESS_N_PER_M: [f64; 2] = [0.1, 1e5];
 
-/// Vibrations are at rest when they have decayed to this part.
+/// Fraction to which vibrations must have decayed at rest.
 const AT_REST: f64 = 0.01;
 
-/// Forces of a script that are shown, and tools with a tip.
+/// Limit of the forces that are shown, and of the tools with a tip.
 const MAX_SHOWN: usize = 8;
 
-/// What to expect of a tissue.
+/// Expected behaviour of a tissue, and of a script on it.
 #[derive(Debug)]
 pub(super) struct Prospect {
     size_m: DVec3,
     mass_kg: f64,
     radius_m: f64,
-    /// The law under a fingertip in the middle; `None` if there is none.
+    /// The law under a fingertip in the middle; `None` if it takes too much work.
     law: Option<Law>,
-    /// Why there is none.
+    /// Why there is no law.
     no_law: &'static str,
-    /// The deepest sensible press by a fingertip, m: half the shorter side, or as far as the law reaches.
+    /// Depth of the deepest sensible press by a fingertip, m: half the shorter side, or as far as the law reaches.
     deepest_m: f64,
     is_by_law: bool,
-    /// Time to rest, s, or why there is none.
+    /// Time to rest, s, or why it is unknown.
     rest_s: Result<f64, &'static str>,
     forces: Vec<Force>,
     tips: Vec<TipUse>,
-    /// Unlikely values, in words.
+    /// Descriptions of unlikely values.
     pub(super) warnings: Vec<String>,
 }
 
 /// A force of a script.
 #[derive(Debug)]
 struct Force {
-    /// At its largest, of all points together, N.
+    /// Largest force, on all points together, N.
     total_n: f64,
-    /// How deep it goes, m; on a mesh at most. `None` if the law takes too much work, or if nothing pulls back.
+    /// Depth to which it pushes, m; an upper bound on a mesh. `None` if the law takes too much work, or if nothing
+    /// pulls back.
     depth_m: Option<f64>,
-    /// What is deeper goes through, m: the longest side, or how thick a mesh is there.
+    /// Depth beyond which it goes through, m: the longest side, or the thickness of a mesh there.
     through_m: f64,
 }
 
@@ -74,17 +75,17 @@ struct TipUse {
 enum Meeting {
     /// Its first pose is later than the end of the script.
     Unused,
-    /// No part of its way is over the tissue.
+    /// No part of its path is over the tissue.
     Beside,
     /// It stays above the tissue.
     Above { gap_m: f64 },
-    /// It touches, and presses the tissue in.
+    /// It touches the tissue and presses it in.
     Pressed {
-        /// Of the deepest place, m.
+        /// Depth of the deepest place, m.
         depth_m: f64,
-        /// There, N; `None` if the law takes too much work.
+        /// Force there, N; `None` if the law takes too much work.
         force_n: Option<f64>,
-        /// A spring between tool and surface makes the depth and the force smaller.
+        /// Whether depth and force are upper bounds, because a spring between tool and surface reduces them.
         is_bound: bool,
     },
     /// It grasps the tissue, and moves it.
@@ -98,12 +99,12 @@ struct Laws<'m> {
 }
 
 impl Laws<'_> {
-    /// The first law under a disc in the middle.
+    /// Returns the law under a disc of this radius in the middle.
     fn of(&mut self, radius_m: f64) -> Option<&Law> {
         self.under(Disc::in_middle(self.model, radius_m))
     }
 
-    /// The first law under a disc, coarse where the exact one takes too much work.
+    /// Returns the law under a disc: a coarse one if the exact one takes too much work, `None` if that does too.
     fn under(&mut self, disc: Disc) -> Option<&Law> {
         let known = self.known.iter().position(|known| known.0 == disc);
         let place = known.unwrap_or_else(|| {
@@ -116,7 +117,7 @@ impl Laws<'_> {
 }
 
 impl Prospect {
-    /// Of a tissue, and of a script on it.
+    /// Computes the expected behaviour of a tissue, and of a script on it.
     pub(super) fn new(model: &Model, script: Option<&Script>) -> Self {
         let (shape, sheet) = (model.shape(), Oscillator::of(&model.scene));
         let size_m = shape.extent().size_m();
@@ -143,7 +144,7 @@ impl Prospect {
         prospect
     }
 
-    /// The stiffness that a fingertip meets where it begins to press, N/m.
+    /// Returns the stiffness that a fingertip meets where it begins to press, N/m.
     fn stiffness_n_per_m(&self) -> Option<f64> {
         self.law.as_ref().map(|law| law.at_depth(0.0).stiffness_n_per_m)
     }
@@ -217,8 +218,8 @@ impl Prospect {
     }
 }
 
-/// When the slowest vibration has decayed to [`AT_REST`], s. That is the one of all points together straight out of the sheet:
-/// springs at rest do not pull there, only anchor springs do.
+/// Returns the time at which the slowest vibration has decayed to [`AT_REST`], s. That is the vibration of all
+/// points together straight out of the sheet: springs at rest do not pull there, only anchor springs do.
 fn rest_s(sheet: &Oscillator) -> Result<f64, &'static str> {
     let Oscillator { mass_kg, damping_n_s_per_m, anchor_stiffness_n_per_m, .. } = *sheet;
     if damping_n_s_per_m <= 0.0 {
@@ -228,14 +229,15 @@ fn rest_s(sheet: &Oscillator) -> Result<f64, &'static str> {
         return Err("unknown: without anchor springs nothing but fixed points pulls the tissue back");
     }
     let (decay_per_s, square) = (0.5 * damping_n_s_per_m / mass_kg, anchor_stiffness_n_per_m / mass_kg);
-    // Beyond the critical damping the tissue creeps back.
+    // Above critical damping the tissue creeps back.
     let beyond = decay_per_s * decay_per_s - square;
     let slowest_per_s = if beyond > 0.0 { square / (decay_per_s + beyond.sqrt()) } else { decay_per_s };
     Ok(-AT_REST.ln() / slowest_per_s)
 }
 
-/// How deep each force of a script goes: as a disc that presses with all of the force, its area that of the falloff, in the
-/// middle of the sheet; beyond the law's reach straight on. On a mesh where it begins (`dent`).
+/// Returns the depth of each force of a script. On a sheet, a disc with the area of the falloff presses with the
+/// whole force in the middle; beyond the law's reach the force continues linearly. On a mesh, the force acts where
+/// it begins (`indentation.rs`).
 fn forces(model: &Model, script: &Script, laws: &mut Laws<'_>) -> Vec<Force> {
     let shape = model.shape();
     let force = |profile: &LoadProfile| {
@@ -256,7 +258,7 @@ fn forces(model: &Model, script: &Script, laws: &mut Laws<'_>) -> Vec<Force> {
     script.forces.iter().map(force).collect()
 }
 
-/// How each tool with a tip meets the tissue, as if the tissue were at rest: no other tool has moved it.
+/// Returns how each tool with a tip meets the tissue at rest, without the effects of other tools.
 #[allow(clippy::cast_precision_loss)]
 fn tips(shape: &dyn RestShape, script: &Script, laws: &mut Laws<'_>) -> Vec<TipUse> {
     let first = script.tools() - script.poses.len();
@@ -265,8 +267,8 @@ fn tips(shape: &dyn RestShape, script: &Script, laws: &mut Laws<'_>) -> Vec<TipU
     (first..).zip(&script.poses).map(of).collect()
 }
 
-/// How a tool meets the tissue at rest until `end_s`. The force is by the law under a disc of its radius: of a sheet in the middle, of a
-/// mesh where it goes deepest.
+/// Returns how a tool meets the tissue at rest until `end_s`. The force is that of the law under a disc of its
+/// radius: in the middle of a sheet, or at the deepest place on a mesh.
 fn meeting(shape: &dyn RestShape, profile: &PoseProfile, end_s: f64, laws: &mut Laws<'_>) -> Meeting {
     let end_s = end_s.min(profile.until_s);
     let endless = PoseProfile { until_s: f64::INFINITY, ..profile.clone() };
@@ -306,7 +308,7 @@ fn meeting(shape: &dyn RestShape, profile: &PoseProfile, end_s: f64, laws: &mut 
     }
 }
 
-/// The ends of the part of a straight way whose x and y are within a box; `None` if no part is.
+/// Returns the ends of the part of a straight path whose x and y are within a box; `None` if no part is.
 fn part_within(from_m: DVec3, to_m: DVec3, least_m: DVec3, most_m: DVec3) -> Option<[DVec3; 2]> {
     let (mut begin, mut end) = (0.0_f64, 1.0_f64);
     for c in 0..2 {
@@ -323,13 +325,13 @@ fn part_within(from_m: DVec3, to_m: DVec3, least_m: DVec3, most_m: DVec3) -> Opt
     (begin <= end).then(|| [from_m.lerp(to_m, begin), from_m.lerp(to_m, end)])
 }
 
-/// The largest force of a profile on all points together, N.
+/// Returns the largest force of a profile on all points together, N.
 fn total_n(shape: &dyn RestShape, profile: &LoadProfile) -> f64 {
     let weights = weights(shape, profile.centre.begins_at_m(), profile.falloff_per_m);
     largest_n(profile).length() * libm::exp(profile.falloff_offset) * weights
 }
 
-/// The largest force of a profile, N.
+/// Returns the largest force of a profile, N.
 fn largest_n(profile: &LoadProfile) -> DVec3 {
     let larger = |a: DVec3, b: DVec3| if b.length() > a.length() { b } else { a };
     match &profile.strength {
@@ -338,13 +340,13 @@ fn largest_n(profile: &LoadProfile) -> DVec3 {
     }
 }
 
-/// The shorter side, of a sheet in its plane, m.
+/// Returns the shorter side, m; of a sheet in its plane.
 fn shorter_m(size_m: DVec3) -> f64 {
     let side_m = size_m.x.min(size_m.y);
     if size_m.z > 0.0 { side_m.min(size_m.z) } else { side_m }
 }
 
-/// Three significant digits.
+/// Formats a value with three significant digits.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn rounded(value: f64) -> String {
     if value == 0.0 || !value.is_finite() {
@@ -358,7 +360,7 @@ fn rounded(value: f64) -> String {
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
 }
 
-/// In mm if it is less than 0.1 m.
+/// Formats a length, in mm if it is less than 0.1 m.
 fn length(length_m: f64) -> String {
     if length_m < 0.1 { format!("{} mm", rounded(1e3 * length_m)) } else { format!("{} m", rounded(length_m)) }
 }
@@ -454,7 +456,7 @@ mod tests {
     use palpate_tissue::limits::Limits;
     use palpate_tissue::scene::Scene;
 
-    /// A soft sheet of 20 mm × 40 mm that a fingertip fits.
+    /// A soft sheet of 20 mm × 40 mm on which a fingertip fits.
     const SOFT: [&str; 4] = [
         "sheet.points=[9, 17]",
         "sheet.spacing_m=0.0025",
@@ -474,12 +476,12 @@ mod tests {
         assert_eq!(found.warnings, [""; 0]);
         let text = found.to_string();
         assert!(text.contains("0.02 m × 0.04 m (20 mm × 40 mm), 10.1 g in all"), "{text}");
-        // 2m/C is 6.6 ms, below the critical damping; ln 100 of these.
+        // 2m/C is 6.6 ms, below the critical damping; ln 100 times that.
         assert!(text.contains("0.0304 s until the slowest vibration"), "{text}");
-        // Half of 20 mm, which the law, of 4 radii, covers.
+        // Half of 20 mm, within the law's reach of 4 radii.
         assert!(text.contains("deepest       10 mm at ") && text.contains(" N: half the shorter side"), "{text}");
         let stiffness = found.stiffness_n_per_m().unwrap();
-        // Some twelve points share a disc of 5 mm, each on a anchor spring of 5 N/m.
+        // Some twelve points share a disc of 5 mm, each on an anchor spring of 5 N/m.
         assert!((50.0..80.0).contains(&stiffness), "{stiffness} N/m");
     }
 
@@ -506,13 +508,13 @@ mod tests {
             ("anchor_springs.stiffness_n_per_m=1e5", "N/m, not from 0.1 to 100000"),
             ("damping.coefficient_n_s_per_m=1e-6", "s to come to rest, more than 60 s"),
         ] {
-            // Nobody looks for the error of these.
+            // No search for the error is needed here.
             let found = prospect(&[set, "stepping.substeps=8"], "").warnings;
             assert!(found.iter().any(|warning| warning.contains(named)), "{set}: {found:?}");
         }
     }
 
-    /// A second of tools with a tip on the soft sheet.
+    /// A script of one second with these tools on the soft sheet.
     fn tools(model: &Model, tools: &[&str]) -> Script {
         let tools: String = tools.iter().map(|tool| format!("[[tool]]\n{tool}\n")).collect();
         let text = format!("duration_s = 1.0\nsample_every_s = 0.1\n{tools}");
@@ -528,7 +530,7 @@ mod tests {
         let model = Model::parse("paper", palpate_tissue::scene::PAPER, &SOFT).unwrap();
         let spring = PRESS.to_owned() + "tip = { spring = { stiffness_n_per_m = 5.0, damping_n_s_per_m = 0.0 } }";
         let half_way = PRESS.to_owned() + "until_s = 0.25";
-        // The sheet is 20 mm wide: this one leaves it at half of its depth.
+        // The sheet is 20 mm wide: this tool leaves it at half of its depth.
         let across = "tip = { radius_m = 0.005 }\nposes = [{ at_s = 0.0, place_m = [-0.005, 0.02, 0.0] }, \
                       { at_s = 0.5, place_m = [0.055, 0.02, -0.01] }]";
         let grasp = "tip = { grasps = true }\nposes = [{ at_s = 0.0, place_m = [0.01, 0.02, 0.003] }, \
@@ -545,9 +547,9 @@ mod tests {
         let [depth_m, force_n] = pressed(&press);
         assert!((depth_m - 0.004).abs() < 1e-12 && (0.2..0.5).contains(&force_n), "{press:?}");
         assert!(press.meeting.to_string().starts_with("presses the tissue in by 4 mm, with about 0."), "{press:?}");
-        // A soft spring bears at most 5 N/m of 4 mm.
+        // A soft spring bears at most 5 N/m times 4 mm.
         assert_eq!(spring.meeting.to_string(), "presses the tissue in by at most 4 mm, with at most 0.02 N");
-        // It is taken away in the middle of its way.
+        // It is removed in the middle of its path.
         assert!((pressed(&half_way)[0] - 0.001).abs() < 1e-12, "{half_way:?}");
         assert!((pressed(&across)[0] - 0.005).abs() < 1e-12, "{across:?}");
         // A grasp takes hold wherever it is over the tissue.
@@ -588,11 +590,11 @@ mod tests {
         assert!(gentle.to_string().contains("force[0]"), "{gentle}");
         let [warning] = rough.warnings.as_slice() else { panic!("{:?}", rough.warnings) };
         assert!(warning.starts_with("force[0]: ") && warning.ends_with("it goes through"), "{warning}");
-        // The linear model of the same: depth and force have the stiffness of the disc between them.
+        // A linear model of that press: depth and force have the stiffness of the disc between them.
         let Force { total_n, depth_m, .. } = gentle.forces[0];
         let stiffness = total_n / depth_m.unwrap();
         assert!((30.0..120.0).contains(&stiffness), "{stiffness} N/m");
-        // Of a mesh it is a bound; of a sheet it is an estimate.
+        // On a mesh the depth is a bound; on a sheet it is an estimate.
         let told = format!("depth: about {}", length(depth_m.unwrap()));
         assert!(gentle.to_string().contains(&told), "{told}: {gentle}");
     }

@@ -1,10 +1,11 @@
-//! Snapshots: a session at one moment, as bytes, from which it goes on with the same bits as if it had never stopped.
+//! Snapshots: a session at one moment, as bytes, from which it continues with the bits that it would have had
+//! without a stop.
 //!
-//! **What it has**: the state of the tissue ([`tissue::saved`]), of each tool (with its path), what recoveries depend on, and
-//! counts. It has no command that waits in an intake, no lease, no audit that is under way, and not the scene.
+//! **Content**: the state of the tissue ([`tissue::saved`]), the state of each tool with its path, what recoveries
+//! depend on, and counts. A snapshot has no waiting commands, no leases, no unfinished audit and no scene.
 //!
-//! **What a caller keeps beside it**: the scene that the session began with, no more. Changes of the tissue and corrections
-//! are in the snapshot as what they came to ([`Saved::tissue`]). So:
+//! **What a caller keeps beside it**: only the scene with which the session began. The snapshot has the result of
+//! all changes and corrections of the tissue ([`Saved::tissue`]). So:
 //!
 //! ```text
 //! let saved = Saved::from_bytes(&bytes, &limits)?;
@@ -12,13 +13,14 @@
 //! let session = Session::restore(&model, &saved)?;
 //! ```
 //!
-//! Later changes are made with that scene as well ([`Model::changed`] has it as `first`). Who records inputs records of a
-//! change the [`TissueState`] that it led to, not the change: nothing is then chosen again, under limits that may be others.
+//! Later changes also need that scene ([`Model::changed`] takes it as `first`). For each change, a recorder of
+//! inputs must record the resulting [`TissueState`] and not the change: so nothing is chosen again, under limits
+//! that may differ.
 //!
-//! **Bytes**: [`MAGIC`], the version of the format, the length of the parts, XXH3-128 of all else (16 bytes), the parts by
-//! `postcard`, and the values at the points. All numbers are little-endian. They are the same on every machine and at every
-//! width of vectors. The checksum finds damage; it does not keep out who computes it again. So nothing is believed that was
-//! not checked, when it is read or restored.
+//! **Bytes**: [`MAGIC`], the version of the format, the length of the parts, XXH3-128 of everything else (16
+//! bytes), the parts as `postcard` encodes them, and the values at the points. All numbers are little-endian. The
+//! bytes are equal on every machine and at every width of vectors. The checksum detects damage, but an attacker can
+//! compute it again. So every value is checked when a snapshot is read or restored.
 
 use std::sync::Arc;
 
@@ -40,45 +42,46 @@ use palpate_tissue::{self as tissue, Model, Tissue};
 /// The first bytes of a snapshot.
 pub const MAGIC: [u8; 8] = *b"PALPSNAP";
 
-/// The version of the format, of the arithmetic too: what reads another would go on with other bits.
+/// Version of the format and of the arithmetic. A program that reads another version would continue with other
+/// bits, so it is refused.
 pub const VERSION: u32 = 2;
 
-/// Memory of the parts for each of their bytes: the least that an entry of a list has there is three bytes, which take 24 in a
-/// vector that may have room for twice as many.
+/// Memory for the parts per byte: the smallest entry of a list is three bytes, which take 24 in a vector that may
+/// have room for twice as many.
 const PARTS_MULTIPLE: u64 = 32;
 
-/// What a reader of lists reserves for those that it has begun, bytes.
+/// Memory that a reader reserves for lists that it has begun, bytes.
 const ROOM: u64 = 4 << 20;
 
-/// Returns the memory that a snapshot takes at most when it is read, bytes, by what its header says.
+/// Returns a bound of the memory for reading a snapshot, bytes, from the lengths in its header.
 pub fn memory_of(bytes: &[u8]) -> u64 {
     let parts = bytes.get(12..20).map_or(0, |length| u64::from_le_bytes(array(length))).min(bytes.len() as u64);
     bytes.len() as u64 + parts.saturating_mul(PARTS_MULTIPLE) + ROOM.min(parts << 10)
 }
 
-/// The bytes before the parts: magic, version, length, checksum.
+/// Length of the bytes before the parts: magic, version, length, checksum.
 const HEADER: usize = 8 + 4 + 8 + 16;
 
-/// Where the checksum is.
+/// Position of the checksum.
 const CHECKSUM: std::ops::Range<usize> = 20..36;
 
-/// A session at one moment.
+/// A snapshot: a session at one moment, in memory or as it was read from bytes.
 #[derive(Debug, Clone)]
 pub struct Saved {
     content: Content,
-    /// By which it is restored.
+    /// Limits by which it is restored.
     limits: Limits,
 }
 
 #[derive(Debug, Clone)]
 enum Content {
-    /// Of a session of this process.
+    /// A copy of a session of this process.
     Taken { own: Arc<SessionParts>, tissue: SavedTissue, state: TissueState, step: u64 },
-    /// Of bytes.
+    /// Content that was read from bytes.
     Read { parts: Arc<Parts>, values: Arc<Vec<u8>> },
 }
 
-/// All of a snapshot but the values at the points.
+/// Everything in a snapshot but the values at the points.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct Parts {
     session: SessionParts,
@@ -119,7 +122,7 @@ struct SavedPosed {
 
 type SavedVector = [f64; 3];
 
-/// [`PathState`].
+/// Serialized form of [`PathState`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 struct SavedPath {
     at_once: bool,
@@ -151,13 +154,13 @@ struct SavedRecovery {
     undone_commands: u64,
     paused_until_step: Option<u64>,
     reason: String,
-    /// Tool, sequence and undone commands.
+    /// Tool, sequence number and undone commands.
     tools: Vec<(u32, u64, u64)>,
 }
 
 impl Session {
-    /// Returns a copy of all that the next steps depend on. It copies memory, as a copy for readers does, and encodes
-    /// nothing: that does [`Saved::to_bytes`], in any thread.
+    /// Returns a copy of everything that the next steps depend on. It only copies memory; [`Saved::to_bytes`]
+    /// encodes it later, in any thread.
     pub fn save(&self) -> Saved {
         let own = SessionParts {
             tools: self.tools.iter().map(SavedTool::of).collect(),
@@ -168,16 +171,16 @@ impl Session {
             hold_reason: self.hold_reason.clone(),
         };
         let (tissue, state, step) = (self.tissue.save(), self.model().tissue_state(), self.step_count());
-        // What this process has taken in is within its limits, whatever they are.
+        // The values come from this process, which has checked them against its own limits.
         let limits = Limits { tools: u32::MAX, point_force_n: f64::INFINITY, ..Limits::default() };
         Saved { content: Content::Taken { own: Arc::new(own), tissue, state, step }, limits }
     }
 
-    /// Creates a session that goes on from a snapshot. `model` is that of the session when it was saved
-    /// ([`Model::resumed`]); the width of its vectors may be another.
+    /// Creates a session that continues from a snapshot. `model` is that of the session when it was saved
+    /// ([`Model::resumed`]); only the width of its vectors may differ.
     ///
     /// # Errors
-    /// Refuses a snapshot of another model, and what no session has.
+    /// Refuses a snapshot of another model, and values that no session can have.
     pub fn restore(model: &Arc<Model>, saved: &Saved) -> Result<Self> {
         match &saved.content {
             Content::Taken { own, tissue, .. } => {
@@ -210,8 +213,8 @@ impl Session {
         })
     }
 
-    /// Lets go of all tools, as if their leases ended at this step: what a server does that goes on with a session after a
-    /// restart. It is an input: who records inputs records it at this step.
+    /// Releases all tools, as if their leases ended at this step: a server does this when it continues a session
+    /// after a restart. It is an input, so a recorder of inputs must record it at this step.
     pub fn let_go(&mut self) {
         for index in 0..self.tools.len() {
             self.end_lease(index);
@@ -220,7 +223,7 @@ impl Session {
 }
 
 impl Saved {
-    /// Steps done.
+    /// Returns the number of steps done.
     pub fn step(&self) -> u64 {
         match &self.content {
             Content::Taken { step, .. } => *step,
@@ -228,7 +231,7 @@ impl Saved {
         }
     }
 
-    /// Returns how the tissue is stepped, and its coefficients: for [`Model::resumed`].
+    /// Returns the scheme and the coefficients of the tissue, for [`Model::resumed`].
     pub fn tissue(&self) -> &TissueState {
         match &self.content {
             Content::Taken { state, .. } => state,
@@ -236,7 +239,7 @@ impl Saved {
         }
     }
 
-    /// Returns it as bytes. Takes as long as to read the state several times, and the model once.
+    /// Encodes the snapshot. It takes as long as reading the state several times, and the model once.
     pub fn to_bytes(&self) -> Vec<u8> {
         match &self.content {
             Content::Taken { own, tissue, .. } => {
@@ -247,10 +250,11 @@ impl Saved {
         }
     }
 
-    /// Reads bytes. Whether they fit a model is seen when the session is restored, under the same limits.
+    /// Decodes a snapshot and checks its checksum and sizes. [`Session::restore`] checks later, under these limits,
+    /// that it fits a model.
     ///
     /// # Errors
-    /// Refuses what is no snapshot, is damaged, of another version or above the limits.
+    /// Refuses bytes that are no snapshot, that are damaged or of another version, and a snapshot above the limits.
     pub fn from_bytes(bytes: &[u8], limits: &Limits) -> Result<Self> {
         let refuse = |reason, message: &str| Err(Refusal::new(reason, SNAPSHOT, message));
         let Some((header, content)) = bytes.split_at_checked(HEADER).filter(|(header, _)| header.starts_with(&MAGIC))
@@ -266,7 +270,7 @@ impl Saved {
             return refuse(Reason::NotAvailable, &message);
         }
         if header[CHECKSUM] != checksum(&header[..CHECKSUM.start], content).to_le_bytes() {
-            return refuse(Reason::Unreadable, "is damaged or cut off: its checksum is another");
+            return refuse(Reason::Unreadable, "is damaged or cut off: its checksum does not match");
         }
         let length = usize::try_from(u64::from_le_bytes(array(&header[12..20]))).unwrap_or(usize::MAX);
         let Some((parts, values)) = content.split_at_checked(length) else {
@@ -288,7 +292,7 @@ impl Saved {
     }
 }
 
-/// The bytes of a slice that has so many.
+/// Returns the bytes of a slice of length N as an array; zeros for another length.
 fn array<const N: usize>(bytes: &[u8]) -> [u8; N] {
     bytes.try_into().unwrap_or([0; N])
 }
@@ -301,7 +305,7 @@ fn checksum(header: &[u8], content: &[u8]) -> u128 {
 }
 
 fn encoded(parts: &Parts, values: &[u8]) -> Vec<u8> {
-    // Plain data in memory is always written.
+    // Serialization of plain data to memory can't fail.
     let parts = postcard::to_stdvec(parts).unwrap_or_default();
     let mut bytes = Vec::with_capacity(HEADER + parts.len() + values.len());
     bytes.extend_from_slice(&MAGIC);
@@ -314,8 +318,8 @@ fn encoded(parts: &Parts, values: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// Writes the checksum of a snapshot into it, so that what is behind it can be tried with bytes that were bent. Does nothing to
-/// what is too short.
+/// Writes the matching checksum into a snapshot, so that a test can pass altered bytes to what checks them next.
+/// Bytes shorter than a header stay as they are.
 pub fn seal(bytes: &mut [u8]) {
     if let Some((header, content)) = bytes.split_at_mut_checked(HEADER) {
         let sum = checksum(&header[..CHECKSUM.start], content).to_le_bytes();
@@ -403,7 +407,7 @@ impl SavedPath {
             watched_s: self.watched_s,
             counts: self.counts,
         });
-        path.ok_or_else(|| unsound("a path that no tool takes"))
+        path.ok_or_else(|| unsound("an invalid path of a tool"))
     }
 }
 
@@ -430,9 +434,9 @@ impl SavedRecoveries {
     }
 
     fn restored(&self, now: u64, checks: &Checks<'_>) -> Result<Recoveries> {
-        ensure(self.newest.len() <= MAX_RECOVERIES, "more recoveries than are kept")?;
+        ensure(self.newest.len() <= MAX_RECOVERIES, "more recoveries than a session keeps")?;
         let newest = self.newest.iter().map(|saved| {
-            ensure(saved.step <= now, "a recovery that has not been yet")?;
+            ensure(saved.step <= now, "a recovery after its last step")?;
             let recovery = Recovery {
                 step: saved.step,
                 state_of_step: saved.state_of_step,
@@ -447,10 +451,10 @@ impl SavedRecoveries {
             });
             Ok(Arc::new(Recovered { recovery, tools: ended.collect::<Result<_>>()? }))
         });
-        // Their counts are added.
+        // The counts are summed, so each is limited.
         const MAX_COUNTED: u64 = 1 << 24;
         let acts = self.acts.iter().map(|(step, tool, count)| {
-            ensure(*step <= now && *count < MAX_COUNTED, "commands that have not come yet")?;
+            ensure(*step <= now && *count < MAX_COUNTED, "commands after its last step")?;
             checks.tool(u64::from(*tool))?;
             Ok(Acts { step: *step, tool: *tool, count: *count })
         });

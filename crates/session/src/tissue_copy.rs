@@ -1,4 +1,5 @@
-//! A copy of a session's tissue for one tool, which a client leads without a delay ([`palpate_haptics::prediction`]).
+//! A copy of a session's tissue for one tool, which a client steps itself without delay
+//! ([`palpate_haptics::prediction`]).
 
 use std::sync::Arc;
 
@@ -12,27 +13,28 @@ use palpate_tissue::Model;
 use palpate_tissue::scene::action_check::check_tip;
 use palpate_tissue::scene::script::Action;
 
-/// The tool of a copy.
+/// Number of the copy's only tool.
 const TOOL: u32 = 0;
 
-/// What a copy's steps may take in a millisecond, in points times substeps: up to 1 ms with a tip on it.
+/// Limit of a copy's steps in a millisecond, in points times substeps: they take up to 1 ms with a tip on the
+/// tissue.
 pub const TICK_POINT_SUBSTEPS: u64 = 100_000;
 
-/// The largest radius of a tip on a copy, in lengths of an edge: contact costs what the tip covers.
+/// Largest radius of a tip on a copy, in lengths of an edge: the cost of contact grows with the area of the tip.
 const MAX_EDGES: f64 = 32.0;
 
 /// A client's usual tick, s.
 const TICK_S: f64 = 1e-3;
 
-/// A copy that has more than this to catch up goes on from now, s: the client was not there for so long.
+/// Time behind the client's above which a copy skips to the present, s: the client has paused.
 const MAX_BEHIND_S: f64 = 0.005;
 
-/// A tissue with one tool.
+/// A copy of a tissue with one tool, which predicts the force on the tool between a server's samples.
 pub struct TissueCopy {
     session: Session,
     tip: Tip,
     due: Vec<Due>,
-    /// The client's time less the copy's, s; none before the first tick.
+    /// The client's time minus the copy's, s; `None` before the first tick.
     ahead_s: Option<f64>,
     place_m: DVec3,
     /// Points times substeps that may be computed in a tick.
@@ -40,23 +42,24 @@ pub struct TissueCopy {
 }
 
 impl TissueCopy {
-    /// Creates a copy at rest, for a tool with this tip.
+    /// Creates a copy at rest, for a tool with this tip, without a limit of its work.
     pub fn new(model: &Arc<Model>, tip: Tip) -> Self {
         let (session, due) = (Session::new(model), Vec::with_capacity(1));
         TissueCopy { session, tip, due, ahead_s: None, place_m: DVec3::ZERO, most_point_substeps: u64::MAX }
     }
 
-    /// Creates a copy that tells nothing any more, for good, once so many points are awake that a tick takes more than
-    /// this, in points times substeps: the loop that it is in must not be late.
+    /// Returns this copy with a limit of points times substeps in a tick. Once more points are awake than that
+    /// allows, it predicts nothing, because the loop that it runs in must not be late.
     #[must_use]
     pub fn within(self, most_point_substeps: u64) -> Self {
         TissueCopy { most_point_substeps, ..self }
     }
 
-    /// Creates a copy such as a client can step in time, of a tissue that a server tells of.
+    /// Creates a copy of a tissue that a server describes, limited to what a client can step in time
+    /// ([`TICK_POINT_SUBSTEPS`]).
     ///
     /// # Errors
-    /// Refuses a tip that does not fit the tissue, or that covers too many of its points.
+    /// Refuses a tip that does not fit the tissue, or that is too large for a copy.
     pub fn of_stranger(model: &Arc<Model>, tip: Tip) -> Result<Self> {
         let shape = model.shape();
         check_tip("tip", shape, &tip)?;
@@ -66,14 +69,14 @@ impl TissueCopy {
         Ok(TissueCopy::new(model, tip).within(TICK_POINT_SUBSTEPS))
     }
 
-    /// Steps until `now_s`, with the tool on a straight way to `place_m`. Steps are done up to the nearest, so that ticks that
-    /// come a little early or late have one each. None: too much is awake for that.
+    /// Steps until `now_s`, with the tool on a straight path to `place_m`. The number of steps is rounded, so that
+    /// ticks that are a little early or late have one step each. `None` if too many points are awake.
     fn step_to(&mut self, now_s: f64, place_m: DVec3) -> Option<()> {
         let step_s = self.session.model().scene.stepping.rate_hz.recip();
         let time_s = self.session.time_s();
         let behind_s = self.ahead_s.map(|ahead_s| now_s - ahead_s - time_s);
         let behind_s = behind_s.filter(|behind_s| *behind_s <= MAX_BEHIND_S.max(2.0 * step_s)).unwrap_or_else(|| {
-            // The tool goes there at once; no tool leaps farther than its largest speed lets it.
+            // The tool gets there at once; its largest speed limits how far it moves in a step.
             (self.ahead_s, self.place_m) = (Some(now_s - step_s - time_s), place_m);
             step_s
         });
@@ -94,7 +97,7 @@ impl TissueCopy {
         Some(())
     }
 
-    /// Whether a tick's steps take more than they may.
+    /// Returns whether a tick's steps take more than their limit.
     #[allow(clippy::cast_precision_loss)]
     fn is_too_much(&self, step_s: f64) -> bool {
         let substeps = f64::from(self.session.model().plan.substeps) * (TICK_S / step_s).max(1.0);
@@ -127,7 +130,7 @@ impl std::fmt::Debug for TissueCopy {
 mod tests {
     use super::*;
 
-    /// A press of 3 mm and a stroke.
+    /// Returns the place at a tick of a press of 3 mm and a stroke.
     fn place_m(tick: u32) -> DVec3 {
         let time_s = f64::from(tick) * TICK_S;
         let down = (time_s / 0.1).min(1.0);
@@ -143,7 +146,7 @@ mod tests {
         .unwrap()
     }
 
-    /// The same poses at the same steps, in a session.
+    /// Returns the forces of a session with equal poses at equal steps.
     fn truth_n(model: &Arc<Model>, ticks: u32) -> Vec<DVec3> {
         let (mut session, tip) = (Session::new(model), Tip::default());
         let felt = (0..ticks).map(|tick| {
@@ -203,7 +206,7 @@ mod tests {
         let model = model();
         let mut copy = TissueCopy::new(&model, Tip::default()).within(50);
         let felt: Vec<_> = (0..200).map(|tick| copy.feel(f64::from(tick) * TICK_S, place_m(tick))).collect();
-        // It takes nothing at rest.
+        // Nothing is computed at rest.
         assert!(felt[0].is_some() && felt[199].is_none());
     }
 }

@@ -1,23 +1,23 @@
-//! How deep a tool goes into a mesh at rest on its way.
+//! How deep a tool's path goes into a mesh at rest.
 
 use glam::DVec3;
 use palpate_geometry::surface::Surface;
 
-/// Samples of a straight part of a way, at most: each looks for the nearest place.
+/// Limit of the samples of a straight part of a path: each searches for the nearest place of the surface.
 const MAX_SAMPLES: u32 = 256;
 
-/// The deepest place of a tool's way.
+/// The deepest place of a tool's path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Deepest {
-    /// From the surface, towards the side where the tool did not begin, m. Negative if it stays away.
+    /// Depth below the surface, on the side where the tool did not begin, m; negative if it stays away.
     pub(super) depth_m: f64,
     /// The place of the surface that is nearest to it, m.
     pub(super) rest_m: DVec3,
 }
 
-/// The deepest place of a way along these points by a tip of `radius_m`, m, as a tool meets a mesh (`tissue::contact`): on the side where
-/// it begins, and only while the nearest place of the surface is within its radius across the normal. None if it is beside the mesh all
-/// the time.
+/// Returns the deepest place of a path along these points by a tip of `radius_m`, m, as a tool meets a mesh
+/// (`palpate_tissue::contact`): relative to the side on which it begins, and only while the nearest place of the
+/// surface is within its radius across the normal. `None` if it is beside the mesh all the time.
 pub(super) fn deepest(surface: &Surface, way_m: &[DVec3], radius_m: f64) -> Option<Deepest> {
     let last = way_m.last().map(|end_m| [*end_m; 2]);
     let parts = way_m.windows(2).map(|pair| [pair[0], pair[1]]).chain(last);
@@ -39,7 +39,7 @@ pub(super) fn deepest(surface: &Surface, way_m: &[DVec3], radius_m: f64) -> Opti
     found
 }
 
-/// The beginning of a straight way, and places on it that are at most `apart_m` from each other.
+/// Returns the beginning of a straight path, and places on it that are at most `apart_m` apart; at most 256 in all.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn samples([from_m, to_m]: [DVec3; 2], apart_m: f64) -> impl Iterator<Item = DVec3> {
     let count = ((from_m.distance(to_m) / apart_m).ceil() as u32).clamp(1, MAX_SAMPLES);
@@ -51,7 +51,7 @@ mod tests {
     #![allow(clippy::unwrap_used, clippy::cast_possible_truncation)]
     use super::*;
 
-    /// A ball about the origin: the faces of an octahedron in `parts`² triangles each.
+    /// A ball about the origin: the faces of an octahedron, in `parts`² triangles each.
     fn ball(radius_m: f64, parts: u32) -> Surface {
         let (mut vertices_m, mut triangles) = (Vec::new(), Vec::new());
         for octant in 0..8_u32 {

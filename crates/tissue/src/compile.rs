@@ -96,6 +96,23 @@ impl Model {
 
     /// Compiles a scene, after checking it.
     ///
+    /// The substep follows from the stability bound: here one of a millisecond or less, within the step of 1 ms.
+    ///
+    /// ```
+    /// use palpate_tissue::Model;
+    /// use palpate_tissue::limits::Limits;
+    /// use palpate_tissue::scene::{PAPER, Scene};
+    ///
+    /// let limits = Limits::default();
+    /// let scene = Scene::parse("paper", PAPER, &["sheet.points=[9, 9]".to_owned()], &limits)?;
+    /// let model = Model::compile(&scene, &limits)?;
+    /// assert_eq!(model.len(), 81);
+    /// assert!(model.plan.stable && model.expected_error <= scene.stepping.tolerance);
+    /// assert!((f64::from(model.plan.substeps) * model.plan.substep_s - 1e-3).abs() < 1e-12);
+    /// println!("{} substeps, no vibration is faster than {} rad/s", model.plan.substeps, model.omega_bound_per_s);
+    /// # Ok::<(), palpate_refusal::Refusal>(())
+    /// ```
+    ///
     /// # Errors
     /// Refuses a scene that is not valid, that no scheme can step within the limits, or that this machine can't run.
     pub fn compile(scene: &Scene, limits: &Limits) -> Result<Arc<Self>> {
@@ -274,7 +291,8 @@ impl Model {
         compiled.collect()
     }
 
-    /// Returns the processor time that a step is expected to take while all of the sheet moves, s.
+    /// Returns the processor time that a step is expected to take while all of the sheet moves, s: t₀ + t₁·P·n, with P points, n
+    /// substeps, and t₀ and t₁ measured.
     #[allow(clippy::cast_precision_loss)]
     pub fn predicted_step_s(&self) -> f64 {
         let point_ns =

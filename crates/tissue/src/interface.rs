@@ -45,7 +45,7 @@ impl PointState {
     }
 }
 
-/// Energies of the whole sheet, J.
+/// Energies of the whole sheet, J: sums over all points, and over all springs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Energy {
     /// ½m·v².
@@ -75,6 +75,38 @@ pub struct Released {
 }
 
 /// A sheet in motion, in any precision.
+///
+/// A force of 0.1 N on one point, which an anchor spring of 5 N/m holds, brings it 20 mm down (Hooke: u = F/K″):
+///
+/// ```
+/// use glam::DVec3;
+/// use palpate_tissue::scene::PAPER;
+/// use palpate_tissue::scene::profile::Poke;
+/// use palpate_tissue::{Model, Push, at_rest};
+///
+/// let model = Model::parse("anchors", PAPER, &["sheet.points=[5, 5]", "springs.stiffness_n_per_m=0"])?;
+/// let middle = model.shape().nearest(model.shape().extent().middle_m());
+/// let mut tissue = at_rest(&model);
+/// tissue.push(
+///     0,
+///     Some(Push::Constant(Poke {
+///         point: Some(middle),
+///         centre_m: model.shape().rest_m(middle),
+///         force_n: -0.1 * DVec3::Z,
+///         // e^(-c·h) of the neighbours, 33 mm away, is nothing.
+///         falloff_per_m: 3000.0,
+///         falloff_offset: 0.0,
+///     })),
+/// );
+/// for _ in 0..1500 {
+///     tissue.step().expect("a stable substep");
+/// }
+/// // 1.5 s at 1 kHz, fifteen times the time constant C/K″ = 0.1 s.
+/// let state = tissue.point(middle);
+/// assert!((state.displacement_m.z + 0.02).abs() < 1e-5, "{} m", state.displacement_m);
+/// assert!((state.reaction_n().z - 0.1).abs() < 1e-4, "{} N", state.reaction_n());
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
 pub trait Tissue: Send {
     /// The model that it was made from.
     fn model(&self) -> &Arc<Model>;

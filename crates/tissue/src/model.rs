@@ -174,7 +174,7 @@ impl Model {
         STATES * self.state_bytes() + self.bytes()
     }
 
-    /// Returns what the state of a sheet takes, bytes.
+    /// Returns what the state of a sheet takes, bytes: three components of u, d and what the scheme keeps, of each place in memory.
     pub fn state_bytes(&self) -> u64 {
         let fields = 2 + self.plan.scheme.kept(self.precision == Precision::Compensated);
         let plane_bytes = match self.precision {
@@ -225,7 +225,7 @@ impl Model {
         self.graph.as_ref().map_or(PointId::new(index), |graph| graph.point_in(index))
     }
 
-    /// Returns the mass of a point, kg.
+    /// Returns the mass of a point, that of reference times the point's factor, kg.
     pub fn mass_kg(&self, point: PointId) -> f64 {
         self.scene.point_mass_kg() * self.scene.relative_mass(point)
     }
@@ -235,7 +235,7 @@ impl Model {
         self.scene.anchor_stiffness_n_per_m * self.scene.relative_anchor_stiffness(point)
     }
 
-    /// Returns c of a point, N·s/m.
+    /// Returns C of a point, N·s/m: C/m is the same at every point.
     pub fn damping_n_s_per_m(&self, point: PointId) -> f64 {
         self.scene.damping_n_s_per_m * self.scene.relative_mass(point)
     }

@@ -12,13 +12,13 @@ use super::output::{new_file, unwritten};
 pub(super) struct CutArguments {
     #[command(flatten)]
     source: JournalSource,
-    /// The step that it begins with
+    /// The first step of the part
     #[arg(long, value_name = "STEP")]
     from: u64,
-    /// The step that it ends with
+    /// The last step of the part
     #[arg(long, value_name = "STEP")]
     to: u64,
-    /// The new journal
+    /// The new journal file
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
 }

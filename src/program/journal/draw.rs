@@ -18,13 +18,13 @@ pub(super) struct RenderArguments {
     /// The file to write: a .png of one moment, or a .gif
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// The moment to draw, steps done [default: the one of the largest force that was felt]
+    /// The moment to draw, as the number of steps done [default: that of the largest force on a tool]
     #[arg(long, value_name = "STEP")]
     at: Option<u64>,
-    /// The step with which a film begins [default: that of the journal]
+    /// The first step of a film [default: that of the journal]
     #[arg(long, value_name = "STEP")]
     from: Option<u64>,
-    /// The step with which a film ends [default: that of the journal]
+    /// The last step of a film [default: that of the journal]
     #[arg(long, value_name = "STEP")]
     to: Option<u64>,
     /// Show the mesh instead of the texture

@@ -12,27 +12,27 @@ use super::{JournalSource, foxglove};
 
 #[derive(clap::Args)]
 #[command(
-    after_help = "jsonl and csv have what was recorded while the session ran, without simulating it: place, displacement \
-    and force of each tool, some 100 times a second. mcap simulates the journal again; Foxglove opens the file: curves of each \
-    tool and of the energies (palpate.journal.v1.ToolCurve, TissueCurve), and the points of the tissue 30 times a second \
-    (foxglove.PointCloud, frame `tissue`)."
+    after_help = "jsonl and csv contain the values recorded while the session ran, without a simulation: place, \
+    displacement and force of each tool, some 100 times a second. mcap simulates the journal again, for Foxglove: \
+    curves of each tool and of the energies (palpate.journal.v1.ToolCurve, TissueCurve), and the points of the \
+    tissue 30 times a second (foxglove.PointCloud, frame `tissue`)."
 )]
 pub(super) struct ExportArguments {
     #[command(flatten)]
     source: JournalSource,
-    /// What to write
+    /// Output format
     #[arg(long, value_enum)]
     format: ExportFormat,
-    /// Write here; required for mcap [default: the standard output]
+    /// Output file; required for mcap [default: the standard output]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum ExportFormat {
-    /// One object a line
+    /// One object per line
     Jsonl,
-    /// One row a line, with names in the first
+    /// One row per line, with names in the first line
     Csv,
     /// For Foxglove
     Mcap,

@@ -29,28 +29,31 @@ pub(crate) struct JournalArguments {
 
 #[derive(clap::Subcommand)]
 enum JournalCommand {
-    /// List the journals of a folder: sessions, runs, steps, sizes, and how each ends
+    /// List the journals of a folder: sessions, runs, steps, sizes, and the kind of end
     List(list::ListArguments),
-    /// Show what happened in a session, as lines
+    /// Show the events of a session, one per line
     Show(show::ShowArguments),
-    /// Simulate journals again and compare every hash; name the first step that differs, and how many steps were proved
+    /// Simulate journals again and compare every hash; report the first step that differs, and the number of proven
+    /// steps
     #[command(
-        after_help = "A step is proved if a hash at it or after it is equal: the inputs in the file give these bits. Somebody \
-        who can change a file can change its hashes too. --signed-by checks the signatures of the server that wrote the \
-        file.\n\n\
-        Exit status: 0 when all hashes are equal, also when there are none; 1 when one differs, or a signature is missing or \
-        wrong; 2 when a journal can't be read, is damaged, or was written by a version that computes other bits."
+        after_help = "A step is proven if a hash at or after that step is equal: the inputs in the file give these \
+        bits. Anyone who can change a file can change its hashes too. --signed-by checks the signatures of the \
+        server that wrote the file.\n\n\
+        Exit status: 0 when all hashes are equal, or when there are none; 1 when one differs, or a signature is \
+        missing or wrong; 2 when a journal can't be read, is damaged, or was written by a version that computes \
+        other bits."
     )]
     Verify(verify::VerifyArguments),
     /// Simulate a journal again, and write records as `palpate run` does; or play it on a server
     Replay(records::ReplayArguments),
     /// Draw a session: a PNG image of one moment, or a GIF of all of it
     Render(draw::RenderArguments),
-    /// Write what was felt as JSON Lines or CSV, or curves and a moving surface as MCAP for Foxglove
+    /// Write places and forces of tools as JSON Lines or CSV, or curves and a moving surface as MCAP for Foxglove
     Export(export::ExportArguments),
-    /// Write a part of a journal: a journal that verifies alone
+    /// Write a part of a journal, as a journal that you can verify alone
     Cut(cut::CutArguments),
-    /// Finish a journal whose server was killed, or that is damaged, up to its last whole batch; report what was lost
+    /// Complete a journal that is damaged or whose server was killed, up to its last whole batch; report what was
+    /// lost
     Recover(recover::RecoverArguments),
     /// Make a key with which a server signs its journals
     Key(key::KeyArguments),

@@ -22,23 +22,23 @@ pub(super) struct ReplayArguments {
     /// Write the records here instead of to the standard output
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// A record every so many steps
+    /// Number of steps between records
     #[arg(long, value_name = "STEPS", default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..))]
     every: u64,
     /// A point in the records: X,Y of a sheet, or the number of a vertex; may be repeated. Tools are always in them
     #[arg(long, value_name = "POINT")]
     point: Vec<PointName>,
-    /// The step to begin at [default: that of the journal]
+    /// The first step [default: that of the journal]
     #[arg(long, value_name = "STEP")]
     from: Option<u64>,
-    /// The step to end at [default: that of the journal]
+    /// The last step [default: that of the journal]
     #[arg(long, value_name = "STEP")]
     to: Option<u64>,
-    /// Play at so many times real time; else as fast as it goes, on a server in real time
+    /// Play at this multiple of real time [default: as fast as possible; on a server in real time]
     #[arg(long, value_name = "FACTOR")]
     speed: Option<f64>,
-    /// Send the journal to this server and play it there, for others to see; compare its hashes; with --output write the records
-    /// that the server sends; `palpate-client play --help` shows more options
+    /// Send the journal to this server, play it there for viewers, and compare its hashes; with --output write the
+    /// records that the server sends; `palpate-client play --help` shows more options
     #[arg(long, value_name = "URL", conflicts_with = "config")]
     server: Option<String>,
     /// Show no progress

@@ -11,7 +11,7 @@ use super::output::{new_file, unwritten};
 pub(super) struct RecoverArguments {
     /// The journal
     file: PathBuf,
-    /// The finished journal [default: replaces FILE; a damaged FILE is kept as FILE.damaged]
+    /// The completed journal [default: replaces FILE; a damaged FILE is kept as FILE.damaged]
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
 }

@@ -86,7 +86,7 @@ fn kind(command: &pb::Command) -> &'static str {
         Some(Action::Grasp(_)) => "grasps",
         Some(Action::Pose(pose)) if pose.tip.is_some_and(|tip| tip.grasps) => "holds with its tip",
         Some(Action::Pose(_)) => "touches with its tip",
-        Some(Action::Release(_)) | None => "lets go",
+        Some(Action::Release(_)) | None => "is released",
     }
 }
 
@@ -122,11 +122,11 @@ fn input(input: &pb::Input) -> String {
         Some(What::Command(command)) => format!("tool {}: {}", command.tool, told(command)),
         Some(What::Tissue(changed)) => tissue(changed),
         Some(What::Start(start)) => match start.until_step {
-            Some(until) => format!("time goes on until step {until}"),
-            None => "time goes on".to_owned(),
+            Some(until) => format!("time runs until step {until}"),
+            None => "time runs".to_owned(),
         },
-        Some(What::Pause(_)) => "time stands".to_owned(),
-        Some(What::DroppedSteps(dropped)) => format!("{} steps were not done in time, and dropped", dropped.steps),
+        Some(What::Pause(_)) => "time stops".to_owned(),
+        Some(What::DroppedSteps(dropped)) => format!("{} late steps were dropped", dropped.steps),
         Some(What::Revive(_)) => "revived, at rest".to_owned(),
         Some(What::Hold(hold)) => format!("held: {}", hold.reason),
         None => "an input of a later version".to_owned(),

@@ -18,7 +18,7 @@ pub(super) struct VerifyArguments {
     /// The journals
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// Check that the server with this public key (PEM) signed each of them, and that nothing was changed since
+    /// Check that the server with this public key (PEM) signed each journal, and that nothing was changed since
     #[arg(long, value_name = "KEY.pub")]
     signed_by: Option<PathBuf>,
     /// Configuration file (TOML) with other limits, in a section [limits]

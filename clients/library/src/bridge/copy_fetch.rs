@@ -64,7 +64,7 @@ impl Copying {
             let parts = SessionServiceClient::new(channel).save_snapshot(request).await?.into_inner();
             let bytes = snapshot::collect_within(parts, MAX_BYTES).await?;
             let none = |error| Error::Internal(format!("no thread for a copy of the tissue: {error}"));
-            let made = stepping::made_apart(move || make(&bytes, tip), permit).map_err(none)?;
+            let made = copy_thread::made_apart(move || make(&bytes, tip), permit).map_err(none)?;
             let panicked = |_| Error::Internal("making a copy of the tissue panicked".to_owned());
             made.await.map_err(panicked)?.map_err(Error::Argument)
         });

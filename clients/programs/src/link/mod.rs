@@ -68,7 +68,7 @@ pub(crate) struct LinkArguments {
     /// other)
     #[arg(long, default_value = "stream", conflicts_with_all = ["random", "boundary"])]
     transport: Transport,
-    /// Mean number of packets that are lost in a row; 1: each by itself
+    /// Mean number of packets lost in a row; 1: losses are independent
     #[arg(long, value_name = "PACKETS", default_value_t = 1.0, conflicts_with_all = ["random", "boundary"])]
     loss_burst: f64,
     /// Once a second nothing gets through for this long, ms
@@ -86,7 +86,7 @@ pub(crate) struct LinkArguments {
     /// The tissue changes at this time, s
     #[arg(long, value_name = "SECONDS", conflicts_with_all = ["random", "boundary"])]
     tissue_change_s: Option<f64>,
-    /// With --tissue-change-s: by which factor all springs are stiffer then
+    /// With --tissue-change-s: factor by which all springs become stiffer
     #[arg(long, value_name = "FACTOR", default_value_t = 1.5, requires = "tissue_change_s")]
     tissue_change_factor: f64,
     /// Stall the client once a second, at a random moment, for this long, ms; the device holds its last force
@@ -98,11 +98,12 @@ pub(crate) struct LinkArguments {
     /// How the client renders samples [default: prediction on a mesh, model on a sheet, as `bridge` does]
     #[arg(long)]
     scheme: Option<Rendering>,
-    /// Send a sample only when the force that the client renders is off by more than this fraction; 0 sends one per step
+    /// Send a sample only if the error of the force that the client renders exceeds this fraction; 0 sends one per
+    /// step
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0, conflicts_with = "random")]
     deadband: f64,
-    /// Send a place of the tool only when the server would be wrong about it by more than this fraction of the force; 0
-    /// sends one per tick
+    /// Send a place of the tool only if the server's prediction would be wrong by more than this fraction of the
+    /// force; 0 sends one per tick
     #[arg(long, value_name = "FRACTION", default_value_t = 0.0, conflicts_with_all = ["random", "boundary"])]
     up_deadband: f64,
     /// Duration in simulated time, s
@@ -111,8 +112,7 @@ pub(crate) struct LinkArguments {
     /// Seed of the task and the network
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Where the task is done, m: the place of the tissue's rest surface that is nearest to this; of a sheet X,Y. The middle,
-    /// if absent
+    /// Place of the task, m: the nearest place of the tissue's rest surface; for a sheet X,Y [default: the middle]
     #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', allow_hyphen_values = true, conflicts_with_all = ["random", "boundary"])]
     place: Vec<f64>,
     /// Radius of the tool's tip, m

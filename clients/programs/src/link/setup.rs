@@ -20,8 +20,8 @@ pub(super) enum Rendering {
     Hold,
     /// The local model, evaluated along the tool's path, within the safety envelope
     Model,
-    /// A copy of the tissue that the client simulates, corrected by samples, or the local model while that has been nearer to
-    /// them; within the safety envelope
+    /// A copy of the tissue that the client simulates and corrects by samples, or the local model while it recently
+    /// matched the samples better; within the safety envelope
     Prediction,
 }
 

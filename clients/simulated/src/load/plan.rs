@@ -90,6 +90,21 @@ pub(crate) struct Phase {
 }
 
 /// A plan.
+///
+/// Four users a second arrive for 10 s, and each stays for 5 s. A share below 0 is refused, with its line:
+///
+/// ```
+/// use palpate_refusal::Reason;
+/// use palpate_simulated::load::LoadPlan;
+///
+/// let text = "[[phase]]\nname = \"busy\"\nseconds = 10\narrivals = \"steady\"\nrate_per_s = 4\nstays_s = 5\n";
+/// LoadPlan::parse("plan.toml", text)?;
+///
+/// let wrong = format!("{text}[[scene]]\nname = \"paper\"\nshare = -1\n");
+/// let refusal = LoadPlan::parse("plan.toml", &wrong).expect_err("no share is below 0");
+/// assert_eq!((refusal.reason, refusal.place.as_deref()), (Reason::OutOfRange, Some("plan.toml:9")));
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
 #[derive(Debug, Clone)]
 pub struct LoadPlan {
     pub(crate) name: String,

@@ -1,4 +1,4 @@
-//! One call at whichever member answers: which are tried, for how long, and when not again.
+//! One call at any member that answers: which members are tried, for how long, and which are skipped for a while.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -16,32 +16,32 @@ use super::login::{Login, Token};
 use super::member::{BACK_OFF, Member};
 use super::options::EtcdOptions;
 
-/// The first wait between two rounds of attempts; it doubles up to [`BACK_OFF`].
+/// First wait between two rounds of attempts; it doubles up to [`BACK_OFF`].
 const FIRST_WAIT: Duration = Duration::from_millis(25);
 
-/// All members, and what calls know of them.
+/// All members, and the state that calls share.
 pub(super) struct MemberCalls {
     pub(super) members: Vec<Member>,
     /// Time limit of an attempt.
     pub(super) limit: Duration,
     login: Login,
-    /// The member that answered last.
+    /// Index of the member that answered last.
     preferred: AtomicUsize,
-    /// The latest term of etcd's leaders that we have heard of.
+    /// The latest raft term in any answer so far.
     term: AtomicU64,
 }
 
-/// An attempt at a member.
+/// One attempt at a member: the connection and token that it uses.
 pub(super) struct MemberCall {
     pub(super) member: usize,
-    /// The number of the connection.
+    /// Number of the connection.
     pub(super) number: u64,
     pub(super) channel: Channel,
     token: Option<Token>,
 }
 
 impl MemberCall {
-    /// A request with our token, which only a member with a leader takes.
+    /// Returns a request that has our token and that a member without a leader refuses.
     pub(super) fn request<M>(&self, message: M) -> Request<M> {
         let mut request = Request::new(message);
         request.metadata_mut().insert("hasleader", MetadataValue::from_static("true"));
@@ -52,16 +52,16 @@ impl MemberCall {
     }
 }
 
-/// Whether a call may be done twice.
+/// Whether a call may be executed twice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Repeat {
-    /// Twice is as good as once.
+    /// Twice has the same effect as once.
     Freely,
-    /// Only if it was certainly not done.
+    /// Repeat only if it was certainly not executed.
     Never,
 }
 
-/// What came of an attempt at one member.
+/// Result of an attempt at one member.
 enum Attempt<T> {
     Done(T),
     Refused(String),
@@ -73,7 +73,7 @@ impl MemberCalls {
     pub(super) fn new(options: EtcdOptions, limit: Duration) -> EtcdResult<Self> {
         let uris = options.checked()?;
         let options = Arc::new(options);
-        // Many clients begin at different members.
+        // Clients begin at a random member, to spread their load.
         let mut random = [0; 4];
         let first = getrandom::fill(&mut random).map_or(0, |()| u32::from_le_bytes(random) as usize % uris.len());
         let members = uris.into_iter().map(|uri| Member::new(uri, options.clone(), limit)).collect();
@@ -81,26 +81,26 @@ impl MemberCalls {
         Ok(MemberCalls { members, limit, login: Login::new(options), preferred, term })
     }
 
-    /// The member that answered last.
+    /// Returns the index of the member that answered last.
     pub(super) fn preferred(&self) -> usize {
         self.preferred.load(Ordering::Relaxed)
     }
 
-    /// Has calls begin at the next member, unless they already begin at another.
+    /// Makes calls begin at the member after `member`, unless they already begin at another.
     pub(super) fn pass_over(&self, member: usize) {
         let next = (member + 1) % self.members.len();
         let _ = self.preferred.compare_exchange(member, next, Ordering::Relaxed, Ordering::Relaxed);
     }
 
-    /// Takes note of the term in an answer; whether it is the latest that we have heard of. An older one comes from a member
-    /// that has not yet heard of the present leader.
+    /// Keeps the raft term of an answer if it is the latest. Returns whether it is: an older term comes from a
+    /// member that has not yet heard of the present leader.
     pub(super) fn is_latest(&self, header: Option<&ResponseHeader>) -> bool {
         let term = header.map_or(0, |header| header.raft_term);
         self.term.fetch_max(term, Ordering::Relaxed) <= term
     }
 
-    /// Does a call at the first member that can. It is tried for as long as all members together have time for an attempt, then
-    /// the attempt that is under way ends.
+    /// Executes a call at the first member that can. New attempts begin until all members together have had the
+    /// time of one attempt each; an attempt under way may still finish.
     pub(super) async fn call<T, F, A>(&self, what: &str, repeat: Repeat, attempt: F) -> EtcdResult<T>
     where
         F: Fn(MemberCall) -> A,
@@ -190,7 +190,7 @@ impl MemberCalls {
                 member.give_up(number).await;
             }
             match judge(&status) {
-                // Once: a new token that is not taken either is a refusal.
+                // Once: a refusal of a new token is final.
                 ErrorVerdict::Stale if used.is_some() && stale.is_none() => stale = used,
                 ErrorVerdict::Stale | ErrorVerdict::Refused => return Attempt::Refused(text(&status)),
                 ErrorVerdict::Elsewhere => return Attempt::NotDone(text(&status)),

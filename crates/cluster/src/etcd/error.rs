@@ -1,42 +1,43 @@
-//! Errors of calls to etcd: whether something was done, and what to do about it.
+//! Errors of calls to etcd: whether the call was executed, and what to do about it.
 
 use std::error::Error;
 
 use tonic::{Code, ConnectError, Status};
 
-/// Why a call to etcd has not been done, or may not have been.
+/// Why a call to etcd was not executed, or may not have been.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum EtcdError {
-    /// No member can be reached, or none knows of a leader. Nothing was done, except that a lease may have been granted that
-    /// nobody knows of, and ends by itself. Try again.
+    /// No member can be reached, or none knows of a leader. Nothing was done, except that a lease may have been
+    /// granted that nobody knows of and that ends by itself. Try again.
     #[error("{0}")]
     Unreachable(String),
-    /// etcd has refused, or the options are wrong: the same call fails again. Nothing was done.
+    /// etcd has refused, or the options are wrong: the same call would fail again. Nothing was done.
     #[error("{0}")]
     Refused(String),
-    /// A transaction was sent and its answer was lost: it was done, or not, or will be in a moment. Read its keys again. If they
-    /// don't show it, repeat it only with comparisons that can't hold if the first one was done after all.
+    /// A transaction was sent and its answer was lost: it was executed, or was not, or will be soon. Read its keys
+    /// again. If they don't show it, repeat it only with comparisons that can't hold if the first one was executed
+    /// after all.
     #[error("{0}")]
     Unknown(String),
 }
 
-/// What came of an attempt, or why it can't be done.
+/// Result of a call to etcd.
 pub type EtcdResult<T> = std::result::Result<T, EtcdError>;
 
-/// What an answer that is an error says of the request.
+/// What an error in an answer implies for the request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum ErrorVerdict {
-    /// Every member would refuse it.
+    /// Every member would refuse the request.
     Refused,
-    /// It was not done here, and another member may do it.
+    /// The request was not executed here; another member may execute it.
     Elsewhere,
-    /// It was not done because the token is not, or no longer, valid.
+    /// The request was not executed because the token is not valid, or no longer.
     Stale,
-    /// It may have been done.
+    /// The request may have been executed.
     Lost,
 }
 
-/// Judges an error. What is not known to be harmless is [`ErrorVerdict::Lost`].
+/// Classifies an error. An error that is not known to be harmless is [`ErrorVerdict::Lost`].
 pub(super) fn judge(status: &Status) -> ErrorVerdict {
     if is_of_transport(status) {
         let mut causes = std::iter::successors(status.source(), |&cause| cause.source());
@@ -47,11 +48,11 @@ pub(super) fn judge(status: &Status) -> ErrorVerdict {
     match status.code() {
         Code::Unauthenticated => ErrorVerdict::Stale,
         Code::Unknown | Code::InvalidArgument if says("revision of auth store is old") => ErrorVerdict::Stale,
-        // The first is told before anything is done, since requests ask for a leader.
+        // "no leader" comes before anything is executed, because requests ask for a leader.
         Code::Unavailable if says("no leader") || says("not capable") || says("for learner") => ErrorVerdict::Elsewhere,
         Code::ResourceExhausted if says("too many requests") => ErrorVerdict::Elsewhere,
         Code::FailedPrecondition if says("not leader") => ErrorVerdict::Elsewhere,
-        // Our own complaint about an answer that was too large.
+        // tonic's own error for an answer that is too large.
         Code::OutOfRange if says("decoded message length") => ErrorVerdict::Lost,
         Code::InvalidArgument
         | Code::NotFound
@@ -65,12 +66,12 @@ pub(super) fn judge(status: &Status) -> ErrorVerdict {
     }
 }
 
-/// Whether the connection has failed, rather than etcd.
+/// Returns whether the connection has failed, rather than etcd.
 pub(super) fn is_of_transport(status: &Status) -> bool {
     status.source().is_some()
 }
 
-/// What an error says, in words.
+/// Returns the text of an error, without etcd's prefix.
 pub(super) fn text(status: &Status) -> String {
     match status.source() {
         Some(source) => root(source),
@@ -78,12 +79,12 @@ pub(super) fn text(status: &Status) -> String {
     }
 }
 
-/// Returns the first cause of an error.
+/// Returns the text of an error's innermost cause.
 pub fn root(error: &(dyn Error + 'static)) -> String {
     std::iter::successors(Some(error), |&cause| cause.source()).last().map(ToString::to_string).unwrap_or_default()
 }
 
-/// What to do about a refusal.
+/// Returns what to do about a refusal, from its text.
 pub(super) fn advice(refusal: &str) -> &'static str {
     const ADVICE: [(&str, &str); 8] = [
         (

@@ -1,4 +1,4 @@
-//! Leases: the stream that keeps them alive, one question and its answer at a time.
+//! Leases: the stream that keeps them alive, with one request and its answer at a time.
 
 use palpate_proto::etcd::etcdserverpb::lease_client::LeaseClient;
 use palpate_proto::etcd::etcdserverpb::{LeaseKeepAliveRequest, LeaseKeepAliveResponse};
@@ -8,29 +8,31 @@ use tonic::{Status, Streaming};
 
 use super::calls::{MemberCall, MemberCalls};
 
-/// A lease: keys that are written with it are deleted when it ends.
+/// A lease of etcd: keys that are written with it are deleted when it ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Lease {
-    /// Its number.
+    /// Number of the lease.
     pub id: i64,
-    /// Seconds that it lasts each time that it is kept alive, as etcd has granted: at least what was asked for.
+    /// Seconds that the lease lasts after each renewal, as etcd granted: at least the requested time.
     pub ttl_s: u64,
 }
 
-/// An open stream. It is given up as soon as an answer does not come: a late one would be taken for the next.
+/// An open keepalive stream. It is dropped as soon as an answer is late: that answer would be taken for the next
+/// one.
 pub(super) struct LeaseKeepAlive {
     pub(super) member: usize,
-    /// The number of the connection.
+    /// Number of the connection.
     pub(super) number: u64,
     questions: mpsc::Sender<LeaseKeepAliveRequest>,
     answers: Streaming<LeaseKeepAliveResponse>,
 }
 
 impl LeaseKeepAlive {
-    /// Opens a stream, and asks for `lease` with it. The answer as in [`LeaseKeepAlive::ask`].
+    /// Opens a stream and renews `lease` with it. Returns the stream and the seconds that the lease lasts; `None`
+    /// if it has ended.
     pub(super) async fn open(way: MemberCall, calls: &MemberCalls, lease: i64) -> Result<(Self, Option<u64>), Status> {
         let (questions, asked) = mpsc::channel(1);
-        // etcd says nothing, not even that the stream is open, before it has a question.
+        // etcd does not even confirm the stream before it has a request.
         questions.try_send(LeaseKeepAliveRequest { id: lease }).map_err(|_| ended())?;
         let request = way.request(ReceiverStream::new(asked));
         let answers = LeaseClient::new(way.channel).lease_keep_alive(request).await?.into_inner();
@@ -39,7 +41,7 @@ impl LeaseKeepAlive {
         Ok((pulse, ttl_s))
     }
 
-    /// Has a lease begin anew: the seconds that it lasts, `None` if there is none.
+    /// Renews a lease. Returns the seconds that it lasts, or `None` if it has ended.
     pub(super) async fn ask(&mut self, calls: &MemberCalls, lease: i64) -> Result<Option<u64>, Status> {
         self.questions.try_send(LeaseKeepAliveRequest { id: lease }).map_err(|_| ended())?;
         self.answer(calls, lease).await

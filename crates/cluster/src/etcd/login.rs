@@ -1,4 +1,4 @@
-//! Our token at etcd: had for a password, and renewed when etcd no longer takes it.
+//! The authentication token for etcd: obtained with a password, and renewed when etcd rejects it.
 
 use std::sync::Arc;
 
@@ -11,14 +11,14 @@ use tonic::transport::Channel;
 
 use super::options::EtcdOptions;
 
-/// A token and its number.
+/// A token and its number, which counts renewals.
 #[derive(Clone)]
 pub(super) struct Token {
     pub(super) number: u64,
     pub(super) value: MetadataValue<Ascii>,
 }
 
-/// Who we are, and the token that all calls share.
+/// Our user, and the token that all calls share.
 pub(super) struct Login {
     options: Arc<EtcdOptions>,
     token: Mutex<Option<Token>>,
@@ -29,7 +29,7 @@ impl Login {
         Login { options, token: Mutex::new(None) }
     }
 
-    /// The token; another than number `stale`. `None` if we have no name.
+    /// Returns the token, after a renewal if the present one has number `stale`. `None` if no user is configured.
     pub(super) async fn token(&self, channel: &Channel, stale: Option<u64>) -> Result<Option<Token>, Status> {
         let Some(user) = &self.options.user else { return Ok(None) };
         let mut kept = self.token.lock().await;

@@ -1,4 +1,4 @@
-//! A member of etcd: the connection to it, made when it is needed and again after it broke.
+//! A member of etcd, and the connection to it: opened when it is needed and reopened after it failed.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,17 +12,18 @@ use tonic::transport::{Channel, Endpoint, Uri};
 use super::error::{root, text};
 use super::options::{EtcdOptions, is_secure};
 
-/// A member to which no connection could be made is left alone for so long, and so long is the longest wait between attempts.
+/// Time without new attempts after a failed connection to a member, and the longest wait between rounds of
+/// attempts.
 pub(super) const BACK_OFF: Duration = Duration::from_millis(250);
 
-/// A connection with calls under way that is silent for so long is pinged. etcd ends connections that ping it more often than
-/// every 5 s.
+/// Silence after which a connection with calls under way is pinged. etcd closes connections that ping more often
+/// than every 5 s.
 const SILENCE: Duration = Duration::from_secs(6);
 
-/// Bytes that may wait unread, of a stream and of a connection.
+/// Flow-control windows of a stream and of a connection, bytes.
 const WINDOWS_BYTES: (u32, u32) = (1 << 20, 4 << 20);
 
-/// A member, by its address.
+/// A member of etcd, with its shared connection.
 pub(super) struct Member {
     uri: Uri,
     url: String,
@@ -34,10 +35,10 @@ pub(super) struct Member {
 /// The connection that all calls share.
 #[derive(Default)]
 struct Line {
-    /// With its number, since a call that failed must not end the connection after it.
+    /// The connection and its number: a call that failed must not close the connection after it.
     channel: Option<(u64, Channel)>,
     made: u64,
-    /// When the last attempt failed, and why.
+    /// Time of the last failed attempt, and its reason.
     failed: Option<(Instant, String)>,
 }
 
@@ -47,13 +48,14 @@ impl Member {
         Member { uri, url, options, limit, line: Mutex::default() }
     }
 
-    /// Its address, for messages.
+    /// Returns its address, for messages.
     pub(super) fn url(&self) -> &str {
         &self.url
     }
 
-    /// The connection, and its number. One that is new has been tried by a call that changes nothing, so that a member which
-    /// accepts connections and does not answer gets no transaction. An error says why there is none; nothing was sent then.
+    /// Returns the shared connection and its number; opens it if there is none. A new connection is tested by a
+    /// call without effects, so that a member which accepts connections and does not answer gets no transaction.
+    /// The error is the reason why there is no connection; nothing was sent then.
     pub(super) async fn line(&self) -> std::result::Result<(u64, Channel), String> {
         let mut line = self.line.lock().await;
         if let Some(made) = &line.channel {
@@ -77,13 +79,13 @@ impl Member {
         }
     }
 
-    /// Gives a connection up that has failed or does not answer: the next call makes another.
+    /// Drops the connection `number`, if it is still the present one: the next call opens another.
     pub(super) async fn give_up(&self, number: u64) {
         let mut line = self.line.lock().await;
         line.channel.take_if(|made| made.0 == number);
     }
 
-    /// A connection for one caller alone.
+    /// Opens a connection for one caller alone.
     pub(super) async fn connect(&self) -> std::result::Result<Channel, String> {
         let mut endpoint = Endpoint::from(self.uri.clone())
             .connect_timeout(self.limit)
@@ -99,7 +101,7 @@ impl Member {
         endpoint.connect().await.map_err(|e| root(&e))
     }
 
-    /// What to say of a member that does not answer.
+    /// Returns the reason for a member that does not answer.
     pub(super) fn silent(&self) -> String {
         format!("has not answered within {} s", self.limit.as_secs_f64())
     }

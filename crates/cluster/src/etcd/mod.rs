@@ -1,16 +1,18 @@
-//! A client of etcd, as much of it as a fleet of servers needs: keys, transactions, leases, and changes as they come.
+//! A client of etcd with what a fleet of servers needs: keys, transactions, leases and watches.
 //!
-//! **Members.** A call begins at the member that answered last and goes on to the others. A member that can't be reached, or
-//! that knows of no leader, is passed over at once; one that does not answer after the time limit of an attempt. When all have
-//! failed, another round begins after 0.25 s at most, until there was time for an attempt at each. So a call takes at most
-//! `limit × (members + 2)`, and lasts over the election of another leader. Reads and transactions beyond 128 at a time wait for
-//! those before them; leases and watches do not.
+//! **Members.** A call begins at the member that answered last and continues with the others. A member that can't
+//! be reached, or that knows of no leader, is skipped at once; a member that does not answer is skipped after the
+//! time limit of an attempt. When all have failed, another round begins after at most 0.25 s, until there was time
+//! for one attempt at each member. So a call takes at most `limit × (members + 2)`, and survives the election of
+//! another leader. At most 128 reads and transactions run at a time; further ones wait. Leases and watches do not
+//! wait.
 //!
-//! **Once.** Reads, leases and watches may be done twice. A transaction is sent to another member only if the one before has
-//! certainly not taken it; otherwise it ends in [`EtcdError::Unknown`], and its caller reads what has become of it.
+//! **Once.** Reads, leases and watches may be repeated. A transaction is sent to another member only if the
+//! previous one has certainly not executed it; otherwise it ends in [`EtcdError::Unknown`], and its caller reads
+//! the keys to find out.
 //!
-//! **Time.** A lease runs from when etcd grants it or keeps it alive, which is after the call began. Whoever relies on a lease
-//! reads a monotonic clock before the call, and counts from there.
+//! **Time.** A lease runs from when etcd grants it or keeps it alive, which is after the call began. A caller that
+//! relies on a lease reads a monotonic clock before the call, and counts from there.
 
 mod calls;
 mod error;
@@ -43,25 +45,27 @@ pub use store::{Compare, KeyValue, Op, TransactionOutcome, Txn};
 use store::{key_value, prefix_range, revision, signed};
 pub use watch::{Watch, WatchError, WatchEvent};
 
-/// Time limit of an attempt at one member, unless another is given.
+/// Default time limit of an attempt at one member.
 pub const LIMIT: Duration = Duration::from_secs(1);
 
-/// Keys of one answer to a list.
+/// Keys per answer to a list.
 const PAGE: i64 = 1000;
 
-/// Most keys of a list: a hundred thousand sessions have a few each.
+/// Limit of keys in a list: enough for a hundred thousand sessions with a few keys each.
 const MAX_KEYS: usize = 1 << 20;
 
-/// Largest answer that is taken.
+/// Size limit of an answer, bytes.
 const LARGEST_BYTES: usize = 64 << 20;
 
-/// Reads and transactions under way at a time; others wait for these. More would not be done sooner, and all would be late.
+/// Limit of concurrent reads and transactions; further ones wait. More would not finish sooner, and would delay
+/// each other.
 const AT_A_TIME: usize = 128;
 
-/// How often a list is begun anew because etcd dropped the revision that it was reading.
+/// Attempts at a list, if etcd compacts the revision that it reads.
 const LIST_ATTEMPTS: usize = 3;
 
-/// A client of etcd. Clones share connections.
+/// Client of one etcd cluster. Clones share the connections, the keepalive stream and the limit of concurrent
+/// calls.
 #[derive(Clone)]
 pub struct Etcd {
     calls: Arc<MemberCalls>,
@@ -77,7 +81,7 @@ impl std::fmt::Debug for Etcd {
 }
 
 impl Etcd {
-    /// Returns a client with the time limit [`LIMIT`] for each attempt. Nothing is connected before the first call.
+    /// Creates a client with the time limit [`LIMIT`] (1 s) for each attempt. It connects at the first call.
     ///
     /// # Errors
     /// Returns an error if the options are wrong or a file can't be read.
@@ -85,24 +89,25 @@ impl Etcd {
         Etcd::open_within(options, LIMIT)
     }
 
-    /// Returns a client with a time limit for each attempt.
+    /// Creates a client with the time limit `limit` for each attempt at a member. It connects at the first call.
     ///
     /// # Errors
-    /// As for [`Etcd::open`].
+    /// Returns an error if the options are wrong or a file can't be read.
     pub fn open_within(options: &EtcdOptions, limit: Duration) -> EtcdResult<Self> {
         let calls = Arc::new(MemberCalls::new(options.clone(), limit)?);
         Ok(Etcd { calls, pulse: Arc::default(), turns: Arc::new(Semaphore::new(AT_A_TIME)) })
     }
 
-    /// Returns the member at which the next call begins: the one that answered last.
+    /// Returns the address of the member at which the next call begins: the one that answered last.
     pub fn endpoint(&self) -> &str {
         self.calls.members[self.calls.preferred()].url()
     }
 
-    /// Returns a key, and the revision of the store. No older than any write that has been answered before.
+    /// Reads a key. Returns its value, or `None` if it does not exist, and the store's revision. The read is
+    /// linearizable: it sees every write that was answered before.
     ///
     /// # Errors
-    /// Returns an error if no member can tell.
+    /// Returns an error if no member can answer, or if etcd refuses.
     pub async fn get(&self, key: &str) -> EtcdResult<(Option<KeyValue>, u64)> {
         let request = RangeRequest { key: key.into(), ..Default::default() };
         let response = self.range(&format!("read the key `{key}`"), request).await?;
@@ -110,11 +115,11 @@ impl Etcd {
         Ok((response.kvs.into_iter().next().and_then(key_value), revision))
     }
 
-    /// Returns all keys that begin with `prefix`, in order, at one revision, and that revision. No older than any write
-    /// that has been answered before. Keys that are no text are left out.
+    /// Reads all keys that begin with `prefix`, in order and at one revision. Returns them and that revision. The
+    /// read sees every write that was answered before. Keys that are not UTF-8 are left out.
     ///
     /// # Errors
-    /// Returns an error if no member can tell, or if there are more than 1,048,576.
+    /// Returns an error if no member can answer, if etcd refuses, or if there are more than 1,048,576 keys.
     pub async fn list(&self, prefix: &str) -> EtcdResult<(Vec<KeyValue>, u64)> {
         let what = format!("list the keys `{prefix}…`");
         let mut attempts = 1..=LIST_ATTEMPTS;
@@ -145,7 +150,7 @@ impl Etcd {
                 let why = format!("can't {what}: there are more than {MAX_KEYS}; give this fleet a prefix of its own");
                 return Err(EtcdError::Refused(why));
             }
-            // The next key that there could be.
+            // The smallest key after `last`.
             request.key = last;
             request.key.push(0);
         }
@@ -163,11 +168,11 @@ impl Etcd {
         Ok(response)
     }
 
-    /// Does a transaction.
+    /// Executes a transaction and returns its outcome.
     ///
     /// # Errors
-    /// Returns [`EtcdError::Unknown`] if it may have been done although there is no answer: read its keys again. With every
-    /// other error it was not done.
+    /// Returns [`EtcdError::Unknown`] if the transaction may have been executed although there is no answer: read
+    /// its keys again. With every other error it was not executed.
     pub async fn transact(&self, transaction: Txn) -> EtcdResult<TransactionOutcome> {
         let repeat = if transaction.only_reads() { Repeat::Freely } else { Repeat::Never };
         let request = TxnRequest::from(transaction);
@@ -182,10 +187,10 @@ impl Etcd {
         Ok(response.into())
     }
 
-    /// Makes a lease. One of which we have not heard, because the answer was lost, ends by itself.
+    /// Creates a lease of at least `ttl_s` seconds. If the answer is lost, the unused lease ends by itself.
     ///
     /// # Errors
-    /// Returns an error if no member can, or if etcd refuses so long a time.
+    /// Returns an error if no member can answer, or if etcd refuses a time to live that long.
     pub async fn grant(&self, ttl_s: u64) -> EtcdResult<Lease> {
         let message = LeaseGrantRequest { ttl: signed(ttl_s), id: 0 };
         let attempt = |way: MemberCall| {
@@ -197,14 +202,14 @@ impl Etcd {
         Ok(Lease { id: granted.id, ttl_s: store::unsigned(granted.ttl) })
     }
 
-    /// Has a lease begin anew: the seconds that it lasts from now on, `None` if it has ended. Leases of one client wait for each
-    /// other. An attempt over the open stream comes before those at each member.
+    /// Renews a lease. Returns the seconds that it lasts from now on, or `None` if it has ended. Leases of one
+    /// client are renewed one after the other. The open stream is tried first, then each member.
     ///
     /// # Errors
-    /// Returns an error if no member can. The lease may have begun anew all the same.
+    /// Returns an error if no member can answer. The lease may have been renewed nevertheless.
     pub async fn keep_alive(&self, lease: i64) -> EtcdResult<Option<u64>> {
         let mut kept = self.pulse.lock().await;
-        // It is back only with an answer: who gives up waiting gives the stream up as well.
+        // It is put back only with an answer: a caller that is cancelled drops the stream as well.
         if let Some(mut pulse) = kept.take() {
             let asked = timeout(self.calls.limit, pulse.ask(&self.calls, lease)).await;
             if let Ok(Ok(ttl_s)) = asked {
@@ -222,10 +227,10 @@ impl Etcd {
         Ok(ttl_s)
     }
 
-    /// Ends a lease, and deletes its keys. It is no error if it has ended already.
+    /// Ends a lease, and deletes its keys. A lease that has already ended is no error.
     ///
     /// # Errors
-    /// Returns an error if no member can.
+    /// Returns an error if no member can answer.
     pub async fn revoke(&self, lease: i64) -> EtcdResult<()> {
         let attempt = |way: MemberCall| {
             let request = way.request(LeaseRevokeRequest { id: lease });
@@ -239,8 +244,9 @@ impl Etcd {
         self.calls.call("revoke a lease", Repeat::Freely, attempt).await
     }
 
-    /// Follows the keys that begin with `prefix`, from a revision on; 0 for what changes from when it is opened, which is in the
-    /// first [`Watch::next`]. After a list, that is the revision after the list's.
+    /// Returns a watch of the keys that begin with `prefix`, from revision `from_revision` on; 0 stands for the
+    /// changes after the watch is opened, which happens in the first [`Watch::next`]. After a list, pass the
+    /// revision after the list's.
     pub fn watch(&self, prefix: &str, from_revision: u64) -> Watch {
         Watch::new(self.calls.clone(), prefix, from_revision)
     }

@@ -1,4 +1,4 @@
-//! How to reach etcd: endpoints, certificates, and who we are there.
+//! How to reach etcd: endpoints, certificates, and the user.
 
 use std::net::IpAddr;
 use std::path::{Path, PathBuf};
@@ -8,29 +8,30 @@ use tonic::transport::{Certificate, ClientTlsConfig, Identity, Uri};
 use super::error::{EtcdError, EtcdResult};
 use palpate_tissue::files;
 
-/// Most members that are named: etcd itself advises seven at most.
+/// Limit of endpoints: etcd itself advises at most seven members.
 const MAX_ENDPOINTS: usize = 16;
 
-/// Where etcd is, and who we are there. It has no secret in it: passwords and keys are read from their files when they are
-/// needed, so that files that have changed hold from the next connection on.
+/// Addresses and credentials for etcd. The struct holds no secret: passwords and keys are read from their files
+/// when a connection needs them, so a changed file takes effect at the next connection.
 #[derive(Debug, Clone, Default)]
 pub struct EtcdOptions {
-    /// The members' addresses for clients, `http://…` or `https://…`.
+    /// Addresses of the members for clients, `http://…` or `https://…`; 1 to 16.
     pub endpoints: Vec<String>,
-    /// Certificates (PEM) of the authorities that have signed the members' certificates; required with `https://`.
+    /// File of the certificates (PEM) of the authorities that signed the members' certificates; required with
+    /// `https://`.
     pub ca: Option<PathBuf>,
-    /// Our own certificate (PEM), if etcd asks for one.
+    /// File of our own certificate (PEM), if etcd requires one.
     pub certificate: Option<PathBuf>,
-    /// Its private key (PEM).
+    /// File of the private key (PEM) of our own certificate.
     pub key: Option<PathBuf>,
-    /// Our name there, if etcd asks for passwords.
+    /// Our user name, if etcd requires passwords.
     pub user: Option<String>,
-    /// The file that has the password. A line break at its end does not count.
+    /// File of the password. Line breaks at its end are ignored.
     pub password_file: Option<PathBuf>,
 }
 
 impl EtcdOptions {
-    /// The endpoints, if everything fits together and the files can be read.
+    /// Returns the endpoints, if all options fit together and the files can be read.
     pub(super) fn checked(&self) -> EtcdResult<Vec<Uri>> {
         let refuse = |why: String| Err(EtcdError::Refused(why));
         if self.endpoints.is_empty() || self.endpoints.len() > MAX_ENDPOINTS {
@@ -56,7 +57,7 @@ impl EtcdOptions {
     }
 
     fn endpoint(&self, url: &str) -> EtcdResult<Uri> {
-        // What can't be read is not quoted if it may have a password in it.
+        // A text that can't be parsed is not quoted if it may contain a password.
         let quoted = if url.contains('@') { "an endpoint of etcd" } else { url };
         let refuse = |why: &str| EtcdError::Refused(format!("{quoted}: {why}"));
         let uri: Uri =
@@ -79,7 +80,7 @@ impl EtcdOptions {
         Ok(uri)
     }
 
-    /// TLS as the files are now.
+    /// Returns the TLS configuration from the files as they are now.
     pub(super) fn tls(&self) -> std::result::Result<ClientTlsConfig, String> {
         let Some(ca) = &self.ca else {
             return Err("https:// needs the certificates of etcd's authorities: name the file that has them".into());
@@ -92,7 +93,7 @@ impl EtcdOptions {
         }
     }
 
-    /// The password, as the file is now; empty without one.
+    /// Returns the password from the file as it is now; empty if no file is named.
     pub(super) fn password(&self) -> std::result::Result<String, String> {
         let Some(path) = &self.password_file else { return Ok(String::new()) };
         let text =
@@ -105,7 +106,7 @@ impl EtcdOptions {
     }
 }
 
-/// Whether an endpoint is reached by TLS.
+/// Returns whether an endpoint uses TLS.
 pub(super) fn is_secure(uri: &Uri) -> bool {
     uri.scheme_str() == Some("https")
 }

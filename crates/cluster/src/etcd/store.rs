@@ -1,4 +1,4 @@
-//! Keys, values and transactions, as callers have them and as etcd has them.
+//! Keys, values and transactions, in the form of this client and in etcd's.
 
 use palpate_proto::etcd::etcdserverpb::compare::{CompareResult, CompareTarget, TargetUnion};
 use palpate_proto::etcd::etcdserverpb::request_op::Request;
@@ -8,27 +8,27 @@ use palpate_proto::etcd::etcdserverpb::{
 };
 use palpate_proto::etcd::mvccpb;
 
-/// A key and what is at it. Revisions count the changes of the whole store.
+/// A key, its value and its history. A revision counts the changes of the whole store.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeyValue {
     /// The key.
     pub key: String,
-    /// What is at it.
+    /// The value of the key.
     pub value: Vec<u8>,
-    /// The revision at which the key was made, since it was last deleted.
+    /// Revision at which the key was created, after its last deletion.
     pub create_revision: u64,
-    /// The revision at which it was last written.
+    /// Revision at which the key was last written.
     pub mod_revision: u64,
-    /// The lease at whose end it is deleted; 0 for none.
+    /// Lease at whose end the key is deleted; 0 for none.
     pub lease: i64,
 }
 
 /// A condition of a transaction.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Compare {
-    /// There is no such key.
+    /// The key does not exist.
     Absent(String),
-    /// There is such a key.
+    /// The key exists.
     Present(String),
     /// The key was last written at this revision.
     ModRevision(String, u64),
@@ -41,42 +41,42 @@ pub enum Op {
     Put {
         /// The key.
         key: String,
-        /// What is at it from now on.
+        /// The new value.
         value: Vec<u8>,
-        /// The lease at whose end it is deleted. Without one it stays, also if it had one before.
+        /// Lease at whose end the key is deleted. `None` detaches the key from any lease, so it stays.
         lease: Option<i64>,
     },
-    /// Deletes a key, if there is one.
+    /// Deletes a key, if it exists.
     Delete(String),
     /// Reads a key.
     Get(String),
 }
 
-/// A transaction: all of `then` if all of `if_all` holds, else all of `otherwise`, at one revision. etcd refuses one with more
-/// than 128 operations, or that writes a key twice.
+/// A transaction: executes all of `then` if all of `if_all` hold, else all of `otherwise`, at one revision. etcd
+/// refuses more than 128 operations, and two writes of one key.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Txn {
-    /// What has to hold.
+    /// Conditions.
     pub if_all: Vec<Compare>,
-    /// What is done if it holds.
+    /// Operations if all conditions hold.
     pub then: Vec<Op>,
-    /// What is done otherwise.
+    /// Operations otherwise.
     pub otherwise: Vec<Op>,
 }
 
-/// What came of a transaction.
+/// Outcome of a transaction that was executed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TransactionOutcome {
     /// Whether the conditions held.
     pub succeeded: bool,
-    /// The revision of the store after it: of what it wrote, if it wrote.
+    /// Revision of the store after the transaction, which is that of its writes if it wrote.
     pub revision: u64,
-    /// What each [`Op::Get`] of the operations that were done has read, in their order.
+    /// Results of the executed [`Op::Get`]s, in their order; `None` for a key that does not exist.
     pub got: Vec<Option<KeyValue>>,
 }
 
 impl Txn {
-    /// Whether it writes nothing, whatever holds.
+    /// Returns whether it writes nothing in either case.
     pub(super) fn only_reads(&self) -> bool {
         self.then.iter().chain(&self.otherwise).all(|op| matches!(op, Op::Get(_)))
     }
@@ -133,7 +133,7 @@ impl From<TxnResponse> for TransactionOutcome {
     }
 }
 
-/// `None` if the key is no text: it is none of ours.
+/// Converts etcd's form. `None` if the key is not UTF-8: such a key belongs to another program.
 pub(super) fn key_value(raw: mvccpb::KeyValue) -> Option<KeyValue> {
     Some(KeyValue {
         key: String::from_utf8(raw.key).ok()?,
@@ -144,31 +144,31 @@ pub(super) fn key_value(raw: mvccpb::KeyValue) -> Option<KeyValue> {
     })
 }
 
-/// The store's revision when an answer was made.
+/// Returns the store's revision when an answer was made; 0 without a header.
 pub(super) fn revision(header: Option<&ResponseHeader>) -> u64 {
     header.map_or(0, |header| unsigned(header.revision))
 }
 
-/// The first key beyond those that begin with `prefix`, as etcd wants it: the keys from `prefix` up to it begin so. An empty
-/// prefix is that of all keys.
+/// Returns the range of keys that begin with `prefix`, as etcd expects it: `prefix` itself and the first key
+/// beyond. An empty prefix covers all keys.
 pub(super) fn prefix_range(prefix: &str) -> (Vec<u8>, Vec<u8>) {
     if prefix.is_empty() {
         return (vec![0], vec![0]);
     }
     let mut end = prefix.as_bytes().to_vec();
-    // No byte of UTF-8 is the largest one.
+    // No byte of UTF-8 has the largest value, so this can't overflow.
     if let Some(last) = end.last_mut() {
         *last = last.saturating_add(1);
     }
     (prefix.as_bytes().to_vec(), end)
 }
 
-/// etcd's revisions have a sign that they don't use.
+/// Converts etcd's signed revision, which is never negative.
 pub(super) fn unsigned(revision: i64) -> u64 {
     u64::try_from(revision).unwrap_or(0)
 }
 
-/// A revision as etcd has it.
+/// Converts a revision to etcd's signed form.
 pub(super) fn signed(revision: u64) -> i64 {
     i64::try_from(revision).unwrap_or(i64::MAX)
 }

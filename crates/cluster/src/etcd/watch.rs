@@ -1,4 +1,4 @@
-//! Changes of keys as they come, each once and in order, also over a member's death.
+//! Watches: changes of keys as they happen, each once and in order, even when a member fails.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -20,22 +20,22 @@ use super::error::{EtcdError, text};
 use super::member::BACK_OFF;
 use super::store::{KeyValue, key_value, prefix_range, revision, signed, unsigned};
 
-/// Largest message that is taken: etcd parts larger ones at about 2 MB.
+/// Size limit of a message, bytes: etcd splits larger ones at about 2 MB.
 const LARGEST_BYTES: usize = 16 << 20;
 
-/// The number in answers that are for no watch.
+/// Watch number in answers that belong to no watch.
 const NO_WATCH: i64 = -1;
 
 /// A change of a key.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum WatchEvent {
-    /// It was written; its `mod_revision` tells when.
+    /// The key was written, at its `mod_revision`.
     Put(KeyValue),
-    /// It was deleted, or its lease has ended.
+    /// The key was deleted, or its lease has ended.
     Delete {
         /// The key.
         key: String,
-        /// When.
+        /// Revision of the deletion.
         revision: u64,
     },
 }
@@ -43,24 +43,25 @@ pub enum WatchEvent {
 /// Why a watch has ended.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum WatchError {
-    /// etcd no longer has the changes since the last one seen: list the keys, and watch from the revision after that list's.
+    /// etcd no longer has the changes since the last one seen: list the keys, and watch from the revision after
+    /// that list's.
     #[error("etcd no longer has the changes since revision {since}: list the keys again")]
     Compacted {
         /// The first revision that was missed.
         since: u64,
     },
-    /// etcd refuses it: it would again.
+    /// etcd refuses the watch, and would refuse it again.
     #[error("{0}")]
     Refused(String),
 }
 
-/// Changes of the keys that begin with a prefix. It works only while [`Watch::next`] is waited for, and takes no more from etcd
-/// than fits the connection's window. It has a connection of its own, so that what waits there delays nothing else.
+/// Changes of the keys that begin with a prefix. It works only while a [`Watch::next`] is polled, and reads no more
+/// from etcd than fits the connection's window. It has a connection of its own, so its backlog delays nothing else.
 pub struct Watch {
     calls: Arc<MemberCalls>,
-    /// The member that it was last open at; `usize::MAX` before the first.
+    /// Index of the member at which it was last open; `usize::MAX` before the first.
     member: Arc<AtomicUsize>,
-    /// What the next batch comes from. Who gives up waiting leaves it to who waits next, so that nothing is lost.
+    /// Future of the next batch. A caller that is cancelled leaves it here for the next call, so nothing is lost.
     next: Pin<Box<dyn Future<Output = (Following, WatchEvents)> + Send>>,
 }
 
@@ -82,36 +83,36 @@ impl Watch {
         Watch { calls, member, next: Box::pin(following.next()) }
     }
 
-    /// Returns the next changes, at least one, in their order. Those of one transaction come together, unless they are
-    /// more than a megabyte. You may give up waiting at any time: nothing is lost.
+    /// Waits for the next changes and returns them in order, at least one. The changes of one transaction come
+    /// together, unless they exceed about a megabyte. You may cancel the call at any time: nothing is lost.
     ///
-    /// While etcd can't be reached this waits: a keep-alive of a lease tells that sooner.
+    /// It waits while etcd can't be reached; a renewal of a lease reports that sooner.
     ///
     /// # Errors
-    /// Returns an error if it can't go on; then every call returns that.
+    /// Returns an error if the watch has ended; then every further call returns the same error.
     pub async fn next(&mut self) -> Result<Vec<WatchEvent>, WatchError> {
         let (following, batch) = self.next.as_mut().await;
         self.next = Box::pin(following.next());
         batch
     }
 
-    /// Returns the member that it is open at, or was last.
+    /// Returns the address of the member at which the watch is or was last open; `None` before the first.
     pub fn endpoint(&self) -> Option<&str> {
         self.calls.members.get(self.member.load(Ordering::Relaxed)).map(super::member::Member::url)
     }
 }
 
-/// Where a watch has got to.
+/// Position of a watch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct WatchPosition {
-    /// The first revision that is not wholly seen; 0 before the watch was opened from now on.
+    /// First revision that is not wholly seen; 0 before a watch of new changes was opened.
     from: u64,
-    /// Events of that revision that were seen.
+    /// Number of events of that revision that were seen.
     seen: usize,
 }
 
 impl WatchPosition {
-    /// The place after events of these revisions, of which more may come if `parted`.
+    /// Returns the position after events of these revisions. More events of the last revision follow if `parted`.
     fn after(self, revisions: impl Iterator<Item = u64>, parted: bool) -> WatchPosition {
         let mut place = self;
         for revision in revisions {
@@ -122,7 +123,7 @@ impl WatchPosition {
     }
 }
 
-/// A watch at work.
+/// State of a watch, which each future of [`Watch::next`] owns and hands back.
 struct Following {
     calls: Arc<MemberCalls>,
     member: Arc<AtomicUsize>,
@@ -137,13 +138,13 @@ struct WatchStream {
     member: usize,
     questions: mpsc::Sender<WatchRequest>,
     answers: Streaming<WatchResponse>,
-    /// Whether we have asked whether it lives, and have had no answer.
+    /// Whether a request for progress is unanswered.
     asked: bool,
-    /// Events of the first revision that were seen before the break.
+    /// Number of events of the first revision that were seen before the connection broke, and are skipped.
     again: usize,
 }
 
-/// Why a stream goes on no longer.
+/// Why a stream has ended.
 enum Break {
     Ended(WatchError),
     Broken,
@@ -181,7 +182,7 @@ impl Following {
         }
     }
 
-    /// Opens it at a member, from its place on.
+    /// Opens the watch at a member, from its position on.
     async fn open(&mut self) -> Result<WatchStream, EtcdError> {
         let (key, range_end) = prefix_range(&self.prefix);
         let create = WatchCreateRequest {
@@ -209,7 +210,7 @@ impl Following {
     }
 }
 
-/// Opens a stream; the revision at which etcd has taken it.
+/// Opens a stream. Returns it and the store's revision at which etcd has accepted the watch.
 async fn opened(way: MemberCall, channel: Channel, create: WatchCreateRequest) -> Result<(WatchStream, u64), Status> {
     let (questions, asked) = mpsc::channel(2);
     let create = WatchRequest { request_union: Some(RequestUnion::CreateRequest(create)) };
@@ -221,7 +222,7 @@ async fn opened(way: MemberCall, channel: Channel, create: WatchCreateRequest) -
         return Err(Status::unavailable("has not opened the watch"));
     }
     if first.canceled && first.compact_revision == 0 {
-        // etcd says so of a token that is no longer valid, too.
+        // etcd also reports an invalid token in this way.
         return Err(Status::unauthenticated(first.cancel_reason));
     }
     let open = WatchStream { member: way.member, questions, answers, asked: false, again: 0 };
@@ -229,14 +230,15 @@ async fn opened(way: MemberCall, channel: Channel, create: WatchCreateRequest) -
 }
 
 impl WatchStream {
-    /// What etcd sends next, and the place after it. Nothing if that is no change.
+    /// Waits up to `limit` for etcd's next message. Returns its events, none if it reports no change, and moves
+    /// `place` beyond them.
     async fn receive(
         &mut self,
         place: &mut WatchPosition,
         limit: std::time::Duration,
     ) -> Result<Vec<WatchEvent>, Break> {
         let Ok(answer) = timeout(limit, self.answers.message()).await else {
-            // A member that lives answers this at once.
+            // A member that works answers this at once.
             let progress = WatchRequest { request_union: Some(RequestUnion::ProgressRequest(WatchProgressRequest {})) };
             let silent = std::mem::replace(&mut self.asked, true) || self.questions.try_send(progress).is_err();
             return if silent { Err(Break::Broken) } else { Ok(Vec::new()) };
@@ -256,7 +258,8 @@ impl WatchStream {
         if answer.canceled {
             return Err(Break::Broken);
         }
-        // Answers to our own questions say nothing of which changes have been sent: etcd before 3.4.25 overtakes these.
+        // Answers to our requests do not show which changes have been sent: before etcd 3.4.25 they may overtake
+        // changes.
         if answer.watch_id == NO_WATCH || answer.created {
             return Ok(Vec::new());
         }
@@ -283,12 +286,12 @@ impl WatchStream {
     }
 }
 
-/// The revision of an event.
+/// Returns the revision of an event.
 fn written(event: &mvccpb::Event) -> u64 {
     event.kv.as_ref().map_or(0, |kv| unsigned(kv.mod_revision))
 }
 
-/// `None` if the key is no text: it is none of ours.
+/// Converts an event. `None` if the key is not UTF-8: such a key belongs to another program.
 fn watch_event(event: mvccpb::Event) -> Option<WatchEvent> {
     let deleted = event.r#type() == EventType::Delete;
     let kv = key_value(event.kv?)?;

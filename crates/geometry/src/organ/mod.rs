@@ -179,6 +179,22 @@ fn in_mm(length_m: f64) -> f64 {
 /// an adult. The mesh is in one part, a manifold, and, except for the colon and the patch, closed. Each group is the set of
 /// vertices of whole triangles, so that formats which group triangles can keep it.
 ///
+/// A surface of area A has about A/(½√3·l²) vertices with edges of length l: a triangle with equal sides has the area ¼√3·l², and
+/// there are two of them for each vertex.
+///
+/// ```
+/// use palpate_geometry::organ::{Organ, generate};
+/// use palpate_geometry::report;
+///
+/// let mesh = generate(Organ::Gallbladder, 0.003, 1)?;
+/// let report = report(&mesh);
+/// assert_eq!((report.components, report.holes), (1, 0));
+/// assert!((0.7..1.3).contains(&(report.edge_m.median / 0.003)), "edges of {} m", report.edge_m.median);
+/// let names: Vec<&str> = mesh.groups.iter().map(|group| group.name.as_str()).collect();
+/// assert_eq!(names, ["bed", "neck"]);
+/// # Ok::<(), palpate_geometry::organ::OrganError>(())
+/// ```
+///
 /// # Errors
 /// Refuses an edge length that is not a number above 0, that would give more than [`MAX_VERTICES`], or that is too long for
 /// the thinnest part of the organ; the refusal tells the nearest one that fits.

@@ -118,6 +118,22 @@ fn is_utf16(bytes: &[u8]) -> bool {
 /// Reads a mesh file. The content decides the format, then the extension of `name`. Vertices keep the numbers of the file,
 /// from 0, unless a note tells otherwise. `neighbours` gives the content of a file in the same folder by its bare name.
 ///
+/// A file has no unit, so you tell it: here a corner of a cube with edges of 10 mm.
+///
+/// ```
+/// use palpate_geometry::{ReadLimits, read, report};
+///
+/// let obj = b"v 0 0 0\nv 10 0 0\nv 0 10 0\nv 0 0 10\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n";
+/// let mm = "mm".parse().expect("a unit");
+/// let file = read("corner.obj", obj, mm, &|_| None, &ReadLimits::default())?;
+/// let report = report(&file.mesh);
+/// assert_eq!((report.vertices, report.triangles, report.holes), (4, 4, 0));
+/// // A sixth of 1 cm³.
+/// let volume_m3 = report.volume_m3.expect("the surface is closed");
+/// assert!((volume_m3 - 1e-6 / 6.0).abs() < 1e-18, "{volume_m3} m³");
+/// # Ok::<(), palpate_geometry::MeshError>(())
+/// ```
+///
 /// # Errors
 /// Refuses what breaks its format, ends early, is above the limits, or has coordinates that are not finite or indices out
 /// of range, and says at which element.

@@ -1,11 +1,11 @@
-//! How much memory there is, and how what is free gets back to the system.
+//! The memory of the machine, and how freed memory gets back to the system.
 
 use std::path::{Path, PathBuf};
 
-/// Where nothing is known of the machine.
+/// Memory that is assumed if the machine's is unknown, bytes.
 const UNKNOWN: u64 = 1 << 30;
 
-/// Returns half of what the machine has, or of what the control groups of this process leave it, if that is less, bytes.
+/// Returns half of the machine's memory, or of the limit of this process's control groups if that is less, bytes.
 pub fn half_of_the_machine() -> u64 {
     let machine =
         std::fs::read_to_string("/proc/meminfo").ok().and_then(|text| total(&text)).or_else(told_by_the_system);
@@ -14,7 +14,8 @@ pub fn half_of_the_machine() -> u64 {
     limits.chain(machine).min().unwrap_or(UNKNOWN) / 2
 }
 
-/// What the machine has, where /proc does not tell it (`ProcSubset=pid` of a systemd unit).
+/// Returns the machine's memory from a system call, bytes, if /proc does not have it (`ProcSubset=pid` of a systemd
+/// unit).
 fn told_by_the_system() -> Option<u64> {
     #[cfg(target_os = "linux")]
     {
@@ -27,13 +28,13 @@ fn told_by_the_system() -> Option<u64> {
     None
 }
 
-/// `MemTotal:  16324520 kB`.
+/// Parses `MemTotal:  16324520 kB`. Returns bytes.
 fn total(meminfo: &str) -> Option<u64> {
     let line = meminfo.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
     Some(line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? << 10)
 }
 
-/// The files in which the groups of `/proc/self/cgroup` and those above them say how much there may be.
+/// Returns the files with the memory limits of the groups in `/proc/self/cgroup` and of those above them.
 fn groups_of(text: &str) -> Vec<PathBuf> {
     let root = Path::new("/sys/fs/cgroup");
     let mut files = Vec::new();
@@ -45,7 +46,7 @@ fn groups_of(text: &str) -> Vec<PathBuf> {
             "memory" => (root.join("memory"), &["memory.limit_in_bytes"]),
             _ => continue,
         };
-        // In a container the group's own path may not be there, but its root is.
+        // In a container the group's own path may not exist, but its root does.
         let group = Path::new(group.trim_start_matches('/'));
         let above = group.ancestors().map(|group| root.join(group));
         files.extend(above.flat_map(|folder| names.iter().map(move |name| folder.join(name))));
@@ -53,19 +54,20 @@ fn groups_of(text: &str) -> Vec<PathBuf> {
     files
 }
 
-/// What the file of a group says. A group without a limit says `max`, or the largest number of whole pages, 9.2e18 bytes.
+/// Parses the limit of a group, bytes. A group without a limit has `max`, or the largest number of whole pages,
+/// 9.2e18 bytes.
 fn limit(text: &str) -> Option<u64> {
     const NO_MACHINE_HAS: u64 = 1 << 56;
     text.trim().parse().ok().filter(|bytes| *bytes < NO_MACHINE_HAS)
 }
 
-/// From how many bytes on a block is a mapping of its own. Smaller ones would ask the system too often: a mapping costs some
-/// µs, and a page fault for each 4 KiB.
+/// Size from which a block becomes a mapping of its own, bytes. Smaller ones would ask the system too often: a
+/// mapping costs some µs, and a page fault for each 4 KiB.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 const SEPARATE_BYTES: std::ffi::c_int = 256 << 10;
 
-/// Gives back to the system what has been freed and lies about in the allocator. Some milliseconds: not for a thread that
-/// steps.
+/// Returns memory to the system that has been freed and is still held by the allocator. It takes some milliseconds,
+/// so a stepping thread must not call it. It does nothing without the GNU allocator.
 #[allow(unsafe_code)]
 pub fn give_back_to_the_system() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
@@ -78,15 +80,17 @@ pub fn give_back_to_the_system() {
     }
 }
 
-/// Sets up the GNU allocator for a server that runs for long. Call it before threads are started.
+/// Sets up the GNU allocator for a server that runs for long. Call it before threads are started. With another
+/// allocator it does nothing.
 ///
-/// Blocks of [`SEPARATE_BYTES`] and more become mappings of their own, which go back to the system when they are freed. Without a
-/// fixed threshold the allocator raises it to the largest block that was freed, up to 32 MiB; large blocks then lie among small
-/// ones in the heaps of threads, and the free space between them stays resident. After 4 minutes of a siege 15 MiB were in use and
-/// 104 MiB of the heaps free, of which `malloc_trim` returned 6; after 15 minutes 102 MiB stayed resident.
+/// Blocks of [`SEPARATE_BYTES`] and more become mappings of their own, which go back to the system when they are
+/// freed. Without a fixed threshold the allocator raises it to the largest block that was freed, up to 32 MiB;
+/// large blocks then lie among small ones in the heaps of threads, and the free space between them stays resident.
+/// After 4 minutes of an overload test 15 MiB were in use and 104 MiB of the heaps free, of which `malloc_trim`
+/// returned 6; after 15 minutes 102 MiB stayed resident.
 ///
-/// If the system limits the addresses of this process (`ulimit -v`), all threads share one heap: each would otherwise reserve 64
-/// MiB or more of them, and the first request would end the process.
+/// If the address space of this process is limited (`ulimit -v`), all threads share one heap: each would otherwise
+/// reserve 64 MiB or more of it, and the first request would end the process.
 #[allow(unsafe_code)]
 pub fn set_up_allocator() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
@@ -104,10 +108,10 @@ pub fn set_up_allocator() {
     }
 }
 
-/// Returns the bytes as people write them: `512MiB`, `2GiB`, `1048576`.
+/// Parses an amount of memory such as `512MiB`, `2GiB` or `1048576`. Returns bytes.
 ///
 /// # Errors
-/// Returns a message if the text is not a number of bytes.
+/// Returns a message if the text is not a whole number of bytes or units, or is below 1 MiB.
 pub fn parse_bytes(text: &str) -> Result<u64, String> {
     const UNITS: [(&str, u32); 5] = [("KiB", 10), ("MiB", 20), ("GiB", 30), ("TiB", 40), ("", 0)];
     let number = UNITS.iter().find_map(|(unit, shift)| Some((text.strip_suffix(unit)?, *shift)));
@@ -116,7 +120,7 @@ pub fn parse_bytes(text: &str) -> Result<u64, String> {
     bytes.filter(|bytes| *bytes >= 1 << 20).ok_or_else(|| why.to_owned())
 }
 
-/// Number of cores that this process may use.
+/// Returns the number of cores that this process may use.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn cores() -> f64 {
     std::thread::available_parallelism().map_or(1.0, |cores| cores.get() as f64)

@@ -1,10 +1,11 @@
-//! What callers share: memory, sessions, streams, leases, and the processor time of their requests. One rule for all of it.
+//! Resources that callers share: memory, sessions, streams, leases, and processor time. One rule divides them all.
 //!
-//! A caller may have what is in proportion to what is left: its own is at most (1 − r)/r of the rest, where r is the part
-//! that a caller who is alone must leave. So one alone gets all but r; of two who want as much as they can get, each gets
-//! the same; and there is always something left for the next. Nobody's part has to be configured, and none lies idle.
+//! A caller may take in proportion to what is left: its own amount is at most (1 − r)/r of the rest, where r is the
+//! part that a single caller must leave. So a single caller gets all but r; two callers who want as much as
+//! possible get equal amounts; and something is always left for the next. No part has to be configured, and none
+//! lies idle.
 //!
-//! Whatever is taken is a [`Taken`], which gives it back when it is dropped. Time is an argument here.
+//! An amount that was taken is a [`Taken`], which gives it back when it is dropped. Time is an argument here.
 
 mod machine;
 mod time;
@@ -23,22 +24,22 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 
-/// What memory is taken for.
+/// Purpose for which memory is taken.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
     /// The state of a session, its checkpoint, and the scene.
     Session,
-    /// Tissues that wait for their step.
+    /// Changed tissues that wait for their step.
     Change,
-    /// What viewers are shown, and what waits for them.
+    /// Frames of viewers, and what waits for them.
     Frames,
-    /// Records that wait for who probes.
+    /// Records that wait for their reader.
     Records,
     /// Commands that wait for their step.
     Commands,
-    /// Textures that are kept or made.
+    /// Textures that are kept or computed.
     Textures,
-    /// What clients have sent and nobody has read yet, and what they were sent and have not taken.
+    /// Data that clients have sent and the server has not read, and data that clients have not taken.
     Connections,
     /// Force laws that sessions keep.
     Laws,
@@ -51,7 +52,7 @@ pub enum Purpose {
 }
 
 impl Purpose {
-    /// All of them.
+    /// Every purpose, in the order of declaration.
     pub const ALL: [Purpose; 11] = [
         Purpose::Session,
         Purpose::Change,
@@ -66,7 +67,7 @@ impl Purpose {
         Purpose::Requests,
     ];
 
-    /// Returns the name that metrics give it.
+    /// Returns the name of the purpose in the metrics.
     pub fn name(self) -> &'static str {
         match self {
             Purpose::Session => "sessions",
@@ -84,21 +85,21 @@ impl Purpose {
     }
 }
 
-/// What can be taken.
+/// A resource that can be taken.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Resource {
-    /// Bytes.
+    /// Memory, bytes.
     Memory(Purpose),
-    /// Sessions, by who made them.
+    /// Sessions, charged to the account that created them.
     Sessions,
-    /// Streams, by who reads them.
+    /// Streams, charged to the account that reads them.
     Streams,
     /// Tools that are held.
     Leases,
 }
 
 impl Resource {
-    /// Its pool.
+    /// Returns the index of its pool.
     fn index(self) -> usize {
         match self {
             Resource::Memory(_) => 0,
@@ -108,13 +109,13 @@ impl Resource {
         }
     }
 
-    /// Whether it is memory that is laid out when it is taken. That of a connection is what its window allows, which few
-    /// use up.
+    /// Returns whether it is memory that is allocated when it is taken. The memory of a connection is what its
+    /// window allows, which few connections use up.
     fn is_laid_out(self) -> bool {
         matches!(self, Resource::Memory(purpose) if purpose != Purpose::Connections)
     }
 
-    /// For people, and the key of the configuration that bounds it.
+    /// Returns the unit for messages, and the key of the configuration that limits it.
     fn words(self) -> (&'static str, &'static str) {
         match self {
             Resource::Memory(_) => ("bytes", "limits.memory_bytes"),
@@ -125,24 +126,25 @@ impl Resource {
     }
 }
 
-/// So many of something, and who has how many.
+/// A limited amount of one resource, and how much of it each account has.
 #[derive(Debug, Default)]
 pub struct Pool {
     most: u64,
-    /// Whoever is alone leaves so many to others.
+    /// The amount that a single account must leave to others.
     reserve: u64,
     taken: u64,
-    /// By number of account; those that have none are left out.
+    /// Amounts by number of account; accounts without any are left out.
     by: BTreeMap<u64, u64>,
 }
 
 impl Pool {
-    /// Creates a pool of `most`, of which whoever is alone leaves the part 1/`reserve` (none, if there are too few to part).
+    /// Creates a pool of `most`. A single account must leave the part 1/`reserve` of it, rounded down (nothing if
+    /// `most` is below `reserve`).
     pub fn new(most: u64, reserve: u64) -> Self {
         Pool { most, reserve: most / reserve, ..Pool::default() }
     }
 
-    /// The most that anybody can ever have.
+    /// Returns the most that one account can ever have.
     fn most_each(&self) -> u64 {
         self.most - self.reserve
     }
@@ -152,7 +154,7 @@ impl Pool {
         taken <= self.most && u128::from(own) * u128::from(self.reserve) <= u128::from(self.most_each()) * left
     }
 
-    /// Takes so many, if they are within the part of `account`.
+    /// Takes `amount` for `account`. Returns false, and takes nothing, if that is beyond the account's part.
     pub fn take(&mut self, account: u64, amount: u64) -> bool {
         let own = self.of(account).saturating_add(amount);
         let fits = self.fits(own, self.taken.saturating_add(amount));
@@ -163,7 +165,7 @@ impl Pool {
         fits
     }
 
-    /// Gives back so many.
+    /// Gives back `amount` of `account`.
     pub fn give_back(&mut self, account: u64, amount: u64) {
         self.taken = self.taken.saturating_sub(amount);
         if let Some(own) = self.by.get_mut(&account) {
@@ -174,52 +176,53 @@ impl Pool {
         }
     }
 
-    /// Returns what that account has.
+    /// Returns the amount that `account` has.
     pub fn of(&self, account: u64) -> u64 {
         self.by.get(&account).copied().unwrap_or(0)
     }
 
-    /// Returns what all have together.
+    /// Returns the amount that all accounts have together.
     pub fn taken(&self) -> u64 {
         self.taken
     }
 }
 
-/// What a server has to share.
+/// The shared resources of a server, with the accounts of its callers.
 #[derive(Debug)]
 pub struct Budget {
     /// By [`Resource::index`].
     pools: [Mutex<Pool>; 4],
-    /// Of memory, by [`Purpose`].
+    /// Bytes taken, by [`Purpose`].
     purposes: Mutex<[u64; Purpose::ALL.len()]>,
     times: Mutex<[RecentTime; Work::ALL.len()]>,
     accounts: Mutex<Accounts>,
 }
 
-/// Of callers that have gone so many are remembered, at least for as long as what they spent.
+/// Number of accounts above which accounts without users are forgotten. Until then their spent time is remembered.
 const MAX_FORMER: usize = 4096;
 
 #[derive(Debug, Default)]
 struct Accounts {
     numbers: u64,
-    /// A number outlives the account, so that what was spent stays known.
+    /// A number outlives its account, so that spent time stays known.
     known: BTreeMap<String, (u64, Weak<Owner>)>,
 }
 
 impl Budget {
-    /// Creates the budget of a server with these limits, and so many threads that step and that serve the network.
+    /// Creates the budget of a server with `limits`, and with `stepping` stepping threads and `network` network
+    /// threads. If `limits.memory_bytes` is 0, memory is half of the machine's.
     #[allow(clippy::cast_precision_loss)]
     pub fn new(limits: &Limits, stepping: usize, network: usize) -> Arc<Self> {
         let bytes = if limits.memory_bytes > 0 { limits.memory_bytes } else { half_of_the_machine() };
         let pools = [
             Pool::new(bytes, 4),
-            // Without tokens an address is one caller: it has nearly all.
+            // Without tokens an address is one caller, which gets nearly everything.
             Pool::new(limits.sessions as u64, 64),
             Pool::new(limits.streams as u64, 16),
             Pool::new(limits.leases as u64, 16),
         ];
         let threads = [stepping, network].map(|threads| threads.max(1) as f64);
-        // Where there are fewer cores than threads, the threads share them.
+        // If there are fewer cores than threads, the threads share them.
         let cores = (machine::cores() / threads.iter().sum::<f64>()).min(1.0);
         let times = Work::ALL.map(|work| match work {
             Work::Reading => RecentTime::new(cores * threads[0]),
@@ -233,7 +236,7 @@ impl Budget {
         })
     }
 
-    /// Returns the account of the caller of that name: one, however often it is asked for.
+    /// Returns the account of the caller of that name. Repeated calls return the same account while it is in use.
     pub fn account(self: &Arc<Self>, name: &str) -> Account {
         let mut accounts = lock(&self.accounts);
         let known = accounts.known.get(name).map(|(number, owner)| (*number, owner.upgrade()));
@@ -255,27 +258,27 @@ impl Budget {
         Account(owner)
     }
 
-    /// Returns those who have something, or are there.
+    /// Returns the accounts that are in use, by name.
     pub fn accounts(&self) -> Vec<Account> {
         lock(&self.accounts).known.values().filter_map(|(_, owner)| owner.upgrade()).map(Account).collect()
     }
 
-    /// Returns what all have of something: of memory, all purposes together.
+    /// Returns the amount of a resource that all accounts have together; for memory, over all purposes.
     pub fn taken(&self, resource: Resource) -> u64 {
         lock(&self.pools[resource.index()]).taken()
     }
 
-    /// Returns the bytes that are taken for something.
+    /// Returns the bytes that are taken for one purpose.
     pub fn bytes_for(&self, purpose: Purpose) -> u64 {
         lock(&self.purposes)[purpose as usize]
     }
 
-    /// Returns the bytes that are taken, for whatever it is.
+    /// Returns the bytes that are taken for all purposes.
     pub fn bytes_taken(&self) -> u64 {
         self.taken(Resource::Memory(Purpose::Session))
     }
 
-    /// Returns the bytes that there are to share.
+    /// Returns the bytes that can be taken in all.
     pub fn bytes(&self) -> u64 {
         lock(&self.pools[0]).most
     }
@@ -289,68 +292,72 @@ struct Owner {
     turn: tokio::sync::Mutex<()>,
 }
 
-/// A caller's account: what it takes is charged to it.
+/// Account of a caller, to which everything that it takes is charged.
 #[derive(Debug, Clone)]
 pub struct Account(Arc<Owner>);
 
 impl Account {
-    /// Creates an account of nobody else, without bounds that matter: for what no server shares.
+    /// Creates an account with a budget of its own and practically no limit of memory, for work outside a server.
     pub fn alone() -> Self {
         Budget::new(&Limits { memory_bytes: u64::MAX / 4, ..Limits::default() }, 1, 1).account("alone")
     }
 
-    /// Returns as who it is known.
+    /// Returns the name of the caller.
     pub fn name(&self) -> &str {
         &self.0.name
     }
 
-    /// Tells it from others.
+    /// Returns the number of the account, which no other account of the budget has.
     pub fn number(&self) -> u64 {
         self.0.number
     }
 
-    /// Returns what is to be shared.
+    /// Returns the budget to which the account belongs.
     pub fn budget(&self) -> &Arc<Budget> {
         &self.0.budget
     }
 
-    /// Returns what it has of something.
+    /// Returns the amount of a resource that the account has.
     pub fn has(&self, resource: Resource) -> u64 {
         lock(&self.0.budget.pools[resource.index()]).of(self.0.number)
     }
 
-    /// Takes so much of something, until what this returns is dropped. `field` is named by a refusal.
+    /// Takes `amount` of a resource until the returned value is dropped. `field` is the field that a refusal names.
     ///
     /// # Errors
-    /// Refuses what is beyond the part of the account or of all, and memory that the system does not have.
+    /// Refuses an amount beyond the part of this account or the limit of all, and memory that the system does not
+    /// have.
     pub fn take(&self, resource: Resource, amount: u64, field: &str) -> Result<Taken> {
         let mut taken = Taken { account: self.clone(), resource, amount: 0 };
         taken.grow_to(amount, field)?;
         Ok(taken)
     }
 
-    /// Charges it for a request that took so long, ns, of threads that do such work.
+    /// Charges the account for a request that took `took_ns` of processor time on the threads that do such work.
     pub fn spend(&self, work: Work, now_ns: u64, took_ns: u64) {
         lock(&self.0.budget.times)[work as usize].add(self.0.number, now_ns, took_ns);
     }
 
-    /// Returns its calls begin one after another: what one takes is known before the next begins.
+    /// Waits for and reserves the account's turn, so that its calls begin one after another: what one takes is
+    /// known before the next begins. Dropping the guard ends the turn.
     pub async fn turn(&self) -> tokio::sync::MutexGuard<'_, ()> {
         self.0.turn.lock().await
     }
 
-    /// Returns how long it has to wait until its part of such work is free again, ns; 0 if it need not wait.
+    /// Returns how long the account must wait until its part of such work is free again, ns; 0 if it need not
+    /// wait.
     pub fn must_wait_ns(&self, work: Work, now_ns: u64) -> u64 {
         lock(&self.0.budget.times)[work as usize].wait_ns(self.0.number, now_ns)
     }
 
-    /// Returns the processor time of such work that it took of late, as a part of a core.
+    /// Returns the processor time of such work that it took recently, as a fraction of a core. Older time fades
+    /// within milliseconds.
     pub fn share(&self, work: Work, now_ns: u64) -> f64 {
         lock(&self.0.budget.times)[work as usize].share(self.0.number, now_ns)
     }
 }
 
-/// An amount that was taken, given back when this is dropped.
+/// An amount of a resource that an account has taken. Dropping it gives the amount back.
 #[derive(Debug)]
 pub struct Taken {
     account: Account,
@@ -359,28 +366,29 @@ pub struct Taken {
 }
 
 impl Taken {
-    /// Returns how much.
+    /// Returns the amount.
     pub fn amount(&self) -> u64 {
         self.amount
     }
 
-    /// Returns whose.
+    /// Returns the account that is charged.
     pub fn account(&self) -> &Account {
         &self.account
     }
 
-    /// Takes more, so that it is `amount`; or is as it was, and tells why. Of memory that is laid out the system must
-    /// have as much.
+    /// Takes more, so that the amount is `amount`; a smaller `amount` changes nothing. Memory that is allocated at
+    /// once must be available in the system. `field` is the field that a refusal names.
     ///
     /// # Errors
-    /// As for [`Account::take`].
+    /// Refuses an amount beyond the part of the account or the limit of all, and memory that the system does not
+    /// have. The amount then stays as it was.
     pub fn grow_to(&mut self, amount: u64, field: &str) -> Result<()> {
         let more = amount.saturating_sub(self.amount);
         if more == 0 {
             return Ok(());
         }
         if self.resource.is_laid_out() && more <= self.account.0.budget.bytes() {
-            memory::check(more, "what was asked for").map_err(|refusal| refusal.within(field))?;
+            memory::check(more, "this request").map_err(|refusal| refusal.within(field))?;
         }
         let (budget, number) = (&self.account.0.budget, self.account.0.number);
         let mut pool = lock(&budget.pools[self.resource.index()]);
@@ -395,7 +403,7 @@ impl Taken {
         Ok(())
     }
 
-    /// Gives back what is above `amount`.
+    /// Gives back what exceeds `amount`.
     pub fn shrink_to(&mut self, amount: u64) {
         let less = self.amount.saturating_sub(amount);
         if less == 0 {
@@ -449,7 +457,7 @@ mod tests {
         let fill = |account: &Account| std::iter::from_fn(|| account.take(MEMORY, 1, "").ok()).collect::<Vec<_>>();
         let first = fill(&greedy);
         assert_eq!(first.len(), 750);
-        // Who comes later finds three quarters of what was left, and the next of that again.
+        // A later caller finds three quarters of what was left, and the next one three quarters of the rest.
         let (second, third) = (fill(&budget.account("b")), fill(&budget.account("c")));
         assert_eq!((second.len(), third.len()), (187, 47));
         let refused = greedy.take(MEMORY, 1, "scene").unwrap_err();

@@ -1,35 +1,35 @@
-//! Processor time of callers' requests: what each took of late, fading, by the same rule as everything that is shared.
+//! Processor time of callers' requests: the recent time of each, divided by the rule of every shared resource.
 
 use std::collections::BTreeMap;
 
-/// What threads do for a caller's requests, beside stepping.
+/// Kind of work that threads do for a caller's requests, beside stepping.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Work {
-    /// Calls, and the messages of streams, on the threads of the network.
+    /// Calls, and the messages of streams, on the network threads.
     Network,
-    /// Records, hashes and frames, on the threads that step.
+    /// Records, hashes and frames, on the stepping threads.
     Reading,
 }
 
 impl Work {
-    /// Both.
+    /// Both kinds.
     pub const ALL: [Work; 2] = [Work::Network, Work::Reading];
 }
 
-/// Over which time it fades, s: what was taken so long ago counts for 1/e.
-/// It is also how long a burst may keep others waiting.
+/// Time constant of fading, s: time spent this long ago counts for 1/e. It is also how long a burst may keep others
+/// waiting.
 const MEMORY_S: f64 = 0.005;
 
-/// Of all the time there is, who is alone leaves so much.
+/// Part of all available time that a single caller must leave.
 const RESERVE: f64 = 0.5;
 
-/// Less is nothing, s.
+/// Time below which an account is forgotten, s.
 const NOTHING_S: f64 = 1e-9;
 
-/// Time that was spent of late, s, by number of account.
+/// Recently spent time by number of account, s, which fades exponentially.
 #[derive(Debug)]
 pub(super) struct RecentTime {
-    /// That threads could have spent.
+    /// Time that the threads could have spent, s.
     most_s: f64,
     at_ns: u64,
     all_s: f64,
@@ -38,14 +38,14 @@ pub(super) struct RecentTime {
 
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 impl RecentTime {
-    /// Of threads that have so many cores together.
+    /// Creates the record of threads that have `cores` cores together.
     pub(super) fn new(cores: f64) -> Self {
         RecentTime { most_s: cores * MEMORY_S, at_ns: 0, all_s: 0.0, by: BTreeMap::new() }
     }
 
     fn fade(&mut self, now_ns: u64) {
         let elapsed_s = now_ns.saturating_sub(self.at_ns) as f64 * 1e-9;
-        // A thousandth of the memory: nobody sees the difference.
+        // 1/250 of the time constant: the difference is negligible.
         if elapsed_s < 2e-5 {
             return;
         }
@@ -65,7 +65,7 @@ impl RecentTime {
         self.all_s += took_s;
     }
 
-    /// Until own·r ≤ (1 − r)·(most − all), both fading.
+    /// Returns how long the account must wait, ns: until own·r ≤ (1 − r)·(most − all), as both fade.
     pub(super) fn wait_ns(&mut self, account: u64, now_ns: u64) -> u64 {
         self.fade(now_ns);
         let own_s = self.by.get(&account).copied().unwrap_or(0.0);
@@ -73,7 +73,7 @@ impl RecentTime {
         if own_s == 0.0 || excess <= 1.0 { 0 } else { (excess.ln() * MEMORY_S * 1e9).ceil() as u64 }
     }
 
-    /// Parts of a core.
+    /// Returns the account's recent time as a fraction of a core.
     pub(super) fn share(&mut self, account: u64, now_ns: u64) -> f64 {
         self.fade(now_ns);
         self.by.get(&account).copied().unwrap_or(0.0) / MEMORY_S
@@ -84,8 +84,8 @@ impl RecentTime {
 mod tests {
     use super::*;
 
-    /// In virtual time: each of `callers` works in slices of 0.1 ms whenever it need not wait; the part of a thread that
-    /// each got.
+    /// In virtual time: each of `callers` works in slices of 0.1 ms whenever it need not wait. Returns the part of
+    /// a thread that each got.
     fn parts(callers: u64) -> Vec<f64> {
         let (mut spent, mut got) = (RecentTime::new(1.0), vec![0.0; callers as usize]);
         let mut now_ns = 0;

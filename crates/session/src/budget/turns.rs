@@ -1,8 +1,8 @@
-//! Accounts take turns: each has a queue of its own, and the next item comes from the next account's.
+//! A queue with turns: each account has a queue of its own, and the next item comes from the next account's.
 
 use std::collections::VecDeque;
 
-/// What waits, by the account that it waits for.
+/// Items that wait, by account, which accounts take in turns.
 #[derive(Debug)]
 pub struct Turns<T> {
     /// By number of account, in the order of their turns; no queue is empty.
@@ -20,12 +20,12 @@ impl<T> Turns<T> {
         self.queues.iter_mut().find(|queue| queue.0 == account).map(|queue| &mut queue.1)
     }
 
-    /// Returns who has items that wait.
+    /// Returns the accounts with waiting items, in the order of their turns.
     pub fn accounts(&self) -> impl Iterator<Item = u64> {
         self.queues.iter().map(|queue| queue.0)
     }
 
-    /// Returns how many items of `account` wait.
+    /// Returns the number of waiting items of `account`.
     pub fn count(&self, account: u64) -> usize {
         self.queues.iter().find(|queue| queue.0 == account).map_or(0, |queue| queue.1.len())
     }
@@ -35,7 +35,7 @@ impl<T> Turns<T> {
         self.push_before(account, item, |_| false);
     }
 
-    /// Adds an item before the first of `account` that `may_wait`, or behind all.
+    /// Adds an item before the first item of `account` for which `may_wait` holds, or behind all.
     pub fn push_before(&mut self, account: u64, item: T, may_wait: impl Fn(&T) -> bool) {
         match self.queue(account) {
             Some(queue) => {
@@ -46,7 +46,7 @@ impl<T> Turns<T> {
         }
     }
 
-    /// Returns the rest of an item to where it was taken from: before all others of `account`.
+    /// Puts an item before all others of `account`, such as the rest of one that was taken.
     pub fn push_front(&mut self, account: u64, item: T) {
         match self.queue(account) {
             Some(queue) => queue.push_front(item),
@@ -54,7 +54,8 @@ impl<T> Turns<T> {
         }
     }
 
-    /// Takes the first item of the first account that `may` have a turn, whose next turn comes after all others'.
+    /// Removes and returns the first item of the first account for which `may` holds, with the account's number.
+    /// Its next turn comes after all others'. `None` if there is no such account.
     pub fn next(&mut self, may: impl Fn(u64) -> bool) -> Option<(u64, T)> {
         let turn = self.queues.iter().position(|queue| may(queue.0))?;
         let (account, mut queue) = self.queues.remove(turn)?;
@@ -65,7 +66,7 @@ impl<T> Turns<T> {
         Some((account, item))
     }
 
-    /// Removes the items of `account` that are not to be kept.
+    /// Removes the items of `account` for which `keep` is false.
     pub fn retain(&mut self, account: u64, keep: impl FnMut(&T) -> bool) {
         if let Some(queue) = self.queue(account) {
             queue.retain(keep);
@@ -73,12 +74,12 @@ impl<T> Turns<T> {
         self.queues.retain(|queue| !queue.1.is_empty());
     }
 
-    /// Returns all items.
+    /// Returns all items, by account in the order of turns.
     pub fn iter(&self) -> impl Iterator<Item = &T> {
         self.queues.iter().flat_map(|queue| &queue.1)
     }
 
-    /// Returns whether nothing waits.
+    /// Returns whether no items wait.
     pub fn is_empty(&self) -> bool {
         self.queues.is_empty()
     }
@@ -98,7 +99,7 @@ mod tests {
         assert_eq!((turns.count(1), turns.count(2), turns.count(3)), (3, 1, 0));
         assert_eq!(turns.iter().copied().collect::<Vec<_>>(), [0, 1, 2, 10]);
         assert_eq!(turns.next(|_| true), Some((1, 0)));
-        // The rest of what account 1 had comes first at its next turn, which is after that of account 2.
+        // The rest of account 1's item comes first at its next turn, which is after that of account 2.
         turns.push_front(1, 0);
         let order: Vec<_> = std::iter::from_fn(|| turns.next(|_| true)).collect();
         assert_eq!(order, [(2, 10), (1, 0), (1, 1), (1, 2)]);

@@ -1,4 +1,4 @@
-//! The intake in virtual time: rest, stamps, leases.
+//! Tests of the intake in virtual time: rest, stamps, leases.
 #![allow(clippy::unwrap_used)]
 
 use super::super::batch::SLICE;
@@ -10,7 +10,7 @@ use palpate_tissue::shape::PointId;
 const LEASE: LeaseId = 7;
 const MS: u64 = 1_000_000;
 
-/// Tool 0 is held for a second from 0 on; step k is due at k ms.
+/// Tool 0 is held for a second from time 0 on; step k is due at k ms.
 fn intake() -> (Intake, Schedule) {
     let limits = Limits::default();
     let scene = Scene::parse("paper", PAPER, &[], &limits).unwrap();
@@ -30,11 +30,11 @@ fn steps(intake: &Intake) -> Vec<u64> {
 #[test]
 fn a_command_at_rest_acts_at_the_next_step_by_the_clock_and_wakes_once() {
     let (mut intake, schedule) = intake();
-    // At rest until the lease would lapse.
+    // At rest until the lease would expire.
     assert_eq!(intake.rest(5, u64::MAX, &schedule), 1001);
     intake.submit(LEASE, vec![release(1, None)], 500 * MS).unwrap();
     assert_eq!((steps(&intake), intake.take_wake(), intake.take_wake()), (vec![501], true, false));
-    // Time does not pass what waits: a second one comes after it, or with it.
+    // Time does not pass a waiting command: a second one comes with it or after it.
     intake.submit(LEASE, vec![release(2, None)], 520 * MS).unwrap();
     assert_eq!(steps(&intake), [501, 501]);
     assert!(!intake.take_wake());
@@ -51,7 +51,7 @@ fn stamps_mean_the_same_at_rest() {
     intake.rest(0, u64::MAX, &schedule);
     let commands = vec![release(1, Some(400)), release(2, Some(501)), release(3, Some(800))];
     intake.submit(LEASE, commands, 500 * MS).unwrap();
-    // 400 is over at 500 ms, though no step was computed.
+    // Step 400 is over at 500 ms, though no step was computed.
     assert_eq!(steps(&intake), [501, 501, 800]);
     assert_eq!(intake.queue.in_order().iter().map(|(_, due)| due.late).collect::<Vec<_>>(), [true, false, false]);
     assert_eq!(intake.rest(0, u64::MAX, &schedule), 501);
@@ -69,7 +69,7 @@ fn a_lease_lapses_at_rest_and_what_is_wanted_earlier_comes_first() {
     assert_eq!(intake.rest(51, u64::MAX, &schedule), 1001);
     intake.lapse(1000 * MS);
     assert_eq!((intake.lapsed(), steps(&intake), intake.take_wake()), (1, vec![1001], true));
-    // Whose very next step is wanted does not rest.
+    // A session whose very next step is wanted does not rest.
     assert_eq!(intake.rest(1001, u64::MAX, &schedule), 1001);
     assert!(!intake.is_resting());
 }
@@ -93,7 +93,7 @@ fn a_command_without_a_sequence_follows_the_one_before() {
     intake.submit(LEASE, vec![unnumbered()], 0).unwrap();
     let sequences: Vec<_> = due(&mut intake, 2).iter().map(|due| due.command.sequence).collect();
     assert_eq!(sequences, [0, 1, 7, 8, 9].map(Some));
-    // Nothing follows the last number.
+    // No number follows the largest one.
     intake.submit(LEASE, vec![release(u64::MAX, Some(3))], 0).unwrap();
     assert_eq!(intake.submit(LEASE, vec![unnumbered()], 0).unwrap_err().reason, Reason::StaleSequence);
 }
@@ -112,7 +112,7 @@ fn a_tool_keeps_its_tip_until_it_is_released() {
     intake.submit(LEASE, vec![lead(1, 0.005)], 0).unwrap();
     let refused = intake.submit(LEASE, vec![lead(2, 0.005), lead(3, 0.006)], 0).unwrap_err();
     assert_eq!((refused.reason, refused.field.as_str()), (Reason::OutOfTurn, "pose.tip.radius_m"));
-    // Of a batch that is refused nothing is taken in.
+    // A refused batch changes nothing.
     intake.submit(LEASE, vec![lead(2, 0.005), release(3, None), lead(4, 0.006)], 0).unwrap();
     assert!(intake.submit(LEASE, vec![lead(5, 0.005)], 0).is_err());
 }
@@ -128,12 +128,12 @@ fn poses_that_came_by_datagram_may_have_been_overtaken_and_no_others() {
     };
     intake.submit(LEASE, vec![pose(5, true)], 0).unwrap();
     intake.submit(LEASE, vec![pose(3, true), pose(4, true)], 0).unwrap();
-    // What came late does not lower the newest number.
+    // A late pose does not lower the newest number.
     assert_eq!(intake.submit(LEASE, vec![pose(5, false)], 0).unwrap_err().reason, Reason::StaleSequence);
     intake.submit(LEASE, vec![pose(6, false)], 0).unwrap();
     let sequences: Vec<_> = due(&mut intake, 1).iter().map(|due| due.command.sequence).collect();
     assert_eq!(sequences, [5, 3, 4, 6].map(Some));
-    // A velocity is for poses that are played by the client's time.
+    // Velocities are for poses that are played by client time.
     let action =
         Action::Pose { place_m: glam::DVec3::ZERO, velocity_m_per_s: Some(glam::DVec3::X), tip: Tip::default() };
     let refused = intake.submit(LEASE, vec![Command { action, ..release(7, Some(9)) }], 0).unwrap_err();
@@ -171,7 +171,7 @@ fn every_accepted_command_is_counted_by_one_outcome() {
     let (mut intake, _) = intake();
     let commands = vec![grasp(1, 5), grasp(2, 5), grasp(3, 5), grasp(4, 6), release(5, Some(6)), release(6, Some(9))];
     intake.submit(LEASE, commands, 0).unwrap();
-    // Of places for one step the last one counts.
+    // The last of several positions for one step counts.
     let counts = Counts { accepted: 6, superseded: 2, waiting: 4, ..Counts::default() };
     assert_eq!(intake.counts(), counts);
     assert_eq!(due(&mut intake, 5).len(), 1);
@@ -179,7 +179,7 @@ fn every_accepted_command_is_counted_by_one_outcome() {
     assert_eq!(due(&mut intake, 6).len(), 2);
     intake.release(LEASE).unwrap();
     assert_eq!(intake.counts(), Counts { applied: 3, dropped: 1, waiting: 0, ..counts });
-    // What ends the lease is not a client's command.
+    // The end of a lease is not a client's command.
     assert!(due(&mut intake, 7).iter().all(|due| due.ends_lease));
     assert_eq!(intake.counts(), Counts { applied: 3, dropped: 1, waiting: 0, ..counts });
 }
@@ -218,7 +218,7 @@ fn a_change_of_tissue_is_made_from_the_newest() {
     });
     assert_eq!(intake.change(Some(&first), &second, Some(7), 0), Ok(None));
     assert_eq!(intake.change(None, &first, Some(7), 0), Ok(Some(7)));
-    // Made from what is no longer the newest.
+    // Made from a tissue that is no longer the newest.
     assert_eq!(intake.change(None, &second, Some(8), 0), Ok(None));
     assert_eq!(intake.change(Some(&first), &second, Some(8), 0), Ok(Some(8)));
     assert!(intake.take_change(6).is_none());
@@ -236,11 +236,11 @@ fn a_batch_is_taken_in_slices_and_acts_whole() {
     let mut batch = intake.accept(LEASE, checked, 0).unwrap();
     let mut slices = 1;
     assert!(intake.go_on(&mut batch));
-    // Others are not kept out; of this lease nothing can come between.
+    // Other leases are not blocked; no other command of this lease can come between.
     let of_other = |sequence| Command { tool: 1, ..release(sequence, Some(3)) };
     intake.submit(LEASE + 1, vec![of_other(1)], 0).unwrap();
     assert_eq!(intake.submit(LEASE, vec![release(1000, None)], 0).unwrap_err().reason, Reason::OutOfTurn);
-    // What came before the batch acts at its step.
+    // Commands from before the batch act at their step.
     let mut due = Vec::new();
     intake.take_due(4, 0, &mut due);
     let came = due.iter().map(|due| (due.command.tool, due.command.sequence));
@@ -267,7 +267,7 @@ fn a_batch_whose_tool_is_released_meanwhile_is_dropped_whole() {
     assert!(intake.go_on(&mut batch));
     assert_eq!(intake.counts(), Counts { accepted: 600, waiting: 600, ..Counts::default() });
     intake.release(LEASE).unwrap();
-    // Who takes the tool next has nothing of it.
+    // The next holder of the tool has none of it.
     intake.acquire(&[0], "next", 1.0, LEASE + 1, 0).unwrap();
     while intake.go_on(&mut batch) {}
     let mut due = Vec::new();
@@ -281,7 +281,7 @@ fn the_memory_of_commands_that_wait_is_charged_and_given_back_as_they_are_done_o
     let account = Account::alone();
     let mut intake = intake().0.charged_to(&account);
     let charged = || account.has(Resource::Memory(Purpose::Commands));
-    // In whole pieces, and the first is free. Nodes of a tree are two thirds full.
+    // In whole pieces, of which the first is free. Nodes of a tree are two thirds full.
     let is_charged = |count: u64| {
         let bytes = 3 * count * size_of::<(QueueKey, Due)>() as u64 / 2;
         charged().is_multiple_of(PIECE_BYTES) && (charged()..charged() + PIECE_BYTES).contains(&bytes)
@@ -294,7 +294,7 @@ fn the_memory_of_commands_that_wait_is_charged_and_given_back_as_they_are_done_o
     for (step, left) in [(10, 2000), (11, 1000), (12, 0)] {
         assert_eq!((due(&mut intake, step).len(), is_charged(left)), (1000, true), "{} bytes for {left}", charged());
     }
-    // All of a batch at once, and the end of its lease discards it.
+    // A batch is discarded as a whole at the end of its lease.
     intake.submit(LEASE, (3000..6000).map(|sequence| release(sequence, Some(100))).collect(), 0).unwrap();
     assert!(is_charged(3000), "{}", charged());
     intake.release(LEASE).unwrap();
@@ -304,7 +304,7 @@ fn the_memory_of_commands_that_wait_is_charged_and_given_back_as_they_are_done_o
 
 #[test]
 fn of_poses_for_one_step_the_last_counts_and_of_those_played_by_the_clients_time_each_does() {
-    // Sequence, step, and the client's time: a pose with a step is played at that step, whatever its time.
+    // Sequence, step, and client time: a pose with a step is played at that step, whatever its time.
     let superseded = |at_step: Option<u64>, client_time_ns: u64| {
         let (mut intake, _) = intake();
         let pose = |sequence: u64| Command {
@@ -365,7 +365,7 @@ fn a_tool_that_is_in_the_tissue_when_a_session_goes_on_keeps_its_tip() {
         (refused.reason, refused.field)
     };
     let refused = (Reason::OutOfTurn, "pose.tip.radius_m".to_owned());
-    // Whoever takes it, and whoever has it from another server.
+    // Both for a client that acquires the tool, and for one whose lease comes from another server.
     let mut taken = Intake::new(&model.scene, &limits).continued(&session, None);
     taken.acquire(&[0, 1], "test", 1.0, LEASE, 0).unwrap();
     assert_eq!(other(&mut taken, 0), refused);
@@ -374,19 +374,19 @@ fn a_tool_that_is_in_the_tissue_when_a_session_goes_on_keeps_its_tip() {
     let mut adopting = Intake::new(&model.scene, &limits).continued(&session, None);
     adopting.adopt(crate::intake_transfer::Handed { waiting: Vec::new(), ..handed }, 0);
     assert_eq!(other(&mut adopting, 0), refused);
-    // Once it has let go, a new tip is as good as another; and a lease that ends takes the tip with it.
+    // After a release any tip may be used; and a lease that ends takes its tip with it.
     adopting.submit(LEASE, vec![Command::new(0, None, Action::Release), Command::new(0, None, pose(0.01))], 0).unwrap();
     adopting.release(LEASE).unwrap();
     adopting.acquire(&[0], "test", 1.0, LEASE, 0).unwrap();
     adopting.submit(LEASE, vec![Command::new(0, None, pose(0.04))], 0).unwrap();
-    // All let go, as after a crash: nothing is known.
+    // All tools are released, as after a crash, so no tip is known.
     session.let_go();
     let mut after = Intake::new(&model.scene, &limits).continued(&session, None);
     after.acquire(&[2], "test", 1.0, LEASE, 0).unwrap();
     after.submit(LEASE, vec![Command::new(2, None, pose(0.01))], 0).unwrap();
 }
 
-/// 64 tips of a third of an organ on one session stopped the others of its thread for 4.5 s.
+/// 64 tips of a third of an organ on one session stopped the other sessions of its thread for 4.5 s.
 #[test]
 fn tips_that_a_step_has_no_time_for_are_refused_with_the_radius_that_fits() {
     let (limits, model) = (Limits::default(), Model::parse("gallbladder", crate::GALLBLADDER, &[]).unwrap());
@@ -410,15 +410,15 @@ fn tips_that_a_step_has_no_time_for_are_refused_with_the_radius_that_fits() {
     assert!((2..40).contains(&taken), "{taken}");
     assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "pose.tip.radius_m"));
     assert!(refusal.to_string().contains("m fits"), "{refusal}");
-    // The radius that fits does fit, and who is there moves on.
+    // The radius that the message names fits, and present tips may move on.
     let fits_m: f64 = refusal.to_string().rsplit("; ").next().unwrap().split(' ').next().unwrap().parse().unwrap();
     intake.submit(LEASE, vec![pose(taken, 1, fits_m), pose(0, 2, radius_m)], 0).unwrap();
-    // In one call as well as in many: none of it is taken.
+    // In one call as in many: none of it is accepted.
     let many: Vec<Command> = (taken + 1..64).map(|tool| pose(tool, 1, radius_m)).collect();
     assert_eq!(intake.submit(LEASE, many, 0).unwrap_err().reason, Reason::TooLarge);
-    // What is released makes room.
+    // A release makes room.
     intake.submit(LEASE, vec![Command::new(0, Some(3), Action::Release), pose(taken + 1, 1, radius_m)], 0).unwrap();
-    // A sheet's discs are bounded, and a run of its own waits for nobody.
+    // The discs of a sheet have bounded cost, and an offline run delays no other session.
     let mut alone = Intake::new(&model.scene, &limits);
     alone.acquire(&tools, "test", 1.0, LEASE, 0).unwrap();
     alone.submit(LEASE, tools.iter().map(|tool| pose(*tool, 1, radius_m)).collect(), 0).unwrap();

@@ -1,37 +1,38 @@
-//! The names of journals in a folder.
+//! File names of journals in a folder.
 
 use std::path::{Path, PathBuf};
 
-/// A journal in a folder.
+/// File of the journal of one run.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct JournalFile {
-    /// The session's id.
+    /// ID of the session.
     pub session_id: String,
     /// Number of the run.
     pub run: u64,
-    /// Where it is.
+    /// Path of the file.
     pub path: PathBuf,
 }
 
-/// Longest id of a session in a name.
+/// Length limit of a session's ID in a file name, bytes.
 const MAX_LETTERS: usize = 128;
 
-/// Returns the name of the file of a run.
+/// Returns the file name of a run: `SESSION.RUN.mcap`.
 pub fn name(session_id: &str, run: u64) -> String {
     format!("{session_id}.{run}.mcap")
 }
 
-/// Returns the session and the run that a name tells; `None` if it is no journal's.
+/// Returns the session and the run of a file name; `None` if it is not a journal's.
 pub fn parse(name: &str) -> Option<(String, u64)> {
     let (session_id, run) = name.strip_suffix(".mcap")?.rsplit_once('.')?;
     let is_letter = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
     let is_id = !session_id.is_empty() && session_id.len() <= MAX_LETTERS && session_id.chars().all(is_letter);
     let number = run.parse().ok()?;
-    // One name each: no sign, no zeros before.
+    // Each run has one name: no sign, and no leading zeros.
     (is_id && number > 0 && run == format!("{number}")).then(|| (session_id.to_owned(), number))
 }
 
-/// Returns the journals in a folder, by session and run: files, and not pipes or folders with such names.
+/// Returns the journals in a folder, sorted by session and run. Only regular files count, not pipes or folders with
+/// such names.
 ///
 /// # Errors
 /// Returns an error if the folder can't be read.

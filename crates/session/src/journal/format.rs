@@ -1,4 +1,4 @@
-//! What every journal has in common: its topics, their schemas, and the bounds of a batch.
+//! The format of journals: topics, their schemas, and limits of a batch.
 
 use std::collections::BTreeSet;
 
@@ -7,42 +7,43 @@ use prost::Message;
 
 use super::records::{self, CHANNEL, SCHEMA};
 
-/// Raised with each change after which the same inputs give other bits: a journal with another number is shown and exported, but
-/// neither verified nor gone on from.
+/// Generation of the arithmetic. It is raised with each change after which equal inputs give other bits. A journal
+/// with another number can be shown and exported, but neither verified nor continued.
 pub const REPLAYS: u32 = 3;
 
-/// The version that writes.
+/// Version of this program, which it writes into journals.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// Most inputs in a batch. With more, a flush writes several.
+/// Limit of inputs in a batch. With more, a flush writes several batches.
 pub const MAX_INPUTS: usize = 1 << 16;
 
-/// Largest chunk that is read, bytes. A writer begins another batch long before; only a single snapshot may be large.
+/// Size limit of a chunk that is read, bytes. A writer ends a batch long before; only a single snapshot may be
+/// large.
 pub const MAX_BYTES: u64 = 1 << 30;
 
-/// The messages of a journal. Their numbers are those of their channels and schemas.
+/// Topics of a journal's messages. The number of a topic is that of its channel and its schema.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Topic {
-    /// `Header`.
+    /// Message `Header`: the session, its scene and the run.
     Header = 1,
-    /// `Inputs`.
+    /// Message `Inputs`: the inputs of a batch.
     Inputs = 2,
-    /// `Hash`.
+    /// Message `Hash`: a hash of the state at a step.
     Hashes = 3,
-    /// `Snapshot`.
+    /// Message `Snapshot`: a session at a step.
     Snapshots = 4,
-    /// `Felt`.
+    /// Message `Felt`: poses and forces of the tools.
     Felt = 5,
-    /// `End`.
+    /// Message `End`: why the journal ends.
     End = 6,
-    /// `Waiting`.
+    /// Message `Waiting`: changes of the tissue that wait for their step.
     Waiting = 7,
-    /// `Signature`.
+    /// Message `Signature`: a signature of all messages before it.
     Signatures = 8,
 }
 
 impl Topic {
-    /// All of them.
+    /// Every topic, by number.
     pub const ALL: [Topic; 8] = [
         Topic::Header,
         Topic::Inputs,
@@ -54,7 +55,7 @@ impl Topic {
         Topic::Signatures,
     ];
 
-    /// Returns the topic of its channel.
+    /// Returns the name of the topic, as its channel has it.
     pub fn name(self) -> &'static str {
         match self {
             Topic::Header => "/header",
@@ -68,7 +69,7 @@ impl Topic {
         }
     }
 
-    /// Name of the message.
+    /// Returns the name of the message type.
     fn message(self) -> &'static str {
         match self {
             Topic::Header => "Header",
@@ -82,13 +83,13 @@ impl Topic {
         }
     }
 
-    /// Returns the number of its channel.
+    /// Returns the number of the topic's channel, which is also that of its schema.
     pub fn channel(self) -> u16 {
         self as u16
     }
 }
 
-/// A file of the protocol, as far as its imports are concerned.
+/// Name and imports of a file of the protocol.
 #[derive(Clone, PartialEq, Message)]
 struct ProtoFile {
     #[prost(string, tag = "1")]
@@ -97,14 +98,14 @@ struct ProtoFile {
     dependency: Vec<String>,
 }
 
-/// Files of the protocol, each as its bytes.
+/// Encoded files of the protocol.
 #[derive(Clone, PartialEq, Message)]
 struct Files {
     #[prost(bytes = "vec", repeated, tag = "1")]
     file: Vec<Vec<u8>>,
 }
 
-/// The schema of a topic.
+/// Returns the schema of a topic.
 fn schema(topic: Topic) -> Vec<u8> {
     schema_of(if topic == Topic::Header {
         "palpate/journal/v1/header.proto"
@@ -113,11 +114,11 @@ fn schema(topic: Topic) -> Vec<u8> {
     })
 }
 
-/// Returns a file of the protocol and all that it imports: a `FileDescriptorSet`.
+/// Returns a file of the protocol and all files that it imports, as an encoded `FileDescriptorSet`.
 pub fn schema_of(file: &str) -> Vec<u8> {
     let all = Files::decode(pb::DESCRIPTORS).unwrap_or_default();
     let mut wanted = BTreeSet::from([file.to_owned()]);
-    // Each file is after its imports.
+    // Each file comes after its imports.
     let mut kept: Vec<Vec<u8>> = Vec::new();
     for bytes in all.file.into_iter().rev() {
         let file = ProtoFile::decode(&*bytes).unwrap_or_default();
@@ -130,7 +131,7 @@ pub fn schema_of(file: &str) -> Vec<u8> {
     Files { file: kept }.encode_to_vec()
 }
 
-/// The schemas and channels of all topics, as records; that of signatures only if there are some.
+/// Appends the schemas and channels of all topics, as records; those of signatures only if `signed`.
 pub(super) fn channels(out: &mut Vec<u8>, signed: bool) {
     for topic in Topic::ALL.into_iter().filter(|topic| signed || *topic != Topic::Signatures) {
         records::record(out, SCHEMA, |body| {

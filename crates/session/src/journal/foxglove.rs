@@ -1,4 +1,4 @@
-//! Exports for Foxglove: curves of tools and energies, and the points of the tissue as they move.
+//! Exports for Foxglove: curves of tools and energies, and the moving points of the tissue.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -16,10 +16,10 @@ use super::format::{VERSION, schema_of};
 use crate::Session;
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// An export that is being written.
+/// An MCAP export for Foxglove that is being written.
 pub struct Export<W: Write + Seek> {
     writer: Writer<W>,
-    /// Time of step `begin`, Unix.
+    /// Time of step `begin`, ns since the Unix epoch.
     begun_ns: u64,
     begin: u64,
     rate_hz: f64,
@@ -27,7 +27,7 @@ pub struct Export<W: Write + Seek> {
     points: Arc<Channel<'static>>,
     of_tools: Arc<Schema<'static>>,
     tools: BTreeMap<u32, Arc<Channel<'static>>>,
-    /// The newest step of curves, and of surfaces.
+    /// The newest written step of the curves, and of the surface.
     newest: [Option<u64>; 2],
 }
 
@@ -45,11 +45,11 @@ fn channel(id: u16, topic: String, schema: &Arc<Schema<'static>>) -> Arc<Channel
     Arc::new(Channel { id, topic, schema, message_encoding, metadata: BTreeMap::new() })
 }
 
-/// The channels of tools follow this number.
+/// Number before the channels of the tools: tool n has the channel 16 + n.
 const FIRST_TOOL: u16 = 16;
 
 impl<W: Write + Seek> Export<W> {
-    /// Begins an export of a session as it stands, at the time `begun_ns`.
+    /// Begins an export of a session at its present step, whose time is `begun_ns`, ns since the Unix epoch.
     ///
     /// # Errors
     /// Refuses an output that can't be written.
@@ -71,14 +71,15 @@ impl<W: Write + Seek> Export<W> {
         })
     }
 
-    /// Time of a step: as if each had taken its time since the beginning.
+    /// Returns the time of a step, ns since the Unix epoch, as if each step since the beginning had taken its
+    /// nominal time.
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn unix_ns(&self, step: u64) -> u64 {
         let since_s = step.saturating_sub(self.begin) as f64 / self.rate_hz;
         self.begun_ns.saturating_add((since_s * 1e9) as u64)
     }
 
-    /// Whether a step is not written yet.
+    /// Notes a step as the newest. Returns whether it is not the newest already.
     fn is_new(&mut self, which: usize, step: u64) -> bool {
         self.newest[which].replace(step) != Some(step)
     }
@@ -96,7 +97,8 @@ impl<W: Write + Seek> Export<W> {
         self.writer.write(&record).map_err(|e| unwritten(&e))
     }
 
-    /// Returns what tools feel, and the energies.
+    /// Writes the curves of the session's present step: the pose and force of each tool, and the energies, J. A
+    /// step that was written last is not written again.
     ///
     /// # Errors
     /// Refuses an output that can't be written.
@@ -137,7 +139,8 @@ impl<W: Write + Seek> Export<W> {
         self.write(&channel, step, &curve)
     }
 
-    /// Returns the points of the tissue: where they are, and how far they have moved.
+    /// Writes a point cloud of the session's present step: the place of each point and the length of its
+    /// displacement, m. A step that was written last is not written again.
     ///
     /// # Errors
     /// Refuses an output that can't be written.
@@ -180,7 +183,7 @@ impl<W: Write + Seek> Export<W> {
         self.write(&channel, step, &cloud)
     }
 
-    /// Ends the export; gives the output back.
+    /// Writes the end of the export, and returns the output.
     ///
     /// # Errors
     /// Refuses an output that can't be written.

@@ -1,6 +1,7 @@
-//! The inputs of a journal from a step on, batch by batch; and inputs that are in none yet, as bytes.
+//! The inputs of a journal from a step on, batch by batch; and encoded inputs that are not in a journal yet.
 //!
-//! A session that plays a journal reads batches. One that goes to another server takes along what waits for its step.
+//! A playback reads the former. A session that moves to another server takes the latter with it: the inputs that
+//! wait for their step.
 
 use std::collections::VecDeque;
 use std::io::{Read, Seek};
@@ -18,7 +19,7 @@ use palpate_refusal::Result;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 
-/// Reads the inputs of a journal.
+/// Reader of the inputs in a journal, from a step on.
 pub struct Inputs<R> {
     reader: JournalReader<R>,
     first: Arc<Model>,
@@ -27,19 +28,19 @@ pub struct Inputs<R> {
     from_step: u64,
 }
 
-/// Inputs, each with the steps done before it acts, and the step before which there are no others.
+/// Inputs of one batch.
 pub struct Piece {
-    /// In order.
+    /// Inputs in order, each with the number of steps done before it acts.
     pub inputs: VecDeque<(u64, Input)>,
-    /// All that act before this step have been read.
+    /// All inputs that act before this step have been read.
     pub until_step: u64,
 }
 
 impl<R: Read + Seek> Inputs<R> {
-    /// Creates the inputs that act at `step` and later. `survey` is that of the journal, and `first` the tissue with which
-    /// its session began.
+    /// Creates a reader of the inputs that act at `step` and later. `survey` must be that of the journal, and
+    /// `first` the tissue with which its session began.
     pub fn new(mut reader: JournalReader<R>, survey: &Survey, first: &Arc<Model>, given: &Limits, step: u64) -> Self {
-        // A batch with a snapshot of a step has all inputs that act at that step, or later ones have.
+        // A batch with a snapshot of a step has all inputs that act at that step, or later batches have them.
         match survey.snapshots.iter().rev().find(|at| at.step <= step) {
             Some(at) => reader.go_to(at),
             None => reader.rewind(),
@@ -49,7 +50,7 @@ impl<R: Read + Seek> Inputs<R> {
         Inputs { reader, first: first.clone(), rules, limits, from_step: step }
     }
 
-    /// Returns the next batch; `None` after the last.
+    /// Returns the inputs of the next batch; `None` after the last.
     ///
     /// # Errors
     /// Refuses a journal that is damaged, and inputs that no session accepts.
@@ -68,7 +69,7 @@ impl<R: Read + Seek> Inputs<R> {
     }
 }
 
-/// What changes bits. Whether time went on, its viewer decides.
+/// Returns the input in a message, if it changes bits. Whether time advances is left to the viewer of a playback.
 fn input(message: &pb::Input, rules: &Rules, first: &Model, limits: &Limits) -> Result<Option<Input>> {
     use pb::input::What;
     Ok(match message.what.as_ref() {
@@ -80,10 +81,10 @@ fn input(message: &pb::Input, rules: &Rules, first: &Model, limits: &Limits) -> 
     })
 }
 
-/// Inputs in one piece of bytes.
+/// Limit of the inputs in one piece.
 const PIECE: usize = 2048;
 
-/// Inputs, each with its step, as pieces of bytes that [`decoded`] reads.
+/// Encodes inputs, each with its step, as pieces of bytes that [`decoded`] reads.
 pub fn encoded(inputs: &[(u64, Input)]) -> Vec<Vec<u8>> {
     let piece = |inputs: &[(u64, Input)]| {
         let mut tips = Tips::new();
@@ -93,10 +94,11 @@ pub fn encoded(inputs: &[(u64, Input)]) -> Vec<Vec<u8>> {
     inputs.chunks(PIECE).map(piece).collect()
 }
 
-/// Returns the inputs of such a piece, of a session that began with the tissue of `first`.
+/// Decodes one piece of encoded inputs, for a session that began with the tissue `first`. Inputs that change no
+/// bits are left out.
 ///
 /// # Errors
-/// Refuses what is no such piece, and inputs that no session accepts.
+/// Refuses bytes that are no such piece, and inputs that no session accepts.
 pub fn decoded(bytes: &[u8], first: &Arc<Model>, given: &Limits) -> Result<Vec<(u64, Input)>> {
     let limits = message::limits(given);
     let rules = Rules::new(&first.scene, &limits);
@@ -152,7 +154,7 @@ mod tests {
         let elsewhere = Refusal::new(Reason::Elsewhere, "session_id", "another server has it");
         let (handed, _) = intake.hand_over(elsewhere.clone());
         assert_eq!(intake.acquire(&[2], "late", 1.0, LEASE + 2, 0).unwrap_err().reason, Reason::Elsewhere);
-        // What was of a lease that has ended was dropped here.
+        // The waiting command of a lease that has ended was dropped here.
         assert_eq!(intake.counts(), Counts { accepted: 1, dropped: 1, ..Counts::default() });
         let pieces = encoded(&handed.waiting);
         let waiting = pieces.iter().flat_map(|piece| decoded(piece, &first, &limits).unwrap()).collect();
@@ -162,7 +164,7 @@ mod tests {
         assert_eq!(other.adopt(Handed { leases: handed.leases, waiting }, 5 * MS), 0);
         assert_eq!(other.counts(), Counts { accepted: 3, waiting: 3, ..Counts::default() });
         let first_due = due(&mut other, 7);
-        // The end of the other lease came first: that was for step 0, which is over.
+        // The end of the other lease comes first: it was for step 0, which is over.
         let of = |due: &Due| (due.command.tool, due.command.sequence, due.ends_lease);
         assert_eq!(first_due.iter().map(of).collect::<Vec<_>>(), [(1, None, true), (0, Some(1), false)]);
         assert!(matches!(first_due[1].command.action, Action::Pose { place_m, .. } if place_m == glam::DVec3::Z));
@@ -171,7 +173,7 @@ mod tests {
         assert_eq!(other.changed_to().unwrap().tissue_state(), changed.tissue_state());
         assert_eq!(due(&mut other, 8).iter().map(of).collect::<Vec<_>>(), [(0, Some(2), false)]);
         assert_eq!(due(&mut other, 9).iter().map(of).collect::<Vec<_>>(), [(0, Some(3), false)]);
-        // The lease goes on, and its commands are numbered anew.
+        // The lease continues, and sequence numbers of its commands start again.
         other.submit(LEASE, vec![release(0, None)], 5 * MS).unwrap();
         assert!(other.submit(LEASE + 1, vec![release(0, None)], 5 * MS).is_err());
         assert!(decoded(&[1, 2, 3], &first, &limits).is_err());

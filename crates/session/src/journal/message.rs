@@ -1,4 +1,4 @@
-//! Sessions, models and inputs as messages of a journal, and back.
+//! Conversion of sessions, models and inputs to messages of a journal, and back.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -25,17 +25,17 @@ use palpate_tissue::scene::{Appearance, Body, Integrator, MeshShape, Named, Pain
 use palpate_tissue::shape::PointId;
 use palpate_tissue::state::saved::{CorrectedPlan, TissueState};
 
-/// So many tools a journal is replayed with at least, whatever the limits of the server were.
+/// Least number of tools with which a journal is read, whatever the limits of this program are.
 const MAX_TOOLS: u32 = 4096;
 
-/// Returns the limits under which a journal is read: what a server has accepted is not refused for its force, its reach
-/// or the number of its tool, which its configuration may allow to be larger.
+/// Returns the limits under which a journal is read. An input that a server has accepted is not refused for its
+/// force, its reach or the number of its tool, for which that server's configuration may have allowed more.
 pub fn limits(limits: &Limits) -> Limits {
     let tools = limits.tools.max(MAX_TOOLS);
     Limits { point_force_n: f64::MAX, reach_in_sheets: f64::MAX, tools, ..limits.clone() }
 }
 
-/// The mesh that a scene is on, as its file or its client gave it.
+/// Returns the mesh of a scene, as its file or its client gave it.
 fn mesh(shape: &MeshShape) -> pb::TriangleMesh {
     let own;
     let mesh = match shape.shown() {
@@ -91,7 +91,7 @@ fn from_mesh(message: &pb::TriangleMesh, limits: &Limits) -> Result<TriangleMesh
     }
 }
 
-/// The scene with which a session began, in three parts of a header.
+/// Returns the scene with which a session began, as three parts of a header.
 pub(super) fn scene(scene: &Scene) -> (palpate_proto::pb::Scene, Option<pb::TriangleMesh>, pb::Appearance) {
     let mesh = match &scene.body {
         Body::Mesh(of_mesh) => Some(mesh(&of_mesh.shape)),
@@ -107,10 +107,10 @@ pub(super) fn scene(scene: &Scene) -> (palpate_proto::pb::Scene, Option<pb::Tria
     (sent(scene), mesh, appearance)
 }
 
-/// Refuses a journal whose inputs would give other bits here.
+/// Checks that this program computes the bits that the journal's inputs gave.
 ///
 /// # Errors
-/// Names both versions.
+/// Refuses a journal of another generation ([`REPLAYS`]), and names both versions.
 pub fn check_replays(header: &pb::Header) -> Result<()> {
     if header.replays == REPLAYS {
         return Ok(());
@@ -125,7 +125,7 @@ pub fn check_replays(header: &pb::Header) -> Result<()> {
     Err(Refusal::new(Reason::NotAvailable, "replays", message))
 }
 
-/// Returns the tissue with which the session began.
+/// Returns the tissue with which the session of a journal began.
 ///
 /// # Errors
 /// Refuses a header that does not describe a tissue within the limits.
@@ -149,7 +149,7 @@ fn from_appearance(message: &pb::Appearance) -> Result<Appearance> {
     Ok(Appearance { texture, surface, texture_seed: message.texture_seed, texture_size })
 }
 
-/// Returns a tissue, and how it is stepped.
+/// Returns a tissue as a message: its coefficients, and how it is stepped.
 pub fn tissue(model: &Model) -> pb::Tissue {
     let TissueState {
         stiffness_n_per_m,
@@ -213,10 +213,10 @@ fn compiled(first: &Scene, message: &pb::Tissue, limits: &Limits) -> Result<Arc<
     Model::resumed(first, &state, limits)
 }
 
-/// The tips of tools as the poses of a batch have told them: a pose like the one before it says nothing of its tip.
+/// Tips of tools, from the poses of a batch so far: a pose with the tip of the previous one leaves it out.
 pub(super) type Tips = BTreeMap<u32, pb::Tip>;
 
-/// An input that acts at `step`.
+/// Returns an input that acts at `step` as a message. `tips` are those of the batch so far, and are updated.
 pub(super) fn input(step: u64, input: &Input, tips: &mut Tips) -> pb::Input {
     use pb::input::What;
     let what = match input {
@@ -282,7 +282,7 @@ fn command(due: &Due, tips: &mut Tips) -> pb::Command {
 /// Fills in the tips that poses of a batch leave out.
 ///
 /// # Errors
-/// Refuses a pose whose tip no earlier one has told.
+/// Refuses a pose without a tip if no earlier pose of its tool has one.
 pub(super) fn fill_tips(inputs: &mut [pb::Input]) -> Result<()> {
     use pb::{command::Action, input::What};
     let mut tips = Tips::new();
@@ -297,10 +297,10 @@ pub(super) fn fill_tips(inputs: &mut [pb::Input]) -> Result<()> {
     Ok(())
 }
 
-/// The command in a message, if it keeps to `rules`, for a tissue of `points` points.
+/// Returns the command in a message, for a tissue of `points` points.
 ///
 /// # Errors
-/// Refuses what no session accepts.
+/// Refuses a command that breaks `rules`, or that no session accepts.
 pub(super) fn from_command(message: &pb::Command, rules: &Rules, points: usize) -> Result<Due> {
     use pb::command::Action as Message;
     let most = rules.most_tools();
@@ -352,7 +352,7 @@ pub(super) fn from_command(message: &pb::Command, rules: &Rules, points: usize) 
     Ok(Due { command, late: message.late, late_commands: message.late_commands, ends_lease: message.ends_lease })
 }
 
-/// What tools feel after `step` steps.
+/// Returns the poses and forces of the tools after `step` steps as a message.
 #[allow(clippy::cast_possible_truncation)]
 pub(super) fn moment(step: u64, felt: &[Felt]) -> pb::Moment {
     let vector = |v: DVec3| Some(pb::Vector { x: v.x as f32, y: v.y as f32, z: v.z as f32 });
@@ -365,7 +365,7 @@ pub(super) fn moment(step: u64, felt: &[Felt]) -> pb::Moment {
     pb::Moment { step, tools: felt.iter().map(tool).collect() }
 }
 
-/// Returns a hash as messages have it.
+/// Returns a hash as 32 hexadecimal digits, as messages have it.
 pub fn hash(hash: u128) -> String {
     format!("{hash:032x}")
 }
@@ -373,7 +373,7 @@ pub fn hash(hash: u128) -> String {
 /// Returns the hash in a message.
 ///
 /// # Errors
-/// Refuses what is no hash.
+/// Refuses a text that is not 32 hexadecimal digits.
 pub fn from_hash(text: &str) -> Result<u128> {
     let hash = u128::from_str_radix(text, 16).ok().filter(|_| text.len() == 32);
     hash.ok_or_else(|| Refusal::new(Reason::Unreadable, "hash", "must be 32 hexadecimal digits"))
@@ -383,7 +383,7 @@ pub fn from_hash(text: &str) -> Result<u128> {
 mod tests {
     use super::*;
 
-    /// The model that a journal of one of `model` gives.
+    /// Returns the model that is read from a journal of a session of `model`.
     fn again(model: &Arc<Model>) -> Arc<Model> {
         let (scene, mesh, appearance) = scene(&model.scene);
         let (scene, appearance, tissue) = (Some(scene), Some(appearance), Some(tissue(model)));

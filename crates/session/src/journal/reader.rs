@@ -1,13 +1,14 @@
-//! Reads a journal batch by batch, whatever has happened to its file.
+//! Reader of a journal, batch by batch, which works with damaged files.
 //!
-//! A record that is not as a writer makes it is looked at in the light of what follows it. If a later batch says that the
-//! one here was on the disk for certain, the file is damaged: that is an error, which names the place. Otherwise the file is
-//! torn here: what follows had not reached the disk, and the journal ends with the batch before.
+//! An invalid record is judged by what follows it. If a later batch says that the batch here was certainly on the
+//! disk, the file is damaged: that is an error, which names the place. Otherwise the file is torn here: what
+//! follows had not reached the disk, and the journal ends with the previous batch.
 //!
-//! A chunk's checksum finds every single bit that is other than it was written. What is outside chunks (records' lengths, indexes,
-//! the summary) decides nothing but where chunks are, and their numbers have no gap.
+//! A chunk's checksum detects every changed bit. The bytes outside chunks (records' lengths, indexes, the summary)
+//! only determine where chunks are, and the numbers of batches have no gap.
 //!
-//! What a batch takes in memory is known, and taken from the account of who pays, before its messages are decoded.
+//! The memory of a batch is known, and charged to the account that pays for the reader, before its messages are
+//! decoded.
 
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -27,39 +28,39 @@ use crate::budget::Taken;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::memory;
 
-/// A batch, whose messages are decoded when they are asked for.
+/// A batch of a journal: the content of one chunk. Its messages are decoded on request.
 #[derive(Debug, Clone)]
 pub struct JournalBatch {
-    /// Its number.
+    /// Number of the batch, from 0.
     pub number: u64,
-    /// Where its chunk begins in the file.
+    /// Position of the batch's chunk in the file, bytes.
     pub offset: u64,
     /// The file is complete up to this step.
     pub until_step: u64,
-    /// Batches that were on the disk for certain when it was written.
+    /// Number of batches that were certainly on the disk when this one was written.
     pub durable_batches: u64,
-    /// Inputs in the batches before.
+    /// Number of inputs in the batches before.
     pub first_input: u64,
-    /// Inputs in it.
+    /// Number of inputs in this batch.
     pub input_count: u64,
-    /// Time at which it was written.
+    /// Time at which the batch was written, ns since the Unix epoch.
     pub unix_ns: u64,
     place: String,
     data: Vec<u8>,
     messages: Vec<(Topic, Range<usize>)>,
-    /// Channel, time and place of each message, also of those that are not known here.
+    /// Channel, time and position of each message, including messages of unknown channels.
     places: Vec<(u16, u64, u64)>,
 }
 
-/// What the inputs of a batch may take in memory whatever their length, bytes: there are no more of them than [`MAX_INPUTS`], in a
+/// Memory that the inputs of a batch may take whatever their length, bytes: there are at most [`MAX_INPUTS`], in a
 /// vector that has grown.
 const INPUTS_ROOM: usize = 2 * MAX_INPUTS * size_of::<pb::Input>();
 
-/// What a message takes beside what it refers to, in the lists in which it waits, bytes.
+/// Memory of a message beside what it refers to, in the lists in which it waits, bytes.
 const MESSAGE_BYTES: usize = 1024;
 
 impl JournalBatch {
-    /// What it takes when all of its messages are decoded, bytes.
+    /// Returns the memory of the batch with all its messages decoded, bytes.
     fn memory(&self) -> Result<u64> {
         let mut sum = self.data.len() + size_of_val(self.places.as_slice());
         for (topic, range) in &self.messages {
@@ -76,13 +77,13 @@ impl JournalBatch {
             };
             let memory =
                 memory.map_err(|refusal| self.refuse(format!("a message {}: {}", topic.name(), refusal.message)))?;
-            // As messages, and as the list of what acts in order, whose entries are larger.
+            // As messages, and as the list of items in order, whose entries are larger.
             sum = sum.saturating_add(3 * memory + MESSAGE_BYTES);
         }
         Ok(sum as u64)
     }
 
-    /// Each message of a topic, decoded.
+    /// Returns each message of a topic, decoded.
     fn all<M: Message + Default>(&self, topic: Topic) -> impl Iterator<Item = Result<M>> + '_ {
         let of_topic = self.messages.iter().filter(move |message| message.0 == topic);
         of_topic.map(move |(_, range)| {
@@ -91,27 +92,27 @@ impl JournalBatch {
         })
     }
 
-    /// Each of its messages that is known here, as it was written, in order.
+    /// Returns each of its messages with a known topic, as it was written, in order.
     pub(super) fn messages(&self) -> impl Iterator<Item = (Topic, &[u8])> {
         self.messages.iter().map(|(topic, range)| (*topic, &self.data[range.clone()]))
     }
 
-    /// The content of its chunk.
+    /// Returns the content of its chunk.
     pub(super) fn data(&self) -> &[u8] {
         &self.data
     }
 
-    /// The index of its chunk.
+    /// Returns the index of its chunk.
     pub(super) fn places(&self) -> &[(u16, u64, u64)] {
         &self.places
     }
 
-    /// A refusal of something in it.
+    /// Returns a refusal of something in the batch.
     pub(super) fn refuse(&self, message: String) -> Refusal {
         self.placed(Refusal::new(Reason::Unreadable, "", message))
     }
 
-    /// A refusal with the place of this batch.
+    /// Returns a refusal with the place of this batch.
     pub(super) fn placed(&self, refusal: Refusal) -> Refusal {
         let JournalBatch { number, offset, until_step, .. } = self;
         let field = if refusal.field.is_empty() { String::new() } else { format!("{}: ", refusal.field) };
@@ -119,10 +120,10 @@ impl JournalBatch {
         Refusal { place: Some(self.place.clone()), message, field: String::new(), ..refusal }
     }
 
-    /// Returns its inputs, in order.
+    /// Returns the inputs of the batch, in order.
     ///
     /// # Errors
-    /// Refuses what can't be decoded.
+    /// Refuses messages that can't be decoded.
     pub fn inputs(&self) -> Result<Vec<pb::Input>> {
         let mut inputs = Vec::new();
         for message in self.all::<pb::Inputs>(Topic::Inputs) {
@@ -132,35 +133,35 @@ impl JournalBatch {
         Ok(inputs)
     }
 
-    /// Returns its hashes, in order.
+    /// Returns the hashes of the batch, in order.
     ///
     /// # Errors
-    /// Refuses what can't be decoded.
+    /// Refuses messages that can't be decoded.
     pub fn hashes(&self) -> Result<Vec<pb::Hash>> {
         self.all(Topic::Hashes).collect()
     }
 
-    /// Returns its snapshots, in order.
+    /// Returns the snapshots of the batch, in order.
     ///
     /// # Errors
-    /// Refuses what can't be decoded.
+    /// Refuses messages that can't be decoded.
     pub fn snapshots(&self) -> Result<Vec<pb::Snapshot>> {
         self.all(Topic::Snapshots).collect()
     }
 
-    /// Returns what tools felt.
+    /// Returns the recorded poses and forces of the tools, in order.
     ///
     /// # Errors
-    /// Refuses what can't be decoded.
+    /// Refuses messages that can't be decoded.
     pub fn felt(&self) -> Result<Vec<pb::Moment>> {
         let messages: Result<Vec<pb::Felt>> = self.all(Topic::Felt).collect();
         Ok(messages?.into_iter().flat_map(|felt| felt.moments).collect())
     }
 
-    /// Returns the newest message of it that tells which changes of the tissue wait.
+    /// Returns the batch's last list of the changes of the tissue that wait for their step, if it has one.
     ///
     /// # Errors
-    /// Refuses what can't be decoded.
+    /// Refuses messages that can't be decoded.
     pub fn waiting(&self) -> Result<Option<pb::Waiting>> {
         self.all(Topic::Waiting).last().transpose()
     }
@@ -168,136 +169,137 @@ impl JournalBatch {
     /// Returns the end of the journal, if it is in this batch.
     ///
     /// # Errors
-    /// Refuses what can't be decoded.
+    /// Refuses a message that can't be decoded.
     pub fn end(&self) -> Result<Option<pb::End>> {
         self.all(Topic::End).next().transpose()
     }
 
-    /// The header, which is in the first batch.
+    /// Returns the header, which is in the first batch.
     fn header(&self) -> Result<pb::Header> {
         self.all(Topic::Header).next().unwrap_or_else(|| Err(self.refuse("the header is missing".to_owned())))
     }
 
-    /// Returns whether it has messages of a topic.
+    /// Returns whether the batch has messages of a topic.
     pub fn has(&self, topic: Topic) -> bool {
         self.messages.iter().any(|message| message.0 == topic)
     }
 }
 
-/// Where a snapshot is.
+/// Position of a snapshot in a journal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SnapshotAt {
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
-    /// Where its chunk begins.
+    /// Position of the snapshot's chunk in the file, bytes.
     pub offset: u64,
-    /// The number of its batch.
+    /// Number of the batch that has the snapshot.
     pub batch: u64,
 }
 
-/// What a journal has, after one pass over it.
+/// Content of a journal, as one pass over it finds.
 #[derive(Debug, Clone, Default)]
 pub struct Survey {
-    /// Batches.
+    /// Number of batches.
     pub batches: u64,
-    /// The file is complete up to this step: the last durable one.
+    /// The file is complete up to this step, the last durable one.
     pub until_step: u64,
-    /// Inputs.
+    /// Number of inputs.
     pub inputs: u64,
-    /// Hashes.
+    /// Number of hashes.
     pub hashes: u64,
-    /// Snapshots, by ascending step.
+    /// Positions of the snapshots, by ascending step.
     pub snapshots: Vec<SnapshotAt>,
-    /// Changes of the tissue that had been accepted at its end, and may have acted by then.
+    /// Changes of the tissue that had been accepted before the journal's end. Some of them may have taken effect.
     pub waiting: Vec<pb::Input>,
-    /// Times of the first and the last batch.
+    /// Times of the first and the last batch, ns since the Unix epoch.
     pub unix_ns: [u64; 2],
-    /// The end, if it was written.
+    /// The end of the journal, if it was written.
     pub end: Option<pb::End>,
-    /// Bytes up to the end of the last whole batch.
+    /// Length of the file up to the end of the last whole batch, bytes.
     pub whole_bytes: u64,
-    /// Bytes after that which belong to no whole batch.
+    /// Bytes after that, which belong to no whole batch.
     pub torn_bytes: u64,
-    /// Whether the file has a summary, so that every tool opens it.
+    /// Whether the file has a summary, so that every MCAP tool opens it.
     pub sealed: bool,
-    /// Why reading ended before the end, if the file is damaged there and is read [up to that](JournalReader::up_to_damage).
+    /// Why reading ended before the end: the file is damaged there, and the reader stops at damage
+    /// ([`JournalReader::up_to_damage`]).
     pub damage: Option<String>,
 }
 
 impl Survey {
-    /// The damage, to follow the words on what the journal has; empty without.
+    /// Returns the damage as the end of a message about the journal's content; empty without damage.
     pub(super) fn and_damage(&self) -> String {
         self.damage.as_ref().map_or(String::new(), |damage| format!("; the journal is {damage}"))
     }
 }
 
-/// Changes of the tissue that wait, at most: more than any session lets wait.
+/// Limit of the waiting changes of the tissue that are read: more than any session lets wait.
 const MAX_WAITING: usize = 4096;
 
-/// An index is read over, not sought over, if it has no more bytes.
+/// Length up to which an index is read and discarded rather than skipped by a seek, bytes.
 const SHORT: usize = 4096;
 
-/// What comes next in a file.
+/// The next record of a file.
 enum NextRecord {
     Chunk(u64),
     DataEnd,
     End,
-    /// What is wrong.
+    /// Description of what is wrong.
     Wrong(String),
 }
 
-/// Reads a journal. It takes the memory of one batch.
+/// Reader of a journal. It keeps one batch in memory at a time.
 pub struct JournalReader<R> {
     place: String,
     source: R,
     length: u64,
-    /// Where the next record begins, and the number of the next batch and input.
+    /// Position of the next record, and the numbers of the next batch and the next input.
     at: u64,
     batch: u64,
     input: u64,
     header: pb::Header,
-    /// Where the first chunk begins.
+    /// Position of the first chunk.
     begin: u64,
     /// Channel numbers of the topics.
     channels: Vec<(u16, Topic)>,
     torn_bytes: u64,
     sealed: bool,
     ended: bool,
-    /// Damage ends the journal in place of being an error.
+    /// Whether damage ends the journal rather than being an error.
     stops_at_damage: bool,
     damage: Option<String>,
-    /// Where the source stands: to seek empties its buffer.
+    /// Position of the source: a seek would empty its buffer.
     stands: u64,
-    /// The newest head of a record that was read, and where it is.
+    /// Position, kind and length of the newest record whose head was read.
     peeked: Option<(u64, (u8, u64))>,
-    /// What is taken from who pays for its memory. `None`: it is the user's own.
+    /// Charge of the account that pays for its memory; `None` if nothing is charged.
     paid: Option<Taken>,
-    /// What stays in memory beside the batch that is read, and what that takes, bytes.
+    /// Memory that stays beside the batch that is read, and the memory of that batch, bytes.
     kept_bytes: u64,
     batch_bytes: u64,
 }
 
 impl JournalReader<BufReader<File>> {
-    /// Opens a file.
+    /// Opens the file of a journal.
     ///
     /// # Errors
-    /// Refuses a file that can't be read, and as [`JournalReader::new`] does.
+    /// Refuses a file that can't be read, and whatever [`JournalReader::new`] refuses.
     pub fn open(path: &Path) -> Result<Self> {
         JournalReader::new(&path.display().to_string(), file(path)?)
     }
 }
 
-/// Returns a file to read a journal from.
+/// Opens a regular file from which a journal can be read.
 ///
 /// # Errors
-/// Refuses one that can't be read.
+/// Refuses a file that can't be read, and anything that is not a regular file.
 pub fn file(path: &Path) -> Result<BufReader<File>> {
     let place = path.display().to_string();
     let unreadable = |e: std::io::Error| Refusal {
         place: Some(place.clone()),
         ..Refusal::new(Reason::Unreadable, "", format!("can't be read: {e}"))
     };
-    // Before it is opened: a pipe would wait for somebody who writes into it.
+    // Checked before it is opened: opening a pipe would wait for a writer.
     let kind = std::fs::metadata(path).map_err(unreadable)?.file_type();
     if !kind.is_file() {
         let what = if kind.is_dir() { "it is a folder" } else { "it is not a file" };
@@ -308,19 +310,20 @@ pub fn file(path: &Path) -> Result<BufReader<File>> {
 }
 
 impl<R: Read + Seek> JournalReader<R> {
-    /// Reads the beginning of a journal; `place` is what refusals call it.
+    /// Creates a reader and reads the beginning of the journal. `place` is the name of the file in refusals.
     ///
     /// # Errors
-    /// Refuses what is no journal, and one without a whole batch ([`Reason::Missing`]): then its session was never told to be
-    /// durable.
+    /// Refuses a file that is no journal, and one without a whole batch ([`Reason::Missing`]): then its session was
+    /// never reported as durable.
     pub fn new(place: &str, source: R) -> Result<Self> {
         JournalReader::paid(place, source, None)
     }
 
-    /// Does the same, for somebody who pays for its memory: `paid` grows by it.
+    /// Creates a reader as [`JournalReader::new`] does, whose memory is charged: `paid` grows by what the reader
+    /// needs.
     ///
     /// # Errors
-    /// As for [`JournalReader::new`]; refuses what is beyond the part of who pays.
+    /// Refuses whatever [`JournalReader::new`] refuses, and memory beyond the account's part.
     pub fn paid(place: &str, mut source: R, paid: Option<Taken>) -> Result<Self> {
         let length = source.seek(SeekFrom::End(0)).map_err(|e| unreadable(place, &e.to_string()))?;
         let mut reader = JournalReader {
@@ -364,12 +367,13 @@ impl<R: Read + Seek> JournalReader<R> {
         Ok(reader)
     }
 
-    /// Returns the header.
+    /// Returns the header of the journal.
     pub fn header(&self) -> &pb::Header {
         &self.header
     }
 
-    /// Reads a journal of a stranger: what it names of this machine is left out.
+    /// Returns this reader without the names of files on the machine that wrote the journal, which an untrusted
+    /// party may have sent.
     #[must_use]
     pub fn without_files(mut self) -> Self {
         if let Some(appearance) = &mut self.header.appearance {
@@ -378,19 +382,20 @@ impl<R: Read + Seek> JournalReader<R> {
         self
     }
 
-    /// Reads what is whole: a journal that is damaged in the middle ends there, and [`JournalReader::damage`] tells why. Who
-    /// goes on with a session wants an error.
+    /// Returns this reader so that a journal that is damaged in the middle ends there, rather than being refused;
+    /// [`JournalReader::damage`] then has the reason. To continue a session, use a reader that refuses damage.
     #[must_use]
     pub fn up_to_damage(self) -> Self {
         JournalReader { stops_at_damage: true, ..self }
     }
 
-    /// Returns why the last batch is not that of the journal, if it is damaged behind it; known after that batch.
+    /// Returns why the last batch is not the journal's last, if the file is damaged after it; known after that
+    /// batch.
     pub fn damage(&self) -> Option<&str> {
         self.damage.as_deref()
     }
 
-    /// Returns what refusals call the file.
+    /// Returns the name of the file in refusals.
     pub fn place(&self) -> &str {
         &self.place
     }
@@ -400,34 +405,34 @@ impl<R: Read + Seek> JournalReader<R> {
         self.length
     }
 
-    /// Returns how much of it was read, bytes.
+    /// Returns the position of the next record, bytes.
     pub fn position(&self) -> u64 {
         self.at
     }
 
-    /// Returns the bytes at the end that belong to no whole batch; known after the last batch.
+    /// Returns the number of bytes at the end that belong to no whole batch; known after the last batch.
     pub fn torn_bytes(&self) -> u64 {
         self.torn_bytes
     }
 
-    /// A refusal of something in the file.
+    /// Returns a refusal of something in the file.
     pub(super) fn refuse(&self, message: &str) -> Refusal {
         unreadable(&self.place, message)
     }
 
-    /// Goes to where a batch is that holds a snapshot: the next batch will be that one.
+    /// Moves to the batch that has a snapshot: that batch comes next.
     pub fn go_to(&mut self, snapshot: &SnapshotAt) {
         (self.at, self.batch, self.ended, self.torn_bytes) = (snapshot.offset, snapshot.batch, false, 0);
         (self.input, self.damage) = (u64::MAX, None);
     }
 
-    /// Goes back to the first batch.
+    /// Moves to the first batch.
     pub fn rewind(&mut self) {
         (self.at, self.batch, self.input, self.ended, self.torn_bytes) = (self.begin, 0, 0, false, 0);
         self.damage = None;
     }
 
-    /// The bytes before the first batch.
+    /// Returns the bytes before the first batch.
     ///
     /// # Errors
     /// Refuses a file that can't be read.
@@ -437,11 +442,12 @@ impl<R: Read + Seek> JournalReader<R> {
         Ok(bytes)
     }
 
-    /// Passes over the file once, from its beginning, which is where it is afterwards. `progress` gets the bytes
-    /// that are read.
+    /// Reads the file once, and moves to the first batch again. `progress` gets the number of bytes read. Returns
+    /// what the journal has.
     ///
     /// # Errors
-    /// Refuses a file that is damaged in the middle, unless it is read [up to that](JournalReader::up_to_damage).
+    /// Refuses a file that is damaged in the middle, unless the reader stops there
+    /// ([`JournalReader::up_to_damage`]).
     pub fn survey(&mut self, progress: &mut dyn FnMut(u64)) -> Result<Survey> {
         self.rewind();
         let mut survey = Survey { whole_bytes: self.begin, ..Survey::default() };
@@ -476,7 +482,8 @@ impl<R: Read + Seek> JournalReader<R> {
     /// Returns the next batch; `None` after the last whole one.
     ///
     /// # Errors
-    /// Refuses a file that is damaged before its end, unless it is read [up to that](JournalReader::up_to_damage).
+    /// Refuses a file that is damaged before its end, unless the reader stops there
+    /// ([`JournalReader::up_to_damage`]).
     pub fn next_batch(&mut self) -> Result<Option<JournalBatch>> {
         while !self.ended {
             let wrong = match self.next_record()? {
@@ -507,7 +514,7 @@ impl<R: Read + Seek> JournalReader<R> {
         Ok(None)
     }
 
-    /// Memory for so many bytes of the file, which has them.
+    /// Returns a buffer for `size` bytes of the file, and charges it.
     fn buffer(&mut self, size: u64) -> Result<Vec<u8>> {
         self.pay(size)?;
         let length = usize::try_from(size).unwrap_or(usize::MAX);
@@ -515,17 +522,18 @@ impl<R: Read + Seek> JournalReader<R> {
             .map_err(|refusal| Refusal { place: Some(self.place.clone()), ..refusal })
     }
 
-    /// Takes what is needed at once beside what is kept, bytes. What was taken for the batch before is used for this one.
+    /// Charges the memory of the batch that is read beside the memory that stays, bytes. It replaces that of the
+    /// previous batch.
     fn pay(&mut self, bytes: u64) -> Result<()> {
         memory::check(bytes, "a part of a journal")?;
         self.batch_bytes = bytes;
         self.take(0)
     }
 
-    /// Takes what is made of the batch that was read, and lasts no longer than it, bytes.
+    /// Charges memory for what is made of the present batch and lasts no longer than it, bytes.
     ///
     /// # Errors
-    /// Refuses what is beyond the part of who pays.
+    /// Refuses memory beyond the account's part.
     pub(super) fn pay_beside(&mut self, bytes: u64) -> Result<()> {
         memory::check(bytes, "a part of a journal")?;
         self.take(bytes)
@@ -536,17 +544,18 @@ impl<R: Read + Seek> JournalReader<R> {
         self.paid.as_mut().map_or(Ok(()), |paid| paid.grow_to(sum, ""))
     }
 
-    /// Takes what is made of the journal and stays as long as this reader, bytes: a tissue and its session.
+    /// Charges memory for what is made of the journal and lasts as long as this reader, such as a tissue and its
+    /// session, bytes.
     ///
     /// # Errors
-    /// Refuses what is beyond the part of who pays.
+    /// Refuses memory beyond the account's part.
     pub(super) fn keep(&mut self, bytes: u64) -> Result<()> {
         self.pay_beside(bytes)?;
         self.kept_bytes = self.kept_bytes.saturating_add(bytes);
         Ok(())
     }
 
-    /// What was made of the journal is paid for by others from now on.
+    /// Releases the charge of what was made of the journal, because another owner pays for it from now on.
     pub(super) fn let_go(&mut self, bytes: u64) {
         self.kept_bytes = self.kept_bytes.saturating_sub(bytes);
         if let Some(paid) = &mut self.paid {
@@ -563,10 +572,10 @@ impl<R: Read + Seek> JournalReader<R> {
         Ok(())
     }
 
-    /// Kind and length of the record at a place.
+    /// Returns the kind and the length of the record at a position.
     fn head(&mut self, at: u64) -> Result<(u8, u64)> {
         if let Some((_, head)) = self.peeked.filter(|peeked| peeked.0 == at) {
-            // What follows is read next.
+            // What follows it is read next.
             return Ok(head);
         }
         let mut bytes = [0; HEAD as usize];
@@ -593,7 +602,7 @@ impl<R: Read + Seek> JournalReader<R> {
             CHUNK if length < CHUNK_HEAD => NextRecord::Wrong("a chunk is too short".to_owned()),
             CHUNK => NextRecord::Chunk(length),
             DATA_END if length == 4 => {
-                // The last record is the footer, and the file ends as it began.
+                // The last record is the footer, and the file ends with the bytes with which it began.
                 let mut magic = [0; 8];
                 if left > HEAD + 4 + 8 {
                     self.read_at(self.length - 8, &mut magic)?;
@@ -621,7 +630,7 @@ impl<R: Read + Seek> JournalReader<R> {
         Ok(())
     }
 
-    /// What a chunk has, or what is wrong with it.
+    /// Returns the batch in a chunk, or a description of what is wrong with it.
     fn batch(&mut self, data: Vec<u8>) -> std::result::Result<JournalBatch, String> {
         let messages = messages_of(&data, if self.batch == 0 { None } else { Some(&self.channels) })?;
         if let Some(channels) = messages.channels {
@@ -652,7 +661,7 @@ impl<R: Read + Seek> JournalReader<R> {
         })
     }
 
-    /// Decides what is wrong: damage, which is an error, or a torn end.
+    /// Decides whether an invalid record is damage, which is an error, or a torn end.
     fn judge(&mut self, what: &str) -> Result<()> {
         let (at, batch) = (self.at, self.batch);
         let later = self.find_durable(at + 1, batch)?;
@@ -673,7 +682,8 @@ impl<R: Read + Seek> JournalReader<R> {
         Ok(())
     }
 
-    /// A later batch which says that batch `wanted` was on the disk for certain: its number, and where it is.
+    /// Returns the number and the position of a later batch that says that batch `wanted` was certainly on the
+    /// disk, if there is one.
     fn find_durable(&mut self, from: u64, wanted: u64) -> Result<Option<(u64, u64)>> {
         let channels = std::mem::take(&mut self.channels);
         let found = self.find_chunk(from, &mut |data| {
@@ -684,16 +694,16 @@ impl<R: Read + Seek> JournalReader<R> {
         found
     }
 
-    /// Whether there is any whole chunk.
+    /// Returns whether there is any whole chunk at or after `from`.
     fn find_any(&mut self, from: u64) -> Result<bool> {
         Ok(self.find_chunk(from, &mut |_| Some(0))?.is_some())
     }
 
-    /// The first whole chunk at or after `from` that `wanted` accepts, with its place.
+    /// Returns the first whole chunk at or after `from` that `wanted` accepts, with its position.
     fn find_chunk(&mut self, from: u64, wanted: &mut dyn FnMut(&[u8]) -> Option<u64>) -> Result<Option<(u64, u64)>> {
         const WINDOW: u64 = 1 << 16;
         let mut window = vec![0; (WINDOW + HEAD + CHUNK_HEAD) as usize];
-        // What looks like chunks and is none is not read for ever.
+        // Limits the reading of bytes that only look like chunks.
         let mut budget = 4 * (self.length - from.min(self.length)) + (1 << 20);
         let mut at = from;
         while at + HEAD + CHUNK_HEAD <= self.length {
@@ -737,7 +747,7 @@ fn unreadable(place: &str, message: &str) -> Refusal {
     Refusal { place: Some(place.to_owned()), ..Refusal::new(Reason::Unreadable, "", message) }
 }
 
-/// The length of a chunk that is not compressed, if `head` begins one.
+/// Returns the length of a chunk that is not compressed, if `head` begins one.
 fn plain_chunk(head: &[u8]) -> Option<u64> {
     if head[0] != CHUNK {
         return None;
@@ -748,12 +758,12 @@ fn plain_chunk(head: &[u8]) -> Option<u64> {
     (plain == Some(size) && packed == Some(size) && number::<4>(head, 37) == Some(0)).then_some(length)
 }
 
-/// Whether the checksum of a chunk is that of its messages.
+/// Returns whether the checksum of a chunk matches its messages.
 fn is_sound(data: &[u8]) -> bool {
     number::<4>(data, 24) == Some(u64::from(crc32fast::hash(&data[CHUNK_HEAD as usize..])))
 }
 
-/// The beginning of a message `Inputs`.
+/// The first fields of a message `Inputs`.
 #[derive(Debug, Default)]
 struct InputsHead {
     batch: u64,
@@ -764,7 +774,7 @@ struct InputsHead {
 }
 
 impl InputsHead {
-    /// Reads the numbers, and counts the inputs: so their memory is known before they are decoded.
+    /// Reads the numbers, and counts the inputs, so that their memory is known before they are decoded.
     fn read(mut bytes: &[u8]) -> Option<Self> {
         let mut head = InputsHead::default();
         while !bytes.is_empty() {
@@ -791,7 +801,7 @@ impl InputsHead {
     }
 }
 
-/// What is in a chunk.
+/// Content of a chunk.
 struct Messages {
     found: Vec<(Topic, Range<usize>)>,
     places: Vec<(u16, u64, u64)>,
@@ -801,10 +811,10 @@ struct Messages {
     channels: Option<Vec<(u16, Topic)>>,
 }
 
-/// Most messages of a chunk, and records: a writer makes few.
+/// Limit of the messages and channels of a chunk: a writer makes few.
 const MAX_MESSAGES: usize = 1 << 16;
 
-/// The messages of a chunk; `channels` are those that are known, if it does not define them itself.
+/// Returns the messages of a chunk. `channels` are the known ones, if the chunk does not define them itself.
 fn messages_of(data: &[u8], channels: Option<&[(u16, Topic)]>) -> std::result::Result<Messages, String> {
     let cut_off = || "a record within a chunk is cut off".to_owned();
     let size = (data.len() as u64).saturating_sub(CHUNK_HEAD);
@@ -844,7 +854,7 @@ fn messages_of(data: &[u8], channels: Option<&[(u16, Topic)]>) -> std::result::R
                 unix_ns = number::<8>(data, begin + 6).unwrap_or_default();
                 #[allow(clippy::cast_possible_truncation)]
                 places.push((channel as u16, unix_ns, at as u64 - CHUNK_HEAD));
-                // Channels of later versions are passed over.
+                // Channels of later versions are ignored.
                 if let Some(topic) = topic {
                     let range = begin + MESSAGE_HEAD..end;
                     if topic == Topic::Inputs {

@@ -1,43 +1,43 @@
-//! Records of MCAP, as journals have them: written by hand, so that a file needs no writer that stays.
+//! Records of MCAP as journals have them. They are written here, so that a file needs no writer that stays open.
 //!
 //! A record is its kind (a byte), the length of its content (8 bytes) and the content; numbers are little-endian.
 
-/// What a file begins and ends with.
+/// First and last bytes of a file.
 pub const MAGIC: [u8; 8] = [0x89, b'M', b'C', b'A', b'P', 0x30, b'\r', b'\n'];
 
-/// Kinds of records.
+/// Kind of the record that begins a file.
 pub const HEADER: u8 = 0x01;
-/// The end of the file.
+/// Kind of the record that ends a file.
 pub const FOOTER: u8 = 0x02;
-/// What a message means.
+/// Kind of a record with a schema: the type of a message.
 pub const SCHEMA: u8 = 0x03;
-/// A topic.
+/// Kind of a record with a channel: a topic and its schema.
 pub const CHANNEL: u8 = 0x04;
-/// A message.
+/// Kind of a record with a message.
 pub const MESSAGE: u8 = 0x05;
-/// Some messages with a checksum.
+/// Kind of a record with a chunk: messages with a checksum.
 pub const CHUNK: u8 = 0x06;
-/// Where the messages of a chunk are.
+/// Kind of a record with the positions of a chunk's messages.
 pub const MESSAGE_INDEX: u8 = 0x07;
-/// Where a chunk is.
+/// Kind of a record with the position of a chunk.
 pub const CHUNK_INDEX: u8 = 0x08;
-/// How many messages there are.
+/// Kind of a record with the numbers of messages, channels and chunks.
 pub const STATISTICS: u8 = 0x0B;
-/// Where the parts of the summary are.
+/// Kind of a record with the position of a part of the summary.
 pub const SUMMARY_OFFSET: u8 = 0x0E;
-/// The end of the data.
+/// Kind of the record that ends the data.
 pub const DATA_END: u8 = 0x0F;
 
-/// Bytes before the content of a record.
+/// Length of a record before its content, bytes.
 pub const HEAD: u64 = 9;
 
-/// Bytes of a chunk before its messages, if it is not compressed.
+/// Length of a chunk before its messages, bytes, if it is not compressed.
 pub const CHUNK_HEAD: u64 = 40;
 
-/// Bytes of a message before its data.
+/// Length of a message before its data, bytes.
 pub const MESSAGE_HEAD: usize = 22;
 
-/// Appends a record whose content `fill` writes.
+/// Appends a record whose content `fill` appends.
 pub fn record(out: &mut Vec<u8>, kind: u8, fill: impl FnOnce(&mut Vec<u8>)) {
     out.push(kind);
     let at = out.len();
@@ -47,19 +47,19 @@ pub fn record(out: &mut Vec<u8>, kind: u8, fill: impl FnOnce(&mut Vec<u8>)) {
     out[at..at + 8].copy_from_slice(&length.to_le_bytes());
 }
 
-/// Appends a string with its length.
+/// Appends a string after its length.
 pub fn string(out: &mut Vec<u8>, text: &str) {
     bytes(out, text.as_bytes());
 }
 
-/// Appends bytes with their length, which is below 2³².
+/// Appends bytes after their length, which must be below 2³².
 #[allow(clippy::cast_possible_truncation)]
 pub fn bytes(out: &mut Vec<u8>, bytes: &[u8]) {
     out.extend((bytes.len() as u32).to_le_bytes());
     out.extend(bytes);
 }
 
-/// Returns what a file begins with.
+/// Returns the first bytes of a file: the magic bytes and the header. `library` names the program that writes.
 pub fn beginning(library: &str) -> Vec<u8> {
     let mut out = MAGIC.to_vec();
     record(&mut out, HEADER, |body| {
@@ -69,25 +69,26 @@ pub fn beginning(library: &str) -> Vec<u8> {
     out
 }
 
-/// A chunk that is being filled: messages of one moment.
+/// A chunk that is being filled with messages of one moment.
 #[derive(Debug)]
 pub struct Chunk {
     out: Vec<u8>,
     unix_ns: u64,
     sequence: u32,
-    /// Channel and place of each message.
+    /// Channel and position of each message.
     index: Vec<(u16, u64)>,
 }
 
 impl Chunk {
-    /// Begins a chunk; all its messages have this time and number. `first` is put before them: schemas and channels.
+    /// Begins a chunk. All its messages have the time `unix_ns` (ns since the Unix epoch) and the number
+    /// `sequence`. `first` is put before them: schemas and channels.
     pub fn new(unix_ns: u64, sequence: u32, first: &[u8]) -> Self {
         let mut out = vec![0; (HEAD + CHUNK_HEAD) as usize];
         out.extend(first);
         Chunk { out, unix_ns, sequence, index: Vec::new() }
     }
 
-    /// Adds a message.
+    /// Appends a message to the chunk.
     pub fn add(&mut self, channel: u16, data: &[u8]) {
         self.index.push((channel, self.out.len() as u64 - HEAD - CHUNK_HEAD));
         let Chunk { out, unix_ns, sequence, .. } = self;
@@ -100,7 +101,7 @@ impl Chunk {
         });
     }
 
-    /// Returns the chunk, and the index of its messages.
+    /// Returns the chunk's record, followed by the index of its messages.
     pub fn finish(self) -> Vec<u8> {
         let Chunk { mut out, unix_ns, mut index, .. } = self;
         let size = out.len() as u64 - HEAD - CHUNK_HEAD;
@@ -121,7 +122,8 @@ impl Chunk {
     }
 }
 
-/// Appends the index of a chunk: channel, time and place of each of its messages, by ascending channel.
+/// Appends the index of a chunk from the channel, time and position of each message, which must be sorted by
+/// channel.
 #[allow(clippy::cast_possible_truncation)]
 pub fn indexes(out: &mut Vec<u8>, messages: &[(u16, u64, u64)]) {
     for of_channel in messages.chunk_by(|a, b| a.0 == b.0) {
@@ -136,7 +138,7 @@ pub fn indexes(out: &mut Vec<u8>, messages: &[(u16, u64, u64)]) {
     }
 }
 
-/// Returns a whole number at a place, if there are enough bytes.
+/// Returns the little-endian number of N bytes at `at`; `None` if there are not enough bytes.
 pub fn number<const N: usize>(bytes: &[u8], at: usize) -> Option<u64> {
     let mut whole = [0; 8];
     whole[..N].copy_from_slice(bytes.get(at..at + N)?);

@@ -1,4 +1,5 @@
-//! Makes a journal whole: one that was torn, or never finished, or a part of one.
+//! Repair and cutting of journals: makes a complete journal from one that is torn or unfinished, or from a part of
+//! one.
 
 use std::io::{self, Read, Seek, Write};
 
@@ -19,12 +20,13 @@ fn unwritten(e: &io::Error) -> Refusal {
     Refusal::new(Reason::Unreadable, "", format!("the new journal can't be written: {e}"))
 }
 
-/// Writes the whole batches of a journal to `output`, which is empty, and finishes it: with an end, if it has none, and with the
-/// summary. Tells what the journal had.
+/// Writes the whole batches of a journal to `output`, which must be empty, and completes it: with an end, if the
+/// journal has none, and with the summary. `progress` gets the bytes read. Returns the survey of the original
+/// journal.
 ///
 /// # Errors
-/// Refuses a journal that is damaged in the middle, unless it is read [up to that](JournalReader::up_to_damage), and an output that can't
-/// be written.
+/// Refuses a journal that is damaged in the middle, unless `reader` stops there ([`JournalReader::up_to_damage`]),
+/// and an output that can't be written.
 pub fn recover<R: Read + Seek>(
     mut reader: JournalReader<R>,
     output: &mut (impl Read + Write + Seek),
@@ -52,11 +54,12 @@ pub fn recover<R: Read + Seek>(
     Ok(survey)
 }
 
-/// Writes the part of a journal from step `from` to step `to` to `output`, which is empty: a journal that verifies alone. Tells
-/// what the whole journal had.
+/// Writes the part of a journal from step `from` to step `to` to `output`, which must be empty, as a journal that
+/// can be verified alone. Returns the survey of the whole journal.
 ///
 /// # Errors
-/// Refuses steps that the journal has not, a journal that can't be simulated, and an output that can't be written.
+/// Refuses steps that the journal does not have, a journal that can't be simulated, and an output that can't be
+/// written.
 pub fn cut<R: Read + Seek>(
     mut reader: JournalReader<R>,
     [from, to]: [u64; 2],
@@ -102,7 +105,7 @@ pub fn cut<R: Read + Seek>(
             match item {
                 JournalItem::Input(input) if input.step < to => writer.add_input(input),
                 JournalItem::Hash(hash) if hash.step <= to => writer.add_hash(hash),
-                // The first one is there.
+                // The first snapshot is already written.
                 JournalItem::Snapshot(snapshot) if (from + 1..=to).contains(&snapshot.step) => {
                     writer.add_snapshot(snapshot);
                 }

@@ -1,4 +1,5 @@
-//! Simulates a journal again: from its beginning or from a snapshot, up to a step, comparing every hash on the way.
+//! Replay of a journal: simulates it from its beginning or from a snapshot, up to a step, and compares every hash
+//! on the way.
 
 use std::collections::VecDeque;
 use std::io::{Cursor, Read, Seek};
@@ -22,19 +23,19 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::memory;
 use palpate_tissue::select::scheme_selection::given_up;
 
-/// What a journal has in its order.
+/// An entry of a journal that a replay uses.
 #[derive(Debug, Clone)]
 pub enum JournalItem {
-    /// An input.
+    /// An input to the session.
     Input(pb::Input),
     /// A hash to compare with.
     Hash(pb::Hash),
-    /// A snapshot.
+    /// A snapshot to compare with or to begin from.
     Snapshot(pb::Snapshot),
 }
 
 impl JournalItem {
-    /// Steps done when it happened.
+    /// Returns the number of steps done before the entry.
     pub fn step(&self) -> u64 {
         match self {
             JournalItem::Input(input) => input.step,
@@ -44,10 +45,10 @@ impl JournalItem {
     }
 }
 
-/// Returns what a batch has, in order.
+/// Returns the inputs, hashes and snapshots of a batch, in order.
 ///
 /// # Errors
-/// Refuses what can't be decoded, and what is not in the order of the inputs.
+/// Refuses messages that can't be decoded, and hashes or snapshots that do not lie among the inputs of the batch.
 pub fn items(batch: &JournalBatch) -> Result<VecDeque<JournalItem>> {
     let hashes = batch.hashes()?.into_iter().map(|hash| (hash.after_inputs, JournalItem::Hash(hash)));
     let snapshots =
@@ -69,26 +70,26 @@ pub fn items(batch: &JournalBatch) -> Result<VecDeque<JournalItem>> {
     Ok(items)
 }
 
-/// Where the recorded session and the one that is simulated again differ.
+/// First difference between the recorded session and the replay.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Difference {
-    /// The first step at which they are known to differ.
+    /// The first step at which the recording and the replay are known to differ.
     pub step: u64,
-    /// The last step at which they are known to be equal.
+    /// The last step at which the two are known to be equal; `None` if no hash was compared before.
     pub equal_until: Option<u64>,
-    /// What differs.
+    /// Description of the difference, for people.
     pub what: String,
 }
 
-/// What a replay tells on its way.
+/// Event of a replay.
 pub enum ReplayEvent<'s> {
-    /// A step was done, or skipped at rest.
+    /// A step was done, or steps were skipped at rest.
     Step(&'s Session),
     /// An input acts now, before the next step.
     Input(&'s pb::Input),
 }
 
-/// A journal that is simulated again.
+/// A journal that is being replayed, with the session at the present step.
 pub struct Replay<R> {
     reader: JournalReader<R>,
     survey: Survey,
@@ -97,7 +98,7 @@ pub struct Replay<R> {
     rules: Rules,
     session: Session,
     items: VecDeque<JournalItem>,
-    /// What acts at the next step.
+    /// Commands and a change of the tissue that act at the next step.
     commands: Vec<Due>,
     change: Option<Arc<Model>>,
     running: bool,
@@ -106,7 +107,7 @@ pub struct Replay<R> {
     snapshots: u64,
     equal_until: Option<u64>,
     difference: Option<Difference>,
-    /// A multiple of so many steps is not skipped.
+    /// The step counts that are multiples of this are not skipped at rest.
     stops_every: u64,
 }
 
@@ -114,7 +115,7 @@ impl<R: Read + Seek> Replay<R> {
     /// Begins a replay at the beginning of a journal.
     ///
     /// # Errors
-    /// Refuses a journal of another generation, and one whose tissue or first snapshot is not valid.
+    /// Refuses a journal of another generation, and one whose tissue or first snapshot is invalid.
     pub fn new(reader: JournalReader<R>, survey: Survey, limits: &Limits) -> Result<Self> {
         let header = reader.header();
         let begins = |at: &&SnapshotAt| at.step == header.begin_step && at.batch == 0;
@@ -125,12 +126,13 @@ impl<R: Read + Seek> Replay<R> {
     /// Begins a replay at the newest snapshot that is not after `step`.
     ///
     /// # Errors
-    /// As for [`Replay::new`]; refuses a step before the beginning of the journal, or after its end.
+    /// Refuses a journal of another generation, an invalid tissue or snapshot, and a step outside the journal.
     pub fn near(reader: JournalReader<R>, survey: Survey, limits: &Limits, step: u64) -> Result<Self> {
         Replay::near_with(reader, survey, limits, step, None)
     }
 
-    /// The same. If `known` is of a journal of the same session, its tissue is not made again.
+    /// Begins a replay as [`Replay::near`] does. The tissue of `known` is reused if it belongs to a journal of that
+    /// session.
     fn near_with(
         reader: JournalReader<R>,
         survey: Survey,
@@ -213,13 +215,13 @@ impl<R: Read + Seek> Replay<R> {
         Ok(replay)
     }
 
-    /// Returns the steps that are multiples of `every` are seen also where the tissue rests.
+    /// Returns this replay with events at all steps that are multiples of `every`, even where the tissue rests.
     #[must_use]
     pub fn stopping_every(self, every: u64) -> Self {
         Replay { stops_every: every.max(1), ..self }
     }
 
-    /// Returns the session as it stands.
+    /// Returns the session at the present step.
     pub fn session(&self) -> &Session {
         &self.session
     }
@@ -229,18 +231,18 @@ impl<R: Read + Seek> Replay<R> {
         &self.first
     }
 
-    /// Returns what the journal has.
+    /// Returns the survey of the journal.
     pub fn survey(&self) -> &Survey {
         &self.survey
     }
 
-    /// Returns whether time goes on, and until which step.
+    /// Returns whether time advances, and the step count at which it pauses, if any.
     pub fn running(&self) -> (bool, Option<u64>) {
         let reached = self.until.is_some_and(|until| self.session.step_count() >= until);
         (self.running && !reached && self.session.hold_reason().is_none(), self.until)
     }
 
-    /// Hashes and snapshots that were compared so far.
+    /// Returns the number of hashes and of snapshots that were compared so far.
     pub fn compared(&self) -> [u64; 2] {
         [self.hashes, self.snapshots]
     }
@@ -250,11 +252,11 @@ impl<R: Read + Seek> Replay<R> {
         self.difference.as_ref()
     }
 
-    /// Simulates until so many steps are done, at most as many as the journal has. What acts at that step has not acted then.
-    /// Ends early at a difference.
+    /// Simulates until `until` steps are done, or to the end of the journal. The inputs that act at that step have
+    /// not acted then. It ends early at a difference. `see` gets each event, and may end the call with an error.
     ///
     /// # Errors
-    /// Refuses a journal that is damaged, or that has what no session accepts.
+    /// Refuses a journal that is damaged or has inputs that no session accepts, and returns errors of `see`.
     pub fn advance(&mut self, until: u64, see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()>) -> Result<()> {
         let until = until.min(self.survey.until_step);
         while self.difference.is_none() {
@@ -265,7 +267,7 @@ impl<R: Read + Seek> Replay<R> {
                 break;
             }
             if step < self.session.step_count() {
-                let text = format!("something acts at step {step}, when {} are done", self.session.step_count());
+                let text = format!("an input acts at step {step}, but {} steps are done", self.session.step_count());
                 return Err(self.reader.refuse(&text));
             }
             self.run_to(step, see)?;
@@ -278,7 +280,7 @@ impl<R: Read + Seek> Replay<R> {
         self.run_to(until, see)
     }
 
-    /// Reads the next batch that has something, if all is taken.
+    /// Reads the next batch with any items, if all earlier ones are used.
     fn fill(&mut self) -> Result<()> {
         while self.items.is_empty() {
             let Some(batch) = self.reader.next_batch()? else { break };
@@ -294,7 +296,7 @@ impl<R: Read + Seek> Replay<R> {
                 self.session.change(&model);
             }
             if let Some(reason) = self.session.hold_reason() {
-                let what = format!("the session is held here and went on when it was recorded: {reason}");
+                let what = format!("the session is held here, but continued when it was recorded: {reason}");
                 self.differ(step, what);
                 break;
             }
@@ -317,7 +319,7 @@ impl<R: Read + Seek> Replay<R> {
         Ok(())
     }
 
-    /// Refuses steps that no server would do: the journal may be a stranger's.
+    /// Refuses steps that no server would do, because the journal may come from an untrusted party.
     fn check_work(&self) -> Result<()> {
         let (model, most) = (self.session.model(), self.limits.point_substeps_per_step);
         let (points, substeps) = (model.swept_points(), model.plan.substeps);
@@ -370,7 +372,7 @@ impl<R: Read + Seek> Replay<R> {
         let computed = self.session.tissue().state_hash();
         if from_hash(recorded)? != computed {
             let step = self.session.step_count();
-            self.differ(step, format!("the {what} was {recorded} when it was recorded, and is {computed:032x}"));
+            self.differ(step, format!("the recorded hash of the {what} is {recorded}, but here it is {computed:032x}"));
         }
         Ok(())
     }
@@ -387,7 +389,7 @@ impl<R: Read + Seek> Replay<R> {
             Some(What::Revive(_)) => {
                 let step = self.session.step_count();
                 if self.session.hold_reason().is_none() {
-                    self.differ(step, "the session was held when it was recorded, and is not here".to_owned());
+                    self.differ(step, "the session was held when it was recorded, but is not held here".to_owned());
                     return Ok(());
                 }
                 let mut session = Session::new(self.session.model());
@@ -401,10 +403,11 @@ impl<R: Read + Seek> Replay<R> {
         Ok(())
     }
 
-    /// Goes on to `step`. Gives the session there, the tissue with which it began, and the reader, for what follows.
+    /// Continues to `step`. Returns the session there, the tissue with which it began, and the reader for what
+    /// follows.
     ///
     /// # Errors
-    /// As for [`Replay::advance`]; refuses a journal whose hashes are others, and when `stop` is set.
+    /// Refuses whatever [`Replay::advance`] refuses, a journal whose hashes differ, and when `stop` is set.
     pub fn reach(mut self, step: u64, stop: &AtomicBool) -> Result<(Session, Arc<Model>, JournalReader<R>)> {
         self.advance(step, &mut |_| if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) })?;
         match self.difference {
@@ -416,11 +419,11 @@ impl<R: Read + Seek> Replay<R> {
         }
     }
 
-    /// Goes on to the end of the journal, and tells what was compared. `progress` gets the steps done and the last one, from time
-    /// to time.
+    /// Continues to the end of the journal, and returns what was compared. `progress` gets the number of steps done
+    /// and the last step, every 1024 steps.
     ///
     /// # Errors
-    /// As for [`Replay::advance`].
+    /// Refuses whatever [`Replay::advance`] refuses. A difference is not an error but part of the verdict.
     pub fn verify(mut self, progress: &mut dyn FnMut(u64, u64)) -> Result<Verdict> {
         let (begin, end) = (self.reader.header().begin_step, self.survey.until_step);
         self.advance(u64::MAX, &mut |seen| {
@@ -435,11 +438,11 @@ impl<R: Read + Seek> Replay<R> {
         Ok(Verdict { steps: [begin, end], proved_until, compared: self.compared(), difference: self.difference })
     }
 
-    /// Goes on to the end of the journal, for a server that goes on with the session: commands for the step after its end
-    /// have no effect, because their leases are over; what else was written does.
+    /// Continues to the end of the journal, for a server that continues the session. Commands for the step after
+    /// its end have no effect, because their leases are over; other inputs for that step act.
     ///
     /// # Errors
-    /// As for [`Replay::advance`]; and refuses a journal whose hashes are others.
+    /// Refuses whatever [`Replay::advance`] refuses, and a journal whose hashes differ.
     pub fn resume(mut self) -> Result<Resumed> {
         let see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()> = &mut |_| Ok(());
         self.advance(u64::MAX, see)?;
@@ -469,7 +472,7 @@ impl<R: Read + Seek> Replay<R> {
         })
     }
 
-    /// The changes of the tissue that wait for a step after this one; none of a session that is held.
+    /// Returns the changes of the tissue that wait for a step after this one; none if the session is held.
     fn waiting(&self) -> Result<Vec<(u64, Input)>> {
         let next = self.session.step_count() + u64::from(self.change.is_some());
         let is_held = self.session.hold_reason().is_some();
@@ -497,7 +500,7 @@ impl std::fmt::Display for Difference {
     }
 }
 
-/// The snapshot there: its batch, and what comes after it in that.
+/// Reads a snapshot. Returns its batch, the snapshot, and the items that follow it in the batch.
 fn snapshot<R: Read + Seek>(
     reader: &mut JournalReader<R>,
     at: &SnapshotAt,
@@ -516,46 +519,48 @@ fn snapshot<R: Read + Seek>(
     }
 }
 
-/// What is saved in a snapshot, and the tissue of that.
+/// Returns the saved session in a snapshot, and its tissue.
 fn saved(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Result<(Saved, Arc<Model>)> {
     let saved = Saved::from_bytes(&snapshot.saved, limits)?;
     if saved.step() != snapshot.step {
-        let message = format!("is of step {}, where one of step {} should be", saved.step(), snapshot.step);
+        let message = format!("is of step {}, but should be of step {}", saved.step(), snapshot.step);
         return Err(Refusal::new(Reason::Unreadable, "snapshot", message));
     }
-    // Most sessions have the tissue that they began with.
+    // Most sessions have the tissue with which they began.
     let is_first = *saved.tissue() == first.tissue_state();
     let model = if is_first { first.clone() } else { Model::resumed(&first.scene, saved.tissue(), limits)? };
     Ok((saved, model))
 }
 
-/// The session in a snapshot.
+/// Returns the session in a snapshot.
 fn restored(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Result<Session> {
     let (saved, model) = saved(snapshot, first, limits)?;
     Session::restore(&model, &saved)
 }
 
-/// A session at the end of its journal.
+/// A session at the end of its journal, ready to be continued.
 pub struct Resumed {
     /// The journal's header.
     pub header: pb::Header,
-    /// The tissue with which the session began: of its scene, changes are made.
+    /// The tissue with which the session began; later changes are made from its scene.
     pub first: Arc<Model>,
-    /// The session at the last durable step. Its tools are as they were: who goes on lets go of them.
+    /// The session at the last durable step. Its tools are still held: the caller releases them
+    /// ([`Session::let_go`]).
     pub session: Session,
-    /// The tissue from this step on, if it changes here: for `Session::change`.
+    /// The tissue from this step on, if it changes here: to be passed to [`Session::change`].
     pub pending: Option<Arc<Model>>,
     /// Changes of the tissue that wait for a later step, each with that step.
     pub waiting: Vec<(u64, Input)>,
-    /// Whether time goes on.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step at which it pauses.
+    /// The step count at which the session pauses, if any.
     pub until_step: Option<u64>,
-    /// What the journal has.
+    /// Survey of the journal.
     pub survey: Survey,
 }
 
-/// Returns the session at the end of a journal, computed from its newest snapshot on, with its hashes compared.
+/// Returns the session at the end of a journal. It is simulated from the newest snapshot on, and its hashes are
+/// compared.
 ///
 /// # Errors
 /// Refuses a journal that is damaged in the middle, is of another generation, or gives other hashes.
@@ -563,17 +568,17 @@ pub fn resume<R: Read + Seek>(reader: JournalReader<R>, limits: &Limits) -> Resu
     resume_as(reader, limits, None)
 }
 
-/// Returns a copy of the tissue in the bytes of a snapshot, as it was then but at rest, for a client's tool with this
-/// tip: such as can be stepped at 1 kHz. Neither steps nor tools of the session are restored, whatever they would cost.
+/// Returns a copy of the tissue in an encoded journal with one snapshot, at rest, for a client's tool with this
+/// tip; it can be stepped at 1 kHz. The session's steps and tools are not restored, whatever they would cost.
 ///
 /// # Errors
-/// Refuses what is no snapshot of one moment, a tissue that is too large or a tip that covers too much of it, and tells that
-/// there is no memory.
+/// Returns a message if the bytes are no such journal, if the tissue is too large or the tip covers too much of it,
+/// or if memory is missing.
 pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predictor>, String> {
     #[allow(clippy::cast_possible_truncation)]
     let limits = message::limits(&Limits { points: TICK_POINT_SUBSTEPS as usize, ..Limits::default() });
     let copy = || {
-        // It came from a server: what it names of the machine there is not for this one.
+        // The bytes come from a server: file names in them do not apply to this machine.
         let mut reader = JournalReader::new("the snapshot", Cursor::new(bytes))?.without_files();
         check_replays(reader.header())?;
         let survey = reader.survey(&mut |_| {})?;
@@ -587,13 +592,14 @@ pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predict
     Ok(Box::new(copy))
 }
 
-/// The header of a journal, and the tissue that it begins with.
+/// Header of a journal, with the compiled tissue with which its session began.
 pub type Known = (pb::Header, Arc<Model>);
 
-/// Does the same. If `known` is of a journal of the same session, its tissue is not made again.
+/// Returns the session at the end of a journal as [`resume`] does. The tissue of `known` is reused if it belongs to
+/// a journal of that session.
 ///
 /// # Errors
-/// As for [`resume`].
+/// Refuses a journal that is damaged in the middle, is of another generation, or gives other hashes.
 pub fn resume_as<R: Read + Seek>(
     mut reader: JournalReader<R>,
     limits: &Limits,
@@ -608,10 +614,11 @@ fn is_same_tissue(a: &pb::Header, b: &pb::Header) -> bool {
     a.session_id == b.session_id && a.scene == b.scene && a.mesh == b.mesh && a.tissue == b.tissue
 }
 
-/// Returns the session after `step` steps, computed from the newest snapshot before.
+/// Returns the session after `step` steps, simulated from the newest snapshot before, and the tissue with which it
+/// began.
 ///
 /// # Errors
-/// Refuses a step that the journal has not, and as [`resume`] does; also when `stop` is set.
+/// Refuses a step that the journal does not have, a journal that [`resume`] refuses, and when `stop` is set.
 pub fn session_at<R: Read + Seek>(
     mut reader: JournalReader<R>,
     limits: &Limits,
@@ -623,22 +630,72 @@ pub fn session_at<R: Read + Seek>(
     Ok((session, first))
 }
 
-/// The result of a verification.
+/// Result of a verification.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Verdict {
-    /// Steps done at the beginning and at the end.
+    /// Step counts at the beginning and at the end of the journal.
     pub steps: [u64; 2],
-    /// The last step whose hash is in the journal and was equal: nothing is known of the steps after it. That of the beginning if no
+    /// The last step whose recorded hash was equal; nothing is known of the steps after it. The beginning if no
     /// hash was compared.
     pub proved_until: u64,
-    /// Hashes and snapshots that were compared.
+    /// Number of hashes and of snapshots that were compared.
     pub compared: [u64; 2],
-    /// The first difference.
+    /// The first difference; `None` if there is none.
     pub difference: Option<Difference>,
 }
 
-/// Simulates all of a journal, and compares every hash and every snapshot. `progress` gets the steps done and the last one, from
-/// time to time.
+/// Simulates a whole journal, and compares every hash and every snapshot. `progress` gets the number of steps done
+/// and the last step, every 1024 steps.
+///
+/// A journal is recorded while a session runs. Then it is simulated again, and both hashes are the same:
+///
+/// ```
+/// use std::io::Cursor;
+///
+/// use palpate_session::Session;
+/// use palpate_session::command::{Command, Due};
+/// use palpate_session::input::Input;
+/// use palpate_session::journal::{JournalReader, JournalWriter, Opening, pb, verify};
+/// use palpate_tissue::Model;
+/// use palpate_tissue::limits::Limits;
+/// use palpate_tissue::scene::PAPER;
+/// use palpate_tissue::scene::profile::Poke;
+/// use palpate_tissue::scene::script::Action;
+///
+/// let model = Model::parse("paper", PAPER, &["sheet.points=[5, 5]"])?;
+/// let opening = Opening {
+///     session_id: "example",
+///     run: 1,
+///     owner: "",
+///     idle_timeout_s: 900.0,
+///     first: &model,
+///     begin_step: 0,
+///     running: true,
+///     until_step: None,
+///     ownership_revision: 0,
+/// };
+/// // Times are in nanoseconds since 1970; a step is a millisecond.
+/// let mut writer = JournalWriter::new(&opening, 0);
+/// let mut session = Session::new(&model);
+/// writer.snapshot(0, session.tissue().state_hash(), &model, session.save().to_bytes());
+/// // 0.1 N down on the middle, from the first step on.
+/// let centre_m = model.shape().extent().middle_m();
+/// let force_n = glam::DVec3::new(0.0, 0.0, -0.1);
+/// let poke = Poke { point: None, centre_m, force_n, falloff_per_m: 100.0, falloff_offset: 0.0 };
+/// let mut due = vec![Due::in_time(Command::new(0, Some(1), Action::Push(poke)))];
+/// writer.input(0, &Input::Command(due[0].clone()));
+/// for _ in 0..100 {
+///     session.advance(&mut due, |_| {});
+/// }
+/// writer.hash(100, session.tissue().state_hash());
+/// let journal = writer.finish(pb::Why::Drained, "the example ended", 100, 100_000_000);
+///
+/// let reader = JournalReader::new("example.mcap", Cursor::new(journal))?;
+/// let verdict = verify(reader, &Limits::default(), &mut |_, _| {})?;
+/// assert_eq!((verdict.steps, verdict.proved_until), ([0, 100], 100));
+/// assert_eq!(verdict.difference, None);
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
 ///
 /// # Errors
 /// Refuses a journal that can't be read or simulated.

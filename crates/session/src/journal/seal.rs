@@ -1,4 +1,4 @@
-//! Makes a complete journal a file that every tool opens: appends the index of its chunks, statistics, and the end.
+//! Completes a journal so that every MCAP tool opens it: appends the index of its chunks, statistics, and the end.
 
 use std::collections::BTreeMap;
 use std::io::{self, Read, Seek, SeekFrom, Write};
@@ -8,23 +8,23 @@ use super::records::{
     SUMMARY_OFFSET, number,
 };
 
-/// A chunk, as its index tells of it.
+/// Position and content of a chunk, for its index.
 struct ChunkAt {
     at: u64,
     length: u64,
     /// Times of its first and last message.
     times: [u64; 2],
-    /// Where the index of each channel is, and how many messages it has.
+    /// For each channel: its number, the position of its index, and the number of its messages.
     indexes: Vec<(u16, u64, u64)>,
-    /// Bytes of these indexes.
+    /// Length of these indexes, bytes.
     index_length: u64,
 }
 
-/// Appends the summary to a file of whole batches, and nothing after them. It takes the memory of one index at a time, and reads
-/// the file twice, without its messages.
+/// Appends the summary to a file of whole batches, which must have nothing after them. It keeps one index in memory
+/// at a time, and reads the file twice, without its messages.
 ///
 /// # Errors
-/// Returns the error of `file`; or one of invalid data if it does not consist of whole batches.
+/// Returns the error of `file`, or one of invalid data if the file does not consist of whole batches.
 pub fn seal<F: Read + Write + Seek>(file: &mut F) -> io::Result<()> {
     let length = file.seek(SeekFrom::End(0))?;
     let mut out = Vec::new();
@@ -100,7 +100,7 @@ pub fn seal<F: Read + Write + Seek>(file: &mut F) -> io::Result<()> {
         body.extend(offsets_begin.to_le_bytes());
         body.extend([0; 4]);
     });
-    // The checksum of the summary includes the footer up to the checksum.
+    // The checksum of the summary covers the footer up to the checksum.
     let crc_at = offsets.len() - 4;
     writer.crc.update(&offsets[..crc_at]);
     let crc = writer.crc.finalize();
@@ -111,7 +111,7 @@ pub fn seal<F: Read + Write + Seek>(file: &mut F) -> io::Result<()> {
     file.flush()
 }
 
-/// The summary as it grows.
+/// The summary while it is written: its position, its checksum, and its parts.
 struct Summary {
     at: u64,
     crc: crc32fast::Hasher,
@@ -152,14 +152,14 @@ fn read_at(file: &mut (impl Read + Seek), at: u64, into: &mut [u8]) -> io::Resul
     file.read_exact(into)
 }
 
-/// Where the first chunk is.
+/// Returns the position of the first chunk.
 fn first_chunk(file: &mut (impl Read + Seek)) -> io::Result<u64> {
     let mut head = [0; HEAD as usize];
     read_at(file, MAGIC.len() as u64, &mut head)?;
     Ok(MAGIC.len() as u64 + HEAD + number::<8>(&head, 1).unwrap_or_default())
 }
 
-/// The chunk at `at` with its indexes, which end at the new `at`; `None` at `end`.
+/// Returns the chunk at `at` and moves `at` beyond its indexes; `None` at `end`.
 fn next_chunk(file: &mut (impl Read + Seek), at: &mut u64, end: u64) -> io::Result<Option<ChunkAt>> {
     if *at >= end {
         return Ok(None);
@@ -192,7 +192,7 @@ fn next_chunk(file: &mut (impl Read + Seek), at: &mut u64, end: u64) -> io::Resu
     Ok(Some(chunk))
 }
 
-/// The records of schemas and channels of the first chunk; tells how many of each.
+/// Appends the records of schemas and of channels in the first chunk to `into`. Returns how many of each there are.
 fn define(file: &mut (impl Read + Seek), chunk: &ChunkAt, into: &mut [Vec<u8>; 2]) -> io::Result<[u32; 2]> {
     let (mut at, end) = (chunk.at + HEAD + CHUNK_HEAD, chunk.at + chunk.length);
     let mut counts = [0; 2];

@@ -1,7 +1,8 @@
-//! Signatures in a journal, for who has to prove that nobody has changed it: Ed25519, by the key of the server that wrote it.
+//! Signatures in a journal, which prove that it has not been changed: Ed25519, by the key of the server that wrote
+//! it.
 //!
-//! A signature is of all messages before it in the file, with the times of their batches. So what was added, left out or changed
-//! before it is found; that the file was cut off behind one is seen by its missing end.
+//! A signature covers all messages before it in the file, with the times of their batches. So any addition,
+//! omission or change before it is detected; if the file was cut off after a signature, its end is missing.
 
 use std::sync::Arc;
 
@@ -14,18 +15,18 @@ use super::format::Topic;
 use super::reader::JournalBatch;
 use palpate_refusal::Result;
 
-/// What a signature is of begins so: the key may sign other things too.
+/// First bytes of the signed text: the key may sign other things too.
 const PURPOSE: &[u8] = b"palpate journal 1\0";
 
-/// What a public key begins with in DER: its kind (RFC 8410).
+/// First bytes of a public key in DER: its kind (RFC 8410).
 const KIND: [u8; 12] = [0x30, 0x2a, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x03, 0x21, 0x00];
 
-/// A public key.
+/// Public part of a server's key. It is displayed in hexadecimal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PublicKey([u8; 32]);
 
 impl PublicKey {
-    /// Returns the key in a `SubjectPublicKeyInfo` (DER); `None` if it is none, or of another kind.
+    /// Returns the key in a `SubjectPublicKeyInfo` (DER); `None` if the bytes are not an Ed25519 key.
     pub fn of(der: &[u8]) -> Option<Self> {
         der.strip_prefix(&KIND).and_then(|bytes| bytes.try_into().ok()).map(PublicKey)
     }
@@ -37,23 +38,24 @@ impl std::fmt::Display for PublicKey {
     }
 }
 
-/// The key of a server. `Debug` shows its public part.
+/// Private key of a server. `Debug` shows only its public part.
 #[derive(Debug, Clone)]
 pub struct Key(Arc<Ed25519KeyPair>);
 
 impl Key {
-    /// Returns the key in PKCS#8 (DER), with or without its public part; `None` if it is none, or of another kind.
+    /// Returns the key in PKCS#8 (DER), with or without its public part; `None` if the bytes are not an Ed25519
+    /// key.
     pub fn of(der: &[u8]) -> Option<Self> {
         Some(Key(Arc::new(Ed25519KeyPair::from_pkcs8_maybe_unchecked(der).ok()?)))
     }
 
-    /// Returns its public part.
+    /// Returns the public part of the key.
     pub fn public(&self) -> PublicKey {
         PublicKey(self.0.public_key().as_ref().try_into().unwrap_or_default())
     }
 }
 
-/// Sums up messages in their order.
+/// Digest of messages in their order.
 #[derive(Clone)]
 struct MessageDigest(Context);
 
@@ -69,23 +71,23 @@ impl MessageDigest {
         self.0.update(bytes);
     }
 
-    /// What is signed.
+    /// Returns the text that is signed.
     fn text(&self) -> Vec<u8> {
         [PURPOSE, self.0.clone().finish().as_ref()].concat()
     }
 }
 
-/// Signs a journal while it is written.
+/// Signer of a journal while it is written.
 pub(super) struct Signer {
     key: Key,
     sum: MessageDigest,
     /// Whether there are messages after the last signature.
     is_behind: bool,
-    /// When it signed last.
+    /// Time of the last signature, ns since the Unix epoch.
     unix_ns: Option<u64>,
 }
 
-/// It signs so often at most, ns: a signature takes 96 bytes and some 20 µs.
+/// Least time between signatures, ns: a signature takes 96 bytes and some 20 µs.
 const EVERY_NS: u64 = 1_000_000_000;
 
 impl Signer {
@@ -93,13 +95,14 @@ impl Signer {
         Signer { key, sum: MessageDigest::new(), is_behind: false, unix_ns: None }
     }
 
-    /// A message was written.
+    /// Adds a written message to the digest.
     pub(super) fn add(&mut self, topic: Topic, unix_ns: u64, bytes: &[u8]) {
         self.sum.add(topic, unix_ns, bytes);
         self.is_behind = true;
     }
 
-    /// The message with the signature of all until now, if it is time for one, or if these are `all` that there will be.
+    /// Returns the message with a signature of all messages so far, if one is due or if these are `all` that there
+    /// will be.
     pub(super) fn sign(&mut self, unix_ns: u64, all: bool) -> Option<Vec<u8>> {
         let is_due = self.unix_ns.is_none_or(|last| unix_ns >= last.saturating_add(EVERY_NS));
         if !self.is_behind || !(is_due || all) {
@@ -118,38 +121,38 @@ impl std::fmt::Debug for Signer {
     }
 }
 
-/// Checks the signatures of a journal, batch by batch.
+/// Verifier of the signatures of a journal, batch by batch.
 pub struct Signatures {
     key: PublicKey,
     sum: MessageDigest,
-    /// The step up to which the last batch is complete that was signed, and its number.
+    /// The step up to which the last signed batch is complete, and the batch's number.
     signed: Option<(u64, u64)>,
-    /// Messages after the last signature.
+    /// Number of messages after the last signature.
     behind: u64,
     ended: bool,
 }
 
-/// How much of a journal is signed.
+/// Signed extent of a journal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Signed {
-    /// Nothing up to this step was changed since the server wrote it.
+    /// No message up to this step has been changed since the server wrote it.
     pub until_step: u64,
-    /// Messages after the last signature: anybody may have written them.
+    /// Number of messages after the last signature, which anybody may have written.
     pub unsigned: u64,
-    /// Its end is signed as well, so nothing was cut off.
+    /// Whether the end is signed too, so that nothing was cut off.
     pub ended: bool,
 }
 
 impl Signatures {
-    /// Creates the signatures of the server with this key.
+    /// Creates a verifier of signatures by the server with this key.
     pub fn of(key: PublicKey) -> Self {
         Signatures { key, sum: MessageDigest::new(), signed: None, behind: 0, ended: false }
     }
 
-    /// Checks the next batch. All are to be given in order, from the first.
+    /// Checks the next batch. The batches must be given in order, from the first.
     ///
     /// # Errors
-    /// Refuses a signature by another key, and one that is not of what comes before it.
+    /// Refuses a signature by another key, and one that does not match the messages before it.
     pub fn check(&mut self, batch: &JournalBatch) -> Result<()> {
         let mut ends = false;
         for (topic, bytes) in batch.messages() {
@@ -178,7 +181,7 @@ impl Signatures {
         Ok(())
     }
 
-    /// Returns how much was signed; `None` if nothing was.
+    /// Returns the signed extent so far; `None` if nothing is signed.
     pub fn signed(&self) -> Option<Signed> {
         let Signatures { behind, ended, .. } = *self;
         self.signed.map(|(until_step, _)| Signed { until_step, unsigned: behind, ended: ended && behind == 0 })

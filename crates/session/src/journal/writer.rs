@@ -1,4 +1,4 @@
-//! Writes the journal of a run: takes in what happens, and gives the bytes to append to its file.
+//! Writer of the journal of a run: it collects events, and returns the bytes to append to the file.
 
 use palpate_proto::journal as pb;
 use prost::Message;
@@ -11,26 +11,26 @@ use super::signature::{Key, Signer};
 use crate::input::{Felt, Input};
 use palpate_tissue::Model;
 
-/// What a journal begins with.
+/// Description of a session at the beginning of a journal.
 #[derive(Debug, Clone)]
 pub struct Opening<'a> {
-    /// The session's id.
+    /// ID of the session.
     pub session_id: &'a str,
     /// Number of the run, from 1.
     pub run: u64,
-    /// Who made the session, for people.
+    /// Name of the account that created the session, for people.
     pub owner: &'a str,
-    /// Time without use after which it is deleted, s.
+    /// Time without use after which the session is deleted, s.
     pub idle_timeout_s: f64,
     /// The tissue with which the session began, in its first run.
     pub first: &'a Arc<Model>,
-    /// Steps done.
+    /// Number of steps done.
     pub begin_step: u64,
-    /// Whether time goes on.
+    /// Whether the session's time advances.
     pub running: bool,
-    /// The step at which it pauses, if it runs to one.
+    /// The step count at which the session pauses, if any.
     pub until_step: Option<u64>,
-    /// The revision at which the server became the session's owner; 0 without a fleet.
+    /// Revision at which the server became the session's owner; 0 without a fleet.
     pub ownership_revision: u64,
 }
 
@@ -57,21 +57,21 @@ impl Opening<'_> {
     }
 }
 
-/// A batch is begun anew when its messages have so many bytes.
+/// Size of a batch's messages at which the batch ends, bytes.
 const USUAL_BYTES: usize = 4 << 20;
 
-/// The writer of a journal. It holds what waits for the next flush, and nothing else: neither a file nor an index.
+/// Writer of a journal. It holds the events until the next flush, but neither a file nor an index.
 #[derive(Debug)]
 pub struct JournalWriter {
-    /// Batches made so far, and inputs in them.
+    /// Number of batches so far, and of inputs in them.
     batches: u64,
     inputs_before: u64,
-    /// Batches that are on the disk for certain.
+    /// Number of batches that are certainly on the disk.
     durable: u64,
     until_step: u64,
-    /// Whether time goes on, and until which step.
+    /// Whether time advances, and to which step.
     running: (bool, Option<u64>),
-    /// The time of the last flush.
+    /// Time of the last flush, ns since the Unix epoch.
     unix_ns: u64,
     inputs: Vec<pb::Input>,
     tips: Tips,
@@ -79,23 +79,23 @@ pub struct JournalWriter {
     /// Other messages, in order.
     messages: Vec<(Topic, Vec<u8>)>,
     bytes: usize,
-    /// Chunks that are full before their flush.
+    /// Chunks that were full before their flush.
     full: Vec<u8>,
     signer: Option<Signer>,
-    /// Nothing comes after the batch that is written.
+    /// Whether the batch that is written is the last.
     ends: bool,
 }
 
 impl JournalWriter {
-    /// Begins a journal. The first flush gives its beginning.
+    /// Creates the writer of a journal. The first flush returns the beginning of the file.
     ///
-    /// A session that does not begin at rest needs a snapshot of its beginning in the first batch ([`JournalWriter::snapshot`]).
-    /// `unix_ns` is the time.
+    /// A session that does not begin at rest needs a snapshot of its beginning in the first batch
+    /// ([`JournalWriter::snapshot`]). `unix_ns` is the time, ns since the Unix epoch.
     pub fn new(opening: &Opening<'_>, unix_ns: u64) -> Self {
         JournalWriter::with_header(&opening.message(), unix_ns)
     }
 
-    /// The same with a header that another journal had.
+    /// Creates a writer with the header of another journal.
     pub(super) fn with_header(header: &pb::Header, unix_ns: u64) -> Self {
         let bytes = header.encode_to_vec();
         JournalWriter {
@@ -116,25 +116,26 @@ impl JournalWriter {
         }
     }
 
-    /// Returns the same, which signs what it writes.
+    /// Returns this writer with a key by which it signs what it writes; `None` for no signatures.
     #[must_use]
     pub fn signed(self, key: Option<&Key>) -> Self {
         JournalWriter { signer: key.map(|key| Signer::new(key.clone())), ..self }
     }
 
-    /// For what is appended to a journal that has so many batches and inputs, up to a step.
+    /// Creates a writer of what is appended to a journal with `batches` batches and `inputs` inputs, complete up to
+    /// `until_step`.
     pub(super) fn after(batches: u64, inputs: u64, until_step: u64) -> Self {
         let writer = JournalWriter::with_header(&pb::Header { begin_step: until_step, ..Default::default() }, 0);
         JournalWriter { batches, inputs_before: inputs, durable: batches, messages: Vec::new(), bytes: 0, ..writer }
     }
 
-    /// Writes an input that acts at `step`: on the state after so many steps. In the order in which they act.
+    /// Adds an input that acts when `step` steps are done. Add inputs in the order in which they act.
     pub fn input(&mut self, step: u64, input: &Input) {
         let message = message::input(step, input, &mut self.tips);
         self.add_input(message);
     }
 
-    /// The same as a message.
+    /// Adds an input that is already a message.
     pub(super) fn add_input(&mut self, message: pb::Input) {
         match &message.what {
             Some(pb::input::What::Start(start)) => self.running = (true, start.until_step),
@@ -148,7 +149,7 @@ impl JournalWriter {
         }
     }
 
-    /// Writes the state's hash after `step` steps, before what acts at that step.
+    /// Adds the hash of the state after `step` steps, before the inputs that act at that step.
     pub fn hash(&mut self, step: u64, hash: u128) {
         self.add_hash(pb::Hash { step, hash: message::hash(hash), after_inputs: 0 });
     }
@@ -158,8 +159,8 @@ impl JournalWriter {
         self.message(Topic::Hashes, hash.encode_to_vec());
     }
 
-    /// Writes a snapshot after `step` steps, before what acts at that step: the state's hash, its tissue, and the session's state as
-    /// `Saved::to_bytes` gives it.
+    /// Adds a snapshot after `step` steps, before the inputs that act at that step: the state's hash, its tissue
+    /// `model`, and `saved`, the session's state from `Saved::to_bytes`.
     pub fn snapshot(&mut self, step: u64, hash: u128, model: &Model, saved: Vec<u8>) {
         let (tissue, hash) = (Some(message::tissue(model)), message::hash(hash));
         self.add_snapshot(pb::Snapshot { step, hash, tissue, saved, ..Default::default() });
@@ -171,7 +172,8 @@ impl JournalWriter {
         self.message(Topic::Snapshots, snapshot.encode_to_vec());
     }
 
-    /// Writes all changes of the tissue that wait for their step, each with that step: these instead of those told before.
+    /// Adds the list of all changes of the tissue that wait for their step, each with that step. It replaces
+    /// earlier lists.
     pub fn waiting(&mut self, changes: &[(u64, Arc<Model>)]) {
         let input =
             |(step, model): &(u64, Arc<Model>)| message::input(*step, &Input::Tissue(model.clone()), &mut Tips::new());
@@ -179,7 +181,7 @@ impl JournalWriter {
         self.message(Topic::Waiting, waiting.encode_to_vec());
     }
 
-    /// Writes what the tools feel after `step` steps.
+    /// Adds the poses of the tools and the forces on them after `step` steps; nothing if `felt` is empty.
     pub fn felt(&mut self, step: u64, felt: &[Felt]) {
         if !felt.is_empty() {
             self.add_moment(message::moment(step, felt));
@@ -203,30 +205,31 @@ impl JournalWriter {
         self.inputs_before + self.inputs.len() as u64
     }
 
-    /// Returns the bytes that wait for a flush, about.
+    /// Returns the approximate number of bytes that wait for a flush.
     pub fn waiting_bytes(&self) -> usize {
         self.bytes + self.full.len()
     }
 
-    /// Returns the last step up to which the batches so far are complete.
+    /// Returns the step up to which the batches so far are complete.
     pub fn until_step(&self) -> u64 {
         self.until_step
     }
 
-    /// Batches made so far: when what a flush gave is on the disk for certain, [`JournalWriter::durable`] is to be told the number
-    /// that this was after that flush.
+    /// Returns the number of batches so far. When the bytes of a flush are certainly on the disk, pass the number
+    /// after that flush to [`JournalWriter::durable`].
     pub fn batches(&self) -> u64 {
         self.batches
     }
 
-    /// Notes that the first `batches` batches are on the disk for certain. Later batches say so, and damage among them is told from
-    /// a torn end.
+    /// Sets that the first `batches` batches are certainly on the disk. Later batches record that, so that a reader
+    /// can tell damage among them from a torn end.
     pub fn durable(&mut self, batches: u64) {
         self.durable = self.durable.max(batches.min(self.batches));
     }
 
-    /// Ends the batch: everything that acts before `until_step` steps are done has been taken in. The bytes are to be
-    /// appended to the file in one piece; none if nothing has happened, not even steps. `unix_ns` is the time.
+    /// Ends the batch and returns the bytes to append to the file in one piece: all inputs that act before
+    /// `until_step` steps are done must have been added. Returns no bytes if there were neither events nor steps.
+    /// `unix_ns` is the time, ns since the Unix epoch.
     pub fn flush(&mut self, until_step: u64, unix_ns: u64) -> Vec<u8> {
         let is_new = self.batches == 0 || until_step > self.until_step;
         self.until_step = self.until_step.max(until_step);
@@ -237,8 +240,8 @@ impl JournalWriter {
         std::mem::take(&mut self.full)
     }
 
-    /// Returns the last batch, which says why the journal ends. [`super::seal`] makes an indexed file of what is then
-    /// complete.
+    /// Returns the bytes of the last batch, which says why the journal ends. [`super::seal`] then makes an indexed
+    /// file of the complete journal.
     pub fn finish(mut self, why: pb::Why, message: &str, until_step: u64, unix_ns: u64) -> Vec<u8> {
         let end = pb::End { why: why.into(), message: message.to_owned() };
         self.message(Topic::End, end.encode_to_vec());

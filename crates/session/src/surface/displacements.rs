@@ -1,4 +1,4 @@
-//! The displacements of a sheet at one moment, from which frames are made.
+//! The displacements of a tissue at one moment, from which frames are made.
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
 #![allow(clippy::needless_range_loop)]
 
@@ -9,29 +9,32 @@ use super::skin::Skin;
 use super::wide::{Available, LANES, SixteenLanes, WideWork, Width};
 use palpate_tissue::scene::Scene;
 
-/// The displacements of a sheet at one moment, from which frames are made.
+/// The displacements of a tissue at one moment, in the order of a frame. All viewers' frames of that moment are
+/// made from it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Snapshot {
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
     /// Simulated time, s.
     pub simulation_time_s: f64,
-    /// Displacements, m: x, y and z separate, point [i, j] at i·ny + j; of a mesh in the order of memory.
+    /// Displacements, m: x, y and z separate. Point [i, j] of a sheet is at i·ny + j; the vertices of a mesh are in
+    /// the order of memory.
     displacement_m: [Vec<f32>; 3],
-    /// What moves with those points, if other ones are shown, and by how much, once somebody wants to know.
+    /// The skin, if other vertices are shown than are simulated; and the displacements of those, computed at first
+    /// use.
     skin: Option<Arc<Skin>>,
     shown_m: OnceLock<[Vec<f32>; 3]>,
-    /// The least and the greatest of each component, m, once somebody wants to know.
+    /// The least and the greatest value of each component, m, computed at first use.
     box_m: OnceLock<[[f32; 2]; 3]>,
-    /// Points along x and y; of a mesh, rows and places of a row.
+    /// Number of points along x and y; of a mesh, rows and places per row.
     pub(super) points: [usize; 2],
-    /// Distance between points, m.
+    /// Distance between points, m; of a mesh, the usual length of an edge.
     pub(super) spacing_m: f64,
 }
 
 impl Snapshot {
-    /// Creates a snapshot of the tissue of a scene. `displacement_m` has a value for each place of a frame and component, m
-    /// (`Tissue::shown_displacements_m`).
+    /// Creates a snapshot of the tissue of a scene. `displacement_m` has a value for each component and place of a
+    /// frame, m (`Tissue::shown_displacements_m`).
     pub fn new(scene: &Scene, step: u64, simulation_time_s: f64, displacement_m: [Vec<f32>; 3]) -> Self {
         let (points, spacing_m) = grid(scene);
         Snapshot {
@@ -46,14 +49,14 @@ impl Snapshot {
         }
     }
 
-    /// Returns the same of a tissue on a mesh. If other vertices are shown than are simulated, who encodes finds out
-    /// where they are.
+    /// Returns this snapshot with the skin of a tissue on a mesh. If other vertices are shown than are simulated,
+    /// the encoder computes their displacements; otherwise the skin is ignored.
     #[must_use]
     pub fn with_skin(self, skin: Option<&Arc<Skin>>) -> Self {
         Snapshot { skin: skin.filter(|skin| skin.is_bound()).cloned(), ..self }
     }
 
-    /// The displacements of what is shown, m.
+    /// Returns the displacements of the shown vertices, m.
     pub(super) fn displacement_m(&self) -> &[Vec<f32>; 3] {
         match &self.skin {
             None => &self.displacement_m,
@@ -64,19 +67,20 @@ impl Snapshot {
         }
     }
 
-    /// The bounding box. Computed once for all encodings, by who encodes: a stepping thread makes the snapshot.
+    /// Returns the bounding box. The thread that encodes computes it once for all encodings, not the stepping
+    /// thread.
     pub(super) fn box_m(&self) -> &[[f32; 2]; 3] {
         self.box_m.get_or_init(|| self.displacement_m().each_ref().map(|values| range(values)))
     }
 
-    /// All points.
+    /// Returns all points.
     pub(super) fn points(&self) -> Points<'_> {
         let values = self.displacement_m().each_ref().map(Vec::as_slice);
         Points { values, stride: self.points[1], count: self.points }
     }
 }
 
-/// The least and the greatest of the values.
+/// Returns the least and the greatest of the values.
 fn range(values: &[f32]) -> [f32; 2] {
     let mut range = [f32::INFINITY, f32::NEG_INFINITY];
     Width::widest().run(Range { values, range: &mut range });

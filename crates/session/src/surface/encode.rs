@@ -1,4 +1,5 @@
-//! Frames: the refined displacements as bytes, in patches small enough that other streams can interleave with them.
+//! Frames: the refined displacements as bytes, in patches that are small enough for other streams to interleave
+//! with.
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
 #![allow(clippy::needless_range_loop)]
 
@@ -11,7 +12,7 @@ use super::refine::{COMPONENTS, Points, Rows, Source, Written};
 use super::wide::{Available, SixteenLanes, WideWork, Width};
 use palpate_tissue::memory;
 
-/// Number format of displacements.
+/// Number format of displacements in a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Encoding {
     /// 4-byte IEEE floats, little-endian, m.
@@ -32,7 +33,7 @@ impl Encoding {
         }
     }
 
-    /// Returns the largest integer q in displacement = origin + scale·q, the least being its negative; `None` for
+    /// Returns the largest integer q in displacement = origin + scale·q; the least is its negative. `None` for
     /// floats.
     pub fn largest_integer(self) -> Option<f64> {
         match self {
@@ -42,34 +43,34 @@ impl Encoding {
     }
 }
 
-/// Most bytes in a patch: small messages of other streams wait for one patch at most.
+/// Size limit of a patch, bytes: a small message of another stream waits for one patch at most.
 const PATCH_BYTES: usize = 64 << 10;
 
-/// An encoded frame, shared by all viewers that request the same kind.
+/// An encoded frame, shared by all viewers that request its refinement and encoding.
 #[derive(Debug, Clone)]
 pub struct Frame {
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
     /// Simulated time, s.
     pub simulation_time_s: f64,
-    /// The refinement.
+    /// Refinement of the surface.
     pub refinement: Refinement,
-    /// The encoding.
+    /// Number format of the displacements.
     pub encoding: Encoding,
     /// Scale and origin of the encoding's integers.
     pub quanta: Quanta,
-    /// Whether every vertex is in the patches.
+    /// Whether the patches have every vertex.
     pub full: bool,
-    /// The patches. No vertex is in two of them.
+    /// The patches, which share no vertex.
     pub patches: Vec<Patch>,
 }
 
-/// Scale and origin: a displacement is origin + scale·q for each component; m.
+/// Scale and origin of integers: a displacement is origin + scale·q for each component, m.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Quanta {
-    /// Middle of the bounding box for integers, 0 for floats.
+    /// Middle of the bounding box for integers, 0 for floats, m.
     pub origin_m: DVec3,
-    /// Quantum of integers, 1 for floats.
+    /// Displacement of one integer step, m; 1 for floats.
     pub scale_m: DVec3,
 }
 
@@ -80,8 +81,9 @@ impl Default for Quanta {
 }
 
 impl Quanta {
-    /// The finest quanta that the integers of `encoding` allow in a box, but none finer than `finest_m`. Interpolation
-    /// between values in the box stays in the box. `box_m`: least and greatest value of each component.
+    /// Returns the finest quanta that the integers of `encoding` allow in a box, but none finer than `finest_m`.
+    /// Interpolation between values in the box stays in the box. `box_m`: least and greatest value of each
+    /// component, m.
     pub(super) fn over(encoding: Encoding, box_m: &[[f32; 2]; COMPONENTS], finest_m: f64) -> Self {
         let Some(largest) = encoding.largest_integer() else { return Quanta::default() };
         let spans = box_m.map(|[low, high]| {
@@ -93,7 +95,8 @@ impl Quanta {
         Quanta { origin_m: spans.map(|span| span.0).into(), scale_m: spans.map(|span| span.1).into() }
     }
 
-    /// How far a point may move along each axis before `encoding` shows it: half a quantum, not at all for floats.
+    /// Returns how far a point may move along each axis before `encoding` shows it, m: half a quantum; 0 for
+    /// floats.
     #[allow(clippy::cast_possible_truncation)]
     pub(super) fn unseen_m(&self, encoding: Encoding) -> [f32; COMPONENTS] {
         match encoding.largest_integer() {
@@ -102,7 +105,7 @@ impl Quanta {
         }
     }
 
-    /// A source that writes `points` in these quanta.
+    /// Returns a source that writes `points` in these quanta.
     #[allow(clippy::cast_possible_truncation)]
     pub(super) fn source<'v>(&self, points: Points<'v>) -> Source<'v> {
         // A box without extent holds only its middle.
@@ -112,26 +115,26 @@ impl Quanta {
     }
 }
 
-/// A rectangle of vertices.
+/// A rectangle of vertices in a frame, with their displacements.
 #[derive(Debug, Clone)]
 pub struct Patch {
     /// The first vertex along x and y.
     pub first: [usize; 2],
-    /// Vertices along x and y.
+    /// Number of vertices along x and y.
     pub count: [usize; 2],
-    /// Displacements, three components per vertex. The y index runs fastest.
+    /// Displacements in the frame's encoding, three components per vertex. The y index runs fastest.
     pub bytes: Bytes,
 }
 
 impl Frame {
-    /// A frame with its patches laid out, but without bytes.
+    /// Creates a frame with its patches laid out, but without bytes.
     fn blank(refinement: Refinement, encoding: Encoding) -> Self {
         let patches = lay_out([0, 0], refinement.vertices(), encoding);
         Frame { step: 0, simulation_time_s: 0.0, refinement, encoding, quanta: Quanta::default(), full: true, patches }
     }
 }
 
-/// Patches without bytes for a rectangle of vertices.
+/// Returns patches without bytes that cover a rectangle of vertices.
 pub(super) fn lay_out(first: [usize; 2], [count_x, count_y]: [usize; 2], encoding: Encoding) -> Vec<Patch> {
     // Whole rows, as many as fit, or parts of a row if a whole one does not fit.
     let vertices = PATCH_BYTES / encoding.bytes_per_vertex();
@@ -148,13 +151,36 @@ pub(super) fn lay_out(first: [usize; 2], [count_x, count_y]: [usize; 2], encodin
     patches
 }
 
-/// Refines and encodes `snapshot`, whose points are those of `refinement`.
+/// Refines and encodes `snapshot`, whose points must be those of `refinement`. Returns a full frame.
+///
+/// A sheet of 3 × 3 points, whose middle is 2 mm deep, with a vertex between neighbours: 5 × 5 vertices, of which the one beside the
+/// middle is 1 mm deep.
+///
+/// ```
+/// use palpate_session::surface::{Encoding, Refinement, Snapshot, encode};
+/// use palpate_tissue::limits::Limits;
+/// use palpate_tissue::scene::{PAPER, Scene};
+///
+/// let limits = Limits::default();
+/// let scene = Scene::parse("paper", PAPER, &["sheet.points=[3, 3]".to_owned()], &limits)?;
+/// let mut z_m = vec![0.0; 9];
+/// z_m[4] = -0.002;
+/// let snapshot = Snapshot::new(&scene, 100, 0.1, [vec![0.0; 9], vec![0.0; 9], z_m]);
+/// let frame = encode(&snapshot, Refinement::new(&scene, 1, &limits)?, Encoding::F32);
+/// assert!(frame.full && frame.refinement.vertices() == [5, 5]);
+/// let bytes = &frame.patches[0].bytes;
+/// // Vertex [1, 2]: x, y and z as floats of 4 bytes.
+/// let z = &bytes[12 * (5 + 2) + 8..][..4];
+/// let depth_m = -f32::from_le_bytes([z[0], z[1], z[2], z[3]]);
+/// assert!((depth_m - 0.001).abs() < 1e-9, "{depth_m} m");
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
 pub fn encode(snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -> Frame {
     encode_over(snapshot, Frame::blank(refinement, encoding))
 }
 
-/// Makes the next frame of the kind of `spent`, which is a full frame, and reuses its buffers where nothing else holds
-/// them: fresh memory costs more than writing the frame.
+/// Refines and encodes `snapshot` in the refinement and encoding of `spent`, which is a full frame. Reuses the
+/// buffers of `spent` that nothing else holds: fresh memory costs more than writing the frame.
 pub fn encode_over(snapshot: &Snapshot, spent: Frame) -> Frame {
     encode_at(Width::widest(), snapshot, spent)
 }
@@ -168,7 +194,7 @@ fn encode_at(width: Width, snapshot: &Snapshot, spent: Frame) -> Frame {
     frame
 }
 
-/// Refines and encodes the rows into patches laid out for them.
+/// Refines and encodes the rows into patches that were laid out for them.
 pub(super) fn fill(width: Width, encoding: Encoding, patches: &mut [Patch], rows: &mut Rows<'_>) {
     match encoding {
         Encoding::F32 => width.run(Fill::<4> { patches, rows }),
@@ -176,7 +202,7 @@ pub(super) fn fill(width: Width, encoding: Encoding, patches: &mut [Patch], rows
     }
 }
 
-/// Writes all rows into the patches, with `BYTES` bytes per component.
+/// Work of writing all rows into the patches, with `BYTES` bytes per component.
 struct Fill<'f, 'v, const BYTES: usize> {
     patches: &'f mut [Patch],
     rows: &'f mut Rows<'v>,
@@ -201,7 +227,7 @@ where
                 }
                 patch.bytes = bytes.freeze();
             } else {
-                // One row, in parts.
+                // A single row, in parts.
                 let length = COMPONENTS * band.iter().map(|patch| patch.count[1]).sum::<usize>();
                 if parted.len() != length {
                     parted = memory::filled(length, [0; BYTES], "a row of a frame");
@@ -220,7 +246,7 @@ where
 }
 
 impl Patch {
-    /// A buffer of `length` bytes: the patch's own, if nothing else reads it.
+    /// Returns a buffer of `length` bytes: the patch's own, if nothing else reads it.
     fn buffer(&mut self, length: usize) -> BytesMut {
         let mut bytes = std::mem::take(&mut self.bytes).try_into_mut().unwrap_or_default();
         bytes.resize(length, 0);
@@ -239,13 +265,13 @@ pub(super) mod tests {
         Snapshot::new(&scene([31, 17]), 7, 0.007, std::array::from_fn(|c| (0..31 * 17).map(|k| wave(k, c)).collect()))
     }
 
-    /// A signed integer of any length, little-endian.
+    /// Reads a signed integer of any length, little-endian.
     fn integer(bytes: &[u8]) -> i64 {
         let sign = if bytes.last().is_some_and(|byte| *byte >= 0x80) { -1 } else { 0 };
         bytes.iter().rev().fold(sign, |q, byte| q << 8 | i64::from(*byte))
     }
 
-    /// Decodes the vertices of a patch of a frame as a client does.
+    /// Decodes the vertices of a patch as a client does.
     pub(in crate::surface) fn decoded(frame: &Frame, patch: &Patch) -> Vec<[f64; 3]> {
         let size = frame.encoding.bytes_per_vertex();
         assert_eq!(patch.bytes.len(), patch.count[0] * patch.count[1] * size);

@@ -1,5 +1,7 @@
-//! Frames for viewers: the sheet refined by bilinear interpolation, or the vertices of a mesh as they are, encoded, in
-//! patches.
+//! Frames for viewers: the points of a sheet, refined by bilinear interpolation, or the vertices of a mesh as they
+//! are; encoded in patches.
+//!
+//! Frames carry no normals; viewers compute them: `clients/library/src/shown.rs` and `src/render/surface.rs`.
 
 mod displacements;
 pub mod encode;
@@ -14,7 +16,7 @@ pub use refine::{LARGEST_REFINEMENT, MESH_ROW, Refinement};
 pub use skin::Skin;
 pub use tiles::FrameTiles;
 
-/// A scene with so many points along x and y, 1 cm apart.
+/// Returns a scene with this many points along x and y, 1 cm apart.
 #[cfg(test)]
 fn scene([nx, ny]: [usize; 2]) -> palpate_tissue::scene::Scene {
     let sets = [format!("sheet.points=[{nx}, {ny}]"), "sheet.spacing_m=0.01".to_owned()];

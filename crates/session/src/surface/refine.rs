@@ -1,5 +1,5 @@
-//! Refinement: bilinear interpolation between neighbouring points. With n vertices between neighbours, as in the paper,
-//! a side of m points has M = (m − 1)·n + m vertices.
+//! Refinement of a sheet: bilinear interpolation between neighbouring points. With n vertices between neighbours,
+//! as in the paper, a side of m points has M = (m − 1)·n + m vertices.
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
 #![allow(clippy::needless_range_loop)]
 
@@ -12,17 +12,19 @@ use palpate_tissue::memory;
 use palpate_tissue::scene::{Body, Scene, Sheet};
 use palpate_tissue::shape::{PointId, RestShape};
 
-/// The name of buffers in messages.
+/// Name of the buffers in messages.
 const ROW: &str = "a row of a frame";
 
-/// The largest n.
+/// Upper limit of the refinement n.
 pub const LARGEST_REFINEMENT: u32 = 10;
 
-/// Vertices of a mesh in a row of a frame. 16 rows are a tile, and a tile of the sleeping logic.
+/// Number of a mesh's vertices in a row of a frame. 16 rows are a tile of the frame, and a tile of the sleeping
+/// logic.
 pub const MESH_ROW: usize = 16;
 
-/// The points of a scene as a frame has them, along x and y, and their distance at rest, m. Those of a mesh are in rows, in
-/// an order that keeps neighbours together; the last row may have places without a vertex.
+/// Returns the number of points of a scene along x and y, as a frame has them, and their distance at rest, m. The
+/// vertices of a mesh are in rows, in an order that keeps neighbours together; the last row may have places without
+/// a vertex.
 pub(super) fn grid(scene: &Scene) -> ([usize; 2], f64) {
     match &scene.body {
         Body::Sheet(Sheet { points, spacing_m, .. }) => (*points, *spacing_m),
@@ -33,14 +35,15 @@ pub(super) fn grid(scene: &Scene) -> ([usize; 2], f64) {
     }
 }
 
-/// A refined grid.
+/// Grid of a frame: the points of a sheet with n vertices between neighbours, or the vertices of a mesh in rows (n
+/// = 0).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refinement {
-    /// Points along x and y; of a mesh, rows and places of a row.
+    /// Number of points along x and y; of a mesh, rows and places per row.
     pub(super) points: [usize; 2],
-    /// Their distance at rest, m.
+    /// Distance between points at rest, m; of a mesh, the usual length of an edge.
     point_spacing_m: f64,
-    /// n.
+    /// The n of the refinement.
     pub(super) between: usize,
 }
 
@@ -48,7 +51,8 @@ impl Refinement {
     /// Creates refinement `n` of the tissue of a scene.
     ///
     /// # Errors
-    /// Refuses an `n` above [`LARGEST_REFINEMENT`] and a grid with too many vertices.
+    /// Refuses an `n` above [`LARGEST_REFINEMENT`] (10), an `n` above 0 on a mesh, and a grid with too many
+    /// vertices.
     pub fn new(scene: &Scene, n: u32, limits: &Limits) -> Result<Self> {
         if n > LARGEST_REFINEMENT {
             let message = format!("must be from 0 to {LARGEST_REFINEMENT}, but is {n}");
@@ -68,7 +72,7 @@ impl Refinement {
         Ok(refinement)
     }
 
-    /// Vertices along x and y.
+    /// Returns the number of vertices along x and y; of a mesh, rows and places per row.
     pub fn vertices(&self) -> [usize; 2] {
         self.points.map(|points| (points - 1) * (self.between + 1) + 1)
     }
@@ -78,7 +82,7 @@ impl Refinement {
         Refinement { between: 0, ..self }
     }
 
-    /// Returns n: vertices between neighbouring points.
+    /// Returns n, the number of vertices between neighbouring points.
     pub fn between(&self) -> usize {
         self.between
     }
@@ -94,7 +98,8 @@ impl Refinement {
         nx * ny
     }
 
-    /// Returns distance between vertices at rest, m.
+    /// Returns the distance between neighbouring vertices of a sheet at rest, m; of a mesh, the usual length of an
+    /// edge.
     #[allow(clippy::cast_precision_loss)]
     pub fn spacing_m(&self) -> f64 {
         self.point_spacing_m / (self.between + 1) as f64
@@ -106,14 +111,14 @@ impl Refinement {
         (point.index() / self.points[1]) * step * ny + (point.index() % self.points[1]) * step
     }
 
-    /// Returns where a vertex rests, m.
+    /// Returns the rest position of a vertex of a sheet, m. On a mesh use [`Skin::rest_m`](super::Skin::rest_m).
     #[allow(clippy::cast_precision_loss)]
     pub fn rest_m(&self, vertex: usize) -> DVec3 {
         let [_, ny] = self.vertices();
         self.spacing_m() * DVec3::new((vertex / ny) as f64, (vertex % ny) as f64, 0.0)
     }
 
-    /// Returns the texture coordinates of a vertex: 0 to 1 along x and along y.
+    /// Returns the texture coordinates of a vertex of a sheet: 0 to 1 along x and along y.
     #[allow(clippy::cast_precision_loss)]
     pub fn texture_at(&self, vertex: usize) -> DVec2 {
         let [nx, ny] = self.vertices();
@@ -121,13 +126,14 @@ impl Refinement {
         DVec2::new(share(vertex / ny, nx), share(vertex % ny, ny))
     }
 
-    /// Returns the number of cells, of two triangles each.
+    /// Returns the number of a sheet's cells, of two triangles each.
     pub fn cell_count(&self) -> usize {
         let [nx, ny] = self.vertices();
         (nx - 1) * (ny - 1)
     }
 
-    /// Returns the vertices of the two triangles of a cell, three and three, anticlockwise seen from above the tissue.
+    /// Returns the vertices of the two triangles of a sheet's cell, three and three, anticlockwise seen from above
+    /// the tissue.
     pub fn triangles(&self, cell: usize) -> [usize; 6] {
         let [_, ny] = self.vertices();
         let corner = cell / (ny - 1) * ny + cell % (ny - 1);
@@ -136,10 +142,10 @@ impl Refinement {
     }
 }
 
-/// Components of a point or vertex. In a row, x, y and z of a vertex are adjacent, as in a patch.
+/// Components of a point or vertex. In a row of a patch, x, y and z of a vertex are adjacent.
 pub(super) const COMPONENTS: usize = 3;
 
-/// The written form of a component.
+/// Written form of a component.
 pub(super) trait Written: Copy + Default {
     /// Writes displacements in quanta.
     fn write<L: SixteenLanes>(values: L, to: &mut [Self; LANES]);
@@ -147,7 +153,7 @@ pub(super) trait Written: Copy + Default {
     fn weave<L: SixteenLanes>(xyz: [L; COMPONENTS], to: &mut [[Self; LANES]; COMPONENTS]);
 }
 
-/// Not encoded: refined further.
+/// Not encoded, because it is refined further.
 impl Written for f32 {
     #[inline(always)]
     fn write<L: SixteenLanes>(values: L, to: &mut [Self; LANES]) {
@@ -197,7 +203,7 @@ impl Written for [u8; 2] {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Source<'v> {
     points: Points<'v>,
-    /// The same value in each lane. The compiler would shuffle a value that it knows to be uniform.
+    /// The value repeated in each lane. The compiler would shuffle a value that it knows to be uniform.
     origin: [Block<f32>; COMPONENTS],
     per_scale: [Block<f32>; COMPONENTS],
 }
@@ -207,14 +213,14 @@ pub(super) struct Source<'v> {
 pub(super) struct Points<'v> {
     /// x, y and z separate. Points along y are adjacent.
     pub(super) values: [&'v [f32]; COMPONENTS],
-    /// From one point to the next along x.
+    /// Distance from one point to the next along x, in values.
     pub(super) stride: usize,
-    /// Along x and y.
+    /// Number of points along x and y.
     pub(super) count: [usize; 2],
 }
 
 impl<'v> Points<'v> {
-    /// Row `i` of component `c`.
+    /// Returns row `i` of component `c`.
     #[inline(always)]
     pub(super) fn row(&self, c: usize, i: usize) -> &'v [f32] {
         &self.values[c][i * self.stride..][..self.count[1]]
@@ -227,13 +233,13 @@ impl<'v> Source<'v> {
     }
 }
 
-/// The rows of vertices between some points, from the first to the last.
+/// Writer of the rows of vertices between some points, from the first to the last.
 ///
-/// Points are converted to quanta before refinement, because there are fewer points than vertices. Interpolation along
-/// y costs permutations, interpolation along x does not. So rows of points are refined along y, and rows of vertices
-/// are mixed from them.
+/// Points are converted to quanta before refinement, because there are fewer points than vertices. Interpolation
+/// along y costs permutations, interpolation along x does not. So rows of points are refined along y, and rows of
+/// vertices are mixed from them.
 pub(super) struct Rows<'v> {
-    /// Vertices for each point except the last.
+    /// Number of vertices for each point except the last.
     cells: usize,
     source: Source<'v>,
     /// The rows of points on either side of the row of vertices, refined along y, in whole periods of `spread`.
@@ -244,25 +250,25 @@ pub(super) struct Rows<'v> {
     spread: Vec<BlockPattern>,
 }
 
-/// Aligned to one cache line: a load across two costs twice as much.
+/// Sixteen values that are aligned to one cache line: a load across two lines costs twice as much.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 struct Block<T>([T; LANES]);
 
-/// A block of vertices in a row. The pattern repeats 16 points on, after as many blocks as a point has components of
-/// vertices.
+/// A block of vertices in a row. The pattern repeats after 16 points, which are as many blocks as a point has
+/// components of vertices.
 struct BlockPattern {
-    /// Beginning of the block of points that it is made from.
+    /// Beginning of the block of points from which it is made.
     begin: usize,
-    /// Indices of the components on the left and right side in that block.
+    /// Indices in that block of the components on the left and right side.
     left: Block<i32>,
     right: Block<i32>,
-    /// The position of each vertex between left (0) and right (1).
+    /// Position of each vertex between left (0) and right (1).
     part: Block<f32>,
 }
 
 impl<'v> Rows<'v> {
-    /// Rows of at most `most` vertices, `between` of them between neighbouring points.
+    /// Creates the writer of rows of at most `most` vertices, with `between` of them between neighbouring points.
     pub(super) fn new(between: usize, most: usize, source: Source<'v>) -> Self {
         let cells = between + 1;
         let periods = if cells == 1 { 0 } else { most.div_ceil(cells * LANES) };
@@ -277,7 +283,8 @@ impl<'v> Rows<'v> {
         self.source = source;
     }
 
-    /// Writes row `a`, three components per vertex, as many as `to` has room for. Call it for consecutive rows from 0.
+    /// Writes row `a`, three components per vertex, as many as `row` has room for. Call it for consecutive rows
+    /// from 0.
     #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn write<L: SixteenLanes, W: Written>(&mut self, with: Available<L>, a: usize, row: &mut [W]) {
@@ -356,7 +363,7 @@ fn weave<L: SixteenLanes, W: Written>(with: Available<L>, source: &Source<'_>, i
     for block in 0..blocks.len() {
         source.weave(with, [&x[block], &y[block], &z[block]], &mut blocks[block]);
     }
-    // The last block overlaps the one before.
+    // The last block overlaps the previous one.
     let last = (values[0].last_chunk(), values[1].last_chunk(), values[2].last_chunk(), row.last_chunk_mut());
     if let (Some(x), Some(y), Some(z), Some(block)) = last {
         source.weave(with, [x, y, z], block);
@@ -364,7 +371,7 @@ fn weave<L: SixteenLanes, W: Written>(with: Available<L>, source: &Source<'_>, i
 }
 
 impl Source<'_> {
-    /// x, y and z of a block, in quanta.
+    /// Writes x, y and z of a block, in quanta.
     #[inline(always)]
     fn weave<L: SixteenLanes, W: Written>(
         &self,
@@ -429,7 +436,7 @@ mod tests {
     use super::*;
     use crate::surface::scene;
 
-    /// All rows of one component.
+    /// Returns all rows of one component.
     fn refine(grid: Refinement, values: &[f32]) -> Vec<Vec<f32>> {
         let points = Points { values: [values; COMPONENTS], stride: grid.points[1], count: grid.points };
         let [x, y] = grid.vertices();

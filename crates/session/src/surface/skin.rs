@@ -1,5 +1,5 @@
-//! What frames show of a mesh: its vertices in an order that keeps neighbours together. Where a coarser mesh is simulated than
-//! the file has, each vertex of the file moves with a place on that one.
+//! The vertices of a mesh as frames show them, in an order that keeps neighbours together. If a coarser mesh is
+//! simulated than the file has, each vertex of the file moves with a place on that one.
 
 use std::sync::Arc;
 
@@ -11,28 +11,28 @@ use palpate_tissue::memory;
 use palpate_tissue::scene::{Body, BoundPlace, MeshShape};
 use palpate_tissue::shape::RestShape;
 
-/// The name of its tables in messages.
-const TABLES: &str = "what is shown of a mesh";
+/// Name of the skin's tables in messages.
+const TABLES: &str = "the shown surface of a mesh";
 
-/// How the vertices of a mesh are in a frame.
+/// Skin of a tissue on a mesh: the order of its vertices in a frame, and how they move with the simulated ones.
 #[derive(Debug, PartialEq)]
 pub struct Skin {
     shape: Arc<MeshShape>,
-    /// The vertex of each place of a frame, and the place of each vertex.
+    /// The vertex at each place of a frame, and the place of each vertex.
     vertices: Vec<u32>,
     places: Vec<u32>,
     /// Texture coordinates of each vertex, if the file has them.
     uv: Option<Vec<[f32; 2]>>,
-    /// Where another mesh is simulated: how each place moves with it.
+    /// If another mesh is simulated: how each place of a frame moves with it. Otherwise empty.
     bound: Vec<SkinVertex>,
-    /// Where the vertices of that mesh rest, in the order of memory, m.
+    /// Rest positions of that mesh's vertices, in the order of memory, m.
     rest_m: Vec<DVec3>,
 }
 
 /// A vertex that moves with a triangle of the simulated mesh.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct SkinVertex {
-    /// Places of its corners in memory.
+    /// Slots of the triangle's corners in memory.
     corners: [u32; 3],
     weights: [f64; 3],
     height_m: f64,
@@ -50,7 +50,7 @@ impl Skin {
         };
         let corners =
             |place: &BoundPlace| shape.triangles()[place.triangle as usize].map(|vertex| slot_of[vertex as usize]);
-        // What moves with neighbours is shown side by side.
+        // Vertices that move with neighbouring triangles are shown side by side.
         let count = shown.places.len();
         #[allow(clippy::cast_possible_truncation)]
         let mut vertices: Vec<u32> = memory::collected(0..count as u32, TABLES);
@@ -73,33 +73,33 @@ impl Skin {
         Some(Arc::new(Skin { vertices, places, uv, bound, rest_m, shape }))
     }
 
-    /// Returns the vertices that are shown, numbered as in the file, in their order in a frame.
+    /// Returns the shown vertices, numbered as in the file, in their order in a frame.
     pub fn vertices(&self) -> &[u32] {
         &self.vertices
     }
 
-    /// Returns the place of each vertex of the file in a frame.
+    /// Returns the place in a frame of each vertex of the file.
     pub fn places(&self) -> &[u32] {
         &self.places
     }
 
-    /// Returns where a vertex of the file rests, m.
+    /// Returns the rest position of a vertex of the file, m.
     pub fn rest_m(&self, vertex: u32) -> DVec3 {
         let own = self.shape.shown().map_or(self.shape.vertices_m(), |shown| &shown.mesh.vertices_m);
         own[vertex as usize]
     }
 
-    /// Returns three vertices of the file each, counterclockwise seen from outside.
+    /// Returns the triangles of the file, each as three of its vertices, anticlockwise seen from outside.
     pub fn triangles(&self) -> &[[u32; 3]] {
         self.shape.shown().map_or(self.shape.triangles(), |shown| &shown.mesh.triangles)
     }
 
-    /// Returns named vertices of the file.
+    /// Returns the named groups of the file's vertices.
     pub fn groups(&self) -> &[Group] {
         self.shape.shown().map_or(&self.shape.told().groups, |shown| &shown.mesh.groups)
     }
 
-    /// Returns texture coordinates of a vertex of the file, if it has them.
+    /// Returns the texture coordinates of a vertex of the file; `None` if the file has none.
     pub fn texture_at(&self, vertex: u32) -> Option<[f32; 2]> {
         self.uv.as_ref().map(|uv| uv[vertex as usize])
     }
@@ -109,20 +109,20 @@ impl Skin {
         self.shape.edge_m()
     }
 
-    /// Returns the bytes that it takes.
+    /// Returns the memory of the tables, bytes.
     pub fn bytes(&self) -> u64 {
         let uv = self.uv.as_deref().map_or(0, size_of_val);
         let tables = size_of_val(&*self.vertices) + size_of_val(&*self.places);
         (tables + uv + size_of_val(&*self.bound) + size_of_val(&*self.rest_m)) as u64
     }
 
-    /// Whether another mesh is simulated than is shown.
+    /// Returns whether the shown vertices differ from the simulated ones.
     pub(super) fn is_bound(&self) -> bool {
         !self.bound.is_empty()
     }
 
-    /// The displacements of the vertices in the order of a frame of `count` places, given those of the simulated ones in the
-    /// order of memory, m.
+    /// Returns the displacements of the shown vertices, m, in the order of a frame of `count` places, from those of
+    /// the simulated vertices in the order of memory.
     #[allow(clippy::cast_possible_truncation)]
     pub(super) fn displacement_m(&self, simulated_m: &[Vec<f32>; 3], count: usize) -> [Vec<f32>; 3] {
         let mut shown_m = [(); 3].map(|()| memory::zeroed::<f32>(count, TABLES));

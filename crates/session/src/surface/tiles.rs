@@ -1,11 +1,11 @@
-//! Frames of changes: which tiles of a sheet a viewer has to get. A sheet is cut into tiles of 16 × 16 points. A tile
-//! is rewritten when its last written state no longer shows its position, and each viewer gets the tiles that are
+//! Frames of changes: the tiles that each viewer needs. A sheet is divided into tiles of 16 × 16 points. A tile is
+//! rewritten when its last written state no longer shows its position, and each viewer gets the tiles that are
 //! newer than its own copy.
 //!
-//! A tile keeps the displacements that it was last written from and is compared with those, not with the last frame,
-//! because slow creep adds up. It is rewritten when a point has moved by more than half a quantum since; rounding may
-//! take the other half. The box that quanta cover only grows until the next keyframe, so earlier writes are never
-//! coarser than the present ones: every vertex is within one quantum of its true place.
+//! A tile keeps the displacements from which it was last written, and is compared with those, not with the last
+//! frame, because slow creep adds up. It is rewritten when a point has moved by more than half a quantum since;
+//! rounding may add the other half. The box that the quanta cover only grows until the next keyframe, so earlier
+//! writes are never coarser than the present ones: every vertex is within one quantum of its true place.
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions.
 #![allow(clippy::needless_range_loop)]
 
@@ -16,33 +16,35 @@ use super::encode::{Encoding, Frame, Patch, Quanta, fill, lay_out};
 use super::refine::{COMPONENTS, Points, Refinement, Rows};
 use super::wide::{Available, LANES, SixteenLanes, WideWork, Width};
 
-/// Points along a side of a tile.
+/// Number of points along a side of a tile.
 const SIDE: usize = 16;
 
-/// Simulated time between keyframes, if anything changes. A keyframe writes all tiles in a box that fits.
+/// Simulated time between keyframes, if anything changes, s. A keyframe writes all tiles in a box that fits.
 const KEYFRAME_S: f64 = 5.0;
 
-/// The finest quantum, in spacings of the points: smaller movements are invisible, so an almost resting sheet is still.
+/// Finest quantum, as a fraction of the distance between points: smaller movements are invisible, so an almost
+/// resting sheet is still.
 const FINEST: f64 = 1e-6;
 
-/// The state of a sheet as viewers of one refinement and encoding see it.
+/// Surface of a tissue as viewers of one refinement and encoding see it, divided into tiles. A version counts the
+/// updates.
 #[derive(Debug)]
 pub struct FrameTiles {
     refinement: Refinement,
     encoding: Encoding,
     finest_m: f64,
-    /// Counts updates. A tile has the version of the update at which it was last written.
+    /// Number of updates. A tile has the version of the update at which it was last written.
     version: u64,
-    /// The snapshot that the keyframe was written from.
+    /// The snapshot from which the keyframe was written.
     key: Arc<Snapshot>,
-    /// Whether anything was written since the keyframe.
+    /// Whether anything has been written since the keyframe.
     changed: bool,
     /// The newest snapshot. All tiles show it within a quantum.
     now: Arc<Snapshot>,
     box_m: [[f32; 2]; COMPONENTS],
     quanta: Quanta,
     tiles: Vec<Tile>,
-    /// For each tile, the last patches written for a viewer, and their version.
+    /// For each tile, the version of the patches that were last written for a viewer, and those patches.
     written: Vec<(u64, Vec<Patch>)>,
 }
 
@@ -50,11 +52,12 @@ pub struct FrameTiles {
 struct Tile {
     area: Area,
     version: u64,
-    /// The displacements it was last written from, if that was after the keyframe: x, y and z of `area.points`.
+    /// The displacements from which it was last written, if that was after the keyframe: x, y and z of
+    /// `area.points`.
     own: Option<[Vec<f32>; COMPONENTS]>,
 }
 
-/// The place of a tile.
+/// Position of a tile.
 #[derive(Debug, Clone, Copy)]
 struct Area {
     /// Its vertices.
@@ -80,7 +83,7 @@ impl Area {
         Area { first, vertices, first_point: tile.map(|tile| tile * SIDE), points }
     }
 
-    /// The tile's points within those of a whole sheet.
+    /// Returns the tile's points within those of a whole sheet.
     fn of_sheet<'v>(&self, snapshot: &'v Snapshot) -> Points<'v> {
         let Points { values, stride, .. } = snapshot.points();
         let from = self.first_point[0] * stride + self.first_point[1];
@@ -93,7 +96,7 @@ fn tiles_along(points: usize) -> usize {
 }
 
 impl Tile {
-    /// The displacements that it was last written from.
+    /// Returns the displacements from which it was last written.
     fn shown<'v>(&'v self, key: &'v Snapshot) -> Points<'v> {
         match &self.own {
             None => self.area.of_sheet(key),
@@ -104,7 +107,7 @@ impl Tile {
         }
     }
 
-    /// Stores `points` as the displacements it is written from.
+    /// Stores `points` as the displacements from which it is written.
     fn take(&mut self, points: Points<'_>, version: u64) {
         let mut own = self.own.take().unwrap_or_default();
         for (c, own) in own.iter_mut().enumerate() {
@@ -117,7 +120,7 @@ impl Tile {
 }
 
 impl FrameTiles {
-    /// Begins with a keyframe.
+    /// Creates the tiles of `snapshot`, with a keyframe of it as the first version.
     pub fn new(snapshot: &Arc<Snapshot>, refinement: Refinement, encoding: Encoding) -> Self {
         let [along_x, along_y] = refinement.points.map(tiles_along);
         let place = |number: usize| Area::of(refinement, [number / along_y, number % along_y]);
@@ -139,27 +142,28 @@ impl FrameTiles {
         tiles
     }
 
-    /// Returns the refinement.
+    /// Returns the refinement of the tiles.
     pub fn refinement(&self) -> Refinement {
         self.refinement
     }
 
-    /// Returns the encoding.
+    /// Returns the encoding of the tiles.
     pub fn encoding(&self) -> Encoding {
         self.encoding
     }
 
-    /// Returns the number of updates. A viewer with the frame of this version has everything.
+    /// Returns the number of updates. A viewer with the frame of this version is up to date.
     pub fn version(&self) -> u64 {
         self.version
     }
 
-    /// Finds the tiles that changed.
+    /// Advances to `snapshot`: rewrites the tiles that have visibly changed since they were last written or, 5 s of
+    /// simulated time after a keyframe, all of them. A snapshot that is already the newest changes nothing.
     pub fn update(&mut self, snapshot: &Arc<Snapshot>) {
         if Arc::ptr_eq(snapshot, &self.now) {
             return;
         }
-        // Reuse the buffers of tiles that keep changing; drop the others.
+        // Buffers of tiles that keep changing are reused; others are freed.
         for (version, patches) in &mut self.written {
             if *version != self.version {
                 patches.clear();
@@ -205,12 +209,13 @@ impl FrameTiles {
         self.quanta = Quanta::over(self.encoding, &self.box_m, self.finest_m);
     }
 
-    /// Returns whether any tile is newer than `version`; `None` is older than all.
+    /// Returns whether any tile is newer than `version`; `None` is older than every version.
     pub fn is_newer_than(&self, version: Option<u64>) -> bool {
         self.tiles.iter().any(|tile| Some(tile.version) > version)
     }
 
-    /// Returns a frame of the tiles newer than `version`. Each tile is written once for all viewers that need it.
+    /// Returns a frame of the tiles newer than `version`; all of them for `None`. Each tile is encoded once for all
+    /// viewers.
     pub fn newer_than(&mut self, version: Option<u64>) -> Frame {
         let FrameTiles { refinement, encoding, version: now_at, quanta, key, now, tiles, written, .. } = self;
         let (width, most) = (Width::widest(), SIDE * (refinement.between + 1) + 1);
@@ -239,7 +244,7 @@ impl FrameTiles {
     }
 }
 
-/// Compares whether a point has moved by more than is visible.
+/// Comparison of whether any point has moved by more than is invisible.
 struct Compare<'v> {
     now: Points<'v>,
     shown: Points<'v>,
@@ -293,7 +298,7 @@ mod tests {
         Refinement::new(&scene(points), n, &Limits::default()).unwrap()
     }
 
-    /// A viewer's state: it keeps vertices and writes patches over them.
+    /// State of a viewer: it keeps vertices and writes patches over them.
     #[derive(Clone)]
     struct Picture {
         vertices: Vec<Option<[f64; 3]>>,
@@ -322,8 +327,8 @@ mod tests {
             count
         }
 
-        /// Checks that every vertex is within `quanta` quanta of its true place, floats to the bit, and that quanta are no
-        /// larger than they have to be.
+        /// Checks that every vertex is within `quanta` quanta of its true place, floats exactly, and that quanta
+        /// are no larger than needed.
         fn check(&self, tiles: &FrameTiles, truth: &Snapshot, quanta: f64) {
             let mut exact = Picture::new();
             exact.show(&encode(truth, tiles.refinement, Encoding::F32));
@@ -373,7 +378,8 @@ mod tests {
             (0, [20, 20], 1),
             (0, [16, 20], 1),
             (3, [20, 20], 1),
-            // On the first row of a tile: there are vertices between its points and the last ones of the tile before.
+            // On the first row of a tile: there are vertices between its points and the last ones of the previous
+            // tile.
             (3, [16, 20], 2),
             (3, [16, 32], 4),
         ] {
@@ -437,7 +443,7 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig { cases: 40, failure_persistence: None, ..ProptestConfig::default() })]
 
-        /// For any movement and any selection of frames: after each frame a viewer sees the present.
+        /// For any movement and any selection of frames, a viewer sees the present after each frame.
         #[test]
         fn a_viewer_sees_the_present_whichever_frames_it_got(
             n in 0_u32..4,

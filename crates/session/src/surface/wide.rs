@@ -1,9 +1,9 @@
-//! Sixteen numbers at a time, with AVX-512, AVX2 or plain instructions, chosen at run time.
+//! Vectors of sixteen numbers, with AVX-512, AVX2 or plain instructions, chosen at run time.
 //!
-//! Every operation is one that IEEE 754 rounds exactly, or moves bits, so the bits are the same at every width. Code
+//! Every operation is one that IEEE 754 rounds exactly, or moves bits, so results are equal at every width. Code
 //! that the compiler does not inline into the function of a width loses that width's instructions: hot code is
-//! `#[inline(always)]` and uses neither iterators nor closures over lanes. This is the only file here with unsafe code:
-//! the processor must have each instruction, which [`Width::run`] ensures.
+//! `#[inline(always)]` and uses neither iterators nor closures over lanes. This is the only file of the folder with
+//! unsafe code: the processor must have each instruction, which [`Width::run`] ensures.
 #![allow(unsafe_code)]
 #![allow(clippy::needless_range_loop)]
 
@@ -12,8 +12,8 @@ use std::marker::PhantomData;
 /// Number of lanes.
 pub(super) const LANES: usize = 16;
 
-/// Sixteen numbers. A value is the proof that the processor has the instructions: unsafe functions create the first
-/// ones through an [`Available`], and all others come from values.
+/// Sixteen numbers. A value proves that the processor has the instructions: unsafe functions create the first ones
+/// through an [`Available`], and all others come from values.
 pub(super) trait SixteenLanes: Copy {
     /// # Safety
     /// The processor has the instructions.
@@ -25,17 +25,17 @@ pub(super) trait SixteenLanes: Copy {
     fn add(self, other: Self) -> Self;
     fn sub(self, other: Self) -> Self;
     fn mul(self, other: Self) -> Self;
-    /// The smaller; `other` if one is NaN.
+    /// Returns the smaller number of each lane; `other` if one is NaN.
     fn smaller(self, other: Self) -> Self;
-    /// The larger; `other` if one is NaN.
+    /// Returns the larger number of each lane; `other` if one is NaN.
     fn larger(self, other: Self) -> Self;
     /// Stores x, y and z of sixteen points as x0 y0 z0 x1 …
     fn weave(xyz: [Self; 3], to: &mut [[f32; LANES]; 3]);
-    /// The same, rounded as in [`SixteenLanes::store_rounded`].
+    /// Stores x, y and z of sixteen points as x0 y0 z0 x1 …, each rounded as [`SixteenLanes::store_rounded`] does.
     fn weave_rounded(xyz: [Self; 3], to: &mut [[[u8; 2]; LANES]; 3]);
-    /// Lane l of the result is lane `from[l]`, below 16.
+    /// Returns a vector whose lane l is lane `from[l]` of this one; the indices are below 16.
     fn permute(self, from: &[i32; LANES]) -> Self;
-    /// The nearest integers, little-endian, of values within ±32767.
+    /// Stores the nearest integers, little-endian, of values within ±32767.
     fn store_rounded(self, to: &mut [[u8; 2]; LANES]);
 }
 
@@ -70,17 +70,17 @@ impl<L: SixteenLanes> Available<L> {
         unsafe { L::load(from) }
     }
 
-    /// `value` in every lane.
+    /// Returns a vector with `value` in every lane.
     #[inline(always)]
     pub(super) fn splat(self, value: f32) -> L {
-        // SAFETY: the same.
+        // SAFETY: the creator of this value promised the instructions.
         unsafe { L::splat(value) }
     }
 }
 
 /// A computation that can run at any width.
 pub(super) trait WideWork {
-    /// Runs it; implement it with `#[inline(always)]`.
+    /// Runs it; implementations must be `#[inline(always)]`.
     fn work<L: SixteenLanes>(self, with: Available<L>);
 }
 
@@ -109,7 +109,7 @@ impl Width {
         self == Width::Plain
     }
 
-    /// The widest that this machine has.
+    /// Returns the widest instruction set that this machine has.
     pub(super) fn widest() -> Width {
         Width::ALL.into_iter().rfind(|width| width.is_available()).unwrap_or(Width::Plain)
     }
@@ -120,7 +120,7 @@ impl Width {
             // SAFETY: the processor has the instructions.
             #[cfg(target_arch = "x86_64")]
             Width::Avx512 if self.is_available() => unsafe { x86::with_avx512(work) },
-            // SAFETY: the same.
+            // SAFETY: the processor has the instructions.
             #[cfg(target_arch = "x86_64")]
             Width::Avx2 if self.is_available() => unsafe { x86::with_avx2(work) },
             _ => work.work(Available::PLAIN),
@@ -131,7 +131,7 @@ impl Width {
 #[derive(Clone, Copy)]
 pub(super) struct Plain([f32; LANES]);
 
-/// Lane by lane.
+/// Computes each lane.
 macro_rules! each {
     (|$lane:ident| $body:expr) => {{
         let mut out = [0.0; LANES];
@@ -227,8 +227,8 @@ mod x86 {
         work.work(unsafe { Available::<Narrow>::new() });
     }
 
-    /// For each of `lanes` lanes, the source lane of component `c` when three vectors are interleaved. In each of the
-    /// three results the component takes other lanes, so one permutation is enough.
+    /// Returns, for each lane of a result, the source lane of component `c` when three vectors are interleaved. In
+    /// each of the three results the component takes other lanes, so one permutation is enough.
     const fn sources<const N: usize>(c: usize) -> [i32; N] {
         let mut sources = [0; N];
         let mut place = c;
@@ -283,7 +283,7 @@ mod x86 {
             const X: [i32; LANES] = sources(0);
             const Y: [i32; LANES] = sources(1);
             const Z: [i32; LANES] = sources(2);
-            // SixteenLanes n, n + 3, …
+            // Lanes n, n + 3, …
             const FIRST: u16 = 0x9249;
             const SECOND: u16 = 0x2492;
             const THIRD: u16 = 0x4924;
@@ -345,13 +345,13 @@ mod x86 {
     struct Narrow([__m256; 2]);
 
     impl Narrow {
-        /// Eight points.
+        /// Interleaves eight points.
         #[inline(always)]
         fn weave_half(x: __m256, y: __m256, z: __m256) -> [__m256; 3] {
             const X: [i32; 8] = sources(0);
             const Y: [i32; 8] = sources(1);
             const Z: [i32; 8] = sources(2);
-            // SixteenLanes n, n + 3, …, of eight.
+            // Lanes n, n + 3, …, of eight.
             const FIRST: i32 = 0x49;
             const SECOND: i32 = 0x92;
             const THIRD: i32 = 0x24;
@@ -374,7 +374,7 @@ mod x86 {
             [Narrow([a, b]), Narrow([c, d]), Narrow([e, f])]
         }
 
-        /// Eight lanes of sixteen.
+        /// Returns eight permuted lanes of sixteen.
         #[inline(always)]
         fn permute_half(self, from: __m256i) -> __m256 {
             unsafe {
@@ -386,7 +386,7 @@ mod x86 {
         }
     }
 
-    /// Each half separately.
+    /// Applies an operation to each half.
     macro_rules! halves {
         ($operation:ident, $a:ident, $b:ident) => {
             unsafe { Narrow([$operation($a.0[0], $b.0[0]), $operation($a.0[1], $b.0[1])]) }

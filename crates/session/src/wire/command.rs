@@ -1,4 +1,4 @@
-//! Conversion of commands.
+//! Conversion of commands from and to messages.
 
 use glam::{DQuat, DVec2, DVec3};
 use palpate_haptics::Tip;
@@ -13,10 +13,10 @@ use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::shape::{PointId, RestShape};
 
-/// Returns the command in a message that arrived at `arrival_ns`.
+/// Returns the command in a message that arrived at `arrival_ns`, ns of the server's clock.
 ///
 /// # Errors
-/// Returns an error if a field is missing, a point or place is not on the tissue, or an orientation is not of length 1.
+/// Refuses an absent field, a point or place that is not on the tissue, and an orientation whose length is not 1.
 pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u64) -> Result<Command> {
     use pb::command::Action as Message;
     let action = match required("action", message.action.as_ref())? {
@@ -66,7 +66,7 @@ pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u6
     })
 }
 
-/// The place of a force in the rest plane of a sheet.
+/// Returns the place of a force in the rest plane of a sheet, m.
 fn on_sheet(shape: &dyn RestShape, place_m: DVec2) -> Result<DVec3> {
     if shape.dimensions() > 2 {
         let message = "is a place in the plane of a sheet; on a mesh give `vertex`, or `at_m`, a place in space";
@@ -75,13 +75,13 @@ fn on_sheet(shape: &dyn RestShape, place_m: DVec2) -> Result<DVec3> {
     Ok(place_m.extend(0.0))
 }
 
-/// The place of a force in space: on a sheet, the nearest one in its rest plane.
+/// Returns the place of a force in space, m; on a sheet, the nearest one in its rest plane.
 fn at(shape: &dyn RestShape, place_m: DVec3) -> Result<DVec3> {
     shape.check_place("force.at_m", place_m)?;
     Ok(if shape.dimensions() == 2 { place_m.truncate().extend(0.0) } else { place_m })
 }
 
-/// The point that a tool has grasped.
+/// Returns the point that a tool grasps.
 fn grasped(shape: &dyn RestShape, position: &pb::Position) -> Result<PointId> {
     let (point, vertex) = (position.point.as_ref(), position.vertex);
     if point.is_some() && vertex.is_some() {
@@ -96,7 +96,7 @@ fn grasped(shape: &dyn RestShape, position: &pb::Position) -> Result<PointId> {
     shape.find(field, required(field, from_point(point, vertex))?)
 }
 
-/// The position of a pose's tip, m.
+/// Returns the position of a pose's tip, m: the position plus the turned offset of the tip.
 fn from_pose(pose: &pb::Pose) -> Result<DVec3> {
     let position_m = from_vector(required("pose.position_m", pose.position_m.as_ref()).map(Some)?);
     let offset_m = from_vector(pose.tip_offset_m.as_ref());
@@ -106,7 +106,8 @@ fn from_pose(pose: &pb::Pose) -> Result<DVec3> {
     Ok(position_m + turn.normalize() * offset_m)
 }
 
-/// Returns the message of a script's command to tool `tool`, which acts at step `at_step`.
+/// Returns the message for a script's command to tool `tool`, which acts at step `at_step`. Its sequence number is
+/// `at_step` + 1.
 #[allow(clippy::cast_possible_truncation)]
 pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Action, client_time_ns: u64) -> pb::Command {
     use pb::command::Action as Message;

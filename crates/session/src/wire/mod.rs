@@ -1,5 +1,5 @@
-//! Conversion between protobuf messages and our types. The defaults of absent fields are defined here, once. Messages, and
-//! what clients convert as well, are in the crate `palpate-proto`.
+//! Conversion between protobuf messages and the types of this crate. The defaults of absent fields are defined
+//! here. The messages, and conversions that clients need too, are in the crate `palpate-proto`.
 
 pub mod command;
 pub mod sample;
@@ -13,7 +13,7 @@ use palpate_tissue::shape::{Extent, PointName};
 /// Returns the value of a required field.
 ///
 /// # Errors
-/// Returns an error that names the field if it is absent.
+/// Refuses an absent field, by the name `field`.
 pub fn required<T>(field: &str, value: Option<T>) -> Result<T> {
     value.ok_or_else(|| Refusal::new(Reason::Missing, field, "is missing"))
 }
@@ -21,7 +21,7 @@ pub fn required<T>(field: &str, value: Option<T>) -> Result<T> {
 /// Returns the N of an "every Nth step" field; 1 if it is absent.
 ///
 /// # Errors
-/// Returns an error if N is 0.
+/// Refuses 0.
 pub fn every(field: &str, steps: Option<u32>) -> Result<u64> {
     match steps {
         Some(0) => Err(Refusal::new(Reason::OutOfRange, field, "must be at least 1, but is 0")),
@@ -29,7 +29,8 @@ pub fn every(field: &str, steps: Option<u32>) -> Result<u64> {
     }
 }
 
-/// Returns the name of a mass point as a message: the fields `point` and `vertex`.
+/// Returns the name of a mass point as the message fields `point` (of a sheet) and `vertex` (of a mesh); one of
+/// them is `None`.
 pub fn point(name: PointName) -> (Option<pb::GridPoint>, Option<u32>) {
     match name {
         PointName::Point(place) => (Some(geometry::point(place)), None),
@@ -37,21 +38,22 @@ pub fn point(name: PointName) -> (Option<pb::GridPoint>, Option<u32>) {
     }
 }
 
-/// Returns the name of a mass point in the fields `point` and `vertex` of a message; `None` if neither is there.
+/// Returns the name of a mass point from the message fields `point` and `vertex`, of which `vertex` wins; `None` if
+/// both are absent.
 pub fn from_point(point: Option<&pb::GridPoint>, vertex: Option<u32>) -> Option<PointName> {
     let vertex = vertex.map(PointName::Vertex);
     vertex.or_else(|| point.map(|point| PointName::Point(geometry::from_point(point))))
 }
 
-/// The name of a mass point of a record; the first point's if it has none.
+/// Returns the name of a record's mass point; the first point of a sheet if it has none.
 fn from_record(point: &pb::PointRecord) -> PointName {
     from_point(point.point.as_ref(), point.vertex).unwrap_or(PointName::Point([0, 0]))
 }
 
-/// Returns the names of the mass points that a probe is of, and the field that has them; `None` for all points.
+/// Returns the mass points that a probe requests, with the name of the field that has them; `None` for all points.
 ///
 /// # Errors
-/// Returns an error if the request does not say which.
+/// Refuses a request that names neither points nor all of them.
 pub fn from_probed(r#where: Option<&pb::probe_request::Where>) -> Result<Option<(&'static str, Vec<PointName>)>> {
     use pb::probe_request::Where;
     match r#where {
@@ -69,7 +71,8 @@ pub fn from_probed(r#where: Option<&pb::probe_request::Where>) -> Result<Option<
     }
 }
 
-/// Returns some mass points of a tissue as the subject of a probe.
+/// Returns the request of a probe for these mass points. If any is a vertex of a mesh, points of a sheet are left
+/// out.
 pub fn probed(names: impl Iterator<Item = PointName>) -> pb::probe_request::Where {
     let (mut points, mut vertices) = (Vec::new(), Vec::new());
     for name in names {
@@ -84,7 +87,7 @@ pub fn probed(names: impl Iterator<Item = PointName>) -> pb::probe_request::Wher
     }
 }
 
-/// Returns the box around a tissue or a mesh, as a message. Its `top_m` is absent.
+/// Returns the box around a tissue or a mesh as a message, without `top_m`.
 pub fn extent(extent: &Extent) -> pb::Extent {
     let vector = geometry::vector;
     let [least_m, most_m, middle_m] = [extent.least_m, extent.most_m, extent.middle_m()].map(vector);

@@ -10,10 +10,11 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
 use palpate_tissue::shape::RestShape;
 
-/// Returns the samples that a stream asks for. `renders`: the stream has declared a device.
+/// Returns the settings of a stream of samples, with defaults for absent fields. `renders`: the stream has declared
+/// a device.
 ///
 /// # Errors
-/// Returns an error if a value is out of range, or if a deadband of rendered force is given without a device.
+/// Refuses a value out of range, and a deadband of rendered force without a device.
 pub fn sampling(
     every_steps: Option<u32>,
     only: Option<Vec<u32>>,
@@ -43,7 +44,8 @@ pub fn sampling(
     Ok(sampling)
 }
 
-/// Returns a sample of a tissue of this shape as a message that is sent at `now_ns`.
+/// Returns a sample as a message that is sent at `now_ns`. `dropped` is the number of samples that the stream has
+/// lost so far.
 pub fn sample(paced: &PacedSample, shape: &dyn RestShape, dropped: u64, now_ns: u64) -> pb::Sample {
     let sample = &paced.sample;
     #[allow(clippy::cast_possible_truncation)]
@@ -93,7 +95,7 @@ fn tool_sample(tool: &ToolSample, shape: &dyn RestShape, due_ns: u64, now_ns: u6
     }
 }
 
-/// Returns a refused command as a message.
+/// Returns the refusal of a command as a message.
 pub fn rejection(tool: u32, sequence: u64, refusal: &Refusal) -> pb::Rejection {
     pb::Rejection {
         tool,
@@ -105,11 +107,12 @@ pub fn rejection(tool: u32, sequence: u64, refusal: &Refusal) -> pb::Rejection {
     }
 }
 
-/// Points per message of a record.
+/// Limit of points per message of a record.
 const POINTS_PER_MESSAGE: usize = 1000;
 
-/// Returns message `part` of a record that was made at `step`; `None` after the last. A record without points has one
-/// message. The messages are made one at a time: those of a large sheet together would take a second and a gigabyte.
+/// Returns message `part` of a record of step `step`; `None` after the last. A record without points has one
+/// message. The messages are made one at a time: those of a large sheet together would take a second and a
+/// gigabyte.
 pub fn record(step: u64, record: &Record, dropped: u64, part: usize) -> Option<pb::ProbeResponse> {
     let parts = record.points.len().div_ceil(POINTS_PER_MESSAGE).max(1);
     let points = record.points.chunks(POINTS_PER_MESSAGE).nth(part).unwrap_or_default();
@@ -160,7 +163,8 @@ fn tool_record(record: &ToolRecord) -> pb::ToolRecord {
     }
 }
 
-/// Adds a message to a record; returns whether it was the record's last.
+/// Appends a message's points to a record, and takes the other fields from the last message. Returns whether it was
+/// the last.
 pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
     let array = |v: &Option<pb::Vector3>| from_vector(v.as_ref()).to_array();
     record.time_s = message.simulation_time_s;
@@ -196,19 +200,19 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
     message.last
 }
 
-/// Returns a recovery as a message.
+/// Converts a recovery to a message.
 pub fn recovery(recovery: Recovery) -> pb::Recovery {
     let Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason } = recovery;
     pb::Recovery { step, state_of_step, undone_commands, reason, at_rest, paused_until_step }
 }
 
-/// Returns a recovery of a session, as a record has it.
+/// Converts a recovery from a message.
 pub fn from_recovery(recovery: pb::Recovery) -> Recovery {
     let pb::Recovery { step, state_of_step, undone_commands, reason, at_rest, paused_until_step } = recovery;
     Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason }
 }
 
-/// Returns an encoding as a message has it.
+/// Converts an encoding to its number in messages.
 pub fn encoding(encoding: Encoding) -> pb::Encoding {
     match encoding {
         Encoding::F32 => pb::Encoding::F32,
@@ -216,7 +220,7 @@ pub fn encoding(encoding: Encoding) -> pb::Encoding {
     }
 }
 
-/// Returns the encoding that a viewer asks for.
+/// Returns the encoding that a viewer requests; F32 if it requests none.
 ///
 /// # Errors
 /// Refuses a number that no encoding has.

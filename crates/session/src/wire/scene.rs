@@ -1,4 +1,5 @@
-//! Conversion of scenes: the fields and defaults of a scene file. Ranges are checked when the scene is compiled.
+//! Conversion of scenes, with the fields and defaults of a scene file. Ranges are checked when the scene is
+//! compiled.
 
 use std::sync::Arc;
 
@@ -15,11 +16,12 @@ use palpate_tissue::scene::{
 };
 use palpate_tissue::shape::RestShape;
 
-/// Returns the scene in a message. A scene on a mesh names the `mesh` that its client has sent before.
+/// Returns the scene in a message. `mesh` is the mesh that a scene on a mesh names, which its client has sent
+/// before.
 ///
 /// # Errors
-/// Returns an error if a required field is missing, if a name or set is unknown, if the mesh is missing, or if a material or
-/// inclusions do not fit it.
+/// Refuses an absent required field, an unknown name or set, an absent mesh, and a material or inclusions that do
+/// not fit the mesh.
 pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Scene> {
     let substance = match &message.mesh {
         None => from_sheet(message)?,
@@ -44,7 +46,7 @@ pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Sc
     })
 }
 
-/// A tissue whose coefficients the message gives.
+/// Returns a tissue whose coefficients the message gives.
 fn from_coefficients(message: &pb::Scene, body: Body) -> Result<Substance> {
     let springs = required("springs", message.springs.as_ref())?;
     let anchor_springs = required("anchor_springs", message.anchor_springs.as_ref())?;
@@ -102,7 +104,7 @@ fn from_mesh(message: &pb::Scene, of_mesh: &pb::Mesh, mesh: &TriangleMesh) -> Re
     }
     let bending = springs.bending_factor.unwrap_or(if springs.bending { 1.0 } else { 0.0 });
     let bending = number("springs.bending_factor", bending, "from 0 to 10", |v| (0.0..=10.0).contains(&v))?;
-    // A material says later what a point weighs.
+    // A material determines the mass of a point later.
     let point_mass_kg = required("mesh.point_mass_kg", of_mesh.point_mass_kg.or(material.map(|_| 1.0)))?;
     let vertices = of_mesh.vertices.map(|vertices| vertices as usize);
     if let Some(vertices) = vertices {
@@ -153,7 +155,7 @@ fn from_material(message: &pb::Material) -> Result<Material> {
     })
 }
 
-/// Refuses what follows from a material.
+/// Refuses coefficients that follow from a material.
 fn refuse_coefficients(message: &pb::Scene, of_mesh: &pb::Mesh) -> Result<()> {
     let springs = message.springs.unwrap_or_default();
     for (field, is_there, why) in [
@@ -236,7 +238,7 @@ pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::Update
     }
 }
 
-/// Returns a scene as a client sends it: without what follows from a material.
+/// Returns a scene as a client sends it: without the coefficients that follow from a material.
 pub fn sent(scene: &Scene) -> pb::Scene {
     let mut message = self::scene(scene);
     if message.material.is_some() {
@@ -250,7 +252,7 @@ pub fn sent(scene: &Scene) -> pb::Scene {
     message
 }
 
-/// Returns a scene as a message, with all defaults filled in, and what follows from a material.
+/// Returns a scene as a message, with all defaults filled in and the coefficients that follow from a material.
 pub fn scene(scene: &Scene) -> pb::Scene {
     let of_mesh = match &scene.body {
         Body::Mesh(mesh) => Some(mesh),
@@ -284,7 +286,7 @@ pub fn scene(scene: &Scene) -> pb::Scene {
     }
 }
 
-/// A mesh as a message, without its vertices.
+/// Returns a mesh as a message, without its vertices.
 fn mesh(mesh: &Mesh) -> pb::Mesh {
     let ball = |(centre_m, radius_m): &(DVec3, f64)| pb::Ball { centre_m: vector(*centre_m), radius_m: *radius_m };
     let fixed = match &mesh.shape.told().fixed {
@@ -326,7 +328,7 @@ fn inclusion(inclusion: &Inclusion) -> pb::Inclusion {
     }
 }
 
-/// A sheet as a message.
+/// Returns a sheet as a message.
 fn sheet(sheet: &Sheet) -> pb::Sheet {
     #[allow(clippy::cast_possible_truncation)]
     let [points_x, points_y] = sheet.points.map(|points| Some(points as u32));
@@ -360,14 +362,14 @@ mod tests {
         }
     }
 
-    /// The names in quotes in the comment above a field of `scene.proto`.
+    /// Returns the names in quotes in the comment above a field of `scene.proto`.
     fn told(field: &str) -> Vec<&'static str> {
         let (before, _) = include_str!("../../../../proto/palpate/v1/scene.proto").split_once(field).unwrap();
         let comment = before.trim_end().lines().rev().take_while(|line| line.trim_start().starts_with("//"));
         let mut lines: Vec<_> = comment.collect();
         lines.reverse();
         let mut names: Vec<_> = lines.into_iter().flat_map(|line| line.split('"').skip(1).step_by(2)).collect();
-        // The default is told once more.
+        // The default is named a second time.
         names.pop_if(|last| *last == "auto");
         names
     }
@@ -391,7 +393,7 @@ mod tests {
         }
     }
 
-    /// Of a material, with a ball and a group that differ.
+    /// A scene of a material, with a ball and a group whose factors differ.
     fn of_a_material() -> pb::Scene {
         pb::Scene {
             mesh: Some(pb::Mesh::default()),
@@ -442,7 +444,7 @@ mod tests {
         assert_eq!((changed.springs.unwrap().stiffness_n_per_m, changed.material), (Some(1.0), Some(material)));
         let softer = Change { volume_stiffness_pa: Some(0.0), ..Change::default() };
         assert_eq!(scene(&made.changed(&softer, &made)).volume, Some(pb::Volume { stiffness_pa: Some(0.0) }));
-        // Inclusions alone go with coefficients.
+        // Inclusions without a material go with coefficients.
         let even = pb::Scene { material: None, ..told };
         assert_eq!(scene(&read(&even)), even);
     }

@@ -15,7 +15,8 @@ use crate::shape::RestShape;
 /// Places on a raster of this part of the radius have laws of their own. It has the points of the sheet in it, or some of them.
 const APART_IN_RADII: f64 = 0.5;
 
-/// Returns the place at rest that is to a disc of `radius_m` as `at_m` is.
+/// Returns the place at rest that is to a disc of `radius_m` as `at_m` is. On a sheet a rim counts that is nearer than ½(a + r), with a
+/// the radius and r how far the disc is noticed ([`tangent::half_window_m`]).
 pub fn place_alike(model: &Model, radius_m: f64, at_m: DVec3) -> DVec3 {
     let Some(sheet) = model.scene.sheet() else {
         let shape = model.shape();

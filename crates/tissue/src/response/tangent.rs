@@ -8,7 +8,8 @@
 //!
 //! K of a spring along n is k[nnᵀ + max(0, 1 − L0/L)(I − nnᵀ)]: without the clamp a pressed spring would make it
 //! indefinite. The pressure of a volume adds κ/V0·a·aᵀ, of all points: those far away are held too, so κ is less by what they
-//! would give way ([`volume_compliance`]). Conjugate gradients, the three systems side by side, preconditioned by the points' own blocks. Points far
+//! would give way ([`volume_compliance`]). Conjugate gradients (Hestenes and Stiefel, Journal of Research of the National Bureau of
+//! Standards 49(6), 1952, doi:10.6028/jres.049.044), the three systems side by side, preconditioned by the points' own blocks. Points far
 //! enough away not to notice are held: a press reaches √(k/K″) spacings.
 
 use std::cell::Cell;
@@ -136,13 +137,13 @@ impl SharedPressure {
 /// What a disc feels of slow and small movements.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tangent {
-    /// S, N/m.
+    /// S = (Eᵀ K⁻¹ E)⁻¹, with the weights E of the disc and the tangent stiffness K of the tissue, N/m.
     pub stiffness_n_per_m: DMat3,
-    /// B of movements with the tissue, N·s/m.
+    /// B = C·φ̂ᵀφ̂ of movements with the tissue, φ̂ = K⁻¹·E·S, N·s/m.
     pub damping_n_s_per_m: DMat3,
-    /// D of sliding, in the rest plane, N·s/m.
+    /// D = C·Σ ∂u·∂u of sliding, in the rest plane, N·s/m.
     pub drag_n_s_per_m: f64,
-    /// M, kg.
+    /// M = m·φ̂ᵀφ̂, kg.
     pub mass_kg: f64,
     /// Iterations that it took.
     pub iterations: u32,
@@ -450,7 +451,8 @@ fn symmetric(of: impl Fn(usize, usize) -> f64) -> DMat3 {
 }
 
 /// Presses slowly by a disc of `radius_m` at `centre_m` (a place at rest), at `count` depths, `step_m` apart,
-/// from 0 on.
+/// from 0 on. At each depth d Newton's method finds the displacements at which the springs are in balance with the disc's
+/// force along the normal, while Σ w·u = −d along it.
 pub fn press(model: &Model, radius_m: f64, centre_m: DVec3, step_m: f64, count: u32) -> Vec<Pressed> {
     let course = Course { radius_m, centre_m, step_m, count, points: usize::MAX };
     let mut press = Press::new(model, course, Accuracy::EXACT);
@@ -572,7 +574,7 @@ impl Press {
 
 /// Returns the same tissue in points `spacing_m` apart, each of which stands for several; as far as `half_m` from the
 /// middle, where it is held, or all of it. What holds a membrane is in the springs whatever their length; mass, damping
-/// and anchor springs are of an area.
+/// and anchor springs are of an area: m, C and K″ are multiplied by (`spacing_m`/h)², with h the distance between points, k stays.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 pub fn stand_in(model: &Model, spacing_m: f64, half_m: f64) -> Model {
     let Some(fine) = model.scene.sheet() else { return model.clone() };

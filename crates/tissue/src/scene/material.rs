@@ -95,9 +95,17 @@ impl Material {
     /// Returns a tissue of this material, with springs of bending whose k is the part `bending` of that of the edge
     /// they cross.
     ///
-    /// A vertex has a third of the area of its triangles, and mass, K″ and C by that (one without an edge those of the mean); an edge has k = E·t·(A₁ + A₂)/L² (van
-    /// Gelder 1998), times one factor for the mesh that makes its springs, those of bending included, store what the material
-    /// does when it is stretched alike to all sides (`membrane`).
+    /// A vertex has a third of the area of its triangles, A, and mass, K″ and C by that (one without an edge those of the mean):
+    ///
+    /// m = ρ·H·A/3,  K″ = k″·A,  C = 2ζ·√(K″·m),
+    ///
+    /// with H how deep the tissue moves along: of displacements that fall linearly with depth, the kinetic energy is that of a third
+    /// of the mass. ζ is the damping ratio of a point on its anchor spring alone.
+    ///
+    /// An edge of length L between triangles of areas A₁ and A₂ has k = E·t·(A₁ + A₂)/L² (Van Gelder, Approximate simulation of elastic
+    /// membranes by triangulated spring meshes, Journal of Graphics Tools 3(2), 1998), times one factor for the mesh that makes its
+    /// springs, those of bending included, store what the material does when it is stretched alike to all sides: E·t/(1 − ν) on each m²
+    /// for a strain of 1, with ν = 1/3 (`membrane`).
     ///
     /// # Errors
     /// Refuses a number out of its range, and a mesh with a vertex without area.
@@ -194,7 +202,8 @@ pub struct Inclusion {
     pub stiffness_factor: f64,
     /// K″ of the points there over that around.
     pub anchor_stiffness_factor: f64,
-    /// So far beyond the region the factors fall to 1, m.
+    /// So far beyond the region the factors fall to 1, m: a factor f acts as 1 + (f − 1)·p, with p = 1 within the region and
+    /// p = 1 − x²·(3 − 2x) at x times this distance beyond it. A spring has the mean p of its ends.
     pub edge_m: f64,
 }
 

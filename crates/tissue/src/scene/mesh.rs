@@ -54,7 +54,8 @@ pub struct PerNodeFactors {
 /// The largest eigenvalue of the stiffness of springs under any deformation, and where it comes from.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StiffnessBound {
-    /// The eigenvalue, with the masses of reference, is at most this, over the k of reference.
+    /// The eigenvalue, with the masses of reference, is at most this, over the k of reference: that of the Laplacian of the weighted
+    /// graph, Σ k_ij/m_i·(x_i − x_j) = λ·x_i, since a spring along n contributes at most k·I to the stiffness under any deformation.
     pub bound: f64,
     /// The vertex that has most of it.
     pub vertex: u32,
@@ -221,7 +222,7 @@ impl Mesh {
         self.differences.extra_anchor.get(point.index()).copied().unwrap_or(0.0)
     }
 
-    /// Returns the mass of all points that have an edge, kg.
+    /// Returns the mass of all points that have an edge, kg: Σ m_i.
     pub fn mass_kg(&self) -> f64 {
         let used = (0..self.shape.vertices_m.len()).filter(|vertex| self.shape.is_used(*vertex));
         self.point_mass_kg * used.map(|vertex| self.relative_mass(PointId::new(vertex))).sum::<f64>()

@@ -54,6 +54,25 @@ pub const BUILT_IN: [(&str, &str); 7] = [
 ];
 
 /// A tissue and how it is stepped. The fields are those of a scene file; SI units.
+///
+/// A scene is a text in TOML. What is wrong in it is refused with its place:
+///
+/// ```
+/// use palpate_refusal::Reason;
+/// use palpate_tissue::limits::Limits;
+/// use palpate_tissue::scene::{PAPER, Scene};
+///
+/// let limits = Limits::default();
+/// let scene = Scene::parse("paper", PAPER, &["sheet.point_mass_kg=0.02".to_owned()], &limits)?;
+/// // 31 × 31 points of 20 g.
+/// assert!((scene.mass_kg() - 19.22).abs() < 1e-9, "{} kg", scene.mass_kg());
+/// assert_eq!(scene.anchor_stiffness_n_per_m, 5.0);
+///
+/// let refusal = Scene::parse("paper", PAPER, &["sheet.spacing=0.01".to_owned()], &limits).expect_err("no such key");
+/// assert_eq!(refusal.reason, Reason::UnknownKey);
+/// println!("{refusal}");
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
     /// Any name, for people.
@@ -178,7 +197,7 @@ impl Change {
                                volume_stiffness_pa";
 }
 
-/// Springs between neighbours: the force on a from a spring a–b is k (L − L0)(x_b − x_a)/L.
+/// Springs between neighbours: the force on a from a spring a–b is k (L − L0)(x_b − x_a)/L (Hooke's law).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Springs {
     /// k of (1,0) and (0,1), N/m.

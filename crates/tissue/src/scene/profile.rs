@@ -184,7 +184,9 @@ pub struct MotionProfile {
     pub moves: Vec<Move>,
 }
 
-/// A smooth displacement: `by_m`·s((t − from)/(to − from)), s(x) = 10x³ − 15x⁴ + 6x⁵ clamped to 0…1.
+/// A smooth displacement: `by_m`·s((t − from)/(to − from)), s(x) = 10x³ − 15x⁴ + 6x⁵ clamped to 0…1. That is the movement of least
+/// jerk from rest to rest (Flash and Hogan, The coordination of arm movements, Journal of Neuroscience 5(7), 1985,
+/// doi:10.1523/JNEUROSCI.05-07-01688.1985).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Move {
     /// Time at which it begins, s.
@@ -208,7 +210,8 @@ pub struct PoseProfile {
 }
 
 impl PoseProfile {
-    /// Returns the place of the tip at a time, m; none before the first pose and from the end on.
+    /// Returns the place of the tip at a time, m; none before the first pose and from the end on. Between two poses it is
+    /// x₀ + (x₁ − x₀)·s(x), with s as in a [`Move`].
     pub fn at(&self, time_s: f64) -> Option<DVec3> {
         let after = self.poses.partition_point(|pose| pose.0 <= time_s);
         let (begun_s, from_m) = *self.poses.get(after.checked_sub(1)?)?;
@@ -233,7 +236,9 @@ pub struct Motion {
 }
 
 impl MotionProfile {
-    /// Returns the displacement, velocity and acceleration at a time.
+    /// Returns the displacement, velocity and acceleration at a time: the sum of those of all moves. With x the part of a move's
+    /// time T that has passed, they are `by_m` times s(x) ([`Move`]), s′(x)/T = 30x²(1 − x)²/T and
+    /// s″(x)/T² = 60x(1 − x)(1 − 2x)/T².
     pub fn at(&self, time_s: f64) -> Motion {
         let mut motion = Motion::default();
         for Move { from_s, to_s, by_m } in &self.moves {

@@ -11,7 +11,7 @@ use palpate_refusal::{Reason, Refusal, Result};
 /// What a closed mesh encloses.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Volume {
-    /// V0, m³.
+    /// V0 = Σ x_a·(x_b × x_c)/6 over the triangles, m³.
     pub volume_m3: f64,
     /// a of each vertex, m².
     pub areas_m2: Vec<DVec3>,
@@ -33,6 +33,10 @@ pub struct Swelling {
 impl Swelling {
     /// Returns the largest eigenvalue of pressure and springs together, with the masses of reference, N/m. `springs`
     /// bounds that of the springs alone, over the k of reference.
+    ///
+    /// That is ½(p + q) + √(¼(p − q)² + r²), the larger eigenvalue of [[p, r], [r, q]], with p = κ·σ + k·s the stiffness of the
+    /// vibration itself ([`Swelling::by_pressure_m`], [`Swelling::by_springs`]), q the bound of the springs, and r = k·j
+    /// ([`Swelling::passed_on`]).
     ///
     /// With v the unit vector of the vibration, any other unit vector is c·v + s·w, w across v, and the springs' form is at
     /// most that of their Laplacian L. So the eigenvalue is at most that of the matrix of κ·σ + vᵀLv and the bound of L,

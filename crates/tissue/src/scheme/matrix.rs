@@ -37,8 +37,10 @@ impl Matrix {
         self.values.iter().fold(0.0, |largest, value| value.abs().max(largest))
     }
 
-    /// Returns e to the matrix: a Taylor series of the matrix halved until it is small, then squared as often. The
-    /// result for a matrix that is not finite is NaN.
+    /// Returns e to the matrix: a Taylor series of the matrix halved until it is small, then squared as often,
+    /// e^A = (e^{A/2ᵏ})^{2ᵏ} (scaling and squaring: Moler and Van Loan, Nineteen dubious ways to compute the exponential of a matrix,
+    /// twenty-five years later, SIAM Review 45(1), 2003, doi:10.1137/S00361445024180). The result for a matrix that is not finite is
+    /// NaN.
     pub fn exponential(&self) -> Matrix {
         if !self.values.iter().all(|value| value.is_finite()) {
             return Matrix::of(self.n, |_, _| f64::NAN);
@@ -61,7 +63,8 @@ impl Matrix {
         sum
     }
 
-    /// Returns the largest magnitude among the eigenvalues: the 2ᵏ-th root of the size of the 2ᵏ-th power.
+    /// Returns the largest magnitude among the eigenvalues: the 2ᵏ-th root of the size of the 2ᵏ-th power (Gelfand's formula,
+    /// ρ(A) = lim ‖Aⁿ‖^{1/n}).
     pub fn spectral_radius(&self) -> f64 {
         let (mut power, mut logarithm, mut exponent) = (*self, 0.0, 1.0);
         for _ in 0..36 {

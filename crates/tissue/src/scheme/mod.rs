@@ -113,7 +113,7 @@ fn like<'t, F: 'static>(_from: &F, to: &'t dyn Any) -> Option<&'t F> {
     to.downcast_ref()
 }
 
-/// Returns the power of the substep with which the error of an integrator falls.
+/// Returns the power p of the substep with which the error of an integrator falls, as dtᵖ. The file of each scheme has its equations.
 pub fn order(integrator: Integrator) -> f64 {
     entry(integrator).order
 }
@@ -165,7 +165,8 @@ impl Scheme {
         each!(self, |family| family.last_field())
     }
 
-    /// Returns the u and d that a constant force of 1 adds in a substep.
+    /// Returns the u and d that a constant force of 1 adds in a substep. Exact where the scheme is exponential:
+    /// ∫₀¹ e^{A(1−s)}·b ds, in the terms of its file.
     pub fn constant(&self) -> [f64; 2] {
         each!(self, |family| family.constant())
     }
@@ -191,7 +192,7 @@ impl Scheme {
         each!(self, |family| family.propagator(z))
     }
 
-    /// Returns the largest growth factor of a vibration z in a substep.
+    /// Returns the largest growth factor of a vibration z = (ω·dt)² in a substep: the spectral radius of its propagator.
     pub fn growth(&self, z: f64) -> f64 {
         self.propagator(z).spectral_radius()
     }

@@ -14,18 +14,19 @@ pub struct Oscillator {
 }
 
 impl Oscillator {
-    /// Returns a and g for a substep.
+    /// Returns a = K″·dt²/m and g = C·dt/m for a substep of length dt.
     pub fn scaled(&self, substep_s: f64) -> (f64, f64) {
         let a = self.anchor_stiffness_n_per_m * substep_s * substep_s / self.mass_kg;
         (a, self.damping_n_s_per_m * substep_s / self.mass_kg)
     }
 
-    /// Returns the springs' largest stiffness in a substep's terms, (ω·dt)².
+    /// Returns the springs' largest stiffness in a substep's terms, (ω·dt)² = λ·dt²/m, with λ their largest eigenvalue.
     pub fn scaled_spring_stiffness(&self, substep_s: f64) -> f64 {
         self.spring_stiffness_n_per_m * substep_s * substep_s / self.mass_kg
     }
 
-    /// Returns ω_b, rad/s: an upper bound of every vibration's frequency, under any deformation.
+    /// Returns ω_b = √((λ + K″)/m), rad/s: an upper bound of every vibration's frequency, under any deformation, since ω² is an
+    /// eigenvalue of stiffness over mass and that of a sum is at most the sum of the largest ones.
     pub fn omega_bound_per_s(&self) -> f64 {
         ((self.spring_stiffness_n_per_m + self.anchor_stiffness_n_per_m) / self.mass_kg).sqrt()
     }

@@ -22,6 +22,10 @@ pub fn endurance(omega_per_s: f64, decay_s: f64) -> f64 {
 
 /// Returns the largest eigenvalue of the springs' stiffness matrix under any deformation, with the masses of reference,
 /// N/m.
+///
+/// On a sheet that is [`largest_stiffness_of_a_sheet_n_per_m`]. On a mesh it is at most k·β + K″·ε, with β the bound of
+/// the graph's Laplacian over k ([`StiffnessBound`]) and ε what K″/m of a point is at most above that of reference. A volume replaces k·β by
+/// [`Swelling::bound_n_per_m`](crate::scene::Swelling::bound_n_per_m).
 pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
     match &scene.body {
         Body::Sheet(_) => largest_stiffness_of_a_sheet_n_per_m(&scene.springs),
@@ -38,7 +42,7 @@ pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
     }
 }
 
-/// Returns the same without the pressure of a volume, N/m.
+/// Returns the same without the pressure of a volume, k·β + K″·ε, N/m.
 pub fn stiffness_of_springs_n_per_m(scene: &Scene) -> f64 {
     match &scene.body {
         Body::Mesh(mesh) if mesh.volume.is_some() => {
@@ -50,7 +54,7 @@ pub fn stiffness_of_springs_n_per_m(scene: &Scene) -> f64 {
 }
 
 /// Returns what turns the rounding of displacements into force, N/m. That of many points hardly adds up to a change of
-/// the volume.
+/// the volume: λ + κ·σ/√n, with λ that of the springs, σ = Σ a²/(m·V0) and n points.
 #[allow(clippy::cast_precision_loss)]
 pub fn approximate_stiffness_n_per_m(scene: &Scene) -> f64 {
     let of_springs = stiffness_of_springs_n_per_m(scene);
@@ -95,7 +99,8 @@ const VIBRATIONS: u32 = 48;
 /// Largest growth factor of a vibration per substep that counts as stable: 1 plus rounding error.
 const NO_GROWTH: f64 = 1.0 + 1e-7;
 
-/// Returns whether no vibration grows, of springs up to `stiffness` = (ω·dt)².
+/// Returns whether no vibration grows, of springs up to `stiffness` = (ω·dt)²: whether each eigenvalue of the scheme's propagator
+/// has at most size 1, at 49 stiffnesses z = `stiffness`·(k/48)².
 pub fn is_stable(scheme: &Scheme, stiffness: f64) -> bool {
     (0..=VIBRATIONS).all(|k| {
         // Dense towards the stiff end, where schemes fail first.
@@ -105,11 +110,15 @@ pub fn is_stable(scheme: &Scheme, stiffness: f64) -> bool {
 }
 
 /// Returns the fewest substeps of `step_s` with which any scheme is stable. Saturates for absurd scenes.
+///
+/// That is dt·ω_b ≤ 2, the bound of central differences: u₊ − (2 − W)·u + u₋ = 0 with W = (dt·ω)² has the solutions zⁿ with
+/// z² − (2 − W)·z + 1 = 0, and both are on the unit circle as long as |2 − W| ≤ 2.
 pub fn least_substeps(step_s: f64, sheet: &Oscillator) -> u32 {
     substeps_of_turn(step_s, sheet.omega_bound_per_s(), 2.0)
 }
 
-/// Returns the fewest substeps of `step_s` with which a scheme is stable. Saturates for absurd scenes.
+/// Returns the fewest substeps of `step_s` with which a scheme is stable ([`is_stable`]). Tried upwards from [`least_substeps`], an
+/// eighth more each time. Saturates for absurd scenes.
 pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     let mut substeps = least_substeps(step_s, sheet);
     let stable = |substeps: u32| {
@@ -129,6 +138,9 @@ pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) 
 
 /// Returns the fewest substeps of `step_s` with which a yardstick is stable, and as accurate as it promises. Saturates
 /// for absurd scenes.
+///
+/// For `central` that is dt·ω_b ≤ [`THETA`]/e, with e = [`endurance`] at τ = 2m/C; for `lagged` also C·dt/m ≤ 1, half of its
+/// bound 2 (W + 2g < 4 with W = 0).
 pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
     let omega = sheet.omega_bound_per_s();

@@ -96,7 +96,7 @@ impl ErrorExtent {
 }
 
 impl ErrorExtent {
-    /// Returns these as differences, relative to the largest values; 0 where nothing differs.
+    /// Returns these as differences, relative to the largest values: max|Δu|/max|u| and max|Δf|/max|f|; 0 where nothing differs.
     pub fn relative_to(self, largest: ErrorExtent) -> AuditedError {
         let part = |difference: f64, largest: f64| if difference == 0.0 { 0.0 } else { difference / largest };
         AuditedError {

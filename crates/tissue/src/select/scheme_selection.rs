@@ -312,7 +312,7 @@ pub(crate) fn least_substeps(asked: Integrator, step_s: f64, sheet: &Oscillator)
 }
 
 /// Returns the fewest substeps that a scene can do with, or those that it gives, and the time that a step of the
-/// cheapest kind takes with them while all of the sheet moves, s.
+/// cheapest kind takes with them while all of the sheet moves, s: as [`Model::predicted_step_s`](crate::Model::predicted_step_s).
 #[allow(clippy::cast_precision_loss)]
 pub fn least_step(scene: &Scene) -> (u32, f64) {
     let Stepping { integrator, substeps, precision, rate_hz, lanes, .. } = scene.stepping;

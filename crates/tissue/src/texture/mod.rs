@@ -43,6 +43,21 @@ pub struct Texture {
 
 /// Returns an image of a kind of surface, `size` × `size` pixels.
 ///
+/// The same seed and size give the same bytes on any machine:
+///
+/// ```
+/// use palpate_tissue::limits::Limits;
+/// use palpate_tissue::scene::PaintedSurface;
+/// use palpate_tissue::texture::painted;
+///
+/// let limits = Limits::default();
+/// let image = painted(PaintedSurface::Liver, 1, 32, &limits)?;
+/// assert_eq!((image.width, image.height, image.rgb.len()), (32, 32, 3 * 32 * 32));
+/// assert_eq!(image, painted(PaintedSurface::Liver, 1, 32, &limits)?);
+/// assert!(image.png()?.starts_with(b"\x89PNG"));
+/// # Ok::<(), palpate_refusal::Refusal>(())
+/// ```
+///
 /// # Errors
 /// Refuses a size outside the limits.
 pub fn painted(surface: PaintedSurface, seed: u64, size: u32, limits: &Limits) -> Result<Image> {

@@ -319,7 +319,8 @@ impl Footprint {
         self.relative_inverse_mass
     }
 
-    /// Returns s, the place of the disc, in m, and ∂s/∂c, for points displaced by `displacement_m`.
+    /// Returns s, the place of the disc, in m, and ∂s/∂c, for points displaced by `displacement_m`: s = Σ w·(X + u) and
+    /// ∂s/∂c = Σ ∂w/∂c·(X + u), with X where the points rest.
     pub fn surface(&self, displacement_m: impl Fn([usize; 2]) -> DVec3) -> (DVec3, [DVec3; 2]) {
         let (mut place, mut along) = (self.rest_m, self.along);
         for WeightedNode { point, weight, gradient, .. } in &self.reached {
@@ -331,7 +332,8 @@ impl Footprint {
         (place, along)
     }
 
-    /// Returns where the disc is on the tissue at rest, m, and the unit normal out of the tissue there.
+    /// Returns where the disc is on the tissue at rest, Σ w·X, m, and the unit normal out of the tissue there, along
+    /// ∂s/∂c₁ × ∂s/∂c₂.
     pub fn at_rest(&self) -> (DVec3, DVec3) {
         (self.rest_m, self.outward(&self.along))
     }

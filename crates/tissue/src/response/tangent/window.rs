@@ -212,8 +212,9 @@ fn of_mesh(model: &Model, graph: &MeshPlaces, slots: &[usize], free: &[bool]) ->
     found
 }
 
-/// How far from the middle of a disc of `radius_m` points notice what it does, in spacings; infinite without anchor
-/// springs.
+/// How far from the middle of a disc of `radius_m` points notice what it does, in spacings h; infinite without anchor
+/// springs: a/h + `REACHES`·√(k/K″) + 2. Beyond a disc displacements fall as e^{−r/l} with l = h·√(k/K″), at which a membrane
+/// of springs and its foundation are in balance, k·h²·u″ = K″·u.
 fn half_window(model: &Model, radius_m: f64) -> f64 {
     let scene = &model.scene;
     let springs = &scene.springs;
@@ -222,7 +223,8 @@ fn half_window(model: &Model, radius_m: f64) -> f64 {
     radius_m / model.unit_m + REACHES * reach + 2.0
 }
 
-/// Returns the same in m.
+/// Returns how far from the middle of a disc of `radius_m` points notice what it does, m: a + `REACHES`·h·√(k/K″) + 2h, with h the
+/// distance between points and k the larger one of structural and shear springs; the root counts as at least 1.
 pub fn half_window_m(model: &Model, radius_m: f64) -> f64 {
     half_window(model, radius_m) * model.unit_m
 }
