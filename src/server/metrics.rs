@@ -105,7 +105,7 @@ impl<F: Fn() -> Standing + Send + Sync + 'static> Collector for InFleet<F> {
             gauge.encode(encoder.encode_descriptor(&name, help, unit, MetricType::Gauge)?)?;
         }
         for (name, help, unit, count) in [
-            ("mirrored", "Bytes of its journals that were copied to a second disk", Some(&Unit::Bytes), now.mirrored_bytes),
+            ("mirrored", "Bytes of its journals copied to a second disk", Some(&Unit::Bytes), now.mirrored_bytes),
             ("taken_over", "Sessions whose owner was gone and that continue here", None, now.taken_over),
             ("moved", "Sessions that were moved from here to another server", None, now.moved),
             ("lost", "Sessions that another server had taken over when this one returned", None, now.lost),
@@ -244,7 +244,7 @@ impl Collector for Stepping {
         let audits = pacer.audit_tally();
         for (name, help, count) in [
             ("audited_windows", "Windows (runs of steps) whose error was measured", &audits.windows),
-            ("audited_windows_above_tolerance", "Measured windows with an error above the scene's tolerance", &audits.above),
+            ("audited_windows_above_tolerance", "Measured windows with an error above tolerance", &audits.above),
             ("corrections", "Tissues that are stepped more accurately because of an audit", &audits.corrections),
         ] {
             tell(name, help, None, &ConstCounter::new(count.get()))?;
@@ -291,9 +291,9 @@ impl Collector for Stepping {
         gauge("viewers", "Streams of frames", pacer.viewers() as f64)?;
         let newest = sessions.iter().filter_map(|handle| handle.audited().newest);
         let worst = newest.map(|(_, error)| error).reduce(AuditedError::max).unwrap_or_default();
-        let help = "Largest error of a displacement in the newest audits of all sessions, relative to the largest displacement";
+        let help = "Largest error of a displacement in the newest audits, relative to the largest";
         gauge("audited_displacement_error_max", help, worst.displacement)?;
-        gauge("audited_force_error_max", "Largest error of a force in the newest audits of all sessions, relative to the largest force", worst.force)?;
+        gauge("audited_force_error_max", "As audited_displacement_error_max, of a force", worst.force)?;
         let running = statuses.iter().filter(|status| status.state == RunState::Running);
         let slowest = running.map(|status| status.dilation.value).fold(1.0, f64::min);
         gauge("time_dilation_min", "Simulated over real time of the session that is furthest behind", slowest)

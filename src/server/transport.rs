@@ -65,7 +65,7 @@ impl Gate {
         }
     }
 
-    /// Counts a frame with this many bytes that the transport was given.
+    /// Counts a frame of this many bytes as passed to the transport.
     fn given(&self, bytes: usize) {
         self.charged_bytes.fetch_add(charge(bytes), Ordering::AcqRel);
     }

@@ -39,7 +39,7 @@ impl Fleet {
         }
     }
 
-    /// Claims a session, if its owner is gone.
+    /// Claims a session if its owner is gone, and continues it here.
     async fn claim(self: &Arc<Self>, id: String) {
         if lock(&self.coming).contains(&id) {
             return;

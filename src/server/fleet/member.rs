@@ -274,7 +274,7 @@ impl Fleet {
         loop {
             let may_act = self.pacer.fence.may_act();
             if might_act && !may_act {
-                error!("etcd has not confirmed the lease in time: sessions stand still and answer nothing until it does");
+                error!("etcd has not confirmed the lease in time: sessions stand still and silent until it does");
                 self.pacer.fall_silent();
             }
             might_act = may_act;

@@ -100,7 +100,7 @@ pub(super) struct Fleet {
 /// This server's lease and key in etcd.
 #[derive(Debug, Clone, Copy, Default)]
 struct HeldLease {
-    /// Its lease; 0 before it has one.
+    /// The lease; 0 before it has one.
     lease: i64,
     /// The revision at which this process last wrote the server's key.
     key_revision: u64,
