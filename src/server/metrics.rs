@@ -293,7 +293,7 @@ impl Collector for Stepping {
         let worst = newest.map(|(_, error)| error).reduce(AuditedError::max).unwrap_or_default();
         let help = "Largest error of a displacement in the newest audits, relative to the largest";
         gauge("audited_displacement_error_max", help, worst.displacement)?;
-        gauge("audited_force_error_max", "As audited_displacement_error_max, of a force", worst.force)?;
+        gauge("audited_force_error_max", "Largest relative error of a force in the newest audits", worst.force)?;
         let running = statuses.iter().filter(|status| status.state == RunState::Running);
         let slowest = running.map(|status| status.dilation.value).fold(1.0, f64::min);
         gauge("time_dilation_min", "Simulated over real time of the session that is furthest behind", slowest)
