@@ -39,9 +39,9 @@ use wtransport::{ClientConfig, Connection, Endpoint};
 
 use crate::connect::Server;
 
-/// Time for the session to open, and how often it is tried: within the ten seconds of a ticket, which is used up only when a session
-/// is open. (HTTP/3 below may wait for ever for settings that were sent again after a loss: wtransport 0.7.) The stream carries
-/// everything until then.
+/// Time limit for one attempt to open the session, and number of attempts: together within the ten seconds of a
+/// ticket, which is used up only when a session is open. The stream carries everything until then. (HTTP/3 may wait
+/// without limit for settings that were resent after a loss: wtransport 0.7.)
 const OPEN_TIMEOUT: Duration = Duration::from_secs(2);
 const ATTEMPTS: usize = 4;
 
