@@ -178,8 +178,8 @@ fn simulated(file: &TriangleMesh, vertex_of: &[Option<u32>], least: &[u32]) -> T
     }
 }
 
-/// Boxes that are looked at to find what is nearest to the vertices that no triangle has: so many, and so many for each triangle and
-/// vertex. Usually one takes some tens.
+/// Maximum number of boxes that are visited to find the nearest points for the vertices that no triangle uses: a
+/// fixed number, and a number for each triangle and vertex. A search typically takes some tens.
 const LOOKS: [u64; 2] = [1_000_000, 60];
 
 /// Returns the simulated vertex of each; for one without a triangle, the nearest, or a near one ([`LOOKS`]).
