@@ -9,7 +9,7 @@ import { type Failure, keepOpen, CALL_TIMEOUT_MS, Server } from "./server.js";
 /** Maximum number of unacknowledged frames: enough for a round trip of 60 ms at 60 frames a second. */
 const IN_FLIGHT = 4;
 
-/** Cost of a part of a frame, and of a patch in it, in values; and the limits that follow from it. */
+/** Each part of a frame and each patch counts as this many values. A frame has at most `MAX_PARTS` parts and patches. */
 const PART_VALUES = 64;
 const MAX_PARTS = 1 << 16;
 
