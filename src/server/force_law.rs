@@ -294,7 +294,7 @@ mod tests {
             self.handle.law(&self.handle.model, Disc::in_middle(&self.handle.model, self.radius_m())).unwrap()
         }
 
-        /// Changes the tissue; tells the step from which on the other acts.
+        /// Changes the tissue, and returns the step from which the change takes effect.
         fn change(&self, anchor_stiffness_n_per_m: f64, at_step: Option<u64>) -> (u64, Arc<Model>) {
             let change = Change { anchor_stiffness_n_per_m: Some(anchor_stiffness_n_per_m), ..Change::default() };
             self.handle.change(&change, at_step, |_| Ok(()), &NEVER).unwrap()

@@ -249,7 +249,7 @@ unsafe fn init<T: Versioned>(options: *mut T, size: usize) -> palpate_result {
             return Err(CodedError::argument(why));
         }
         let initial = T::initial();
-        // SAFETY: so many bytes are valid on both sides; the structure of an older header is shorter.
+        // SAFETY: this number of bytes is valid on both sides; the structure of an older header is shorter.
         unsafe {
             std::ptr::copy_nonoverlapping((&raw const initial).cast::<u8>(), options.cast::<u8>(), size);
             options.cast::<usize>().write(size);
@@ -276,7 +276,7 @@ pub(crate) unsafe fn options_at<T: Versioned>(pointer: *const T) -> Result<T, Co
         );
         return Err(CodedError::argument(why));
     }
-    // SAFETY: so many bytes are valid on both sides.
+    // SAFETY: this number of bytes is valid on both sides.
     unsafe { std::ptr::copy_nonoverlapping(pointer.cast::<u8>(), (&raw mut options).cast::<u8>(), size) };
     Ok(options)
 }

@@ -81,7 +81,7 @@ impl Connected {
         self.wait_for(1, call)
     }
 
-    /// Waits for `calls` calls in succession, at most for the time limit of so many calls.
+    /// Waits for `calls` calls in succession, at most for `calls` times the time limit of a call.
     fn wait_for<T, E: Into<CodedError>>(
         &self,
         calls: u32,
@@ -340,7 +340,7 @@ pub unsafe extern "C" fn palpate_session_create_from_mesh(
         if mesh_bytes.is_null() {
             return Err(CodedError::argument("mesh_bytes is null"));
         }
-        // SAFETY: the caller promises that there are so many bytes.
+        // SAFETY: the caller guarantees this number of bytes.
         let bytes = unsafe { std::slice::from_raw_parts(mesh_bytes, byte_count) };
         let made = Scene::parse_given("scene_text", scene, (mesh_name, bytes), &Limits::default()).map_err(refused)?;
         *out = create_own(shared, &made, sent::said("scene_text", scene).map_err(refused)?)?;

@@ -18,8 +18,9 @@ fn parts(file: &[u8]) -> impl Iterator<Item = (u64, Vec<u8>, bool)> {
     })
 }
 
-/// Uploads the file of a mesh; `unit` is the length of 1 in it: "m", "cm", "mm" or a number of metres. `repair` mends
-/// faults. The answer contains the `mesh_id` for `Scene.mesh`, and a report of whether the mesh can be used.
+/// Uploads the file of a mesh. `unit` is the length of 1 in it: "m", "cm", "mm" or a number of metres. If `repair` is
+/// true, the server repairs faults. The answer contains the `mesh_id` for `Scene.mesh`, and a report of whether the
+/// mesh can be used.
 ///
 /// # Errors
 /// Returns the server's refusal, or how the connection broke.

@@ -84,7 +84,7 @@ impl PlaySource {
         called!(self.session, SessionServiceClient.start_session(request)).map(drop)
     }
 
-    /// Waits until so many steps of the script are done. Raises Failed if the session is stopped.
+    /// Waits until `step` steps of the script are done. Raises Failed if the session is stopped.
     async fn until(&mut self, step: u64) -> PyResult<pb::Session> {
         loop {
             let request = pb::GetSessionRequest { session_id: self.id() };

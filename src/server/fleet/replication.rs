@@ -285,8 +285,8 @@ impl Fleet {
         counts
     }
 
-    /// Handles a report that a server has so many bytes of a journal on its disk. At first, names it in etcd as the
-    /// standby.
+    /// Handles a report of how many bytes of a journal a server has on its disk. On the first one, names that server
+    /// in etcd as the standby.
     async fn is_mirrored(&self, name: &str, at: &pb::Mirrored) {
         let id = &at.session_id;
         let Some((event_log, step)) = self.growth.mirrored(id, at.run, at.durable_bytes) else { return };

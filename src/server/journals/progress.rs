@@ -105,7 +105,7 @@ impl Growth {
             .collect()
     }
 
-    /// Records that so many bytes of a run are replicated. Returns the event log and the step up to which they are
+    /// Records that `bytes` of a run are replicated. Returns the event log and the step up to which they are
     /// complete.
     pub(in crate::server) fn mirrored(&self, session_id: &str, run: u32, bytes: u64) -> Option<(Arc<EventLog>, u64)> {
         let mut files = lock(&self.files);
