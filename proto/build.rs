@@ -28,7 +28,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     std::fs::write(out.join("shapes.rs"), shapes(&files)?)?;
     if std::env::var_os("CARGO_FEATURE_AGONES").is_some() {
         println!("cargo::rerun-if-changed=agones");
-        // With its server: tests imitate the SDK.
+        // Including its server: tests imitate the SDK.
         tonic_prost_build::configure()
             .build_transport(false)
             .compile_fds(protox::compile(["agones/sdk.proto", "agones/beta.proto"], ["."])?)?;
@@ -44,20 +44,21 @@ fn main() -> Result<(), Box<dyn Error>> {
     // Frames are shared between viewers, not copied for each.
     let shared = [".palpate.v1.Patch.displacement", ".palpate.v1.GetTextureResponse.png"];
     let configured = shared.iter().fold(tonic_prost_build::configure(), tonic_prost_build::Builder::bytes);
-    // Messages are measured before they are decoded (`measure`), by their names.
+    // The size of messages is measured by their names before they are decoded (`measure`).
     let mut named = tonic_prost_build::Config::new();
     named.enable_type_names();
     configured
         .build_client(has("CLIENT"))
         .build_server(has("SERVER"))
-        // Connections are the users' choice.
+        // Users of this crate choose their connections.
         .build_transport(false)
         .codec_path("crate::codec::BoundedCodec")
         .compile_fds_with_config(descriptors, named)?;
     Ok(())
 }
 
-/// The messages of journals, in a folder of their own: they use those of the protocol, which are generated once.
+/// Compiles the messages of journals into a folder of their own: they use those of the protocol, which are generated
+/// once.
 fn compile_journal(out: &Path) -> Result<Vec<FileDescriptorProto>, Box<dyn Error>> {
     println!("cargo::rerun-if-changed=foxglove");
     const FILES: [&str; 3] =
@@ -68,13 +69,13 @@ fn compile_journal(out: &Path) -> Result<Vec<FileDescriptorProto>, Box<dyn Error
     let mut config = prost_build::Config::new();
     config.out_dir(&own).extern_path(".palpate.v1", "crate::pb").enable_type_names();
     config.compile_fds(descriptors.clone())?;
-    // Journals have the schemas in them, without their comments.
+    // Journals contain the schemas, without comments.
     descriptors.file.iter_mut().for_each(|file| file.source_code_info = None);
     std::fs::write(own.join("journal.bin"), prost::Message::encode_to_vec(&descriptors))?;
     Ok(descriptors.file)
 }
 
-/// The calls of etcd, of which we are a client only.
+/// Compiles the calls of etcd, of which we are only a client.
 fn compile_etcd(out: &Path) -> Result<Vec<FileDescriptorProto>, Box<dyn Error>> {
     println!("cargo::rerun-if-changed=etcd");
     let descriptors = protox::compile(["etcd/rpc.proto"], ["."])?;
@@ -88,7 +89,7 @@ fn compile_etcd(out: &Path) -> Result<Vec<FileDescriptorProto>, Box<dyn Error>> 
     Ok(files)
 }
 
-/// The modules of the generated messages that are measured, by their packages.
+/// The modules of the generated messages that are measured, by package.
 const MODULES: [(&str, &str); 4] = [
     ("palpate.v1", "crate::pb"),
     ("palpate.journal.v1", "crate::journal"),
@@ -96,7 +97,7 @@ const MODULES: [(&str, &str); 4] = [
     ("mvccpb", "crate::etcd::mvccpb"),
 ];
 
-/// A table of what each message is made of, for `measure`.
+/// Returns a table of the fields of each message, for `measure`.
 fn shapes(files: &[FileDescriptorProto]) -> Result<String, Box<dyn Error>> {
     let mut paths = BTreeSet::new();
     let mut messages = Vec::new();

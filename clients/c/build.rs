@@ -1,4 +1,4 @@
-//! Gives the shared library the name by which programs find it.
+//! Sets the soname of the shared library, by which programs find it.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");

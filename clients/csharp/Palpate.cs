@@ -1,6 +1,6 @@
-// Palpate for C#: libpalpate by P/Invoke, and a small interface over it. One file: copy it into your project, and put
-// libpalpate.so (Windows: palpate.dll) where your program finds native libraries. C# 7, .NET Standard 2.0, Mono, Unity.
-// The rules of palpate.h hold: which thread may call what, and what waits.
+// Palpate for C#: libpalpate by P/Invoke, and a small interface over it. It is a single file: copy it into your
+// project, and put libpalpate.so (Windows: palpate.dll) where your program finds native libraries. For C# 7, .NET
+// Standard 2.0, Mono, Unity. The rules of palpate.h apply: which thread may call what, and which calls wait.
 using System;
 using System.Globalization;
 using System.Runtime.InteropServices;
@@ -8,7 +8,7 @@ using System.Text;
 
 namespace Palpate
 {
-    /// <summary>Three components, in the axes that were asked for.</summary>
+    /// <summary>Three components, in the axes that were requested.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct Vector
     {
@@ -23,13 +23,13 @@ namespace Palpate
     /// <summary>Whether forces are rendered; see palpate_state.</summary>
     public enum State : uint { Waiting = 0, Disabled = 1, Enabled = 2, Paused = 3, Fault = 4 }
 
-    /// <summary>With which priority a loop runs; see palpate_priority.</summary>
+    /// <summary>Scheduling priority of a loop; see palpate_priority.</summary>
     public enum Priority : uint { Usual = 0, RealTime = 1, Refused = 2 }
 
-    /// <summary>Why a call did nothing; see palpate_result.</summary>
+    /// <summary>Why a call failed; see palpate_result.</summary>
     public enum Code { Ok = 0, Argument = 1, Connection = 2, Refused = 3, Device = 4, Buffer = 5, Busy = 6, Internal = 7 }
 
-    /// <summary>The box around a tissue at rest, in Palpate's own axes, m.</summary>
+    /// <summary>The bounding box of a tissue at rest, in Palpate's own axes, m.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct Extent { public Vector Least, Most, Middle, Top; }
 
@@ -43,19 +43,19 @@ namespace Palpate
         public bool Enable { get { return enable != 0; } set { enable = value ? 1u : 0u; } }
     }
 
-    /// <summary>What a tick tells.</summary>
+    /// <summary>Result of a tick.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct Felt
     {
         public Vector Force;
         uint state, isOver;
-        /// <summary>How old the newest news of the tissue is, s; negative before the first.</summary>
+        /// <summary>Age of the newest data about the tissue, s; negative before the first.</summary>
         public double Age;
         public State State { get { return (State)state; } }
         public bool IsOver { get { return isOver != 0; } }
     }
 
-    /// <summary>What a haptic device can bear; see palpate_limits.</summary>
+    /// <summary>Limits of a haptic device; see palpate_limits.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct Limits
     {
@@ -68,11 +68,11 @@ namespace Palpate
         }
     }
 
-    /// <summary>What went over the network; see palpate_traffic.</summary>
+    /// <summary>Network traffic; see palpate_traffic.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct Traffic { public ulong Connections, Failed, Samples, Positions; uint connected, unused; public bool IsConnected { get { return connected != 0; } } }
 
-    /// <summary>How a loop stands; see palpate_bridge_state.</summary>
+    /// <summary>State of a loop; see palpate_bridge_state.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct BridgeState
     {
@@ -84,18 +84,18 @@ namespace Palpate
         public bool IsOver { get { return isOver != 0; } }
     }
 
-    /// <summary>What a loop has done; see palpate_bridge_report.</summary>
+    /// <summary>Statistics of a loop; see palpate_bridge_report.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct Report
     {
         public ulong Ticks, LateTicks, MissedTicks, Connections, Samples, Positions;
         uint priority, result;
         public Priority Priority { get { return (Priority)priority; } }
-        /// <summary>Why the loop has ended: Ok if you have ended it.</summary>
+        /// <summary>Why the loop ended: Ok if you ended it.</summary>
         public Code Result { get { return (Code)result; } }
     }
 
-    /// <summary>A change of the tissue; what is not a number stays.</summary>
+    /// <summary>A change of the tissue. Values that are NaN are left unchanged.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct Change
     {
@@ -103,7 +103,7 @@ namespace Palpate
         public static Change None { get { double n = double.NaN; return new Change { Stiffness = n, Damping = n, AnchorStiffness = n, VolumeStiffness = n }; } }
     }
 
-    /// <summary>What was written of a surface; see palpate_dirty.</summary>
+    /// <summary>Which part of a surface was written; see palpate_dirty.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct Dirty
     {
@@ -114,7 +114,7 @@ namespace Palpate
         public int Count { get { return (int)count; } }
     }
 
-    /// <summary>How to touch; see palpate_touch_options.</summary>
+    /// <summary>Options for touching; see palpate_touch_options.</summary>
     [StructLayout(LayoutKind.Sequential)]
     public struct TouchOptions
     {
@@ -127,7 +127,8 @@ namespace Palpate
         public double Deadband, UpDeadband;
         uint datagrams, realTime;
         IntPtr holder, warn, warnUser;
-        /// <summary>Of which tissues to keep a copy: 0 none, 1 meshes, 2 any; see palpate_touch_options.</summary>
+        /// <summary>Which tissues to keep a local copy of: 0 none, 1 meshes, 2 any; see
+        /// palpate_touch_options.</summary>
         public uint Prediction;
         public bool InTissueFrame { get { return inTissueFrame != 0; } set { inTissueFrame = value ? 1u : 0u; } }
         public bool Grasps { get { return grasps != 0; } set { grasps = value ? 1u : 0u; } }
@@ -159,7 +160,7 @@ namespace Palpate
     [StructLayout(LayoutKind.Sequential)]
     struct DeviceCalls { public IntPtr User, Descriptor, Read, Write; }
 
-    /// <summary>An error of the library.</summary>
+    /// <summary>An error that the library reported.</summary>
     public class PalpateException : Exception
     {
         public Code Code { get; private set; }
@@ -241,7 +242,7 @@ namespace Palpate
         }
     }
 
-    /// <summary>Something of the library that is to be given back.</summary>
+    /// <summary>An object of the library that must be disposed of.</summary>
     public abstract class Handle : IDisposable
     {
         internal IntPtr Pointer;
@@ -261,7 +262,7 @@ namespace Palpate
         /// <summary>The library's version.</summary>
         public static string Version { get { return Native.Text(Native.palpate_version()); } }
 
-        /// <summary>Connects. Waits for the server.</summary>
+        /// <summary>Connects to a server. Waits for the server.</summary>
         public Server(string url, string token = null, string caPem = null, double timeout = 60.0)
         {
             ConnectOptions options;
@@ -278,13 +279,13 @@ namespace Palpate
             finally { one.Free(); two.Free(); }
         }
 
-        /// <summary>The names of its scenes. Waits for the server.</summary>
+        /// <summary>The names of the server's scenes. Waits for the server.</summary>
         public string[] Scenes()
         {
             return Native.Text((byte[] text, UIntPtr capacity, out UIntPtr needed) => Native.palpate_scenes(Pointer, text, capacity, out needed)).Split('\n');
         }
 
-        /// <summary>Makes a session of a scene that the server has. Waits for the server.</summary>
+        /// <summary>Creates a session from a scene that the server has. Waits for the server.</summary>
         public Session Create(string scene)
         {
             IntPtr session;
@@ -292,7 +293,8 @@ namespace Palpate
             return new Session(session);
         }
 
-        /// <summary>Makes a session of the text of a scene that names no file. Waits for the server.</summary>
+        /// <summary>Creates a session from the text of a scene that refers to no file. Waits for the
+        /// server.</summary>
         public Session CreateFromText(string scene)
         {
             IntPtr session;
@@ -300,7 +302,7 @@ namespace Palpate
             return new Session(session);
         }
 
-        /// <summary>Makes a session of a scene file of yours, and sends its mesh. Waits for the server.</summary>
+        /// <summary>Creates a session from a local scene file, and sends its mesh. Waits for the server.</summary>
         public Session CreateFromFile(string path)
         {
             IntPtr session;
@@ -308,8 +310,9 @@ namespace Palpate
             return new Session(session);
         }
 
-        /// <summary>Makes a session of the text of a scene and the bytes of a mesh file, which [mesh] of the text calls `name`. `Obj` makes
-        /// such bytes of an engine's mesh. Waits for the server.</summary>
+        /// <summary>Creates a session from the text of a scene and the bytes of a mesh file. [mesh] of the scene
+        /// refers to this file as `name`. `Obj` creates such bytes from an engine's mesh. Waits for the
+        /// server.</summary>
         public Session CreateFromMesh(string scene, string name, byte[] bytes)
         {
             IntPtr session;
@@ -318,12 +321,12 @@ namespace Palpate
             return new Session(session);
         }
 
-        /// <summary>A mesh in these axes as a file (OBJ) in Palpate's own: three coordinates for each vertex, three vertices for each
-        /// triangle.</summary>
+        /// <summary>Converts a mesh in these axes to an OBJ file in Palpate's own axes. There are three coordinates
+        /// for each vertex and three vertices for each triangle.</summary>
         public static byte[] Obj(float[] positions, int[] triangles, Axes axes)
         {
             var text = new StringBuilder();
-            // Unity has y and z exchanged; Unreal x and y, and centimetres.
+            // In Unity, y and z are exchanged; in Unreal, x and y, and the unit is centimetres.
             int[] at = axes == Axes.Unity ? new[] { 0, 2, 1 } : axes == Axes.Unreal ? new[] { 1, 0, 2 } : new[] { 0, 1, 2 };
             double metres = axes == Axes.Unreal ? 0.01 : 1.0;
             for (int k = 0; k + 2 < positions.Length; k += 3)
@@ -332,7 +335,7 @@ namespace Palpate
                 foreach (int axis in at) text.Append(' ').Append((metres * positions[k + axis]).ToString("R", CultureInfo.InvariantCulture));
                 text.Append('\n');
             }
-            // Unity's triangles are clockwise from outside.
+            // Unity's triangles are clockwise seen from outside.
             bool isTurned = axes == Axes.Unity;
             for (int k = 0; k + 2 < triangles.Length; k += 3)
             {
@@ -371,7 +374,7 @@ namespace Palpate
         /// <summary>Changes the tissue. Waits for the server.</summary>
         public void Apply(Change change) { Native.Check(Native.palpate_session_change(Pointer, ref change)); }
 
-        /// <summary>Deletes it on the server, for everybody. Waits for the server.</summary>
+        /// <summary>Deletes the session on the server, for all users. Waits for the server.</summary>
         public void Delete() { Native.Check(Native.palpate_session_delete(Pointer)); }
 
         /// <summary>Takes a tool for a loop of your own. Waits for the server.</summary>
@@ -391,12 +394,12 @@ namespace Palpate
         internal override void Free(IntPtr pointer) { Native.palpate_session_free(pointer); }
     }
 
-    /// <summary>A tool that a loop of your own leads.</summary>
+    /// <summary>A tool that your own loop moves.</summary>
     public sealed class Touch : Handle
     {
         internal Touch(IntPtr pointer) { Pointer = pointer; }
 
-        /// <summary>A loop over what was recorded; see palpate_touch_begin_offline.</summary>
+        /// <summary>Creates a touch that replays recorded messages; see palpate_touch_begin_offline.</summary>
         public static Touch Offline(TouchOptions options, Vector middle)
         {
             IntPtr touch;
@@ -404,11 +407,11 @@ namespace Palpate
             return new Touch(touch);
         }
 
-        /// <summary>A recorded message arrives; see palpate_touch_arrive.</summary>
+        /// <summary>Delivers a recorded message; see palpate_touch_arrive.</summary>
         public void Arrive(byte[] bytes) { Native.Check(Native.palpate_touch_arrive(Pointer, bytes, (UIntPtr)bytes.Length)); }
 
-        /// <summary>The force until the next tick, for a thread of your own, a thousand times a second. Never waits, and throws
-        /// nothing: after an error the force is zero.</summary>
+        /// <summary>Returns the force until the next tick. Call it on your own thread, a thousand times a second. It
+        /// never waits and throws no exceptions: after an error the force is zero.</summary>
         public Felt Tick(Reading reading, double time)
         {
             Felt felt;
@@ -427,8 +430,9 @@ namespace Palpate
         internal override void Free(IntPtr pointer) { Native.palpate_touch_end(pointer); }
     }
 
-    /// <summary>A device of your own. A thread of the library calls Read and Write, a thousand times a second; an exception ends the
-    /// loop. Keep them short and free of garbage: a collection stops them.</summary>
+    /// <summary>A device of your own. A thread of the library calls Read and Write a thousand times a second; an
+    /// exception ends the loop. Keep them short, and allocate nothing: a garbage collection would stop
+    /// them.</summary>
     public interface IDevice
     {
         Limits Limits { get; }
@@ -436,10 +440,10 @@ namespace Palpate
         void Write(Vector force);
     }
 
-    /// <summary>The loop of a device.</summary>
+    /// <summary>The loop that drives a device.</summary>
     public sealed class Bridge : Handle
     {
-        // The library calls these until the end.
+        // The library calls these until the loop ends.
         readonly Descriptor descriptor;
         readonly Read read;
         readonly Write write;
@@ -472,10 +476,11 @@ namespace Palpate
             return state;
         }
 
-        /// <summary>Stops rendering until Enable goes from false to true again. Any thread.</summary>
+        /// <summary>Stops rendering until Enable goes from false to true again. Can be called on any
+        /// thread.</summary>
         public void Disable() { Native.Check(Native.palpate_bridge_disable(Pointer)); }
 
-        /// <summary>Ends the loop and tells what it has done, or how the device failed.</summary>
+        /// <summary>Ends the loop and returns its statistics. Throws if the device failed.</summary>
         public Report End()
         {
             Report report;
@@ -483,7 +488,7 @@ namespace Palpate
             return report;
         }
 
-        /// <summary>The same; the report is there also if it throws because the device has failed.</summary>
+        /// <summary>Ends the loop. `report` is set even if this throws because the device failed.</summary>
         public void End(out Report report)
         {
             var pointer = System.Threading.Interlocked.Exchange(ref Pointer, IntPtr.Zero);
@@ -495,18 +500,18 @@ namespace Palpate
         internal override void Free(IntPtr pointer) { Report report; Native.palpate_bridge_end(pointer, out report); }
     }
 
-    /// <summary>The surface of a session, in arrays of its own.</summary>
+    /// <summary>The surface of a session, in its own arrays.</summary>
     public sealed class Surface : Handle
     {
-        /// <summary>x, y, z of each vertex, one after the other.</summary>
+        /// <summary>x, y, z of each vertex, one vertex after the other.</summary>
         public readonly float[] Positions;
-        /// <summary>The same of their normals.</summary>
+        /// <summary>x, y, z of each vertex normal, in the same order as Positions.</summary>
         public readonly float[] Normals;
-        /// <summary>Three for each triangle.</summary>
+        /// <summary>Three vertex indices for each triangle.</summary>
         public readonly int[] Indices;
-        /// <summary>u, v of each vertex; null if it has none.</summary>
+        /// <summary>u, v of each vertex; null if the mesh has no texture coordinates.</summary>
         public readonly float[] Uv;
-        /// <summary>Whether no more will come.</summary>
+        /// <summary>Whether the surface will receive no more updates.</summary>
         public bool IsLost { get; private set; }
         bool isRead;
 
@@ -529,7 +534,7 @@ namespace Palpate
             Native.Check(Native.palpate_surface_uv(Pointer, Uv, (UIntPtr)8, size.Vertices));
         }
 
-        /// <summary>Brings positions and normals up to date; tells which vertices have changed. Never waits.</summary>
+        /// <summary>Updates positions and normals, and returns which vertices changed. Never waits.</summary>
         public Dirty Read()
         {
             GCHandle positions = GCHandle.Alloc(Positions, GCHandleType.Pinned), normals = GCHandle.Alloc(Normals, GCHandleType.Pinned);

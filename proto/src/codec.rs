@@ -1,6 +1,6 @@
-//! Decodes messages that come, requests and answers, within bounds: they are measured before they are decoded (`measure`). A
-//! megabyte of empty parts would otherwise occupy a network thread for a tenth of a second and take many times its size in memory.
-//! What a larger request takes is taken from its caller's budget first ([`paid_by`]).
+//! Decodes received messages, requests and responses, within limits: they are measured before they are decoded
+//! (`measure`). A megabyte of empty parts would otherwise occupy a network thread for a tenth of a second and take
+//! many times its size in memory. The memory of a larger request is charged to its caller first ([`paid_by`]).
 
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -16,27 +16,27 @@ use palpate_refusal::{Reason, Refusal, Result};
 /// Largest number of fields at a request's top level: a batch of as many commands as may wait, and some more.
 const MAX_FIELDS: usize = 4096 + 256;
 
-/// Largest number of fields of all levels of a request together: such a batch of poses, or 20,000 fixed points.
+/// Largest number of fields of a request on all levels together: such a batch of poses, or 20,000 fixed points.
 const MAX_FIELDS_IN_ALL: usize = 1 << 16;
 
-/// A request that takes less memory than this is not paid for, bytes: a caller has few calls at once, and thousands a second.
+/// Memory below which a request is not charged, bytes: a caller has few calls at once, and thousands per second.
 const SMALL: usize = 16 << 10;
 
-/// Pays for the memory of requests, before they are decoded.
+/// Charges the memory of requests before they are decoded.
 pub trait Payer: Send + Sync {
-    /// A request is decoded that takes so many bytes.
+    /// Charges for a request that takes this many bytes. Called before it is decoded.
     ///
     /// # Errors
-    /// Refuses what the caller has no memory for.
+    /// Refuses if the caller has no memory for it.
     fn pay(&self, bytes: u64) -> Result<()>;
 }
 
 thread_local! {
-    /// Who pays for what this thread decodes.
+    /// The payer of the requests that this thread decodes.
     static PAYER: RefCell<Option<Arc<dyn Payer>>> = const { RefCell::new(None) };
 }
 
-/// Puts back who paid before.
+/// Restores the previous payer when it is dropped.
 struct PreviousPayer(Option<Arc<dyn Payer>>);
 
 impl Drop for PreviousPayer {
@@ -45,13 +45,13 @@ impl Drop for PreviousPayer {
     }
 }
 
-/// Does something, and has `payer` pay for the requests that this thread decodes meanwhile.
+/// Runs `act` with `payer` charged for the requests that this thread decodes in the meantime.
 pub fn paid_by<T>(payer: &Arc<dyn Payer>, act: impl FnOnce() -> T) -> T {
     let _previous = PreviousPayer(PAYER.replace(Some(payer.clone())));
     act()
 }
 
-/// The protobuf codec with a bound on the memory of what comes, and on the fields of requests.
+/// The protobuf codec with a limit on the memory of received messages, and on the fields of requests.
 pub struct BoundedCodec<T, U>(ProstCodec<T, U>);
 
 impl<T, U> Default for BoundedCodec<T, U> {
@@ -92,7 +92,7 @@ impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
 
     fn decode(&mut self, buffer: &mut DecodeBuf<'_>) -> std::result::Result<Option<D::Item>, Status> {
         use bytes::Buf;
-        // The buffer holds the message in one chunk.
+        // The buffer contains the message in one chunk.
         if let Some(shape) = self.shape {
             check(buffer.chunk(), shape, self.is_request)?;
         }
@@ -111,15 +111,16 @@ impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
     }
 }
 
-/// Returns whether the codec decodes the bytes of a message of this type: what it refuses before.
+/// Returns whether the codec would decode a message of this type: performs its checks before decoding.
 ///
 /// # Errors
-/// Refuses a message that takes more memory than any valid one, and a request with more fields.
+/// Refuses a message that takes more memory than any valid one, and a request with too many fields.
 pub fn accepts<M: Name>(message: &[u8]) -> Result<()> {
     Shape::of::<M>().map_or(Ok(()), |shape| check(message, shape, M::NAME.ends_with("Request")))
 }
 
-/// Refuses a message that takes more memory than any valid one, and a request with more fields.
+/// Refuses a message that takes more memory than any valid one, and a request with too many fields. Charges a large
+/// request.
 fn check(message: &[u8], shape: &Shape, is_request: bool) -> Result<()> {
     let most_memory = message.len().saturating_mul(MULTIPLE).saturating_add(ROOM);
     let most_fields = if is_request { [MAX_FIELDS, MAX_FIELDS_IN_ALL] } else { [usize::MAX; 2] };
@@ -185,7 +186,7 @@ mod tests {
 
     #[test]
     fn the_bytes_of_a_file_are_no_fields() {
-        // Zeros would be fields, half a million, and the corners of `vt 0 0` are such.
+        // Zeros would be half a million fields, and the corners of `vt 0 0` are such.
         let part = vec![0; 1 << 20];
         checked(&pb::UploadMeshRequest { part: part.clone(), ..Default::default() }).unwrap();
         checked(&pb::UploadJournalRequest { part: part.clone(), ..Default::default() }).unwrap();
@@ -202,7 +203,7 @@ mod tests {
     #[test]
     fn answers_have_a_bound_too() {
         let answer = |sessions| pb::ListSessionsResponse { sessions: vec![Default::default(); sessions] };
-        // Sessions without a word, which no server sends.
+        // Sessions without any content, which no server sends.
         checked(&answer(500)).unwrap();
         assert_eq!(checked(&answer(100_000)).unwrap_err().reason, Reason::TooLarge);
     }

@@ -1,9 +1,9 @@
-//! Datagrams of touch: what both ends agree on beside the messages.
+//! Datagrams of touch: limits and conversions that both ends share.
 //!
-//! **Congestion.** The congestion control of a stream halves its rate when packets are lost, and what waits then is old when it
-//! goes out. Touch can't wait, and has a rate of its own: at most one datagram of [`MAX_BYTES`] each way and step, some 8 Mbit/s
-//! at 1 kHz, and a thirtieth of that where both ends send news alone. So its window is constant ([`WINDOW_BYTES`]), and a buffer
-//! of a few packets drops the oldest when the network takes less.
+//! **Congestion.** The congestion control of a stream halves its rate when packets are lost, and waiting data is
+//! outdated when it is sent. Touch can't wait, and has a limited rate anyway: at most one datagram of [`MAX_BYTES`]
+//! per direction and step, some 8 Mbit/s at 1 kHz, and a thirtieth of that if both ends send only news. So its window
+//! is constant ([`WINDOW_BYTES`]), and a buffer of a few packets drops the oldest when the network accepts less.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -15,23 +15,23 @@ use wtransport::quinn::{IdleTimeout, TransportConfig, VarInt};
 use crate::geometry::{from_vector, vector};
 use crate::pb;
 
-/// Largest message, bytes: it fits in one packet on any path that QUIC can use.
+/// Largest message, bytes: it fits into one packet on any path that QUIC can use.
 pub const MAX_BYTES: usize = 1024;
 
-/// Most poses before the newest in a datagram.
+/// Maximum number of earlier poses beside the newest in a datagram.
 pub const MAX_EARLIER: usize = 8;
 
-/// Bytes that may be under way: a second of 1 kHz at 250 bytes.
+/// Bytes that may be in flight: a second of 1 kHz at 250 bytes.
 const WINDOW_BYTES: u64 = 256 << 10;
 
 /// Bytes of datagrams that may wait to be sent, and to be read.
 const WAITING_BYTES: usize = 4 * MAX_BYTES;
 
-/// A session over which nothing came for so long has ended. The client asks the server for another then: sooner than QUIC, whose
-/// pauses double, would find out that the network is back.
+/// Time without any data after which a session has ended. The client then asks the server for another: sooner than
+/// QUIC, whose pauses double, would notice that the network is back.
 const IDLE: Duration = Duration::from_secs(10);
 
-/// Returns a session's settings of QUIC.
+/// Returns the QUIC settings of a session.
 pub fn transport() -> TransportConfig {
     let mut transport = TransportConfig::default();
     transport
@@ -39,7 +39,7 @@ pub fn transport() -> TransportConfig {
         .datagram_send_buffer_size(WAITING_BYTES)
         .datagram_receive_buffer_size(Some(WAITING_BYTES))
         .max_idle_timeout(Some(IdleTimeout::from(VarInt::from_u32(IDLE.as_millis() as u32))))
-        // Those of HTTP/3, and one for what must not be lost.
+        // The streams of HTTP/3, and one for messages that must not be lost.
         .max_concurrent_bidi_streams(VarInt::from_u32(4))
         .max_concurrent_uni_streams(VarInt::from_u32(8))
         .stream_receive_window(VarInt::from_u32(32 << 10))
@@ -48,7 +48,7 @@ pub fn transport() -> TransportConfig {
     transport
 }
 
-/// A constant window.
+/// A congestion controller with a constant window.
 #[derive(Debug, Clone)]
 struct Constant;
 
@@ -80,20 +80,20 @@ impl Controller for Constant {
     }
 }
 
-/// One pose of a tool, as a datagram has it.
+/// One pose of a tool in a datagram.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Posed {
-    /// Of the command.
+    /// Sequence number of its command.
     pub sequence: u64,
-    /// By the client's clock.
+    /// Time of the client's clock, ns.
     pub client_time_ns: u64,
     /// The pose.
     pub pose: pb::Pose,
 }
 
-/// Returns the message of the newest pose of `tool`, and of the poses before it, newest first. Those of another tip, or
-/// so far away that their difference has no place in the message, are left out: nothing but a gap of some milliseconds
-/// is lost.
+/// Returns the message with the newest pose of `tool` and the `earlier` ones, newest first, at most [`MAX_EARLIER`].
+/// Earlier poses with another tip, or too far away for their difference to fit, are left out, which only matters
+/// during a gap of some milliseconds.
 pub fn tool_poses<'a>(tool: u32, newest: &Posed, earlier: impl Iterator<Item = &'a Posed>) -> pb::ToolPoses {
     let place_m = from_vector(newest.pose.position_m.as_ref());
     let difference = |before: &Posed| {
@@ -118,7 +118,7 @@ pub fn tool_poses<'a>(tool: u32, newest: &Posed, earlier: impl Iterator<Item = &
     }
 }
 
-/// Returns the commands in that message, oldest first. What makes no sense is left out.
+/// Returns the commands in a message, oldest first. Invalid ones are left out.
 pub fn commands(message: &pb::ToolPoses) -> impl Iterator<Item = pb::Command> {
     let pb::ToolPoses { tool, sequence, client_time_ns, pose, earlier } = message;
     let command = |sequence: u64, client_time_ns: u64, pose: pb::Pose| pb::Command {

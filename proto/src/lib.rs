@@ -1,14 +1,15 @@
 //! Palpate's protocol in Rust, for servers and clients.
 //!
-//! - [`pb`]: the messages, clients and servers that are generated from `palpate/v1/*.proto`, which document them. The
-//!   features `client` and `server` choose what is generated besides the messages. To connect, use `tonic::transport` or
-//!   the crate `palpate-client`.
+//! - [`pb`]: the messages, clients and servers generated from `palpate/v1/*.proto`, which document them. The features
+//!   `client` and `server` choose what is generated besides the messages. To connect, use `tonic::transport` or the
+//!   crate `palpate-client`.
 //! - [`journal`]: the messages of journals, from `palpate/journal/v1/*.proto`.
 //! - `agones` (feature `agones`): the calls of the SDK of Agones that servers of a fleet use, from `agones/*.proto`.
 //! - Refusals as gRPC statuses are in the crate `palpate-refusal`, with its feature `status`.
 //! - `etcd` (feature `etcd`): messages and clients of etcd, from `etcd/*.proto`, which have what a fleet of servers uses.
-//! - [`measure`]: how much memory a message takes, before it is decoded; [`codec`]: decodes what comes within that bound.
-//! - `datagram` (feature `datagrams`): what both ends of datagrams agree on.
+//! - [`measure`]: how much memory a message takes, measured before it is decoded; [`codec`]: decodes messages within
+//!   such limits.
+//! - `datagram` (feature `datagrams`): limits and conversions that both ends of datagrams share.
 //! - [`geometry`] and [`touch`]: conversion of vectors, and of the types of the crate `palpate-haptics`.
 
 pub mod codec;
@@ -26,33 +27,34 @@ pub mod pb {
     /// Every file of the protocol, for reflection.
     pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/palpate.bin"));
 
-    /// The request of every call, by its name: whether bytes can be decoded as one.
+    /// For the request type of every call, its name and a function that returns whether bytes can be decoded as one.
     pub const DECODERS: &[(&str, fn(&[u8]) -> bool)] = include!(concat!(env!("OUT_DIR"), "/decoders.rs"));
 }
 
-/// The generated messages, clients and servers of the SDK of Agones, from `agones/*.proto`: those that servers of a fleet use.
+/// The generated messages, clients and servers of the SDK of Agones, from `agones/*.proto`: the part that servers of
+/// a fleet use.
 #[cfg(feature = "agones")]
 #[allow(missing_docs, clippy::all, clippy::pedantic, clippy::unwrap_used, unreachable_pub, rust_2018_idioms)]
 pub mod agones {
     tonic::include_proto!("agones.dev.sdk");
 
-    /// What is not stable yet: counters.
+    /// The part of the SDK that is not stable yet: counters.
     pub mod beta {
         tonic::include_proto!("agones.dev.sdk.beta");
     }
 }
 
-/// The generated messages of package `palpate.journal.v1`: what is in the journal of a session.
+/// The generated messages of package `palpate.journal.v1`: the contents of a session's journal.
 #[allow(missing_docs, clippy::all, clippy::pedantic, clippy::unwrap_used, unreachable_pub, rust_2018_idioms)]
 pub mod journal {
     include!(concat!(env!("OUT_DIR"), "/journal/palpate.journal.v1.rs"));
 
-    /// A convention of Foxglove, for exports.
+    /// Message formats of Foxglove, for exports.
     pub mod foxglove {
         include!(concat!(env!("OUT_DIR"), "/journal/foxglove.rs"));
     }
 
-    /// Their files and those that they import, each after its own imports.
+    /// The descriptors of these files and their imports, each after its own imports.
     pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/journal/journal.bin"));
 }
 

@@ -1,35 +1,35 @@
-//! How much memory a message takes once it is decoded, and how many fields it has: found by a walk over its bytes by its type,
-//! before anything is allocated. Bounds of requests, answers, journals and what etcd says all come from this walk.
+//! Measures how much memory a message takes once it is decoded, and how many fields it has, by walking over its bytes
+//! before anything is allocated. The limits of requests, responses, journals and data from etcd all use this.
 //!
-//! An entry of two bytes may be a message of hundreds in memory. What is in a field of type `bytes` or `string` is not looked at:
-//! a file in it may look like any message.
+//! An entry of two bytes may become a message of hundreds in memory. The contents of fields of type `bytes` or
+//! `string` are not parsed: a file in them may look like any message.
 
 use prost::{Message, Name};
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// A message may take so many bytes of memory for each byte that came, and [`ROOM`] beside.
+/// Memory that a message may take per received byte, in addition to [`ROOM`].
 pub const MULTIPLE: usize = 32;
 
-/// What a message may take whatever its length, bytes: a full batch of commands that say little takes less.
+/// Memory that a message may take regardless of its length, bytes: more than a full batch of short commands.
 pub const ROOM: usize = 2 << 20;
 
-/// Levels that are looked at: more than any message has.
+/// Number of nested levels that are measured: more than any message has.
 const LEVELS: u32 = 16;
 
-/// Fields of a message, at most.
+/// Maximum number of different fields of a message.
 const FIELDS: usize = 64;
 
-/// The least that a text takes, bytes.
+/// Smallest memory of a text, bytes.
 const MIN_TEXT: usize = 8;
 
-/// What a field is in memory.
+/// The representation of a field in memory.
 enum FieldKind {
-    /// A number or an enumeration, of so many bytes in memory. On the wire it has so many, or, if 0, as many as it needs.
+    /// A number or an enumeration: its bytes in memory, and on the wire; 0 for a variable length.
     Number(usize, usize),
     /// A text or byte string.
     Text,
-    /// The message of this place in [`SHAPES`].
+    /// The message with this index in [`SHAPES`].
     Message(usize),
 }
 
@@ -40,38 +40,39 @@ struct Field {
     kind: FieldKind,
 }
 
-/// What a message is made of.
+/// The fields and size of a type of message.
 pub struct Shape {
     /// Its full name.
     name: &'static str,
-    /// What it takes itself, without what it refers to, bytes.
+    /// Size of the type itself, without what it refers to, bytes.
     bytes: usize,
     fields: &'static [Field],
-    /// Decodes it.
+    /// Returns whether bytes can be decoded as such a message.
     decode: fn(&[u8]) -> bool,
 }
 
 include!(concat!(env!("OUT_DIR"), "/shapes.rs"));
 
-/// What a message has and takes.
+/// The size of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Measure {
-    /// Fields at its top level.
+    /// Number of fields at its top level.
     pub own_fields: usize,
-    /// Fields of all levels.
+    /// Number of fields on all levels.
     pub fields: usize,
-    /// Memory that it refers to when it is decoded, bytes. Vectors that grow have room for up to twice their entries.
+    /// Memory that it refers to when it is decoded, bytes. Growing vectors have room for up to twice their entries.
     pub memory: usize,
 }
 
 impl Shape {
-    /// Returns the shape of a type of message. `None` if it is none of this crate's own.
+    /// Returns the shape of a type of message; `None` if it does not belong to this crate.
     pub fn of<M: Name>() -> Option<&'static Shape> {
         let name = M::full_name();
         SHAPES.iter().find(|shape| shape.name == name)
     }
 
-    /// Returns the shapes of every type of message: of the protocol, of journals and, with the feature `etcd`, of etcd.
+    /// Returns the shapes of all types of messages: of the protocol, of journals and, with the feature `etcd`, of
+    /// etcd.
     pub fn all() -> &'static [Shape] {
         SHAPES
     }
@@ -81,13 +82,13 @@ impl Shape {
         self.name
     }
 
-    /// Returns whether bytes can be decoded as such a message, whatever that takes.
+    /// Returns whether bytes can be decoded as such a message, without any limit.
     pub fn decodes(&self, bytes: &[u8]) -> bool {
         (self.decode)(bytes)
     }
 
-    /// Measures the bytes of a message; ends early when it has more than `most_fields` fields or takes more than `most_memory`
-    /// bytes. Bytes that are no message are measured up to where that shows: the decoder refuses them there.
+    /// Measures the bytes of a message. Stops when it has more than `most_fields` fields or takes more than
+    /// `most_memory` bytes. Invalid bytes are measured up to the error: the decoder refuses them there.
     pub fn measure(&self, bytes: &[u8], most_fields: usize, most_memory: usize) -> Measure {
         let mut walk = Walk { measure: Measure::default(), most_fields, most_memory };
         walk.message(self, bytes, LEVELS);
@@ -107,7 +108,7 @@ impl Walk {
         self.measure.fields > self.most_fields || self.measure.memory > self.most_memory
     }
 
-    /// `None` where the bytes are no message, or the walk is over.
+    /// Measures a message on one level. Returns `None` if the bytes are not a message, or a limit was exceeded.
     fn message(&mut self, shape: &Shape, mut bytes: &[u8], levels: u32) -> Option<()> {
         let mut counts = [0_usize; FIELDS];
         while !bytes.is_empty() && !self.is_over() {
@@ -157,13 +158,14 @@ impl Walk {
     }
 }
 
-/// For how many entries a vector has room at most that has grown to so many, one by one. A message that comes several times where
-/// it may come once is one in the end, with the entries of all: so their sum counts, and not the next power of two of each.
+/// Returns the largest capacity of a vector that has grown to `entries` one by one. A single message that occurs
+/// several times is merged into one with the entries of all: so the sum of these counts, and not the next power of
+/// two of each.
 fn room(entries: usize) -> usize {
     if entries == 0 { 0 } else { entries.saturating_mul(2).max(4) }
 }
 
-/// Takes a varint from the front of `bytes`.
+/// Reads a varint from the front of `bytes`, and advances it; `None` if there is none.
 pub fn varint(bytes: &mut &[u8]) -> Option<u64> {
     let mut value = 0;
     for shift in (0..64).step_by(7) {
@@ -176,10 +178,10 @@ pub fn varint(bytes: &mut &[u8]) -> Option<u64> {
     None
 }
 
-/// Returns the memory that the message in `bytes` takes when it is decoded.
+/// Returns the memory that the message in `bytes` takes when it is decoded, bytes.
 ///
 /// # Errors
-/// Refuses one that would take more than [`MULTIPLE`] times its bytes and `room`.
+/// Refuses a message that would take more than [`MULTIPLE`] times its bytes plus `room`.
 pub fn memory_of<M: Name>(bytes: &[u8], room: usize) -> Result<usize> {
     let Some(shape) = Shape::of::<M>() else { return Ok(0) };
     let most = bytes.len().saturating_mul(MULTIPLE).saturating_add(room);
@@ -194,10 +196,10 @@ pub fn memory_of<M: Name>(bytes: &[u8], room: usize) -> Result<usize> {
     Err(Refusal::new(Reason::TooLarge, "", message))
 }
 
-/// Decodes a message that takes no more memory than [`memory_of`] allows it, with [`ROOM`].
+/// Decodes a message that takes no more memory than [`memory_of`] allows with [`ROOM`].
 ///
 /// # Errors
-/// Refuses what [`memory_of`] refuses, and what can't be decoded.
+/// Returns the refusals of [`memory_of`], and refuses bytes that can't be decoded.
 pub fn decoded<M: Message + Name + Default>(bytes: &[u8]) -> Result<M> {
     memory_of::<M>(bytes, ROOM)?;
     M::decode(bytes).map_err(|error| Refusal::new(Reason::Unreadable, "", format!("can't be decoded: {error}")))
@@ -218,7 +220,7 @@ mod tests {
         let (bytes, measure) = (felt.encoded_len(), measured(&felt));
         assert_eq!((bytes, measure.fields, measure.own_fields), (2000, 1000, 1000));
         assert_eq!(measure.memory, 2000 * size_of::<journal::Moment>());
-        // Of inner levels, too, and the least that a vector takes.
+        // On inner levels too, with the smallest capacity of a vector.
         let moments = vec![journal::Moment { step: 0, tools: vec![Default::default()] }; 1000];
         let memory = measured(&journal::Felt { moments }).memory;
         assert_eq!(memory, 2000 * size_of::<journal::Moment>() + 1000 * 4 * size_of::<journal::FeltTool>());

@@ -1,4 +1,4 @@
-//! Conversion of devices, tips, force laws and local models.
+//! Conversion of devices, tips, force laws and local models to messages and back.
 
 use glam::{DMat3, DVec3};
 use palpate_haptics::force_law::{Law, Row};
@@ -28,7 +28,7 @@ pub fn from_device(message: &pb::Device) -> Result<Device> {
     })
 }
 
-/// Returns a device as a message.
+/// Converts a device to a message.
 pub fn device(device: &Device) -> pb::Device {
     pb::Device {
         name: device.name.to_owned(),
@@ -40,7 +40,7 @@ pub fn device(device: &Device) -> pb::Device {
     }
 }
 
-/// Returns the tip in a message; the default tip if it is absent, and the default friction if that is.
+/// Returns the tip in a message; the default tip if it is absent, with the default friction if that is absent.
 pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
     tip.map_or_else(Tip::default, |tip| Tip {
         radius_m: tip.radius_m,
@@ -53,7 +53,7 @@ pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
     })
 }
 
-/// Returns a tip as a message.
+/// Converts a tip to a message.
 pub fn tip(tip: &Tip) -> pb::Tip {
     pb::Tip {
         radius_m: tip.radius_m,
@@ -68,7 +68,7 @@ pub fn tip(tip: &Tip) -> pb::Tip {
     }
 }
 
-/// Returns the pose of a tool whose tip is at `place_m`, m.
+/// Creates the pose of a tool whose tip is at `place_m`, m.
 pub fn pose(place_m: DVec3, tip: &Tip) -> pb::Pose {
     pb::Pose {
         position_m: vector(place_m),
@@ -79,7 +79,7 @@ pub fn pose(place_m: DVec3, tip: &Tip) -> pb::Pose {
     }
 }
 
-/// Returns a force law with its number in the stream, as a message.
+/// Converts a force law to a message, with its number in the stream.
 pub fn law(law: &Law, number: u32) -> pb::ForceLaw {
     let row = |row: &Row| pb::ForceLawRow {
         force_n: row.force_n,
@@ -112,8 +112,8 @@ pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
     if law.is_sound() { Ok(law) } else { Err(wrong()) }
 }
 
-/// Returns the law that takes the place of law `before`, with its number; or the reason and the message why there is
-/// none. `tissue_step`: the step from whose beginning on another tissue acts, if that is the cause.
+/// Creates the message with the law that replaces law `before`, and its number; or with the reason and message why
+/// there is none. `tissue_step` is the step from whose beginning a changed tissue acts, if that is the cause.
 pub fn law_update(
     before: u32,
     tissue_step: Option<u64>,
@@ -139,7 +139,7 @@ fn from_symmetric(m: Option<&pb::Symmetric3>) -> DMat3 {
     })
 }
 
-/// Returns a local model as a message.
+/// Converts a local model to a message.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn local_model(model: &LocalModel) -> pb::LocalModel {
     let contact = match model.contact_state {
@@ -166,7 +166,7 @@ pub fn local_model(model: &LocalModel) -> pb::LocalModel {
     }
 }
 
-/// Returns the local model in a message. The renderer refuses models that it can't render.
+/// Returns the local model in a message. The renderer refuses invalid models.
 pub fn from_local_model(message: &pb::LocalModel, step: u64) -> LocalModel {
     let contact_state = match message.contact() {
         pb::Contact::Unspecified | pb::Contact::Free => ContactState::Free,

@@ -1,5 +1,5 @@
-//! A canvas of samples with depth: draws triangles and lines, and resolves pixels. Linear light; several samples per
-//! pixel.
+//! A canvas of samples with depth: draws triangles and lines, and resolves them to pixels. Works in linear light,
+//! with several samples per pixel.
 
 use glam::{DVec2, DVec3};
 
@@ -8,7 +8,8 @@ use palpate_tissue::texture::Image;
 /// Samples along each side of a pixel.
 pub(super) const SAMPLES: usize = 3;
 
-/// A corner of a triangle on the canvas: its place in samples, and the inverse of its distance from the eye's plane.
+/// A corner of a triangle on the canvas: its position in samples, and the inverse of its distance from the eye's
+/// plane, 1/m.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Corner {
     pub(super) at: DVec2,
@@ -18,37 +19,38 @@ pub(super) struct Corner {
 #[derive(Debug)]
 pub(super) struct Canvas {
     size: [usize; 2],
-    /// Linear red, green and blue, and inverse distance.
+    /// Linear red, green and blue, and inverse distance, of each sample, row by row.
     samples: Vec<[f32; 4]>,
 }
 
-/// Linear light, 0 to 1, of an sRGB byte.
+/// Returns the linear light, 0 to 1, of an sRGB byte.
 pub(super) fn linear(byte: u8) -> f64 {
     let value = f64::from(byte) / 255.0;
     if value <= 0.040_45 { value / 12.92 } else { libm::pow((value + 0.055) / 1.055, 2.4) }
 }
 
-/// The sRGB byte of linear light.
+/// Returns the sRGB byte of linear light; clamps values outside 0 to 1.
 fn srgb(linear: f64) -> u8 {
     let value = linear.clamp(0.0, 1.0);
     let value = if value <= 0.003_130_8 { 12.92 * value } else { 1.055 * libm::pow(value, 1.0 / 2.4) - 0.055 };
     (255.0 * value + 0.5) as u8
 }
 
-/// Linear light of an sRGB colour.
+/// Returns the linear light of an sRGB colour.
 pub(super) fn colour([r, g, b]: [u8; 3]) -> DVec3 {
     DVec3::new(linear(r), linear(g), linear(b))
 }
 
 impl Canvas {
-    /// A canvas of `size` pixels. The background is farther than everything else.
+    /// Creates a canvas of `size` pixels. The background is farther away than everything else.
     pub(super) fn new(size: [usize; 2], background: DVec3) -> Self {
         let size = size.map(|pixels| pixels * SAMPLES);
         let [r, g, b] = background.as_vec3().to_array();
         Canvas { size, samples: vec![[r, g, b, 0.0]; size[0] * size[1]] }
     }
 
-    /// The samples whose middles lie in a box, clipped to the canvas.
+    /// Returns the range of samples along `axis` whose centres lie between the smallest and largest value, clipped to
+    /// the canvas.
     fn span(&self, axis: usize, values: impl Iterator<Item = f64> + Clone) -> std::ops::Range<usize> {
         let low = values.clone().fold(f64::INFINITY, f64::min);
         let high = values.fold(f64::NEG_INFINITY, f64::max);
@@ -64,7 +66,7 @@ impl Canvas {
         }
     }
 
-    /// Draws a triangle. `shade` gives the colour from the perspective-correct weights of the corners.
+    /// Draws a triangle. `shade` returns the colour for the perspective-correct weights of the corners.
     pub(super) fn triangle(&mut self, corners: [Corner; 3], shade: impl Fn([f64; 3]) -> DVec3) {
         let [a, b, c] = corners.map(|corner| corner.at);
         let area = (b - a).perp_dot(c - a);
@@ -88,7 +90,7 @@ impl Canvas {
         }
     }
 
-    /// Draws a line `width` pixels wide. It hides surfaces that are nearer by at most the fraction `bias` of its
+    /// Draws a line `width` pixels wide. It also hides surfaces that are nearer by at most the fraction `bias` of its
     /// distance.
     pub(super) fn line(&mut self, from: Corner, to: Corner, width: f64, bias: f64, colour: DVec3) {
         let half = 0.5 * width * SAMPLES as f64;
@@ -109,7 +111,7 @@ impl Canvas {
         }
     }
 
-    /// The mean of each pixel's samples.
+    /// Resolves the canvas to an image: each pixel is the mean of its samples.
     pub(super) fn image(&self) -> Image {
         let [width, height] = self.size.map(|samples| samples / SAMPLES);
         let mut rgb = Vec::with_capacity(3 * width * height);

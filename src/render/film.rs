@@ -1,4 +1,4 @@
-//! A script played to make pictures.
+//! Plays a script to make pictures and GIFs.
 
 use std::collections::VecDeque;
 use std::io::Write;
@@ -15,13 +15,13 @@ use palpate_tissue::scene::profile::{Moment, Poke};
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::texture::Image;
 
-/// The reason why there is no picture.
+/// The reasons why there is no picture.
 #[derive(Debug, thiserror::Error)]
 pub enum FilmFailure {
-    /// The guard has ended the session.
+    /// The guard has stopped the session because its motion grew unstable.
     #[error("the run was stopped: {0}")]
     Held(String),
-    /// The input is refused.
+    /// The input was refused.
     #[error("{0}")]
     Refused(#[from] Refusal),
     /// The file can't be written.
@@ -29,7 +29,7 @@ pub enum FilmFailure {
     Output(String),
 }
 
-/// A script being played.
+/// A script that is played step by step to make pictures of it.
 pub struct Film<'a> {
     session: Session,
     player: Player<'a>,
@@ -46,7 +46,7 @@ pub struct Still {
 }
 
 impl<'a> Film<'a> {
-    /// Begins the script.
+    /// Starts the script on a new session of `model`.
     ///
     /// # Errors
     /// Returns a failure if a change of the tissue is refused.
@@ -58,7 +58,7 @@ impl<'a> Film<'a> {
         Ok(Film { session, player, script, changes, shown: Skin::of(model) })
     }
 
-    /// Advances until `step` steps are done.
+    /// Advances the session until `step` steps are done.
     fn advance(&mut self, step: u64) -> Result<(), FilmFailure> {
         while self.session.step_count() < step {
             run::change(&mut self.session, &mut self.changes);
@@ -72,14 +72,15 @@ impl<'a> Film<'a> {
         Ok(())
     }
 
-    /// Returns the tissue when `step` steps are done.
+    /// Plays the script until `step` steps are done, and returns the tissue then. It can't go back to an earlier
+    /// step.
     ///
     /// # Errors
     /// Returns a failure if the guard stops the run or a change of the tissue is refused.
     pub fn at(&mut self, step: u64) -> Result<Still, FilmFailure> {
         self.advance(step)?;
         let model = self.session.model();
-        // The force until now: at a jump, the one just before it.
+        // The force of the step just done: at a jump, the value before it.
         let before = step.saturating_sub(1);
         let moment = Moment { step: before, fraction: if step > 0 { 1.0 } else { 0.0 } };
         let pokes = self.script.forces.iter().map(|profile| profile.at(moment, model.scene.stepping.rate_hz));
@@ -88,10 +89,10 @@ impl<'a> Film<'a> {
         Ok(Still::of(&self.session, self.shown.as_ref(), arrows))
     }
 
-    /// Returns the tissue at the script's sample time with the largest displacement.
+    /// Plays the whole script. Returns the tissue at the sample time with the largest displacement.
     ///
     /// # Errors
-    /// As for [`Film::at`].
+    /// Returns the failures of [`Film::at`].
     pub fn deepest(&mut self) -> Result<Still, FilmFailure> {
         let (mut most_m, mut found) = (f64::NEG_INFINITY, None);
         for step in (0..=self.script.steps).step_by(self.script.sample_every.max(1) as usize) {
@@ -109,7 +110,7 @@ impl<'a> Film<'a> {
 }
 
 impl Still {
-    /// Returns the tissue of a session as it stands; `shown` is what is shown of a mesh.
+    /// Returns the current tissue of a session; `shown` is the surface that is drawn of a mesh.
     pub fn of(session: &Session, shown: Option<&Arc<Skin>>, arrows: Vec<Arrow>) -> Self {
         let mut displacement_m = std::array::from_fn(|_| Vec::new());
         session.tissue().shown_displacements_m(&mut displacement_m);
@@ -123,13 +124,13 @@ impl Still {
         self.snapshot.simulation_time_s
     }
 
-    /// Draws it.
+    /// Draws the tissue as seen by `view`.
     pub fn picture(&self, model: &Model, view: &View) -> Image {
         picture(model.shape(), self.shown.as_deref(), &self.snapshot, &self.arrows, view)
     }
 }
 
-/// A GIF that is being written, at the speed of simulated time.
+/// A GIF that is being written, played at the speed of simulated time.
 pub struct Gif<W: Write> {
     encoder: gif::Encoder<W>,
     size: [u16; 2],
@@ -142,7 +143,8 @@ fn broken(e: &gif::EncodingError) -> FilmFailure {
 }
 
 impl<W: Write> Gif<W> {
-    /// Begins a film of `frames_hz` pictures a second of simulated time, of a session with `rate_hz` steps a second.
+    /// Starts a GIF of `frames_hz` pictures per second of simulated time, for a session of `rate_hz` steps per
+    /// second. A GIF counts in hundredths of a second, so the rate is rounded accordingly.
     ///
     /// # Errors
     /// Returns a failure if the output can't be written.
@@ -150,17 +152,17 @@ impl<W: Write> Gif<W> {
         let size = view.size.map(|pixels| pixels as u16);
         let mut encoder = gif::Encoder::new(output, size[0], size[1], &[]).map_err(|e| broken(&e))?;
         encoder.set_repeat(gif::Repeat::Infinite).map_err(|e| broken(&e))?;
-        // A GIF counts in hundredths of a second.
+        // A GIF measures delays in hundredths of a second.
         let delay = (100.0 / frames_hz).round().max(1.0);
         Ok(Gif { encoder, size, delay, steps_a_frame: 0.01 * delay * rate_hz })
     }
 
-    /// Returns the step of a frame, from the step of the first one.
+    /// Returns the step that a frame shows, counted from the step of the first frame.
     pub fn step(&self, frame: u64) -> u64 {
         (frame as f64 * self.steps_a_frame).round() as u64
     }
 
-    /// Adds a picture.
+    /// Writes a picture as the next frame.
     ///
     /// # Errors
     /// Returns a failure if the output can't be written.
@@ -171,8 +173,8 @@ impl<W: Write> Gif<W> {
     }
 }
 
-/// Plays the whole script into a GIF of `frames_hz` pictures a second, at the speed of simulated time. `progress` gets
-/// the step from time to time.
+/// Plays the whole script into a GIF of `frames_hz` pictures per second, at the speed of simulated time. Calls
+/// `progress` with the step of each frame.
 ///
 /// # Errors
 /// Returns a failure if the guard stops the run, a change of the tissue is refused, or the file can't be written.

@@ -1,5 +1,5 @@
-//! Pictures of a tissue without a screen: a software rasteriser that gives the same pixels on any machine. The server
-//! does not use it.
+//! Pictures of a tissue without a screen: a software rasteriser that computes the same pixels on any machine. The
+//! server does not use it.
 
 mod canvas;
 mod film;

@@ -9,14 +9,14 @@ use palpate_session::surface::{Refinement, Skin as Shown, Snapshot};
 use palpate_tissue::shape::{PointId, PointName, RestShape};
 use palpate_tissue::texture::Image;
 
-/// The camera. It always looks at the middle of the tissue.
+/// A camera that looks at the middle of the tissue.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
-    /// Rotation about the tissue's normal from its front side (y = 0), degrees.
+    /// Rotation about the tissue's normal, from its front side (y = 0), degrees, -360 to 360.
     pub azimuth_deg: f64,
-    /// Elevation above the tissue, degrees; 90 is straight from above.
+    /// Elevation above the tissue, degrees, 1 to 90; 90 is straight from above.
     pub elevation_deg: f64,
-    /// Distance of the eye from the middle, in longer sides of the sheet.
+    /// Distance of the eye from the middle, as a multiple of the tissue's longest side, 0.3 to 20.
     pub distance: f64,
 }
 
@@ -29,7 +29,7 @@ impl Default for Camera {
 impl std::str::FromStr for Camera {
     type Err = Refusal;
 
-    /// `AZIMUTH,ELEVATION` or `AZIMUTH,ELEVATION,DISTANCE`.
+    /// Parses `AZIMUTH,ELEVATION` or `AZIMUTH,ELEVATION,DISTANCE`. Refuses values out of range.
     fn from_str(text: &str) -> Result<Self> {
         let wrong = || {
             let message =
@@ -54,16 +54,16 @@ impl std::str::FromStr for Camera {
     }
 }
 
-/// How a picture is drawn.
+/// How a picture is drawn: camera, size and surface.
 #[derive(Debug, Clone)]
 pub struct View {
-    /// The camera.
+    /// Position of the eye.
     pub camera: Camera,
     /// Pixels along x and y.
     pub size: [usize; 2],
-    /// Vertices between neighbouring points.
+    /// Number of vertices drawn between neighbouring points.
     pub refinement: Refinement,
-    /// Texture of the surface; `None` shows its mesh.
+    /// Texture of the surface; `None` draws the lines of its mesh instead.
     pub texture: Option<Image>,
 }
 
@@ -73,22 +73,22 @@ pub const LARGEST_SIDE: usize = 1920;
 /// A force drawn as an arrow.
 #[derive(Debug, Clone, Copy)]
 pub struct Arrow {
-    /// The point at its tip.
+    /// The mass point at its tip.
     pub point: PointId,
-    /// Its direction.
+    /// Its direction; the length has no effect.
     pub towards: DVec3,
 }
 
 /// Half the height of the field of view, at a distance of 1.
 const HALF_VIEW: f64 = 0.30;
 
-/// Length of an arrow, in longer sides of the sheet.
+/// Length of an arrow, as a fraction of the tissue's longest side.
 const ARROW: f64 = 0.16;
 
-/// The eye and its projection.
+/// The eye and its projection to the picture.
 struct Eye {
     at_m: DVec3,
-    /// To the right, up and forward in the picture.
+    /// Unit vectors to the right, up and forward in the picture.
     axes: [DVec3; 3],
     middle: DVec2,
     /// Samples per unit of offset from the axis, at a distance of 1.
@@ -107,7 +107,7 @@ impl Eye {
         Eye {
             at_m: centre_m + distance * shape.longest_side_m() * away,
             axes: [right, right.cross(-away), -away],
-            // Near parts take more of the picture than far parts, so the middle of the sheet is drawn above the
+            // Near parts take up more of the picture than far parts, so the middle of the sheet is drawn above the
             // picture's middle.
             middle: DVec2::new(0.48 * width, 0.44 * height),
             scale: width.min(height * 4.0 / 3.0) * 0.375 / HALF_VIEW,
@@ -122,7 +122,7 @@ impl Eye {
     }
 }
 
-/// Draws the tissue in the state of `snapshot`; `shown` is what frames show of a mesh.
+/// Draws the tissue in the state of `snapshot`; `shown` is the surface that frames show of a mesh.
 pub fn picture(
     shape: &dyn RestShape,
     shown: Option<&Shown>,
@@ -179,7 +179,7 @@ fn draw(
     let tail_m = tip_m - ARROW * shape.longest_side_m() * arrow.towards.normalize_or_zero();
     let (Some(tip), Some(tail)) = (eye.project(tip_m, nearest_m), eye.project(tail_m, nearest_m)) else { return };
     let ink = colour(if view.texture.is_some() { [150, 205, 255] } else { [20, 80, 160] });
-    // In front of everything: the arrow's target may be at the bottom of a dent.
+    // Drawn in front of everything: the arrow's target may be at the bottom of a dent.
     let [tip, tail] = [tip, tail].map(|corner| Corner { nearness: 2.0 / nearest_m, ..corner });
     let along = (tip.at - tail.at).normalize_or_zero();
     let head = 0.022 * (view.size[0] * SAMPLES) as f64;
@@ -202,10 +202,11 @@ fn between(vertices: &[Vertex; 3], shares: [f64; 3]) -> Vertex {
     sum
 }
 
-/// Wet tissue under a lamp to the left of the eye, low enough to show the relief; its light falls off with distance.
+/// Shading of wet tissue under a lamp to the left of the eye, low enough to show relief. The light decreases with
+/// distance.
 struct Skin<'a> {
     image: &'a Image,
-    /// Linear light of each byte.
+    /// Linear light of each byte value.
     linear: Vec<f64>,
     eye_m: DVec3,
     lamp_m: DVec3,
@@ -223,9 +224,9 @@ impl<'a> Skin<'a> {
         Skin { image, linear, eye_m: eye.at_m, lamp_m, usual_m: lamp_m.distance(centre_m) }
     }
 
-    /// The texture's colour. The middles of its corner pixels lie on the sheet's corners, so an image of as many pixels
-    /// as the sheet has vertices puts one on each. Row 0 is at the far side (y largest). Beyond its sides it goes on as in a
-    /// mirror.
+    /// Returns the texture's colour, bilinearly interpolated. The centres of its corner pixels lie on the sheet's
+    /// corners, so an image with as many pixels as the sheet has vertices puts one on each. Row 0 is at the far side
+    /// (largest y). Beyond its sides the texture is mirrored.
     fn albedo(&self, share: DVec2) -> DVec3 {
         let Image { width, height, rgb } = self.image;
         let mirrored = |x: f64| if (0.0..=1.0).contains(&x) { x } else { 1.0 - (1.0 - x.rem_euclid(2.0)).abs() };
@@ -241,8 +242,8 @@ impl<'a> Skin<'a> {
         at(column, row).lerp(at(column + 1, row), s).lerp(at(column, row + 1).lerp(at(column + 1, row + 1), s), t)
     }
 
-    /// The texture's colour at a vertex. One without texture coordinates has that of the texture seen along each axis, as far as
-    /// it faces there.
+    /// Returns the texture's colour at a vertex. Without texture coordinates, it blends the texture projected along
+    /// each axis, weighted by how far the surface faces that axis.
     fn albedo_at(&self, vertex: &Vertex) -> DVec3 {
         let Vertex { rest, facing, .. } = *vertex;
         let weights = facing * facing * facing * facing;
@@ -258,18 +259,18 @@ impl<'a> Skin<'a> {
         let to_eye = (self.eye_m - vertex.at_m).normalize_or_zero();
         let mut normal = vertex.normal.normalize_or_zero();
         if normal.dot(to_eye) < 0.0 {
-            // The underside, seen from below.
+            // The surface is seen from its underside.
             normal = -normal;
         }
         let to_lamp_m = self.lamp_m - vertex.at_m;
         let to_lamp = to_lamp_m.normalize_or_zero();
         let light = (self.usual_m * self.usual_m / to_lamp_m.length_squared()).min(2.0);
-        // Light scatters a little way in tissue and comes out beyond the edge of a shadow.
+        // Light scatters a little way in tissue and emerges beyond the edge of a shadow.
         let diffuse = ((normal.dot(to_lamp) + 0.18) / 1.18).max(0.0);
         let around = DVec3::new(0.15, 0.10, 0.09) * normal.z.max(0.0);
         let albedo = self.albedo_at(vertex);
         let mut colour = albedo * vertex.open * (around + DVec3::splat(2.3 * light * diffuse * diffuse));
-        // The film of liquid: a broad sheen and a sharp glint, stronger at a grazing view (Schlick's approximation).
+        // The film of liquid: a broad sheen and a sharp glint, stronger at grazing angles (Schlick's approximation).
         let half = normal.dot((to_lamp + to_eye).normalize_or_zero()).max(0.0);
         let graze = 1.0 - normal.dot(to_eye).max(0.0);
         let mirrored = 0.25 + 0.75 * graze.powi(5);

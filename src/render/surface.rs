@@ -1,11 +1,11 @@
-//! The tissue as vertices in space, refined as for viewers, with normals and texture coordinates.
+//! The drawn surface of the tissue: vertices in space, refined as for viewers, with normals and texture coordinates.
 
 use glam::{DVec2, DVec3};
 
 use palpate_session::surface::{Encoding, Refinement, Skin, Snapshot, encode};
 use palpate_tissue::shape::RestShape;
 
-/// A triangle that shows so many times as much of the texture along its sides as half of all do is across a seam.
+/// Factor over the median of texture per length above which a triangle is taken to cross a seam of the texture.
 const SEAM: f64 = 6.0;
 
 #[derive(Debug, Clone, Copy, Default)]
@@ -16,26 +16,27 @@ pub(super) struct Vertex {
     pub(super) normal: DVec3,
     /// Texture coordinates, 0 to 1 along x and along y.
     pub(super) share: DVec2,
-    /// Without these, on a mesh: place at rest, 0 to 1 over the longest side, and how far the surface there faces along each axis.
+    /// For a mesh without texture coordinates: position at rest, 0 to 1 over the longest side, and how far the
+    /// surface faces each axis.
     pub(super) rest: DVec3,
     pub(super) facing: DVec3,
-    /// The fraction of ambient light that reaches the vertex: less in a dent.
+    /// Fraction of ambient light that reaches the vertex: less in a dent.
     pub(super) open: f64,
 }
 
-/// What is drawn.
+/// The vertices, triangles and lines that are drawn.
 #[derive(Debug)]
 pub(super) struct DrawnSurface {
     pub(super) vertices: Vec<Vertex>,
     pub(super) triangles: Vec<[usize; 3]>,
-    /// The ends of the lines that show its mesh.
+    /// The ends of the lines that show the mesh.
     pub(super) lines: Vec<[usize; 2]>,
-    /// Vertices along a side, about.
+    /// Approximate number of vertices along a side.
     pub(super) along: usize,
 }
 
 impl DrawnSurface {
-    /// Of what a frame shows.
+    /// Computes the surface from the frame that a viewer would get of `snapshot`.
     pub(super) fn new(shape: &dyn RestShape, skin: Option<&Skin>, snapshot: &Snapshot, refinement: Refinement) -> Self {
         match skin {
             None => Self::of_sheet(snapshot, refinement),
@@ -83,8 +84,9 @@ impl DrawnSurface {
         surface
     }
 
-    /// A vertex at a seam has the texture coordinates of one side, so a triangle across would show much of the texture, squeezed.
-    /// It gets vertices of its own, without texture coordinates, that face as told.
+    /// Separates triangles that cross a seam of the texture. A vertex at a seam has the texture coordinates of one
+    /// side, so such a triangle would show much of the texture, squeezed. It gets vertices of its own, textured by
+    /// the direction `facing`.
     fn part_at_seams(&mut self, facing: impl Fn(usize) -> DVec3) {
         let squeeze = |triangle: &[usize; 3]| {
             let [a, b, c] = triangle.map(|vertex| self.vertices[vertex]);
@@ -109,7 +111,8 @@ impl DrawnSurface {
 
     fn of_sheet(snapshot: &Snapshot, refinement: Refinement) -> Self {
         let points = refinement.coarsest();
-        // Interpolate the points' normals, so that shading is smooth: a bilinear patch has creases of its own.
+        // Normals are interpolated between the points, so that shading is smooth: a bilinear patch has creases of its
+        // own.
         let places_m = places(snapshot, points);
         let grid = points.vertices();
         let (normals, open) = (normals(grid, &places_m), openness(points, &places_m));
@@ -140,13 +143,13 @@ impl DrawnSurface {
     }
 }
 
-/// The positions of the vertices, m, from the data that a viewer gets.
+/// Returns the positions of the vertices, m, from the data that a viewer gets.
 fn places(snapshot: &Snapshot, refinement: Refinement) -> Vec<DVec3> {
     let rest = |(vertex, moved_m)| refinement.rest_m(vertex) + moved_m;
     displacements(snapshot, refinement).into_iter().enumerate().map(rest).collect()
 }
 
-/// The displacements of the vertices, m, from the data that a viewer gets.
+/// Returns the displacements of the vertices, m, from the data that a viewer gets.
 fn displacements(snapshot: &Snapshot, refinement: Refinement) -> Vec<DVec3> {
     let [_, ny] = refinement.vertices();
     let mut displacements = vec![DVec3::ZERO; refinement.vertex_count()];
@@ -175,7 +178,8 @@ fn normals([nx, ny]: [usize; 2], places: &[DVec3]) -> Vec<DVec3> {
         .collect()
 }
 
-/// The ambient openness of each point, from the height of its surroundings at some distances. Stored in x.
+/// Returns in x the fraction of ambient light that reaches each point, from the height of its surroundings at several
+/// distances.
 fn openness(points: Refinement, places_m: &[DVec3]) -> Vec<DVec3> {
     let [nx, ny] = points.vertices();
     let of = |index: usize| {
@@ -199,7 +203,7 @@ fn openness(points: Refinement, places_m: &[DVec3]) -> Vec<DVec3> {
     (0..nx * ny).map(of).collect()
 }
 
-/// Interpolates `values`, one for each point, at vertex `[a, b]`; there are `part` vertices per spacing.
+/// Interpolates `values`, one per point, at vertex `[a, b]`; there are `part` vertices per spacing.
 fn bilinear([nx, ny]: [usize; 2], values: &[DVec3], [a, b]: [usize; 2], part: usize) -> DVec3 {
     let (i, j) = (a / part, b / part);
     let (s, t) = ((a % part) as f64 / part as f64, (b % part) as f64 / part as f64);

@@ -1,4 +1,5 @@
-//! `AdminService`: shows what callers use, and takes it back.
+//! `AdminService`: lists what callers use, and cuts or frees it. In a fleet, lists servers and sessions and moves
+//! sessions.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -16,7 +17,7 @@ use palpate_realtime::clock::now_ns;
 use palpate_refusal::{Reason, Refusal, excerpt};
 use palpate_session::budget::{Account, Purpose, Resource, Work};
 
-/// Sessions of a fleet in one message.
+/// Sessions per message of `ListFleetSessions`.
 const FLEET_SESSIONS_PER_PART: usize = 1000;
 
 pub(super) struct Admin {

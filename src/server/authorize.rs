@@ -1,4 +1,4 @@
-//! The layer that every call goes through: it authenticates the caller and checks the caller's role.
+//! The layer that every call passes through: it authenticates the caller and checks the caller's role.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -35,11 +35,11 @@ pub(super) struct AuthorizeLayer {
     pub(super) message_timeout: Duration,
     pub(super) traffic: Arc<Traffic>,
     pub(super) budget: Arc<Budget>,
-    /// Authentication is disabled because only this machine can reach the server. Then pages of other sites must not call.
+    /// Authentication is disabled because only this machine can reach the server. Pages of other sites are then refused.
     pub(super) local_only: bool,
     /// Origins whose pages may call.
     pub(super) origins: Arc<[HeaderValue]>,
-    /// In a fleet: until when this server may speak for its sessions.
+    /// In a fleet: the time until which this server may act for its sessions.
     pub(super) fence: Option<Arc<Fence>>,
 }
 
@@ -51,36 +51,37 @@ impl<S> Layer<S> for AuthorizeLayer {
     }
 }
 
-/// Lets a call through if its caller has the required role.
+/// A service that passes on a call only if its caller has the required role.
 #[derive(Clone)]
 pub(super) struct CallAuthorizer<S> {
     layer: AuthorizeLayer,
     inner: S,
 }
 
-/// The answer to a call.
+/// The future response to a call.
 type CallResponse<E> = Pin<Box<dyn Future<Output = std::result::Result<Response<Body>, E>> + Send>>;
 
-/// A caller; if it was authenticated, with its credentials and the version of the token file that accepted them.
+/// A caller. If it was authenticated: its credentials and the version of the token file that accepted them.
 type Identified = (Caller, Option<(PresentedCredentials, u64)>);
 
-/// Calls of this server's own protocol.
+/// Path prefix of this server's own protocol.
 const OWN: &str = "/palpate.";
 
-/// Calls of this server's own protocol that do not speak for sessions.
+/// Path prefixes of the server's own protocol that do not act for sessions.
 const OF_THE_FLEET: [&str; 3] = [NODES, "/palpate.v1.AdminService/List", "/palpate.v1.SessionService/LocateSession"];
 
-/// Its messages arrive for as long as the client holds a tool; the call sets the deadline for the first.
+/// Path of `Touch`. Its messages arrive for as long as the client holds a tool; the call sets the deadline for the
+/// first.
 const TOUCH: &str = "/palpate.v1.HapticService/Touch";
 
-/// Streams of other servers of the fleet, for as long as these are there.
+/// Path prefix of the streams of other servers of the fleet. They stay open for as long as those servers run.
 const NODES: &str = "/palpate.v1.NodeService/";
 
-/// Calls without authentication and with many messages.
+/// Path prefix of reflection: calls without authentication and with many messages.
 const REFLECTION: &str = "/grpc.reflection.";
 
 impl AuthorizeLayer {
-    /// The caller, if the call is allowed; otherwise the refusal, and for how long to delay it.
+    /// Returns the caller if the call is allowed; otherwise the refusal and the time by which to delay it.
     fn admit<B>(&self, request: &Request<B>) -> std::result::Result<Identified, (Refusal, Duration)> {
         let peer = request.extensions().get::<Peer>();
         peer.map_or(Ok(()), |peer| peer.calls.pass())?;
@@ -114,13 +115,13 @@ impl AuthorizeLayer {
                 let message = format!("no role allows the call {}", excerpt(path));
                 Err(Refusal::new(Reason::RoleMissing, "", message))
             }
-            // Not one of our calls: a page's file, or nothing.
+            // Not a gRPC call of this server: a file of the page, or an unknown path.
             None => anonymous(),
         }
     }
 
-    /// Refuses pages of other sites (DNS rebinding). A site can give its own name the address of this machine, so that
-    /// its pages seem to come from this server. Such an origin is a name, never an address or `localhost`.
+    /// Refuses pages of other sites (DNS rebinding): a site can point its own name at the address of this machine, so
+    /// that its pages seem to come from this server. Such an origin is a name, never an address or `localhost`.
     fn check_origin<B>(&self, request: &Request<B>) -> Result<()> {
         let Some(origin) = request.headers().get(header::ORIGIN).filter(|_| self.local_only) else { return Ok(()) };
         if is_here(origin.to_str().unwrap_or_default()) || self.origins.contains(origin) {
@@ -131,25 +132,26 @@ impl AuthorizeLayer {
     }
 }
 
-/// The host of an origin.
+/// Returns the host of an origin.
 fn host(origin: &str) -> Option<String> {
     Some(origin.parse::<http::Uri>().ok()?.host()?.to_owned())
 }
 
-/// Whether the host of an origin is an address or `localhost`, which no site can give to its own name.
+/// Returns whether the host of an origin is an address or `localhost`, which no site can give to its own name.
 fn is_here(origin: &str) -> bool {
     host(origin)
         .is_some_and(|host| host == "localhost" || host.trim_matches(['[', ']']).parse::<std::net::IpAddr>().is_ok())
 }
 
-/// Whether a page of that origin may open datagrams at `authority`: it is of the same host, of an address, or of an origin that
-/// may call.
+/// Returns whether a page of `origin` may open datagrams at `authority`: its host is that of `authority`, an address
+/// or `localhost`, or it is one of the allowed `origins`.
 pub(super) fn is_own_or_among(origin: &str, authority: &str, origins: &[HeaderValue]) -> bool {
     let own = format!("https://{authority}");
     is_here(origin) || host(origin).is_some_and(|of| host(&own) == Some(of)) || origins.iter().any(|of| of == origin)
 }
 
-/// The answer to a request for a gRPC call that is not gRPC itself: a status of gRPC would be invisible to such a client.
+/// Returns the response to a request for a gRPC call that is not gRPC itself (405 or 415 as plain text); `None` if it
+/// is gRPC. Such a client would not see a gRPC status.
 fn answer_if_not_grpc<B>(request: &Request<B>) -> Option<Response<Body>> {
     let path = request.uri().path();
     access(path)?;
@@ -190,7 +192,7 @@ where
     fn call(&mut self, mut request: Request<Body>) -> Self::Future {
         match self.layer.admit(&request) {
             Ok((caller, presented)) => {
-                // After the check of the role: an unauthorized caller gets that refusal first.
+                // After the check of the role: an unauthorized caller gets that refusal instead.
                 if let Some(answer) = answer_if_not_grpc(&request) {
                     return Box::pin(async move { Ok(answer) });
                 }
@@ -217,7 +219,8 @@ where
                 let request = request.map(|body| RequestBody::wrap(body, call.clone(), gate, limit));
                 // The span adds path and client to every line that the call logs.
                 let span = info_span!("call", path = request.uri().path(), client = &*caller.name);
-                // Behind the fence no session is spoken for; of the fleet itself may be spoken.
+                // Once the fence has passed, calls that act for sessions get no answer; calls about the fleet itself
+                // still do.
                 let path = request.uri().path();
                 let is_of_sessions = path.starts_with(OWN) && !OF_THE_FLEET.iter().any(|of| path.starts_with(of));
                 let fence = self.layer.fence.clone().filter(|_| is_of_sessions);

@@ -1,4 +1,4 @@
-//! The scenes and scripts that a server knows by name: those of its folders, and the built-in ones.
+//! Scenes and scripts by name: the files of the server's folders, and the built-in ones.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex};
@@ -12,17 +12,17 @@ use palpate_tissue::scene::script::Script;
 use palpate_tissue::scene::script_reader::fits;
 use palpate_tissue::scene::{BUILT_IN, Scene};
 
-/// Scenes and scripts by name.
+/// The scenes and scripts that clients can ask for by name.
 #[derive(Debug, Clone)]
 pub struct Catalog {
     scenes: Collection,
     scripts: Collection,
-    /// The built-in scenes that were asked for so far: to lay out an organ takes a second.
+    /// Built-in scenes that were loaded before, by name: laying out an organ takes about a second.
     built_in: Arc<Mutex<Vec<(String, Scene)>>>,
 }
 
 impl Catalog {
-    /// Returns the scenes and scripts of two folders, either of which may be missing, and the built-in ones.
+    /// Creates the catalog of two folders and the built-in scenes and scripts. Either folder may be missing.
     pub fn new(scenes: &Path, scripts: &Path) -> Self {
         Catalog {
             scenes: Collection::new(TextKind::Scene, scenes),
@@ -36,14 +36,14 @@ impl Catalog {
         self.scenes.names(limits)
     }
 
-    /// Returns the refusals of scripts in the folder of scenes and of scenes in that of scripts, which have no name
-    /// here.
+    /// Returns a refusal for each script in the folder of scenes and each scene in the folder of scripts. The catalog
+    /// does not list such files.
     pub fn misplaced(&self, limits: &Limits) -> Vec<Refusal> {
         [&self.scenes, &self.scripts].into_iter().flat_map(|all| all.all_misplaced(limits)).collect()
     }
 
-    /// Returns the names of the scenes that are not built in word for word: nobody has looked yet whether they are
-    /// valid.
+    /// Returns the names of the scenes whose text differs from the built-in scene of that name. They have not been
+    /// validated.
     pub fn foreign_names(&self, limits: &Limits) -> Vec<String> {
         self.scenes.names_where(&self.scripts, limits, |name, text| !is_built_in(name, text))
     }
@@ -53,12 +53,13 @@ impl Catalog {
         self.scripts.names(limits)
     }
 
-    /// Returns the names of the scripts that are made for the scene of that name, sorted.
+    /// Returns the names of the scripts made for the scene named `scene`, sorted.
     pub fn script_names_for(&self, scene: &str, limits: &Limits) -> Vec<String> {
         self.scripts.names_where(&self.scenes, limits, |_, text| fits(text, scene))
     }
 
-    /// Loads the scene of that name; `--set` assignments override its keys.
+    /// Loads the scene named `name`; `assignments` ("key=value") override its keys. Keeps a built-in scene for later
+    /// calls.
     ///
     /// # Errors
     /// Returns an error if there is no such scene, or if it is invalid.
@@ -77,7 +78,7 @@ impl Catalog {
         Ok(scene)
     }
 
-    /// Loads the script of that name and binds it to a scene.
+    /// Loads the script named `name` and binds it to `scene`.
     ///
     /// # Errors
     /// Returns an error if there is no such script, or if it is invalid for this scene.
@@ -87,7 +88,7 @@ impl Catalog {
     }
 }
 
-/// Whether this is the text of the built-in scene of that name.
+/// Returns whether `text` is exactly that of the built-in scene `name`.
 fn is_built_in(name: &str, text: &str) -> bool {
     BUILT_IN.iter().any(|(other, own)| *other == name && *own == text)
 }

@@ -1,5 +1,5 @@
-//! The caller of a call: the account that it is charged to. Its name is that of the token or certificate, or the address
-//! where authentication is disabled.
+//! The caller of a call as the account that is charged for it. The account is named after the token or certificate,
+//! or after the address if authentication is disabled.
 
 use http::{Request, Version, header};
 use tonic::Extensions;
@@ -8,17 +8,17 @@ use super::address::address_name;
 use super::connections::Peer;
 use palpate_session::budget::Account;
 
-/// The caller. `authorize` puts it into the extensions of every call that it lets through.
+/// The account that a call is charged to. `authorize` adds it to the extensions of every call that it admits.
 #[derive(Debug, Clone)]
 pub(crate) struct ChargedCaller {
     pub(crate) account: Account,
-    /// The client may go away without the server noticing by its connection: HTTP/1.1, and gRPC-web, whose connections a
+    /// The client may disappear without its connection closing: over HTTP/1.1, and over gRPC-web, whose connections a
     /// browser shares among pages.
     pub(crate) may_vanish: bool,
 }
 
 impl ChargedCaller {
-    /// The name of a caller's account; `caller` is the authenticated name, if any.
+    /// Returns the name of a caller's account; `caller` is the authenticated name, if any.
     pub(super) fn account_name(caller: Option<&str>, peer: Option<&Peer>) -> String {
         match (caller, peer) {
             (Some(name), _) => format!("token:{name}"),
@@ -33,7 +33,7 @@ impl ChargedCaller {
         ChargedCaller { account, may_vanish: is_web || request.version() < Version::HTTP_2 }
     }
 
-    /// The caller of the call with these extensions.
+    /// Returns the caller that `authorize` added to these extensions, or an account of its own if there is none.
     pub(super) fn of(extensions: &Extensions) -> Self {
         let known = extensions.get::<ChargedCaller>().cloned();
         known.unwrap_or_else(|| ChargedCaller { account: Account::alone(), may_vanish: true })

@@ -1,4 +1,4 @@
-//! What makes a server one of a fleet: the section `[cluster]` of the configuration.
+//! The section `[cluster]` of the configuration, which makes a server a member of a fleet.
 
 use std::path::PathBuf;
 
@@ -7,47 +7,48 @@ use serde::Deserialize;
 use palpate_cluster::key::{Keys, check_name};
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// The section `[cluster]`.
+/// The section `[cluster]`: the server's fleet and its access to etcd.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ClusterConfig {
     /// URLs of the members of etcd. Empty: the server belongs to no fleet.
     pub etcd: Vec<String>,
-    /// Name of the fleet: servers of one name share their sessions.
+    /// Name of the fleet: servers with the same name share their sessions.
     pub name: String,
-    /// URL under which clients and other servers of the fleet reach this one.
+    /// URL at which clients and other servers of the fleet reach this server.
     pub advertise: Option<String>,
     /// Name of this server in the fleet; empty: host and port of `advertise`.
     pub node: String,
-    /// Time to live of the server's lease, s: so long after its death others may take over.
+    /// Time to live of the server's lease in etcd, 2 to 60 s: after its death other servers wait this long before
+    /// they take over.
     pub ttl_s: u64,
-    /// What `durable_step` means: `one`, on the disk of this server; `two`, also on that of the server that stands by.
+    /// What `durable_step` means: `one`, on the disk of this server; `two`, also on the disk of its standby server.
     pub durable: Durable,
-    /// Tells Agones how the server stands, by the SDK at `localhost:$AGONES_SDK_GRPC_PORT` (9357).
+    /// Reports the server's state to Agones, through its SDK at `localhost:$AGONES_SDK_GRPC_PORT` (9357).
     pub agones: bool,
-    /// Certificate authorities (PEM) of the servers of the fleet, for both ends of a connection between two. Each shows the others
-    /// its own certificate, `tls_cert`. Other clients need none.
+    /// Certificate authorities (PEM) for connections between servers of the fleet; both ends check them. Each server
+    /// presents its certificate `tls_cert`. Other clients need none.
     pub ca: Option<PathBuf>,
     /// Certificate authorities (PEM) of etcd.
     pub etcd_ca: Option<PathBuf>,
     /// This server's certificate for etcd, PEM.
     pub etcd_cert: Option<PathBuf>,
-    /// Its key, PEM.
+    /// Private key of `etcd_cert`, PEM.
     pub etcd_key: Option<PathBuf>,
-    /// User of etcd, if it asks for a password.
+    /// User name for etcd, if it requires a password.
     pub etcd_user: Option<String>,
-    /// File of that user's password.
+    /// File with the password of `etcd_user`.
     pub etcd_password_file: Option<PathBuf>,
 }
 
-/// What the rest of the configuration has.
+/// The keys of the rest of the configuration that a fleet depends on.
 pub(super) struct Beside {
     pub(super) journal: bool,
     pub(super) tls: bool,
     pub(super) insecure: bool,
 }
 
-/// Where what is called durable is.
+/// Where data must be before the server reports it as durable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum Durable {
@@ -79,17 +80,17 @@ impl Default for ClusterConfig {
 }
 
 impl ClusterConfig {
-    /// Returns whether the server is of a fleet.
+    /// Returns whether the server belongs to a fleet.
     pub fn is_on(&self) -> bool {
         !self.etcd.is_empty()
     }
 
-    /// The URL for others; that of a server that is of a fleet.
+    /// Returns `advertise` without a slash at its end; empty if the server belongs to no fleet.
     pub(super) fn endpoint(&self) -> &str {
         self.advertise.as_deref().unwrap_or_default().trim_end_matches('/')
     }
 
-    /// This server's name in its fleet.
+    /// Returns this server's name in its fleet: `node`, or host and port of `advertise`.
     pub(super) fn node(&self) -> String {
         if self.node.is_empty() {
             self.endpoint().split_once("://").map_or("", |(_, rest)| rest).replace(['[', ']'], "")
@@ -101,7 +102,7 @@ impl ClusterConfig {
     /// Checks the section, and that the rest of the configuration fits it.
     ///
     /// # Errors
-    /// Names the first key that is missing or wrong.
+    /// Returns an error that names the first key that is missing or wrong.
     pub(super) fn check(&self, beside: Beside) -> Result<()> {
         if self.agones && !cfg!(feature = "agones") {
             let message = "is set, but this program was built without the feature `agones`";

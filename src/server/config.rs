@@ -1,4 +1,4 @@
-//! The configuration of a server: a TOML file, which the command line overrides.
+//! The configuration of a server: a TOML file whose keys the command line overrides.
 
 use std::path::{Path, PathBuf};
 
@@ -12,66 +12,67 @@ use palpate_tissue::files;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::toml_document::nearest_name;
 
-/// Everything that you can configure. Absent keys keep their defaults.
+/// The configuration of a server. Absent keys keep their defaults.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Where to listen: address:port. An address that other machines can reach requires TLS, and tokens or client
-    /// certificates.
+    /// Address to listen on: address:port. An address that other machines can reach requires TLS, and tokens or
+    /// client certificates.
     pub listen: String,
     /// File of the server's certificate chain, PEM. This file and the next three are reloaded when they change.
     pub tls_cert: Option<PathBuf>,
     /// File of the server's private key, PEM.
     pub tls_key: Option<PathBuf>,
-    /// File of certificate authorities, PEM: a client must present a certificate that one of them has signed.
+    /// File of certificate authorities, PEM: clients must present a certificate that one of them has signed.
     pub tls_client_ca: Option<PathBuf>,
-    /// File of the roles of tokens and client certificates (docs/tokens.md).
+    /// File with the roles of tokens and client certificates (docs/tokens.md).
     pub tokens: Option<PathBuf>,
-    /// Serve without TLS or authentication even where other machines can reach the server.
+    /// Serve without TLS or authentication even if other machines can reach the server.
     pub insecure: bool,
-    /// Origins of other sites whose pages may call, such as `https://example.org`.
+    /// Origins of other sites whose pages may call the server, such as `https://example.org`.
     pub origins: Vec<String>,
-    /// Touch by datagram (WebTransport) beside gRPC, on the UDP port of the same number, where there is TLS or only this machine
-    /// can reach the server.
+    /// Accept touch by datagrams (WebTransport) as well as gRPC, on the UDP port of the same number. Requires TLS, or
+    /// an address that only this machine can reach.
     pub datagrams: bool,
-    /// HOST:PORT that clients are told for datagrams, if they reach it under another than the server's own: behind a proxy, in a
-    /// container.
+    /// HOST:PORT that the server sends to clients for datagrams, if it differs from the server's own address: behind
+    /// a proxy, in a container.
     pub datagrams_advertise: Option<String>,
-    /// Where to serve `/metrics` for Prometheus, without authentication: address:port. `None` disables it.
+    /// Address for `/metrics` (Prometheus), without authentication: address:port. `None` disables it.
     pub metrics: Option<String>,
     /// Folder of the scenes that clients can create sessions from by name.
     pub scenes: PathBuf,
-    /// Folder of the scripts that clients can ask for by name.
+    /// Folder of the scripts that clients can request by name.
     pub scripts: PathBuf,
-    /// Folder of the page that `/` serves, built by `npm run build`.
+    /// Folder of the page served at `/`, built by `npm run build`.
     pub viewer: PathBuf,
-    /// Stepping threads; 0: one less than the machine has cores.
+    /// Number of stepping threads; 0: one fewer than the cores of the machine.
     pub threads: usize,
-    /// Network threads; 0: as many as the stepping threads leave cores, at least 1.
+    /// Number of network threads; 0: the cores that the stepping threads leave, at least 1.
     pub network_threads: usize,
-    /// Fraction of a core for measuring the errors of live sessions; 0 disables the measurement.
+    /// Fraction of a core, 0 to 1, for measuring the errors of live sessions; 0 disables the measurement.
     pub audit_share: f64,
-    /// Time that open streams get to end at shutdown before they are cut, s.
+    /// Time that open streams have to end at shutdown before they are cut, s.
     pub shutdown_deadline_s: f64,
-    /// Duration of a tool's lease if the client gives none, s.
+    /// Duration of a tool's lease if the client requests none, s.
     pub lease_s: f64,
-    /// A session is deleted after this time without a call, a held tool or a stream, s.
+    /// Time without a call, a held tool or a stream after which a session is deleted, s.
     pub idle_session_s: f64,
-    /// Folder of the journals: what happens to sessions is kept there, and a server that is started again continues them. `None`
-    /// keeps nothing.
+    /// Folder of the journals, which record what happens to sessions. A restarted server continues the sessions from
+    /// them. `None` records nothing.
     pub journal: Option<PathBuf>,
-    /// How long the journals of sessions that have ended are kept, and how many bytes all journals may take before the oldest
-    /// of these are removed: `30d`, `10GiB`, `30d,10GiB`, or `0` to keep none.
+    /// How long the journals of ended sessions are kept, and the size of all journals above which the oldest of those
+    /// are removed: `30d`, `10GiB`, `30d,10GiB`, or `0` to keep none.
     pub journal_keep: Keep,
-    /// Sessions whose mesh a client has sent have journals too, which contain it; else they have none, and end with the server.
+    /// Whether sessions whose mesh a client has sent have journals, which then contain the mesh. Without one such a
+    /// session ends with the server.
     pub journal_meshes: bool,
     /// File of the private key that signs the journals, PEM. `None`: they are not signed.
     pub journal_key: Option<PathBuf>,
-    /// The fleet that the server is of.
+    /// The fleet that the server belongs to.
     pub cluster: ClusterConfig,
     /// The log filter: `info`, `debug`, `palpate=debug,tonic=warn`, …
     pub log: String,
-    /// Upper bounds.
+    /// Upper limits on what clients may use.
     pub limits: Limits,
 }
 
@@ -109,7 +110,7 @@ impl Default for Config {
 }
 
 impl Config {
-    /// Reads a configuration file.
+    /// Reads and checks a configuration file.
     ///
     /// # Errors
     /// Returns an error if the file can't be read, or if the configuration is invalid.
@@ -117,7 +118,7 @@ impl Config {
         Config::parse(&path.display().to_string(), &files::read_text(path, Limits::default().file_bytes)?)
     }
 
-    /// Parses a configuration; refusals call it `name`.
+    /// Parses and checks a configuration; refusals refer to it as `name`.
     ///
     /// # Errors
     /// Returns an error with the line if the text is not TOML or has an unknown key, and the errors of [`Config::check`].
@@ -132,7 +133,7 @@ impl Config {
         Ok(config)
     }
 
-    /// Checks ranges, and that keys that need each other are given together.
+    /// Checks that all values are within their ranges and that keys that require each other are given together.
     ///
     /// # Errors
     /// Returns an error that names the first key that is out of range or missing.
@@ -149,7 +150,7 @@ impl Config {
         ] {
             positive(field, value)?;
         }
-        // A 0 in any of these would refuse everything.
+        // A limit of 0 would refuse everything.
         macro_rules! whole {
             ($($limit:ident)*) => { [$((concat!("limits.", stringify!($limit)), self.limits.$limit == 0),)*] };
         }
@@ -239,7 +240,7 @@ mod tests {
         let mut named = 0;
         for line in limits.lines() {
             let Some((key, _)) = line.trim_start_matches(['#', ' ']).split_once(" = ") else { continue };
-            // 0 is allowed here: half of the machine's memory, and no reserved stream.
+            // 0 is valid for these keys: half of the machine's memory, and no reserved stream.
             if ["memory_bytes", "streams_for_holders"].contains(&key) {
                 continue;
             }

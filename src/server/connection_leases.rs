@@ -1,5 +1,5 @@
 //! Leases that outlast the call that acquired them (`AcquireTool`). They end with the connection over which they were
-//! acquired, or when their holder may not hold a tool any more.
+//! acquired, or when their holder loses the right to hold a tool.
 
 use std::sync::{Arc, Mutex, Weak};
 
@@ -11,7 +11,7 @@ use palpate_tissue::lock::lock;
 struct LastingLease {
     handle: Weak<SessionHandle>,
     id: LeaseId,
-    /// The credentials of its holder, if they decide when it ends.
+    /// The credentials of its holder, if the lease ends when they are revoked.
     presented: Option<PresentedCredentials>,
 }
 
@@ -22,13 +22,13 @@ impl LastingLease {
             .is_some_and(|handle| handle.at_intake(|intake, _| intake.tools_of(self.id).next().is_some()))
     }
 
-    /// False if it had ended already.
+    /// Ends the lease. Returns false if it had ended already.
     fn end(&self) -> bool {
         self.handle.upgrade().is_some_and(|handle| handle.at_intake(|intake, _| intake.release(self.id)).is_ok())
     }
 }
 
-/// Those of one connection, or of all authenticated callers.
+/// The lasting leases of one connection, or of all authenticated callers.
 #[derive(Default)]
 pub(super) struct LastingLeases(Mutex<Vec<LastingLease>>);
 
@@ -39,7 +39,7 @@ impl std::fmt::Debug for LastingLeases {
 }
 
 impl LastingLeases {
-    /// One more. Those that have ended otherwise are forgotten, now and then.
+    /// Adds a lease. From time to time, also removes those that have ended otherwise.
     pub(super) fn add(&self, handle: &Arc<SessionHandle>, id: LeaseId, presented: Option<PresentedCredentials>) {
         let mut leases = lock(&self.0);
         if leases.len().is_power_of_two() && leases.len() >= 64 {
@@ -48,7 +48,7 @@ impl LastingLeases {
         leases.push(LastingLease { handle: Arc::downgrade(handle), id, presented });
     }
 
-    /// Ends those for which `chosen` holds, by their holder's credentials; tells how many were still held.
+    /// Ends and removes the leases whose holder's credentials `chosen` accepts. Returns how many were still held.
     pub(super) fn end(&self, chosen: impl Fn(Option<&PresentedCredentials>) -> bool) -> usize {
         let ended: Vec<LastingLease> = lock(&self.0).extract_if(.., |lease| chosen(lease.presented.as_ref())).collect();
         ended.iter().filter(|lease| lease.end()).count()

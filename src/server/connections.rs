@@ -1,5 +1,5 @@
-//! Accepts connections, plain or TLS. Bounds their number, the time until a client's first bytes, and the rate of calls;
-//! counts the bytes they carry. No connection waits for another's handshake.
+//! Accepts connections, plain or TLS. Limits their number, the time until a client's first bytes, and the rate of
+//! calls; counts the bytes that they carry. No connection waits for the handshake of another.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::io;
@@ -32,25 +32,27 @@ use palpate_session::budget::{Budget, Purpose, Resource, Taken};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 
-/// Time before accepting again after an error: file descriptors that have run out become free again.
+/// Pause before accepting again after an error, so that file descriptors can become free again.
 const ACCEPT_RETRY: Duration = Duration::from_millis(100);
 
-/// Bytes that a client must send in time: the length of HTTP/2's connection preface. An HTTP/1.1 request is longer.
+/// Bytes that a client must send before its deadline: the length of HTTP/2's connection preface. An HTTP/1.1 request
+/// is longer.
 const PREFACE_BYTES: usize = 24;
 
-/// Time between two accepted connections: a thousand that arrive at once would otherwise occupy a core for tens of
-/// milliseconds. Meanwhile the others wait in the system's queue.
+/// Interval between two accepted connections: a thousand that arrive at once would otherwise occupy a core for tens
+/// of milliseconds. The others wait in the system's queue.
 const ACCEPT_INTERVAL: Duration = Duration::from_millis(1);
 
-/// Connections that may exceed the limits for a moment, while connections that we told to close are still open.
+/// Connections that may exceed the limits for a moment, while connections that the server is closing are still open.
 const CLOSING: usize = 16;
-/// After this many bytes a connection yields to the others: small frames cost some hundred nanoseconds each.
+/// Bytes that a connection may read before it yields to the others: small frames cost some hundred nanoseconds each.
 const BYTES_PER_TURN: usize = 8 << 10;
 
-/// Accepted connections that may wait to be served.
+/// Accepted connections that may wait until they are served.
 const QUEUE: usize = 64;
 
-/// The connections to `listener`, through TLS if it is configured. The stream never ends and yields no errors.
+/// Returns the stream of connections to `listener`, through TLS if it is configured. It never ends and yields no
+/// errors.
 pub(super) fn incoming(
     listener: TcpListener,
     tls: Option<Arc<Reloaded<Tls>>>,
@@ -97,7 +99,7 @@ pub(super) fn incoming(
                 }
             };
             // Nagle's algorithm would delay a sample by milliseconds. An error means that the client has closed the
-            // connection; reading will notice that.
+            // connection; the next read reports that.
             let _ = socket.set_nodelay(true);
             let entry = AcceptedConnection::new(address, Arc::new(slot), gate, window, &limits, &traffic, &register);
             let Some(tls) = &tls else {
@@ -124,21 +126,21 @@ pub(super) fn incoming(
     ReceiverStream::new(connections)
 }
 
-/// Limits the number of connections: in all, and from one address.
+/// Limits the number of connections: in total, and per address.
 #[derive(Debug)]
 pub(super) struct ConnectionSlots {
     most: usize,
     most_each: usize,
-    /// The largest number of unauthenticated ones; `None` if the server authenticates nobody.
+    /// Limit on unauthenticated connections; `None` if the server does not authenticate callers.
     most_unauthenticated: Option<usize>,
     open: Mutex<OpenConnections>,
 }
 
 #[derive(Debug, Default)]
 struct OpenConnections {
-    /// The number of connections of each address that has any.
+    /// Number of connections of each address that has any.
     by_address: HashMap<IpAddr, usize>,
-    /// Those that have not authenticated, the oldest first.
+    /// Connections that have not authenticated, the oldest first.
     unauthenticated: VecDeque<Unauthenticated>,
     last_number: u64,
 }
@@ -151,7 +153,7 @@ struct Unauthenticated {
 }
 
 impl OpenConnections {
-    /// Closes the oldest unauthenticated connection, of `address` if one is given; returns whether there was one.
+    /// Closes the oldest unauthenticated connection, of `address` if one is given. Returns whether there was one.
     fn close_oldest_unauthenticated(&mut self, address: Option<IpAddr>) -> bool {
         let is_meant = |other: &Unauthenticated| address.is_none_or(|address| address == other.address);
         let oldest = self.unauthenticated.iter().position(is_meant);
@@ -163,7 +165,7 @@ impl OpenConnections {
     }
 }
 
-/// A connection's slot within the limits, until it is dropped.
+/// One connection's place within the limits, which dropping it frees.
 #[derive(Debug)]
 pub(super) struct ConnectionSlot {
     slots: Arc<ConnectionSlots>,
@@ -173,20 +175,23 @@ pub(super) struct ConnectionSlot {
 }
 
 impl ConnectionSlots {
-    /// For as many connections as `limits` allow, of which at most `most_unauthenticated` may be unauthenticated. When a
-    /// limit is reached, the oldest of those is closed in favour of a new connection.
+    /// Creates the limits for as many connections as `limits` allow, of which at most `most_unauthenticated` may be
+    /// unauthenticated. When a limit is reached, a new connection replaces the oldest unauthenticated one.
     pub(super) fn new(limits: &Limits, most_unauthenticated: Option<usize>) -> Self {
         let (most, most_each) = (limits.connections, limits.connections_per_address);
         ConnectionSlots { most, most_each, most_unauthenticated, open: Mutex::default() }
     }
 
-    /// Takes a slot for a connection, or says why there is none.
+    /// Takes a slot for a connection.
+    ///
+    /// # Errors
+    /// Returns the reason if a limit is reached and no unauthenticated connection can be closed.
     fn take(self: &Arc<Self>, address: IpAddr, gate: &Arc<Gate>) -> Result<ConnectionSlot, String> {
         let address = network(address);
         let mut open = lock(&self.open);
         let all: usize = open.by_address.values().sum();
         let each = open.by_address.get(&address).copied().unwrap_or_default();
-        // A connection that was told to close needs a moment, and counts until then.
+        // A connection that is being closed needs a moment, and counts until it has closed.
         let closing = if self.most_unauthenticated.is_some() { CLOSING } else { 0 };
         let is_full =
             all >= self.most || self.most_unauthenticated.is_some_and(|most| open.unauthenticated.len() >= most);
@@ -210,7 +215,7 @@ impl ConnectionSlots {
 }
 
 impl ConnectionSlot {
-    /// Marks the connection as authenticated: it is not closed in favour of others any more.
+    /// Marks the connection as authenticated, so that new connections no longer replace it.
     pub(super) fn mark_authenticated(&self) {
         if !self.is_authenticated.swap(true, Ordering::Relaxed) {
             lock(&self.slots.open).unauthenticated.retain(|other| other.number != self.number);
@@ -231,37 +236,37 @@ impl Drop for ConnectionSlot {
     }
 }
 
-/// The client's side of a connection, as every request on it knows it.
+/// The client's side of a connection, shared by all requests on it.
 #[derive(Debug, Clone)]
 pub(crate) struct Peer {
     /// The client's address.
     pub(crate) address: SocketAddr,
-    /// The names in its certificate, if it had to present one.
+    /// The names in the client's certificate, if it had to present one.
     pub(crate) certificate: Option<Arc<[String]>>,
-    /// Limits the rate of all calls.
+    /// Rate limit for all calls.
     pub(super) calls: Arc<RateLimiter>,
-    /// Limits the rate of calls that create a session.
+    /// Rate limit for calls that create a session.
     pub(super) creations: Arc<RateLimiter>,
     /// Flow control between the connection and its transport.
     pub(super) gate: Arc<Gate>,
-    /// The connection's slot within the limits.
+    /// The connection's place within the limits.
     pub(super) slot: Arc<ConnectionSlot>,
-    /// Leases that end with the connection.
+    /// Leases of tools that end with the connection.
     pub(super) leases: Arc<LastingLeases>,
-    /// Numbers of the accounts that have called over it.
+    /// Numbers of the accounts that have called over this connection.
     callers: Arc<Mutex<BTreeSet<u64>>>,
-    /// A service of ours was called over it.
+    /// Whether one of the server's own services was called over it.
     pub(super) is_served: Arc<AtomicBool>,
 }
 
 impl Peer {
-    /// Remembers that the caller with this account has called.
+    /// Records that the caller with this account has called over the connection.
     pub(super) fn used_by(&self, account: u64) {
         lock(&self.callers).insert(account);
     }
 }
 
-/// The open connections, by number, after the last number given.
+/// The open connections by number, and the last number assigned.
 #[derive(Debug, Default)]
 pub(crate) struct Register(Mutex<(u64, BTreeMap<u64, Peer>)>);
 
@@ -274,15 +279,15 @@ impl Register {
         number
     }
 
-    /// Closes the connections over which nobody has called a service of ours: they ask for the health, for reflection or for
-    /// pages.
+    /// Closes the connections over which none of the server's own services was called: they only request health,
+    /// reflection or pages.
     pub(super) fn close_strangers(&self) {
         let open = lock(&self.0);
         let strangers = open.1.values().filter(|peer| !peer.is_served.load(Ordering::Relaxed));
         strangers.for_each(|peer| peer.gate.close());
     }
 
-    /// Closes the connections over which this account has called; returns their number.
+    /// Closes the connections over which this account has called. Returns their number.
     pub(super) fn cut(&self, account: u64) -> usize {
         let open = lock(&self.0);
         let theirs = open.1.values().filter(|peer| lock(&peer.callers).contains(&account));
@@ -293,11 +298,11 @@ impl Register {
 /// An accepted connection before its TLS handshake.
 struct AcceptedConnection {
     address: SocketAddr,
-    /// The memory that unread data may take.
+    /// The memory reserved for unread data.
     window: Taken,
     calls: RateLimiter,
     creations: RateLimiter,
-    /// For the handshake and the first bytes together.
+    /// Deadline for the handshake and the first bytes together.
     deadline: Pin<Box<Sleep>>,
     traffic: Arc<Traffic>,
     register: Arc<Register>,
@@ -365,20 +370,20 @@ enum Transport {
     Tls(Box<TlsStream<TcpStream>>),
 }
 
-/// A connection that counts the bytes it carries, before encryption.
+/// An accepted connection that counts the bytes it carries, before encryption.
 pub(super) struct Connection {
     transport: Transport,
     peer: Peer,
-    /// The frames that it receives and sends.
+    /// Parsers of the frames received and sent.
     inward: FrameParser,
     outward: FrameParser,
     read_pause: ReadPause,
-    /// While the client has not sent this many bytes: how many are left, and the deadline.
+    /// Until the client has sent enough bytes: the number still missing, and the deadline.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
     traffic: Arc<Traffic>,
     register: Arc<Register>,
     number: u64,
-    /// Bytes read since the connection last yielded to the others.
+    /// Bytes read since the connection last yielded to others.
     bytes_this_turn: usize,
     _open: Open,
     _window: Taken,
@@ -392,12 +397,13 @@ impl Drop for Connection {
 }
 
 impl Connection {
-    /// Returns an error if the connection is to be closed; otherwise registers the task to be woken when it is.
+    /// Returns an error if the connection is to be closed; otherwise registers the current task to be woken when it
+    /// is.
     fn check_open(&self, context: &Context<'_>) -> io::Result<()> {
         if self.peer.gate.is_closed(context) { Err(io::ErrorKind::ConnectionAborted.into()) } else { Ok(()) }
     }
 
-    /// Counts the first `bytes` bytes of `slices`, which were sent, and reads their frames.
+    /// Counts the first `bytes` bytes of `slices` as sent, and parses their frames.
     fn count_sent(&mut self, slices: &[io::IoSlice<'_>], bytes: usize) {
         self.traffic.bytes_out.inc_by(bytes as u64);
         // An HTTP/1.1 answer has no frames.
@@ -443,7 +449,7 @@ impl AsyncRead for Connection {
         if let Some(cut) = this.inward.pass(received, Some(&this.peer.gate)) {
             this.traffic.cut(this.peer.address, "client", &cut);
         }
-        // Pending: the socket is empty, so the other connections get their turn anyway.
+        // Pending: the socket is empty, so other connections run anyway.
         this.bytes_this_turn = if polled.is_pending() { 0 } else { this.bytes_this_turn + received.len() };
         let Some((left, deadline)) = &mut this.preface else { return polled };
         if polled.is_pending() {
@@ -542,7 +548,7 @@ mod tests {
         assert!(is_closed(&known[0].1).await && !is_closed(&known[1].1).await);
         known.iter().for_each(|(slot, _)| slot.mark_authenticated());
         let unknown: Vec<_> = (4..=30).map_while(|host| take(&slots, &format!("192.0.2.{host}")).ok()).collect();
-        // Connections that were told to close, and do not, take only a few slots.
+        // Connections that do not close when asked to take only a few slots.
         assert_eq!(known.len() + unknown.len(), 5 + CLOSING);
         for (_, gate) in &known[1..] {
             assert!(!is_closed(gate).await);

@@ -1,7 +1,7 @@
-//! The price of a call: the processor time that it takes on the network threads, charged to its caller. The calls of a
-//! caller that has used up its share wait, and are refused if they wait too long. Haptic streams, `ReleaseTool`,
-//! `AdminService` and health are not charged and never wait. (Haptic streams have limits of their own, and are the server's
-//! main task.)
+//! Charges callers for calls: each call pays for the processor time that it takes on the network threads. The calls
+//! of a caller that has used up its share wait, and are refused if they wait too long. Haptic streams, `ReleaseTool`,
+//! `AdminService` and health are not charged and never wait. (Haptic streams have limits of their own, and are the
+//! server's main task.)
 
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
@@ -25,7 +25,7 @@ const NEVER_WAIT: [&str; 4] = [
     "/grpc.health.",
 ];
 
-/// Longest time that a call waits for its caller's share.
+/// Longest time that a call waits for its caller's share before it is refused.
 const SHARE_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// The account that the processor time of a call is charged to.
@@ -33,7 +33,7 @@ const SHARE_TIMEOUT: Duration = Duration::from_secs(1);
 pub(super) struct CpuAccount(Account);
 
 impl CpuAccount {
-    /// For a call of `account`; `None` if the call is not charged.
+    /// Returns the account for a call to `path` by `account`; `None` if such calls are not charged.
     pub(super) fn of(path: &str, account: &Account) -> Option<Self> {
         let never_waits = NEVER_WAIT.iter().any(|beginning| path.starts_with(beginning));
         (!never_waits).then(|| CpuAccount(account.clone()))
@@ -44,7 +44,7 @@ impl CpuAccount {
         (ns > 0).then(|| Duration::from_nanos(ns))
     }
 
-    /// A wait until the caller's share may allow more; `None` if it does.
+    /// Returns a timer until the caller's share may allow more; `None` if it allows more now.
     fn sleep(&self) -> Option<Pin<Box<Sleep>>> {
         self.must_wait().map(|wait| Box::pin(tokio::time::sleep(wait)))
     }
@@ -64,7 +64,11 @@ impl CpuAccount {
         done
     }
 
-    /// Runs a call and charges it. The call begins when its caller's share allows; a caller's calls begin one after another.
+    /// Runs a call and charges it. The call starts when its caller's share allows; a caller's calls start one after
+    /// another.
+    ///
+    /// # Errors
+    /// Returns an error if the call would wait longer than [`SHARE_TIMEOUT`].
     pub(super) async fn answer<F: Future>(&self, call: F) -> Result<F::Output> {
         let mut call = std::pin::pin!(call);
         let begun = {
@@ -77,7 +81,7 @@ impl CpuAccount {
                 let message = "the calls of this caller take more than its share of the server's time";
                 return Err(Refusal::new(Reason::Overloaded, "", message));
             };
-            // Polls once only: while the call waits for something, the caller's next call may begin.
+            // Polls only once: while the call waits for something, the caller's next call may start.
             std::future::poll_fn(|context| Poll::Ready(self.measure(|| call.as_mut().poll(context)))).await
         };
         match begun {
@@ -86,7 +90,7 @@ impl CpuAccount {
         }
     }
 
-    /// The body of the answer, charged: it is sent as fast as its caller's share allows.
+    /// Wraps the body of the response so that it is charged and sent as fast as its caller's share allows.
     pub(super) fn body(self, answer: Body) -> Body {
         Body::new(Charged { answer, price: self, wait: None })
     }
@@ -107,14 +111,14 @@ impl http_body::Body for Charged {
         context: &mut Context<'_>,
     ) -> Poll<Option<std::result::Result<Frame<Bytes>, Status>>> {
         let this = self.get_mut();
-        // Other calls of the caller may have used its share meanwhile.
+        // Other calls of the caller may have used up its share in the meantime.
         while let Some(wait) = &mut this.wait {
             ready!(wait.as_mut().poll(context));
             this.wait = this.price.sleep();
         }
         let answer = &mut this.answer;
         let frame = ready!(this.price.measure(|| Pin::new(answer).poll_frame(context)));
-        // Trailers are sent at once.
+        // Trailers are sent immediately.
         if frame.as_ref().is_some_and(|frame| frame.as_ref().is_ok_and(Frame::is_data)) {
             this.wait = this.price.sleep();
         }

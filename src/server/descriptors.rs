@@ -1,4 +1,4 @@
-//! File descriptors: raises the process's limit, and bounds the number of connections by it.
+//! File descriptors: raises the process's limit, and limits the number of connections accordingly.
 
 use tracing::warn;
 
@@ -6,7 +6,7 @@ use tracing::warn;
 #[cfg(unix)]
 const RESERVE: usize = 64;
 
-/// Raises the soft limit of open files to the hard limit.
+/// Raises the soft limit of open files to the hard limit. Logs a warning if that fails.
 pub(super) fn raise() {
     #[cfg(unix)]
     {
@@ -19,14 +19,14 @@ pub(super) fn raise() {
     }
 }
 
-/// The number of connections that the limit of open files allows, at most `wanted`. `others` is the number of
-/// connections with descriptors of their own, such as those to the metrics.
+/// Returns the number of connections that the limit of open files allows, at most `wanted`, and logs a warning if it
+/// is lower. `others` is the number of other connections with descriptors, such as those to the metrics.
 pub(super) fn connections(wanted: usize, others: usize) -> usize {
     #[cfg(unix)]
     {
         let limit = rustix::process::getrlimit(rustix::process::Resource::Nofile).current;
         let Some(limit) = limit.and_then(|limit| usize::try_from(limit).ok()) else { return wanted };
-        // Without a /proc, assume as many open files as are reserved.
+        // Without /proc, assume that as many files are open as are reserved.
         let open = std::fs::read_dir("/proc/self/fd").map_or(RESERVE, Iterator::count);
         let most = room(limit, open + others);
         if most < wanted {
@@ -44,7 +44,7 @@ pub(super) fn connections(wanted: usize, others: usize) -> usize {
     }
 }
 
-/// The number of connections that fit, at least 1. Of a small limit, a quarter is reserved.
+/// Returns the number of connections that fit, at least 1. A quarter of a small limit is reserved.
 #[cfg(unix)]
 fn room(limit: usize, taken: usize) -> usize {
     limit.saturating_sub(taken + RESERVE.min(limit / 4)).max(1)

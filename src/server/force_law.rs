@@ -1,6 +1,7 @@
-//! The force laws of a haptic stream: first one that is there at once, then the exact one, when it is computed.
-//!
-//! The same again when another tissue acts, and when the tool has come to a place whose law is another ([`Disc::follow`]).
+//! The force laws of a haptic stream: the force on a tool's tip as a function of its depth, which the client
+//! evaluates locally. A stream starts with a coarse law that is available immediately, and gets the exact one when it
+//! is computed. Both are computed anew when the tissue changes, and when the tool has moved to a place with another
+//! law ([`Disc::follow`]).
 
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
@@ -25,35 +26,36 @@ use palpate_session::current_laws::{FIRST, Laws};
 use palpate_tissue::Model;
 use palpate_tissue::response::force_law::Disc;
 
-/// After the laws of a place so many times as long passes until those of another are begun, but not longer than this.
+/// After computing the laws of a place, the pause before those of the next place is this multiple of the time they
+/// took, but at most `LONGEST_PAUSE`.
 const PAUSES: u32 = 3;
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 
-/// Places nearer than this to the one told last are no news: their law is the same, or nearly so.
+/// Distance, in tip radii, below which a new place of the tool is ignored: its law is nearly equal.
 const NEWS_IN_RADII: f64 = 0.25;
 
-/// A law for a stream, or why there is none.
+/// A new law for a stream, or the reason why there is none.
 struct LawUpdate {
-    /// The number of the law that it replaces, or that stays.
+    /// The number of the law that is replaced, or that stays in use.
     before: u32,
-    /// The step from whose beginning on another tissue acts, if that is the cause.
+    /// The step from whose beginning a changed tissue acts, if that is the cause.
     tissue_step: Option<u64>,
     law: Result<(u32, Arc<Law>), Status>,
 }
 
-/// What a stream is told of its law after its opening.
+/// The updates of a stream's force law after its opening, and the place of its tool.
 pub(super) struct Updates {
     told: mpsc::Receiver<LawUpdate>,
     laws: Arc<Laws>,
-    /// The tool that the laws are for, of several the first.
+    /// The tool that the laws are computed for: the first of the stream's tools.
     tool: Option<u32>,
     tip: Disc,
-    /// What it presses, where that rests, m.
+    /// The point of the surface at rest that the tool presses, m.
     place_m: watch::Sender<Option<DVec3>>,
 }
 
 impl Updates {
-    /// Further laws are of where the tool is in this sample.
+    /// Sets the place of the next laws to where the tool presses in `sample`.
     pub(super) fn follow(&self, sample: &Sample) {
         let of_tool = sample.tools.iter().find(|tool| Some(tool.tool) == self.tool);
         let feel = of_tool.and_then(|tool| tool.feel.as_ref());
@@ -67,8 +69,8 @@ impl Updates {
         });
     }
 
-    /// The next message. Samples use its law from then on: so none that names it can come before the message. `None`: no
-    /// message will follow.
+    /// Polls for the next message, whose law later samples use: no sample can refer to a law before its message.
+    /// `None`: no message will follow.
     pub(super) fn poll(&mut self, context: &mut Context<'_>) -> Poll<Option<pb::ForceLawUpdate>> {
         let Some(LawUpdate { before, tissue_step, law }) = ready!(self.told.poll_recv(context)) else {
             return Poll::Ready(None);
@@ -87,20 +89,21 @@ impl Updates {
     }
 }
 
-/// The law that a stream was told last.
+/// The law that was last sent to the stream.
 struct Known {
     number: u32,
-    /// The tissue that it is of, or for which there is none.
+    /// The tissue that the law describes, or that has no law.
     model: Arc<Model>,
-    /// Where it is of.
+    /// The place that the law describes.
     disc: Disc,
-    /// Whether the exact law may follow.
+    /// Whether the exact law is still to come.
     is_coarse: bool,
-    /// Whether the tissue has laws of other places: of a sheet only exact ones, so none if one of them can't be had.
+    /// Whether laws of other places can be computed. A sheet has only exact ones, so none if one of them can't be
+    /// computed.
     has_places: bool,
 }
 
-/// Who computes the laws of a stream.
+/// Computes the laws of a stream in the job pool.
 struct Maker {
     job_pool: JobPool,
     account: Account,
@@ -108,14 +111,13 @@ struct Maker {
 }
 
 impl Maker {
-    /// The law to begin with: at most 50 ms of work.
+    /// Computes the first law of `disc`: at most 50 ms of work.
     async fn first(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
         let sought = self.handle.law(model, disc)?;
         Ok(self.job_pool.work_as(Urgency::Law, &self.account, move |stop| sought.first(stop.flag())).await??)
     }
 
-    /// The exact law. It is computed depth by depth: between two of them it is the turn of other work, also of the same
-    /// caller.
+    /// Computes the exact law of `disc`, depth by depth. Between two depths other work can run, also of this caller.
     async fn exact(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<Law>, Status> {
         let sought = self.handle.law(model, disc)?;
         let _turn = sought.turn().await;
@@ -130,7 +132,8 @@ impl Maker {
         }
     }
 
-    /// Tells the stream what it does not know of the laws of `model`, the tissue since `step`, where its tool is.
+    /// Sends the laws of `model`, the tissue since `step`, that the stream does not have yet, at the place of its
+    /// tool.
     async fn tell(
         &self,
         known: &mut Known,
@@ -143,7 +146,7 @@ impl Maker {
         let place_m = place_m.filter(|_| known.has_places || is_other);
         let disc = place_m.map_or(known.disc, |place_m| known.disc.follow(model, place_m));
         if is_other || disc != known.disc {
-            // A coarse law of a sheet is that of the middle.
+            // The coarse law of a sheet is computed in its middle.
             let is_exact = !is_other && model.shape().dimensions() == 2;
             let law = if is_exact { self.exact(model, disc).await } else { self.first(model, disc).await };
             let (is_coarse, has_places) = (law.as_ref().is_ok_and(|law| law.is_coarse), !is_exact || law.is_ok());
@@ -169,13 +172,13 @@ impl Maker {
             debug!(session = %self.handle.id, message = status.message(), "a force law can't be had");
         }
         let number = known.number.wrapping_add(u32::from(law.is_ok()));
-        // A stream that has ended is told nothing.
+        // The stream may have ended; then the update is dropped.
         let _ = tell.send(LawUpdate { before: known.number, tissue_step, law: law.map(|law| (number, law)) }).await;
         known.number = number;
     }
 }
 
-/// The laws of a stream, as they are computed.
+/// The running computation of a stream's laws.
 pub(super) struct Computing {
     maker: Maker,
     tissue: watch::Receiver<(u64, Arc<Model>)>,
@@ -183,10 +186,11 @@ pub(super) struct Computing {
 }
 
 impl Computing {
-    /// The law that a stream of `handle` with a tip of `radius_m` begins with, and what comes after it.
+    /// Computes the first law for a stream of `handle` with a tip of `radius_m`. Returns it with the computation of
+    /// the later laws.
     ///
     /// # Errors
-    /// Returns an error if no law can be had now: for want of memory, work or time.
+    /// Returns an error if no law can be computed now: for lack of memory, work or time.
     pub(super) async fn begin(
         job_pool: &JobPool,
         account: &Account,
@@ -202,8 +206,8 @@ impl Computing {
         Ok((law, Computing { maker, tissue, known }))
     }
 
-    /// Goes on until the handle is dropped: tells the exact law, and those of other tissues and of the places of `tool`. A
-    /// computation ends when a newer tissue acts.
+    /// Starts a task that sends the exact law, and the laws of changed tissues and of the places of `tool`, until the
+    /// returned handle is dropped. A newer tissue stops the computation for an older one.
     pub(super) fn go_on(self, laws: Arc<Laws>, tool: Option<u32>) -> (Updates, AbortOnDropHandle<()>) {
         let Computing { maker, mut tissue, mut known } = self;
         let (tip, (place_m, mut places)) = (known.disc, watch::channel(None));
@@ -216,11 +220,11 @@ impl Computing {
                 let changed = tokio::select! {
                     changed = tissue.changed() => changed,
                     () = maker.tell(&mut known, step, &model, place_m, &tell) => {
-                        // A tool that moves on and on takes a part of a core for its laws, not all of it.
+                        // A tool that moves all the time takes a part of a core for its laws, not all of it.
                         let pause = (PAUSES * begun.elapsed()).min(LONGEST_PAUSE);
                         let moved = async {
                             tokio::time::sleep(pause).await;
-                            // Who tells no further place still has tissues that change.
+                            // A stream that reports no further place still has tissues that change.
                             if places.changed().await.is_err() {
                                 std::future::pending::<()>().await;
                             }
@@ -290,7 +294,7 @@ mod tests {
             self.handle.law(&self.handle.model, Disc::in_middle(&self.handle.model, self.radius_m())).unwrap()
         }
 
-        /// Changes the tissue; tells the step from which on the other acts.
+        /// Changes the tissue, and returns the step from which the change takes effect.
         fn change(&self, anchor_stiffness_n_per_m: f64, at_step: Option<u64>) -> (u64, Arc<Model>) {
             let change = Change { anchor_stiffness_n_per_m: Some(anchor_stiffness_n_per_m), ..Change::default() };
             self.handle.change(&change, at_step, |_| Ok(()), &NEVER).unwrap()
@@ -308,7 +312,7 @@ mod tests {
         let sought = course.sought();
         assert!(first.is_coarse && sought.exact().is_none());
         let (mut updates, _computing) = computing.go_on(laws.clone(), None);
-        // Local models refer to it when it was told, not before.
+        // Local models refer to it once it was sent, not before.
         while sought.exact().is_none() {
             tokio::task::yield_now().await;
         }
@@ -320,7 +324,7 @@ mod tests {
         let exact = sought.exact().unwrap().unwrap();
         assert_eq!(touch::from_law(&law).unwrap(), *exact);
         assert_eq!(laws.newest(), (1, exact.clone()));
-        // Whoever comes later begins with it.
+        // A stream that opens later starts with it.
         assert_eq!(course.begin().await.0, exact);
     }
 
@@ -343,7 +347,7 @@ mod tests {
         let (_, laws, computing) = course.begin().await;
         let sought = course.sought();
         let (mut updates, handle) = computing.go_on(laws.clone(), None);
-        // It is under way when its turn is taken.
+        // The job is running when its turn is taken.
         while sought.is_free() {
             tokio::task::yield_now().await;
         }
@@ -376,7 +380,7 @@ mod tests {
             palpate_tissue::response::force_law::exact(&model, course.radius_m())
         );
         assert_eq!(laws.newest().0, 3);
-        // A stream that opens now begins with it.
+        // A stream that opens now starts with it.
         let law = course.begin().await.0;
         assert_eq!(law, laws.newest().1);
     }

@@ -1,4 +1,4 @@
-//! A frame as the messages of one viewer.
+//! Splits a frame of the displaced surface into messages for one viewer.
 
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
@@ -10,7 +10,8 @@ use palpate_realtime::frames::Delivery;
 /// Bytes of displacements per message: messages of other streams wait for at most one of these.
 const FRAME_BYTES_PER_MESSAGE: usize = 64 << 10;
 
-/// Returns the messages of a frame for one viewer.
+/// Returns the messages of a frame for one viewer; the last one has `last` set. `skipped` is the number of frames
+/// before it that were not sent.
 pub fn frame_messages(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec<pb::WatchFramesResponse> {
     let frame = &delivery.frame;
     let [vertices_x, vertices_y] = frame.refinement.vertices();

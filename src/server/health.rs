@@ -1,4 +1,4 @@
-//! What the health service reports: the services, the files of tokens, and the job pool.
+//! The health service: states of the services, of the token files and of the job pool.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -18,7 +18,7 @@ use palpate_proto::pb::haptic_service_server::HapticServiceServer;
 use palpate_proto::pb::session_service_server::SessionServiceServer;
 use palpate_proto::pb::view_service_server::ViewServiceServer;
 
-/// The services that the health service reports. The server itself, "", is serving even while one of the others is not.
+/// The services that the health service reports. The server itself, "", is serving even if one of the others is not.
 pub(super) const SERVICES: [&str; 6] = [
     "",
     <SessionServiceServer<Sessions> as NamedService>::NAME,
@@ -28,10 +28,10 @@ pub(super) const SERVICES: [&str; 6] = [
     JOB_POOL,
 ];
 
-/// The health service that is serving while the tokens in use are those of the file.
+/// Name of the health service that is serving while the tokens in use are those of the file.
 const TOKENS: &str = "palpate.tokens";
 
-/// Reports, to health and metrics, files whose contents are not in use. Never completes.
+/// Reports files whose contents are not in use to the health service and the metrics. Never completes.
 pub(super) fn report_files(
     protection: &Protection,
     health: HealthReporter,
@@ -65,8 +65,7 @@ pub(super) fn report_files(
     }
 }
 
-/// Reports that the server is not serving any more. Then ends the streams that watch its health: shutdown would wait for
-/// them.
+/// Reports all services as not serving. Then ends the streams that watch their health: shutdown would wait for them.
 pub(super) async fn end_health(mut health: HealthReporter) {
     for service in SERVICES {
         health.set_service_status(service, ServingStatus::NotServing).await;
@@ -76,10 +75,10 @@ pub(super) async fn end_health(mut health: HealthReporter) {
     }
 }
 
-/// The health service that is serving while heavy work is done in time.
+/// Name of the health service that is serving while heavy work completes in time.
 const JOB_POOL: &str = "palpate.job_pool";
 
-/// Reports by [`JOB_POOL`] whether the job pool's oldest job is within its deadline. Never completes.
+/// Reports whether the oldest job of the job pool is within its deadline, as [`JOB_POOL`]. Never completes.
 pub(super) async fn report_job_pool(job_pool: JobPool, health: HealthReporter) {
     let mut checks = tokio::time::interval(Duration::from_millis(250));
     let mut was_late = None;

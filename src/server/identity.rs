@@ -1,10 +1,11 @@
-//! Authentication and authorization: roles, the role that each call requires, and the file of tokens. That file gives
-//! roles to tokens and client certificates.
+//! Authentication and authorization: roles, the role that each call requires, and the token file, which gives roles
+//! to tokens and client certificates.
 //!
-//! A call of our own package without an entry in the table is refused on a server that authenticates, and a test goes through
-//! the protocol's descriptors: no call can be forgotten. Ids of sessions and leases are 128 random bits each: a caller with the
-//! role `touch` still needs the one to find a session and the other to command a tool. A server without credentials on loopback
-//! refuses pages whose origin is a host name other than `localhost`: such a name may resolve to this machine.
+//! A server that authenticates refuses calls of its own package that are not in the table [`CALLS`]; a test checks
+//! the table against the protocol's descriptors, so no call can be forgotten. Ids of sessions and leases are 128
+//! random bits each: a caller with the role `touch` still needs the one to find a session and the other to command a
+//! tool. A server without credentials on loopback refuses pages whose origin is a host name other than `localhost`:
+//! such a name may resolve to this machine.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -18,7 +19,7 @@ use palpate_realtime::ids::random_bits;
 use palpate_refusal::{Reason, Refusal, Result, label};
 use palpate_tissue::scene::toml_document::nearest_name;
 
-/// What a caller may do. Every role includes `Watch`, and `Administer` includes every role but `Node`.
+/// A role: what a caller may do. Every role includes `Watch`, and `Administer` includes every role but `Node`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
@@ -28,9 +29,9 @@ pub enum Role {
     Touch,
     /// Create, start, pause and delete sessions.
     Create,
-    /// List all sessions of the server, and everything else but what nodes do.
+    /// List all sessions of the server, and everything else except the calls between servers.
     Administer,
-    /// A server of the same fleet: create sessions for callers of its own, mirror journals, hand sessions over.
+    /// A server of the same fleet: create sessions for its own callers, replicate journals, hand sessions over.
     Node,
 }
 
@@ -49,7 +50,7 @@ impl Role {
         }
     }
 
-    /// Returns the role of that name.
+    /// Returns the role with that name.
     ///
     /// # Errors
     /// Returns an error if there is no such role.
@@ -64,14 +65,14 @@ impl Role {
 /// What a call requires of its caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
-    /// Nothing: the call reveals nothing about sessions.
+    /// No role: the call reveals nothing about sessions.
     Open,
-    /// This role.
+    /// The caller must have this role.
     Role(Role),
 }
 
-/// What each call requires. The server refuses calls of its own protocol that are not in this table; `tests/identity.rs`
-/// checks the table against the protocol's descriptors.
+/// The role that each call requires, by path. The server refuses calls of its own protocol that are not in this
+/// table; `tests/identity.rs` checks the table against the protocol's descriptors.
 pub const CALLS: &[(&str, Access)] = &[
     ("/grpc.health.v1.Health/Check", Access::Open),
     ("/grpc.health.v1.Health/Watch", Access::Open),
@@ -104,11 +105,11 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.SessionService/GetScript", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/GetSession", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/GetStateHash", Access::Role(Role::Watch)),
-    // Like ListSessions, it reveals IDs.
+    // Reveals IDs, as ListSessions does.
     ("/palpate.v1.SessionService/ListJournals", Access::Role(Role::Administer)),
     ("/palpate.v1.SessionService/ListScenes", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/ListScripts", Access::Role(Role::Watch)),
-    // It reveals the IDs of all sessions, and whoever knows an ID can use that session.
+    // Reveals the IDs of all sessions; a caller that knows an ID can use that session.
     ("/palpate.v1.SessionService/ListSessions", Access::Role(Role::Administer)),
     ("/palpate.v1.SessionService/LocateSession", Access::Role(Role::Watch)),
     ("/palpate.v1.SessionService/PauseSession", Access::Role(Role::Create)),
@@ -123,12 +124,12 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.ViewService/WatchFrames", Access::Role(Role::Watch)),
 ];
 
-/// Returns what the call with that path requires; `None` if it is not in the table.
+/// Returns what the call at `path` requires; `None` if it is not in the table.
 pub fn access(path: &str) -> Option<Access> {
     CALLS.iter().find(|call| call.0 == path).map(|call| call.1)
 }
 
-/// The caller of a call.
+/// An authenticated or anonymous caller with its roles.
 #[derive(Debug, Clone)]
 pub struct Caller {
     /// The caller's name in the token file, for logs and messages.
@@ -137,12 +138,12 @@ pub struct Caller {
 }
 
 impl Caller {
-    /// The caller where authentication is disabled: it may do everything.
+    /// Returns the caller of a server without authentication: it may do everything.
     fn unrestricted() -> Self {
         Caller { name: "anonymous".into(), roles: vec![Role::Administer, Role::Node] }
     }
 
-    /// The caller of a call that requires nothing: it has no role.
+    /// Returns the caller of a call that requires no role: it has none.
     pub(super) fn anonymous() -> Self {
         Caller { roles: Vec::new(), ..Caller::unrestricted() }
     }
@@ -161,7 +162,7 @@ impl Caller {
     }
 }
 
-/// Every token begins with this, so that people and programs recognize a token wherever it appears.
+/// Every token begins with this, so that people and programs recognize it.
 const PREFIX: &str = "palpate_";
 
 /// Creates a token of 256 random bits.
@@ -184,10 +185,10 @@ fn owner(field: &str, name: &str) -> Result<()> {
     label(field, name)
 }
 
-/// Returns the entry of a token for the token file. It holds the token's hash, not the token.
+/// Returns the entry of a token for the token file. It contains the token's hash, not the token.
 ///
 /// # Errors
-/// Returns an error if the name is not fit for a log.
+/// Returns an error if the name is empty or not fit for a log.
 pub fn entry(name: &str, roles: &[Role], token: &str) -> Result<String> {
     owner("name", name)?;
     let roles: Vec<_> = roles.iter().map(|role| format!("\"{}\"", role.name())).collect();
@@ -196,7 +197,7 @@ pub fn entry(name: &str, roles: &[Role], token: &str) -> Result<String> {
     Ok(format!("[[token]]\nname = {name}\nroles = [{}]\nsha256 = \"{hash}\"\n", roles.join(", ")))
 }
 
-/// The hash of a token. Since a token has 256 random bits, the hash needs neither salt nor a slow function.
+/// Returns the hash of a token. Since a token has 256 random bits, the hash needs neither salt nor a slow function.
 fn hash(token: &str) -> [u8; 32] {
     let mut bytes = [0; 32];
     bytes.copy_from_slice(digest(&SHA256, token.as_bytes()).as_ref());
@@ -227,23 +228,23 @@ struct CertificateEntry {
     roles: Vec<Role>,
 }
 
-/// The callers that the server knows.
+/// The callers that the server knows: its tokens and client certificates with their roles.
 pub struct KnownCallers {
     /// Authentication is disabled.
     open: bool,
-    /// There is no token file: every client certificate may do everything.
+    /// There is no token file: any valid client certificate gives all rights.
     any_certificate: bool,
     tokens: Vec<([u8; 32], Caller)>,
     certificates: Vec<(String, Caller)>,
 }
 
 impl KnownCallers {
-    /// Returns the identities of a server whose authentication is disabled: every caller may do everything.
+    /// Returns the callers of a server whose authentication is disabled: every caller may do everything.
     pub fn open() -> Self {
         KnownCallers { open: true, any_certificate: false, tokens: Vec::new(), certificates: Vec::new() }
     }
 
-    /// Returns the identities of a server on which every caller with a valid client certificate may do everything.
+    /// Returns the callers of a server on which every caller with a valid client certificate may do everything.
     pub fn certified() -> Self {
         KnownCallers { open: false, any_certificate: true, ..KnownCallers::open() }
     }
@@ -260,7 +261,7 @@ impl KnownCallers {
     pub fn parse(path: &Path, text: &str) -> Result<Self> {
         let file: TokenFileContent = toml::from_str(text).map_err(|e| {
             let line = e.span().map_or(1, |span| text[..span.start].matches('\n').count() + 1);
-            // TOML's message may quote a token from the wrong place; a token must not appear in a log.
+            // TOML's message may quote a misplaced token; a token must not appear in a log.
             let message =
                 if e.message().contains(PREFIX) { "unexpected value".to_owned() } else { nearest_name(e.message()) };
             let place = Some(format!("{}:{line}", path.display()));
@@ -304,7 +305,7 @@ impl KnownCallers {
         Ok(known)
     }
 
-    /// Authenticates a caller by the header `authorization` if there is one, otherwise by the names of the client
+    /// Authenticates a caller by the header `authorization` if there is one, otherwise by the names in its client
     /// certificate.
     pub(super) fn caller(&self, authorization: Option<&HeaderValue>, certificate: Option<&[String]>) -> Result<Caller> {
         if self.open {
@@ -359,7 +360,7 @@ pub(super) struct PresentedCredentials {
 }
 
 impl PresentedCredentials {
-    /// The caller, if the credentials are enough.
+    /// Returns the caller if the credentials are valid and give it the required role.
     pub(super) fn check(&self, credentials: &KnownCallers) -> Result<Caller> {
         let caller = credentials.caller(self.authorization.as_ref(), self.certificate.as_deref())?;
         caller.needs(self.role)?;

@@ -1,11 +1,13 @@
 //! Threads of low priority for heavy work that a call waits for: scenes, force laws, textures. Callers take turns,
 //! and each has at most one job running. A caller with many jobs therefore delays only itself, as long as there are
 //! fewer such callers than threads; beyond that, others wait for at most one job. A job that no call waits for any
-//! more is not started, or is told to stop.
+//! longer is not started, or is cancelled if it runs.
 //!
-//! Jobs are bounded by counted work, not by time, so that the same request has the same result on every machine:
-//! `limits.rehearsal_work` (points × substeps of the rehearsals of a choice), `limits.law_work` (springs × iterations of a force
-//! law), `limits.mesh_work` (what is done with a mesh, whose triangles a stranger may have laid). A scene that needs more is refused, never chosen less accurately; offline programs allow 32 times as much.
+//! Jobs are limited by counted work, not by time, so that one request has one result on every machine:
+//! `limits.rehearsal_work` (points × substeps of the rehearsals that choose a scene's stepping), `limits.law_work`
+//! (springs × iterations of a force law), `limits.mesh_work` (operations on a mesh, whose triangles may come from a
+//! stranger). A scene that needs more is refused, never stepped less accurately; offline programs allow 32 times as
+//! much.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -27,24 +29,24 @@ use palpate_tissue::select::scheme_selection::given_up;
 /// Number of threads of a job pool.
 const THREADS: usize = 2;
 
-/// Which of a caller's jobs comes first; those of one kind in the order of their requests. Many laws so delay no call that
-/// somebody waits for.
+/// The order of one caller's jobs; jobs of one kind run in the order of their requests. Many laws thus delay no call
+/// that somebody waits for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Urgency {
-    /// What a call needs.
+    /// Work that a call needs.
     Call,
-    /// A force law that a haptic stream begins with, or that its tool is in need of.
+    /// A force law that a haptic stream starts with, or that its tool needs.
     Law,
-    /// A better law than the one that is in use.
+    /// A more accurate law than the one in use.
     BetterLaw,
 }
 
-/// Tells a job that its call does not wait for it any more.
+/// A flag that tells a job to stop, because its call does not wait for it any longer.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct CancelFlag(Arc<AtomicBool>);
 
 impl CancelFlag {
-    /// The flag; it is set when the call does not wait any more.
+    /// Returns the flag, which is set when the call does not wait any longer.
     pub(crate) fn flag(&self) -> &AtomicBool {
         &self.0
     }
@@ -60,19 +62,20 @@ struct Job {
 #[derive(Default)]
 struct PoolState {
     waiting: Turns<Job>,
-    /// The running jobs: the account's number, and when the job was requested, ns.
+    /// The running jobs: the account's number, and the time at which the job was requested, ns.
     running: Vec<(u64, u64)>,
     next_number: u64,
     is_closed: bool,
 }
 
-/// Whether one of the `running` jobs is of `account`.
+/// Returns whether one of the `running` jobs belongs to `account`.
 fn is_running(running: &[(u64, u64)], account: u64) -> bool {
     running.iter().any(|job| job.0 == account)
 }
 
 impl PoolState {
-    /// Starts the first job of the next account without a running job, and returns both.
+    /// Takes the first job of the next account without a running job and counts it as running. Returns the account's
+    /// number and the job.
     fn start_next(&mut self) -> Option<(u64, Job)> {
         let (account, job) = self.waiting.next(|account| !is_running(&self.running, account))?;
         self.running.push((account, job.requested_ns));
@@ -84,7 +87,7 @@ impl PoolState {
         self.waiting.accounts().any(|account| !is_running(&self.running, account))
     }
 
-    /// Ends the running job of `account`.
+    /// Removes the running job of `account` from the list.
     fn end(&mut self, account: u64) {
         if let Some(done) = self.running.iter().position(|running| running.0 == account) {
             self.running.swap_remove(done);
@@ -110,9 +113,9 @@ impl PoolShared {
         }
     }
 
-    /// Ends the job of the account `done`, waits for the next that may start, and starts it. A thread that gives way may be
-    /// stopped for tens of milliseconds wherever it is, also where it holds the lock that calls wait for. So it holds it once a
-    /// job, for as short as can be, and wakes others without it.
+    /// Marks the job of the account `done` as ended, waits for the next job that may start, and takes it. A thread of
+    /// low priority may be stopped for tens of milliseconds anywhere, also while it holds the lock that calls wait
+    /// for. So it holds the lock once per job, as briefly as possible, and wakes others without it.
     fn next(&self, done: Option<u64>) -> Option<(u64, Job)> {
         let mut queue = lock(&self.queue);
         if let Some(account) = done {
@@ -136,7 +139,7 @@ impl PoolShared {
     }
 }
 
-/// Ends the threads when it is dropped, with the last clone of a job pool.
+/// Closes the job pool when it is dropped, with the last clone; its threads then end.
 struct CloseOnDrop(Arc<PoolShared>);
 
 impl Drop for CloseOnDrop {
@@ -146,13 +149,13 @@ impl Drop for CloseOnDrop {
     }
 }
 
-/// A call's wait for its job. When it is dropped, the job is cancelled: removed from the queue, or told to stop.
+/// A call's wait for its job. Dropping it cancels the job: removes it from the queue, or sets its flag.
 struct CancelOnDrop {
     shared: Arc<PoolShared>,
     account: u64,
     number: u64,
     cancelled: CancelFlag,
-    /// The job is not in the queue any more.
+    /// Whether the job has left the queue.
     is_started: Arc<AtomicBool>,
 }
 
@@ -165,7 +168,7 @@ impl Drop for CancelOnDrop {
     }
 }
 
-/// How busy a job pool is.
+/// The load of a job pool.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Load {
     /// Number of jobs that wait for their turn.
@@ -176,12 +179,12 @@ pub(crate) struct Load {
     pub(crate) is_late: bool,
 }
 
-/// Threads for heavy work. They end with the last clone.
+/// A pool of threads for heavy work. They end with the last clone.
 #[derive(Clone)]
 pub(crate) struct JobPool(Arc<CloseOnDrop>);
 
 impl JobPool {
-    /// Starts the threads.
+    /// Starts the threads, named `name` and a number.
     ///
     /// # Errors
     /// Returns the system's error if a thread can't be started.
@@ -201,12 +204,12 @@ impl JobPool {
         Ok(JobPool(close))
     }
 
-    /// Runs `work` when it is the turn of `account`. If the call ends or the deadline passes before that, `work` never runs;
-    /// if it happens while `work` runs, the flag that `work` has is set.
+    /// Runs `work` when it is the turn of `account`, and returns its result. If the call ends or the deadline passes
+    /// before that, `work` never runs; if that happens while `work` runs, its flag is set.
     ///
     /// # Errors
-    /// Returns an error if too many jobs of this account wait, if the deadline passes, if `work` takes too many operations, or if it
-    /// panics.
+    /// Returns an error if too many jobs of this account wait, if the deadline passes, if `work` takes too many
+    /// operations, or if it panics.
     pub(crate) async fn work<T: Send + 'static>(
         &self,
         account: &Account,
@@ -215,10 +218,10 @@ impl JobPool {
         self.work_as(Urgency::Call, account, work).await
     }
 
-    /// The same, behind what is more urgent of this account.
+    /// Runs `work` in the pool like [`JobPool::work`], but after the more urgent jobs of this account.
     ///
     /// # Errors
-    /// As for [`JobPool::work`].
+    /// Returns the errors of [`JobPool::work`].
     pub(crate) async fn work_as<T: Send + 'static>(
         &self,
         urgency: Urgency,
@@ -243,7 +246,7 @@ impl JobPool {
                 let message = format!("would take more than {most} operations on its mesh (limits.mesh_work)");
                 Err(Refusal::new(Reason::TooLarge, "", message).into())
             }
-            // Nobody would be told.
+            // Nobody waits for the result any longer.
             Ok(Ok(Err(GivenUp::Stopped))) => Err(given_up().into()),
             Ok(Err(_)) => Err(Status::internal("internal error (worker panicked)")),
             Err(_) => {
@@ -278,7 +281,7 @@ impl JobPool {
         Ok(CancelOnDrop { shared: shared.clone(), account, number, cancelled, is_started })
     }
 
-    /// How busy the job pool is.
+    /// Returns the load of the job pool.
     pub(crate) fn load(&self) -> Load {
         let queue = lock(&self.0.0.queue);
         let running = queue.running.iter().map(|running| running.1);
@@ -383,12 +386,12 @@ mod tests {
             assert_eq!(job_pool.work(&other, move |_| number).await.unwrap(), number);
         }
         assert_eq!(job_pool.load().waiting, 4);
-        // Those that wait go first: the end of the running job would begin the next.
+        // The waiting jobs are cancelled first: the end of the running job would start the next.
         for asked in asked.into_iter().rev() {
             asked.abort();
             assert!(asked.await.unwrap_err().is_cancelled());
         }
-        // The running job was told to stop; the others never began.
+        // The running job was cancelled; the others never started.
         end.recv().unwrap();
         assert_eq!(job_pool.load().waiting, 0);
         assert_eq!(job_pool.work(&greedy, |_| 7).await.unwrap(), 7);

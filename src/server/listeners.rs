@@ -1,4 +1,4 @@
-//! A server's listeners and its protection, before it serves; and why a server can't run.
+//! Opens a server's listeners and loads its protection before it serves.
 
 use std::net::SocketAddr;
 
@@ -10,16 +10,16 @@ use super::datagrams::Socket;
 use super::protection::Protection;
 use palpate_refusal::{Reason, Refusal};
 
-/// Why a server can't run.
+/// The reasons why a server can't run.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
     /// The configuration is invalid or not safe.
     #[error("{0}")]
     Refused(#[from] Refusal),
-    /// The address is in use, or not one of this machine.
+    /// The address is in use, or does not belong to this machine.
     #[error("can't listen on {address}: {}", unavailable(.field, .error))]
     Listen {
-        /// The configuration's key of the address.
+        /// The configuration key of the address.
         field: &'static str,
         /// The address as it was given.
         address: String,
@@ -37,7 +37,7 @@ pub enum ServeError {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// Why an address is not available, and what to do.
+/// Describes why an address is not available, and what to do.
 fn unavailable(field: &str, error: &std::io::Error) -> String {
     match error.kind() {
         std::io::ErrorKind::AddrInUse => format!(
@@ -56,7 +56,7 @@ fn unavailable(field: &str, error: &std::io::Error) -> String {
     }
 }
 
-/// A server's listeners and its protection.
+/// A server's open listeners and its protection (TLS and credentials).
 pub struct Listeners {
     pub(super) listener: TcpListener,
     pub(super) metrics: Option<TcpListener>,
@@ -93,7 +93,7 @@ impl Listeners {
         Ok(Listeners { listener, metrics, datagrams, protection })
     }
 
-    /// Returns the server's URL.
+    /// Returns the server's URL: scheme, address and port.
     pub fn url(&self) -> String {
         url(self.protection.scheme(), &self.listener)
     }

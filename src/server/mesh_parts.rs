@@ -1,20 +1,21 @@
-//! The vertices and triangles of a tissue at rest, in parts, as viewers get them.
+//! The vertices and triangles of a tissue at rest, split into messages for viewers.
 
 use palpate_geometry::Group;
 use palpate_proto::pb;
 
 use palpate_session::surface::{MESH_ROW, Refinement, Skin};
 
-/// Vertices of one message: with positions and texture coordinates 40 KiB.
+/// Vertices per message: 40 KiB with positions and texture coordinates.
 const VERTICES_PER_PART: usize = 2048;
 
-/// Triangles of one message: at most 60 KiB.
+/// Triangles per message: at most 60 KiB.
 const TRIANGLES_PER_PART: usize = 4096;
 
-/// Vertices of groups in one message: at most 16 KiB.
+/// Vertices of groups per message: at most 16 KiB.
 const MEMBERS_PER_PART: usize = 4096;
 
-/// Part `part` of a tissue's surface: first the vertices, then the triangles. `None` after the last.
+/// Returns message `part` of a tissue's surface: first the vertices, then the triangles. `skin` is the surface of a
+/// mesh; without it, `grid` is that of a sheet. `None` after the last message.
 pub(super) fn mesh_part(skin: Option<&Skin>, grid: Refinement, part: usize) -> Option<pb::GetMeshResponse> {
     skin.map_or_else(|| part_of_sheet(grid, part), |skin| part_of_mesh(skin, part))
 }
@@ -51,7 +52,8 @@ fn part_of_sheet(grid: Refinement, part: usize) -> Option<pb::GetMeshResponse> {
     Some(message)
 }
 
-/// The same of a mesh, whose vertices are in the order of its frames. The groups are in the first parts.
+/// Returns message `part` of a mesh. Its vertices are in the order of its frames; the groups are in the first
+/// messages.
 #[allow(clippy::cast_possible_truncation)]
 fn part_of_mesh(skin: &Skin, part: usize) -> Option<pb::GetMeshResponse> {
     let (order, triangles) = (skin.vertices(), skin.triangles());
@@ -85,7 +87,8 @@ fn part_of_mesh(skin: &Skin, part: usize) -> Option<pb::GetMeshResponse> {
     Some(message)
 }
 
-/// What part `part` has of the groups: the vertices of all of them in succession are cut into parts of the same length.
+/// Returns the groups in message `part`: the vertices of all groups in succession are split into parts of
+/// `MEMBERS_PER_PART`.
 fn groups(groups: &[Group], part: usize) -> Vec<pb::VertexGroup> {
     let (from, to) = (part * MEMBERS_PER_PART, (part + 1) * MEMBERS_PER_PART);
     let mut begin = 0;

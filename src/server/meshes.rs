@@ -1,4 +1,4 @@
-//! Meshes that clients send.
+//! Meshes that clients upload: receiving, checking, repairing and keeping them.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,26 +19,26 @@ use palpate_tissue::memory;
 use palpate_tissue::select::scheme_selection::given_up;
 use palpate_tissue::shape::Extent;
 
-/// Triangles for each vertex that a mesh may have: a closed surface has two.
+/// Triangles per vertex that a mesh may have: a closed surface has two.
 const TRIANGLES_PER_VERTEX: usize = 4;
 
-/// Memory of mending, preparing and reporting a mesh, for each vertex and triangle, bytes.
+/// Memory for repairing, preparing and reporting a mesh, bytes per vertex and triangle.
 const PREPARING: u64 = 500;
 
-/// Groups whose names a report tells.
+/// Most group names that a report contains.
 const GROUPS_TOLD: usize = 1000;
 
-/// The meshes of all clients.
+/// The uploaded meshes of all clients.
 #[derive(Clone)]
 pub(crate) struct Meshes {
     uploads: Uploads<TriangleMesh>,
     vertices: usize,
 }
 
-/// The unit in a request.
+/// Parses the unit of length in a request.
 ///
 /// # Errors
-/// Refuses what is no unit.
+/// Refuses an empty text and one that is not a unit.
 pub(super) fn unit(text: &str) -> Result<Unit> {
     if text.is_empty() {
         let message = "is missing: mesh files do not state theirs; \"m\", \"cm\", \"mm\" or so many metres";
@@ -51,7 +51,7 @@ pub(super) fn unit(text: &str) -> Result<Unit> {
 }
 
 impl Meshes {
-    /// None yet.
+    /// Creates the store, without meshes.
     pub(super) fn new(limits: &Limits) -> Self {
         let uploads = Uploads::new(UploadKind {
             names: ["mesh", "meshes"],
@@ -68,7 +68,7 @@ impl Meshes {
     /// Adds a part of a file, as [`Uploads::add`] does.
     ///
     /// # Errors
-    /// As for [`Uploads::add`].
+    /// Returns the errors of [`Uploads::add`].
     pub(super) fn add(&self, request: &pb::UploadMeshRequest, account: &Account) -> Result<pb::UploadMeshResponse> {
         let pb::UploadMeshRequest { mesh_id, offset, part, last, .. } = request;
         let part = FilePart { id: mesh_id, offset: *offset, bytes: part, last: *last };
@@ -76,19 +76,19 @@ impl Meshes {
         Ok(pb::UploadMeshResponse { mesh_id, received_bytes, ..Default::default() })
     }
 
-    /// Takes a file that has come in full, to read it. If what this returns is dropped, the file is gone. Refusals call it
-    /// `file_name`.
+    /// Takes a completely received file out of the uploads, to read it. Dropping the result deletes the file.
+    /// Refusals refer to it as `file_name`.
     ///
     /// # Errors
-    /// Refuses a mesh that this caller is not sending.
+    /// Refuses a mesh that this caller is not uploading.
     pub(super) fn read(&self, id: &str, file_name: &str, account: &Account) -> Result<UploadReading> {
         Ok(UploadReading { received: self.uploads.take(id, account)?, name: name_of(file_name), limits: self.limits() })
     }
 
-    /// A mesh that this caller has sent.
+    /// Returns a mesh that this caller has uploaded.
     ///
     /// # Errors
-    /// Refuses one that this caller has not sent, or not in full, and one that has expired.
+    /// Refuses a mesh that this caller has not uploaded, not uploaded in full, or that has expired.
     pub(super) fn get(&self, id: &str, account: &Account) -> Result<Arc<TriangleMesh>> {
         if id.is_empty() {
             let message = "is missing: a client sends its mesh with UploadMesh, which tells its mesh_id";
@@ -97,7 +97,7 @@ impl Meshes {
         self.uploads.get(id, account).map_err(|refusal| refusal.within("scene.mesh"))
     }
 
-    /// Forgets the meshes whose last part came too long ago.
+    /// Removes the meshes whose last part arrived too long ago.
     pub(super) fn forget_expired(&self, now_ns: u64) {
         self.uploads.forget_expired(now_ns);
     }
@@ -111,7 +111,8 @@ impl Meshes {
     }
 }
 
-/// What refusals call a file: not its folders, and of a long name the end, which tells the format.
+/// Returns the name of a file in refusals: without folders, and of a long name the last 64 characters, which contain
+/// the format.
 fn name_of(file_name: &str) -> String {
     let name = file_name.rsplit(['/', '\\']).next().unwrap_or_default();
     let skipped = name.chars().count().saturating_sub(64);
@@ -119,7 +120,7 @@ fn name_of(file_name: &str) -> String {
     if end.is_empty() { "the mesh".to_owned() } else { end }
 }
 
-/// A file that is being read.
+/// A received mesh file that is being read.
 pub(super) struct UploadReading {
     received: Received<TriangleMesh>,
     name: String,
@@ -127,10 +128,10 @@ pub(super) struct UploadReading {
 }
 
 impl UploadReading {
-    /// Reads the file, mends it if asked to, and reports it. It can be used from then on, unless the report refuses it.
-    ///
+    /// Reads the file, repairs the mesh if `mends`, and returns a report. Keeps the mesh for use by sessions unless
+    /// the report refuses it.
     /// # Errors
-    /// Refuses a file that can't be read, by element and place, too little memory, and when `stop` is set.
+    /// Refuses a file that can't be read (with element and place), too little memory, and when `stop` is set.
     pub(super) fn finish(mut self, unit: Unit, mends: bool, stop: &AtomicBool) -> Result<pb::MeshReport> {
         memory::attempt("part", || self.finished(unit, mends, stop))
     }
@@ -139,7 +140,7 @@ impl UploadReading {
         let go_on = || if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) };
         let limits = &self.limits;
         let bytes = std::mem::take(&mut self.received.bytes);
-        // The file is kept while it is read, in a vector that has grown.
+        // The file stays in memory while it is read, in a vector whose capacity may be twice its length.
         let kept = 2 * bytes.len() as u64;
         let mut paid = Ok(());
         let mut pay = |reading: u64| {
@@ -161,14 +162,13 @@ impl UploadReading {
             problems.extend(repaired.faults.into_iter().map(|fault| note(format!("Not as asked for: {fault}."))));
             go_on()?;
         }
-        // As a session prepares it, which tells that as well.
+        // Prepares the mesh as a session does, for the notes of that.
         let prepared = prepare(mesh.clone());
         let found = prepared.report_within(limits);
         problems.extend(prepared.notes.into_iter().map(note));
         go_on()?;
         let refused = found.refusal().is_some();
-        // What is refused comes first.
-        // The rim of an open surface is meant.
+        // Refusals come first. The rim of an open surface is not a hole.
         let holes = found.borders.iter().filter(|border| !border.is_rim).map(hole);
         let problems = found.problems.iter().map(problem).chain(holes).chain(problems).collect();
         let count = |count: usize| u32::try_from(count).unwrap_or(u32::MAX);
@@ -195,14 +195,14 @@ impl UploadReading {
     }
 }
 
-/// What a mesh takes, bytes.
+/// Returns the memory that a mesh takes, bytes.
 fn bytes_of(mesh: &TriangleMesh) -> u64 {
     let groups: usize = mesh.groups.iter().map(|group| group.name.len() + size_of_val(group.vertices.as_slice())).sum();
     let uv = mesh.uv.as_deref().map_or(0, size_of_val);
     (size_of_val(mesh.vertices_m.as_slice()) + size_of_val(mesh.triangles.as_slice()) + uv + groups) as u64
 }
 
-/// What was done with a mesh.
+/// Returns an entry of the report that says what was done with a mesh.
 fn note(what: String) -> pb::MeshProblem {
     pb::MeshProblem { what, ..Default::default() }
 }
@@ -220,7 +220,7 @@ fn hole(border: &Border) -> pb::MeshProblem {
     pb::MeshProblem { what, element: String::new(), place_m: vector(border.place_m.into()) }
 }
 
-/// A file that can't be read. The message names element and place.
+/// Returns the refusal of a file that can't be read. The message contains element and place.
 fn refuse(error: MeshError) -> Refusal {
     Refusal::new(Reason::Unreadable, "part", error.to_string())
 }
@@ -284,12 +284,12 @@ mod tests {
         }
         assert_eq!(meshes.get(&id, &one).unwrap_err().reason, Reason::OutOfTurn);
         assert_eq!(meshes.add(&part(&id, 8, b"v 1 0 0\n"), &one).unwrap().received_bytes, 16);
-        // A further one fits, not two: those under way are not given up.
+        // One more upload fits, not two: unfinished ones are not given up.
         let second = meshes.add(&part("", 0, b"v"), &one).unwrap().mesh_id;
         assert_eq!(meshes.add(&part("", 0, b"v"), &one).unwrap_err().reason, Reason::TooMany);
         let refused = meshes.add(&part(&second, 1, &[b' '; 100]), &one).unwrap_err();
         assert_eq!(refused.reason, Reason::TooLarge);
-        // It is gone, and one that has come in full gives way.
+        // The refused one is gone, and a completed one is replaced.
         let third = sent(&meshes, &one);
         sent(&meshes, &one);
         assert_eq!(meshes.get(&third, &one).unwrap_err().reason, Reason::UnknownMesh);

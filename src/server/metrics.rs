@@ -1,5 +1,5 @@
-//! What Prometheus is told: counts of the stepping threads, the sessions as they stand, and what goes over the network.
-//! Nothing here names a session: whoever knows a session's id can use it.
+//! The metrics for Prometheus: counts of the stepping threads, the current state of the sessions, and network
+//! traffic. They name no session: a caller that knows a session's ID can use it.
 
 use std::net::SocketAddr;
 use std::pin::Pin;
@@ -32,7 +32,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::scene::record::AuditedError;
 
-/// Everything, as it is when it is asked for.
+/// Creates the registry of all metrics. Their values are read when Prometheus requests them.
 pub(super) fn registry(
     pacer: &Arc<Pacer>,
     traffic: &Traffic,
@@ -44,22 +44,22 @@ pub(super) fn registry(
     let connections = "Connections that are open";
     registry.register("connections", connections, traffic.connections.clone());
     registry.register("connected", "Connections so far", traffic.connected.clone());
-    let failed = "Connections that were cut off before they were secure";
+    let failed = "Connections whose TLS handshake failed";
     registry.register("tls_handshakes_failed", failed, traffic.handshakes_failed.clone());
     let silent = "Connections that sent no request in time";
     registry.register("silent_connections", silent, traffic.silent.clone());
-    let cuts = "Connections that a transport has cut: whose, and why (RFC 9113)";
+    let cuts = "Connections that a transport has cut, by side and reason (RFC 9113)";
     registry.register("transport_cuts", cuts, traffic.cuts.clone());
-    let useless = "1 while what these files hold is not in force: they can't be read, or make no sense";
+    let useless = "1 while the contents of these files are not in use: unreadable or invalid";
     registry.register("useless_files", useless, traffic.useless_files.clone());
     let (bytes_in, bytes_out) = (traffic.bytes_in.clone(), traffic.bytes_out.clone());
-    registry.register_with_unit("received", "What clients sent, before encryption", Unit::Bytes, bytes_in);
-    registry.register_with_unit("sent", "What clients were sent, before encryption", Unit::Bytes, bytes_out);
-    registry.register("calls", "Calls that were let through", traffic.calls.clone());
-    registry.register("commands", "Commands to tools that were taken", traffic.commands.clone());
-    let sessions = "Sessions for datagrams that were let in";
+    registry.register_with_unit("received", "Data received from clients, before encryption", Unit::Bytes, bytes_in);
+    registry.register_with_unit("sent", "Data sent to clients, before encryption", Unit::Bytes, bytes_out);
+    registry.register("calls", "Calls that were admitted", traffic.calls.clone());
+    registry.register("commands", "Commands to tools that were accepted", traffic.commands.clone());
+    let sessions = "Datagram sessions that were accepted";
     registry.register("datagram_sessions", sessions, traffic.datagram_sessions.clone());
-    let refused = "Sessions for datagrams that were refused: without a good ticket, of another site, or too slow";
+    let refused = "Datagram sessions that were refused: without a valid ticket, of another site, or too slow";
     registry.register("datagram_sessions_refused", refused, traffic.datagram_sessions_refused.clone());
     let refusals = "Calls and commands that were refused, by reason";
     registry.register("refusals", refusals, traffic.refusals.clone());
@@ -74,7 +74,7 @@ pub(super) fn registry(
     registry
 }
 
-/// The server in its fleet.
+/// The metrics of the server as a member of its fleet.
 struct InFleet<F>(F);
 
 impl<F> fmt::Debug for InFleet<F> {
@@ -88,15 +88,15 @@ impl<F: Fn() -> Standing + Send + Sync + 'static> Collector for InFleet<F> {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
         let now = (self.0)();
         for (name, help, unit, value) in [
-            ("acts", "1 while the server may step and speak for its sessions", None, f64::from(u8::from(now.acts))),
-            ("fence", "For how long it may, if etcd confirms nothing more", Some(&Unit::Seconds), now.to_fence_s),
+            ("acts", "1 while the server may step and answer for its sessions", None, f64::from(u8::from(now.acts))),
+            ("fence", "Time that is left for this if etcd confirms nothing more", Some(&Unit::Seconds), now.to_fence_s),
             ("nodes", "Servers of the fleet that this one sees", None, now.nodes as f64),
-            ("load", "The part of the stepping threads that its sessions take, 0 to 1", None, now.load),
+            ("load", "Fraction of the stepping threads that its sessions use, 0 to 1", None, now.load),
             ("sessions", "Sessions that it owns", None, now.sessions as f64),
-            ("sessions_without_standby", "Of those, the ones for which no server stands by", None, {
+            ("sessions_without_standby", "Sessions that it owns and that have no standby server", None, {
                 now.without_standby as f64
             }),
-            ("unmirrored", "Bytes of its journals that are on no second disk", Some(&Unit::Bytes), {
+            ("unmirrored", "Bytes of its journals that are not on a second disk yet", Some(&Unit::Bytes), {
                 now.unmirrored_bytes as f64
             }),
         ] {
@@ -105,10 +105,10 @@ impl<F: Fn() -> Standing + Send + Sync + 'static> Collector for InFleet<F> {
             gauge.encode(encoder.encode_descriptor(&name, help, unit, MetricType::Gauge)?)?;
         }
         for (name, help, unit, count) in [
-            ("mirrored", "Of its journals, what came onto a second disk", Some(&Unit::Bytes), now.mirrored_bytes),
-            ("taken_over", "Sessions whose owner was gone, and that go on here", None, now.taken_over),
+            ("mirrored", "Bytes of its journals copied to a second disk", Some(&Unit::Bytes), now.mirrored_bytes),
+            ("taken_over", "Sessions whose owner was gone and that continue here", None, now.taken_over),
             ("moved", "Sessions that were moved from here to another server", None, now.moved),
-            ("lost", "Sessions that another server had when this one came back", None, now.lost),
+            ("lost", "Sessions that another server had taken over when this one returned", None, now.lost),
         ] {
             let counter = ConstCounter::new(count);
             let name = format!("fleet_{name}");
@@ -118,7 +118,7 @@ impl<F: Fn() -> Standing + Send + Sync + 'static> Collector for InFleet<F> {
     }
 }
 
-/// The journals.
+/// The metrics of the journals.
 #[derive(Debug)]
 struct JournalGauges(Arc<KeeperTally>);
 
@@ -127,20 +127,20 @@ impl Collector for JournalGauges {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
         let KeeperTally { bytes, rounds, broken, lag_ns } = &*self.0;
         for (name, help, unit, count) in [
-            ("journal_written", "What was written to journals", Some(&Unit::Bytes), bytes),
+            ("journal_written", "Data written to journals", Some(&Unit::Bytes), bytes),
             ("journal_rounds", "How often written data was flushed to the disk", None, rounds),
             ("journal_broken", "Sessions whose journal can't be written any more", None, broken),
         ] {
             let counter = ConstCounter::new(count.load(Ordering::Relaxed));
             counter.encode(encoder.encode_descriptor(name, help, unit, MetricType::Counter)?)?;
         }
-        let help = "From the newest of what happened to its being on the disk, in the last round";
+        let help = "Time from the newest event until it was on the disk, in the last flush";
         let lag = ConstGauge::new(lag_ns.load(Ordering::Relaxed) as f64 * 1e-9);
         lag.encode(encoder.encode_descriptor("journal_lag", help, Some(&Unit::Seconds), MetricType::Gauge)?)
     }
 }
 
-/// What waits in the job pool.
+/// The metrics of the job pool.
 struct Heavy(JobPool);
 
 impl fmt::Debug for Heavy {
@@ -154,9 +154,9 @@ impl Collector for Heavy {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
         let load = self.0.load();
         let waiting = ConstGauge::new(load.waiting as f64);
-        let help = "Pieces of heavy work (sessions laid out, force laws) that wait for their turn";
+        let help = "Jobs (creation of sessions, force laws) that wait for their turn";
         waiting.encode(encoder.encode_descriptor("job_pool_waiting", help, None, MetricType::Gauge)?)?;
-        let (unit, help) = (Some(&Unit::Seconds), "Age of the oldest piece of heavy work, under way or waiting");
+        let (unit, help) = (Some(&Unit::Seconds), "Age of the oldest job that runs or waits");
         ConstGauge::new(load.oldest_s).encode(encoder.encode_descriptor(
             "job_pool_oldest",
             help,
@@ -166,7 +166,7 @@ impl Collector for Heavy {
     }
 }
 
-/// The stepping threads and the sessions.
+/// The metrics of the stepping threads and the sessions.
 struct Stepping(Arc<Pacer>);
 
 impl fmt::Debug for Stepping {
@@ -175,10 +175,10 @@ impl fmt::Debug for Stepping {
     }
 }
 
-/// Times of all stepping threads as one histogram.
+/// The durations that all stepping threads measured, as one histogram.
 struct Histogram {
     sum_s: f64,
-    /// Bound, s, and times within it and above the last.
+    /// Upper bound of each bucket, s, and the number of durations within it and above the bound before.
     buckets: Vec<(f64, u64)>,
 }
 
@@ -204,25 +204,25 @@ impl EncodeMetric for Histogram {
     }
 }
 
-/// Counts of the stepping threads: name, what it is, and where.
+/// Counters of the stepping threads: name, description, and how to read it.
 type CounterTable = [(&'static str, &'static str, fn(&ThreadCounters) -> &Count); 11];
 
 const COUNTS: CounterTable = [
-    ("rested_steps", "Steps that were passed over at rest", |tally| &tally.rested_steps),
+    ("rested_steps", "Steps that were skipped because the tissue was at rest", |tally| &tally.rested_steps),
     ("overruns", "Steps that were due and dropped", |tally| &tally.overruns),
-    ("late_commands", "Commands that came too late for their step", |tally| &tally.late_commands),
+    ("late_commands", "Commands that arrived too late for their step", |tally| &tally.late_commands),
     ("paused_commands", "Commands without effect: their tool was paused after recoveries", |tally| {
         &tally.paused_commands
     }),
-    ("lapsed_leases", "Tools whose lease lapsed", |tally| &tally.lapsed_leases),
-    ("guard_events", "How often the guard went back to a checkpoint", |tally| &tally.guard_events),
-    ("recoveries", "How often a tissue was taken back to an earlier state", |tally| &tally.recoveries),
-    ("held_sessions", "Sessions stopped by a blow-up, a fault of the program or missing memory", |tally| {
+    ("lapsed_leases", "Leases of tools that expired", |tally| &tally.lapsed_leases),
+    ("guard_events", "Returns of the guard to a checkpoint", |tally| &tally.guard_events),
+    ("recoveries", "Returns of a tissue to an earlier state", |tally| &tally.recoveries),
+    ("held_sessions", "Sessions stopped by an instability, a bug of the program or lack of memory", |tally| {
         &tally.held_sessions
     }),
-    ("limited_steps", "Steps in which a tool was held to the speed limit", |tally| &tally.limited_steps),
-    ("dropped_poses", "Poses that were not newer, or passed over as a backlog", |tally| &tally.dropped_poses),
-    ("stale_releases", "Tools let go because nothing came any more", |tally| &tally.stale_releases),
+    ("limited_steps", "Steps in which a tool was slowed to the speed limit", |tally| &tally.limited_steps),
+    ("dropped_poses", "Poses that were not newer, or skipped as a backlog", |tally| &tally.dropped_poses),
+    ("stale_releases", "Tools released because no poses arrived any more", |tally| &tally.stale_releases),
 ];
 
 impl Collector for Stepping {
@@ -233,9 +233,9 @@ impl Collector for Stepping {
             metric.encode(encoder.encode_descriptor(name, help, unit, metric.metric_type())?)
         };
         let step_time = Histogram::of(pacer.tallies().map(|tally| &tally.step_time));
-        tell("step_time", "What a step took, with all that it told", Some(&Unit::Seconds), &step_time)?;
+        tell("step_time", "Duration of a step, with all messages that it sent", Some(&Unit::Seconds), &step_time)?;
         let lateness = Histogram::of(pacer.tallies().map(|tally| &tally.lateness));
-        tell("step_lateness", "How long after it was due a step began", Some(&Unit::Seconds), &lateness)?;
+        tell("step_lateness", "Delay of the start of a step after it was due", Some(&Unit::Seconds), &lateness)?;
         for (name, help, count) in COUNTS {
             let sum: u64 = pacer.tallies().map(|tally| count(tally).get()).sum();
             tell(name, help, None, &ConstCounter::new(sum))?;
@@ -243,9 +243,9 @@ impl Collector for Stepping {
 
         let audits = pacer.audit_tally();
         for (name, help, count) in [
-            ("audited_windows", "Windows of steps whose error was measured", &audits.windows),
-            ("audited_windows_above_tolerance", "Of those, with an error above the scene's tolerance", &audits.above),
-            ("corrections", "Tissues that are stepped more accurately since an audit", &audits.corrections),
+            ("audited_windows", "Windows (runs of steps) whose error was measured", &audits.windows),
+            ("audited_windows_above_tolerance", "Measured windows with an error above tolerance", &audits.above),
+            ("corrections", "Tissues that are stepped more accurately because of an audit", &audits.corrections),
         ] {
             tell(name, help, None, &ConstCounter::new(count.get()))?;
         }
@@ -269,7 +269,7 @@ impl Collector for Stepping {
             states.encode_family(&[("state", name)])?.encode_gauge(&(count as i64))?;
         }
         let budget = &pacer.budget;
-        let help = "Memory that is taken, by what it is for";
+        let help = "Memory in use, by purpose";
         let mut taken = encoder.encode_descriptor("memory_taken", help, Some(&Unit::Bytes), MetricType::Gauge)?;
         for purpose in Purpose::ALL {
             let bytes = budget.bytes_for(purpose) as i64;
@@ -282,8 +282,8 @@ impl Collector for Stepping {
         let points: usize = sessions.iter().map(|handle| handle.model.len()).sum();
         let awake: usize = statuses.iter().map(|status| status.awake_points).sum();
         let streams: usize = sessions.iter().map(|handle| handle.streams()).sum();
-        gauge("memory_budget_bytes", "Memory that there is for callers", budget.bytes() as f64)?;
-        gauge("callers", "Callers that have something, or are there", budget.accounts().len() as f64)?;
+        gauge("memory_budget_bytes", "Memory available to callers", budget.bytes() as f64)?;
+        gauge("callers", "Callers that are connected or own something", budget.accounts().len() as f64)?;
         gauge("held_tools", "Tools that are held", budget.taken(Resource::Leases) as f64)?;
         gauge("points", "Mass points of all sessions", points as f64)?;
         gauge("awake_points", "Mass points that the last steps of all sessions computed", awake as f64)?;
@@ -291,19 +291,19 @@ impl Collector for Stepping {
         gauge("viewers", "Streams of frames", pacer.viewers() as f64)?;
         let newest = sessions.iter().filter_map(|handle| handle.audited().newest);
         let worst = newest.map(|(_, error)| error).reduce(AuditedError::max).unwrap_or_default();
-        let help = "Of the newest audits of all sessions the largest error of a displacement, relative to the largest";
+        let help = "Largest error of a displacement in the newest audits, relative to the largest";
         gauge("audited_displacement_error_max", help, worst.displacement)?;
-        gauge("audited_force_error_max", "The same of a force", worst.force)?;
+        gauge("audited_force_error_max", "Largest relative error of a force in the newest audits", worst.force)?;
         let running = statuses.iter().filter(|status| status.state == RunState::Running);
         let slowest = running.map(|status| status.dilation.value).fold(1.0, f64::min);
         gauge("time_dilation_min", "Simulated over real time of the session that is furthest behind", slowest)
     }
 }
 
-/// Connections to the metrics at once: who has been there longest goes when another comes.
+/// Maximum number of connections to the metrics; a new one replaces the oldest.
 pub(super) const SCRAPERS: usize = 16;
 
-/// The connections to the metrics.
+/// The connections to the metrics, as a listener.
 struct Scrapers(SocketAddr, Pin<Box<dyn Stream<Item = io::Result<Connection>> + Send>>);
 
 impl axum::serve::Listener for Scrapers {
@@ -332,7 +332,7 @@ pub(super) async fn serve(
     registry: Registry,
     shutdown: CancellationToken,
 ) -> io::Result<()> {
-    // One at a time: what is asked for more often than it can be told is no use to anybody.
+    // One request at a time: more would only slow each other down.
     let registry = Arc::new(Mutex::new(registry));
     let told = move || {
         let registry = registry.clone();
@@ -345,7 +345,7 @@ pub(super) async fn serve(
     };
     let limits = Limits { connections: SCRAPERS, connections_per_address: SCRAPERS, ..limits.clone() };
     let slots = Arc::new(ConnectionSlots::new(&limits, Some(SCRAPERS)));
-    // What the server's clients do and take is counted elsewhere.
+    // The other metrics and budgets cover the server's clients; requests for metrics are not counted there.
     let budget = Budget::new(&limits, 1, 1);
     let address = listener.local_addr()?;
     let connections = connections::incoming(listener, None, slots, &limits, budget, Arc::default(), Arc::default());

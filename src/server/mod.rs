@@ -1,5 +1,5 @@
-//! The server: gRPC and gRPC-web services over `realtime`, the page, health, reflection, metrics, and a shutdown with a
-//! deadline.
+//! The server: gRPC and gRPC-web services over the stepping threads of `palpate_realtime`, the page, health,
+//! reflection, metrics, and shutdown with a deadline.
 
 mod address;
 mod admin;

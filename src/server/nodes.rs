@@ -1,4 +1,4 @@
-//! `NodeService`: what other servers of the fleet ask of this one.
+//! `NodeService`: the calls that other servers of the fleet make to this one.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use tonic::{Request, Response, Status, Streaming};
 use super::fleet::Fleet;
 use super::sessions::Sessions;
 
-/// Answers that wait for the network.
+/// Responses per stream that wait for the network.
 const WAITING: usize = 4;
 
 pub(super) struct Nodes {

@@ -1,8 +1,8 @@
-//! The page that a browser shows: files of the built viewer, on the port that serves gRPC.
+//! The page for browsers: the files of the built viewer, on the port that serves gRPC.
 //!
-//! They are looked up when they are asked for: in the folder of the configuration, then within the program (feature
-//! `viewer`). Without either, `/` says what is missing. A file is read and hashed once as long as it does not change, and
-//! all answers share its bytes; so an answer that nobody reads takes no memory of its own.
+//! The server looks for a file when it is requested: first in the configured folder, then within the program (feature
+//! `viewer`). Without either, `/` shows what is missing. A file is read and hashed once until it changes, and all
+//! responses share its bytes, so a response that nobody reads takes no memory of its own.
 
 use std::collections::BTreeMap;
 use std::io::ErrorKind;
@@ -19,18 +19,18 @@ use bytes::Bytes;
 use tracing::warn;
 use xxhash_rust::xxh3::xxh3_128;
 
-/// What a browser may do with the page: nothing from elsewhere, no script but its own.
+/// What a browser allows the page: nothing from other sites, and no script but its own.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; \
                       connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
 
-/// The policy; and no word of the session's name to other sites.
+/// Headers of all responses: the policy, and no referrer, so that the session's name is not sent to other sites.
 const GUARDS: [(header::HeaderName, &str); 3] = [
     (header::CONTENT_SECURITY_POLICY, POLICY),
     (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
     (header::REFERRER_POLICY, "no-referrer"),
 ];
 
-/// What `/` shows where there is no page.
+/// The text that `/` shows if there is no page.
 const MISSING: &str = include_str!("missing.html");
 
 #[cfg(feature = "viewer")]
@@ -38,7 +38,7 @@ const MISSING: &str = include_str!("missing.html");
 #[folder = "clients/viewer/dist"]
 struct Embedded;
 
-/// Content types of what a build makes, by the ends of names.
+/// Returns the content type of a file of the build, by the ending of its name.
 fn content_type(path: &str) -> &'static str {
     match path.rsplit_once('.').map_or("", |(_, end)| end) {
         "html" => "text/html; charset=utf-8",
@@ -54,13 +54,13 @@ fn content_type(path: &str) -> &'static str {
     }
 }
 
-/// Bytes of all files that are kept. A larger file is not served.
+/// Limit on the bytes of all cached files. A larger file is not served.
 const MAX_BYTES: usize = 64 << 20;
 
-/// Files that are kept, at most.
+/// Limit on the number of cached files.
 const MAX_FILES: usize = 256;
 
-/// Length and time of change of a file of the folder; none of one within the program.
+/// Length and modification time of a file of the folder; `None` for a file within the program.
 type Stamp = Option<(u64, Option<SystemTime>)>;
 
 /// A file of the page.
@@ -68,11 +68,11 @@ type Stamp = Option<(u64, Option<SystemTime>)>;
 struct PageFile {
     stamp: Stamp,
     bytes: Bytes,
-    /// For `ETag`.
+    /// The value of `ETag`.
     tag: String,
 }
 
-/// The page's folder, and the files that were asked for.
+/// The page's folder, and a cache of the files that were requested.
 #[derive(Debug)]
 pub(super) struct Page {
     folder: PathBuf,
@@ -80,29 +80,30 @@ pub(super) struct Page {
     policy: HeaderValue,
 }
 
-/// Files by their paths.
+/// The cached files by their paths.
 #[derive(Debug, Default)]
 struct PageFiles(BTreeMap<String, PageFile>);
 
 impl Page {
-    /// The page in a folder. It may open datagrams at its own port; `datagrams` is HOST:PORT of another, if they are there.
+    /// Creates the page of a folder. It may open datagrams at its own port; `datagrams` is HOST:PORT of another one
+    /// that it may use.
     pub(super) fn of(folder: PathBuf, datagrams: Option<&str>) -> Arc<Self> {
         let connects = datagrams.map(|at| format!("connect-src 'self' https://{at}"));
         let policy = connects.and_then(|connects| POLICY.replace("connect-src 'self'", &connects).try_into().ok());
         Arc::new(Page { folder, kept: Arc::default(), policy: policy.unwrap_or(HeaderValue::from_static(POLICY)) })
     }
 
-    /// An answer with the page's own policy.
+    /// Replaces the policy of a response by the page's own.
     fn guarded(&self, mut answer: Response) -> Response {
         answer.headers_mut().insert(header::CONTENT_SECURITY_POLICY, self.policy.clone());
         answer
     }
 
-    /// A file. They are looked up one at a time, so requests take one thread for files, and none reads what another is
-    /// reading.
+    /// Returns the file at `path`, if there is one. Files are looked up one at a time, so requests occupy one thread
+    /// for files, and none reads what another is reading.
     async fn file(self: &Arc<Self>, path: &str) -> Option<PageFile> {
         let inside = PathBuf::from(path);
-        // Nothing that could lead out of the folder.
+        // Refuses paths that could lead out of the folder.
         if !inside.components().all(|part| matches!(part, Component::Normal(_))) {
             return None;
         }
@@ -113,7 +114,7 @@ impl Page {
 }
 
 impl PageFiles {
-    /// The file of that path, read anew if it has changed.
+    /// Returns the file at `path`, read again if it has changed. Empties the cache when it exceeds its limits.
     fn find(&mut self, file: &Path, path: String) -> Option<PageFile> {
         let stamp = match std::fs::metadata(file) {
             Ok(data) => data.is_file().then(|| (data.len(), data.modified().ok())),
@@ -141,7 +142,7 @@ impl PageFiles {
     }
 }
 
-/// All of a file of the folder.
+/// Reads a whole file of the folder. `None`, with a warning in the log, if it is too large or can't be read.
 fn read(file: &Path) -> Option<Bytes> {
     let mut bytes = Vec::new();
     let read = std::fs::File::open(file).and_then(|file| file.take(MAX_BYTES as u64 + 1).read_to_end(&mut bytes));
@@ -153,7 +154,7 @@ fn read(file: &Path) -> Option<Bytes> {
     None
 }
 
-/// A file within the program.
+/// Returns a file within the program.
 fn embedded(path: &str) -> Option<Bytes> {
     #[cfg(feature = "viewer")]
     let found = Embedded::get(path).map(|file| match file.data {
@@ -165,7 +166,7 @@ fn embedded(path: &str) -> Option<Bytes> {
     found
 }
 
-/// Bytes that a browser keeps and asks for again by their hash.
+/// Returns a response that a browser may cache and validate by its `ETag` (304 if it is unchanged).
 pub(super) fn cached(
     bytes: Bytes,
     tag: String,
@@ -182,7 +183,7 @@ pub(super) fn cached(
     (GUARDS, headers, [(header::CONTENT_TYPE, content_type)], bytes).into_response()
 }
 
-/// Answers whatever no service does.
+/// Answers every request that belongs to no service.
 pub(super) async fn page(page: Arc<Page>, request: Request) -> Response {
     let headers = request.headers();
     let is_grpc = |value: &header::HeaderValue| value.as_bytes().starts_with(b"application/grpc");
@@ -200,14 +201,14 @@ pub(super) async fn page(page: Arc<Page>, request: Request) -> Response {
     }
     .to_owned();
     match page.file(&path).await {
-        // Names in assets/ have a hash of what is in them.
+        // Names in assets/ contain a hash of their contents.
         Some(PageFile { bytes, tag, .. }) if path.starts_with("assets/") => {
             page.guarded(cached(bytes, tag, content_type(&path), "public, max-age=31536000, immutable", headers))
         }
         Some(PageFile { bytes, tag, .. }) => page.guarded(cached(bytes, tag, content_type(&path), "no-cache", headers)),
         None if path == "index.html" => {
             let html = [(header::CONTENT_TYPE, content_type(&path)), (header::CACHE_CONTROL, "no-store")];
-            // Without this the policy would keep the page's own few rules out.
+            // The page's own policy would block the few style rules of this text.
             let style =
                 [(header::CONTENT_SECURITY_POLICY, "default-src 'none'; style-src 'unsafe-inline'; img-src data:")];
             let page = MISSING.replace("FOLDER", &escaped(&page.folder.display().to_string()));
@@ -261,7 +262,7 @@ mod tests {
             assert_eq!(page.file(&name.to_string()).await.unwrap().bytes, name.to_string());
             assert!(page.kept.lock().await.0.len() <= MAX_FILES);
         }
-        // Sparse: they take nothing of the disk.
+        // Sparse files: they take no space on the disk.
         for (name, bytes) in [("half", MAX_BYTES / 2), ("more", MAX_BYTES / 2 + 1), ("huge", MAX_BYTES + 1)] {
             std::fs::File::create(folder.path().join(name)).unwrap().set_len(bytes as u64).unwrap();
             assert_eq!(page.file(name).await.map(|file| file.bytes.len()), (bytes <= MAX_BYTES).then_some(bytes));

@@ -1,4 +1,4 @@
-//! A server's protection: TLS and credentials. A server that other machines can reach does not start without them.
+//! A server's protection: TLS and credentials. A server that other machines can reach does not start without both.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -10,20 +10,23 @@ use super::reload::{Reloaded, of_file, warn_if_readable};
 use super::tls::{self, Tls};
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Time between two checks of when certificates expire.
+/// Interval between two checks of when certificates expire.
 const MINUTE: Duration = Duration::from_secs(60);
 
-/// What will expire soon is told again after so many.
+/// Interval, in minutes, at which the warning of an upcoming expiry is repeated.
 const MINUTES_OF_DAY: u32 = 24 * 60;
 
-/// The protection of one server.
+/// TLS and the known callers of one server, both reloaded when their files change.
 pub(super) struct Protection {
     pub(super) tls: Option<Arc<Reloaded<Tls>>>,
     pub(super) credentials: Arc<Reloaded<KnownCallers>>,
 }
 
 impl Protection {
-    /// Reads the files that the configuration names. Refuses an unprotected address that other machines can reach.
+    /// Reads the files that the configuration names.
+    ///
+    /// # Errors
+    /// Refuses an invalid configuration or file, and an unprotected address that other machines can reach.
     pub(super) fn load(config: &Config, address: SocketAddr) -> Result<Self> {
         config.check()?;
         let tls = match (&config.tls_cert, &config.tls_key) {
@@ -64,7 +67,7 @@ impl Protection {
         Ok(Protection { tls, credentials: Arc::new(credentials) })
     }
 
-    /// The scheme of the server's URLs.
+    /// Returns the scheme of the server's URLs.
     pub(super) fn scheme(&self) -> &'static str {
         if self.tls.is_some() { "https" } else { "http" }
     }

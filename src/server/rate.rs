@@ -1,8 +1,10 @@
-//! Rate limits: a token bucket that fills steadily; each request takes one. Time is an argument of the bucket.
+//! Rate limits by token buckets: a bucket fills steadily, and each request takes one token. Callers pass the time to
+//! it.
 //!
-//! Commands above a stream's rate are refused one by one. When the excess is more than the bucket holds, so that refusing costs
-//! too much as well, the stream ends with the reason. Other calls are counted by connection; the refusal of one that comes too
-//! fast is delayed until the next would be allowed, which slows callers that retry at once.
+//! Commands above a stream's rate are refused one by one. When the excess is more than the bucket holds, so that
+//! refusing costs too much as well, the stream ends with that reason. Other calls are counted per connection; the
+//! refusal of one that arrives too early is delayed until the next would be allowed, which slows clients that retry
+//! immediately.
 
 use std::sync::Mutex;
 use std::time::Duration;
@@ -11,25 +13,25 @@ use palpate_realtime::clock::now_ns;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::lock::lock;
 
-/// A token bucket.
+/// A token bucket: one request takes one token.
 #[derive(Debug, Clone)]
 pub(super) struct Bucket {
     per_s: f64,
     most: f64,
     left: f64,
     filled_ns: u64,
-    /// Requests that were refused, less those granted since; never below 0.
+    /// Refused requests minus those granted since; never below 0.
     refused: f64,
 }
 
 impl Bucket {
-    /// A full bucket that holds `most` and gains `per_s` per second.
+    /// Creates a full bucket that holds `most` tokens (at least 1) and gains `per_s` per second.
     pub(super) fn new(per_s: f64, most: f64) -> Self {
         let most = most.max(1.0);
         Bucket { per_s, most, left: most, filled_ns: 0, refused: 0.0 }
     }
 
-    /// Takes one. Returns an error if the bucket is empty; its message calls the requests `what`.
+    /// Takes a token. Returns an error if the bucket is empty; its message refers to the requests as `what`.
     pub(super) fn take(&mut self, now_ns: u64, what: &str) -> Result<()> {
         if !self.has_one(now_ns) {
             self.refused += 1.0;
@@ -42,7 +44,7 @@ impl Bucket {
         Ok(())
     }
 
-    /// Time until there is one, at most a second; `None` if there is one.
+    /// Returns the time until there is a token, at most a second; `None` if there is one.
     pub(super) fn time_to_one(&mut self, now_ns: u64) -> Option<Duration> {
         (!self.has_one(now_ns)).then(|| self.wait())
     }
@@ -55,19 +57,20 @@ impl Bucket {
         self.left >= 1.0
     }
 
-    /// Time until the next request would be granted, at most a second.
+    /// Returns the time until the next request would be granted, at most a second.
     fn wait(&self) -> Duration {
         Duration::from_secs_f64(((1.0 - self.left) / self.per_s).clamp(0.0, 1.0))
     }
 
-    /// Whether requests come so fast that even refusing them costs too much: the excess is more than the bucket holds.
+    /// Returns whether requests arrive so fast that even refusing them costs too much: the excess is more than the
+    /// bucket holds.
     pub(super) fn is_abused(&self) -> bool {
         self.refused > self.most
     }
 }
 
-/// A bucket that all calls of a connection share. A refusal is delayed until the next call would be granted. A client that
-/// retries in a loop, one call after another, is thus slowed to the allowed rate.
+/// A bucket that all calls of a connection share. A refusal is delayed until the next call would be granted, which
+/// slows a client that retries in a loop to the allowed rate.
 #[derive(Debug)]
 pub(super) struct RateLimiter {
     bucket: Mutex<Bucket>,
@@ -79,7 +82,7 @@ impl RateLimiter {
         RateLimiter { bucket: Mutex::new(Bucket::new(per_s, most)), what }
     }
 
-    /// Lets a call through, or returns the refusal and for how long to delay it.
+    /// Counts a call. If it exceeds the rate, returns the refusal and the time by which to delay it.
     pub(super) fn pass(&self) -> std::result::Result<(), (Refusal, Duration)> {
         let mut bucket = lock(&self.bucket);
         bucket.take(now_ns(), self.what).map_err(|refusal| (refusal, bucket.wait()))
@@ -109,7 +112,7 @@ mod tests {
             |bucket: &mut Bucket, now_ns| (0..100).take_while(|_| bucket.take(now_ns, "things").is_ok()).count();
         assert_eq!(taken(&mut bucket, 1), 5);
         assert_eq!(taken(&mut bucket, 250_000_000), 2);
-        // Time that goes back gains nothing; a long time gains no more than the bucket holds.
+        // Time that runs backwards gains nothing; a long time gains no more than the bucket holds.
         assert_eq!(taken(&mut bucket, 0), 0);
         assert_eq!(taken(&mut bucket, 1_000_000_000_000), 5);
         assert_eq!(bucket.take(1_000_000_000_000, "things").unwrap_err().reason, Reason::RateLimited);

@@ -1,4 +1,4 @@
-//! What a haptic stream is told of recoveries: a rejection for each of its tools that was released.
+//! Reports recoveries to a haptic stream: a rejection for each of its tools that a recovery released.
 
 use palpate_proto::pb;
 
@@ -7,23 +7,24 @@ use palpate_session::Sample;
 use palpate_session::recovery::describe;
 use palpate_session::wire;
 
-/// What one stream has been told so far.
+/// The recoveries that were already reported to one stream.
 #[derive(Debug)]
 pub(super) struct Notices {
     tools: Vec<u32>,
-    /// The tools have been held since this step. Earlier recoveries released other holders' tools.
+    /// The step since which the stream holds its tools. Earlier recoveries released tools of other holders.
     since_step: u64,
-    /// Recoveries that were told of.
+    /// Number of recoveries already reported.
     told: u64,
 }
 
 impl Notices {
-    /// For a stream that holds `tools` from step `since_step` on.
+    /// Creates the notices of a stream that holds `tools` from step `since_step` on.
     pub(super) fn new(tools: Vec<u32>, since_step: u64) -> Self {
         Notices { tools, since_step, told: 0 }
     }
 
-    /// The rejections that go before `sample`: one for each tool of the stream that the newest recovery released, once.
+    /// Returns the rejections to send before `sample`: one for each tool of the stream that the newest recovery
+    /// released, once.
     pub(super) fn of(&mut self, sample: &Sample) -> Vec<pb::Rejection> {
         let Some(recovered) = sample.recovered.as_ref().filter(|_| sample.recoveries > self.told) else {
             return Vec::new();
@@ -72,7 +73,7 @@ mod tests {
         assert!(rejection.message.contains("it grew") && rejection.message.contains("step 93"), "{rejection:?}");
         assert!(notices.of(&sample(1, 102)).is_empty());
         assert_eq!(notices.of(&sample(2, 300)).len(), 1);
-        // A recovery before the tools were taken is not the stream's.
+        // A recovery before the stream took its tools does not concern it.
         assert!(Notices::new(vec![2], 100).of(&sample(1, 100)).is_empty());
         assert!(Notices::new(vec![5], 0).of(&sample(1, 100)).is_empty());
     }

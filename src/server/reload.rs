@@ -1,4 +1,4 @@
-//! Values made from files, and made again when the files change: certificates, keys, tokens.
+//! Values built from files, and built again when the files change: certificates, keys, tokens.
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
@@ -14,25 +14,25 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::files;
 use palpate_tissue::lock::lock;
 
-/// Time between two checks. They compare contents, not times: so a changed symbolic link counts too.
+/// Interval between two checks. They compare contents, not times, so a changed symbolic link counts too.
 const INTERVAL: Duration = Duration::from_millis(500);
 
-/// A check that takes longer is reported: the files may be on a disk that does not answer.
+/// Time after which a check is reported as too slow: the files may be on a disk that does not answer.
 const CHECK_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// For this long an empty file counts as one that is being written; then it takes effect as an empty file.
+/// Time during which an empty file counts as being written, ns; after that it takes effect as an empty file.
 const EMPTY_NS: u64 = 60_000_000_000;
 
-/// Makes the value from the files' texts, in the order of their paths.
+/// Builds the value from the files' texts, in the order of their paths.
 type Make<T> = Box<dyn Fn(&[String]) -> Result<T> + Send + Sync>;
 
-/// A value made from files.
+/// A value built from files that follows their changes.
 pub(super) struct Reloaded<T> {
     what: &'static str,
     paths: Vec<PathBuf>,
     make: Make<T>,
     current: Mutex<Arc<T>>,
-    /// The number of changes.
+    /// The number of changes so far.
     version: watch::Sender<u64>,
     /// Why the files' contents are not in use; `None` if they are.
     problem: watch::Sender<Option<Refusal>>,
@@ -41,16 +41,19 @@ pub(super) struct Reloaded<T> {
 
 /// The result of the last check.
 struct LastRead {
-    /// Of the texts that were used last, valid or not.
+    /// Hash of the texts that were used last, valid or not.
     digest: u128,
-    /// What is wrong with them.
+    /// The error in those texts, if they are invalid.
     error: Option<Refusal>,
-    /// Since when one of the files is empty.
+    /// Since when one of the files is empty, ns.
     empty_since_ns: Option<u64>,
 }
 
 impl<T: Send + Sync + 'static> Reloaded<T> {
-    /// Reads the files for the first time.
+    /// Reads the files and builds the first value.
+    ///
+    /// # Errors
+    /// Returns an error if a file can't be read or its contents are invalid.
     pub(super) fn load(
         what: &'static str,
         paths: Vec<PathBuf>,
@@ -63,28 +66,28 @@ impl<T: Send + Sync + 'static> Reloaded<T> {
         Ok(Reloaded { what, paths, make: Box::new(make), current, version, problem, last_read })
     }
 
-    /// The current value.
+    /// Returns the current value.
     pub(super) fn get(&self) -> Arc<T> {
         lock(&self.current).clone()
     }
 
-    /// The number of changes so far.
+    /// Returns the number of changes so far.
     pub(super) fn version(&self) -> u64 {
         *self.version.borrow()
     }
 
-    /// Reports each change.
+    /// Returns a receiver that is notified of each change.
     pub(super) fn changes(&self) -> watch::Receiver<u64> {
         self.version.subscribe()
     }
 
-    /// Reports why the files' contents are not in use; `None` while they are.
+    /// Returns a receiver of the reason why the files' contents are not in use; `None` while they are.
     pub(super) fn problems(&self) -> watch::Receiver<Option<Refusal>> {
         self.problem.subscribe()
     }
 
-    /// Checks the files. If they have changed, makes the value again; if they are invalid, keeps the old value and reports
-    /// why.
+    /// Checks the files. If they have changed, builds the value again; if they are invalid, keeps the old value and
+    /// reports the reason.
     fn refresh(&self, now_ns: u64) {
         let checked = read(&self.paths).and_then(|texts| self.take(&texts, now_ns));
         self.report(checked.err());
@@ -123,7 +126,7 @@ impl<T: Send + Sync + 'static> Reloaded<T> {
         last.error.clone().map_or(Ok(()), Err)
     }
 
-    /// Logs and publishes a problem, or that there is none any more: once for each change.
+    /// Logs and publishes a problem, or that there is none any longer, once per change.
     fn report(&self, problem: Option<Refusal>) {
         self.problem.send_if_modified(|reported| {
             if *reported == problem {
@@ -138,8 +141,8 @@ impl<T: Send + Sync + 'static> Reloaded<T> {
         });
     }
 
-    /// Checks the files steadily, and at once on SIGHUP; never completes. The checks run on a blocking thread, because a
-    /// file may be on a disk that does not answer.
+    /// Checks the files at a fixed interval, and at once on SIGHUP; never completes. The checks run on a blocking
+    /// thread, because a file may be on a disk that does not answer.
     pub(super) async fn watch(self: Arc<Self>) {
         let mut ticks = tokio::time::interval(INTERVAL);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -220,7 +223,7 @@ mod tests {
         assert_eq!(says(2), ("old".into(), true));
         assert_eq!(says(1 + EMPTY_NS), ("old".into(), true));
         assert_eq!(says(2 + EMPTY_NS), (String::new(), false));
-        // A write in between starts the time anew.
+        // A write in between restarts the time.
         std::fs::write(&path, "new").unwrap();
         assert_eq!(says(3 + EMPTY_NS), ("new".into(), false));
         std::fs::write(&path, "").unwrap();

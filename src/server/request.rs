@@ -1,6 +1,6 @@
-//! The body of a request. It must arrive in time, its caller's credentials must still be valid, and each part that is read
-//! lets the connection receive more. What a large message takes in memory is its caller's, from before it is decoded until the
-//! call is answered.
+//! The body of a request. It must arrive in time, and its caller's credentials must still be valid; each part that is
+//! read allows the connection to receive more. The memory of a large message is charged to its caller from before it
+//! is decoded until the call is answered.
 
 use std::pin::Pin;
 use std::sync::{Arc, Mutex};
@@ -20,39 +20,39 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::budget::{Account, Purpose, Resource, Taken};
 use palpate_tissue::lock::lock;
 
-/// How long the messages of a call may take to arrive.
+/// Time limit for the messages of a call.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum TimeLimit {
-    /// The whole body must arrive within this time: a call with one message.
+    /// The whole body must arrive within this time: for a call with one message.
     WholeBody(Duration),
-    /// Each message must arrive within this time after the one before: a call with many messages.
+    /// Each message must arrive within this time after the one before: for a call with many messages.
     EachMessage(Duration),
     /// The call itself sets its deadlines.
     None,
 }
 
-/// A request's body.
+/// A request's body with its time limit, credentials and flow control.
 pub(super) struct RequestBody {
     body: Body,
-    /// Present if the caller was authenticated.
+    /// The call, if its caller was authenticated.
     call: Option<Arc<Call>>,
     gate: Option<Arc<Gate>>,
     limit: TimeLimit,
-    /// Created when the body is first waited for.
+    /// Created when the body is first polled.
     deadline: Option<Pin<Box<Sleep>>>,
     begun: Instant,
 }
 
 impl RequestBody {
     pub(super) fn wrap(body: Body, call: Option<Arc<Call>>, gate: Option<Arc<Gate>>, limit: TimeLimit) -> Body {
-        // An empty body needs no wait and no check.
+        // An empty body needs neither a time limit nor a check.
         if http_body::Body::is_end_stream(&body) {
             return body;
         }
         Body::new(RequestBody { body, call, gate, limit, deadline: None, begun: Instant::now() })
     }
 
-    /// Ready with the refusal when the time limit has passed.
+    /// Returns the refusal once the time limit has passed.
     fn poll_late(&mut self, context: &mut Context<'_>) -> Poll<Refusal> {
         let (TimeLimit::WholeBody(within) | TimeLimit::EachMessage(within)) = self.limit else { return Poll::Pending };
         let until = self.begun + within;
@@ -99,7 +99,8 @@ impl http_body::Body for RequestBody {
     }
 }
 
-/// The memory of a call's message. Of a call with many messages it is that of the last: who reads them pays for what it keeps.
+/// The memory charged for a call's message. In a call with many messages it is that of the last one: the reader pays
+/// for what it keeps.
 struct MessageMemory {
     account: Account,
     taken: Mutex<Option<Taken>>,
@@ -114,7 +115,7 @@ impl Payer for MessageMemory {
     }
 }
 
-/// Runs a call whose message is paid for by `account`.
+/// Runs a call and charges the memory of its messages to `account`.
 pub(super) async fn paid_for<F: Future>(account: Account, call: F) -> F::Output {
     let payer: Arc<dyn Payer> = Arc::new(MessageMemory { account, taken: Mutex::default() });
     let mut call = std::pin::pin!(call);
@@ -157,7 +158,7 @@ mod tests {
         let poor = account(100_000);
         let refused = paid_for(poor, async { accepts::<pb::SendCommandsRequest>(&large) }).await.unwrap_err();
         assert_eq!(refused.reason, Reason::TooLarge, "{refused}");
-        // What no call decodes is nobody's.
+        // A message decoded outside a call is charged to nobody.
         accepts::<pb::SendCommandsRequest>(&large).unwrap();
     }
 }

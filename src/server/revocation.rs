@@ -1,5 +1,6 @@
-//! Ends the calls of callers whose credentials are revoked. A call is checked when a message of it comes or goes, if the
-//! file of tokens has changed. When the file changes, all calls are checked: a client that does not read would never be.
+//! Ends the calls of callers whose credentials are revoked. When a message of a call is received or sent, the call is
+//! checked if the token file has changed. When the file changes, all calls are checked, since a client that does not
+//! read would never be.
 
 use std::collections::HashMap;
 use std::pin::Pin;
@@ -25,15 +26,15 @@ use palpate_refusal::{Refusal, Result};
 use palpate_session::lease::LeaseId;
 use palpate_tissue::lock::lock;
 
-/// So long a client may take to read that its call is over; then its connection is closed.
+/// Time that a client has to read that its call has ended; then its connection is closed.
 const GRACE: Duration = Duration::from_secs(1);
 
-/// The calls under way of authenticated callers.
+/// The running calls of authenticated callers.
 pub(super) struct Calls {
     credentials: Arc<Reloaded<KnownCallers>>,
     under_way: Mutex<HashMap<u64, Weak<Call>>>,
     begun: AtomicU64,
-    /// What calls that are over have left.
+    /// Leases of tools that outlast the call that acquired them.
     leases: LastingLeases,
 }
 
@@ -47,7 +48,8 @@ impl Calls {
         })
     }
 
-    /// A call from `peer` with these credentials, which were enough by the file of `version`.
+    /// Registers a call from `peer` with credentials that were valid in `version` of the token file. Dropping the
+    /// result removes it.
     pub(super) fn begin(
         self: &Arc<Self>,
         presented: PresentedCredentials,
@@ -69,7 +71,7 @@ impl Calls {
         call
     }
 
-    /// Ends the calls of those who are struck from the file, for ever.
+    /// Ends the calls and leases of callers whose credentials are removed from the file. Runs until the server ends.
     pub(super) async fn watch(self: Arc<Self>) {
         let mut changes = self.credentials.changes();
         while changes.changed().await.is_ok() {
@@ -77,7 +79,7 @@ impl Calls {
             let released =
                 self.leases.end(|presented| presented.is_some_and(|presented| presented.check(&credentials).is_err()));
             if released > 0 {
-                info!(released, "tools released: who held them may not any more");
+                info!(released, "tools released: their holders' credentials were revoked");
             }
             let calls: Vec<_> = lock(&self.under_way).values().filter_map(Weak::upgrade).collect();
             let ended: Vec<_> = calls.iter().filter(|call| call.refused().is_some()).map(Arc::downgrade).collect();
@@ -98,7 +100,7 @@ impl Calls {
     }
 }
 
-/// Who made a call, for what outlasts it.
+/// The credentials of a call's caller, for leases that outlast the call.
 #[derive(Clone)]
 pub(super) struct Tenure {
     calls: Arc<Calls>,
@@ -106,26 +108,26 @@ pub(super) struct Tenure {
 }
 
 impl Tenure {
-    /// Has a lease end when who made the call may not make it any more.
+    /// Makes a lease end when the caller's credentials are revoked.
     ///
     /// # Errors
-    /// Refuses, and ends the lease, if that is so already.
+    /// Refuses, and ends the lease, if they are revoked already.
     pub(super) fn bind(&self, handle: &Arc<SessionHandle>, lease: LeaseId) -> Result<()> {
         self.calls.leases.add(handle, lease, Some(self.presented.clone()));
-        // The file may have changed since the call was let in. A change from now on finds the lease.
+        // The file may have changed since the call was admitted. A later change finds the lease.
         self.presented.check(&self.calls.credentials.get()).map(|_| ()).inspect_err(|_| {
             let _ = handle.at_intake(|intake, _| intake.release(lease));
         })
     }
 }
 
-/// A call, until both its directions are over.
+/// A call, until both its directions have ended.
 pub(super) struct Call {
     calls: Arc<Calls>,
     number: u64,
     presented: PresentedCredentials,
     peer: Option<Peer>,
-    /// Of the file by which it was looked at last.
+    /// Version of the token file by which the call was last checked.
     version: AtomicU64,
     state: Mutex<RevocationState>,
     inward: AtomicWaker,
@@ -139,13 +141,13 @@ struct RevocationState {
 }
 
 impl Call {
-    /// Who made it.
+    /// Returns the caller's credentials, for leases that outlast the call.
     pub(super) fn tenure(&self) -> Tenure {
         Tenure { calls: self.calls.clone(), presented: self.presented.clone() }
     }
 
-    /// Why the caller may not go on, if so. Then what the call holds (a tool, perhaps) is given back, and both directions
-    /// are told.
+    /// Returns the refusal if the caller's credentials are revoked. Then also drops the response, and with it what
+    /// the call holds, such as a tool, and wakes both directions.
     fn refused(&self) -> Option<Refusal> {
         let credentials = &self.calls.credentials;
         let version = credentials.version();
@@ -158,7 +160,7 @@ impl Call {
             }
             state.refusal.get_or_insert(refusal);
             let answer = state.answer.take();
-            // What is dropped here may wake, and ask.
+            // Dropping the response may wake a task that calls this method.
             drop(state);
             drop(answer);
             self.inward.wake();
@@ -167,16 +169,17 @@ impl Call {
         lock(&self.state).refusal.clone()
     }
 
-    /// Whether a further message may come in; who asks is woken when none may.
+    /// Returns an error if no further message may be received; registers the current task to be woken when that
+    /// happens.
     pub(super) fn may_say(&self, context: &Context<'_>) -> Result<()> {
         self.inward.register(context.waker());
         self.refused().map_or(Ok(()), Err)
     }
 
-    /// The answer, until the caller is told to go.
+    /// Wraps the body of the response, which ends with the refusal when the credentials are revoked.
     pub(super) fn answer(self: Arc<Self>, answer: Body) -> Body {
         let mut state = lock(&self.state);
-        // A call that is over already has nothing to answer but that.
+        // A call that has ended already is answered only by its refusal.
         if state.refusal.is_none() {
             state.answer = Some(answer);
         }
@@ -191,7 +194,7 @@ impl Drop for Call {
     }
 }
 
-/// The answer to a call.
+/// The body of the response to a call.
 struct Answer {
     call: Arc<Call>,
     over: bool,
@@ -219,7 +222,7 @@ impl http_body::Body for Answer {
         let mut state = lock(&self.call.state);
         match &mut state.answer {
             Some(answer) => Pin::new(answer).poll_frame(context),
-            // It was taken away since: the next turn tells why.
+            // It was dropped in the meantime: the next poll returns the reason.
             None => {
                 context.waker().wake_by_ref();
                 Poll::Pending

@@ -1,4 +1,4 @@
-//! Serves: puts the services, the page and the metrics together, and shuts down with a deadline.
+//! Runs the server: combines the services, the page and the metrics, and shuts down with a deadline.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -40,7 +40,7 @@ use palpate_realtime::Pacer;
 use palpate_realtime::clock::now_ns;
 use palpate_session::budget::{Budget, give_back_to_the_system};
 
-/// The headers that pages of these origins may send and read in gRPC-web calls.
+/// Returns the layer that lets pages of these origins send and read the headers of gRPC-web calls.
 fn cors(origins: &[HeaderValue]) -> CorsLayer {
     let own = |name| HeaderName::from_static(name);
     let sent =
@@ -54,15 +54,16 @@ fn cors(origins: &[HeaderValue]) -> CorsLayer {
         .max_age(Duration::from_secs(3600))
 }
 
-/// At shutdown connections that use none of the services get so long to end.
+/// Time that connections which use none of the services have to end at shutdown.
 const STRANGERS: Duration = Duration::from_secs(1);
 
-/// When this many bytes have become free, the allocator is asked to return its free memory to the system.
+/// Bytes that must become free before the allocator is asked to return free memory to the system.
 const WORTH_GIVING_BACK: u64 = 16 << 20;
 
-/// Serves at `listeners` until `shutdown` is cancelled. Then ends all streams, and returns at the latest after the configured
-/// deadline. `ready` is called when all that can be refused at the beginning is there: the journals, the sessions of the server
-/// before this one, the fleet. The caller must end its runtime without waiting (`shutdown_background`).
+/// Serves at `listeners` until `shutdown` is cancelled. Then ends all streams, and returns within the configured
+/// deadline. Calls `ready` when everything that can fail at the start is done: opening the journals, continuing the
+/// sessions of the previous process, joining the fleet. The caller must end its runtime without waiting
+/// (`shutdown_background`).
 ///
 /// A server on any free port, and a client that asks what it serves. Both end within the example:
 ///
@@ -105,7 +106,8 @@ pub fn serve(
     shutdown: CancellationToken,
     ready: Box<dyn FnOnce()>,
 ) -> LocalBoxFuture<'static, Result<(), ServeError>> {
-    // Boxed, so that all services are compiled in this crate: a program that polled the future as it is would compile them again.
+    // Boxed, so that all services are compiled in this crate: a program that polled the unboxed future would compile
+    // them again.
     Box::pin(run(listeners, config, shutdown, ready))
 }
 
@@ -144,7 +146,7 @@ async fn run(
         Some(fleet) => Some((fleet.own_sessions().await?, fleet.growth())),
         None => None,
     };
-    // Sessions of the server before this one go on before anybody is let in.
+    // Continues the sessions of the previous process before any client is admitted.
     let (continued, kept) = (pacer.clone(), config.clone());
     let opened = tokio::task::spawn_blocking(move || Journals::open(&kept, &continued, own)).await;
     let journals = opened.map_err(std::io::Error::other)??;
@@ -222,7 +224,7 @@ async fn run(
         }
     };
 
-    // Unauthenticated connections leave half of the limit to the others.
+    // Unauthenticated connections can use at most half of the limit.
     let most_unauthenticated = (!open).then_some(limits.connections.div_ceil(2));
     let slots = Arc::new(ConnectionSlots::new(&limits, most_unauthenticated));
     let register = Arc::new(connections::Register::default());
@@ -231,7 +233,7 @@ async fn run(
     let silence = Some(Duration::from_secs_f64(limits.keepalive_s));
     let bytes = limits.message_bytes;
     let pages = page::Page::of(services.config.viewer.clone(), services.config.datagrams_advertise.as_deref());
-    // A part of a mesh may have as many bytes; its other fields have some as well.
+    // A part of a mesh may be as long as the limit; its other fields add some bytes.
     let with_part = bytes.saturating_add(4096);
     let sessions = SessionServiceServer::new(sessions::Sessions(services.clone())).max_decoding_message_size(with_part);
     let haptics = HapticServiceServer::new(haptics::Haptics(services.clone())).max_decoding_message_size(bytes);
@@ -255,7 +257,7 @@ async fn run(
     };
     let routes = routes
         .into_axum_router()
-        // Not for the routes below: the layer refuses what is not gRPC.
+        // Not for the routes below: the layer refuses requests that are not gRPC.
         .route_layer(GrpcWebLayer::new())
         .route("/textures/{file}", axum::routing::get(move |file, headers| textures::file(textures, file, headers)))
         .fallback(move |request| page::page(pages.clone(), request));
@@ -273,14 +275,14 @@ async fn run(
         .add_routes(routes.into())
         .serve_with_incoming_shutdown(incoming, drain.clone().cancelled_owned());
 
-    // One deadline for everything that is left to do. A step that takes longer ends with the process.
+    // One deadline for all remaining work. A step that takes longer ends with the process.
     let (stopping, begun) = (pacer.clone(), shutdown.clone());
     let stop = async move {
         begun.cancelled().await;
         info!("shutting down");
         end_health(health).await;
         drain.cancel();
-        // Who only asks for the health has no work to lose, and may not read the end of its stream.
+        // Clients that only request health have no work to lose, and may not read the end of their stream.
         tokio::spawn(async move {
             tokio::time::sleep(STRANGERS).await;
             register.close_strangers();

@@ -1,4 +1,4 @@
-//! What every service shares.
+//! State that all services share.
 
 use std::sync::Arc;
 
@@ -16,7 +16,7 @@ use palpate_proto::pb;
 use palpate_realtime::{Pacer, SessionHandle};
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// What every service needs.
+/// The state that every service needs.
 #[derive(Clone)]
 pub(crate) struct Services {
     pub(crate) config: Arc<Config>,
@@ -29,16 +29,16 @@ pub(crate) struct Services {
     pub(crate) job_pool: JobPool,
     pub(crate) traffic: Arc<Traffic>,
     pub(super) recorded: Arc<Recorded>,
-    /// The fleet that this server is of, if it is of one.
+    /// The fleet that this server belongs to, if any.
     pub(super) fleet: Option<Arc<Fleet>>,
 }
 
 impl Services {
-    /// The session of that ID.
+    /// Returns the session with that ID.
     ///
     /// # Errors
-    /// Refuses an unknown ID, a session that another server of the fleet has, and all while this server may not speak for its
-    /// sessions.
+    /// Refuses an unknown ID, a session that another server of the fleet has, and every ID while this server may not
+    /// act for its sessions.
     pub(super) async fn session(&self, id: &str) -> Result<Arc<SessionHandle>> {
         match (self.pacer.get(id), &self.fleet) {
             (Err(unknown), Some(fleet)) if unknown.reason == Reason::UnknownSession => {
@@ -48,16 +48,16 @@ impl Services {
         }
     }
 
-    /// A session as clients are told of it.
+    /// Returns a session as the message that clients receive, with its owner if the server belongs to a fleet.
     pub(super) fn told(&self, handle: &SessionHandle) -> pb::Session {
         let ownership = self.fleet.as_ref().map(|fleet| fleet.own(handle));
         pb::Session { ownership, ..status::session(handle) }
     }
 
-    /// The fleet that this server is of.
+    /// Returns the fleet that this server belongs to.
     ///
     /// # Errors
-    /// Refuses if it is of none.
+    /// Refuses if the server belongs to no fleet.
     pub(super) fn fleet(&self) -> Result<&Arc<Fleet>> {
         self.fleet.as_ref().ok_or_else(|| {
             Refusal::new(Reason::NotAvailable, "", "this server belongs to no fleet (`palpate serve --cluster`)")

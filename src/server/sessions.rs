@@ -1,4 +1,5 @@
-//! `SessionService`: creates, starts, changes, pauses and deletes sessions; lists scenes and scripts.
+//! `SessionService`: creates, starts, changes, pauses and deletes sessions; lists scenes, scripts and journals;
+//! receives meshes.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -27,14 +28,14 @@ use palpate_tissue::scene::script::Script;
 
 pub(super) struct Sessions(pub(super) Services);
 
-/// Bytes of a snapshot that go in one message.
+/// Bytes of a snapshot per message.
 const SNAPSHOT_PART_BYTES: usize = 64 << 10;
 
 impl Sessions {
-    /// Creates a session on this server, for `account`.
+    /// Creates a session on this server, owned by `account`.
     ///
     /// # Errors
-    /// Refuses what no session can be made of.
+    /// Refuses a request from which no session can be created.
     pub(super) async fn create_here(
         &self,
         request: pb::CreateSessionRequest,
@@ -45,7 +46,7 @@ impl Sessions {
         let idle_timeout_s = request.idle_timeout_s.unwrap_or(most_s);
         let range = format!("above 0 and at most {most_s}");
         number("idle_timeout_s", idle_timeout_s, &range, |value| value > 0.0 && value <= most_s)?;
-        // A large tissue takes a while to read and to compile.
+        // Reading and compiling a large tissue takes a while.
         let pacer = self.0.pacer.clone();
         let payer = account.clone();
         let source = request.source;
@@ -306,7 +307,8 @@ impl SessionService for Sessions {
         let ChargedCaller { account, .. } = ChargedCaller::of(request.extensions());
         let request = request.into_inner();
         let handle = self.0.session(&request.session_id).await?;
-        // A request for the current hash waits for its caller's share. A request for a later step must reach that step.
+        // A request for the current hash waits for its caller's share. A request for a later step must reach that
+        // step.
         let wait_ns = account.must_wait_ns(Work::Reading, now_ns());
         if request.at_step.is_none() && wait_ns > 0 {
             tokio::time::sleep(Duration::from_nanos(wait_ns)).await;
@@ -347,7 +349,7 @@ impl SessionService for Sessions {
         let guard = handle.open_stream("GetScript", StreamKind::ReadsOnly, &account)?;
         let cut = guard.cut().clone();
         let (catalog, config) = (self.0.catalog.clone(), self.0.config.clone());
-        // A script may have megabytes of traces.
+        // A script may contain megabytes of traces.
         let read = move |_: &CancelFlag| catalog.script(&request.script_name, &handle.model.scene, &config.limits);
         let script = self.0.job_pool.work(&account, read).await??;
         let out = stream::unfold(Some((script, 0, guard)), |state| async move {
@@ -362,10 +364,11 @@ impl SessionService for Sessions {
 /// Commands per message, about 50 KiB.
 const COMMANDS_PER_PART: usize = 500;
 
-/// Steps that are searched for one message: a script of a week must not occupy a thread.
+/// Steps searched per message: a script of a week must not occupy a thread.
 const STEPS_PER_PART: u64 = 100_000;
 
-/// The message with the script's commands from step `from` on, and the step at which the next message begins.
+/// Returns the message with the script's commands from step `from` on, and the step at which the next message begins;
+/// `None` after the last.
 #[allow(clippy::cast_possible_truncation)]
 fn script_part(script: &Script, from: u64) -> (pb::GetScriptResponse, Option<u64>) {
     let mut message = pb::GetScriptResponse { steps: script.steps, tools: script.tools() as u32, ..Default::default() };

@@ -1,23 +1,23 @@
-//! Signals of the system: those that end the server, and those that must not.
+//! Signals of the system: those that end the server, and those that must not end it.
 
 use tokio_util::sync::CancellationToken;
 
-/// Catches signals that would end the process by default. SIGHUP makes the server check its files; SIGUSR1 and SIGUSR2 do
-/// nothing; with SIGXFSZ caught, writing to a log at its size limit returns an error instead.
+/// Catches signals that would end the process by default: SIGHUP makes the server check its files; SIGUSR1 and
+/// SIGUSR2 do nothing; with SIGXFSZ caught, writing to a log at its size limit returns an error instead.
 pub fn outlive() {
     #[cfg(unix)]
     {
         use rustix::process::Signal;
         use tokio::signal::unix::{SignalKind, signal};
         for ignored in [Signal::HUP, Signal::USR1, Signal::USR2, Signal::XFSZ] {
-            // This call installs the handler, which stays when the stream of signals is dropped.
+            // Installs the handler, which stays when the stream of signals is dropped.
             let _ = signal(SignalKind::from_raw(ignored.as_raw()));
         }
     }
 }
 
-/// Cancels `shutdown` at Ctrl-C or SIGTERM; a second one ends the process at once. Both are caught when this returns: who is told
-/// that the server listens may end it at once. Call it within a runtime.
+/// Cancels `shutdown` on Ctrl-C or SIGTERM; a second one ends the process at once. Both are caught when this returns,
+/// so a program may send one as soon as the server reports that it listens. Call it within a runtime.
 pub fn cancel_on(shutdown: CancellationToken) {
     #[cfg(unix)]
     let (mut interrupt, mut terminate) = {

@@ -1,4 +1,4 @@
-//! A session as a message: its state, counts, audits and tissue.
+//! Converts a session to its message: its state, counts, audits and tissue.
 
 use palpate_proto::geometry::vector;
 use palpate_proto::pb;
@@ -11,7 +11,7 @@ use palpate_tissue::scene::Named;
 use palpate_tissue::scene::record::AuditedError;
 use palpate_tissue::select::audit::Origin;
 
-/// The current state of a session as a message.
+/// Returns the current state of a session as a message.
 pub(super) fn session(handle: &SessionHandle) -> pb::Session {
     let status = handle.status();
     let (held_tools, lapsed_leases, counts) = handle.at_intake(|intake, _| {
@@ -66,7 +66,7 @@ pub(super) fn session(handle: &SessionHandle) -> pb::Session {
     with_model(session, model)
 }
 
-/// What a session plays.
+/// Returns what a session plays back.
 fn playback(playback: &Playback) -> pb::Playback {
     pb::Playback {
         session_id: playback.session_id.clone(),
@@ -77,7 +77,7 @@ fn playback(playback: &Playback) -> pb::Playback {
     }
 }
 
-/// How far a session is kept on disk.
+/// Returns how far a session is recorded on disk.
 fn journal(event_log: &EventLog) -> pb::Journal {
     let progress = event_log.progress().borrow().clone();
     pb::Journal {
@@ -89,7 +89,7 @@ fn journal(event_log: &EventLog) -> pb::Journal {
     }
 }
 
-/// The results of a session's audits; `None` before the first.
+/// Returns the results of a session's audits; `None` before the first.
 fn audit(handle: &SessionHandle) -> Option<pb::Audit> {
     let audited = handle.audited();
     let (step, newest) = audited.newest?;

@@ -6,7 +6,7 @@ use futures_util::stream::{self, Stream, StreamExt};
 use tokio_util::sync::CancellationToken;
 use tonic::Status;
 
-/// Passes `out` on. When `cut` is cancelled, ends the stream with the reason.
+/// Forwards `out`. When `cut` is cancelled, ends the stream with that reason.
 pub(super) fn until_cut<T: Send + 'static>(
     out: impl Stream<Item = Result<T, Status>> + Send + 'static,
     cut: CancellationToken,

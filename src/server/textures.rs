@@ -23,13 +23,13 @@ use palpate_tissue::texture::{Texture, texture};
 /// The account that textures are charged to. No caller pays for them: a kept texture serves later callers too.
 const ACCOUNT: &str = "textures";
 
-/// Number of textures that a server keeps.
+/// Number of textures that a server keeps; the oldest is dropped first.
 const MAX_KEPT: usize = 8;
 
 /// Memory for painting a texture, bytes per pixel.
 const BYTES_PER_PIXEL: u64 = 16;
 
-/// The textures that were requested last, the newest last.
+/// The textures that were created last, the newest last, and the threads that paint them.
 #[derive(Clone)]
 pub(crate) struct Textures {
     kept: Arc<Mutex<Vec<(Appearance, Texture, Taken)>>>,
@@ -40,7 +40,8 @@ pub(crate) struct Textures {
     pacer: Arc<Pacer>,
 }
 
-/// Answers a browser's request for `NAME.png`. If there is no such texture, the page paints its own.
+/// Answers a browser's request for `NAME.png`. Responds without content if there is no such texture: the page then
+/// paints its own.
 pub(super) async fn file(textures: Textures, Path(file): Path<String>, headers: HeaderMap) -> Response {
     match textures.texture(file.strip_suffix(".png").unwrap_or(&file)).await {
         // A scene's image may change.
@@ -70,14 +71,14 @@ impl Textures {
         })
     }
 
-    /// The texture of a session by its ID, of a scene by its name, or the one named `default`. It is made or read once and
-    /// then kept; the first request takes about a second.
+    /// Returns the texture of a session by its ID, of a scene by its name, or the one named `default`. It is painted
+    /// or read once and then kept; the first request takes about a second.
     ///
     /// # Errors
     /// Returns an error if there is no such session or scene, if its image is invalid, or if the server is overloaded.
     pub(crate) async fn texture(&self, name: &str) -> Result<Texture, Status> {
         let (textures, name) = (self.clone(), name.to_owned());
-        // One account, so one at a time: the next request may be for the same texture.
+        // One account, so one texture at a time: the next request may be for the one being painted.
         let account = self.pacer.budget.account(ACCOUNT);
         Ok(self.job_pool.work(&account, move |_| textures.find(&name)).await??)
     }

@@ -15,26 +15,26 @@ use super::validity::{self, DAY_S};
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::lock::lock;
 
-/// The TLS configuration of new connections.
+/// The TLS configuration of new connections, and when its certificates expire.
 pub(super) struct Tls {
     pub(super) config: Arc<ServerConfig>,
     expiries: Mutex<Vec<Expiry>>,
 }
 
-/// When a certificate expires.
+/// A certificate's expiry, and how urgently the log warned of it.
 struct Expiry {
     path: PathBuf,
     /// s since 1970.
     at_s: i64,
-    /// How urgent that was when it was last looked at.
+    /// Number of the thresholds in [`URGENT_S`] that had been passed at the last check.
     urgency: usize,
 }
 
-/// It becomes more urgent when a certificate expires within so many seconds.
+/// Remaining times below which a warning becomes more urgent, s.
 const URGENT_S: [i64; 4] = [14 * DAY_S, DAY_S, 3600, 0];
 
 impl Expiry {
-    /// What to warn of, if that has become more urgent.
+    /// Returns the text of a warning if it has become more urgent since the last call.
     fn news(&mut self, now_s: i64) -> Option<String> {
         let left_s = self.at_s.saturating_sub(now_s);
         let urgency = URGENT_S.iter().filter(|urgent_s| left_s <= **urgent_s).count();
@@ -49,7 +49,7 @@ impl Expiry {
     }
 }
 
-/// The time of day, s since 1970: certificates expire by it.
+/// Returns the wall-clock time, s since 1970: certificates expire by it.
 #[allow(clippy::disallowed_methods)]
 fn unix_s() -> i64 {
     let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
@@ -57,7 +57,8 @@ fn unix_s() -> i64 {
 }
 
 impl Tls {
-    /// Logs a warning for each certificate that has expired or will soon: when that becomes more urgent, and if `again`, anyway.
+    /// Logs a warning for each certificate that has expired or expires soon: when it has become more urgent, or if
+    /// `again` is set.
     pub(super) fn warn_of_expiry(&self, again: bool) {
         let now_s = unix_s();
         for expiry in lock(&self.expiries).iter_mut() {
@@ -71,8 +72,9 @@ impl Tls {
     }
 }
 
-/// Loads the certificate chain `cert` and its key. With `client_ca`, clients must present a certificate that one of its
-/// authorities has signed, or one of `node_ca`: those of the other servers of a fleet. With `node_ca` alone clients need none.
+/// Loads the certificate chain `cert` and its key. With `client_ca`, clients must present a certificate signed by one
+/// of its authorities or of `node_ca`, the authorities of the other servers of the fleet. With `node_ca` alone
+/// clients need none.
 pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>, node_ca: Option<&Path>) -> Result<Reloaded<Tls>> {
     warn_if_readable(key, "the private key");
     let mut paths = vec![cert.to_owned(), key.to_owned()];
@@ -81,7 +83,8 @@ pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>, node_ca: O
     Reloaded::load("TLS", paths, move |texts| configure(&named, texts, everyone))
 }
 
-/// Of certificate, key and authorities. `everyone` needs a certificate of these, or only who wants to show one.
+/// Builds the configuration from the texts of certificate, key and authorities. If `everyone` is set, all clients
+/// must present a certificate of these authorities; otherwise only those that want to.
 fn configure(paths: &[PathBuf], texts: &[String], everyone: bool) -> Result<Tls> {
     let unreadable = |what: &str| Refusal::new(Reason::Unreadable, "", what.to_owned());
     let chain = certificates(&paths[0], &texts[0])?;
@@ -127,7 +130,8 @@ fn certificates(path: &Path, text: &str) -> Result<Vec<CertificateDer<'static>>>
     if certificates.is_empty() { Err(refuse("has no certificate in PEM".into())) } else { Ok(certificates) }
 }
 
-/// The names in a client's certificate: DNS names and URIs of its `subjectAltName`. TLS has verified the chain before.
+/// Returns the names in a client's certificate: DNS names and URIs of its `subjectAltName`. TLS has already verified
+/// the chain.
 pub(super) fn names(chain: &[CertificateDer<'_>]) -> Vec<String> {
     let Some(certificate) = chain.first().and_then(|first| webpki::EndEntityCert::try_from(first).ok()) else {
         return Vec::new();
@@ -143,13 +147,13 @@ mod tests {
     fn a_certificate_is_warned_of_when_it_becomes_more_urgent() {
         let mut expiry = Expiry { path: PathBuf::new(), at_s: 100 * DAY_S, urgency: 0 };
         let mut told = Vec::new();
-        // Every minute, as the server looks.
+        // One check per minute, as the server does.
         for minute in 0..101 * 24 * 60 {
             told.extend(expiry.news(60 * minute));
         }
         let expired = "has expired: clients and other servers refuse it";
         assert_eq!(told, ["expires in 14 days", "expires in 1 days", "expires in 1 h", expired].map(str::to_owned));
-        // A clock that is set back and goes on.
+        // A clock that is set back and then forward again.
         assert_eq!(expiry.news(0), None);
         assert_eq!(expiry.news(99 * DAY_S + 3600 * 23 + 60 * 30), Some("expires in 30 min".to_owned()));
         assert_eq!(expiry.news(200 * DAY_S), Some(expired.to_owned()));

@@ -1,4 +1,4 @@
-//! Counts of what goes over the network.
+//! Counts of network traffic: connections, bytes, calls and refusals.
 
 use std::net::SocketAddr;
 
@@ -11,10 +11,10 @@ use super::identity::CALLS;
 use super::transport::Cut;
 use palpate_refusal::Reason;
 
-/// One label.
+/// One label of a metric: name and value.
 type Label = [(&'static str, &'static str); 1];
 
-/// What goes over the network.
+/// Counters and gauges of the network traffic, for the metrics.
 #[derive(Debug, Default)]
 pub(crate) struct Traffic {
     pub(super) connections: Gauge,
@@ -32,7 +32,7 @@ pub(crate) struct Traffic {
     pub(super) refusals: Family<Label, Counter>,
 }
 
-/// Counts a connection until it is dropped.
+/// Counts a connection as open until it is dropped.
 pub(super) struct Open(Gauge);
 
 impl Drop for Open {
@@ -42,7 +42,7 @@ impl Drop for Open {
 }
 
 impl Traffic {
-    /// A connection is open for as long as what this returns.
+    /// Counts a connection as open until the returned value is dropped.
     pub(super) fn open(&self) -> Open {
         self.connected.inc();
         self.connections.inc();
@@ -54,37 +54,37 @@ impl Traffic {
         self.handshakes_failed.inc();
     }
 
-    /// A connection had to be closed that did not say what it wants.
+    /// Counts and logs a connection that was closed because it sent no request in time.
     pub(super) fn stayed_silent(&self, client: SocketAddr) {
         info!(%client, "connection closed: it sent no request in time");
         self.silent.inc();
     }
 
-    /// The transport of `side` has cut a connection.
+    /// Counts and logs a connection that the transport of `side` has cut.
     pub(super) fn cut(&self, client: SocketAddr, side: &'static str, cut: &Cut) {
         let Cut { reason, words } = cut;
         warn!(%client, reason, "connection cut by the transport of the {side}: {words}");
         self.cuts.get_or_create(&[("side", side), ("reason", reason)]).inc();
     }
 
-    /// What these files hold is in force, or not.
+    /// Records whether the contents of these files are unused (unreadable or invalid).
     pub(super) fn files(&self, what: &'static str, are_useless: bool) {
         self.useless_files.get_or_create(&[("files", what)]).set(are_useless.into());
     }
 
-    /// A call was let through.
+    /// Counts an admitted call.
     pub(super) fn called(&self, path: &str) {
         if let Some((path, _)) = CALLS.iter().find(|call| call.0 == path) {
             self.calls.get_or_create(&[("call", path)]).inc();
         }
     }
 
-    /// Commands were taken.
+    /// Counts accepted commands.
     pub(super) fn commanded(&self, commands: usize) {
         self.commands.inc_by(commands as u64);
     }
 
-    /// A call or a command was refused.
+    /// Counts a refused call or command.
     pub(super) fn refused(&self, reason: Reason) {
         self.refusals.get_or_create(&[("reason", reason.as_str())]).inc();
     }

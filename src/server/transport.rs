@@ -1,13 +1,15 @@
-//! Flow control between a socket and the transport (HTTP/2), and the reason when a transport closes a connection.
+//! Flow control between a socket and the transport (HTTP/2), and the reason why a transport closes a connection.
 //!
-//! The transport counts small DATA frames that it has received and that no reader has taken: it charges each with 256 bytes
-//! less its length. When the sum exceeds half of the connection's window, it assumes an attack and closes the connection. A
-//! client that commands a tool at 1 kHz sends nothing but such frames. After a stall of the server, seconds of them wait in
-//! the socket, and the transport would read them all before any reader runs. So we give it no more than a portion until its
-//! readers have taken that. The rest waits in the system's buffer, where TCP slows the client down.
+//! The transport counts small DATA frames that it has received and that no reader has taken: it charges each with 256
+//! bytes minus its length. When the sum exceeds half of the connection's window, it assumes an attack and closes the
+//! connection. A client that commands a tool at 1 kHz sends nothing but such frames. After a stall of the server,
+//! seconds of them wait in the socket, and the transport would read them all before any reader runs. So the server
+//! passes it only a portion at a time, until readers have taken that. The rest waits in the system's buffer, where
+//! TCP slows the client down.
 //!
 //! Frames that reach no reader (PING, SETTINGS, WINDOW_UPDATE, PRIORITY, RST_STREAM) cost the transport some hundred
-//! nanoseconds each, and a client can send millions a second. So a connection with too many of them is read more slowly.
+//! nanoseconds each, and a client can send millions a second. So a connection with too many of them is read more
+//! slowly.
 
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -17,28 +19,30 @@ use std::time::Duration;
 use futures_util::task::AtomicWaker;
 use tokio::time::{Instant, Sleep};
 
-/// A frame is charged with this many bytes less its length (`DEFAULT_DATA_FRAME_OVERHEAD_THRESHOLD` of the crate h2).
+/// The transport charges a frame with this many bytes minus its length (`DEFAULT_DATA_FRAME_OVERHEAD_THRESHOLD` of
+/// the crate h2).
 const SMALL_BYTES: usize = 256;
 
-/// Portions in a connection's window. Reading stops when the frames that no reader has taken are charged with a portion; the
-/// transport closes the connection at half of the window, so after eight portions of which none was taken.
+/// Number of portions in a connection's window. Reading stops when the frames that no reader has taken are charged
+/// with one portion; the transport closes the connection at half of the window, which is eight portions.
 const PORTIONS: usize = 16;
 
-/// Longest time without reading while readers take nothing. Then another portion is read regardless: an answer may depend on
-/// later frames, and frames of a stream that has ended are never taken.
+/// Longest pause of reading while readers take nothing. Then another portion is read regardless: a response may
+/// depend on later frames, and frames of a stream that has ended are never taken.
 const READER_TIMEOUT: Duration = Duration::from_millis(100);
 
-/// Control frames that are read in a second, and at once. A client that reads from this server as fast as it can sends some
+/// Rate and burst of control frames that are read. A client that reads from this server as fast as it can sends some
 /// thousand a second.
 const CONTROL_FRAMES_PER_S: f64 = 10_000.0;
 const CONTROL_FRAMES_AT_ONCE: f64 = 10_000.0;
 
-/// The bytes that one connection's untaken frames are charged with, and whether the connection is to be closed.
+/// State shared between a connection and its readers: the charge of frames not yet taken, and whether the connection
+/// is to be closed.
 #[derive(Debug)]
 pub(super) struct Gate {
     portion_bytes: usize,
     charged_bytes: AtomicUsize,
-    /// Control frames since they were counted last.
+    /// Control frames since they were last counted.
     control_frames: AtomicUsize,
     closed: AtomicBool,
     waker: AtomicWaker,
@@ -49,7 +53,7 @@ fn charge(bytes: usize) -> usize {
 }
 
 impl Gate {
-    /// For a connection with that window.
+    /// Creates the gate of a connection with a window of `window_bytes`.
     pub(super) fn new(window_bytes: u32) -> Self {
         let portion_bytes = (window_bytes as usize / PORTIONS).max(SMALL_BYTES);
         Gate {
@@ -61,12 +65,13 @@ impl Gate {
         }
     }
 
-    /// Counts a frame with this many bytes that the transport was given.
+    /// Counts a frame of this many bytes as passed to the transport.
     fn given(&self, bytes: usize) {
         self.charged_bytes.fetch_add(charge(bytes), Ordering::AcqRel);
     }
 
-    /// Counts a frame with this many bytes that its reader has taken.
+    /// Counts a frame of this many bytes as taken by its reader; wakes the connection when half of a portion is free
+    /// again.
     pub(super) fn taken(&self, bytes: usize) {
         let less = |charged: usize| Some(charged.saturating_sub(charge(bytes)));
         let before = self.charged_bytes.fetch_update(Ordering::AcqRel, Ordering::Acquire, less).unwrap_or_default();
@@ -76,13 +81,13 @@ impl Gate {
         }
     }
 
-    /// Closes the connection, whatever its state.
+    /// Closes the connection, in any state.
     pub(super) fn close(&self) {
         self.closed.store(true, Ordering::Release);
         self.waker.wake();
     }
 
-    /// Whether the connection is to be closed; registers the task to be woken when it is.
+    /// Returns whether the connection is to be closed; registers the current task to be woken when it is.
     pub(super) fn is_closed(&self, context: &Context<'_>) -> bool {
         self.waker.register(context.waker());
         self.closed.load(Ordering::Acquire)
@@ -98,7 +103,8 @@ impl Gate {
     }
 }
 
-/// Stops reading from a connection while its readers take nothing, and slows it while it sends too many control frames.
+/// Pauses reading from a connection while its readers take nothing, and slows it while it sends too many control
+/// frames.
 #[derive(Debug)]
 pub(super) struct ReadPause {
     untaken: Option<Pin<Box<Sleep>>>,
@@ -113,7 +119,7 @@ impl ReadPause {
         ReadPause { untaken: None, control_frames: CONTROL_FRAMES_AT_ONCE, filled: Instant::now(), slowed: None }
     }
 
-    /// Ready when more may be read. The caller has registered its task by [`Gate::is_closed`] before.
+    /// Ready when more may be read. The caller must have registered its task by [`Gate::is_closed`].
     pub(super) fn poll(&mut self, gate: &Gate, context: &mut Context<'_>) -> Poll<()> {
         ready!(self.poll_slowed(gate, context));
         if gate.is_full() {
@@ -139,7 +145,7 @@ impl ReadPause {
         Poll::Ready(())
     }
 
-    /// Counts control frames that were read. Returns how long to read nothing, if they were too many.
+    /// Counts control frames that were read. Returns the time to pause reading if they were too many.
     #[allow(clippy::cast_precision_loss)]
     fn debt(&mut self, read: usize, now: Instant) -> Option<Duration> {
         let gained = CONTROL_FRAMES_PER_S * (now - self.filled).as_secs_f64();
@@ -158,7 +164,7 @@ pub(super) struct Cut {
     pub(super) words: String,
 }
 
-/// A reader of the frame headers in one direction of a connection: the state of its parser.
+/// A parser of the frame headers in one direction of a connection, as its current state.
 #[derive(Debug, Default)]
 pub(super) enum FrameParser {
     /// Nothing has arrived yet.
@@ -173,7 +179,7 @@ pub(super) enum FrameParser {
     GoAway(usize, Vec<u8>),
 }
 
-/// A frame's header: length (3 bytes), type, flags and stream (4).
+/// Length of a frame's header: length (3 bytes), type, flags and stream (4).
 const HEAD_BYTES: usize = 9;
 const PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 const DATA: u8 = 0;
@@ -181,7 +187,7 @@ const HEADERS: u8 = 1;
 const GOAWAY: u8 = 7;
 const CONTINUATION: u8 = 9;
 
-/// Bytes of a GOAWAY's payload that are kept: the last stream, the error code, and the beginning of the debug data.
+/// Bytes of a GOAWAY's payload that are kept: the last stream, the error code, and the start of the debug data.
 const MAX_OF_GOAWAY: usize = 8 + 64;
 
 /// Names of the error codes, RFC 9113, section 7.
@@ -203,17 +209,18 @@ const REASONS: [&str; 14] = [
 ];
 
 impl FrameParser {
-    /// The state before a server's first frame: a server sends no preface.
+    /// Creates the parser for a server's frames: a server sends no preface.
     pub(super) fn of_server() -> Self {
         FrameParser::Head([0; HEAD_BYTES], 0)
     }
 
-    /// Whether the protocol is HTTP/2.
+    /// Returns whether the protocol is HTTP/2.
     pub(super) fn are_read(&self) -> bool {
         !matches!(self, FrameParser::Unknown | FrameParser::Preface(_) | FrameParser::Other)
     }
 
-    /// Parses further bytes and counts their DATA frames at `gate`. Returns the reason if they end the connection.
+    /// Parses further bytes and counts their DATA and control frames at `gate`. Returns the reason if they close the
+    /// connection.
     pub(super) fn pass(&mut self, mut bytes: &[u8], gate: Option<&Gate>) -> Option<Cut> {
         let mut cut = None;
         while !bytes.is_empty() {
@@ -275,7 +282,7 @@ impl FrameParser {
     }
 }
 
-/// The reason in a GOAWAY's payload; `None` for an orderly end.
+/// Returns the reason in a GOAWAY's payload; `None` for an orderly end.
 fn parse_goaway(payload: &[u8]) -> Option<Cut> {
     let code: [u8; 4] = payload.get(4..8)?.try_into().ok()?;
     let reason =
@@ -350,7 +357,7 @@ mod tests {
         frames.pass(PREFACE, Some(&gate));
         frames.pass(&[frame(6, &[0; 8]), frame(1, &[0; 8]), frame(DATA, &[0; 8]), frame(4, &[])].concat(), Some(&gate));
         assert_eq!(gate.control_frames.load(Ordering::Acquire), 2);
-        // A third of them at once, the rest in two seconds.
+        // A third of them at once, the rest within two seconds.
         let begun = read_pause.filled;
         let mut now = begun;
         for _ in 0..30 {

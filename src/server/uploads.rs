@@ -1,4 +1,4 @@
-//! Files that clients send in parts: kept in memory for a while, each for the caller who has sent it.
+//! Files that clients send in parts: kept in memory for a limited time, each for the caller that sent it.
 
 use std::sync::{Arc, Mutex};
 
@@ -8,31 +8,31 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::budget::{Account, Purpose, Resource, Taken};
 use palpate_tissue::lock::lock;
 
-/// What is sent: how refusals name it, and its bounds.
+/// The properties of one kind of upload: its names in refusals, and its limits.
 pub(super) struct UploadKind {
-    /// One of it, and several.
+    /// Its name, singular and plural.
     pub(super) names: [&'static str; 2],
-    /// The field of requests that names it.
+    /// The field of requests that contains its id.
     pub(super) id: &'static str,
-    /// The reason of a refusal if there is none of that name.
+    /// The reason of the refusal if there is none with that id.
     pub(super) unknown: Reason,
     pub(super) purpose: Purpose,
-    /// The most bytes, and the key of the configuration that says so.
+    /// Maximum number of bytes, and the configuration key of that limit.
     pub(super) most_bytes: (u64, &'static str),
-    /// The most of one caller, and the key of the configuration that says so.
+    /// Maximum number per caller, and the configuration key of that limit.
     pub(super) most_each: (usize, &'static str),
-    /// So long it is kept after it was last used, s.
+    /// Time after its last use for which it is kept, s.
     pub(super) kept_s: f64,
 }
 
-/// A part of a file.
+/// One part of an uploaded file.
 pub(super) struct FilePart<'p> {
-    /// Names the file; empty with its first part.
+    /// The file's id; empty in its first part.
     pub(super) id: &'p str,
-    /// So many bytes of the file come before it.
+    /// Position of the part in the file, bytes.
     pub(super) offset: u64,
     pub(super) bytes: &'p [u8],
-    /// No other part follows.
+    /// Whether this is the last part.
     pub(super) last: bool,
 }
 
@@ -40,17 +40,17 @@ pub(super) struct FilePart<'p> {
 struct Upload<T> {
     id: String,
     state: UploadState<T>,
-    /// When the last part came, or it was used last.
+    /// When its last part arrived or it was last used, ns.
     touched_ns: u64,
     taken: Taken,
 }
 
 enum UploadState<T> {
-    /// What has come so far.
+    /// The bytes received so far.
     Receiving(Vec<u8>),
-    /// A job reads it.
+    /// A job is reading the file.
     Reading,
-    /// It can be used.
+    /// The value read from the file, ready for use.
     Ready(Arc<T>),
 }
 
@@ -59,7 +59,7 @@ struct UploadShared<T> {
     uploads: Mutex<Vec<Upload<T>>>,
 }
 
-/// The files of one kind of all clients, each read as a `T` when it has come in full.
+/// The uploads of one kind from all clients; each complete file is read as a `T`.
 pub(super) struct Uploads<T>(Arc<UploadShared<T>>);
 
 impl<T> Clone for Uploads<T> {
@@ -69,7 +69,7 @@ impl<T> Clone for Uploads<T> {
 }
 
 impl<T> Uploads<T> {
-    /// None yet.
+    /// Creates the store, without uploads.
     pub(super) fn new(kind: UploadKind) -> Self {
         Uploads(Arc::new(UploadShared { kind, uploads: Mutex::default() }))
     }
@@ -78,11 +78,12 @@ impl<T> Uploads<T> {
         &self.0.kind
     }
 
-    /// Adds a part of a file, the first of a new one if it names none. Returns the file's id, and how many bytes have come.
+    /// Adds a part to a file, or starts a new file if the part has no id. Returns the file's id and the number of
+    /// bytes received.
     ///
     /// # Errors
-    /// Refuses a part that does not follow what has come before, a file that this caller is not sending, and more than the
-    /// limits or the caller's part of the memory allow.
+    /// Refuses a part that does not follow the bytes received so far, a file that this caller is not sending, and
+    /// more than the limits or the caller's share of the memory allow.
     pub(super) fn add(&self, part: &FilePart<'_>, account: &Account) -> Result<(String, u64)> {
         let (now, kind) = (now_ns(), self.kind());
         self.forget_expired(now);
@@ -106,7 +107,7 @@ impl<T> Uploads<T> {
         match added {
             Ok(received_bytes) => Ok((upload.id.clone(), received_bytes)),
             Err(refusal) => {
-                // One that has not begun well can't be named by its client.
+                // The client does not know the id of a file whose first part was refused.
                 if part.id.is_empty() || refusal.reason == Reason::TooLarge {
                     uploads.swap_remove(index);
                 }
@@ -115,7 +116,10 @@ impl<T> Uploads<T> {
         }
     }
 
-    /// Makes room for a further file of a caller: the oldest one that has come in full gives way.
+    /// Makes room for another file of a caller by removing its oldest complete one.
+    ///
+    /// # Errors
+    /// Refuses if the caller is at its limit and has no complete file.
     fn make_room(&self, uploads: &mut Vec<Upload<T>>, account: &Account) -> Result<()> {
         let UploadKind { names: [_, names], most_each: (most, key), .. } = self.kind();
         let of_caller = || uploads.iter().enumerate().filter(|(_, upload)| upload.is_of(account));
@@ -133,7 +137,8 @@ impl<T> Uploads<T> {
         Ok(())
     }
 
-    /// Takes a file that has come in full, to read it. If what this returns is dropped before it is finished, the file is gone.
+    /// Takes a completely received file, to read it. Dropping the result before [`Received::finish`] deletes the
+    /// file.
     ///
     /// # Errors
     /// Refuses a file that this caller is not sending.
@@ -150,10 +155,10 @@ impl<T> Uploads<T> {
         }
     }
 
-    /// What this caller has sent.
+    /// Returns the value of a file that this caller has sent, and extends the time for which it is kept.
     ///
     /// # Errors
-    /// Refuses what this caller has not sent, or not in full, and what has expired.
+    /// Refuses a file that this caller has not sent, that is incomplete, or that has expired.
     pub(super) fn get(&self, id: &str, account: &Account) -> Result<Arc<T>> {
         self.forget_expired(now_ns());
         let mut uploads = lock(&self.0.uploads);
@@ -168,14 +173,14 @@ impl<T> Uploads<T> {
         }
     }
 
-    /// Forgets the files whose last part came too long ago.
+    /// Removes the files that were last used too long ago.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(super) fn forget_expired(&self, now_ns: u64) {
         let kept_ns = (self.kind().kept_s * 1e9) as u64;
         lock(&self.0.uploads).retain(|upload| now_ns.saturating_sub(upload.touched_ns) < kept_ns);
     }
 
-    /// The upload of that id and caller.
+    /// Returns the index of the upload with that id of this caller.
     fn find(&self, uploads: &[Upload<T>], id: &str, account: &Account) -> Result<usize> {
         let found = uploads.iter().position(|upload| upload.id == id && upload.is_of(account));
         found.ok_or_else(|| unknown(self.kind()))
@@ -199,7 +204,7 @@ impl<T> Upload<T> {
         self.taken.account().number() == account.number()
     }
 
-    /// Adds a part; returns how many bytes there are now.
+    /// Appends a part; returns the number of bytes received.
     fn add(&mut self, part: &FilePart<'_>, kind: &UploadKind) -> Result<u64> {
         let UploadState::Receiving(bytes) = &mut self.state else { return Err(complete(kind)) };
         let length = bytes.len() as u64;
@@ -215,7 +220,7 @@ impl<T> Upload<T> {
         if part.bytes.is_empty() && !part.last {
             return Err(Refusal::new(Reason::Missing, "part", "is empty, and is not the last"));
         }
-        // What a vector takes that grows.
+        // A growing vector may take twice its length.
         self.taken.grow_to(2 * sum, "part")?;
         if bytes.try_reserve(part.bytes.len()).is_err() {
             return Err(Refusal::new(Reason::Overloaded, "part", "the system has no memory for it"));
@@ -225,7 +230,7 @@ impl<T> Upload<T> {
     }
 }
 
-/// A file that has come in full and is being read.
+/// A completely received file that is being read.
 pub(super) struct Received<T> {
     uploads: Uploads<T>,
     id: String,
@@ -240,10 +245,10 @@ impl<T> Drop for Received<T> {
 }
 
 impl<T> Received<T> {
-    /// Takes as much memory as this for it, or gives some back.
+    /// Sets the memory that is charged for the file to `bytes`.
     ///
     /// # Errors
-    /// Refuses more than the caller may take, and a file that is forgotten.
+    /// Refuses more than the caller may use, and a file that was removed.
     pub(super) fn charge(&self, bytes: u64) -> Result<()> {
         match lock(&self.uploads.0.uploads).iter_mut().find(|upload| upload.id == self.id) {
             Some(upload) => {
@@ -254,10 +259,10 @@ impl<T> Received<T> {
         }
     }
 
-    /// It can be used from now on.
+    /// Stores the value read from the file, of `bytes` bytes: it can be used from now on.
     ///
     /// # Errors
-    /// As [`Received::charge`] does, for what it takes from now on.
+    /// Returns the errors of [`Received::charge`].
     pub(super) fn finish(&self, value: T, bytes: u64) -> Result<()> {
         self.charge(bytes)?;
         if let Some(upload) = lock(&self.uploads.0.uploads).iter_mut().find(|upload| upload.id == self.id) {

@@ -1,4 +1,4 @@
-//! When a certificate expires. The library that verifies certificates does not expose that.
+//! Reads when a certificate expires. The library that verifies certificates does not expose that.
 
 /// A day, s.
 pub(super) const DAY_S: i64 = 86_400;
@@ -9,7 +9,7 @@ const GENERALIZED_TIME: u8 = 0x18;
 /// The tag of the version, a field that certificates of version 1 lack.
 const VERSION: u8 = 0xa0;
 
-/// When a certificate (X.509 in DER, RFC 5280) expires, s since 1970.
+/// Returns when a certificate (X.509 in DER, RFC 5280) expires, s since 1970; `None` if it can't be parsed.
 pub(super) fn expires_s(certificate: &[u8]) -> Option<i64> {
     let (certificate, _) = element(certificate, Some(SEQUENCE))?;
     let (mut rest, _) = element(certificate, Some(SEQUENCE))?;
@@ -27,7 +27,8 @@ pub(super) fn expires_s(certificate: &[u8]) -> Option<i64> {
     time_s(kind, text)
 }
 
-/// The contents of the first element and the bytes after it; `None` if the element is not of `kind`, where one is given.
+/// Returns the contents of the first element and the bytes after it; `None` if it is truncated or not of `kind`, if
+/// that is given.
 fn element(bytes: &[u8], kind: Option<u8>) -> Option<(&[u8], &[u8])> {
     let (&first, &length) = (bytes.first()?, bytes.get(1)?);
     if kind.is_some_and(|kind| kind != first) {
@@ -47,7 +48,7 @@ fn element(bytes: &[u8], kind: Option<u8>) -> Option<(&[u8], &[u8])> {
     Some((rest.get(..length)?, rest.get(length..)?))
 }
 
-/// Parses a time: YYMMDDhhmmssZ, or with four digits of the year.
+/// Parses a time, `YYMMDDhhmmssZ` or with a year of four digits. Returns s since 1970.
 fn time_s(kind: u8, text: &[u8]) -> Option<i64> {
     let number = |from: usize, count: usize| -> Option<i64> {
         let digits = std::str::from_utf8(text.get(from..from + count)?).ok()?;
@@ -84,7 +85,7 @@ mod tests {
             let key = rcgen::KeyPair::generate().unwrap();
             let certificate = params.self_signed(&key).unwrap();
             assert_eq!(expires_s(certificate.der()), Some(expires));
-            // A certificate that is cut off has no expiry.
+            // A truncated certificate has no expiry.
             let bytes = certificate.der();
             for length in 0..bytes.len() {
                 assert!(expires_s(&bytes[..length]).is_none());

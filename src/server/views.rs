@@ -1,4 +1,4 @@
-//! `ViewService`: streams of frames, textures, and the vertices of a tissue.
+//! `ViewService`: streams of frames, textures, and the surface of a tissue at rest.
 
 use std::collections::VecDeque;
 use std::pin::Pin;
@@ -27,16 +27,16 @@ pub(super) struct Views(pub(super) Services);
 
 type ViewMessages<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
-/// Frames a second if the viewer does not say.
+/// Frames per second if the viewer requests no rate.
 const DEFAULT_RATE_HZ: f64 = 60.0;
 
-/// A stream of frames under way.
+/// A running stream of frames.
 struct ViewStream {
     viewer_id: String,
     reader: FrameReader,
     _guard: StreamGuard,
     messages: VecDeque<pb::WatchFramesResponse>,
-    /// Number of the last frame, and how many had been left out by then because nothing had changed.
+    /// Number of the last frame, and how many had been left out until then because nothing had changed.
     last: Option<(u64, u64)>,
     skipped: u64,
 }
@@ -56,7 +56,7 @@ impl ViewStream {
                 Err(refusal) => return Some((Err(refusal.into()), None)),
             }
         } else {
-            // Between the parts of a frame the messages of other streams get their turn.
+            // Between the parts of a frame, messages of other streams can be sent.
             tokio::task::yield_now().await;
         }
         let message = self.messages.pop_front()?;
@@ -95,7 +95,7 @@ impl ViewService for Views {
         let cut = guard.cut().clone();
         let Texture { png, etag } = self.0.textures.texture(&request.session_id).await?;
         let png = if etag == request.known_etag { Bytes::new() } else { png };
-        // Even of nothing there is one part.
+        // An empty texture still has one part.
         let rest = Some((png, etag, guard));
         let out = stream::unfold(rest, |rest| async move {
             let (mut png, etag, guard) = rest?;
@@ -154,5 +154,5 @@ impl ViewService for Views {
     }
 }
 
-/// Bytes of a texture in one message.
+/// Bytes of a texture per message.
 const BYTES_PER_PART: usize = 64 << 10;

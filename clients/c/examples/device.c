@@ -1,5 +1,5 @@
-/* Connects a device of your own: `device URL SCENE SECONDS`. The three functions are all there is of a device; this one is a
- * hand without mass that goes up and down. Put your maker's calls in their place. Prints one line of JSON. */
+/* Connects a device of your own: `device URL SCENE SECONDS`. A device consists of the three functions below; here it is a
+ * massless hand that moves up and down. Replace them with the calls of your device's SDK. Prints one line of JSON. */
 #define _POSIX_C_SOURCE 200112L
 #include <math.h>
 #include <palpate.h>
@@ -7,7 +7,7 @@
 #include <stdlib.h>
 #include <time.h>
 
-/* Your device's state: only the loop's thread uses it until the end. */
+/* State of the device. Until the loop ends, only the loop's thread uses it. */
 struct device {
     unsigned long ticks;
     double force_max_n;
@@ -16,7 +16,7 @@ struct device {
 
 static int descriptor(void *user, palpate_limits *limits) {
     (void)user;
-    /* What the maker says of it. */
+    /* Limits from the device's data sheet. */
     palpate_limits mine = {12.0, 12.0, 5000.0, 30.0, 0.075};
     *limits = mine;
     return 0;
@@ -27,7 +27,7 @@ static int read_device(void *user, palpate_reading *reading) {
     /* From the middle of the workspace, m: x right, y away, z up. From 4 mm above down to 3 mm below, and up, in 2 s. */
     double turn = 3.14159265358979 * (double)device->ticks++ / 1000.0;
     reading->position.z = 0.0005 + 0.0035 * cos(turn);
-    /* The operator asks for forces, by a button; this one presses it twice a second, so also after a connection was lost. */
+    /* The user enables forces with a button. It is pressed twice a second here, so also after a lost connection. */
     reading->enable = device->ticks % 500 < 250;
     return 0;
 }
@@ -67,7 +67,7 @@ int main(int count, char **arguments) {
     options.warn = warn;
     palpate_bridge *bridge = NULL;
     if (status == 0 && palpate_bridge_begin(session, &device, &options, &bridge)) status = failed("device");
-    /* The loop runs; this thread looks at it ten times a second. */
+    /* The loop is running; this thread checks its state ten times a second. */
     for (int look = 0; status == 0 && look < (int)(10.0 * seconds); look++) {
         palpate_bridge_state state;
         palpate_bridge_look(bridge, &state);

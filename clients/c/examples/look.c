@@ -1,4 +1,4 @@
-/* Looks at a tissue: `look URL SCENE SECONDS`. Prints one line: vertices, triangles, frames and the height of the surface. */
+/* Watches a tissue: `look URL SCENE SECONDS`. Prints one line: vertices, triangles, frames and the height of the surface. */
 #define _POSIX_C_SOURCE 200112L
 #include <palpate.h>
 #include <stdio.h>
@@ -25,11 +25,11 @@ int main(int count, char **arguments) {
     if (status == 0 && palpate_surface_open(session, NULL, &surface)) status = failed("surface");
     if (status == 0) palpate_surface_size_of(surface, &size);
 
-    /* Position and normal of a vertex side by side, as engines have them. */
+    /* Position and normal of a vertex next to each other, as in many engines. */
     float *vertices = calloc(size.vertices + 1, 6 * sizeof(float));
     palpate_buffers buffers = {vertices, 6 * sizeof(float), vertices + 3, 6 * sizeof(float), size.vertices, 0};
     palpate_dirty dirty = {0, 0, 0, 0, 0.0};
-    /* Once whole, then what has changed, sixty times a second. */
+    /* Everything once, then the changes, sixty times a second. */
     buffers.everything = 1;
     for (int frame = 0; status == 0 && frame < (int)(60.0 * seconds); frame++) {
         if (palpate_surface_read(surface, &buffers, &dirty)) status = failed("read");

@@ -12,7 +12,7 @@ static int failed(const char *what) {
     return 1;
 }
 
-/* Seconds of a clock that nobody sets. */
+/* Seconds of a monotonic clock. */
 static double now_s(void) {
     struct timespec now;
     clock_gettime(CLOCK_MONOTONIC, &now);
@@ -41,7 +41,7 @@ int main(int count, char **arguments) {
     palpate_touch_options options;
     palpate_touch_options_init(&options, sizeof options);
     palpate_limits_of("omega3", &options.limits);
-    /* Positions are those of the tissue, wherever that is; its middle may be far from its surface. */
+    /* Positions are in the frame of the tissue, wherever that is; its middle may be far from its surface. */
     options.in_tissue_frame = 1;
     options.limits.workspace_radius_m = 1.0;
     palpate_touch *touch = NULL;

@@ -1,33 +1,33 @@
-//! Frames of engines: which way axes point, and how long a unit is.
+//! The coordinate frames of engines: directions of their axes, and length of their units.
 
 use glam::DVec3;
 
 use crate::error::CodedError;
 
-/// Axes and unit of positions, normals and forces.
+/// The directions of axes, and the unit of positions.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum palpate_axes {
-    /// Palpate's own: right-handed, x to the right, y away, z up; metres.
+    /// Palpate's own axes: right-handed, x to the right, y away, z up; metres.
     #[default]
     PALPATE_AXES_OWN = 0,
-    /// Unity's: left-handed, x to the right, y up, z away; metres. Triangles are clockwise from outside.
+    /// Unity's axes: left-handed, x to the right, y up, z away; metres. Triangles are clockwise from outside.
     PALPATE_AXES_UNITY = 1,
-    /// Unreal's: left-handed, x away, y to the right, z up; centimetres. Textures begin at the top.
+    /// Unreal's axes: left-handed, x away, y to the right, z up; centimetres. Textures start at the top.
     PALPATE_AXES_UNREAL = 2,
 }
 
 pub use palpate_axes::*;
 
-/// Three components, in the axes that were asked for.
+/// A vector in the axes of the options.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct palpate_vector {
-    /// The first component.
+    /// The component along x.
     pub x: f64,
-    /// The second.
+    /// The component along y.
     pub y: f64,
-    /// The third.
+    /// The component along z.
     pub z: f64,
 }
 
@@ -42,7 +42,7 @@ impl palpate_vector {
 }
 
 impl palpate_axes {
-    /// The axes of a number from outside.
+    /// Returns the axes with this number; refuses an unknown one.
     pub(crate) fn of(number: u32) -> Result<Self, CodedError> {
         match number {
             0 => Ok(PALPATE_AXES_OWN),
@@ -52,7 +52,7 @@ impl palpate_axes {
         }
     }
 
-    /// The same direction in these axes. Each is its own inverse.
+    /// Converts a direction to these axes. Each conversion is its own inverse.
     pub(crate) fn turn<T>(self, [x, y, z]: [T; 3]) -> [T; 3] {
         match self {
             PALPATE_AXES_OWN => [x, y, z],
@@ -65,32 +65,32 @@ impl palpate_axes {
         self.turn(v.to_array()).into()
     }
 
-    /// Units a metre.
+    /// Returns the number of units per metre.
     pub(crate) fn units_per_m(self) -> f64 {
         if self == PALPATE_AXES_UNREAL { 100.0 } else { 1.0 }
     }
 
-    /// A position in these axes.
+    /// Converts a position, m, to these axes.
     pub(crate) fn position(self, place_m: DVec3) -> palpate_vector {
         palpate_vector::own(self.units_per_m() * self.turned(place_m))
     }
 
-    /// A position of these axes, m.
+    /// Converts a position in these axes to metres.
     pub(crate) fn to_m(self, place: palpate_vector) -> DVec3 {
         self.turned(place.vector()) / self.units_per_m()
     }
 
-    /// A force in these axes, N.
+    /// Converts a force, N, to these axes.
     pub(crate) fn force(self, force_n: DVec3) -> palpate_vector {
         palpate_vector::own(self.turned(force_n))
     }
 
-    /// Whether the corners of a triangle go the other way round.
+    /// Returns whether triangles have their corners in clockwise order.
     pub(crate) fn is_clockwise(self) -> bool {
         self == PALPATE_AXES_UNITY
     }
 
-    /// Whether v of a texture begins at the top.
+    /// Returns whether the texture coordinate v starts at the top.
     pub(crate) fn has_top_first(self) -> bool {
         self == PALPATE_AXES_UNREAL
     }

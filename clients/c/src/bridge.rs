@@ -1,4 +1,4 @@
-//! Our loop: a device of the caller's by three functions, on a real-time thread of the library.
+//! The library's own loop: a device given by three functions, on a real-time thread of the library.
 
 use std::ffi::c_void;
 use std::io;
@@ -19,23 +19,23 @@ use crate::options::{options_at, palpate_limits, palpate_touch_options};
 use crate::server::{CONNECTING, Connected, palpate_session};
 use crate::touch::{palpate_reading, palpate_state, state_of};
 
-/// A device of your own. The functions are called by one thread of the library, a thousand times a second: first `read`, then
-/// `write`. Both must return within a fraction of a millisecond, and return 0, or anything else if the device fails, which
-/// ends the loop. At its end, whatever the cause, `write` gets a force of zero.
+/// A device of your own. One thread of the library calls the functions, a thousand times per second: first `read`,
+/// then `write`. Both must return within a fraction of a millisecond. They return 0, or another value if the device
+/// fails, which ends the loop. At the end of the loop, for any reason, `write` gets a force of zero.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct palpate_device {
-    /// Is handed to the functions.
+    /// Passed to the functions.
     pub user: *mut c_void,
-    /// Writes what the device can bear. Called once, before the loop begins, by the thread that begins it.
+    /// Writes the limits of the device. Called once, before the loop starts, by the thread that starts it.
     pub descriptor: Option<unsafe extern "C" fn(user: *mut c_void, limits: *mut palpate_limits) -> i32>,
-    /// Writes where the device is, in the axes of the options; its origin is the middle of its workspace.
+    /// Writes the device's position, in the axes of the options; its origin is the middle of its workspace.
     pub read: Option<unsafe extern "C" fn(user: *mut c_void, reading: *mut palpate_reading) -> i32>,
-    /// Renders a force until the next tick, N, in the axes of the options.
+    /// Sets the force to render until the next tick, N, in the axes of the options.
     pub write: Option<unsafe extern "C" fn(user: *mut c_void, force_n: *const palpate_vector) -> i32>,
 }
 
-/// The loop of a device.
+/// A device's loop that runs on a thread of the library.
 pub struct palpate_bridge {
     shared: Arc<Connected>,
     seen: Arc<Mutex<LoopObservation>>,
@@ -45,62 +45,62 @@ pub struct palpate_bridge {
     axes: palpate_axes,
 }
 
-/// With which priority the loop runs.
+/// The priority of a loop's thread.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum palpate_priority {
-    /// As all threads.
+    /// The usual priority.
     #[default]
     PALPATE_PRIORITY_USUAL = 0,
-    /// Before all that are not of real time.
+    /// Real-time priority, above all usual threads.
     PALPATE_PRIORITY_REAL_TIME = 1,
-    /// Real time was asked for and the system did not allow it; `warn` said why.
+    /// Real-time priority was requested and refused by the system; `warn` got the reason.
     PALPATE_PRIORITY_REFUSED = 2,
 }
 
 pub use palpate_priority::*;
 
-/// How a loop stands.
+/// The current state of a loop.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct palpate_bridge_state {
-    /// Ticks so far.
+    /// Number of ticks so far.
     pub ticks: u64,
-    /// Where the tool was at the last tick, in the tissue's frame, in the axes of the options.
+    /// The tool's position at the last tick, in the tissue's frame, in the axes of the options.
     pub position: palpate_vector,
-    /// The force that was rendered, N.
+    /// The force rendered at the last tick, N.
     pub force_n: palpate_vector,
-    /// One of `palpate_state`.
+    /// Whether forces are rendered: one of `palpate_state`.
     pub state: u32,
-    /// One of `palpate_priority`.
+    /// The priority of its thread: one of `palpate_priority`.
     pub priority: u32,
-    /// 1 if the loop has ended: `palpate_bridge_end` says why.
+    /// 1 if the loop has ended; `palpate_bridge_end` returns why.
     pub is_over: u32,
 }
 
-/// What a loop has done.
+/// The results of a loop.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct palpate_bridge_report {
-    /// Ticks.
+    /// Number of ticks.
     pub ticks: u64,
-    /// Ticks that began more than a millisecond late.
+    /// Number of ticks that started more than a millisecond late.
     pub late_ticks: u64,
-    /// Ticks that were left out.
+    /// Number of ticks that were skipped.
     pub missed_ticks: u64,
-    /// Connections that were opened.
+    /// Number of connections that were opened.
     pub connections: u64,
-    /// Samples that came.
+    /// Number of samples that arrived.
     pub samples: u64,
-    /// Positions that went.
+    /// Number of positions that were sent.
     pub positions: u64,
-    /// One of `palpate_priority`.
+    /// The priority of its thread: one of `palpate_priority`.
     pub priority: u32,
-    /// Why it has ended, one of `palpate_result`: 0 if you have ended it.
+    /// The reason why it ended, one of `palpate_result`: 0 if you have ended it.
     pub result: u32,
 }
 
-/// What the loop shows of itself.
+/// The state of the loop that other threads can see.
 #[derive(Default)]
 struct LoopObservation {
     ticks: u64,
@@ -112,7 +112,7 @@ fn seen_of(seen: &Mutex<LoopObservation>) -> MutexGuard<'_, LoopObservation> {
     seen.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The caller's functions as a device.
+/// The caller's functions as a haptic device.
 struct Called {
     device: palpate_device,
     limits: Device,
@@ -149,17 +149,17 @@ impl HapticDevice for Called {
 
     fn ticked(&mut self, tick: &Tick) {
         self.ticks += 1;
-        // Who looks must not delay a tick.
+        // A thread that reads the state must not delay a tick.
         if let Ok(mut seen) = self.seen.try_lock() {
             (seen.ticks, seen.newest) = (self.ticks, Some(*tick));
         }
     }
 }
 
-/// Connects a device of your own to a session, on a thread of the library at 1 kHz, with real-time priority where the system
-/// allows it. `options` may be null; its `limits` are not used: `descriptor` tells them. Waits for the first connection. Writes a
-/// handle for `palpate_bridge_end`. What `device` points at is copied; its `user` must be valid until the end. Any thread;
-/// waits for the server.
+/// Connects a device of your own to a session, on a thread of the library at 1 kHz, with real-time priority if the
+/// system allows it. `options` may be null; its `limits` are ignored, since `descriptor` provides them. Waits for the
+/// first connection. Writes a handle for `palpate_bridge_end`. `device` is copied; its `user` must stay valid until
+/// the end. Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_bridge_begin(
     session: *const palpate_session,
@@ -231,7 +231,7 @@ pub unsafe extern "C" fn palpate_bridge_begin(
 }
 
 impl palpate_bridge {
-    /// Ends the loop, and waits for that. What it has done, and why it could not go on, if it couldn't.
+    /// Ends the loop and waits for that. Returns its results, and the error if it failed.
     fn end(self) -> (palpate_bridge_report, Option<CodedError>) {
         self.stop.notify_one();
         let (report, fault) = match self.shared.threads.block_on(self.task) {
@@ -259,7 +259,7 @@ impl palpate_bridge {
     }
 }
 
-/// Writes how the loop stands. Any thread.
+/// Writes the current state of the loop. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_bridge_look(
     bridge: *const palpate_bridge,
@@ -282,8 +282,8 @@ pub unsafe extern "C" fn palpate_bridge_look(
     })
 }
 
-/// Stops rendering until `enable` of a reading goes from 0 to 1 again; the force falls within the next ticks. Any thread, also from
-/// a function of the device.
+/// Stops rendering until `enable` of a reading changes from 0 to 1; the force falls within the next ticks. Any
+/// thread, also from a function of the device.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_bridge_disable(bridge: *const palpate_bridge) -> palpate_result {
     guard(|| {
@@ -293,8 +293,9 @@ pub unsafe extern "C" fn palpate_bridge_disable(bridge: *const palpate_bridge) -
     })
 }
 
-/// Ends the loop, waits for that, and writes what it has done, also if it has failed; `report` may be null. `PALPATE_DEVICE` if the
-/// device has failed: `palpate_last_error` tells how. The handle is given back in any case. Any thread, once; not from a function of the device.
+/// Ends the loop, waits for that, and writes its results, even if it has failed; `report` may be null. Returns
+/// `PALPATE_DEVICE` if the device has failed: `palpate_last_error` describes how. Frees the handle in any case. Any
+/// thread, once; not from a function of the device.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_bridge_end(
     bridge: *mut palpate_bridge,

@@ -1,4 +1,4 @@
-//! Errors: codes for programs, words for people, and the guard around every entry.
+//! Errors: codes for programs, messages for people, and the guard around every function.
 
 use std::borrow::Cow;
 use std::cell::Cell;
@@ -7,17 +7,18 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use palpate_client::Error;
 
-/// Why a function did nothing.
+/// The result of a function: success, or the reason why it did nothing.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum palpate_result {
-    /// It did what it says.
+    /// The function succeeded.
     PALPATE_OK = 0,
-    /// An argument is not valid: a null pointer, a number that is not finite or out of range, a text that is no UTF-8.
+    /// An argument is not valid: a null pointer, a number that is not finite or out of range, a text that is not
+    /// UTF-8.
     PALPATE_ARGUMENT = 1,
     /// The server can't be reached, or the connection broke.
     PALPATE_CONNECTION = 2,
-    /// The server refused the call: no such scene, no right to it, a value out of its range.
+    /// The server refused the call: an unknown scene, a missing permission, a value out of its range.
     PALPATE_REFUSED = 3,
     /// The device can't be read or written.
     PALPATE_DEVICE = 4,
@@ -25,45 +26,45 @@ pub enum palpate_result {
     PALPATE_BUFFER = 5,
     /// Another thread is in a function that only one thread at a time may call.
     PALPATE_BUSY = 6,
-    /// A fault of the library, or of the code that it called. The handle may be unusable from now on.
+    /// A bug in the library, or in code that it called. The handle may be unusable from now on.
     PALPATE_INTERNAL = 7,
 }
 
 pub use palpate_result::*;
 
-/// Bytes of the longest message, with the zero at its end.
+/// Maximum length of a message in bytes, with the zero at its end.
 const LONGEST: usize = 1024;
 
 thread_local! {
-    /// Without a request for memory: ticks fail too.
+    /// The message of the thread's last error. In place, without allocating memory: ticks fail too.
     static WORDS: Cell<[u8; LONGEST]> = const { Cell::new([0; LONGEST]) };
 }
 
-/// Keeps the words of an error of this thread, shortened to what fits.
+/// Stores the message of an error for this thread, truncated to what fits.
 fn keep(text: &str) {
     WORDS.with(|words| {
         let mut end = text.len().min(LONGEST - 1);
         while !text.is_char_boundary(end) {
             end -= 1;
         }
-        // SAFETY: only this thread has this place, and nobody reads it during the call.
+        // SAFETY: only this thread has this place, and nothing reads it during the call.
         let words = unsafe { &mut *words.as_ptr() };
         words[..end].copy_from_slice(&text.as_bytes()[..end]);
         words[end] = 0;
     });
 }
 
-/// Returns the words of this thread's last error; empty before the first. They stay until another call of this thread
-/// fails.
+/// Returns the message of this thread's last error; empty before the first. It stays valid until another call of this
+/// thread fails.
 #[unsafe(no_mangle)]
 pub extern "C" fn palpate_last_error() -> *const c_char {
     WORDS.try_with(|words| words.as_ptr().cast_const().cast()).unwrap_or(c"".as_ptr())
 }
 
-/// An error with a code.
+/// An error with a code and a message.
 pub(crate) struct CodedError {
     code: palpate_result,
-    /// Those of a tick are there already: it asks for no memory.
+    /// The message; for errors of ticks a constant, so that a tick allocates no memory.
     words: Cow<'static, str>,
 }
 
@@ -101,7 +102,7 @@ impl From<tonic::Status> for CodedError {
     }
 }
 
-/// Runs an entry: keeps the words of its error, and lets no panic out. It asks for no memory itself.
+/// Runs the body of a function: stores the message of its error, and catches panics. Allocates no memory itself.
 pub(crate) fn guard(entry: impl FnOnce() -> Result<(), CodedError>) -> palpate_result {
     match catch_unwind(AssertUnwindSafe(entry)) {
         Ok(Ok(())) => PALPATE_OK,
@@ -116,37 +117,37 @@ pub(crate) fn guard(entry: impl FnOnce() -> Result<(), CodedError>) -> palpate_r
     }
 }
 
-/// What a pointer points at.
+/// Returns the value that a pointer points at; an error if it is null.
 ///
 /// # Safety
-/// It is null or valid.
+/// The pointer must be null or valid.
 pub(crate) unsafe fn at<'a, T>(pointer: *const T, words: &'static str) -> Result<&'a T, CodedError> {
     // SAFETY: the caller's promise.
     unsafe { pointer.as_ref() }.ok_or_else(|| CodedError::argument(words))
 }
 
-/// The same, to be written.
+/// Returns the value that a pointer points at, to be written; an error if it is null.
 ///
 /// # Safety
-/// It is null or valid, and nobody else uses it meanwhile.
+/// The pointer must be null or valid, and nothing else may use the value during its lifetime.
 pub(crate) unsafe fn at_mut<'a, T>(pointer: *mut T, words: &'static str) -> Result<&'a mut T, CodedError> {
     // SAFETY: the caller's promise.
     unsafe { pointer.as_mut() }.ok_or_else(|| CodedError::argument(words))
 }
 
-/// A text.
+/// Returns the text that a pointer points at; an error if it is null or not UTF-8.
 ///
 /// # Safety
-/// It is null or ends with a zero byte.
+/// The pointer must be null or point to a zero-terminated text.
 pub(crate) unsafe fn text<'a>(pointer: *const c_char, name: &'static str) -> Result<&'a str, CodedError> {
     // SAFETY: the caller's promise.
     unsafe { optional_text(pointer, name) }?.ok_or_else(|| CodedError::argument(format!("{name} is null")))
 }
 
-/// A text that may be absent.
+/// Returns the text that a pointer points at; `None` if it is null, an error if it is not UTF-8.
 ///
 /// # Safety
-/// It is null or ends with a zero byte.
+/// The pointer must be null or point to a zero-terminated text.
 pub(crate) unsafe fn optional_text<'a>(
     pointer: *const c_char,
     name: &'static str,
@@ -159,10 +160,11 @@ pub(crate) unsafe fn optional_text<'a>(
     text.to_str().map(Some).map_err(|_| CodedError::argument(format!("{name} is not UTF-8")))
 }
 
-/// Writes a text into a buffer of the caller's, with a zero byte, and how many bytes it takes.
+/// Writes a text with a zero byte into the caller's buffer, and the number of bytes it takes. Either may be null, but
+/// not both.
 ///
 /// # Safety
-/// The pointers are null or valid, `buffer` for `capacity` bytes.
+/// The pointers must be null or valid, `buffer` for `capacity` bytes.
 pub(crate) unsafe fn write_text(
     text: &str,
     buffer: *mut c_char,

@@ -1,8 +1,9 @@
-//! libpalpate: the client library of Palpate for C. `include/palpate.h` is made from the functions here.
+//! libpalpate: the client library of Palpate for C. `include/palpate.h` is generated from the functions here.
 //!
-//! Every entry catches panics, checks its pointers and turns errors into codes; `error` keeps their words for the thread.
+//! Every function catches panics, checks its pointers and turns errors into codes; `error` keeps their messages per
+//! thread.
 
-// The interface is C's: names, pointers and promises of callers.
+// The interface is that of C: names, pointers and promises of callers.
 #![allow(unsafe_code, non_camel_case_types, clippy::missing_safety_doc, clippy::not_unsafe_ptr_arg_deref)]
 // Clients live in real time; the rule is for what a server computes.
 #![allow(clippy::disallowed_methods)]
@@ -26,16 +27,17 @@ pub use server::*;
 pub use surface::*;
 pub use touch::*;
 
-/// The version of the interface. A change that breaks programs raises it, and the number in the library's file name.
+/// The version of the interface. A change that breaks programs increases it, and the number in the library's file
+/// name.
 pub const PALPATE_ABI: u32 = 0;
 
-/// Returns the version of the interface that this library has: `PALPATE_ABI` of the header it goes with. Any thread.
+/// Returns the version of the library's interface; compare it with `PALPATE_ABI` of the header. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn palpate_abi() -> u32 {
     PALPATE_ABI
 }
 
-/// Returns the version of the library, such as "0.1.0". The text is there for ever. Any thread.
+/// Returns the version of the library, such as "0.1.0". The text stays valid until the program ends. Any thread.
 #[unsafe(no_mangle)]
 pub extern "C" fn palpate_version() -> *const c_char {
     const VERSION: &CStr = match CStr::from_bytes_with_nul(concat!(env!("CARGO_PKG_VERSION"), "\0").as_bytes()) {

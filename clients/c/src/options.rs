@@ -1,4 +1,4 @@
-//! What callers choose: structures that begin with their size, so that later versions can add to them.
+//! Options of callers: structures that start with their size, so that later versions can add fields.
 
 use std::ffi::{c_char, c_void};
 use std::sync::Arc;
@@ -11,102 +11,106 @@ use palpate_session::journal;
 use crate::axes::palpate_axes;
 use crate::error::{CodedError, guard, optional_text, palpate_result, text};
 
-/// A function of the caller's that is shown texts for people.
+/// A function of the caller that gets messages for people.
 pub type palpate_warn = Option<unsafe extern "C" fn(user: *mut c_void, message: *const c_char)>;
 
-/// How to connect.
+/// Options of a connection.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct palpate_connect_options {
-    /// Of this structure, as `palpate_connect_options_init` has set it.
+    /// Size of this structure, set by `palpate_connect_options_init`.
     pub size: usize,
     /// Your token, or null. It is sent only over TLS or to this machine.
     pub token: *const c_char,
-    /// Certificates (PEM) to trust in place of the system's, or null.
+    /// Certificates (PEM) to trust instead of the system's, or null.
     pub ca_pem: *const c_char,
-    /// The name that the server's certificate must carry if it is not the URL's host, or null.
+    /// The name that the server's certificate must carry if it differs from the host of the URL, or null.
     pub tls_name: *const c_char,
     /// Your certificate (PEM), or null.
     pub certificate_pem: *const c_char,
-    /// Its private key (PEM), or null.
+    /// The private key of your certificate (PEM), or null.
     pub key_pem: *const c_char,
-    /// Time for each call, s; 60: a session of an organ takes the server some seconds. For the connection 10 at most.
+    /// Time limit of each call, s; default 60, since creating a session of an organ takes the server some seconds.
+    /// For connecting at most 10 s.
     pub timeout_s: f64,
 }
 
-/// What a haptic device can bear. No force goes beyond it, nor beyond 3.3 N.
+/// The limits of a haptic device. No force exceeds them, nor 3.3 N.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct palpate_limits {
-    /// N.
+    /// Largest force, N.
     pub max_force_n: f64,
-    /// For longer than 2 s, N.
+    /// Largest force for longer than 2 s, N.
     pub continuous_force_n: f64,
-    /// N/m.
+    /// Largest stiffness, N/m.
     pub max_stiffness_n_per_m: f64,
-    /// N·s/m.
+    /// Largest damping, N·s/m.
     pub max_damping_n_s_per_m: f64,
-    /// Radius of the workspace around the middle of the tissue, m. Outside it nothing is rendered.
+    /// Radius of the workspace around its middle, which is placed on the top of the tissue, m. Outside it nothing is
+    /// rendered.
     pub workspace_radius_m: f64,
 }
 
-/// How to touch.
+/// Options for touching with a tool.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct palpate_touch_options {
-    /// Of this structure, as `palpate_touch_options_init` has set it.
+    /// Size of this structure, set by `palpate_touch_options_init`.
     pub size: usize,
-    /// The tool's number; 0.
+    /// Number of the tool; default 0.
     pub tool: u32,
-    /// One of `palpate_axes`: of positions and forces.
+    /// Axes of positions and forces, one of `palpate_axes`; default `PALPATE_AXES_OWN`.
     pub axes: u32,
-    /// What positions mean. 0: they are in the device's frame, whose origin lies on the top of the tissue. 1: they are in the
-    /// tissue's frame, as positions of its surface are.
+    /// The frame of positions. 0 (default): the device's frame, whose origin is placed on the top of the tissue. 1:
+    /// the tissue's frame, in which positions of its surface are given too.
     pub in_tissue_frame: u32,
-    /// The tip holds the tissue, pulling as well as pushing; 0: it touches.
+    /// 1: the tip holds the tissue, and pulls as well as pushes; 0 (default): it touches and only pushes.
     pub grasps: u32,
-    /// Radius of the tip, m; 0.005.
+    /// Radius of the tip, m, 0.0001 to 0.1; default 0.005.
     pub tip_radius_m: f64,
-    /// Friction coefficient of the tip; 0.2.
+    /// Friction coefficient of the tip, 0 to 10; default 0.2.
     pub friction: f64,
-    /// What the device can bear; 2 N.
+    /// Limits of the device; by default 2 N.
     pub limits: palpate_limits,
-    /// A sample is sent only when the rendered force would be off by more than this fraction; 0: one per step.
+    /// The server sends a sample only when the force rendered without it would be wrong by more than this fraction, 0
+    /// to 1; 0 (default): one per step.
     pub deadband: f64,
-    /// A position is sent only when the server would be wrong by more than this fraction of the force; 0: one per tick.
+    /// The library sends a position only when the server's prediction would be wrong by more than this fraction of
+    /// the force, 0 to 1; 0 (default): one per tick.
     pub up_deadband: f64,
-    /// Positions and samples go by datagram where the server has them; 1.
+    /// 1 (default): positions and samples go by datagram if the server offers datagrams; 0: never.
     pub datagrams: u32,
-    /// Our loop asks the system for real-time priority; 1.
+    /// 1 (default): the library's own loop requests real-time priority; 0: it does not.
     pub real_time: u32,
-    /// Your name, which other users of the server see; null: "libpalpate".
+    /// Your name, which other users of the server see; null (default): "libpalpate".
     pub holder: *const c_char,
-    /// Shows a text for people: a warning of the server, a connection that broke. From any thread of the library; it must not
-    /// wait. Null: nobody is told.
+    /// Called with messages for people: a warning of the server, a connection that broke. Called from any thread of
+    /// the library; it must not wait. Null (default): the messages are dropped.
     pub warn: palpate_warn,
-    /// Is handed to `warn`.
+    /// Passed to `warn`.
     pub warn_user: *mut c_void,
-    /// Of which tissues to keep a copy, which is simulated here, so that forces come without the delay of the network; samples
-    /// correct them. 0: none; 1: meshes, over whose rims, folds and lumps nothing else knows what comes next; 2: any. A thread
-    /// of the library steps the copy; a tick takes what that found at the last one, and waits for nothing. 0.
+    /// Which tissues to copy and simulate locally, so that forces come without the delay of the network; samples
+    /// correct the copy. 0 (default): none; 1: meshes, whose rims, folds and lumps no local model can predict; 2:
+    /// all. A thread of the library steps the copy; a tick uses its result for the last tick, and waits for nothing.
     pub prediction: u32,
 }
 
-/// Which surface to show.
+/// Options for showing a surface.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct palpate_surface_options {
-    /// Of this structure, as `palpate_surface_options_init` has set it.
+    /// Size of this structure, set by `palpate_surface_options_init`.
     pub size: usize,
-    /// One of `palpate_axes`.
+    /// Axes of positions and normals, one of `palpate_axes`; default `PALPATE_AXES_OWN`.
     pub axes: u32,
-    /// So many vertices are put between neighbouring points; 0 to 10; 0.
+    /// Number of vertices between neighbouring points, 0 to 10; default 0.
     pub refinement: u32,
-    /// Frames a second; 60.
+    /// Frames per second, above 0 and at most the session's step rate; default 60.
     pub rate_hz: f64,
 }
 
-/// Fills in what holds if you change nothing; `size` is `sizeof *options`. Any thread.
+/// Sets all options to their defaults; `size` is `sizeof *options`. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_connect_options_init(
     options: *mut palpate_connect_options,
@@ -116,7 +120,7 @@ pub unsafe extern "C" fn palpate_connect_options_init(
     unsafe { init(options, size) }
 }
 
-/// Fills in what holds if you change nothing; `size` is `sizeof *options`. Any thread.
+/// Sets all options to their defaults; `size` is `sizeof *options`. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_options_init(
     options: *mut palpate_touch_options,
@@ -126,7 +130,7 @@ pub unsafe extern "C" fn palpate_touch_options_init(
     unsafe { init(options, size) }
 }
 
-/// Fills in what holds if you change nothing; `size` is `sizeof *options`. Any thread.
+/// Sets all options to their defaults; `size` is `sizeof *options`. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_surface_options_init(
     options: *mut palpate_surface_options,
@@ -136,8 +140,8 @@ pub unsafe extern "C" fn palpate_surface_options_init(
     unsafe { init(options, size) }
 }
 
-/// Returns the limits of a device by its name: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7, inverse3.
-/// Any thread.
+/// Writes the limits of a device by its name: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7,
+/// inverse3. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_limits_of(name: *const c_char, limits: *mut palpate_limits) -> palpate_result {
     guard(|| {
@@ -165,7 +169,7 @@ impl From<Device> for palpate_limits {
 }
 
 impl palpate_limits {
-    /// The device with these limits.
+    /// Returns a device with these limits; refuses invalid ones.
     pub(crate) fn device(&self) -> Result<Device, CodedError> {
         let message = pb::Device {
             name: "libpalpate".to_owned(),
@@ -179,10 +183,10 @@ impl palpate_limits {
     }
 }
 
-/// A structure that begins with its size.
+/// A structure that starts with its size.
 ///
 /// # Safety
-/// The first field is its size, a `usize`, and all bytes may be copied.
+/// The first field must be its size, a `usize`, and all bytes may be copied.
 pub(crate) unsafe trait Versioned: Copy {
     fn initial() -> Self;
 }
@@ -245,7 +249,7 @@ unsafe fn init<T: Versioned>(options: *mut T, size: usize) -> palpate_result {
             return Err(CodedError::argument(why));
         }
         let initial = T::initial();
-        // SAFETY: so many bytes are valid on both sides; the structure of an older header is shorter.
+        // SAFETY: this number of bytes is valid on both sides; the structure of an older header is shorter.
         unsafe {
             std::ptr::copy_nonoverlapping((&raw const initial).cast::<u8>(), options.cast::<u8>(), size);
             options.cast::<usize>().write(size);
@@ -254,10 +258,10 @@ unsafe fn init<T: Versioned>(options: *mut T, size: usize) -> palpate_result {
     })
 }
 
-/// The options of a caller, whose structure may be that of an older header; null stands for the initial ones.
+/// Reads the options of a caller, whose structure may be that of an older header; null means the defaults.
 ///
 /// # Safety
-/// It is null, or as many bytes as its first field says are valid.
+/// The pointer must be null, or as many bytes as its first field says must be valid.
 pub(crate) unsafe fn options_at<T: Versioned>(pointer: *const T) -> Result<T, CodedError> {
     let mut options = T::initial();
     if pointer.is_null() {
@@ -265,19 +269,19 @@ pub(crate) unsafe fn options_at<T: Versioned>(pointer: *const T) -> Result<T, Co
     }
     // SAFETY: the first field is the size.
     let size = unsafe { pointer.cast::<usize>().read() };
-    // What a later header has beyond this library's is not known here: it might be of importance.
+    // Fields that only a later header has are unknown here and might matter: refuse them.
     if size < size_of::<usize>() || size > size_of::<T>() {
         let why = format!(
             "options.size is {size}: fill the structure by its _init function first; or the header is newer than the library"
         );
         return Err(CodedError::argument(why));
     }
-    // SAFETY: so many bytes are valid on both sides.
+    // SAFETY: this number of bytes is valid on both sides.
     unsafe { std::ptr::copy_nonoverlapping(pointer.cast::<u8>(), (&raw mut options).cast::<u8>(), size) };
     Ok(options)
 }
 
-/// Options of touch, checked.
+/// Checked options for touching.
 pub(crate) struct TouchOptions {
     pub(crate) tool: u32,
     pub(crate) axes: palpate_axes,
@@ -293,7 +297,7 @@ pub(crate) struct TouchOptions {
     pub(crate) copies: Option<Copies>,
 }
 
-/// By the number of `palpate_touch_options`.
+/// Returns the tissues to copy, by the value of `prediction` in `palpate_touch_options`.
 fn copies(number: u32) -> Result<Option<Copies>, CodedError> {
     if number > 2 {
         return Err(CodedError::argument(format!("prediction is {number}: must be 0, 1 or 2")));
@@ -301,7 +305,7 @@ fn copies(number: u32) -> Result<Option<Copies>, CodedError> {
     Ok((number > 0).then(|| Copies { make: Arc::new(journal::prediction), of_sheets: number == 2 }))
 }
 
-/// A caller's function for texts.
+/// The caller's function for messages, and its argument.
 struct TextCallback {
     show: unsafe extern "C" fn(*mut c_void, *const c_char),
     user: *mut c_void,
@@ -322,7 +326,7 @@ impl TextCallback {
 
 impl palpate_touch_options {
     /// # Safety
-    /// `holder` is null or a text.
+    /// `holder` must be null or a zero-terminated text.
     pub(crate) unsafe fn checked(&self) -> Result<TouchOptions, CodedError> {
         let within = |name: &str, value: f64, range: std::ops::RangeInclusive<f64>| {
             let wrong = || {

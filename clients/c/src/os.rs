@@ -1,7 +1,7 @@
-//! What differs between operating systems: on Unix a write to a connection that the other end has closed sends SIGPIPE, which
-//! ends a program that does not expect it. Programs in Rust ignore it from their start; those in C do not, and their disposition
-//! is theirs. So the library blocks it in its own threads, and in the caller's while that waits for the network. And a process
-//! that is forked has none of its parent's threads.
+//! What depends on the operating system. On Unix a write to a connection that the other end has closed sends SIGPIPE,
+//! which ends a program that does not expect it. Rust programs ignore it from their start; C programs do not, and how
+//! they handle it is up to them. So the library blocks it in its own threads, and in the caller's thread while that
+//! waits for the network. In addition, a forked process has none of its parent's threads.
 
 use std::future::Future;
 
@@ -10,12 +10,12 @@ use tokio::task::JoinHandle;
 
 use crate::error::{CodedError, PALPATE_INTERNAL};
 
-/// Threads for the network, which no closed connection ends. A child that was forked has not got them: there every use is
-/// refused, which would wait for ever.
+/// The library's threads for the network, in which SIGPIPE is blocked. A forked child does not have these threads:
+/// there every use is refused, since it would never complete.
 pub(crate) struct Threads {
-    /// Always there, till it is dropped.
+    /// Always present, until it is dropped.
     runtime: Option<Runtime>,
-    /// Who has the threads.
+    /// The process that has the threads.
     process: u32,
 }
 
@@ -31,21 +31,21 @@ impl Threads {
         Ok(Threads { runtime: Some(runtime), process: std::process::id() })
     }
 
-    /// The threads, if this process has them.
+    /// Returns the threads, if this process has them.
     pub(crate) fn here(&self) -> Result<&Runtime, CodedError> {
         let words = "the handle is of the process that this one was forked from: connect here for a handle of its own";
         let is_here = self.process == std::process::id();
         self.runtime.as_ref().filter(|_| is_here).ok_or_else(|| CodedError::argument(words))
     }
 
-    /// Waits for `future` in this thread, which no closed connection ends meanwhile.
+    /// Waits for `future` in this thread, in which SIGPIPE is blocked meanwhile.
     pub(crate) fn block_on<F: Future>(&self, future: F) -> Result<F::Output, CodedError> {
         let runtime = self.here()?;
         let _blocked = sigpipe::Blocked::new();
         Ok(runtime.block_on(future))
     }
 
-    /// Does `future` on these threads.
+    /// Runs `future` on these threads.
     pub(crate) fn spawn<F>(&self, future: F) -> Result<JoinHandle<F::Output>, CodedError>
     where
         F: Future<Output: Send> + Send + 'static,
@@ -57,7 +57,7 @@ impl Threads {
 impl Drop for Threads {
     fn drop(&mut self) {
         if self.here().is_err() {
-            // The end of a runtime waits for its threads.
+            // Dropping a runtime waits for its threads, which a child does not have.
             std::mem::forget(self.runtime.take());
         }
     }
@@ -91,14 +91,14 @@ mod sigpipe {
         unsafe { libc::sigpending(set.as_mut_ptr()) == 0 && is_in(&set.assume_init()) }
     }
 
-    /// Blocks it in this thread; tells which signals were blocked before.
+    /// Blocks SIGPIPE in this thread; returns the signals that were blocked before.
     pub(super) fn block() -> Option<sigset_t> {
         let mut before = MaybeUninit::uninit();
         // SAFETY: both sets are valid; the second is initialized if it returns 0.
         unsafe { (libc::pthread_sigmask(SIG_BLOCK, &only(), before.as_mut_ptr()) == 0).then(|| before.assume_init()) }
     }
 
-    /// It is blocked in this thread as long as this is there.
+    /// Blocks SIGPIPE in this thread until it is dropped.
     pub(super) struct Blocked {
         before: Option<sigset_t>,
         was_pending: bool,
@@ -114,7 +114,7 @@ mod sigpipe {
     impl Drop for Blocked {
         fn drop(&mut self) {
             let Some(before) = self.before.filter(|before| !is_in(before)) else { return };
-            // What came meanwhile was this library's.
+            // A signal that arrived in the meantime was caused by this library.
             if !self.was_pending && is_pending() {
                 let mut signal = 0;
                 // SAFETY: both are valid; it is pending, so this does not wait.
@@ -144,10 +144,10 @@ mod sigpipe {
                     raise();
                     assert!(is_pending());
                 }
-                // This process goes on, and nothing is left.
+                // This process continues, and no signal is left.
                 assert!(!is_pending());
                 assert!(!blocked());
-                // Who has blocked it has it blocked, and keeps what came.
+                // If the caller has blocked it, it stays blocked and pending.
                 raise();
                 drop(Blocked::new());
                 assert!(is_pending() && blocked());
@@ -165,7 +165,7 @@ mod sigpipe {
 mod sigpipe {
     pub(super) fn block() {}
 
-    /// There is no such signal.
+    /// This system has no such signal.
     pub(super) struct Blocked;
 
     impl Blocked {
@@ -184,7 +184,7 @@ mod tests {
     fn in_a_child_that_was_forked_the_parents_threads_are_not_waited_for() {
         let threads = Threads::start().map_err(|_| "threads").unwrap();
         assert_eq!(threads.block_on(async { 7 }).map_err(|_| "here"), Ok(7));
-        // As a child sees what it has of its parent.
+        // A child sees its parent's handles like this.
         let mut of_parent = Threads::start().map_err(|_| "threads").unwrap();
         of_parent.process ^= 1;
         let refused = of_parent.block_on(std::future::pending::<()>()).err().unwrap();

@@ -29,7 +29,7 @@ pub struct palpate_server {
     pub(crate) shared: Arc<Connected>,
 }
 
-/// What a server's handle and all that was made from it share.
+/// The state shared by a server's handle and everything created from it.
 pub(crate) struct Connected {
     pub(crate) threads: Threads,
     pub(crate) server: Server,
@@ -37,43 +37,43 @@ pub(crate) struct Connected {
     pub(crate) timeout: Duration,
 }
 
-/// A session: one tissue in use. Any thread, also several at once.
+/// A session on a server: one simulated tissue. Any thread, also several at once.
 pub struct palpate_session {
     pub(crate) shared: Arc<Connected>,
     pub(crate) session_id: String,
     extent: palpate_extent,
 }
 
-/// The box around a tissue at rest, in Palpate's own axes, m.
+/// The bounding box of a tissue at rest, in Palpate's own axes, m.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct palpate_extent {
-    /// Its corner with the least coordinates.
+    /// The corner with the smallest coordinates.
     pub least_m: palpate_vector,
-    /// Its corner with the greatest.
+    /// The corner with the largest coordinates.
     pub most_m: palpate_vector,
-    /// Its middle.
+    /// The middle of the box.
     pub middle_m: palpate_vector,
-    /// The highest place of the surface in line with its middle: positions of devices begin there.
+    /// The highest place of the surface above or below its middle: the origin of devices is placed there.
     pub top_m: palpate_vector,
 }
 
-/// A change of the tissue under way. Not a number: it stays as it is.
+/// A change of the tissue's coefficients. A value that is NaN leaves the coefficient as it is.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct palpate_change {
-    /// Of structural springs, N/m.
+    /// Stiffness of the structural springs, N/m.
     pub stiffness_n_per_m: f64,
-    /// N·s/m.
+    /// Damping, N·s/m.
     pub damping_n_s_per_m: f64,
-    /// Of anchor springs, N/m.
+    /// Stiffness of the anchor springs, which pull points to their places at rest, N/m.
     pub anchor_stiffness_n_per_m: f64,
-    /// Of the volume of a closed mesh, Pa.
+    /// Stiffness of the volume of a closed mesh, Pa.
     pub volume_stiffness_pa: f64,
 }
 
 impl Connected {
-    /// Waits for a call, for no longer than the time for calls.
+    /// Waits for a call, at most for the time limit of calls.
     pub(crate) fn wait<T, E: Into<CodedError>>(
         &self,
         call: impl Future<Output = Result<T, E>>,
@@ -81,7 +81,7 @@ impl Connected {
         self.wait_for(1, call)
     }
 
-    /// The same for so many calls, one after the other.
+    /// Waits for `calls` calls in succession, at most for `calls` times the time limit of a call.
     fn wait_for<T, E: Into<CodedError>>(
         &self,
         calls: u32,
@@ -98,7 +98,7 @@ impl Connected {
         }
     }
 
-    /// A call for a session: of a fleet, another server may have it.
+    /// Makes a call for a session, which another server of a fleet may have.
     pub(crate) fn follow<T, F>(&self, call: impl Fn(SessionServiceClient<Channel>) -> F) -> Result<T, CodedError>
     where
         F: Future<Output = Result<T, tonic::Status>>,
@@ -114,7 +114,7 @@ impl Connected {
 }
 
 impl palpate_session {
-    /// What a tool with these options is connected to.
+    /// Returns the target of a tool with these options.
     pub(crate) fn target(&self, options: &TouchOptions) -> Target {
         Target {
             server: self.shared.server.clone(),
@@ -129,11 +129,11 @@ impl palpate_session {
     }
 }
 
-/// Longest time for a connection.
+/// Longest time for connecting.
 pub(crate) const CONNECTING: Duration = Duration::from_secs(10);
 
-/// Connects to the server at `url`, such as "http://127.0.0.1:7117". `options` may be null. Waits for its first answer, for 10 s
-/// at most. Writes a handle for `palpate_server_free`. Any thread.
+/// Connects to the server at `url`, such as "http://127.0.0.1:7117". `options` may be null. Waits for the first
+/// answer, at most 10 s. Writes a handle for `palpate_server_free`. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_connect(
     url: *const c_char,
@@ -177,7 +177,8 @@ pub unsafe extern "C" fn palpate_connect(
     })
 }
 
-/// Closes a connection when nothing that was made from it is left. Null is allowed. Any thread, once.
+/// Frees the handle of a connection, which closes when nothing created from it is left. Null is allowed. Any thread,
+/// once.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_server_free(server: *mut palpate_server) {
     // SAFETY: the caller's promise.
@@ -185,7 +186,7 @@ pub unsafe extern "C" fn palpate_server_free(server: *mut palpate_server) {
 }
 
 /// # Safety
-/// It is null or from `Box::into_raw`.
+/// The pointer must be null or from `Box::into_raw`.
 pub(crate) unsafe fn free<T>(handle: *mut T) -> Result<(), CodedError> {
     if !handle.is_null() {
         // SAFETY: the caller's promise.
@@ -194,8 +195,9 @@ pub(crate) unsafe fn free<T>(handle: *mut T) -> Result<(), CodedError> {
     Ok(())
 }
 
-/// Writes the names of the server's scenes into `names`, a line each, and into `needed` how many bytes that takes; either may be
-/// null. `PALPATE_BUFFER` if `capacity` bytes are too few. Any thread; waits for the server.
+/// Writes the names of the server's scenes into `names`, one per line, and into `needed` the number of bytes that
+/// they take; either may be null. Returns `PALPATE_BUFFER` if `capacity` bytes are too few. Any thread; waits for the
+/// server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_scenes(
     server: *const palpate_server,
@@ -230,8 +232,9 @@ fn create(shared: &Arc<Connected>, source: Source) -> Result<*mut palpate_sessio
     handle(shared, answer.into_inner().session)
 }
 
-/// Makes a session of a scene that the server has. It runs at once. Nobody deletes it but `palpate_session_delete`, and the
-/// server when nobody has used it for long. Writes a handle for `palpate_session_free`. Any thread; waits for the server.
+/// Creates a session of one of the server's scenes. It runs at once. It exists until `palpate_session_delete`, or
+/// until the server deletes it because it is idle. Writes a handle for `palpate_session_free`. Any thread; waits for
+/// the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_create(
     server: *const palpate_server,
@@ -253,10 +256,11 @@ pub unsafe extern "C" fn palpate_session_create(
     })
 }
 
-/// Parts of a file are not smaller, bytes.
+/// Smallest size of the parts of an uploaded file, bytes.
 const PART_BYTES: usize = 256 << 10;
 
-/// A session of a scene that was read here; its mesh is sent first. `said` is what its text says of that.
+/// Creates a session of a scene that was read here, after uploading its mesh. `said` is what the scene file says
+/// about the mesh.
 fn create_own(
     shared: &Arc<Connected>,
     scene: &Scene,
@@ -264,7 +268,7 @@ fn create_own(
 ) -> Result<*mut palpate_session, CodedError> {
     let mut message = ::palpate_session::wire::scene::sent(scene);
     if let (Body::Mesh(mesh), Some(of_scene)) = (&scene.body, &mut message.mesh) {
-        // As many vertices as were asked for, of which there may be some fewer here.
+        // The number of vertices as requested in the file; the mesh may have fewer.
         let vertices = said.and_then(|said| said.vertices);
         of_scene.vertices = vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
         let (name, bytes, unit) = sent::file(mesh);
@@ -283,8 +287,9 @@ fn refused(refusal: Refusal) -> CodedError {
     CodedError::argument(refusal.to_string())
 }
 
-/// Returns the same of a scene file of your own (TOML), by its path. The file of its mesh, if it names one, is read
-/// where the scene file says, and sent to the server. Any thread; waits for the server.
+/// Creates a session of a scene file of your own (TOML), by its path. If the file names a mesh, that is read from the
+/// given path and sent to the server. The session runs at once, and exists until `palpate_session_delete`, or until
+/// it is idle for long. Writes a handle for `palpate_session_free`. Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_create_from_file(
     server: *const palpate_server,
@@ -308,9 +313,10 @@ pub unsafe extern "C" fn palpate_session_create_from_file(
     })
 }
 
-/// Returns the same of the text of a scene file and of a mesh in memory: the `byte_count` bytes of a file (OBJ, STL,
-/// PLY, glTF, Gmsh or VTK) that `[mesh]` of the text calls `mesh_name`. The mesh is sent to the server. Any thread;
-/// waits for the server.
+/// Creates a session of the text of a scene file, with a mesh in memory: the `byte_count` bytes of a file (OBJ, STL,
+/// PLY, glTF, Gmsh or VTK) that `[mesh]` of the text calls `mesh_name`. Sends the mesh to the server. The session
+/// runs at once, and exists until `palpate_session_delete`, or until it is idle for long. Writes a handle for
+/// `palpate_session_free`. Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_create_from_mesh(
     server: *const palpate_server,
@@ -334,7 +340,7 @@ pub unsafe extern "C" fn palpate_session_create_from_mesh(
         if mesh_bytes.is_null() {
             return Err(CodedError::argument("mesh_bytes is null"));
         }
-        // SAFETY: the caller's promise, that there are so many.
+        // SAFETY: the caller guarantees this number of bytes.
         let bytes = unsafe { std::slice::from_raw_parts(mesh_bytes, byte_count) };
         let made = Scene::parse_given("scene_text", scene, (mesh_name, bytes), &Limits::default()).map_err(refused)?;
         *out = create_own(shared, &made, sent::said("scene_text", scene).map_err(refused)?)?;
@@ -342,8 +348,9 @@ pub unsafe extern "C" fn palpate_session_create_from_mesh(
     })
 }
 
-/// Returns the same of the text of a scene file that names no other file: of a sheet, or of an organ that is generated.
-/// Any thread; waits for the server.
+/// Creates a session of the text of a scene file that names no other file: a sheet, or a generated organ. The session
+/// runs at once, and exists until `palpate_session_delete`, or until it is idle for long. Writes a handle for
+/// `palpate_session_free`. Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_create_from_text(
     server: *const palpate_server,
@@ -366,8 +373,7 @@ pub unsafe extern "C" fn palpate_session_create_from_text(
     })
 }
 
-/// Returns a session that is there already, by its id. Writes a handle for `palpate_session_free`. Any thread; waits
-/// for the server.
+/// Joins an existing session by its ID. Writes a handle for `palpate_session_free`. Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_join(
     server: *const palpate_server,
@@ -394,7 +400,8 @@ pub unsafe extern "C" fn palpate_session_join(
     })
 }
 
-/// Writes the session's id, by which others join it, and how many bytes it takes, as `palpate_scenes` does. Any thread.
+/// Writes the session's ID, by which others join it, and the number of bytes it takes, as `palpate_scenes` does. Any
+/// thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_id(
     session: *const palpate_session,
@@ -408,7 +415,7 @@ pub unsafe extern "C" fn palpate_session_id(
     })
 }
 
-/// Writes where the tissue rests. Any thread.
+/// Writes the bounding box of the tissue at rest. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_extent(
     session: *const palpate_session,
@@ -422,7 +429,7 @@ pub unsafe extern "C" fn palpate_session_extent(
     })
 }
 
-/// Returns a change that changes nothing. Any thread.
+/// Initializes a change so that it changes nothing. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_change_init(change: *mut palpate_change) -> palpate_result {
     guard(|| {
@@ -439,7 +446,8 @@ pub unsafe extern "C" fn palpate_change_init(change: *mut palpate_change) -> pal
     })
 }
 
-/// Changes the tissue from the next step on; whoever touches it feels the change. Any thread; waits for the server.
+/// Changes the tissue from the next step on; all users who touch it feel the change. Any thread; waits for the
+/// server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_change(
     session: *const palpate_session,
@@ -465,7 +473,8 @@ pub unsafe extern "C" fn palpate_session_change(
     })
 }
 
-/// Deletes the session on the server, for everybody. The handle is still to be freed. Any thread; waits for the server.
+/// Deletes the session on the server, for all users. The handle must still be freed. Any thread; waits for the
+/// server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_delete(session: *const palpate_session) -> palpate_result {
     guard(|| {
@@ -480,7 +489,7 @@ pub unsafe extern "C" fn palpate_session_delete(session: *const palpate_session)
     })
 }
 
-/// Gives a handle back. The session goes on. Null is allowed. Any thread, once.
+/// Frees a handle. The session continues on the server. Null is allowed. Any thread, once.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_free(session: *mut palpate_session) {
     // SAFETY: the caller's promise.

@@ -1,4 +1,4 @@
-//! The newest surface, in buffers of the caller's.
+//! The newest surface of a session, written into the caller's buffers.
 
 use std::sync::Arc;
 
@@ -13,70 +13,70 @@ use crate::options::{options_at, palpate_surface_options};
 use crate::server::{Connected, free, palpate_session};
 use crate::touch::Exclusive;
 
-/// The surface of a session.
+/// The surface of a session, which follows its newest frame.
 pub struct palpate_surface {
     axes: palpate_axes,
     vertices: usize,
     seen: Exclusive<SurfaceObservation>,
-    // After what runs on it.
+    // Declared last: dropped after what runs on it.
     _shared: Arc<Connected>,
 }
 
-/// What the caller has seen.
+/// The state of the surface that the caller has read last.
 struct SurfaceObservation {
     shown: ShownSurface,
     position_m: Vec<[f32; 3]>,
     normal: Vec<[f32; 3]>,
 }
 
-/// How large a surface is.
+/// The size of a surface. It never changes.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct palpate_surface_size {
-    /// Vertices; they never become others.
+    /// Number of vertices.
     pub vertices: usize,
-    /// Indices: three for each triangle.
+    /// Number of indices: three per triangle.
     pub indices: usize,
-    /// 1 if the vertices have texture coordinates.
+    /// 1 if the vertices have texture coordinates, else 0.
     pub has_uv: u32,
 }
 
-/// Where to write a surface.
+/// The buffers to write a surface to.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct palpate_buffers {
-    /// x, y, z of the first vertex; null: they are not wanted.
+    /// x, y, z of the first vertex; null: positions are not written.
     pub positions: *mut f32,
     /// Bytes from one vertex to the next: 12 or more.
     pub positions_stride: usize,
-    /// x, y, z of the first vertex' normal; null: they are not wanted.
+    /// x, y, z of the first vertex' normal; null: normals are not written.
     pub normals: *mut f32,
-    /// Bytes from one to the next: 12 or more.
+    /// Bytes from one normal to the next: 12 or more.
     pub normals_stride: usize,
-    /// For how many vertices there is room.
+    /// Number of vertices for which there is room.
     pub vertices: usize,
-    /// Write every vertex; 0: only those that have changed since the last time, for buffers that keep the others.
+    /// 1: write every vertex; 0: only those that have changed since the last call, for buffers that keep the others.
     pub everything: u32,
 }
 
-/// What was written.
+/// The range of vertices that was written, and the moment that they show.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct palpate_dirty {
-    /// The first vertex that was written.
+    /// Index of the first vertex that was written.
     pub first: usize,
-    /// How many from there on; 0 if nothing has changed.
+    /// Number of vertices that were written; 0 if nothing has changed.
     pub count: usize,
-    /// Frames that have come from the server; 0: the surface at rest.
+    /// Number of frames received from the server; 0: the surface is at rest.
     pub frames: u64,
-    /// Steps that the session had done.
+    /// Number of steps that the session had done.
     pub step: u64,
-    /// Its time, s.
+    /// Simulated time, s.
     pub simulation_time_s: f64,
 }
 
-/// Gets the surface of a session and begins to watch it. `options` may be null. Writes a handle for `palpate_surface_free`.
-/// Any thread; waits for the server.
+/// Gets the surface of a session and starts to watch it. `options` may be null. Writes a handle for
+/// `palpate_surface_free`. Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_surface_open(
     session: *const palpate_session,
@@ -95,7 +95,7 @@ pub unsafe extern "C" fn palpate_surface_open(
         let shared = session.shared.clone();
         let opening = async {
             let request = pb::GetSessionRequest { session_id: session.session_id.clone() };
-            // Of a fleet, another server may have the session.
+            // Another server of a fleet may have the session.
             let at = fleet::follow_from(&shared.server, shared.channel.clone(), |channel| {
                 let request = request.clone();
                 async move { SessionServiceClient::new(channel).get_session(request).await }
@@ -111,7 +111,7 @@ pub unsafe extern "C" fn palpate_surface_open(
     })
 }
 
-/// Writes how large the surface is. One thread at a time. Never waits.
+/// Writes the size of the surface. One thread at a time. Never waits.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_surface_size_of(
     surface: *const palpate_surface,
@@ -132,8 +132,8 @@ pub unsafe extern "C" fn palpate_surface_size_of(
     })
 }
 
-/// Writes all indices, three for each triangle, in the order that the axes' engine takes for the front. They never change. One
-/// thread at a time. Never waits.
+/// Writes all indices, three per triangle, in the order that the engine of these axes takes for the front. They never
+/// change. One thread at a time. Never waits.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_surface_indices(
     surface: *const palpate_surface,
@@ -160,8 +160,8 @@ pub unsafe extern "C" fn palpate_surface_indices(
     })
 }
 
-/// Writes u and v of each vertex, `stride` bytes (8 or more) from one to the next. They never change. `PALPATE_ARGUMENT` if the
-/// surface has none. One thread at a time. Never waits.
+/// Writes u and v of each vertex, `stride` bytes (8 or more) apart. They never change. Returns `PALPATE_ARGUMENT` if
+/// the surface has none. One thread at a time. Never waits.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_surface_uv(
     surface: *const palpate_surface,
@@ -195,9 +195,9 @@ pub unsafe extern "C" fn palpate_surface_uv(
     })
 }
 
-/// Writes the newest positions and normals that have come, and which vertices these are. Never waits: not for the server, nor for
-/// another thread. `PALPATE_CONNECTION` if no more will come: the last are written all the same, and `palpate_last_error`
-/// says why. One thread at a time.
+/// Writes the newest positions and normals, and which vertices were written. Never waits, neither for the server nor
+/// for another thread. Returns `PALPATE_CONNECTION` if no more will arrive: the last ones are written all the same,
+/// and `palpate_last_error` describes why. One thread at a time.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_surface_read(
     surface: *const palpate_surface,
@@ -243,7 +243,7 @@ pub unsafe extern "C" fn palpate_surface_read(
 }
 
 impl SurfaceObservation {
-    /// Takes the newest moment; tells which vertices are to be written.
+    /// Takes the newest moment; returns which vertices to write.
     fn take(&mut self, everything: bool) -> palpate_dirty {
         let is_new = self.shown.refresh();
         let SurfaceObservation { shown, position_m, normal, .. } = self;
@@ -271,7 +271,7 @@ impl SurfaceObservation {
     }
 }
 
-/// Gives a handle back. Null is allowed. Any thread, once, when no other is in a function of this handle.
+/// Frees a handle. Null is allowed. Any thread, once, when no other thread is in a function of this handle.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_surface_free(surface: *mut palpate_surface) {
     // SAFETY: the caller's promise.

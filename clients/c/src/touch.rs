@@ -1,4 +1,5 @@
-//! Your loop: a handle whose tick a thread of the caller's calls a thousand times a second; also of what was recorded.
+//! A loop of the caller: a handle whose tick the caller calls a thousand times per second, also for rendering
+//! recordings.
 
 use std::cell::UnsafeCell;
 use std::sync::Arc;
@@ -13,81 +14,84 @@ use crate::error::{CodedError, PALPATE_BUSY, at, at_mut, guard, palpate_result};
 use crate::options::{options_at, palpate_touch_options};
 use crate::server::{Connected, palpate_session};
 
-/// A tool that your loop leads.
+/// A tool that your own loop moves.
 pub struct palpate_touch {
     ticker: Exclusive<Ticker>,
     axes: palpate_axes,
     far: Far,
 }
 
-/// The other end.
+/// The other end of the loop: a server or a recording.
 #[allow(clippy::large_enum_variant)] // One a tool.
 enum Far {
-    // In this order: the connection ends on the runtime.
+    // Declared in this order: the connection ends on the runtime.
     Server { connection: Connection, shared: Arc<Connected> },
     Record(Exclusive<OfflineNetwork>),
 }
 
-/// Whether forces are rendered.
+/// Whether forces are rendered, and why not.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum palpate_state {
     /// There was no connection yet.
     #[default]
     PALPATE_STATE_WAITING = 0,
-    /// Nothing is rendered until `enable` goes from 0 to 1. Also if it has, until the first news of the tissue.
+    /// Nothing is rendered until `enable` changes from 0 to 1, and then until the first data of the tissue arrives.
     PALPATE_STATE_DISABLED = 1,
-    /// Rendering, or beginning to.
+    /// Forces are rendered, or fade in.
     PALPATE_STATE_ENABLED = 2,
-    /// Nothing came from the server for too long, or no tick came. Nothing is rendered until `enable` goes from 0 to 1.
+    /// No data arrived from the server for too long, or there was no tick. Nothing is rendered until `enable` changes
+    /// from 0 to 1.
     PALPATE_STATE_PAUSED = 3,
-    /// The tool was outside the workspace, or a number was not finite. Nothing is rendered until `enable` goes from 0 to 1.
+    /// The tool was outside the workspace, or a number was not finite. Nothing is rendered until `enable` changes
+    /// from 0 to 1.
     PALPATE_STATE_FAULT = 4,
 }
 
 pub use palpate_state::*;
 
-/// What a device reports.
+/// The position and button of a device.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct palpate_reading {
-    /// In the axes and frame of `palpate_touch_options`.
+    /// Position, in the axes and frame of `palpate_touch_options`.
     pub position: palpate_vector,
-    /// The operator asks for forces, by a button or pedal. Only a change from 0 to another value enables them.
+    /// Whether the operator requests forces, by a button or pedal. Only a change from 0 to another value enables
+    /// them.
     pub enable: u32,
 }
 
-/// What a tick tells.
+/// The results of a tick.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct palpate_felt {
     /// The force on the hand until the next tick, N.
     pub force_n: palpate_vector,
-    /// One of `palpate_state`.
+    /// Whether forces are rendered: one of `palpate_state`.
     pub state: u32,
-    /// 1 if the connection has ended for good.
+    /// 1 if the connection has ended for good, else 0.
     pub is_over: u32,
-    /// How old the newest news of the tissue is, s; negative before the first.
+    /// Age of the newest data of the tissue, s; negative before the first.
     pub age_s: f64,
 }
 
-/// What went over the network.
+/// Totals of what was sent and received.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct palpate_traffic {
-    /// Connections that were opened.
+    /// Number of connections that were opened.
     pub connections: u64,
-    /// Attempts that failed, and connections that broke.
+    /// Number of failed attempts, and of connections that broke.
     pub failed: u64,
-    /// Samples that came.
+    /// Number of samples that arrived.
     pub samples: u64,
-    /// Positions that went.
+    /// Number of positions that were sent.
     pub positions: u64,
-    /// 1 while a connection stands.
+    /// 1 while there is a connection, else 0.
     pub is_connected: u32,
 }
 
-/// A value that one thread at a time may change; another is sent away, and does not wait.
+/// A value that one thread at a time may change; another thread gets an error and does not wait.
 pub(crate) struct Exclusive<T> {
     is_busy: AtomicBool,
     value: UnsafeCell<T>,
@@ -102,7 +106,7 @@ impl<T> Exclusive<T> {
     }
 
     pub(crate) fn with<R>(&self, change: impl FnOnce(&mut T) -> R) -> Result<R, CodedError> {
-        /// Also if `change` panics.
+        /// Leaves also if `change` panics.
         struct Leave<'a>(&'a AtomicBool);
         impl Drop for Leave<'_> {
             fn drop(&mut self) {
@@ -113,7 +117,7 @@ impl<T> Exclusive<T> {
             return Err(CodedError::new(PALPATE_BUSY, "another thread is in a function of this handle"));
         }
         let _leave = Leave(&self.is_busy);
-        // SAFETY: nobody else is here.
+        // SAFETY: no other thread is here.
         Ok(change(unsafe { &mut *self.value.get() }))
     }
 }
@@ -128,9 +132,10 @@ pub(crate) fn state_of(state: Option<RenderingState>) -> palpate_state {
     }
 }
 
-/// Takes a tool of a session for a loop of your own, such as that of an engine's haptic thread, and waits until it may be used.
-/// `options` may be null. From then on call `palpate_touch_tick` a thousand times a second. When the connection breaks, the
-/// library connects again. Writes a handle for `palpate_touch_end`. Any thread; waits for the server.
+/// Acquires a tool of a session for a loop of your own, such as that of an engine's haptic thread, and waits until it
+/// can be used. `options` may be null. From then on call `palpate_touch_tick` a thousand times per second. When the
+/// connection breaks, the library connects again. Writes a handle for `palpate_touch_end`. Any thread; waits for the
+/// server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_begin(
     session: *const palpate_session,
@@ -155,9 +160,10 @@ pub unsafe extern "C" fn palpate_touch_begin(
     })
 }
 
-/// Returns a loop over what was recorded, without a server: the same messages, positions and times give the same forces, bit by bit.
-/// It has no copy of the tissue, whatever `prediction` says. `options` may be null; `middle_m` is where the middle of the
-/// workspace is laid in the tissue (`palpate_extent.top_m`), in Palpate's own axes. Writes a handle for `palpate_touch_end`. Any thread.
+/// Creates a loop that renders recordings, without a server: equal messages, positions and times give equal forces,
+/// bit by bit. It has no copy of the tissue; `prediction` is ignored. `options` may be null; `middle_m` is the place
+/// in the tissue of the middle of the workspace (`palpate_extent.top_m`), in Palpate's own axes. Writes a handle for
+/// `palpate_touch_end`. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_begin_offline(
     options: *const palpate_touch_options,
@@ -179,8 +185,8 @@ pub unsafe extern "C" fn palpate_touch_begin_offline(
     })
 }
 
-/// Takes a recorded message, which arrives now: the bytes of a `palpate.v1.TouchResponse`. The next tick knows it. Only of a
-/// handle of `palpate_touch_begin_offline`. One thread at a time; it may be another than that of the ticks.
+/// Delivers a recorded message: the bytes of a `palpate.v1.TouchResponse`. The next tick uses it. Only for a handle
+/// of `palpate_touch_begin_offline`. One thread at a time; it may be another than that of the ticks.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_arrive(
     touch: *const palpate_touch,
@@ -201,10 +207,10 @@ pub unsafe extern "C" fn palpate_touch_arrive(
     })
 }
 
-/// Gives the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, by a clock that
-/// goes on between ticks. Takes a bounded time: no lock, no call of the system, no memory asked for or given back. It may be
-/// late, early or left out: forces then fade, and return within the safety envelope. After an error, `felt` has a force of zero.
-/// One thread at a time.
+/// Writes the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, of
+/// a clock that advances between ticks. Takes bounded time: no lock, no call of the system, no memory allocated or
+/// freed. Ticks may be late, early or missing: forces then fade, and return within the safety envelope. After an
+/// error, `felt` has a force of zero. One thread at a time.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_tick(
     touch: *const palpate_touch,
@@ -226,7 +232,7 @@ pub unsafe extern "C" fn palpate_touch_tick(
         *felt = palpate_felt {
             force_n: touch.axes.force(force_n),
             state: state_of(state) as u32,
-            // A record never ends.
+            // A recording never ends.
             is_over: u32::from(is_over),
             age_s: age_s.unwrap_or(-1.0),
         };
@@ -237,8 +243,8 @@ pub unsafe extern "C" fn palpate_touch_tick(
     })
 }
 
-/// Stops rendering until `enable` goes from 0 to 1 again; the force falls within the next ticks. One thread at a time, as for
-/// `palpate_touch_tick`.
+/// Stops rendering until `enable` changes from 0 to 1; the force falls within the next ticks. One thread at a time,
+/// as for `palpate_touch_tick`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_disable(touch: *const palpate_touch) -> palpate_result {
     guard(|| {
@@ -247,8 +253,8 @@ pub unsafe extern "C" fn palpate_touch_disable(touch: *const palpate_touch) -> p
     })
 }
 
-/// Writes what went over the network. `PALPATE_CONNECTION` while there is no connection: `palpate_last_error` says why. Any
-/// thread; not for the thread of the ticks, as it takes a lock.
+/// Writes the totals of what was sent and received. Returns `PALPATE_CONNECTION` while there is no connection:
+/// `palpate_last_error` describes why. Any thread except that of the ticks, as it takes a lock.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_traffic(
     touch: *const palpate_touch,
@@ -271,7 +277,8 @@ pub unsafe extern "C" fn palpate_touch_traffic(
     })
 }
 
-/// Gives the tool and the handle back. Null is allowed. Any thread, once, when no other is in a function of this handle.
+/// Releases the tool and frees the handle. Null is allowed. Any thread, once, when no other thread is in a function
+/// of this handle.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_end(touch: *mut palpate_touch) {
     guard(|| {
@@ -284,7 +291,7 @@ pub unsafe extern "C" fn palpate_touch_end(touch: *mut palpate_touch) {
             Far::Server { connection, shared } if shared.threads.here().is_ok() => {
                 shared.threads.block_on(connection.end())
             }
-            // The parent has the tool.
+            // The tool belongs to the parent process.
             far @ Far::Server { .. } => {
                 std::mem::forget(far);
                 Ok(())

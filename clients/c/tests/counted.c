@@ -1,5 +1,5 @@
-/* Counts what ticks ask of the system: `counted RECORD`, a record as replay.c reads it. The functions that give memory, take locks and
- * call the kernel are this program's, and count the calls of the thread that ticks. */
+/* Counts system services that ticks use: `counted RECORD`, a record as replay.c reads it. This program replaces the functions
+ * that allocate memory, take locks and call the kernel, and counts the calls of the thread that ticks. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <palpate.h>
@@ -44,7 +44,7 @@ int pthread_mutex_lock(pthread_mutex_t *mutex) {
     locks += is_ticking;
     return next(mutex);
 }
-/* Rust's locks wait by this one. */
+/* Rust's locks use this to wait. */
 long syscall(long number, ...) {
     static long (*next)(long, ...) = NULL;
     if (!next) *(void **)&next = dlsym(RTLD_NEXT, "syscall");
@@ -85,7 +85,7 @@ int main(int count, char **arguments) {
             palpate_felt felt;
             is_ticking = 1;
             palpate_result result = palpate_touch_tick(touch, &reading, tick[0], &felt);
-            /* What is wrong costs nothing either. */
+            /* Invalid arguments use no services either. */
             if (ticks % 100 == 99) palpate_touch_tick(touch, NULL, tick[0], &felt);
             is_ticking = 0;
             if (result) return 5;

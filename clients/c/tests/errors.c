@@ -1,4 +1,4 @@
-/* What is wrong is an error with words, and never more than that: `errors URL`. */
+/* Each wrong use results in an error with a message, and nothing worse: `errors URL`. */
 #define _POSIX_C_SOURCE 200809L
 #include <math.h>
 #include <palpate.h>
@@ -9,7 +9,7 @@
 
 static int failures = 0;
 
-/* `code` is what `call` must return; its words must contain `words`. */
+/* Checks that a call returned `code`, and that the error message contains `words`. */
 static void expect(int line, palpate_result got, palpate_result code, const char *words) {
     const char *said = code == PALPATE_OK ? "" : palpate_last_error();
     if (got != code || (words && !strstr(said, words))) {
@@ -30,10 +30,10 @@ static int limits_wrong(void *user, palpate_limits *limits) {
 }
 static int read_fails(void *user, palpate_reading *reading) {
     (void)reading;
-    /* After it has been connected for a while. */
+    /* Fails after some time. */
     return ++*(int *)user > 2000 ? 7 : 0;
 }
-/* Above the tissue. Asks for forces again and again, or goes on as it was. */
+/* A device above the tissue. It requests forces repeatedly; with `holds`, always. */
 static volatile int holds = 0;
 static int read_asks(void *user, palpate_reading *reading) {
     reading->position.z = 0.01;
@@ -47,7 +47,7 @@ static int write_ok(void *user, const palpate_vector *force_n) {
     return 0;
 }
 
-/* Leaves the processor to the bridge's thread, for tools that let one thread run at a time. */
+/* Lets the bridge's thread run first, for tools that run only one thread at a time. */
 static void look_later(const palpate_bridge *bridge, palpate_bridge_state *state) {
     nanosleep(&(struct timespec){0, 1000000}, NULL);
     palpate_bridge_look(bridge, state);
@@ -131,7 +131,7 @@ int main(int count, char **arguments) {
     EXPECT(palpate_session_join(server, "00000000000000000000000000000000", &session), PALPATE_REFUSED, NULL);
     EXPECT(palpate_session_create_from_text(server, "sheet = 7", &session), PALPATE_ARGUMENT, "scene_text:1");
     EXPECT(palpate_session_create_from_text(server, "", &session), PALPATE_ARGUMENT, NULL);
-    /* Scenes of your own on a mesh: generated, in memory, in a file. */
+    /* Local scenes with a mesh: generated, in memory, in a file. */
     const char *of_mesh = "[mesh]\nfile = \"ball.obj\"\nunit = \"mm\"\npoint_mass_kg = 0.01\n[springs]\nstiffness_n_per_m = 100.0\n"
                           "[anchor_springs]\nstiffness_n_per_m = 5.0\n[damping]\ncoefficient_n_s_per_m = 1.0\n";
     const char *ball = "v 50 0 0\nv -50 0 0\nv 0 50 0\nv 0 -50 0\nv 0 0 50\nv 0 0 -50\n"
@@ -196,7 +196,7 @@ int main(int count, char **arguments) {
     palpate_felt felt;
     EXPECT(palpate_touch_tick(touch, NULL, 0.0, &felt), PALPATE_ARGUMENT, "reading is null");
     EXPECT(palpate_touch_tick(touch, &reading, 0.0, &felt), PALPATE_OK, NULL);
-    /* Enabled as soon as there is news of the tissue, and not before. */
+    /* Enabled as soon as there is data about the tissue, and not before. */
     for (int tick = 1; felt.state != PALPATE_STATE_ENABLED && !felt.is_over; tick++) {
         if (felt.state != PALPATE_STATE_DISABLED || felt.age_s >= 0.0) break;
         nanosleep(&(struct timespec){0, 1000000}, NULL);
@@ -285,7 +285,7 @@ int main(int count, char **arguments) {
     EXPECT(palpate_bridge_end(bridge, &report), PALPATE_OK, NULL);
     if (report.result != PALPATE_OK) failures++, fprintf(stderr, "result %u\n", report.result);
 
-    /* What is deleted is gone; handles stay usable, in any order. */
+    /* A deleted session no longer exists; handles remain usable, in any order. */
     EXPECT(palpate_session_delete(session), PALPATE_OK, NULL);
     EXPECT(palpate_session_delete(session), PALPATE_REFUSED, NULL);
     palpate_server_free(server);

@@ -1,4 +1,4 @@
-//! The header in the repository is the one that cbindgen makes of the sources. `make header` writes it anew.
+//! Checks that the header in the repository is the one that cbindgen generates. `make header` writes it again.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 use std::path::Path;

@@ -1,5 +1,5 @@
-/* Renders what was recorded: `replay RECORD FORCES`. The record is a row of numbers (little endian): 0, a length and so many
- * bytes of a TouchResponse; or 1, a time, a position and whether forces are asked for, as doubles. */
+/* Renders a recording: `replay RECORD FORCES`. The record is a sequence of entries, little-endian: 0, a length and as many
+ * bytes of a TouchResponse; or 1, a time, a position and whether forces are requested, as doubles. */
 #include <palpate.h>
 #include <stdio.h>
 #include <stdlib.h>

@@ -1,5 +1,6 @@
-// A whole front end on a terminal: `front_end URL SCENE SECONDS`. A device goes up and down in the middle, on a thread of the
-// library; this thread shows the force and the surface along the middle, and makes the tissue softer at half time.
+// A complete front end in a terminal: `front_end URL SCENE SECONDS`. A device moves up and down in the middle, on a
+// thread of the library; this thread shows the force and the surface along the middle, and makes the tissue softer at
+// half time.
 #include <chrono>
 #include <cmath>
 #include <cstdio>
@@ -7,7 +8,7 @@
 #include <palpate.hpp>
 #include <thread>
 
-/// Put your maker's calls into its functions.
+/// Replace the bodies of its functions with the calls of your device's SDK.
 struct Mine : palpate::Device {
     long ticks = 0;
     double most_n = 0.0;

@@ -1,4 +1,4 @@
-// Looks at a tissue: `look URL SCENE SECONDS`. Prints one line of JSON.
+// Watches a tissue: `look URL SCENE SECONDS`. Prints one line of JSON.
 #include <algorithm>
 #include <chrono>
 #include <cstdio>

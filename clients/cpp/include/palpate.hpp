@@ -1,5 +1,5 @@
-// C++17 over libpalpate: handles that free themselves, and results in place of exceptions. Header only; link palpate.
-// The rules of palpate.h hold: which thread may call what, and what waits.
+// C++17 over libpalpate: handles that free themselves, and results instead of exceptions. Header only; link palpate.
+// The rules of palpate.h apply: which thread may call what, and which calls wait.
 #ifndef PALPATE_HPP
 #define PALPATE_HPP
 
@@ -29,7 +29,7 @@ struct Error {
     std::string words;
 };
 
-/// A value, or why there is none.
+/// A value, or the error why there is none.
 template <class T>
 class Result {
 public:
@@ -38,7 +38,7 @@ public:
     explicit operator bool() const { return value_.has_value(); }
     T& operator*() { return *value_; }
     T* operator->() { return &*value_; }
-    /// Only if there is no value.
+    /// May be called only if there is no value.
     const Error& error() const { return error_; }
 
 private:
@@ -61,7 +61,7 @@ inline Error error(palpate_result code) { return Error{code, palpate_last_error(
 
 inline void end_bridge(palpate_bridge* bridge) { palpate_bridge_end(bridge, nullptr); }
 
-/// A text of the library, of which it tells the size first.
+/// Gets a text from the library, which returns its size first.
 template <class Write>
 Result<std::string> text(Write write) {
     std::size_t needed = 0;
@@ -73,30 +73,31 @@ Result<std::string> text(Write write) {
 }
 }  // namespace detail
 
-/// How to touch. Fields as in palpate_touch_options.
+/// Options for touching. The fields are those of palpate_touch_options.
 struct TouchOptions : palpate_touch_options {
     TouchOptions() { palpate_touch_options_init(this, sizeof(palpate_touch_options)); }
 };
 
-/// Which surface to show. Fields as in palpate_surface_options.
+/// Options for a surface. The fields are those of palpate_surface_options.
 struct SurfaceOptions : palpate_surface_options {
     SurfaceOptions() { palpate_surface_options_init(this, sizeof(palpate_surface_options)); }
 };
 
-/// How to connect. Fields as in palpate_connect_options.
+/// Options for connecting. The fields are those of palpate_connect_options.
 struct ConnectOptions : palpate_connect_options {
     ConnectOptions() { palpate_connect_options_init(this, sizeof(palpate_connect_options)); }
 };
 
-/// A change of the tissue. Fields as in palpate_change; what you do not set stays.
+/// A change of the tissue. The fields are those of palpate_change; fields that you do not set are left unchanged.
 struct Change : palpate_change {
     Change() { palpate_change_init(this); }
 };
 
-/// A tool that a loop of your own leads.
+/// A tool that your own loop moves.
 class Touch {
 public:
-    /// The force until the next tick, for a thread of your own, a thousand times a second. Never waits. After an error it is zero.
+    /// Returns the force until the next tick. Call it on your own thread, a thousand times a second. It never waits.
+    /// After an error the force is zero.
     Felt tick(const Reading& reading, double time_s) noexcept {
         Felt felt{};
         palpate_touch_tick(touch_.get(), &reading, time_s, &felt);
@@ -104,18 +105,18 @@ public:
     }
     /// Stops rendering until `enable` goes from 0 to 1 again.
     void disable() noexcept { palpate_touch_disable(touch_.get()); }
-    /// What went over the network.
+    /// Returns the network traffic.
     Traffic traffic() const noexcept {
         Traffic traffic{};
         palpate_touch_traffic(touch_.get(), &traffic);
         return traffic;
     }
-    /// A recorded message arrives; see palpate_touch_arrive.
+    /// Delivers a recorded message; see palpate_touch_arrive.
     std::optional<Error> arrive(const std::uint8_t* bytes, std::size_t count) {
         if (auto code = palpate_touch_arrive(touch_.get(), bytes, count)) return detail::error(code);
         return std::nullopt;
     }
-    /// A loop over what was recorded; see palpate_touch_begin_offline.
+    /// Creates a touch that replays recorded messages; see palpate_touch_begin_offline.
     static Result<Touch> offline(const TouchOptions& options, Vector middle_m) {
         palpate_touch* touch = nullptr;
         if (auto code = palpate_touch_begin_offline(&options, middle_m, &touch)) return detail::error(code);
@@ -127,18 +128,18 @@ private:
     detail::Handle<palpate_touch, palpate_touch_end> touch_;
 };
 
-/// A device of your own: derive from it. A thread of the library calls it, a thousand times a second.
+/// A device of your own: derive from this class. A thread of the library calls it a thousand times a second.
 class Device {
 public:
     virtual ~Device() = default;
-    /// What the device can bear.
+    /// Returns the limits of the device.
     virtual Limits limits() = 0;
-    /// Where it is; false if it fails.
+    /// Reads the state of the device; false if it fails.
     virtual bool read(Reading& reading) = 0;
     /// Renders a force until the next tick, N; false if it fails.
     virtual bool write(const Vector& force_n) = 0;
 
-    /// As the library wants it.
+    /// Returns the device in the form that the library expects.
     palpate_device called() {
         palpate_device device{};
         device.user = this;
@@ -156,24 +157,24 @@ public:
     }
 };
 
-/// The loop of a device, on a thread of the library. It ends with this.
+/// The loop that drives a device, on a thread of the library. It ends when this object is destroyed.
 class Bridge {
 public:
-    /// How it stands.
+    /// Returns the state of the loop.
     palpate_bridge_state look() const noexcept {
         palpate_bridge_state state{};
         palpate_bridge_look(bridge_.get(), &state);
         return state;
     }
-    /// Stops rendering until `enable` goes from 0 to 1 again. Any thread.
+    /// Stops rendering until `enable` goes from 0 to 1 again. Can be called on any thread.
     void disable() noexcept { palpate_bridge_disable(bridge_.get()); }
-    /// Ends the loop and tells what it has done, or how the device failed.
+    /// Ends the loop and returns its statistics, or the error of a device that failed.
     Result<Report> end() {
         Report report{};
         if (auto error = end(report)) return *error;
         return report;
     }
-    /// The same, and what a device has done that failed.
+    /// Ends the loop. `report` is set even if the device failed.
     std::optional<Error> end(Report& report) {
         if (auto code = palpate_bridge_end(bridge_.release(), &report)) return detail::error(code);
         return std::nullopt;
@@ -184,25 +185,25 @@ private:
     detail::Handle<palpate_bridge, detail::end_bridge> bridge_;
 };
 
-/// The surface of a session, in vectors of its own.
+/// The surface of a session, in its own vectors.
 class Surface {
 public:
-    /// x, y, z of each vertex, one after the other.
+    /// Returns x, y, z of each vertex, one vertex after the other.
     const std::vector<float>& positions() const { return positions_; }
-    /// The same of their normals.
+    /// Returns x, y, z of each vertex normal, in the same order as the positions.
     const std::vector<float>& normals() const { return normals_; }
-    /// Three for each triangle.
+    /// Returns three vertex indices for each triangle.
     const std::vector<std::uint32_t>& indices() const { return indices_; }
-    /// u and v of each vertex; empty if it has none.
+    /// Returns u, v of each vertex; empty if the mesh has no texture coordinates.
     const std::vector<float>& uv() const { return uv_; }
-    /// Brings positions and normals up to date; tells which vertices have changed. Never waits.
+    /// Updates positions and normals, and returns which vertices changed. Never waits.
     palpate_dirty read() {
         palpate_dirty dirty{};
         lost_ = palpate_surface_read(surface_.get(), &buffers_, &dirty) != PALPATE_OK;
         buffers_.everything = 0;
         return dirty;
     }
-    /// Whether no more will come.
+    /// Returns whether the surface will receive no more updates.
     bool lost() const { return lost_; }
 
     explicit Surface(palpate_surface* surface) : surface_(surface) {
@@ -231,12 +232,12 @@ private:
 /// A session: one tissue in use.
 class Session {
 public:
-    /// By which others join it.
+    /// Returns the id with which others join the session.
     std::string id() const {
         auto id = detail::text([&](auto... place) { return palpate_session_id(session_.get(), place...); });
         return id ? *id : std::string();
     }
-    /// Where the tissue rests, in Palpate's own axes, m.
+    /// Returns the bounding box of the tissue at rest, in Palpate's own axes, m.
     Extent extent() const {
         Extent extent{};
         palpate_session_extent(session_.get(), &extent);
@@ -266,7 +267,7 @@ public:
         if (auto code = palpate_session_change(session_.get(), &change)) return detail::error(code);
         return std::nullopt;
     }
-    /// Deletes it on the server, for everybody. Waits for the server.
+    /// Deletes the session on the server, for all users. Waits for the server.
     std::optional<Error> remove() const {
         if (auto code = palpate_session_delete(session_.get())) return detail::error(code);
         return std::nullopt;
@@ -280,13 +281,13 @@ private:
 /// A connection to a server.
 class Server {
 public:
-    /// Connects. Waits for the server.
+    /// Connects to a server. Waits for the server.
     static Result<Server> connect(const std::string& url, const ConnectOptions& options = {}) {
         palpate_server* server = nullptr;
         if (auto code = palpate_connect(url.c_str(), &options, &server)) return detail::error(code);
         return Server(server);
     }
-    /// The names of its scenes. Waits for the server.
+    /// Returns the names of the server's scenes. Waits for the server.
     Result<std::vector<std::string>> scenes() const {
         auto lines = detail::text([&](auto... place) { return palpate_scenes(server_.get(), place...); });
         if (!lines) return lines.error();
@@ -295,17 +296,18 @@ public:
         for (std::string name; std::getline(text, name);) names.push_back(name);
         return names;
     }
-    /// Makes a session of a scene that the server has. Waits for the server.
+    /// Creates a session from a scene that the server has. Waits for the server.
     Result<Session> create(const std::string& scene) const { return made(palpate_session_create, scene); }
-    /// Makes a session of the text of a scene that names no file. Waits for the server.
+    /// Creates a session from the text of a scene that refers to no file. Waits for the server.
     Result<Session> create_from_text(const std::string& text) const {
         return made(palpate_session_create_from_text, text);
     }
-    /// Makes a session of a scene file of yours, and sends its mesh. Waits for the server.
+    /// Creates a session from a local scene file, and sends its mesh. Waits for the server.
     Result<Session> create_from_file(const std::string& path) const {
         return made(palpate_session_create_from_file, path);
     }
-    /// Makes a session of the text of a scene and the bytes of a mesh file, which `[mesh]` calls `mesh_name`. Waits for the server.
+    /// Creates a session from the text of a scene and the bytes of a mesh file. `[mesh]` of the scene refers to this
+    /// file as `mesh_name`. Waits for the server.
     Result<Session> create_from_mesh(const std::string& text, const std::string& mesh_name, const std::string& bytes) const {
         palpate_session* session = nullptr;
         auto data = reinterpret_cast<const unsigned char*>(bytes.data());

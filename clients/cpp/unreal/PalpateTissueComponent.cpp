@@ -1,4 +1,4 @@
-// The tissue of a session in Unreal. Not built by Palpate's tests: they have no Unreal.
+// The tissue of a session in Unreal. Palpate's tests do not build it, because they have no Unreal.
 #include "PalpateTissueComponent.h"
 
 #include "HAL/PlatformProcess.h"
@@ -46,7 +46,7 @@ void UPalpateTissueComponent::BeginPlay() {
 
 void UPalpateTissueComponent::EndPlay(const EEndPlayReason::Type Reason) {
     if (Thread) {
-        // Stops it and waits for its end.
+        // Stops the loop and waits for its end.
         Thread->Kill(true);
         delete Thread;
         Thread = nullptr;
@@ -98,7 +98,8 @@ uint32 UPalpateTissueComponent::FLoop::Run() {
             FScopeLock Lock(&Exchange);
             To = Wanted;
         }
-        // A frame moves the tool sixty times a second; a hand does not jump. In the place of this, a haptic device would be read.
+        // The game moves the tool sixty times a second, in jumps; a hand does not. So its movement is smoothed. With
+        // a haptic device, read its position here instead.
         const double Share = 0.02;
         At.position.x += Share * (To.position.x - At.position.x);
         At.position.y += Share * (To.position.y - At.position.y);

@@ -1,4 +1,4 @@
-// The tissue of a session in Unreal. Not built by Palpate's tests: they have no Unreal.
+// The tissue of a session in Unreal. Palpate's tests do not build it, because they have no Unreal.
 #pragma once
 
 #include "CoreMinimal.h"
@@ -11,7 +11,7 @@
 
 #include "PalpateTissueComponent.generated.h"
 
-/// Shows the surface of a session, and leads a tool in it.
+/// Shows the surface of a session, and moves a tool in it.
 UCLASS(ClassGroup = (Palpate), meta = (BlueprintSpawnableComponent))
 class UPalpateTissueComponent : public UProceduralMeshComponent {
     GENERATED_BODY()
@@ -25,11 +25,12 @@ public:
     UPROPERTY(EditAnywhere, Category = Palpate)
     FString Scene = TEXT("liver");
 
-    /// Where the tool is to be, in this component's frame, cm. Forces are rendered when `bEnable` becomes true.
+    /// Sets the target position of the tool, in this component's frame, cm. Forces are rendered when `bEnable`
+    /// becomes true.
     UFUNCTION(BlueprintCallable, Category = Palpate)
     void SetTool(FVector Place, bool bEnable);
 
-    /// The force on the tool, N.
+    /// Returns the force on the tool, N.
     UFUNCTION(BlueprintCallable, Category = Palpate)
     FVector GetForce() const;
 
@@ -53,7 +54,7 @@ private:
 
     void Show();
 
-    // Freed from the last to the first.
+    // Freed in reverse order.
     std::unique_ptr<palpate::Server> Server;
     std::unique_ptr<palpate::Session> Session;
     std::unique_ptr<palpate::Surface> Surface;

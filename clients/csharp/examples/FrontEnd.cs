@@ -1,11 +1,11 @@
-// A whole front end on a terminal: `FrontEnd.exe URL SCENE SECONDS`. A device goes up and down in the middle, on a thread of the
-// library; this thread shows force and surface, and makes the tissue softer at half time.
+// A complete front end in a terminal: `FrontEnd.exe URL SCENE SECONDS`. A device moves up and down in the middle, on
+// a thread of the library; this thread shows force and surface, and makes the tissue softer at half time.
 using System;
 using System.Globalization;
 using System.Threading;
 using Palpate;
 
-/// Put your maker's calls in here.
+/// Replace this with the calls of your device's SDK.
 class Mine : IDevice
 {
     long ticks;

@@ -1,4 +1,4 @@
-// Looks at a tissue: `Look.exe URL SCENE SECONDS`. Prints one line of JSON.
+// Watches a tissue: `Look.exe URL SCENE SECONDS`. Prints one line of JSON.
 using System;
 using System.Globalization;
 using System.Threading;
@@ -20,7 +20,7 @@ static class Look
                 Thread.Sleep(16);
             }
             float least = float.MaxValue, most = float.MinValue;
-            // Up is y in Unity.
+            // In Unity, y points up.
             for (int k = 1; k < surface.Positions.Length; k += 3)
             {
                 least = Math.Min(least, surface.Positions[k]);

@@ -1,4 +1,4 @@
-// What is wrong is an exception with words: `Errors.exe URL`.
+// Errors are exceptions with a message: `Errors.exe URL`.
 using System;
 using System.Linq;
 using Palpate;
@@ -34,7 +34,7 @@ static class Errors
         {
             if (!server.Scenes().Contains("liver") || Server.Version != "0.1.0") failures++;
             Expect(Code.Refused, "nowhere", () => server.Create("nowhere"));
-            // A mesh of Unity's axes: y is up there, and triangles are clockwise.
+            // A mesh in Unity's axes: y points up, and triangles are clockwise.
             const string scene = "[mesh]\nfile = \"ball.obj\"\nunit = \"m\"\npoint_mass_kg = 0.01\n[springs]\nstiffness_n_per_m = 100.0\n"
                 + "[anchor_springs]\nstiffness_n_per_m = 5.0\n[damping]\ncoefficient_n_s_per_m = 1.0\n";
             float[] corners = { 0.05f, 0, 0, -0.05f, 0, 0, 0, 0.07f, 0, 0, -0.07f, 0, 0, 0, 0.05f, 0, 0, -0.05f };
@@ -52,7 +52,7 @@ static class Errors
             {
                 Expect(Code.Refused, "", () => joined.Apply(Change.None));
                 if (joined.Extent.Middle.X != session.Extent.Middle.X) failures++;
-                // The fields of structures lie where the library has them.
+                // The fields of the structures must be at the same offsets as in the library.
                 if (TouchOptions.Default.Friction != 0.2 || TouchOptions.Default.Limits.WorkspaceRadius != 0.075 || !TouchOptions.Default.RealTime) failures++;
                 using (var surface = session.Surface(Axes.Own))
                 {

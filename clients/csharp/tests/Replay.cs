@@ -1,4 +1,4 @@
-// Renders what was recorded, as clients/c/tests/replay.c does: `Replay.exe RECORD FORCES`.
+// Renders recorded messages, as clients/c/tests/replay.c does: `Replay.exe RECORD FORCES`.
 using System.IO;
 using Palpate;
 

@@ -1,4 +1,4 @@
-//! How long a tick takes while the network's side and other threads are busy: `make bench-tick`.
+//! Measures the duration of a tick while the network side and other threads are busy: `make bench-tick`.
 #![allow(clippy::unwrap_used, clippy::disallowed_methods)]
 
 use std::f64::consts::TAU;
@@ -14,16 +14,16 @@ use palpate_proto::{pb, touch};
 use pb::touch_response::Message as Heard;
 use prost::Message;
 
-/// Ticks that are measured of each round trip; a tenth of them with a sample before each.
+/// Ticks measured per round trip; a tenth of them with a sample before each.
 const TICKS: u32 = 10_000_000;
-/// The longest time that is counted by itself, in steps of 10 ns.
+/// Longest duration that is counted separately, in steps of 10 ns.
 const MAX_TICKS: usize = 100_000;
 
 fn bytes(message: Heard) -> Vec<u8> {
     pb::TouchResponse { message: Some(message) }.encode_to_vec()
 }
 
-/// A law that hardens, as long as those of servers.
+/// A force law that hardens, as long as those of servers.
 fn law() -> Law {
     let row = |k: u32| Row {
         force_n: 0.02 * f64::from(k) + 1e-4 * f64::from(k * k),
@@ -36,7 +36,7 @@ fn law() -> Law {
     Law { step_m: 1e-4, rows: (0..200).map(row).collect(), is_coarse: false }
 }
 
-/// A circle through the tissue, at its deepest 3 mm.
+/// The place at a tick: on a circle through the tissue, at most 3 mm deep.
 fn place_m(tick: u32) -> DVec3 {
     let (sin, cos) = (TAU * f64::from(tick % 2000) / 2000.0).sin_cos();
     DVec3::new(0.004 * cos, 0.0, -0.001 + 0.002 * sin)
@@ -65,7 +65,7 @@ fn sample(tick: u32, curvature_per_m: f64) -> Vec<u8> {
     bytes(Heard::Sample(pb::Sample { step: u64::from(tick), tools: vec![tool], ..Default::default() }))
 }
 
-/// The sample of a tick, of a course that repeats itself; only time and number go on.
+/// The sample of a tick, from a course that repeats; only time and number advance.
 fn sample_of(models: &[Vec<u8>], tick: u32) -> Vec<u8> {
     let mut message = pb::TouchResponse::decode(models[tick as usize % models.len()].as_slice()).unwrap();
     if let Some(Heard::Sample(sample)) = &mut message.message {
@@ -83,7 +83,7 @@ fn offline() -> Offline {
     offline
 }
 
-/// Times, each counted in steps of 10 ns.
+/// Durations, counted in steps of 10 ns.
 struct TickTimes {
     counts: Vec<u64>,
     most_ns: u128,
@@ -120,7 +120,7 @@ impl TickTimes {
 
 const HEAD: &str = "| round trip, ms | p50, µs | p99, µs | p99.9, µs | most, µs |\n|---|---|---|---|---|";
 
-/// Others that ask for memory and give it back: an allocator's lock is what a tick must not meet.
+/// Starts threads that allocate and free memory: a tick must not meet the allocator's lock.
 fn busy<'s>(scope: &'s std::thread::Scope<'s, '_>, others: usize, is_over: &'s AtomicBool) {
     for _ in 0..others {
         scope.spawn(move || {
@@ -133,7 +133,7 @@ fn busy<'s>(scope: &'s std::thread::Scope<'s, '_>, others: usize, is_over: &'s A
 
 fn main() {
     let others = std::thread::available_parallelism().map_or(1, usize::from);
-    // A sheet is flat, an organ is not.
+    // The law of a sheet is flat, that of an organ is curved.
     let [flat, round] = [0.0, 20.0].map(|curvature| (0..2000).map(|tick| sample(tick, curvature)).collect::<Vec<_>>());
     println!("A sample before each tick; {} ticks, {others} other threads busy:", TICKS / 10);
     for (what, models, round_trip) in [("a sheet", &flat), ("an organ", &round)]

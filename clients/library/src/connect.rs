@@ -17,24 +17,25 @@ use tonic_health::pb::health_client::HealthClient;
 
 use crate::Error;
 
-/// The caller's credentials, and which servers are trusted. The default has none, and trusts the authorities of the system.
+/// The caller's credentials, and the certificates it trusts. The default has none, and trusts the authorities of the
+/// system.
 #[derive(Debug, Clone, Default)]
 pub struct Credentials {
-    /// Your token. A token is sent only over TLS or to this machine.
+    /// Your token. It is sent only over TLS or to this machine.
     pub token: Option<Token>,
     /// Certificates (PEM) to trust instead of the system's.
     pub ca: Option<String>,
-    /// Name that the server's certificate must carry, if it differs from the URL's host.
+    /// Name that the server's certificate must carry, if it differs from the host of the URL.
     pub tls_name: Option<String>,
     /// Your client certificate and its private key (PEM), if the server requires one.
     pub cert_and_key: Option<(String, String)>,
 }
 
 impl Credentials {
-    /// Checks that what should be certificates or a key is some.
+    /// Checks that certificates and key are in PEM.
     ///
     /// # Errors
-    /// Returns an error that begins with what is wrong: `ca`, `cert` or `key`.
+    /// Returns an error that begins with the name of the wrong part: `ca`, `cert` or `key`.
     pub fn check(&self) -> Result<(), Error> {
         let (cert, key) = self.cert_and_key.as_ref().map(|(cert, key)| (cert, key)).unzip();
         let of = |name, what, begin, text: Option<&String>| match text {
@@ -51,15 +52,15 @@ impl Credentials {
     }
 }
 
-/// A token. It is not shown by `Debug`.
+/// A token that authenticates the caller. `Debug` does not show it.
 #[derive(Clone)]
 pub struct Token(MetadataValue<Ascii>);
 
 impl Token {
-    /// Returns the token in a text; space around it does not count.
+    /// Parses a token; surrounding space is ignored.
     ///
     /// # Errors
-    /// Returns an error if the text can't be a token. The message does not quote it: it would appear in a log.
+    /// Returns an error if the text can't be a token. The message does not quote it, since it might appear in a log.
     pub fn new(text: &str) -> Result<Self, Error> {
         let token = text.trim();
         let wrong = || Error::Argument("holds no token; `palpate token` makes one".to_owned());
@@ -117,7 +118,7 @@ pub struct Server {
     url: String,
     endpoint: Endpoint,
     bearer: Bearer,
-    /// For other servers of its fleet.
+    /// Used for other servers of its fleet.
     credentials: Credentials,
     /// Time limit for the connection and the first answer.
     patience: Duration,
@@ -129,8 +130,8 @@ pub struct Server {
 /// Default time limit for the connection and the first answer.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// A connection that is silent for so long is pinged, and closed after a further [`CONNECT_TIMEOUT`]. That is longer than a server
-/// may stall.
+/// Time without data after which a connection is pinged; it is closed after a further [`CONNECT_TIMEOUT`]. That is
+/// longer than a server may stall.
 const SILENCE: Duration = Duration::from_secs(5);
 
 /// Bytes that may wait unread on a connection. The transport closes a connection when unread small messages, counted as 256
@@ -144,11 +145,11 @@ impl std::fmt::Debug for Server {
 }
 
 impl Server {
-    /// Returns the server at `url`; you may omit http://.
+    /// Creates a server at `url`; http:// may be omitted. Does not connect.
     ///
     /// # Errors
-    /// Returns an error if the URL is not valid, if a token would be sent in the clear, or if the credentials are not those
-    /// of a connection with TLS or can't be read.
+    /// Returns an error if the URL is not valid, if a token would be sent unencrypted, or if the credentials require
+    /// TLS or can't be read.
     pub fn new(url: &str, credentials: &Credentials) -> Result<Self, Error> {
         credentials.check()?;
         let refuse = |why: &str| Error::Argument(format!("{url}: {why}"));
@@ -189,10 +190,10 @@ impl Server {
         })
     }
 
-    /// Creates another server of its fleet, with the same credentials and time limit.
+    /// Creates another server of the fleet, with the credentials and time limit of this one.
     ///
     /// # Errors
-    /// Returns an error as [`Server::new`] does; and if this server is reached by TLS, but the other is not to be.
+    /// Returns the errors of [`Server::new`], and an error if this server is reached by TLS and the other is not.
     pub fn at(&self, url: &str) -> Result<Self, Error> {
         if url.trim_end_matches('/') == self.url {
             return Ok(self.clone());
@@ -205,17 +206,17 @@ impl Server {
         Ok(other.within(self.patience))
     }
 
-    /// Returns its URL.
+    /// Returns the server's URL.
     pub fn url(&self) -> &str {
         &self.url
     }
 
-    /// The time limit for connecting.
+    /// Returns the time limit for connecting.
     pub(crate) fn patience(&self) -> Duration {
         self.patience
     }
 
-    /// Returns its host, as in the URL, without brackets.
+    /// Returns the host of the URL, without brackets.
     pub fn host(&self) -> &str {
         &self.host.0
     }
@@ -230,12 +231,12 @@ impl Server {
     /// Connects and waits for a first answer: a listener that accepts connections and stays silent is an error.
     ///
     /// # Errors
-    /// Returns an error that says in words why the server can't be reached.
+    /// Returns an error that explains why the server can't be reached.
     pub async fn connect(&self) -> Result<Channel, Error> {
         let unreached = |why: String| Error::Connection(format!("can't reach {}: {why}", self.url));
         let connecting = async {
             let channel = self.endpoint.connect().await.map_err(|e| (root(&e), in_words(&root(&e))))?;
-            // Any answer will do, also a refusal.
+            // Any answer is sufficient, even a refusal.
             match HealthClient::new(channel.clone()).check(HealthCheckRequest::default()).await {
                 Err(status) if status.source().is_some() => Err((root(&status), broken(&status))),
                 _ => Ok(channel),
@@ -258,14 +259,14 @@ impl Server {
         Ok(InterceptedService::new(channel, self.bearer.clone()))
     }
 
-    /// What to say of a URL whose scheme is not the server's.
+    /// Returns the message for a URL whose scheme is not that of the server.
     fn other_scheme(&self, does: &str, from: &str, to: &str) -> String {
         let address = self.url.trim_start_matches(from).trim_start_matches("://").trim_end_matches('/');
         format!("can't reach {}: the server at {address} {does}: use {to}://{address}", self.url)
     }
 }
 
-/// Whether a server speaks TLS: it answers what is not TLS with an alert of TLS.
+/// Returns whether a server speaks TLS: it answers other data with an alert of TLS.
 async fn speaks_tls((host, port): &(String, u16)) -> bool {
     const ALERT: [u8; 2] = [0x15, 0x03];
     const TLS_PROBE_TIMEOUT: Duration = Duration::from_secs(1);
@@ -294,7 +295,7 @@ fn broken(status: &Status) -> String {
     printable(format_args!("the connection broke: {}{hint}", in_words(&root)))
 }
 
-/// The message of an error's innermost cause.
+/// Returns the message of an error's innermost cause.
 fn root(error: &(dyn std::error::Error + 'static)) -> String {
     let mut cause = error;
     while let Some(deeper) = cause.source() {
@@ -303,7 +304,7 @@ fn root(error: &(dyn std::error::Error + 'static)) -> String {
     cause.to_string()
 }
 
-/// Library errors in plain words.
+/// Explains known errors of libraries.
 fn in_words(said: &str) -> String {
     let known = [
         (
@@ -327,7 +328,7 @@ fn in_words(said: &str) -> String {
         .map_or_else(|| said.to_owned(), |(_, words)| format!("{words} ({said})"))
 }
 
-/// What a connection with TLS needs.
+/// Builds the configuration of TLS.
 fn tls(credentials: &Credentials) -> ClientTlsConfig {
     let mut tls = ClientTlsConfig::new();
     tls = match &credentials.ca {

@@ -1,4 +1,5 @@
-//! The datagrams of a haptic stream: poses and samples go by them while they get through, and by the stream else.
+//! The datagrams of a haptic stream: poses and samples go by datagram while these get through, otherwise by the
+//! stream.
 //!
 //! ```no_run
 //! use palpate_client::datagrams::Datagrams;
@@ -38,21 +39,22 @@ use wtransport::{ClientConfig, Connection, Endpoint};
 
 use crate::connect::Server;
 
-/// Time for the session to open, and how often it is tried: within the ten seconds of a ticket, which is used up only when a session
-/// is open. (HTTP/3 below may wait for ever for settings that were sent again after a loss: wtransport 0.7.) The stream carries
-/// everything until then.
+/// Time limit for one attempt to open the session, and number of attempts: together within the ten seconds of a
+/// ticket, which is used up only when a session is open. The stream carries everything until then. (HTTP/3 may wait
+/// without limit for settings that were resent after a loss: wtransport 0.7.)
 const OPEN_TIMEOUT: Duration = Duration::from_secs(2);
 const ATTEMPTS: usize = 4;
 
-/// A session that has ended, or did not open, is opened anew as often as this, s: a blocked port costs a few packets each time.
+/// Interval at which a session that has ended, or did not open, is requested again, s: on a blocked port each attempt
+/// costs a few packets.
 const AGAIN_S: f64 = 4.0;
 
-/// The datagrams of one stream.
+/// The datagram session of one haptic stream, reopened when it breaks.
 #[derive(Debug)]
 pub struct Datagrams {
-    /// Of the server, if it has offered a session.
+    /// Host of the server, if it has offered a session.
     host: Option<String>,
-    /// When a session was last asked for, s.
+    /// When a session was last requested, s.
     asked_s: f64,
     opening: JoinSet<Option<Connection>>,
     connection: Option<Connection>,
@@ -60,15 +62,16 @@ pub struct Datagrams {
     pulse: SendInterval,
     begun: Instant,
     life: Interval,
-    /// Of each tool the newest poses, newest first: what was lost goes out again with the next.
+    /// For each tool its newest poses, newest first: they are sent again with the next one, in case they were lost.
     recent: BTreeMap<u32, VecDeque<Posed>>,
     wanted_s: f64,
-    /// Revision of the session's owner, and step.
+    /// Owner's revision and step of the newest sample.
     newest: Option<(u64, u64)>,
 }
 
 impl Datagrams {
-    /// Opens the session that a stream was offered, in the background. Without an offer nothing ever goes by datagram.
+    /// Opens the session that a stream was offered, in the background. Without an offer nothing is ever sent by
+    /// datagram.
     pub fn dial(offer: Option<&pb::DatagramOffer>, server: &Server) -> Self {
         let mut life = interval(Duration::from_secs_f64(0.5 * LIFE_S));
         life.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -91,7 +94,8 @@ impl Datagrams {
         datagrams
     }
 
-    /// Opens another session, which a stream was offered in the place of the last ([`Datagrams::asks`]), in the background.
+    /// Opens another session that the server offered after [`Datagrams::asks`], in the background. Closes the current
+    /// one.
     pub fn take_offer(&mut self, offer: &pb::DatagramOffer) {
         let Some(own) = &self.host else { return };
         let host = if offer.host.is_empty() { own.clone() } else { offer.host.clone() };
@@ -100,7 +104,7 @@ impl Datagrams {
         self.opening.spawn(async move {
             for _ in 0..ATTEMPTS {
                 if let Ok(opened) = tokio::time::timeout(OPEN_TIMEOUT, open(&host, &offer)).await {
-                    // What was refused stays so.
+                    // A refusal is final.
                     return opened;
                 }
             }
@@ -108,8 +112,8 @@ impl Datagrams {
         });
     }
 
-    /// Returns whether the session is over, so that it is time to ask the server for another: by `renew` with
-    /// `datagrams`, which it answers with an offer ([`Datagrams::take_offer`]). True once in four seconds.
+    /// Returns whether the session has ended and the server is to be asked for another, by `renew` with `datagrams`,
+    /// which it answers with an offer ([`Datagrams::take_offer`]). True at most once in four seconds.
     pub fn asks(&mut self) -> bool {
         let now_s = self.now_s();
         let is_over = self.host.is_some() && self.connection.is_none() && self.opening.is_empty();
@@ -124,8 +128,8 @@ impl Datagrams {
         self.begun.elapsed().as_secs_f64()
     }
 
-    /// Sends a pose that is played by the client's time (`client_time_ns` and `sequence` given, no `at_step`). Returns false
-    /// if the stream has to carry it: datagrams do not get through at present, or it is another command.
+    /// Sends a pose that is played by the client's time (`client_time_ns` and `sequence` set, no `at_step`). Returns
+    /// false if the stream must carry it: datagrams do not get through at present, or it is another command.
     pub fn send(&mut self, command: &pb::Command) -> bool {
         let (Some(pb::command::Action::Pose(pose)), Some(sequence), None) =
             (&command.action, command.sequence, command.at_step)
@@ -144,7 +148,7 @@ impl Datagrams {
         self.carrier.carries(now_s) && self.datagram(vec![message], now_s)
     }
 
-    /// Sends a datagram; false if it is too long, or the session is over.
+    /// Sends a datagram. Returns false if it is too long or the session has ended.
     fn datagram(&mut self, tools: Vec<pb::ToolPoses>, now_s: f64) -> bool {
         let Some(connection) = &self.connection else { return false };
         let (number, acknowledges) = self.carrier.send(now_s);
@@ -154,8 +158,8 @@ impl Datagrams {
         message.encoded_len() <= most && connection.send_datagram(message.encode_to_vec()).is_ok()
     }
 
-    /// Returns the next sample that comes by datagram. Samples that were overtaken are left out. Waits for ever when
-    /// there is no session. Call it all the time: it keeps the session alive. Nothing is lost if you drop the future.
+    /// Returns the next sample that arrives by datagram. Skips overtaken samples. Never completes without a session.
+    /// Call it all the time: it keeps the session alive. Dropping the future loses nothing.
     pub async fn next(&mut self) -> pb::Sample {
         loop {
             let connection = self.connection.clone();
@@ -173,7 +177,7 @@ impl Datagrams {
                             return sample;
                         }
                     }
-                    // The stream goes on.
+                    // The stream continues.
                     Err(_) => self.connection = None,
                 },
                 _ = self.life.tick() => {
@@ -181,7 +185,7 @@ impl Datagrams {
                     if self.connection.is_some() && self.carrier.is_silent(now_s) {
                         self.datagram(Vec::new(), now_s);
                     }
-                    // Notices that nothing is confirmed any more, also while nothing is sent.
+                    // Detects that nothing is confirmed any longer, even while nothing is sent.
                     self.carrier.carries(now_s);
                 }
             }
@@ -199,10 +203,11 @@ impl Datagrams {
         message.sample.filter(|sample| self.is_newer(sample))
     }
 
-    /// Returns whether a sample is newer than all that came by here and that were shown to this before: by whichever
-    /// way they come.
+    /// Returns whether a sample is at least as new as all samples seen so far, by datagram or passed to this method,
+    /// and records it if so. Call it for samples of the stream.
     pub fn is_newer(&mut self, sample: &pb::Sample) -> bool {
-        // Whoever took a session over may continue it at an earlier step; who had it before has no say.
+        // A server that took the session over may continue it at an earlier step; samples of the previous owner are
+        // outdated.
         let this = (sample.ownership_revision, sample.step);
         let is_newer = self.newest.is_none_or(|newest| this >= newest);
         if is_newer {
@@ -216,13 +221,13 @@ impl Datagrams {
         self.wanted_s
     }
 
-    /// Returns what was carried so far.
+    /// Returns the number of messages that were carried by datagram so far.
     pub fn carried(&self) -> Carried {
         self.carrier.carried()
     }
 }
 
-/// Opens a session; `None` if it can't be opened.
+/// Opens a session; `None` if that fails.
 async fn open(host: &str, offer: &pb::DatagramOffer) -> Option<Connection> {
     let hash: [u8; 32] = offer.certificate_sha256.as_slice().try_into().ok()?;
     let ticket: [u8; 16] = offer.ticket.as_slice().try_into().ok()?;
@@ -233,7 +238,7 @@ async fn open(host: &str, offer: &pb::DatagramOffer) -> Option<Connection> {
         SocketAddr::V4(_) => (Ipv4Addr::UNSPECIFIED, 0).into(),
         SocketAddr::V6(_) => (Ipv6Addr::UNSPECIFIED, 0).into(),
     };
-    // The stream has told the hash of the certificate.
+    // The offer, sent over the stream, contained the hash of the certificate.
     let config = ClientConfig::builder().with_bind_address(any);
     let mut config = config.with_server_certificate_hashes([Sha256Digest::new(hash)]).build();
     config.quic_config_mut().transport_config(Arc::new(datagram::transport()));

@@ -1,29 +1,30 @@
 //! The interface of haptic devices.
 //!
-//! Implement [`HapticDevice`] with your manufacturer's library and pass it to [`crate::bridge::run`], which calls it at 1 kHz
-//! on a thread of its own. Positions are in metres and forces in newtons, in the device's frame: its origin is the middle of
-//! the device's workspace, x points right, y away from the operator, and z up. The bridge places the origin on the middle of
-//! the sheet, whose z points out of the tissue. Forces act on the hand. Convert the library's units and axes in your adapter.
-//! [`crate::devices`] has adapters for the devices of some makers, and lays a workspace over the tissue elsewhere.
+//! Implement [`HapticDevice`] with your manufacturer's library and pass it to [`crate::bridge::run`], which calls it
+//! at 1 kHz on a thread of its own. Positions are in metres and forces in newtons, in the device's frame: its origin
+//! is the middle of the device's workspace, x points right, y away from the operator, and z up. The bridge places the
+//! origin on the top of the tissue, which is the middle of a sheet; z points out of the tissue. Forces act on the
+//! hand. Convert the library's units and axes in your adapter. [`crate::devices`] has adapters for the devices of
+//! some makers, and can place a workspace elsewhere.
 
 use glam::DVec3;
 use palpate_haptics::Device;
 
 use crate::bridge::Tick;
 
-/// What a device reports at a tick.
+/// The position and button of a device at a tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reading {
     /// Position in the device's frame, m.
     pub place_m: DVec3,
-    /// The operator asks for forces, by a button or pedal. Only a change from false to true enables them.
+    /// Whether the operator requests forces, by a button or pedal. Only a change from false to true enables them.
     pub enable: bool,
 }
 
 /// A haptic device.
 ///
-/// Each tick calls `read` and then `write` once; both must return within a fraction of a tick. An error of either ends the
-/// loop, which then writes a force of zero once. So does every other end of the loop.
+/// Each tick calls `read` and then `write` once; both must return within a fraction of a tick. An error of either
+/// ends the loop. At every end, the loop writes a force of zero once.
 ///
 /// # Example
 ///
@@ -71,7 +72,7 @@ pub struct Reading {
 /// # adapter.write(DVec3::Z).unwrap();
 /// ```
 pub trait HapticDevice: Send {
-    /// The device's limits. The server is told them, and no force goes beyond them.
+    /// Returns the device's limits. They are sent to the server, and no force exceeds them.
     fn descriptor(&self) -> Device;
     /// Reads position and button.
     ///
@@ -83,15 +84,15 @@ pub trait HapticDevice: Send {
     /// # Errors
     /// Returns an error if the force can't be set.
     fn write(&mut self, force_n: DVec3) -> std::io::Result<()>;
-    /// The buttons that were pressed at the newest reading, as bits. By default none is told of.
+    /// Returns the buttons that were pressed at the newest reading, as bits. By default none is reported.
     fn buttons(&self) -> u32 {
         0
     }
-    /// How many buttons [`HapticDevice::buttons`] may tell of.
+    /// Returns how many buttons [`HapticDevice::buttons`] can report.
     fn button_count(&self) -> u32 {
         0
     }
-    /// Is told of each tick after `write`; for displays. It must not wait.
+    /// Called after `write` at each tick, for displays. It must not wait.
     fn ticked(&mut self, _tick: &Tick) {}
 }
 

@@ -1,7 +1,7 @@
-//! What two threads share so that neither waits for the other: a queue, and the newest of something.
+//! Data that two threads share so that neither waits for the other: a queue, and the newest value of something.
 //!
-//! Each has one end that writes and one that reads. No operation takes a lock, calls the system or requests memory;
-//! `tests/tick.rs` counts what a device's loop allocates.
+//! Each has one end that writes and one that reads. No operation takes a lock, calls the system or allocates memory;
+//! `tests/tick.rs` counts the allocations of a device's loop.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
@@ -9,22 +9,22 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use rtrb::{Consumer, Producer, PushError, RingBuffer};
 use triple_buffer::{Input, Output, TripleBuffer};
 
-/// What a third thread sees of a queue.
+/// The state of a queue that a third thread can see.
 #[derive(Default)]
 struct QueueStatus {
-    /// Values that wait. An end may be counted before the other: for a moment it may be off by one.
+    /// Number of waiting values. The ends count separately, so it may be off by one for a moment.
     waiting: AtomicUsize,
-    /// One of the ends was dropped.
+    /// Whether one of the ends was dropped.
     is_over: AtomicBool,
 }
 
-/// The end of a queue that writes.
+/// The writing end of a queue.
 pub(crate) struct QueueWriter<T> {
     values: Producer<T>,
     status: Arc<QueueStatus>,
 }
 
-/// The end of a queue that reads.
+/// The reading end of a queue.
 pub(crate) struct QueueReader<T> {
     values: Consumer<T>,
     status: Arc<QueueStatus>,
@@ -33,7 +33,7 @@ pub(crate) struct QueueReader<T> {
 /// A view of a queue, for a third thread.
 pub(crate) struct QueueView(Arc<QueueStatus>);
 
-/// A queue of at most `length` values.
+/// Creates a queue of at most `length` values.
 pub(crate) fn queue<T>(length: usize) -> (QueueWriter<T>, QueueReader<T>) {
     let (writer, reader) = RingBuffer::new(length);
     let status = Arc::<QueueStatus>::default();
@@ -41,7 +41,7 @@ pub(crate) fn queue<T>(length: usize) -> (QueueWriter<T>, QueueReader<T>) {
 }
 
 impl<T> QueueWriter<T> {
-    /// Returns how many values fit now; more fit later, as they are read.
+    /// Returns how many values fit now.
     pub(crate) fn room(&self) -> usize {
         self.values.slots()
     }
@@ -80,14 +80,14 @@ impl QueueView {
 }
 
 impl<T> QueueReader<T> {
-    /// Takes the oldest value.
+    /// Takes the oldest value; `None` if the queue is empty.
     pub(crate) fn pop(&mut self) -> Option<T> {
         let value = self.values.pop().ok()?;
         self.status.waiting.fetch_sub(1, Ordering::Release);
         Some(value)
     }
 
-    /// Returns whether the writer is gone. What it wrote before can still be read.
+    /// Returns whether the writer is gone. What it wrote can still be read.
     pub(crate) fn is_over(&self) -> bool {
         self.values.is_abandoned()
     }
@@ -111,14 +111,14 @@ pub(crate) struct NewestWriter<T: Send>(Input<T>);
 /// The end that reads the newest value.
 pub(crate) struct NewestReader<T: Send>(Output<T>);
 
-/// A value of which only the newest counts, and what it is at first.
+/// Creates a shared value of which only the newest version counts, with its first version.
 pub(crate) fn newest<T: Clone + Send>(first: &T) -> (NewestWriter<T>, NewestReader<T>) {
     let (writer, reader) = TripleBuffer::new(first).split();
     (NewestWriter(writer), NewestReader(reader))
 }
 
 impl<T: Send> NewestWriter<T> {
-    /// Changes the value. `write` gets an older one to write over.
+    /// Publishes a new value. `write` overwrites an older one.
     pub(crate) fn write(&mut self, write: impl FnOnce(&mut T)) {
         write(self.0.input_buffer_mut());
         self.0.publish();
@@ -126,12 +126,12 @@ impl<T: Send> NewestWriter<T> {
 }
 
 impl<T: Send> NewestReader<T> {
-    /// Returns whether there is a newer value than before; it is then what [`NewestReader::read`] returns.
+    /// Takes a newer value, if there is one, for [`NewestReader::read`]. Returns whether there was one.
     pub(crate) fn refresh(&mut self) -> bool {
         self.0.update()
     }
 
-    /// Returns the newest value of the last [`NewestReader::refresh`].
+    /// Returns the value that the last [`NewestReader::refresh`] took.
     pub(crate) fn read(&self) -> &T {
         self.0.peek_output_buffer()
     }

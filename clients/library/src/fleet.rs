@@ -1,7 +1,8 @@
-//! Which server of a fleet has a session, and calls that go there.
+//! Finds the server of a fleet that has a session, and directs calls to it.
 //!
-//! A server that does not have a session names the one that has it (`ELSEWHERE`), or asks for patience while another takes the
-//! session over (`FENCED`). A server that is of no fleet does neither: everything here then is one call more, or none.
+//! A server that does not have a session names the one that does (`ELSEWHERE`), or refuses temporarily while another
+//! takes the session over (`FENCED`). A server without a fleet does neither: everything here then costs at most one
+//! more call.
 
 use std::time::Duration;
 
@@ -18,7 +19,7 @@ use tonic_types::StatusExt;
 use crate::Error;
 use crate::connect::{Channel, Server};
 
-/// The answer to a call, and who gave it.
+/// The answer to a call, and the server that gave it.
 #[derive(Debug, Clone)]
 pub struct At<T> {
     /// The server.
@@ -29,32 +30,33 @@ pub struct At<T> {
     pub answer: T,
 }
 
-/// Time between two questions to a server while the fleet has nobody who serves the session.
+/// Interval between calls to a server while no server of the fleet has the session.
 pub(crate) const AGAIN: Duration = Duration::from_millis(250);
 
-/// The largest number of servers that are asked for one session.
+/// Maximum number of servers that are asked for one session.
 const MAX_SERVERS: usize = 16;
 
-/// The largest number of servers that a call is sent on by, one after the other.
+/// Maximum number of redirections of one call.
 const MAX_HOPS: u32 = 8;
 
-/// Returns whether a server of a fleet asks for patience: another is about to have the session, or it has lost touch
-/// with the fleet.
+/// Returns whether a server of a fleet refused temporarily: another server is about to have the session, or this one
+/// has lost contact with the fleet.
 pub fn is_fenced(status: &Status) -> bool {
     status.get_details_error_info().is_some_and(|info| info.reason == Reason::Fenced.as_str())
 }
 
-/// Returns the server that has a session, and what it tells of it. `server` may be any of the fleet. Waits while
-/// another server takes the session over, as long as it may take to connect ([`Server::within`]).
+/// Finds the server that has a session. Returns it with the session. `server` may be any server of the fleet. Waits
+/// while another server takes the session over, at most the time limit for connecting ([`Server::within`]).
 ///
 /// # Errors
-/// Returns the refusal of whoever has the session, or why nobody can be reached.
+/// Returns the refusal of the server that has the session, or why no server can be reached.
 pub async fn locate(server: &Server, session_id: &str) -> Result<At<pb::Session>, Error> {
     Trail::new(server.clone()).seek(session_id).await
 }
 
-/// Calls a server, or the one that has the session that the call is for: where that server is told in a refusal, and the call is made
-/// again there. While the session is being taken over it is made again every quarter of a second, as long as it may take to connect.
+/// Calls a server, and repeats the call at the server that has the session if a refusal names another one. While the
+/// session is being taken over, repeats the call every quarter of a second, at most for the time limit for
+/// connecting.
 ///
 /// ```no_run
 /// use palpate_client::watch::Samples;
@@ -69,7 +71,7 @@ pub async fn locate(server: &Server, session_id: &str) -> Result<At<pb::Session>
 /// ```
 ///
 /// # Errors
-/// Returns the refusal of whoever has the session, or why it can't be reached.
+/// Returns the refusal of the server that has the session, or why it can't be reached.
 pub async fn follow<T, F>(server: &Server, call: impl Fn(Channel) -> F) -> Result<At<T>, Error>
 where
     F: Future<Output = Result<T, Status>>,
@@ -77,10 +79,10 @@ where
     follow_from(server, server.connect().await?, call).await
 }
 
-/// Does what [`follow`] does, with a connection to `server`.
+/// Like [`follow`], over an open connection `channel` to `server`.
 ///
 /// # Errors
-/// Returns an error as [`follow`] does.
+/// Returns the errors of [`follow`].
 pub async fn follow_from<T, F>(server: &Server, channel: Channel, call: impl Fn(Channel) -> F) -> Result<At<T>, Error>
 where
     F: Future<Output = Result<T, Status>>,
@@ -104,7 +106,8 @@ where
     }
 }
 
-/// Returns the server that has a session that `server` has created: a fleet may have made it at another.
+/// Returns the server that has a session created by a call to `server`: a fleet may have created it on another
+/// server.
 ///
 /// # Errors
 /// Returns an error if the credentials can't be used there.
@@ -115,23 +118,24 @@ pub fn home(server: &Server, created: &pb::Session) -> Result<Server, Error> {
     }
 }
 
-/// Who to ask for a session.
+/// The servers to ask for a session.
 #[derive(Debug)]
 pub(crate) struct Trail {
-    /// The first server, to which whoever calls has the URL.
+    /// The first server, whose URL the program has.
     first: Server,
-    /// The last that had the session, or was said to have it.
+    /// The server that last had the session, or was named as having it.
     server: Server,
-    /// URLs of others.
+    /// URLs of other servers.
     others: Vec<String>,
-    /// The largest revision of an owner that was seen.
+    /// The largest ownership revision seen.
     revision: u64,
-    /// The fleet answers, but nobody serves the session yet.
+    /// Whether the fleet answers, but no server has the session yet.
     is_awaited: bool,
-    /// Of the newest stream: after a move its tool is still in the tissue, and goes on by this lease at the next server. Empty if it
-    /// does not.
+    /// Lease of the newest stream: after a move its tool is still in the tissue, and the next server continues this
+    /// lease. Empty if it can't be continued.
     pub(crate) lease_id: String,
-    /// Of the newest command. It rises over all streams: where a lease goes on, what has a smaller one is old.
+    /// Number of the newest command. It increases across all streams: a continued lease ignores commands with smaller
+    /// ones.
     pub(crate) sequence: u64,
 }
 
@@ -148,17 +152,17 @@ impl Trail {
         }
     }
 
-    /// The server to ask first.
+    /// Returns the server to ask first.
     pub(crate) fn server(&self) -> &Server {
         &self.server
     }
 
-    /// Whether, when [`Trail::seek`] last failed, the fleet answered, but nobody served the session yet.
+    /// Returns whether, when [`Trail::seek`] last failed, the fleet answered but no server had the session yet.
     pub(crate) fn is_awaited(&self) -> bool {
         self.is_awaited
     }
 
-    /// The session is said to be there.
+    /// Sets the server that was named as having the session.
     ///
     /// # Errors
     /// Returns an error if the credentials can't be used there.
@@ -171,18 +175,19 @@ impl Trail {
         Ok(())
     }
 
-    /// Whether who says this revision still speaks for the session.
+    /// Returns whether the owner with this revision is not outdated, and records the largest revision seen.
     pub(crate) fn is_current(&mut self, revision: u64) -> bool {
         let is_current = revision >= self.revision;
         self.revision = self.revision.max(revision);
         is_current
     }
 
-    /// Finds who has the session. Servers are asked one after the other: the next as soon as one can't be reached, asks for patience,
-    /// or is silent for a quarter of a second; and whoever is said to have it at once. Those that have it not are asked again.
+    /// Finds the server that has the session. Asks servers one after another: the next one when the current can't be
+    /// reached, refuses temporarily, or is silent for a quarter of a second, and a server that is named as the owner
+    /// at once. Repeats the question to those that do not have the session.
     ///
-    /// # Errors
-    /// Returns any other refusal at once; and the last answer when nobody of all can be reached, or it takes longer than a server
+    /// Returns any other refusal at once; returns the last answer when no server can be reached, or the time limit
+    /// for connecting has passed.
     /// may take to connect.
     pub(crate) async fn seek(&mut self, session_id: &str) -> Result<At<pb::Session>, Error> {
         self.is_awaited = false;
@@ -225,7 +230,7 @@ impl Trail {
                         round.ask_next();
                     }
                     None if is_broken(status) => round.fail(&server, error, self.is_awaited),
-                    // Whoever says this knows the session's fate.
+                    // A server that answers this knows the session's fate.
                     None => {
                         self.server = server;
                         return Err(error);
@@ -256,22 +261,22 @@ fn silent() -> Error {
     Error::Connection("no server answers".to_owned())
 }
 
-/// Whether a call has not come to a server, or its answer not back.
+/// Returns whether a call did not reach the server, or its answer did not arrive.
 fn is_broken(status: &Status) -> bool {
     std::error::Error::source(status).is_some() || status.code() == tonic::Code::Unavailable
 }
 
-/// What a server says.
+/// The answer of a server.
 type ServerMetadata = (Server, Result<(Channel, pb::Session), Error>);
 
-/// Servers as they are asked.
+/// The servers that are being asked for a session.
 struct Round {
     session_id: String,
-    /// With the credentials for all.
+    /// The server whose credentials are used for all.
     first: Server,
-    /// URLs of those that are not asked yet.
+    /// URLs of the servers not asked yet.
     rest: Vec<String>,
-    /// URLs of those that are asked, and whether they can't be reached.
+    /// URLs of the servers being asked, and whether they can't be reached.
     asked: Vec<(String, bool)>,
     asking: JoinSet<()>,
     tell: mpsc::Sender<ServerMetadata>,
@@ -299,7 +304,7 @@ impl Round {
         round
     }
 
-    /// Asks a server again and again, unless it is asked already.
+    /// Starts to ask a server repeatedly, unless it is being asked already.
     fn ask(&mut self, server: Server) {
         if self.asked.len() >= MAX_SERVERS || self.asked.iter().any(|(url, _)| url == server.url()) {
             return;
@@ -313,14 +318,14 @@ impl Round {
         let before = self.asked.len();
         while !self.rest.is_empty() && self.asked.len() == before {
             let next = self.rest.remove(0);
-            // Where the credentials can't be used nobody is asked.
+            // Servers for which the credentials can't be used are skipped.
             if let Ok(next) = self.first.at(&next) {
                 self.ask(next);
             }
         }
     }
 
-    /// A server can't be reached. What the fleet has answered says more.
+    /// Records that a server can't be reached, and asks the next. An answer of the fleet is kept as the last error.
     fn fail(&mut self, server: &Server, error: Error, has_answer: bool) {
         if !has_answer {
             self.last = Some(error);
@@ -329,13 +334,13 @@ impl Round {
         self.ask_next();
     }
 
-    /// Whether none of all can be reached.
+    /// Returns whether no server can be reached.
     fn is_lost(&self) -> bool {
         self.rest.is_empty() && self.asked.iter().all(|(_, is_lost)| *is_lost)
     }
 }
 
-/// Asks a server for a session until nobody listens.
+/// Asks a server for a session until the answers are no longer received.
 async fn ask(server: Server, session_id: String, tell: mpsc::Sender<ServerMetadata>) {
     let mut channel = None;
     loop {
@@ -375,7 +380,7 @@ mod tests {
         let mut trail = Trail::new(server("http://127.0.0.1:1"));
         let seen = [3, 3, 5, 4, 5].map(|revision| trail.is_current(revision));
         assert_eq!(seen, [true, true, true, false, true]);
-        // A server that is of no fleet has no revisions.
+        // A server without a fleet has no revisions.
         trail.learn(server("http://127.0.0.1:1"), None);
         assert!(trail.is_current(0));
     }

@@ -1,4 +1,4 @@
-//! A session, wherever in its fleet it is: calls go to the server that has it, and streams are opened there again.
+//! A session that is followed through its fleet: calls go to the server that has it, and streams are reopened there.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -12,52 +12,53 @@ use crate::Error;
 use crate::connect::{Channel, Server};
 use crate::fleet::{At, Trail};
 
-/// How often a call goes on to another server, or to one that has the session again.
+/// Maximum number of times that one call is repeated at another server, or at a server that has the session again.
 const MAX_MOVES: u32 = 8;
 
-/// A session that is followed from server to server. A server of no fleet is called as any client does.
+/// A session that is followed from server to server. With a server outside a fleet, calls simply go to that one.
 #[derive(Debug)]
 pub struct Followed {
     session_id: String,
     place: Mutex<LastOwner>,
-    /// Only one call at a time asks who has the session: others wait for what it finds.
+    /// Only one call at a time searches for the server that has the session: others wait for its result.
     seeking: tokio::sync::Mutex<Trail>,
 }
 
-/// Who had the session at last.
+/// The server that last had the session.
 #[derive(Debug, Clone)]
 struct LastOwner {
     server: Server,
     channel: Channel,
-    /// Counts the places.
+    /// Number of servers found so far.
     number: u64,
-    /// The largest revision of an owner that was seen.
+    /// The largest ownership revision seen.
     revision: u64,
 }
 
-/// Returns whether the call may find the session at another server: it has moved, or its server is gone, or is about to
-/// be.
+/// Returns whether a call may find the session at another server: the session has moved, or its server is gone or
+/// about to end.
 pub fn is_away(status: &Status) -> bool {
     let is_broken = std::error::Error::source(status).is_some() || status.code() == tonic::Code::Unavailable;
     elsewhere(status).is_some() || is_broken
 }
 
-/// Whether the server ends in order.
+/// Returns whether the server is shutting down in an orderly way.
 fn is_ending(status: &Status) -> bool {
     status.get_details_error_info().is_some_and(|info| info.reason == Reason::ShuttingDown.as_str())
 }
 
 impl Followed {
-    /// Creates a session that `server` has, or had at last, with a connection to it.
+    /// Creates a followed session from its ID and a connection to the server that has it, or last had it.
     pub fn new(server: Server, channel: Channel, session_id: String) -> Self {
         let place = LastOwner { server: server.clone(), channel, number: 0, revision: 0 };
         Followed { session_id, place: Mutex::new(place), seeking: Trail::new(server).into() }
     }
 
-    /// Returns a session that `server` knows of, or has made: another of its fleet may have it.
+    /// Finds a session that `server` knows or has created: another server of its fleet may have it. Returns it with
+    /// its status.
     ///
     /// # Errors
-    /// Returns the refusal of whoever has the session, or why nobody can be reached.
+    /// Returns the refusal of the server that has the session, or why no server can be reached.
     pub async fn find(server: Server, channel: Channel, session_id: String) -> Result<(Self, pb::Session), Error> {
         let followed = Followed::new(server, channel, session_id);
         let session = followed.seek(None).await?;
@@ -69,7 +70,7 @@ impl Followed {
         &self.session_id
     }
 
-    /// Returns the server that had the session at last.
+    /// Returns the server that last had the session.
     pub fn server(&self) -> Server {
         self.place().server.clone()
     }
@@ -78,14 +79,15 @@ impl Followed {
         self.place.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns whether who says this revision still speaks for the session.
+    /// Returns whether this is the newest ownership revision seen, and remembers it if it is newer.
     pub fn is_current(&self, revision: u64) -> bool {
         let mut place = self.place();
         place.revision = place.revision.max(revision);
         revision == place.revision
     }
 
-    /// Asks who has the session, after a refusal that says so, or none.
+    /// Finds the server that has the session, starting with the one that `refused` names, if any. Returns the
+    /// session.
     async fn seek(&self, refused: Option<&Status>) -> Result<pb::Session, Error> {
         let mut trail = self.seeking.lock().await;
         if let Some(endpoint) = refused.and_then(elsewhere) {
@@ -98,11 +100,11 @@ impl Followed {
         Ok(answer)
     }
 
-    /// Calls the server that has the session. Where the call finds that another has it, or that the server is gone, it is made again
-    /// at the one that has the session then. A call whose answer was lost is made a second time, too.
+    /// Calls the server that has the session. If that has moved or its server is gone, repeats the call at the server
+    /// that has it then. A call whose answer was lost is repeated too, so it may take effect twice.
     ///
     /// # Errors
-    /// Returns the refusal of whoever has the session, or why nobody can be reached.
+    /// Returns the refusal of the server that has the session, or why no server can be reached.
     pub async fn call<T, F>(&self, call: impl Fn(Channel) -> F) -> Result<T, Error>
     where
         F: Future<Output = Result<T, Status>>,
@@ -118,23 +120,25 @@ impl Followed {
             if !is_away(&status) || moves > MAX_MOVES {
                 return Err(status.into());
             }
-            // Unless another call has found it by now.
+            // Unless another call has found it in the meantime.
             if self.place().number == number {
                 self.after(status).await?;
             }
         }
     }
 
-    /// Finds who has the session after a call or a stream has ended with `status`. Then open it again, by [`Followed::call`].
+    /// Finds the server that has the session after a call or a stream has ended with `status`. Then open the stream
+    /// again, by [`Followed::call`].
     ///
     /// # Errors
-    /// Returns `status` if it is for good; the refusal of whoever has the session, or why nobody can be reached.
+    /// Returns `status` if it is final; otherwise the refusal of the server that has the session, or why no server
+    /// can be reached.
     pub async fn after(&self, status: Status) -> Result<(), Error> {
         if !is_away(&status) {
             return Err(status.into());
         }
         match self.seek(Some(&status)).await {
-            // Of no fleet: its own words say more.
+            // A server outside a fleet: its own message explains more.
             Err(Error::Connection(_)) if is_ending(&status) => Err(status.into()),
             sought => sought.map(drop),
         }

@@ -1,19 +1,21 @@
 //! Clients of a Palpate server.
 //!
-//! - [`connect`]: connections, plain or TLS, with the caller's credentials, deadlines, and errors in words.
-//! - [`fleet`]: which server of a fleet has a session, and calls that go there; [`followed`]: one session, from server to server.
+//! - [`connect`]: connections, plain or TLS, with the caller's credentials, time limits, and errors in words.
+//! - [`fleet`]: finds the server of a fleet that has a session; [`followed`]: follows one session from server to
+//!   server.
 //! - [`touch`]: the haptic stream, for programs that send commands and render forces themselves.
 //! - [`datagrams`]: the datagrams of such a stream, where one lost packet does not delay the next.
 //! - [`device`] and [`bridge`]: the trait of haptic devices, and the loop that connects one to a server at 1 kHz.
-//! - [`devices`]: devices of makers, loaded at run time, and where their workspace is laid over the tissue.
-//! - [`snapshot`]: snapshots of sessions, as servers send them.
+//! - [`devices`]: devices of several makers, loaded at run time, and the placement of their workspace over the
+//!   tissue.
+//! - [`snapshot`]: receives snapshots of sessions; [`upload`]: sends meshes and journals.
 //! - [`shown`]: the surface of a session as an engine shows it: positions, normals, triangles.
-//! - [`os`]: what is of the operating system.
+//! - [`os`]: what depends on the operating system.
 //! - [`watch`]: the samples of a session, without a tool.
 //! - [`view`]: the frames of a session: how its surface moves.
 //!
-//! The messages are those of the crate `palpate-proto`, which also has clients for the calls that need no help: they take a
-//! [`Channel`]. What is rendered, and its safety limits, is in the crate `palpate-haptics`.
+//! The messages are those of the crate `palpate-proto`, which also has clients for the calls that need no help: they
+//! take a [`Channel`]. Rendering of forces and its safety limits are in the crate `palpate-haptics`.
 //!
 //! # Example
 //!
@@ -67,13 +69,13 @@ pub use touch::Touch;
 
 use palpate_refusal::printable::printable;
 
-/// An error of this library. Its text is one line that acts on no terminal, whatever a server has put into it.
+/// An error of this library. Its text is one line without control characters, whatever a server has put into it.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
     /// An argument is not valid. Nothing was sent.
     #[error("{}", printable(.0))]
     Argument(String),
-    /// The server can't be reached, the connection broke, or the server does not keep to the protocol.
+    /// The server can't be reached, the connection broke, or the server violates the protocol.
     #[error("{}", printable(.0))]
     Connection(String),
     /// The server refused a call, or the connection broke during it.
@@ -88,13 +90,13 @@ pub enum Error {
 }
 
 impl Error {
-    /// Whether the server does not let the caller in.
+    /// Returns whether the server rejects the caller's credentials or role.
     pub(crate) fn is_denied(&self) -> bool {
         use tonic::Code::{PermissionDenied, Unauthenticated};
         matches!(self, Error::Call(status) if [Unauthenticated, PermissionDenied].contains(&status.code()))
     }
 
-    /// Returns whether an input was refused, by this library or by the server: the same call would be refused again.
+    /// Returns whether an input was refused, by this library or by the server: an equal call would be refused again.
     pub fn is_refusal(&self) -> bool {
         match self {
             Error::Argument(_) => true,

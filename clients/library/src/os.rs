@@ -1,22 +1,22 @@
-//! What differs between operating systems: so far the priority of a thread.
+//! What depends on the operating system: so far the priority of a thread.
 
 use thread_priority::ThreadPriorityValue;
 
-/// With which priority a thread runs.
+/// The priority of a thread.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Priority {
-    /// Like all others.
+    /// The usual priority.
     Usual,
-    /// Before all that are not of real time.
+    /// Real-time priority, above all usual threads.
     RealTime,
-    /// Real-time priority was asked for, and the system did not give it: why, and what would help.
+    /// Real-time priority was requested and refused by the system: why, and what would help.
     Refused(String),
 }
 
-/// Above what is of no hurry, below the threads of the system itself.
+/// Real-time priority, in the library's scale of 0 to 99: below the threads of the system itself.
 const REAL_TIME: u8 = 50;
 
-/// Asks for real-time priority for this thread.
+/// Requests real-time priority for the current thread. Returns its resulting priority.
 #[cfg(unix)]
 pub fn take_real_time_priority() -> Priority {
     use thread_priority::{
@@ -34,11 +34,11 @@ pub fn take_real_time_priority() -> Priority {
     }
 }
 
-/// Asks for real-time priority for this thread.
+/// Requests real-time priority for the current thread. Returns its resulting priority.
 #[cfg(windows)]
 pub fn take_real_time_priority() -> Priority {
     use thread_priority::{ThreadPriority, set_current_thread_priority};
-    // 99 is time critical there.
+    // 99 is time critical on Windows.
     let priority = ThreadPriorityValue::try_from(REAL_TIME.max(99)).map(ThreadPriority::Crossplatform);
     match priority.map(set_current_thread_priority) {
         Ok(Ok(())) => Priority::RealTime,
@@ -46,7 +46,7 @@ pub fn take_real_time_priority() -> Priority {
     }
 }
 
-/// Asks for real-time priority for this thread.
+/// Refuses real-time priority: it is not supported on this system.
 #[cfg(not(any(unix, windows)))]
 pub fn take_real_time_priority() -> Priority {
     Priority::Refused("this system is not known".to_owned())

@@ -1,12 +1,12 @@
-//! Snapshots of sessions, as servers send them.
+//! Receives snapshots of sessions.
 
 use palpate_proto::pb;
 use tonic::{Status, Streaming};
 
-/// No snapshot is larger, bytes: more would fill the memory.
+/// Limit on the bytes of a snapshot.
 const MAX_BYTES: usize = 1 << 31;
 
-/// Returns the bytes of a snapshot (`SaveSnapshot`): a journal of one moment.
+/// Receives the bytes of a snapshot (`SaveSnapshot`): a journal of a single moment.
 ///
 /// # Errors
 /// Returns the server's refusal, or how the connection broke; refuses a snapshot of more than 2 GiB.
@@ -14,7 +14,7 @@ pub async fn collect(parts: Streaming<pb::SaveSnapshotResponse>) -> Result<Vec<u
     collect_within(parts, MAX_BYTES).await
 }
 
-/// The same, of at most `most_bytes`.
+/// Receives a snapshot of at most `most_bytes`.
 pub(crate) async fn collect_within(
     mut parts: Streaming<pb::SaveSnapshotResponse>,
     most_bytes: usize,

@@ -1,4 +1,4 @@
-//! The surface of a session as an engine shows it: positions and normals of its vertices, and what of it stays.
+//! The surface of a session as an engine shows it: positions and normals of its vertices, and its constant mesh.
 
 use std::sync::{Arc, OnceLock};
 
@@ -11,33 +11,33 @@ use crate::connect::Channel;
 use crate::exchange::{NewestReader, NewestWriter, newest};
 use crate::view::{Frames, MAX_VERTICES, SurfaceState};
 
-/// What of a surface stays.
+/// The part of a surface that does not change: rest positions, texture coordinates and triangles.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ShownMesh {
-    /// Where each vertex rests, m.
+    /// Position of each vertex at rest, m.
     pub rest_m: Vec<[f32; 3]>,
-    /// u, v of each vertex, from the lower left; empty if the surface has none.
+    /// Texture coordinates u, v of each vertex, from the lower left; empty if the surface has none.
     pub texture: Vec<[f32; 2]>,
-    /// Vertices of each triangle, counter-clockwise from outside.
+    /// Vertex indices of each triangle, counter-clockwise from outside.
     pub triangles: Vec<[u32; 3]>,
 }
 
 /// A surface at one moment.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SurfaceMoment {
-    /// Frames so far, counted from 1; 0 at rest, before the first.
+    /// Number of frames so far; 0 at rest, before the first.
     pub frames: u64,
-    /// Steps done.
+    /// Number of steps done.
     pub step: u64,
-    /// s.
+    /// Simulated time, s.
     pub simulation_time_s: f64,
-    /// Of each vertex, m.
+    /// Position of each vertex, m.
     pub position_m: Vec<[f32; 3]>,
-    /// Of each vertex, outward, of length 1; 0 of a vertex without a triangle.
+    /// Outward unit normal of each vertex; 0 for a vertex without a triangle.
     pub normal: Vec<[f32; 3]>,
 }
 
-/// The newest moment of a session's surface. It ends when this is dropped.
+/// A session's surface that follows its newest frame. Watching ends when this is dropped.
 pub struct ShownSurface {
     mesh: Arc<ShownMesh>,
     newest: NewestReader<SurfaceMoment>,
@@ -56,8 +56,9 @@ impl std::fmt::Debug for ShownSurface {
 }
 
 impl ShownSurface {
-    /// Gets the mesh and begins to watch. Positions and normals are computed on the tasks of the runtime; set a time limit around
-    /// this call.
+    /// Gets the mesh and starts to watch its frames. `refinement` is the number of vertices between neighbouring
+    /// points, 0 to 10 (0 on a mesh); `rate_hz` is the number of frames per second, at most the session's step rate.
+    /// Positions and normals are computed in tasks of the runtime. Set a time limit around this call.
     ///
     /// # Errors
     /// Returns the server's refusal, how the connection broke, or that the mesh can't be used.
@@ -86,28 +87,29 @@ impl ShownSurface {
         Ok(ShownSurface { mesh, newest, lost, _watching: watching })
     }
 
-    /// Returns what of it stays.
+    /// Returns the constant part of the surface.
     pub fn mesh(&self) -> &ShownMesh {
         &self.mesh
     }
 
-    /// Returns whether there is a newer moment than before. Never waits.
+    /// Takes the newest moment, if there is a newer one, for [`ShownSurface::read`]. Returns whether there was one.
+    /// Never waits.
     pub fn refresh(&mut self) -> bool {
         self.newest.refresh()
     }
 
-    /// Shows the moment of the last [`ShownSurface::refresh`]. Never waits.
+    /// Calls `read` with the moment that the last [`ShownSurface::refresh`] took. Never waits.
     pub fn read<R>(&self, read: impl FnOnce(&SurfaceMoment) -> R) -> R {
         read(self.newest.read())
     }
 
-    /// Returns why no newer moment comes any more.
+    /// Returns why no newer moment will arrive; `None` while frames arrive.
     pub fn lost(&self) -> Option<&str> {
         self.lost.get().map(String::as_str)
     }
 }
 
-/// Takes frames until there are no more; returns why.
+/// Receives frames until there are no more; returns why.
 async fn watch(mut frames: Frames, mesh: &ShownMesh, mut writer: NewestWriter<SurfaceMoment>) -> String {
     let mut count = 0;
     loop {
@@ -126,9 +128,9 @@ async fn watch(mut frames: Frames, mesh: &ShownMesh, mut writer: NewestWriter<Su
     }
 }
 
-/// Writes positions and normals.
+/// Writes the positions and normals of a moment.
 fn place(mesh: &ShownMesh, surface: &SurfaceState, moment: &mut SurfaceMoment) {
-    // A frame may have places beyond the last vertex.
+    // A frame may have more vertices than the mesh.
     for ((position_m, rest_m), moved_m) in moment.position_m.iter_mut().zip(&mesh.rest_m).zip(&surface.displacement_m) {
         *position_m = [rest_m[0] + moved_m[0], rest_m[1] + moved_m[1], rest_m[2] + moved_m[2]];
     }
@@ -141,7 +143,7 @@ fn normals(position_m: &[[f32; 3]], triangles: &[[u32; 3]]) -> Vec<[f32; 3]> {
     normals
 }
 
-/// The mean of the triangles around a vertex, each by its area.
+/// Computes the normal of each vertex: the mean over its triangles, weighted by their areas.
 fn write_normals(position_m: &[[f32; 3]], triangles: &[[u32; 3]], normals: &mut [[f32; 3]]) {
     normals.fill([0.0; 3]);
     for corners in triangles {
@@ -161,7 +163,7 @@ fn write_normals(position_m: &[[f32; 3]], triangles: &[[u32; 3]], normals: &mut 
     }
 }
 
-/// Returns the mesh of a session, refined.
+/// Gets the mesh of a session, with `refinement` vertices between neighbouring points, 0 to 10 (0 on a mesh).
 ///
 /// # Errors
 /// Returns the server's refusal, how the connection broke, or that the mesh can't be used.

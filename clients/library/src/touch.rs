@@ -17,8 +17,8 @@ pub struct Touch {
 }
 
 impl Touch {
-    /// Opens a stream. `messages` are sent as they come, after `open`; when they end, so does the stream. The server may
-    /// take some time to compute a force law: set a time limit around this call.
+    /// Opens a stream. Sends `open`, then `messages` as they are produced; when they end, so does the stream. The
+    /// server may take some time to compute a force law: set a time limit around this call.
     ///
     /// ```no_run
     /// use palpate_client::{Channel, Touch};
@@ -54,18 +54,18 @@ impl Touch {
         }
     }
 
-    /// Returns the server's answer: the force law, the next step, warnings.
+    /// Returns the server's answer to `open`: the force law, the next step, warnings.
     pub fn opened(&self) -> &pb::TouchOpened {
         &self.opened
     }
 
-    /// Returns the next message of the server; `None` after the last. A message is not lost if you drop the future.
+    /// Returns the next message of the server; `None` after the last. Dropping the future loses no message.
     ///
     /// # Errors
     /// Returns why the server ended the stream, or how the connection broke.
     pub async fn next(&mut self) -> Result<Option<Heard>, Status> {
         while let Some(response) = self.inbound.message().await? {
-            // A newer server may have messages that this client does not know.
+            // A newer server may send messages that this client does not know.
             if response.message.is_some() {
                 return Ok(response.message);
             }

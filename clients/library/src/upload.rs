@@ -1,4 +1,4 @@
-//! Sends a mesh or a journal of your own to the server, in parts, for sessions that it makes from them.
+//! Uploads meshes and journals to the server, in parts, for sessions that it creates from them.
 
 use palpate_proto::pb;
 use pb::session_service_client::SessionServiceClient;
@@ -6,10 +6,10 @@ use tonic::Status;
 
 use crate::connect::Channel;
 
-/// Bytes of a part: other calls of the connection wait for one part at most.
+/// Bytes per part: other calls of the connection wait for at most one part.
 const PART_BYTES: usize = 256 << 10;
 
-/// The parts of a file: where each begins, its bytes, and whether it is the last. An empty file has one.
+/// Splits a file into parts: the offset of each, its bytes, and whether it is the last. An empty file has one.
 fn parts(file: &[u8]) -> impl Iterator<Item = (u64, Vec<u8>, bool)> {
     let count = file.len().div_ceil(PART_BYTES).max(1);
     (0..count).map(move |number| {
@@ -18,8 +18,9 @@ fn parts(file: &[u8]) -> impl Iterator<Item = (u64, Vec<u8>, bool)> {
     })
 }
 
-/// Sends the file of a mesh; `unit` is what a length of 1 in it is: "m", "cm", "mm" or so many metres. The answer has the
-/// `mesh_id` for `Scene.mesh`, and a report that tells whether the mesh can be used.
+/// Uploads the file of a mesh. `unit` is the length of 1 in it: "m", "cm", "mm" or a number of metres. If `repair` is
+/// true, the server repairs faults. The answer contains the `mesh_id` for `Scene.mesh`, and a report of whether the
+/// mesh can be used.
 ///
 /// ```no_run
 /// # async fn example(channel: palpate_client::Channel) -> Result<(), Box<dyn std::error::Error>> {
@@ -49,8 +50,8 @@ pub async fn upload_mesh(
     Ok(answer)
 }
 
-/// Sends a journal or a snapshot (MCAP). The answer has the `upload_id` for `JournalMoment`, and what is in the journal. `sent`
-/// gets the bytes that have arrived after each part.
+/// Uploads a journal or a snapshot (MCAP). The answer contains the `upload_id` for `JournalMoment`, and a description
+/// of the journal. Calls `sent` after each part with the number of bytes that have arrived.
 ///
 /// # Errors
 /// Returns the server's refusal, or how the connection broke.

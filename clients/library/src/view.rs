@@ -14,7 +14,7 @@ pub struct Frames {
     surface: SurfaceState,
 }
 
-/// The displacement of a surface from rest. A frame changes parts of it.
+/// The displacement of a surface from rest. Each frame changes parts of it.
 ///
 /// A part of a frame says where two vertices of a surface of 1 × 2 are; the second is 2 mm deep:
 ///
@@ -33,17 +33,18 @@ pub struct Frames {
 /// ```
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SurfaceState {
-    /// Vertices along x and along y.
+    /// Number of vertices along x and along y.
     pub vertices: [usize; 2],
-    /// x, y, z of each vertex, m; y runs fastest.
+    /// Displacement x, y, z of each vertex, m; the index along y varies fastest.
     pub displacement_m: Vec<[f32; 3]>,
 }
 
-/// The largest number of vertices that a viewer keeps: 200 MB.
+/// Maximum number of vertices of a surface: 200 MB.
 pub(crate) const MAX_VERTICES: usize = 1 << 24;
 
 impl Frames {
-    /// Begins to watch. With `max_frames_in_flight`, acknowledge frames by `ViewServiceClient::acknowledge_frames`.
+    /// Starts to watch frames. With `max_frames_in_flight`, acknowledge them by
+    /// `ViewServiceClient::acknowledge_frames`.
     ///
     /// # Errors
     /// Returns the server's refusal, or how the connection broke.
@@ -52,7 +53,7 @@ impl Frames {
         Ok(Frames { parts, surface: SurfaceState::default() })
     }
 
-    /// Returns the next part of a frame, without reading its displacements; `None` after the last. Use it to count
+    /// Returns the next part of a frame, without decoding its displacements; `None` after the last. Use it to count
     /// frames.
     ///
     /// # Errors
@@ -61,8 +62,8 @@ impl Frames {
         self.parts.message().await
     }
 
-    /// Returns the last part of the next frame, and the whole surface as it is then; `None` after the last frame. If
-    /// you drop the future, the parts that it has read stay in the surface.
+    /// Returns the last part of the next frame, and the whole surface after it; `None` after the last frame. If you
+    /// drop the future, the parts that were read stay in the surface.
     ///
     /// # Errors
     /// Returns why the server ended the stream, how the connection broke, or that a frame can't be read.
@@ -78,10 +79,11 @@ impl Frames {
 }
 
 impl SurfaceState {
-    /// Writes a part of a frame over the surface.
+    /// Applies a part of a frame to the surface. Resets the surface to zero when its size changes.
     ///
     /// # Errors
-    /// Returns what is wrong with a part whose patches are not on the surface or not of the right size.
+    /// Returns what is wrong with a part: patches that are not on the surface or have a wrong size, an unknown
+    /// encoding, or a surface that is too large.
     pub fn write(&mut self, part: &pb::WatchFramesResponse) -> Result<(), String> {
         let vertices = [part.vertices_x as usize, part.vertices_y as usize];
         if vertices != self.vertices {
@@ -115,7 +117,7 @@ impl SurfaceState {
     }
 }
 
-/// Reads component c of a vertex.
+/// Reads component `c` of an encoded vertex.
 type Component = fn(&[u8], usize) -> f64;
 
 fn as_f32(vertex: &[u8], c: usize) -> f64 {
@@ -156,7 +158,7 @@ mod tests {
         let row = |k: usize| [values[3 * k], values[3 * k + 1], values[3 * k + 2]];
         assert_eq!(surface.vertices, [3, 2]);
         assert_eq!(surface.displacement_m, [[0.0; 3], [0.0; 3], row(0), row(1), row(2), row(3)]);
-        // What another patch does not touch stays.
+        // Vertices outside the patch stay as they are.
         let bytes = [2_i16, -4, 1].iter().flat_map(|q| q.to_le_bytes()).collect();
         surface.write(&part(pb::Encoding::I16, patch([1, 1], [1, 1], bytes))).unwrap();
         assert_eq!(surface.displacement_m[2..5], [row(0), [2.0, -1.0, 1.0], row(2)]);
@@ -179,7 +181,7 @@ mod tests {
         assert_eq!(surface.write(&unknown).unwrap_err(), "unknown encoding 7");
         let huge = pb::WatchFramesResponse { vertices_x: u32::MAX, vertices_y: u32::MAX, ..Default::default() };
         assert!(surface.write(&huge).is_err());
-        // A patch of nothing is no error, and neither is an empty surface.
+        // An empty patch is not an error, and neither is an empty surface.
         surface.write(&part(pb::Encoding::F32, patch([0, 0], [2, 0], Vec::new()))).unwrap();
         surface.write(&pb::WatchFramesResponse::default()).unwrap();
     }

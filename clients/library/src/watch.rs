@@ -25,12 +25,12 @@ use crate::connect::Channel;
 #[derive(Debug)]
 pub struct Samples {
     samples: Streaming<pb::WatchSamplesResponse>,
-    /// The largest revision of an owner of the session that was seen.
+    /// The largest ownership revision seen.
     revision: u64,
 }
 
 impl Samples {
-    /// Begins to watch.
+    /// Starts to watch samples.
     ///
     /// # Errors
     /// Returns the server's refusal, or how the connection broke.
@@ -39,8 +39,8 @@ impl Samples {
         Ok(Samples { samples, revision: 0 })
     }
 
-    /// Returns the next sample; `None` after the last. Samples of who does not serve the session any more are left out.
-    /// A sample is not lost if you drop the future.
+    /// Returns the next sample; `None` after the last. Skips samples of a server that no longer owns the session.
+    /// Dropping the future loses no sample.
     ///
     /// # Errors
     /// Returns why the server ended the stream, or how the connection broke.

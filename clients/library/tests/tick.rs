@@ -1,4 +1,4 @@
-//! A tick asks for no memory, gives none back and takes no lock, whatever arrives; and what its caller does wrong is harmless.
+//! A tick allocates and frees no memory and takes no lock, whatever arrives; and mistakes of its caller are harmless.
 #![allow(unsafe_code, clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -13,11 +13,11 @@ use pb::touch_response::Message as Heard;
 use prost::Message;
 
 thread_local! {
-    /// Requests of this thread to the allocator, both ways.
+    /// Calls of this thread to the allocator, in both directions.
     static REQUESTS: Cell<u64> = const { Cell::new(0) };
 }
 
-/// The system's, counted.
+/// The system's allocator, which counts its calls.
 struct CountingAllocator;
 
 // SAFETY: it only counts.
@@ -109,7 +109,7 @@ fn a_tick_asks_for_no_memory_and_gives_none_back() {
             if tick % 7 == 0 {
                 record.arrive(&further(1 + tick)).unwrap();
             }
-            // Copies come, take each other's place, and go with their connection. None is freed in a tick.
+            // Copies arrive, replace each other, and end with their connection. None is freed in a tick.
             if tick % 1000 == 300 {
                 record.predict(Box::new(SpringCopy(400.0)));
             }
@@ -138,7 +138,7 @@ fn laws_that_do_not_fit_wait_and_the_newest_model_counts() {
         record.arrive(&sample(1 + u64::from(tick), 1.0 + time_s, 0.001, 0)).unwrap();
         ticker.tick(enable, time_s);
     }
-    // Nobody ticks for a tenth of a second in which more arrives than fits.
+    // No tick runs for a tenth of a second in which more arrives than fits.
     for number in 1..200 {
         record.arrive(&further(number)).unwrap();
         record.arrive(&sample(700 + u64::from(number), 1.7, 0.001, number)).unwrap();
@@ -146,14 +146,14 @@ fn laws_that_do_not_fit_wait_and_the_newest_model_counts() {
     let mut force_n = DVec3::ZERO;
     for tick in 800..1300_u32 {
         let time_s = 1e-3 * f64::from(tick);
-        // Slowly in, 10 mm/s; the sample is of a tenth of a second before.
+        // Slowly in, at 10 mm/s; the sample is a tenth of a second old.
         let at = |tick: u32| (0.001 - 1e-5 * (f64::from(tick) - 899.0)).min(0.001);
         let z_m = at(tick);
         record.arrive(&sample(200 + u64::from(tick), 0.9 + time_s, at(tick - 100), 199)).unwrap();
         force_n = ticker.tick(Reading { place_m: z_m * DVec3::Z, enable: true }, time_s);
     }
-    // 400 N/m over 2 mm by the sample, 599 N/m, the law of the newest number, over the rest, and the damping. Each sample lowers that
-    // by 2 mN, which decays within 20 ms, so 40 mN are still there.
+    // 400 N/m over 2 mm by the sample, 599 N/m (the newest law) over the rest, and the damping. Each sample lowers
+    // that by 2 mN, which decays within 20 ms, so 40 mN are still there.
     assert!((force_n.z - 0.8 - 0.599 - 0.005 - 0.04).abs() < 2e-3, "{force_n}");
 }
 
@@ -201,7 +201,7 @@ fn bytes_that_are_no_message_are_refused() {
     assert!(record.arrive(&[]).is_ok(), "an empty message is a message of a newer server");
 }
 
-/// What a tick runs through has no lock in it, and reads no clock.
+/// The code that a tick runs has no lock in it, and reads no clock.
 #[test]
 fn a_tick_takes_no_lock() {
     let source = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src");

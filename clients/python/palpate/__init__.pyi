@@ -30,11 +30,12 @@ Settings = Union[dict[str, Any], list[str]]
 Vectors = NDArray[np.float64]
 
 class Scene:
-    """A scene that was read and checked: from TOML text, a file, or the name of one (`scenes()`).
+    """A scene that was read and checked: from TOML text, a file, or a scene's name (`scenes()`).
 
-    `set` overrides keys: {"springs.stiffness_n_per_m": 50}. `folder` is where scenes are that are given by name. With `plan` it is
-    stepped as that tissue is (integrator, substeps, precision, sleep), without the search for what its own tolerance asks for: that
-    saves most of the time of a short run, and nothing is then known of the error (`run(..., audit=True)` measures it).
+    `set` overrides keys: {"springs.stiffness_n_per_m": 50}. `folder` contains the scenes that are given by name. With `plan`
+    the scene is stepped like that tissue (integrator, substeps, precision, sleep), without the search for what its own
+    tolerance requires: that saves most of the time of a short run, but its error is unknown (`run(..., audit=True)` measures
+    it).
     """
 
     def __init__(
@@ -47,23 +48,25 @@ class Scene:
     ) -> None: ...
     @property
     def name(self) -> str:
-        """Its name."""
+        """The scene's name."""
     @property
     def points(self) -> int:
-        """The number of its points."""
+        """The number of mass points."""
     @property
     def rate_hz(self) -> float:
-        """Steps a second."""
+        """Number of steps per second."""
 
 class Script:
-    """Forces and movements over time: from TOML text, a file, or a name (`scripts()`). `folder` is where a text's traces are."""
+    """Forces and movements over time: from TOML text, a file, or a script's name (`scripts()`). `folder` contains the traces
+    that a text names."""
 
     def __init__(self, source: Source, *, folder: Source = "") -> None: ...
     def check(self, scene: Union[Scene, Source]) -> dict[str, Any]:
-        """Binds it to a scene: name, steps, sample_every_steps, tools, warnings. Raises Refused if it does not fit."""
+        """Binds the script to a scene; returns its name, steps, sample_every_steps, tools and warnings. Raises Refused if it
+        does not fit."""
 
 class Tissue:
-    """A compiled scene: what is simulated, and how. Making one may take some tenths of a second, and a Scene does it once."""
+    """A compiled scene: what is simulated, and how. Compiling may take some tenths of a second; a Scene does it once."""
 
     def __init__(self, scene: Union[Scene, Source]) -> None: ...
     def __len__(self) -> int: ...
@@ -72,60 +75,59 @@ class Tissue:
         """The name of its scene."""
     @property
     def rate_hz(self) -> float:
-        """Steps a second."""
+        """Number of steps per second."""
     @property
     def integrator(self) -> str:
-        """The integrator that it is stepped with."""
+        """The integrator with which it is stepped."""
     @property
     def substeps(self) -> int:
-        """Substeps of each step."""
+        """Number of substeps per step."""
     @property
     def precision(self) -> str:
         """The number format of the points."""
     @property
     def lanes(self) -> str:
-        """The vectors of the machine that it is stepped with. They change no bit."""
+        """The vector instructions with which it is stepped. They do not change the results."""
     @property
     def expected_error(self) -> float:
-        """The error that is expected of displacement and force, relative to the largest of each; infinite if nothing is
-        known of it."""
+        """The expected error of displacement and force, relative to the largest of each; infinite if it is unknown."""
     @property
     def warnings(self) -> list[str]:
-        """What a user should know of the scene, in words."""
+        """Warnings about the scene, as sentences."""
     @property
     def grid(self) -> Optional[tuple[int, int]]:
-        """Points along x and y of a sheet: rest_m.reshape(*grid, 3); None of a mesh."""
+        """Number of points along x and y of a sheet, as in rest_m.reshape(*grid, 3); None for a mesh."""
     @property
     def rest_m(self) -> Vectors:
-        """Where each point rests."""
+        """The position of each point at rest, m."""
     @property
     def normals(self) -> Vectors:
-        """The normal of the surface at rest at each point, out of the tissue."""
+        """The outward unit normal of the surface at rest at each point."""
     @property
     def fixed(self) -> NDArray[np.bool_]:
         """Whether each point is fixed."""
     @property
     def mass_kg(self) -> NDArray[np.float64]:
-        """The mass of each point."""
+        """The mass of each point, kg."""
     @property
     def triangles(self) -> NDArray[np.uint32]:
-        """The triangles of the surface, each the rows of its three points, counter-clockwise from outside."""
+        """The triangles of the surface, each with the rows of its three points, counter-clockwise from outside."""
     @property
     def middle_m(self) -> tuple[float, float, float]:
-        """The middle of the box around the tissue at rest."""
+        """The middle of the bounding box of the tissue at rest, m."""
     @property
     def top_m(self) -> tuple[float, float, float]:
-        """The highest place of the surface at rest in line with the middle: of a sheet, its middle. Devices have their origin
-        there."""
+        """The highest place of the surface at rest above or below the middle, m: of a sheet, its middle. Devices have their
+        origin there."""
     def index(self, point: Point) -> int:
-        """The row of a point: (i, j) of a sheet, the number of a vertex of a mesh."""
+        """Returns the row of a point: (i, j) on a sheet, the number of a vertex on a mesh."""
     def point(self, index: int) -> Union[tuple[int, int], int]:
-        """The name of the point of a row."""
+        """Returns the name of the point in a row."""
     def nearest(self, place_m: Vector) -> int:
-        """The row of the point that rests nearest to a place."""
+        """Returns the row of the point that rests nearest to a place."""
 
 class Tip:
-    """The tip of a tool: a disc that touches, or with `grasps` holds. With a stiffness it is coupled by a spring."""
+    """The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring."""
 
     def __init__(
         self,
@@ -138,42 +140,43 @@ class Tip:
     ) -> None: ...
     @property
     def radius_m(self) -> float:
-        """The radius of the disc."""
+        """The radius of the disc, m."""
     @property
     def friction(self) -> float:
         """The coefficient of friction."""
     @property
     def grasps(self) -> bool:
-        """Whether it holds the tissue under it, in place of touching it."""
+        """Whether the tip holds the tissue under it instead of touching it."""
 
 class Session:
-    """A tissue in use. What tools are told acts from the next step on, until they are told something else. Several threads may use
-    one session; the interpreter's lock is free while it steps."""
+    """A simulated tissue. A tool's command acts from the next step on, until its next command. Several threads may use one
+    session; the interpreter's lock is released while it steps."""
 
     def __init__(self, tissue: Union[Tissue, Scene, Source]) -> None: ...
     @staticmethod
     def restore(scene: Union[Scene, Tissue, Source], snapshot: bytes) -> Session:
-        """Goes on from `save()`, of a session that began with `scene`: tools stay where they are, with their tips."""
+        """Restores a session from `save()` that started with `scene`: tools stay where they are, with their tips."""
     def step(self, steps: int = 1) -> None:
-        """Does so many steps. Raises Failed if the tissue can't go on. Ctrl-C ends it between two steps."""
+        """Does `steps` steps. Raises Failed if the tissue can't continue. Ctrl-C ends it between two steps."""
     @property
     def steps(self) -> int:
-        """Steps so far."""
+        """Number of steps done."""
     @property
     def time_s(self) -> float:
-        """Simulated time so far."""
+        """Simulated time, s."""
     @property
     def tissue(self) -> Tissue:
-        """The tissue, with the coefficients that it has now."""
+        """The tissue, with its current coefficients."""
     @property
     def awake_points(self) -> int:
-        """Points that the last step computed; the others are at rest."""
+        """Number of points that the last step computed; the others are at rest."""
     @property
     def guard_events(self) -> int:
-        """How often the guard went back and halved the substep."""
+        """How often the guard went back to a checkpoint and halved the substep."""
     @property
     def fault(self) -> Optional[str]:
-        """Why the tissue is not what its tools made of it, in words: it is held, or has recovered. None if it is."""
+        """Why the tissue is not in the state that its tools caused, as a sentence: it is stopped, or has recovered. None if
+        it is."""
     @property
     def hash(self) -> str:
         """The hash of the state: equal for equal bits."""
@@ -187,15 +190,15 @@ class Session:
         falloff_per_m: float = 200.0,
         falloff_offset: float = 0.0,
     ) -> None:
-        """Pushes at a point or a place; at a distance r from there by force_n * exp(-falloff_per_m * r + falloff_offset)."""
+        """Pushes at a point or a place; at a distance r from there with force_n * exp(-falloff_per_m * r + falloff_offset)."""
     def grasp(self, tool: int, point: Point, displacement_m: Vector) -> None:
-        """Holds a point, and brings it this far from where it rests by the end of the step."""
+        """Holds a point, and moves it to this displacement from its place at rest by the end of the step."""
     def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None:
-        """Brings a tool with a tip here by the end of the step. It stays here until it is told something else."""
+        """Moves a tool with a tip to `place_m` by the end of the step. It stays there until its next command."""
     def release(self, tool: int) -> None:
         """Ends what a tool does."""
     def tool(self, tool: int) -> Optional[ToolState]:
-        """What a tool does and feels; None if it does nothing."""
+        """Returns what a tool does and feels; None if it does nothing."""
     def change(
         self,
         *,
@@ -204,43 +207,45 @@ class Session:
         anchor_stiffness_n_per_m: Optional[float] = None,
         volume_stiffness_pa: Optional[float] = None,
     ) -> None:
-        """Makes the tissue softer or stiffer from the next step on. What is not named stays as it is."""
+        """Makes the tissue softer or stiffer from the next step on. Coefficients that are not given stay as they are."""
     def displacements(self, out: Optional[Vectors] = None) -> Vectors:
-        """How far each point is from where it rests, with the digits of f32 at least; `records` has them all. `out` is an array to
-        write into."""
+        """Returns the displacement of each point from its place at rest, m, with at least the digits of f32; `records` has
+        all digits. `out` is an array to write into."""
     def positions(self, out: Optional[Vectors] = None) -> Vectors:
-        """Where each point is. `out` is an array to write into."""
+        """Returns the position of each point, m. `out` is an array to write into."""
     def velocities(self, out: Optional[Vectors] = None) -> Vectors:
-        """The velocity of each point, m/s. `out` is an array to write into."""
+        """Returns the velocity of each point, m/s. `out` is an array to write into."""
     def records(self, points: Optional[Iterable[Point]] = None) -> NDArray[Any]:
-        """Points with all that is known of them, as in `Run.points`; all points if none is named."""
+        """Returns records of all quantities of the given points, as in `Run.points`; of all points if None."""
     @property
     def energy_j(self) -> dict[str, float]:
-        """The energy of the tissue: kinetic, spring and virtual."""
+        """The energy of the tissue, J: kinetic, spring and virtual."""
     def save(self) -> bytes:
-        """A snapshot, for `restore`."""
+        """Returns a snapshot, for `restore`."""
 
 class Journal:
-    """A recorded session: a file of `palpate serve --journal`."""
+    """A recorded session: a journal file of `palpate serve --journal`."""
 
     def __init__(self, path: Source) -> None: ...
     @property
     def info(self) -> dict[str, Any]:
-        """What it is of: scene, first and last step, and more, by name."""
+        """Information on the recording, by name: scene, first and last step, and more."""
     def tools(self) -> dict[int, _ToolCourse]:
-        """What each tool did and felt, by its number."""
+        """Returns what each tool did and felt, by its number."""
     def commands(self) -> Commands:
-        """Every command, by the step at which it acted."""
+        """Returns all commands, by the step at which they acted."""
     def verify(self) -> Verdict:
-        """Simulates it again, and compares every hash and snapshot."""
+        """Simulates the recording again, and compares every hash and snapshot. Returns the verdict."""
     def session(self, step: Optional[int] = None) -> Session:
-        """The session when so many steps were done; at the end if None."""
+        """Returns the session after `step` steps; at the end of the recording if None."""
 
 class Offline:
-    """A touch loop without a network: the same messages, places and times give the same forces, bit by bit, as in every other language.
+    """A touch loop without a network: equal messages, places and times give equal forces, bit by bit, as in every other
+    language.
 
-    `limits` are those of a device, as of a Course. Places are from the middle of the device's workspace, which is laid on `middle_m` of
-    the tissue (give its `top_m`, as a server does); or, `in_tissue_frame`, in the tissue's own frame.
+    `limits` are the limits of a device, as for a Course. Places are measured from the middle of the device's workspace, which
+    is placed at `middle_m` of the tissue (use its `top_m`, as a server does); with `in_tissue_frame`, in the tissue's own
+    frame.
     """
 
     def __init__(
@@ -252,62 +257,64 @@ class Offline:
         up_deadband: float = 0.0,
     ) -> None: ...
     def arrive(self, message: bytes) -> None:
-        """A message of the server arrives now: the bytes of a `palpate.v1.TouchResponse`. The next tick knows it."""
+        """Delivers a message of the server: the bytes of a `palpate.v1.TouchResponse`. The next tick uses it."""
     def tick(self, place_m: Vector, time_s: float, enable: bool = True) -> tuple[float, float, float]:
-        """The force to render from now on, N, for a device that is here at `time_s`, a time of any origin. A change of enable from False to
-        True asks for forces. Without a connection (an `opened` that has arrived) there are none."""
+        """Returns the force to render from now on, N, for a device that is at `place_m` at `time_s`, a time of any origin. A
+        change of enable from False to True enables forces. Without a connection (an `opened` message that has arrived) the
+        force is zero."""
     def disable(self) -> None:
         """Stops rendering until it is enabled again."""
     @property
     def state(self) -> Literal["waiting", "disabled", "enabled", "paused", "fault"]:
-        """Whether forces are rendered: "waiting" before a connection, "disabled" until forces are asked for, "enabled",
+        """Whether forces are rendered: "waiting" before a connection, "disabled" until forces are enabled, "enabled",
         "paused" after a silence, "fault" after a position that is not finite or outside the workspace."""
     @property
     def place_m(self) -> tuple[float, float, float]:
-        """Where the tool was at the last tick, in the tissue's frame."""
+        """The tool's position at the last tick, in the tissue's frame."""
     @property
     def age_s(self) -> Optional[float]:
-        """How old the newest news of the tissue is; None before the first."""
+        """Age of the newest data of the tissue, s; None before the first."""
 
 class Samples(Iterator[dict[str, Any]]):
-    """The samples of a session, one after the other: what tools feel. Each is a dictionary:
+    """The samples of a session, one after another: what tools feel. Each is a dictionary:
 
     - `step`: steps done; `time_s`: simulated time.
-    - `awake_points`: points that the step computed; `asleep`: nothing moves; `held`: the guard has ended the session.
-    - `overruns`: steps that were due and dropped; `time_dilation`: simulated over real time; `late_commands`: commands that came
-      too late for their step; `dropped_samples`: samples that this reader was too slow for. Counts are since the session began.
-    - `tools`: by its number, each tool that does something, as a dictionary. `displacement_m`: how far the tissue under the tool is from
-      where it rests, under a tip the mean over its disc; `surface_displacement_m`: the same of the surface just under its centre;
-      `velocity_m_per_s`; `force_on_tool_n`: the force of the tissue on the tool; `applied_force_n`: the force of all tools on the tissue
-      there; all in the tissue's frame. `late`: its newest command came too late; `expired`: what it did has ended by itself; `stale`:
-      no pose came for 50 ms.
+    - `awake_points`: points that the step computed; `asleep`: nothing moves; `held`: the guard has stopped the session.
+    - `overruns`: steps that were due and dropped; `time_dilation`: simulated over real time; `late_commands`: commands that
+      arrived too late for their step; `dropped_samples`: samples that were dropped because this reader was too slow. Counts
+      are since the session started.
+    - `tools`: each active tool, by its number, as a dictionary. `displacement_m`: displacement of the tissue under the tool
+      from its place at rest, under a tip the mean over its disc; `surface_displacement_m`: displacement of the surface just
+      under the tool's centre; `velocity_m_per_s`; `force_on_tool_n`: the force of the tissue on the tool; `applied_force_n`:
+      the force of all tools on the tissue there; all in the tissue's frame. `late`: its newest command arrived too late;
+      `expired`: its action has ended by itself; `stale`: no pose arrived for 50 ms.
     """
 
     def take(self, count: int) -> Sampled:
-        """The next samples, as arrays."""
+        """Returns the next `count` samples as arrays; fewer at the end of the stream."""
     def __next__(self) -> dict[str, Any]: ...
 
 class Frames(Iterator[Frame]):
-    """The frames of a session, one after the other: the moving surface."""
+    """The frames of a session, one after another: the moving surface."""
 
     def __next__(self) -> Frame: ...
 
 class RemoteSession:
-    """A session of a server. `with` deletes it at the end. In a fleet it is followed to whichever server has it: calls and streams go on
-    there."""
+    """A session on a server. `with` deletes it at the end. In a fleet, calls and streams follow it to the server that has it.
+    """
 
     @property
     def id(self) -> str:
         """The id of the session, for `Client.session`."""
     @property
     def server(self) -> str:
-        """URL of the server that had it at last."""
+        """URL of the server that last had the session."""
     def status(self) -> dict[str, Any]:
-        """How the session stands: state, step, points, held tools, and more."""
+        """Returns the state of the session: state, step, points, held tools, and more."""
     def start(self, *, until_step: Optional[int] = None) -> int:
-        """Lets it run, until a step if one is named; gives the step that comes next."""
+        """Starts the session, to run until step `until_step` if given. Returns the next step."""
     def pause(self) -> None:
-        """Holds it after the step that is under way."""
+        """Pauses the session after its current step."""
     def change(
         self,
         *,
@@ -317,22 +324,22 @@ class RemoteSession:
         volume_stiffness_pa: Optional[float] = None,
         at_step: Optional[int] = None,
     ) -> int:
-        """Makes the tissue softer or stiffer, from a step on if one is named; gives that step. What is not named stays
-        as it is."""
+        """Makes the tissue softer or stiffer, from step `at_step` on if given, else from the next. Returns that step.
+        Coefficients that are not given stay as they are."""
     def hash(self, *, at_step: Optional[int] = None) -> tuple[int, str]:
-        """How many steps were done and the hash of the state then: after so many, or now."""
+        """Returns a number of steps done and the hash of the state after them: `at_step` if given, else the current one."""
     def save(self) -> bytes:
-        """A journal of this moment (MCAP), for `Journal`."""
+        """Returns a journal of the current moment (MCAP), for `Journal`."""
     def delete(self) -> None:
-        """Ends it for everybody."""
+        """Deletes the session, for all its users."""
     def samples(self, *, every_steps: int = 1, heartbeat_s: Optional[float] = None) -> Samples:
-        """The samples of all tools from now on: of every step, or of every so many. `heartbeat_s` is how often one
-        comes of a tissue at rest."""
+        """Watches the samples of all tools from now on, one per `every_steps` steps. `heartbeat_s` is the longest time
+        between two samples of a tissue at rest, s."""
     def frames(self, *, rate_hz: float = 60.0, refinement: int = 0, precise: bool = True) -> Frames:
-        """The surface from now on, at most `rate_hz` times a second. `refinement` puts so many vertices between two of
-        the tissue; not `precise` halves the bytes."""
+        """Watches the surface from now on, at most `rate_hz` frames per second. `refinement` is the number of vertices
+        between two points of the tissue, 0 to 10; `precise=False` halves the bytes."""
     def mesh(self, *, refinement: int = 0) -> dict[str, Any]:
-        """What of the surface stays: grid, rest_m, uv, triangles, file_vertex."""
+        """Returns the constant part of the surface: grid, rest_m, uv, triangles, file_vertex."""
     def touch(
         self,
         device: Any,
@@ -347,17 +354,18 @@ class RemoteSession:
         holder: str = "python",
         remember: bool = True,
     ) -> Touched:
-        """Touches with a device at 1 kHz, on a thread of its own, by the rendering law and within the safety envelope.
+        """Touches with a device at 1 kHz, on a thread of its own, with rendered forces within the safety envelope.
 
-        `device` is a Course, or an object with `read()`, which returns ((x, y, z), enable), and `write(force_n)`, and perhaps
-        `limits`, as a Course has them. A change of enable from False to True asks for forces. `prediction` says of which tissues
-        the loop simulates a copy, so that forces come without the delay of the network: "auto", of meshes; "always"; "never".
-        Warns (RuntimeWarning) if no force was felt at all. Raises Refused, reason TOOL_HELD, if somebody holds the tool, this
-        session object included.
+        `device` is a Course, or an object with `read()`, which returns ((x, y, z), enable), and `write(force_n)`, and
+        optionally `limits`, as a Course has them. A change of enable from False to True enables forces. `prediction` says of
+        which tissues the loop simulates a copy, so that forces come without the delay of the network: "auto", of meshes;
+        "always"; "never". Warns (RuntimeWarning) if no force was felt at all. Raises Refused, reason TOOL_HELD, if somebody
+        holds the tool, this session object included.
         """
     def pose(self, tool: int, place_m: Vector, tip: Optional[Tip] = None) -> None:
-        """Brings a tool with a tip here by the end of the next step, and takes the tool first if that is needed. It stays here until it
-        is told something else, also when the session moves. Raises Refused, reason TOOL_HELD, if another has the tool."""
+        """Moves a tool with a tip to `place_m` by the end of the next step; acquires the tool first if needed. It stays there
+        until its next command, even if the session moves. Raises Refused, reason TOOL_HELD, if somebody else holds the tool.
+        """
     def push(
         self,
         tool: int,
@@ -368,16 +376,15 @@ class RemoteSession:
         falloff_per_m: float = 200.0,
         falloff_offset: float = 0.0,
     ) -> None:
-        """Pushes at a point or a place; at a distance r from there by force_n * exp(-falloff_per_m * r +
-        falloff_offset)."""
+        """Pushes at a point or a place; at a distance r from there with force_n * exp(-falloff_per_m * r + falloff_offset)."""
     def grasp(self, tool: int, point: Point, displacement_m: Vector) -> None:
-        """Holds a point, and brings it this far from where it rests."""
+        """Holds a point, and moves it to this displacement from its place at rest."""
     def release(self, tool: int) -> None:
-        """Ends what a tool does, and gives it back."""
+        """Ends what a tool does, and releases it."""
     def play(self, script: Union[Script, Source], *, scene: Optional[Union[Scene, Source]] = None) -> Run:
-        """Plays a script in real time, each command at its exact step, from the session's step on. The session must stand, and stands at
-        the end. From step 0 on the records are those of `run(..., held=True)`. A session on a mesh needs its `scene`, unless you made it
-        from one."""
+        """Plays a script in real time, each command at its exact step, starting at the session's current step. The session
+        must be paused, and is paused at the end. If it starts at step 0, the records are those of `run(..., held=True)`. A
+        session on a mesh needs its `scene`, unless you created it from one."""
     def __enter__(self) -> RemoteSession: ...
     def __exit__(self, *raised: object) -> None: ...
 
@@ -385,23 +392,23 @@ class Client:
     """A connection to a server."""
 
     def scenes(self) -> list[str]:
-        """The names of the scenes that the server has."""
+        """Returns the names of the server's scenes."""
     def sessions(self) -> list[dict[str, Any]]:
-        """How each of its sessions stands, as `RemoteSession.status` tells."""
+        """Returns the state of each session of the server, like `RemoteSession.status`."""
     def create_session(
         self, scene: Union[str, Scene], *, paused: bool = False, idle_timeout_s: Optional[float] = None
     ) -> RemoteSession:
-        """A session of a scene that the server has, by its name, or of one of yours. A session that nobody uses for
-        `idle_timeout_s` is deleted."""
+        """Creates a session of one of the server's scenes, by its name, or of a scene of yours. The server deletes it when
+        nobody uses it for `idle_timeout_s`."""
     def load(
         self, plan: Union[Source, dict[str, Any]], *, report: Optional[Union[str, PathLike[str]]] = None
     ) -> dict[str, Any]:
-        """Loads the server with users by a plan, as `palpate-client load --plan` does, and gives the report. `plan` is
-        a file (TOML), its text, or a dict with the same keys. `report` is a file to write a page with plots to (HTML).
-        "kept" of the report tells whether all objectives were met and no stream broke, "why" what was not; see
-        docs/operating.md. Ctrl-C ends it, and deletes its sessions."""
+        """Loads the server with simulated users by a plan, like `palpate-client load --plan`, and returns the report. `plan`
+        is a file (TOML), its text, or a dict with its keys. `report` is a file for a page with plots (HTML). "kept" of the
+        report says whether all objectives were met and no stream broke, "why" lists what was not; see docs/operating.md.
+        Ctrl-C ends it, and deletes its sessions."""
     def session(self, session_id: str) -> RemoteSession:
-        """The session of an id. Raises Refused if there is none."""
+        """Returns the session with this id. Raises Refused if there is none."""
 
 def connect(
     url: str,
@@ -422,8 +429,9 @@ def load(
 def run(
     scene: Union[Scene, Tissue, Source], script: Union[Script, Source], *, held: bool = False, audit: bool = False
 ) -> Run:
-    """Plays a script, with the numbers and the hash of `palpate run`. `held` holds forces within each step, as a client does;
-    `audit` plays it a second time in f64 with a quarter of the substep, and tells the difference (summary["audited_error"])."""
+    """Plays a script, with the numbers and the hash of `palpate run`. `held=True` holds forces constant within each step, as
+    a client does; `audit=True` plays it a second time in f64 with a quarter of the substep, and reports the difference
+    (summary["audited_error"])."""
 
 @overload
 def study(
@@ -443,12 +451,12 @@ def study(
     errors: Literal["return"],
     progress: Optional[Callable[[int, int], object]] = None,
 ) -> list[Union[Run, Exception]]:
-    """Runs of many cases (scene, script) over threads, in their order; by default as many threads as there are processors.
-    `progress` is called with how many are done and how many there are."""
+    """Runs many cases (scene, script) on several threads, and returns the results in their order; by default on as many
+    threads as there are processors. `progress` is called with the number of cases done and of all cases."""
 
 def scenes(folder: Source = "scenes") -> list[str]:
-    """The names of the scenes that are shipped, and of the files in a folder."""
+    """Returns the names of the built-in scenes, and of those in a folder."""
 def scripts(folder: Source = "scripts") -> list[str]:
-    """The names of the scripts that are shipped, and of the files in a folder."""
+    """Returns the names of the built-in scripts, and of those in a folder."""
 def devices() -> list[str]:
-    """The names of the devices whose limits are known."""
+    """Returns the names of the devices whose limits are known."""

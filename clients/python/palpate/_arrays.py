@@ -1,4 +1,4 @@
-"""Types of the arrays that the library makes."""
+"""Record types of the arrays that the library creates."""
 
 import numpy as np
 
@@ -27,5 +27,5 @@ ENERGY = np.dtype([("kinetic", np.float64), ("spring", np.float64), ("virtual", 
 
 
 def tool_state(rows):
-    """What a tool feels, from five vectors."""
+    """Creates a `ToolState` from five vectors."""
     return ToolState(*rows)

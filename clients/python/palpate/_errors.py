@@ -1,17 +1,17 @@
-"""What can go wrong."""
+"""The exceptions of this package."""
 
 import re
 
 
 class Error(Exception):
-    """Any error of Palpate."""
+    """The base class of all errors of Palpate."""
 
 
 class Refused(Error, ValueError):
-    """An input was refused, and changed nothing.
+    """An input was refused; nothing was changed.
 
-    `reason` is a stable name (docs/protocol.md lists them), `field` the offending field as a path, "" if none is, `message` says
-    what is wrong and what would be right, and `place` where it was written, as "scene.toml:5"; None if it came in no text.
+    `reason` is a stable name (docs/protocol.md lists them). `field` is the path of the wrong field, or "". `message` says what is
+    wrong and what would be right. `place` is where the input was written, such as "scene.toml:5"; None if it is not from a text.
     """
 
     def __init__(self, reason, field, message, place=None):
@@ -23,7 +23,7 @@ class Refused(Error, ValueError):
 
     @property
     def line(self):
-        """The line of TOML, from 1; None if the refusal is of no line."""
+        """The line of the TOML text, from 1; None if the refusal is not about a line."""
         found = re.search(r":(\d+)$", self.place or "")
         return int(found.group(1)) if found else None
 
@@ -32,7 +32,7 @@ class Refused(Error, ValueError):
 
 
 class Failed(Error, RuntimeError):
-    """The tissue could not go on: the guard has ended the session."""
+    """The tissue could not continue: the guard has stopped the session."""
 
 
 class Disconnected(Error, ConnectionError):

@@ -1,4 +1,4 @@
-"""What a journal tells, as arrays."""
+"""The contents of journals, as arrays."""
 
 import dataclasses
 from typing import Optional
@@ -8,7 +8,7 @@ import numpy as np
 
 @dataclasses.dataclass(eq=False)
 class Course:
-    """What one tool did and felt, some 100 times a second."""
+    """What one tool did and felt, about 100 times per second: one row of each array per moment."""
 
     time_s: np.ndarray
     step: np.ndarray
@@ -22,10 +22,10 @@ class Course:
 
 @dataclasses.dataclass(eq=False)
 class Commands:
-    """Every command, by the step at which it acted: one row of each array.
+    """All commands, by the step at which they acted: one row of each array per command.
 
-    `kind` is push, grasp, pose, release or end_of_lease. `place_m` is where a force acts, where a pose leads, or by how much a grasp
-    displaces its point (`point`, an index; -1 where no point was named); `force_n` is of a push. NaN where there is none.
+    `kind` is push, grasp, pose, release or end_of_lease. `place_m` is the place of a push, the position of a pose, or the
+    displacement by a grasp; `force_n` is the force of a push; NaN for other kinds. `point` is the row of the point, or -1.
     """
 
     time_s: np.ndarray
@@ -47,7 +47,7 @@ class Commands:
 
 @dataclasses.dataclass
 class Verdict:
-    """Whether a journal that is simulated again gives the same bits."""
+    """The result of simulating a journal again: true if all compared hashes and snapshots are equal, bit by bit."""
 
     begin_step: int
     end_step: int

@@ -1,4 +1,4 @@
-"""What came of a run."""
+"""The results of a run."""
 
 import dataclasses
 import json
@@ -8,11 +8,11 @@ import numpy as np
 
 @dataclasses.dataclass(eq=False)
 class Run:
-    """The records of a run: one row of each array for each moment.
+    """The records of a run: one row of each array per moment.
 
     `points` has the fields displacement_m, velocity_m_per_s, spring_n, anchor_n, damping_n, applied_n, reaction_n and constraint_n
-    (NaN of a point that is not held) for each moment and point, `tools` place_m, displacement_m and force_on_tool_n (NaN while the
-    tool is away) for each moment and tool with a tip, `energy_j` kinetic, spring and virtual.
+    (NaN for a point that is not held), per moment and point. `tools` has place_m, displacement_m and force_on_tool_n (NaN while the
+    tool is away), per moment and tool with a tip. `energy_j` has kinetic, spring and virtual.
     """
 
     time_s: np.ndarray
@@ -31,11 +31,11 @@ class Run:
 
     @property
     def final_hash(self):
-        """The state at the end, as the program `palpate run` tells it."""
+        """The hash of the state at the end, as the program `palpate run` prints it."""
         return self.summary["final_hash"]
 
     def point(self, name):
-        """The records of the point `name` over time."""
+        """Returns the records of the point `name` over time."""
         names = [tuple(other) if isinstance(other, (list, tuple)) else other for other in self.point_names]
         return self.points[:, names.index(tuple(name) if isinstance(name, (list, tuple)) else name)]
 

@@ -1,4 +1,4 @@
-"""Touching: courses to play, and what came of it."""
+"""Touching: courses to play, and their results."""
 
 import dataclasses
 from typing import Optional, Union
@@ -19,7 +19,7 @@ class ToolState:
 
 @dataclasses.dataclass(eq=False)
 class Course:
-    """A device that is led along `places_m`, a row for each millisecond, from the top of the tissue (`Tissue.top_m`), z up.
+    """A device that moves along `places_m`, one row per millisecond, measured from the top of the tissue (`Tissue.top_m`), z up.
 
     `limits` is the name of a device (`palpate.devices()`), or a dict with force_n, continuous_n, stiffness_n_per_m,
     damping_n_s_per_m, workspace_m.
@@ -30,9 +30,9 @@ class Course:
 
 
 def press(depth_m=0.003, *, seconds=2.0, hover_m=0.005, at_m=(0.0, 0.0), limits="omega3"):
-    """A course that comes down from `hover_m` above the tissue, presses `depth_m` deep, holds, and goes up again: smooth, a third of
-    `seconds` each. `at_m` is measured from the top of the tissue: of a sheet its middle, of an organ the highest place of its surface
-    over the middle. Where the surface of an organ lies lower, give its height as a third number, such as `at_m=(0.03, 0.0, -0.008)`."""
+    """Returns a course that moves down from `hover_m` above the tissue, presses `depth_m` deep, holds, and moves up again: smoothly, a
+    third of `seconds` each. `at_m` is measured from the top of the tissue: of a sheet its middle, of an organ the highest place of its
+    surface above the middle. Where the surface of an organ is lower, give its height as a third number: `at_m=(0.03, 0.0, -0.008)`."""
     moments = np.arange(max(1, round(1000 * seconds))) / max(1, round(1000 * seconds))
     down = np.clip(3 * moments, 0, 1) - np.clip(3 * moments - 2, 0, 1)
     smooth = down * down * (3 - 2 * down)
@@ -44,12 +44,13 @@ def press(depth_m=0.003, *, seconds=2.0, hover_m=0.005, at_m=(0.0, 0.0), limits=
 
 @dataclasses.dataclass(eq=False)
 class Touched:
-    """What came of a touch: a row for each tick of the device's loop, and counts.
+    """The results of a touch: one row of each array per tick of the device's loop, and counts.
 
-    `place_m` is where the tool was, in the tissue's frame: a device that reads (0, 0, 0) is at `status()["top_m"]`. `force_n` is what the
-    device was told, on the hand, z up. `time_s` is counted from the first tick; `enabled` says whether forces were on. `ages_s` is how
-    old the newest news of the tissue was, of ticks since the first. `limits` counts the ticks in which each limit of the safety envelope
-    acted, `energy_j` is the energy that the device gave to the hand, and `lost` says why there was no connection at the end.
+    `place_m` is the tool's position in the tissue's frame: a device that reads (0, 0, 0) is at `status()["top_m"]`. `force_n` is the
+    force on the hand that the device was given, z up. `time_s` is counted from the first tick; `enabled` says whether forces were
+    enabled. `ages_s` is the age of the newest data of the tissue, for ticks since the first data. `limits` counts the ticks in which
+    each limit of the safety envelope acted, `energy_j` is the energy that the device gave to the hand, and `lost` is the reason why
+    there was no connection at the end, or None.
     """
 
     time_s: np.ndarray
@@ -74,7 +75,7 @@ class Touched:
 
 @dataclasses.dataclass(eq=False)
 class Sampled:
-    """Samples of a session: a row for each tool of each. `felt` has displacement_m, surface_displacement_m, velocity_m_per_s,
+    """Samples of a session: one row per tool of each sample. `felt` has displacement_m, surface_displacement_m, velocity_m_per_s,
     force_on_tool_n and applied_force_n."""
 
     step: np.ndarray
@@ -90,8 +91,8 @@ class Sampled:
 
 @dataclasses.dataclass(eq=False)
 class Frame:
-    """The surface at one moment: how far each vertex is displaced, as an array [x, y, 3] on a sheet. On a mesh its first two axes
-    together are the vertices of `RemoteSession.mesh()`, and some at the end may stand for none."""
+    """The surface at one moment. `displacement_m` is the displacement of each vertex, an array [x, y, 3] on a sheet. On a mesh its
+    first two axes together are the vertices of `RemoteSession.mesh()`, with possibly some unused rows at the end."""
 
     step: int
     time_s: float

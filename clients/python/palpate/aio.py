@@ -1,4 +1,4 @@
-"""The client of a server for asyncio: what `palpate.connect` gives, with everything that waits to be awaited.
+"""The client of a server for asyncio: like `palpate.connect`, but every call that waits returns an awaitable.
 
     server = await palpate.aio.connect("http://127.0.0.1:7117")
     async with await server.create_session("liver") as session:
@@ -13,7 +13,7 @@ __all__ = ["Client", "Frames", "RemoteSession", "Samples", "connect"]
 
 
 def connect(url, *, token=None, ca=None, tls_name=None, cert=None, key=None, within_s=10.0):
-    """A connection to the server at `url`, to be awaited."""
+    """Connects to the server at `url`; await the result. See `palpate.connect` for the arguments."""
     return Client.connect(
         url, token=token, ca=ca, tls_name=tls_name, cert=cert, key=key, within_s=within_s, awaited=True
     )

@@ -1,7 +1,7 @@
-//! Arrays of NumPy from memory that was filled here, without a copy.
+//! NumPy arrays over memory that was filled here, without a copy.
 //!
-//! An array asks an object for `__array_interface__`, which tells where its numbers are, and keeps the object alive. So neither this
-//! crate nor its users need to be compiled against NumPy.
+//! An array asks an object for `__array_interface__`, which says where its numbers are, and keeps the object alive.
+//! So neither this crate nor its users need to be compiled against NumPy.
 
 use glam::DVec3;
 use palpate_tissue::scene::record::Point;
@@ -10,9 +10,9 @@ use pyo3::types::{PyDict, PyTuple};
 
 use crate::error::wrong;
 
-/// A kind of number, as NumPy calls it.
+/// A type of number that NumPy has.
 pub(crate) trait Number: Send + Sync + 'static {
-    /// Kind and bytes.
+    /// NumPy's code for its kind and its size in bytes.
     const KIND: &'static str;
 }
 
@@ -22,10 +22,10 @@ macro_rules! numbers {
 
 numbers!(f64 = "f8", f32 = "f4", u64 = "u8", u32 = "u4", i64 = "i8", bool = "b1");
 
-/// The memory of an array.
+/// The memory of an array, kept alive by it.
 #[pyclass(frozen)]
 pub(crate) struct Memory {
-    /// Nobody here reads or writes it any more: the array does.
+    /// Only the array reads and writes it from now on.
     _owner: Box<dyn Send + Sync>,
     address: usize,
     kind: &'static str,
@@ -46,28 +46,28 @@ impl Memory {
     }
 }
 
-/// Numbers as an array of this shape, which has as many.
+/// Returns numbers as an array of this shape, whose product must be their count.
 fn array<'py, T: Number>(py: Python<'py>, mut numbers: Vec<T>, shape: Vec<usize>) -> PyResult<Bound<'py, PyAny>> {
     debug_assert_eq!(numbers.len(), shape.iter().product::<usize>());
-    // The numbers stay where they are when the vector is moved.
+    // Moving the vector does not move the numbers.
     let address = numbers.as_mut_ptr().expose_provenance();
     let memory = Memory { _owner: Box::new(numbers), address, kind: T::KIND, shape };
     py.import("numpy")?.call_method1("asarray", (memory,))
 }
 
-/// Numbers in one row.
+/// Returns numbers as a one-dimensional array.
 pub(crate) fn column<'py, T: Number>(py: Python<'py>, numbers: Vec<T>) -> PyResult<Bound<'py, PyAny>> {
     let shape = vec![numbers.len()];
     array(py, numbers, shape)
 }
 
-/// Numbers of a point's record: displacement, velocity, and six forces.
+/// Number of values in a point's record: displacement, velocity, and six forces, each with three components.
 pub(crate) const OF_POINT: usize = 24;
 
-/// Numbers of a tool's record: place, displacement, force.
+/// Number of values in a tool's record: place, displacement, force, each with three components.
 pub(crate) const OF_TOOL: usize = 9;
 
-/// Appends a point's record; NaN for a force that is not there.
+/// Appends a point's record; NaN for a force that does not exist.
 pub(crate) fn add_point(into: &mut Vec<f64>, point: &Point) {
     let constraint_n = point.constraint_n.unwrap_or([f64::NAN; 3]);
     for vector in [
@@ -84,12 +84,12 @@ pub(crate) fn add_point(into: &mut Vec<f64>, point: &Point) {
     }
 }
 
-/// Vectors, one a row.
+/// Returns vectors as an array with one per row.
 pub(crate) fn rows<'py>(py: Python<'py>, numbers: Vec<f64>) -> PyResult<Bound<'py, PyAny>> {
     shaped(py, numbers, &[3])
 }
 
-/// Numbers in rows of this shape.
+/// Returns numbers as an array whose rows have this shape.
 pub(crate) fn shaped<'py, T: Number>(py: Python<'py>, numbers: Vec<T>, row: &[usize]) -> PyResult<Bound<'py, PyAny>> {
     let of_row: usize = row.iter().product();
     let mut shape = vec![numbers.len().checked_div(of_row).unwrap_or(0)];
@@ -97,7 +97,7 @@ pub(crate) fn shaped<'py, T: Number>(py: Python<'py>, numbers: Vec<T>, row: &[us
     array(py, numbers, shape)
 }
 
-/// The same numbers as records of a type of `palpate._arrays`, in this shape.
+/// Returns numbers as an array of records of a type of `palpate._arrays`, in this shape.
 pub(crate) fn records<'py>(
     py: Python<'py>,
     numbers: Vec<f64>,
@@ -108,7 +108,7 @@ pub(crate) fn records<'py>(
     column(py, numbers)?.call_method1("view", (dtype,))?.call_method1("reshape", (PyTuple::new(py, shape)?,))
 }
 
-/// Writes vectors into an array of the caller's.
+/// Writes vectors into an array of the caller. Refuses an array of another shape.
 pub(crate) fn write_into(py: Python<'_>, out: &Bound<'_, PyAny>, numbers: Vec<f64>) -> PyResult<()> {
     let shape: Vec<usize> = out.getattr("shape").and_then(|shape| shape.extract()).unwrap_or_default();
     let expected = [numbers.len() / 3, 3];
@@ -118,7 +118,7 @@ pub(crate) fn write_into(py: Python<'_>, out: &Bound<'_, PyAny>, numbers: Vec<f6
     py.import("numpy")?.call_method1("copyto", (out, rows(py, numbers)?)).map(drop)
 }
 
-/// A vector of three.
+/// Reads a vector of three numbers.
 pub(crate) fn vector(field: &str, value: &Bound<'_, PyAny>) -> PyResult<DVec3> {
     let found: PyResult<[f64; 3]> = value.extract();
     found.map(DVec3::from_array).map_err(|_| wrong(field, "must be three numbers, x, y and z"))

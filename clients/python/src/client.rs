@@ -1,5 +1,5 @@
-//! A client of a server. Each call gives its result at once, or something to await: `awaited` says which, and is handed on from
-//! the connection to what it makes.
+//! A client of a server. Each call returns its result, or an awaitable of it: the flag `awaited` of the connection
+//! decides which, and everything created from the connection has it too.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -32,10 +32,10 @@ use crate::tip::Tip;
 use crate::told::{Bytes, Status, SurfaceMesh, Touched};
 use crate::waiting::{answer, answer_in_order};
 
-/// What a call gives that gives nothing: `None`.
+/// The result of a call without a result: `None`.
 const NOTHING: Option<bool> = None;
 
-/// A number of seconds that may pass.
+/// Converts a number of seconds to a duration; refuses negative ones and those that are not finite.
 fn duration(field: &str, seconds: f64) -> PyResult<Duration> {
     Duration::try_from_secs_f64(seconds)
         .map_err(|_| wrong(field, format!("must be a number of seconds, but is {seconds}")))
@@ -55,7 +55,7 @@ impl Server {
         SessionServiceClient::new(self.channel.clone())
     }
 
-    /// The session of this ID, wherever in the fleet it is.
+    /// Finds the session with this ID, on any server of the fleet.
     async fn found(self, id: String, scene: Option<Arc<scene::Scene>>) -> PyResult<RemoteSession> {
         let found = Followed::find(self.server, self.channel, id).await.map_err(of_client)?;
         Ok(RemoteSession { session: found.0.into(), held: Arc::default(), scene, awaited: self.awaited })
@@ -64,7 +64,7 @@ impl Server {
 
 #[pymethods]
 impl Server {
-    /// What `palpate.connect` and `palpate.aio.connect` call.
+    /// Connects to a server, for `palpate.connect` and `palpate.aio.connect`.
     #[staticmethod]
     #[pyo3(signature = (url, *, token=None, ca=None, tls_name=None, cert=None, key=None, within_s=10.0, awaited=false))]
     #[allow(clippy::too_many_arguments)]
@@ -94,7 +94,7 @@ impl Server {
         })
     }
 
-    /// The names of the scenes that the server has.
+    /// Returns the names of the server's scenes.
     fn scenes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let mut sessions = self.sessions();
         answer(py, self.awaited, async move {
@@ -103,7 +103,7 @@ impl Server {
         })
     }
 
-    /// How each of its sessions stands, as `RemoteSession.status` tells.
+    /// Returns the state of each session of the server, like `RemoteSession.status`.
     #[pyo3(name = "sessions")]
     fn sessions_there<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let mut sessions = self.sessions();
@@ -113,8 +113,8 @@ impl Server {
         })
     }
 
-    /// A session of a scene that the server has, by its name, or of one of yours. A session that nobody uses for
-    /// `idle_timeout_s` is deleted.
+    /// Creates a session of one of the server's scenes, by its name, or of a scene of yours. The server deletes it
+    /// when nobody uses it for `idle_timeout_s`.
     #[pyo3(signature = (scene, *, paused=false, idle_timeout_s=None))]
     fn create_session<'py>(
         &self,
@@ -138,7 +138,7 @@ impl Server {
             let request = pb::CreateSessionRequest { source, paused, idle_timeout_s };
             let made = server.sessions().create_session(request).await.map_err(of_status)?.into_inner().session;
             let made = made.unwrap_or_default();
-            // Another server of the fleet may have made it.
+            // Another server of the fleet may have created it.
             match &made.ownership {
                 Some(_) => server.found(made.session_id, own).await,
                 None => {
@@ -149,9 +149,9 @@ impl Server {
         })
     }
 
-    /// Loads the server with users by a plan, as `palpate-client load --plan` does, and gives the report. `plan` is a
-    /// file (TOML), its text, or a dict with the same keys. `report` is a file to write a page with plots to (HTML).
-    /// "kept" of the report tells whether all objectives were met and no stream broke, "why" what was not; see
+    /// Loads the server with simulated users by a plan, like `palpate-client load --plan`, and returns the report.
+    /// `plan` is a file (TOML), its text, or a dict with its keys. `report` is a file for a page with plots (HTML).
+    /// "kept" of the report says whether all objectives were met and no stream broke, "why" lists what was not; see
     /// docs/operating.md. Ctrl-C ends it, and deletes its sessions.
     #[pyo3(signature = (plan, *, report=None))]
     fn load<'py>(
@@ -163,7 +163,7 @@ impl Server {
         load(py, self.server.clone(), plan, report, self.awaited)
     }
 
-    /// The session of an id. Raises Refused if there is none.
+    /// Returns the session with this id. Raises Refused if there is none.
     fn session<'py>(&self, py: Python<'py>, session_id: String) -> PyResult<Bound<'py, PyAny>> {
         // Refused if there is none.
         answer(py, self.awaited, self.clone().found(session_id, None))
@@ -179,23 +179,23 @@ fn grid_point(point: [usize; 2]) -> pb::GridPoint {
     pb::GridPoint { x, y }
 }
 
-/// A vector as it is: what is not finite the server refuses, with its field.
+/// Converts a vector unchecked: the server refuses one that is not finite, with its field.
 fn numbers(DVec3 { x, y, z }: DVec3) -> pb::Vector3 {
     pb::Vector3 { x, y, z }
 }
 
-/// A session of a server. `with` deletes it at the end. In a fleet it is followed to whichever server has it: calls and
-/// streams go on there.
+/// A session on a server. `with` deletes it at the end. In a fleet, calls and streams follow it to the server that
+/// has it.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct RemoteSession {
     pub(crate) session: Arc<Followed>,
     pub(crate) held: Arc<Held>,
-    /// The scene that the caller has sent.
+    /// The scene from which the caller created it.
     pub(crate) scene: Option<Arc<scene::Scene>>,
     pub(crate) awaited: bool,
 }
 
-/// Calls whichever server has the session.
+/// Calls the server that has the session.
 macro_rules! called {
     ($session:expr, $client:ident . $call:ident ( $request:expr )) => {{
         let request = $request;
@@ -209,7 +209,7 @@ macro_rules! called {
 pub(crate) use called;
 
 impl RemoteSession {
-    /// The session, to be moved into a future; and its ID.
+    /// Returns the session, to be moved into a future, and its ID.
     fn own(&self) -> (Arc<Followed>, String) {
         (self.session.clone(), self.session.session_id().to_owned())
     }
@@ -228,13 +228,13 @@ impl RemoteSession {
         self.session.session_id()
     }
 
-    /// URL of the server that had it at last.
+    /// URL of the server that last had the session.
     #[getter]
     fn server(&self) -> String {
         self.session.server().url().to_owned()
     }
 
-    /// How the session stands: state, step, points, held tools, and more.
+    /// Returns the state of the session: state, step, points, held tools, and more.
     fn status<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
@@ -243,7 +243,7 @@ impl RemoteSession {
         })
     }
 
-    /// Lets it run, until a step if one is named; gives the step that comes next.
+    /// Starts the session, to run until step `until_step` if given. Returns the next step.
     #[pyo3(signature = (*, until_step=None))]
     fn start<'py>(&self, py: Python<'py>, until_step: Option<u64>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
@@ -253,7 +253,7 @@ impl RemoteSession {
         })
     }
 
-    /// Holds it after the step that is under way.
+    /// Pauses the session after its current step.
     fn pause<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
@@ -262,8 +262,8 @@ impl RemoteSession {
         })
     }
 
-    /// Makes the tissue softer or stiffer, from a step on if one is named; gives that step. What is not named stays as
-    /// it is.
+    /// Makes the tissue softer or stiffer, from step `at_step` on if given, else from the next. Returns that step.
+    /// Coefficients that are not given stay as they are.
     #[pyo3(signature = (*, stiffness_n_per_m=None, damping_n_s_per_m=None, anchor_stiffness_n_per_m=None,
         volume_stiffness_pa=None, at_step=None))]
     fn change<'py>(
@@ -287,7 +287,7 @@ impl RemoteSession {
         answer(py, self.awaited, async move { Ok(called!(session, SessionServiceClient.update_tissue(request))?.step) })
     }
 
-    /// How many steps were done and the hash of the state then: after so many, or now.
+    /// Returns a number of steps done and the hash of the state after them: `at_step` if given, else the current one.
     #[pyo3(signature = (*, at_step=None))]
     fn hash<'py>(&self, py: Python<'py>, at_step: Option<u64>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
@@ -298,7 +298,7 @@ impl RemoteSession {
         })
     }
 
-    /// A journal of this moment (MCAP), for `Journal`.
+    /// Returns a journal of the current moment (MCAP), for `Journal`.
     fn save<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
@@ -308,7 +308,7 @@ impl RemoteSession {
         })
     }
 
-    /// Ends it for everybody.
+    /// Deletes the session, for all its users.
     fn delete<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
         answer(py, self.awaited, async move {
@@ -317,8 +317,8 @@ impl RemoteSession {
         })
     }
 
-    /// The samples of all tools from now on: of every step, or of every so many. `heartbeat_s` is how often one comes
-    /// of a tissue at rest.
+    /// Watches the samples of all tools from now on, one per `every_steps` steps. `heartbeat_s` is the longest time
+    /// between two samples of a tissue at rest, s.
     #[pyo3(signature = (*, every_steps=1, heartbeat_s=None))]
     fn samples<'py>(&self, py: Python<'py>, every_steps: u32, heartbeat_s: Option<f64>) -> PyResult<Bound<'py, PyAny>> {
         let request = pb::WatchSamplesRequest {
@@ -334,8 +334,8 @@ impl RemoteSession {
         })
     }
 
-    /// The surface from now on, at most `rate_hz` times a second. `refinement` puts so many vertices between two of the
-    /// tissue; not `precise` halves the bytes.
+    /// Watches the surface from now on, at most `rate_hz` frames per second. `refinement` is the number of vertices
+    /// between two points of the tissue, 0 to 10; `precise=False` halves the bytes.
     #[pyo3(signature = (*, rate_hz=60.0, refinement=0, precise=true))]
     fn frames<'py>(
         &self,
@@ -358,7 +358,7 @@ impl RemoteSession {
         })
     }
 
-    /// What of the surface stays: grid, rest_m, uv, triangles, file_vertex.
+    /// Returns the constant part of the surface: grid, rest_m, uv, triangles, file_vertex.
     #[pyo3(signature = (*, refinement=0))]
     fn mesh<'py>(&self, py: Python<'py>, refinement: u32) -> PyResult<Bound<'py, PyAny>> {
         let (session, session_id) = self.own();
@@ -377,13 +377,13 @@ impl RemoteSession {
         })
     }
 
-    /// Touches with a device at 1 kHz, on a thread of its own, by the rendering law and within the safety envelope.
+    /// Touches with a device at 1 kHz, on a thread of its own, with rendered forces within the safety envelope.
     ///
     /// `device` is a Course, or an object with `read()`, which returns ((x, y, z), enable), and `write(force_n)`, and
-    /// perhaps `limits`, as a Course has them. A change of enable from False to True asks for forces. `prediction` says of which
-    /// tissues the loop simulates a copy, so that forces come without the delay of the network: "auto", of meshes; "always";
-    /// "never". Warns (RuntimeWarning) if no force was felt at all. Raises Refused, reason TOOL_HELD, if somebody holds the
-    /// tool, this session object included.
+    /// optionally `limits`, as a Course has them. A change of enable from False to True enables forces. `prediction`
+    /// says of which tissues the loop simulates a copy, so that forces come without the delay of the network: "auto",
+    /// of meshes; "always"; "never". Warns (RuntimeWarning) if no force was felt at all. Raises Refused, reason
+    /// TOOL_HELD, if somebody holds the tool, this session object included.
     #[pyo3(signature = (device, *, seconds=None, tool=0, tip=None, deadband=0.0, up_deadband=0.0, datagrams=true,
         prediction="auto", holder="python", remember=true))]
     #[allow(clippy::too_many_arguments)]
@@ -428,7 +428,7 @@ impl RemoteSession {
         let held = self.held.clone();
         answer_in_order(py, self.awaited, Some(end), async move {
             let stop = async {
-                // Dropped when nobody waits any more.
+                // Dropped when the caller no longer waits.
                 let _ = ended.await;
             };
             if held.holds(tool).await {
@@ -443,9 +443,9 @@ impl RemoteSession {
         })
     }
 
-    /// Brings a tool with a tip here by the end of the next step, and takes the tool first if that is needed. It stays
-    /// here until it is told something else, also when the session moves. Raises Refused, reason TOOL_HELD, if another
-    /// has the tool.
+    /// Moves a tool with a tip to `place_m` by the end of the next step; acquires the tool first if needed. It stays
+    /// there until its next command, even if the session moves. Raises Refused, reason TOOL_HELD, if somebody else
+    /// holds the tool.
     #[pyo3(signature = (tool, place_m, tip=None))]
     fn pose<'py>(
         &self,
@@ -458,7 +458,8 @@ impl RemoteSession {
         self.tell(py, tool, Action::Pose(touch::pose(vector("place_m", place_m)?, &tip)))
     }
 
-    /// Pushes at a point or a place; at a distance r from there by force_n * exp(-falloff_per_m * r + falloff_offset).
+    /// Pushes at a point or a place; at a distance r from there with force_n * exp(-falloff_per_m * r +
+    /// falloff_offset).
     #[pyo3(signature = (tool, force_n, *, point=None, at_m=None, falloff_per_m=200.0, falloff_offset=0.0))]
     #[allow(clippy::too_many_arguments)]
     fn push<'py>(
@@ -488,7 +489,7 @@ impl RemoteSession {
         self.tell(py, tool, Action::Force(force))
     }
 
-    /// Holds a point, and brings it this far from where it rests.
+    /// Holds a point, and moves it to this displacement from its place at rest.
     fn grasp<'py>(
         &self,
         py: Python<'py>,
@@ -505,15 +506,15 @@ impl RemoteSession {
         self.tell(py, tool, Action::Position(pb::Position { point, vertex, target }))
     }
 
-    /// Ends what a tool does, and gives it back.
+    /// Ends what a tool does, and releases it.
     fn release<'py>(&self, py: Python<'py>, tool: u32) -> PyResult<Bound<'py, PyAny>> {
         let released = self.held.clone().release(self.session.clone(), tool);
         answer(py, self.awaited, async move { released.await.map(|()| NOTHING).map_err(of_client) })
     }
 
-    /// Plays a script in real time, each command at its exact step, from the session's step on. The session must stand,
-    /// and stands at the end. From step 0 on the records are those of `run(..., held=True)`. A session on a mesh needs
-    /// its `scene`, unless you made it from one.
+    /// Plays a script in real time, each command at its exact step, starting at the session's current step. The
+    /// session must be paused, and is paused at the end. If it starts at step 0, the records are those of `run(...,
+    /// held=True)`. A session on a mesh needs its `scene`, unless you created it from one.
     #[pyo3(signature = (script, *, scene=None))]
     fn play<'py>(
         &self,

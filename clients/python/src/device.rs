@@ -1,4 +1,4 @@
-//! Haptic devices: objects of Python, and courses that are played.
+//! Haptic devices: Python objects, and courses that are played.
 
 use std::io::{Error, ErrorKind, Result};
 use std::time::Instant;
@@ -14,13 +14,13 @@ use pyo3::types::PyDict;
 use crate::ending;
 use crate::error::{refused, wrong};
 
-/// The names of the devices whose limits are known.
+/// Returns the names of the devices whose limits are known.
 #[pyfunction]
 pub(crate) fn devices() -> Vec<&'static str> {
     DEVICES.iter().map(|device| device.name).chain([UNDECLARED.name]).collect()
 }
 
-/// What a device can bear: by its name, or as a dict of its limits.
+/// Reads the limits of a device: by its name, or from a dict.
 pub(crate) fn descriptor(value: Option<Bound<'_, PyAny>>) -> PyResult<Device> {
     let Some(value) = value.filter(|value| !value.is_none()) else { return Ok(UNDECLARED) };
     if let Ok(limits) = value.cast::<PyDict>() {
@@ -55,22 +55,22 @@ pub(crate) fn descriptor(value: Option<Bound<'_, PyAny>>) -> PyResult<Device> {
     })
 }
 
-/// A device of Python's making.
+/// A device given by Python.
 pub(crate) enum Given {
     /// An object with `read()` and `write(force_n)`.
     Object { device: Device, read: Py<PyAny>, write: Py<PyAny> },
-    /// Places at 1 kHz.
+    /// A course: a place for each millisecond.
     Course { device: Device, places_m: Vec<DVec3>, begun: Option<Instant> },
 }
 
-/// A course asks for forces with this period, s: the envelope may refuse or stop them.
+/// Interval at which a course requests forces, s: the envelope may refuse or stop them.
 const ASKS_EVERY_S: f64 = 0.3;
 
-/// Places of a course in a second.
+/// Places of a course per second.
 const RATE_HZ: f64 = 1000.0;
 
 impl Given {
-    /// An object, or a `palpate.Course`.
+    /// Reads an object or a `palpate.Course`.
     pub(crate) fn of(value: &Bound<'_, PyAny>) -> PyResult<Self> {
         let device = descriptor(value.getattr_opt("limits")?)?;
         if let Some(places_m) = value.getattr_opt("places_m")? {
@@ -91,7 +91,7 @@ impl Given {
         Ok(Given::Object { device, read: method("read")?, write: method("write")? })
     }
 
-    /// How long it lasts, s, if it ends.
+    /// Returns how long the course lasts, s; `None` for an object.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn lasts_s(&self) -> Option<f64> {
         match self {
@@ -101,7 +101,7 @@ impl Given {
     }
 }
 
-/// With the interpreter, unless it is going down.
+/// Runs `work` with the interpreter, unless it is shutting down.
 fn attached<T>(work: impl FnOnce(Python<'_>) -> PyResult<T>) -> Result<T> {
     ending::attached(work).unwrap_or_else(|| Err(ending::ended())).map_err(Error::other)
 }
@@ -124,7 +124,7 @@ impl HapticDevice for Given {
             }),
             Given::Course { places_m, begun, .. } => {
                 let now_s = begun.get_or_insert_with(Instant::now).elapsed().as_secs_f64();
-                // By the time that has passed: a late tick does not make it longer.
+                // Chosen by the time that has passed: a late tick does not make the course longer.
                 let place_m = places_m.get((now_s * RATE_HZ) as usize).or(places_m.last()).copied();
                 let place_m = place_m.ok_or(ErrorKind::InvalidInput)?;
                 Ok(Reading { place_m, enable: now_s % ASKS_EVERY_S < ASKS_EVERY_S / 2.0 })

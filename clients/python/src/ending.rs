@@ -1,8 +1,8 @@
-//! The interpreter from threads that it does not know, and its end.
+//! Access to the interpreter from threads that it does not know, and its shutdown.
 //!
-//! A thread that waits for the interpreter's lock when the interpreter goes down is ended by it, in the middle of Rust: the process dies.
-//! So who calls Python from such a thread goes through [`attached`], and when the interpreter is about to go down it waits until nobody
-//! is inside, and lets nobody in any more.
+//! A thread that waits for the interpreter's lock while the interpreter shuts down is ended by it, in the middle of
+//! Rust: the process dies. So code that calls Python from such a thread goes through [`attached`]. Before the
+//! interpreter shuts down, it waits until no thread is inside, and admits no more.
 
 use std::cell::Cell;
 use std::future::Future;
@@ -17,14 +17,15 @@ use pyo3_async_runtimes::generic::{ContextExt, Runtime};
 
 use crate::waiting::runtime;
 
-/// The end of a program waits so long for what is inside: a device of Python that never returns must not keep it for ever.
+/// Longest time for which the end of a program waits for threads inside: a Python device that never returns must not
+/// keep it running.
 const EXIT_TIMEOUT: Duration = Duration::from_secs(5);
 
 #[derive(Default)]
 struct Gate {
-    /// Threads inside.
+    /// Number of threads inside.
     inside: usize,
-    /// The interpreter goes down.
+    /// Whether the interpreter is shutting down.
     is_closed: bool,
 }
 
@@ -32,7 +33,7 @@ static GATE: Mutex<Gate> = Mutex::new(Gate { inside: 0, is_closed: false });
 static LEFT: Condvar = Condvar::new();
 
 thread_local! {
-    /// How often this thread has come in: what it calls in Python may come back.
+    /// How many calls of this thread are inside: what it calls in Python may call back.
     static DEPTH: Cell<usize> = const { Cell::new(0) };
 }
 
@@ -40,7 +41,7 @@ fn gate() -> MutexGuard<'static, Gate> {
     GATE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A thread inside.
+/// Marks this thread as inside, until it is dropped.
 struct Inside;
 
 impl Inside {
@@ -67,13 +68,13 @@ impl Drop for Inside {
     }
 }
 
-/// Does `work` with the interpreter. `None`: that goes down.
+/// Runs `work` with the interpreter. `None` if that is shutting down.
 pub(crate) fn attached<T>(work: impl FnOnce(Python<'_>) -> T) -> Option<T> {
     let _inside = Inside::come()?;
     Python::try_attach(work)
 }
 
-/// What is raised in place of what there is no interpreter for any more.
+/// Returns the exception for calls that no longer have an interpreter.
 pub(crate) fn ended() -> PyErr {
     PyRuntimeError::new_err("Python is ending")
 }
@@ -88,13 +89,13 @@ fn close(py: Python<'_>) {
     });
 }
 
-/// Has the gate closed before the interpreter goes down.
+/// Registers the closing of the gate for the shutdown of the interpreter.
 pub(crate) fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.py().import("atexit")?.call_method1("register", (wrap_pyfunction!(close, module)?,))?;
     Ok(())
 }
 
-/// The runtime of futures that Python awaits. Their results go to Python from threads that may block.
+/// The runtime of futures that Python awaits. It passes their results to Python from threads that may block.
 pub(crate) struct NetworkRuntime;
 
 impl Runtime for NetworkRuntime {
@@ -128,7 +129,7 @@ impl ContextExt for NetworkRuntime {
     }
 }
 
-// Without a runtime nothing is awaited.
+// Nothing is awaited before the runtime exists.
 #[allow(clippy::expect_used)]
 fn running() -> &'static tokio::runtime::Runtime {
     runtime().expect("it has been asked for before anything was spawned")

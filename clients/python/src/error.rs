@@ -1,4 +1,4 @@
-//! Refusals and failures as the exceptions of `palpate._errors`.
+//! Converts refusals and failures to the exceptions of `palpate._errors`.
 
 use palpate_refusal::Refusal;
 use palpate_refusal::printable::printable;
@@ -11,7 +11,7 @@ use tonic_types::StatusExt;
 
 use crate::ending;
 
-/// An exception of the package, made with `arguments`, by any thread.
+/// Creates an exception of the package with `arguments`, on any thread.
 fn raised(name: &str, arguments: impl for<'py> pyo3::call::PyCallArgs<'py>) -> PyErr {
     let made = |py: Python<'_>| {
         let made = || py.import("palpate._errors")?.getattr(name)?.cast_into::<PyType>()?.call1(arguments);
@@ -20,23 +20,23 @@ fn raised(name: &str, arguments: impl for<'py> pyo3::call::PyCallArgs<'py>) -> P
     ending::attached(made).unwrap_or_else(ending::ended)
 }
 
-/// `palpate.Refused`.
+/// Returns `palpate.Refused` for a refusal.
 pub(crate) fn refused(refusal: Refusal) -> PyErr {
     let Refusal { reason, field, message, place } = refusal;
     raised("Refused", (reason.as_str(), field, message, place))
 }
 
-/// `palpate.Refused` for an argument of the wrong kind.
+/// Returns `palpate.Refused` for an argument of the wrong kind.
 pub(crate) fn wrong(field: &str, message: impl Into<String>) -> PyErr {
     refused(Refusal::new(palpate_refusal::Reason::WrongKind, field, message))
 }
 
-/// `palpate.Failed`: the tissue could not go on.
+/// Returns `palpate.Failed`: the tissue could not continue.
 pub(crate) fn failed(message: &str) -> PyErr {
     raised("Failed", (message,))
 }
 
-/// Why a run ended early.
+/// Returns the exception for a run that ended early.
 pub(crate) fn of_run(failure: RunFailure) -> PyErr {
     match failure {
         RunFailure::Refused(refusal) => refused(refusal),
@@ -48,12 +48,12 @@ pub(crate) fn of_run(failure: RunFailure) -> PyErr {
     }
 }
 
-/// A refusal of the server, or a connection that broke.
+/// Returns the exception for a refusal of the server, or for a broken connection.
 pub(crate) fn of_status(status: Status) -> PyErr {
     match status.get_details_error_info() {
         Some(info) => {
             let field = info.metadata.get("field").cloned().unwrap_or_default();
-            // The server's text begins with the field.
+            // The server's text starts with the field.
             let message = status.message().strip_prefix(&format!("{field}: ")).unwrap_or(status.message());
             raised("Refused", (printable(info.reason), printable(field), printable(message), None::<String>))
         }
@@ -61,7 +61,7 @@ pub(crate) fn of_status(status: Status) -> PyErr {
     }
 }
 
-/// An error of the client library.
+/// Returns the exception for an error of the client library.
 pub(crate) fn of_client(error: palpate_client::Error) -> PyErr {
     use palpate_client::Error;
     let text = error.to_string();
@@ -69,7 +69,7 @@ pub(crate) fn of_client(error: palpate_client::Error) -> PyErr {
         Error::Call(status) => of_status(status),
         Error::Argument(message) => refused(Refusal::new(palpate_refusal::Reason::OutOfRange, "", message)),
         Error::Connection(_) => raised("Disconnected", (text,)),
-        // What a device in Python raised comes back as itself.
+        // An exception that a Python device raised is raised again unchanged.
         Error::Device(error) => match error.downcast::<PyErr>() {
             Ok(error) => error,
             Err(error) => PyOSError::new_err(format!("the device: {error}")),

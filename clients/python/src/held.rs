@@ -1,5 +1,5 @@
-//! Tools of a session of a server: each is taken when it is first told something, and told again what it was told when the session
-//! has lost it.
+//! Tools of a session on a server: each is acquired at its first command, and acquired again with its command if the
+//! session has lost it.
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -14,17 +14,17 @@ use pb::haptic_service_client::HapticServiceClient;
 use tokio::sync::Mutex;
 use tonic_types::StatusExt;
 
-/// A tool of a program that has ended is let go after so long, s.
+/// Time after which the tools of a program that has ended are released, s.
 const LEASE_S: f64 = 5.0;
 
-/// Leases are renewed so often.
+/// Interval between renewals of leases.
 const RENEWAL: Duration = Duration::from_secs(1);
 
 /// The tools that a session object holds, and their leases.
 #[derive(Default)]
 pub(crate) struct Held {
     leases: Mutex<BTreeMap<u32, String>>,
-    /// Of the newest command.
+    /// Number of the newest command.
     sequence: AtomicU64,
     is_renewing: AtomicBool,
 }
@@ -38,7 +38,7 @@ fn is_lost(error: &Error) -> bool {
     status.get_details_error_info().is_some_and(|info| info.reason == Reason::NotHolder.as_str())
 }
 
-/// Takes a tool.
+/// Acquires a tool. Returns the ID of its lease.
 pub(crate) async fn acquire(session: &Followed, tool: u32) -> Result<String, Error> {
     let request = pb::AcquireToolRequest {
         session_id: session.session_id().to_owned(),
@@ -54,7 +54,7 @@ pub(crate) async fn acquire(session: &Followed, tool: u32) -> Result<String, Err
     Ok(taken.await?.into_inner().lease_id)
 }
 
-/// Tells the tool of a lease what to do, or only that its holder is there.
+/// Sends commands to the tools of a lease, or only renews it if there are none.
 pub(crate) async fn send(session: &Followed, lease_id: &str, commands: Vec<pb::Command>) -> Result<(), Error> {
     let (session_id, lease_id) = (session.session_id().to_owned(), lease_id.to_owned());
     let request = pb::SendCommandsRequest { session_id, lease_id, commands };
@@ -65,28 +65,28 @@ pub(crate) async fn send(session: &Followed, lease_id: &str, commands: Vec<pb::C
     sent.await.map(drop)
 }
 
-/// Renews the leases for as long as they are wanted.
+/// Renews the leases until the session object is dropped.
 async fn renew(held: Weak<Held>, session: Weak<Followed>) {
     loop {
         tokio::time::sleep(RENEWAL).await;
         let (Some(held), Some(session)) = (held.upgrade(), session.upgrade()) else { return };
         let leases = held.leases.lock().await.clone();
         for lease_id in leases.values() {
-            // What it can't be told now it is told when the tool is next used.
+            // If the renewal fails, the next command acquires the tool again.
             let _ = send(&session, lease_id, Vec::new()).await;
         }
     }
 }
 
 impl Held {
-    /// Tells a tool what to do, from the next step on. Takes it first, if that is needed.
+    /// Sends a command to a tool, which acts from the next step on. Acquires the tool first, if needed.
     pub(crate) async fn tell(self: Arc<Self>, session: Arc<Followed>, tool: u32, action: Action) -> Result<(), Error> {
         let mut leases = self.leases.lock().await;
         let sequence = Some(1 + self.sequence.fetch_add(1, Ordering::Relaxed));
         let command = pb::Command { tool, sequence, action: Some(action), ..Default::default() };
         if let Some(lease_id) = leases.get(&tool) {
             match send(&session, lease_id, vec![command]).await {
-                // The server that had it has died, or nothing was heard from here for too long.
+                // The server that had the tool has ended, or the lease was not renewed for too long.
                 Err(error) if is_lost(&error) => drop(leases.remove(&tool)),
                 sent => return sent,
             }
@@ -99,12 +99,12 @@ impl Held {
         send(&session, &lease_id, vec![command]).await
     }
 
-    /// Whether this object has taken a tool, and not given it back.
+    /// Returns whether this object has acquired a tool and not released it.
     pub(crate) async fn holds(&self, tool: u32) -> bool {
         self.leases.lock().await.contains_key(&tool)
     }
 
-    /// Gives a tool back, which ends what it did.
+    /// Releases a tool, which ends what it did.
     pub(crate) async fn release(self: Arc<Self>, session: Arc<Followed>, tool: u32) -> Result<(), Error> {
         let Some(lease_id) = self.leases.lock().await.remove(&tool) else { return Ok(()) };
         let request = pb::ReleaseToolRequest { session_id: session.session_id().to_owned(), lease_id };

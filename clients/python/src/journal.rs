@@ -1,4 +1,4 @@
-//! Journals as arrays.
+//! Journals as NumPy arrays.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -19,7 +19,7 @@ use crate::scene::limits;
 use crate::session::{Session, SessionState};
 use crate::waiting::work;
 
-/// A recorded session: a file of `palpate serve --journal`.
+/// A recorded session: a journal file of `palpate serve --journal`.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Journal {
     path: PathBuf,
@@ -27,7 +27,7 @@ pub(crate) struct Journal {
     survey: Survey,
 }
 
-/// What a tool did and felt.
+/// What one tool did and felt.
 #[derive(Default)]
 struct ToolHistory {
     step: Vec<u64>,
@@ -36,7 +36,7 @@ struct ToolHistory {
     force_n: Vec<f64>,
 }
 
-/// Commands, one a row.
+/// Commands, as columns with one row per command.
 #[derive(Default)]
 struct CommandColumns {
     step: Vec<u64>,
@@ -104,7 +104,7 @@ impl Journal {
         Ok(Journal { path, header, survey })
     }
 
-    /// What it is of: scene, first and last step, and more, by name.
+    /// Information on the recording, by name: scene, first and last step, and more.
     #[getter]
     fn info<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let Journal { header, survey, .. } = self;
@@ -127,7 +127,7 @@ impl Journal {
         Ok(found)
     }
 
-    /// What each tool did and felt, by its number.
+    /// Returns what each tool did and felt, by its number.
     fn tools<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let read = py.detach(|| {
             let mut courses: BTreeMap<u32, ToolHistory> = BTreeMap::new();
@@ -159,7 +159,7 @@ impl Journal {
         Ok(found)
     }
 
-    /// Every command, by the step at which it acted.
+    /// Returns all commands, by the step at which they acted.
     fn commands<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let read = py.detach(|| {
             let (mut commands, mut reader) = (CommandColumns::default(), self.open()?);
@@ -186,7 +186,7 @@ impl Journal {
         py.import("palpate._journal")?.getattr("Commands")?.call((), Some(&given))
     }
 
-    /// Simulates it again, and compares every hash and snapshot.
+    /// Simulates the recording again, and compares every hash and snapshot. Returns the verdict.
     fn verify<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let verified = work(py, |stop| {
             let mut reader = self.open()?;
@@ -203,7 +203,7 @@ impl Journal {
         made.call1((begin, end, hashes, snapshots, step, text))
     }
 
-    /// The session when so many steps were done; at the end if None.
+    /// Returns the session after `step` steps; at the end of the recording if None.
     #[pyo3(signature = (step=None))]
     fn session(&self, py: Python<'_>, step: Option<u64>) -> PyResult<Session> {
         let step = step.unwrap_or(self.survey.until_step);

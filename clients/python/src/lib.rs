@@ -1,11 +1,11 @@
 //! Palpate from Python: the module `palpate._native`, which the package `palpate` wraps.
 //!
-//! Whatever takes long runs without the interpreter's lock, and Ctrl-C ends it. Arrays are handed to NumPy as they are: their
-//! memory is allocated here, filled, and owned by the array.
+//! Long work runs without the interpreter's lock, and Ctrl-C ends it. Arrays are passed to NumPy without a copy:
+//! their memory is allocated and filled here, and owned by the array.
 
-// Programs of one user live in real time; the rule is for what a server computes.
+// Programs of one user run in real time; the rule is for what a server computes.
 #![allow(clippy::disallowed_methods)]
-// What Python sees is documented for `help` here, and in the same words for editors in palpate/__init__.pyi.
+// What Python sees is documented here for `help`, and word for word in palpate/__init__.pyi for editors.
 #![allow(clippy::needless_pass_by_value)]
 // A method of a type with a lifetime is for one lifetime, a closure for all.
 #![allow(clippy::redundant_closure_for_method_calls)]

@@ -1,4 +1,4 @@
-//! Loads of a server by a plan: the same plans and reports as those of `palpate-client load`.
+//! Loads a server by a plan, with the plans and reports of `palpate-client load`.
 
 use std::fs::File;
 use std::io::Write;
@@ -16,12 +16,12 @@ use crate::error::{of_client, refused};
 use crate::scene::{SceneSource, TEXT, toml};
 use crate::waiting::answer_in_order;
 
-/// The plan of a dict, a file, or a text.
+/// Reads a plan from a dict, a file, or a text.
 fn plan(value: &Bound<'_, PyAny>) -> PyResult<LoadPlan> {
     let read = if let Ok(table) = value.cast::<PyDict>() {
         let lines = table.iter().map(|(key, value)| Ok(format!("{} = {}\n", key.str()?, toml("plan", &value)?)));
         let text = lines.collect::<PyResult<String>>()?;
-        // Its lines are ours, and mean nothing to who wrote a dict.
+        // The text was generated: its line numbers mean nothing to the author of a dict.
         LoadPlan::parse(TEXT, &text).map_err(|refusal| Refusal { place: None, ..refusal })
     } else {
         match SceneSource::of("plan", value)? {
@@ -32,7 +32,7 @@ fn plan(value: &Bound<'_, PyAny>) -> PyResult<LoadPlan> {
     read.map_err(refused)
 }
 
-/// A report, for Python as a dict.
+/// A report, which becomes a dict in Python.
 struct ReportDict(String);
 
 impl<'py> IntoPyObject<'py> for ReportDict {
@@ -45,8 +45,8 @@ impl<'py> IntoPyObject<'py> for ReportDict {
     }
 }
 
-/// Loads a server by a plan, and gives its report; writes that to a page too, if one is named. When the wait for it ends early, the
-/// users leave and their sessions are deleted.
+/// Loads a server by a plan, and returns its report; also writes it to a page, if one is given. When the wait ends
+/// early, the simulated users leave and their sessions are deleted.
 pub(crate) fn load<'py>(
     py: Python<'py>,
     server: Server,
@@ -57,13 +57,13 @@ pub(crate) fn load<'py>(
     let plan = plan(given)?;
     let course = py.detach(|| PreparedPlan::new(plan)).map_err(refused)?;
     let unwritten = |path: &PathBuf, error: std::io::Error| PyOSError::new_err(format!("{}: {error}", path.display()));
-    // Before the load: a wrong path must not cost what is measured.
+    // Opened before the load: a wrong path must not cost the measurements.
     let page = page.map(|path| File::create(&path).map_err(|error| unwritten(&path, error)).map(|file| (path, file)));
     let page = page.transpose()?;
     let (end, ended) = oneshot::channel::<()>();
     answer_in_order(py, awaited, Some(end), async move {
         let stop = async {
-            // Dropped when nobody waits any more.
+            // Dropped when the caller no longer waits.
             let _ = ended.await;
         };
         let report = course.run(&server, |_| {}, |_| {}, stop).await.map_err(of_client)?;

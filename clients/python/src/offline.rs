@@ -1,4 +1,4 @@
-//! A touch loop without a network: the caller says what arrives, and when the ticks are.
+//! A touch loop without a network: the caller decides what arrives, and when the ticks are.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -13,11 +13,12 @@ use crate::arrays::vector;
 use crate::device::descriptor;
 use crate::error::{of_client, refused};
 
-/// A touch loop without a network: the same messages, places and times give the same forces, bit by bit, as in every
-/// other language.
+/// A touch loop without a network: equal messages, places and times give equal forces, bit by bit, as in every other
+/// language.
 ///
-/// `limits` are those of a device, as of a Course. Places are from the middle of the device's workspace, which is laid
-/// on `middle_m` of the tissue (give its `top_m`, as a server does); or, `in_tissue_frame`, in the tissue's own frame.
+/// `limits` are the limits of a device, as for a Course. Places are measured from the middle of the device's
+/// workspace, which is placed at `middle_m` of the tissue (use its `top_m`, as a server does); with
+/// `in_tissue_frame`, in the tissue's own frame.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Offline {
     inner: Mutex<bridge::Offline>,
@@ -46,13 +47,14 @@ impl Offline {
         Ok(Offline { inner: Mutex::new(inner) })
     }
 
-    /// A message of the server arrives now: the bytes of a `palpate.v1.TouchResponse`. The next tick knows it.
+    /// Delivers a message of the server: the bytes of a `palpate.v1.TouchResponse`. The next tick uses it.
     fn arrive(&self, message: &[u8]) -> PyResult<()> {
         self.with(|offline| offline.record.arrive(message)).map_err(of_client)
     }
 
-    /// The force to render from now on, N, for a device that is here at `time_s`, a time of any origin. A change of
-    /// enable from False to True asks for forces. Without a connection (an `opened` that has arrived) there are none.
+    /// Returns the force to render from now on, N, for a device that is at `place_m` at `time_s`, a time of any
+    /// origin. A change of enable from False to True enables forces. Without a connection (an `opened` message that
+    /// has arrived) the force is zero.
     #[pyo3(signature = (place_m, time_s, enable=true))]
     fn tick(&self, place_m: [f64; 3], time_s: f64, enable: bool) -> (f64, f64, f64) {
         let reading = Reading { place_m: DVec3::from_array(place_m), enable };
@@ -64,7 +66,7 @@ impl Offline {
         self.with(|offline| offline.ticker.disable());
     }
 
-    /// Whether forces are rendered: "waiting" before a connection, "disabled" until forces are asked for, "enabled",
+    /// Whether forces are rendered: "waiting" before a connection, "disabled" until forces are enabled, "enabled",
     /// "paused" after a silence, "fault" after a position that is not finite or outside the workspace.
     #[getter]
     fn state(&self) -> &'static str {
@@ -77,13 +79,13 @@ impl Offline {
         }
     }
 
-    /// Where the tool was at the last tick, in the tissue's frame.
+    /// The tool's position at the last tick, in the tissue's frame.
     #[getter]
     fn place_m(&self) -> (f64, f64, f64) {
         self.with(|offline| offline.ticker.place_m()).into()
     }
 
-    /// How old the newest news of the tissue is; None before the first.
+    /// Age of the newest data of the tissue, s; None before the first.
     #[getter]
     fn age_s(&self) -> Option<f64> {
         self.with(|offline| offline.ticker.model_age_s())

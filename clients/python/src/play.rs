@@ -1,4 +1,4 @@
-//! Plays a script through a session of a server: each command acts at its exact step.
+//! Plays a script on a session of a server: each command acts at its exact step.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,22 +21,22 @@ use crate::held::{acquire, send};
 use crate::run::RunRecord;
 use crate::scene::Script;
 
-/// Commands are sent so many steps at a time, and twice as many ahead: fewer than a session queues.
+/// Number of steps whose commands are sent at a time, up to twice as many ahead: fewer than a session queues.
 const CHUNK: u64 = 1000;
 
-/// The session is looked at so often.
+/// Interval at which the session's progress is checked.
 const LOOK: Duration = Duration::from_millis(10);
 
-/// Leases of tools that are told nothing are renewed so often.
+/// Interval between renewals of the leases of idle tools.
 const RENEWAL: Duration = Duration::from_secs(1);
 
-/// What is played, and where.
+/// A script being played, and its session.
 struct PlaySource {
     session: Arc<Followed>,
     script: scene::script::Script,
-    /// The step of the session at which the script begins.
+    /// The step of the session at which the script starts.
     begin: u64,
-    /// Of each tool.
+    /// The lease of each tool.
     leases: BTreeMap<u32, String>,
     renewed: Instant,
 }
@@ -84,7 +84,7 @@ impl PlaySource {
         called!(self.session, SessionServiceClient.start_session(request)).map(drop)
     }
 
-    /// Waits until so many steps of the script are done.
+    /// Waits until `step` steps of the script are done. Raises Failed if the session is stopped.
     async fn until(&mut self, step: u64) -> PyResult<pb::Session> {
         loop {
             let request = pb::GetSessionRequest { session_id: self.id() };
@@ -105,7 +105,7 @@ impl PlaySource {
         }
     }
 
-    /// Plays all. The session goes on only as far as it has all commands, so none is ever late.
+    /// Plays the whole script. The session runs only as far as all its commands have been sent, so none is ever late.
     async fn drive(&mut self) -> PyResult<pb::Session> {
         let steps = self.script.steps;
         let (mut sent, mut session) = (0, pb::Session::default());
@@ -123,7 +123,7 @@ impl PlaySource {
     }
 }
 
-/// Reads records until the last of a script.
+/// Receives the records of a script until the last one.
 async fn records(
     mut stream: tonic::Streaming<pb::ProbeResponse>,
     mut left: u64,
@@ -144,7 +144,7 @@ async fn records(
     Ok(())
 }
 
-/// The scene of a session: the caller's own, or as the server tells it.
+/// Returns the scene of a session: the caller's own, or the one that the server reports.
 fn scene_of(own: Option<Arc<scene::Scene>>, session: &pb::Session) -> PyResult<Arc<scene::Scene>> {
     if let Some(own) = own {
         return Ok(own);
@@ -156,7 +156,7 @@ fn scene_of(own: Option<Arc<scene::Scene>>, session: &pb::Session) -> PyResult<A
     wire::scene::from_scene(told, None).map(Arc::new).map_err(refused)
 }
 
-/// Plays a script through a session that stands.
+/// Plays a script on a paused session.
 #[allow(clippy::cast_precision_loss)]
 pub(crate) async fn play(
     session: Arc<Followed>,
@@ -200,7 +200,7 @@ pub(crate) async fn play(
         tools: !script.poses.is_empty(),
     };
     let stream = called!(session, HapticServiceClient.probe(probe))?;
-    // They are counted from step 0 of the session, whose record has that of the beginning as well.
+    // Records are counted from step 0 of the session, which has a record of its own.
     let expected = (begin + steps) / every - begin / every + u64::from(begin == 0);
     let mut player = PlaySource { session, script, begin, leases: BTreeMap::new(), renewed: Instant::now() };
     player.take_tools().await?;
@@ -220,7 +220,7 @@ pub(crate) async fn play(
         points,
         wall_s,
         ns_per_point_substep: wall_s * 1e9 / (substeps as f64 * points as f64),
-        // The server does not tell.
+        // The server does not report it.
         computed_fraction: f64::NAN,
         guard_events: 0,
         final_hash,

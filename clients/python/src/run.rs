@@ -1,4 +1,4 @@
-//! Runs of scripts, one or many over threads.
+//! Runs scripts, one or many over several threads.
 
 use std::io::ErrorKind;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use crate::error::{of_run, refused, wrong};
 use crate::scene::{Scene, Script, Tissue, limits, named};
 use crate::waiting::{LOOK, STACK_BYTES, work};
 
-/// What a run told, as numbers.
+/// The results of a run, as numbers.
 #[derive(Default)]
 pub(crate) struct RunRecord {
     header: Option<Run>,
@@ -37,16 +37,16 @@ pub(crate) struct RunRecord {
 }
 
 impl RunRecord {
-    /// Nothing yet, of a script.
+    /// Creates the empty record of a run of this script.
     #[allow(clippy::cast_possible_truncation)]
     pub(crate) fn of(script: &scene::script::Script) -> Self {
         let point_names = script.sample_points.iter().map(|point| script.shape.name(*point)).collect();
-        // Those with a tip follow the others.
+        // Tools with a tip follow the others.
         let tools = script.first_tip().map_or_else(Vec::new, |first| (first as u32..script.tools() as u32).collect());
         RunRecord { point_names, tools, ..RunRecord::default() }
     }
 
-    /// How it was played, and what came of it.
+    /// Adds the description of the run and its summary.
     pub(crate) fn finish(&mut self, run: Run, summary: Summary) {
         self.warnings = summary.warnings.iter().cloned().chain(summary.fault()).collect();
         (self.header, self.summary) = (Some(run), Some(summary));
@@ -61,7 +61,7 @@ impl RunRecord {
                     let vectors = [tool.place_m, tool.displacement_m, tool.force_on_tool_n];
                     self.felt.extend(vectors.iter().flatten());
                 }
-                // It is away.
+                // The tool is away.
                 None => self.felt.extend([f64::NAN; OF_TOOL]),
             }
         }
@@ -71,7 +71,7 @@ impl RunRecord {
         self.awake_points.push(record.awake_points as u64);
     }
 
-    /// As arrays, for `palpate._run.Run`.
+    /// Returns the results as a `palpate._run.Run` with arrays.
     fn given<'py>(self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let found = PyDict::new(py);
         let (times, points, tools) = (self.time_s.len(), self.point_names.len(), self.tools.len());
@@ -91,7 +91,7 @@ impl RunRecord {
     }
 }
 
-/// Plays a script. `stop` ends it.
+/// Plays a script until it ends or `stop` is set.
 fn play(model: &Arc<Model>, script: &Script, how: [bool; 2], stop: &AtomicBool) -> Result<RunRecord, RunFailure> {
     let script = script.bound(&model.scene)?;
     let mut recorded = RunRecord::of(&script);
@@ -124,7 +124,7 @@ impl<'py> IntoPyObject<'py> for RunRecord {
     }
 }
 
-/// A tissue that is compiled, or is to be.
+/// A compiled tissue, or a scene to compile.
 enum Given {
     Model(Arc<Model>),
     Scene(Py<Scene>),
@@ -146,9 +146,9 @@ impl Given {
     }
 }
 
-/// Plays a script, with the numbers and the hash of `palpate run`. `held` holds forces within each step, as a client
-/// does; `audit` plays it a second time in f64 with a quarter of the substep, and tells the difference
-/// (summary["audited_error"]).
+/// Plays a script, with the numbers and the hash of `palpate run`. `held=True` holds forces constant within each
+/// step, as a client does; `audit=True` plays it a second time in f64 with a quarter of the substep, and reports the
+/// difference (summary["audited_error"]).
 #[pyfunction]
 #[pyo3(signature = (scene, script, *, held=false, audit=false))]
 pub(crate) fn run<'py>(
@@ -163,8 +163,8 @@ pub(crate) fn run<'py>(
     played.map_err(of_run)?.given(py)
 }
 
-/// Runs of many cases (scene, script) over threads, in their order; by default as many threads as there are processors.
-/// `progress` is called with how many are done and how many there are.
+/// Runs many cases (scene, script) on several threads, and returns the results in their order; by default on as many
+/// threads as there are processors. `progress` is called with the number of cases done and of all cases.
 #[pyfunction]
 #[pyo3(signature = (cases, *, held=false, threads=None, errors="raise", progress=None))]
 pub(crate) fn study<'py>(
@@ -245,7 +245,7 @@ pub(crate) fn study<'py>(
     });
     raised?;
     if !returns {
-        // Of several, the first by number that was not merely stopped for another.
+        // Of several failures, the first by number that was not merely stopped because of another.
         for (case, played) in found.iter_mut().enumerate() {
             if let Some(Err(failure)) = played.take_if(|played| is_cause(played)) {
                 let error = of_run(failure);
@@ -261,7 +261,7 @@ pub(crate) fn study<'py>(
     PyList::new(py, given.collect::<PyResult<Vec<_>>>()?)
 }
 
-/// Whether a run failed by itself.
+/// Returns whether a run failed by itself.
 fn is_cause(played: &Result<RunRecord, RunFailure>) -> bool {
     match played {
         Err(RunFailure::Output(error)) => error.kind() != ErrorKind::Interrupted,

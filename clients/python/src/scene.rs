@@ -19,15 +19,15 @@ use crate::arrays::{column, rows, shaped, vector};
 use crate::error::{refused, wrong};
 use crate::waiting::work;
 
-/// What refusals call a text that comes from no file.
+/// The name in refusals of a text that comes from no file.
 pub(crate) const TEXT: &str = "<text>";
 
-/// The limits of a process with one user.
+/// Returns the limits of a process with one user.
 pub(crate) fn limits() -> Limits {
     Limits::default().offline()
 }
 
-/// Where a scene, a script or a plan is from.
+/// The source of a scene, a script or a plan.
 #[derive(Debug, Clone)]
 pub(crate) enum SceneSource {
     Text(String),
@@ -39,7 +39,7 @@ impl SceneSource {
     pub(crate) fn of(field: &str, value: &Bound<'_, PyAny>) -> PyResult<Self> {
         if let Ok(text) = value.cast::<PyString>() {
             let text: String = text.extract()?;
-            // Neither is in a name, and who means a file of such a name gives a pathlib.Path.
+            // A name contains neither; a file with such a name can be given as a pathlib.Path.
             let is_text = text.contains('\n') || text.contains('=');
             return Ok(if is_text { SceneSource::Text(text) } else { SceneSource::Path(text.into()) });
         }
@@ -48,7 +48,7 @@ impl SceneSource {
     }
 }
 
-/// The value of an argument as TOML.
+/// Converts an argument to TOML.
 pub(crate) fn toml(field: &str, value: &Bound<'_, PyAny>) -> PyResult<String> {
     if value.is_instance_of::<PyBool>() {
         return Ok(if value.extract()? { "true" } else { "false" }.to_owned());
@@ -76,7 +76,7 @@ pub(crate) fn toml(field: &str, value: &Bound<'_, PyAny>) -> PyResult<String> {
     Ok(format!("[{}]", items?.join(", ")))
 }
 
-/// `{"springs.stiffness_n_per_m": 50}` as assignments.
+/// Converts `{"springs.stiffness_n_per_m": 50}` to assignments.
 fn assignments(set: Option<&Bound<'_, PyAny>>) -> PyResult<Vec<String>> {
     let Some(set) = set else { return Ok(Vec::new()) };
     if let Ok(table) = set.cast::<PyDict>() {
@@ -85,24 +85,24 @@ fn assignments(set: Option<&Bound<'_, PyAny>>) -> PyResult<Vec<String>> {
     set.extract().map_err(|_| wrong("set", "must be a dict of keys and values, or a list of \"key=value\""))
 }
 
-/// A scene that was read and checked: from TOML text, a file, or the name of one (`scenes()`).
+/// A scene that was read and checked: from TOML text, a file, or a scene's name (`scenes()`).
 ///
-/// `set` overrides keys: {"springs.stiffness_n_per_m": 50}. `folder` is where scenes are that are given by name. With
-/// `plan` it is stepped as that tissue is (integrator, substeps, precision, sleep), without the search for what its own
-/// tolerance asks for: that saves most of the time of a short run, and nothing is then known of the error (`run(...,
+/// `set` overrides keys: {"springs.stiffness_n_per_m": 50}. `folder` contains the scenes that are given by name. With
+/// `plan` the scene is stepped like that tissue (integrator, substeps, precision, sleep), without the search for what
+/// its own tolerance requires: that saves most of the time of a short run, but its error is unknown (`run(...,
 /// audit=True)` measures it).
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Scene {
     pub(crate) scene: scene::Scene,
-    /// What refusals call it.
+    /// Its name in refusals.
     pub(crate) place: String,
-    /// Stepped as this one, without a search for what its tolerance asks for.
+    /// Stepped like this model, without a search for what its tolerance requires.
     plan: Option<Arc<Model>>,
     model: Mutex<Option<Arc<Model>>>,
 }
 
 impl Scene {
-    /// Read from what Python gave: a scene, or what one is made from.
+    /// Reads what Python gave: a scene, or the source of one.
     pub(crate) fn given<'py>(value: &Bound<'py, PyAny>) -> PyResult<Bound<'py, Scene>> {
         if let Ok(scene) = value.cast::<Scene>() {
             return Ok(scene.clone());
@@ -110,13 +110,13 @@ impl Scene {
         Bound::new(value.py(), Scene::new(value, None, "scenes".into(), None)?)
     }
 
-    /// The tissue, compiled once.
+    /// Returns the tissue, which is compiled once.
     pub(crate) fn compiled(&self, stop: &AtomicBool) -> Result<Arc<Model>, Refusal> {
         let mut model = self.model.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(model) = &*model {
             return Ok(model.clone());
         }
-        // As the programs do: an error of compilation belongs to no single line.
+        // As in the programs: an error of compilation belongs to no single line.
         let in_scene = |refusal: Refusal| Refusal { place: Some(self.place.clone()), ..refusal };
         let made = match &self.plan {
             Some(plan) => Model::resumed(&self.scene, &planned(&self.scene, plan), &limits()),
@@ -127,7 +127,7 @@ impl Scene {
     }
 }
 
-/// The coefficients of a scene with the plan of a model. Nothing is known of its error.
+/// Combines the coefficients of a scene with the plan of a model. The error is unknown.
 fn planned(scene: &scene::Scene, plan: &Model) -> TissueState {
     TissueState {
         stiffness_n_per_m: scene.springs.stiffness_n_per_m,
@@ -158,19 +158,19 @@ impl Scene {
         Ok(Scene { plan: plan.map(|plan| plan.get().model.clone()), ..read })
     }
 
-    /// Its name.
+    /// The scene's name.
     #[getter]
     fn name(&self) -> &str {
         &self.scene.name
     }
 
-    /// The number of its points.
+    /// The number of mass points.
     #[getter]
     fn points(&self) -> usize {
         self.scene.shape().point_count()
     }
 
-    /// Steps a second.
+    /// Number of steps per second.
     #[getter]
     fn rate_hz(&self) -> f64 {
         self.scene.stepping.rate_hz
@@ -189,8 +189,8 @@ fn source_scene(source: &SceneSource, sets: &[String], folder: &Path, limits: &L
     Ok(Scene { scene, place, plan: None, model: Mutex::new(None) })
 }
 
-/// Forces and movements over time: from TOML text, a file, or a name (`scripts()`). `folder` is where a text's traces
-/// are.
+/// Forces and movements over time: from TOML text, a file, or a script's name (`scripts()`). `folder` contains the
+/// traces that a text names.
 #[pyclass(frozen, module = "palpate")]
 #[derive(Debug, Clone)]
 pub(crate) struct Script {
@@ -199,7 +199,7 @@ pub(crate) struct Script {
 }
 
 impl Script {
-    /// Made from what Python gave: a script, or what one is made from.
+    /// Reads what Python gave: a script, or the source of one.
     pub(crate) fn given(value: &Bound<'_, PyAny>) -> PyResult<Self> {
         match value.cast::<Script>() {
             Ok(script) => Ok(script.get().clone()),
@@ -207,7 +207,7 @@ impl Script {
         }
     }
 
-    /// Bound to a scene.
+    /// Binds the script to a scene.
     pub(crate) fn bound(&self, scene: &scene::Scene) -> Result<scene::script::Script, Refusal> {
         match &self.source {
             SceneSource::Text(text) => scene::script::Script::parse(TEXT, text, &self.folder, scene, &limits()),
@@ -224,7 +224,8 @@ impl Script {
         Ok(Script { source: SceneSource::of("source", source)?, folder })
     }
 
-    /// Binds it to a scene: name, steps, sample_every_steps, tools, warnings. Raises Refused if it does not fit.
+    /// Binds the script to a scene; returns its name, steps, sample_every_steps, tools and warnings. Raises Refused
+    /// if it does not fit.
     fn check<'py>(&self, py: Python<'py>, scene: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyDict>> {
         let scene = Scene::given(scene)?;
         let script = self.bound(&scene.get().scene).map_err(refused)?;
@@ -245,14 +246,14 @@ impl Script {
     }
 }
 
-/// A compiled scene: what is simulated, and how. Making one may take some tenths of a second, and a Scene does it once.
+/// A compiled scene: what is simulated, and how. Compiling may take some tenths of a second; a Scene does it once.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Tissue {
     pub(crate) model: Arc<Model>,
 }
 
 impl Tissue {
-    /// Compiled from what Python gave: a tissue, a scene, or what one is made from.
+    /// Compiles what Python gave: a tissue, a scene, or the source of one.
     pub(crate) fn given(py: Python<'_>, value: &Bound<'_, PyAny>) -> PyResult<Arc<Model>> {
         if let Ok(tissue) = value.cast::<Tissue>() {
             return Ok(tissue.get().model.clone());
@@ -263,12 +264,12 @@ impl Tissue {
     }
 }
 
-/// The point that Python names: (i, j) of a sheet, the number of a vertex of a mesh.
+/// Finds the point that Python names: (i, j) on a sheet, the number of a vertex on a mesh.
 pub(crate) fn point(model: &Model, value: &Bound<'_, PyAny>) -> PyResult<PointId> {
     model.shape().find("point", point_name(value)?).map_err(refused)
 }
 
-/// What a caller calls a point.
+/// Reads the name of a point.
 pub(crate) fn point_name(value: &Bound<'_, PyAny>) -> PyResult<PointName> {
     if let Ok(vertex) = value.extract::<u32>() {
         return Ok(PointName::Vertex(vertex));
@@ -277,7 +278,7 @@ pub(crate) fn point_name(value: &Bound<'_, PyAny>) -> PyResult<PointName> {
     value.extract().map(PointName::Point).map_err(|_| wrong("point", message))
 }
 
-/// What Python calls a point.
+/// Converts the name of a point for Python.
 pub(crate) fn named<'py>(py: Python<'py>, name: PointName) -> PyResult<Bound<'py, PyAny>> {
     match name {
         PointName::Point([i, j]) => Ok((i, j).into_pyobject(py)?.into_any()),
@@ -302,19 +303,19 @@ impl Tissue {
         self.model.len()
     }
 
-    /// Steps a second.
+    /// Number of steps per second.
     #[getter]
     fn rate_hz(&self) -> f64 {
         self.model.scene.stepping.rate_hz
     }
 
-    /// The integrator that it is stepped with.
+    /// The integrator with which it is stepped.
     #[getter]
     fn integrator(&self) -> &'static str {
         self.model.plan.integrator.name()
     }
 
-    /// Substeps of each step.
+    /// Number of substeps per step.
     #[getter]
     fn substeps(&self) -> u32 {
         self.model.plan.substeps
@@ -326,39 +327,38 @@ impl Tissue {
         self.model.precision.name()
     }
 
-    /// The vectors of the machine that it is stepped with. They change no bit.
+    /// The vector instructions with which it is stepped. They do not change the results.
     #[getter]
     fn lanes(&self) -> &'static str {
         self.model.lanes.name()
     }
 
-    /// The error that is expected of displacement and force, relative to the largest of each; infinite if nothing is
-    /// known of it.
+    /// The expected error of displacement and force, relative to the largest of each; infinite if it is unknown.
     #[getter]
     fn expected_error(&self) -> f64 {
         self.model.expected_error
     }
 
-    /// What a user should know of the scene, in words.
+    /// Warnings about the scene, as sentences.
     #[getter]
     fn warnings(&self) -> Vec<String> {
         self.model.warnings.clone()
     }
 
-    /// Points along x and y of a sheet: rest_m.reshape(*grid, 3); None of a mesh.
+    /// Number of points along x and y of a sheet, as in rest_m.reshape(*grid, 3); None for a mesh.
     #[getter]
     fn grid(&self) -> Option<(usize, usize)> {
         self.model.scene.sheet().map(|sheet| (sheet.points[0], sheet.points[1]))
     }
 
-    /// Where each point rests.
+    /// The position of each point at rest, m.
     #[getter]
     fn rest_m<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let shape = self.model.shape();
         rows(py, self.model.points().flat_map(|point| shape.rest_m(point).to_array()).collect())
     }
 
-    /// The normal of the surface at rest at each point, out of the tissue.
+    /// The outward unit normal of the surface at rest at each point.
     #[getter]
     fn normals<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let shape = self.model.shape();
@@ -373,14 +373,14 @@ impl Tissue {
         column(py, fixed)
     }
 
-    /// The mass of each point.
+    /// The mass of each point, kg.
     #[getter]
     fn mass_kg<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let masses: Vec<f64> = self.model.points().map(|point| self.model.mass_kg(point)).collect();
         column(py, masses)
     }
 
-    /// The triangles of the surface, each the rows of its three points, counter-clockwise from outside.
+    /// The triangles of the surface, each with the rows of its three points, counter-clockwise from outside.
     #[getter]
     #[allow(clippy::cast_possible_truncation)]
     fn triangles<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
@@ -396,12 +396,12 @@ impl Tissue {
         shaped(py, corners, &[3])
     }
 
-    /// The row of a point: (i, j) of a sheet, the number of a vertex of a mesh.
+    /// Returns the row of a point: (i, j) on a sheet, the number of a vertex on a mesh.
     fn index(&self, point: &Bound<'_, PyAny>) -> PyResult<usize> {
         Ok(self::point(&self.model, point)?.index())
     }
 
-    /// The name of the point of a row.
+    /// Returns the name of the point in a row.
     fn point<'py>(&self, py: Python<'py>, index: usize) -> PyResult<Bound<'py, PyAny>> {
         if index >= self.model.len() {
             let message = format!("must be below {}, the number of points, but is {index}", self.model.len());
@@ -410,22 +410,22 @@ impl Tissue {
         named(py, self.model.shape().name(PointId::new(index)))
     }
 
-    /// The row of the point that rests nearest to a place.
+    /// Returns the row of the point that rests nearest to a place.
     fn nearest(&self, place_m: &Bound<'_, PyAny>) -> PyResult<usize> {
         let place_m = vector("place_m", place_m)?;
         palpate_refusal::finite_vector("place_m", place_m).map_err(refused)?;
         Ok(self.model.shape().nearest(place_m).index())
     }
 
-    /// The middle of the box around the tissue at rest.
+    /// The middle of the bounding box of the tissue at rest, m.
     #[getter]
     fn middle_m(&self) -> (f64, f64, f64) {
         let middle_m = self.model.shape().extent().middle_m();
         middle_m.into()
     }
 
-    /// The highest place of the surface at rest in line with the middle: of a sheet, its middle. Devices have their origin
-    /// there.
+    /// The highest place of the surface at rest above or below the middle, m: of a sheet, its middle. Devices have
+    /// their origin there.
     #[getter]
     fn top_m(&self) -> (f64, f64, f64) {
         self.model.shape().top_m().into()
@@ -446,14 +446,14 @@ fn names(kind: TextKind, folder: &Path) -> Vec<String> {
     Collection::new(kind, folder).names(&limits())
 }
 
-/// The names of the scenes that are shipped, and of the files in a folder.
+/// Returns the names of the built-in scenes, and of those in a folder.
 #[pyfunction]
 #[pyo3(signature = (folder="scenes".into()))]
 pub(crate) fn scenes(folder: PathBuf) -> Vec<String> {
     names(TextKind::Scene, &folder)
 }
 
-/// The names of the scripts that are shipped, and of the files in a folder.
+/// Returns the names of the built-in scripts, and of those in a folder.
 #[pyfunction]
 #[pyo3(signature = (folder="scripts".into()))]
 pub(crate) fn scripts(folder: PathBuf) -> Vec<String> {

@@ -1,4 +1,4 @@
-//! Scenes as a server takes them. The mesh of a scene is sent before it.
+//! Converts scenes for a server. The mesh of a scene is uploaded before it.
 
 use std::path::Path;
 
@@ -15,9 +15,9 @@ use pyo3::PyResult;
 use crate::error::{of_status, refused};
 use crate::scene::{Scene, limits};
 
-/// What a session is to be made of.
+/// The source of a new session.
 pub(crate) enum SessionSource {
-    /// A scene of the server's.
+    /// One of the server's scenes.
     Name(String),
     Scene {
         scene: Box<pb::Scene>,
@@ -27,14 +27,14 @@ pub(crate) enum SessionSource {
 }
 
 impl SessionSource {
-    /// Of a scene that was read here.
+    /// Converts a scene that was read here.
     pub(crate) fn of(scene: &Scene) -> Result<Self, Refusal> {
         let mut message = Box::new(wire::scene::sent(&scene.scene));
         let Body::Mesh(mesh) = &scene.scene.body else {
             return Ok(SessionSource::Scene { scene: message, mesh: None });
         };
         let file = Path::new(&scene.place);
-        // As many vertices as were asked for, of which there may be some fewer.
+        // The number of vertices as requested in the file; the mesh may have fewer.
         if file.is_file()
             && let Some(told) = &mut message.mesh
             && let Some(said) = mesh_file(file, &limits())?
@@ -44,7 +44,7 @@ impl SessionSource {
         Ok(SessionSource::Scene { scene: message, mesh: Some(sent::file(mesh).1) })
     }
 
-    /// What a session is to be made of; sends the mesh, if there is one.
+    /// Returns the source for the server; uploads the mesh, if there is one.
     pub(crate) async fn source(self, channel: Channel) -> PyResult<Source> {
         let (mut scene, mesh) = match self {
             SessionSource::Name(name) => return Ok(Source::SceneName(name)),

@@ -24,21 +24,21 @@ use crate::scene::{Scene, Tissue, limits, point};
 use crate::tip::Tip;
 use crate::waiting::LOOK;
 
-/// What is led by a pose, until it is released or does something else.
+/// The target of a posed tool, until it is released or gets another kind of command.
 #[derive(Debug, Clone, Copy)]
 struct PoseTarget {
     place_m: DVec3,
     tip: palpate_haptics::Tip,
 }
 
-/// A session and what a client has beside it.
+/// A session with the state that a client would keep.
 pub(crate) struct SessionState {
     session: session::Session,
-    /// The scene with which it began: changes are made of that.
+    /// The scene with which the session started: changes are based on it.
     first: scene::Scene,
     intake: Intake,
     held: BTreeSet<u32>,
-    /// Tips of the tools that were in the tissue when the session went on, until they are told something.
+    /// Tips of the tools that were in the tissue when the session was restored, until their next command.
     tips: BTreeMap<u32, palpate_haptics::Tip>,
     led: BTreeMap<u32, PoseTarget>,
     due: Vec<Due>,
@@ -51,7 +51,7 @@ impl SessionState {
         SessionState { session, first, intake, held: BTreeSet::new(), tips, led: BTreeMap::new(), due: Vec::new() }
     }
 
-    /// A tool does something from the next step on.
+    /// Gives a tool a command, which acts from the next step on.
     fn submit(&mut self, tool: u32, action: Action) -> Result<(), Refusal> {
         let lease = 1 + u128::from(tool);
         if !self.held.contains(&tool) {
@@ -59,7 +59,7 @@ impl SessionState {
             self.held.insert(tool);
         }
         let step = self.session.step_count();
-        // Several commands may come for one step: their sequence is the intake's matter.
+        // Several commands may come for one step: the intake numbers them.
         let command = Command { sequence: None, ..run::command(tool as usize, step, action.clone()) };
         self.intake.submit(lease, vec![command], 0)?;
         self.tips.remove(&tool);
@@ -72,7 +72,7 @@ impl SessionState {
 
     fn step(&mut self) -> Result<(), Refusal> {
         let step = self.session.step_count();
-        // A tool of which nothing is heard lets go; these are to stay.
+        // A tool without new poses would let go; these tools are to stay.
         let led: Vec<(u32, PoseTarget)> = self.led.iter().map(|(tool, led)| (*tool, *led)).collect();
         for (tool, PoseTarget { place_m, tip }) in led {
             self.submit(tool, Action::Pose { place_m, velocity_m_per_s: None, tip })?;
@@ -87,8 +87,8 @@ impl SessionState {
     }
 }
 
-/// A tissue in use. What tools are told acts from the next step on, until they are told something else. Several threads
-/// may use one session; the interpreter's lock is free while it steps.
+/// A simulated tissue. A tool's command acts from the next step on, until its next command. Several threads may use
+/// one session; the interpreter's lock is released while it steps.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Session {
     inner: Mutex<SessionState>,
@@ -99,7 +99,7 @@ impl Session {
         Session { inner: Mutex::new(inner) }
     }
 
-    /// Does something with the session, without the interpreter's lock: another thread may have it for long.
+    /// Runs `work` on the session without the interpreter's lock: another thread may use the session for long.
     fn with<T: Send>(&self, py: Python<'_>, work: impl FnOnce(&mut SessionState) -> T + Send) -> T {
         py.detach(|| work(&mut self.inner.lock().unwrap_or_else(PoisonError::into_inner)))
     }
@@ -117,7 +117,7 @@ impl Session {
         Ok(Session::of(py.detach(|| SessionState::of(session::Session::new(&model), model.scene.clone()))))
     }
 
-    /// Goes on from `save()`, of a session that began with `scene`: tools stay where they are, with their tips.
+    /// Restores a session from `save()` that started with `scene`: tools stay where they are, with their tips.
     #[staticmethod]
     fn restore(py: Python<'_>, scene: &Bound<'_, PyAny>, snapshot: &[u8]) -> PyResult<Self> {
         let scene = match scene.cast::<Tissue>() {
@@ -132,7 +132,7 @@ impl Session {
         restored.map(Session::of).map_err(refused)
     }
 
-    /// Does so many steps. Raises Failed if the tissue can't go on. Ctrl-C ends it between two steps.
+    /// Does `steps` steps. Raises Failed if the tissue can't continue. Ctrl-C ends it between two steps.
     #[pyo3(signature = (steps=1))]
     fn step(&self, py: Python<'_>, steps: u64) -> PyResult<()> {
         let mut left = steps;
@@ -155,37 +155,38 @@ impl Session {
         }
     }
 
-    /// Steps so far.
+    /// Number of steps done.
     #[getter]
     fn steps(&self, py: Python<'_>) -> u64 {
         self.with(py, |inner| inner.session.step_count())
     }
 
-    /// Simulated time so far.
+    /// Simulated time, s.
     #[getter]
     fn time_s(&self, py: Python<'_>) -> f64 {
         self.with(py, |inner| inner.session.time_s())
     }
 
-    /// The tissue, with the coefficients that it has now.
+    /// The tissue, with its current coefficients.
     #[getter]
     fn tissue(&self, py: Python<'_>) -> Tissue {
         self.with(py, |inner| Tissue { model: inner.session.model().clone() })
     }
 
-    /// Points that the last step computed; the others are at rest.
+    /// Number of points that the last step computed; the others are at rest.
     #[getter]
     fn awake_points(&self, py: Python<'_>) -> usize {
         self.with(py, |inner| inner.session.tissue().awake_points())
     }
 
-    /// How often the guard went back and halved the substep.
+    /// How often the guard went back to a checkpoint and halved the substep.
     #[getter]
     fn guard_events(&self, py: Python<'_>) -> u64 {
         self.with(py, |inner| inner.session.tissue().guard_events())
     }
 
-    /// Why the tissue is not what its tools made of it, in words: it is held, or has recovered. None if it is.
+    /// Why the tissue is not in the state that its tools caused, as a sentence: it is stopped, or has recovered. None
+    /// if it is.
     #[getter]
     fn fault(&self, py: Python<'_>) -> Option<String> {
         self.with(py, |inner| inner.session.fault())
@@ -197,7 +198,8 @@ impl Session {
         self.with(py, |inner| format!("{:032x}", inner.session.tissue().state_hash()))
     }
 
-    /// Pushes at a point or a place; at a distance r from there by force_n * exp(-falloff_per_m * r + falloff_offset).
+    /// Pushes at a point or a place; at a distance r from there with force_n * exp(-falloff_per_m * r +
+    /// falloff_offset).
     #[pyo3(signature = (tool, force_n, *, point=None, at_m=None, falloff_per_m=200.0, falloff_offset=0.0))]
     #[allow(clippy::too_many_arguments)]
     fn push(
@@ -223,7 +225,7 @@ impl Session {
         self.submit(py, tool, Action::Push(Poke { point, centre_m, force_n, falloff_per_m, falloff_offset }))
     }
 
-    /// Holds a point, and brings it this far from where it rests by the end of the step.
+    /// Holds a point, and moves it to this displacement from its place at rest by the end of the step.
     fn grasp(
         &self,
         py: Python<'_>,
@@ -237,7 +239,7 @@ impl Session {
         self.submit(py, tool, Action::Grasp { point, displacement_m })
     }
 
-    /// Brings a tool with a tip here by the end of the step. It stays here until it is told something else.
+    /// Moves a tool with a tip to `place_m` by the end of the step. It stays there until its next command.
     #[pyo3(signature = (tool, place_m, tip=None))]
     fn pose(&self, py: Python<'_>, tool: u32, place_m: &Bound<'_, PyAny>, tip: Option<Tip>) -> PyResult<()> {
         let place_m = vector("place_m", place_m)?;
@@ -251,7 +253,7 @@ impl Session {
         self.submit(py, tool, Action::Release)
     }
 
-    /// What a tool does and feels; None if it does nothing.
+    /// Returns what a tool does and feels; None if it does nothing.
     fn tool<'py>(&self, py: Python<'py>, tool: u32) -> PyResult<Option<Bound<'py, PyAny>>> {
         let sample = self.with(py, |inner| inner.session.sample(Some(&[tool])));
         let Some(contact) = sample.tools.first().and_then(|tool| tool.contact) else { return Ok(None) };
@@ -263,12 +265,12 @@ impl Session {
             contact.applied_force_n,
         ];
         let made = py.import("palpate._arrays")?.getattr("tool_state")?;
-        // −0 is 0, as in records.
+        // −0 becomes 0, as in records.
         let numbers: Vec<f64> = numbers.iter().flat_map(|v| (*v + DVec3::ZERO).to_array()).collect();
         made.call1((rows(py, numbers)?,)).map(Some)
     }
 
-    /// Makes the tissue softer or stiffer from the next step on. What is not named stays as it is.
+    /// Makes the tissue softer or stiffer from the next step on. Coefficients that are not given stay as they are.
     #[pyo3(signature = (*, stiffness_n_per_m=None, damping_n_s_per_m=None, anchor_stiffness_n_per_m=None, volume_stiffness_pa=None))]
     fn change(
         &self,
@@ -287,15 +289,15 @@ impl Session {
         changed.map_err(refused)
     }
 
-    /// How far each point is from where it rests, with the digits of f32 at least; `records` has them all. `out` is an
-    /// array to write into.
+    /// Returns the displacement of each point from its place at rest, m, with at least the digits of f32; `records`
+    /// has all digits. `out` is an array to write into.
     #[pyo3(signature = (out=None))]
     fn displacements<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
         let read = |inner: &mut SessionState, into: &mut Vec<f64>| inner.session.tissue().whole_displacements_m(into);
         self.read(py, out, &read)
     }
 
-    /// Where each point is. `out` is an array to write into.
+    /// Returns the position of each point, m. `out` is an array to write into.
     #[pyo3(signature = (out=None))]
     fn positions<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
         let read = |inner: &mut SessionState, into: &mut Vec<f64>| {
@@ -308,7 +310,7 @@ impl Session {
         self.read(py, out, &read)
     }
 
-    /// The velocity of each point, m/s. `out` is an array to write into.
+    /// Returns the velocity of each point, m/s. `out` is an array to write into.
     #[pyo3(signature = (out=None))]
     fn velocities<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
         let read = |inner: &mut SessionState, into: &mut Vec<f64>| {
@@ -319,7 +321,7 @@ impl Session {
         self.read(py, out, &read)
     }
 
-    /// Points with all that is known of them, as in `Run.points`; all points if none is named.
+    /// Returns records of all quantities of the given points, as in `Run.points`; of all points if None.
     #[pyo3(signature = (points=None))]
     fn records<'py>(&self, py: Python<'py>, points: Option<Vec<Bound<'py, PyAny>>>) -> PyResult<Bound<'py, PyAny>> {
         let model = self.with(py, |inner| inner.session.model().clone());
@@ -336,7 +338,7 @@ impl Session {
         records(py, numbers, "POINT", &[count])
     }
 
-    /// The energy of the tissue: kinetic, spring and virtual.
+    /// The energy of the tissue, J: kinetic, spring and virtual.
     #[getter]
     fn energy_j<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let energy = self.with(py, |inner| inner.session.energy());
@@ -347,7 +349,7 @@ impl Session {
         Ok(found)
     }
 
-    /// A snapshot, for `restore`.
+    /// Returns a snapshot, for `restore`.
     fn save<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
         let bytes = self.with(py, |inner| inner.session.save().to_bytes());
         PyBytes::new(py, &bytes)
@@ -360,7 +362,7 @@ impl Session {
 }
 
 impl Session {
-    /// Vectors of all points, in the caller's array or in a new one.
+    /// Writes vectors of all points to the caller's array or a new one.
     fn read<'py>(
         &self,
         py: Python<'py>,

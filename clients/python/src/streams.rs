@@ -1,4 +1,4 @@
-//! Streams of a session of a server: its samples and its frames. They go on at the server that has the session.
+//! Streams of a session on a server: its samples and its frames. They continue on the server that has the session.
 
 use std::sync::Arc;
 
@@ -15,15 +15,15 @@ use crate::arrays::{column, records, shaped};
 use crate::error::of_client;
 use crate::waiting::answer;
 
-/// How often a stream is opened again before anything comes of it.
+/// Maximum number of times that a stream is reopened without receiving anything.
 const MAX_TRIES: u32 = 8;
 
-/// A stream that goes on where its session is.
+/// A stream that follows its session from server to server.
 pub(crate) struct Following<S, R> {
     session: Arc<Followed>,
     request: R,
     stream: S,
-    /// Since something has come.
+    /// Number of times it was reopened since it last received something.
     tries: u32,
 }
 
@@ -33,18 +33,18 @@ impl<S, R> Following<S, R> {
     }
 }
 
-/// Opens a stream at whoever has its session.
+/// Opens a stream of samples on the server that has the session.
 pub(crate) async fn samples(session: &Followed, request: &pb::WatchSamplesRequest) -> PyResult<watch::Samples> {
     session.call(|channel| watch::Samples::open(channel, request.clone())).await.map_err(of_client)
 }
 
-/// Opens a stream at whoever has its session.
+/// Opens a stream of frames on the server that has the session.
 pub(crate) async fn frames(session: &Followed, request: &pb::WatchFramesRequest) -> PyResult<view::Frames> {
     session.call(|channel| view::Frames::open(channel, request.clone())).await.map_err(of_client)
 }
 
 impl<S, R> Following<S, R> {
-    /// After a stream has ended with `status`: whether to open it again.
+    /// Decides after a stream has ended with `status` whether to reopen it; returns an error if not.
     async fn follow(&mut self, status: Status) -> PyResult<()> {
         self.tries += 1;
         if self.tries > MAX_TRIES {
@@ -96,29 +96,31 @@ impl Following<view::Frames, pb::WatchFramesRequest> {
     }
 }
 
-/// The end of a stream.
+/// Returns the exception that ends an iteration.
 fn at_end(awaited: bool) -> PyErr {
     if awaited { PyStopAsyncIteration::new_err(()) } else { PyStopIteration::new_err(()) }
 }
 
-/// The samples of a session, one after the other: what tools feel. Each is a dictionary:
+/// The samples of a session, one after another: what tools feel. Each is a dictionary:
 ///
 /// - `step`: steps done; `time_s`: simulated time.
-/// - `awake_points`: points that the step computed; `asleep`: nothing moves; `held`: the guard has ended the session.
-/// - `overruns`: steps that were due and dropped; `time_dilation`: simulated over real time; `late_commands`: commands that came
-///   too late for their step; `dropped_samples`: samples that this reader was too slow for. Counts are since the session began.
-/// - `tools`: by its number, each tool that does something, as a dictionary. `displacement_m`: how far the tissue under the tool is from
-///   where it rests, under a tip the mean over its disc; `surface_displacement_m`: the same of the surface just under its centre;
-///   `velocity_m_per_s`; `force_on_tool_n`: the force of the tissue on the tool; `applied_force_n`: the force of all tools on the tissue
-///   there; all in the tissue's frame. `late`: its newest command came too late; `expired`: what it did has ended by itself; `stale`:
-///   no pose came for 50 ms.
+/// - `awake_points`: points that the step computed; `asleep`: nothing moves; `held`: the guard has stopped the
+///   session.
+/// - `overruns`: steps that were due and dropped; `time_dilation`: simulated over real time; `late_commands`:
+///   commands that arrived too late for their step; `dropped_samples`: samples that were dropped because this reader
+///   was too slow. Counts are since the session started.
+/// - `tools`: each active tool, by its number, as a dictionary. `displacement_m`: displacement of the tissue under
+///   the tool from its place at rest, under a tip the mean over its disc; `surface_displacement_m`: displacement of
+///   the surface just under the tool's centre; `velocity_m_per_s`; `force_on_tool_n`: the force of the tissue on the
+///   tool; `applied_force_n`: the force of all tools on the tissue there; all in the tissue's frame. `late`: its
+///   newest command arrived too late; `expired`: its action has ended by itself; `stale`: no pose arrived for 50 ms.
 #[pyclass(frozen, module = "palpate")]
 pub(crate) struct Samples {
     pub(crate) stream: Arc<Mutex<Following<watch::Samples, pb::WatchSamplesRequest>>>,
     pub(crate) awaited: bool,
 }
 
-/// Samples, one row for each tool of each.
+/// Samples as columns, with one row per tool of each sample.
 #[derive(Default)]
 struct Sampled {
     step: Vec<u64>,
@@ -167,7 +169,7 @@ impl<'py> IntoPyObject<'py> for Sampled {
     }
 }
 
-/// A sample, whether it has tools or not.
+/// A sample, with or without tools.
 #[derive(IntoPyObject)]
 struct StreamSample {
     step: u64,
@@ -228,7 +230,7 @@ impl StreamSample {
 
 #[pymethods]
 impl Samples {
-    /// The next samples, as arrays.
+    /// Returns the next `count` samples as arrays; fewer at the end of the stream.
     fn take<'py>(&self, py: Python<'py>, count: usize) -> PyResult<Bound<'py, PyAny>> {
         let stream = self.stream.clone();
         answer(py, self.awaited, async move {
@@ -264,14 +266,14 @@ impl Samples {
     }
 }
 
-/// The frames of a session, one after the other: the moving surface.
+/// The frames of a session, one after another: the moving surface.
 #[pyclass(frozen, name = "Frames", module = "palpate")]
 pub(crate) struct FrameStream {
     pub(crate) stream: Arc<Mutex<Following<view::Frames, pb::WatchFramesRequest>>>,
     pub(crate) awaited: bool,
 }
 
-/// A frame: the whole surface.
+/// A frame: the whole surface at one moment.
 struct SurfaceFrame {
     step: u64,
     time_s: f64,

@@ -1,9 +1,9 @@
-//! The tip of a tool, as Python sees it.
+//! The tip of a tool, for Python.
 
 use palpate_haptics::Coupling;
 use pyo3::prelude::*;
 
-/// The tip of a tool: a disc that touches, or with `grasps` holds. With a stiffness it is coupled by a spring.
+/// The tip of a tool: a disc that touches, or holds with `grasps=True`. With a stiffness it is coupled by a spring.
 #[pyclass(frozen, module = "palpate", from_py_object)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Tip(pub(crate) palpate_haptics::Tip);
@@ -20,7 +20,7 @@ impl Tip {
         Tip(palpate_haptics::Tip { radius_m, friction, grasps, coupling })
     }
 
-    /// The radius of the disc.
+    /// The radius of the disc, m.
     #[getter]
     fn radius_m(&self) -> f64 {
         self.0.radius_m
@@ -32,7 +32,7 @@ impl Tip {
         self.0.friction
     }
 
-    /// Whether it holds the tissue under it, in place of touching it.
+    /// Whether the tip holds the tissue under it instead of touching it.
     #[getter]
     fn grasps(&self) -> bool {
         self.0.grasps

@@ -1,4 +1,4 @@
-//! What a server tells of a session, as Python sees it.
+//! Messages of a server about a session, converted for Python.
 
 use palpate_client::bridge::BridgeReport;
 use palpate_haptics::{LimitCause, RenderingState};
@@ -10,7 +10,7 @@ use pyo3::types::{PyBytes, PyDict};
 
 use crate::arrays::{column, rows, shaped};
 
-/// How a session stands.
+/// The state of a session.
 #[derive(IntoPyObject)]
 pub(crate) struct Status {
     session_id: String,
@@ -84,7 +84,7 @@ impl<'py> IntoPyObject<'py> for Bytes {
     }
 }
 
-/// What of a surface stays.
+/// The constant part of a surface.
 #[derive(Default)]
 pub(crate) struct SurfaceMesh {
     pub(crate) grid: (u32, u32),
@@ -110,7 +110,7 @@ impl<'py> IntoPyObject<'py> for SurfaceMesh {
     }
 }
 
-/// What came of a touch.
+/// The results of touching with a device.
 pub(crate) struct Touched(pub(crate) BridgeReport);
 
 impl<'py> IntoPyObject<'py> for Touched {

@@ -1,4 +1,4 @@
-//! Work that takes long: without the interpreter's lock, and ended by Ctrl-C.
+//! Long work: runs without the interpreter's lock, and Ctrl-C ends it.
 
 use std::future::Future;
 use std::sync::OnceLock;
@@ -15,14 +15,14 @@ use tokio::sync::oneshot;
 
 use crate::ending::NetworkRuntime;
 
-/// So often signals are looked at.
+/// Interval between checks for signals.
 pub(crate) const LOOK: Duration = Duration::from_millis(50);
 
-/// Stack of a thread that computes, as a main thread has.
+/// Stack size of a computing thread, bytes: that of a main thread.
 pub(crate) const STACK_BYTES: usize = 8 << 20;
 
-/// Does `work` on a thread of its own and looks for signals meanwhile. At a signal whose handler raises, as Ctrl-C does,
-/// `work` is told to stop, and the exception is raised when it has.
+/// Runs `work` on a thread of its own and checks for signals in the meantime. If the handler of a signal raises, as
+/// for Ctrl-C, sets the stop flag of `work`, and raises the exception when that has ended.
 pub(crate) fn work<T: Send>(py: Python<'_>, work: impl FnOnce(&AtomicBool) -> T + Send) -> PyResult<T> {
     let stop = AtomicBool::new(false);
     py.detach(|| {
@@ -48,11 +48,11 @@ pub(crate) fn work<T: Send>(py: Python<'_>, work: impl FnOnce(&AtomicBool) -> T 
     })
 }
 
-/// The runtime of all connections.
+/// Returns the runtime of all connections.
 ///
 /// # Errors
-/// Raises RuntimeError if its threads can't be started, and in a process that was forked after they were: it has not got them,
-/// and would wait for ever.
+/// Raises RuntimeError if its threads can't be started, and in a process that was forked after they were: it does not
+/// have them, and would wait without end.
 pub(crate) fn runtime() -> PyResult<&'static Runtime> {
     static RUNTIME: OnceLock<(u32, Option<Runtime>)> = OnceLock::new();
     let (process, made) = RUNTIME.get_or_init(|| {
@@ -68,8 +68,8 @@ pub(crate) fn runtime() -> PyResult<&'static Runtime> {
     made.as_ref().ok_or_else(|| PyRuntimeError::new_err("no threads for the network"))
 }
 
-/// The result of a future, now or as an awaitable of asyncio. A wait that a signal ends drops the future, and so does a task that
-/// is cancelled.
+/// Returns the result of a future, or an awaitable for asyncio. The future is dropped when a signal ends the wait, or
+/// when the awaiting task is cancelled.
 pub(crate) fn answer<'py, T>(
     py: Python<'py>,
     awaited: bool,
@@ -81,7 +81,8 @@ where
     answer_in_order(py, awaited, None, future)
 }
 
-/// The same of a future that ends in order when `end` is dropped: a signal drops that, and what the future gives is lost.
+/// Like [`answer`], for a future that ends by itself when `end` is dropped: a signal drops that, and the result of
+/// the future is lost.
 pub(crate) fn answer_in_order<'py, T>(
     py: Python<'py>,
     awaited: bool,
@@ -105,7 +106,7 @@ where
             loop {
                 match tokio::time::timeout(LOOK, &mut future).await {
                     Ok(found) => return raised.map_or(found, Err),
-                    // It has been told to end.
+                    // The future was asked to end already.
                     Err(_) if raised.is_some() => {}
                     Err(_) => {
                         let looked = Python::attach(|py| py.check_signals());

@@ -1,9 +1,11 @@
-//! Simulated users of a Palpate server: what their hands do, what networks they are behind, and what a server bears of them.
+//! Simulated users of a Palpate server: the movements of their hands, the networks they are behind, and the load that
+//! a server can take.
 //!
-//! [`load`] lets many use a server and counts how it copes. [`task`] is what a hand does, [`network`] when what is sent arrives,
-//! [`relay`] such a network on this machine, [`random`] the dice of all of these. [`scene_file`] gives scenes to a server.
+//! [`load`] lets many simulated users use a server and measures how it copes. [`task`] is the movement of a hand,
+//! [`network`] decides when a message arrives, [`relay`] is such a network on this machine, and [`random`] are their
+//! random numbers. [`scene_file`] sends scenes to a server.
 
-// Clients live in real time; the rule is for what a server computes.
+// Clients run in real time; the rule is for what a server computes.
 #![allow(clippy::disallowed_methods)]
 
 pub mod load;

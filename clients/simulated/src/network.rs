@@ -1,16 +1,19 @@
-//! A network: when what is sent arrives, if it does. Time is an argument, virtual in `link`, real in `proxy`.
+//! A simulated network: decides whether and when a message arrives. Time is an argument: virtual in `link`, real in
+//! `proxy`.
 //!
 //! **A stream** (TCP): nothing is lost and messages stay in order, but a lost packet delays all later ones until it has been
 //! retransmitted: arrival = max(arrival of the message before, sent + delay + jitter + (RTT … RTO if lost)).
 //!
-//! **Datagrams**: what is lost is lost, and messages overtake each other: arrival = sent + delay + jitter.
+//! **Datagrams**: a lost message stays lost, and messages overtake each other: arrival = sent + delay + jitter.
 //!
-//! Losses are independent, or come in bursts (Gilbert 1960): a state in which all is lost, left with 1/length at each
-//! message. An outage loses all that is sent meanwhile; a stream sends it again after its end.
+//! Losses are independent, or come in bursts (Gilbert 1960): a state in which everything is lost, left with
+//! probability 1/length at each message. An outage loses everything that is sent during it; a stream sends it again
+//! afterwards.
 //!
-//! **A link of limited rate** stands before all that. What is sent waits in its queue for what was sent before. A datagram that
-//! finds the queue full is dropped (the tail of the queue, as most routers do). A stream's sender holds back what does not fit,
-//! so it is only late, until the buffers of its computer are full; then what is sent is dropped, as a server drops samples.
+//! **A link of limited rate** comes before all that. A message waits in its queue for those sent before. A datagram
+//! that finds the queue full is dropped (the tail of the queue, as in most routers). A stream's sender holds back
+//! what does not fit, so it is only late, until the buffers of its computer are full; then messages are dropped, as a
+//! server drops samples.
 
 use std::collections::VecDeque;
 
@@ -27,7 +30,7 @@ pub enum Transport {
 }
 
 impl Transport {
-    /// Returns its name, as options have it.
+    /// Returns its name in options.
     pub fn name(self) -> &'static str {
         match self {
             Transport::Stream => "stream",
@@ -54,26 +57,26 @@ pub struct Conditions {
     pub round_trip_s: f64,
     /// Standard deviation of the delay each way, s.
     pub jitter_s: f64,
-    /// Fraction of the packets that are lost.
+    /// Fraction of the packets that are lost, 0 to 1.
     pub loss: f64,
-    /// Mean number of packets lost in a row; up to 1, each is lost by itself.
+    /// Mean number of packets lost in succession; up to 1, each is lost independently.
     pub burst: f64,
-    /// Once a second nothing gets through for this long, s.
+    /// Duration of the outage that occurs once per second, s; 0: none.
     pub outage_s: f64,
-    /// Rate of the link each way, bit/s; 0: without limit.
+    /// Rate of the link in each direction, bit/s; 0: unlimited.
     pub rate_bit_per_s: f64,
     /// Longest time that a datagram waits for the link, s.
     pub queue_s: f64,
 }
 
-/// What the buffers of a stream hold: the socket's at both ends, and the window of HTTP/2, bits.
+/// Capacity of a stream's buffers (of the sockets at both ends, and the window of HTTP/2), bits.
 const STREAM_BITS: f64 = 8.0 * 1024.0 * 1024.0;
 
-/// A link of limited rate, and its queue.
+/// A link of limited rate, with its queue.
 struct Link {
     rate_bit_per_s: f64,
     longest_s: f64,
-    /// When all that waits has been sent, s.
+    /// When everything that waits will have been sent, s.
     free_s: f64,
 }
 
@@ -87,7 +90,7 @@ impl Link {
         Link { rate_bit_per_s, longest_s, free_s: 0.0 }
     }
 
-    /// When a message has passed, s; `None` if it is dropped.
+    /// Returns when a message has passed the link, s; `None` if it is dropped.
     fn pass(&mut self, now_s: f64, bytes: u64) -> Option<f64> {
         if self.rate_bit_per_s <= 0.0 {
             return Some(now_s);
@@ -104,7 +107,7 @@ impl Link {
 /// Least retransmission timeout of TCP, s (RFC 6298 requires 1 s, Linux uses 200 ms).
 const MIN_RTO_S: f64 = 0.2;
 
-/// The moments at which something stands still, once a second.
+/// Random stalls, once per second.
 pub struct Stalls {
     stall_s: f64,
     random: Random,
@@ -118,7 +121,7 @@ impl Stalls {
         Stalls { stall_s, random, begin_s }
     }
 
-    /// Returns the end of the stall at `now_s`, s, if there is one.
+    /// Returns the end of the stall at `now_s`, s; `None` if there is none.
     pub fn at(&mut self, now_s: f64) -> Option<f64> {
         while now_s >= self.begin_s + self.stall_s {
             self.begin_s = self.begin_s.ceil() + self.random.between(0.0, 1.0);
@@ -127,7 +130,7 @@ impl Stalls {
     }
 }
 
-/// The outages of a network: both directions have them together.
+/// The outages of a network, shared by both directions.
 pub struct Outages {
     stalls: Stalls,
     ended_s: f64,
@@ -140,17 +143,17 @@ impl Outages {
         Outages { stalls, ended_s: f64::NEG_INFINITY }
     }
 
-    /// Returns whether there are any.
+    /// Returns whether the network has outages.
     pub fn are_any(&self) -> bool {
         self.stalls.stall_s > 0.0
     }
 
-    /// The end of the outage at `now_s`, s, if there is one.
+    /// Returns the end of the outage at `now_s`, s; `None` if there is none.
     fn at(&mut self, now_s: f64) -> Option<f64> {
         self.stalls.at(now_s)
     }
 
-    /// Returns how long ago the last outage ended, s; 0 in one.
+    /// Returns the time since the end of the last outage, s; 0 during one, infinite before the first.
     pub fn since_s(&mut self, now_s: f64) -> f64 {
         if let Some(end_s) = self.at(now_s) {
             self.ended_s = end_s;
@@ -159,7 +162,7 @@ impl Outages {
     }
 }
 
-/// One direction of a connection.
+/// One direction of a simulated connection, with the messages in it.
 ///
 /// A message takes half of the round trip of 100 ms:
 ///
@@ -180,7 +183,7 @@ pub struct Direction<T> {
     link: Link,
     outages: Outages,
     is_bursting: bool,
-    /// By arrival.
+    /// Messages under way, sorted by arrival, s.
     under_way: VecDeque<(f64, T)>,
     last_s: f64,
     sent: u64,
@@ -188,8 +191,8 @@ pub struct Direction<T> {
 }
 
 impl<T> Direction<T> {
-    /// Creates one direction of the network of a seed. Both have their outages together, the first of these not before
-    /// `from_s`.
+    /// Creates direction `direction` of the network with this seed. Both directions have their outages at equal
+    /// times, the first not before `from_s`.
     pub fn new(conditions: Conditions, seed: u64, direction: u64, from_s: f64) -> Self {
         Direction {
             conditions,
@@ -218,7 +221,7 @@ impl<T> Direction<T> {
         self.is_bursting
     }
 
-    /// Sends a message of a size.
+    /// Sends a message of `bytes` bytes at `now_s`.
     pub fn send(&mut self, now_s: f64, bytes: u64, message: T) {
         let Conditions { transport, round_trip_s, jitter_s, .. } = self.conditions;
         self.sent += 1;
@@ -238,7 +241,7 @@ impl<T> Direction<T> {
                 if is_lost {
                     arrives_s += self.random.between(round_trip_s, (2.0 * round_trip_s).max(MIN_RTO_S));
                 }
-                // The timer of the retransmission that meets no outage any more may run for another timeout.
+                // The retransmission after the outage may have to wait for another timeout.
                 let again_s = outage.map_or(now_s, |end_s| end_s + self.random.between(0.0, MIN_RTO_S));
                 arrives_s = (arrives_s + again_s - now_s).max(self.last_s);
                 self.last_s = arrives_s;
@@ -248,31 +251,31 @@ impl<T> Direction<T> {
         self.under_way.insert(at, (arrives_s, message));
     }
 
-    /// Returns the next message that has arrived.
+    /// Removes and returns the next message that has arrived by `now_s`; `None` if there is none.
     pub fn receive(&mut self, now_s: f64) -> Option<T> {
-        // The nanosecond allows for rounding: times are sums of milliseconds.
+        // A nanosecond more allows for rounding: times are sums of milliseconds.
         if self.under_way.front()?.0 > now_s + 1e-9 {
             return None;
         }
         self.under_way.pop_front().map(|entry| entry.1)
     }
 
-    /// Returns when the next message arrives, s.
+    /// Returns when the next message arrives, s; `None` if there is none.
     pub fn next_s(&self) -> Option<f64> {
         self.under_way.front().map(|entry| entry.0)
     }
 
-    /// Returns the messages that are under way.
+    /// Returns the number of messages under way.
     pub fn under_way(&self) -> usize {
         self.under_way.len()
     }
 
-    /// Returns the messages so far.
+    /// Returns the number of messages sent so far.
     pub fn sent(&self) -> u64 {
         self.sent
     }
 
-    /// Returns the messages that found the queue full.
+    /// Returns the number of messages dropped because the queue was full.
     pub fn overflowed(&self) -> u64 {
         self.overflowed
     }
@@ -308,14 +311,14 @@ mod tests {
         assert!(arrived.len() == 20_000 && arrived.is_sorted());
         let arrived = arrivals(Conditions { transport: Transport::Datagram, ..conditions });
         assert!(!arrived.is_sorted());
-        // A tenth of the time nothing gets through, and of the rest a hundredth is lost.
+        // A tenth of the time nothing gets through, and a hundredth of the rest is lost.
         assert!((17_000..18_600).contains(&arrived.len()), "{}", arrived.len());
     }
 
     #[test]
     fn a_link_passes_no_more_than_its_rate_and_a_datagram_waits_no_longer_than_its_queue() {
-        // 1000 messages of 1000 bits a second, of datagrams and of a stream. What still waits at the end arrives, too: 50 ms of
-        // datagrams, and the 1 MiB of a stream.
+        // 1000 messages of 1000 bits per second, of datagrams and of a stream. Messages that still wait at the end
+        // arrive too: 50 ms of datagrams, and the 1 MiB of a stream.
         let all = [20_000, 20_000];
         for (rate_bit_per_s, longest_s, arrive) in [(2e6, 0.0, all), (1e6, 0.0, all), (5e5, 0.05, [10_025, 18_389])] {
             let conditions = Conditions { rate_bit_per_s, queue_s: 0.05, ..Conditions::default() };

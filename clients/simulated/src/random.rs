@@ -1,10 +1,10 @@
-//! Random numbers that are the same on every machine.
+//! Random numbers that are equal on every machine.
 
-/// A random number generator with the same results on every machine.
+/// A random number generator whose results are equal on every machine.
 pub struct Random(fastrand::Rng);
 
 impl Random {
-    /// Creates one of the independent streams of random numbers of a seed.
+    /// Creates the random numbers number `stream` of a seed; those of different numbers are independent.
     pub fn new(seed: u64, stream: u64) -> Self {
         // The odd factor spreads neighbouring seeds and streams.
         Random(fastrand::Rng::with_seed((seed ^ stream.rotate_left(32)).wrapping_mul(0x9e37_79b9_7f4a_7c15)))

@@ -1,4 +1,5 @@
-//! A bad network on this machine: what is sent to an address here, by TCP or UDP, goes on to another later, or not at all.
+//! A bad network on this machine: forwards data sent to a local address, by TCP or UDP, to another address with a
+//! delay, or loses it.
 
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream, UdpSocket};
@@ -10,16 +11,16 @@ use palpate_client::bridge::Warn;
 
 use crate::network::{Conditions, Direction, Transport};
 
-/// Connections, and senders of datagrams, at a time.
+/// Maximum number of concurrent flows: connections, and senders of datagrams.
 pub const MAX_FLOWS: u64 = 64;
 
-/// Packets of a flow that are under way each way; beyond, TCP waits and datagrams are lost.
+/// Maximum number of packets of a flow under way in each direction; beyond it, TCP waits and datagrams are lost.
 const MAX_UNDER_WAY: usize = 4096;
 
-/// A sender of datagrams that was silent for so long has gone.
+/// Time of silence after which a sender of datagrams counts as gone.
 const GONE: Duration = Duration::from_secs(60);
 
-/// Bytes that are read at a time, from TCP as much as a packet has.
+/// Bytes read at a time: from TCP a packet's payload, from UDP a whole datagram.
 const PACKET_BYTES: [usize; 2] = [1400, 65536];
 
 #[derive(Default)]
@@ -30,17 +31,17 @@ struct PacketCounts {
     bytes: [AtomicU64; 2],
 }
 
-/// What went through a network, each way: to the server, and back.
+/// The totals of what was forwarded, in each direction: to the server, and back.
 pub struct Passed {
-    /// Connections, and senders of datagrams.
+    /// Number of connections, and of senders of datagrams.
     pub flows: u64,
-    /// Packets.
+    /// Number of packets.
     pub packets: [u64; 2],
-    /// Their bytes.
+    /// Number of bytes.
     pub bytes: [u64; 2],
 }
 
-/// The network of all flows.
+/// The simulated network that all relayed flows go through.
 pub struct RelayNetwork {
     conditions: [Conditions; 2],
     most_flows: u64,
@@ -51,8 +52,8 @@ pub struct RelayNetwork {
 }
 
 impl RelayNetwork {
-    /// Creates a network under these conditions, whatever the transport in them, for so many flows at a time. `warn`
-    /// shows people what is not relayed.
+    /// Creates a network with these conditions, whose transport is ignored, for at most `most_flows` concurrent
+    /// flows. `warn` is called with messages about flows that are not relayed.
     pub fn new(conditions: Conditions, seed: u64, most_flows: u64, warn: Arc<Warn>) -> Arc<Self> {
         let of = |transport| Conditions { transport, ..conditions };
         let conditions = [of(Transport::Stream), of(Transport::Datagram)];
@@ -66,7 +67,8 @@ impl RelayNetwork {
         })
     }
 
-    /// Relays connections to an address here, on threads of its own, until the program ends. Returns the address.
+    /// Relays connections to `listen` to the address `to`, on threads of its own, until the program ends. Returns the
+    /// bound address.
     ///
     /// # Errors
     /// Returns an error if the address is not free.
@@ -79,7 +81,8 @@ impl RelayNetwork {
         Ok(bound)
     }
 
-    /// Does the same for datagrams.
+    /// Relays datagrams to `listen` to the address `to`, on threads of its own, until the program ends. Returns the
+    /// bound address.
     ///
     /// # Errors
     /// Returns an error if the address is not free.
@@ -92,7 +95,7 @@ impl RelayNetwork {
         Ok(bound)
     }
 
-    /// Returns what went through so far.
+    /// Returns the totals so far.
     pub fn passed(&self) -> Passed {
         let PacketCounts { flows, packets, bytes, .. } = &self.counts;
         let read = |counts: &[AtomicU64; 2]| [0, 1].map(|way| counts[way].load(Ordering::Relaxed));
@@ -105,7 +108,7 @@ fn thread(work: impl FnOnce() + Send + 'static) -> io::Result<()> {
     begun.map_err(|error| io::Error::new(error.kind(), format!("can't start a thread: {error}")))
 }
 
-/// One direction of a flow: what was read and has not arrived.
+/// One direction of a flow: the packets that were read and have not arrived.
 struct RelayDirection {
     network: Arc<RelayNetwork>,
     way: usize,
@@ -121,7 +124,7 @@ struct RelayState {
 impl RelayDirection {
     fn new(network: &Arc<RelayNetwork>, transport: Transport, flow: u64, way: usize) -> Arc<Self> {
         let conditions = network.conditions[usize::from(transport == Transport::Datagram)];
-        // The outages of all flows are those of the seed. The first streams of random numbers are theirs.
+        // All flows share the outages of the seed, which uses the first streams of random numbers.
         let direction = Direction::new(conditions, network.seed, 8 + 2 * flow + way as u64, 0.0);
         let inner = Mutex::new(RelayState { direction, is_over: false });
         Arc::new(RelayDirection { network: network.clone(), way, inner, changed: Condvar::new() })
@@ -135,7 +138,7 @@ impl RelayDirection {
         self.network.begun.elapsed().as_secs_f64()
     }
 
-    /// Sends a packet off. `waits`: waits for room, in place of dropping it.
+    /// Sends a packet into the network. If there is no room, waits for it if `waits` is set, else drops the packet.
     fn send(&self, packet: &[u8], waits: bool) {
         let mut inner = self.lock();
         while waits && !inner.is_over && inner.direction.under_way() >= MAX_UNDER_WAY {
@@ -148,13 +151,13 @@ impl RelayDirection {
         self.changed.notify_all();
     }
 
-    /// Nothing more comes.
+    /// Ends the direction: nothing more is sent.
     fn end(&self) {
         self.lock().is_over = true;
         self.changed.notify_all();
     }
 
-    /// Waits for the next packet that arrives; `None` after the last.
+    /// Waits for the next packet to arrive; `None` after the last.
     fn next(&self) -> Option<Vec<u8>> {
         let mut inner = self.lock();
         loop {
@@ -199,7 +202,7 @@ impl Drop for Flow {
     }
 }
 
-/// Relays connections.
+/// Accepts and relays connections.
 fn accept(listener: &TcpListener, to: SocketAddr, network: &Arc<RelayNetwork>) {
     for near in listener.incoming() {
         let relayed = near.and_then(|near| {
@@ -236,7 +239,7 @@ fn write(mut to: TcpStream, way: &RelayDirection, _flow: &Flow) {
     while let Some(packet) = way.next() {
         if to.write_all(&packet).is_err() {
             way.end();
-            // Its reader notices.
+            // Its reader notices the shutdown.
             let _ = to.shutdown(Shutdown::Both);
             return;
         }
@@ -249,7 +252,7 @@ fn receive(near: &UdpSocket, to: SocketAddr, network: &Arc<RelayNetwork>) {
     let mut senders: Vec<(SocketAddr, Arc<RelayDirection>)> = Vec::new();
     let mut packet = vec![0; PACKET_BYTES[1]];
     loop {
-        // An error is of a packet that was sent before, to who has gone.
+        // An error concerns an earlier packet, to a sender that has gone.
         let Ok((bytes, from)) = near.recv_from(&mut packet) else { continue };
         senders.retain(|sender| !sender.1.lock().is_over);
         let known = senders.iter().find(|sender| sender.0 == from).map(|sender| sender.1.clone());
@@ -285,7 +288,7 @@ fn begin_sender(
     let [up, down] = [0, 1].map(|way| RelayDirection::new(network, Transport::Datagram, flow.1, way));
     let (near, back, answers) = (near.try_clone()?, far.try_clone()?, down.clone());
     let gone = up.clone();
-    // A server that is not there yet answers by an error, and may come.
+    // A server that is not running yet causes an error, and may start later.
     thread(move || {
         let mut packet = vec![0; PACKET_BYTES[1]];
         loop {

@@ -1,4 +1,4 @@
-//! Scenes by name or from files, as a server takes them. The mesh of a scene file is sent to the server before the scene.
+//! Scenes by name or from files, converted for a server. The mesh of a scene file is uploaded before the scene.
 
 use std::path::Path;
 
@@ -17,12 +17,12 @@ use pb::create_session_request::Source;
 use pb::view_service_client::ViewServiceClient;
 use tonic::Status;
 
-/// The scene of a session.
+/// The scene of a session to create.
 pub struct SceneFile {
     source: Source,
-    /// The scene of a file of our own.
+    /// The scene, if it was read from a file.
     own: Option<Scene>,
-    /// The mesh to be sent.
+    /// The mesh to upload.
     mesh: Option<MeshToSend>,
 }
 
@@ -33,7 +33,7 @@ struct MeshToSend {
 }
 
 impl SceneFile {
-    /// Reads a scene: one of the server's by its name, or the contents of a file that ends in .toml.
+    /// Reads a scene: one of the server's by its name, or a file whose name ends in .toml.
     ///
     /// # Errors
     /// Returns an error if the file can't be read, or if its scene is invalid.
@@ -52,7 +52,7 @@ impl SceneFile {
                 if let Some(told) = &mut message.mesh {
                     told.vertices = said.vertices.map(|vertices| vertices.try_into().unwrap_or(u32::MAX));
                 }
-                // What a glTF file of text names in turn is not sent; one that is written anew has all.
+                // Files that a textual glTF file refers to are not uploaded; a rewritten mesh contains everything.
                 let whole = said.path.filter(|path| path.extension().is_none_or(|extension| extension != "gltf"));
                 Some(match whole {
                     Some(path) => {
@@ -70,7 +70,7 @@ impl SceneFile {
         Ok(SceneFile { source: Source::Scene(message), own: Some(own), mesh })
     }
 
-    /// Returns what a session is to be made of; sends the mesh, if there is one.
+    /// Returns the source of a session; uploads the mesh, if there is one.
     ///
     /// # Errors
     /// Returns the server's refusal, or how the connection broke.
@@ -89,8 +89,9 @@ impl SceneFile {
         Ok(source)
     }
 
-    /// Returns the scene of a session that the server has made of this. Of a mesh of the server's own, places at rest
-    /// are known to seven digits only, it is as fine as its file, and all points and springs are those of reference.
+    /// Returns the scene of a session that the server has created from this source. For a mesh of the server, rest
+    /// positions have only seven digits, the mesh has all vertices of its file, and all points and springs have the
+    /// reference values.
     ///
     /// # Errors
     /// Returns an error if the server's scene or mesh can't be read.
@@ -102,9 +103,10 @@ impl SceneFile {
             (Some(own), Some(_)) => Ok(own.clone()),
             (None, Some(_)) => {
                 let mesh = server_mesh(&session.session_id, channel).await?;
-                // The coefficients that follow from a material are told as well.
+                // The coefficients that follow from a material are sent as well.
                 let mut even = pb::Scene { material: None, inclusions: Vec::new(), ..told.clone() };
-                // Scripts name the vertices of the file. Which point of a coarser mesh each stands for, the server knows.
+                // Scripts name the vertices of the file. Only the server knows which point of a coarser mesh each one
+                // belongs to.
                 even.mesh.iter_mut().for_each(|mesh| mesh.vertices = None);
                 wire::scene::from_scene(&even, Some(&mesh)).map_err(wrong)
             }
@@ -112,7 +114,7 @@ impl SceneFile {
     }
 }
 
-/// The mesh of a session, with the numbers of its file.
+/// Gets the mesh of a session, with the vertex numbers of its file.
 async fn server_mesh(session_id: &str, channel: Channel) -> Result<TriangleMesh, Status> {
     let request = pb::GetMeshRequest { session_id: session_id.to_owned(), refinement: 0 };
     let mut parts = ViewServiceClient::new(channel).get_mesh(request).await?.into_inner();

@@ -1,5 +1,5 @@
-//! The task of a simulated hand: presses from free space into the tissue and out again, some with a stroke along it. The
-//! movements are smooth, like those of hands (minimum jerk), and drawn by a seed.
+//! The movement of a simulated hand: presses from free space into the tissue and out again, some with a stroke along
+//! it. The movements are smooth, like those of hands (minimum jerk), and chosen by random numbers.
 
 use glam::DVec3;
 use palpate_haptics::Law;
@@ -21,10 +21,10 @@ const STROKE_M: f64 = 0.02;
 const STROKE_M_PER_S: f64 = 0.06;
 /// Fraction of the presses that have a stroke.
 const STROKES: f64 = 0.7;
-/// Parts of a press, as fractions of its duration: down, along, up.
+/// Durations of the parts of a press (down, along, up) as fractions of the whole.
 const PARTS: [f64; 3] = [0.3, 0.4, 0.3];
 
-/// Largest speed of a minimum-jerk movement over its mean speed.
+/// Ratio of the largest to the mean speed of a minimum-jerk movement.
 const PEAK: f64 = 1.875;
 
 /// Fraction of the device's largest force that the true force must not exceed.
@@ -37,7 +37,7 @@ struct Leg {
     by_m: DVec3,
 }
 
-/// A moving target.
+/// The movement of a hand's target over time.
 pub struct Task {
     start_m: DVec3,
     legs: Vec<Leg>,
@@ -46,7 +46,7 @@ pub struct Task {
 }
 
 impl Task {
-    /// Presses around `middle_m` from `lead_s` until `duration_s`. Their depth is scaled by `scale`.
+    /// Creates presses around `middle_m` from `lead_s` until `duration_s`, with depths multiplied by `scale`.
     pub fn new(middle_m: DVec3, lead_s: f64, duration_s: f64, scale: f64, random: &mut Random) -> Self {
         let mut height_m = random.between(HEIGHT_M[0], HEIGHT_M[1]);
         let start_m = middle_m + height_m * DVec3::Z;
@@ -95,13 +95,13 @@ impl Task {
     }
 }
 
-/// Returns the scale of depths at which the deepest press of a hand at rest meets [`FORCE_SHARE`] of the largest force:
-/// there the hand's spring and the tissue are in balance.
+/// Returns the scale of depths at which the deepest press of a hand at rest reaches [`FORCE_SHARE`] of the largest
+/// force, where the hand's spring and the tissue are in balance; at most 1.
 pub fn scale(hand: &Hand, law: &Law, most_n: f64) -> f64 {
     let force_n = FORCE_SHARE * MARGIN * most_n;
     let yields_m = if hand.stiffness_n_per_m > 0.0 { force_n / hand.stiffness_n_per_m } else { f64::INFINITY };
     ((law.depth_of(force_n) + yields_m) / DEPTH_M[1]).min(1.0)
 }
 
-/// Margin for damping and friction, which the balance of a hand at rest leaves out.
+/// Margin for damping and friction, which the balance of a hand at rest ignores.
 const MARGIN: f64 = 0.93;

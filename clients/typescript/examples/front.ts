@@ -1,4 +1,4 @@
-// A whole front end: any scene (front.html?scene=gallbladder), drawn with three.js, touched with the mouse.
+// A complete front end: any scene (front.html?scene=gallbladder), drawn with three.js, touched with the mouse.
 
 import { fetchMesh, Field, Frames, Server, Tool, vec, watchSamples } from "palpate";
 import { BufferAttribute, BufferGeometry, DirectionalLight, DoubleSide, HemisphereLight, Mesh, MeshStandardMaterial, PerspectiveCamera, Raycaster, Scene, Vector2, Vector3, WebGLRenderer } from "three";
@@ -9,7 +9,7 @@ const sceneName = new URLSearchParams(location.search).get("scene") ?? "liver";
 const { session } = await server.sessions.createSession({ source: { case: "sceneName", value: sceneName } });
 const { sessionId } = session!;
 
-// The surface: rest places and triangles once, displacements by frames.
+// The surface: positions at rest and triangles are fetched once; displacements come in frames.
 const mesh = await fetchMesh(server, sessionId);
 const field = new Field(...mesh.places);
 const geometry = new BufferGeometry();
@@ -40,7 +40,7 @@ frames.onFrame = () => {
 frames.run(sessionId, 0, field, new AbortController().signal);
 renderer.setAnimationLoop(() => renderer.render(picture, camera));
 
-// The mouse leads a tip a few millimetres below the surface.
+// The mouse moves a tip a few millimetres below the surface.
 const tool = new Tool(server, sessionId, "front");
 const radiusM = Math.max(0.02 * radius, 2 * mesh.edgeM);
 renderer.domElement.onpointermove = renderer.domElement.onpointerdown = ({ clientX, clientY, buttons }) => {

@@ -1,4 +1,4 @@
-// Looks at a tissue that a tool of this page pushes: how deep it is, frame by frame.
+// Watches a tissue that a tool of this page pushes, and shows its depth frame by frame.
 
 import { Field, Frames, Server, Tool } from "palpate";
 
@@ -7,7 +7,7 @@ const server = new Server(location.origin);
 const { session } = await server.sessions.createSession({ source: { case: "sceneName", value: "paper" } });
 const { sessionId, scene } = session!;
 
-// A frame has the displacement of every point of the sheet.
+// A frame contains the displacement of every point of the sheet.
 const field = new Field(scene!.sheet!.pointsX!, scene!.sheet!.pointsY!);
 const frames = new Frames(server);
 let deepestM = 0;

@@ -1,4 +1,4 @@
-// Presses a tip into a tissue, and tells how hard the tissue presses back.
+// Presses a tip into a tissue, and shows how hard the tissue pushes back.
 
 import { norm, Server, Tool, vec, watchSamples } from "palpate";
 import type { Sample } from "palpate/v1";
@@ -16,7 +16,7 @@ const onSample = ({ step, tools }: Sample) => {
 };
 void watchSamples(server, sessionId, 10, onSample, new AbortController().signal);
 
-// From 2 cm above the middle of the sheet to 4 mm below, in a second. The newest place counts.
+// Moves from 2 cm above the middle of the sheet to 4 mm below it within a second. Only the newest position counts.
 const tool = new Tool(server, sessionId, "touch");
 const [x, y] = [0.5 * (pointsX - 1) * spacingM, 0.5 * (pointsY - 1) * spacingM];
 const begunMs = performance.now();

@@ -1,5 +1,5 @@
-// A worker that carries datagrams: a WebTransport session that belongs to a lease. It works however long the page takes to
-// draw: it repeats the newest pose, tells the server that it is there, and passes on what comes.
+// A worker that carries datagrams: a WebTransport session that belongs to a lease. It works however long the page
+// takes to draw: it repeats the newest pose, sends keep-alive datagrams, and passes on what it receives.
 
 import { create, fromBinary, toBinary } from "@bufbuild/protobuf";
 import { DatagramHealth } from "./datagram-health.js";
@@ -7,54 +7,60 @@ import { PosesDatagramSchema, SampleDatagramSchema, TouchResponseSchema } from "
 import type { Rejection, Sample } from "./gen/palpate/v1/haptic_pb.js";
 import { type Lead, Poses } from "./poses.js";
 
-/** Interval between poses of a tool that rests: the server holds a tool after 50 ms without one. */
+/** Interval between poses of a tool at rest. The server holds a tool after 50 ms without a pose. */
 const REPEAT_MS = 20;
 /** Interval between checks for something to send. */
 const TICK_MS = 10;
-/** A page that says nothing for so long leads nothing: a call's command has this time to live. */
+/**
+ * The worker stops sending poses if the page has sent nothing for this time. It is the time to live of a command in a
+ * call.
+ */
 const PAGE_MS = 2000;
 /** Largest datagram, bytes. */
 const MAX_BYTES = 1024;
 /** Largest message of the stream, bytes. */
 const MAX_MESSAGE = 1 << 20;
-/** A datagram that has waited so long is out of date. */
+/** Datagrams that have waited longer than this are dropped as outdated. */
 const OLD_MS = 50;
 
-/** The session to open: the page's first message. */
+/** The page's first message: the session to open. */
 export interface Order {
   url: string;
   certificateSha256: Uint8Array<ArrayBuffer>;
   tool: number;
 }
 
-/** The page's further messages: where the tip is led. `from`: the sequence of the first pose since something else was commanded. */
+/**
+ * Further messages of the page: the target of the tip. `from` is the sequence of the first pose since another action
+ * was commanded.
+ */
 export interface Led {
   lead: Lead;
   from: bigint;
 }
 
-/** No pose goes out until another comes; and the end of the session. */
+/** "rest" stops sending poses until another one is set; "close" ends the session. */
 export type Word = "rest" | "close";
 
 export interface Counts {
-  /** Datagrams. */
+  /** Number of datagrams that were sent, and that arrived. */
   sent: number;
   came: number;
-  /** Poses and samples in them. */
+  /** Number of poses and samples in them. */
   poses: number;
   samples: number;
   fellBack: number;
 }
 
-/** What the page hears. */
+/** Messages to the page. */
 export interface Heard {
   carries: boolean;
   counts: Counts;
-  /** Round trip minus the time that the server held a pose, ms. */
+  /** Round trip time minus the time for which the server held a pose, ms. */
   networkMs?: number;
   sample?: Sample;
   rejection?: Pick<Rejection, "reason" | "message">;
-  /** The session is over. */
+  /** Whether the session has ended. */
   isOver?: boolean;
 }
 
@@ -86,7 +92,7 @@ class DatagramWorker {
     });
     this.session.datagrams.outgoingMaxAge = OLD_MS;
     this.writer = (this.session.datagrams.writable as WritableStream<Uint8Array>).getWriter();
-    // `run` tells how it ends.
+    // `run` reports how the session ends.
     this.session.closed.catch(() => undefined);
     void this.run().catch(() => this.over());
   }
@@ -100,7 +106,7 @@ class DatagramWorker {
   }
 
   close(): void {
-    // A session that is not open yet refuses to close.
+    // A session that is not open yet can't be closed.
     void this.session.ready.then(() => this.session.close(), () => undefined).finally(() => page.close());
   }
 
@@ -128,7 +134,7 @@ class DatagramWorker {
       this.carries = carries;
       this.tell({});
     }
-    // Meanwhile the page leads by calls, and begins anew.
+    // Meanwhile the page sends the poses by calls, and starts anew here later.
     if (!carries || now - this.ledMs > PAGE_MS) this.rest();
     if (this.led && now - this.posedMs >= this.repeatMs) this.pose(now);
     if (this.health.isSilent(now)) this.send([], now);
@@ -137,7 +143,7 @@ class DatagramWorker {
   private pose(now: number): void {
     if (!this.led || !this.poses || !this.carries) return;
     const timeNs = BigInt(Math.round(now * 1e6));
-    // The clock of a page is coarse, and each pose needs a time of its own.
+    // The clock of a page is coarse, but each pose needs a different time.
     this.timeNs = timeNs > this.timeNs ? timeNs : this.timeNs + 1n;
     this.posedMs = now;
     this.counted.poses += 1;
@@ -149,7 +155,7 @@ class DatagramWorker {
     const message = create(PosesDatagramSchema, { ...this.health.send(now), tools, sentNs });
     const bytes = toBinary(PosesDatagramSchema, message);
     if (bytes.length > Math.min(MAX_BYTES, this.session.datagrams.maxDatagramSize)) return;
-    // The end of the session is told by `closed`.
+    // The end of the session is reported by `closed`.
     this.writer.write(bytes).catch(() => undefined);
   }
 
@@ -168,7 +174,10 @@ class DatagramWorker {
     }
   }
 
-  /** What must not be lost, or is too long: each message after its length. */
+  /**
+   * Reads the stream, which carries messages that must not be lost or are too long for a datagram, each after its
+   * length.
+   */
   private async readStream(): Promise<void> {
     const streams = (this.session.incomingUnidirectionalStreams as ReadableStream<ReadableStream<Uint8Array>>).getReader();
     const { value: stream } = await streams.read();
@@ -197,7 +206,7 @@ class DatagramWorker {
   private passOn(sample: Sample | undefined, now: number): void {
     if (!sample) return this.tell({});
     const tool = sample.tools.find(({ tool }) => tool === this.order.tool);
-    // Calls have times of another clock.
+    // Times of calls are from a different clock.
     if (tool && this.led && this.poses?.has(tool.acknowledgedSequence)) {
       this.networkMs = Math.max(0, now - Number(tool.clientTimeNs + tool.serverHoldNs) / 1e6);
     } else {

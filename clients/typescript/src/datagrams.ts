@@ -1,32 +1,36 @@
-// The datagrams of a lease: poses and samples by WebTransport (datagram-worker.ts), where browser, server and network let them
-// through. Nothing depends on that: calls carry everything else, and everything if there are none.
+// The datagrams of a lease: poses and samples by WebTransport (datagram-worker.ts), where browser, server and network
+// allow it. Nothing depends on it: everything else goes by calls, and poses and samples too if there are no
+// datagrams.
 
 import type { Counts, Heard, Led, Order, Word } from "./datagram-worker.js";
 import type { DatagramOffer, Sample } from "./gen/palpate/v1/haptic_pb.js";
 import { isUnimplemented, CALL_TIMEOUT_MS, reasonOf, type Server } from "./server.js";
 
-/** Longest wait before a session is tried again: a network that blocks it still will. */
+/** Longest wait before a session is tried again: a network that blocks datagrams will probably continue to do so. */
 const AVOID_MS = 60_000;
-/** First wait for another session where one has worked. A browser gives one up that hears nothing for some seconds. */
+/**
+ * First wait for another session after one that worked. A browser gives up a session in which it receives nothing for
+ * some seconds.
+ */
 const AGAIN_MS = 1000;
 
-/** When sessions are tried again; never where the browser has none. */
+/** Time at which a session may be tried again; never if the browser does not support them. */
 let avoidedMs = typeof WebTransport === "undefined" ? Infinity : 0;
-/** The wait after the next failure. */
+/** Wait after the next failure. */
 let waitMs = AVOID_MS;
 
 export class Datagrams {
   onSample: (sample: Sample) => void = () => {};
   onRejected: (reason: string, message: string) => void = () => {};
-  /** The way changed. */
+  /** Called when `carries` changes. */
   onChange: () => void = () => {};
   networkMs: number | undefined;
-  /** Whether they get through. */
+  /** Whether datagrams get through. */
   carries = false;
   private worker: Worker | undefined;
   private leaseId = "";
   private again: ReturnType<typeof setTimeout> | undefined;
-  /** The largest revision of an owner of the session that was seen. */
+  /** Newest ownership revision that was seen for this session. */
   private revision = 0n;
   private now = none();
   private before = none();
@@ -38,12 +42,12 @@ export class Datagrams {
     private readonly sampleEverySteps: number,
   ) {}
 
-  /** What was carried, over all leases. */
+  /** Totals over all leases. */
   get counts(): Counts {
     return sum(this.before, this.now);
   }
 
-  /** Opens a session for a lease, as soon as it can, and another if it fails; until `close`. */
+  /** Opens a session for a lease as soon as possible, and another one whenever it fails, until `close`. */
   open(leaseId: string): void {
     this.close();
     this.leaseId = leaseId;
@@ -59,12 +63,13 @@ export class Datagrams {
       const { offer } = await this.server.haptics.openDatagrams({ sessionId, leaseId, sampleEverySteps }, { timeoutMs: CALL_TIMEOUT_MS });
       if (offer && leaseId === this.leaseId) this.start(offer);
     } catch (error) {
-      // The server has none, or is older than they are. Any other refusal is of this lease, or of the moment.
+      // The server has datagrams disabled, or is too old to know them. Any other refusal concerns this lease, or is
+      // temporary.
       if (reasonOf(error) === "NOT_AVAILABLE" || isUnimplemented(error)) avoidedMs = performance.now() + AVOID_MS;
     }
   }
 
-  /** A session has ended by itself. */
+  /** Handles a session that ended by itself. */
   private failed(worked: boolean): void {
     if (worked) waitMs = AGAIN_MS;
     avoidedMs = performance.now() + waitMs;
@@ -97,14 +102,14 @@ export class Datagrams {
     this.onChange();
   }
 
-  /** A server that does not have the session any more has no say. */
+  /** Accepts a sample, unless it is from a server that no longer owns the session. */
   private take(sample: Sample): void {
     if (sample.ownershipRevision < this.revision) return;
     this.revision = sample.ownershipRevision;
     this.onSample(sample);
   }
 
-  /** Leads the tip, until `rest`. Sequences rise from `from` on. */
+  /** Sends poses of the tip until `rest`. Their sequences increase from `from`. */
   lead(led: Led): void {
     this.worker?.postMessage(led);
   }
@@ -113,7 +118,7 @@ export class Datagrams {
     this.say("rest");
   }
 
-  /** Closes the session. */
+  /** Closes the datagram session. */
   close(): void {
     clearTimeout(this.again);
     this.leaseId = "";

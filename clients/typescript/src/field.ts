@@ -1,5 +1,5 @@
 // The field: the displacement of every vertex as the server sent it, and where it changed. The worker that receives
-// frames has one, and the page has a copy that follows it.
+// frames has one, and the page keeps a copy that follows it.
 
 import { Encoding, type Patch, type WatchFramesResponse } from "./gen/palpate/v1/view_pb.js";
 
@@ -11,13 +11,13 @@ export interface Rectangle {
   b1: number;
 }
 
-/** No surface moves farther, m. */
+/** Limit for plausible displacements, m. */
 const FARTHEST_M = 1e6;
 
-/** Vertices of a surface, at most. */
+/** Maximum number of vertices of a surface. */
 export const MAX_VERTICES = 1 << 24;
 
-/** Whether an encoding writes integers, with origin and scale, or floats. */
+/** Returns whether an encoding contains integers, with origin and scale, rather than floating-point numbers. */
 function hasIntegers(encoding: Encoding): boolean {
   switch (encoding) {
     case Encoding.UNSPECIFIED:
@@ -26,13 +26,13 @@ function hasIntegers(encoding: Encoding): boolean {
     case Encoding.I16:
       return true;
     default:
-      // Of a newer server.
+      // From a newer server.
       throw new RangeError(`unknown encoding ${String(encoding)}`);
   }
 }
 
 export class Field {
-  /** Vertex (a, b) has its three components from 3·(a·ny + b) on. */
+  /** The three components of vertex (a, b) begin at index 3·(a·ny + b). */
   readonly displacementM: Float32Array<ArrayBuffer>;
   /** Bounds of all changes since the last `takeChanged`. */
   private changed: Rectangle | undefined;
@@ -46,7 +46,7 @@ export class Field {
     this.displacementM = new Float32Array(3 * nx * ny);
   }
 
-  /** Writes a patch of a frame. */
+  /** Applies a patch of a frame. */
   write(part: WatchFramesResponse, patch: Patch): void {
     const { displacement: bytes, firstX, firstY, countX, countY } = patch;
     const isWhole = hasIntegers(part.encoding);

@@ -10,7 +10,7 @@ export interface FrameTold {
 }
 
 export class Frames {
-  /** Frames received, and frames that the server skipped for this viewer. */
+  /** Number of frames that were received, and number of frames that the server skipped for this viewer. */
   taken = 0;
   skipped = 0n;
   newest: FrameTold | undefined;
@@ -19,8 +19,9 @@ export class Frames {
   constructor(private readonly server: Server) {}
 
   /**
-   * Receives those of a session into `field` until `signal` aborts: then the worker ends, and its stream with it. A field of a mesh has
-   * its places (`MeshData`); one of a sheet has (m − 1)·n + m vertices along a side of m points at refinement n.
+   * Receives the frames of a session into `field` until `signal` aborts; then the worker and its stream end. For a
+   * mesh, the field needs the dimensions of its `MeshData`; for a sheet, (m − 1)·n + m vertices along a side of m
+   * points at refinement n.
    */
   run(
     sessionId: string,

@@ -1,24 +1,24 @@
-// The mesh of a session, as `GetMesh` tells it: what does not change while the tissue moves.
+// The mesh of a session, as `GetMesh` returns it: the data that does not change while the tissue moves.
 
 import type { GetMeshResponse } from "./gen/palpate/v1/view_pb.js";
 import { CALL_TIMEOUT_MS, type Server } from "./server.js";
 
 export interface MeshData {
-  /** Vertices of a frame along x and along y; a frame's last places may stand for no vertex. */
+  /** Number of vertices of a frame along x and along y. The last ones may be unused. */
   places: [number, number];
-  /** x, y, z of each vertex, m. */
+  /** x, y, z of each vertex at rest, m. */
   restM: Float32Array<ArrayBuffer>;
-  /** u, v of each vertex; empty if there are none. */
+  /** u, v of each vertex; empty if the mesh has no texture coordinates. */
   uv: Float32Array<ArrayBuffer>;
-  /** Three vertices each, counter-clockwise from outside. */
+  /** Three vertex indices for each triangle, counterclockwise seen from outside. */
   triangles: Uint32Array<ArrayBuffer>;
-  /** The number of each vertex as forces and samples name it. */
+  /** Index of each vertex in the mesh file, as forces and samples use it. */
   fileVertex: Uint32Array<ArrayBuffer>;
-  /** The usual length of an edge, m. */
+  /** Typical edge length, m. */
   edgeM: number;
 }
 
-/** Parts of an array, one after the other. */
+/** Concatenates the parts of an array. */
 function joined<A extends Float32Array<ArrayBuffer> | Uint32Array<ArrayBuffer>>(parts: number[][], make: (length: number) => A): A {
   const whole = make(parts.reduce((sum, part) => sum + part.length, 0));
   let at = 0;
@@ -29,13 +29,13 @@ function joined<A extends Float32Array<ArrayBuffer> | Uint32Array<ArrayBuffer>>(
   return whole;
 }
 
-/** What is read of a part. */
+/** The fields of a part that are used. */
 type Part = Pick<
   GetMeshResponse,
   "restPositionM" | "textureCoordinates" | "triangles" | "fileVertex" | "verticesX" | "verticesY" | "vertexSpacingM"
 >;
 
-/** Puts the parts together. Throws if a triangle has a vertex that is not there. */
+/** Combines the parts to a mesh. Throws if a triangle refers to a vertex that does not exist. */
 export function meshOf(parts: Part[]): MeshData {
   const floats = (length: number) => new Float32Array(length);
   const whole = (length: number) => new Uint32Array(length);
@@ -47,7 +47,7 @@ export function meshOf(parts: Part[]): MeshData {
   const first = parts[0];
   const isWhole = Number.isInteger(count) && triangles.length % 3 === 0 && triangles.every((vertex) => vertex < count);
   if (!first || !isWhole || !restM.every(Number.isFinite)) throw new RangeError("the server's mesh is not whole");
-  // The last places of a frame may stand for no vertex: less than a row.
+  // The last vertices of a frame may be unused, but fewer than a row.
   const places = first.verticesX * first.verticesY;
   if (places < count || places >= count + Math.max(first.verticesX, first.verticesY)) {
     throw new RangeError(`a mesh of ${count} vertices has no frames of ${first.verticesX} × ${first.verticesY}`);
@@ -62,10 +62,13 @@ export function meshOf(parts: Part[]): MeshData {
   };
 }
 
-/** Numbers of a mesh, at most: of one and a half million vertices. Above that browsers get slow on any machine. */
+/**
+ * Maximum number of values of a mesh: those of one and a half million vertices. With more, browsers are slow on any
+ * machine.
+ */
 const MAX_NUMBERS = 12 * 1_500_000;
 
-/** Asks for the mesh of a session. */
+/** Requests the mesh of a session. */
 export async function fetchMesh(server: Server, sessionId: string): Promise<MeshData> {
   const parts: GetMeshResponse[] = [];
   let numbers = 0;

@@ -1,5 +1,5 @@
-// See and touch tissue from a browser. `Server` has the calls of the protocol (palpate/v1); `fetchMesh` and `Frames` tell how the
-// surface lies, `watchSamples` what the tools feel, and a `Tool` touches.
+// See and touch tissue from a browser. `Server` provides the calls of the protocol (palpate/v1); `fetchMesh` and
+// `Frames` provide the surface, `watchSamples` what the tools feel, and a `Tool` touches.
 
 export { Field, type Rectangle } from "./field.js";
 export { Frames, type FrameTold } from "./frames.js";

@@ -1,18 +1,19 @@
-// A worker that receives frames and returns credit, however long the page takes to draw. The page gets the newest state
-// in one buffer that is passed back and forth: while the page has it, changes accumulate here, and nothing queues.
+// A worker that receives frames and acknowledges them, however long the page takes to draw. The page gets the newest
+// state in one buffer that is passed back and forth: while the page has it, changes accumulate here, and nothing
+// queues.
 
 import { Field, type Rectangle } from "./field.js";
 import { Encoding, type WatchFramesResponse } from "./gen/palpate/v1/view_pb.js";
 import { type Failure, keepOpen, CALL_TIMEOUT_MS, Server } from "./server.js";
 
-/** Frames in flight: a round trip of 60 ms at 60 frames a second. */
+/** Maximum number of unacknowledged frames: enough for a round trip of 60 ms at 60 frames a second. */
 const IN_FLIGHT = 4;
 
-/** A part of a frame, and a patch of it, cost as much as so many values; a frame has at most so many parts and patches. */
+/** Each part of a frame and each patch counts as this many values. A frame has at most `MAX_PARTS` parts and patches. */
 const PART_VALUES = 64;
 const MAX_PARTS = 1 << 16;
 
-/** The stream to receive: the page's first message. Each later message returns the buffer. */
+/** The page's first message: the stream to receive. Each later message returns the buffer. */
 export interface Order {
   url: string;
   token: string;
@@ -24,11 +25,11 @@ export interface Order {
 /** The newest frame, and the changes since the last message. */
 export interface News {
   changed: Rectangle;
-  /** Displacements of the rectangle, at the beginning of the buffer. */
+  /** Displacements of the changed rectangle, at the beginning of the buffer. */
   values: Float32Array<ArrayBuffer>;
   step: bigint;
   timeS: number;
-  /** Frames received, frames that the server skipped in all of this stream, and bytes. */
+  /** Frames that were received, frames that the server skipped since this worker began, and bytes. */
   taken: number;
   skipped: bigint;
   bytes: number;
@@ -50,7 +51,7 @@ class Intake {
   private buffer: Float32Array<ArrayBuffer> | undefined;
   private taken = 0;
   private last: WatchFramesResponse | undefined;
-  /** Frames skipped by the server: in the earlier streams, and in total. */
+  /** Number of frames that the server skipped: in the earlier streams, and in total. */
   private skipped = { before: 0n, now: 0n };
 
   private readonly server: Server;
@@ -78,7 +79,7 @@ class Intake {
     for await (const part of this.server.views.watchFrames(request, { signal })) {
       alive();
       parts.push(part);
-      // A frame has each vertex once.
+      // A frame contains each vertex only once.
       values += PART_VALUES + part.patches.reduce((sum, patch) => sum + PART_VALUES + patch.displacement.byteLength / 2, 0);
       if (values > 2 * this.field.displacementM.length + MAX_PARTS * PART_VALUES) throw new RangeError("a frame has no end");
       if (!part.last) continue;
@@ -93,7 +94,7 @@ class Intake {
     }
   }
 
-  /** The page has finished with the buffer. */
+  /** The page returns the buffer. */
   reuse(buffer: Float32Array<ArrayBuffer>): void {
     this.buffer = buffer;
     this.tell();
@@ -112,7 +113,7 @@ class Intake {
   }
 }
 
-/** Acknowledges frames, one message at a time, always the newest. */
+/** Acknowledges frames, one call at a time, always the newest frame. */
 class Credit {
   private due: [string, bigint] | undefined;
   private underWay = false;
@@ -135,7 +136,7 @@ class Credit {
       try {
         await this.server.views.acknowledgeFrames({ viewerId, frameId }, { signal: this.signal, timeoutMs: CALL_TIMEOUT_MS });
       } catch {
-        // The stream fails as well and reports it; or the next acknowledgement covers this one.
+        // If the connection failed, the stream reports it; otherwise, the next acknowledgement covers this one.
       }
     }
     this.underWay = false;

@@ -1,38 +1,38 @@
-// The poses of a tool in a datagram: the newest, and by their differences those before it, which may have been lost.
+// The poses of a tool in a datagram: the newest, and the differences to those before it, which may have been lost.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { EarlierPoseSchema, PoseSchema, ToolPosesSchema } from "./gen/palpate/v1/haptic_pb.js";
 import type { Vec3 } from "./vector.js";
 
-/** Poses before the newest. */
+/** Maximum number of poses before the newest. */
 const MAX_EARLIER = 8;
-/** What is farther away has no place in the message, nm. */
+/** Largest difference that fits into the message, nm. */
 const FAR_NM = 1e10;
 
-/** Where the tip is led. */
+/** Target of the tip. */
 export interface Lead {
   positionM: Vec3;
   radiusM: number;
 }
 
-/** One pose that was sent. */
+/** A pose that was sent. */
 interface Posed {
   sequence: bigint;
   timeNs: bigint;
   positionM: Vec3;
 }
 
-/** A pose as a message. */
+/** Converts a pose to a message. */
 export function poseOf({ positionM: [x, y, z], radiusM }: Lead): MessageInitShape<typeof PoseSchema> {
   return { positionM: { x, y, z }, tip: { radiusM } };
 }
 
-/** The newest poses of one tool, with one tip. */
+/** The newest poses of a tool with a single tip. */
 export class Poses {
   /** Newest first. */
   private recent: Posed[] = [];
 
-  /** The sequence of the next. */
+  /** Sequence of the next pose. */
   private sequence: bigint;
 
   constructor(
@@ -42,12 +42,12 @@ export class Poses {
     this.sequence = first;
   }
 
-  /** Whether a sequence is of one of these. */
+  /** Returns whether a sequence belongs to one of these poses. */
   has(sequence: bigint): boolean {
     return sequence >= this.first && sequence < this.sequence;
   }
 
-  /** Adds a pose at the client's time `timeNs`, which rises. */
+  /** Adds a pose at the client's time `timeNs`, which must increase. Returns the message. */
   message(lead: Lead, timeNs: bigint): MessageInitShape<typeof ToolPosesSchema> {
     const newest = { sequence: this.sequence, timeNs, positionM: lead.positionM };
     const earlier = this.recent.flatMap((before) => earlierPose(newest, before));
@@ -57,7 +57,7 @@ export class Poses {
   }
 }
 
-/** By how much `before` differs from the newest; nothing if it can't be told. */
+/** Returns how `before` differs from the newest pose; empty if the difference can't be encoded. */
 function earlierPose(newest: Posed, before: Posed): MessageInitShape<typeof EarlierPoseSchema>[] {
   const awayNm = newest.positionM.map((v, i) => Math.round((v - before.positionM[i]!) * 1e9));
   if (!awayNm.every((nm) => Math.abs(nm) < FAR_NM)) return [];

@@ -4,8 +4,8 @@ import type { Sample } from "./gen/palpate/v1/haptic_pb.js";
 import { type Failure, keepOpen, type Server } from "./server.js";
 
 /**
- * Tells the samples of all tools of a session, every so many steps, until `signal` aborts. Connects again when that breaks. Samples
- * of a server that does not have the session any more are left out.
+ * Calls `onSample` with the samples of all tools of a session, at an interval in steps, until `signal` aborts.
+ * Reconnects after failures. Ignores samples from a server that no longer owns the session.
  */
 export function watchSamples(
   server: Server,

@@ -8,19 +8,22 @@ import { HapticService } from "./gen/palpate/v1/haptic_pb.js";
 import { type Session, SessionService } from "./gen/palpate/v1/session_pb.js";
 import { ViewService } from "./gen/palpate/v1/view_pb.js";
 
-/** A call is sent on this often, one server after the other. */
+/** Maximum number of times that a call is forwarded from one server to the next. */
 const MAX_HOPS = 8;
 
-/** Bytes of a message, at most: no honest server sends a longer one. */
+/** Maximum size of a message, bytes. A correct server sends no longer ones. */
 const MAX_MESSAGE_BYTES = 4 << 20;
 
-/** The lengths of the messages in a body, each after a byte of flags. They are kept until they are whole. */
+/**
+ * Checks the lengths of the messages in a response body. Each length comes after a byte of flags, and may be split
+ * between chunks.
+ */
 class Lengths {
   private readonly head = new DataView(new ArrayBuffer(5));
   private filled = 0;
   private left = 0;
 
-  /** Throws where a message begins that is too long. */
+  /** Checks the next bytes. Throws where a message begins that is too long. */
   pass(chunk: Uint8Array): void {
     for (let at = 0; at < chunk.length; ) {
       if (this.left > 0) {
@@ -38,39 +41,39 @@ class Lengths {
   }
 }
 
-/** Where the calls for a session go. */
+/** Where the calls for a session are sent. */
 interface Way {
   url: string;
-  /** Other servers of the fleet, asked in turn when that one can't be reached. */
+  /** Other servers of the fleet, which are tried in turn if this one can't be reached. */
   others: string[];
 }
 
 /**
- * A server, and the calls of its services. In a fleet, calls for a session that another server has go there, if that server lets
- * pages of this origin call it (`origins` of its configuration); if not, they fail as they were refused: `elsewhere` tells where
- * the session is.
+ * A server, and the calls of its services. In a fleet, calls for a session of another server are sent there if that
+ * server allows pages of this origin to call it (`origins` in its configuration). Otherwise they fail with the
+ * original refusal, and `elsewhere` returns where the session is.
  *
- * A browser speaks HTTP/1.1 to a port without TLS, with at most six connections for all its windows of one server. A window uses
- * two streams (frames and samples), two batches of commands, an acknowledgement and a status request. So frames can't have a
- * connection of their own, and a hidden window should close its streams.
+ * To a port without TLS, a browser speaks HTTP/1.1, with at most six connections to a server for all windows. A
+ * window uses two streams (frames and samples), two batches of commands, an acknowledgement and a status request. So
+ * frames can't have a connection of their own, and a hidden window should close its streams.
  */
 export class Server {
-  /** Bytes received in response bodies, without HTTP headers. */
+  /** Number of bytes received in response bodies, without HTTP headers. */
   readonly received = { bytes: 0 };
   readonly sessions: Client<typeof SessionService>;
   readonly haptics: Client<typeof HapticService>;
   readonly views: Client<typeof ViewService>;
-  /** Whether calls go to the server that has the session. */
+  /** Whether calls are sent to the server that owns the session. */
   follows = true;
-  /** Another server has a session. */
+  /** Called when another server owns a session. */
   onElsewhere: (endpoint: string, sessionId: string) => void = () => {};
   private isLeft = false;
-  /** By session; of those that this server has itself, none. */
+  /** By session; sessions that this server owns have no entry. */
   private readonly ways = new Map<string, Way>();
-  /** Where frames come from, and so their acknowledgements go. */
+  /** The server that sends frames; their acknowledgements are sent to it too. */
   private viewing = "";
 
-  /** `url`: scheme, host and port. `token`: who calls; empty where the server knows nobody. */
+  /** `url`: scheme, host and port. `token`: identifies the caller; empty if the server knows no callers. */
   constructor(
     readonly url: string,
     public token = "",
@@ -95,7 +98,7 @@ export class Server {
           return answer;
         } catch (error) {
           const isSentOn = this.note(error, base, sessionId);
-          // The refusal says more than that a browser does not call that server.
+          // The refusal is more helpful than the message that the browser can't call that server.
           if (!isSentOn || hops >= MAX_HOPS) throw refusal !== undefined && isUnreached(error) ? refusal : error;
           refusal = error;
           base = this.urlOf(sessionId);
@@ -109,12 +112,12 @@ export class Server {
     this.views = createClient(ViewService, transport);
   }
 
-  /** The URL of the server that has a session, as far as this one knows. */
+  /** Returns the URL of the server that owns a session, as far as it is known here. */
   urlOf(sessionId: string): string {
     return this.ways.get(sessionId)?.url ?? this.url;
   }
 
-  /** Keeps what an answer tells of the fleet. */
+  /** Remembers what a response says about the fleet. */
   private learn(answer: object, base: string): void {
     const session = "session" in answer ? (answer.session as Session | undefined) : undefined;
     if (!session?.ownership) return;
@@ -123,7 +126,10 @@ export class Server {
     this.ways.set(session.sessionId, { url: known, others: [...new Set([this.url, endpoint, ...others])] });
   }
 
-  /** Keeps what a failure at `base` tells of a session. Returns whether another server has it, and may be called. */
+  /**
+   * Remembers what a failure at `base` says about a session. Returns whether another server owns it, and may be
+   * called.
+   */
   private note(error: unknown, base: string, sessionId: string): boolean {
     const endpoint = elsewhere(error);
     const others = this.ways.get(sessionId)?.others ?? [this.url];
@@ -133,7 +139,7 @@ export class Server {
       if (may) this.ways.set(sessionId, { url: endpoint, others });
       return may;
     }
-    // The next call asks another; unless this one has been found wanting before.
+    // The next call tries another server, unless the failure came from a server that is no longer used.
     const isInVain = isUnreached(error) || reasonOf(error) === "FENCED";
     if (this.follows && isInVain && this.ways.has(sessionId) && this.urlOf(sessionId) === base) {
       const url = others[(others.indexOf(base) + 1) % others.length] ?? this.url;
@@ -142,7 +148,7 @@ export class Server {
     return false;
   }
 
-  /** Passes a stream on, and notes how it fails. */
+  /** Passes a stream on, and remembers what its failure says. */
   private async *noting<T>(messages: AsyncIterable<T>, base: string, sessionId: string): AsyncGenerator<T> {
     try {
       yield* messages;
@@ -152,7 +158,10 @@ export class Server {
     }
   }
 
-  /** A token never goes in the clear, and nobody goes from TLS to none. */
+  /**
+   * Returns whether a server may be called: a token is never sent unencrypted, and a connection with TLS is not
+   * replaced by one without.
+   */
   private mayCall(endpoint: string): boolean {
     if (!URL.canParse(endpoint)) return false;
     const { protocol, hostname } = new URL(endpoint);
@@ -161,12 +170,12 @@ export class Server {
     return protocol === "http:" && new URL(this.url).protocol === "http:" && (isHere || !this.token);
   }
 
-  /** The window is being left: what is sent from now on still arrives. */
+  /** To be called when the window is being closed: requests from now on still arrive. */
   leave(): void {
     this.isLeft = true;
   }
 
-  /** Counts the bytes that pass. */
+  /** Fetches, and counts the received bytes. */
   private async fetch(input: RequestInfo | URL, init?: RequestInit): Promise<Response> {
     const answer = await fetch(input, this.isLeft ? { ...init, keepalive: true } : init);
     if (!answer.body) return answer;
@@ -184,23 +193,23 @@ export class Server {
 }
 
 /**
- * Timeout of every call that is not a stream: a server that takes longer is gone. It is long, because a busy window
- * sees answers late; a server that is not running refuses at once.
+ * Timeout of every call that is not a stream. It is long, because a busy window sees responses late; a server that is
+ * not running refuses at once.
  */
 export const CALL_TIMEOUT_MS = 20_000;
 
-/** The server's reason code (docs/protocol.md, "Errors"); empty if it gave none. */
+/** Returns the server's reason code (docs/protocol.md, "Errors"); empty if it gave none. */
 export function reasonOf(error: unknown): string {
   return ConnectError.from(error).findDetails(ErrorInfoSchema)[0]?.reason ?? "";
 }
 
-/** The URL of the server of the fleet that has the session, if a call was refused because another server was called. */
+/** If a call was refused because another server of the fleet owns the session, returns the URL of that server. */
 export function elsewhere(error: unknown): string | undefined {
   const info = ConnectError.from(error).findDetails(ErrorInfoSchema)[0];
   return info?.reason === "ELSEWHERE" ? info.metadata.endpoint : undefined;
 }
 
-/** Whether a call has not come to a server, or its answer not back. */
+/** Returns whether a call did not reach a server, or its response did not arrive. */
 export function isUnreached(error: unknown): boolean {
   return reasonOf(error) === "" && ConnectError.from(error).code !== Code.Canceled;
 }
@@ -214,16 +223,16 @@ async function* only<T>(message: T): AsyncGenerator<T> {
   yield await Promise.resolve(message);
 }
 
-/** A field of a message; empty if it has none of that name. */
+/** Returns a text field of a message; empty if it has no such field. */
 function textOf(message: MessageShape<DescMessage>, key: string): string {
   const value: unknown = Object.entries(message).find(([name]) => name === key)?.[1];
   return typeof value === "string" ? value : "";
 }
 
-/** What browsers say of a network that fails, each in its own words. */
+/** The words with which different browsers report a network failure. */
 const NETWORK_FAILED = /fetch|network|load failed|input stream|connection/i;
 
-/** The message for an error, without a full stop. */
+/** Returns the message of an error, without a full stop. */
 export function describe(error: unknown): string {
   const { rawMessage, cause, code } = ConnectError.from(error);
   if (cause instanceof TypeError && NETWORK_FAILED.test(rawMessage)) return "the server can't be reached";
@@ -231,12 +240,12 @@ export function describe(error: unknown): string {
   return rawMessage;
 }
 
-/** Whether the session is over for good. */
+/** Returns whether the session no longer exists. */
 export function isGone(error: unknown): boolean {
   return ["UNKNOWN_SESSION", "SESSION_DELETED"].includes(reasonOf(error));
 }
 
-/** Whether the same call may be answered later: a refusal with any other reason would be repeated. */
+/** Returns whether the same call may succeed later: with any other reason it would be refused again. */
 export function isPassing(error: unknown): boolean {
   return ["", "SHUTTING_DOWN", "TOO_MANY", "FENCED", "ELSEWHERE"].includes(reasonOf(error));
 }
@@ -259,21 +268,26 @@ export function sleep(ms: number, signal?: AbortSignal): Promise<void> {
   });
 }
 
-/** The wait grows with each failure, from 0.25 s to 30 s, with some jitter so that not all clients return at once. */
+/**
+ * The wait increases with each failure, from 0.25 s to 30 s, with some jitter so that not all clients return at once.
+ */
 export function backoffMs(failures: number): number {
   return Math.min(30_000, 250 * 2 ** Math.min(failures, 7)) * (0.75 + 0.5 * Math.random());
 }
 
 /** A stream's failure, in a form that a worker can send. */
 export interface Failure {
-  /** Whether the session is over for good. */
+  /** Whether the session no longer exists. */
   isGone: boolean;
   /** The server's reason code; empty if it gave none. */
   reason: string;
   text: string;
 }
 
-/** Keeps a stream open until it is aborted or the session is gone. `onFailure` gets the failure and the wait. */
+/**
+ * Keeps a stream open until it is aborted or the session no longer exists. Calls `onFailure` with each failure and
+ * the wait.
+ */
 export async function keepOpen(
   read: (signal: AbortSignal, alive: () => void) => Promise<void>,
   signal: AbortSignal,
@@ -286,7 +300,7 @@ export async function keepOpen(
       throw new ConnectError("the server ended the stream", Code.Unavailable);
     } catch (error) {
       if (signal.aborted) return;
-      // A session that has moved goes on at once.
+      // If a session has moved, reconnects at once.
       const waitMs = elsewhere(error) !== undefined && failures === 0 ? 0 : backoffMs(failures);
       failures += 1;
       if (waitMs === 0) continue;

@@ -1,7 +1,8 @@
 // A tool of a session, held by a lease.
 //
-// Commands go by calls. Poses of a tip go by datagram while datagrams get through (datagrams.ts); they have times, by which
-// the server plays them. Poses that go by calls have none, and act when they come: a page can't promise one every 50 ms.
+// Commands are sent by calls. Poses of a tip are sent by datagram while datagrams get through (datagrams.ts). These
+// have times, by which the server plays them. Poses in calls have no times and take effect on arrival, because a page
+// can't guarantee one every 50 ms.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import { Datagrams } from "./datagrams.js";
@@ -11,38 +12,44 @@ import { backoffMs, describe, isGone, isUnreached, CALL_TIMEOUT_MS, reasonOf, ty
 
 type Command = MessageInitShape<typeof CommandSchema>;
 
-/** What a tool does: a force or a position, as the protocol has them. */
+/** Action of a tool: a force or a position, as in the protocol. */
 export type Action = NonNullable<Command["action"]>;
 
-/** What a tool is to do now: lead its tip, or another action. `isMoving`: it will be another in a moment, unasked. */
+/**
+ * What a tool should do now: move its tip, or another action. `isMoving`: this changes with time, without a call of
+ * `changed`.
+ */
 export type Wanted = ({ lead: Lead } | { action: Action }) & { isMoving?: boolean };
 
-/** In the tissue's own time, without a newer command: a page that vanishes does not keep pressing. */
+/** In the tissue's time, without a newer command: a page that vanishes does not keep pressing. */
 const TIME_TO_LIVE_S = 2;
-/** Interval between identical commands: well within the time to live. */
+/** Interval between identical commands, well below the time to live. */
 const REPEAT_MS = 100;
 /** Interval between checks for something to send. */
 const TICK_MS = 15;
 const LEASE_S = 4;
-/** After this time at rest the tool is released. */
+/** A tool at rest is released after this time. */
 const IDLE_MS = 5000;
-/** Between sequences of what goes different ways: datagrams count on from theirs. */
+/** Gap between the sequences of calls and of datagrams: datagrams count on from their own. */
 const APART = 1n << 32n;
-/** Batches in flight: a round trip does not slow the hand down, and connections stay free for other calls. */
+/**
+ * Maximum number of batches in flight. So a round trip does not slow the hand down, and connections stay free for
+ * other calls.
+ */
 const IN_FLIGHT = 2;
 
 export class Tool {
-  /** It was taken or lost. */
+  /** Called when the tool was taken or lost. */
   onChange: () => void = () => {};
   onRefused: (message: string, reason: string) => void = () => {};
-  /** Poses and samples that go by datagram. */
+  /** Poses and samples that are sent by datagram. */
   readonly datagrams: Datagrams;
-  /** Round trip of the last batch minus the time that the server held it, ms. */
+  /** Round trip time of the last batch minus the time for which the server held it, ms. */
   private callMs: number | undefined;
   private leaseId: string | undefined;
   private taking: Promise<boolean> | undefined;
   private sequence = 0n;
-  /** The sequence from which datagrams count, while poses go by them. */
+  /** The sequence from which datagrams count, while poses are sent by datagram. */
   private from: bigint | undefined;
   private wanted: ((nowMs: number) => Wanted) | undefined;
   private released = true;
@@ -50,12 +57,12 @@ export class Tool {
   private underWay = 0;
   private sentMs = 0;
   private touchedMs = 0;
-  /** Batches that found no server, one after the other; and until when none is sent because of that. */
+  /** Number of consecutive batches that reached no server, and the time until which none is sent because of that. */
   private unreached = 0;
   private waitsUntilMs = 0;
   private timer: ReturnType<typeof setInterval> | undefined;
 
-  /** Tool number `tool` of a session; `holder` is the name that others see. Nothing is taken yet. */
+  /** Creates tool number `tool` of a session; others see `holder` as its name. The tool is not taken yet. */
   constructor(
     private readonly server: Server,
     readonly sessionId: string,
@@ -70,7 +77,7 @@ export class Tool {
     };
   }
 
-  /** Round trip of commands minus the time that the server held them, ms. */
+  /** Round trip time of commands minus the time for which the server held them, ms. */
   get networkMs(): number | undefined {
     return this.datagrams.networkMs ?? this.callMs;
   }
@@ -111,7 +118,7 @@ export class Tool {
     }
   }
 
-  /** Touches from now on: takes the tool if need be, and asks `wanted` at each time what it is to do. */
+  /** Begins to touch: takes the tool if needed, and calls `wanted` regularly to learn what the tool should do. */
   async touch(wanted: (nowMs: number) => Wanted): Promise<boolean> {
     this.wanted = wanted;
     this.released = false;
@@ -122,12 +129,12 @@ export class Tool {
     return holds;
   }
 
-  /** Leads the tip of the tool to a place, where it stays until it is told another or to rest. */
+  /** Moves the tip of the tool to a position, where it stays until the next call of `lead` or `rest`. */
   lead(lead: Lead): Promise<boolean> {
     return this.touch(() => ({ lead }));
   }
 
-  /** What it is to do has changed. */
+  /** To be called when the result of `wanted` changes. */
   changed(): void {
     if (this.wanted) this.touchedMs = performance.now();
     this.fresh = true;
@@ -153,7 +160,7 @@ export class Tool {
     try {
       await this.server.haptics.releaseTool({ sessionId, leaseId }, { timeoutMs: CALL_TIMEOUT_MS });
     } catch {
-      // The lease lapses by itself, and the tool's action ends with it.
+      // The lease expires by itself, which ends the tool's action.
     }
   }
 
@@ -165,7 +172,7 @@ export class Tool {
     this.onChange();
   }
 
-  /** Sends what it is to do, if that is due. */
+  /** Sends the action, if that is due. */
   private tick(): void {
     if (!this.leaseId) return;
     const now = performance.now();
@@ -174,7 +181,7 @@ export class Tool {
     if (this.underWay >= IN_FLIGHT || now < this.waitsUntilMs) return;
     const isRest = !wanted && this.released;
     if (isRest && now - this.touchedMs > IDLE_MS) return void this.letGo();
-    // At rest, send just often enough to keep the lease.
+    // At rest, sends just often enough to keep the lease.
     if (!this.fresh && now - this.sentMs < (isRest ? (LEASE_S * 1000) / 4 : REPEAT_MS)) return;
     this.fresh = wanted?.isMoving ?? false;
     this.sentMs = now;
@@ -186,7 +193,7 @@ export class Tool {
   private leadOn(lead: Lead, now: number): void {
     this.from ??= this.sequence += APART;
     this.datagrams.lead({ lead, from: this.from });
-    // They keep the lease.
+    // Datagrams keep the lease.
     this.sentMs = now;
     this.fresh = false;
   }
@@ -214,7 +221,7 @@ export class Tool {
       this.unreached = 0;
       if (sample && commands.length > 0) this.measure(sample, performance.now() - begun);
     } catch (error) {
-      // Two batches may overtake each other: the newer one counts.
+      // Of two batches, the older one may arrive last; the newer one counts.
       if (reasonOf(error) !== "STALE_SEQUENCE" && this.leaseId === leaseId) this.failed(error);
     } finally {
       this.underWay -= 1;
@@ -231,13 +238,14 @@ export class Tool {
 
   private failed(error: unknown): void {
     if (isGone(error)) this.wanted = undefined;
-    // Whoever watches the session says that the server is lost; here it is only not asked ever faster.
+    // Other calls for the session report that the server is lost. Here it is only called less and less often.
     if (isUnreached(error)) {
       this.waitsUntilMs = performance.now() + backoffMs(this.unreached++);
       return;
     }
     if (reasonOf(error) !== "NOT_HOLDER" && !isGone(error)) return this.onRefused(describe(error), reasonOf(error));
-    // The server ended the lease because no command came for too long. A user who still presses takes the tool again.
+    // The server ended the lease because no command arrived for too long. If the user is still pressing, the tool is
+    // taken again.
     this.lost();
     if (this.wanted) void this.take().then((holds) => holds && this.tick());
   }

@@ -1,4 +1,4 @@
-// The messages and services of the protocol, palpate.v1, as generated.
+// The generated messages and services of the protocol, palpate.v1.
 
 export * from "./gen/palpate/v1/geometry_pb.js";
 export * from "./gen/palpate/v1/haptic_pb.js";

@@ -20,7 +20,7 @@ after(async () => {
   await server.stop();
 });
 
-/** Opens an example, and waits until its text fits a pattern. @param {string} address @param {RegExp} pattern */
+/** Opens an example, and waits until its text matches a pattern. @param {string} address @param {RegExp} pattern */
 async function says(address, pattern) {
   const page = await browser.newPage();
   page.setDefaultTimeout(TEST_TIMEOUT_MS);

@@ -1,4 +1,4 @@
-// Calls follow a session from server to server of a fleet. Both servers are imitations, which answer in gRPC-web.
+// Calls follow a session from server to server of a fleet. Both servers are fakes, which answer in gRPC-web.
 
 import assert from "node:assert/strict";
 import { createServer } from "node:http";
@@ -16,7 +16,7 @@ after(() => servers.forEach((server) => (server.closeAllConnections(), server.cl
  * @typedef {(asked: Asked, answer: import("node:http").ServerResponse) => void} Answer
  */
 
-/** A server. @param {Answer} answer */
+/** Starts a server. @param {Answer} answer */
 async function serve(answer) {
   const server = createServer((request, response) => {
     request.resume();
@@ -28,7 +28,7 @@ async function serve(answer) {
   return `http://127.0.0.1:${typeof address === "object" && address ? address.port : 0}`;
 }
 
-/** A field of a protobuf message that has a length. @param {number} number @param {Buffer | string} value */
+/** Encodes a length-delimited field of a protobuf message. @param {number} number @param {Buffer | string} value */
 function field(number, value) {
   const bytes = Buffer.from(value);
   assert(bytes.length < 1 << 14);
@@ -120,7 +120,7 @@ test("samples of a server that had the session before are left out", async () =>
 });
 
 test("a server that is away is told of in words of ours, and asked ever more seldom", async () => {
-  // A port that nobody listens on any more.
+  // A port on which no server listens any more.
   const closed = createServer();
   await /** @type {Promise<void>} */ (new Promise((done) => closed.listen(0, "127.0.0.1", done)));
   const address = closed.address();
@@ -128,7 +128,7 @@ test("a server that is away is told of in words of ours, and asked ever more sel
   const server = new Server(`http://127.0.0.1:${typeof address === "object" && address ? address.port : 0}`);
   const error = await server.sessions.getSession({ sessionId: "s" }).catch((/** @type {unknown} */ error) => error);
   assert.equal(describe(error), "the server can't be reached");
-  // A refusal of the server's is told in its own words.
+  // A refusal is reported with the server's own message.
   const refusing = new Server(await serve((_, answer) => refuse(answer, "TOO_MANY")));
   assert.equal(describe(await refusing.sessions.getSession({}).catch((/** @type {unknown} */ error) => error)), "no");
   for (const [failures, ms] of /** @type {const} */ ([[0, 250], [3, 2000], [20, 30_000]])) {

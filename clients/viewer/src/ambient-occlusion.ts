@@ -1,10 +1,10 @@
-// How open a surface is: the fraction of light from around that reaches each vertex, on its outer and on its inner side.
-// Creases, folds and the inside of a tube are darker than what lies open.
+// Ambient occlusion: the fraction of ambient light that reaches each vertex, on its outer and on its inner side.
+// Creases, folds and the inside of a tube are darker than open areas.
 
-/** Directions that light comes from, and pixels a side of each direction's picture of depths. */
+/** Number of light directions, and width of the depth buffer of each direction in pixels. */
 const DIRECTIONS = 28;
 const SIDE = 112;
-/** A vertex so many pixels behind the foremost surface counts as hidden. */
+/** A vertex that is more than this many pixels behind the foremost surface counts as hidden. */
 const BIAS = 2.2;
 
 export interface AmbientOcclusion {
@@ -12,7 +12,10 @@ export interface AmbientOcclusion {
   inner: Float32Array<ArrayBuffer>;
 }
 
-/** Looks at a surface from each direction in turn. `next` looks from one more; it returns the result after the last. */
+/**
+ * Views a surface from each direction in turn. Each call of `next` processes one direction; the last one returns the
+ * result.
+ */
 export class Looks {
   private readonly outer: Float32Array;
   private readonly inner: Float32Array;
@@ -49,7 +52,7 @@ export class Looks {
   }
 
   next(): AmbientOcclusion | undefined {
-    // A spiral of equal areas on the sphere.
+    // Equal-area spiral on the sphere.
     const z = 1 - (2 * this.done + 1) / DIRECTIONS;
     const angle = this.done * Math.PI * (3 - Math.sqrt(5));
     const flat = Math.sqrt(1 - z * z);
@@ -66,7 +69,7 @@ export class Looks {
   private look(dx: number, dy: number, dz: number): void {
     const { position: p, normal: n, across: q, depths, triangles, pixel } = this;
     const [mx, my, mz] = this.middle;
-    // Two directions across.
+    // Two perpendicular directions.
     const [ux, uy, uz] = Math.abs(dz) < 0.9 ? unit(-dy, dx, 0) : unit(0, -dz, dy);
     const [vx, vy, vz] = [dy * uz - dz * uy, dz * ux - dx * uz, dx * uy - dy * ux];
     for (let i = 0; i < p.length; i += 3) {
@@ -82,7 +85,7 @@ export class Looks {
     for (let i = 0, k = 0; i < p.length; i += 3, k++) {
       const facing = n[i]! * dx + n[i + 1]! * dy + n[i + 2]! * dz;
       const at = Math.min(SIDE - 1, Math.max(0, q[i + 1]! | 0)) * SIDE + Math.min(SIDE - 1, Math.max(0, q[i]! | 0));
-      // The slope of what is seen from the side spans depths within a pixel.
+      // On a surface that is seen from the side, depths vary within a pixel.
       const slack = BIAS + 1.2 / Math.max(Math.abs(facing), 0.25);
       const seen = Math.min(1, Math.max(0, 1 - (depths[at]! - q[i + 2]! - slack) / 2));
       if (facing > 0) {
@@ -95,7 +98,7 @@ export class Looks {
     }
   }
 
-  /** Writes a triangle into the picture of depths. */
+  /** Draws a triangle into the depth buffer. */
   private cover(a: number, b: number, c: number): void {
     const { across: q, depths } = this;
     const ax = q[a]!;

@@ -1,6 +1,6 @@
-// A body as drawn and touched: the surface of any triangle mesh, closed or open. Positions follow the frames; normals are the
-// sums of the triangles' own, by their areas. Only what changed is computed again: vertices are in blocks of neighbours, and
-// so are triangles. The same blocks make a ray quick.
+// A body as drawn and touched: the surface of any triangle mesh, closed or open. Positions follow the frames; normals
+// are area-weighted sums of the triangle normals. Only what changed is recomputed: vertices and triangles are divided
+// into blocks of neighbours. These blocks also speed up ray casts.
 
 import { Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, type Ray, Vector3 } from "three";
 import { Field, type MeshData, type Vec3 } from "palpate";
@@ -9,18 +9,24 @@ import { edgesOf, type Lists, lists, opening, touching } from "./topology";
 import type { Felt } from "./samples";
 import type { Centre, Place, Point, Push, Surface } from "./surface";
 
-/** Vertices of a block: 2 to this power. */
+/** Number of vertices in a block, as a power of 2. */
 const BLOCK = 8;
-/** How long light is looked for without a pause, ms. */
+/** Longest time for which ambient light is computed without a pause, ms. */
 const SLICE_MS = 8;
-/** How much darker a dent is, for each length that a push falls off over. */
+/** How much darker a dent is, per falloff length of a push. */
 const DENT = 0.28;
-/** The server tells the mean force within so many lengths of a push, at least and at most so many edges (crates/tissue/src/interpolate.rs). */
+/**
+ * The server reports the mean force within this many falloff lengths of a push, but at least and at most this many
+ * edge lengths (crates/tissue/src/interpolate.rs).
+ */
 const TOLD_WITHIN = { lengths: 7, least: 1.5, most: 4 };
-/** A texture whose scale differs by more than this from the usual, on more than this part of the triangles, has seams. */
+/**
+ * A texture has seams if its scale differs from the typical one by more than this factor, on more than this fraction
+ * of the triangles.
+ */
 const SEAM = { times: 6, part: 0.001 };
 
-/** Whether a texture lies on the triangles without seams, where neighbours in space are far from each other in the image. */
+/** Returns whether a texture is without seams. At a seam, neighbours in space are far apart in the image. */
 function isSeamless({ uv, restM, triangles }: MeshData): boolean {
   if (uv.length === 0) return false;
   const scales = new Float64Array(triangles.length);
@@ -44,9 +50,9 @@ export class Body implements Surface {
   readonly sizeM: number;
   readonly every = 1;
   readonly isOpen: boolean;
-  /** Whether its texture lies by the file's coordinates; else it is projected from three sides. */
+  /** Whether the texture uses the file's coordinates; otherwise it is projected from three sides. */
   readonly isMapped: boolean;
-  /** Called when light in folds was found, so that another picture is due. */
+  /** Called when ambient light was computed, so that another picture is due. */
   onLight: () => void = () => {};
   private readonly count: number;
   private readonly rest: Float32Array;
@@ -58,11 +64,14 @@ export class Body implements Surface {
   private readonly drawn: Record<"position" | "normal" | "open" | "inner", BufferAttribute>;
   private readonly triangles: Uint32Array<ArrayBuffer>;
   private readonly face: Float32Array;
-  /** The triangles of each vertex; those that have a vertex in each block; and those whose first vertex is in it. */
+  /**
+   * The triangles at each vertex; the triangles with a vertex in each block; and the triangles whose first vertex is
+   * in each block.
+   */
   private readonly around: Lists;
   private readonly touching: Lists;
   private readonly owned: Lists;
-  /** Of each block: a ball around its own triangles as they are now. */
+  /** For each block, a bounding sphere of its own triangles in their present positions. */
   private readonly balls: Float32Array;
   private readonly half = new Float64Array(3);
   private readonly blocks: number;
@@ -73,7 +82,7 @@ export class Body implements Surface {
   private readonly found = new Vector3();
   private readonly known: Push & { key: string } = { key: "", sum: 1, share: 1 };
 
-  /** A push falls off over `lengthM`. `points` mass points carry the mesh: fewer than vertices if it was decimated. */
+  /** A push falls off over `lengthM`. The mesh has `points` mass points: fewer than vertices if it was decimated. */
   constructor(
     private readonly data: MeshData,
     private readonly lengthM: number,
@@ -95,7 +104,7 @@ export class Body implements Surface {
     this.around = lists(count, triangles, (i) => Math.floor(i / 3));
     this.owned = lists(this.blocks, Array.from({ length: triangles.length / 3 }, (_, t) => triangles[3 * t]! >> BLOCK), (t) => t);
     this.touching = touching(triangles, this.blocks, BLOCK);
-    // A vertex that no triangle has may be anywhere.
+    // A vertex that no triangle uses may be anywhere.
     for (const vertex of triangles) this.box.expandByPoint(this.found.fromArray(restM, 3 * vertex));
     this.sizeM = this.box.getSize(this.found).length();
     const dynamic = (values: Float32Array, size: number) => new BufferAttribute(values, size).setUsage(DynamicDrawUsage);
@@ -125,7 +134,7 @@ export class Body implements Surface {
     return false;
   }
 
-  /** Looks for light from each direction, with pauses, so that the page goes on meanwhile. */
+  /** Computes the light from each direction, with pauses so that the page stays responsive. */
   private findLight(): void {
     const looks = new Looks(this.rest, this.restNormal, this.triangles);
     const go = (): void => {
@@ -141,7 +150,7 @@ export class Body implements Surface {
       } while (performance.now() - begun < SLICE_MS);
       this.lighting = setTimeout(go);
     };
-    // A small mesh has its light in its first picture.
+    // The light of a small mesh is ready for its first picture.
     go();
   }
 
@@ -175,7 +184,7 @@ export class Body implements Surface {
     return true;
   }
 
-  /** Computes normals of all that moved, and of what is around it. Returns the blocks of these. */
+  /** Recomputes the normals of everything that moved, and of its neighbourhood. Returns the affected blocks. */
   private turn(moved: Uint8Array): Uint8Array {
     const { position: p, triangles, face, touching } = this;
     const turned = new Uint8Array(this.blocks);
@@ -196,7 +205,7 @@ export class Body implements Surface {
         const fx = p[c]! - p[a]!;
         const fy = p[c + 1]! - p[a + 1]!;
         const fz = p[c + 2]! - p[a + 2]!;
-        // Twice the area long.
+        // Its length is twice the area.
         face[t] = ey * fz - ez * fy;
         face[t + 1] = ez * fx - ex * fz;
         face[t + 2] = ex * fy - ey * fx;
@@ -233,7 +242,7 @@ export class Body implements Surface {
     return turned;
   }
 
-  /** How much light reaches vertices: what it was at rest, and less in a dent. */
+  /** Updates how much light reaches vertices: the value at rest, and less in a dent. */
   private shade(blocks: Uint8Array): void {
     const { light, restNormal: n, rest, position: p, open, inner, count } = this;
     if (!light) return;
@@ -249,7 +258,7 @@ export class Body implements Surface {
     }
   }
 
-  /** Finds a ball around a block's own triangles. */
+  /** Computes the bounding sphere of a block's own triangles. */
   private surround(block: number): void {
     const { position: p, triangles, owned, balls, half } = this;
     const [first, last] = [owned.start[block]!, owned.start[block + 1]!];
@@ -275,7 +284,7 @@ export class Body implements Surface {
     balls[4 * block + 3] = Math.sqrt(half[0]! ** 2 + half[1]! ** 2 + half[2]! ** 2) + 1e-6 * this.sizeM;
   }
 
-  /** Asks for blocks of attributes to be sent to the graphics processor. */
+  /** Marks blocks of attributes for upload to the graphics processor. */
   private send(blocks: Uint8Array, names: (keyof Body["drawn"])[]): void {
     for (let from = 0; from < this.blocks; from++) {
       if (!blocks[from]) continue;
@@ -305,8 +314,8 @@ export class Body implements Surface {
   }
 
   /**
-   * The first triangle that a ray meets, of length-1 direction `d` from `o`, within `mostM`: its number and the weights of its
-   * vertices; undefined if there is none.
+   * Returns the first triangle that a ray from `o` in the unit direction `d` meets within `mostM`: its index and
+   * barycentric coordinates. Undefined if there is none.
    */
   private meet(o: Vector3, d: Vector3, mostM: number): { triangle: number; weights: Vec3; atM: number } | undefined {
     const { position: p, triangles, owned, balls } = this;
@@ -338,7 +347,7 @@ export class Body implements Surface {
         const fx = p[c]! - ax;
         const fy = p[c + 1]! - ay;
         const fz = p[c + 2]! - az;
-        // After Möller and Trumbore.
+        // Möller–Trumbore algorithm.
         const qx = dy * fz - dz * fy;
         const qy = dz * fx - dx * fz;
         const qz = dx * fy - dy * fx;
@@ -365,7 +374,7 @@ export class Body implements Surface {
     return triangle < 0 ? undefined : { triangle, weights: [1 - wb - wc, wb, wc], atM: best };
   }
 
-  /** Three numbers of each vertex of a triangle, by the weights of a place. */
+  /** Interpolates a vertex attribute of three numbers in a triangle. */
   private mix(values: Float32Array, triangle: number, weights: Vec3): Vec3 {
     const mixed: Vec3 = [0, 0, 0];
     for (let corner = 0; corner < 3; corner++) {
@@ -375,7 +384,7 @@ export class Body implements Surface {
     return mixed;
   }
 
-  /** The place of a triangle, seen along `along`: it is touched from the side that is seen. */
+  /** Returns a place on a triangle, seen in the direction `along`: it is touched from the visible side. */
   private place(triangle: number, weights: Vec3, along: Vector3): Place {
     const t = 3 * triangle;
     const isOuter = this.face[t]! * along.x + this.face[t + 1]! * along.y + this.face[t + 2]! * along.z <= 0;
@@ -389,7 +398,7 @@ export class Body implements Surface {
     return hit && this.place(hit.triangle, hit.weights, ray.direction);
   }
 
-  /** The place of a vertex, on its outer side or on its inner. */
+  /** Returns the place at a vertex, on its outer or inner side. */
   private atVertex(vertex: number, isOuter: boolean): Place {
     const [i, triangle] = [3 * vertex, this.around.of[this.around.start[vertex]!]];
     const side = isOuter ? 1 : -1;
@@ -400,7 +409,7 @@ export class Body implements Surface {
     return { restM, outward, triangle: triangle ?? 0, weights: weights as Vec3 };
   }
 
-  /** The vertex next to a point as the tissue is now. */
+  /** Returns the vertex nearest to a point, in the present shape of the tissue. */
   private vertexNear({ x, y, z }: Vector3): number {
     const p = this.position;
     let best = Infinity;
@@ -422,7 +431,7 @@ export class Body implements Surface {
     const n = new Vector3(...place.outward);
     const across = way.clone().addScaledVector(n, -way.dot(n));
     const high = 1.5 * way.length();
-    // From above the surface down to it, as it is now.
+    // From above the present surface down to it.
     const from = new Vector3(...place.restM).add(this.displacementAt(place)).add(across).addScaledVector(n, high);
     const hit = this.meet(from, n.negate(), 3 * high);
     if (hit) return this.place(hit.triangle, hit.weights, n);
@@ -448,7 +457,7 @@ export class Body implements Surface {
     const index = vertex === undefined ? undefined : this.byFile.get(vertex);
     if (index === undefined) return undefined;
     const [nx, ny, nz] = [this.restNormal[3 * index]!, this.restNormal[3 * index + 1]!, this.restNormal[3 * index + 2]!];
-    // A closed body is touched from outside; an open one from where the tool pushes.
+    // A closed body is touched from outside, an open one from the side from which the tool pushes.
     return this.atVertex(index, isOuter ?? (!this.isOpen || x * nx + y * ny + z * nz <= 0));
   }
 
@@ -482,12 +491,12 @@ export class Body implements Surface {
       told += weight * taper;
       squares += weight * weight * taper;
     }
-    // As many mass points as there are of vertices, and one at least carries it.
+    // In proportion to the vertices, but at least one mass point carries it.
     const whole = Math.max(1, (this.points / this.count) * sum);
     return Object.assign(this.known, { key, sum: whole, share: squares > 0 ? (whole * told) / squares : 1 });
   }
 
-  /** Along the normal as it is now, as far out as vertices around lift the ball. */
+  /** Places the ball along the present normal, as far out as the vertices around lift it. */
   restOn(place: Place, radiusM: number, middleM: Vector3): void {
     const { position: p, balls, count } = this;
     const [x, y, z] = this.mix(p, place.triangle, place.weights);
@@ -520,12 +529,15 @@ export class Body implements Surface {
     return undefined;
   }
 
-  /** Positions at rest, x, y, z of each vertex. */
+  /** x, y, z of each vertex at rest. */
   get restM(): Float32Array {
     return this.rest;
   }
 
-  /** The sum of all triangles' normals, by area, and the middle of an opening, if there is one: where one looks in. */
+  /**
+   * Returns the area-weighted sum of the triangle normals, and the middle of an opening if there is one, through
+   * which the camera can look in.
+   */
   views(): { facing: Vector3; opening: Vector3 | undefined } {
     const facing = new Vector3();
     let all = 0;

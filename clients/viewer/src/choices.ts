@@ -1,4 +1,5 @@
-// The list of what can be opened: the server's scenes, and what it has recorded, live sessions apart.
+// The list of what can be opened: the server's scenes, and recordings, with those of live sessions in a group of
+// their own.
 
 import { type JournalName, lengthText, type Listed, listJournals, whenText } from "./journal";
 import { part } from "./page";
@@ -7,14 +8,14 @@ import { DEFAULT_SCENE, groupOf, GROUPS, inOrder, titleOf } from "./scenes";
 import { backoffMs, isPassing, CALL_TIMEOUT_MS, sessions, sleep } from "./server";
 import { excerpt } from "./text";
 
-/** What somebody chose. */
+/** What the user chose. */
 export type Choice = { kind: "scene"; scene: string } | ({ kind: "live" | "recorded" } & JournalName);
 
-/** So many scenes are listed. */
+/** Maximum number of scenes in the list. */
 const MAX_SCENES = 1000;
-/** So many of each group are listed, the newest. */
+/** Maximum number of entries in each group of recordings; the newest are listed. */
 const MAX_LISTED = 40;
-/** A list this old is asked for again when somebody turns to it. */
+/** A list older than this is requested again when the user opens it. */
 const OLD_MS = 3000;
 
 const keyOf = ({ sessionId, run }: JournalName, kind: "live" | "recorded") => `${kind} ${sessionId} ${run}`;
@@ -26,7 +27,7 @@ export class Choices {
   private readonly recorded = group("Recorded");
   private readonly choices = new Map<HTMLOptionElement, Choice>();
   private marked = { value: "", name: "" };
-  /** The session that the page is in, which is no choice. */
+  /** The session that the page shows, which is not offered. */
   private present = "";
   private askedMs = -Infinity;
 
@@ -42,13 +43,13 @@ export class Choices {
     }
   }
 
-  /** The scene that the page begins with: the usual one, or the first that the server has. */
+  /** Returns the scene that the page begins with: the default, or the first scene of the server. */
   async first(): Promise<string> {
     const { sceneNames } = await sessions.listScenes({}, { timeoutMs: CALL_TIMEOUT_MS });
     return sceneNames.includes(DEFAULT_SCENE) ? DEFAULT_SCENE : (sceneNames[0] ?? DEFAULT_SCENE);
   }
 
-  /** Fills the list, however long it takes the server to be there; not if it tells this caller nothing. */
+  /** Fills the list, however long the server takes to start. Stops if the server refuses this caller. */
   async fill(): Promise<void> {
     for (let failures = 0; ; failures++) {
       try {
@@ -69,7 +70,7 @@ export class Choices {
     await this.ask();
   }
 
-  /** Asks what is recorded. Call when that may have changed. */
+  /** Requests the recordings. Call this when they may have changed. */
   async ask(): Promise<void> {
     this.askedMs = performance.now();
     const listed = await listJournals();
@@ -100,7 +101,7 @@ export class Choices {
     if (isOther && this.askedMs > 0) void this.ask();
   }
 
-  /** The page shows what was recorded. */
+  /** The page shows a recording. */
   markRecorded(journal: JournalName, sceneName: string): void {
     const value = keyOf(journal, "recorded");
     const isOther = value !== this.marked.value;
@@ -109,7 +110,7 @@ export class Choices {
     if (isOther && this.askedMs > 0) void this.ask();
   }
 
-  /** Selects an entry; what the list does not have, such as a file of one's own, joins it. */
+  /** Selects an entry. One that the list does not have, such as the user's own file, is added. */
   private mark(value: string, name: string): void {
     this.marked = { value, name };
     for (const option of [...this.list.options]) if (option.disabled) option.remove();
@@ -121,13 +122,13 @@ export class Choices {
     this.list.value = value;
   }
 
-  /** The entry of a scene that has no picture. */
+  /** Returns the entry of a scene that has no picture. */
   withoutPicture(scene: string): HTMLOptionElement | undefined {
     if (pictureOf(scene)) return undefined;
     return [...this.list.options].find(({ value, disabled }) => value === scene && !disabled);
   }
 
-  /** A scene has got its picture. */
+  /** Updates the picture of a scene. */
   refresh(entry: HTMLOptionElement): void {
     const { selected } = entry;
     const pictured = entryOf(entry.value);

@@ -1,29 +1,35 @@
-// The tissue that the page makes of a mesh of one's own: coefficients that follow from its size, so that an organ of any size
-// and any number of vertices gives way alike under a finger.
+// The tissue that the page makes from an uploaded mesh. The coefficients depend on its size, so that an organ of any
+// size and with any number of vertices feels alike under a finger.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { MeshReport, SceneSchema } from "palpate/v1";
 
-/** A finger's push falls off over this part of the tissue's size (the diagonal of the box around it); 5 mm on a liver. */
+/**
+ * Falloff length of a finger's push, as a fraction of the tissue's size (the diagonal of its bounding box); 5 mm on a
+ * liver.
+ */
 const FINGER = 0.02;
-/** A push of so many newtons dents the tissue by this part of its size: 1 N and nearly 4 mm on a liver. */
+/**
+ * A push of this many newtons makes a dent of the given fraction of the tissue's size: 1 N and nearly 4 mm on a
+ * liver.
+ */
 const PUSH_N = 1;
 const DENT = 0.015;
-/** Of soft tissue. */
+/** Density of soft tissue. */
 const DENSITY_KG_PER_M3 = 1060;
-/** How deep the tissue is that moves along with the surface, of its size: 30 mm in a liver. */
+/** Depth of tissue that moves along with the surface, as a fraction of its size: 30 mm in a liver. */
 const DEPTH = 0.12;
-/** Part of the damping at which nothing swings any more. */
+/** Fraction of critical damping. */
 const DAMPING_RATIO = 0.5;
-/** With more vertices than this the server is asked to compute with so many. Frames show all of them. */
+/** If there are more vertices than this, the server is asked to simulate only so many. Frames show all of them. */
 export const MAX_VERTICES = 12_000;
 
-/** The length over which a push falls off: a finger's, but no less than an edge. */
+/** Returns the falloff length of a push: a finger's, but not less than an edge. */
 export function fingerM(sizeM: number, edgeM: number): number {
   return Math.max(FINGER * sizeM, edgeM) || 1;
 }
 
-/** The diagonal of a report's extent, m. */
+/** Returns the diagonal of the bounding box in a report, m. */
 export function sizeOf({ extent }: MeshReport): number {
   const [a, b] = [extent?.leastM, extent?.mostM];
   return a && b ? Math.hypot(b.x - a.x, b.y - a.y, b.z - a.z) : 0;
@@ -45,7 +51,7 @@ export function sizeOf({ extent }: MeshReport): number {
  */
 export function sceneOf(name: string, meshId: string, report: MeshReport, vertices: number): MessageInitShape<typeof SceneSchema> {
   const sizeM = sizeOf(report) || 1;
-  // Of a decimated mesh edges are longer, with the same area.
+  // The edges of a decimated mesh are longer, with the same total area.
   const edgeM = (report.edgeM || sizeM) * Math.sqrt(report.vertices / vertices);
   const areaM2 = (report.triangles * Math.sqrt(3) * (report.edgeM || sizeM) ** 2) / 4 / vertices;
   const lengthM = fingerM(sizeM, edgeM);

@@ -1,6 +1,6 @@
-// Adapts the effort for a picture to the time available.
+// Adapts the rendering effort to the time available.
 
-/** Efforts, greatest first. The light is the same in all. */
+/** Effort levels, the greatest first. The lighting is the same in all. */
 export const EFFORTS = [
   { pixels: 1, every: 1 },
   { pixels: 0.75, every: 1 },
@@ -9,13 +9,13 @@ export const EFFORTS = [
   { pixels: 0.45, every: 4 },
 ] as const satisfies { pixels: number; every: number }[];
 
-/** Pictures that take longer are late, ms: with a graphics processor, and with software rendering. */
+/** Pictures that take longer than this are late, ms: with a graphics processor, and with software rendering. */
 const LATE_MS = { hardware: 45, software: 40 };
 /** After this much lateness in consecutive pictures, the effort is reduced. */
 const DEBT_MS = 150;
-/** A longer time was not a picture: the window was hidden, or the machine asleep. */
+/** A longer time than this was not spent on a picture: the window was hidden, or the machine asleep. */
 const PAUSE_MS = 5000;
-/** After this time without a late picture a greater effort is tried; twice as long after each failed try. */
+/** After this time without a late picture a greater effort is tried; the time doubles after each failed try. */
 const RETRY_MS = { least: 4000, most: 128_000 };
 
 export class Effort {

@@ -16,13 +16,13 @@ import type { SheetEdge } from "./sheet-edge";
 import { Table } from "./material";
 import type { Surface } from "./surface";
 
-/** Pixels a side of a body's shadow, and the room around it, of its size. */
+/** Width of a body's shadow texture in pixels, and its margin, as a fraction of the body's size. */
 const SIDE = 64;
 const AROUND = 0.6;
-/** How far above the table an open body hangs, of its size: dents reach below it. */
+/** Height of an open body above the table, as a fraction of its size: dents reach below the body. */
 const GAP = 0.12;
 
-/** Height of the table beneath a body, m. */
+/** Returns the height of the table beneath a body, m. */
 function floorOf({ box, isOpen, sizeM }: Surface): number {
   return box.min.z - (isOpen ? GAP * sizeM : 0);
 }
@@ -66,7 +66,7 @@ export class Ground {
   }
 }
 
-/** Beneath a body. */
+/** Table beneath a body. */
 function square(surface: Surface, farM: number): BufferGeometry {
   const { x, y } = surface.box.getCenter(new Vector3());
   const z = floorOf(surface);
@@ -77,7 +77,7 @@ function square(surface: Surface, farM: number): BufferGeometry {
   return geometry;
 }
 
-/** With a hole beneath the tissue: a dent may reach below the table. */
+/** Table with a hole beneath the tissue, because a dent may reach below the table. */
 function holed([width, length]: [number, number], { roundM, heightM }: SheetEdge, farM: number): BufferGeometry {
   const places: number[] = [];
   const corners = [[0, 0], [width, 0], [width, length], [0, length]] as const;
@@ -99,8 +99,8 @@ function holed([width, length]: [number, number], { roundM, heightM }: SheetEdge
 }
 
 /**
- * How dark the table is beneath a body: red where the body is close to it, green where it is above at all. By vertices, each
- * a soft spot: the wider, the higher.
+ * Returns how dark the table is beneath a body: red where the body is close to it, green where the body is anywhere
+ * above it. Each vertex adds a soft spot, which is wider the higher the vertex is.
  */
 function shadowOf(body: Body, half_: Vector2): DataTexture {
   const { restM, box } = body;
@@ -120,7 +120,7 @@ function shadowOf(body: Body, half_: Vector2): DataTexture {
     for (let round = 0; round < rounds; round++) values = blurred(values);
     return values;
   };
-  // Spots closer than a pixel leave no holes.
+  // Spots closer than a pixel leave no gaps.
   const [red, green] = [soft(close, 3), soft(above, 6)];
   const data = new Uint8Array(2 * SIDE * SIDE);
   for (let i = 0; i < SIDE * SIDE; i++) {
@@ -129,13 +129,13 @@ function shadowOf(body: Body, half_: Vector2): DataTexture {
   }
   const texture = new DataTexture(data, SIDE, SIDE, RGFormat);
   texture.minFilter = texture.magFilter = LinearFilter;
-  // Rows of one or two bytes a pixel need no padding.
+  // Rows of one or two bytes per pixel then need no padding.
   texture.unpackAlignment = 1;
   texture.needsUpdate = true;
   return texture;
 }
 
-/** The mean over each pixel and its neighbours. The border stays clear. */
+/** Returns the mean over each pixel and its neighbours. The border stays clear. */
 function blurred(values: Float32Array): Float32Array {
   const result = new Float32Array(values.length);
   for (let y = 1; y + 1 < SIDE; y++) {

@@ -1,8 +1,8 @@
 // The hand: a tool (of the package `palpate`) that is controlled by mouse, finger or keys.
 //
 // A push is the paper's surgical force at the place where the drag began, leaning in the direction of the drag. A
-// stroke moves that place along, leaning in its direction of movement. A pull grasps a mass point and brings it where
-// you drag it. A tip is led at a depth, and glides. A place has a side on which it is touched, and pushes go into the
+// stroke moves that place along, leaning in its direction of movement. A pull grasps a mass point and moves it with
+// the drag. A tip is held at a depth, and glides. A place has a side on which it is touched, and pushes go into the
 // tissue from there.
 
 import { type Action, type Lead, Tool, type Vec3, type Wanted } from "palpate";
@@ -11,20 +11,20 @@ import type { Place, Surface } from "./surface";
 
 export type Mode = "push" | "pull" | "stroke" | "tip";
 
-/** A tip goes down over this time from beside the tissue: so the server knows from which side it comes. */
+/** A tip moves down from beside the tissue in this time, so that the server knows from which side it comes. */
 const SINK_MS = 250;
-/** And what it feels is known here so much later. */
+/** Additional time until what it feels is known here. */
 const SETTLES_MS = 400;
 
-/** The effect of strength 1 on the tissue. */
+/** Effect of strength 1 on the tissue. */
 export interface Reach {
-  /** A push falls off over this length: on a sheet the spacing of its points. */
+  /** Falloff length of a push; on a sheet, the spacing of its points. */
   lengthM: number;
-  /** Force of a push: on a sheet in the middle of the tool, on a body all of it together, N. */
+  /** Force of a push: on a sheet at the centre of the tool, on a body in total, N. */
   mostN: number;
-  /** Force of the strongest push on the point in the middle of the tool, about, N. */
+  /** Approximate force of the strongest push on the point at the centre of the tool, N. */
   pointN: number;
-  /** Length of a drag that leans a push fully, and of a pull by keys, m. */
+  /** Length of a drag that tilts a push fully, and of a pull by keys, m. */
   depthM: number;
 }
 
@@ -61,28 +61,31 @@ export class Hand {
     return this.tool.touches;
   }
 
-  /** The direction out of the tissue where it touches, or touched last. A tip may slip to where there is another. */
+  /**
+   * Direction out of the tissue at the place that it touches or touched last. A tip may slip to a place with another
+   * direction.
+   */
   get outward(): Vec3 | undefined {
     return this.mode === "tip" ? undefined : this.place?.outward;
   }
 
-  /** Whether it touches the outer side of the tissue. It stays on its side, wherever it slips. */
+  /** Whether it touches the outer side of the tissue. It stays on its side wherever it slips. */
   get isOuter(): boolean | undefined {
     return this.place && this.surface().isOuter(this.place);
   }
 
-  /** The depth that the tip is set to, once it has had the time to get there; nothing if it is not led. */
+  /** Target depth of the tip, once it has had the time to get there; undefined if no tip is used. */
   get setM(): number | undefined {
     const hasSunk = performance.now() - this.pressedMs > SINK_MS + SETTLES_MS;
     return this.mode === "tip" && this.tool.touches && hasSunk ? this.strength * this.reach.depthM : undefined;
   }
 
-  /** What forces on the tool are told times: a push on a body is told by all of it. */
+  /** Factor for displayed forces on the tool: for a push on a body, the total force is shown. */
   get share(): number {
     return this.place && ["push", "stroke"].includes(this.mode) ? this.surface().push(this.place, this.reach.lengthM).share : 1;
   }
 
-  /** Begins to touch at `place`; its tissue is at `onSurfaceM` now. */
+  /** Begins to touch at `place`, which is now at `onSurfaceM`. */
   async press(place: Place, onSurfaceM: Vec3): Promise<void> {
     this.place = place;
     this.onSurfaceM = onSurfaceM;
@@ -95,7 +98,7 @@ export class Hand {
   goOn(place: Place): void {
     const [from, to] = [this.place?.restM ?? place.restM, place.restM];
     const way = [to[0] - from[0], to[1] - from[1], to[2] - from[2]] as const;
-    // The earlier lean fades over the length that leans a push fully.
+    // The earlier tilt fades over the length that tilts a push fully.
     const kept = Math.exp(-Math.hypot(...way) / this.reach.depthM);
     this.place = place;
     this.lean([kept * this.leanM[0] + way[0], kept * this.leanM[1] + way[1], kept * this.leanM[2] + way[2]]);
@@ -118,14 +121,14 @@ export class Hand {
     return this.tool.letGo();
   }
 
-  /** What the tool is to do: at the place where it was pressed, or where it has gone on to. */
+  /** Returns what the tool should do: at the place of the press, or where it has moved to. */
   private wanted(pressed: Place, now: number): Wanted {
     const place = this.place ?? pressed;
     if (this.mode === "tip") return { lead: this.tip(place, now), isMoving: now - this.pressedMs < SINK_MS };
     return { action: this.action(place) };
   }
 
-  /** Where the tip is at a place: on its way from beside the tissue, or at its depth. */
+  /** Returns the position of the tip at a place: on its way from beside the tissue, or at its depth. */
   private tip({ restM, outward: n }: Place, now: number): Lead {
     const radiusM = this.reach.lengthM;
     const part = Math.min(1, (now - this.pressedMs) / SINK_MS);
@@ -147,7 +150,10 @@ export class Hand {
     return { case: "force", value };
   }
 
-  /** Into the tissue, plus the direction of the drag across: at 45° when the drag is as long as the reach. */
+  /**
+   * Returns the force: into the tissue, plus a part in the direction of the drag, tilted by 45° when the drag is as
+   * long as the reach.
+   */
   private forceN(strengthN: number, { outward: n }: Place): { x: number; y: number; z: number } {
     const { leanM: lean, reach } = this;
     const out = lean[0] * n[0] + lean[1] * n[1] + lean[2] * n[2];

@@ -14,7 +14,7 @@ export interface Touched {
   reach: Reach;
 }
 
-/** Whether it goes to the places that a drag meets. */
+/** Returns whether the tool moves to the places under the drag. */
 function glides({ mode }: Hand): boolean {
   return mode === "stroke" || mode === "tip";
 }
@@ -23,13 +23,13 @@ function glides({ mode }: Hand): boolean {
 const TURN = 0.08;
 
 export class Input {
-  /** What becomes of the next press on the tissue, in place of a touch. */
+  /** If set, gets the next press on the tissue instead of a touch. */
   onPlace: ((place: Place) => void) | undefined;
-  /** The pointer is over a place, and does not touch; or it is no longer. */
+  /** Called with the place under a pointer that does not touch, and without a place when it leaves. */
   onPoint: (place?: Place) => void = () => {};
   private dragging: number | undefined;
   private fingers = new Set<number>();
-  /** Where the drag began: the place, and where its tissue was. */
+  /** Start of the drag: the place, and its position then. */
   private from: { place: Place; onSurfaceM: Vec3 } | undefined;
   private aim: Place | undefined;
 
@@ -39,7 +39,7 @@ export class Input {
     private readonly latency: Latency,
     private readonly touched: () => Touched | undefined,
   ) {
-    // Before the view's own: what it turns by depends on whether there is tissue.
+    // Runs before the camera controls' handler, whose behaviour depends on whether the press is on the tissue.
     canvas.addEventListener("pointerdown", (event) => this.down(event), { capture: true });
     canvas.addEventListener("pointermove", (event) => this.moved(event));
     for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) {
@@ -61,7 +61,7 @@ export class Input {
   private down(event: PointerEvent): void {
     if (event.pointerType === "touch") this.fingers.add(event.pointerId);
     const { hand } = this.touched() ?? {};
-    // What can't be touched is turned by any drag.
+    // If nothing can be touched, any drag turns the view.
     if (!hand) return this.stage.turnByDrag(true);
     // A second finger turns the view instead.
     if (this.fingers.size > 1) return this.finish();
@@ -159,12 +159,12 @@ export class Input {
     event.preventDefault();
   }
 
-  /** What keys aim at first: the middle of what is seen. */
+  /** Returns the initial target of the keys: the middle of the visible part. */
   private first({ surface }: Touched): Place {
     return (surface.edge ? undefined : this.stage.pickMiddle()) ?? surface.middle();
   }
 
-  /** A way, and out of the tissue besides as far as a pull lifts. */
+  /** Returns a displacement, plus the height of a pull in the direction out of the tissue. */
   private lifted([x, y, z]: Vec3, { outward: n }: Place, { hand, reach }: Touched): Vec3 {
     const up = hand.mode === "pull" ? reach.depthM * hand.strength : 0;
     return [x + up * n[0], y + up * n[1], z + up * n[2]];

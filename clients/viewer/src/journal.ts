@@ -1,4 +1,4 @@
-// What the server has recorded: the journals that it lists, and what is in one, as the page shows it.
+// Recordings of the server: the list of journals, and the contents of one, as the page shows them.
 
 import type { ForceMoment, GetJournalResponse } from "palpate/v1";
 import { CALL_TIMEOUT_MS, sessions } from "./server";
@@ -14,13 +14,13 @@ export interface Listed extends JournalName {
   sceneName: string;
   begun: Date;
   lengthS: number;
-  /** The session goes on. */
+  /** Whether the session is still running. */
   isLive: boolean;
 }
 
 /**
- * The journals that can be played, the newest first. None if the server keeps none, does not know of any, or does not tell
- * this caller: whoever has a link can use it all the same.
+ * Returns the journals that can be played, the newest first. Empty if the server keeps none, does not support them,
+ * or refuses to list them for this caller; a link to a journal can be used nevertheless.
  */
 export async function listJournals(): Promise<Listed[]> {
   try {
@@ -42,13 +42,16 @@ export async function listJournals(): Promise<Listed[]> {
   }
 }
 
-/** The sessions that somebody looks at: one whose pages are closed goes on for a while, and ends by itself. */
+/**
+ * Returns the sessions that have viewers. A session whose pages were closed continues for a while, and ends by
+ * itself.
+ */
 async function lookedAt(): Promise<Set<string>> {
   const { sessions: all } = await sessions.listSessions({}, { timeoutMs: CALL_TIMEOUT_MS });
   return new Set(all.filter(({ streams }) => streams > 0).map(({ sessionId }) => sessionId));
 }
 
-/** What a journal holds, as far as it was on disk when it was asked for. Steps are those that were done. */
+/** Contents of a journal, as far as it was on disk when it was requested. Steps are completed steps. */
 export class Recording implements JournalName {
   readonly sessionId: string;
   readonly run: number;
@@ -59,9 +62,9 @@ export class Recording implements JournalName {
   readonly begin: number;
   readonly end: number;
   readonly forces: ForceMoment[];
-  /** Steps from which playing begins at once. */
+  /** Steps from which playback can start immediately. */
   readonly snapshots: number[];
-  /** Where it is damaged: it ends before that. Empty if it is whole. */
+  /** Where it is damaged; it ends before that. Empty if it is intact. */
   readonly fault: string;
 
   static async of({ sessionId, run }: JournalName): Promise<Recording> {
@@ -91,7 +94,7 @@ export class Recording implements JournalName {
     return this.timeS(this.end);
   }
 
-  /** The step that is so many seconds after another, within the journal. */
+  /** Returns the step that is `seconds` after another, limited to the journal. */
   after(step: number, seconds: number): number {
     return this.clamp(step + Math.round(seconds * this.rateHz));
   }
@@ -101,15 +104,15 @@ export class Recording implements JournalName {
   }
 }
 
-/** A time as film players tell it: minutes, seconds and tenths. */
+/** Formats a time as in video players: minutes, seconds and tenths. */
 export function clockText(seconds: number): string {
-  // A tenth is told once it is over.
+  // A tenth counts once it has passed.
   const tenths = Math.floor(10 * Math.max(seconds, 0) + 1e-6);
   const [minutes, rest] = [Math.floor(tenths / 600), tenths % 600];
   return `${String(minutes).padStart(2, "0")}:${(rest / 10).toFixed(1).padStart(4, "0")}`;
 }
 
-/** When something was recorded: the time if it was today, else also the day. */
+/** Formats the time of a recording: the time of day if it was today, otherwise with the date. */
 export function whenText(begun: Date): string {
   const isToday = begun.toDateString() === new Date().toDateString();
   const time = { hour: "2-digit", minute: "2-digit" } as const;

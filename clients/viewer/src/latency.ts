@@ -1,8 +1,8 @@
-// The latency from a press to its visible pixel, measured in the page on the picture itself.
+// Latency from a press to the visible change of a pixel, measured in the page on the picture itself.
 
 import type { Stage } from "./stage";
 
-/** Least change of a pixel, summed over red, green and blue: above the effect of smoothed edges. */
+/** Minimum change of a pixel, summed over red, green and blue: more than antialiasing causes. */
 const SEEN = 6;
 
 interface Watch {
@@ -18,7 +18,7 @@ export class Latency {
 
   constructor(private readonly stage: Stage) {}
 
-  /** Resolves with the milliseconds from the next press to the change of the pixel at (x, y) of the window. */
+  /** Resolves with the time from the next press to the change of the pixel at (x, y) of the window, ms. */
   next(x: number, y: number): Promise<number> {
     this.stage.hold(true);
     return new Promise((done) => {
@@ -27,7 +27,7 @@ export class Latency {
     });
   }
 
-  /** Records a press, at the time that the browser gives. */
+  /** Records a press, at the time that the browser reports. */
   pressed(eventMs: number): void {
     if (this.watch && this.watch.pressedMs === undefined) this.watch.pressedMs = eventMs;
   }

@@ -1,4 +1,4 @@
-// Lumps: the stiff places of a scene, shown to an instructor; and lumps that one puts into a mesh of one's own.
+// Lumps: the stiff parts of a scene, shown to an instructor, and lumps that the user adds to an uploaded mesh.
 
 import { create } from "@bufbuild/protobuf";
 import type { Vec3 } from "palpate";
@@ -16,24 +16,27 @@ export interface Lump {
   radiusM: number;
 }
 
-/** Radius of a lump that is put in, of the size of the tissue: 9 mm in a liver; and how it lies beneath the surface, of its radius. */
+/**
+ * Radius of an added lump, as a fraction of the tissue's size (9 mm in a liver), and its depth below the surface, as
+ * a fraction of its radius.
+ */
 const RADIUS = 0.04;
 const BENEATH = 0.4;
-/** Over this part of its radius a lump becomes tissue. */
+/** A lump blends into the tissue over this fraction of its radius. */
 const EDGE = 0.4;
-/** How much stiffer it is, and what is beneath it: as in the scene `liver-organ`. */
+/** Stiffness factors of the lump and of what is beneath it, as in the scene `liver-organ`. */
 const STIFFER = { springs: 1.5, support: 5 };
 
-/** The lumps of a scene. What is stiff by a group of the mesh has no shape of its own. */
+/** Returns the lumps of a scene. Parts that are stiff by a group of the mesh have no shape of their own. */
 function lumpsOf(scene: Scene | undefined): Lump[] {
   return (scene?.inclusions ?? []).flatMap(({ centreM, radiusM }) =>
     centreM ? [{ centreM: [centreM.x, centreM.y, centreM.z] as Vec3, radiusM: radiusM ?? 0 }] : [],
   );
 }
 
-/** A lump beneath a place of a tissue. */
+/** Returns a lump beneath a place of the tissue. */
 function lumpAt({ restM, outward }: Place, sizeM: number, edgeM: number): Inclusion {
-  // Some vertices have to be in it.
+  // It must contain some vertices.
   const radiusM = Math.max(RADIUS * sizeM, 1.5 * edgeM);
   const [x, y, z] = restM.map((v, c) => v - BENEATH * radiusM * outward[c]!) as Vec3;
   return create(InclusionSchema, {
@@ -45,12 +48,12 @@ function lumpAt({ restM, outward }: Place, sizeM: number, edgeM: number): Inclus
   });
 }
 
-/** What lumps need of the page. */
+/** What this module needs of the page. */
 export interface Host {
   present: () => ShownSession | undefined;
-  /** The scene that the page has made of a mesh of one's own, if that is what it shows. */
+  /** The scene that the page made from an uploaded mesh, if it shows one. */
   scene: () => Scene | undefined;
-  /** Shows another scene of the same mesh in its place. */
+  /** Replaces the scene by another one of the same mesh. */
   exchange: (scene: Scene) => Promise<void>;
   notice: (text: string, seconds?: number) => void;
 }
@@ -73,7 +76,7 @@ export class Lumps {
     this.take.addEventListener("click", () => void this.change());
   }
 
-  /** Shows those of a session, if the instructor wants that, and what may be done about them. */
+  /** Shows the lumps of a session, if the instructor wants that, and the controls to change them. */
   show({ scene }: Session): void {
     const lumps = lumpsOf(scene);
     part("lumps-shown", HTMLElement).hidden = lumps.length === 0;
@@ -83,23 +86,23 @@ export class Lumps {
     if (this.input.onPlace) this.place(false);
   }
 
-  /** The next press on the tissue puts a lump there; or it touches again. */
+  /** With `on`, the next press on the tissue adds a lump; otherwise presses touch again. */
   private place(on: boolean): void {
     this.put.setAttribute("aria-pressed", String(on));
     this.input.onPlace = on ? (place) => void this.change(place) : undefined;
-    // On a phone the tissue is above what is in sight.
+    // On a phone the tissue is above the visible part of the page.
     if (on) part("view", HTMLElement).scrollIntoView({ block: "nearest" });
     this.host.notice(on ? "Press where the lump is to be." : "", 0);
   }
 
-  /** Puts a lump beneath a place, or takes all out. */
+  /** Adds a lump beneath a place, or removes all lumps. */
   private async change(place?: Place): Promise<void> {
     this.place(false);
     const [scene, shownSession] = [this.host.scene(), this.host.present()];
     if (!scene || !shownSession) return;
     scene.inclusions = place ? [...scene.inclusions, lumpAt(place, shownSession.surface.sizeM, shownSession.edgeM)] : [];
     try {
-      // Whoever puts one in wants to see where it is.
+      // A user who adds a lump wants to see where it is.
       if (place) this.box.checked = true;
       await this.host.exchange(scene);
       if (place) this.host.notice("The lump is in. Take the tick from “Lumps” to hide it.", 8);

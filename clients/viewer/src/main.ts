@@ -1,11 +1,11 @@
 // The page: connects the parts.
 //
-// It shows only what frames and samples say. A worker receives frames and returns credit (four in flight), so a page that
-// draws slowly is not sent less. Positions and normals are computed once for each picture, for what is drawn; picking and
-// figures use all vertices. Commands go in batches of one with at most two in flight, the newest place only; each push has a
-// time to live, each lease four seconds. While a tool is held, another worker carries poses and samples by datagram, if it
-// can. Without TLS a browser speaks HTTP/1.1 with six connections: hence one stream of frames, one of samples, and one
-// acknowledgement at a time.
+// It shows only data from frames and samples. A worker receives frames and acknowledges them (four in flight), so a
+// page that draws slowly still gets all of them. Positions and normals are computed once for each picture, for the
+// vertices that are drawn; picking and figures use all vertices. Commands are sent in batches of one with at most two
+// in flight, always the newest position; each push has a time to live, and each lease lasts four seconds. While a
+// tool is held, another worker carries poses and samples by datagram, if possible. Without TLS a browser speaks
+// HTTP/1.1 with six connections: hence one stream of frames, one of samples, and one acknowledgement at a time.
 
 import { create, type MessageInitShape } from "@bufbuild/protobuf";
 import { norm } from "palpate";
@@ -35,24 +35,29 @@ import { FileOpener } from "./upload";
 import { ShownSession } from "./session";
 
 /**
- * A session that nobody asks for is deleted after this time: its pages are closed. Browsers let a hidden page ask once a
- * minute.
+ * A session is deleted after this time without a request, because its pages are closed. Browsers let a hidden page
+ * send a request once a minute.
  */
 const IDLE_S = 180;
 
-/** So long after its texture has come a tissue's picture is taken for the list. */
+/** Delay from the arrival of a tissue's texture until its picture for the list is taken. */
 const PICTURE_MS = 1500;
 
-/** When samples are so much newer than the newest frame, nothing moves: frames come 60 times a second. */
+/**
+ * If the newest samples are newer than the newest frame by this time, nothing moves: frames come 60 times a second.
+ */
 const STILL_S = 0.25;
 
-/** So many scripts are listed. */
+/** Maximum number of scripts in the list. */
 const MAX_SCRIPTS = 1000;
 
-/** Of warnings and of holders of tools, so many are told. */
+/** Maximum number of warnings, and of tool holders, that are shown. */
 const MAX_TOLD = 16;
 
-/** A server of a fleet that has not answered for so long may be gone: another takes its sessions over within 4 s. */
+/**
+ * A server of a fleet that has not answered for this time may be gone: another one takes its sessions over within 4
+ * s.
+ */
 const GONE_MS = 3000;
 
 const canvas = part("tissue", HTMLCanvasElement);
@@ -95,7 +100,7 @@ const player = new Player({
   over,
 });
 
-// What is recorded can be looked at only.
+// A recording can only be watched.
 const input = new Input(canvas, stage, latency, () => (shownSession?.session.playback ? undefined : shownSession));
 input.onPoint = (place) => overlay.point(place, shownSession?.reach.lengthM);
 
@@ -124,22 +129,25 @@ function notice(text: string, seconds = 5): void {
   if (seconds > 0) noticed = setTimeout(() => (line.hidden = true), 1000 * seconds);
 }
 
-/** What a new session is made of: that of the last one, if somebody wants another. */
+/** What a new session is created from: the source of the last one, if the user wants another. */
 type Source = NonNullable<MessageInitShape<typeof CreateSessionRequestSchema>["source"]>;
 let made: Source | undefined;
 
 const named = (value: string): Source => ({ case: "sceneName", value });
 
-/** What to open: a session that is there, a new one, or what was recorded, from a step on. `isNew`: by a choice on this page. */
+/**
+ * What to open: an existing session, a new one, or a recording from a step on. `isNew`: the user chose it on this
+ * page.
+ */
 type Target = { isNew?: boolean } & ({ sessionId: string } | { source?: Source } | { moment: JournalName & { step?: number } });
-/** What was to be opened last. */
+/** The last target. */
 let refused: Target = {};
-/** Ends the wait for the next attempt to open something. */
+/** Ends the wait for the next attempt to open a target. */
 let hurry = new AbortController();
 
-/** How often what is shown was left: who waits for something to be shown then waits in vain. */
+/** How often the shown session was left. If this changes, a pending request to show something is obsolete. */
 let left = 0;
-/** Leaves what is shown. */
+/** Leaves the shown session. */
 function leave(): void {
   left += 1;
   shownSession?.leave();
@@ -168,10 +176,10 @@ async function open(target: Target): Promise<void> {
         ? (await sessions.getSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS })).session
         : (await sessions.createSession({ source: (made ??= named(await choices.first())), idleTimeoutS: IDLE_S }, {})).session;
       if (!session) throw new RangeError("it tells of no session");
-      // Another window's playback: this one gets its own.
+      // Playback of another window: this window gets its own.
       if (session.playback) return await open({ moment: { ...session.playback, step: Number(session.step) } });
       const isNew = target.isNew ?? sessionId === undefined;
-      // If what follows fails, the session is there all the same.
+      // Even if the next steps fail, the session exists.
       sessionId = session.sessionId;
       if (begun === left) await show(session, { isNew });
       return;
@@ -183,7 +191,7 @@ async function open(target: Target): Promise<void> {
       if (!isPassing(error)) return over(`${sentence(describe(error))}.`);
       const waitMs = backoffMs(failures);
       status.lose(waitMs);
-      // A server that is busy says so.
+      // A busy server reports that itself.
       if (reasonOf(error) !== "") notice(`${sentence(describe(error))}.`, waitMs / 1000);
       hurry = new AbortController();
       await sleep(waitMs, hurry.signal);
@@ -197,16 +205,16 @@ function tryNow(): void {
   shownSession?.askNow();
 }
 
-/** The server no longer lets the caller do what it did. */
+/** The server no longer permits this caller an action. */
 function barred(reason: string): void {
-  // Another token leads back to the same session.
+  // With another token, the page returns to the same session.
   if (shownSession && !shownSession.session.playback) refused = { sessionId: shownSession.session.sessionId };
   leave();
   status.end("barred", "");
   tokenForm.show(reason);
 }
 
-/** A session has ended: the user decides what to do. */
+/** A session has ended. The user decides what to do. */
 function over(why: string): void {
   leave();
   part("what-was-that", HTMLButtonElement).hidden = true;
@@ -223,28 +231,28 @@ function over(why: string): void {
   part("notice", HTMLElement).append(again);
 }
 
-/** How many sessions were opened: of several that are asked for one after the other the last counts. */
+/** Number of sessions that were opened: if several are requested in a row, the last one counts. */
 let opening = 0;
-/** How many tissues were shown, one after the other. */
+/** Number of tissues that were shown so far. */
 let showing = 0;
 
 /** How a session is shown. */
 interface Showing {
-  /** The page's address before can be gone back to. */
+  /** Whether to keep the previous address of the page in the history. */
   isNew?: boolean;
-  /** In place of the present one, which has the same tissue: surface, camera and texture stay. */
+  /** Replaces the present session, which has the same tissue: surface, camera and texture are kept. */
   keeps?: boolean;
-  /** The step from which it plays what was recorded. */
+  /** The step from which the recording is played. */
   step?: number;
 }
 
-/** Shows a playback that was just made. */
+/** Shows a playback that was just created. */
 async function showOpened(opened: Opened, how: Showing): Promise<void> {
   if (await show(opened.session, { ...how, step: opened.step })) player.attach(opened);
   else discard(opened.session);
 }
 
-/** Shows a session. Returns false if another one has been asked for since. */
+/** Shows a session. Returns false if another one was requested meanwhile. */
 async function show(session: Session, { isNew = false, keeps = false, step }: Showing): Promise<boolean> {
   const isPlayback = session.playback !== undefined;
   const wanted = (opening += 1);
@@ -287,7 +295,7 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   if (!former) {
     showing += 1;
     if (isPlayback) player.makeRoom();
-    // Shaded by its shape at once; the texture comes when it is painted.
+    // Shows the shape at once; the texture follows when it is ready.
     stage.show(next.surface, false, player.heightPx);
     stage.setTools([]);
     overlay.point();
@@ -295,10 +303,10 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   lumps.show(session);
   part("arriving", HTMLElement).hidden = true;
   document.body.classList.remove("empty");
-  // What tells of the session before is no longer true.
+  // Data of the previous session is no longer valid.
   if (before?.sessionId !== session.sessionId) {
     heard(session);
-    // What the server has to say of the scene: of a mesh what was done with it, and what is doubtful.
+    // The server's warnings about the scene: what was done with its mesh, and what is doubtful.
     if (session.warnings.length > 0) notice(session.warnings.slice(0, MAX_TOLD).join(" "), 15);
   }
   next.begin();
@@ -308,7 +316,7 @@ async function show(session: Session, { isNew = false, keeps = false, step }: Sh
   return true;
 }
 
-/** Puts the session's texture on the tissue, if that is still shown when it comes. */
+/** Applies the session's texture to the tissue, if the session is still shown when it arrives. */
 async function dress(sessionId: string): Promise<void> {
   const shown = showing;
   const texture = await tissueTexture(sessionId);
@@ -316,7 +324,7 @@ async function dress(sessionId: string): Promise<void> {
   else if (texture) stage.setTexture(texture);
 }
 
-/** Plays what has just happened in the session that is shown. */
+/** Plays the last seconds of the shown session. */
 async function whatWasThat(): Promise<void> {
   const of = shownSession;
   const run = of?.session.journal?.run;
@@ -337,7 +345,7 @@ async function whatWasThat(): Promise<void> {
   }
 }
 
-/** Takes a picture of a scene that has none in the list, if nobody has touched it or turned the view. */
+/** Takes a picture of a scene that has none in the list, unless the user has touched it or turned the view. */
 function takePicture(of: ShownSession): void {
   const scene = of.session.scene?.name ?? "";
   const entry = choices.withoutPicture(scene);
@@ -346,7 +354,7 @@ function takePicture(of: ShownSession): void {
   choices.refresh(entry);
 }
 
-/** Asking whether another server of the fleet is there. */
+/** Pending search for another server of the fleet. */
 let seeking: Promise<void> | undefined;
 
 function trouble(failure: Failure, waitMs: number): void {
@@ -358,7 +366,7 @@ function trouble(failure: Failure, waitMs: number): void {
   seeking ??= seekAt(session.ownership.others, session.sessionId).finally(() => (seeking = undefined));
 }
 
-/** Handles the session's status. */
+/** Handles a new status of the session. */
 function heard(session: Session): void {
   if (session.sessionId !== shownSession?.session.sessionId) return;
   shownSession.session = session;
@@ -482,7 +490,7 @@ async function play(): Promise<void> {
 
 /** The session in which the user was warned. */
 let warnedIn: ShownSession | undefined;
-/** Warns once if the tissue moved farther than it is long: then a unit is probably wrong. */
+/** Warns once if the tissue moved farther than its own length: a unit is then probably wrong. */
 function warnIfFar(of: ShownSession): void {
   if (of === warnedIn || of.surface.largestM() <= Math.max(of.surface.sizeM, of.reach.lengthM)) return;
   warnedIn = of;
@@ -506,7 +514,7 @@ addEventListener("pagehide", () => {
   void shownSession?.hand.letGo();
   player.close();
 });
-// What was kept of a page that was left has no session of its own any more.
+// A page restored from the browser's cache no longer has a session of its own.
 addEventListener("pageshow", ({ persisted }) => persisted && location.reload());
 addEventListener("popstate", () => {
   const { sessionId, moment } = addressed();
@@ -515,7 +523,7 @@ addEventListener("popstate", () => {
   else if (sessionId !== shownSession?.session.sessionId) void open({ sessionId });
 });
 
-// Ten times a second for values read as they change, once a second for figures.
+// Ten times a second for values that the user follows as they change, once a second for figures.
 setInterval(() => {
   if (!shownSession || document.hidden) return;
   const { samples, reach } = shownSession;
@@ -554,7 +562,7 @@ setInterval(() => {
   });
 }, 1000);
 
-/** Fills the list of scripts with those that are made for the session's scene. */
+/** Fills the list with the scripts that were written for the session's scene. */
 async function listScripts(sessionId: string): Promise<void> {
   for (let failures = 0; shownSession?.session.sessionId === sessionId; failures++) {
     try {
@@ -568,7 +576,7 @@ async function listScripts(sessionId: string): Promise<void> {
   }
 }
 
-/** Whether no frame is due: the server sends none while nothing moves, and samples go on. */
+/** Returns whether no frame is due: the server sends none while nothing moves, but continues to send samples. */
 function isStill({ frames, samples, session, speed }: ShownSession): boolean {
   const { newest } = samples;
   if (session.state !== SessionState.RUNNING) return true;

@@ -1,25 +1,28 @@
-// Light: how tissue, table and instruments are shaded. One light and one sky for all, always by the true normal. The same
-// programs run with and without a graphics processor, and one picture's worth of them is all that is compiled.
+// Shading of tissue, table and instruments. All have the same lamp and sky, and use the true normal. The same shaders
+// run with and without a graphics processor, and only those for one picture are compiled.
 
 import { Color, DoubleSide, ShaderMaterial, type Texture, Vector2, Vector3, Vector4 } from "three";
 
-/** Tools that cast a shadow: each costs every pixel. */
+/** Number of tools that cast a shadow. Each of them costs time at every pixel. */
 export const SHADOWS = 1;
 
-/** What the programs share; `Stage` and `ToolMark` write it. */
+/** Uniforms that the shaders share; `Stage` and `ToolMark` write them. */
 export const light = {
   /** Direction to the lamp. */
   lamp: { value: new Vector3(0, 0, 1) },
-  /** Middle of each tool's tip, and its radius; 0 for none. m. */
+  /** Centre of each tool's tip, m, and its radius; 0 for none. */
   tips: { value: Array.from({ length: SHADOWS }, () => new Vector4(0, 0, 0, 0)) },
   /** Far end of each tool's shaft, and its radius, m. */
   shafts: { value: Array.from({ length: SHADOWS }, () => new Vector4(0, 0, 0, 0)) },
-  /** Rings on the tissue, where a ball's surface meets it: middle and radius; 0 for none. m. The last one is the aim. */
+  /**
+   * Rings on the tissue, where it intersects a sphere: centre and radius, m; 0 for none. The last ring marks the
+   * target of the keys.
+   */
   rings: { value: Array.from({ length: SHADOWS + 1 }, () => new Vector4(0, 0, 0, 0)) },
   ink: { value: new Color() },
 };
 
-/** Soft shadows of capsules under a lamp (after Inigo Quilez), and the dark where a tip is near. */
+/** Soft shadows of capsules (after Inigo Quilez), and the darkening near a tip. */
 const SHADOW = `
 uniform vec3 lamp;
 uniform vec4 tips[${SHADOWS}];
@@ -50,8 +53,8 @@ float contact(vec3 at) {
 }`;
 
 /**
- * Sheets: seen from above, with an image that lies flat on them. Over the edge the image goes on, mirrored, and soon becomes
- * another part of itself, so that nobody sees the mirror.
+ * Sheets: seen from above, with an image that lies flat on them. Beyond the edge the image continues mirrored, and
+ * soon changes to another part of itself, so that the mirroring is not noticeable.
  */
 const SHEET = `
 float beyond() {
@@ -70,8 +73,8 @@ float within(float open) { return 0.0; }
 float window_(vec3 seen, vec3 lamp) { return 0.0; }`;
 
 /**
- * Bodies: the image lies by the file's coordinates, or is projected from three sides where it has none; each of the two sides
- * has light of its own; and what is within, such as the inside of a tube, is lit by a lamp beside the eye.
+ * Bodies: the image uses the file's coordinates, or is projected from three sides if there are none. Both sides have
+ * their own ambient light, and the interior, such as that of a tube, is lit by a lamp beside the eye.
  */
 const BODY = `
 uniform float projected;
@@ -84,30 +87,34 @@ vec3 image() {
   if (projected < 0.5) return texture2D(map, vUv).rgb;
   vec3 lie = pow(abs(normalize(vRestNormal)), vec3(5.0));
   lie /= lie.x + lie.y + lie.z;
-  // Turned, so that the mirror images of the three sides do not line up.
+  // Rotated, so that the mirror images on the three sides do not line up.
   vec3 at = vRest / period;
   vec3 a = texture2D(map, mat2(0.94, 0.34, -0.34, 0.94) * at.yz + 0.21).rgb;
   vec3 b = texture2D(map, mat2(0.77, -0.64, 0.64, 0.77) * at.zx + 0.47).rgb;
   vec3 c = texture2D(map, mat2(0.87, 0.49, -0.49, 0.87) * at.xy + 0.73).rgb;
   return a * lie.x + b * lie.y + c * lie.z;
 }
-// At the outline of a fold slivers of its other side come into sight: there the brighter of both sides counts.
+// At the outline of a fold, slivers of its other side become visible: there, the brighter value of both sides counts.
 float openness(float facing) {
   if (closed > 0.5) return vOpen;
   float own = gl_FrontFacing ? vOpen : vInner;
   return mix(max(vOpen, vInner), own, smoothstep(0.02, 0.15, abs(facing)));
 }
 bool isTurned() { return closed < 0.5; }
-// On what is sharply curved the lamp would be a white dot. Curvature times the body's size: 3.5 on a ball.
+// Where the curvature is large, the lamp would appear as a white dot. Curvature times the body's size is 3.5 on a
+// ball.
 float glints(vec3 n) {
   float bend = (length(dFdx(n)) + length(dFdy(n))) / max(length(dFdx(vAt)) + length(dFdy(vAt)), 1e-9) * reach;
   return 1.0 - smoothstep(13.0, 30.0, bend);
 }
 float within(float open) { return 1.0 - smoothstep(0.02, 0.42, open); }
-// A broad lamp, of which a smooth body shows more than a point.
+// A broad lamp, whose reflection on a smooth body is larger than a point.
 float window_(vec3 seen, vec3 lamp) { return smoothstep(0.80, 0.93, dot(seen, lamp)); }`;
 
-/** Wet tissue: red light scatters the furthest, so shadows have warm edges; a thin film of liquid mirrors lamp and sky. */
+/**
+ * Wet tissue: red light scatters the farthest, so shadows have warm edges; a thin film of liquid reflects lamp and
+ * sky.
+ */
 export class Skin extends ShaderMaterial {
   constructor(isBody: boolean) {
     super({
@@ -120,9 +127,9 @@ export class Skin extends ShaderMaterial {
         tone: { value: new Color(0x8e4538) },
         projected: { value: 1 },
         period: { value: 1 },
-        /** Of a body: whether its inner side is never seen, but for slivers at its outline. */
+        /** For a body: whether its inner side is never visible, except for slivers at its outline. */
         closed: { value: 0 },
-        /** Of a body: how far a lamp beside the eye shines, m. */
+        /** For a body: the range of a lamp beside the eye, m. */
         reach: { value: 1 },
       },
       vertexShader: `
@@ -167,7 +174,8 @@ export class Skin extends ShaderMaterial {
         void main() {
           vec3 eye = normalize(cameraPosition - vAt);
           vec3 n = normalize(vNormal);
-          // By the triangle, not by the normal between vertices: at the outline of a fold that faces away, and would be black.
+          // Uses the triangle, not the interpolated normal: at the outline of a fold this faces away, and the fold
+          // would be black.
           if (!gl_FrontFacing && isTurned()) n = -n;
           vec3 colour = mix(tone, image(), mapped);
           float open = openness(dot(n, eye));
@@ -179,7 +187,8 @@ export class Skin extends ShaderMaterial {
           vec3 around = mix(vec3(0.17, 0.09, 0.08), vec3(0.30, 0.32, 0.36), 0.5 + 0.5 * n.z) * open * near;
           // A shadow in tissue is never black: light comes through from the side.
           vec3 key = diffuse * mix(vec3(0.26, 0.13, 0.12), vec3(1.0), share) * (1.0 - inside);
-          // The lamp, and a weak light beside the eye. Where the lamp can't reach, a stronger one, which fades with distance.
+          // The lamp, and a weak light beside the eye. Where the lamp can't reach, a stronger light, which fades with
+          // distance.
           float beside = 0.24 * max(dot(n, eye), 0.0) * near * open;
           float apart = length(cameraPosition - vAt) / reach;
           float scope = inside / (0.25 + 1.5 * apart * apart);
@@ -218,20 +227,20 @@ export class Skin extends ShaderMaterial {
     this.uniforms.mapped!.value = 1;
   }
 
-  /** Before another tissue's texture arrives, none is shown. */
+  /** Shows no texture until that of another tissue arrives. */
   dropTexture(): void {
     this.uniforms.mapped!.value = 0;
   }
 }
 
-/** The table that the tissue lies on: it fades into the background, and the tissue's shadow lies on it. */
+/** The table that the tissue lies on. It fades into the background, and the tissue's shadow lies on it. */
 export class Table extends ShaderMaterial {
   constructor(isBody: boolean) {
     super({
       defines: isBody ? { BODY: "" } : {},
       uniforms: {
         ...light,
-        /** Of a body: how dark the table is beneath it, over `half_` to each side of the middle. */
+        /** For a body: how dark the table is beneath it, up to `half_` on each side of the middle. */
         dark: { value: null },
         colour: { value: new Color() },
         background: { value: new Color() },

@@ -1,4 +1,4 @@
-// What the page says of a session and its tools, in words for its user.
+// Messages about a session and its tools for the user.
 
 import { type Session, SessionState } from "palpate/v1";
 import { depthText } from "./overlay";
@@ -6,17 +6,17 @@ import { quantity } from "./plot";
 import type { Told } from "./samples";
 import type { ShownSession } from "./session";
 
-/** A tip that is less deep than this part of what it is set to has slipped off. */
+/** A tip whose depth is below this fraction of its target has slipped off. */
 const SLIPPED = 0.6;
-/** A push of which less than this part is felt is less. */
+/** A push is reported as reduced if less than this fraction of it is felt. */
 const LESS = 0.95;
 
-/** The beginning of a sentence. */
+/** Capitalizes the first letter. */
 export function sentence(text: string): string {
   return text.charAt(0).toUpperCase() + text.slice(1);
 }
 
-/** What a session is that is well. */
+/** Describes a session without problems. */
 export function wellText(session: Session): string {
   const name = session.scene?.name ?? "";
   if (session.playback) return `Connected to a recording of ${name}.`;
@@ -25,7 +25,7 @@ export function wellText(session: Session): string {
   return `Connected to ${name}${paused}.${recoveredText(session)}`;
 }
 
-/** How often the tissue recovered and why it did the last time; nothing if it never did. */
+/** Describes how often the tissue recovered, and why it did the last time; empty if it never did. */
 function recoveredText({ recoveryCount, recoveries }: Session): string {
   const newest = recoveries.at(-1);
   if (!newest) return "";
@@ -35,7 +35,7 @@ function recoveredText({ recoveryCount, recoveries }: Session): string {
   return ` The tissue recovered ${times}, the last time because after step ${newest.step} ${newest.reason}.${pause}`;
 }
 
-/** Why the hand was refused a touch, in words for the user. */
+/** Describes for the user why a touch was refused. */
 export function refusedText(message: string, reason: string, session: Session): string {
   if (reason === "ROLE_MISSING") return "Your token lets you watch, not touch.";
   if (reason !== "TOOL_HELD") return `${sentence(message)}.`;
@@ -43,13 +43,13 @@ export function refusedText(message: string, reason: string, session: Session): 
   return `${name} holds the tool. You can touch as soon as ${name} lets go.`;
 }
 
-/** What the strength is of the present tool. */
+/** Describes the strength of the present tool. */
 export function strengthText({ hand: { mode, strength }, reach }: ShownSession): string {
   if (mode === "pull") return "as you drag";
   return mode === "tip" ? quantity(strength * reach.depthM, "m") : quantity(strength * reach.mostN, "N");
 }
 
-/** What the strength means, and how that differs from what is felt. */
+/** Describes what the strength means, and how this differs from what is felt. */
 export function meaningText({ hand, reach, surface }: ShownSession): string {
   const range = quantity(reach.lengthM, "m");
   if (hand.mode === "tip") {
@@ -63,12 +63,12 @@ export function meaningText({ hand, reach, surface }: ShownSession): string {
       "that the push meets: as much as the strength while nothing moves, more or less while the tissue moves.";
 }
 
-/** Whether a push is told as clearly less than its strength: then somebody may ask why. */
+/** Returns whether a push is felt clearly less than its strength, so that the user may wonder why. */
 export function isLess({ hand: { mode, strength }, reach }: ShownSession, told: Told | undefined): boolean {
   return told !== undefined && ["push", "stroke"].includes(mode) && told.allN < LESS * strength * reach.mostN;
 }
 
-/** What a tool feels, in words. */
+/** Describes what a tool feels. */
 export function feltText({ hand }: ShownSession, told: Told | undefined): string {
   const { setM } = hand;
   if (setM !== undefined && (told?.deepM ?? 0) < SLIPPED * setM) {
@@ -79,7 +79,7 @@ export function feltText({ hand }: ShownSession, told: Told | undefined): string
   return `${depthText(told)}, pushes back ${quantity(told.allN, "N")}`;
 }
 
-/** Datagrams belong to a lease. */
+/** Describes the transport of a touch: datagrams belong to a lease. */
 export function wayText({ hand }: ShownSession): string {
   if (!hand.holds) return "no tool is held";
   return hand.tool.datagrams.carries ? "datagrams" : "gRPC-web";

@@ -1,5 +1,5 @@
-// What stands over the picture: the scale bar, beside the tool how deep it is and how hard the tissue pushes back, and a ring
-// where the pointer is, as large as what a press would move.
+// The overlays on the picture: the scale bar, the depth and the force beside the tool, and a ring at the pointer that
+// shows how far a press would move the tissue.
 
 import { part } from "./page";
 import { quantity } from "./plot";
@@ -7,12 +7,12 @@ import type { Told } from "./samples";
 import type { Stage } from "./stage";
 import type { Place } from "./surface";
 
-/** Longest scale bar, pixels, and of the picture's width. */
+/** Maximum length of the scale bar, in pixels and as a fraction of the picture's width. */
 const LONGEST = { pixels: 150, part: 0.28 };
-/** Distance of the words from the tip, pixels. */
+/** Distance of the text from the tip, pixels. */
 const BESIDE = 46;
 
-/** A depth or height in words. */
+/** Describes a depth or height. */
 export function depthText({ deepM }: Told): string {
   return deepM < 0 ? `${quantity(-deepM, "m")} lifted` : `${quantity(deepM, "m")} deep`;
 }
@@ -24,13 +24,13 @@ export class Overlay {
   private readonly bar = part("scale-bar", HTMLElement);
   private readonly length = part("scale-text", HTMLElement);
   private readonly ring = document.getElementById("pointer-ring") as unknown as SVGPathElement;
-  /** The view that the bar was measured in. */
+  /** The view in which the bar was measured. */
   private measured = -1;
   private pointed: { place: Place; radiusM: number } | undefined;
 
   constructor(private readonly stage: Stage) {}
 
-  /** Tells what the first tool feels; nothing if there is none. */
+  /** Shows what the first tool feels; nothing if there is none. */
   tell(felt: Told | undefined): void {
     if (this.touch.hidden === (felt === undefined)) return void (felt && this.write(felt));
     this.touch.hidden = felt === undefined;
@@ -45,7 +45,7 @@ export class Overlay {
     this.force.textContent = `${quantity(felt.allN, "N")} back`;
   }
 
-  /** Shows what a press would move: nothing without a place. It is no part of the picture, which need not be drawn again. */
+  /** Shows what a press would move; nothing without a place. The picture itself need not be drawn again. */
   point(place?: Place, radiusM = 0): void {
     this.pointed = place && { place, radiusM };
     this.drawRing();
@@ -72,7 +72,7 @@ export class Overlay {
     const view = this.touch.parentElement!.getBoundingClientRect();
     const [width, height] = [this.touch.offsetWidth, this.touch.offsetHeight];
     const [x, y] = [at[0] - view.left, at[1] - view.top];
-    // To the left of the tool, which comes from the right; where there is no room, to the right and below.
+    // To the left of the tool, which comes from the right; if there is no room, to the right and below.
     const hasRoom = x - BESIDE - width > 8;
     const left = hasRoom ? x - BESIDE - width : Math.min(x + BESIDE, view.width - width - 8);
     const top = Math.min(Math.max(hasRoom ? y - height / 2 : y + BESIDE / 2, 8), view.height - height - 8);
@@ -89,7 +89,7 @@ export class Overlay {
     const power = 10 ** Math.floor(Math.log10(most));
     const lengthM = power * ([5, 2].find((times) => times * power <= most) ?? 1);
     this.bar.style.width = `${(lengthM * pixels).toFixed(1)}px`;
-    // Lengths of tissue are told in millimetres.
+    // Lengths of tissue are usually given in millimetres.
     this.length.textContent = `${Number((1000 * lengthM).toPrecision(3))} mm`;
   }
 }

@@ -1,4 +1,4 @@
-// What the page tells of itself, for tests and measurements: `window.palpate`.
+// State of the page, for tests and measurements: `window.palpate`.
 
 import { norm } from "palpate";
 import type { Latency } from "./latency";
@@ -31,27 +31,33 @@ export function pageState(present: () => ShownSession | undefined, stage: Stage,
     get forceN() {
       return present()?.samples.tools.map((tool) => norm(tool.forceN)) ?? [];
     },
-    /** Largest displacement of the control point within the length of the plots. */
+    /** Largest displacement of the control point during the time span of the plots. */
     get deepestM() {
       return Math.max(0, ...(present()?.samples.history.map((moment) => norm(moment.displacementM)) ?? []));
     },
     get holds() {
       return present()?.hand.holds ?? false;
     },
-    /** What is played, if anything is. */
+    /** The recording that is played, if any. */
     get recording() {
       return player.moment;
     },
-    /** Where the camera is. */
+    /** Position of the camera. */
     get camera() {
       return stage.camera.matrixWorld.toArray();
     },
-    /** Whether datagrams get through, and how many were sent and came in this session; poses and samples in them. */
+    /**
+     * Whether datagrams get through, and how many were sent and received in this session, with the number of poses
+     * and samples in them.
+     */
     get datagrams() {
       const { carries, counts } = present()?.hand.tool.datagrams ?? {};
       return { carries: carries ?? false, sent: 0, came: 0, poses: 0, samples: 0, fellBack: 0, ...counts };
     },
-    /** The least room between a tool and the tissue as drawn, of the width of the tissue; undefined without a tool. */
+    /**
+     * Smallest distance between a tool and the tissue as drawn, as a fraction of the tissue's width; undefined
+     * without a tool.
+     */
     get clear() {
       const [{ clearM }, shownSession] = [stage, present()];
       return clearM === undefined || !shownSession ? undefined : clearM / shownSession.widthM;
@@ -60,7 +66,7 @@ export function pageState(present: () => ShownSession | undefined, stage: Stage,
     get drawing() {
       return { ...stage.began, hasTexture: stage.isTextured };
     },
-    /** The camera's height above the table and the tissue beneath it, of the width of the tissue. */
+    /** The camera's height above the table and the tissue beneath it, as a fraction of the tissue's width. */
     get cameraHeight() {
       const shownSession = present();
       return shownSession ? stage.heightM / shownSession.widthM : 0;
@@ -69,7 +75,9 @@ export function pageState(present: () => ShownSession | undefined, stage: Stage,
     get widthM() {
       return present()?.widthM ?? 0;
     },
-    /** The window point of the tissue at (x, y): in fractions of a sheet; of a body near there in the picture. */
+    /**
+     * Window coordinates of the tissue at (x, y): fractions of a sheet; for a body, near this point of the picture.
+     */
     at(x: number, y: number): [number, number] | undefined {
       const { surface } = present() ?? {};
       if (!surface) return undefined;

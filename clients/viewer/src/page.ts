@@ -18,7 +18,10 @@ export function askedNumber(key: string, least: number, most: number): number | 
   return text !== null && text !== "" && value >= least && value <= most ? value : undefined;
 }
 
-/** What the address names: a session, or a moment of what was recorded (`journal=ID`, and `run` and `step` if they are known). */
+/**
+ * Returns what the address names: a session, or a moment of a recording (`journal=ID`, and `run` and `step` if they
+ * are known).
+ */
 export function addressed(): { sessionId?: string; moment?: JournalName & { step?: number } } {
   const address = new URLSearchParams(location.search);
   const sessionId = address.get("journal");
@@ -30,7 +33,7 @@ export function addressed(): { sessionId?: string; moment?: JournalName & { step
   return { moment: { sessionId, run: whole("run") ?? 0, step: whole("step") } };
 }
 
-/** Writes what is shown into the address, so that reloading and sharing work. */
+/** Writes what is shown to the address, so that reloading and sharing work. */
 function write(values: Record<string, string>, isNew: boolean): void {
   const address = new URL(location.href);
   for (const key of ["session", "scene", "journal", "run", "step"]) address.searchParams.delete(key);
@@ -39,12 +42,12 @@ function write(values: Record<string, string>, isNew: boolean): void {
   else history.replaceState(null, "", address);
 }
 
-/** Writes the session into the address. */
+/** Writes the session to the address. */
 export function writeAddress(session: string, isNew: boolean): void {
   write({ session }, isNew);
 }
 
-/** Writes a moment of what was recorded into the address. */
+/** Writes a moment of a recording to the address. */
 export function writeMoment({ sessionId, run }: JournalName, step: number, isNew: boolean): void {
   write({ journal: sessionId, run: String(run), step: String(step) }, isNew);
 }
@@ -62,8 +65,8 @@ export function holderName(): string {
 }
 
 /**
- * Removes the token (`#token=…`) from the address, because people share addresses. It comes after `#`, so that it never
- * reaches a server or a log. Returns true if there was one.
+ * Removes the token (`#token=…`) from the address, because people share addresses. It comes after `#`, so it is never
+ * sent to a server or written to a log. Returns true if there was one.
  */
 function takeToken(): boolean {
   const behind = new URLSearchParams(location.hash.slice(1));
@@ -74,7 +77,7 @@ function takeToken(): boolean {
   return true;
 }
 
-/** Keeps a token for as long as this window is open, and shows it with each call from now on. */
+/** Stores a token until this window is closed, and sends it with each call from now on. */
 export function keepToken(token: string): void {
   sessionStorage.setItem("token", token);
   server.token = token;
@@ -85,10 +88,10 @@ server.token = sessionStorage.getItem("token") ?? "";
 // Adding a token to the address of an open page does not reload it by itself.
 addEventListener("hashchange", () => takeToken() && location.reload());
 
-/** Goes to the page of another server of the fleet, with the token behind `#`, where `takeToken` takes it from. */
+/** Moves to the page of another server of the fleet, with the token after `#`, where `takeToken` reads it. */
 function moveTo(endpoint: string, sessionId: string): void {
   const address = new URL(endpoint);
-  // A token never goes in the clear. And the page of this server would send it on without end.
+  // A token is never sent unencrypted. In addition, the page of this server would forward it endlessly.
   const isHere = ["localhost", "127.0.0.1", "[::1]"].includes(address.hostname);
   const isSafe = address.protocol === "https:" || (location.protocol === "http:" && (isHere || !server.token));
   if (!isSafe || address.origin === location.origin) return;
@@ -100,7 +103,7 @@ function moveTo(endpoint: string, sessionId: string): void {
   location.replace(address);
 }
 
-/** Whether a server answers at all. */
+/** Returns whether a server answers at all. */
 async function isThere(endpoint: string): Promise<boolean> {
   try {
     await fetch(endpoint, { mode: "no-cors", cache: "no-store", signal: AbortSignal.timeout(2000) });
@@ -110,11 +113,14 @@ async function isThere(endpoint: string): Promise<boolean> {
   }
 }
 
-// The whole page moves, so that what it calls is where it came from: no browser keeps it from that.
+// The whole page moves to the server that it calls, so the browser's origin rules do not get in the way.
 server.follows = false;
 server.onElsewhere = moveTo;
 
-/** The session's server can't be reached. Another of its fleet may have taken it over, and knows where it is. */
+/**
+ * Used when the session's server can't be reached. Another server of its fleet may have taken the session over, and
+ * knows where it is.
+ */
 export async function seekAt(others: readonly string[], sessionId: string): Promise<void> {
   for (const endpoint of others) if (await isThere(endpoint)) return moveTo(endpoint, sessionId);
 }

@@ -1,27 +1,27 @@
-// Small pictures of scenes for the list of them. Those of the shipped scenes come with the page; others are taken at the first
-// visit of each, and kept by the browser.
+// Small pictures for the list of scenes. Those of the shipped scenes come with the page; others are taken at the
+// first visit, and stored by the browser.
 
 import { shippedPicture, titleOf } from "./scenes";
 import { excerpt } from "./text";
 
-/** Pixels of a picture; it is shown at half that. */
+/** Size of a picture in pixels; it is shown at half this size. */
 const SIZE = { width: 144, height: 96 };
 
 const key = (scene: string) => `picture of ${scene}`;
 
-/** The picture of a scene, if it was visited. */
+/** Returns the picture of a scene, if it was visited. */
 export function pictureOf(scene: string): string | undefined {
   const shipped = shippedPicture(scene);
   if (shipped) return shipped;
   try {
     return localStorage.getItem(key(scene)) ?? undefined;
   } catch {
-    // Some browsers keep nothing.
+    // Some browsers store nothing.
     return undefined;
   }
 }
 
-/** A small picture of the middle of what was just drawn. */
+/** Returns a small picture of the middle of what was just drawn. */
 export function pictureFrom(drawn: HTMLCanvasElement): string {
   const small = document.createElement("canvas");
   Object.assign(small, SIZE);
@@ -32,16 +32,16 @@ export function pictureFrom(drawn: HTMLCanvasElement): string {
   return small.toDataURL("image/jpeg", 0.8);
 }
 
-/** Keeps the picture of a scene. */
+/** Stores the picture of a scene. */
 export function keepPicture(scene: string, drawn: HTMLCanvasElement): void {
   try {
     localStorage.setItem(key(scene), pictureFrom(drawn));
   } catch {
-    // It is full, or the browser keeps nothing.
+    // The storage is full, or the browser stores nothing.
   }
 }
 
-/** An entry of the list. Browsers that show text only in lists show the name. */
+/** Returns an entry of the list. Browsers that support only text in lists show the name. */
 export function entryOf(scene: string): HTMLOptionElement {
   const entry = new Option(excerpt(titleOf(scene)), scene);
   const picture = pictureOf(scene);

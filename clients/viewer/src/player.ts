@@ -1,5 +1,5 @@
-// The player: shows what was recorded, like a film. A playback is a session that the server makes for this window alone. Another
-// moment or speed is another playback, which takes the place of the one before.
+// The player shows a recording, like a film. A playback is a session that the server creates for this window alone.
+// For another moment or speed, it is replaced by another playback.
 
 import { type Session, SessionState } from "palpate/v1";
 import { clockText, type JournalName, Recording, whenText } from "./journal";
@@ -9,23 +9,29 @@ import { excerpt } from "./text";
 import { Timeline } from "./timeline";
 import type { ShownSession } from "./session";
 
-/** A playback that nobody asks for is deleted after this time: a window that vanished can't do that itself. */
+/** A playback is deleted after this time without a request, because a window that vanished can't delete it. */
 const IDLE_S = 120;
-/** "What was that?" begins so long before now, and so far its buttons lead. */
+/** "What was that?" begins this long before now, and the player's buttons jump by this time. */
 export const BACK_S = 10;
-/** Interval between two looks at how far a recording has grown, and of that at least so many times what a look takes. */
+/**
+ * Minimum interval between two checks of how far a recording has grown, and the interval as a multiple of the
+ * duration of a check.
+ */
 const GROWS_MS = 2000;
 const GROWS_TIMES = 10;
-/** What is still being recorded is played on when so much more of it is there, s. */
+/** Playback of a recording in progress continues once this much more is available, s. */
 const MORE_S = 1;
 const TICK_MS = 50;
 
 /** What the player needs of the page. */
 export interface Host {
   present: () => ShownSession | undefined;
-  /** Shows a session in place of the present one, which has the same tissue. False if the page has gone elsewhere since. */
+  /**
+   * Shows a session in place of the present one, which has the same tissue. Returns false if the page shows something
+   * else meanwhile.
+   */
   exchange: (session: Session, step: number) => Promise<boolean>;
-  /** Leaves for a live session, which has the same tissue. */
+  /** Changes to a live session, which has the same tissue. */
   goLive: (session: Session) => Promise<void>;
   notice: (text: string) => void;
   /** Nothing can be shown any more. */
@@ -39,24 +45,24 @@ export interface Opened {
   session: Session;
 }
 
-/** What is shown of a recording, in steps, and the session that plays it. */
+/** The shown part of a recording, in steps, and the session that plays it. */
 export interface Shown extends JournalName {
   begin: number;
   end: number;
   step: number;
   isPlaying: boolean;
-  /** Another moment or speed has been chosen, and is not there yet. */
+  /** Whether another moment or speed was chosen and is not shown yet. */
   isBusy: boolean;
   speed: number;
   playback: string;
 }
 
-/** Ends a playback, whatever comes of it: the server does so too, later. */
+/** Deletes a playback, ignoring failures: the server also does so later. */
 export function discard({ sessionId }: Session): void {
   void sessions.deleteSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS }).catch(() => {});
 }
 
-/** A playback of a recording from a step on. */
+/** Creates a playback of a recording from a step on. */
 function playback(recording: Recording, step: number, speed: number, paused: boolean): Promise<Session> {
   const { sessionId, run } = recording;
   const value = { sessionId, run, step: BigInt(step), plays: true, speed };
@@ -83,19 +89,19 @@ export class Player {
     onCancel: () => this.seek(this.step),
   });
   private opened: Opened | undefined;
-  /** Whether it is to play: when a drag has ended, and when what was recorded goes on. */
+  /** Whether it should play: after a drag, and when the recording grows. */
   private isPlaying = false;
   private isScrubbing = false;
-  /** Whether the playback's time goes on, as far as is known here, and since when. */
+  /** Whether the playback is running, as far as is known here, and since when. */
   private runs = { is: false, sinceMs: 0 };
-  /** The step that was chosen, until it is shown; and whether somebody still has to fetch it. */
+  /** The chosen step, until it is shown, and whether it still has to be requested. */
   private aimed: number | undefined;
   private isDue = false;
   private isBusy = false;
   private wasPlaying = false;
-  /** Whether it waits at the end of what has been recorded. */
+  /** Whether it waits for a recording in progress to grow. */
   private waits = false;
-  /** How often another playback was asked for since the last was lost. */
+  /** How often another playback was requested since the last one was lost. */
   private lost = 0;
 
   constructor(private readonly host: Host) {
@@ -109,14 +115,14 @@ export class Player {
     setInterval(() => this.tick(), TICK_MS);
   }
 
-  /** Makes a playback from a step that depends on how long the recording is. Show it, and `attach` it. */
+  /** Creates a playback from a step that depends on the length of the recording. Then show it, and `attach` it. */
   async begin(of: JournalName, from: (recording: Recording) => number): Promise<Opened> {
     const recording = await Recording.of(of);
     const step = recording.clamp(from(recording));
     return { recording, step, session: await playback(recording, step, 1, false) };
   }
 
-  /** The page shows this now. */
+  /** To be called when the page shows this playback. */
   attach(opened: Opened): void {
     this.close();
     this.opened = opened;
@@ -156,27 +162,27 @@ export class Player {
     return { sessionId, run, begin, end, step, isPlaying, isBusy, playback: session.sessionId, speed: session.playback?.speed ?? 1 };
   }
 
-  /** The bar, at the bottom of the picture. */
+  /** Height of the bar at the bottom of the picture. */
   get heightPx(): number {
     return this.bar.hidden ? 0 : this.bar.offsetHeight;
   }
 
-  /** Shows the bar before anything is known of what it plays: the picture has to leave room for it. */
+  /** Shows the bar before its contents are known, because the picture has to leave room for it. */
   makeRoom(): void {
     this.bar.hidden = false;
   }
 
-  /** The playback's status has come. */
+  /** Handles a new status of the playback. */
   heard(session: Session): void {
     if (session.sessionId !== this.opened?.session.sessionId || this.isBusy || this.isScrubbing) return;
-    // What was asked before the last change tells nothing of it.
+    // A status that was requested before the last change is outdated.
     if ((this.host.present()?.askedMs ?? 0) < this.runs.sinceMs) return;
     this.runs.is = session.state === SessionState.RUNNING;
     if (!this.runs.is && !this.isAtEnd) this.isPlaying = false;
     else if (this.runs.is) this.isPlaying = true;
   }
 
-  /** The playback is gone: the server ended, or nobody asked for it. Another takes its place. */
+  /** Replaces a playback that is gone because the server ended or nobody requested it. */
   revive(): void {
     if (this.lost > 0) return;
     this.lost = 1;
@@ -190,7 +196,7 @@ export class Player {
     void this.follow();
   }
 
-  /** The step that is shown. */
+  /** The shown step. */
   private get step(): number {
     if (!this.opened) return 0;
     if (this.aimed !== undefined) return this.aimed;
@@ -201,7 +207,7 @@ export class Player {
     return recording.clamp(Math.max(newest, Number(session.step)));
   }
 
-  /** Whether all that the playback has was played. */
+  /** Whether the end of the playback was reached. */
   private get isAtEnd(): boolean {
     const end = this.opened?.session.playback?.endStep;
     return end !== undefined && this.aimed === undefined && this.step >= Number(end);
@@ -211,7 +217,7 @@ export class Player {
     if (!this.opened) return;
     this.isPlaying = !this.isPlaying;
     const { recording } = this.opened;
-    // What is at its end begins again.
+    // At its end, playing starts again from the beginning.
     if (this.isPlaying && this.isAtEnd && !recording.isLive) this.seek(recording.begin);
     else void this.follow();
   }
@@ -220,7 +226,7 @@ export class Player {
     if (this.opened) this.seek(this.opened.recording.after(this.step, seconds));
   }
 
-  /** Goes to a step; while somebody still chooses it stands there. */
+  /** Goes to a step. While the user is still scrubbing, it does not play. */
   seek(step: number, isScrubbing = false): void {
     if (!this.opened) return;
     this.waits = false;
@@ -231,7 +237,7 @@ export class Player {
     void this.follow();
   }
 
-  /** Makes true what was chosen, one thing after the other, always the newest. */
+  /** Applies what was chosen, one request after the other, always the newest. */
   private async follow(): Promise<void> {
     if (this.isBusy) return;
     this.isBusy = true;
@@ -278,7 +284,7 @@ export class Player {
       setTimeout(() => this.opened === opened && this.seek(aimed), backoffMs((this.lost += 1)));
       return;
     }
-    // A session that can't be started or stopped; its streams may not know of it yet.
+    // The session can't be started or stopped; its streams may not know yet that it is gone.
     const wasGone = isGone(error) && this.aimed === undefined;
     this.isPlaying = this.runs.is;
     this.isScrubbing = this.isDue = false;
@@ -288,13 +294,13 @@ export class Player {
     else this.host.notice(`That can't be played: ${describe(error)}.`);
   }
 
-  /** Begins a live session at the step that is shown. */
+  /** Starts a live session at the shown step. */
   private async branch(): Promise<void> {
     const { opened } = this;
     if (!opened || this.goOn.disabled) return;
     this.goOn.disabled = true;
     try {
-      // What is seen is what goes on.
+      // The visible state is the one that continues.
       this.isPlaying = false;
       await this.calm();
       const { sessionId } = opened.session;
@@ -311,13 +317,13 @@ export class Player {
     }
   }
 
-  /** Resolves when nothing is under way. */
+  /** Resolves when no request is in progress. */
   private async calm(): Promise<void> {
     void this.follow();
     while (this.isBusy) await sleep(TICK_MS);
   }
 
-  /** Back to the session that is still being recorded. */
+  /** Returns to the session that is still being recorded. */
   async toLive(): Promise<void> {
     const { opened } = this;
     if (!opened) return;
@@ -330,7 +336,7 @@ export class Player {
     }
   }
 
-  /** Follows a recording that grows. */
+  /** Checks how far a recording in progress has grown. */
   private async grow(): Promise<void> {
     const { opened } = this;
     let waitMs = GROWS_MS;
@@ -340,11 +346,11 @@ export class Player {
       const begun = performance.now();
       try {
         const { sessionId } = opened.recording;
-        // The session itself is deleted if nobody asks for it.
+        // The session itself is deleted if nobody requests it.
         await sessions.getSession({ sessionId }, { timeoutMs: CALL_TIMEOUT_MS }).catch(() => {});
         opened.recording = await Recording.of(opened.recording);
       } catch {
-        // The playback's own streams tell if the server is lost.
+        // The playback's own streams report if the server is lost.
       }
       waitMs = Math.max(GROWS_MS, GROWS_TIMES * (performance.now() - begun));
       if (this.opened !== opened) return;
@@ -353,7 +359,7 @@ export class Player {
     }
   }
 
-  /** At the end of what was there: what has been recorded since. */
+  /** At the end of the playback: continues with what was recorded meanwhile. */
   private goOnPlaying(): void {
     const { opened } = this;
     if (!opened || !this.isPlaying || !this.isAtEnd || this.isBusy || this.isScrubbing) return;
@@ -361,7 +367,8 @@ export class Player {
     const end = Number(session.playback?.endStep ?? 0n);
     this.runs.is = false;
     if (recording.timeS(recording.end) - recording.timeS(end) >= MORE_S) {
-      // Of a tissue at rest nothing is recorded until something happens: nobody waits as long again for that.
+      // While a tissue is at rest, nothing is recorded until something happens. Such a pause is skipped in the
+      // playback.
       this.seek(this.waits ? Math.max(end, recording.after(recording.end, -BACK_S)) : end);
     } else if (recording.isLive) {
       this.waits = true;
@@ -386,7 +393,7 @@ export class Player {
     }
   }
 
-  /** Tells what is played. */
+  /** Shows what is played. */
   private tell(): void {
     const { recording } = this.opened ?? {};
     if (!recording) return;
@@ -423,7 +430,7 @@ export class Player {
     event.preventDefault();
   }
 
-  /** Keys lead the recording. */
+  /** Moves the keyboard focus to the player. */
   focus(): void {
     this.timeline.element.focus({ preventScroll: true });
   }

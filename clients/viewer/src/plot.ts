@@ -1,4 +1,5 @@
-// Two small plots of the last seconds: one line per quantity, axes with ticks and values, and what is now.
+// Two small plots of the last seconds: one line for each quantity, axes with ticks and values, and the present
+// values.
 
 import { HISTORY_S, type Moment } from "./samples";
 
@@ -9,31 +10,31 @@ interface Line {
   of: (moment: Moment) => number;
 }
 
-/** The SI prefix for a size: its factor and letters. */
+/** Returns the SI prefix for a magnitude: its factor and letters. */
 function prefixed(most: number): [number, string] {
   if (most >= 1) return [1, ""];
   if (most >= 1e-3 || most < 1e-9) return [1e3, "m"];
   return [1e6, "µ"];
 }
 
-/** A number with its unit, for display. */
+/** Formats a number with its unit. */
 export function quantity(value: number, unit: string): string {
   const [factor, prefix] = prefixed(Math.abs(value));
   return `${value === 0 ? "0" : (value * factor).toPrecision(3)} ${prefix}${unit}`;
 }
 
-/** The distance of ticks, 1, 2 or 5 times a power of ten, so that at most four are in a span. */
+/** Returns the distance of ticks, 1, 2 or 5 times a power of ten, so that at most four fit in a span. */
 function tickDistance(span: number): number {
   const least = span / 4;
   const power = 10 ** Math.floor(Math.log10(least));
   return power * ([1, 2, 5].find((times) => times * power >= least) ?? 10);
 }
 
-/** Room for the values of the axes, pixels. */
+/** Space for the axis values, pixels. */
 const LEFT = 38;
 const TOP = 19;
 const BOTTOM = 15;
-/** Seconds between two ticks. */
+/** Time between two ticks, s. */
 const TICK_S = 2;
 
 class Plot {
@@ -47,7 +48,7 @@ class Plot {
     this.pen = canvas.getContext("2d");
   }
 
-  /** `least` is the least span that is shown: less than that is noise. */
+  /** `least` is the smallest span that is shown: smaller changes are noise. */
   draw(history: Moment[], nowS: number, least: number): void {
     const { pen, canvas } = this;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -143,7 +144,7 @@ export class Plots {
     ]);
   }
 
-  /** `leastM` and `leastN` are the least spans of the axes. */
+  /** `leastM` and `leastN` are the smallest spans of the axes. */
   draw(history: Moment[], nowS: number, leastM: number, leastN: number): void {
     this.depth.draw(history, nowS, leastM);
     this.force.draw(history, nowS, leastN);

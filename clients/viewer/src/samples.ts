@@ -1,4 +1,4 @@
-// The samples of the tools: the newest, and those of the last seconds.
+// Samples of the tools: the newest, and those of the last seconds.
 
 import type { GridPoint, Sample, ToolSample } from "palpate/v1";
 import { norm, vec, type Vec3, watchSamples } from "palpate";
@@ -7,7 +7,7 @@ import { type Failure, server } from "./server";
 /** The sample of a tool at the end of a step. */
 export interface Felt {
   tool: number;
-  /** The control point: its indices in the grid of a sheet, or its number in the file of a mesh. */
+  /** The control point: its indices in the grid of a sheet, or its index in the file of a mesh. */
   point: GridPoint | undefined;
   vertex: number | undefined;
   displacementM: Vec3;
@@ -15,12 +15,12 @@ export interface Felt {
   appliedN: Vec3;
 }
 
-/** What a tool feels, by the direction out of the tissue where it is. */
+/** What a tool feels, relative to the direction out of the tissue at its place. */
 export interface Told {
-  /** Displacement of the control point: into the tissue, and across. */
+  /** Displacement of the control point: into the tissue, and sideways. */
   deepM: number;
   asideM: number;
-  /** Force of the tissue on the tool: out of the tissue, and across; and all of it. */
+  /** Force of the tissue on the tool: out of the tissue, sideways, and its magnitude. */
   outN: number;
   acrossN: number;
   allN: number;
@@ -32,13 +32,16 @@ export interface Moment extends Told {
   displacementM: Vec3;
 }
 
-/** How a tool feels: the direction out of the tissue at a tool, and what forces on it are told times. */
+/**
+ * How to interpret samples of a tool: the direction out of the tissue at the tool, and the factor for displayed
+ * forces.
+ */
 export interface Sense {
   outward: Vec3;
   share: number;
 }
 
-/** Samples per second: more than a screen shows, few enough for any network. */
+/** Samples per second: more than a screen shows, but few enough for any network. */
 const RATE_HZ = 100;
 
 /** Steps between two samples. */
@@ -49,7 +52,7 @@ export function sampleEvery(stepRateHz: number): number {
 /** Length of the plots, s. */
 export const HISTORY_S = 6;
 
-/** Moments of the plots, and tools of a sample, at most. */
+/** Maximum number of moments in the plots, and of tools in a sample. */
 const MAX_MOMENTS = 8 * HISTORY_S * RATE_HZ;
 const MAX_TOOLS = 256;
 
@@ -62,16 +65,16 @@ export class Samples {
   tools: Felt[] = [];
   readonly history: Moment[] = [];
   onSample: (sample: Sample) => void = () => {};
-  /** The tools of the newest sample that had those of everybody. */
+  /** The tools in the newest sample that contained all tools. */
   private all: ToolSample[] = [];
 
-  /** Forces of the tissue on a tool that are worth telling come to about a hundredth of `pointN`. */
+  /** Forces of the tissue on a tool that are worth showing are at least about a hundredth of `pointN`. */
   constructor(
     private readonly pointN: number,
     private readonly sense: (tool: Felt) => Sense,
   ) {}
 
-  /** A tool's sample in words of the place that it touches. */
+  /** Converts a tool's sample to the directions of the place that it touches. */
   tell(tool: Felt): Told {
     const { outward: n, share } = this.sense(tool);
     const [u, f] = [tool.displacementM, tool.forceN];
@@ -80,13 +83,13 @@ export class Samples {
     return { deepM: -along(u), asideM: across(u), outN: share * along(f), acrossN: share * across(f), allN: share * norm(f) };
   }
 
-  /** Goes on from those of another session, which had the same history up to a time. */
+  /** Continues from the samples of another session, which had the same history until `timeS`. */
   follow({ tools, history }: Samples, timeS: number): void {
     this.tools = tools;
     this.history.push(...history.filter((moment) => moment.timeS <= timeS && moment.timeS > timeS - HISTORY_S));
   }
 
-  /** Reads until `signal` aborts. */
+  /** Receives samples until `signal` aborts. */
   run(
     sessionId: string,
     stepRateHz: number,
@@ -100,13 +103,13 @@ export class Samples {
     return watchSamples(server, sessionId, sampleEvery(stepRateHz), take, signal, onFailure);
   }
 
-  /** Takes a sample of the own tool alone, which came another way. */
+  /** Adds a sample of this page's own tool, which arrived by datagram. */
   takeOwn(sample: Sample): void {
     const isOwn = ({ tool }: ToolSample) => sample.tools.some((own) => own.tool === tool);
     this.take(sample, [...sample.tools, ...this.all.filter((tool) => !isOwn(tool))]);
   }
 
-  /** Takes a sample, unless a newer one came the other way. */
+  /** Adds a sample, unless a newer one already arrived by the other transport. */
   private take(sample: Sample, tools: ToolSample[]): void {
     if (!Number.isFinite(sample.simulationTimeS) || (this.newest && sample.step < this.newest.step)) return;
     this.newest = sample;
@@ -126,7 +129,7 @@ export class Samples {
     this.tools = felt.filter((tool) => norm(tool.appliedN) > least || norm(tool.forceN) > least);
     const timeS = sample.simulationTimeS;
     const first = this.tools[0] ?? felt[0];
-    // The same step may come both ways.
+    // The same step may arrive by both transports.
     if (this.history.at(-1)?.timeS === timeS) this.history.pop();
     if (first) this.history.push({ timeS, displacementM: first.displacementM, ...this.tell(first) });
     // A gap of a second or more stays visible. Older samples are dropped.

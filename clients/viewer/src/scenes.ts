@@ -1,6 +1,7 @@
-// What the list says of the scenes that come with the server: a title, a group, and a picture (`make scene-pictures`).
+// How the list presents the scenes that come with the server: a title, a group, and a picture (`make
+// scene-pictures`).
 
-/** Groups, in the order of the list. Scenes of others are in the last one. */
+/** Groups, in the order of the list. Scenes that do not come with the server are in the last one. */
 export const GROUPS = ["Organs", "Slabs of tissue", "From the paper", "Other scenes"] as const;
 type Group = (typeof GROUPS)[number];
 
@@ -27,14 +28,14 @@ export function groupOf(scene: string): Group {
   return KNOWN[scene]?.[1] ?? "Other scenes";
 }
 
-/** Scenes in the order of the list, the organs first. */
+/** Orders scenes, the organs first. */
 export function inOrder(scenes: readonly string[]): string[] {
   const known = Object.keys(KNOWN);
   const place = (scene: string) => (known.includes(scene) ? known.indexOf(scene) : known.length);
   return [...scenes].sort((a, b) => place(a) - place(b));
 }
 
-/** The picture that comes with the page. */
+/** Returns the picture that comes with the page. */
 export function shippedPicture(scene: string): string | undefined {
   return PICTURES[`./scenes/${scene}.jpg`];
 }

@@ -7,11 +7,11 @@ import { haptics, CALL_TIMEOUT_MS, sessions, sleep } from "./server";
 /** Delay from the start to the first command's step, and how far ahead the others are sent, s. */
 const LEAD_S = 0.3;
 const AHEAD_S = 1;
-/** Most commands in a message. */
+/** Maximum number of commands in a message. */
 const BATCH = 500;
 const LEASE_S = 2;
 
-/** Plays to the end or until it is aborted. `onProgress` gets the fraction done. */
+/** Plays to the end or until it is aborted. Calls `onProgress` with the completed fraction. */
 export async function playScript(
   sessionId: string,
   scriptName: string,

@@ -1,4 +1,4 @@
-// The server that the page came from, and who calls.
+// The server that the page came from, called with the caller's token.
 
 import { Server } from "palpate";
 

@@ -16,10 +16,10 @@ const ASK_MS = 1000;
 
 /** The default refinement has at most this many vertices; the user may select more. */
 const CHOSEN_VERTICES = 40_000;
-/** Above this browsers get slow on any machine. */
+/** Maximum number of vertices. With more, browsers are slow on any machine. */
 const MAX_VERTICES = 1_500_000;
 
-/** Points of a sheet, at most. */
+/** Maximum number of points of a sheet. */
 const MAX_POINTS = 1 << 23;
 
 /** Callbacks of a shown session. */
@@ -27,7 +27,7 @@ export interface Told {
   onSession: (session: Session) => void;
   onTrouble: (failure: Failure, waitMs: number) => void;
   onWell: () => void;
-  /** What a caller may no longer do: the server's reason. */
+  /** What the caller may no longer do: the server's reason. */
   onBarred: (reason: string) => void;
 }
 
@@ -38,21 +38,21 @@ export class ShownSession {
   readonly reach: Reach;
   /** Width of the tissue, m. */
   readonly widthM: number;
-  /** The usual length of an edge of a mesh, m. */
+  /** Typical edge length of a mesh, m. */
   readonly edgeM: number;
   readonly rateHz: number;
   readonly mostRefinement: number;
   surface: Surface;
   refinement = 0;
   roundTripMs: number | undefined;
-  /** When the server last answered, of this window's clock. */
+  /** When the server last answered, by this window's clock. */
   heardMs = performance.now();
-  /** Whether the server does not answer: then only one question after the other asks whether it is back. */
+  /** Whether the server does not answer. If so, only one request at a time asks whether it is back. */
   private isLost = false;
   private asking = new AbortController();
-  /** When its newest answer was asked for. */
+  /** When its newest answer was requested. */
   askedMs = -Infinity;
-  /** Points of a sheet along its sides; vertices and 1 of a body. */
+  /** Points along the sides of a sheet; for a body, the number of vertices and 1. */
   private readonly points: [number, number];
   private readonly ended = new AbortController();
   private seen = new AbortController();
@@ -61,7 +61,10 @@ export class ShownSession {
   private clock: { timeS: number; localS: number; roundTripMs: number; atMs: number; overruns: bigint } | undefined;
   private readonly mesh: MeshData | undefined;
 
-  /** Finds out what the session shows, which for a body is its mesh. It takes over the surface of one with the same tissue. */
+  /**
+   * Loads what the session shows; for a body, this includes its mesh. With `former`, takes over the surface of a
+   * session with the same tissue.
+   */
   static async to(
     session: Session,
     holder: string,
@@ -93,16 +96,16 @@ export class ShownSession {
     if (mesh) {
       const sizeM = boxOf(mesh);
       const lengthM = fingerM(sizeM, mesh.edgeM);
-      // Springs across carry the less of a push, the more points share it.
+      // The more points share a push, the less of it the springs between them carry.
       const aPointN = 2 * lengthM * (anchor + 2 * k * Math.min(1, (mesh.edgeM / lengthM) ** 2));
       this.surface = former?.surface ?? new Body(mesh, lengthM, session.points);
       const { sum } = this.surface.push(this.surface.middle(), lengthM);
-      // Of a tissue whose springs are not all alike nothing is told.
+      // If the springs of a tissue differ, no such force can be given.
       const mostN = rounded(sum * aPointN || 2);
       this.reach = { lengthM, mostN, pointN: mostN / sum, depthM: 3 * lengthM };
       this.widthM = sizeM;
     } else {
-      // A push falls off over a spacing, so that a few points share it: it sinks in by about two spacings.
+      // A push falls off over a spacing, so that a few points share it: its depth is about two spacings.
       const lengthM = sheet?.spacingM ?? 1;
       const mostN = 2 * lengthM * (2 * k + anchor) || lengthM;
       this.reach = { lengthM, mostN, pointN: mostN, depthM: 3 * lengthM };
@@ -118,13 +121,13 @@ export class ShownSession {
     }
     this.surface ??= former?.surface ?? this.newSheet();
     this.samples = new Samples(this.reach.pointN, (tool) => this.sense(tool));
-    // Until its own come, those of the other are what is seen.
+    // Until its own samples arrive, those of the former session are shown.
     if (former) this.samples.follow(former.samples, session.simulationTimeS);
     this.hand = new Hand(session.sessionId, holder, this.reach, () => this.surface, sampleEvery(this.rateHz));
     this.hand.tool.datagrams.onSample = (sample) => this.samples.takeOwn(sample);
   }
 
-  /** Vertices of refinement n: M = (m − 1)·n + m along a side of a sheet. */
+  /** Returns the number of vertices along a side of a sheet at refinement n: M = (m − 1)·n + m. */
   private vertices(n: number): number {
     return this.points.map((m) => (m - 1) * n + m).reduce((x, y) => x * y);
   }
@@ -135,14 +138,14 @@ export class ShownSession {
     return new Sheet(nx, ny, this.reach.lengthM / (n + 1), n + 1);
   }
 
-  /** The side that a tool touches. Only of the own hand is known how a force is spread. */
+  /** Returns the side that a tool touches. How a force is distributed is known only of this page's hand. */
   private sense(tool: Felt): Sense {
     const isMine = tool.tool === 0 && this.hand.holds;
     const outward = (isMine && this.hand.outward) || this.placeOf(tool)?.outward || [0, 0, 1];
     return { outward, share: isMine ? this.hand.share : 1 };
   }
 
-  /** Where a tool touches. The own hand knows from which side. */
+  /** Returns where a tool touches. For this page's hand, the side is known. */
   placeOf(tool: Felt): Place | undefined {
     const isMine = tool.tool === 0 && this.hand.holds;
     return this.surface.ofTool(tool, isMine ? this.hand.isOuter : undefined);
@@ -171,7 +174,7 @@ export class ShownSession {
     this.frames.run(this.session.sessionId, this.refinement, this.surface.field, signal, (failure, waitMs) => this.broken(failure, waitMs));
   }
 
-  /** A stream has failed. Whether the server is there, its status tells. */
+  /** A stream has failed. Whether the server is there is determined by the status requests. */
   private broken(failure: Failure, waitMs: number): void {
     if (!this.isLost && !isBarred(failure.reason)) this.told.onTrouble(failure, waitMs);
   }
@@ -196,7 +199,7 @@ export class ShownSession {
     this.seen.abort();
   }
 
-  /** How fast its time goes on: other than 1 only of what is played. */
+  /** Speed of its time: different from 1 only in a playback. */
   get speed(): number {
     return this.session.playback?.speed ?? 1;
   }
@@ -239,7 +242,7 @@ export class ShownSession {
       (failure, waitMs) => {
         if (failure.isGone || isBarred(failure.reason)) this.leave();
         if (isBarred(failure.reason)) return this.told.onBarred(failure.reason);
-        // Each stream would ask on its own.
+        // Otherwise each stream would retry on its own.
         this.isLost = true;
         this.seen.abort();
         this.told.onTrouble(failure, waitMs);
@@ -271,7 +274,7 @@ export class ShownSession {
   }
 }
 
-/** Throws if a session can't be shown, whatever its server says. */
+/** Throws if a session can't be shown, whatever its server claims. */
 function check({ scene }: Session): void {
   const isPositive = (value = 1) => Number.isFinite(value) && value > 0;
   const { sheet, stepping, springs, anchorSprings } = scene ?? {};
@@ -285,7 +288,7 @@ function check({ scene }: Session): void {
   }
 }
 
-/** The diagonal of the box around the triangles of a mesh, m. */
+/** Returns the diagonal of the bounding box of a mesh, m. */
 function boxOf({ restM, triangles }: MeshData): number {
   const low = [Infinity, Infinity, Infinity];
   const high = [-Infinity, -Infinity, -Infinity];
@@ -298,7 +301,7 @@ function boxOf({ restM, triangles }: MeshData): number {
   return norm([high[0]! - low[0]!, high[1]! - low[1]!, high[2]! - low[2]!]);
 }
 
-/** One or two digits of a force: a slider goes up to it. */
+/** Rounds a force to one or two digits, as the maximum of a slider. */
 function rounded(force: number): number {
   return Number(force.toPrecision(2));
 }

@@ -1,14 +1,14 @@
-// The flank of the tissue: from the edge of the sheet round and down to the table. It says that tissue is a body; the server
-// computes its surface only.
+// The flank of the tissue: from the edge of the sheet around and down to the table. It shows that tissue is a body,
+// though the server computes only its surface.
 
 import { BufferAttribute, BufferGeometry, DynamicDrawUsage } from "three";
 
-/** Height of the body, and radius of its edges and corners, of the shorter side of the sheet. */
+/** Height of the body, and radius of its edges and corners, as fractions of the shorter side of the sheet. */
 const HEIGHT = 0.2;
 const ROUND = 0.075;
 /** Segments of a corner. */
 const CORNER = 6;
-/** Each row's angle on the rounded edge; below these, two more. */
+/** The angle of each row on the rounded edge; two more rows are below. */
 const ANGLES = [0, 0.3, 0.65, 1.0, 1.3, Math.PI / 2];
 const ROWS = ANGLES.length + 2;
 
@@ -16,7 +16,7 @@ export class SheetEdge {
   readonly geometry = new BufferGeometry();
   readonly heightM: number;
   readonly roundM: number;
-  /** Of each column: the vertex of the sheet's edge, and the direction outwards. */
+  /** For each column: the vertex of the sheet's edge, and the direction outwards. */
   private sources = new Uint32Array();
   private outwards = new Float32Array();
   private position = new BufferAttribute(new Float32Array(), 3);
@@ -33,7 +33,7 @@ export class SheetEdge {
     this.roundM = ROUND * side;
   }
 
-  /** Begins around the `mx` × `my` drawn vertices. */
+  /** Creates the flank around the `mx` × `my` drawn vertices. */
   begin(edge: BufferAttribute, edgeNormal: BufferAttribute, mx: number, my: number): void {
     [this.edge, this.edgeNormal] = [edge, edgeNormal];
     const sources: number[] = [];
@@ -49,7 +49,7 @@ export class SheetEdge {
         outwards.push(Math.cos(turned), Math.sin(turned));
       }
     };
-    // Anticlockwise, from the near left corner.
+    // Counterclockwise, from the near left corner.
     side(mx, (i) => i * my, -Math.PI / 2);
     side(my, (i) => (mx - 1) * my + i, 0);
     side(mx, (i) => (mx - 1 - i) * my + my - 1, Math.PI / 2);
@@ -69,7 +69,7 @@ export class SheetEdge {
       for (let column = 0; column < columns; column++) {
         const i = row * columns + column;
         const at = sources[column]!;
-        // The image goes on over the edge, mirrored.
+        // The image continues over the edge, mirrored.
         uv[2 * i] = Math.floor(at / my) / Math.max(mx - 1, 1) + (outwards[2 * column]! * arcM) / (this.widthM || 1);
         uv[2 * i + 1] = (at % my) / Math.max(my - 1, 1) + (outwards[2 * column + 1]! * arcM) / (this.lengthM || 1);
         open[i] = row < ANGLES.length ? 1 : [0.85, 0.45][row - ANGLES.length]!;
@@ -83,7 +83,7 @@ export class SheetEdge {
     this.geometry.setIndex(triangles);
   }
 
-  /** Of a row: how far out, how far down, the direction of its normal, and the length along the flank, m. */
+  /** For a row: distance outwards and downwards, direction of its normal, and length along the flank, m. */
   private profile(row: number): { outM: number; downM: number; angle: number; arcM: number } {
     const { roundM: r, heightM } = this;
     const angle = ANGLES[row];
@@ -93,7 +93,7 @@ export class SheetEdge {
     return { outM: isLast ? 0.8 * r : 1.0 * r, downM, angle: isLast ? 1.8 : 1.62, arcM: (Math.PI / 2 - 1) * r + downM };
   }
 
-  /** Follows the edge of the sheet. */
+  /** Moves with the edge of the sheet. */
   follow(): void {
     const p = this.position.array as Float32Array;
     const n = this.normal.array as Float32Array;

@@ -1,5 +1,5 @@
-// A sheet as drawn: positions and normals of all vertices, or of every second or fourth one per side; and around it the
-// flank of the tissue, as high as the body that is drawn.
+// A sheet as drawn: positions and normals of all vertices, or of every second or fourth one per side, and around it
+// the flank of the tissue, down to the height of the drawn body.
 
 import { Box3, BufferAttribute, BufferGeometry, DynamicDrawUsage, Plane, type Ray, Vector3 } from "three";
 import { Field, type Rectangle } from "palpate";
@@ -7,13 +7,13 @@ import { SheetEdge } from "./sheet-edge";
 import type { Felt } from "./samples";
 import type { Centre, Place, Point, Push, Surface } from "./surface";
 
-/** With fewer vertices than this, a sheet shows its coarse drawing. */
+/** A sheet with fewer vertices than this would look coarse. */
 const MIN_VERTICES = 6000;
-/** How many spacings of mass points away the surroundings count for the light in a dent. */
+/** Radius of the neighbourhood that affects the light in a dent, in spacings of mass points. */
 const WIDEST = 4;
-/** How far beside the sheet a press still means its edge, of its size. */
+/** Distance beside the sheet at which a press still counts as on its edge, as a fraction of the sheet's size. */
 const BESIDE = 0.01;
-/** Places of a shaft that must be clear of tissue. */
+/** Number of points of a shaft that must be outside the tissue. */
 const CHECKED = 16;
 
 export class Sheet implements Surface {
@@ -33,7 +33,7 @@ export class Sheet implements Surface {
   private columns = new Uint32Array();
   private position = new BufferAttribute(new Float32Array(), 3);
   private normal = this.position;
-  /** The fraction of light from around that reaches each vertex: less in a dent. */
+  /** Fraction of ambient light that reaches each vertex: less in a dent. */
   private open = this.position;
   private readonly found = new Vector3();
   private readonly spanM: readonly [number, number];
@@ -41,8 +41,8 @@ export class Sheet implements Surface {
   private movedM = 0;
 
   /**
-   * Vertex (a, b) rests at (a, b, 0)·spacing, and has texture coordinates (a/(nx − 1), b/(ny − 1)). `GetMesh` would
-   * return the same, in megabytes. Every `pointEvery`-th vertex is a mass point.
+   * Vertex (a, b) rests at (a, b, 0)·spacing, and has the texture coordinates (a/(nx − 1), b/(ny − 1)). `GetMesh`
+   * would return the same values in megabytes of data. Every `pointEvery`-th vertex is a mass point.
    */
   constructor(
     nx: number,
@@ -100,7 +100,7 @@ export class Sheet implements Surface {
     return true;
   }
 
-  /** Call before each picture: updates positions and normals of what changed since the last. */
+  /** Updates positions and normals of what changed since the last picture. Call this before each picture. */
   refresh(): boolean {
     const changed = this.field.takeChanged();
     if (!changed) return false;
@@ -116,7 +116,7 @@ export class Sheet implements Surface {
     return true;
   }
 
-  /** Drawn vertices between neighbouring mass points. */
+  /** Number of drawn vertices between neighbouring mass points. */
   private get stride(): number {
     return Math.max(1, Math.round(this.pointEvery / this.every));
   }
@@ -157,7 +157,7 @@ export class Sheet implements Surface {
     this.movedM += most;
   }
 
-  /** How far vertices moved at most since the last call, m. */
+  /** Returns how far vertices moved since the last call, at most, m. */
   takeMoved(): number {
     const moved = this.movedM;
     this.movedM = 0;
@@ -165,8 +165,9 @@ export class Sheet implements Surface {
   }
 
   /**
-   * Normals: the cross product of the differences across each vertex along x and along y. They reach to the neighbouring
-   * mass points: between these the surface is bilinear, and narrower ones would show its creases.
+   * Computes normals: the cross product of the differences across each vertex along x and along y. The differences
+   * extend to the neighbouring mass points: between these the surface is bilinear, and shorter differences would show
+   * its creases.
    */
   private turn(a0: number, a1: number, b0: number, b1: number): void {
     const p = this.position.array as Float32Array;
@@ -197,7 +198,7 @@ export class Sheet implements Surface {
         n[i] = x / length;
         n[i + 1] = y / length;
         n[i + 2] = z / length;
-        // How far the surroundings rise above it, near and far.
+        // Height of the surroundings above it, near and far.
         const height = p[i + 2]!;
         const close = (p[l + 2]! + p[r + 2]! + p[d + 2]! + p[u + 2]!) / 4 - height;
         const across = 3 * Math.min(wide, ny - 1 - b);
@@ -209,14 +210,14 @@ export class Sheet implements Surface {
     }
   }
 
-  /** A place of the rest plane; beside the sheet, that of its edge. */
+  /** Returns the place at a point of the rest plane; beside the sheet, the place on its edge. */
   private placeOf(xM: number, yM: number): Place {
     const within = (v: number, most: number) => Math.min(Math.max(v, 0), most);
     const restM: [number, number, number] = [within(xM, this.spanM[0]), within(yM, this.spanM[1]), 0];
     return { restM, outward: [0, 0, 1], triangle: -1, weights: [1, 0, 0] };
   }
 
-  /** The place in the rest plane whose tissue a ray meets; undefined beside the sheet. */
+  /** Returns the place in the rest plane whose tissue a ray meets; undefined beside the sheet. */
   pick(ray: Ray): Place | undefined {
     const level = new Plane(new Vector3(0, 0, 1), 0);
     const hit = new Vector3();
@@ -274,7 +275,7 @@ export class Sheet implements Surface {
     return { sum: 1, share: 1 };
   }
 
-  /** Displacement at a place, between vertices as well. The result is valid until the next call. */
+  /** Returns the displacement at a place, interpolated between vertices. The result is valid until the next call. */
   displacementAt({ restM }: Place): Vector3 {
     return this.displacementAtM(restM[0], restM[1]);
   }
@@ -293,7 +294,7 @@ export class Sheet implements Surface {
     return this.found.set(of(0), of(1), of(2));
   }
 
-  /** Height of the tissue above or below a place; beside the tissue, that of its edge. */
+  /** Returns the height of the tissue above or below a place; beside the tissue, that of its edge. */
   heightAt(xM: number, yM: number): number {
     let [u, v] = [xM, yM];
     for (let round = 0; round < 4; round++) {
@@ -303,7 +304,7 @@ export class Sheet implements Surface {
     return this.displacementAtM(u, v).z;
   }
 
-  /** Above the place as it has moved, as high as the tissue around lifts the ball. */
+  /** Places the ball above the present position of the place, as high as the tissue around lifts it. */
   restOn(place: Place, radiusM: number, middleM: Vector3): void {
     const moved = this.displacementAt(place);
     const [xM, yM] = [place.restM[0] + moved.x, place.restM[1] + moved.y];
@@ -330,7 +331,7 @@ export class Sheet implements Surface {
     return least;
   }
 
-  /** Displacement of the vertex nearest to a place in the rest plane. */
+  /** Returns the displacement of the vertex nearest to a point of the rest plane. */
   private displacementOfNearest(xM: number, yM: number): [number, number, number] {
     const { nx, ny, displacementM: d } = this.field;
     const near = (at: number, count: number) => Math.min(Math.max(Math.round(at / this.spacingM), 0), count - 1);
@@ -338,12 +339,12 @@ export class Sheet implements Surface {
     return [d[i]!, d[i + 1]!, d[i + 2]!];
   }
 
-  /** The place at (x, y) of the sheet, in fractions of its sides. */
+  /** Returns the place at (x, y), as fractions of the sheet's sides. */
   placeAt(x: number, y: number): Place {
     return this.placeOf(x * this.spanM[0], y * this.spanM[1]);
   }
 
-  /** The largest displacement of any vertex, m. */
+  /** Returns the largest displacement of any vertex, m. */
   largestM(): number {
     let most = 0;
     const d = this.field.displacementM;
@@ -358,7 +359,7 @@ export class Sheet implements Surface {
   }
 }
 
-/** Lines along rows and columns of mass points, through the drawn vertices between them. */
+/** Returns lines along rows and columns of mass points, through the drawn vertices between them. */
 function gridLines(rows: Uint32Array, columns: Uint32Array, pointEvery: number): Uint32Array {
   const ends: number[] = [];
   rows.forEach((row, a) => {

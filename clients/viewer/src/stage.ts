@@ -1,4 +1,4 @@
-// The picture: tissue, table, tools and camera. Drawn on changes, at most once per display frame.
+// The picture: tissue, table, tools and camera. It is drawn when something changes, at most once per display frame.
 
 import {
   Box3,
@@ -33,29 +33,32 @@ import type { Lump } from "./lumps";
 import type { Place, Surface } from "./surface";
 import { type Seen, type ShownTool, ToolMark } from "./tool";
 
-/** After this time without a frame, tool changes are drawn on their own. */
+/** After this time without a frame, changes of the tools are drawn on their own. */
 const ALONE_MS = 40;
-/** After this time without a change, a picture of less effort is drawn again in full. */
+/** After this time without a change, a picture that was drawn with reduced effort is drawn again in full. */
 const CALM_MS = 450;
-/** Pixels a side of that for each pixel of the screen, without a graphics processor: it smooths edges. */
+/** Resolution of that picture relative to the screen, without a graphics processor: more pixels smooth edges. */
 const CALM_PIXELS = 1.5;
-/** If that would take longer, one has to do: a press must not wait for it. */
+/** If that would take longer than this, normal resolution is used, because a press must not wait for it. */
 const CALM_TAKES_MS = 500;
-/** Movements of the tissue that nobody sees, of its size. */
+/** Movements of the tissue that are invisible, as a fraction of its size. */
 const UNSEEN = 2e-5;
 const FIELD_OF_VIEW = 28;
-/** Corners of the ring where the pointer is. */
+/** Corners of the ring at the pointer. */
 const RING_POINTS = 32;
-/** Least height of the camera above a sheet, of its size. */
+/** Minimum height of the camera above a sheet, as a fraction of its size. */
 const MIN_HEIGHT = 0.06;
-/** The least distance of the camera from a closed body, and of what it turns about in an open one, of its size. */
+/**
+ * Minimum distance of the camera from a closed body, and from the orbit target in an open one, as a fraction of the
+ * body's size.
+ */
 const NEAREST = 0.05;
 const AHEAD = 0.15;
-/** The camera's range of heights about its target, from straight above: of a sheet, and of a body. */
+/** The camera's range of polar angles about its target, measured from straight above: for a sheet, and for a body. */
 const POLAR = { sheet: [0, 0.46 * Math.PI], body: [0.02, Math.PI - 0.02] } as const;
-/** Where the lamp of a body is, to the right of the eye, above and behind it. */
+/** Position of the lamp of a body, relative to the eye: to the right, above and behind. */
 const LAMP = [-0.66, 0.78, 0.34] as const;
-/** The length of a texture on a body that has none of its own coordinates, m: where its details have their natural size. */
+/** Size of a projected texture on a body, m: at this size its details look natural. */
 const PERIOD_M = 0.075;
 
 export class Stage {
@@ -64,21 +67,21 @@ export class Stage {
   onDrawn: () => void = () => {};
   /** Number of pictures drawn. */
   drawn = 0;
-  /** Grows whenever the view changes. */
+  /** Increases whenever the view changes. */
   views = 0;
-  /** Whether the tissue was ever drawn, and whether its texture was then there: for tests. */
+  /** Whether the tissue was ever drawn, and whether it then had its texture: for tests. */
   readonly began = { isDrawn: false, isTextured: false };
   private readonly renderer: WebGLRenderer;
   private readonly scene = new Scene();
   private readonly orbit: OrbitControls;
-  /** Of sheets and of bodies: each is compiled when it is first used. */
+  /** Materials of sheets and of bodies. Each is compiled when it is first used. */
   private readonly skins = { sheet: new Skin(false), body: new Skin(true) };
   private skin = this.skins.sheet;
   private ground: Ground | undefined;
   private readonly colour = { table: new Color(), background: new Color() };
   private readonly hidden = new MeshBasicMaterial({ side: DoubleSide, polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 });
   private readonly wires = new LineBasicMaterial();
-  /** Lumps are seen through the tissue. */
+  /** Shape of lumps, which are visible through the tissue. */
   private readonly ball = new SphereGeometry(1, 32, 24);
   private readonly lumpy = new MeshBasicMaterial({ color: 0x3d8bff, depthTest: false, transparent: true, opacity: 0.45 });
   private lumps: Mesh[] = [];
@@ -89,23 +92,23 @@ export class Stage {
   private readonly marks: ToolMark[] = [];
   private tools: ShownTool[] = [];
   private aim: Place | undefined;
-  /** Whether the camera is where the page put it. */
+  /** Whether the camera is still in its initial position. */
   private isHome = true;
-  /** Pixels at the bottom of the picture that something covers. */
+  /** Height of the covered area at the bottom of the picture, pixels. */
   private coveredPx = 0;
   private wanted = false;
   private before = 0;
-  /** Time that the last picture of what moves took, ms. */
+  /** Time that the last picture with movement took, ms. */
   private tookMs = 0;
   private readonly effort: Effort;
   private wireframe = false;
   private held = false;
   private isSoftware: boolean;
   private isFine = false;
-  /** Whether more than the tissue changed since the last picture; and how far it moved since, m. */
+  /** Whether more than the tissue changed since the last picture, and how far the tissue moved since, m. */
   private isDue = false;
   private unseenM = 0;
-  /** A pending picture of tools, drawn if no frame causes one first; and one in full. */
+  /** A pending picture of the tools, if no frame causes one first; and a pending picture in full. */
   private later: ReturnType<typeof setTimeout> | undefined;
   private calm: ReturnType<typeof setTimeout> | undefined;
   private readonly spot = new Vector3();
@@ -120,7 +123,8 @@ export class Stage {
   ) {
     this.isSoftware = isDrawnBySoftware();
     this.effort = new Effort(this.isSoftware, isFixed);
-    // Smooth edges cost nothing with a graphics processor; without one, they cost several times everything else.
+    // Antialiasing costs nothing with a graphics processor; without one, it costs several times as much as everything
+    // else.
     this.renderer = new WebGLRenderer({ canvas, antialias: isFixed || !this.isSoftware });
     this.renderer.outputColorSpace = SRGBColorSpace;
     this.camera.up.set(0, 0, 1);
@@ -140,7 +144,10 @@ export class Stage {
     this.colours();
   }
 
-  /** Shows a surface. `keepView` keeps the camera and the texture; else the tissue is seen above what is covered. */
+  /**
+   * Shows a surface. `keepView` keeps the camera and the texture; otherwise the whole tissue is shown above the
+   * covered area.
+   */
   show(surface: Surface, keepView: boolean, coveredPx = 0): void {
     if (!keepView) this.coveredPx = coveredPx;
     for (const old of [this.mesh, this.edge, this.lines, this.ground?.mesh]) if (old) this.scene.remove(old);
@@ -155,7 +162,7 @@ export class Stage {
     const size = surface.sizeM;
     if (isBody) {
       skin.uniforms.projected!.value = surface.isMapped ? 0 : 1;
-      // A body of another size than an organ has as many details.
+      // A body whose size is not that of an organ gets equally many details.
       skin.uniforms.period!.value = size > 0.4 * PERIOD_M && size < 10 * PERIOD_M ? PERIOD_M : size / 3;
       skin.uniforms.reach!.value = size;
       skin.uniforms.closed!.value = surface.isOpen ? 0 : 1;
@@ -167,7 +174,7 @@ export class Stage {
     this.ground = new Ground(surface, this.colour.table, this.colour.background);
     for (const part of [this.mesh, this.edge, this.lines, this.ground.mesh]) {
       if (!part) continue;
-      // Bounds of a moving surface are not worth computing.
+      // Computing the bounds of a moving surface is not worthwhile.
       part.frustumCulled = false;
       this.scene.add(part);
     }
@@ -177,7 +184,7 @@ export class Stage {
     this.orbit.maxDistance = size * 5;
     [this.orbit.minPolarAngle, this.orbit.maxPolarAngle] = POLAR[isBody ? "body" : "sheet"];
     this.orbit.screenSpacePanning = isBody;
-    // What is under the pointer comes nearer.
+    // Zooms towards the pointer.
     this.orbit.zoomToCursor = isBody;
     this.aim = undefined;
     if (!keepView) this.isHome = true;
@@ -185,20 +192,20 @@ export class Stage {
     this.setWireframe(this.wireframe);
   }
 
-  /** The tissue's texture has arrived. */
+  /** To be called when the tissue's texture arrives. */
   setTexture(texture: Texture): void {
     if (!this.isSoftware) texture.anisotropy = 8;
     this.skin.setTexture(texture);
     this.draw();
   }
 
-  /** Puts the camera back to where the page put it first. */
+  /** Returns the camera to its initial position. */
   resetView(): void {
     this.isHome = true;
     this.goHome();
   }
 
-  /** Puts the camera where the whole tissue fills the picture. */
+  /** Places the camera so that the whole tissue fills the picture. */
   private goHome(): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const surface = this.surface;
@@ -249,11 +256,12 @@ export class Stage {
       this.marks.push(mark);
       this.scene.add(mark.group);
     }
-    // A tool's movement also moves tissue. A picture of the tool alone would only delay the one that shows both.
+    // A tool's movement usually also moves tissue. A picture of the tool alone would only delay the one that shows
+    // both.
     this.later ??= setTimeout(() => this.draw(), ALONE_MS);
   }
 
-  /** Puts the tools on the tissue as it is drawn now. */
+  /** Places the tools on the tissue as it is drawn now. */
   private placeTools(): void {
     const surface = this.surface;
     this.seen.right.setFromMatrixColumn(this.camera.matrixWorld, 0);
@@ -270,12 +278,12 @@ export class Stage {
     ring.set(at.x, at.y, at.z, surface.sizeM / 42);
   }
 
-  /** The first tool's tip in the window; undefined if there is none. */
+  /** Returns the window position of the first tool's tip; undefined if there is no tool. */
   tipInWindow(): [number, number] | undefined {
     return this.tools.length > 0 && this.marks[0] ? this.inWindow(this.marks[0].tipM.toArray()) : undefined;
   }
 
-  /** The least room between a drawn tool and the drawn tissue, m; undefined without a tool. */
+  /** Smallest distance between a drawn tool and the drawn tissue, m; undefined without a tool. */
   get clearM(): number | undefined {
     if (!this.surface || this.tools.length === 0) return undefined;
     return Math.min(...this.marks.slice(0, this.tools.length).map((mark) => mark.clearM));
@@ -292,7 +300,7 @@ export class Stage {
     return this.skin.uniforms.mapped!.value === 1;
   }
 
-  /** Pixels of the window for a metre across, at the middle of the tissue. */
+  /** Returns the number of window pixels for one metre, at the middle of the tissue. */
   pixelsPerMetre(): number {
     if (!this.surface) return NaN;
     const middle = this.surface.box.getCenter(new Vector3()).toArray();
@@ -304,7 +312,7 @@ export class Stage {
     return Math.hypot(x1 - x0, y1 - y0) / (2 * step);
   }
 
-  /** For measurements: hides everything but tissue, and makes each picture like the one before. */
+  /** For measurements: hides everything except the tissue, and makes consecutive pictures identical. */
   hold(on: boolean): void {
     this.held = on;
   }
@@ -314,7 +322,7 @@ export class Stage {
     return this.effort.describe(this.surface?.every ?? 1);
   }
 
-  /** Marks the place where the keys aim. */
+  /** Marks the target of the keys. */
   setAim(place: Place | undefined): void {
     this.aim = place;
     this.draw();
@@ -344,17 +352,17 @@ export class Stage {
     return caster;
   }
 
-  /** The place of the tissue under a point of the window; undefined where there is none. */
+  /** Returns the place of the tissue at a point of the window; undefined if there is none. */
   pick(x: number, y: number): Place | undefined {
     return this.surface?.pick(this.ray(x, y).ray);
   }
 
-  /** The place in the middle of the window, or next to it. */
+  /** Returns the place in the middle of the window, or the nearest one. */
   pickMiddle(): Place | undefined {
     return this.pickNear(0.5, 0.5);
   }
 
-  /** The place nearest to a point of the picture, in fractions of its width and height. */
+  /** Returns the place nearest to a point of the picture, which is given as fractions of its width and height. */
   pickNear(fx: number, fy: number): Place | undefined {
     const box = this.canvas.getBoundingClientRect();
     const step = Math.min(box.width, box.height) / 24;
@@ -370,20 +378,20 @@ export class Stage {
     return undefined;
   }
 
-  /** Whether a drag with the left button or one finger turns the view. */
+  /** Sets whether a drag with the left button or one finger turns the view. */
   turnByDrag(on: boolean): void {
     this.orbit.mouseButtons.LEFT = on ? MOUSE.ROTATE : null;
     this.orbit.touches.ONE = on ? TOUCH.ROTATE : null;
   }
 
-  /** The place of a window point on the plane through `at` that faces the camera. */
+  /** Returns the point at a window position on the plane through `at` that faces the camera. */
   onFacingPlane(x: number, y: number, at: Vec3): Vec3 | undefined {
     const facing = this.camera.getWorldDirection(new Vector3());
     const plane = new Plane().setFromNormalAndCoplanarPoint(facing, new Vector3(...at));
     return this.ray(x, y).ray.intersectPlane(plane, new Vector3())?.toArray();
   }
 
-  /** The window point of a place. */
+  /** Returns the window position of a point. */
   inWindow(at: Vec3): [number, number] {
     const box = this.canvas.getBoundingClientRect();
     this.camera.updateMatrixWorld();
@@ -391,7 +399,7 @@ export class Stage {
     return [box.left + ((p.x + 1) / 2) * box.width, box.top + ((1 - p.y) / 2) * box.height];
   }
 
-  /** A direction across the tissue at a place, of length 1: `way` to the right and up, as seen. */
+  /** Returns a unit vector along the tissue at a place: `way` gives its components to the right and up, as seen. */
   across({ outward }: Place, way: [number, number]): Vector3 {
     const out = new Vector3(...outward);
     const right = new Vector3().setFromMatrixColumn(this.camera.matrixWorld, 0);
@@ -401,13 +409,13 @@ export class Stage {
     return out.cross(right).multiplyScalar(way[1]).addScaledVector(right, way[0]);
   }
 
-  /** Where a place is now, in the window. */
+  /** Returns the present window position of a place. */
   placeInWindow(place: Place): [number, number] | undefined {
     if (!this.surface) return undefined;
     return this.inWindow(new Vector3(...place.restM).add(this.surface.displacementAt(place)).toArray());
   }
 
-  /** A ring that lies on the tissue around a place, as points of the window. */
+  /** Returns a ring on the tissue around a place, in window coordinates. */
   ringInWindow(place: Place, radiusM: number): [number, number][] {
     if (!this.surface) return [];
     const at = new Vector3(...place.restM).add(this.surface.displacementAt(place));
@@ -419,7 +427,7 @@ export class Stage {
     });
   }
 
-  /** Requests a picture of a frame. One that moves nothing visibly is not worth drawing what stands there in full again. */
+  /** Requests a picture of a frame. If the frame moves nothing visibly, a picture that was drawn in full is kept. */
   drawFrame(): void {
     const wasDue = this.isDue;
     this.draw();
@@ -455,7 +463,7 @@ export class Stage {
     // The browser may block the page until the picture is done, so measure its time afterwards.
     setTimeout(() => {
       const now = performance.now();
-      // Only pictures that the page waited for count.
+      // Only the time counts for which the page waited.
       const tookMs = now - Math.max(this.before, askedMs);
       this.before = now;
       if (!this.isFine) this.tookMs = tookMs;
@@ -475,7 +483,7 @@ export class Stage {
     this.renderer.render(this.scene, this.camera);
   }
 
-  /** Keeps the camera's target in the tissue, and the camera above a sheet and its table; and puts the lamp where it belongs. */
+  /** Keeps the camera's target in the tissue, and the camera above a sheet and its table, and positions the lamp. */
   private stayAbove(): void {
     const surface = this.surface;
     if (!surface) return;
@@ -490,7 +498,7 @@ export class Stage {
         this.camera.lookAt(target);
       }
       this.camera.updateMatrixWorld();
-      // From the left and behind the tissue, as seen: dents turn a dark flank to the eye, and the far ones shine.
+      // From the left and behind the tissue, as seen: dents then show their dark side, and the far side is bright.
       const ahead = this.spot.copy(target).sub(position).setZ(0).normalize();
       light.lamp.value.set(0.5 * ahead.x - 0.62 * ahead.y, 0.5 * ahead.y + 0.62 * ahead.x, 0.98).normalize();
       return;
@@ -498,13 +506,13 @@ export class Stage {
     if (surface.isOpen) this.goIn(surface, target);
     else this.stayOutside(surface);
     this.camera.updateMatrixWorld();
-    // Over the left shoulder, whatever is looked at.
+    // Over the left shoulder, whatever the view.
     const lamp = light.lamp.value.set(0, 0, 0);
     LAMP.forEach((part, column) => lamp.addScaledVector(this.spot.setFromMatrixColumn(this.camera.matrixWorld, column), part));
     lamp.normalize();
   }
 
-  /** An open body is entered: what the camera turns about stays ahead of it. */
+  /** Lets the camera enter an open body: the orbit target stays ahead of it. */
   private goIn(surface: Surface, target: Vector3): void {
     const { position } = this.camera;
     const ahead = this.spot.copy(target).sub(position);
@@ -513,7 +521,7 @@ export class Stage {
     this.bounds.copy(surface.box).expandByScalar(0.2 * surface.sizeM).clampPoint(target, target);
   }
 
-  /** A closed body is not entered. */
+  /** Keeps the camera outside a closed body. */
   private stayOutside(surface: Surface): void {
     const { position } = this.camera;
     surface.box.clampPoint(this.orbit.target, this.orbit.target);
@@ -525,7 +533,7 @@ export class Stage {
     const apart = at.distanceTo(position);
     const normal = surface.outerAt(hit);
     const least = NEAREST * surface.sizeM;
-    // The eye sees an inner side, or is about to.
+    // The camera sees an inner side, or is about to.
     if (normal.dot(ahead) > 0) {
       const back = surface.pick(new Ray(position.clone(), ahead.clone().negate()));
       const out = back ? surface.displacementAt(back).add(this.spot.set(...back.restM)).distanceTo(position) : 0;
@@ -535,25 +543,25 @@ export class Stage {
     }
   }
 
-  /** Whether the camera is where the page put it. */
+  /** Whether the camera is in its initial position. */
   get isAtHome(): boolean {
     return this.isHome;
   }
 
-  /** Gives a picture right after drawing it, when it can be read. */
+  /** Calls `take` with the next picture directly after drawing it, when it can be read. */
   snap(take: (drawn: HTMLCanvasElement) => void): void {
     this.paint();
     take(this.canvas);
   }
 
-  /** Draws again what stands still, with all pixels and smooth edges. */
+  /** Draws a picture without movement again, with all pixels and antialiasing. */
   private paintInFull(): void {
     if (this.held || this.wanted || document.hidden) return;
     this.fit(true);
     this.paint();
   }
 
-  /** One pixel of the picture, right after drawing; waits for the graphics processor. */
+  /** Returns one pixel of the picture, directly after drawing; waits for the graphics processor. */
   pixel(x: number, y: number): Uint8Array {
     const gl = this.renderer.getContext();
     const box = this.canvas.getBoundingClientRect();
@@ -563,7 +571,7 @@ export class Stage {
     return colour;
   }
 
-  /** Simpler pictures are better than fewer pictures. */
+  /** Adapts the effort: simpler pictures are better than fewer pictures. */
   private adapt(tookMs: number): void {
     if (this.held || !this.effort.tell(tookMs)) return;
     this.surface?.drawEvery(this.effort.now.every);
@@ -583,7 +591,7 @@ export class Stage {
     this.draw();
   }
 
-  /** Sets the number of pixels: as many as there is time for, or all. */
+  /** Sets the number of pixels: as many as time permits, or all. */
   private fit(isFine: boolean): void {
     const { clientWidth: width, clientHeight: height } = this.canvas;
     const ratio = Math.min(devicePixelRatio, 2);

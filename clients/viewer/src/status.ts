@@ -1,13 +1,13 @@
-// The status line: a light (good, slow, lost), what the session says, and on demand the figures behind it.
+// The status line: a light (good, slow, lost), a message about the session, and on demand the figures behind it.
 
 import { received } from "./server";
 import { excerpt } from "./text";
 
-/** The figures, in display order. An absent one is unknown. */
+/** The figures, in display order. A missing figure is unknown. */
 export interface Figures {
   roundTripMs?: number;
   networkMs?: number;
-  /** How touch goes to the server and back. */
+  /** Transport of touches between page and server. */
   way: string;
   frameAgeMs?: number;
   /** Whether nothing moves, so that no frame is due. */
@@ -19,18 +19,18 @@ export interface Figures {
   framesSkipped: bigint;
   /** What is reduced in the picture. */
   picture: string;
-  /** How fast what was recorded is played; 1 otherwise. */
+  /** Playback speed of a recording; 1 otherwise. */
   speed: number;
   overruns: bigint;
   dilation: number;
   awakePoints?: number;
   isAsleep: boolean;
-  /** The larger relative error of displacement and force in the newest audit; absent before the first. */
+  /** The larger of the relative errors of displacement and force in the newest audit; missing before the first. */
   auditedError?: number;
   tolerance?: number;
 }
 
-/** What makes the light slow, and what lost. */
+/** Limits beyond which the light is slow or lost. */
 const SLOW = { roundTripMs: 300, dilation: 0.8, frameAgeMs: 600, drawn: 6, taken: 12 };
 const LOST_MS = 4000;
 
@@ -45,11 +45,11 @@ const WORDS: Record<Light, string> = {
 };
 
 export class Status {
-  /** Whether a stream failed and nothing came since, or nothing will come. */
+  /** Whether a stream failed and nothing arrived since, or nothing will arrive. */
   private isLost = false;
-  /** When the server is asked again. */
+  /** Time of the next request to the server. */
   private againMs = 0;
-  /** Seconds in a row that something was slow. */
+  /** Number of consecutive seconds in which something was slow. */
   private slowTimes = 0;
   private readonly word: HTMLElement;
   private readonly values = new Map<string, HTMLElement>();
@@ -69,7 +69,7 @@ export class Status {
     });
   }
 
-  /** The server is lost, until it answers; it is asked again in `waitMs`. */
+  /** The server is lost until it answers. The next request is in `waitMs`. */
   lose(waitMs: number): void {
     this.isLost = true;
     this.againMs = performance.now() + waitMs;
@@ -78,7 +78,7 @@ export class Status {
     this.count();
   }
 
-  /** Nothing will come any more, and why. */
+  /** Nothing will arrive any more; `text` says why. */
   end(light: "ended" | "barred", text: string): void {
     this.isLost = true;
     this.againMs = 0;
@@ -96,14 +96,14 @@ export class Status {
     this.say(text);
   }
 
-  /** Says when the server is asked again. Call about once a second. */
+  /** Shows when the server is asked again. Call this about once a second. */
   count(): void {
     if (this.againMs === 0) return;
     const seconds = Math.ceil((this.againMs - performance.now()) / 1000);
     this.say(seconds > 0 ? `The connection is lost. Trying again in ${seconds} s.` : "The connection is lost. Trying again …");
   }
 
-  /** Shows the light, and why if it is not good. What is lost is drawn without colour: nobody knows whether it still holds. */
+  /** Shows the light, with the reason if it is not good. Outdated values are drawn without colour. */
   private shine(light: Light, why = ""): void {
     const text = WORDS[light] + (why && `: ${why}`);
     if (this.light.dataset.light !== light) this.light.dataset.light = light;
@@ -111,7 +111,7 @@ export class Status {
     document.body.dataset.light = light;
   }
 
-  /** Judges the figures. One slow second does not count. */
+  /** Evaluates the figures. A single slow second does not count. */
   private judge(figures: Figures, taken: number, drawn: number): void {
     const { roundTripMs = 0, dilation, silentMs, frameAgeMs = 0, isStill } = figures;
     if (this.isLost) return;
@@ -131,13 +131,13 @@ export class Status {
     else this.shine("good");
   }
 
-  /** Screen readers announce it, so only changes are written. */
+  /** Shows a message. Screen readers announce it, so only changes are written. */
   say(text: string): void {
     const said = excerpt(text);
     if (this.line.textContent !== said) this.line.textContent = said;
   }
 
-  /** Updates the figures. Call about once a second. */
+  /** Updates the figures. Call this about once a second. */
   show(figures: Figures): void {
     const ms = performance.now();
     const seconds = (ms - this.before.ms) / 1000;

@@ -1,5 +1,6 @@
-// What the page shows and touches: a sheet (sheet.ts) or a body, the surface of any mesh (body.ts). The rest of the page
-// knows places on it, their normals, and what its geometry is; how its vertices are arranged only these two know.
+// What the page shows and touches: a sheet (sheet.ts), or a body, which is the surface of any mesh (body.ts). The
+// rest of the page uses places on it, their normals, and its geometry; only these two modules know how its vertices
+// are arranged.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import type { Box3, BufferGeometry, Ray, Vector3 } from "three";
@@ -10,26 +11,26 @@ import type { Felt } from "./samples";
 
 /** A place on the tissue. */
 export interface Place {
-  /** Where it rests, m. */
+  /** Position at rest, m. */
   restM: Vec3;
-  /** The direction out of the tissue, on the side that is touched; of length 1. */
+  /** Unit vector out of the tissue, on the side that is touched. */
   outward: Vec3;
-  /** Of a body: the triangle, and the weights of its vertices. */
+  /** For a body: the triangle, and the barycentric coordinates in it. */
   triangle: number;
   weights: Vec3;
 }
 
-/** How the commands of a push and of a pull name a place. */
+/** How the commands of a push and of a pull identify a place. */
 export type Centre = NonNullable<MessageInitShape<typeof ForceSchema>["centre"]>;
 export type Point = Pick<MessageInitShape<typeof PositionSchema>, "point" | "vertex">;
 
-/** What becomes of a push. 1 and 1 on a sheet, whose pushes are told by what they are in their middle. */
+/** Effect of a push. Both values are 1 on a sheet, where the strength of a push is the force at its centre. */
 export interface Push {
-  /** All points together get so many times what a point in the middle gets. */
+  /** Ratio of the total force on all points to that on a point at the centre. */
   sum: number;
   /**
-   * The server tells the mean force on the tool of the points around it, by their weights. When nothing moves, so many times
-   * that is the force on all of them.
+   * The server reports the mean force on the tool of the points around it, weighted. If nothing moves, the force on
+   * all points is this multiple of it.
    */
   share: number;
 }
@@ -37,63 +38,68 @@ export interface Push {
 export interface Surface {
   /** Displacements as the server sent them. */
   readonly field: Field;
-  /** Geometry of the triangles: attributes `position`, `normal`, `open`, and what its material needs besides. */
+  /**
+   * Geometry of the triangles: the attributes `position`, `normal` and `open`, and others that its material needs.
+   */
   readonly geometry: BufferGeometry;
   /** Geometry of the lines between mass points. */
   readonly lines: BufferGeometry;
-  /** Around a sheet. */
+  /** The flank around a sheet. */
   readonly edge: SheetEdge | undefined;
-  /** Around the tissue at rest, without its flank, m. */
+  /** Bounding box of the tissue at rest, without its flank, m. */
   readonly box: Box3;
-  /** Length of its diagonal. */
+  /** Length of its diagonal, m. */
   readonly sizeM: number;
-  /** One in so many vertices per side is drawn. */
+  /** One in this many vertices per side is drawn. */
   readonly every: number;
-  /** Whether both its sides can be seen. */
+  /** Whether both its sides may be visible. */
   readonly isOpen: boolean;
 
-  /** Draws fewer vertices, as far as it can. Returns true if the number changed. */
+  /** Draws fewer vertices, as far as possible. Returns true if the number changed. */
   drawEvery(wanted: number): boolean;
-  /** Call before each picture: updates what is drawn by what changed since the last. Returns true if anything did. */
+  /** Updates what is drawn to the changes since the last picture. Call this before each picture. */
   refresh(): void;
-  /** How far vertices moved at most since the last call, m. */
+  /** Returns how far vertices moved since the last call, at most, m. */
   takeMoved(): number;
-  /** The largest displacement of any vertex, m. */
+  /** Returns the largest displacement of any vertex, m. */
   largestM(): number;
 
-  /** The place that a ray from the eye meets first. */
+  /** Returns the place that a ray from the eye meets first. */
   pick(ray: Ray): Place | undefined;
-  /** The place that keys aim at first. */
+  /** Returns the initial target of the keys. */
   middle(): Place;
-  /** The place about `way` from another. */
+  /** Returns the place approximately at the offset `way` from another. */
   beside(place: Place, way: Vector3): Place;
-  /** The mass point next to a place. */
+  /** Returns the mass point nearest to a place. */
   nearest(place: Place): Place;
   /**
-   * The place of a tool's control point; undefined if it has none. Its outward side is that from which the tool acts: the outer one
-   * or not, if the caller knows, else by its force.
+   * Returns the place of a tool's control point; undefined if it has none. Its outward direction is on the side from
+   * which the tool acts: given by `isOuter` if the caller knows it, otherwise by the tool's force.
    */
   ofTool(tool: Pick<Felt, "point" | "vertex" | "appliedN">, isOuter?: boolean): Place | undefined;
-  /** Whether a place is touched from the tissue's outer side. */
+  /** Returns whether a place is touched from the tissue's outer side. */
   isOuter(place: Place): boolean;
-  /** The normal of a place at rest, on the tissue's outer side. */
+  /** Returns the normal of a place at rest, on the tissue's outer side. */
   outerAt(place: Place): Vector3;
-  /** Displacement of a place. The result is valid until the next call. */
+  /** Returns the displacement of a place. The result is valid until the next call. */
   displacementAt(place: Place): Vector3;
-  /** A place as forces name it, and its mass point as grasps do. */
+  /** Returns a place in the form that forces use; its mass point is in the form that grasps use. */
   centre(place: Place): Centre;
   point(place: Place): Point;
-  /** A push that falls off over `lengthM` around a place. */
+  /** Returns the effect of a push that falls off over `lengthM` around a place. */
   push(place: Place, lengthM: number): Push;
 
-  /** Puts the middle of a ball where it rests on the tissue at a place. */
+  /** Sets `middleM` to the centre of a ball that rests on the tissue at a place. */
   restOn(place: Place, radiusM: number, middleM: Vector3): void;
   /**
-   * The least distance of a shaft's underside from the tissue, m; negative if the shaft is in it. It begins at `tipM`,
-   * `radiusM` is that of the tip, and the shaft's own is `part` of it.
+   * Returns the smallest distance of a shaft's underside from the tissue, m; negative if the shaft is in the tissue.
+   * The shaft begins at `tipM`; `radiusM` is the radius of the tip, and the shaft's radius is `part` of it.
    */
   room(tipM: Vector3, axis: Vector3, lengthM: number, radiusM: number, part: number): number;
-  /** Height of the tissue above (x, y), where only what lies above it has to be clear of it: of a sheet. */
+  /**
+   * Returns the height of the tissue at (x, y) if what is above this height is certainly outside the tissue, as for a
+   * sheet.
+   */
   heightAt(xM: number, yM: number): number | undefined;
 
   dispose(): void;

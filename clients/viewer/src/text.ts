@@ -1,12 +1,15 @@
-// Text of a server, as the page shows it.
+// Text from a server, as the page shows it.
 
-/** Letters, at most. */
+/** Maximum number of characters. */
 const MAX_LETTERS = 600;
 
-/** What does something other than to show itself (proto/src/printable.rs): controls, of direction too, and what has no width. */
+/**
+ * Characters that have another effect than to be visible (proto/src/printable.rs): control characters, including
+ * those for direction, and characters without width.
+ */
 const ACTS = /[\p{Cc}\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb\u{e0000}-\u{e007f}]/gu;
 
-/** A text that may be a server's: each character that acts is `?`, and what is too long to be read is cut. */
+/** Prepares a text from a server for display: each such character is replaced by `?`, and long texts are cut. */
 export function excerpt(text: string): string {
   const begin = text.length > MAX_LETTERS ? `${text.slice(0, MAX_LETTERS)} …` : text;
   return begin.replace(ACTS, "?");

@@ -1,4 +1,4 @@
-// The image on the tissue: the server's image for the session. Without one the tissue keeps one colour.
+// The image on the tissue: the server's image for the session. Without one the tissue has a single colour.
 
 import { CanvasTexture, MirroredRepeatWrapping, SRGBColorSpace, type Texture } from "three";
 
@@ -7,7 +7,7 @@ export async function tissueTexture(session: string): Promise<Texture | undefine
   if (!picture) return undefined;
   const texture = new CanvasTexture(picture);
   texture.colorSpace = SRGBColorSpace;
-  // The flank shows the image on, mirrored.
+  // The image continues on the flank, mirrored.
   texture.wrapS = texture.wrapT = MirroredRepeatWrapping;
   return texture;
 }

@@ -1,23 +1,23 @@
-// The timeline of a recording: the force over its whole length as a curve, a playhead, and marks. A click or a drag chooses
-// a moment.
+// The timeline of a recording: the force over its whole length as a curve, a playhead, and marks. The user chooses a
+// moment with a click or a drag.
 
 import { clockText, type Recording } from "./journal";
 import { part } from "./page";
 import { quantity } from "./plot";
 
-/** Room for the times beneath the curve, and for the playhead at both ends, pixels. */
+/** Space for the times beneath the curve, and for the playhead at both ends, pixels. */
 const BOTTOM = 14;
 const SIDE = 7;
-/** Least distance of two times, pixels. */
+/** Minimum distance of two times, pixels. */
 const APART = 74;
-/** A pointer that moves so far drags, pixels. */
+/** A pointer that moves by more than this drags, pixels. */
 const DRAG = 3;
-/** Distances of marks, s. */
+/** Possible distances of marks, s. */
 const MARKS_S = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14_400];
-/** Between two moments of the curve that are so much farther apart than is usual, the tissue was at rest. */
+/** If two moments of the curve are farther apart than usual by this factor, the tissue was at rest in between. */
 const GAP = 3;
 
-/** A moment is being chosen, was chosen, or is not chosen after all. */
+/** Called when a moment is being chosen, was chosen, or when choosing was cancelled. */
 export interface Chosen {
   onScrub: (step: number) => void;
   onSeek: (step: number) => void;
@@ -54,7 +54,7 @@ export class Timeline {
     this.moveTo(this.step, true);
   }
 
-  /** Moves the playhead; `isSmooth` if it does so by itself. */
+  /** Moves the playhead. `isSmooth`: this is a part of continuous playback. */
   moveTo(step: number, isSmooth: boolean): void {
     this.step = step;
     const { recording } = this;
@@ -62,7 +62,7 @@ export class Timeline {
     const x = this.x(step);
     this.head.style.transform = `translateX(${x.toFixed(1)}px)`;
     this.played.style.width = `${Math.max(0, x - SIDE).toFixed(1)}px`;
-    // Screen readers read each change.
+    // Screen readers read out each change.
     const now = performance.now();
     if (isSmooth && now - this.toldMs < 1000) return;
     if (isSmooth) this.toldMs = now;
@@ -122,7 +122,7 @@ export class Timeline {
     this.hover.hidden = true;
   }
 
-  /** Tells what is under the pointer. */
+  /** Shows the time and force under the pointer. */
   private point(event: PointerEvent): void {
     const { recording } = this;
     if (!recording) return;
@@ -134,7 +134,7 @@ export class Timeline {
     this.hover.style.transform = `translateX(${Math.round(Math.min(Math.max(x, half), this.width - half) - half)}px)`;
   }
 
-  /** The largest force in each column of pixels. */
+  /** Computes the largest force in each column of pixels. */
   private fill(width: number): void {
     this.columns = new Array<number>(width + 1).fill(0);
     const { forces } = this.recording ?? { forces: [] };
@@ -171,7 +171,7 @@ export class Timeline {
     const style = getComputedStyle(canvas);
     const colour = (name: string) => style.getPropertyValue(name);
     const bottom = height - BOTTOM;
-    // Marks of time, and of what is played at once.
+    // Marks for times, and for moments from which playback starts immediately.
     pen.font = "11px system-ui, sans-serif";
     pen.lineWidth = 1;
     const perSecond = (width - 2 * SIDE) / Math.max(recording.lengthS, 1e-3);
@@ -193,7 +193,7 @@ export class Timeline {
       pen.fillText(every < 1 ? text : text.slice(0, -2), k === 0 ? 0 : Math.min(x, width), height - 2);
     }
     pen.strokeStyle = colour("--faint");
-    // Where they are dense they tell nothing.
+    // If they are dense they show nothing useful.
     if (recording.snapshots.length * 4 < width) for (const step of recording.snapshots) line(this.x(step), bottom, bottom + 3);
     const most = Math.max(...this.columns);
     const y = (force: number) => bottom - 0.5 - (most > 0 ? force / most : 0) * (bottom - 5);

@@ -1,4 +1,5 @@
-// Sliders of k, C and K″: factors on the scene's initial values, sent one command at a time, newest last.
+// Sliders for k, C and K″: factors on the scene's initial values. Commands are sent one at a time, the newest value
+// last.
 
 import { part } from "./page";
 import { quantity } from "./plot";
@@ -25,7 +26,7 @@ function valuesOf(scene: Scene | undefined): Values {
 export class TissueValues {
   private readonly sliders = NAMES.map((name) => part(name, HTMLInputElement));
   private begun: Values = { k: 1, c: 1, v: 1 };
-  /** The same; 1 instead of 0, because a factor can't change 0. */
+  /** The initial values, with 1 instead of 0, because a factor can't change 0. */
   private base: Values = this.begun;
   private sessionId = "";
   private wanted: Partial<Values> | undefined;
@@ -42,7 +43,7 @@ export class TissueValues {
     part("original", HTMLButtonElement).addEventListener("click", () => this.set(this.begun));
   }
 
-  /** Begins with another session: its present values are the middle of the sliders. */
+  /** Begins with another session: its present values become the middle of the sliders. */
   begin(session: Session): void {
     this.sessionId = session.sessionId;
     this.begun = valuesOf(session.scene);
@@ -50,7 +51,7 @@ export class TissueValues {
     this.show(session);
   }
 
-  /** Shows the session's values, unless a change is still to be sent. */
+  /** Shows the session's values, unless a change has yet to be sent. */
   show(session: Session): void {
     if (this.underWay || this.wanted) return;
     const values = valuesOf(session.scene);

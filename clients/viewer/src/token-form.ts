@@ -1,14 +1,14 @@
-// The form for a token, in place of the page where the server refuses who calls. It says why.
+// The form for a token. It replaces the page if the server refuses the caller, and says why.
 
 import { keepToken, part } from "./page";
 import { reasonOf, server } from "./server";
 
-/** Whether a call was refused because of who calls. */
+/** Returns whether a reason concerns the caller's identity or rights. */
 export function isBarred(reason: string): boolean {
   return reason === "UNAUTHENTICATED" || reason === "ROLE_MISSING";
 }
 
-/** What to say to whom a call was refused for a reason. */
+/** Returns title and text for a reason. */
 function words(reason: string): [string, string] {
   if (reason === "ROLE_MISSING") {
     const next = "Open the link to a session that somebody else has opened, or use another token.";
@@ -24,7 +24,7 @@ export class TokenForm {
   private readonly form = part("token-form", HTMLFormElement);
   private readonly field = part("token-form-token", HTMLInputElement);
 
-  /** `onToken`: somebody has entered a token. */
+  /** `onToken` is called when the user has entered a token. */
   constructor(onToken: () => void) {
     this.form.addEventListener("submit", (event) => {
       event.preventDefault();
@@ -37,7 +37,7 @@ export class TokenForm {
     });
   }
 
-  /** Shows it in place of the page, if a call was refused because of who calls. Returns whether it was. */
+  /** Shows the form in place of the page if a call was refused because of the caller. Returns whether this is so. */
   stops(error: unknown): boolean {
     const reason = reasonOf(error);
     if (!isBarred(reason)) return false;

@@ -1,4 +1,4 @@
-// A tool as drawn: a probe whose tip rests on the tissue, its depth below the level of rest, and the force on it.
+// A tool as drawn: a probe whose tip rests on the tissue, its depth below the surface at rest, and the force on it.
 
 import {
   ConeGeometry,
@@ -21,39 +21,45 @@ export interface ShownTool {
   place: Place;
   /** Force of the tissue on the tool. */
   forceN: Vec3;
-  /** How strong that is, as a part of the strongest push. */
+  /** Magnitude of the force, as a fraction of the strongest push. */
   part: number;
 }
 
-/** How one looks at it: where the eye is, and what is to the right. */
+/** The view: position of the eye, and the direction to the right. */
 export interface Seen {
   eye: Vector3;
   right: Vector3;
 }
 
-/** Radius of the shaft, of that of the tip; length of the shaft, of the size of the tissue. */
+/** Radius of the shaft relative to the tip, and length of the shaft relative to the tissue's size. */
 const SHAFT = 0.42;
 const LENGTH = 0.75;
-/** A tool that is closer to the eye than this part of the tissue's size is drawn smaller, down to this part of itself. */
+/**
+ * A tool that is closer to the eye than this fraction of the tissue's size is drawn smaller, down to the given
+ * fraction of its own size.
+ */
 const NEAR = 0.9;
 const MIN_SCALE = 0.25;
-/** How far the shaft leans aside, as long as there is room. */
+/** Direction of the shaft if there is enough room. */
 const LEAN = new Vector3(0.5, 0.28, 0.82).normalize();
-/** The gauge of the depth is not drawn when one looks along it: from so much of its direction, a cosine, on. */
+/** The depth gauge is not drawn if the view is along it: above this cosine of the angle. */
 const END_ON = 0.9;
-/** Where a shaft in a tube points to: how far beside the eye, across and ahead, of its length. There the tissue leaves room. */
+/**
+ * Directions of a shaft in a tube: it points past the eye, sideways and ahead, in units of its length. The tissue
+ * leaves room there.
+ */
 const BESIDE_EYE = [[0.25, 0], [-0.25, 0], [0, 0.25], [0, -0.25], [0.1, 0], [-0.1, 0]] as const;
-/** Other directions out of the tissue that are tried in a tube. */
+/** Number of other directions out of the tissue that are tried in a tube. */
 const AROUND = 16;
 /** Where the dark part of a shaft begins and ends, in radii of the tip. In a tube it ends before the wall. */
 const HANDLE = { from: 6, to: 66 };
-/** The longest arrow, of the size of the tissue, and of the room that there is. */
+/** Maximum length of the force arrow, relative to the tissue's size and to the available room. */
 const ARROW = { size: 0.26, room: 0.9 };
 const UP = new Vector3(0, 0, 1);
 
 export class ToolMark {
   readonly group = new Group();
-  /** Middle of the tip, and the direction of the shaft. */
+  /** Centre of the tip, and direction of the shaft. */
   readonly tipM = new Vector3();
   private readonly axis = new Vector3(0, 0, 1);
   private readonly probe = new Group();
@@ -65,7 +71,7 @@ export class ToolMark {
   private readonly foot: Mesh;
   private readonly level: Mesh;
   private readonly tried = new Vector3();
-  /** Out of the tissue where the tool is, and two directions across. */
+  /** The direction out of the tissue at the tool, and two perpendicular directions. */
   private readonly out = new Vector3(0, 0, 1);
   private readonly across = new Vector3();
   private readonly aside = new Vector3();
@@ -115,7 +121,7 @@ export class ToolMark {
     this.group.visible = true;
     const { place } = tool;
     const moved = this.moved.copy(surface.displacementAt(place));
-    // From within a body one looks at it from close by.
+    // Inside a body the view is from close by.
     const apart = this.tipM.set(...place.restM).add(moved).distanceTo(eye);
     const near = surface.edge ? 1 : Math.min(1, Math.max(apart / (NEAR * size), MIN_SCALE));
     const r = (this.radiusM = (near * size) / 64);
@@ -123,7 +129,7 @@ export class ToolMark {
     surface.restOn(place, r, this.tipM);
     this.turn(place, right);
     this.direct(surface, eye);
-    // The tip rests on the tissue, so it has none to spare.
+    // The tip rests on the tissue, so its distance is 0.
     this.roomM = Math.min(0, this.roomOf(surface, this.axis));
     this.probe.position.copy(this.tipM);
     this.probe.scale.setScalar(r);
@@ -138,7 +144,7 @@ export class ToolMark {
     if (acts) {
       this.force.set(...tool.forceN).divideScalar(strength);
       let long = near * Math.min(tool.part, 1.2) * ARROW.size * size + 2.4 * r;
-      // Within a tube it ends before the wall.
+      // Inside a tube it ends before the wall.
       if (!surface.edge) long = Math.max(ARROW.room * (long + Math.min(0, surface.room(this.tipM, this.force, long, r, 0))), 3 * r);
       this.arrow.position.copy(this.tipM);
       this.arrow.quaternion.setFromUnitVectors(UP, this.force);
@@ -149,16 +155,17 @@ export class ToolMark {
     const out = moved.dot(this.out);
     const deep = Math.abs(out) > 0.8 * r;
     this.level.visible = deep;
-    // Whoever looks along it sees nothing of its length.
+    // Seen along its direction, its length is not visible.
     const along = Math.abs(this.tried.copy(eye).sub(this.tipM).normalize().dot(this.out));
     this.gauge.visible = this.foot.visible = deep && along < END_ON;
     if (deep) {
       this.level.position.set(...place.restM).add(moved).addScaledVector(this.out, -out);
-      // Down to where the tip's underside is drawn: on a curved surface that is not the tissue beside it.
+      // Down to the underside of the drawn tip, which on a curved surface is not at the height of the tissue beside
+      // it.
       const high = out > 0 ? out : this.tried.copy(this.tipM).sub(this.level.position).dot(this.out) - r;
       this.level.scale.setScalar(r);
       this.level.quaternion.setFromUnitVectors(UP, this.out);
-      // Beside the arrow, from the level of rest to the tissue.
+      // Beside the arrow, from the level of the surface at rest to the tissue.
       this.tried.copy(right).addScaledVector(this.out, -right.dot(this.out)).normalize();
       this.gauge.position.copy(this.level.position).addScaledVector(this.tried, -1.78 * r);
       this.gauge.quaternion.copy(this.level.quaternion);
@@ -170,11 +177,11 @@ export class ToolMark {
     light.tips.value[this.index]!.set(this.tipM.x, this.tipM.y, this.tipM.z, r);
     const end = this.tried.copy(this.tipM).addScaledVector(this.axis, this.lengthM);
     light.shafts.value[this.index]!.set(end.x, end.y, end.z, 1.2 * SHAFT * r);
-    // In a dent of a body it would be several rings, where its walls meet the ball.
+    // In a dent of a body there would be several rings, where its walls intersect the sphere.
     light.rings.value[this.index]!.copy(light.tips.value[this.index]!).setW(deep && !surface.edge ? 0 : 2.1 * r);
   }
 
-  /** The directions of the place: a shaft that stands on it goes on leaning as it did. */
+  /** Updates the directions at the place. A shaft keeps its tilt while it stays there. */
   private turn(place: Place, right: Vector3): void {
     const before = this.tried.copy(this.out);
     this.out.set(...place.outward);
@@ -191,12 +198,15 @@ export class ToolMark {
     this.isNew = false;
   }
 
-  /** A direction of the place: to the right, ahead, and out. */
+  /** Returns a vector in the directions of the place: to the right, ahead, and out. */
   private along(x: number, y: number, z: number): Vector3 {
     return this.tried.set(0, 0, 0).addScaledVector(this.across, x).addScaledVector(this.aside, y).addScaledVector(this.out, z).normalize();
   }
 
-  /** Turns the shaft as far aside as the tissue leaves room; else upright, towards where the tissue came from, or to the eye. */
+  /**
+   * Tilts the shaft as far as the tissue leaves room; otherwise it is upright, or points to where the tissue came
+   * from or to the eye.
+   */
   private direct(surface: Surface, eye: Vector3): void {
     let best = -Infinity;
     const [dx, dy] = [this.moved.dot(this.across), this.moved.dot(this.aside)];
@@ -206,7 +216,7 @@ export class ToolMark {
       if (k < 5) this.along(LEAN.x * (1 - k / 4), LEAN.y * (1 - k / 4), LEAN.z * (1 - k / 4) + k / 4);
       else if (k < 8) this.along(-dx * part, -dy * part, 1);
       else if (k >= 8 + BESIDE_EYE.length) {
-        // A spiral on the half of the sphere that is out of the tissue.
+        // Spiral on the hemisphere that points out of the tissue.
         const z = 1 - (k - 8 - BESIDE_EYE.length + 0.5) / AROUND;
         this.along(Math.sqrt(1 - z * z) * Math.cos(2.4 * k), Math.sqrt(1 - z * z) * Math.sin(2.4 * k), z);
       } else {
@@ -227,7 +237,10 @@ export class ToolMark {
     return surface.room(this.tipM, axis, this.lengthM, this.radiusM, 1.25 * SHAFT);
   }
 
-  /** The least room between tip or shaft and the tissue when the tool was placed on it, m: what came since is not drawn. */
+  /**
+   * Smallest distance between tip or shaft and the tissue when the tool was placed on it, m. Later changes are not
+   * drawn.
+   */
   get clearM(): number {
     return this.roomM;
   }

@@ -1,14 +1,14 @@
-// Which triangles and edges of a mesh belong together.
+// Connectivity of the triangles and edges of a mesh.
 
 import { Vector3 } from "three";
 
-/** Lists of whole numbers, one after the other: list i is from `start[i]` to `start[i + 1]`. */
+/** Lists of integers, stored one after the other: list i is from `start[i]` to `start[i + 1]`. */
 export interface Lists {
   start: Uint32Array;
   of: Uint32Array;
 }
 
-/** The list of each of `count`: all `values[i]` whose `keys[i]` names it, in their order. */
+/** Groups values into `count` lists: list k contains all `values(i)` with `keys[i]` = k, in their order. */
 export function lists(count: number, keys: ArrayLike<number>, values: (i: number) => number): Lists {
   const start = new Uint32Array(count + 1);
   for (let i = 0; i < keys.length; i++) start[keys[i]! + 1]! += 1;
@@ -19,7 +19,7 @@ export function lists(count: number, keys: ArrayLike<number>, values: (i: number
   return { start, of };
 }
 
-/** The triangles that have a vertex in each block of 2 to the power of `bits` vertices, each once. */
+/** Returns for each block of 2^`bits` vertices the triangles with a vertex in it, without repetitions. */
 export function touching(triangles: Uint32Array, blocks: number, bits: number): Lists {
   const keys: number[] = [];
   const values: number[] = [];
@@ -39,7 +39,7 @@ export function touching(triangles: Uint32Array, blocks: number, bits: number): 
   return lists(blocks, keys, (i) => values[i]!);
 }
 
-/** Keys of edges, ascending; the same edge's follow each other. */
+/** Returns keys of the edges, ascending. Equal keys belong to the same edge. */
 function edgeKeys(triangles: Uint32Array, count: number): Float64Array {
   const keys = new Float64Array(triangles.length);
   for (let t = 0; t < triangles.length; t++) {
@@ -49,7 +49,7 @@ function edgeKeys(triangles: Uint32Array, count: number): Float64Array {
   return keys.sort();
 }
 
-/** Both ends of each edge, and whether any has a single triangle. */
+/** Returns both ends of each edge, and whether any edge belongs to a single triangle. */
 export function edgesOf(triangles: Uint32Array, count: number): { edges: Uint32Array<ArrayBuffer>; isOpen: boolean } {
   const keys = edgeKeys(triangles, count);
   const edges = new Uint32Array(2 * keys.length);
@@ -66,7 +66,7 @@ export function edgesOf(triangles: Uint32Array, count: number): { edges: Uint32A
   return { edges: edges.slice(0, at), isOpen };
 }
 
-/** The middle of the longest border. */
+/** Returns the middle of the longest border. */
 export function opening(triangles: Uint32Array, rest: Float32Array): Vector3 | undefined {
   const count = rest.length / 3;
   const keys = edgeKeys(triangles, count);

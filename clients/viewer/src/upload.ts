@@ -1,7 +1,9 @@
-// A file of one's own: dropped on the page or chosen, sent in parts, reported, and made into a session that can be touched.
+// Upload of a mesh file: dropped on the page or chosen, sent in parts, checked by the server, and made into a session
+// that can be touched.
 //
-// Mesh files do not state their unit, so the page asks for it. It does not read the file: the server does, at first as if in
-// metres, and from the size that it reports follows that in every other unit.
+// Mesh files do not state their unit, so the page asks the user. The page does not read the file. The server reads
+// it, at first with metres as the unit; from the size that it reports, the page computes the size in every other
+// unit.
 
 import type { MessageInitShape } from "@bufbuild/protobuf";
 import { MAX_VERTICES, sceneOf } from "./coefficients";
@@ -10,13 +12,13 @@ import { part } from "./page";
 import { describe, CALL_TIMEOUT_MS, sessions } from "./server";
 import { excerpt } from "./text";
 
-/** Bytes of a part. */
+/** Size of a part, bytes. */
 const PART_BYTES = 1 << 20;
-/** Reading and checking a large mesh takes a while, after its last part. */
+/** Timeout after the last part: reading and checking a large mesh takes a while. */
 const READING_MS = 120_000;
-/** Problems that are told, at most. */
+/** Maximum number of problems that are shown. */
 const TOLD = 12;
-/** The longest side of an organ is about this, m: for the guess. */
+/** Typical length of the longest side of an organ, m, used to guess the unit. */
 const USUAL_M = 0.15;
 
 const UNITS = [
@@ -27,30 +29,30 @@ const UNITS = [
 
 type Scene = MessageInitShape<typeof SceneSchema>;
 
-/** A mesh that the server has, with what it is like. */
+/** A mesh that the server has received, with its report. */
 interface Sent {
   meshId: string;
   report: MeshReport;
-  /** What the server keeps of it for longer than the session, in words; empty if nothing. */
+  /** Describes what the server keeps of it for longer than the session; empty if nothing. */
   kept: string;
 }
 
-/** The sides of a box in words. */
+/** Formats the dimensions of a box. */
 export function sidesText(sidesM: readonly number[]): string {
   const most = Math.max(...sidesM);
   const [factor, unit] = most >= 1 ? [1, "m"] : most >= 1e-3 || most === 0 ? [1e3, "mm"] : [1e6, "µm"];
   return `${sidesM.map((side) => Number((side * factor).toPrecision(3))).join(" × ")} ${unit}`;
 }
 
-/** The unit in which a file is about as large as an organ, by its longest side. */
+/** Returns the unit in which the size of a file is most like that of an organ, judged by its longest side. */
 export function likelyUnit(longest: number): (typeof UNITS)[number]["unit"] {
   const far = ({ metres }: { metres: number }) => Math.abs(Math.log(Math.max(longest * metres, 1e-30) / USUAL_M));
   return UNITS.reduce((best, unit) => (far(unit) < far(best) ? unit : best)).unit;
 }
 
-/** A problem with where it is, in the unit of the file. */
+/** Describes a problem and its position, in the unit of the file. */
 function problemText({ what, element, placeM }: MeshProblem, { unit, metres }: (typeof UNITS)[number]): string {
-  // What the command line calls an option is a button here.
+  // What is an option on the command line is a button here.
   const words = what.replace(/[;,:] --vertices N [^;]*/, "").replace(/--repair/g, "“Mend it”");
   const place = placeM && [placeM.x, placeM.y, placeM.z].map((v) => Number((v / metres).toPrecision(3))).join(", ");
   const at = place ? ` at (${place}) ${unit}` : "";
@@ -73,7 +75,7 @@ function reportText(report: MeshReport): string {
 /** The user has closed the dialog. */
 class Ended extends Error {}
 
-/** Problems of a mesh that are told. */
+/** Maximum number of problems in a report that are shown. */
 const MAX_PROBLEMS = 100;
 
 export class FileOpener {
@@ -83,7 +85,7 @@ export class FileOpener {
   private readonly progress = part("own-progress", HTMLProgressElement);
   private readonly problems = part("own-problems", HTMLElement);
   private readonly buttons = part("own-buttons", HTMLElement);
-  /** Ends what is under way when the dialog closes. */
+  /** Cancels pending requests when the dialog closes. */
   private ending = new AbortController();
 
   constructor(private readonly onSession: (session: Session, scene: Scene) => void) {
@@ -91,7 +93,7 @@ export class FileOpener {
     part("open-file", HTMLButtonElement).addEventListener("click", () => chosen.click());
     chosen.addEventListener("change", () => {
       const file = chosen.files?.[0];
-      // The same file may be chosen again.
+      // Lets the user choose the same file again.
       chosen.value = "";
       if (file) void this.take(file);
     });
@@ -99,7 +101,7 @@ export class FileOpener {
     this.dropping();
   }
 
-  /** Takes files that are dropped anywhere on the page. */
+  /** Accepts files that are dropped anywhere on the page. */
   private dropping(): void {
     const hint = part("drop-hint", HTMLElement);
     const hasFile = (event: DragEvent) => event.dataTransfer?.types.includes("Files") ?? false;
@@ -108,7 +110,7 @@ export class FileOpener {
       if (!hasFile(event)) return;
       event.preventDefault();
       hint.hidden = false;
-      // Browsers do not tell reliably that a drag has left, but repeat this while it is there.
+      // Browsers do not report reliably that a drag has left the page, but they repeat this event while it is there.
       clearTimeout(hiding);
       hiding = setTimeout(() => (hint.hidden = true), 400);
     });
@@ -121,7 +123,7 @@ export class FileOpener {
     });
   }
 
-  /** Leads a file all the way to a session. */
+  /** Processes a file from upload to session. */
   private async take(file: File): Promise<void> {
     this.ending.abort();
     this.ending = new AbortController();
@@ -176,7 +178,10 @@ export class FileOpener {
     }
   }
 
-  /** Asks what a length of 1 is, and says what size results for each unit. The file is kept only if one goes on, so tells that first. */
+  /**
+   * Asks for the unit of the file, and shows the resulting size for each unit. The file is kept only if the user
+   * continues, so this is said first.
+   */
   private async askUnit(raw: number[], kept: string, signal: AbortSignal): Promise<(typeof UNITS)[number]> {
     this.show("Mesh files do not say in which unit they are. How large is it?", kept ? [kept] : []);
     const likely = likelyUnit(Math.max(...raw));
@@ -196,7 +201,7 @@ export class FileOpener {
     return UNITS.find(({ unit }) => unit === chosen) ?? UNITS[0];
   }
 
-  /** Shows a report. One without a flaw needs no answer. */
+  /** Shows a report. If there are no problems, no answer is needed. */
   private async showReport(
     report: MeshReport,
     unit: (typeof UNITS)[number],
@@ -215,7 +220,7 @@ export class FileOpener {
     return await this.ask(answers.filter(([value]) => (value === "touch" ? !refused : !isMended)), signal);
   }
 
-  /** Makes a session, with fewer points than vertices if there are many and the server can. */
+  /** Creates a session, with fewer points than vertices if there are many and the server can decimate. */
   private async make(fileName: string, { meshId, report }: Sent, signal: AbortSignal): Promise<[Session | undefined, Scene]> {
     const name = fileName.replace(/\.[^.]*$/, "") || fileName;
     const call = { signal, timeoutMs: READING_MS };
@@ -224,7 +229,7 @@ export class FileOpener {
     const create = async (value: Scene) => (await sessions.createSession({ source: { case: "scene", value } }, call)).session;
     const session = await create(scene);
     if (!session || session.points <= 1.5 * fewer) return [session, scene];
-    // A server that does not decimate computes all of them: their coefficients are others.
+    // A server that can't decimate simulates all vertices, which need other coefficients.
     await sessions.deleteSession({ sessionId: session.sessionId }, call);
     const whole = sceneOf(name, meshId, report, session.points);
     return [await create(whole), whole];
@@ -272,7 +277,7 @@ export class FileOpener {
   }
 }
 
-/** The sides of what a report is about, m. */
+/** Returns the dimensions in a report, m. */
 function sidesOf({ extent }: MeshReport): number[] {
   const [a, b] = [extent?.leastM, extent?.mostM];
   if (!a || !b) throw new Error("there is no vertex in it");

@@ -1,13 +1,14 @@
-//! The curvature of a surface of triangles.
+//! The curvature of a triangulated surface.
 
 use glam::{DMat3, DVec3};
 
 use crate::tree::corners;
 
-/// At each vertex how the outward normal changes per metre along the surface, 1/m: xx, yy, zz, xy, xz and yz of a symmetric
-/// matrix that is 1/R along a sphere. Within a triangle the change is that of the normals of its corners, interpolated
-/// linearly; a vertex has the mean of its triangles by area. So the mean over a part of the surface is, but for its edge, the
-/// change of normal across that part, however the triangles lie.
+/// Returns the curvature at each vertex: how the outward normal changes per metre along the surface, 1/m, as xx, yy,
+/// zz, xy, xz and yz of a symmetric matrix that is 1/R along a sphere. Within a triangle the change is that of the
+/// normals of its corners, interpolated linearly; a vertex has the mean of its triangles, weighted by area. So the
+/// mean over a part of the surface is, except at its edge, the change of normal across that part, for any
+/// triangulation.
 #[allow(clippy::cast_possible_truncation)]
 pub(crate) fn curvatures(vertices_m: &[DVec3], triangles: &[[u32; 3]]) -> Vec<[f32; 6]> {
     let mut normals = vec![DVec3::ZERO; vertices_m.len()];
@@ -25,7 +26,8 @@ pub(crate) fn curvatures(vertices_m: &[DVec3], triangles: &[[u32; 3]]) -> Vec<[f
         let normal_m2 = doubled(triangle);
         let [a, b, c] = corners(vertices_m, *triangle);
         let of_corners = triangle.map(|vertex| normals[vertex as usize]);
-        // The gradient of a corner's hat is n × (the opposite side)/(2·area), so this is area times gradient of the normal.
+        // The gradient of a corner's hat function is n × (opposite side)/(2·area), so this is area times gradient of
+        // the normal.
         let across = normal_m2.normalize_or_zero();
         let mut change = DMat3::ZERO;
         for (normal, opposite_m) in of_corners.iter().zip([c - b, a - c, b - a]) {

@@ -1,4 +1,4 @@
-//! Fewer vertices for the same surface: edges collapse, those first that change the surface least.
+//! Decimates a mesh: edges collapse, starting with those that change the surface least.
 //!
 //! The error of a vertex is the sum of squared distances to the planes of the triangles that it stands for (Garland and
 //! Heckbert, Surface simplification using quadric error metrics, SIGGRAPH 1997, doi:10.1145/258734.258849). A small part of the edge's length is added, so that flat regions get even edges.
@@ -13,43 +13,43 @@ use crate::tree::{Tree, corners};
 use crate::work::spend;
 use crate::{Group, TriangleMesh};
 
-/// How much the length of an edge counts beside the error of the surface.
+/// Weight of the edge length relative to the error of the surface.
 const EVEN: f64 = 1e-2;
 
-/// How much the border counts beside the surface.
+/// Weight of the border relative to the surface.
 const BORDER: f64 = 10.0;
 
-/// The least cosine between a triangle's normals before and after a collapse.
+/// Smallest cosine of the angle between a triangle's normals before and after a collapse.
 const TURN: f64 = 0.3;
 
-/// The least quality of a new triangle, 1 for one with equal sides, unless the old one was worse.
+/// Smallest quality of a new triangle (1 for equal sides), unless the old one was worse.
 const QUALITY: f64 = 0.2;
 
-/// Triangles around a vertex, above which it stays as it is: the work for a collapse grows with them.
+/// Number of triangles around a vertex above which it stays as it is: the work for a collapse grows with them.
 const MAX_AROUND: usize = 256;
 
-/// A closed surface has so many at least.
+/// Smallest number of vertices of a closed surface.
 pub const MIN_VERTICES: usize = 4;
 
-/// A place on a mesh.
+/// A point on a mesh.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeshPlace {
-    /// The triangle.
+    /// Index of the triangle.
     pub triangle: u32,
-    /// Weights of its vertices; their sum is 1.
+    /// Weights of its three vertices; their sum is 1.
     pub barycentric: [f64; 3],
 }
 
-/// A mesh with fewer vertices.
+/// The result of a decimation.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Decimated {
-    /// The mesh; without texture coordinates. A vertex is in a group if one that it stands for was.
+    /// The decimated mesh, without texture coordinates. A vertex is in a group if one that it replaces was.
     pub mesh: TriangleMesh,
-    /// For each vertex of the mesh before, the nearest place on this one; empty if this one has no triangle.
+    /// For each vertex of the original mesh, the nearest point on this one; empty if this one has no triangle.
     pub places: Vec<MeshPlace>,
 }
 
-/// A sum of squared distances to planes: xᵀ·a·x + 2·b·x + c.
+/// A weighted sum of squared distances to planes: xᵀ·a·x + 2·b·x + c.
 #[derive(Clone, Copy, Default)]
 struct Quadric {
     /// xx, xy, xz, yy, yz, zz.
@@ -59,7 +59,7 @@ struct Quadric {
 }
 
 impl Quadric {
-    /// Of the plane through a point, times a weight. The normal has unit length.
+    /// Creates the squared distance to the plane through a point, times a weight. The normal has unit length.
     fn plane(normal: DVec3, through: DVec3, weight: f64) -> Self {
         let DVec3 { x, y, z } = normal;
         let distance = -normal.dot(through);
@@ -86,18 +86,18 @@ impl Quadric {
     }
 }
 
-/// An edge that may collapse; the least cost comes first, then the least vertices.
+/// An edge that may collapse. The smallest cost comes first, then the smallest vertices.
 struct Candidate {
     cost: f64,
     vertices: [u32; 2],
     place: DVec3,
-    /// How often the vertices had changed when the cost was computed.
+    /// Number of changes of the vertices when the cost was computed.
     versions: [u32; 2],
 }
 
 impl Ord for Candidate {
     fn cmp(&self, other: &Self) -> Ordering {
-        // The heap gives the greatest first.
+        // The heap returns the largest first.
         other.cost.total_cmp(&self.cost).then_with(|| other.vertices.cmp(&self.vertices))
     }
 }
@@ -116,7 +116,9 @@ impl PartialEq for Candidate {
 
 impl Eq for Candidate {}
 
-/// Collapses edges until at most `vertices` are left, or none can collapse without folding the surface. Borders stay borders.
+/// Collapses edges until at most `vertices` are left (at least 4), or no edge can collapse without folding the
+/// surface. Border vertices stay on the border. All coordinates must be finite and all indices in range; vertices
+/// without triangles are dropped.
 ///
 /// The cost of an edge of length l is Q(x) + 0.01·l⁴. Q(x) = xᵀAx + 2b·x + c is the sum of the squared distances from the planes of both
 /// ends, by their triangles' areas. x = −A⁻¹b, where Q is least, or the best of both ends and the middle.
@@ -128,7 +130,7 @@ pub fn decimate(mesh: &TriangleMesh, vertices: usize) -> Decimated {
     work.finish(mesh)
 }
 
-/// A mesh while it is decimated.
+/// The state of a decimation.
 struct Decimation {
     at: Vec<DVec3>,
     triangles: Vec<[u32; 3]>,
@@ -136,10 +138,10 @@ struct Decimation {
     around: Vec<Vec<u32>>,
     quadrics: Vec<Quadric>,
     is_border: Vec<bool>,
-    /// At vertices that are no manifold nothing collapses.
+    /// Whether a vertex is not manifold: its edges do not collapse.
     is_fixed: Vec<bool>,
     versions: Vec<u32>,
-    /// The vertex that stands for each one; itself if it is there.
+    /// The vertex that replaces each one; itself if it still exists.
     stands_in: Vec<u32>,
     left: usize,
     heap: BinaryHeap<Candidate>,
@@ -188,7 +190,7 @@ impl Decimation {
             let [a, b] = edge.vertices.map(|vertex| vertex as usize);
             match topology.sides(edge) {
                 [side] => {
-                    // A plane through the border, across the surface.
+                    // A plane through the border, perpendicular to the surface.
                     let along = work.at[b] - work.at[a];
                     let surface = normal(corners(&work.at, mesh.triangles[side.triangle as usize]));
                     let across = along.cross(surface).normalize_or_zero();
@@ -208,12 +210,12 @@ impl Decimation {
         work
     }
 
-    /// The triangles that both vertices have.
+    /// Returns the number of triangles that contain both vertices.
     fn shared(&self, [a, b]: [u32; 2]) -> usize {
         self.around[a as usize].iter().filter(|triangle| self.triangles[**triangle as usize].contains(&b)).count()
     }
 
-    /// Puts an edge on the heap, if it may collapse at all.
+    /// Pushes an edge to the heap, if it may collapse at all.
     fn consider(&mut self, vertices: [u32; 2]) {
         let [a, b] = vertices.map(|vertex| vertex as usize);
         if self.around[a].len() + self.around[b].len() > MAX_AROUND {
@@ -233,7 +235,7 @@ impl Decimation {
         let trace = matrix.x_axis.x + matrix.y_axis.y + matrix.z_axis.z;
         if matrix.determinant().abs() > 1e-6 * trace * trace * trace {
             let best = matrix.inverse() * -quadric.b;
-            // Not where nearly parallel planes meet.
+            // Not far away, where nearly parallel planes meet.
             if best.is_finite() && best.distance(middle) <= from.distance(to) {
                 places.insert(0, best);
             }
@@ -250,7 +252,7 @@ impl Decimation {
             }
         }
         if let Some((error, place)) = best {
-            // Both are lengths to the fourth power.
+            // Both are fourth powers of a length.
             let cost = error + EVEN * length * length;
             let versions = [self.versions[a], self.versions[b]];
             self.heap.push(Candidate { cost, vertices, place, versions });
@@ -271,7 +273,7 @@ impl Decimation {
         }
     }
 
-    /// The neighbours of a vertex, ascending.
+    /// Returns the neighbours of a vertex, ascending.
     fn neighbours(&self, vertex: u32) -> Vec<u32> {
         let own = self.around[vertex as usize].iter().flat_map(|triangle| self.triangles[*triangle as usize]);
         let mut neighbours: Vec<u32> = own.filter(|other| *other != vertex).collect();
@@ -280,7 +282,7 @@ impl Decimation {
         neighbours
     }
 
-    /// Whether the surface stays a manifold, without folds and new slivers.
+    /// Returns whether the surface stays a manifold, without folds and new slivers.
     fn may_collapse(&self, candidate: &Candidate) -> bool {
         let [a, b] = candidate.vertices;
         spend(8 * (self.around[a as usize].len() + self.around[b as usize].len()));
@@ -291,7 +293,7 @@ impl Decimation {
             return false;
         }
         let common = common.by_ref().count();
-        // The common neighbours are those opposite of the edge, or a ring of three would close up.
+        // The common neighbours must be only those opposite the edge; otherwise a ring of three would close up.
         if common != shared || shared == 0 || (of_a.len() <= 3 && of_b.len() <= 3) {
             return false;
         }
@@ -370,7 +372,7 @@ impl Decimation {
     }
 }
 
-/// The last of each chain of stand-ins, which stands for itself.
+/// Returns for each vertex the last of its chain of replacements, which replaces itself.
 fn last_of(stands_in: &[u32]) -> Vec<u32> {
     let mut last = stands_in.to_vec();
     for vertex in 0..last.len() {
@@ -378,7 +380,7 @@ fn last_of(stands_in: &[u32]) -> Vec<u32> {
         while last[end as usize] != end {
             end = last[end as usize];
         }
-        // The next chain that comes here ends at once.
+        // Shortens the chain for later searches.
         let mut at = vertex;
         while last[at] != end {
             at = std::mem::replace(&mut last[at], end) as usize;

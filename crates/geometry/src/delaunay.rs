@@ -1,4 +1,4 @@
-//! Edges turned until the triangles are Delaunay: springs along such edges resist stretch most evenly.
+//! Flips edges until the triangles are Delaunay: springs along such edges resist stretch most evenly.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -9,13 +9,14 @@ use crate::report::has_area;
 use crate::topology::{Topology, is_proper};
 use crate::work::spend;
 
-/// Edges that are looked at, for each edge of the mesh; on curved surfaces flips need not end by themselves.
+/// Number of edge checks per edge of the mesh; on curved surfaces, flips need not end by themselves.
 const LOOKS: usize = 20;
 
-/// Cosine of the angle between two triangles above which their common edge is a fold of the surface and stays.
+/// Cosine of the angle between two triangles below which their common edge is a fold of the surface and is not
+/// flipped.
 const FOLD: f64 = 0.5;
 
-/// An edge with the vertices opposite of it: the triangles are (a, b, c) and (b, a, d).
+/// An edge with the vertices opposite it: its triangles are (a, b, c) and (b, a, d).
 struct Diamond {
     a: u32,
     b: u32,
@@ -23,15 +24,16 @@ struct Diamond {
     d: u32,
 }
 
-/// Flips edges between two triangles until the angles opposite of each are at most π together. Edges of the border, folds of
-/// more than 60° and seams of the texture stay. Vertices and groups stay as they are. Returns the number of flips.
+/// Flips edges between two triangles until the sum of the angles opposite each edge is at most π. Does not flip
+/// border edges, folds of more than 60°, and seams of the texture. Vertices and groups do not change. Returns the
+/// number of flips.
 ///
 /// With α and β these angles, α + β ≤ π is cot α + cot β = sin(α + β)/(sin α·sin β) ≥ 0, and cot α = u·v/|u × v| for the sides u
 /// and v from the corner to the ends of the edge.
 pub fn flip_to_delaunay(mesh: &mut TriangleMesh) -> usize {
     flip(mesh, |vertices, edge| {
         let at = |vertex: u32| vertices[vertex as usize];
-        // Negative if the angles opposite of the edge are more than π together.
+        // Negative if the sum of the angles opposite the edge is more than π.
         let cotangent = |apex: u32| {
             let (u, v) = (at(edge.a) - at(apex), at(edge.b) - at(apex));
             u.dot(v) / u.cross(v).length()
@@ -40,7 +42,8 @@ pub fn flip_to_delaunay(mesh: &mut TriangleMesh) -> usize {
     })
 }
 
-/// Flips the longest edge of each triangle that has no area though its vertices differ: then both triangles have one.
+/// Flips the longest edge of each triangle that has three different vertices but no area, so that both triangles get
+/// one. Returns the number of flips.
 pub(crate) fn flip_degenerate(mesh: &mut TriangleMesh) -> usize {
     flip(mesh, |vertices, edge| {
         let length = |a: u32, b: u32| vertices[a as usize].distance_squared(vertices[b as usize]);
@@ -58,7 +61,7 @@ fn flip(mesh: &mut TriangleMesh, wants: impl Fn(&[DVec3], &Diamond) -> bool) -> 
     let topology = Topology::new(mesh.vertices_m.len(), &mesh.triangles);
     let vertices = &mesh.vertices_m;
     let mut valence = topology.valence.clone();
-    // The triangle on the left of each directed edge; only looked up. `None` where there are several.
+    // The triangle on the left of each directed edge; only looked up. `None` if there are several.
     let mut left: HashMap<[u32; 2], Option<u32>> = HashMap::new();
     for (number, triangle) in (0..).zip(&mesh.triangles).filter(|(_, triangle)| is_proper(triangle)) {
         for corner in 0..3 {
@@ -82,7 +85,7 @@ fn flip(mesh: &mut TriangleMesh, wants: impl Fn(&[DVec3], &Diamond) -> bool) -> 
         let diamond = Diamond { a, b, c: opposite(first), d: opposite(second) };
         let (c, d) = (diamond.c, diamond.d);
         let is_free = c != d && !left.contains_key(&[c, d]) && !left.contains_key(&[d, c]);
-        // Three edges at least, or the surface folds upon itself.
+        // Each end must have more than three edges, or the surface would fold onto itself.
         let is_rich = valence[a as usize] > 3 && valence[b as usize] > 3;
         if !is_free || !is_rich || !wants(vertices, &diamond) || !stays_smooth(vertices, &diamond) {
             continue;
@@ -105,7 +108,7 @@ fn flip(mesh: &mut TriangleMesh, wants: impl Fn(&[DVec3], &Diamond) -> bool) -> 
         left.remove(&[b, a]);
         for (triangle, edges) in [(first, [[a, d], [d, c], [c, a]]), (second, [[d, b], [b, c], [c, d]])] {
             for edge in edges {
-                // A triangle among several on the left of an edge stays unknown.
+                // If several triangles are on the left of an edge, it stays unknown.
                 left.entry(edge).and_modify(|other| *other = other.map(|_| triangle)).or_insert(Some(triangle));
             }
         }
@@ -121,7 +124,7 @@ fn flip(mesh: &mut TriangleMesh, wants: impl Fn(&[DVec3], &Diamond) -> bool) -> 
     flips
 }
 
-/// Whether the surface is no fold at an edge, and faces the same side after its flip.
+/// Returns whether the surface has no fold at an edge, and faces the same side after its flip.
 fn stays_smooth(vertices: &[DVec3], edge: &Diamond) -> bool {
     let normal = |triangle: [u32; 3]| {
         let [a, b, c] = triangle.map(|vertex| vertices[vertex as usize]);
@@ -131,7 +134,7 @@ fn stays_smooth(vertices: &[DVec3], edge: &Diamond) -> bool {
     let (first, second) = (normal([a, b, c]), normal([b, a, d]));
     let sum = first + second;
     let new = [[a, d, c], [d, b, c]];
-    // The normal of a triangle without area is rounding.
+    // The normal of a triangle without area is only rounding error.
     let is_flat = !has_area(vertices, [a, b, c]) || !has_area(vertices, [b, a, d]);
     (is_flat || first.dot(second) >= FOLD * first.length() * second.length())
         && new.iter().all(|triangle| normal(*triangle).dot(sum) > 0.0 && has_area(vertices, *triangle))

@@ -1,14 +1,16 @@
-//! Welding along edges: triangles are joined where an edge of one lies where an edge of another does, whatever numbers its
-//! vertices have. Where more than two meet, each solid is closed on itself.
+//! Joins triangles along edges: where an edge of one coincides with an edge of another, for any numbers of its
+//! vertices. If more than two meet at an edge, they are paired so that each solid is closed.
 //!
-//! A *place* is the position of vertices that have the same one. Vertices are joined with the triangles at them, and not by
-//! their places alone: two closed parts that touch at a vertex stay two.
+//! A *place* is the common position of vertices. Vertices are joined through the triangles at them, and not by their
+//! places alone: two closed parts that touch at a vertex stay separate.
 //!
-//! What the file joins, by two triangles that name the same edge, stays joined. All other triangles at an edge are free. Two
-//! free triangles are joined. Of more, we look along the edge, from its first place p to its second one q, at the triangles
-//! around it in the order of their angles. The normal of a triangle that runs from p to q is (q − p) × (o − p), with o its third
-//! vertex: it points to larger angles, so the solid behind such a triangle ends there, and behind one that runs from q to p it
-//! begins. Beginnings and ends are paired like parentheses around the edge. Those that are left face the same way, since some
+//! Two triangles that name an edge by equal vertices stay joined. All other triangles at an edge are free. Two free
+//! triangles are joined. If there are more, they are sorted by their angles around the edge, seen from its first
+//! place p to its second q. The normal of a triangle that runs from p to q is (q − p) × (o − p), with o its third
+//! vertex: it points to larger angles, so the solid behind such a triangle ends there, and behind one that runs from
+//! q to p it begins. Beginnings and ends are paired like parentheses around the edge. The remaining ones face one
+//! way, since some triangles of the file are turned: neighbours are joined. At most one triangle is left over; it has
+//! a border there.
 //! triangles of the file are turned: neighbours are joined. At most one triangle is left over; it has a border there.
 
 use std::collections::{BTreeSet, HashMap};
@@ -19,42 +21,42 @@ use crate::TriangleMesh;
 use crate::topology::{Sets, Side, is_proper};
 use crate::work::spend;
 
-/// Angles that differ by less are the same, in quarters of a turn.
+/// Difference below which angles count as equal, in quarters of a turn.
 const SAME_ANGLE: f64 = 1e-9;
 
 /// How the triangles of a mesh are joined.
 pub(crate) struct Joined {
-    /// The joined vertex of each corner of each triangle: numbers that say only which are the same.
+    /// The joined vertex of each corner of each triangle. Only equality of these numbers has a meaning.
     corners: Vec<[u32; 3]>,
-    /// Two triangles at an edge. A side is forward where it runs from the lesser place to the larger one.
+    /// Pairs of triangles at an edge. A side is forward if it runs from the smaller place to the larger one.
     pub(crate) pairs: Vec<[Side; 2]>,
-    /// Triangles at an edge that no other is joined with, and the places of the edge.
+    /// Triangles at an edge without a partner, with the places of the edge.
     pub(crate) borders: Vec<(u32, [u32; 2])>,
-    /// Triangles at edges that more than two name, in an odd number: all stay joined there ([`Odd::Stay`]).
+    /// Triangles at edges that an odd number above one names: all stay joined there ([`Odd::Stay`]).
     pub(crate) crowded: Vec<u32>,
-    /// For each edge that several pairs have, these: the corners of both triangles at its lesser place and at its larger one. A
-    /// corner is three times its triangle and its place there.
+    /// For each edge with several pairs, these pairs: the corners of both triangles at its smaller and at its larger
+    /// place. A corner is three times its triangle plus its index there.
     pub(crate) touching: Vec<Vec<[[u32; 2]; 2]>>,
-    /// Edges at which more than two free triangles were paired.
+    /// Number of edges at which more than two free triangles were paired.
     pub(crate) paired_edges: usize,
-    /// Borders at such edges.
+    /// Number of borders at such edges.
     pub(crate) left_over: usize,
 }
 
-/// What becomes of an odd number of triangles, above one, that name the same edge.
+/// What to do with an odd number of triangles, above one, that name one edge by equal vertices.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Odd {
-    /// They stay joined: no surface has such an edge, and the report says so.
+    /// They stay joined: no surface has such an edge, and the report names it.
     Stay,
     /// They are paired, and one has a border.
     Pair,
 }
 
-/// The place of each vertex: the least vertex of all at that position. Positions are finite.
+/// Returns the place of each vertex: the smallest vertex at its position. Positions must be finite.
 pub(crate) fn places(vertices: &[DVec3]) -> Vec<u32> {
     spend(4 * vertices.len());
     let mut order: Vec<u32> = (0..).take(vertices.len()).collect();
-    // −0 is 0.
+    // −0 counts as 0.
     let key = |vertex: &u32| (vertices[*vertex as usize] + DVec3::ZERO).to_array().map(f64::to_bits);
     order.sort_by_cached_key(key);
     let mut places = vec![0; vertices.len()];
@@ -64,11 +66,12 @@ pub(crate) fn places(vertices: &[DVec3]) -> Vec<u32> {
     places
 }
 
-/// Joins triangles, given the place of each vertex. Those with a place twice take no part; indices are in range.
+/// Joins triangles, given the place of each vertex. Ignores triangles with two corners at one place; indices must be
+/// in range.
 pub(crate) fn join(vertices: &[DVec3], triangles: &[[u32; 3]], places: &[u32], odd: Odd) -> Joined {
     spend(16 * triangles.len());
     let place = |vertex: u32| places[vertex as usize];
-    // Of each side of each triangle: the places of its edge, then the vertices of its edge.
+    // For each side of each triangle: the places of its edge, then the vertices of its edge.
     let mut halves: Vec<([u32; 2], [u32; 2], Side)> = Vec::with_capacity(3 * triangles.len());
     for (number, triangle) in (0..).zip(triangles).filter(|(_, triangle)| is_proper(&triangle.map(place))) {
         for corner in 0..3 {
@@ -138,8 +141,8 @@ pub(crate) fn join(vertices: &[DVec3], triangles: &[[u32; 3]], places: &[u32], o
 }
 
 impl Joined {
-    /// Gives each joined vertex vertices of its own: of several that share one the first in the order of triangles keeps it, the
-    /// others get copies behind the last. Returns of which vertex each copy is.
+    /// Gives each joined vertex vertices of its own: of several that share one, the first in the order of triangles
+    /// keeps it, the others get copies appended at the end. Returns the original vertex of each copy.
     pub(crate) fn split_vertices(&self, mesh: &mut TriangleMesh) -> Vec<u32> {
         let mut keeps = vec![u32::MAX; mesh.vertices_m.len()];
         // Only looked up.
@@ -160,7 +163,7 @@ impl Joined {
         }
         for group in &mut mesh.groups {
             spend(1 + 4 * copies.len());
-            // Copies have larger numbers, which ascend.
+            // Copies have larger numbers, in ascending order.
             let new = (keeps.len() as u32..).zip(&copies).filter(|(_, old)| group.vertices.binary_search(old).is_ok());
             let new: Vec<u32> = new.map(|(new, _)| new).collect();
             group.vertices.extend(new);
@@ -168,11 +171,11 @@ impl Joined {
         copies
     }
 
-    /// Where several pairs have both ends of their edge in common, halves the triangles of all but the first, at a vertex in the
-    /// middle of the edge: a surface has only one edge between two vertices. Of each triangle at most one edge; returns the
-    /// triangles that were halved, whose other halves are behind the last, in this order.
+    /// Where several pairs have both ends of their edge in common, halves the triangles of all but the first by a
+    /// vertex in the middle of the edge: a surface has only one edge between two vertices. Halves at most one edge of
+    /// each triangle. Returns the halved triangles; their other halves are appended in this order.
     ///
-    /// For the mesh of [`Joined::split_vertices`].
+    /// Apply it to the mesh after [`Joined::split_vertices`].
     pub(crate) fn halve(&self, mesh: &mut TriangleMesh) -> Vec<u32> {
         let mut halved: BTreeSet<u32> = BTreeSet::new();
         let mut order = Vec::new();
@@ -212,8 +215,9 @@ impl Joined {
         order
     }
 
-    /// For each vertex, the number of the joined one that it is part of, if it is in a triangle; and for each joined one its least
-    /// vertex, which ascends. Joined vertices share none: that of [`Joined::split_vertices`] is given.
+    /// Returns for each vertex the number of the joined one that it belongs to, if it is in a triangle; and for each
+    /// joined one its smallest vertex, ascending. Joined vertices must share none: apply it after
+    /// [`Joined::split_vertices`].
     pub(crate) fn numbered(&self, mesh: &TriangleMesh) -> (Vec<Option<u32>>, Vec<u32>) {
         const NONE: u32 = u32::MAX;
         let mut set_of = vec![NONE; mesh.vertices_m.len()];
@@ -236,7 +240,7 @@ impl Joined {
     }
 }
 
-/// Adds a vertex in the middle of an edge; `None` if no number is between its ends.
+/// Adds a vertex in the middle of an edge; `None` if no number lies between its ends.
 fn middle_vertex(mesh: &mut TriangleMesh, edge: [u32; 2]) -> Option<u32> {
     let [from, to] = edge.map(|vertex| mesh.vertices_m[vertex as usize]);
     let (place, middle) = (from.midpoint(to), u32::try_from(mesh.vertices_m.len()).ok()?);
@@ -253,8 +257,8 @@ fn middle_vertex(mesh: &mut TriangleMesh, edge: [u32; 2]) -> Option<u32> {
     Some(middle)
 }
 
-/// The sides at an edge in the order of their angles around it; where two have the same angle, the solid that ends there comes
-/// before the one that begins.
+/// Sorts the sides at an edge by their angles around it; of two with equal angles, the end of a solid comes before a
+/// beginning.
 fn around(
     vertices: &[DVec3],
     triangles: &[[u32; 3]],
@@ -271,14 +275,14 @@ fn around(
     };
     let first = across(&sides[0]);
     let second = along.cross(first);
-    // Grows with the angle as the angle does, from 0 to 4, by arithmetic that is the same on every machine.
+    // A number from 0 to 4 that grows with the angle, by arithmetic with equal results on every machine.
     let angle = |side: &Side| {
         let off = across(side);
         let (x, y) = (off.dot(first), off.dot(second));
         let part = y / (x.abs() + y.abs());
         let angle = if x < 0.0 { 2.0 - part } else { part };
         let angle = if angle.is_nan() { 0.0 } else { angle };
-        // Just before a whole turn is where it begins.
+        // An angle just below a whole turn counts as the beginning.
         if angle < -SAME_ANGLE { angle + 4.0 } else { angle }
     };
     let mut ordered: Vec<(f64, Side)> = sides.iter().map(|side| (angle(side), *side)).collect();
@@ -289,11 +293,11 @@ fn around(
     ordered.into_iter().map(|(_, side)| side).collect()
 }
 
-/// Pairs sides in the order around their edge; returns the one that is left over, if there is one.
+/// Pairs sides in their order around the edge; returns the one that is left over, if any.
 fn pair(around: &[Side], pairs: &mut Vec<[Side; 2]>) -> Option<Side> {
     let mut is_paired = vec![false; around.len()];
     let mut begun = Vec::new();
-    // Twice around: what begins before the first angle ends after it.
+    // Two turns: what begins before the first angle ends after it.
     for (turn, which) in (0..2).flat_map(|turn| (0..around.len()).map(move |which| (turn, which))) {
         if is_paired[which] {
             continue;

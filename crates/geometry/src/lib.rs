@@ -1,4 +1,5 @@
-//! Triangle meshes of organs: read from files, checked, mended, written, generated. No tissue, no network, no clock.
+//! Triangle meshes of organs: reading, checking, repairing, writing and generating them. Independent of tissue,
+//! network and clock.
 
 mod curvature;
 pub mod decimate;

@@ -1,22 +1,22 @@
-//! A triangle mesh: vertices in space, triangles between them, and what the file said besides.
+//! A triangle mesh: vertices, triangles, texture coordinates and groups.
 
 use glam::DVec3;
 
-/// A mesh of triangles. Nothing about it is promised but that indices are in range: `report` tells what is wrong with it.
+/// A triangle mesh. Only indices are guaranteed to be in range; `report` lists its faults.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TriangleMesh {
-    /// Where the vertices are, m, in the order of the file.
+    /// Positions of the vertices, m, in the order of the file.
     pub vertices_m: Vec<DVec3>,
-    /// Three vertices each, counterclockwise seen from outside.
+    /// Three vertex indices per triangle, counterclockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
-    /// Texture coordinates of each corner of each triangle, if the file has them; as long as `triangles`.
+    /// Texture coordinates (u, v) of each corner of each triangle, if the file has them; as many as `triangles`.
     pub uv: Option<Vec<[[f32; 2]; 3]>>,
-    /// Named sets of vertices: groups, objects, materials, physical names.
+    /// Named sets of vertices: groups, objects, materials or physical names of the file.
     pub groups: Vec<Group>,
 }
 
 impl TriangleMesh {
-    /// Keeps the triangles for which `keep` is true, with their texture coordinates.
+    /// Removes the triangles for which `keep` is false, with their texture coordinates.
     pub(crate) fn keep_triangles(&mut self, keep: &[bool]) {
         let mut kept = keep.iter();
         self.triangles.retain(|_| *kept.next().unwrap_or(&true));
@@ -26,7 +26,7 @@ impl TriangleMesh {
         }
     }
 
-    /// Turns the triangles for which `is_turned` is true to their other side.
+    /// Reverses the triangles for which `is_turned` is true.
     pub(crate) fn turn_triangles(&mut self, is_turned: &[bool]) {
         for (triangle, _) in self.triangles.iter_mut().zip(is_turned).filter(|(_, is_turned)| **is_turned) {
             triangle.swap(1, 2);
@@ -36,7 +36,8 @@ impl TriangleMesh {
         }
     }
 
-    /// Writes the texture coordinates of each vertex, if the file has them; at a seam those of the first corner there.
+    /// Writes the texture coordinates of each vertex to `into`, if there are any; at a seam, those of its first
+    /// corner.
     pub fn write_vertex_uv(&self, into: &mut [[f32; 2]]) {
         // Backwards, so that the first corner is written last.
         for (triangle, corners) in self.triangles.iter().zip(self.uv.as_deref().unwrap_or_default()).rev() {
@@ -48,8 +49,8 @@ impl TriangleMesh {
 /// A named set of vertices of a mesh.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Group {
-    /// As the file names it.
+    /// Name of the set in the file.
     pub name: String,
-    /// Ascending, each once.
+    /// Vertex indices, ascending and unique.
     pub vertices: Vec<u32>,
 }

@@ -1,9 +1,10 @@
-//! Which way triangles face: neighbours the same, and closed parts outward from the tissue.
+//! Orients triangles: neighbours consistently, and closed parts outward from the tissue.
 //!
-//! A part is what triangles that are joined at edges make. Where most triangles of a part agree on a side, the others are turned.
-//! A closed part encloses a volume whose sign tells whether it faces outward. One that lies within an odd number of other closed
-//! parts is the wall of a cavity: the tissue is around it, so outward from the tissue is into the cavity. What is open has no
-//! inside: it stays as the file has it, unless its holes are so small that nobody can mean its inner side.
+//! A part is a set of triangles that are joined at edges. The triangles that face another side than the majority of
+//! their part are turned. A closed part encloses a volume whose sign says whether it faces outward. One that lies
+//! within an odd number of other closed parts is the wall of a cavity: the tissue is around it, so outward from the
+//! tissue is into the cavity. An open part has no inside and stays as in the file, unless its holes are so small that
+//! its inner side can't be meant.
 
 use std::f64::consts::PI;
 
@@ -13,47 +14,47 @@ use crate::join::Joined;
 use crate::ray::Enclosures;
 use crate::tree::corners;
 
-/// A part whose holes could be covered by at most this share of its area is nearly closed: it has an inside.
+/// Ratio of the largest area of its holes to its own area up to which a part is nearly closed and has an inside.
 const NEARLY_CLOSED: f64 = 0.02;
 
-/// The least part of its area, weighted by distance from the middle, by which a part that is not closed faces outward or inward.
+/// Fraction of its area, weighted by distance from the middle, above which an open part faces outward or inward.
 const FACES: f64 = 0.2;
 
-/// A closed part whose volume is a smaller part of what its area could enclose is flat, and has no inside.
+/// Ratio of its volume to what its area could enclose below which a closed part is flat, and has no inside.
 const FLAT: f64 = 1e-9;
 
 /// A part of a mesh: triangles that are joined at edges.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Part {
-    /// Ascending.
+    /// Its triangles, ascending.
     pub(crate) triangles: Vec<u32>,
     /// Whether it has no border.
     pub(crate) is_closed: bool,
     /// Whether its triangles can all face the same side.
     pub(crate) is_orientable: bool,
-    /// How many of its triangles face another side than most.
+    /// Number of its triangles that face another side than the majority.
     pub(crate) turned: usize,
-    /// Whether all of it is turned, since it is closed, or nearly so, and faces inward.
+    /// Whether the whole part is turned, since it is closed, or nearly so, and faces inward.
     pub(crate) is_turned: bool,
     /// Whether it is the wall of a cavity of another part.
     pub(crate) is_cavity: bool,
-    /// Whether it is open and faces inward, which stays.
+    /// Whether it is open and faces inward; it is not turned.
     pub(crate) faces_inward: bool,
     /// The closed parts around it.
     pub(crate) around: Vec<u32>,
 }
 
-/// The parts of a mesh, and which triangles must be turned.
+/// The parts of a mesh, and the triangles to turn.
 pub(crate) struct Oriented {
     pub(crate) parts: Vec<Part>,
-    /// The part of each triangle; beyond the last for those that take no part.
+    /// The part of each triangle; beyond the last for ignored triangles.
     pub(crate) part_of: Vec<u32>,
     pub(crate) is_turned: Vec<bool>,
-    /// Parts of which it took too much work to find what is around them; they count as within none.
+    /// Number of parts for which finding the surrounding parts took too much work; they count as within none.
     pub(crate) unknown: usize,
 }
 
-/// Finds the parts and how they face.
+/// Finds the parts and their orientation.
 pub(crate) fn orient(vertices: &[DVec3], triangles: &[[u32; 3]], joined: &Joined) -> Oriented {
     let mut found = connect(triangles.len(), joined);
     for triangle in joined.borders.iter().map(|border| border.0).chain(joined.crowded.iter().copied()) {
@@ -79,7 +80,7 @@ pub(crate) fn orient(vertices: &[DVec3], triangles: &[[u32; 3]], joined: &Joined
     for ((part, (facing, around)), border_m) in found.parts.iter_mut().zip(faced).zip(border_m) {
         part.around = around;
         part.is_cavity = part.around.len() % 2 == 1 && part.is_orientable;
-        // No hole with a border of this length is larger than a disc.
+        // The largest hole with a border of this length is a disc.
         let is_nearly_closed =
             border_m * border_m / (4.0 * PI) <= NEARLY_CLOSED * facing.area && facing.outward.abs() > FACES;
         let (has_inside, is_flat) = (part.is_closed || is_nearly_closed, facing.outward.abs() <= FLAT);
@@ -92,11 +93,11 @@ pub(crate) fn orient(vertices: &[DVec3], triangles: &[[u32; 3]], joined: &Joined
     found
 }
 
-/// How a part faces, with its triangles turned.
+/// The orientation of a part, with its triangles turned.
 struct Facing {
     /// Its area, m².
     area: f64,
-    /// 1 if all of it faces away from its middle, −1 if all of it faces there.
+    /// 1 if all of it faces away from its middle, −1 if all of it faces towards it.
     outward: f64,
 }
 
@@ -112,7 +113,8 @@ impl Facing {
             sum += own * middle(triangle);
         }
         let middle_of_all = if area > 0.0 { sum / area } else { of.first().map_or(DVec3::ZERO, |first| at(first)[0]) };
-        // Three times the volume of the cones from the middle to the triangles, with its sign, and at most.
+        // Three times the volume of the cones from the middle to the triangles, with its sign, and its largest
+        // possible value.
         let (mut signed, mut most) = (0.0, 0.0);
         for triangle in of {
             let (normal, off) = (normal(at(triangle)), middle(at(triangle)) - middle_of_all);
@@ -124,7 +126,7 @@ impl Facing {
     }
 }
 
-/// Finds the triangles that are joined, and turns those that face another side than most of their part.
+/// Finds the triangles that are joined, and turns those that face another side than the majority of their part.
 fn connect(count: usize, joined: &Joined) -> Oriented {
     const NONE: u32 = u32::MAX;
     // Each side of a triangle has at most one partner: which one, and whether that faces the other side.
@@ -165,7 +167,7 @@ fn connect(count: usize, joined: &Joined) -> Oriented {
         }
         triangles.sort_unstable();
         let mut turned = triangles.iter().filter(|triangle| found.is_turned[**triangle as usize]).count();
-        // The side that most triangles face; none is turned where no way of turning fits.
+        // Chooses the side of the majority; turns none if the part has only one side.
         if !is_orientable {
             triangles.iter().for_each(|triangle| found.is_turned[*triangle as usize] = false);
             turned = 0;
@@ -188,7 +190,7 @@ fn connect(count: usize, joined: &Joined) -> Oriented {
 }
 
 impl Oriented {
-    /// What is turned, in sentences.
+    /// Returns sentences that describe what is turned.
     pub(crate) fn notes(&self) -> Vec<String> {
         let mut notes = Vec::new();
         let turned: usize = self.parts.iter().map(|part| part.turned).sum();

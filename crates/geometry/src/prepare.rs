@@ -1,5 +1,5 @@
-//! From the mesh of a file to a surface of tissue: what has the same position is joined, closed parts face outward, what is there
-//! twice is there once. Nothing is moved, and no hole is filled: that is `repair`.
+//! Converts the mesh of a file to a surface of tissue: joins vertices at one position, turns closed parts outward,
+//! and removes duplicates. Moves nothing and fills no hole: that is `repair`.
 
 use glam::DVec3;
 
@@ -14,35 +14,36 @@ use crate::{Group, ReadLimits, TriangleMesh};
 /// A mesh to simulate, and that of the file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prepared {
-    /// The mesh to simulate. A vertex is in a group if one of those that it stands for is.
+    /// The mesh to simulate. A vertex is in a group if one of the file's vertices that it represents is.
     pub mesh: TriangleMesh,
-    /// The mesh of the file, if it has other vertices.
+    /// The mesh of the file, if its vertices differ.
     pub file: Option<FileMesh>,
-    /// What was done, with counts; empty if nothing was.
+    /// Sentences on what was done, with counts; empty if nothing was.
     pub notes: Vec<String>,
-    /// For each vertex of `mesh`, the least of those of the file that it stands for.
+    /// For each vertex of `mesh`, the smallest vertex of the file that it represents.
     vertex_names: Vec<u32>,
     /// For each triangle of `mesh`, its number in the file.
     triangle_names: Vec<u32>,
 }
 
-/// The triangles that are simulated, between the vertices of the file: at a seam of its texture it has several at one position.
+/// The simulated triangles with the vertices of the file, which has several at one position along a seam of its
+/// texture.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FileMesh {
-    /// The mesh. A vertex of the file that several simulated ones stand for has copies behind the last.
+    /// The mesh. A vertex of the file that several simulated ones represent has copies appended at the end.
     pub mesh: TriangleMesh,
-    /// For each of its vertices, the simulated one that stands for it; for one in no triangle, the nearest.
+    /// For each of its vertices, the simulated vertex that represents it; for one without a triangle, the nearest.
     pub vertex_of: Vec<u32>,
 }
 
 impl Prepared {
-    /// Reports the mesh to simulate, with the numbers that vertices and triangles have in the file.
+    /// Reports on the mesh to simulate, with the file's numbers of vertices and triangles, within the default limits.
     #[must_use]
     pub fn report(&self) -> MeshReport {
         self.report_within(&ReadLimits::default())
     }
 
-    /// Returns the same within other limits.
+    /// Reports on the mesh to simulate, with the file's numbers of vertices and triangles, within `limits`.
     #[must_use]
     pub fn report_within(&self, limits: &ReadLimits) -> MeshReport {
         let mut report = report_within(&self.mesh, limits);
@@ -54,19 +55,19 @@ impl Prepared {
     }
 }
 
-/// Notes what was done so many times, if it was.
+/// Adds a note on what was done `count` times, if that is not 0.
 pub(crate) fn note(notes: &mut Vec<String>, count: usize, what: &str) {
     if count > 0 {
         notes.push(format!("{what}: {count}."));
     }
 }
 
-/// What is not settled after so many passes stays so. One is enough for what only has to be joined; of the others each has
-/// something to turn, to drop or to split, and what that changes may lead to more.
+/// Maximum number of passes; faults left after that stay. Joining alone takes one pass; other passes have something
+/// to turn, drop or split, which may lead to more.
 const PASSES: usize = 8;
 
-/// Prepares a mesh. One with indices out of range or positions that are not finite stays as it is: the report refuses it. What
-/// has been prepared does not change when it is prepared again.
+/// Prepares a mesh. Returns one with indices out of range or positions that are not finite unchanged: the report
+/// refuses it. Preparing a prepared mesh again does not change it.
 #[must_use]
 pub fn prepare(mut mesh: TriangleMesh) -> Prepared {
     let count = mesh.vertices_m.len();
@@ -110,13 +111,13 @@ pub fn prepare(mut mesh: TriangleMesh) -> Prepared {
 }
 
 impl Prepared {
-    /// Drops, splits and turns what must be; returns how the triangles are joined, if nothing had to be.
+    /// Drops, splits and turns what is necessary. Returns how the triangles are joined, if nothing had to change.
     fn pass(&mut self, mesh: &mut TriangleMesh) -> Option<Joined> {
         let places = places(&mesh.vertices_m);
         let changes = match_diagonals(mesh) + self.drop_doubled(mesh, &places);
         let joined = join(&mesh.vertices_m, &mesh.triangles, &places, Odd::Stay);
         let mut oriented = orient(&mesh.vertices_m, &mesh.triangles, &joined);
-        // What could not be found is told once.
+        // Notes on what could not be found out appear once.
         let notes: Vec<String> = oriented.notes().into_iter().filter(|note| !self.notes.contains(note)).collect();
         self.notes.extend(notes);
         let copies = joined.split_vertices(mesh);
@@ -132,14 +133,14 @@ impl Prepared {
             self.triangle_names.push(self.triangle_names[triangle]);
             oriented.is_turned.push(oriented.is_turned[triangle]);
         }
-        // A vertex in the middle of an edge has no name of the file but its own.
+        // A vertex in the middle of an edge has no name in the file; it gets a new number.
         self.vertex_names.extend((0..).take(mesh.vertices_m.len()).skip(self.vertex_names.len()));
         mesh.turn_triangles(&oriented.is_turned);
         let is_same = changes == 0 && mesh.vertices_m.len() == places.len() && !oriented.is_turned.contains(&true);
         is_same.then_some(joined)
     }
 
-    /// Drops the triangles that are there more than once, and those that are lines; returns how many.
+    /// Drops duplicate triangles and those that are lines; returns their number.
     fn drop_doubled(&mut self, mesh: &mut TriangleMesh, places: &[u32]) -> usize {
         let mut found = doubled(mesh, places);
         let mut lines = 0;
@@ -160,7 +161,7 @@ impl Prepared {
     }
 }
 
-/// The mesh of joined vertices.
+/// Builds the mesh of joined vertices.
 fn simulated(file: &TriangleMesh, vertex_of: &[Option<u32>], least: &[u32]) -> TriangleMesh {
     let new = |vertex: u32| vertex_of[vertex as usize];
     let group = |group: &Group| {
@@ -177,11 +178,11 @@ fn simulated(file: &TriangleMesh, vertex_of: &[Option<u32>], least: &[u32]) -> T
     }
 }
 
-/// Boxes that are looked at to find what is nearest to the vertices that no triangle has: so many, and so many for each triangle and
-/// vertex. Usually one takes some tens.
+/// Maximum number of boxes that are visited to find the nearest points for the vertices that no triangle uses: a
+/// fixed number, and a number for each triangle and vertex. A search typically takes some tens.
 const LOOKS: [u64; 2] = [1_000_000, 60];
 
-/// The simulated vertex of each; for one that no triangle has, the nearest, or one that is near ([`LOOKS`]).
+/// Returns the simulated vertex of each; for one without a triangle, the nearest, or a near one ([`LOOKS`]).
 fn stand_ins(vertex_of: &[Option<u32>], file: &TriangleMesh, simulated: &TriangleMesh) -> Vec<u32> {
     let of = (&simulated.vertices_m[..], &simulated.triangles[..]);
     let mut tree = None;

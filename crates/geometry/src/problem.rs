@@ -1,119 +1,119 @@
-//! What can be wrong with a mesh file or a mesh, where, and what the user can do about it.
+//! The faults of a mesh file or a mesh, where they are, and what the user can do about them.
 
 use std::fmt;
 
 use crate::Unit;
 use crate::format::{length, place, rounded};
 
-/// What is wrong. Its text says what to do.
+/// A fault of a mesh file or a mesh. Its text says what to do.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Problem {
-    /// Text that is no unit of length.
+    /// A text is not a unit of length.
     Unit {
-        /// What was given.
+        /// The given text.
         text: String,
     },
-    /// Neither the content nor the extension tells the format.
+    /// Neither the content nor the extension of a file identifies its format.
     UnknownFormat,
     /// The file breaks its format.
     Syntax {
         /// What was expected, or what is wrong.
         message: String,
     },
-    /// A variant of a format that no reader here knows.
+    /// The file uses a variant of its format that is not supported.
     Unsupported {
         /// The variant, and what to do.
         message: String,
     },
-    /// The file ends early.
+    /// The file ends too early.
     Truncated {
         /// What is missing.
         missing: String,
     },
-    /// A file that this file names can't be had.
+    /// Another file to which this file refers can't be read.
     NeighbourMissing {
-        /// As this file names it.
+        /// The name of that file, as given in this one.
         name: String,
     },
-    /// More than the limit.
+    /// The file or mesh exceeds a limit.
     TooLarge {
-        /// Of what: bytes, vertices, triangles, …
+        /// The limited quantity: bytes, vertices, triangles, …
         what: &'static str,
         /// The limit.
         limit: usize,
     },
     /// A coordinate is not a number, or infinite.
     NotFinite,
-    /// A triangle names a vertex that does not exist.
+    /// A triangle refers to a vertex that does not exist.
     IndexOutOfRange {
-        /// The vertex as the file gives it.
+        /// The vertex number as in the file.
         index: i64,
-        /// How many there are.
+        /// Number of vertices.
         vertices: usize,
     },
-    /// Fewer vertices than a tissue needs.
+    /// The mesh has fewer vertices than a tissue needs.
     TooFewVertices {
-        /// How many there are.
+        /// Number of vertices.
         vertices: usize,
     },
     /// No triangle has an area.
     OnlyDegenerate,
     /// More than two triangles share an edge.
     NonManifoldEdge {
-        /// How many share it.
+        /// Number of triangles that share it.
         triangles: usize,
     },
-    /// Surfaces touch at a vertex and share no edge there.
+    /// Surfaces touch at a vertex without sharing an edge there.
     NonManifoldVertex {
-        /// How many surfaces.
+        /// Number of surfaces.
         fans: usize,
     },
     /// Two triangles at an edge face opposite sides.
     Orientation,
-    /// A closed surface whose triangles face inwards.
+    /// The triangles of a closed surface face inwards.
     FacesInward,
-    /// The wall of a cavity, inside of another closed surface, whose triangles face the tissue.
+    /// The triangles of a cavity's wall, inside another closed surface, face the tissue.
     CavityFacesTissue,
-    /// An open surface whose triangles face its middle.
+    /// The triangles of an open surface face its middle.
     OpenFacesInward,
-    /// A triangle without area.
+    /// A triangle has no area.
     Degenerate,
-    /// The vertices of an earlier triangle.
+    /// A triangle has the vertices of an earlier one.
     DuplicateTriangle,
-    /// The position of an earlier vertex.
+    /// A vertex has the position of an earlier one.
     DuplicateVertex {
-        /// The earlier one.
+        /// The earlier vertex.
         of: u32,
     },
-    /// In no triangle.
+    /// A vertex is in no triangle.
     UnusedVertex,
-    /// Edge lengths that differ much.
+    /// Edge lengths differ much.
     EdgeSpread {
-        /// Longest over shortest.
+        /// Ratio of the longest to the shortest.
         ratio: f64,
     },
-    /// Areas that differ much.
+    /// Areas differ much.
     AreaSpread {
-        /// Largest over smallest.
+        /// Ratio of the largest to the smallest.
         ratio: f64,
     },
-    /// A size that suggests another unit.
+    /// The size of the mesh suggests another unit.
     Size {
         /// The longest side of the bounding box, m.
         longest_m: f64,
-        /// Which other unit would fit, if one does.
+        /// The unit that would fit, if any.
         instead: Option<&'static str>,
     },
-    /// Triangles that cut through each other.
+    /// Triangles cut through each other.
     SelfIntersection {
         /// The triangle that is cut.
         by: u32,
     },
-    /// The check for triangles that cut each other ended early.
+    /// The search for triangles that cut each other ended early.
     SelfIntersectionUnknown,
-    /// Several surfaces that share no vertex.
+    /// The mesh has several surfaces that share no vertex.
     Components {
-        /// How many.
+        /// Number of surfaces.
         count: usize,
     },
 }
@@ -153,7 +153,7 @@ impl Problem {
         }
     }
 
-    /// Returns whether a mesh with it is refused; else the user is warned.
+    /// Returns whether a mesh with this fault is refused; otherwise the user is warned.
     #[must_use]
     pub fn is_refused(&self) -> bool {
         !matches!(
@@ -264,7 +264,7 @@ impl fmt::Display for Problem {
 /// A part of a file or of a mesh. Vertices, faces and triangles are numbered from 0, lines from 1.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Element {
-    /// All of it.
+    /// The whole file or mesh.
     Whole,
     /// A line of a text file.
     Line(u64),
@@ -283,7 +283,7 @@ pub enum Element {
 }
 
 impl Element {
-    /// Gives its vertices and triangles other numbers.
+    /// Renumbers its vertices and triangles.
     pub(crate) fn rename(&mut self, vertex: impl Fn(u32) -> u32, triangle: impl Fn(u32) -> u32) {
         match self {
             Element::Vertex(number) => *number = vertex(*number),
@@ -312,16 +312,16 @@ impl fmt::Display for Element {
     }
 }
 
-/// Why a mesh is refused: file, element, place in space, and what is wrong.
+/// The reason why a mesh is refused: file, element, place in space, and fault.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub struct MeshError {
     /// The file's name as the caller gave it.
     pub file: String,
     /// The part of the file or mesh.
     pub element: Element,
-    /// Where it is, m, if it has a place.
+    /// Its position, m, if it has one.
     pub place_m: Option<[f64; 3]>,
-    /// What is wrong.
+    /// The fault.
     pub problem: Problem,
 }
 

@@ -1,4 +1,4 @@
-//! What lies inside of what: which closed parts of a surface are around a part.
+//! Finds which closed parts of a surface enclose a part.
 
 use std::collections::BTreeMap;
 
@@ -6,31 +6,33 @@ use glam::DVec3;
 
 use crate::tree::{Tree, corners};
 
-/// Places of a part that are looked at.
+/// Number of test points of a part.
 const PLACES: usize = 16;
 
-/// Where on a triangle they are: nowhere that meshes of boxes have an edge.
+/// Barycentric position of the test point on a triangle: not where meshes of boxes have edges.
 const AT: [f64; 3] = [0.437, 0.342, 0.221];
 
-/// Boxes and triangles that are looked at in all: so many, and so many for each triangle.
+/// Limit on the boxes and triangles searched in total: a constant, plus a number per triangle.
 const LOOKS: [u64; 2] = [1_000_000, 60];
 
-/// A ray that passes an edge or begins on a triangle by less is not sure of it, as a part of the triangle's size.
+/// Distance from an edge or to the first triangle, as a fraction of the triangle's size, below which a ray is
+/// unreliable.
 const UNSURE: f64 = 1e-9;
 
-/// The closed parts of a surface, to be asked what is inside.
+/// The closed parts of a surface, for queries of what encloses a part.
 pub(crate) struct Enclosures<'m> {
     vertices: &'m [DVec3],
     triangles: &'m [[u32; 3]],
     part_of: &'m [u32],
     tree: Tree,
-    /// Where rays end.
+    /// The largest x, at which rays end.
     end: f64,
     looks_left: u64,
 }
 
 impl<'m> Enclosures<'m> {
-    /// Of the triangles that `encloses` tells; a part is a number of `part_of`. Coordinates are finite, indices in range.
+    /// Creates the search over the triangles that `encloses` accepts; a part is a number of `part_of`. Coordinates
+    /// must be finite, indices in range.
     pub(crate) fn new(
         vertices: &'m [DVec3],
         triangles: &'m [[u32; 3]],
@@ -44,8 +46,8 @@ impl<'m> Enclosures<'m> {
         Self { vertices, triangles, part_of, tree, end, looks_left }
     }
 
-    /// The parts that are around a part, ascending: those that are around all of its places that are looked at. None where
-    /// nothing is sure, as where two parts are in the same place. `None` after too much work.
+    /// Returns the parts that enclose a part, ascending: those around all of its test points. Empty if no test is
+    /// reliable, as for two parts at one place. `None` after too much work.
     pub(crate) fn around(&mut self, own: u32, triangles_of_part: &[u32]) -> Option<Vec<u32>> {
         let mut found: Option<Vec<u32>> = None;
         let step = triangles_of_part.len().div_ceil(PLACES).max(1);
@@ -68,8 +70,8 @@ impl<'m> Enclosures<'m> {
         Some(found.unwrap_or_default())
     }
 
-    /// The parts around a place, but for `own`: those that a ray from there crosses an odd number of times. `None` if it passes
-    /// an edge or begins on a triangle.
+    /// Returns the parts around a place, except `own`: those that a ray from there crosses an odd number of times.
+    /// `None` if it passes an edge or starts on a triangle.
     fn around_place(&mut self, from: DVec3, own: u32) -> Option<Vec<u32>> {
         let (mut crossed, mut is_sure, mut looked) = (BTreeMap::new(), true, 0);
         let (vertices, triangles, part_of) = (self.vertices, self.triangles, self.part_of);
@@ -91,14 +93,14 @@ impl<'m> Enclosures<'m> {
     }
 }
 
-/// Whether a ray along x crosses a triangle; `None` if it is near its edge or begins on it.
+/// Returns whether a ray along x crosses a triangle; `None` if it is near its edge or starts on it.
 fn is_crossed(from: DVec3, triangle: [DVec3; 3]) -> Option<bool> {
     let [a, b, c] = triangle.map(|at| at - from);
     let double = |u: DVec3, v: DVec3| u.y * v.z - u.z * v.y;
     let weights = [double(b, c), double(c, a), double(a, b)];
     let whole: f64 = weights.iter().sum();
     let longest = (b - a).length_squared().max((c - b).length_squared()).max((a - c).length_squared());
-    // One along the ray: what it joins tells.
+    // The triangle lies along the ray: its neighbours decide.
     if whole.abs() <= 1e-12 * longest {
         return Some(false);
     }

@@ -1,5 +1,5 @@
-//! Mending: weld, drop, pair, orient, fill. Each step tells what it did, and where vertices went; what came out is compared with
-//! what was asked for.
+//! Repairs meshes: weld vertices, drop triangles, resolve non-manifold edges, orient, fill holes. Each step reports
+//! what it did and where the vertices went; the result is compared with the original surface.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
@@ -17,37 +17,40 @@ use crate::tree::corners;
 use crate::walls::{doubled, match_diagonals};
 use crate::{Group, TriangleMesh};
 
-/// The tolerance of welding, as a part of the diagonal of the bounding box, unless it is given.
+/// Default welding tolerance, as a fraction of the diagonal of the bounding box.
 const WELD: f64 = 1e-6;
 
-/// Vertices of one cell that others are compared with.
+/// Maximum number of vertices of a cell that others are compared with.
 const COMPARED: usize = 8;
 
-/// How often triangles are halved at an edge that surfaces share: each has three.
+/// Maximum number of rounds in which triangles are halved at an edge that surfaces share: a triangle has three edges.
 const HALVINGS: usize = 8;
 
-/// Parts of the area or of the volume that differ by more are told as lost.
+/// A change of the area or of the volume by more than this fraction is reported as a loss.
 const LOST: f64 = 0.01;
 
-/// What is mended. The default is everything.
+/// What is repaired. The default is everything.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Repair {
-    /// Weld vertices that are this near, m; `None`: a millionth of the diagonal; 0: the same position only.
+    /// Weld vertices that are at most this far apart, m. `None`: a millionth of the diagonal of the bounding box; 0:
+    /// only vertices at exactly the same position.
     pub weld_m: Option<f64>,
-    /// Drop triangles without area, those that have the vertices of an earlier one, and walls inside that are there from both
-    /// sides.
+    /// Drop triangles without area, triangles with the vertices of an earlier one, and internal walls that are
+    /// present from both sides.
     pub degenerate: bool,
-    /// Pair the triangles of edges that more than two have, so that each solid closes on itself; give each surface at a shared
-    /// vertex its own one.
+    /// Pair the triangles of edges that more than two triangles share, so that each solid is closed; give each
+    /// surface its own copy of a vertex that several surfaces share.
     pub manifold: bool,
-    /// Turn triangles to one side; closed surfaces outwards from the tissue, so walls of cavities into these.
+    /// Orient triangles consistently: closed surfaces outwards from the tissue, so walls of cavities into the
+    /// cavities.
     pub orient: bool,
-    /// Keep the connected surface with the most triangles, with what touches it at edges and what is inside of it.
+    /// Keep the connected surface with the most triangles, along with surfaces that touch it at edges and surfaces
+    /// inside it.
     pub largest: bool,
-    /// Fill holes with at most so many edges: those with three, and those with a border shorter than the diagonal of the
-    /// bounding box.
+    /// Fill holes with at most this many edges: holes with three edges, and holes with a border shorter than the
+    /// diagonal of the bounding box.
     pub hole_edges: usize,
-    /// Drop vertices that no triangle has.
+    /// Drop vertices that no triangle uses.
     pub unused: bool,
 }
 
@@ -65,24 +68,24 @@ impl Default for Repair {
     }
 }
 
-/// A mended mesh.
+/// A repaired mesh.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Repaired {
     /// The mesh.
     pub mesh: TriangleMesh,
-    /// What was done, with counts; empty if nothing was.
+    /// What was done, with counts; empty if the mesh was not changed.
     pub told: Vec<String>,
-    /// For each vertex of the mesh before, the vertex that it is now; `None` if it was dropped.
+    /// For each vertex of the original mesh, its index in the new mesh; `None` if it was dropped.
     pub vertex_of: Vec<Option<u32>>,
-    /// What the surface was, and what it is.
+    /// Size of the surface before the repair.
     pub before: SurfaceMeasure,
-    /// What the surface is now.
+    /// Size of the surface after the repair.
     pub after: SurfaceMeasure,
-    /// Why this is not what was asked for; empty if it is.
+    /// Ways in which the result falls short of the request; empty if it does not.
     pub faults: Vec<String>,
 }
 
-/// How large a surface is.
+/// Size of a surface.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct SurfaceMeasure {
     /// The area of all triangles, m²: Σ |(b − a) × (c − a)|/2.
@@ -94,7 +97,7 @@ pub struct SurfaceMeasure {
 }
 
 impl SurfaceMeasure {
-    /// Measures a surface whose coordinates are finite and whose indices are in range.
+    /// Measures a surface. Its coordinates must be finite and its indices in range.
     #[must_use]
     pub fn of(mesh: &TriangleMesh) -> Self {
         let (vertices, triangles) = (&mesh.vertices_m, &mesh.triangles);
@@ -114,7 +117,7 @@ impl SurfaceMeasure {
     }
 }
 
-/// Mends a mesh. Triangles whose vertices don't exist or are not finite are dropped.
+/// Repairs a mesh. Triangles whose vertices don't exist or are not finite are dropped.
 #[must_use]
 pub fn repair(mesh: &TriangleMesh, how: &Repair) -> Repaired {
     let mut work = RepairedMesh {
@@ -136,7 +139,7 @@ pub fn repair(mesh: &TriangleMesh, how: &Repair) -> Repaired {
     }
     if how.hole_edges > 0 {
         work.fill_holes(how.hole_edges);
-        // What is closed now has an inside.
+        // A surface that is closed now has an inside.
         work.join(how);
     }
     if how.unused {
@@ -147,7 +150,7 @@ pub fn repair(mesh: &TriangleMesh, how: &Repair) -> Repaired {
     Repaired { mesh: work.mesh, told: work.told, vertex_of: work.vertex_of, before, after, faults: work.faults }
 }
 
-/// A mesh while it is mended.
+/// A mesh that is being repaired.
 struct RepairedMesh {
     mesh: TriangleMesh,
     told: Vec<String>,
@@ -155,10 +158,10 @@ struct RepairedMesh {
     faults: Vec<String>,
 }
 
-/// Triangles that are joined at edges.
+/// The triangles, connected at edges to parts.
 struct Parts {
     oriented: Oriented,
-    /// Two triangles of parts that touch at an edge.
+    /// Pairs of triangles of parts that touch at an edge.
     touching: Vec<[u32; 2]>,
 }
 
@@ -171,14 +174,14 @@ impl RepairedMesh {
         Topology::new(self.mesh.vertices_m.len(), &self.mesh.triangles)
     }
 
-    /// Keeps some triangles; returns how many it drops.
+    /// Keeps the marked triangles. Returns the number of dropped triangles.
     fn keep(&mut self, keep: &[bool]) -> usize {
         let before = self.mesh.triangles.len();
         self.mesh.keep_triangles(keep);
         before - self.mesh.triangles.len()
     }
 
-    /// Gives vertices other numbers, in triangles, groups and the map.
+    /// Renumbers vertices, in triangles, groups and the map.
     fn renumber(&mut self, new_of: &[Option<u32>]) {
         let new = |vertex: u32| new_of.get(vertex as usize).copied().flatten();
         for vertex in self.mesh.triangles.iter_mut().flatten() {
@@ -206,7 +209,7 @@ impl RepairedMesh {
         let vertices = &self.mesh.vertices_m;
         let tolerance = weld_m.unwrap_or_else(|| WELD * extent(vertices, &self.mesh.triangles).length());
         let tolerance = if tolerance.is_finite() { tolerance.max(0.0) } else { 0.0 };
-        // The cell of a position; without a tolerance the position itself. Only looked up.
+        // The grid cell of a position; without a tolerance, the position itself. Used for lookups only.
         let mut cells: HashMap<[i64; 3], Vec<u32>> = HashMap::new();
         #[allow(clippy::cast_possible_truncation)]
         let cell = |at: DVec3| -> [i64; 3] {
@@ -249,7 +252,7 @@ impl RepairedMesh {
         }
     }
 
-    /// Returns how many copies of triangles it drops.
+    /// Returns the number of dropped duplicate triangles.
     fn drop_degenerate(&mut self) -> usize {
         let flipped = flip_degenerate(&mut self.mesh);
         self.tell(flipped, "Edges flipped beside triangles without area");
@@ -265,8 +268,8 @@ impl RepairedMesh {
         found.copies
     }
 
-    /// Joins triangles at edges, each with one other at most; gives surfaces that touch vertices of their own, and turns
-    /// triangles, if asked to.
+    /// Connects each triangle to at most one other triangle per edge. If requested, gives touching surfaces separate
+    /// vertices, and reorients triangles.
     fn join(&mut self, how: &Repair) -> Parts {
         let odd = if how.manifold { Odd::Pair } else { Odd::Stay };
         let joined = |mesh: &TriangleMesh| join(&mesh.vertices_m, &mesh.triangles, &places(&mesh.vertices_m), odd);
@@ -308,7 +311,7 @@ impl RepairedMesh {
         for (number, part) in (0..).zip(parts) {
             sizes[sets.find(number) as usize] += part.triangles.len();
         }
-        // Of several as large, the first.
+        // If several are equally large, the first one.
         let largest = (0_u32..).zip(&sizes).min_by_key(|(_, size)| Reverse(**size)).map(|(number, _)| number);
         let Some(largest) = largest else { return };
         let is_kept: Vec<bool> = (0..)
@@ -357,7 +360,8 @@ impl RepairedMesh {
             sorted.sort_unstable();
             sorted.dedup();
             let is_loop = hole.len() >= 3 && sorted.len() == hole.len() && is_border(&topology, &hole);
-            // The rim of an open sheet is longer than the sheet. A missing triangle of a coarse mesh may be, too.
+            // The boundary of an open sheet is longer than the sheet. That of a missing triangle in a coarse mesh may
+            // be, too.
             let is_small = hole.len() <= most_edges && (hole.len() == 3 || border < longest);
             if !is_loop || !is_small {
                 tangled += usize::from(is_small);
@@ -365,7 +369,7 @@ impl RepairedMesh {
             }
             let uv = |vertex: u32| uv_of.get(&vertex).copied().unwrap_or_default();
             if let [a, b, c] = hole[..] {
-                // A triangle by itself has such a border, too.
+                // A separate triangle also has such a border.
                 if border_triangle(&topology, a, b).is_some_and(|own| self.mesh.triangles[own].contains(&c)) {
                     continue;
                 }
@@ -404,7 +408,7 @@ impl RepairedMesh {
         }
     }
 
-    /// Tells what is not as it was and should be.
+    /// Reports losses in comparison with the original surface.
     fn compare(&mut self, before: &SurfaceMeasure, after: &SurfaceMeasure) {
         match (before.volume_m3, after.volume_m3) {
             (Some(was), Some(is)) if (is - was).abs() > LOST * was => self.faults.push(format!(
@@ -441,12 +445,13 @@ impl RepairedMesh {
     }
 }
 
-/// Whether the last edge of a loop is a border too: a line of border edges that is no loop has none there.
+/// Returns whether the last edge of a loop is also a border. If the border edges are an open line, there is no such
+/// edge.
 fn is_border(topology: &Topology, hole: &[u32]) -> bool {
     border_triangle(topology, hole[0], hole[hole.len() - 1]).is_some()
 }
 
-/// The triangle at an edge that has only one.
+/// Returns the triangle at an edge that belongs to only one triangle.
 fn border_triangle(topology: &Topology, a: u32, b: u32) -> Option<usize> {
     let found = topology.edges.binary_search_by(|other| other.vertices.cmp(&[a.min(b), a.max(b)])).ok()?;
     match topology.sides(&topology.edges[found]) {

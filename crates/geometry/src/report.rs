@@ -1,4 +1,4 @@
-//! What a mesh is: size, counts, holes, volume, how even it is, and what is wrong with it.
+//! Reports on a mesh: size, counts, holes, volume, uniformity, and problems.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -15,29 +15,29 @@ use crate::topology::{Topology, is_proper};
 use crate::tree::{Tree, corners, cut};
 use crate::{Element, MeshError, Problem, TriangleMesh, Unit};
 
-/// Elements that are listed for each kind of problem; the others are counted.
+/// Maximum number of elements that are listed for each kind of problem. All are counted.
 pub const LISTED: usize = 10;
 
-/// Edge lengths and areas that differ by more are warned of.
+/// Ratio of the largest to the smallest edge length or area above which a warning is given.
 const SPREAD: f64 = 100.0;
 
-/// The longest side of an organ, m; outside, the unit is doubted.
+/// Plausible range for the longest side of an organ, m. Outside this range, the unit is questioned.
 const LENGTHS_M: [f64; 2] = [0.005, 5.0];
 
-/// Coordinates of places below this part of the longest side are rounding.
+/// Coordinates of reported positions below this fraction of the longest side are rounding errors.
 const NOISE: f64 = 1e-9;
 
-/// Boxes that the check for self-intersection looks at for each triangle.
+/// Maximum number of boxes that the check for self-intersection visits per triangle.
 const LOOKS: u64 = 400;
 
-/// The least, the median and the largest of some values.
+/// Minimum, median and maximum of some values.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Spread {
-    /// The least.
+    /// The minimum.
     pub least: f64,
-    /// The median; of an even number of values, the larger one in the middle.
+    /// The median; of an even number of values, the larger of the two middle ones.
     pub median: f64,
-    /// The largest.
+    /// The maximum.
     pub largest: f64,
 }
 
@@ -50,26 +50,26 @@ impl Spread {
         Self { least: values[0], median: values[values.len() / 2], largest: values[values.len() - 1] }
     }
 
-    /// Returns the largest over the least; `None` without values, or if the least is 0.
+    /// Returns the ratio of the maximum to the minimum. `None` if there are no values, or if the minimum is 0.
     #[must_use]
     pub fn ratio(&self) -> Option<f64> {
         (self.least > 0.0).then(|| self.largest / self.least)
     }
 }
 
-/// Something that is wrong, and where.
+/// A problem, and where it is.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finding {
-    /// What is wrong.
+    /// The problem.
     pub problem: Problem,
-    /// Where.
+    /// The element that has the problem.
     pub element: Element,
-    /// Where in space, m.
+    /// Position in space, m.
     pub place_m: Option<[f64; 3]>,
 }
 
 impl Finding {
-    /// Gives vertices and triangles other numbers.
+    /// Renumbers vertices and triangles.
     pub(crate) fn rename(&mut self, vertex: impl Fn(u32) -> u32, triangle: impl Fn(u32) -> u32) {
         match &mut self.problem {
             Problem::DuplicateVertex { of } => *of = vertex(*of),
@@ -93,7 +93,7 @@ impl Serialize for Finding {
 }
 
 impl Finding {
-    /// Returns the finding in words, with its place in a unit.
+    /// Describes the finding, with its position in the given unit.
     #[must_use]
     pub fn text(&self, unit: Unit) -> String {
         let at = self.place_m.map(|place_m| format!(" at {}", format::place(place_m, unit))).unwrap_or_default();
@@ -110,27 +110,28 @@ impl fmt::Display for Finding {
     }
 }
 
-/// A border of a surface: a hole, or the rim of an open one.
+/// A border of a surface: a hole in it, or the outer boundary (rim) of an open surface.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Border {
-    /// How many edges it has.
+    /// Number of edges.
     pub edges: usize,
-    /// How long it is, m.
+    /// Length, m.
     pub length_m: f64,
-    /// Whether it is as long as the diagonal of the box around the mesh: rather the rim of an open surface than a hole in one.
+    /// Whether it is at least as long as the diagonal of the bounding box: it is then probably the rim of an open
+    /// surface rather than a hole.
     pub is_rim: bool,
-    /// The middle of its vertices, m.
+    /// Middle of its vertices, m.
     pub place_m: [f64; 3],
 }
 
 impl Border {
-    /// Returns what it is: a hole, or a rim.
+    /// Returns "hole" or "rim".
     #[must_use]
     pub fn name(&self) -> &'static str {
         if self.is_rim { "rim" } else { "hole" }
     }
 
-    /// Returns the border in words, with its place in a unit.
+    /// Describes the border, with its position in the given unit.
     #[must_use]
     pub fn text(&self, unit: Unit) -> String {
         let (length, place) = (format::length(self.length_m, unit), format::place(self.place_m, unit));
@@ -144,35 +145,36 @@ impl From<MeshError> for Finding {
     }
 }
 
-/// A report of a mesh.
+/// A report on a mesh.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct MeshReport {
-    /// Vertices.
+    /// Number of vertices.
     pub vertices: usize,
-    /// Triangles.
+    /// Number of triangles.
     pub triangles: usize,
-    /// Surfaces that share no vertex.
+    /// Number of surfaces that share no vertex.
     pub components: usize,
-    /// Borders of the surface: closed loops of edges with one triangle.
+    /// Number of borders of the surface: closed loops of edges that belong to only one triangle.
     pub holes: usize,
-    /// The borders, the longest first; at most [`LISTED`].
+    /// The longest borders, in descending order; at most [`LISTED`].
     pub borders: Vec<Border>,
     /// The volume inside, m³, if the surface is closed and consistently oriented; negative if it faces inwards: Σ a·(b × c)/6 over
     /// the triangles (a, b, c), by the theorem of Gauss with the field x/3.
     pub volume_m3: Option<f64>,
     /// The area, m²: Σ |(b − a) × (c − a)|/2.
     pub area_m2: f64,
-    /// The sides of the box around all triangles, m: x, y, z.
+    /// Dimensions of the bounding box of all triangles, m: x, y, z.
     pub extent_m: [f64; 3],
     /// Edge lengths, m.
     pub edge_m: Spread,
-    /// Areas of triangles, m².
+    /// Triangle areas, m².
     pub triangle_m2: Spread,
-    /// Edges of a vertex.
+    /// Number of edges at a vertex.
     pub valence: Spread,
-    /// What is wrong: what is refused first, then by kind. At most [`LISTED`] of a kind.
+    /// Problems: first those for which the mesh is refused, then the others, in the order in which they were found.
+    /// At most [`LISTED`] of each kind.
     pub problems: Vec<Finding>,
-    /// All problems by their names, counted.
+    /// Number of problems of each kind, by name.
     pub counts: BTreeMap<&'static str, usize>,
 }
 
@@ -189,7 +191,7 @@ impl MeshReport {
 struct Findings {
     list: Vec<Finding>,
     counts: BTreeMap<&'static str, usize>,
-    /// Coordinates below this are rounding, m.
+    /// Coordinates below this value are rounding errors, m.
     noise_m: f64,
 }
 
@@ -204,18 +206,18 @@ impl Findings {
     }
 }
 
-/// A place with 0 for coordinates below some length.
+/// Returns a position with coordinates below `noise_m` set to 0.
 fn without_noise(place: DVec3, noise_m: f64) -> [f64; 3] {
     place.to_array().map(|part| if part.abs() < noise_m { 0.0 } else { part })
 }
 
-/// Reports what a mesh is, with the default limits.
+/// Reports on a mesh, with the default limits.
 #[must_use]
 pub fn report(mesh: &TriangleMesh) -> MeshReport {
     report_within(mesh, &ReadLimits::default())
 }
 
-/// Reports what a mesh is; one above the limits is only counted.
+/// Reports on a mesh. A mesh that exceeds `limits` is only counted.
 #[must_use]
 pub fn report_within(mesh: &TriangleMesh, limits: &ReadLimits) -> MeshReport {
     let mut findings = Findings::default();
@@ -237,7 +239,7 @@ pub fn report_within(mesh: &TriangleMesh, limits: &ReadLimits) -> MeshReport {
         }
     }
     let mut report = MeshReport { vertices: vertices.len(), triangles: triangles.len(), ..MeshReport::default() };
-    // With these, nothing else can be said.
+    // If there are such problems, nothing else can be determined.
     if findings.list.is_empty() {
         examine(mesh, &mut report, &mut findings);
     }
@@ -250,11 +252,11 @@ pub fn report_within(mesh: &TriangleMesh, limits: &ReadLimits) -> MeshReport {
 pub(crate) fn area([a, b, c]: [DVec3; 3]) -> (f64, bool) {
     let double = (b - a).cross(c - a).length();
     let longest = (b - a).length_squared().max((c - b).length_squared()).max((a - c).length_squared());
-    // Twice the area over the longest side is the height.
+    // Twice the area divided by the longest side is the height.
     (double / 2.0, double > 1e-10 * longest)
 }
 
-/// Whether a triangle has an area.
+/// Returns whether a triangle has a nonzero area.
 pub(crate) fn has_area(vertices: &[DVec3], triangle: [u32; 3]) -> bool {
     is_proper(&triangle) && area(corners(vertices, triangle)).1
 }
@@ -270,7 +272,7 @@ pub(crate) fn volume(vertices: &[DVec3], triangles: &[[u32; 3]]) -> f64 {
     triangles.iter().map(of).sum()
 }
 
-/// The sides of the box around triangles; vertices that none has do not count.
+/// Returns the dimensions of the bounding box of triangles; unused vertices are ignored.
 pub(crate) fn extent(vertices: &[DVec3], triangles: &[[u32; 3]]) -> DVec3 {
     let used = || triangles.iter().flatten().map(|vertex| vertices[*vertex as usize]);
     let least = used().reduce(DVec3::min).unwrap_or_default();
@@ -278,7 +280,7 @@ pub(crate) fn extent(vertices: &[DVec3], triangles: &[[u32; 3]]) -> DVec3 {
     most - least
 }
 
-/// The borders of a surface, the longest first.
+/// Returns the borders of a surface, the longest first.
 fn borders(vertices: &[DVec3], holes: &[Vec<u32>], extent: DVec3) -> Vec<Border> {
     let noise_m = NOISE * extent.max_element();
     let of = |hole: &Vec<u32>| {
@@ -294,7 +296,7 @@ fn borders(vertices: &[DVec3], holes: &[Vec<u32>], extent: DVec3) -> Vec<Border>
     borders
 }
 
-/// Everything about a mesh whose coordinates are finite and whose indices are in range.
+/// Examines a mesh whose coordinates are finite and whose indices are in range.
 fn examine(mesh: &TriangleMesh, report: &mut MeshReport, findings: &mut Findings) {
     let (vertices, triangles) = (&mesh.vertices_m, &mesh.triangles);
     let at = |vertex: u32| Some(vertices[vertex as usize]);
@@ -397,14 +399,14 @@ fn examine(mesh: &TriangleMesh, report: &mut MeshReport, findings: &mut Findings
     check_cuts(mesh, &places, findings);
 }
 
-/// Doubts the unit of a mesh that is too small or too large for an organ.
+/// Questions the unit of a mesh that is too small or too large for an organ.
 fn check_size(extent_m: [f64; 3], findings: &mut Findings) {
     let longest_m = extent_m.into_iter().fold(0.0, f64::max);
     let fits = |length: f64| (LENGTHS_M[0]..=LENGTHS_M[1]).contains(&length);
     if longest_m == 0.0 || fits(longest_m) {
         return;
     }
-    // A user takes one of these units for another one. Of those that fit, the one that makes the most usual organ.
+    // The user may have confused two units. Suggests the one that results in the most typical organ size.
     let factors = [
         (1e-3, "1000 times smaller: mm instead of m"),
         (1e-2, "100 times smaller: cm instead of m"),
@@ -419,7 +421,7 @@ fn check_size(extent_m: [f64; 3], findings: &mut Findings) {
     findings.add(Problem::Size { longest_m, instead: instead.map(|found| found.1) }, Element::Whole, None);
 }
 
-/// Looks for triangles that cut each other, within a bound of work.
+/// Looks for triangles that intersect each other, with a limit on the work.
 fn check_cuts(mesh: &TriangleMesh, places: &[u32], findings: &mut Findings) {
     let (vertices, triangles) = (&mesh.vertices_m, &mesh.triangles);
     let at_places = |triangle: [u32; 3]| triangle.map(|vertex| places[vertex as usize]);
@@ -435,7 +437,7 @@ fn check_cuts(mesh: &TriangleMesh, places: &[u32], findings: &mut Findings) {
         let boxes = tree.overlapping((vertices, triangles), [least, most], |other| {
             looked += 1;
             let triangle = triangles[other as usize];
-            // Each pair once; those that have a place in common touch anyway.
+            // Checks each pair once. Triangles with a common position touch in any case.
             if other > number && !at_places(triangle).iter().any(|place| own.contains(place)) {
                 let is_cut = cut(at, corners(vertices, triangle));
                 by = is_cut.then_some(other);

@@ -1,8 +1,11 @@
-//! The surface of a mesh as something to walk on: places, straight ways over edges, and discs.
+//! Geometry on the surface of a mesh: points, straight paths (geodesics) across edges, and discs.
 //!
-//! A way is straight if the triangles that it crosses are unfolded into one plane. A disc is all places that straight ways
-//! of at most its radius lead to. Where the surface is curved, ways that pass a vertex on either side part a little: by the
-//! angle that is missing at the vertex, so by less the finer the mesh is.
+//! A path is straight if it is a straight line once the triangles that it crosses are unfolded into one plane. A disc
+//! contains all points that straight paths of at most its radius reach. Where the surface is curved, paths that pass
+//! a vertex on different sides diverge slightly: by the angle defect of the vertex, which is smaller the finer the
+//! mesh is.
+//!
+//! A hat is the piecewise linear function that is 1 at one vertex and 0 at all others.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -10,45 +13,45 @@ use crate::curvature::curvatures;
 pub use crate::tree::nearest_place;
 use crate::tree::{Tree, corners};
 
-/// What there is beyond a side of a triangle.
+/// What is on the other side of a side of a triangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Beyond {
-    /// The triangle; [`NONE`] beyond a rim.
+    /// The neighbouring triangle; [`NONE`] at a boundary.
     triangle: u32,
-    /// Which corner of it is opposite the side.
+    /// Which corner of the neighbour is opposite the side.
     apex: u8,
-    /// Where that corner is in the plane of this triangle: along the side from its first corner, in lengths of the side,
-    /// and away from this triangle, in the same.
+    /// Position of this corner, unfolded into the plane of this triangle: along the side from its first corner, and
+    /// away from this triangle, both in units of the side's length.
     at: DVec2,
 }
 
 const NONE: u32 = u32::MAX;
 
-/// How far within its triangle a place is kept, in barycentric coordinates: a way that begins exactly at a corner could find
-/// no side to leave by.
+/// Minimum barycentric coordinate of a point in its triangle. A path that begins exactly at a corner might not find a
+/// side through which to leave.
 const INSIDE: f64 = 1e-7;
 
-/// Most triangles that a way crosses: no mesh is so large that a way of use crosses more.
+/// Maximum number of triangles that a path crosses. Paths in practice are shorter on a mesh of any size.
 const LONGEST_WAY: usize = 1 << 14;
 
-/// A place on a surface, with two directions.
+/// A point on a surface, with two directions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Place {
     /// The triangle.
     pub triangle: u32,
-    /// Where in it.
+    /// Barycentric coordinates in the triangle.
     pub barycentric: [f64; 3],
-    /// Two perpendicular unit vectors in the plane of the triangle. Their cross product is its outward normal where the
-    /// triangles are oriented alike.
+    /// Two perpendicular unit vectors in the plane of the triangle. Their cross product is the outward normal if the
+    /// triangles are oriented consistently.
     pub frame: [DVec3; 2],
 }
 
-/// A mesh, prepared for walking.
+/// A mesh that is prepared for paths and discs on its surface.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Surface {
     vertices_m: Vec<DVec3>,
     triangles: Vec<[u32; 3]>,
-    /// Side k of a triangle is from its corner k to the next.
+    /// Side k of a triangle leads from its corner k to the next corner.
     beyond: Vec<[Beyond; 3]>,
     areas_m2: Vec<f64>,
     curvatures_per_m: Vec<[f32; 6]>,
@@ -57,19 +60,19 @@ pub struct Surface {
     tree: Tree,
 }
 
-/// The corners of a triangle that a way leaves by side k, in the order in which the side has them, and the one opposite.
+/// Returns the corners at the two ends of side k, in order, and the opposite corner.
 fn side(k: usize) -> [usize; 3] {
     [k, (k + 1) % 3, (k + 2) % 3]
 }
 
-/// Counterclockwise by a right angle.
+/// Rotates a vector counterclockwise by a right angle.
 fn turned(way: DVec2) -> DVec2 {
     DVec2::new(-way.y, way.x)
 }
 
 impl Surface {
-    /// Creates the surface of a mesh whose vertices are finite and whose edges have at most two triangles. Triangles without area are left out
-    /// of it: no way leads there.
+    /// Creates the surface of a mesh whose vertices are finite and whose edges have at most two triangles. Triangles
+    /// without area are omitted, since no path crosses them.
     #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
     pub fn new(vertices_m: &[DVec3], triangles: &[[u32; 3]]) -> Self {
         let has_area = |triangle: &[u32; 3]| {
@@ -109,7 +112,7 @@ impl Surface {
             triangle.iter().for_each(|vertex| areas_m2[*vertex as usize] += third_m2);
         }
         let tree = Tree::new(vertices_m, &kept, 0..kept.len() as u32);
-        // That of equilateral triangles of the same area.
+        // The edge length of equilateral triangles of this area.
         let mean_m2 = areas_m2.iter().sum::<f64>() / kept.len().max(1) as f64;
         let edge_m = (mean_m2 * 4.0 / 3.0_f64.sqrt()).sqrt();
         let curvatures_per_m = curvatures(vertices_m, &kept);
@@ -117,12 +120,12 @@ impl Surface {
         Surface { vertices_m, triangles: kept, beyond, areas_m2, curvatures_per_m, is_closed, edge_m, tree }
     }
 
-    /// Returns where the vertices are, m.
+    /// Returns the positions of the vertices, m.
     pub fn vertices_m(&self) -> &[DVec3] {
         &self.vertices_m
     }
 
-    /// Returns the vertices of the triangle of a place.
+    /// Returns the vertices of the triangle that contains a point of the surface.
     pub fn triangle(&self, place: &Place) -> [u32; 3] {
         self.triangles[place.triangle as usize]
     }
@@ -133,8 +136,8 @@ impl Surface {
         &self.areas_m2
     }
 
-    /// Returns how the outward normal changes per metre along the surface at a vertex, 1/m: symmetric, 1/R along a
-    /// sphere. Its mean over a disc is that of the surface there.
+    /// Returns the curvature tensor at a vertex: how the outward normal changes per metre along the surface, 1/m. It
+    /// is symmetric, and 1/R along a sphere of radius R. Its mean over a disc is the curvature of the surface there.
     ///
     /// In a triangle of area A and normal N, whose corners have the normals n_k, the change of the interpolated normal is
     /// Σ n_k ⊗ ∇h_k, with ∇h_k = N × e_k/2A the gradient of the hat of corner k and e_k the side opposite to it. n_k is the mean of the
@@ -149,8 +152,9 @@ impl Surface {
         self.edge_m
     }
 
-    /// Returns the side of it on which something of `radius_m` is that comes new, `height_m` above its nearest place: 1
-    /// outside, -1 inside. What is below a closed surface by at most its radius counts as outside.
+    /// Returns on which side of the surface a tool of `radius_m` is when it first appears `height_m` above its
+    /// nearest point: 1 for outside, -1 for inside. A tool below a closed surface by at most its radius counts as
+    /// outside.
     pub fn side(&self, height_m: f64, radius_m: f64) -> f64 {
         let below_m = if self.is_closed { radius_m } else { 0.0 };
         if height_m >= -below_m { 1.0 } else { -1.0 }
@@ -162,7 +166,7 @@ impl Surface {
         (0..3).map(|corner| at_m[corner] * place.barycentric[corner]).sum()
     }
 
-    /// Returns the place that is nearest to a point in space; none on a surface without area.
+    /// Returns the point of the surface that is nearest to `point_m`. `None` if the surface has no area.
     pub fn nearest(&self, point_m: DVec3) -> Option<Place> {
         let found = self.tree.nearest((&self.vertices_m, &self.triangles), point_m)?;
         let [a, b, c] = corners(&self.vertices_m, self.triangles[found.triangle as usize]);
@@ -172,15 +176,15 @@ impl Surface {
         Some(Place { triangle: found.triangle, barycentric, frame: [along, across] })
     }
 
-    /// Returns the end of the straight way from a place by `by_m`, m in the directions of its frame. A way that meets a
-    /// rim goes on along it.
+    /// Returns the end of the straight path of length and direction `by_m` from a point, in metres along the
+    /// directions of its frame. A path that meets a boundary continues along it.
     pub fn walk(&self, from: &Place, by_m: DVec2) -> Place {
         let mut place = *from;
         let mut left_m = by_m.x * place.frame[0] + by_m.y * place.frame[1];
         for _ in 0..LONGEST_WAY {
             let corners_m = corners(&self.vertices_m, self.triangle(&place));
             let area = (corners_m[1] - corners_m[0]).cross(corners_m[2] - corners_m[0]);
-            // How the coordinate of the corner opposite side k changes.
+            // How fast the coordinate of the corner opposite side k changes.
             let opposite = |k: usize| side(k)[2];
             let rate = |k: usize| {
                 let [a, b, _] = side(k).map(|corner| corners_m[corner]);
@@ -205,14 +209,14 @@ impl Surface {
             let Beyond { triangle, apex, .. } = self.beyond[place.triangle as usize][k];
             if triangle == NONE {
                 left_m = left_m.dot(along) * along;
-                // Stays off the rim by nothing that matters, so that it is not met again at once.
+                // Stays off the boundary by a negligible distance, so that the path does not meet it again at once.
                 place.barycentric = inside(place.barycentric);
                 if left_m.length() <= 1e-15 * (b - a).length() {
                     break;
                 }
                 continue;
             }
-            // Unfold: what was away from this triangle goes into the next.
+            // Unfolds: what pointed away from this triangle points into the next.
             let next = self.triangles[triangle as usize];
             let far_m = self.vertices_m[next[usize::from(apex)] as usize];
             let out = -((c - a) - (c - a).dot(along) * along).normalize();
@@ -234,17 +238,18 @@ impl Surface {
         place
     }
 
-    /// Calls `crossed` for each triangle on the straight way from a place along a direction of its frame (of length 1), until
-    /// it is `radius_m` long or at a rim.
+    /// Calls `crossed` for each triangle on the straight path from a point along a direction (of length 1) in its
+    /// frame, until the path is `radius_m` long or meets a boundary.
     fn trace(&self, from: &Place, direction: DVec2, radius_m: f64, mut crossed: impl FnMut(Crossing)) {
         let triangle_m = corners(&self.vertices_m, self.triangle(from));
         let at_m = self.at_m(from);
-        // The corners in the frame, from the place.
+        // Positions of the corners in the frame, relative to the point.
         let mut plane = triangle_m
             .map(|corner_m| DVec2::new((corner_m - at_m).dot(from.frame[0]), (corner_m - at_m).dot(from.frame[1])));
         let mut triangle = from.triangle;
         let is_left = |at: DVec2| direction.perp_dot(at) > 0.0;
-        // The side that the way leaves by: one of its ends is on each hand, and it is farther along than the other such side.
+        // The path leaves through a side with one end on the left and one on the right, and of the two such sides,
+        // the one that is farther along.
         let meets = |a: DVec2, b: DVec2| {
             let [left, right] = [direction.perp_dot(a), direction.perp_dot(b)];
             let part = left / (left - right);
@@ -295,7 +300,7 @@ impl Surface {
             }
             let (a_at, b_at, c_at) = (plane[a], plane[b], plane[side(k)[2]]);
             let along = b_at - a_at;
-            // Away from this triangle.
+            // Points away from this triangle.
             let away = if along.perp_dot(c_at - a_at) > 0.0 { -turned(along) } else { turned(along) };
             let apex_at = a_at + at.x * along + at.y * away;
             let vertices = self.triangles[triangle as usize];
@@ -307,99 +312,104 @@ impl Surface {
             for (corner, vertex) in self.triangles[next as usize].into_iter().enumerate() {
                 (plane[corner], hats[corner]) = of(vertex);
             }
-            // The side opposite the apex is that from the corner after it.
+            // The side opposite the apex begins at the corner after it.
             entered = Some((usize::from(apex) + 1) % 3);
             (triangle, distance_m) = (next, leaves_m);
         }
     }
 }
 
-/// Barycentric coordinates kept off the sides.
+/// Returns barycentric coordinates that are kept off the sides of the triangle.
 fn inside(barycentric: [f64; 3]) -> [f64; 3] {
     let kept = barycentric.map(|hat| hat.max(INSIDE));
     let sum: f64 = kept.iter().sum();
     kept.map(|hat| hat / sum)
 }
 
-/// The same two directions, perpendicular and of length 1 to the last digit.
+/// Makes two directions perpendicular and of length 1 again, after rounding.
 fn square([along, across]: &[DVec3; 2]) -> [DVec3; 2] {
     let along = along.normalize();
     [along, (*across - across.dot(along) * along).normalize()]
 }
 
-/// A part of a straight way: within one triangle.
+/// The part of a straight path in one triangle.
 #[derive(Debug, Clone, Copy)]
 struct Crossing {
     vertices: [u32; 3],
-    /// Where it begins and ends, from the beginning of the way, m.
+    /// Distances from the beginning of the path at which this part begins and ends, m.
     from_m: f64,
     to_m: f64,
-    /// The hats of the vertices there.
+    /// The hats of the vertices at both ends.
     hats: [[f64; 3]; 2],
 }
 
-/// A vertex whose hat a disc covers.
+/// A vertex whose hat overlaps a disc.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Covered {
     /// The vertex.
     pub vertex: u32,
-    /// The mean of its hat over the disc; those of all vertices add up to 1.
+    /// Mean of its hat over the disc. The weights of all vertices add up to 1.
     pub weight: f64,
-    /// Its change with the place of the disc, in the directions of the place's frame, 1/m.
+    /// Derivative of the weight with respect to the position of the disc, in the directions of the frame of its
+    /// centre, 1/m.
     pub gradient: DVec2,
 }
 
-/// Least and largest number of ways in a disc, and how many there are for each edge's length in the radius.
+/// Minimum and maximum number of paths in a disc, and their number per edge length in its radius.
 const WAYS: [usize; 2] = [48, 192];
 const WAYS_PER_EDGE: f64 = 32.0;
 
-/// The radius of the disc that hats are averaged over is at least this part of the disc's own, where it is matched to its area.
+/// Minimum radius of the disc over which hats are averaged, as a fraction of the disc's own radius, when its area is
+/// matched.
 const MIN_PART: f64 = 0.05;
 
-/// A disc that folds so much that its middle moves less than this part of the area that its place moves over has no normal to
-/// rely on. A cylinder's is 0.72 where the disc reaches half around it, 0.18 where it meets itself, and turns over beyond; a
-/// sphere's is 0.41 at the equator.
+/// If a disc folds so much that its middle moves over less than this fraction of the area that its centre moves over,
+/// it has no reliable normal. The fraction is 0.72 on a cylinder if the disc reaches half around it, 0.18 where it
+/// meets itself, and becomes negative beyond that; on a sphere it is 0.41 if the disc reaches the equator.
 const MIN_SPAN: f64 = 0.25;
 
-/// A disc may cover this part of its area a second time: more, and it meets itself, or wraps an end. (On a sphere, straight ways
-/// crowd: 8 % at an angle of 1, 17 % at 1.5.)
+/// Fraction of its area that a disc may cover a second time. If it covers more, it meets itself, or wraps around an
+/// end. (On a sphere, straight paths converge: 8 % at an angle of 1, 17 % at 1.5.)
 const MAX_OVERLAP: f64 = 0.2;
 
-/// Ways that are farther apart at the rim than this part of an edge can't tell how often they cover a vertex.
+/// If paths are farther apart at the edge of the disc than this fraction of an edge length, it can't be determined
+/// how often they cover a vertex.
 const DENSE: f64 = 0.4;
 
-/// A disc of a larger radius, in edges, is first tried at half of it, and so on down.
+/// A disc with a radius of more edge lengths than this is first tried with half of its radius, recursively.
 const STAGE_EDGES: f64 = 4.0;
 const MAX_STAGES: u32 = 20;
 
-/// Times that the search for the largest plain disc halves its interval.
+/// Number of bisections in the search for the largest simple disc.
 const HALVINGS: u32 = 16;
 
-/// A disc of given radius that can be laid anywhere on a surface.
+/// A disc of given radius that can be placed anywhere on a surface.
 ///
-/// The hats of a mesh blur a disc: under even pressure it acts as if it were larger, by much where the mesh is coarse. The
-/// area that matters is 1/Σ(w²/A): a foundation of k N/m³ resists with k times that area. So the hats are averaged over a
-/// smaller disc whose area in that sense is πa², found anew for each place. Along a way, hats change linearly within each
-/// triangle and are integrated exactly; over the directions of the ways the sum is a mean of equal parts.
+/// The hats of a mesh blur a disc: under uniform pressure it acts as if it were larger, considerably so on a coarse
+/// mesh. Its effective area is 1/Σ(w²/A): an elastic foundation of k N/m³ resists with k times this area. So the hats
+/// are averaged over a smaller disc whose effective area is πa², determined anew at each position. Along a path, hats
+/// are linear in each triangle and are integrated exactly; over the directions of the paths, the integral is a sum of
+/// equal parts.
 ///
-/// On a part that is thinner than the disc, straight ways lead around it: they meet on its far side, or wrap its end. Such a
-/// disc has no place and no normal. It is made smaller until it is plain: it covers hardly anything twice, and its middle
-/// moves with its place ([`MIN_SPAN`]). On the end of a thread that is next to a point.
+/// On a part that is thinner than the disc, straight paths lead around it: they meet on its far side, or wrap around
+/// its end. Such a disc has no well-defined position or normal. It is made smaller until it is simple: it covers
+/// hardly anything twice, and its middle moves with its centre ([`MIN_SPAN`]). At the end of a thread it is almost a
+/// point.
 #[derive(Debug, Clone)]
 pub struct SurfaceDisc {
     radius_m: f64,
     edge_m: f64,
-    /// ρ, that of the disc that hats are averaged over where it lies.
+    /// ρ: radius of the disc over which hats are averaged at the present position.
     drawn_m: f64,
     directions: Vec<DVec2>,
-    /// The crossings of all ways, with places in `covered` for vertices; and where those of each way end.
+    /// The parts of all paths, with indices into `covered` for vertices, and the end of each path in this list.
     crossings: Vec<SurfacePart>,
     ends: Vec<usize>,
     covered: Vec<Covered>,
     areas_m2: Vec<f64>,
-    /// Places in `covered` by vertex, [`NONE`] where free: as many as a power of two.
+    /// Hash table: index into `covered` by vertex; [`NONE`] marks a free slot. Its length is a power of two.
     found: Vec<(u32, u32)>,
-    /// Scratch memory: ∂w/∂ρ.
+    /// Scratch memory: ∂w/∂ρ of each covered vertex.
     widening: Vec<f64>,
 }
 
@@ -412,13 +422,13 @@ struct SurfacePart {
 }
 
 impl SurfacePart {
-    /// What is within a radius, as a share of the whole part, which begins within it.
+    /// Returns the part within a radius, as a fraction of this whole part. It must begin within the radius.
     fn share_within(&self, rho_m: f64) -> f64 {
         let whole_m = self.to_m - self.from_m;
         if whole_m > 0.0 { (self.to_m.min(rho_m) - self.from_m) / whole_m } else { 0.0 }
     }
 
-    /// The hats after a share of it, and the places in `covered` of their vertices.
+    /// Returns the hats at a fraction of this part, with the indices of their vertices in `covered`.
     fn hats_at(&self, share: f64) -> impl Iterator<Item = (usize, f64)> {
         let [first, last] = self.hats;
         let hat = move |corner: usize| first[corner] + share * (last[corner] - first[corner]);
@@ -427,14 +437,14 @@ impl SurfacePart {
     }
 }
 
-/// The number of ways of a disc.
+/// Returns the number of paths of a disc.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn ways_of(radius_m: f64, edge_m: f64) -> usize {
     let wanted = (WAYS_PER_EDGE * radius_m / edge_m) as usize;
     wanted.next_multiple_of(8).clamp(WAYS[0], WAYS[1])
 }
 
-/// The parts of each way that begin within a radius.
+/// Returns for each path its parts that begin within a radius.
 fn ways<'c>(
     crossings: &'c [SurfacePart],
     ends: &'c [usize],
@@ -445,7 +455,7 @@ fn ways<'c>(
 }
 
 impl SurfaceDisc {
-    /// Creates a disc on a surface whose edges are about `edge_m` long.
+    /// Creates a disc for a surface with edges of about `edge_m`.
     #[allow(clippy::cast_precision_loss)]
     pub fn new(radius_m: f64, edge_m: f64) -> Self {
         let count = ways_of(radius_m, edge_m);
@@ -479,13 +489,13 @@ impl SurfaceDisc {
         self.radius_m
     }
 
-    /// Returns the vertices that the disc covers where it is.
+    /// Returns the vertices that the disc covers at its present position.
     pub fn covered(&self) -> &[Covered] {
         &self.covered
     }
 
-    /// Returns the weight of a vertex where the disc is: 0 of one that it does not cover. Takes the same time however
-    /// many it covers.
+    /// Returns the weight of a vertex at the present position of the disc, 0 if the disc does not cover it. The time
+    /// does not depend on the number of covered vertices.
     pub fn weight_of(&self, vertex: u32) -> f64 {
         match self.found[slot_of(vertex, &self.found)] {
             (NONE, _) => 0.0,
@@ -502,7 +512,7 @@ impl SurfaceDisc {
     /// Lays the disc on a place: finds the radius ρ over which hats are averaged with Σ(w²/A)·πa² = 1, a the disc's radius and A the
     /// areas of the vertices, by Newton's method between two bounds.
     pub fn lay(&mut self, surface: &Surface, place: &Place) {
-        // Around a thin part ways go on and on: a large disc is tried from a small one on.
+        // Around a thin part, paths have no end: a large disc is tried in stages, from a small one upwards.
         let mut stages = 0;
         while self.radius_m / f64::from(1 << stages) > STAGE_EDGES * self.edge_m && stages < MAX_STAGES {
             stages += 1;
@@ -516,7 +526,8 @@ impl SurfaceDisc {
         }
         self.trace(surface, place, self.radius_m);
         let target_m2 = std::f64::consts::PI * self.radius_m * self.radius_m;
-        // The radius ρ at which Σ(w²/A)·πa² is 1. It falls with ρ; Newton's method, kept between two bounds.
+        // Finds the radius ρ at which Σ(w²/A)·πa² is 1. The sum decreases with ρ; Newton's method, kept between two
+        // bounds.
         let (mut low, mut high) = (MIN_PART * self.radius_m, self.radius_m);
         let mut rho_m = high;
         let (mut excess, mut slope) = self.weigh(rho_m, target_m2);
@@ -551,7 +562,7 @@ impl SurfaceDisc {
             return self.shrink(surface, rho_m);
         }
         if is_matched && slope < 0.0 {
-            // ρ changes with the place as well.
+            // ρ also changes with the position.
             let mut change = DVec2::ZERO;
             for (covered, area_m2) in self.covered.iter().zip(&self.areas_m2) {
                 change += 2.0 * covered.weight / area_m2 * target_m2 * covered.gradient;
@@ -563,7 +574,8 @@ impl SurfaceDisc {
         }
     }
 
-    /// Whether the disc of radius ρ, as it is weighed and inclined, covers hardly anything twice, and moves with its place.
+    /// Returns whether the disc of radius ρ, with its present weights and gradients, covers hardly anything twice and
+    /// moves with its centre.
     fn is_plain(&self, surface: &Surface, rho_m: f64) -> bool {
         let (mut along, mut twice_m2) = ([DVec3::ZERO; 2], 0.0);
         let area_m2 = std::f64::consts::PI * rho_m * rho_m;
@@ -579,7 +591,7 @@ impl SurfaceDisc {
         along[0].cross(along[1]).length() >= MIN_SPAN && !(is_told && twice_m2 > MAX_OVERLAP * area_m2)
     }
 
-    /// Averages the hats over a disc of radius ρ, whatever its area. Returns whether it is plain.
+    /// Averages the hats over a disc of radius ρ, without matching its area. Returns whether it is simple.
     fn draw(&mut self, surface: &Surface, rho_m: f64) -> bool {
         self.drawn_m = rho_m;
         self.weigh(rho_m, 1.0);
@@ -587,18 +599,18 @@ impl SurfaceDisc {
         self.is_plain(surface, rho_m)
     }
 
-    /// Makes the disc the largest plain one below ρ: a point, next to, if there is none.
+    /// Makes the disc the largest simple one with a radius below ρ. If there is none, it is almost a point.
     fn shrink(&mut self, surface: &Surface, rho_m: f64) {
         let (mut low, mut high) = (0.0, rho_m);
         for _ in 0..HALVINGS {
             let middle = 0.5 * (low + high);
             if self.draw(surface, middle) { low = middle } else { high = middle }
         }
-        // Half of the shortest interval is a plain disc within its triangle, as good as a point.
+        // Half of the shortest interval is a simple disc within its triangle, as good as a point.
         self.draw(surface, if low > 0.0 { low } else { high });
     }
 
-    /// Follows all ways to a radius.
+    /// Follows all paths up to a radius.
     fn trace(&mut self, surface: &Surface, place: &Place, reach_m: f64) {
         self.crossings.clear();
         self.ends.clear();
@@ -618,7 +630,7 @@ impl SurfaceDisc {
         self.widening.resize(self.covered.len(), 0.0);
     }
 
-    /// Averages the hats over a disc of radius ρ. Returns Σ(w²/A)·πa² − 1, and its change with ρ, 1/m.
+    /// Averages the hats over a disc of radius ρ. Returns Σ(w²/A)·πa² − 1, and its derivative with respect to ρ, 1/m.
     fn weigh(&mut self, rho_m: f64, target_m2: f64) -> (f64, f64) {
         let SurfaceDisc { crossings, ends, covered, areas_m2, widening, .. } = self;
         covered.iter_mut().for_each(|covered| covered.weight = 0.0);
@@ -627,7 +639,7 @@ impl SurfaceDisc {
         for part in ways(crossings, ends, rho_m).flatten() {
             let SurfacePart { from_m, to_m, hats: [first, last], .. } = part;
             let (length_m, share) = (to_m.min(rho_m) - from_m, part.share_within(rho_m));
-            // ∫ r dr, and ∫ of the part of the way that is done, times r.
+            // ∫ r dr, and the integral of the fraction of this part that is passed, times r.
             let (even, rising) =
                 (length_m * (from_m + 0.5 * length_m), share * length_m * (0.5 * from_m + length_m / 3.0));
             area += even;
@@ -652,7 +664,8 @@ impl SurfaceDisc {
         (sum * target_m2 - 1.0, slope * target_m2)
     }
 
-    /// The changes of the weights of a disc of radius ρ with its place: what comes in at its rim.
+    /// Computes the derivatives of the weights of a disc of radius ρ with respect to its position: what enters at its
+    /// edge.
     fn incline(&mut self, rho_m: f64) {
         let SurfaceDisc { directions, crossings, ends, covered, .. } = self;
         covered.iter_mut().for_each(|covered| covered.gradient = DVec2::ZERO);
@@ -676,7 +689,7 @@ impl SurfaceDisc {
     }
 }
 
-/// Where a vertex stands in `found`, or would stand.
+/// Returns the slot of a vertex in `found`, or the free slot for it.
 fn slot_of(vertex: u32, found: &[(u32, u32)]) -> usize {
     let mut slot = (vertex.wrapping_mul(0x9E37_79B1) >> 7) as usize & (found.len() - 1);
     while found[slot].0 != NONE && found[slot].0 != vertex {
@@ -685,7 +698,7 @@ fn slot_of(vertex: u32, found: &[(u32, u32)]) -> usize {
     slot
 }
 
-/// The place of a vertex among those that are covered; a new one, if it has none yet.
+/// Returns the index of a vertex in `covered`, and adds it if it is not there yet.
 #[allow(clippy::cast_possible_truncation)]
 fn number(
     vertex: u32,

@@ -1,8 +1,8 @@
-//! The top of a surface: where a device has its origin.
+//! The top of a surface, where a device has its origin.
 
 use glam::DVec3;
 
-/// The z of a triangle at the x and y of a place, m; `None` beside it.
+/// Returns the z of a triangle at the x and y of `place_m`, m. `None` if this point is outside the triangle.
 fn height_m(place_m: DVec3, [a, b, c]: [DVec3; 3]) -> Option<f64> {
     let across = |a: DVec3, b: DVec3| (a - place_m).truncate().perp_dot((b - place_m).truncate());
     let parts = [across(b, c), across(c, a), across(a, b)];
@@ -22,7 +22,7 @@ pub fn top_m(vertices_m: &[DVec3], triangles: &[[u32; 3]], normals: &[DVec3], mi
     let beside = || {
         let used = triangles.iter().flatten().map(|vertex| *vertex as usize);
         let off_m = |vertex: usize| (vertices_m[vertex] - middle_m).truncate().length();
-        // Steeper ones are passed over while there is another: a tip would slip off them.
+        // Steeper vertices are used only if there is no other: a tip would slip off them.
         let nearer = |a: &usize, b: &usize| {
             let is_steep = |vertex: usize| normals[vertex].z < 0.5;
             is_steep(*a).cmp(&is_steep(*b)).then(off_m(*a).total_cmp(&off_m(*b)))
@@ -49,18 +49,18 @@ mod tests {
 
     #[test]
     fn the_top_is_the_highest_place_in_line_with_the_middle() {
-        // A pyramid that leans: its tip is not over its middle, where the slope is half as high.
+        // A leaning pyramid: its tip is not above its middle, where the slope is half as high.
         let pyramid = [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0], [4.0, 4.0, 0.0], [0.0, 4.0, 0.0], [1.0, 2.0, 3.0]];
         let sides = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4], [0, 2, 1], [0, 3, 2]];
         assert_eq!(top_of(&pyramid, &sides, [2.0, 2.0, 1.5]), DVec3::new(2.0, 2.0, 2.0));
-        // At a vertex and at an edge it is found as well.
+        // Also at a vertex and at an edge.
         assert_eq!(top_of(&pyramid, &sides, [1.0, 2.0, 0.0]), DVec3::new(1.0, 2.0, 3.0));
         assert_eq!(top_of(&pyramid, &sides, [4.0, 2.0, 9.0]), DVec3::new(4.0, 2.0, 0.0));
     }
 
     #[test]
     fn where_nothing_is_in_line_with_the_middle_it_is_beside_that() {
-        // Two squares with a gap between them; a wall in the gap, nearer to the middle, is too steep.
+        // Two squares with a gap between them. A wall in the gap is nearer to the middle, but too steep.
         let square = |x: f64, z: f64| [[x, 0.0, z], [x + 1.0, 0.0, z], [x + 1.0, 1.0, z], [x, 1.0, z]];
         let wall = [[1.6, 0.4, 0.0], [1.6, 0.6, 0.0], [1.6, 0.5, 5.0]];
         let vertices_m = [square(0.0, 0.5).as_slice(), &square(2.1, 0.25), &wall].concat();

@@ -1,8 +1,8 @@
-//! How the triangles of a mesh are connected: edges, surfaces, holes, and where they are no manifold.
+//! How the triangles of a mesh are connected: edges, surfaces, holes, and non-manifold elements.
 
 use crate::work::spend;
 
-/// Ways that are compared where more than two borders meet.
+/// Maximum number of continuations that are compared where more than two borders meet.
 const CHOICES: usize = 8;
 
 /// A triangle at an edge.
@@ -10,46 +10,47 @@ const CHOICES: usize = 8;
 pub struct Side {
     /// The triangle.
     pub triangle: u32,
-    /// Whether the triangle runs from the edge's smaller vertex to its larger one.
+    /// Whether the triangle runs along the edge from the vertex with the smaller index to the other one.
     pub is_forward: bool,
 }
 
 /// An edge of a mesh.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Edge {
-    /// Its vertices, the smaller first.
+    /// Its vertices, the smaller index first.
     pub vertices: [u32; 2],
     first: usize,
     count: usize,
 }
 
-/// The connections of a mesh. Triangles that have a vertex twice take no part in them.
+/// The connectivity of a mesh. Triangles that use a vertex twice are ignored.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Topology {
-    /// Ascending by their vertices.
+    /// In ascending order of their vertices.
     pub edges: Vec<Edge>,
-    /// The edges of each vertex, counted.
+    /// Number of edges at each vertex.
     pub valence: Vec<u32>,
-    /// The connected surface of each triangle, numbered by its least vertex; `None` if it takes no part.
+    /// Index of the connected surface of each triangle, in the order of the first triangles of the surfaces; `None`
+    /// if the triangle is ignored.
     pub component: Vec<Option<u32>>,
-    /// How many connected surfaces there are.
+    /// Number of connected surfaces.
     pub components: usize,
-    /// At each vertex, how many fans of triangles there are that share no edge: 1 on a manifold, 0 without triangles.
+    /// For each vertex, the number of fans of triangles that share no edge: 1 on a manifold, 0 without triangles.
     pub fans: Vec<u32>,
-    /// The fan of each corner of each triangle, numbered from 0 within its vertex.
+    /// Index of the fan of each corner of each triangle; each vertex numbers its fans from 0.
     pub fan_of_corner: Vec<[u32; 3]>,
-    /// The triangles that have the vertices of an earlier one, ascending.
+    /// Triangles with the vertices of an earlier triangle, ascending.
     pub duplicates: Vec<u32>,
     sides: Vec<Side>,
 }
 
-/// Whether a triangle has three vertices.
+/// Returns whether a triangle has three different vertices.
 pub(crate) fn is_proper(triangle: &[u32; 3]) -> bool {
     let [a, b, c] = *triangle;
     a != b && b != c && c != a
 }
 
-/// Sets that are joined; the least member stands for its set.
+/// Disjoint sets (union-find); the smallest member represents its set.
 pub(crate) struct Sets(Vec<u32>);
 
 impl Sets {
@@ -74,8 +75,8 @@ impl Sets {
 }
 
 impl Topology {
-    /// Connects triangles between so many vertices. Triangles whose indices are out of range take no
-    /// part.
+    /// Determines the connectivity of triangles between `vertices` vertices. Triangles whose indices are out of range
+    /// are ignored.
     #[must_use]
     pub fn new(vertices: usize, triangles: &[[u32; 3]]) -> Self {
         let is_in = |triangle: &[u32; 3]| is_proper(triangle) && triangle.iter().all(|v| (*v as usize) < vertices);
@@ -98,7 +99,8 @@ impl Topology {
         }
         let sides: Vec<Side> = halves.into_iter().map(|(_, side)| side).collect();
 
-        // Surfaces are connected through vertices; fans through edges: there corners are joined instead of vertices.
+        // Surfaces are connected through vertices, fans through edges: for fans, corners are joined instead of
+        // vertices.
         let mut surfaces = Sets::new(vertices);
         let mut corners = Sets::new(3 * triangles.len());
         let corner_of = |triangle: u32, vertex: u32| {
@@ -130,7 +132,7 @@ impl Topology {
         let mut fan_of_corner: Vec<[u32; 3]> = vec![[0; 3]; triangles.len()];
         for (number, triangle) in (0_u32..).zip(triangles).filter(|(_, triangle)| is_in(triangle)) {
             for (corner, vertex) in (0_u32..).zip(triangle) {
-                // The least corner of a fan comes first and numbers it.
+                // The smallest corner of a fan comes first and assigns its index.
                 let root = corners.find(3 * number + corner);
                 let fan = if root == 3 * number + corner {
                     fans[*vertex as usize] += 1;
@@ -166,7 +168,7 @@ impl Topology {
         self.edges.iter().filter(|edge| edge.count > 2)
     }
 
-    /// Returns the edges at which two triangles face opposite sides.
+    /// Returns the edges at which two triangles have opposite orientations.
     pub fn inconsistent_edges(&self) -> impl Iterator<Item = &Edge> {
         self.edges.iter().filter(|edge| match self.sides(edge) {
             [a, b] => a.is_forward == b.is_forward,
@@ -174,25 +176,25 @@ impl Topology {
         })
     }
 
-    /// Returns whether there are triangles and each edge has two.
+    /// Returns whether there are triangles and each edge has exactly two.
     #[must_use]
     pub fn is_closed(&self) -> bool {
         !self.edges.is_empty() && self.edges.iter().all(|edge| edge.count == 2)
     }
 
-    /// Returns the borders of the surface: loops of vertices along edges with one triangle. A triangle that fills a loop has its
-    /// vertices in this order, if the mesh is oriented. Lines of edges that are no loop, at vertices that are no manifold, count
-    /// as loops as well.
+    /// Returns the borders of the surface: loops of vertices along edges that belong to only one triangle. If the
+    /// mesh is oriented, the vertices are in the order of a triangle that would fill the loop. Open lines of edges,
+    /// which occur at non-manifold vertices, are also returned as loops.
     #[must_use]
     pub fn holes(&self) -> Vec<Vec<u32>> {
-        // From where to where a filling triangle would run, by where it begins.
+        // Start and end of each border edge, in the direction of a filling triangle.
         let mut borders: Vec<[u32; 2]> = Vec::new();
         for edge in self.edges.iter().filter(|edge| edge.count == 1) {
             let [a, b] = edge.vertices;
             borders.push(if self.sides(edge)[0].is_forward { [b, a] } else { [a, b] });
         }
-        // The borders at each vertex, both those that begin and that end there: in a mesh that is not oriented directions say
-        // nothing.
+        // The border edges that begin or end at each vertex. Both are needed: in a mesh that is not oriented,
+        // directions mean nothing.
         let mut begin = vec![0_usize; self.valence.len() + 1];
         for vertex in borders.iter().flatten() {
             begin[*vertex as usize + 1] += 1;
@@ -221,7 +223,8 @@ impl Topology {
                 hole.push(at);
                 let vertex = at as usize;
                 let (mut next, mut looked) = (None, 0);
-                // Two borders meet at a vertex of a manifold; of many elsewhere, a few are enough to choose from.
+                // Two border edges meet at a vertex of a manifold. Elsewhere there may be many, but a few are enough
+                // to choose from.
                 while looked < left[vertex].min(CHOICES) {
                     let number = at_vertex[begin[vertex] + looked];
                     if is_done[number] {
@@ -229,7 +232,7 @@ impl Topology {
                         at_vertex.swap(begin[vertex] + looked, begin[vertex] + left[vertex]);
                         continue;
                     }
-                    // Along the direction of the border, if there is such a way.
+                    // Prefers to continue in the direction of the border.
                     let key = (borders[number][0] != at, number);
                     next = Some(next.map_or(key, |best: (bool, usize)| best.min(key)));
                     looked += 1;

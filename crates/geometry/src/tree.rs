@@ -1,31 +1,33 @@
-//! A bounding volume tree over triangles: which ones overlap a box, and which place is nearest to a point.
+//! A bounding volume hierarchy of triangles: finds the triangles that overlap a box, and the nearest point to a given
+//! point.
 
 use glam::DVec3;
 
 use crate::work::spend;
 
-/// Triangles in a leaf.
+/// Maximum number of triangles in a leaf.
 const LEAF: usize = 4;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct TreeNode {
     least: DVec3,
     most: DVec3,
-    /// The triangles of the subtree: a range of `order`.
+    /// The triangles of the subtree, as a range of `order`.
     start: usize,
     end: usize,
-    /// The second child; the first one follows its parent. `None` in a leaf.
+    /// Index of the second child; the first child comes directly after its parent. `None` in a leaf.
     second: Option<usize>,
 }
 
-/// The tree. Its methods are given the vertices and triangles that it was made of, so that the owner of both can keep it.
+/// The tree. Its methods expect the vertices and triangles from which it was created, so that the owner of these can
+/// store it too.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Tree {
     nodes: Vec<TreeNode>,
     order: Vec<u32>,
 }
 
-/// A place on a triangle.
+/// A point on a triangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Nearest {
     pub(crate) triangle: u32,
@@ -33,19 +35,19 @@ pub(crate) struct Nearest {
     pub(crate) squared: f64,
 }
 
-/// The vertices of a triangle.
+/// Returns the positions of a triangle's vertices.
 pub(crate) fn corners(vertices: &[DVec3], triangle: [u32; 3]) -> [DVec3; 3] {
     triangle.map(|vertex| vertices[vertex as usize])
 }
 
 impl Tree {
-    /// A tree over some triangles. All coordinates are finite, all indices in range.
+    /// Creates a tree of some triangles. All coordinates must be finite, and all indices in range.
     pub(crate) fn new(vertices: &[DVec3], triangles: &[[u32; 3]], of: impl Iterator<Item = u32>) -> Self {
         let mut tree = Self { nodes: Vec::new(), order: of.collect() };
         if tree.order.is_empty() {
             return tree;
         }
-        // Ranges that wait for their node, each with the parent whose second child it is.
+        // Ranges that have no node yet, with the parent if the node will be its second child.
         let mut waiting = vec![(0, tree.order.len(), None)];
         while let Some((start, end, parent)) = waiting.pop() {
             let number = tree.nodes.len();
@@ -79,8 +81,8 @@ impl Tree {
         tree
     }
 
-    /// Calls `found` for the triangles whose boxes overlap a box, until it returns false. Returns how many boxes were looked
-    /// at.
+    /// Calls `found` for the triangles whose boxes overlap a box, until it returns false. Returns the number of
+    /// visited boxes.
     pub(crate) fn overlapping(
         &self,
         (vertices, triangles): (&[DVec3], &[[u32; 3]]),
@@ -115,14 +117,16 @@ impl Tree {
         looked
     }
 
-    /// The place nearest to a point; of several as near, that of the least triangle.
+    /// Returns the nearest point. If several are equally near, returns the one on the triangle with the smallest
+    /// index.
     pub(crate) fn nearest(&self, of: (&[DVec3], &[[u32; 3]]), point: DVec3) -> Option<Nearest> {
         let mut looks = u64::MAX;
         self.nearest_within(of, point, &mut looks)
     }
 
-    /// The same, or one that is near, once `looks` at boxes and triangles are used up: where very many are nearly as near, as in the
-    /// middle of a sphere, it can take a look at each to find out which is the nearest.
+    /// Works as [`Self::nearest`], but once `looks` visits of boxes and triangles are used up, returns a point that
+    /// is merely near. Finding the nearest of very many points at almost equal distance, as in the middle of a
+    /// sphere, can require visiting each of them.
     pub(crate) fn nearest_within(
         &self,
         (vertices, triangles): (&[DVec3], &[[u32; 3]]),
@@ -160,8 +164,8 @@ impl Tree {
     }
 }
 
-/// Returns the barycentric place of a triangle that is nearest to a point (Ericson, Real-Time Collision Detection,
-/// 5.1.5).
+/// Returns the barycentric coordinates of the point of a triangle that is nearest to `point` (Ericson, Real-Time
+/// Collision Detection, 5.1.5).
 pub fn nearest_place(point: DVec3, [a, b, c]: [DVec3; 3]) -> [f64; 3] {
     let (ab, ac, ap) = (b - a, c - a, point - a);
     let (d1, d2) = (ab.dot(ap), ac.dot(ap));
@@ -198,7 +202,7 @@ pub fn nearest_place(point: DVec3, [a, b, c]: [DVec3; 3]) -> [f64; 3] {
     if sum > 0.0 { [va / sum, vb / sum, vc / sum] } else { [1.0, 0.0, 0.0] }
 }
 
-/// Whether two triangles without a common vertex cut each other. Triangles in one plane count as not cutting.
+/// Returns whether two triangles without a common vertex intersect. Coplanar triangles don't count as intersecting.
 pub(crate) fn cut(a: [DVec3; 3], b: [DVec3; 3]) -> bool {
     let edges = |t: [DVec3; 3]| [[t[0], t[1]], [t[1], t[2]], [t[2], t[0]]];
     edges(a).into_iter().any(|edge| pierces(edge, b)) || edges(b).into_iter().any(|edge| pierces(edge, a))
@@ -211,7 +215,7 @@ fn pierces([from, to]: [DVec3; 2], [a, b, c]: [DVec3; 3]) -> bool {
     let across = way.cross(ac);
     let determinant = ab.dot(across);
     let scale = ab.length() * ac.length() * way.length();
-    // Nearly parallel, or without area.
+    // Nearly parallel, or the triangle has no area.
     if determinant.abs() <= 1e-12 * scale {
         return false;
     }

@@ -1,14 +1,14 @@
-//! The unit of a file's lengths. Mesh files don't state it, so the user does.
+//! Unit of the lengths in a file. Mesh files don't state it, so the user specifies it.
 
 use std::fmt;
 use std::str::FromStr;
 
 use crate::Problem;
 
-/// Units that have a name, and their metres.
+/// Named units, and their lengths in metres.
 const UNITS: [(&str, f64); 3] = [("m", 1.0), ("cm", 1e-2), ("mm", 1e-3)];
 
-/// How many metres one unit of a file is.
+/// Length of one unit of a file in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Unit {
     metres: f64,
@@ -25,7 +25,7 @@ impl Unit {
     /// Metres.
     pub const METRE: Unit = Unit { metres: 1.0 };
 
-    /// Returns metres in one unit: above 0 and finite.
+    /// Returns the length of one unit in metres: above 0 and finite.
     #[must_use]
     pub fn metres(self) -> f64 {
         self.metres
@@ -33,7 +33,7 @@ impl Unit {
 }
 
 impl fmt::Display for Unit {
-    /// What stands after a number: the unit's name, or what the number is multiplied with.
+    /// Writes what comes after a number: the name of the unit, or the factor that converts to metres.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let known = UNITS.iter().find(|(_, metres)| *metres == self.metres);
         match known {
@@ -46,7 +46,7 @@ impl fmt::Display for Unit {
 impl FromStr for Unit {
     type Err = Problem;
 
-    /// Reads "m", "cm", "mm" or the metres of one unit, such as "0.0254".
+    /// Parses "m", "cm", "mm" or the length of one unit in metres, such as "0.0254".
     fn from_str(text: &str) -> Result<Self, Problem> {
         let text = text.trim();
         let known = UNITS.iter().find(|(name, _)| *name == text).map(|(_, metres)| *metres);

@@ -1,12 +1,14 @@
-//! Triangles that are there more than once, between the same places: copies of a surface, and the walls inside of a solid that
-//! both of its cells have.
+//! Triangles that are present more than once at the same positions: duplicate surfaces, and internal walls of a solid
+//! that both adjacent cells contain.
 //!
-//! Of copies one stays. Of two that face opposite sides one stays as well where the surface needs it: a surface of two sides, or
-//! a triangle that was also written the other way around. Where the surface around goes on without both, they are a wall inside
-//! of a solid, and both are dropped: as boundaries of two cells they cancel.
+//! Of duplicates, one stays. Of two triangles with opposite orientations, one stays as well where the surface needs
+//! it: on a two-sided surface, or where a triangle was also written in reverse order. Where the surrounding surface
+//! is complete without both, they are a wall inside a solid, and both are dropped: as boundaries of two cells they
+//! cancel.
 //!
-//! Cells that were split into tetrahedra by themselves have walls that are split along different diagonals. The four triangles of
-//! such a wall are the faces of a flat tetrahedron; one diagonal is flipped first, so that they are there twice.
+//! If cells were split into tetrahedra separately, their common walls may be split along different diagonals. The
+//! four triangles of such a wall are the faces of a flat tetrahedron; one diagonal is flipped first, so that the
+//! triangles match.
 
 use std::collections::BTreeMap;
 
@@ -15,32 +17,33 @@ use crate::ray::Enclosures;
 use crate::topology::{Sets, Topology, is_proper};
 use crate::work::spend;
 
-/// A tetrahedron is flat if six times its volume is at most this part of the cube of its longest edge.
+/// A tetrahedron is flat if six times its volume is at most this fraction of the cube of its longest edge.
 const FLAT: f64 = 1e-4;
 
-/// Triangles at an edge of which each two are compared.
+/// Maximum number of triangles at an edge that are compared in pairs.
 const COMPARED: usize = 16;
 
-/// What was dropped.
+/// Result of [`doubled`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Doubled {
     /// Whether each triangle stays.
     pub(crate) keep: Vec<bool>,
-    /// Triangles that were copies.
+    /// Number of dropped duplicate triangles.
     pub(crate) copies: usize,
-    /// Triangles of walls inside.
+    /// Number of dropped triangles of internal walls.
     pub(crate) walls: usize,
 }
 
-/// Triangles between the same three places.
+/// Triangles between the same three positions.
 struct Class {
-    /// Those that run through their places in the order of a rotation of the ascending one, and the others.
+    /// First the triangles whose positions are a rotation of the ascending order, then the others.
     facing: [Vec<u32>; 2],
-    /// Whether all have the same vertices.
+    /// Whether all of them use the same vertices.
     is_shared: bool,
 }
 
-/// Tells which triangles are there more than once, given the place of each vertex. Indices are in range.
+/// Finds triangles that are present more than once. `places` gives the position of each vertex, as the first vertex
+/// there. Indices must be in range.
 pub(crate) fn doubled(mesh: &TriangleMesh, places: &[u32]) -> Doubled {
     let triangles = &mesh.triangles;
     let at = |triangle: [u32; 3]| triangle.map(|vertex| places[vertex as usize]);
@@ -77,7 +80,7 @@ pub(crate) fn doubled(mesh: &TriangleMesh, places: &[u32]) -> Doubled {
 }
 
 impl Doubled {
-    /// Drops all triangles of a class but the first.
+    /// Drops all triangles of a class except the first.
     fn drop_copies(&mut self, class: &Class) {
         let first = class.facing.iter().flatten().min();
         for triangle in class.facing.iter().flatten().filter(|triangle| Some(*triangle) != first) {
@@ -86,7 +89,7 @@ impl Doubled {
         }
     }
 
-    /// Drops as many of both sides of a wall as there are of the rarer one.
+    /// Drops equal numbers of both sides of a wall, as many as there are of the rarer side.
     fn drop_wall(&mut self, class: &Class) {
         let both = class.facing[0].len().min(class.facing[1].len());
         for triangle in class.facing.iter().flat_map(|one| &one[..both]) {
@@ -97,7 +100,8 @@ impl Doubled {
         self.drop_copies(&Class { facing: rest, is_shared: class.is_shared });
     }
 
-    /// Decides about the triangles that are there from both sides, by what else is at the edges of each connected patch of them.
+    /// Decides about triangles that are present from both sides, based on the other triangles at the edges of each
+    /// connected patch.
     fn judge(
         &mut self,
         mesh: &TriangleMesh,
@@ -122,7 +126,8 @@ impl Doubled {
                 doubled.for_each(|other| patches.join(first, other));
             }
         }
-        // Of each patch: its classes, and whether an edge has an odd number of other triangles, or any.
+        // For each patch: its classes, whether an edge has an odd number of other triangles, and whether an edge has
+        // other triangles at all.
         let mut of_patch: BTreeMap<u32, (Vec<u32>, bool, bool)> = BTreeMap::new();
         for class in (0..).take(classes.len()) {
             of_patch.entry(patches.find(class)).or_default().0.push(class);
@@ -140,7 +145,7 @@ impl Doubled {
         for (of, is_odd, has_others) in of_patch.into_values() {
             let of: Vec<&Class> = of.iter().map(|class| &classes[*class as usize]).collect();
             let is_shared = of.iter().all(|class| class.is_shared);
-            // One that touches nothing is a surface of two sides, unless it is inside of a solid.
+            // A patch that touches nothing is a two-sided surface, unless it is inside a solid.
             let is_wall = if is_odd {
                 false
             } else if has_others {
@@ -161,8 +166,8 @@ impl Doubled {
     }
 }
 
-/// Flips a diagonal of each two pairs of triangles that are the faces of a flat tetrahedron; then they are there from both sides. Returns
-/// how many.
+/// Flips one diagonal of each two pairs of triangles that form a flat tetrahedron, so that they match. Returns the
+/// number of flips.
 pub(crate) fn match_diagonals(mesh: &mut TriangleMesh) -> usize {
     let topology = Topology::new(mesh.vertices_m.len(), &mesh.triangles);
     let sorted = |mut three: [u32; 3]| {
@@ -205,14 +210,15 @@ pub(crate) fn match_diagonals(mesh: &mut TriangleMesh) -> usize {
             let [ua, ub, uc, ud] = [corner(first, a), corner(first, b), corner(first, c), corner(second, d)];
             (uv[first], uv[second]) = ([ua, ud, ub], [ud, uc, ub]);
         }
-        // They were (a, c, b) and (c, a, d).
+        // Before, they were (a, c, b) and (c, a, d).
         (mesh.triangles[first], mesh.triangles[second]) = ([a, d, b], [d, c, b]);
         flipped += 1;
     }
     flipped
 }
 
-/// Whether the triangles (a, c, b) and (c, a, d) are flat together, and a quadrilateral of which a–c and b–d are diagonals.
+/// Returns whether the triangles (a, c, b) and (c, a, d) are coplanar and form a quadrilateral with the diagonals a–c
+/// and b–d.
 fn is_flat(mesh: &TriangleMesh, [a, c, b, d]: [u32; 4]) -> bool {
     let [a, b, c, d] = [a, b, c, d].map(|vertex| mesh.vertices_m[vertex as usize]);
     let edges = [c - a, b - a, d - a, b - c, d - c, d - b];

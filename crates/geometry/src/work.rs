@@ -1,45 +1,47 @@
-//! Work that can be given up: by a flag that whoever waits for it sets, or because it takes more operations than it may.
+//! Computations that can be cancelled, by a flag that the waiting thread sets or by a limit on the number of
+//! operations.
 //!
-//! How long a mesh takes depends on how its triangles lie, which a stranger decides. So every loop whose work is not bounded by a
-//! few passes over the mesh tells here what it does, by [`spend`]. It need not know who waits: the bounds belong to the thread,
-//! while it is within [`within`]. Outside of that nothing is given up, as in a program that has one user.
+//! How long a mesh takes depends on how its triangles lie, which an untrusted user decides. So every loop whose work
+//! is not bounded by a few passes over the mesh reports its operations here, with [`spend`]. It does not need to know
+//! who is waiting: the limits belong to the thread while it is inside [`within`]. Outside, nothing is cancelled, as
+//! in a program with a single user.
 //!
-//! Work that is given up unwinds up to there, as a computation does for which there is no memory. It leaves nothing half done,
-//! since it changes only what is its own.
+//! A cancelled computation unwinds to `within`, as after a failed allocation. It leaves nothing in an inconsistent
+//! state, because it changes only its own data.
 
 use std::cell::{Cell, RefCell};
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// An operation is what takes some nanoseconds, at most a tenth of a microsecond. After so many the flag is looked at: a few
-/// milliseconds.
+/// An operation takes a few nanoseconds, at most a tenth of a microsecond. The flag is checked after this many
+/// operations: every few milliseconds.
 const BETWEEN_LOOKS: u64 = 1 << 16;
 
-/// Why work was given up.
+/// Why a computation was cancelled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GivenUp {
     /// The flag was set.
     Stopped,
-    /// It would have taken more operations than it may: so many.
+    /// It would have exceeded the limit, which is given here.
     TooMuch(u64),
 }
 
-/// The bounds of what a thread does.
+/// Limits for the computation of a thread.
 struct Bounds {
     stop: Arc<AtomicBool>,
     most: u64,
-    /// Operations left after the next look.
+    /// Operations that are left after the next check.
     left: u64,
 }
 
 thread_local! {
     static BOUNDS: RefCell<Option<Bounds>> = const { RefCell::new(None) };
-    /// Operations up to the next look.
+    /// Operations until the next check.
     static UP_TO_LOOK: Cell<u64> = const { Cell::new(u64::MAX) };
 }
 
-/// Puts back the bounds that were before.
+/// Restores the previous limits when dropped.
 struct Before(Option<Bounds>, u64);
 
 impl Drop for Before {
@@ -49,10 +51,10 @@ impl Drop for Before {
     }
 }
 
-/// Does something that is given up once `stop` is set, or when it has taken `most` operations.
+/// Runs `act`, which is cancelled once `stop` is set or `most` operations are exceeded.
 ///
 /// # Errors
-/// Tells why it was given up.
+/// Returns why it was cancelled.
 pub fn within<T>(stop: &Arc<AtomicBool>, most: u64, act: impl FnOnce() -> T) -> Result<T, GivenUp> {
     let bounds = Bounds { stop: stop.clone(), most, left: most };
     let before = Before(BOUNDS.replace(Some(bounds)), UP_TO_LOOK.replace(0));
@@ -64,7 +66,7 @@ pub fn within<T>(stop: &Arc<AtomicBool>, most: u64, act: impl FnOnce() -> T) -> 
     })
 }
 
-/// Tells that so many operations follow. Unwinds if they are not to be done.
+/// Reports that `operations` follow. Unwinds if the computation is cancelled.
 #[inline]
 pub fn spend(operations: usize) {
     let (operations, up_to_look) = (operations as u64, UP_TO_LOOK.get());
@@ -75,7 +77,7 @@ pub fn spend(operations: usize) {
     }
 }
 
-/// Looks at the bounds before so many operations.
+/// Checks the limits before `operations` more.
 #[cold]
 fn look(operations: u64) {
     let given_up = BOUNDS.with_borrow_mut(|bounds| {

@@ -1,26 +1,26 @@
-//! Mesh files from meshes: OBJ, STL and PLY. Lengths are metres.
+//! Writes meshes to files: OBJ, STL and PLY. Lengths are in metres.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
 
 use crate::{Problem, TriangleMesh};
 
-/// A format that is written.
+/// A file format for writing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// Wavefront OBJ, with texture coordinates and groups.
     Obj,
     /// STL, binary.
     Stl,
-    /// PLY, binary, least byte first.
+    /// PLY, binary, little-endian.
     Ply,
 }
 
 impl Format {
-    /// Returns the format of a file's extension.
+    /// Returns the format for the extension of a file name.
     ///
     /// # Errors
-    /// Refuses other extensions.
+    /// Fails for other extensions.
     pub fn of(name: &str) -> Result<Self, Problem> {
         let extension = name.rsplit_once('.').map_or(String::new(), |(_, extension)| extension.to_ascii_lowercase());
         match extension.as_str() {
@@ -32,7 +32,8 @@ impl Format {
     }
 }
 
-/// Returns a mesh as the bytes of a file. OBJ keeps positions exactly, PLY too; STL has them in single precision.
+/// Returns the contents of a file with this mesh. OBJ and PLY keep positions exactly; STL rounds them to single
+/// precision.
 #[must_use]
 pub fn write(mesh: &TriangleMesh, format: Format) -> Vec<u8> {
     match format {
@@ -42,7 +43,7 @@ pub fn write(mesh: &TriangleMesh, format: Format) -> Vec<u8> {
     }
 }
 
-/// The groups of each triangle: those that all its vertices are in. Sets of groups are numbered as they first appear.
+/// Returns the groups of each triangle: those that contain all its vertices.
 fn groups_of(mesh: &TriangleMesh) -> Vec<Vec<usize>> {
     let mut of_vertex: Vec<Vec<usize>> = vec![Vec::new(); mesh.vertices_m.len()];
     for (number, group) in mesh.groups.iter().enumerate() {
@@ -62,11 +63,11 @@ fn groups_of(mesh: &TriangleMesh) -> Vec<Vec<usize>> {
 
 fn obj(mesh: &TriangleMesh) -> String {
     let mut text = String::from("# lengths in metres\n");
-    // Writing into a string does not fail.
+    // Writing to a string can't fail.
     for at in &mesh.vertices_m {
         let _ = writeln!(text, "v {} {} {}", at.x, at.y, at.z);
     }
-    // Corners that meet share their texture coordinates.
+    // Corners with equal texture coordinates share one entry.
     let mut numbers = BTreeMap::new();
     for uv in mesh.uv.iter().flatten().flatten() {
         let count = numbers.len() + 1;

@@ -1,7 +1,7 @@
-//! What reading a file takes in memory is within a multiple of its bytes, and paid for before it is allocated: valid files, bent
-//! ones, and the shapes of files that say much in few bytes.
+//! The memory for reading a file is at most a multiple of its size, and is accounted for before it is allocated.
+//! Tested with valid files, with corrupted ones, and with small files that demand much memory.
 //!
-//! A thousand bent files a reader in every run of the tests; `PALPATE_FUZZ_INPUTS` says how many instead.
+//! Each test run reads a thousand corrupted files for each reader, or `PALPATE_FUZZ_INPUTS`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 #![allow(
     clippy::cast_possible_truncation,
@@ -21,11 +21,11 @@ use fastrand::Rng;
 use palpate_geometry::read::{MULTIPLE, ROOM};
 use palpate_geometry::{ReadLimits, Unit, prepare, read_paid};
 
-/// What is not counted: messages, and a vector that grows a little before it is paid for.
+/// Memory that is not accounted for: messages, and a vector that grows slightly before it is.
 const SLACK: usize = 256 << 10;
 
-/// The most of a reader: by how many times its bytes and the room a file took memory, and how many bytes an element of a mesh
-/// took when it was prepared.
+/// Maxima of a reader: memory as a multiple of the size of a file and its allowance, and bytes per element of a mesh
+/// for preparing it.
 #[derive(Default)]
 struct Most {
     multiple: f64,
@@ -46,7 +46,7 @@ fn try_one(name: &str, bytes: &[u8], most: &mut BTreeMap<String, Most>) -> bool 
     own.multiple = own.multiple.max(took.saturating_sub(ROOM) as f64 / bytes.len().max(1) as f64);
     let shown = String::from_utf8_lossy(&bytes[..bytes.len().min(300)]);
     assert!(took <= paid + SLACK, "{name}: {} bytes took {took}, but {paid} were paid for: {shown}", bytes.len());
-    // Of packed arrays, four bytes for each count as the file's.
+    // For compressed arrays, four bytes for each compressed byte count towards the file size.
     let multiple = if name.ends_with(".vtp") || name.ends_with(".vtu") { 5 * MULTIPLE } else { MULTIPLE };
     assert!(took <= multiple * bytes.len() + ROOM + SLACK, "{name}: {} bytes took {took}: {shown}", bytes.len());
     let Ok(mesh) = read else { return false };
@@ -81,7 +81,7 @@ fn bent_files_take_no_more_than_a_multiple_of_their_bytes() {
             let to = (from + random.usize(1..64)).min(bytes.len());
             match random.u8(0..4) {
                 0 => bytes[from] = random.u8(..),
-                // Digits to larger numbers.
+                // Larger digits.
                 1 => bytes[from..to].iter_mut().filter(|byte| byte.is_ascii_digit()).for_each(|byte| *byte = b'9'),
                 2 => {
                     let piece = bytes[from..to].repeat(random.usize(1..200));
@@ -99,7 +99,7 @@ fn bent_files_take_no_more_than_a_multiple_of_their_bytes() {
     assert!(taken > inputs / 100, "{taken} taken");
 }
 
-/// A text of VTK's XML with arrays as given: name, type, and what it holds.
+/// VTK XML with the given arrays: name, type, and contents.
 fn vtp(points: &str, more: &str) -> Vec<u8> {
     format!(
         "<VTKFile type=\"PolyData\" byte_order=\"LittleEndian\" header_type=\"UInt32\" compressor=\"vtkZLibDataCompressor\">\
@@ -109,7 +109,7 @@ fn vtp(points: &str, more: &str) -> Vec<u8> {
     .into_bytes()
 }
 
-/// Zeros packed by zlib in blocks, in base64, with what its header says of the size of a block.
+/// Zeros compressed with zlib in blocks, in base64. The header states `said` as the size of a block.
 fn packed(blocks: usize, bytes: usize, said: usize) -> String {
     use base64::Engine;
     use base64::engine::general_purpose::STANDARD;

@@ -1,4 +1,5 @@
-//! Files as other programs write them, and as hands change them: each is read as what it means, or refused with the cause.
+//! Files as other programs write them and as people edit them: each is either read correctly, or refused with the
+//! cause.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod common;
@@ -47,7 +48,7 @@ fn obj() -> String {
     box_obj(1)
 }
 
-/// The box as OBJ; its first vertex has a number.
+/// The box as OBJ. `first` is the index of its first vertex.
 fn box_obj(first: usize) -> String {
     let vertices: String = CORNERS.lines().map(|line| format!("v {line}\n")).collect();
     vertices + &triangles(|[a, b, c]| format!("f {} {} {}\n", a + first, b + first, c + first))
@@ -150,10 +151,10 @@ fn every_text_may_end_lines_and_itself_as_any_system_does_and_begin_with_a_mark(
     // In JSON a comma ends a number.
     let comma = refusal("a.gltf", common::gltf_embedded().replace("[-1,0,0]", "[-1,5,0,0,0,0]"));
     assert!(comma.contains("decimal comma"), "{comma}");
-    // Lists of numbers with commas between them have none.
+    // In lists of numbers with commas between them, these are not decimal commas.
     let list = refusal("a.obj", obj().replace("v 40 30 0", "v 40, 30, 0"));
     assert!(list.contains("`40,` is not a number"), "{list}");
-    // Lines are counted as editors count them.
+    // Lines are counted as in editors.
     for end in ["\n", "\r\n", "\r"] {
         let refusal = refusal("a.obj", obj().replace("f 1 6 5", "f 1 6 x").replace('\n', end));
         assert!(refusal.starts_with("a.obj: line 14: `x`"), "{refusal}");
@@ -250,7 +251,7 @@ fn strips_of_triangles_are_read() {
     is_box("in rows", "a.ply", strips(&format!("10 {}\n4 {}\n4 {}", parts[0], parts[1], parts[2]), "uint"));
     let end = u32::MAX;
     is_box("unsigned", "a.ply", strips(&format!("20 {} {end} {} {end} {}", parts[0], parts[1], parts[2]), "uint"));
-    // A vertex twice goes on elsewhere; the sense alternates there as well.
+    // A repeated vertex connects strips; the orientation alternates there as well.
     is_box("joined", "a.ply", strips("22 4 0 5 1 6 2 7 3 4 0 0 7 7 4 6 5 5 1 1 0 2 3", "int"));
     let refusal = refusal("a.ply", strips("4 0 4 1 8", "int"));
     assert!(refusal.contains("face 0: vertex 8 does not exist"), "{refusal}");
@@ -285,7 +286,7 @@ fn what_vtk_keeps_beside_a_surface_is_skipped() {
     let head = vtk();
     let head = head.split("POLYGONS").next().unwrap();
     for kind in ["vtktypeint64", "vtkIdType", "int", "unsigned_char"] {
-        // Which version the first line has, lists tell by themselves.
+        // Lists show their version themselves, whatever the first line says.
         let lists = format!("POLYGONS 13 36\nOFFSETS {kind}\n{offsets}\nCONNECTIVITY {kind}\n{corners}\n");
         is_box(kind, "a.vtk", format!("{head}{lists}"));
         is_box(kind, "a.vtk", format!("{head}{information}{}", lists.to_lowercase()));
@@ -338,16 +339,16 @@ fn polygons_are_split_in_their_plane() {
         assert_eq!((triangles, mm2, is_degenerate), (2, 24.0, false), "{start}");
         assert_eq!(notes[0].contains("first vertex"), is_fan, "{start} {notes:?}");
     }
-    // The same seen from the other side, in another plane, and not quite flat.
+    // Seen from the other side, in another plane, and not quite flat.
     assert_eq!(area(&format!("{dart}f 4 3 2 1\nf 3 2 1 4\n")).1, 48.0);
     assert_eq!(area("v 0 0 0\nv 0 10 4\nv 0 0 8\nv 0 4 4\nf 1 2 3 4\n").1, 24.0);
     assert!((area("v 0 0 0.01\nv 10 4 0\nv 0 8 0.01\nv 4 4 0\nf 1 2 3 4\n").1 - 24.0).abs() < 0.1);
-    // Convex ones are a fan as ever.
+    // Convex polygons are still split into a fan.
     let hexagon: String =
         (0..6).map(|k| f64::from(k).to_radians() * 60.0).map(|a| format!("v {} {} 0\n", a.cos(), a.sin())).collect();
     let found = read_mm("a.obj", format!("{hexagon}f 1 2 3 4 5 6\n")).unwrap();
     assert_eq!(found.mesh.triangles, [[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]]);
-    // A vertex in the middle of a side makes no triangle without area, wherever the polygon begins.
+    // A vertex in the middle of a side does not result in a triangle without area, whichever corner is first.
     let side = "v 0 0 0\nv 5 0 0\nv 10 0 0\nv 10 10 0\nv 0 10 0\n";
     for start in 0..5 {
         let face: String = (0..5).map(|k| format!(" {}", (start + k) % 5 + 1)).collect();
@@ -363,7 +364,7 @@ fn polygons_are_split_in_their_plane() {
     let face: String = (1..=teeth.len()).map(|k| format!(" {k}")).collect();
     let (triangles, mm2, _, _) = area(&format!("{vertices}f{face}\n"));
     assert_eq!((triangles, mm2), (teeth.len() - 2, f64::from(exact) / 2.0));
-    // What crosses itself, has no plane or is no number is split the same way each time.
+    // A polygon that crosses itself, has no plane or contains NaN is always split in the same way.
     for text in [
         "v 0 0 0\nv 10 10 0\nv 10 0 0\nv 0 10 0\nf 1 2 3 4\n",
         "v 0 0 0\nv 1 0 0\nv 2 0 0\nv 3 0 0\nf 1 2 3 4\n",
@@ -392,7 +393,7 @@ fn stl_ends_and_begins_in_more_than_one_way() {
         ("no name", text.replace(" box", "")),
         ("a long name", text.replace(" box", " a box of 40,5 mm, end solid")),
         ("two solids", format!("{}endsolid box\nsolid vertex\n{}", &text[..half], &text[half..])),
-        // The surface is closed, so that nothing else is missing.
+        // The surface is closed, so nothing can be missing.
         ("no end", text.replace("endsolid box\n", "")),
     ] {
         is_box(what, "a.stl", text);
@@ -447,13 +448,13 @@ fn gltf_names_what_it_needs() {
     }
     let both = refusal("a.gltf", with(r#""extensionsRequired":["ACME_a","KHR_texture_basisu","ACME_b"]"#));
     assert!(both.contains("needs ACME_a, ACME_b,"), "{both}");
-    // Before the buffer is missed that only the extension fills.
+    // Reported before the missing buffer, which only the extension fills.
     let empty = r#"{"extensionsRequired":["EXT_meshopt_compression"],"buffers":[{"byteLength":100}]}"#;
     assert!(refusal("a.gltf", empty).contains("needs EXT_meshopt_compression"));
     let unsaid = r#"{"buffers":[{"byteLength":9,"extensions":{"EXT_meshopt_compression":{"fallback":true}}}]}"#;
     assert!(refusal("a.gltf", unsaid).contains("buffer 0: needs EXT_meshopt_compression"));
     assert!(refusal("a.gltf", r#"{"buffers":[{"byteLength":9}]}"#).contains("its content is missing"));
-    // Compressed, though it does not say so.
+    // Compressed, although it does not declare the extension as required.
     let draco = gltf().replacen("\"indices\":1", r#""indices":1,"extensions":{"KHR_draco_mesh_compression":{}}"#, 1);
     assert_eq!(report_of("a.gltf", &draco).triangles, 8);
     let draco = refusal("a.gltf", draco.replacen("{\"bufferView\":0,", "{", 1));
@@ -481,18 +482,18 @@ fn elements_given_twice_count_once() {
     let found = read_mm("a.vtk", mixed).unwrap();
     let note = "Volume elements left out that have the corners of an earlier one: 1.";
     assert!(found.notes.iter().any(|own| own == note), "{:?}", found.notes);
-    // Tetrahedra with other numbers of the same corners.
+    // Tetrahedra with other vertex indices for the same corners.
     let tetrahedra = "# vtk DataFile Version 3.0\n\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 5 float\n0 0 0 10 0 0 0 10 0 0 0 10 \
                       10 10 10\nCELLS 5 25\n4 0 1 2 3\n4 1 2 3 4\n4 2 1 0 3\n4 4 3 2 1\n4 0 1 2 3\nCELL_TYPES 5\n10 10 10 10 10\n";
     let report = report_of("a.vtk", tetrahedra);
     assert_eq!((report.triangles, report.holes, report.refusal()), (6, 0, None));
     assert!((report.volume_m3.unwrap() - 0.5e-6).abs() < 1e-15, "{report:?}");
-    // A brick that is collapsed to a wedge.
+    // A hexahedron that is collapsed to a wedge.
     let wedge =
         tetrahedra.split("CELLS").next().unwrap().to_owned() + "CELLS 1 9\n8 0 1 2 2 3 4 4 4\nCELL_TYPES 1\n12\n";
     let report = report_of("a.vtk", wedge);
     assert_eq!((report.holes, report.refusal(), report.counts.get("degenerate")), (0, None, None), "{report:?}");
-    // Gmsh writes an element once for each of its groups.
+    // Gmsh writes an element once for each group that contains it.
     let elements: Vec<String> = triangles(|[a, b, c]| format!("1 2 2 2 1 {} {} {}\n", b + 1, c + 1, a + 1))
         .lines()
         .take(4)
@@ -516,7 +517,7 @@ fn a_vertex_without_a_triangle_does_not_change_the_size() {
             assert_eq!(report.counts.get("unused_vertex"), Some(&1));
         }
     }
-    // Nor what is near enough to be welded.
+    // It does not change the welding tolerance either: nothing is welded here.
     let near = obj() + "v 0 0 20.0005\nv 1e9 0 0\nf 9 5 6\n";
     let found = read_mm("a.obj", near).unwrap().mesh;
     let repaired = palpate_geometry::repair::repair(
@@ -538,7 +539,7 @@ fn holes_are_told_with_their_place_in_the_unit_of_the_file() {
         hole.text("0.0254".parse().unwrap()),
         "rim of 3 edges, 4.72 × 0.0254 m around, at (1.05, 0.394, 0.787) × 0.0254 m"
     );
-    // A small hole, at the middle of a disc but for rounding.
+    // A small hole in the middle of a disc, at the origin except for rounding.
     let ring: String = (0..40)
         .map(|k| (if k % 2 == 0 { 1.0 } else { 30.0 }, f64::from(k / 2) * 18_f64.to_radians()))
         .map(|(radius, angle)| format!("v {} {} 1e-14\n", radius * angle.cos(), radius * angle.sin()))
@@ -553,7 +554,7 @@ fn holes_are_told_with_their_place_in_the_unit_of_the_file() {
         texts,
         ["rim of 20 edges, 188 mm around, at (0, 0, 0) mm", "hole of 20 edges, 6.26 mm around, at (0, 0, 0) mm"]
     );
-    // Findings as well.
+    // Also in findings.
     let turned = report_of("a.obj", obj().replace("f 1 6 5", "f 1 5 6"));
     let texts: Vec<String> = turned.problems.iter().map(|finding| finding.text(mm())).collect();
     assert!(texts[0].starts_with("edge 0-4 at (0, 0, 10) mm: "), "{texts:?}");

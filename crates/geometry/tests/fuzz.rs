@@ -1,7 +1,7 @@
-//! Every reader under inputs that are nearly right: valid files, bent, cut, spliced, with the numbers that hurt. Whatever is
-//! taken is reported, mended, decimated and written.
+//! Tests every reader with inputs that are almost valid: valid files that are corrupted, cut, spliced, and filled
+//! with critical numbers. Each accepted file is reported, repaired, decimated and written.
 //!
-//! Four thousand inputs a reader in every run of the tests; `PALPATE_FUZZ_INPUTS` says how many instead.
+//! Each test run uses four thousand inputs for each reader, or `PALPATE_FUZZ_INPUTS`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod common;
@@ -16,16 +16,16 @@ use palpate_geometry::report::report;
 use palpate_geometry::write::{Format, write};
 use palpate_geometry::{ReadLimits, Unit, prepare, read};
 
-/// Inputs that were taken and are bent further.
+/// Number of accepted inputs that are mutated further.
 const CORPUS: usize = 256;
 
 /// Longest input, bytes.
 const LONGEST: usize = 1 << 14;
 
-/// Memory that a run of all readers may take at most, bytes. One count that was believed would take more.
+/// Maximum memory for a run of all readers, bytes. A single unchecked count would need more.
 const MEMORY: u64 = 512 << 20;
 
-/// Pieces at which readers stumble.
+/// Byte sequences that are critical for readers.
 fn pieces() -> Vec<Vec<u8>> {
     let texts = [
         "nan",
@@ -83,7 +83,7 @@ fn pieces() -> Vec<Vec<u8>> {
     pieces
 }
 
-/// `bytes` with one thing changed.
+/// Returns `bytes` with one change.
 fn bend(random: &mut Rng, mut bytes: Vec<u8>, other: &[u8], pieces: &[Vec<u8>]) -> Vec<u8> {
     let from = random.usize(0..=bytes.len());
     let to = (from + random.usize(0..=16)).min(bytes.len());
@@ -98,7 +98,7 @@ fn bend(random: &mut Rng, mut bytes: Vec<u8>, other: &[u8], pieces: &[Vec<u8>]) 
         }
         4 | 5 => {
             let piece = pieces[random.usize(0..pieces.len())].clone();
-            // In the place of something as long, or between.
+            // Replaces as many bytes, or is inserted.
             let to = if random.bool() { (from + piece.len()).min(bytes.len()) } else { from };
             bytes.splice(from..to, piece);
         }
@@ -113,7 +113,7 @@ fn bend(random: &mut Rng, mut bytes: Vec<u8>, other: &[u8], pieces: &[Vec<u8>]) 
     bytes
 }
 
-/// Reads a file, and does everything with the mesh that can be done. Returns the triangles of a file that was taken.
+/// Reads a file, and applies all operations to the mesh. Returns the number of triangles if the file was accepted.
 fn try_all(name: &str, bytes: &[u8]) -> Option<usize> {
     let neighbour = |_: &str| Some(vec![1; 128]);
     let found = match read(name, bytes, Unit::METRE, &neighbour, &ReadLimits::default()) {
@@ -149,7 +149,7 @@ fn try_all(name: &str, bytes: &[u8]) -> Option<usize> {
     assert_eq!(repaired.vertex_of.len(), count);
     let after = report(&repaired.mesh);
     for name in ["degenerate", "duplicate_triangle", "unused_vertex", "not_finite", "index_out_of_range"] {
-        // Holes may be filled with what is nearly flat.
+        // Filled holes may contain almost flat triangles.
         assert!(name == "degenerate" || !after.counts.contains_key(name), "{name}: {:?}", repaired.told);
     }
     let mut flipped = mesh.clone();
@@ -163,7 +163,7 @@ fn try_all(name: &str, bytes: &[u8]) -> Option<usize> {
     Some(mesh.triangles.len())
 }
 
-/// The most memory that this process has had, bytes; 0 where the system does not tell.
+/// The peak memory of this process, bytes; 0 if the system does not provide it.
 fn most_memory() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
@@ -196,7 +196,7 @@ fn fuzz(extensions: &[&str]) {
             panic!("{name} panics at {bytes:?}\nas text: {}", String::from_utf8_lossy(&bytes));
         };
         taken += u64::from(triangles.is_some());
-        // What has nothing left to go wrong with teaches nothing. The seeds stay.
+        // A file without triangles is not worth mutating. The seeds stay.
         if triangles.is_some_and(|triangles| triangles > 0) {
             if corpus.len() < CORPUS {
                 corpus.push((name, bytes));
@@ -207,7 +207,7 @@ fn fuzz(extensions: &[&str]) {
     }
     println!("{extensions:?}: {inputs} inputs, {taken} of them taken, {} MiB", most_memory() >> 20);
     assert!(most_memory() < MEMORY, "{} MiB", most_memory() >> 20);
-    // Else the reader was hardly tried.
+    // Otherwise the reader was hardly tested.
     assert!(taken > inputs / 1000 && taken < inputs, "{taken} of {inputs} taken");
 }
 

@@ -1,5 +1,5 @@
-//! Meshes as users have them: every format, whole and cut, sound and not; each is read, mended as asked, or refused with
-//! element and place.
+//! Meshes as users have them: in every format, complete and cut off, valid and invalid. Each is read, repaired as
+//! requested, or refused with the element and its position.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod common;
@@ -23,7 +23,7 @@ fn read_mm(name: &str, bytes: impl AsRef<[u8]>) -> Result<ReadMesh, MeshError> {
     read(name, bytes.as_ref(), unit("mm"), &|_| None, &ReadLimits::default())
 }
 
-/// The names of what is refused.
+/// The names of the problems for which the mesh is refused.
 fn refused(report: &MeshReport) -> Vec<&'static str> {
     report.problems.iter().filter(|found| found.problem.is_refused()).map(|found| found.problem.name()).collect()
 }
@@ -31,7 +31,7 @@ fn refused(report: &MeshReport) -> Vec<&'static str> {
 fn mended(mesh: &TriangleMesh) -> Repaired {
     let repaired = repair(mesh, &Repair::default());
     assert_eq!(repaired.vertex_of.len(), mesh.vertices_m.len());
-    // Who was not dropped is where it was, or within the tolerance of welding.
+    // A vertex that was not dropped did not move, except within the welding tolerance.
     for (at, new) in mesh.vertices_m.iter().zip(&repaired.vertex_of) {
         let moved = new.map(|new| at.distance(repaired.mesh.vertices_m[new as usize]));
         assert!(moved.is_none_or(|moved| moved <= 1e-5 * at.length()), "{moved:?}");
@@ -39,7 +39,7 @@ fn mended(mesh: &TriangleMesh) -> Repaired {
     repaired
 }
 
-/// Positions of the corners of a mesh's triangles, each triangle begun at its least corner, sorted.
+/// Positions of the triangles' corners, each triangle beginning at its smallest corner, sorted.
 fn shape(mesh: &TriangleMesh) -> Vec<[[i64; 3]; 3]> {
     #[allow(clippy::cast_possible_truncation)]
     let at = |vertex: u32| mesh.vertices_m[vertex as usize].to_array().map(|part| (part * 1e6).round() as i64);
@@ -63,7 +63,7 @@ fn every_format_gives_the_same_mesh() {
         assert_eq!((report.components, report.holes), (1, 0), "{name}");
         assert!((report.volume_m3.unwrap() - VOLUME_M3).abs() < 1e-9, "{name}: {report:?}");
         assert!(report.extent_m.iter().all(|side| (side - 0.2).abs() < 1e-7), "{name}");
-        // But for STL, vertices are numbered as in the file.
+        // Except for STL, vertices have the same indices as in the file.
         if !name.ends_with("stl") {
             assert!(
                 found
@@ -96,7 +96,7 @@ fn what_was_done_to_a_file_is_told() {
     assert_eq!(found.mesh.triangles, [[0, 1, 2], [0, 2, 3], [0, 1, 4]]);
     assert_eq!(found.notes.len(), 2, "{:?}", found.notes);
     assert!(found.notes[0].contains("from their first vertex: 1."));
-    // The content decides.
+    // The content decides, not the extension.
     let other = read_mm("wrong.obj", common::stl_binary()).unwrap();
     assert!(other.notes[0].contains("Stl"), "{:?}", other.notes);
 }
@@ -147,7 +147,7 @@ fn a_file_that_ends_early_is_refused_with_a_place_or_read_as_far_as_it_goes() {
             let end = bytes.len() * part / 100;
             match read_mm(name, &bytes[..end]) {
                 Ok(found) => {
-                    // All elements can be there, and what follows counts for nothing; or there are no faces yet.
+                    // Either the cut removed only data that is ignored, or there are no faces yet.
                     let is_whole = shape(&found.mesh) == shape(&octahedron());
                     let may = !knows_its_end || is_whole || found.mesh.triangles.is_empty();
                     assert!(may, "{name} cut at {end}");
@@ -216,7 +216,7 @@ fn limits_hold_however_much_a_file_claims() {
         let short = ReadLimits { bytes: bytes.len() - 1, ..ReadLimits::default() };
         assert_eq!(read(name, &bytes, unit("mm"), &|_| None, &short).unwrap_err().problem.name(), "too_large");
     }
-    // Counts without bytes behind them.
+    // Counts without the data.
     let mut stl = vec![0; 80];
     stl.extend(u32::MAX.to_le_bytes());
     stl.extend([0; 60]);
@@ -234,12 +234,12 @@ fn limits_hold_however_much_a_file_claims() {
             Err(error) => assert!(["truncated", "too_large"].contains(&error.problem.name()), "{error}"),
         }
     }
-    // Nested deeper than any stack.
+    // Nested more deeply than any stack allows.
     let deep = "[".repeat(1 << 20);
     assert!(read_mm("a.gltf", format!("{{\"nodes\":{deep}")).is_err());
     let deep = "<a>".repeat(1 << 20);
     assert!(read_mm("a.vtp", format!("<VTKFile type=\"PolyData\">{deep}")).is_err());
-    // Little text, much work: many nodes with the same many primitives.
+    // A small text that needs much work: many nodes that share many primitives.
     let primitives = [r#"{"attributes":{"POSITION":0}}"#; 2000].join(",");
     let nodes = [r#"{"mesh":0}"#; 2000].join(",");
     let many = format!(
@@ -308,7 +308,7 @@ fn meshes_made_elsewhere_are_checked_as_well() {
 #[test]
 fn holes_are_counted_and_small_ones_filled() {
     let mut mesh = sphere(3);
-    // One triangle, and all around another vertex.
+    // A missing triangle, and a missing fan around another vertex.
     mesh.triangles.remove(100);
     mesh.triangles.retain(|triangle| !triangle.contains(&40));
     let found = report(&mesh);
@@ -319,11 +319,11 @@ fn holes_are_counted_and_small_ones_filled() {
     assert_eq!((after.holes, after.problems.len()), (0, 0), "{after:?}");
     assert!((after.volume_m3.unwrap() / report(&sphere(3)).volume_m3.unwrap() - 1.0).abs() < 0.01);
     assert!(repaired.told.iter().any(|line| line == "Holes filled: 2."), "{:?}", repaired.told);
-    // Of a coarse mesh, too.
+    // Also in a coarse mesh.
     let mut coarse = octahedron();
     coarse.triangles.remove(3);
     assert_eq!(shape(&mended(&coarse).mesh), shape(&octahedron()));
-    // The rim of a sheet is no hole to fill.
+    // The boundary of a sheet is not a hole to fill.
     let flat = sheet(4, || 0.0);
     let repaired = mended(&flat);
     assert_eq!((repaired.mesh, report(&flat).holes), (flat, 1));
@@ -339,7 +339,7 @@ fn flipped_triangles_are_turned() {
     assert_eq!((refused(&found).len(), found.counts["orientation"]), (9, 9));
     assert!(matches!(found.problems[0].element, Element::Edge(_)) && found.problems[0].place_m.is_some());
     assert_eq!(shape(&mended(&mesh).mesh), shape(&sphere(2)));
-    // All of them.
+    // All triangles.
     mesh = sphere(2);
     mesh.triangles.iter_mut().for_each(|triangle| triangle.swap(1, 2));
     let found = report(&mesh);
@@ -378,7 +378,7 @@ fn duplicates_are_found_and_dropped() {
     let repaired = mended(&mesh);
     assert_eq!(shape(&repaired.mesh), shape(&sphere(2)));
     assert_eq!(repaired.told, ["Triangles dropped that have the vertices of an earlier one: 2."]);
-    // Each triangle with its own vertices, one of them a little off.
+    // Each triangle with separate vertices, one of them slightly displaced.
     let whole = sphere(2);
     let mut soup = TriangleMesh::default();
     for triangle in &whole.triangles {
@@ -432,7 +432,7 @@ fn slivers_and_sizes_are_warned_of() {
 
 #[test]
 fn triangles_in_a_line_are_flipped_away() {
-    // The middle of an edge of the octahedron is a vertex, but of a triangle without area beside it.
+    // The middle of an edge of the octahedron is a vertex, but only of a triangle without area beside the edge.
     let mut mesh = octahedron();
     mesh.vertices_m.push((mesh.vertices_m[0] + mesh.vertices_m[2]) / 2.0);
     mesh.triangles.retain(|triangle| *triangle != [0, 2, 4]);
@@ -515,7 +515,7 @@ fn decimation_keeps_borders_and_groups() {
     assert_eq!((after.vertices, after.holes, refused(&after).len()), (200, 1, 0));
     assert!((after.area_m2 - 0.01).abs() < 1e-9, "{}", after.area_m2);
     assert!(coarse.groups[0].vertices.iter().any(|vertex| coarse.vertices_m[*vertex as usize].x.abs() < 1e-12));
-    // No more than can go without folding.
+    // Removes only as many triangles as possible without folding.
     assert!(report(&decimate(&octahedron(), 1).mesh).volume_m3.unwrap() > 0.0);
 }
 

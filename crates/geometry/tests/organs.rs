@@ -1,4 +1,5 @@
-//! What generated organs promise: manifold, even, in one part, of the asked edge length, the same bits for the same seed.
+//! Guarantees for generated organs: manifold, uniform, connected, with the requested edge length, and bitwise
+//! reproducible for a seed.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 use std::collections::BTreeMap;
@@ -7,11 +8,11 @@ use glam::DVec3;
 use palpate_geometry::TriangleMesh;
 use palpate_geometry::organ::{MAX_VERTICES, Organ, OrganError, generate};
 
-/// What the tests ask about a mesh.
+/// Properties of a mesh that the tests check.
 struct Measures {
-    /// Edges that one triangle has.
+    /// Number of edges with a single triangle.
     boundary: usize,
-    /// Closed lines of boundary edges.
+    /// Number of closed loops of boundary edges.
     boundaries: usize,
     components: usize,
     /// Vertices − edges + triangles.
@@ -19,7 +20,7 @@ struct Measures {
     /// Shortest and longest edge, m.
     edges_m: [f64; 2],
     mean_edge_m: f64,
-    /// Smallest and largest valence of vertices within.
+    /// Smallest and largest valence of vertices in the interior.
     valences: [usize; 2],
     area_m2: f64,
     volume_m3: f64,
@@ -131,7 +132,7 @@ fn topology(organ: Organ) -> (usize, i64) {
     }
 }
 
-/// What is wrong with one mesh.
+/// Returns the problems of a mesh.
 fn complaints(organ: Organ, edge_mm: f64, seed: u64) -> Vec<String> {
     let name = format!("{organ}, {edge_mm} mm, seed {seed}");
     let mesh = match generate(organ, edge_mm * 1e-3, seed) {
@@ -195,7 +196,7 @@ fn surfaces_face_the_side_that_is_touched() {
             }
         };
         assert!(mesh.triangles.iter().all(facing), "{organ}");
-        // Litres: a small gallbladder and a stomach.
+        // Litres.
         let volume = measure(&mesh).volume_m3 * 1e3;
         assert!(topology(organ).0 > 0 || (volume > 0.02 && volume < 1.5), "{organ}: {volume} l");
     }

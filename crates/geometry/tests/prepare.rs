@@ -1,4 +1,5 @@
-//! Whatever numbers and senses the vertices and triangles of a file have: the same shape is the same tissue, and repair loses none.
+//! Whatever the vertex indices and orientations in a file are, the same shape results in the same tissue, and repair
+//! does not remove parts of it.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_possible_truncation)]
 
 mod common;
@@ -12,7 +13,7 @@ use palpate_geometry::organ::{Organ, generate};
 use palpate_geometry::repair::{Repair, Repaired, SurfaceMeasure, repair};
 use palpate_geometry::{Group, MeshReport, Prepared, ReadLimits, TriangleMesh, Unit, prepare, read, report};
 
-/// Each corner of each triangle as a vertex of its own.
+/// Gives each corner of each triangle a separate vertex.
 fn soup(mesh: &TriangleMesh) -> TriangleMesh {
     TriangleMesh {
         vertices_m: mesh.triangles.iter().flatten().map(|vertex| mesh.vertices_m[*vertex as usize]).collect(),
@@ -21,7 +22,7 @@ fn soup(mesh: &TriangleMesh) -> TriangleMesh {
     }
 }
 
-/// With the triangles turned for which `is_turned` is true.
+/// Reverses the triangles for which `is_turned` is true.
 fn turned(mesh: &TriangleMesh, mut is_turned: impl FnMut(usize) -> bool) -> TriangleMesh {
     let mut mesh = mesh.clone();
     mesh.triangles.iter_mut().enumerate().filter(|(n, _)| is_turned(*n)).for_each(|(_, of)| of.swap(0, 1));
@@ -42,7 +43,7 @@ fn both(one: &TriangleMesh, other: &TriangleMesh) -> TriangleMesh {
     mesh
 }
 
-/// Boxes of side 1 cm, each with triangles of its own; vertices are shared.
+/// Boxes with sides of 1 cm, each with separate triangles but shared vertices.
 fn boxes(cells: &[[i32; 3]]) -> TriangleMesh {
     let mut mesh = TriangleMesh::default();
     let mut known = BTreeMap::new();
@@ -72,11 +73,11 @@ fn same(one: f64, other: f64) {
     assert!((one / other - 1.0).abs() < 1e-9, "{one} {other}");
 }
 
-/// Checks that it can be used; returns its report.
+/// Checks that the mesh can be used. Returns its report.
 fn usable(prepared: &Prepared) -> MeshReport {
     let report = prepared.report();
     assert!(report.refusal().is_none(), "{:?} {:?}", report.problems, prepared.notes);
-    // What has been prepared stays as it is.
+    // Preparing it again changes nothing.
     let file = prepared.file.as_ref().map_or(&prepared.mesh, |file| &file.mesh);
     let again = prepare(file.clone());
     assert!((&again.mesh, &again.file) == (&prepared.mesh, &prepared.file), "{:?} {:?}", prepared.notes, again.notes);
@@ -130,7 +131,7 @@ fn a_shape_is_the_same_however_its_triangles_are_numbered_and_turned() {
             let report = usable(&prepared);
             assert_eq!((report.vertices, report.components, report.holes), (mesh.vertices_m.len(), 1, 0));
             same(report.volume_m3.unwrap(), measure.volume_m3.unwrap());
-            // The vertices of the file keep their numbers.
+            // The vertices of the file keep their indices.
             if let Some(file) = prepared.file {
                 assert_eq!(file.mesh.vertices_m, other.vertices_m);
             }
@@ -168,10 +169,10 @@ fn closed_parts_face_outward_from_the_tissue_around_their_cavities() {
         same(report.volume_m3.unwrap(), expected);
         assert!(!report.counts.contains_key("faces_inward") && !report.counts.contains_key("cavity_faces_tissue"));
     }
-    // Those that cut each other are not within each other.
+    // Surfaces that intersect each other are not inside each other.
     let cutting = both(&outer, &moved(&outer, 0.9, DVec3::new(0.03, 0.01, 0.02)));
     same(usable(&prepare(cutting.clone())).volume_m3.unwrap(), volume(&outer) * (1.0 + 0.9_f64.powi(3)));
-    // What is told of a file as it is.
+    // The report on an unchanged file.
     let hollow = both(&outer, &inner);
     assert_eq!(report(&hollow).counts["cavity_faces_tissue"], 1);
     assert_eq!(report(&turned(&both(&outer, &beside), |n| n < 128)).counts["faces_inward"], 1);
@@ -189,7 +190,7 @@ fn repair_keeps_the_walls_of_cavities_and_tells_what_it_drops() {
         same(repaired.before.volume_m3.unwrap(), hollow);
         assert_eq!(repaired.faults, [""; 0]);
     }
-    // Debris is dropped, and a second organ, too, but that is not what is asked for.
+    // Debris is dropped. A second organ is dropped too, but this is reported as a fault.
     let debris = both(&outer, &moved(&octahedron(), 0.02, DVec3::new(0.2, 0.0, 0.0)));
     let (repaired, report) = mended(&debris);
     assert_eq!((report.components, repaired.faults.len()), (1, 0), "{:?}", repaired.faults);
@@ -216,7 +217,7 @@ fn solids_that_touch_at_an_edge_or_a_vertex_are_closed_each() {
             assert_eq!(report.holes, 0);
             same(report.volume_m3.unwrap(), 2.0 * BOX_M3);
         }
-        // An edge holds them together, a vertex does not.
+        // Parts that share an edge stay together; parts that share only a vertex do not.
         let (repaired, report) = mended(&mesh);
         let is_edge = other.contains(&0);
         same(report.volume_m3.unwrap(), BOX_M3 * if is_edge { 2.0 } else { 1.0 });
@@ -265,7 +266,7 @@ fn open_surfaces_face_one_side_and_are_told_if_that_is_inward() {
         let report = usable(&prepared);
         assert_eq!((report.vertices, report.holes), (25, 1));
         assert!(!report.counts.contains_key("orientation") && !report.counts.contains_key("open_faces_inward"));
-        // The side that most of it faced.
+        // The orientation of the majority is kept.
         let mesh = &prepared.mesh;
         let up = mesh.triangles.iter().filter(|of| {
             let [a, b, c] = of.map(|vertex| mesh.vertices_m[vertex as usize]);
@@ -278,7 +279,7 @@ fn open_surfaces_face_one_side_and_are_told_if_that_is_inward() {
     assert!(!usable(&prepare(half.clone())).counts.contains_key("open_faces_inward"));
     let inward = prepare(turned(&half, |_| true));
     assert_eq!(usable(&inward).counts["open_faces_inward"], 1);
-    // A hole that nobody means: its inside is known.
+    // A small unintended hole: the inside is still known.
     let mut nearly = turned(&sphere(4), |_| true);
     nearly.triangles.truncate(nearly.triangles.len() - 3);
     let prepared = prepare(nearly);
@@ -322,7 +323,7 @@ fn seams_of_texture_and_groups_are_kept() {
     let group = &prepared.mesh.groups[0].vertices;
     assert!(group.is_sorted_by(|a, b| a < b) && group.len() == lower.len());
     assert!(copies.iter().all(|vertex| group.contains(vertex)), "the seam belongs to both sides");
-    // A vertex that is split is in its groups with all of its copies.
+    // If a vertex is split, all its copies are in its groups.
     let mut touching = boxes(&[[0, 0, 0], [1, 1, 1]]);
     let shared = touching.vertices_m.iter().position(|at| *at == DVec3::splat(0.01)).unwrap() as u32;
     touching.groups = vec![Group { name: "shared".into(), vertices: vec![shared] }];
@@ -343,7 +344,7 @@ fn a_vertex_that_no_triangle_has_is_no_tissue() {
         let file = prepared.file.unwrap();
         let nearest = prepared.mesh.vertices_m[file.vertex_of[3] as usize];
         assert_eq!(nearest.y, 0.01);
-        // Vertices are told by their numbers in the file.
+        // Messages use the vertex indices of the file.
         let mut torn = boxes(&[[0, 0, 0]]);
         torn.vertices_m.insert(0, DVec3::splat(far + 0.03));
         torn.triangles.iter_mut().flatten().for_each(|vertex| *vertex += 1);
@@ -353,7 +354,7 @@ fn a_vertex_that_no_triangle_has_is_no_tissue() {
     }
 }
 
-/// The cells of a grid as VTK, each as five tetrahedra whose diagonals are those of `is_odd`, or as a hexahedron.
+/// The cells of a grid as in VTK, each as five tetrahedra whose diagonals depend on `kind`, or as a hexahedron.
 fn grid(size: [i32; 3], mut kind: impl FnMut([i32; 3]) -> Option<bool>) -> TriangleMesh {
     let [nx, ny, nz] = size;
     let number = |[x, y, z]: [i32; 3]| x + (nx + 1) * (y + (ny + 1) * z);
@@ -400,7 +401,7 @@ fn cells_whose_diagonals_do_not_match_are_one_solid() {
     for (size, rounds) in [([2, 1, 1], 2), ([2, 2, 1], 4), ([3, 1, 1], 4), ([2, 2, 2], 8), ([3, 3, 3], 12)] {
         for round in 0..rounds {
             let mesh = grid(size, |[x, y, z]| match round {
-                // The same everywhere; only the one in the middle is another.
+                // All cells are equal, except the one in the middle.
                 0 => Some(false),
                 1 => Some((x + y + z) % 2 == usize::from([x, y, z] == [1, 1, 1]) as i32),
                 2 => [None, Some(false), Some(true)][dice.usize(..3)],
@@ -425,7 +426,7 @@ fn cells_whose_diagonals_do_not_match_are_one_solid() {
 #[test]
 fn voxels_that_hang_together_are_closed_and_whole() {
     let mut dice = Rng::with_seed(4);
-    // Around an edge of the middle voxels, both ends of which they share, and such sets by chance.
+    // Around an edge between the middle voxels, which share both its ends; and random sets like this.
     let ring = [[0, 0, 0], [1, 1, 0], [0, 0, 1], [1, 1, 1], [0, 0, 2], [1, 1, 2]];
     let bridges = [[1, 0, 0], [1, 0, 2]];
     let mut sets = vec![ring.iter().chain(&bridges).copied().collect::<Vec<_>>()];
@@ -442,7 +443,7 @@ fn voxels_that_hang_together_are_closed_and_whole() {
         same(repaired.after.volume_m3.unwrap(), report.volume_m3.unwrap());
     }
     for _ in 0..60 {
-        // A walk from voxel to voxel through faces and edges.
+        // A random walk from voxel to voxel through faces and edges.
         let (mut at, mut cells) = ([0_i32; 3], vec![[0; 3]]);
         for _ in 0..dice.usize(1..14) {
             let from = at;

@@ -1,4 +1,4 @@
-//! Walking on a surface, and laying a disc on it.
+//! Paths and discs on a surface.
 #![allow(
     clippy::unwrap_used,
     clippy::cast_possible_truncation,
@@ -34,7 +34,7 @@ fn flat(side: u32, jitter: f64, seed: u64) -> Surface {
     Surface::new(&vertices, &triangles)
 }
 
-/// A sphere of radius 1: an octahedron with its edges halved so often.
+/// A sphere of radius 1: an octahedron, subdivided `times` times.
 fn sphere(times: usize) -> Surface {
     let mesh = common::sphere(times);
     let vertices: Vec<DVec3> = mesh.vertices_m.iter().map(|place| place.normalize()).collect();
@@ -46,7 +46,7 @@ fn place(surface: &Surface, x: f64, y: f64) -> Place {
 }
 
 fn rest(surface: &Surface, vertex: u32) -> DVec3 {
-    // The place of a vertex is that of the hat's only bearer.
+    // The vertex is the point at which its hat is 1.
     surface.vertices_m()[vertex as usize]
 }
 
@@ -150,7 +150,7 @@ fn the_gradient_is_the_change_of_the_weights() {
 
 #[test]
 fn weights_change_without_jumps_along_a_way() {
-    // Relative to the disc's radius: on a curved surface a way comes to pass a vertex on the other side.
+    // Relative to the disc's radius: on a curved surface, a path may change the side on which it passes a vertex.
     for (surface, most) in [(flat(40, 0.3, 7), 1e-4), (sphere(4), 2e-3)] {
         let edge = (surface.areas_m2().iter().sum::<f64>() / surface.areas_m2().len() as f64).sqrt();
         let mut disc = SurfaceDisc::new(2.0 * edge, edge);

@@ -1,5 +1,5 @@
-//! Meshes that strangers laid so that something takes very long: each is done within operations that are counted, as many as a few
-//! passes over it, or told to stop.
+//! Meshes that were designed to take very long: each is processed within a number of operations that corresponds to a
+//! few passes over it, or cancelled.
 #![allow(clippy::unwrap_used, clippy::disallowed_methods)]
 
 use std::f64::consts::{PI, TAU};
@@ -11,7 +11,7 @@ use palpate_geometry::decimate::decimate;
 use palpate_geometry::work::{GivenUp, within};
 use palpate_geometry::{Group, Prepared, TriangleMesh, prepare};
 
-/// Does something within so many operations for each triangle of a mesh.
+/// Runs `act` with a limit of operations for each triangle of a mesh.
 fn bounded<T>(mesh: &TriangleMesh, for_each: u64, act: impl FnOnce() -> T) -> T {
     let most = for_each * mesh.triangles.len() as u64;
     within(&Arc::new(AtomicBool::new(false)), most, act).unwrap()
@@ -21,7 +21,7 @@ fn prepared(mesh: &TriangleMesh, for_each: u64) -> Prepared {
     bounded(mesh, for_each, || prepare(mesh.clone()))
 }
 
-/// Two cones on one circle of so many vertices: each tip is in half of all triangles.
+/// Two cones on a common circle of `around` vertices: each tip is in half of all triangles.
 fn two_hubs(around: u32) -> TriangleMesh {
     let mut vertices_m = vec![DVec3::new(0.0, 0.0, 0.05), DVec3::new(0.0, 0.0, -0.05)];
     vertices_m.extend((0..around).map(|k| {
@@ -65,7 +65,7 @@ fn vertices_without_triangles_in_the_middle_of_a_sphere_get_a_near_one() {
     let mut mesh = sphere(60);
     let count = mesh.vertices_m.len();
     mesh.vertices_m.extend((0..20_000).map(|k| DVec3::splat(1e-9 * f64::from(k))));
-    // Beside those, one that is near.
+    // In addition, a vertex that is near another one.
     mesh.vertices_m.insert(count, 1.01 * mesh.vertices_m[7]);
     let found = prepared(&mesh, 3000);
     let file = found.file.unwrap();
@@ -83,7 +83,7 @@ fn surfaces_within_surfaces_are_looked_at_by_what_is_around_them_in_order() {
         mesh.triangles.extend([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]].map(|of| of.map(|corner| 4 * k + corner)));
     }
     let found = prepared(&mesh, 5000);
-    // The walls of cavities, every second one, are turned.
+    // Every second surface is the wall of a cavity, and is turned.
     assert!(found.notes.iter().any(|note| note.contains("cavities")), "{:?}", found.notes);
 }
 

@@ -1,5 +1,5 @@
-//! The certificate of datagram sessions: the server makes and signs it by itself. Browsers accept such a one by its hash if its
-//! key is of P-256 and it is valid for at most 14 days.
+//! The certificate of datagram sessions, which the server makes and signs itself. Browsers accept such a certificate
+//! by its hash if its key is of P-256 and it is valid for at most 14 days.
 
 use std::time::Duration;
 
@@ -7,13 +7,13 @@ use wtransport::Identity;
 use wtransport::tls::error::InvalidSan;
 use wtransport::tls::self_signed::time;
 
-/// Another certificate takes its place after so long.
+/// Time after which a new certificate replaces the current one.
 pub(super) const ROTATED: Duration = Duration::from_secs(7 * 24 * 3600);
 
-/// Days for which a certificate is valid. The first has passed when it is made: clocks differ.
+/// Days for which a certificate is valid. The first has already passed when it is made, since clocks differ.
 const VALID_DAYS: u32 = 14;
 
-/// A new certificate and its SHA-256.
+/// Creates a certificate. Returns it and its SHA-256.
 ///
 /// # Errors
 /// Returns an error if the library can't make it.

@@ -1,4 +1,4 @@
-//! A datagram session of a stream: what it carries, and when the stream has to.
+//! The datagram session of a stream or lease: decides which samples go by datagram and which by the gRPC stream.
 
 use std::sync::{Arc, Mutex};
 
@@ -16,10 +16,10 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::sample_selection::WantedHeartbeat;
 use palpate_tissue::lock::lock;
 
-/// The datagrams of a stream, in both directions. Who listens and who tells share it.
+/// The datagrams of a stream, in both directions. Its receiving and its sending task share it.
 #[derive(Debug)]
 pub(in crate::server) struct DatagramChannel {
-    /// How often a message is taken in. More of them overflow their buffer, which costs nothing.
+    /// Limits the rate at which messages are read. The rest overflow their buffer, which costs nothing.
     pace: Mutex<Bucket>,
     inner: Mutex<Inner>,
     wanted: Arc<WantedHeartbeat>,
@@ -37,12 +37,12 @@ fn seconds(ns: u64) -> f64 {
 }
 
 impl DatagramChannel {
-    /// Messages are taken in at this pace.
+    /// Creates a channel, without a session yet, that reads messages at this pace.
     pub(in crate::server) fn new(pace: Bucket) -> Self {
         DatagramChannel { pace: Mutex::new(pace), inner: Mutex::default(), wanted: Arc::default() }
     }
 
-    /// Waits for the session; `None` if nobody takes its ticket.
+    /// Waits for the session; `None` if no client presents its ticket.
     pub(in crate::server) async fn arrive(&self, arrival: &mut Option<Arrival>) -> Option<Connection> {
         if let Some(waiting) = arrival {
             let connection = waiting.await.ok();
@@ -52,7 +52,11 @@ impl DatagramChannel {
         lock(&self.inner).connection.clone()
     }
 
-    /// The next message of the client, when there is time for it. Waits for ever if there is no session, or no more.
+    /// Returns the client's next message when the pace allows it. Never completes if there is no session or it has
+    /// ended.
+    ///
+    /// # Errors
+    /// Refuses a datagram that is too long or can't be decoded.
     pub(in crate::server) async fn next(&self, arrival: &mut Option<Arrival>) -> Result<pb::PosesDatagram> {
         let Some(connection) = self.arrive(arrival).await else { return std::future::pending().await };
         loop {
@@ -80,7 +84,7 @@ impl DatagramChannel {
         Ok(message)
     }
 
-    /// Sends a sample, unless the stream has to carry it. Returns false then.
+    /// Sends a sample as a datagram. Returns false if the gRPC stream must carry it instead.
     pub(in crate::server) fn send(&self, sample: &pb::Sample) -> bool {
         let now_ns = now_ns();
         let mut inner = lock(&self.inner);
@@ -89,7 +93,7 @@ impl DatagramChannel {
             && inner.datagram(Some(sample.clone()), now_ns).is_some()
     }
 
-    /// Sends a sign of life if nothing was sent for a while.
+    /// Sends an empty datagram (heartbeat) if nothing was sent for a while.
     pub(in crate::server) fn stay_alive(&self) {
         let now_ns = now_ns();
         let mut inner = lock(&self.inner);
@@ -98,26 +102,26 @@ impl DatagramChannel {
         }
     }
 
-    /// Ends the session, if there is one.
+    /// Closes the session, if there is one.
     pub(in crate::server) fn part(&self) {
         if let Some(connection) = lock(&self.inner).connection.take() {
             connection.close(VarInt::from_u32(0), b"it is over");
         }
     }
 
-    /// How often the client wants samples.
+    /// Returns the interval at which the client wants samples; the client's messages update it.
     pub(in crate::server) fn wanted(&self) -> Arc<WantedHeartbeat> {
         self.wanted.clone()
     }
 }
 
 impl Inner {
-    /// Sends a datagram; `None` if it is too long, or the session is over.
+    /// Sends a datagram; `None` if it is too long or the session has ended.
     fn datagram(&mut self, sample: Option<pb::Sample>, now_ns: u64) -> Option<()> {
         let connection = self.connection.as_ref()?;
         let heartbeat_s = self.pulse.heartbeat_s(seconds(now_ns)) as f32;
         let mut message = pb::SampleDatagram { number: 0, acknowledges: 0, heartbeat_s, sample, sent_ns: now_ns };
-        // Numbers are counted only for what is sent. They take a few bytes.
+        // Only sent datagrams get a number. The numbers take a few bytes.
         const NUMBERS_BYTES: usize = 22;
         let most = connection.max_datagram_size().map_or(0, |most| most.min(MAX_BYTES));
         if message.encoded_len() + NUMBERS_BYTES > most {

@@ -1,5 +1,5 @@
-//! Accepts datagram sessions: those that present a ticket, from pages of allowed origins. Bounds the handshakes at a time, and
-//! how many a network begins.
+//! Accepts datagram sessions that present a ticket, from pages of allowed origins. Limits the number of concurrent
+//! handshakes, and the rate at which one network starts them.
 
 use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr, UdpSocket};
@@ -25,23 +25,25 @@ use palpate_realtime::clock::now_ns;
 use palpate_realtime::priority::{give_way_a_little, thread};
 use palpate_tissue::lock::lock;
 
-/// Handshakes at a time; more are ignored, and their clients try again.
+/// Maximum number of concurrent handshakes; others are ignored, and their clients try again.
 const HANDSHAKES: usize = 64;
 
-/// Time for a handshake and the ticket.
+/// Time limit for a handshake and its ticket.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Handshakes of a network: so many a second, and at once.
+/// Rate (per second) and burst of handshakes from one network.
 const EACH: (f64, f64) = (10.0, 40.0);
 
-/// Networks whose handshakes are counted. When they are more, all are forgotten: what is left is bounded by [`HANDSHAKES`].
+/// Maximum number of networks whose handshakes are counted. Beyond it, all counts are reset: [`HANDSHAKES`] still
+/// limits the work.
 const NETWORKS: usize = 1024;
 
-/// Time to tell the clients that the server ends.
+/// Time limit for informing the clients that the server ends.
 const FAREWELL: Duration = Duration::from_secs(1);
 
-/// Receives at `socket` until `shutdown` is cancelled, and returns what can be offered: nothing without a socket. On a thread of
-/// its own that gives way: whatever comes by UDP, true or not, takes little from those who call by gRPC.
+/// Receives at `socket` until `shutdown` is cancelled, and returns what offers datagram sessions: none without a
+/// socket. Runs on its own thread of lower priority, so that UDP packets, genuine or not, take little time from calls
+/// by gRPC.
 pub(in crate::server) async fn receive(
     socket: Option<Socket>,
     origins: Arc<[HeaderValue]>,
@@ -80,7 +82,7 @@ struct Listener {
     door: Arc<Door>,
 }
 
-/// What decides about a session.
+/// Decides which sessions are accepted.
 struct Door {
     offers: Arc<Offers>,
     origins: Arc<[HeaderValue]>,
@@ -100,7 +102,7 @@ impl Listener {
         let offers = Arc::new(Offers::new(advertised, hash));
         let (door, handshakes) = (Arc::new(Door { offers, origins, traffic }), Arc::new(Semaphore::new(HANDSHAKES)));
         let mut rotation = interval(ROTATED);
-        // The first tick is at once.
+        // The first tick is immediate.
         rotation.reset();
         Ok(Listener { endpoint, rotation, handshakes, begun: HashMap::new(), door })
     }
@@ -117,7 +119,8 @@ impl Listener {
         let _ = timeout(FAREWELL, self.endpoint.wait_idle()).await;
     }
 
-    /// Begins a handshake with a client that has shown that it is where it says: so nobody makes the server answer to others.
+    /// Starts a handshake with a client that has proved its address, so that nobody can make the server send packets
+    /// to others.
     fn take(&mut self, incoming: IncomingSession) {
         if !incoming.remote_address_validated() {
             return incoming.retry();
@@ -134,12 +137,12 @@ impl Listener {
         }
     }
 
-    /// Another certificate for sessions from now on. Those that are open keep theirs; of the offers that are out the few that
-    /// nobody has taken fail, and their streams go on without datagrams.
+    /// Creates a new certificate for later sessions. Open sessions keep theirs; outstanding offers that no client has
+    /// used yet fail, and their streams continue without datagrams.
     fn rotate(&self) {
         let made = certificate::make().map_err(|error| error.to_string());
         let reloaded = made.and_then(|(identity, hash)| {
-            // The address has no meaning: the endpoint keeps its socket.
+            // The address has no effect: the endpoint keeps its socket.
             let config = ServerConfig::builder().with_bind_default(0).with_identity(identity).build();
             self.endpoint.reload_config(settled(config), false).map_err(|error| error.to_string())?;
             *lock(&self.door.offers.certificate_sha256) = hash;
@@ -151,16 +154,16 @@ impl Listener {
     }
 }
 
-/// With the settings of touch.
+/// Applies the transport settings of touch to a configuration.
 fn settled(mut config: ServerConfig) -> ServerConfig {
     config.quic_config_mut().transport_config(Arc::new(datagram::transport()));
-    // What waits for a decision about its address is retried at once.
+    // Clients whose address is not yet decided on retry at once.
     config.quic_config_mut().max_incoming(HANDSHAKES).incoming_buffer_size_total(1 << 20);
     config
 }
 
 impl Door {
-    /// Lets a session in that presents a good ticket.
+    /// Accepts a session that presents a valid ticket; counts and logs a refused one.
     async fn admit(self: Arc<Self>, incoming: IncomingSession, address: SocketAddr, _slot: OwnedSemaphorePermit) {
         let refused = match timeout(HANDSHAKE_TIMEOUT, self.enter(incoming)).await {
             Ok(Ok(())) => return,

@@ -1,8 +1,9 @@
-//! Touch by datagram: WebTransport beside gRPC, on the UDP port of the same number.
+//! Touch by datagram: WebTransport in addition to gRPC, on the UDP port of the same number.
 //!
-//! A call that the caller was let in for offers a *ticket* (`tickets`). The session that presents it belongs to that call's
-//! stream or lease, and ends with it: datagrams need no other authentication. The server signs its own certificate
-//! (`certificate`), for which the call that carries the offer vouches. `endpoint` accepts sessions, `channel` is one of them.
+//! An admitted call offers a *ticket* (`tickets`), a random number that is valid once. The session that presents it
+//! belongs to that call's stream or lease, and ends with it: datagrams need no other authentication. The server signs
+//! its own certificate (`certificate`); the call that carries the offer vouches for it by its hash. `offers` creates
+//! offers, `endpoint` accepts sessions, and `channel` is one of them.
 
 mod certificate;
 mod channel;

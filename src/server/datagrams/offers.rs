@@ -1,4 +1,4 @@
-//! Offers of datagram sessions: where to go, and with which ticket.
+//! Offers of datagram sessions: the address to connect to, and the ticket to present.
 
 use std::net::{SocketAddr, UdpSocket};
 use std::sync::{Arc, Mutex};
@@ -12,18 +12,18 @@ use palpate_realtime::clock::now_ns;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::lock::lock;
 
-/// Where datagrams are received, if at all.
+/// The UDP socket for datagrams, and the host and port that clients are sent.
 pub(in crate::server) struct Socket {
     pub(super) socket: UdpSocket,
     pub(super) advertised: (String, u16),
 }
 
 impl Socket {
-    /// The UDP socket beside the listener at `address`. `None` where datagrams are disabled, or where tickets would be sent in
-    /// the clear.
+    /// Opens the UDP socket at the address of the listener. `None` if datagrams are disabled, or if tickets would be
+    /// sent unencrypted.
     ///
     /// # Errors
-    /// Returns why the port can't be had: touch works without it.
+    /// Returns the system's error if the port is not available: touch works without it.
     pub(in crate::server) fn open(config: &Config, address: SocketAddr) -> std::io::Result<Option<Socket>> {
         let is_private = config.tls_cert.is_some() || address.ip().is_loopback();
         if !config.datagrams || !is_private {
@@ -36,11 +36,11 @@ impl Socket {
     }
 }
 
-/// Offers sessions for datagrams, or none if the server has none.
+/// Offers datagram sessions, if the server has any.
 #[derive(Clone, Default)]
 pub(in crate::server) struct Datagrams(pub(super) Option<Arc<Offers>>);
 
-/// The tickets that are out, and where they are good.
+/// The outstanding tickets, and the address and certificate for which they are valid.
 pub(super) struct Offers {
     advertised: (String, u16),
     pub(super) tickets: Mutex<Tickets>,
@@ -48,18 +48,18 @@ pub(super) struct Offers {
 }
 
 impl Offers {
-    /// Of what is received at that host and port, under the certificate of that hash.
+    /// Creates the offers of sessions at that host and port, with a certificate of that hash.
     pub(super) fn new(advertised: (String, u16), certificate_sha256: [u8; 32]) -> Self {
         Offers { advertised, tickets: Mutex::default(), certificate_sha256: Mutex::new(certificate_sha256) }
     }
 }
 
 impl Datagrams {
-    /// An offer for one stream or lease, and the session that takes it. `None` if the server has no datagrams, or too many
-    /// tickets are out.
+    /// Creates an offer for one stream or lease, and the future session that accepts it. `None` if the server has no
+    /// datagrams, or too many tickets are outstanding.
     ///
     /// # Errors
-    /// Returns an error if the system has no random numbers.
+    /// Returns an error if the system provides no random numbers.
     pub(in crate::server) fn offer(&self) -> Result<Option<(pb::DatagramOffer, Arrival)>> {
         let Some(offers) = &self.0 else { return Ok(None) };
         let Some((ticket, arrival)) = lock(&offers.tickets).give(now_ns())? else { return Ok(None) };
@@ -70,7 +70,7 @@ impl Datagrams {
     }
 }
 
-/// The refusal of a call for datagrams that the server does not have.
+/// Returns the refusal of a call for datagrams on a server without them.
 pub(in crate::server) fn not_available() -> Refusal {
     let message = "this server has no datagrams at the moment: samples come by WatchSamples, poses go by SendCommands";
     Refusal::new(Reason::NotAvailable, "", message)

@@ -1,4 +1,4 @@
-//! Tickets for datagram sessions: 128 random bits, each for one session, within ten seconds.
+//! Tickets for datagram sessions: 128 random bits, each valid for one session, within ten seconds.
 
 use std::collections::HashMap;
 use std::time::Duration;
@@ -9,17 +9,17 @@ use wtransport::Connection;
 use palpate_realtime::ids::random_bits;
 use palpate_refusal::Result;
 
-/// The session that presents a ticket, once it does.
+/// The future session that presents a ticket.
 pub(in crate::server) type Arrival = oneshot::Receiver<Connection>;
 
-/// A ticket is good for so long.
+/// Time for which a ticket is valid.
 pub(in crate::server) const GOOD: Duration = Duration::from_secs(10);
 const GOOD_NS: u64 = 1_000_000_000 * GOOD.as_secs();
 
-/// The most tickets that are out at a time; each belongs to a stream or a call.
+/// Maximum number of outstanding tickets; each belongs to a stream or a call.
 const MAX_TICKETS: usize = 4096;
 
-/// The tickets that are out.
+/// The outstanding tickets.
 #[derive(Debug, Default)]
 pub(super) struct Tickets(HashMap<[u8; 16], Ticket>);
 
@@ -30,7 +30,7 @@ struct Ticket {
 }
 
 impl Tickets {
-    /// A new ticket, and the session that will present it; `None` if too many are out.
+    /// Creates a ticket. Returns it and the future session that presents it; `None` if too many are outstanding.
     pub(super) fn give(&mut self, now_ns: u64) -> Result<Option<([u8; 16], Arrival)>> {
         if self.0.len() >= MAX_TICKETS {
             self.0.retain(|_, ticket| ticket.is_good(now_ns));
@@ -44,8 +44,8 @@ impl Tickets {
         Ok(Some((number, arrival)))
     }
 
-    /// Takes the ticket in a path, `/touch/` and 32 hexadecimal digits: where its session goes. `None` if there is none that is
-    /// good.
+    /// Takes the ticket out of a path, `/touch/` and 32 hexadecimal digits. Returns where to send its session; `None`
+    /// if there is no valid ticket.
     pub(super) fn take(&mut self, path: &str, now_ns: u64) -> Option<oneshot::Sender<Connection>> {
         let digits = path.strip_prefix("/touch/").filter(|digits| digits.len() == 32 && digits.is_ascii())?;
         let number = u128::from_str_radix(digits, 16).ok()?.to_be_bytes();

@@ -1,4 +1,4 @@
-//! What Agones is told of this server, if it runs under it.
+//! Reports the state of this server to Agones, if it runs under it.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -7,7 +7,7 @@ use super::Fleet;
 use palpate_cluster::agones::{self, ServerStatus};
 
 impl Fleet {
-    /// Tells Agones for ever; without `cluster.agones` nothing at all.
+    /// Reports to Agones until the server ends. Returns at once without `cluster.agones`.
     pub(super) async fn tell_agones(self: Arc<Self>) {
         if !self.config.cluster.agones {
             return;

@@ -1,4 +1,5 @@
-//! Sessions whose owner is gone: this server claims those for which it stands by, and goes on with them from their journals.
+//! Takes over sessions whose owner is gone: this server claims those for which it is the standby, and continues them
+//! from their journals.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -15,18 +16,18 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::journal::file::JournalFile;
 use palpate_tissue::lock::lock;
 
-/// It is looked for such sessions so often, and whenever a server comes or goes.
+/// Interval between searches for orphaned sessions. A search also runs when a server joins or leaves.
 const LOOK: Duration = Duration::from_millis(500);
 
-/// A server that starts waits so long till it can keep a session of its own, and tries so often.
+/// Longest time a starting server tries to reclaim a session of its own, and the pause between tries.
 const CLAIM_TIMEOUT: Duration = Duration::from_secs(10);
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Sessions at once.
+/// Sessions that are claimed concurrently.
 const AT_ONCE: usize = 8;
 
 impl Fleet {
-    /// Takes over for ever.
+    /// Runs until the server ends: claims sessions whose owner is gone.
     pub(super) async fn take_over(self: Arc<Self>) {
         let mut nodes = self.nodes.subscribe();
         loop {
@@ -38,13 +39,13 @@ impl Fleet {
         }
     }
 
-    /// Claims a session, if its owner is gone.
+    /// Claims a session if its owner is gone, and continues it here.
     async fn claim(self: &Arc<Self>, id: String) {
         if lock(&self.coming).contains(&id) {
             return;
         }
         if self.revision(&id).is_some() && self.pacer.has(&id) {
-            // It goes on here from what is as new.
+            // It already runs here, from a state at least as new.
             return self.stand_by.forget(&id);
         }
         let seen = match self.session_value(&id).await {
@@ -52,12 +53,12 @@ impl Fleet {
             Err(refusal) => return warn!(session = %id, "{refusal}"),
         };
         let Some((value, revision)) = seen else {
-            // It is deleted.
+            // The session is deleted.
             return self.stand_by.forget(&id);
         };
         let is_own = value.node == self.node;
         if !is_own && value.standby != self.node {
-            // Another stands by, or the owner has begun anew.
+            // Another server is its standby, or the owner has started a new journal.
             if self.is_there(&value.node) && self.stand_by.is_long_unsent(&id) {
                 self.stand_by.forget(&id);
             }
@@ -75,22 +76,23 @@ impl Fleet {
             return;
         }
         let claim = if is_own {
-            // A claim of this server was done after all. What was read may be old by now: it counts when it is written again.
+            // An earlier claim of ours succeeded. The value read may be outdated, so confirm it with another write.
             rules::keep(&self.keys, &id, revision, &self.node, "")
         } else {
-            // What is here of a course that nobody took must not be gone on with.
+            // Delete local journal data of a branch that no server continued.
             journals.remove_from(&id, run.into());
             rules::claim(&self.keys, &id, (&value, revision), &self.node)
         };
         match self.transact(claim, &id, |found| self.is_own(found, "")).await {
             Ok(Ok(revision)) => self.go_on_with(id, &value.node, revision).await,
             Ok(Err(_)) => {}
-            // What became of it shows when it is looked for the next time.
+            // The next search finds out what became of the claim.
             Err(refusal) => warn!(session = %id, "{refusal}"),
         }
     }
 
-    /// Goes on with a session of which this server has become the owner.
+    /// Continues a session of which this server has become the owner. If that fails, logs the error and leaves its
+    /// journal and key as they are.
     pub(super) async fn go_on_with(self: &Arc<Self>, id: String, from: &str, revision: u64) {
         lock(&self.owned).insert(id.clone(), Owned::since(revision));
         let (fleet, session) = (self.clone(), id.clone());
@@ -106,7 +108,7 @@ impl Fleet {
         }
     }
 
-    /// Goes on with a session from the journal that is here.
+    /// Continues a session from the journal on this server.
     fn go_on(&self, id: &str, revision: u64) -> Result<()> {
         let Some(journals) = self.journals.get() else { return Ok(()) };
         let run = self.take_newer(id, journals.folder())?;
@@ -116,7 +118,8 @@ impl Fleet {
         Ok(())
     }
 
-    /// Takes a journal for which this server stood by into its own, if it is newer than these. Tells its run.
+    /// Moves a journal that this server kept as a standby to its own journals, if it is newer than these. Returns its
+    /// run, the number of the recording; `None` if it is not newer.
     ///
     /// # Errors
     /// Refuses if it can't be moved.
@@ -130,11 +133,12 @@ impl Fleet {
         }
     }
 
-    /// The sessions in this server's folder, and those for which it stood by, that are still its own, and the revision of each: they
-    /// go on here. It may have claimed one, or been handed it, just before it ended.
+    /// Returns the sessions that this server still owns, with their revisions: those in its folder, and those for
+    /// which it was the standby. They continue here. It may have claimed one, or been handed it, just before it
+    /// ended.
     ///
     /// # Errors
-    /// Refuses while etcd can't be reached, and a folder that can't be read.
+    /// Refuses if etcd can't be reached or a folder can't be read.
     pub(in crate::server) async fn own_sessions(&self) -> Result<BTreeMap<String, u64>> {
         let folder = self.config.journal.clone().unwrap_or_default();
         let files = list(&folder)?;
@@ -145,7 +149,8 @@ impl Fleet {
         for id in ids {
             let Some((value, revision)) = self.session_value(id).await? else {
                 let newest = files.iter().rfind(|file| file.session_id == id);
-                // One from before the server was of a fleet. One that was of it, and is not in etcd, is deleted.
+                // A journal from before the server belonged to a fleet. One written in the fleet that is not in etcd
+                // is deleted.
                 let is_new = newest.is_some_and(|file| {
                     palpate_session::journal::JournalReader::open(&file.path)
                         .is_ok_and(|r| r.header().ownership_revision == 0)
@@ -168,8 +173,8 @@ impl Fleet {
         Ok(own)
     }
 
-    /// Says once more that a session is this server's. What the process before it has asked for may be under way. `None`: another has
-    /// it by now.
+    /// Confirms ownership again, since a request of the previous process may still be in flight. Returns the new
+    /// revision; `None`: another server owns it.
     async fn keep_own(&self, id: &str, mut revision: u64) -> Result<Option<u64>> {
         let until = Instant::now() + CLAIM_TIMEOUT;
         loop {
@@ -190,7 +195,7 @@ impl Fleet {
     }
 }
 
-/// The journals of a folder.
+/// Lists the journals in a folder.
 fn list(folder: &Path) -> Result<Vec<JournalFile>> {
     palpate_session::journal::file::list(folder).map_err(|error| {
         let message = format!("{}: can't be read: {error}", folder.display());

@@ -1,5 +1,5 @@
-//! Answers of a server of a fleet: behind the fence nothing more is said. A frozen server that thaws has samples and answers that
-//! waited to be sent; another server may have the session by then.
+//! Responses of a server in a fleet end once its fence has passed, the time until which it may act. A frozen server
+//! that resumes has samples and responses waiting to be sent; another server may have the session by then.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use tonic::body::Body;
 use palpate_realtime::fence::Fence;
 use palpate_realtime::fenced;
 
-/// The body of an answer, until the fence is passed.
+/// The body of a response, which ends with an error once the fence has passed.
 pub(in crate::server) struct FencedBody {
     body: Body,
     fence: Arc<Fence>,
@@ -36,7 +36,7 @@ impl http_body::Body for FencedBody {
             return Poll::Ready(None);
         }
         let frame = Pin::new(&mut self.body).poll_frame(context);
-        // After the frame was made, so that no freeze lies between.
+        // Checked after the frame was created, so that no freeze can lie between.
         if !self.fence.may_act() {
             self.is_over = true;
             let mut trailers = HeaderMap::new();

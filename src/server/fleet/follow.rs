@@ -1,5 +1,5 @@
-//! Follows the keys of this server's sessions: where another than this server has written another owner (an administrator with
-//! etcdctl, say), the session ends here. Otherwise two servers would step it.
+//! Watches the etcd keys of this server's sessions: if anyone else has written another owner (an administrator with
+//! etcdctl, for example), the session ends here. Otherwise two servers would step it.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,11 +14,11 @@ use palpate_cluster::key::{SessionValue, decode};
 use palpate_refusal::Result;
 use palpate_tissue::lock::lock;
 
-/// After a failure it is tried again so soon.
+/// Pause before another try after a failure.
 const PAUSE: Duration = Duration::from_millis(500);
 
 impl Fleet {
-    /// Follows for ever.
+    /// Watches the keys until the server ends.
     pub(super) async fn follow_owned(self: Arc<Self>) {
         let prefix = self.keys.sessions();
         loop {
@@ -38,7 +38,7 @@ impl Fleet {
                     }
                 };
                 for event in events {
-                    // A key that is deleted says of nobody that it has the session: it goes on.
+                    // A deleted key names no other owner: the session continues.
                     let WatchEvent::Put(found) = event else { continue };
                     let id = found.key.strip_prefix(&prefix);
                     if let (Some(id), Some(value)) = (id, decode::<SessionValue>(&found.value)) {
@@ -49,7 +49,7 @@ impl Fleet {
         }
     }
 
-    /// Looks at all keys of sessions. Tells the revision.
+    /// Checks the keys of all sessions. Returns their revision.
     async fn look_at_owned(&self, prefix: &str) -> Result<u64> {
         let (found, revision) = self.etcd.list(prefix).await.map_err(super::of_etcd)?;
         for found in found {
@@ -60,13 +60,14 @@ impl Fleet {
         Ok(revision)
     }
 
-    /// A key says since `revision` who has a session. One that is being handed over is looked at by who does that.
+    /// Ends a session here if its key has named another owner since `revision`. Sessions that are being handed over
+    /// are left to the task that does that.
     fn is_owned_by(&self, id: &str, value: SessionValue, revision: u64) {
         let is_newer = self.revision(id).is_some_and(|own| own < revision);
         if !is_newer || value.node == self.node || lock(&self.moving).contains(id) {
             return;
         }
-        warn!(session = %id, node = value.node, "etcd says that another server has this session: it ends here");
+        warn!(session = %id, node = value.node, "etcd names another server as the owner of this session: it ends here");
         self.tally.lost.one_more();
         let found: Found = Some((value, revision));
         self.lose(id, self.is_lost(found));

@@ -1,4 +1,5 @@
-//! Membership: the server's lease and its fence, and who else is there.
+//! Membership in the fleet: this server's lease in etcd and its fence (the time until which it may act), and the
+//! other servers.
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -20,29 +21,31 @@ use palpate_realtime::fence::boot_ns;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::lock::lock;
 
-/// After a failure it is tried again so soon.
+/// Pause before another try after a failure.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// A server that starts waits so long for etcd.
+/// Time for which a starting server waits for etcd.
 const START: Duration = Duration::from_secs(10);
 
-/// The fence is looked at so often, to end streams when it is passed.
+/// Interval between checks of the fence; streams end when it has passed.
 const LOOK: Duration = Duration::from_millis(20);
 
-/// What the server tells of itself is told so often, if it has changed.
+/// Interval at which the server publishes its own state, if it has changed.
 const TELL: Duration = Duration::from_millis(500);
 
-/// No more often than this times the number of servers: etcd then gets at most a hundred such writes a second, however many there are.
+/// That interval is at least this times the number of servers, so that etcd gets at most a hundred such writes a
+/// second.
 const TELL_EACH: Duration = Duration::from_millis(10);
 
-/// Transactions at once.
+/// Concurrent transactions.
 const AT_ONCE: usize = 16;
 
 impl Fleet {
-    /// The same, waiting a while for an etcd that is about to start too.
+    /// Registers this server's name in etcd. Retries for up to [`START`] if etcd can't be reached, since it may be
+    /// starting too.
     ///
     /// # Errors
-    /// As for [`Fleet::register`].
+    /// Returns the errors of [`Fleet::register`].
     pub(super) async fn register_first(self: &Arc<Self>) -> Result<()> {
         let until = Instant::now() + START;
         loop {
@@ -56,7 +59,7 @@ impl Fleet {
         }
     }
 
-    /// Puts this server's name in etcd, under a new lease.
+    /// Writes this server's name to etcd, under a new lease.
     ///
     /// # Errors
     /// Refuses if etcd can't be reached, or another server has this name.
@@ -72,7 +75,7 @@ impl Fleet {
             let message = format!("another server of the fleet has the name `{}`: give each its own", self.node);
             return Err(Refusal::new(Reason::OutOfTurn, "cluster.node", message));
         }
-        // The one before this process, of the same folder, has ended.
+        // The previous process with this folder has ended.
         let as_seen =
             found.map_or(Compare::Absent(key.clone()), |found| Compare::ModRevision(key.clone(), found.mod_revision));
         let put = Op::Put { key: key.clone(), value: encode(&own), lease: Some(lease.id) };
@@ -97,10 +100,10 @@ impl Fleet {
         Ok(())
     }
 
-    /// The sessions of this server go on: it takes new ones, and steps and speaks for its own while it has its lease.
+    /// Starts the server's work in the fleet: it accepts new sessions, and acts for its own while it has its lease.
     pub(in crate::server) fn begin(self: &Arc<Self>, journals: &Arc<Journals>) {
         let _ = self.journals.set(journals.clone());
-        // Those that can't be continued stay as they are, in etcd too. Others that are not here are deleted.
+        // Sessions that can't be continued keep their journals and their keys. Others that are not here are deleted.
         lock(&self.owned).retain(|id, owned| {
             owned.was_here = true;
             let stays = self.pacer.has(id) || !journals.has_left_alone(id);
@@ -122,13 +125,13 @@ impl Fleet {
         self.spawn(self.clone().tell_agones());
     }
 
-    /// Does `work` until the server is no more of the fleet.
+    /// Runs `work` until the server leaves the fleet.
     pub(super) fn spawn(&self, work: impl Future<Output = ()> + Send + 'static) -> AbortHandle {
         tokio::spawn(self.ended.clone().run_until_cancelled_owned(work)).abort_handle()
     }
 
-    /// Keeps the lease, for ever; moves the fence on. When the lease has ended, gets another, and takes back the sessions that nobody
-    /// has claimed.
+    /// Renews the lease and advances the fence, until the server ends. If the lease has ended, gets a new one and
+    /// takes back the sessions that no other server has claimed.
     pub(super) async fn keep_alive(self: Arc<Self>) {
         let every = self.between_keepalives();
         let mut is_well = true;
@@ -141,7 +144,7 @@ impl Fleet {
                     is_well = true;
                     let was_fenced = !self.pacer.fence.may_act();
                     self.confirmed_ns.store(rules::fence_ns(sent_ns, ttl_s), Ordering::Release);
-                    // Nothing is stepped or said before this server's own sessions are here.
+                    // The fence stays closed until this server's own sessions are here.
                     if self.journals.get().is_some() {
                         self.pacer.fence.set(self.confirmed_ns.load(Ordering::Acquire));
                     }
@@ -155,7 +158,7 @@ impl Fleet {
                     self.rejoin().await;
                 }
                 Err(error) => {
-                    // Once for each time that it goes away.
+                    // Logs it once per outage.
                     if std::mem::take(&mut is_well) {
                         warn!("{error}");
                     }
@@ -169,8 +172,8 @@ impl Fleet {
         Duration::from_millis(self.ttl_s * 1000 / 6)
     }
 
-    /// Gets another lease, and takes back what nobody has claimed. Nothing is stepped or said till the next keepalive. If the new lease
-    /// ends before all is taken back, it begins anew.
+    /// Gets a new lease, and takes back the sessions that no other server has claimed. The fence stays closed until
+    /// the next renewal. If the new lease ends before all are taken back, starts again.
     async fn rejoin(self: &Arc<Self>) {
         self.confirmed_ns.store(0, Ordering::Release);
         self.pacer.fence.set(0);
@@ -190,7 +193,7 @@ impl Fleet {
         }
     }
 
-    /// Keeps the lease, and leaves the fence where it is, till it has ended.
+    /// Renews the lease, without advancing the fence, until it has ended.
     async fn until_lease_ends(&self) {
         let lease = lock(&self.held).lease;
         while !matches!(self.etcd.keep_alive(lease).await, Ok(None)) {
@@ -198,7 +201,8 @@ impl Fleet {
         }
     }
 
-    /// Whether it is known of all sessions whether they still are this server's. If not, its lease has ended.
+    /// Takes back all sessions. Returns whether it is known for each of them who owns it; if not, the lease has
+    /// ended.
     async fn take_all_back(&self) -> bool {
         let owned: Vec<(String, u64)> =
             lock(&self.owned).iter().map(|(id, owned)| (id.clone(), owned.revision)).collect();
@@ -213,8 +217,8 @@ impl Fleet {
         true
     }
 
-    /// Says that this server still owns a session, or lets it go if another does. Tells whether it could find out: it can't if its
-    /// lease has ended.
+    /// Confirms in etcd that this server owns a session, or gives it up if another does. Returns whether that could
+    /// be found out: it can't if the lease has ended.
     async fn take_back(&self, id: &str, revision: u64) -> bool {
         loop {
             let keep = |revision| rules::keep(&self.keys, id, revision, &self.node, "");
@@ -232,7 +236,7 @@ impl Fleet {
                 }
                 Ok(Err(Some((value, _)))) if value.node == self.node => return false,
                 Ok(Err(found)) => {
-                    // Unless the watch of its key has told that before.
+                    // Unless the watch of its key has found that before.
                     if self.revision(id).is_some() {
                         let node = found.as_ref().map_or("", |(value, _)| &value.node);
                         info!(session = %id, node, "another server has taken over");
@@ -249,14 +253,14 @@ impl Fleet {
         }
     }
 
-    /// The refusal of a session that is found to be another server's.
+    /// Returns the refusal of a session that turned out to belong to another server.
     pub(super) fn is_lost(&self, found: Found) -> Refusal {
         let node = found.map_or_else(String::new, |(value, _)| value.node);
         let endpoint = self.nodes.borrow().get(&node).map(|there| there.endpoint.clone());
         elsewhere(&node, endpoint.unwrap_or_default())
     }
 
-    /// A session of this server has another owner.
+    /// Ends a session here that has another owner now.
     pub(super) fn lose(&self, id: &str, why: Refusal) {
         lock(&self.owned).remove(id);
         lock(&self.standbys).remove(id);
@@ -264,13 +268,13 @@ impl Fleet {
         let _ = self.pacer.leave(id, why);
     }
 
-    /// Ends streams and lets tools go when the fence is passed.
+    /// Ends streams and releases tools when the fence has passed.
     async fn watch_fence(self: Arc<Self>) {
         let mut might_act = false;
         loop {
             let may_act = self.pacer.fence.may_act();
             if might_act && !may_act {
-                error!("etcd has not confirmed the lease in time: no step is done and nothing is said until it does");
+                error!("etcd has not confirmed the lease in time: sessions stand still and silent until it does");
                 self.pacer.fall_silent();
             }
             might_act = may_act;
@@ -278,7 +282,7 @@ impl Fleet {
         }
     }
 
-    /// Reads who is there. Tells the revision.
+    /// Reads the list of servers from etcd. Returns its revision.
     pub(super) async fn list_nodes(&self) -> Result<u64> {
         let prefix = self.keys.nodes();
         let (found, revision) = self.etcd.list(&prefix).await.map_err(super::of_etcd)?;
@@ -288,7 +292,7 @@ impl Fleet {
         Ok(revision)
     }
 
-    /// Follows who is there, for ever.
+    /// Watches which servers are in the fleet, until this server ends.
     async fn watch_nodes(self: Arc<Self>) {
         let prefix = self.keys.nodes();
         loop {
@@ -331,7 +335,8 @@ impl Fleet {
         }
     }
 
-    /// Tells what this server has to do, when that has changed; forgets deleted sessions. In a large fleet it tells that less often.
+    /// Publishes this server's load when it has changed, and removes deleted sessions from etcd. Larger fleets do so
+    /// less often.
     async fn tell(self: Arc<Self>) {
         let mut told = None;
         loop {
@@ -346,8 +351,8 @@ impl Fleet {
         }
     }
 
-    /// Writes the server's key, as this process has left it: so an older process, or one that waited, can't bring it under an older
-    /// lease.
+    /// Writes the server's key if it is unchanged since this process last wrote it, so that neither an older process
+    /// nor a delayed request can restore it under an old lease. Returns whether it was written.
     async fn tell_once(&self, own: &NodeValue) -> bool {
         let HeldLease { lease, key_revision } = *lock(&self.held);
         let key = self.keys.node(&self.node);
@@ -360,21 +365,21 @@ impl Fleet {
         };
         let now = match written {
             Some(revision) => Some(revision),
-            // It may have been written all the same.
+            // The write may have succeeded all the same.
             None => match self.etcd.get(&key).await {
                 Ok((found, _)) => found.filter(|found| found.lease == lease).map(|found| found.mod_revision),
                 Err(_) => None,
             },
         };
         let mut held = lock(&self.held);
-        // Not if it has a new lease by now.
+        // Not if it has a new lease in the meantime.
         if let Some(now) = now.filter(|_| held.lease == lease) {
             held.key_revision = held.key_revision.max(now);
         }
         written.is_some()
     }
 
-    /// What this server has to do.
+    /// Measures this server's load and number of sessions.
     #[allow(clippy::cast_precision_loss)]
     fn measure(&self) -> NodeValue {
         let sessions = self.pacer.list();
@@ -386,7 +391,7 @@ impl Fleet {
         own.clone()
     }
 
-    /// How this server stands, for Prometheus.
+    /// Returns the state of this server in the fleet, for Prometheus.
     pub(in crate::server) fn standing(&self) -> Standing {
         let (mirrored_bytes, unmirrored_bytes) = self.growth.mirrored_bytes();
         let owned: Vec<String> = lock(&self.owned).keys().cloned().collect();
@@ -410,7 +415,7 @@ impl Fleet {
         }
     }
 
-    /// The server ends: others may take over at once.
+    /// Leaves the fleet, so that others can take over at once. Waits up to 2 s until the journals are replicated.
     pub(in crate::server) async fn leave(&self) {
         let until = Instant::now() + Duration::from_secs(2);
         while !self.growth.is_mirrored() && self.nodes.borrow().len() > 1 && Instant::now() < until {

@@ -1,8 +1,8 @@
-//! Moves sessions of this server to others while they go on.
+//! Moves sessions of this server to others while they run.
 //!
-//! The other server first gets the session's state while it goes on, and makes its tissue of that: the longer part. Then the session
-//! stands here, the other gets its last state, and etcd says in one transaction that it is the owner. If anything fails before that,
-//! the session goes on here.
+//! The other server first gets the session's state while it runs here, and builds its tissue from it: the longer
+//! part. Then the session stands still here, the other server gets its last state, and one transaction in etcd makes
+//! it the owner. If anything fails before that, the session continues here.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -32,23 +32,23 @@ use palpate_session::lease::HandedLease;
 use palpate_tissue::lock::lock;
 use palpate_tissue::response::force_law::Disc;
 
-/// The other server makes the tissue within this time, or the session stays.
+/// Time limit for the other server to build the tissue; beyond it the session stays.
 const PREPARATION: Duration = Duration::from_secs(30);
 
-/// etcd says within this time what is at the session's key, or the session stays.
+/// Time limit for etcd to return the session's key; beyond it the session stays.
 const CERTAINTY: Duration = Duration::from_secs(5);
 
-/// The session stands for no longer than this.
+/// Longest time for which the session stands still.
 const STANDSTILL: Duration = Duration::from_secs(2);
 
-/// Bytes in one message.
+/// Bytes of a state per message.
 const PART_BYTES: usize = 256 << 10;
 
 pub(super) fn broken(why: &str) -> Refusal {
     Refusal::new(Reason::NotAvailable, "node", format!("the session stays here: {why}"))
 }
 
-/// One stream to the server that is to take a session.
+/// A stream to the server that is to take a session.
 struct Handing {
     say: mpsc::Sender<pb::TakeSessionRequest>,
     heard: Streaming<pb::TakeSessionResponse>,
@@ -84,7 +84,8 @@ fn held_lease(lease: HandedLease) -> pb::HeldLease {
     pb::HeldLease { tool, lease_id: format!("{id:032x}"), holder, lease_s: duration_ns as f64 * 1e-9, owner }
 }
 
-/// Tells the other server that it has the session, what was in its intake, and what is known of its tissue.
+/// Completes the handover: sends the other server the inputs that waited, the leases, and the force laws known for
+/// its tissue.
 async fn hand(handing: &mut Handing, revision: u64, handed: Handed, laws: Vec<(Disc, Arc<Law>)>) -> Result<()> {
     for piece in inputs::encoded(&handed.waiting) {
         handing.send(Say::Waiting(piece)).await?;
@@ -100,7 +101,7 @@ async fn hand(handing: &mut Handing, revision: u64, handed: Handed, laws: Vec<(D
     handing.answered().await
 }
 
-/// A session that is being handed over, till this is dropped.
+/// Marks a session as being handed over, until it is dropped.
 struct Moving<'f> {
     fleet: &'f Fleet,
     id: String,
@@ -113,17 +114,19 @@ impl Drop for Moving<'_> {
 }
 
 impl Fleet {
-    /// Moves a session of this server to `node`, or, if that is empty, to the one with the most room. Tells who has it then, and for
-    /// how long no step was done, s.
+    /// Moves a session of this server to `node`, or, if that is empty, to the server with the most room. Returns the
+    /// new owner, and the time for which no step was done, s.
     ///
     /// # Errors
-    /// Refuses an unknown node, one that gives other bits, and if the other does not take it: then the session goes on here.
+    /// Refuses an unknown node, one that computes different bits, and if the other server does not take it: then the
+    /// session continues here.
     pub(in crate::server) async fn move_session(
         self: Arc<Self>,
         handle: Arc<SessionHandle>,
         node: &str,
     ) -> Result<(pb::Ownership, f64)> {
-        // Also if nobody waits for the answer any more: a session must not be left standing.
+        // In a task of its own, which runs even if nobody waits for the answer any longer: a session must not be left
+        // standing still.
         let (fleet, node) = (self.clone(), node.to_owned());
         let moved = tokio::spawn(async move { fleet.move_to(&handle, &node).await });
         moved.await.map_err(|error| broken(&error.to_string()))?
@@ -177,7 +180,7 @@ impl Fleet {
                     return Err(refusal);
                 }
                 found => {
-                    // Else who found that out has done so.
+                    // Otherwise the task that found that out has ended it.
                     if self.revision(&handle.id).is_some() {
                         self.lose(&handle.id, self.is_lost(found));
                     }
@@ -196,10 +199,10 @@ impl Fleet {
         Ok((self.ownership(&value, revision), gap_s))
     }
 
-    /// A session begins to be handed over, till what is returned is dropped.
+    /// Marks a session as being handed over, until the returned value is dropped.
     ///
     /// # Errors
-    /// Refuses one that is not this server's, or is being handed over.
+    /// Refuses a session that is not this server's, or is being handed over already.
     fn begins_to_move(&self, id: &str) -> Result<Moving<'_>> {
         if !lock(&self.moving).insert(id.to_owned()) {
             return Err(Refusal::new(Reason::OutOfTurn, "session_id", "the session is being moved already"));
@@ -208,11 +211,11 @@ impl Fleet {
         self.revision(id).map(|_| moving).ok_or_else(|| broken("it is not this server's"))
     }
 
-    /// Waits until etcd says for certain who stands by for a session that begins to move. One that has just been created is about to
-    /// be told of its first: with that its key changes, and what was asked for at the revision before fails.
+    /// Waits until etcd has confirmed the standby of a session that is about to move. A new session is about to get
+    /// its first standby: that changes its key, and a transaction at the revision before fails.
     ///
     /// # Errors
-    /// Refuses if etcd does not say so in time, and if another server has the session.
+    /// Refuses if etcd does not answer in time, and if another server has the session.
     async fn ends_naming(&self, id: &str) -> Result<()> {
         if lock(&self.standbys).get(id).is_none_or(|standby| standby.naming.is_none()) {
             return Ok(());
@@ -225,7 +228,8 @@ impl Fleet {
         }
     }
 
-    /// Why a transaction for a session of this server at `revision` was not done, by what is at the session's key instead.
+    /// Describes why a transaction for a session of this server at `revision` failed, by what its key contains
+    /// instead.
     fn why_not(&self, found: Option<&(SessionValue, u64)>, revision: u64) -> String {
         match found {
             None => "it is not this server's any more".to_owned(),
@@ -235,7 +239,8 @@ impl Fleet {
         }
     }
 
-    /// The last part: the session stands.
+    /// The last part of a move, while the session stands still. Returns the revision at which the other server owns
+    /// it.
     async fn hand_over(
         &self,
         handle: &Arc<SessionHandle>,
@@ -243,7 +248,8 @@ impl Fleet {
         to: &str,
         handing: &mut Handing,
     ) -> Result<u64> {
-        // The other server is told the revision at which it is handed over, and goes by that: at another it is not.
+        // The other server learns the revision at which it is handed over: a transaction at another one does not
+        // concern it.
         let revision = self.revision(&handle.id).ok_or_else(|| broken("it is not this server's"))?;
         handle.is_owned_since(revision);
         let last = self.state_of(handle, present).await?;
@@ -254,7 +260,7 @@ impl Fleet {
         let over = rules::hand_over(&self.keys, &handle.id, revision, [&self.node, to]);
         let made = self.transact(over, &handle.id, |found| found.is_some_and(|value| value.node == to)).await?;
         let revision = made.map_err(|found| broken(&self.why_not(found.as_ref(), revision)))?;
-        // From here on the session is the other's, whatever becomes of this stream.
+        // From here on the session belongs to the other server, whatever happens to this stream.
         let endpoint = self.nodes.borrow().get(to).map(|node| node.endpoint.clone()).unwrap_or_default();
         let (handed, _) = handle.at_intake(|intake, _| intake.hand_over(elsewhere(to, endpoint)));
         if hand(handing, revision, handed, handle.known_laws()).await.is_err() {
@@ -263,12 +269,13 @@ impl Fleet {
         Ok(revision)
     }
 
-    /// Who has the session, after a transaction that may still be done: this server says once more that it has it, after which the
-    /// other can't be done any more. However long that takes, the session stands.
+    /// Finds out who has the session after a transaction that may still take place: this server confirms its
+    /// ownership again, after which the earlier transaction can't take place any longer. The session stands still
+    /// until that is known.
     async fn settled(&self, id: &str) -> Found {
         loop {
             let revision = self.revision(id)?;
-            // Who certainly stands by goes on to do so.
+            // A confirmed standby stays the standby.
             let named = lock(&self.standbys).get(id).filter(|standby| standby.naming.is_none()).cloned();
             let standby = named.unwrap_or_default().named;
             let keep = |revision| rules::keep(&self.keys, id, revision, &self.node, &standby);
@@ -285,7 +292,7 @@ impl Fleet {
                         .for_each(|handle| handle.is_owned_since(now));
                     return Some((SessionValue { node: self.node.clone(), standby }, now));
                 }
-                // Its lease has ended: what was asked for may still be done when it has another.
+                // Its lease has ended: the request may still take place when it has another.
                 Ok(Err(Some((value, _)))) if value.node == self.node => {}
                 Ok(Err(found)) => return found,
                 Err(refusal) => warn!(session = %id, "who has this session is not known: {refusal}"),
@@ -300,7 +307,8 @@ impl Fleet {
         encoded.map_err(|error| broken(&error.to_string()))?
     }
 
-    /// Takes no new sessions, and moves all to others; or takes sessions again. Tells what became of each.
+    /// Stops accepting sessions and moves all to others, or, if `is_on` is false, accepts sessions again. Yields the
+    /// result for each session.
     pub(in crate::server) fn drain(self: Arc<Self>, is_on: bool) -> impl Stream<Item = pb::DrainNodeResponse> {
         self.set_draining(is_on);
         let sessions = if is_on { self.pacer.list() } else { Vec::new() };

@@ -1,9 +1,12 @@
-//! This server as one of a fleet. `member` keeps its lease, and with it the fence; `mirror` sends journals to the servers that
-//! stand by, `receive` takes in those of others, which `stand_by` keeps; `take_over` claims sessions whose owner is gone,
-//! `hand_over` moves those of this server, and `take_in` takes those of others. `owned` keeps the keys of this server's sessions,
-//! `follow` ends those that etcd says are another's, and `settle` puts right what etcd says of it and is not so.
+//! This server as a member of a fleet. `member` keeps its lease in etcd, and with it the *fence*: the time until
+//! which it may act for its sessions. `owned` keeps the etcd keys of this server's sessions, `follow` ends sessions
+//! whose key names another owner, and `reconcile` repairs keys that wrongly name this server. `replication` sends
+//! journals to the standby servers; `replica_receiver` receives the journals of others, which `replica` keeps.
+//! `failover` claims sessions whose owner is gone, `migrate` moves sessions of this server to others, and `receive`
+//! takes sessions that others hand over. `peers` holds the connections to other servers, `fenced` ends responses at
+//! the fence, and `counters` and `agones` report the state.
 //!
-//! Clients connect to the owner of a session. No call is passed on but the creation of a session.
+//! Clients connect to the owner of a session. No call is forwarded except the creation of a session.
 
 #[cfg(feature = "agones")]
 mod agones;
@@ -47,13 +50,13 @@ use palpate_tissue::lock::lock;
 use peers::Peers;
 use replica::StandBy;
 
-/// URLs of other servers that a client is told.
+/// Maximum number of URLs of other servers that a client is sent.
 const MAX_OTHERS: usize = 8;
 
-/// The nodes of a fleet, by name.
+/// The servers of a fleet, by name.
 type Nodes = BTreeMap<String, NodeValue>;
 
-/// This server as one of a fleet.
+/// This server as a member of a fleet.
 pub(super) struct Fleet {
     /// This server's name.
     node: String,
@@ -63,63 +66,63 @@ pub(super) struct Fleet {
     pacer: Arc<Pacer>,
     config: Arc<Config>,
     nodes: watch::Sender<Arc<Nodes>>,
-    /// What this server tells of itself.
+    /// The state that this server publishes of itself.
     own: Mutex<NodeValue>,
-    /// Sessions that were sent to a node since it told how many it has.
+    /// Sessions that were sent to each server since it last published how many it has.
     sent: Mutex<BTreeMap<String, u32>>,
     peers: Peers,
     /// The sessions of which this server is the owner in etcd.
     owned: Mutex<BTreeMap<String, Owned>>,
-    /// Sessions that are coming to this server: handed over, claimed, or found again. They are not its own yet.
+    /// Sessions that are arriving at this server: handed over, claimed, or found again. It does not own them yet.
     coming: Mutex<BTreeSet<String>>,
-    /// Sessions that this server is handing over: it names nobody who stands by for them meanwhile.
+    /// Sessions that this server is handing over: meanwhile it names no standby for them.
     moving: Mutex<BTreeSet<String>>,
-    /// Sessions that can't go on here: their journals and their keys stay as they are.
+    /// Sessions that can't continue here: their journals and keys stay as they are.
     left_alone: Mutex<BTreeSet<String>>,
-    /// The end of a transaction is unknown: etcd may say of this server what is not so.
+    /// Notified when the result of a transaction is unknown: etcd may name this server wrongly as an owner.
     unsettled: Notify,
     growth: Arc<Growth>,
     tally: counters::FleetTally,
     stand_by: StandBy,
-    /// Who stands by for each session.
+    /// The standby of each session.
     standbys: Mutex<BTreeMap<String, Standby>>,
-    /// Sessions that are deleted or were moved, and that servers need not stand by for any more, by the server.
+    /// Deleted or moved sessions whose journals the named server need not keep any longer, by server.
     past: Mutex<BTreeMap<String, Vec<String>>>,
     journals: OnceLock<Arc<Journals>>,
     held: Mutex<HeldLease>,
-    /// The fence that etcd has confirmed, also before this server acts for sessions.
+    /// The fence that etcd has confirmed, ns, also before this server acts for sessions.
     confirmed_ns: AtomicU64,
     is_draining: AtomicBool,
-    /// It is no more of the fleet.
+    /// Cancelled when the server leaves the fleet.
     ended: CancellationToken,
 }
 
-/// What this server holds in etcd.
+/// This server's lease and key in etcd.
 #[derive(Debug, Clone, Copy, Default)]
 struct HeldLease {
-    /// Its lease; 0 before it has one.
+    /// The lease; 0 before it has one.
     lease: i64,
-    /// The revision at which this process has last written the server's key.
+    /// The revision at which this process last wrote the server's key.
     key_revision: u64,
 }
 
-/// Who stands by for a session.
+/// The standby of a session: the server that keeps a copy of its journal and may take it over.
 #[derive(Debug, Clone, Default)]
 struct Standby {
-    /// As etcd says; empty if it says of none.
+    /// The standby in etcd; empty if there is none.
     named: String,
-    /// A server that has all, and is about to be named. Till etcd has said so, nothing further counts as mirrored: either may be the
-    /// one that claims the session.
+    /// A server that has the whole journal and is about to be named. Until etcd has confirmed it, nothing further
+    /// counts as replicated: either may be the one that claims the session.
     naming: Option<String>,
 }
 
 impl Standby {
-    /// Whether what that server has counts.
+    /// Returns whether `name` is the confirmed standby, so that its copy counts as replicated.
     fn is(&self, name: &str) -> bool {
         self.naming.is_none() && self.named == name
     }
 
-    /// Whether etcd may say that it is that server: what it has is kept there.
+    /// Returns whether etcd may name `name` as the standby: the copy there is kept.
     fn may_be(&self, name: &str) -> bool {
         self.named == name || self.naming.as_deref() == Some(name)
     }
@@ -128,25 +131,26 @@ impl Standby {
 /// A session of which this server is the owner in etcd.
 struct Owned {
     revision: u64,
-    /// It has been here: if it is not any more, it is deleted.
+    /// Whether it has been here: if so and it is gone, it was deleted.
     was_here: bool,
     since_ns: u64,
 }
 
 impl Owned {
-    /// Since that revision; the session is about to come.
+    /// Creates the entry of a session owned since that revision; the session is about to arrive.
     fn since(revision: u64) -> Self {
         Owned { revision, was_here: false, since_ns: now_ns() }
     }
 }
 
-/// A refusal because etcd does not answer, or not as asked.
+/// Returns the refusal of a call that etcd did not answer, or not as expected.
 fn of_etcd(error: EtcdError) -> Refusal {
     Refusal::new(Reason::Fenced, "", error.to_string())
 }
 
 impl Fleet {
-    /// Joins the fleet: the server's name is in etcd, under a lease that is kept from then on. It does not act for sessions yet.
+    /// Joins the fleet: writes the server's name to etcd, under a lease that it renews from then on. The server does
+    /// not act for sessions yet.
     ///
     /// # Errors
     /// Refuses if etcd can't be reached, or another server has this name.
@@ -172,7 +176,7 @@ impl Fleet {
             threads: u32::try_from(config.stepping_threads()).unwrap_or(u32::MAX),
             load: 0.0,
             sessions: 0,
-            // Until its own sessions go on, others must not send it new ones.
+            // Until its own sessions continue, others must not send it new ones.
             draining: true,
         };
         let fleet = Arc::new(Fleet {
@@ -202,22 +206,22 @@ impl Fleet {
             is_draining: false.into(),
             ended: CancellationToken::new(),
         });
-        // Nothing is stepped or said before the lease is there.
+        // The fence stays closed until the server has a lease.
         pacer.fence.set(0);
         fleet.register_first().await?;
-        // Also while its own sessions are looked for, which may take longer than the lease.
+        // Runs also while the server looks for its own sessions, which may take longer than the lease.
         fleet.spawn(fleet.clone().keep_alive());
-        // From then on they are watched: a list that came late would hide what that has told.
+        // The watch starts later: a list read after it could hide its newer events.
         fleet.list_nodes().await?;
         Ok(fleet)
     }
 
-    /// The account of that name.
+    /// Returns the account with that name.
     pub(super) fn account(&self, name: &str) -> Account {
         self.pacer.budget.account(name)
     }
 
-    /// What the keeper of journals tells.
+    /// Returns the progress of the journals, which their keeper updates.
     pub(super) fn growth(&self) -> Arc<Growth> {
         self.growth.clone()
     }
@@ -239,16 +243,16 @@ impl Fleet {
         }
     }
 
-    /// Who serves a session of this server, as clients are told.
+    /// Returns the ownership of a session of this server, as clients receive it.
     pub(super) fn own(&self, handle: &SessionHandle) -> pb::Ownership {
         let standby = lock(&self.standbys).get(&handle.id).map(|standby| standby.named.clone()).unwrap_or_default();
         self.ownership(&SessionValue { node: self.node.clone(), standby }, handle.revision())
     }
 
-    /// Who serves a session.
+    /// Returns the server that owns a session.
     ///
     /// # Errors
-    /// Refuses an unknown ID, while etcd can't be reached, and while nobody serves it.
+    /// Refuses an unknown ID, and if etcd can't be reached or no server has the session now.
     pub(super) async fn locate(&self, id: &str) -> Result<pb::Ownership> {
         let unknown =
             || Refusal::new(Reason::UnknownSession, "session_id", format!("there is no session `{}`", excerpt(id)));
@@ -260,7 +264,7 @@ impl Fleet {
         Ok(self.ownership(&value, revision))
     }
 
-    /// Why this server does not serve a session that is `unknown` here.
+    /// Returns why this server does not serve a session that is `unknown` here.
     pub(super) async fn refuse(&self, id: &str, unknown: Refusal) -> Refusal {
         match self.locate(id).await {
             Ok(ownership) if ownership.node == self.node => between_owners(Some(&self.node)),
@@ -270,7 +274,8 @@ impl Fleet {
         }
     }
 
-    /// The node that is to take a new session, if that is another.
+    /// Returns the name and endpoint of the server that is to create a new session, if it is another one. Counts the
+    /// session as sent to it.
     fn place(&self) -> Option<(String, String)> {
         let mut nodes = (**self.nodes.borrow()).clone();
         let mut sent = lock(&self.sent);
@@ -283,14 +288,14 @@ impl Fleet {
         (name != self.node).then_some((name, endpoint))
     }
 
-    /// Has another node create a session, if one has more room. `None`: this server is to do it.
+    /// Lets another server create a session, if one has more room. `None`: this server is to create it.
     pub(super) async fn create_elsewhere(
         &self,
         request: &pb::CreateSessionRequest,
         owner: &Account,
     ) -> Option<std::result::Result<pb::Session, tonic::Status>> {
         use pb::create_session_request::Source;
-        // A mesh or a journal that a client has sent is here.
+        // An uploaded mesh or journal is on this server.
         let is_anywhere = match &request.source {
             Some(Source::SceneName(_)) => true,
             Some(Source::Scene(scene)) => scene.mesh.is_none(),
@@ -304,13 +309,13 @@ impl Fleet {
         let created = self.peers.at(&endpoint).ok()?.create_here(here).await;
         match created {
             Ok(answer) => answer.into_inner().session.map(Ok),
-            // It is not there, or has just lost its lease: then this server does it.
+            // That server is gone, or has just lost its lease: this server creates the session.
             Err(status) if status.code() == tonic::Code::Unavailable => None,
             Err(status) => Some(Err(status)),
         }
     }
 
-    /// The servers of the fleet.
+    /// Returns the servers of the fleet.
     pub(super) fn nodes(&self) -> Vec<pb::Node> {
         let nodes = self.nodes.borrow();
         let of = |(name, node): (&String, &NodeValue)| pb::Node {
@@ -326,10 +331,10 @@ impl Fleet {
         nodes.iter().map(of).collect()
     }
 
-    /// The sessions of the fleet, by ID.
+    /// Returns the sessions of the fleet, by ID.
     ///
     /// # Errors
-    /// Refuses while etcd can't be reached.
+    /// Refuses if etcd can't be reached.
     pub(super) async fn sessions(&self) -> Result<Vec<pb::FleetSession>> {
         let prefix = self.keys.sessions();
         let (found, _) = self.etcd.list(&prefix).await.map_err(of_etcd)?;
@@ -342,13 +347,13 @@ impl Fleet {
         Ok(found.into_iter().filter_map(of).collect())
     }
 
-    /// Whether this server takes no new sessions.
+    /// Sets whether this server refuses new sessions.
     fn set_draining(&self, is_draining: bool) {
         self.is_draining.store(is_draining, Ordering::Relaxed);
     }
 }
 
-/// The refusal of a session that no server has now; `standby` is the one that may claim it, if it is there.
+/// Returns the refusal of a session that no server has now; `standby` is the server that may claim it, if it runs.
 fn between_owners(standby: Option<&str>) -> Refusal {
     let message = match standby {
         Some(node) => {
@@ -362,7 +367,7 @@ fn between_owners(standby: Option<&str>) -> Refusal {
     Refusal::new(Reason::Fenced, "session_id", message)
 }
 
-/// The refusal of a session that another server has.
+/// Returns the refusal of a session that another server has.
 fn elsewhere(node: &str, endpoint: String) -> Refusal {
     let message = format!("the server `{node}` of the fleet has this session; connect there");
     Refusal { place: Some(endpoint), ..Refusal::new(Reason::Elsewhere, "session_id", message) }

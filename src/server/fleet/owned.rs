@@ -1,4 +1,5 @@
-//! The sessions of which this server is the owner in etcd: made, kept, and deleted; and how it is told what became of a transaction.
+//! The sessions that this server owns in etcd: their keys are created, confirmed and deleted here, and unclear
+//! transactions resolved.
 
 use std::result::Result as Made;
 use std::sync::Arc;
@@ -17,19 +18,20 @@ use palpate_realtime::ids::random_id;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::lock::lock;
 
-/// A session that does not come within this time, ns, was given up by who wanted it.
+/// Time after which a session that was announced and has not arrived counts as given up, ns.
 const COMES_NS: u64 = 300_000_000_000;
 
-/// A deletion waits so long for etcd.
+/// Longest time for which a deletion waits for etcd.
 const DELETE_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// etcd is asked again so soon.
+/// Pause before etcd is asked again.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// What is at a session's key, and since which revision.
+/// The value of a session's key and its revision; `None` if there is no such key.
 pub(super) type Found = Option<(SessionValue, u64)>;
 
-/// A session that is coming to this server, till this is dropped: nobody else here claims it, takes it in or settles it.
+/// Marks a session as arriving at this server, until it is dropped: no other task here claims it, receives it or
+/// reconciles it.
 pub(super) struct Coming {
     fleet: Arc<Fleet>,
     id: String,
@@ -41,7 +43,7 @@ impl Drop for Coming {
     }
 }
 
-/// The revision that a transaction finds at `key`, or fails; 0 if it finds none.
+/// Returns the revision that a transaction requires at `key`; 0 if it requires none.
 fn found_at(txn: &Txn, key: &str) -> u64 {
     let at = |compare: &Compare| match compare {
         Compare::ModRevision(of, revision) if of == key => Some(*revision),
@@ -51,11 +53,11 @@ fn found_at(txn: &Txn, key: &str) -> u64 {
 }
 
 impl Fleet {
-    /// A transaction whose end may be unknown: if so, what etcd has is read. `is_done` tells by that whether it took place. Tells the
-    /// revision that it made, or what is there instead.
+    /// Runs a transaction whose result may be unknown: then reads the session's key, from which `is_done` decides
+    /// whether it took place. Returns the new revision, or what the key contains instead.
     ///
     /// # Errors
-    /// Refuses while etcd can't be reached, and if it can't be told yet: what was asked for may still come.
+    /// Refuses if etcd can't be reached, and if the result can't be determined yet: the request may still take place.
     pub(super) async fn transact(
         &self,
         txn: Txn,
@@ -77,7 +79,7 @@ impl Fleet {
         let (found, _) = self.etcd.get(&key).await.map_err(of_etcd)?;
         let found = found.and_then(|found| Some((decode::<SessionValue>(&found.value)?, found.mod_revision)));
         let Some(unknown) = unknown else { return Ok(Err(found)) };
-        // A key that is as it was proves nothing, also if it has what was asked for: that may have been so before.
+        // An unchanged key proves nothing, even if it has the requested value: it may have had it before.
         let now = found.as_ref().map_or(0, |found| found.1);
         if now == before {
             return Err(of_etcd(unknown));
@@ -85,11 +87,12 @@ impl Fleet {
         Ok(if is_done(found.as_ref().map(|found| &found.0)) { Ok(now) } else { Err(found) })
     }
 
-    /// Changes the key of a session of this server: `make` gives the transaction for the revision that the key has. This server may
-    /// have changed the key itself since it looked: then it is made anew. Tells the revision, or what is there if that is another's.
+    /// Changes the key of a session of this server: `make` returns the transaction for the key's current revision. If
+    /// this server itself has changed the key in the meantime, tries again with the new revision. Returns the new
+    /// revision, or what the key contains if it belongs to another server.
     ///
     /// # Errors
-    /// As for [`Fleet::transact`].
+    /// Returns the errors of [`Fleet::transact`].
     pub(super) async fn change(
         &self,
         id: &str,
@@ -105,13 +108,13 @@ impl Fleet {
         }
     }
 
-    /// Whether a key says that this server is the owner, and who stands by.
+    /// Returns whether a key names this server as the owner and `standby` as its standby.
     pub(super) fn is_own(&self, found: Option<&SessionValue>, standby: &str) -> bool {
         found.is_some_and(|value| value.node == self.node && value.standby == standby)
     }
 
-    /// The session's key has been written at that revision: whether that is its newest, so far as this server knows. An answer may
-    /// come late.
+    /// Records that the session's key was written at that revision. Returns whether it is the newest that this server
+    /// knows: an answer may arrive late.
     pub(super) fn owns_since(&self, id: &str, revision: u64) -> bool {
         let mut all = lock(&self.owned);
         let Some(owned) = all.get_mut(id).filter(|owned| owned.revision <= revision) else { return false };
@@ -119,17 +122,17 @@ impl Fleet {
         true
     }
 
-    /// A session begins to come to this server. `None` if it does already, or is here.
+    /// Marks a session as arriving at this server. `None` if it is arriving already, or is here.
     pub(super) fn comes(self: &Arc<Self>, id: &str) -> Option<Coming> {
         let is_new = lock(&self.coming).insert(id.to_owned());
         let coming = is_new.then(|| Coming { fleet: self.clone(), id: id.to_owned() })?;
         (self.revision(id).is_none() && !self.pacer.has(id)).then_some(coming)
     }
 
-    /// Makes this server the owner of a new session.
+    /// Creates the etcd key of a new session, with this server as its owner.
     ///
     /// # Errors
-    /// Refuses while etcd can't be reached, and if this server has lost its lease.
+    /// Refuses if etcd can't be reached, and if this server has lost its lease.
     pub(in crate::server) async fn birth(&self) -> Result<SessionReservation> {
         let id = random_id()?;
         let made = self.transact(rules::create(&self.keys, &id, &self.node), &id, |found| found.is_some()).await?;
@@ -138,7 +141,7 @@ impl Fleet {
         Ok(SessionReservation { id, revision, recorded: true })
     }
 
-    /// The session of a birth is there; or, if `is_there` is false, will not come.
+    /// Records that the session of a reservation was created, or, if `is_there` is false, removes its key.
     pub(in crate::server) async fn born(&self, birth: &SessionReservation, is_there: bool) {
         if let Some(owned) = lock(&self.owned).get_mut(&birth.id) {
             owned.was_here = true;
@@ -148,7 +151,7 @@ impl Fleet {
         }
     }
 
-    /// Sessions that this server has no more, because they are deleted, are no more in etcd either.
+    /// Deletes the etcd keys of sessions that were deleted on this server, or never arrived.
     pub(super) async fn forget_the_deleted(&self) {
         let mut gone = Vec::new();
         for (id, owned) in lock(&self.owned).iter_mut() {
@@ -165,7 +168,7 @@ impl Fleet {
         }
     }
 
-    /// Deletes the key of a session of this server. Tells who has the session, if that is another.
+    /// Deletes the key of a session of this server. Returns the value of the key if another server has the session.
     async fn forget(&self, id: &str, revision: u64) -> Result<Option<SessionValue>> {
         let delete = |revision| rules::delete(&self.keys, id, revision);
         let found = match self.change(id, revision, delete, |found| found.is_none()).await? {
@@ -184,13 +187,13 @@ impl Fleet {
     /// Waits until a session that was deleted here is deleted in etcd too.
     ///
     /// # Errors
-    /// Refuses if etcd does not confirm that in time: then the deletion goes on later. Refuses if another server has the session by
-    /// now.
+    /// Refuses if etcd does not confirm that in time: then the deletion continues later. Refuses if another server
+    /// has the session in the meantime.
     pub(in crate::server) async fn until_deleted(&self, id: &str) -> Result<()> {
         let until = Instant::now() + DELETE_TIMEOUT;
         loop {
             let Some(revision) = self.revision(id) else {
-                // Somebody else here was quicker.
+                // Another task of this server has deleted it.
                 return match self.session_value(id).await {
                     Ok(None) => Ok(()),
                     Ok(Some((value, _))) => Err(not_deleted(&format!("the server `{}` has the session", value.node))),
@@ -210,14 +213,14 @@ impl Fleet {
         }
     }
 
-    /// The revision at which this server owns a session.
+    /// Returns the revision at which this server owns a session; `None` if it does not.
     pub(super) fn revision(&self, id: &str) -> Option<u64> {
         lock(&self.owned).get(id).map(|owned| owned.revision)
     }
 
-    /// The session's key in etcd.
+    /// Reads the session's key in etcd.
     pub(super) async fn session_value(&self, id: &str) -> Result<Found> {
-        // What is no ID would be another key.
+        // A text that is not an ID would be another key.
         if id.len() != 32 || !id.bytes().all(|byte| byte.is_ascii_hexdigit()) {
             return Ok(None);
         }
@@ -226,7 +229,7 @@ impl Fleet {
     }
 }
 
-/// The refusal of a deletion that etcd has not confirmed.
+/// Returns the refusal of a deletion that etcd has not confirmed.
 fn not_deleted(why: &str) -> Refusal {
     let message =
         format!("the session is deleted on this server, but whether the fleet has it no more is not sure yet: {why}");

@@ -16,18 +16,18 @@ use palpate_cluster::etcd::root;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::lock::lock;
 
-/// A server that is silent for so long is given up.
+/// Time without an answer after which a server counts as unreachable.
 const SILENCE: Duration = Duration::from_secs(1);
 
-/// How to reach the other servers.
+/// The connections to the other servers, by their URLs.
 pub(super) struct Peers {
-    /// This server's certificate and the authorities of theirs, as the files are now.
+    /// This server's certificate and the authorities of the others, as the files are now.
     tls: Option<Arc<Reloaded<ClientTlsConfig>>>,
-    /// Each with the version of these files by which it was made.
+    /// Each connection, with the version of these files for which it was made.
     channels: Mutex<BTreeMap<String, (u64, Channel)>>,
 }
 
-/// Of the authorities, and this server's certificate and key if it has one.
+/// Builds the configuration from the authorities, and this server's certificate and key if it has one.
 fn configure(texts: &[String]) -> Result<ClientTlsConfig> {
     let mut tls = ClientTlsConfig::new();
     let mut texts = texts.iter();
@@ -37,19 +37,19 @@ fn configure(texts: &[String]) -> Result<ClientTlsConfig> {
     if let (Some(cert), Some(key)) = (texts.next(), texts.next()) {
         tls = tls.identity(Identity::from_pem(cert, key));
     }
-    // The library reads them only now. Its error quotes no key.
+    // The library parses them only here. Its error quotes no key.
     let tried = Endpoint::from_static("https://localhost").tls_config(tls.clone());
     tried.map_err(|error| Refusal::new(Reason::Unreadable, "cluster.ca", root(&error)))?;
     Ok(tls)
 }
 
-/// What a call of another server has failed of: of a connection, the first cause.
+/// Returns why a call of another server failed: for a failed connection, the first cause.
 pub(super) fn why(status: &Status) -> String {
     status.source().map_or_else(|| status.message().to_owned(), root)
 }
 
 impl Peers {
-    /// With this server's certificate, if it has one.
+    /// Creates the connections, with this server's certificate if it has one.
     ///
     /// # Errors
     /// Refuses files that can't be read or used.
@@ -62,7 +62,7 @@ impl Peers {
         Ok(Peers { tls, channels: Mutex::default() })
     }
 
-    /// Follows the files of certificates, for ever: connections that are made from then on show the new ones.
+    /// Watches the certificate files until the server ends: later connections use the new ones.
     pub(super) fn watch(&self) -> impl Future<Output = ()> + Send + 'static + use<> {
         let tls = self.tls.clone();
         async move {
@@ -72,10 +72,10 @@ impl Peers {
         }
     }
 
-    /// The server at that URL, which is connected to when it is called.
+    /// Returns a client of the server at that URL; it connects at the first call.
     ///
     /// # Errors
-    /// Refuses what is no URL.
+    /// Refuses a text that is not a URL.
     pub(super) fn at(&self, endpoint: &str) -> Result<NodeServiceClient<Channel>> {
         let version = self.tls.as_ref().map_or(0, |tls| tls.version());
         let mut channels = lock(&self.channels);
@@ -106,13 +106,13 @@ impl Peers {
         Ok(client(channel))
     }
 
-    /// Servers that are not there any more are forgotten.
+    /// Drops connections to servers that have left.
     pub(super) fn keep(&self, is_there: impl Fn(&str) -> bool) {
         lock(&self.channels).retain(|endpoint, _| is_there(endpoint));
     }
 }
 
-/// Bytes of a message between nodes, at most.
+/// Limit on the bytes of a message between servers of the fleet.
 pub(in crate::server) const MAX_MESSAGE_BYTES: usize = 8 << 20;
 
 fn client(channel: Channel) -> NodeServiceClient<Channel> {

@@ -1,4 +1,4 @@
-//! Takes in a session that another server hands over.
+//! Receives a session that another server hands over.
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
@@ -32,19 +32,19 @@ use palpate_tissue::memory;
 use palpate_tissue::response::force_law::Disc;
 use palpate_tissue::select::scheme_selection::NEVER;
 
-/// Bytes of a session's state, at most.
+/// Limit on the bytes of a session's state.
 const MAX_STATE_BYTES: usize = 1 << 30;
 
-/// Bytes of the inputs that wait, at most; what is beyond is dropped.
+/// Limit on the memory of the inputs that wait; the rest is dropped.
 const MAX_WAITING_BYTES: usize = 64 << 20;
 
-/// When the other server has said nothing for so long, etcd is asked who has the session.
+/// Time without a message from the other server after which etcd is asked who has the session.
 const SILENCE: Duration = Duration::from_secs(1);
 
-/// And again so often.
+/// Interval between further requests to etcd.
 const ASK: Duration = Duration::from_millis(250);
 
-/// Force laws that are taken over, at most.
+/// Limit on the number of force laws that are taken over.
 const MAX_LAWS: usize = 64;
 
 type Tell = mpsc::Sender<Result<pb::TakeSessionResponse, Status>>;
@@ -57,10 +57,13 @@ fn internal(error: impl std::fmt::Display) -> Status {
     Status::internal(error.to_string())
 }
 
-/// The account of what other servers hand over, as long as it is not known whose it is.
+/// The account charged for a handover as long as the session's owner is not known.
 const PAYER: &str = "servers of the fleet";
 
-/// The bytes of a state. `paid` grows by them, before they are kept.
+/// Receives a state. `paid` is charged for the bytes before they are stored.
+///
+/// # Errors
+/// Refuses a state that ends early, is above [`MAX_STATE_BYTES`], or exceeds the memory.
 async fn state(inbound: &mut Streaming<pb::TakeSessionRequest>, paid: &mut Taken) -> Result<Vec<u8>, Status> {
     let mut bytes = Vec::new();
     loop {
@@ -72,31 +75,32 @@ async fn state(inbound: &mut Streaming<pb::TakeSessionRequest>, paid: &mut Taken
         if bytes.len() + part.len() > MAX_STATE_BYTES {
             return Err(Refusal::new(Reason::TooLarge, "part", "the state is above 1 GiB").into());
         }
-        // What a vector takes that grows.
+        // A growing vector may take twice its length.
         paid.grow_to(2 * (bytes.len() + part.len()) as u64, "part")?;
         bytes.extend(part);
     }
 }
 
-/// What the other server has said since its last state.
+/// What the other server has sent since its last state.
 struct SenderState {
-    /// What the pieces take.
+    /// The memory charged for the pieces.
     paid: Taken,
     leases: Vec<pb::HeldLease>,
     laws: Vec<pb::KnownLaw>,
-    /// Inputs that wait, as `inputs::decoded` reads them.
+    /// Inputs that wait, encoded for `inputs::decoded`.
     pieces: Vec<Vec<u8>>,
     bytes: usize,
 }
 
 impl SenderState {
-    /// Hears on until it says since which revision the session is this server's. `None`: it says no more.
+    /// Reads messages until the other server sends the revision since which this server owns the session. `None` if
+    /// the stream ends without it.
     async fn hear(&mut self, inbound: &mut Streaming<pb::TakeSessionRequest>) -> Option<u64> {
         loop {
             match inbound.message().await.ok().flatten()?.message? {
                 Message::Waiting(piece) => {
                     self.bytes += piece.len();
-                    // With what they are when they are decoded.
+                    // Includes the memory that they take once decoded.
                     let memory = (self.bytes * (1 + MULTIPLE)) as u64;
                     if self.bytes <= MAX_WAITING_BYTES && self.paid.grow_to(memory, "waiting").is_ok() {
                         self.pieces.push(piece);
@@ -112,7 +116,7 @@ impl SenderState {
     }
 }
 
-/// A law that a client can use, and its tip.
+/// Returns a force law with its place, if both are valid.
 fn known_law(known: &pb::KnownLaw) -> Option<(Disc, Law)> {
     let disc = Disc { radius_m: known.radius_m, at_m: from_vector(known.at_m.as_ref()) };
     let is_sound = disc.radius_m > 0.0 && disc.radius_m.is_finite() && disc.at_m.is_finite();
@@ -120,7 +124,7 @@ fn known_law(known: &pb::KnownLaw) -> Option<(Disc, Law)> {
 }
 
 impl Fleet {
-    /// Takes a session, as the stream tells it.
+    /// Receives a session over a stream; sends a failure back on it.
     pub(in crate::server) async fn take_in(
         self: Arc<Self>,
         mut inbound: Streaming<pb::TakeSessionRequest>,
@@ -131,7 +135,7 @@ impl Fleet {
         }
     }
 
-    /// Takes nothing yet, and grows.
+    /// Returns an empty charge that can grow.
     fn paid(&self) -> palpate_refusal::Result<Taken> {
         self.account(PAYER).take(Resource::Memory(Purpose::Journals), 0, "part")
     }
@@ -152,7 +156,7 @@ impl Fleet {
         tell: &Tell,
     ) -> Result<(), Status> {
         let answer = || tell.send(Ok(pb::TakeSessionResponse {}));
-        // Of the first state the tissue is made, which takes the longest.
+        // Building the tissue from the first state takes the longest.
         let mut paid = self.paid()?;
         let before = self.restored(state(inbound, &mut paid).await?, None).await?;
         paid.shrink_to(0);
@@ -164,13 +168,13 @@ impl Fleet {
         let offered = resumed.header.ownership_revision;
         let id = resumed.header.session_id.clone();
         let here =
-            || Refusal::new(Reason::OutOfTurn, "session_id", "is that of a session that is here, or comes already");
+            || Refusal::new(Reason::OutOfTurn, "session_id", "is that of a session that is here or arriving already");
         let _coming = self.comes(&id).ok_or_else(here)?;
         if !self.pacer.fence.may_act() {
             return Err(fenced().into());
         }
         let handle = self.admit(resumed).await?;
-        // Not before it is on the disk: from then on a crash of this server does not lose it.
+        // Only once it is on the disk: a crash of this server can't lose it from then on.
         if let Some(why) = until_on_disk(&handle).await {
             self.withdraw(&handle).await;
             return Err(Refusal::new(Reason::NotAvailable, "", why).into());
@@ -178,7 +182,7 @@ impl Fleet {
         let _ = answer().await;
         let mut told = SenderState { paid, leases: Vec::new(), laws: Vec::new(), pieces: Vec::new(), bytes: 0 };
         let Some(revision) = self.until_certain(&id, offered, inbound, &mut told).await else {
-            info!(session = %id, "a session that was being handed over does not come");
+            info!(session = %id, "a session that was being handed over does not arrive");
             self.withdraw(&handle).await;
             return Err(ended().into());
         };
@@ -193,7 +197,8 @@ impl Fleet {
         Ok(())
     }
 
-    /// The inputs that wait. What can't be read is left out: the session is this server's, and goes on.
+    /// Decodes the inputs that wait. Unreadable ones are dropped with a warning: the session belongs to this server
+    /// and continues.
     async fn waiting(&self, id: &str, pieces: Vec<Vec<u8>>, first: Arc<Model>) -> Vec<(u64, Input)> {
         let limits = self.config.limits.clone();
         let read = move || -> palpate_refusal::Result<Vec<(u64, Input)>> {
@@ -205,14 +210,15 @@ impl Fleet {
         };
         match tokio::task::spawn_blocking(read).await {
             Ok(Ok(waiting)) => return waiting,
-            Ok(Err(refusal)) => warn!(session = id, "what waited there can't be read: {refusal}"),
-            Err(error) => warn!(session = id, "what waited there can't be read: {error}"),
+            Ok(Err(refusal)) => warn!(session = id, "the inputs that waited for it can't be read: {refusal}"),
+            Err(error) => warn!(session = id, "the inputs that waited for it can't be read: {error}"),
         }
         Vec::new()
     }
 
-    /// Waits until it is certain whose the session is: the other server says that it is this one's, or etcd does. As long as its key is
-    /// as it was when it was `offered`, the other's transaction may still come. `None`: it does not come.
+    /// Waits until it is certain who has the session, and returns the revision if it is this server: according to the
+    /// other server, or to etcd. As long as its key has the revision `offered`, the other server's transaction may
+    /// still take place. `None`: the session does not arrive.
     async fn until_certain(
         &self,
         id: &str,
@@ -226,15 +232,16 @@ impl Fleet {
         loop {
             match self.session_value(id).await {
                 Ok(Some((value, revision))) if value.node == self.node => return Some(revision),
-                // Its owner is gone: this server claims it from its journal, and so finds out.
+                // The owner is gone: claiming the session from its journal finds out whether the transaction took
+                // place.
                 Ok(Some((value, _))) if rules::may_claim(&value, &self.node, |node| self.is_there(node)) => {
                     return None;
                 }
                 Ok(Some((_, revision))) if revision == offered => {}
                 Ok(_) => return None,
-                Err(refusal) => warn!(session = %id, "who has this session is not known: {refusal}"),
+                Err(refusal) => warn!(session = %id, "the owner of this session is not known: {refusal}"),
             }
-            // It may say so yet. If the stream has ended, etcd is asked.
+            // The other server may still say so. If the stream has ended, etcd is asked again.
             let wait = sleep(ASK);
             tokio::pin!(wait);
             tokio::select! {
@@ -247,7 +254,7 @@ impl Fleet {
         }
     }
 
-    /// A session does not come: nothing of it is kept. Its journal is of a course that was not taken.
+    /// Discards a session that does not arrive, with its journal, which records a branch that no server continued.
     async fn withdraw(&self, handle: &SessionHandle) {
         if self.pacer.withdraw(&handle.id, ended()).is_ok() {
             let _ = until_complete(handle).await;
@@ -256,8 +263,8 @@ impl Fleet {
         self.unsettled.notify_one();
     }
 
-    /// The session, which stands and is not served yet. Whether there is room for it shows before the other server gives it up. Its
-    /// tools stay where they are: who holds them comes here.
+    /// Creates the session, which stands still and is not served yet: whether there is room for it must be known
+    /// before the other server gives it up. Its tools keep their places, since their holders will connect here.
     async fn admit(&self, resumed: Resumed) -> Result<Arc<SessionHandle>, Status> {
         let begin = Begin {
             id: resumed.header.session_id.clone(),
@@ -268,7 +275,7 @@ impl Fleet {
             playback: None,
             after_run: resumed.header.run,
             revision: resumed.header.ownership_revision,
-            // They come with the commands that wait.
+            // They arrive with the commands that wait.
             waiting: Vec::new(),
             frozen: true,
             recorded: true,
@@ -279,7 +286,7 @@ impl Fleet {
         Ok(tokio::task::spawn_blocking(admit).await.map_err(internal)??)
     }
 
-    /// The tools that are held go on being held.
+    /// Restores the leases of the held tools, and then the inputs that wait.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn adopt(&self, handle: &SessionHandle, leases: Vec<pb::HeldLease>, waiting: Vec<(u64, Input)>) {
         let longest_s = self.config.limits.lease_s;
@@ -291,7 +298,7 @@ impl Fleet {
         }
         for (id, leases) in by_lease {
             let account = leases.first().map(|lease| self.account(&lease.owner));
-            // Beyond their share too: the tool is in the tissue.
+            // Even beyond the account's share: the tool is already in the tissue.
             let charge = |_: &HandedLease| account.as_ref()?.take(Resource::Leases, 1, "tools").ok();
             let charges = leases.iter().filter_map(charge).collect();
             handle.at_intake(|intake, now| {
@@ -299,7 +306,7 @@ impl Fleet {
                 intake.charge(id, charges);
             });
         }
-        // The leases are there: so what waits belongs to them.
+        // After the leases, to which the waiting inputs belong.
         handle.adopt_waiting(waiting);
     }
 }

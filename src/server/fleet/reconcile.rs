@@ -1,5 +1,5 @@
-//! What etcd says of this server and is not so: sessions that are this server's by their keys, and that it has not got. That comes of
-//! transactions whose end nobody learned, and of folders that are lost.
+//! Repairs entries in etcd that name this server as owner of sessions it does not have: the result of transactions
+//! whose outcome nobody learned, and of lost folders.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -14,20 +14,20 @@ use palpate_cluster::rules;
 use palpate_refusal::Result;
 use palpate_tissue::lock::lock;
 
-/// What was so this long before, and is so still, is settled: a session that is just being made or taken is not meant.
+/// Time for which a wrong entry must persist before it is repaired: a session may just be created or received.
 const AGAIN: Duration = Duration::from_secs(3);
 
-/// A transaction whose end is unknown shows within this time, if it is done at all.
+/// Time within which a transaction with an unknown result shows its effect, if it has any.
 const SHOWS: Duration = Duration::from_secs(30);
 
-/// Without any such transaction it is looked this often.
+/// Interval between checks without such a transaction.
 const RARELY: Duration = Duration::from_secs(600);
 
-/// Sessions that have not been found here, and the revisions of their keys.
+/// Sessions that were not found here, and the revisions of their keys.
 type Missing = BTreeMap<String, u64>;
 
 impl Fleet {
-    /// Settles for ever.
+    /// Checks and repairs entries until the server ends.
     pub(super) async fn settle(self: Arc<Self>) {
         let mut missing = Missing::new();
         let mut until = Instant::now() + SHOWS;
@@ -45,7 +45,8 @@ impl Fleet {
         }
     }
 
-    /// Settles what was `missing` before and still is; tells what is missing for the first time.
+    /// Repairs the entries that were `missing` before and still are. Returns those that are missing for the first
+    /// time.
     async fn look_for_missing(self: &Arc<Self>, missing: &Missing) -> Result<Missing> {
         let prefix = self.keys.sessions();
         let (found, _) = self.etcd.list(&prefix).await.map_err(super::of_etcd)?;
@@ -68,14 +69,15 @@ impl Fleet {
         Ok(new)
     }
 
-    /// If a journal is here, the session goes on. Otherwise who stands by may claim it, or, if nobody does, it is forgotten.
+    /// Repairs the entry of one session. If its journal is here, continues it. Otherwise gives it up to its standby,
+    /// or deletes its key if it has none.
     async fn settle_one(self: &Arc<Self>, id: &str, value: &SessionValue, revision: u64) {
         let (fleet, session) = (self.clone(), id.to_owned());
         let is_here = tokio::task::spawn_blocking(move || {
             let can_go_on = |journals: &Arc<_>| crate::server::journals::Journals::can_go_on(journals, &session);
             fleet.stand_by.whole_run(&session).is_some() || fleet.journals.get().is_some_and(can_go_on)
         });
-        // What can't be looked at is left as it is.
+        // If the check failed, the entry stays as it is.
         let Ok(is_here) = is_here.await else { return };
         if is_here {
             let keep = rules::keep(&self.keys, id, revision, &self.node, "");
@@ -85,7 +87,7 @@ impl Fleet {
                 Err(refusal) => warn!(session = %id, "{refusal}"),
             };
         }
-        warn!(session = %id, "this server has not got this session any more");
+        warn!(session = %id, "this server does not have this session any more");
         let txn = if value.standby.is_empty() {
             rules::delete(&self.keys, id, revision)
         } else {

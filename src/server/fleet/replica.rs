@@ -1,4 +1,4 @@
-//! The journals of sessions for which this server stands by: received, written, and synced.
+//! The journals of sessions for which this server is the standby: received, written, and synced.
 
 use std::collections::BTreeMap;
 use std::fs::{DirBuilder, File};
@@ -16,20 +16,20 @@ use palpate_session::journal;
 use palpate_tissue::files;
 use palpate_tissue::lock::lock;
 
-/// Where they are, in the folder of journals.
+/// Subfolder for these journals, in the folder of journals.
 const FOLDER: &str = "standby";
 
-/// Where the server's own random number is, in the folder of journals.
+/// File with the server's own random number, in the folder of journals.
 const INSTANCE: &str = "node";
 
 fn unusable(path: &Path, error: &std::io::Error) -> Refusal {
     Refusal::new(Reason::Unreadable, "journal", format!("{}: can't be used: {error}", path.display()))
 }
 
-/// The number of the server whose journals are in `folder`; a new one if there is none.
+/// Returns the random number of the server whose journals are in `folder`; creates it if there is none.
 ///
 /// # Errors
-/// Refuses a folder that can't be used.
+/// Refuses a folder that can't be used, and a number that can't be read.
 pub(super) fn instance(folder: &Path) -> Result<String> {
     let path = folder.join(INSTANCE);
     if path.symlink_metadata().is_ok() {
@@ -40,33 +40,33 @@ pub(super) fn instance(folder: &Path) -> Result<String> {
     Ok(id)
 }
 
-/// A journal for which this server stands by.
+/// A journal for which this server is the standby.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct ReplicaFile {
     run: u32,
     bytes: u64,
-    /// The server that sends it, or has sent it last; empty if that was before this process.
+    /// The server that sends it or sent it last; empty if that was before this process.
     from: String,
-    /// The stream by which it comes; 0 if by none now.
+    /// Number of the stream that sends it; 0 if none does now.
     stream: u64,
-    /// Since when none, if none.
+    /// Since when no stream sends it, ns.
     since_ns: u64,
 }
 
-/// What is not needed any more is kept so long after its stream has ended, ns: a transaction that names this server may still be under
-/// way.
+/// Time for which an unneeded journal is kept after its stream has ended, ns: a transaction that names this server
+/// may still be in flight.
 const KEEPS_NS: u64 = 30_000_000_000;
 
-/// The journals for which this server stands by.
+/// The journals for which this server is the standby, by session.
 pub(super) struct StandBy {
     folder: PathBuf,
     kept: Mutex<BTreeMap<String, ReplicaFile>>,
-    /// Streams so far.
+    /// Number of streams so far.
     streams: AtomicU64,
 }
 
 impl StandBy {
-    /// Those that are on the disk.
+    /// Opens the journals that are on the disk. Creates the folder if it is missing.
     ///
     /// # Errors
     /// Refuses a folder that can't be used.
@@ -76,7 +76,7 @@ impl StandBy {
         let mut kept = BTreeMap::new();
         for file in journal::file::list(&folder).map_err(|error| unusable(&folder, &error))? {
             let bytes = std::fs::metadata(&file.path).map_or(0, |metadata| metadata.len());
-            // By ascending run: the newest stays.
+            // Sorted by run, so the newest remains.
             let run = u32::try_from(file.run).unwrap_or(u32::MAX);
             kept.insert(
                 file.session_id,
@@ -90,7 +90,7 @@ impl StandBy {
         self.folder.join(journal::file::name(id, u64::from(run)))
     }
 
-    /// All that is there.
+    /// Returns all journals, with their runs and lengths.
     pub(super) fn list(&self) -> Vec<pb::Mirrored> {
         let kept = lock(&self.kept);
         let of = |(id, kept): (&String, &ReplicaFile)| pb::Mirrored {
@@ -101,18 +101,18 @@ impl StandBy {
         kept.iter().map(of).collect()
     }
 
-    /// The number of a stream that begins.
+    /// Returns the number of a new stream, from 1.
     pub(super) fn new_stream(&self) -> u64 {
         self.streams.fetch_add(1, Ordering::Relaxed) + 1
     }
 
-    /// A server begins to send. Tells it all that is there.
+    /// Records that a server sends over `stream` from now on. Returns all journals that are here.
     pub(super) fn stream_begins(&self, node: &str, stream: u64) -> Vec<pb::Mirrored> {
         lock(&self.kept).values_mut().filter(|kept| kept.from == node).for_each(|kept| kept.stream = stream);
         self.list()
     }
 
-    /// Nothing more comes by a stream.
+    /// Records that a stream has ended.
     pub(super) fn stream_ended(&self, stream: u64) {
         let by_it = |kept: &&mut ReplicaFile| kept.stream == stream;
         for kept in lock(&self.kept).values_mut().filter(by_it) {
@@ -120,31 +120,32 @@ impl StandBy {
         }
     }
 
-    /// Sessions whose journals no server sends now: by no stream, or by that of a server that is gone. One that is frozen keeps its
-    /// stream.
+    /// Returns the sessions whose journals no running server sends: no stream does, or that of a server that is gone.
+    /// A frozen server keeps its stream.
     pub(super) fn unsent(&self, is_there: impl Fn(&str) -> bool) -> Vec<String> {
         let kept = lock(&self.kept);
         let unsent = kept.iter().filter(|(_, kept)| kept.stream == 0 || !is_there(&kept.from));
         unsent.map(|(id, _)| id.clone()).collect()
     }
 
-    /// Whether nobody has sent a journal for so long that nobody will.
+    /// Returns whether a journal has not been sent for so long ([`KEEPS_NS`]) that it is no longer needed.
     pub(super) fn is_long_unsent(&self, id: &str) -> bool {
         let is_long = |kept: &ReplicaFile| kept.stream == 0 && now_ns().saturating_sub(kept.since_ns) > KEEPS_NS;
         lock(&self.kept).get(id).is_some_and(is_long)
     }
 
-    /// The run of a session's journal that is here, if the session can go on from it.
+    /// Returns the run of a session's journal that is here, if the session can be continued from it.
     pub(super) fn whole_run(&self, id: &str) -> Option<u32> {
         let run = lock(&self.kept).get(id)?.run;
         journal::JournalReader::open(&self.path(id, run)).is_ok().then_some(run)
     }
 
-    /// Writes what a server has sent by a stream, and gets it to the disk. Tells how far the journals are there. Those of older runs
-    /// than are here come from a server that has lost the session, and does not know it yet: they are passed over.
+    /// Writes the parts that a server has sent over a stream, and syncs them. Returns how far the journals are on the
+    /// disk. Skips runs older than those here: they come from a server that has lost the session and does not know it
+    /// yet.
     ///
     /// # Errors
-    /// Refuses parts that do not fit what is there, and what can't be written.
+    /// Refuses parts that do not continue what is here, and those that can't be written.
     pub(super) fn take(&self, (node, stream): (&str, u64), parts: &[pb::MirrorPart]) -> Result<Vec<pb::Mirrored>> {
         let mut files: BTreeMap<(&str, u32), File> = BTreeMap::new();
         let mut taken: BTreeMap<&str, pb::Mirrored> = BTreeMap::new();
@@ -188,14 +189,14 @@ impl StandBy {
         Ok(taken.into_values().collect())
     }
 
-    /// This server stands by for a session no longer.
+    /// Removes the journal of a session that this server is no longer the standby of.
     pub(super) fn forget(&self, id: &str) {
         if let Some(kept) = lock(&self.kept).remove(id) {
             let _ = std::fs::remove_file(self.path(id, kept.run));
         }
     }
 
-    /// The same, if the journal has come from that server.
+    /// Removes the journal of a session if it came from that server.
     pub(super) fn forget_from(&self, node: &str, id: &str) {
         let is_its = lock(&self.kept).get(id).is_some_and(|kept| kept.from == node);
         if is_its {
@@ -203,7 +204,7 @@ impl StandBy {
         }
     }
 
-    /// Takes a journal out, to go on with it from `folder`. Tells its run.
+    /// Moves a journal into `folder`, to continue the session from it. Returns its run.
     ///
     /// # Errors
     /// Refuses if there is none, or it can't be moved.
@@ -237,7 +238,8 @@ mod tests {
         for bad in [part("s1", 1, 9, b"z"), part("../s1", 1, 0, b"z"), part("s1", 2, 4, b"z")] {
             assert!(stand_by.take(from_a, &[bad]).is_err());
         }
-        // A newer stream of the same server goes on when the older one ends. What the server does when it is gone is another matter.
+        // A newer stream of the same server keeps its journals when the older one ends. If the server is gone, they
+        // count as unsent.
         let newer = stand_by.new_stream();
         assert_eq!(stand_by.stream_begins("a", newer).len(), 2);
         stand_by.stream_ended(from_a.1);
@@ -245,17 +247,17 @@ mod tests {
         assert_eq!(stand_by.unsent(|_| false), ["s1", "s2"]);
         stand_by.stream_ended(newer);
         assert_eq!(stand_by.unsent(|node| node == "a"), ["s1", "s2"]);
-        // Not at once: etcd may yet name this server.
+        // Not immediately: etcd may still name this server.
         assert!(!stand_by.is_long_unsent("s1"));
         let again = StandBy::open(folder.path()).unwrap();
         assert_eq!(again.list().iter().map(|at| at.durable_bytes).collect::<Vec<_>>(), [4, 1]);
-        // The next run takes the place of the one before, which is not taken any more.
+        // The next run replaces the one before, of which no further parts are accepted.
         let from_b = ("b", again.new_stream());
         again.take(from_b, &[part("s1", 2, 0, b"n")]).unwrap();
         assert!(!folder.path().join("standby/s1.1.mcap").exists());
         assert_eq!(again.take(("a", again.new_stream()), &[part("s1", 1, 0, b"old")]).unwrap(), []);
         assert_eq!(again.whole_run("s1"), None);
-        // Who has not sent it can't have it forgotten.
+        // Only the server that has sent it can have it removed.
         again.forget_from("a", "s1");
         assert_eq!(again.hand_out("s1", folder.path()).unwrap(), 2);
         assert_eq!(std::fs::read(folder.path().join("s1.2.mcap")).unwrap(), b"n");

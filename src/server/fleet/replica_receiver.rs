@@ -1,4 +1,4 @@
-//! Takes in the journals of sessions for which this server stands by.
+//! Receives the journals of sessions for which this server is the standby.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use palpate_refusal::{Reason, Refusal};
 type Tell = mpsc::Sender<Result<pb::MirrorResponse, Status>>;
 
 impl Fleet {
-    /// Receives the journals of a server, until its stream ends.
+    /// Receives the journals of a server until its stream ends. Confirms over `tell` what is on the disk.
     pub(in crate::server) async fn receive(self: Arc<Self>, mut inbound: Streaming<pb::MirrorRequest>, tell: Tell) {
         let stream = self.stand_by.new_stream();
         let why = self.receive_from(stream, &mut inbound, &tell).await;
@@ -47,7 +47,7 @@ impl Fleet {
                 }
                 Some(Message::End(end)) => {
                     self.stand_by.forget_from(&node, &end.session_id);
-                    // So that what was said before is known from what is said after.
+                    // A confirmation, by which the sender tells older reports from newer ones.
                     let forgotten = pb::Mirrored { session_id: end.session_id, run: 0, durable_bytes: 0 };
                     let _ = tell.send(Ok(pb::MirrorResponse { mirrored: vec![forgotten] })).await;
                 }

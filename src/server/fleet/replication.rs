@@ -1,7 +1,7 @@
-//! Sends the journals of this server to the servers that stand by for their sessions, as they grow.
+//! Sends the growing journals of this server's sessions to the standby servers of these sessions.
 //!
-//! What is sent is read from the files: a server that has just come, one that was away, and one that keeps up get their parts in the
-//! same way, and nothing waits in memory.
+//! The data is read from the files: a new standby, one that was away, and one that keeps up get their parts in one
+//! way, and nothing waits in memory.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -24,48 +24,49 @@ use palpate_cluster::{placement, rules};
 use palpate_realtime::event_log::EventLog;
 use palpate_tissue::lock::lock;
 
-/// A server that can't be reached is tried again so soon.
+/// Pause before another try to reach a server.
 const PAUSE: Duration = Duration::from_millis(250);
 
-/// What has grown is looked for at least so often.
+/// Longest interval between checks for grown journals.
 const LOOK: Duration = Duration::from_millis(200);
 
-/// Bytes of journals in one message, about.
+/// Approximate bytes of journals per message.
 const MESSAGE_BYTES: u64 = 1 << 20;
 
-/// Sessions that are deleted or were moved, of which a server is still to be told; it finds the others out by itself when the stream ends.
+/// Limit on the deleted or moved sessions that a server still has to be notified of; it finds out about others when
+/// the stream ends.
 const MAX_PAST: usize = 10_000;
 
 /// Messages that wait for the network.
 const WAITING: usize = 2;
 
-/// What a server that stands by has been sent: of each session the run and its bytes.
+/// What a standby server was sent: the run and its bytes, per session.
 type SentBytes = BTreeMap<String, (u32, u64)>;
 
-/// What a server that stands by has said of its disk, over one stream.
+/// What a standby server has confirmed over one stream.
 #[derive(Debug, Default)]
 struct Heard {
-    /// How far it has each journal.
+    /// Each journal, with the bytes that are on its disk.
     confirmed: BTreeMap<String, pb::Mirrored>,
-    /// How often it was told to forget a session, and has not said yet that it has. What it says of the session meanwhile it said
-    /// before it heard that: it is not so any more.
+    /// Number of requests per session to forget it that are not confirmed yet. What the server reports of the session
+    /// until then was sent before it received them, and no longer holds.
     ending: BTreeMap<String, u32>,
 }
 
 impl Heard {
-    /// All that it has when the stream begins.
+    /// Creates the state at the start of a stream, with all that the server has.
     fn new(there: &[pb::Mirrored]) -> Self {
         let confirmed = there.iter().map(|at| (at.session_id.clone(), at.clone())).collect();
         Heard { confirmed, ending: BTreeMap::new() }
     }
 
-    /// It is told to forget a session.
+    /// Records that the server is requested to forget a session.
     fn end(&mut self, id: &str) {
         self.confirmed.remove(id);
         *self.ending.entry(id.to_owned()).or_default() += 1;
     }
 
-    /// It says how far it has a journal. Tells whether that counts.
+    /// Records a report of the server about a journal. Returns whether it counts.
     fn hear(&mut self, at: &pb::Mirrored) -> bool {
         if let Some(left) = self.ending.get_mut(&at.session_id) {
             *left -= u32::from(at.durable_bytes == 0);
@@ -78,14 +79,14 @@ impl Heard {
         true
     }
 
-    /// How far it has that run of a session.
+    /// Returns what it has of that run of a session.
     fn of(&self, id: &str, run: u32) -> Option<pb::Mirrored> {
         self.confirmed.get(id).filter(|at| at.run == run).cloned()
     }
 }
 
 impl Fleet {
-    /// Sends for ever.
+    /// Sends journals to the other servers until the server ends.
     pub(super) async fn mirror(self: Arc<Self>) {
         let mut nodes = self.nodes.subscribe();
         let mut tasks: BTreeMap<String, AbortHandle> = BTreeMap::new();
@@ -108,7 +109,7 @@ impl Fleet {
         }
     }
 
-    /// The server that stands by for a session of this one.
+    /// Returns the server that is to be the standby of a session of this one.
     fn standby_of(&self, id: &str) -> Option<String> {
         placement::standby(id, &self.node, &self.nodes.borrow()).map(str::to_owned)
     }
@@ -120,9 +121,9 @@ impl Fleet {
             if let Some(endpoint) = endpoint
                 && let Err(why) = self.mirror_once(&name, &endpoint).await
             {
-                // Once for each reason.
+                // Logs each reason once.
                 if why != told {
-                    warn!(node = name, "journals can't be mirrored there: {why}");
+                    warn!(node = name, "journals can't be replicated to this server: {why}");
                     told = why;
                 }
             }
@@ -130,7 +131,7 @@ impl Fleet {
         }
     }
 
-    /// Sends over one stream, until that breaks.
+    /// Sends over one stream, until it breaks. Returns the reason.
     async fn mirror_once(self: &Arc<Self>, name: &str, endpoint: &str) -> Result<(), String> {
         let told = |status: tonic::Status| why(&status);
         let mut peer = self.peers.at(endpoint).map_err(|refusal| refusal.to_string())?;
@@ -146,19 +147,19 @@ impl Fleet {
         let closed = || "the stream is closed".to_owned();
         let sending = async {
             loop {
-                // Before the look: what grows meanwhile is news.
+                // Registered before the check: what grows during it triggers another one.
                 let news = self.growth.news();
                 tokio::pin!(news);
                 news.as_mut().enable();
                 let is_told = |id: &str| lock(&self.standbys).get(id).is_some_and(|standby| standby.is(name));
                 let is_named = |id: &str| lock(&self.standbys).get(id).is_some_and(|standby| standby.may_be(name));
-                // One that another server hands over is not this server's yet. Who stands by, as etcd says, does so until another
-                // has all.
+                // A session that another server is handing over does not belong to this one yet. The standby in etcd
+                // remains until another server has the whole journal.
                 let is_wanted = |id: &str| {
                     self.revision(id).is_some() && (is_named(id) || self.standby_of(id).as_deref() == Some(name))
                 };
                 let grown = self.growth.chosen(is_wanted);
-                // What it has of sessions for which etcd certainly names another, it may forget; also of those that are deleted.
+                // It may forget sessions whose key certainly names another standby, and deleted ones.
                 let gone = sent.keys().filter(|id| !grown.iter().any(|grown| grown.session_id == **id));
                 let mut forgotten: Vec<String> =
                     gone.filter(|id| self.has_another_standby(id, name)).cloned().collect();
@@ -168,7 +169,8 @@ impl Fleet {
                     lock(&of_disk).end(&session_id);
                     say.send(message(Say::End(pb::MirrorEnd { session_id }))).await.map_err(|_| closed())?;
                 }
-                // It has all, and etcd does not say so: that was not done before, or was undone.
+                // It has the whole journal, and etcd does not name it: the transaction was not done before, or was
+                // undone.
                 for grown in grown.iter().filter(|grown| !is_told(&grown.session_id)) {
                     let at = lock(&of_disk).of(&grown.session_id, grown.run);
                     if let Some(at) = at {
@@ -210,14 +212,14 @@ impl Fleet {
         }
     }
 
-    /// Whether etcd certainly says that another than `name` stands by for a session of this server.
+    /// Returns whether etcd certainly names a standby other than `name` for a session of this server.
     fn has_another_standby(&self, id: &str, name: &str) -> bool {
         let is_another =
             |standby: &Standby| standby.naming.is_none() && !standby.named.is_empty() && standby.named != name;
         self.revision(id).is_some() && lock(&self.standbys).get(id).is_some_and(is_another)
     }
 
-    /// etcd names nobody any more who stands by for a session. Who did has what it had, and may be named again.
+    /// Records that etcd names no standby any longer. The previous one keeps its copy, and may be named again.
     pub(super) fn names_nobody(&self, id: &str) {
         if let Some(standby) = lock(&self.standbys).get_mut(id) {
             let named = std::mem::take(&mut standby.named);
@@ -225,7 +227,7 @@ impl Fleet {
         }
     }
 
-    /// A session is deleted, or certainly another's, at whose key nobody stands by: who stood by for it may forget it.
+    /// Notes that a session was deleted or belongs to another server: its former standby may remove its copy.
     pub(super) fn tell_past(&self, id: &str, standby: Standby) {
         let stood_by = [Some(standby.named), standby.naming].into_iter().flatten();
         for name in stood_by.filter(|name| self.is_there(name)) {
@@ -237,10 +239,10 @@ impl Fleet {
         }
     }
 
-    /// Whether etcd is to be told that a server stands by for a session, because it has all up to `step`. From then on nothing counts
-    /// as mirrored till etcd has said so.
+    /// Returns whether to name a server in etcd as the standby of a session, because it has the journal up to `step`.
+    /// If so, nothing counts as replicated until etcd has confirmed it.
     fn begins_to_name(&self, id: &str, name: &str, event_log: &EventLog, step: u64) -> bool {
-        // Nobody else changes its key meanwhile: who begins to move it sees that it is being named.
+        // While this lock is held no move can start; a later one sees that a standby is being named.
         let moving = lock(&self.moving);
         if moving.contains(id) {
             return false;
@@ -252,8 +254,8 @@ impl Fleet {
             Some(other) => other == name || is_chosen,
             None => is_chosen,
         };
-        // The one before has more: it stays until this one has as much. With the lock, so that it can't have still more by the time
-        // that it does not count any more.
+        // The previous standby has more: it remains until this one has as much. Checked with the lock held, so that
+        // its count can't grow before it stops counting.
         if !is_free || event_log.mirrored_step().is_some_and(|mirrored| step < mirrored) {
             return false;
         }
@@ -261,7 +263,8 @@ impl Fleet {
         true
     }
 
-    /// etcd has said that a server stands by. Tells whether that is so still: another may be about to be named by now.
+    /// Records that etcd names a server as the standby. Returns false if another is about to be named in the
+    /// meantime.
     fn is_named_now(&self, id: &str, name: &str) -> bool {
         let mut standbys = lock(&self.standbys);
         let Some(standby) = standbys.get_mut(id).filter(|standby| standby.naming.as_deref() == Some(name)) else {
@@ -271,8 +274,8 @@ impl Fleet {
         true
     }
 
-    /// Counts what a server has on its disk, if etcd says that it stands by, and no other is about to be named. That other was told of
-    /// when it had all that counted: nothing may be added after that.
+    /// Counts what a server has on its disk, if etcd names it as the standby and no other is about to be named. That
+    /// other one had all that counted when it was chosen: nothing may be added after that. Returns whether it counts.
     fn counts(&self, id: &str, name: &str, event_log: &EventLog, step: u64) -> bool {
         let standbys = lock(&self.standbys);
         let counts = standbys.get(id).is_some_and(|standby| standby.is(name));
@@ -282,7 +285,8 @@ impl Fleet {
         counts
     }
 
-    /// A server has so much of a journal on its disk. The first time, etcd is told who stands by.
+    /// Handles a report of how many bytes of a journal a server has on its disk. On the first one, names that server
+    /// in etcd as the standby.
     async fn is_mirrored(&self, name: &str, at: &pb::Mirrored) {
         let id = &at.session_id;
         let Some((event_log, step)) = self.growth.mirrored(id, at.run, at.durable_bytes) else { return };
@@ -295,23 +299,24 @@ impl Fleet {
         }
         let keep = rules::keep(&self.keys, id, revision, &self.node, name);
         match self.transact(keep, id, |found| self.is_own(found, name)).await {
-            // An answer that came late says nothing: the key has been written since.
+            // A late answer says nothing: the key has been written since.
             Ok(Ok(now)) if self.owns_since(id, now) && self.is_named_now(id, name) => {
                 if let Ok(handle) = self.pacer.get(id) {
                     handle.is_owned_since(now);
                 }
-                info!(session = %id, node = name, "this server stands by");
+                info!(session = %id, node = name, "standby server named");
                 self.counts(id, name, &event_log, step);
             }
-            // This server has written it itself, and has not heard so. It is tried again.
+            // This server has written the key itself, and has not received the answer. It tries again later.
             Ok(Err(Some((value, now)))) if value.node == self.node => _ = self.owns_since(id, now),
-            // Another has the session, or etcd does not answer: that is for the lease to find out. It is tried again.
+            // Another server has the session, or etcd does not answer: the lease finds that out. It tries again
+            // later.
             Ok(_) | Err(_) => {}
         }
     }
 }
 
-/// The parts of journals that were not sent, in messages of a usual size.
+/// Returns the parts of journals that were not sent yet, in messages of about [`MESSAGE_BYTES`].
 fn parts(behind: &[Grown], sent: &SentBytes) -> Vec<Vec<pb::MirrorPart>> {
     let (mut messages, mut parts, mut bytes_in) = (Vec::new(), Vec::new(), 0);
     for Grown { session_id, run, path, bytes } in behind {
@@ -333,7 +338,7 @@ fn parts(behind: &[Grown], sent: &SentBytes) -> Vec<Vec<pb::MirrorPart>> {
                 bytes_in = 0;
             }
         }
-        // A round does not hold all journals of a server in memory.
+        // At most four messages per round: it must not hold all journals of a server in memory.
         if messages.len() >= 4 {
             break;
         }
@@ -358,9 +363,9 @@ mod tests {
         assert_eq!((heard.of("s", 1), heard.of("s", 2)), (Some(at("s", 1, 9)), None));
         heard.end("s");
         assert_eq!(heard.of("s", 1), None);
-        // It was under way; others are heard as ever.
+        // It was in flight; reports about other sessions still count.
         assert!(!heard.hear(&at("s", 1, 20)) && heard.hear(&at("t", 1, 3)));
-        // Sent anew, and ended again before the first end was confirmed.
+        // Sent again, and ended again before the first end was confirmed.
         heard.end("s");
         assert!(!heard.hear(&at("s", 0, 0)) && !heard.hear(&at("s", 1, 30)) && !heard.hear(&at("s", 0, 0)));
         assert_eq!(heard.of("s", 1), None);

@@ -1,19 +1,20 @@
-//! What a haptic stream is told besides samples.
+//! Events that a haptic stream sends besides samples.
 
 use palpate_proto::pb;
 use tonic::Status;
 
-/// What a haptic stream is told besides samples.
+/// An event that a haptic stream sends besides samples.
 pub(super) enum StreamEvent {
     Rejected(pb::Rejection),
-    /// The client's time, and when it came; another session for datagrams, if it asked for one.
+    /// The answer to `renew`: the client's time, when it arrived, and another datagram session if the client
+    /// requested one.
     Renewed {
         client_time_ns: u64,
         arrival_ns: u64,
         datagrams: Option<pb::DatagramOffer>,
     },
-    /// What the client sent can't be read.
+    /// A message of the client could not be read.
     Failed(Status),
-    /// The client has said all it wanted to say.
+    /// The client has closed its side of the stream.
     Finished,
 }

@@ -1,4 +1,4 @@
-//! Who holds tools: takes in what is said to them, by the stream or by datagram.
+//! Takes in a tool holder's commands, from the stream or by datagram.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -21,21 +21,22 @@ use palpate_session::wire;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::script::Action;
 
-/// Whoever holds the tools of a lease.
+/// The holder of the tools of one lease: checks, limits and submits its commands.
 pub(super) struct LeaseController {
     pub(super) handle: Arc<SessionHandle>,
     pub(super) lease: LeaseId,
     device: Option<Device>,
     traffic: Arc<Traffic>,
     commands: Bucket,
-    /// Of each tool whose poses may come more than once those that have come.
+    /// For each tool whose poses may arrive twice (by stream and by datagram): the sequence numbers that have
+    /// arrived.
     seen: BTreeMap<u32, ReceiveWindow>,
 }
 
-/// A command, unless its pose is outside the declared workspace.
+/// Returns the command, or a refusal if its pose is outside the declared workspace.
 fn within_reach(command: Command, handle: &SessionHandle, device: Option<&Device>) -> Result<Command> {
     if let (Action::Pose { place_m, .. }, Some(device)) = (&command.action, device) {
-        // A device has its origin on the top; other clients may have it in the middle.
+        // A device's origin is on the top of the tissue; other clients may have theirs in the middle.
         let shape = handle.model.shape();
         let away_m = place_m.distance(shape.top_m()).min(place_m.distance(shape.extent().middle_m()));
         let range =
@@ -45,14 +46,14 @@ fn within_reach(command: Command, handle: &SessionHandle, device: Option<&Device
     Ok(command)
 }
 
-/// Whether a command may also come by datagram: a pose that is played by the client's time.
+/// Returns whether a command may also arrive by datagram: a pose that is played back by the client's time.
 fn may_overtake(command: &pb::Command) -> bool {
     let is_pose = matches!(command.action, Some(pb::command::Action::Pose(_)));
     is_pose && command.client_time_ns != 0 && command.at_step.is_none() && command.sequence.is_some()
 }
 
 impl LeaseController {
-    /// Of the tools of a lease. `by_datagram`: their poses may come by datagram as well.
+    /// Creates the controller of the tools of a lease. `by_datagram`: their poses may arrive by datagram as well.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn new(
         handle: Arc<SessionHandle>,
@@ -63,7 +64,7 @@ impl LeaseController {
         limits: &Limits,
         traffic: Arc<Traffic>,
     ) -> Self {
-        // So many for each step and tool, and at once twice what may wait.
+        // A rate per step and tool, and a burst of twice the number of commands that may wait.
         let seen = tools.iter().filter(|_| by_datagram).map(|tool| (*tool, ReceiveWindow::default())).collect();
         let tools = tools.len().max(1) as f64;
         let per_s = limits.commands_per_step * handle.model.scene.stepping.rate_hz * tools;
@@ -71,28 +72,28 @@ impl LeaseController {
         LeaseController { handle, lease, device, traffic, commands, seen }
     }
 
-    /// Takes in a command of the stream. Tells `events` if it is refused.
+    /// Accepts a command of the stream. Sends a rejection to `events` if it is refused.
     ///
     /// # Errors
-    /// Returns a refusal that ends the stream: commands come far too fast.
+    /// Returns a refusal that ends the stream if commands arrive far too fast.
     pub(super) fn command(&mut self, command: &pb::Command, events: &Writer<StreamEvent>) -> Result<()> {
         let by_datagram = self.seen.contains_key(&command.tool) && may_overtake(command);
-        // It may have come by datagram before.
+        // It may have arrived by datagram before.
         if by_datagram && !self.is_new(command) {
             return Ok(());
         }
         self.take(command, by_datagram, events)
     }
 
-    /// How often commands may come.
+    /// Returns the rate limit of commands.
     pub(super) fn pace(&self) -> Bucket {
         self.commands.clone()
     }
 
-    /// Takes in the poses of a datagram. One that can't be read is dropped.
+    /// Accepts the poses of a datagram. Ignores one that can't be read.
     ///
     /// # Errors
-    /// As for a command.
+    /// Returns a refusal that ends the stream if commands arrive far too fast.
     pub(super) fn datagram(&mut self, datagram: Result<pb::PosesDatagram>, events: &Writer<StreamEvent>) -> Result<()> {
         let Ok(message) = datagram else { return Ok(()) };
         for command in message.tools.iter().flat_map(datagram::commands) {
@@ -103,16 +104,16 @@ impl LeaseController {
         Ok(())
     }
 
-    /// Counts something else that came with the commands.
+    /// Counts another message of the client against the rate of commands.
     ///
     /// # Errors
-    /// Refuses it if too much comes; the flag tells whether that ends the stream.
+    /// Refuses it if there are too many; the flag says whether that ends the stream.
     pub(super) fn message(&mut self, now_ns: u64) -> std::result::Result<(), (Refusal, bool)> {
         self.commands.take(now_ns, "messages of this stream").map_err(|refusal| (refusal, self.commands.is_abused()))
     }
 
     fn is_new(&mut self, command: &pb::Command) -> bool {
-        // A tool of somebody else is refused below.
+        // Commands to tools of other holders are refused in `take`.
         let seen = self.seen.get_mut(&command.tool).zip(command.sequence);
         seen.is_none_or(|(seen, sequence)| seen.take(sequence))
     }

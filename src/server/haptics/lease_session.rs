@@ -21,7 +21,7 @@ use palpate_refusal::{Refusal, Result};
 use palpate_session::budget::Account;
 use palpate_session::wire;
 
-/// A session that was offered for a lease.
+/// A datagram session that was offered for a lease.
 struct LeaseSession {
     controller: LeaseController,
     responses: ResponseStream,
@@ -30,7 +30,7 @@ struct LeaseSession {
     events: Writer<StreamEvent>,
 }
 
-/// Offers datagrams for the tools of a lease.
+/// Offers a datagram session for the tools of a lease, and serves it in a task of its own.
 pub(super) async fn offer(
     services: &Services,
     request: &pb::OpenDatagramsRequest,
@@ -66,10 +66,10 @@ pub(super) async fn offer(
 }
 
 impl LeaseSession {
-    /// Serves until the lease or the session ends; says why it did.
+    /// Serves until the lease or the session ends; returns the reason.
     async fn serve(self) -> String {
         let LeaseSession { mut controller, mut responses, channel, mut arrival, events } = self;
-        // Until then it has a place among the streams of the session.
+        // Until the session arrives, it counts as a stream of the simulated session.
         let Ok(Some(connection)) = tokio::time::timeout(GOOD, channel.arrive(&mut arrival)).await else {
             return "nobody took the ticket".to_owned();
         };

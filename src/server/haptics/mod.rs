@@ -1,4 +1,4 @@
-//! `HapticService`: streams of commands and samples, single commands, hashes and records.
+//! `HapticService`: streams of commands and samples, tools, single commands, and records of probes.
 
 mod event;
 mod lease_controller;
@@ -36,13 +36,13 @@ pub(super) struct Haptics(pub(super) Services);
 
 type TouchMessages<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;
 
-/// The refusal of a call for a single tool, whose field is called `tool`.
+/// Renames the field of a refusal from `tools` to `tool`, for a call that concerns a single tool.
 fn of_one_tool(refusal: Refusal) -> Refusal {
     if refusal.field == "tools" { Refusal { field: "tool".to_owned(), ..refusal } } else { refusal }
 }
 
 impl Haptics {
-    /// The points that a probe names.
+    /// Finds the points that a probe names. Refuses more than `limits.probe_points` and unknown ones.
     fn probed(&self, field: &str, shape: &dyn RestShape, names: Vec<PointName>) -> Result<Vec<PointId>, Refusal> {
         let limit = self.0.config.limits.probe_points;
         if names.len() > limit {

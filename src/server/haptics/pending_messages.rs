@@ -1,22 +1,22 @@
-//! What a client says before its haptic stream is open.
+//! Messages that a client sends before its haptic stream is open.
 
 use std::collections::VecDeque;
 
 use palpate_proto::pb;
 use tonic::{Status, Streaming};
 
-/// What a client says before its stream is open, which may take as long as a force law does. It is taken from the transport,
-/// which cuts connections whose small messages nobody reads.
+/// Messages that a client sends before its stream is open, which may take as long as a force law does. They are read
+/// from the transport, which cuts connections whose small messages nobody reads.
 #[derive(Default)]
 pub(super) struct PendingMessages {
     said: VecDeque<Result<Option<pb::TouchRequest>, Status>>,
-    /// Commands that were dropped for newer ones, and of the last of those tool and sequence number.
+    /// Number of commands dropped in favour of newer ones; and tool and sequence number of the newest of these.
     pub(super) refused: usize,
     pub(super) dropped: VecDeque<(u32, u64)>,
 }
 
 impl PendingMessages {
-    /// Waits for `opening`, and keeps the newest `most` messages that come meanwhile.
+    /// Waits for `opening`, and keeps the newest `most` messages that arrive in the meantime.
     pub(super) async fn gather<T>(
         &mut self,
         opening: impl Future<Output = T>,
@@ -26,7 +26,7 @@ impl PendingMessages {
         use pb::touch_request::Message;
         let mut opening = std::pin::pin!(opening);
         loop {
-            // Behind the end, or what should not come now, nothing is kept.
+            // After the end, or a message that is not expected now, nothing more is read.
             let goes_on = self.said.back().is_none_or(|said| {
                 let message = said.as_ref().ok().and_then(|said| said.as_ref()?.message.as_ref());
                 matches!(message, Some(Message::Command(_) | Message::Renew(_)))
@@ -47,7 +47,7 @@ impl PendingMessages {
         }
     }
 
-    /// What was said next.
+    /// Returns the next message, first of those kept.
     pub(super) async fn next(
         &mut self,
         inbound: &mut Streaming<pb::TouchRequest>,

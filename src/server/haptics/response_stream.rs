@@ -1,4 +1,4 @@
-//! What a haptic stream tells its client: samples, laws, rejections.
+//! The messages that a haptic stream sends to its client: samples, laws, rejections.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -17,21 +17,21 @@ use palpate_realtime::queue::Reader;
 use palpate_session::sample_selection::PacedSample;
 use palpate_session::wire;
 
-/// While samples go by datagram, one goes by the stream as well after so long.
+/// Longest interval between samples on the stream while they go by datagram, ns.
 const HEARTBEAT_NS: u64 = 1_000_000_000;
 
-/// What the output of a haptic stream reads from. Samples go by datagram while those get through.
+/// The sources of a haptic stream's messages. Samples go by datagram while those arrive.
 pub(super) struct ResponseStream {
     updates: Option<Updates>,
     events: Reader<StreamEvent>,
     samples: Reader<PacedSample>,
     notices: Notices,
     channel: Arc<DatagramChannel>,
-    /// When the last sample went by the stream.
+    /// When the last sample was sent on the stream, ns.
     streamed_ns: u64,
-    /// What goes before the next sample, and that sample.
+    /// The messages before the next sample, and that sample.
     ready: VecDeque<pb::touch_response::Message>,
-    /// Answers that the client was too slow for.
+    /// Number of answers that were dropped because the client was too slow.
     dropped_answers: u64,
     guard: StreamGuard,
 }
@@ -58,7 +58,7 @@ impl ResponseStream {
         }
     }
 
-    /// The next message of the stream; `None` at its end.
+    /// Polls for the next message of the stream; `None` at its end.
     pub(super) fn poll(
         &mut self,
         context: &mut Context<'_>,
@@ -100,7 +100,7 @@ impl ResponseStream {
             let told = |rejection| Message::Rejection(pb::Rejection { dropped_answers, ..rejection });
             self.ready.extend(self.notices.of(&paced.sample).into_iter().map(told));
             let sample = wire::sample::sample(&paced, self.guard.shape(), dropped, now_ns());
-            // The stream has a heartbeat of its own, by which a client knows that it is alive.
+            // The stream has a heartbeat of its own, which shows a client that it still works.
             let (now, by_datagram) = (now_ns(), self.channel.send(&sample));
             if !by_datagram || now.saturating_sub(self.streamed_ns) >= HEARTBEAT_NS {
                 self.streamed_ns = now;

@@ -1,4 +1,4 @@
-//! The haptic stream: how it is opened, and what its client says.
+//! The haptic stream: opens it, and reads what its client sends.
 
 use std::pin::Pin;
 use std::sync::Arc;
@@ -35,10 +35,10 @@ use palpate_session::sample_selection::PacedSample;
 use palpate_session::wire;
 use palpate_tissue::scene::action_check::check_tip;
 
-/// What the output of a haptic stream begins with.
+/// What the output of a haptic stream starts with.
 struct Opened {
     answer: pb::TouchOpened,
-    /// What will be told of the law, if the stream has one.
+    /// Later updates of the force law, if the stream has one.
     updates: Option<Updates>,
     samples: Reader<PacedSample>,
     notices: Notices,
@@ -46,26 +46,27 @@ struct Opened {
     channel: Arc<DatagramChannel>,
 }
 
-/// The tools of a stream, given back when it ends however it ends.
+/// The tools of a stream, released when it ends for any reason.
 struct StreamTools {
     tools: usize,
     controller: LeaseController,
     channel: Arc<DatagramChannel>,
-    /// If the client wants datagrams: when a session was last offered, and that session until it has come.
+    /// If the client wants datagrams: when a session was last offered, ns, and the offered session until it arrives.
     offered_ns: Option<u64>,
     arrival: Option<Arrival>,
-    /// Computes further laws as long as the stream is there.
+    /// Computes further laws while the stream is open.
     _computing: Option<AbortOnDropHandle<()>>,
 }
 
-/// Time between two offers of datagrams to a stream, ns.
+/// Minimum time between two offers of datagrams to a stream, ns.
 const BETWEEN_OFFERS_NS: u64 = 1_000_000_000;
 
 impl StreamTools {
-    /// Another session for datagrams in place of the one that there was.
+    /// Offers another datagram session, which replaces the current one. `None` too soon after the last offer, or if
+    /// none is available.
     fn offer(&mut self, services: &Services, now_ns: u64) -> Option<pb::DatagramOffer> {
         self.offered_ns.filter(|before_ns| now_ns.saturating_sub(*before_ns) >= BETWEEN_OFFERS_NS)?;
-        // Without random numbers there is no ticket, and the stream goes on.
+        // Without random numbers there is no ticket, and the stream continues.
         let (offer, arrival) = services.datagrams.offer().ok().flatten()?;
         self.channel.part();
         (self.offered_ns, self.arrival) = (Some(now_ns), Some(arrival));
@@ -76,7 +77,7 @@ impl StreamTools {
 impl Drop for StreamTools {
     fn drop(&mut self) {
         if self.tools > 0 {
-            // A lease that has lapsed already has nothing to give back.
+            // An expired lease has nothing to release.
             let _ = self.controller.handle.at_intake(|intake, _| intake.release(self.controller.lease));
         }
     }
@@ -102,12 +103,12 @@ impl KeepaliveTimer {
     }
 }
 
-/// Answers the first message of a haptic stream.
+/// Handles the first message of a haptic stream: checks it, computes the first law and acquires the tools.
 async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> Result<(Opened, StreamTools), Status> {
     let handle = services.session(&open.session_id).await?;
     let device = open.device.as_ref().map(touch::from_device).transpose()?;
     let tip = touch::from_tip(open.tip.as_ref());
-    // A stream that neither renders nor says anything of a tip may push with forces on any tissue.
+    // A stream that neither renders nor declares a tip may push with forces on any tissue.
     if device.is_some() || open.tip.is_some() {
         check_tip("tip", handle.model.shape(), &tip)?;
     }
@@ -115,7 +116,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     let (every, deadband) = (open.sample_every_steps, open.deadband.as_ref());
     let mut sampling = wire::sample::sampling(every, only, deadband, open.heartbeat_s, device.is_some())?;
     if open.touch_stiffness && device.is_none() {
-        let message = "is missing: touch_stiffness is of its local models";
+        let message = "is missing: touch_stiffness belongs to its local models";
         return Err(Refusal::new(Reason::Missing, "device", message).into());
     }
     sampling.touch_stiffness = open.touch_stiffness;
@@ -147,7 +148,7 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     })?;
     let led = open.tools.first().copied();
     let (updates, _computing) = computing.zip(laws).map(|(computing, laws)| computing.go_on(laws, led)).unzip();
-    // Held from here on: what fails below gives the tools back.
+    // The tools are held from here on: any failure below releases them.
     let tools = open.tools.len();
     let (limits, traffic) = (&services.config.limits, services.traffic.clone());
     let controller = LeaseController::new(handle.clone(), lease, &open.tools, device, open.datagrams, limits, traffic);
@@ -179,17 +180,17 @@ async fn begin(services: &Services, open: &pb::TouchOpen, account: &Account) -> 
     Ok((Opened { answer, updates, samples, notices, guard, channel }, held))
 }
 
-/// Opens a stream and reads what the client says, until it ends.
+/// Opens a stream and reads the client's messages in a task of its own, until it ends.
 pub(super) fn open(services: Services, inbound: Streaming<pb::TouchRequest>, account: Account) -> Output {
     let (writer, events) = queue(services.config.limits.queued_samples);
-    // The client may wait for our headers before it opens, so its first message is not waited for here.
+    // The client may wait for our headers before it sends `open`, so this does not wait for its first message.
     let (opened, opening) = oneshot::channel();
     let listening = tokio::spawn(listen(services, inbound, account, opened, writer).in_current_span());
     let _listening = AbortOnDropHandle::new(listening);
     Output { stage: StreamStage::Opening(opening, Some(events)), _listening }
 }
 
-/// Reads what the client says until it ends.
+/// Reads the client's messages until it ends.
 async fn listen(
     services: Services,
     mut inbound: Streaming<pb::TouchRequest>,
@@ -269,7 +270,7 @@ async fn listen(
                 if held.tools > 0
                     && let Err(refusal) = handle.at_intake(|intake, now| intake.renew(held.controller.lease, now))
                 {
-                    // A lease is not named in a stream.
+                    // Streams do not name their lease.
                     let refusal = Refusal { field: String::new(), ..refusal };
                     events.push(StreamEvent::Rejected(wire::sample::rejection(0, 0, &refusal)));
                 }
@@ -282,20 +283,20 @@ async fn listen(
             }
             Ok(None) => return events.push(StreamEvent::Finished),
             Err(status) => {
-                debug!(session = %handle.id, %status, "a client vanished, or sent what can't be read");
+                debug!(session = %handle.id, %status, "a client disappeared or sent an unreadable message");
                 return events.push(StreamEvent::Failed(status));
             }
         }
     }
 }
 
-/// The output of a haptic stream. When nobody wants it any more, nothing is listened to any more, and tools are let go.
+/// The output of a haptic stream. Dropping it stops reading from the client and releases its tools.
 pub(super) struct Output {
     stage: StreamStage,
     _listening: AbortOnDropHandle<()>,
 }
 
-/// First the answer to `open`, then samples and rejections.
+/// The stages of a stream: first the answer to `open`, then samples and rejections.
 enum StreamStage {
     Opening(oneshot::Receiver<Result<Opened, Status>>, Option<Reader<StreamEvent>>),
     Open(ResponseStream),
@@ -315,7 +316,7 @@ impl Stream for Output {
                     Some(Ok(Message::Opened(answer)))
                 }
                 (Ok(Err(status)), _) => Some(Err(status)),
-                // The client vanished before it said anything.
+                // The client disappeared before it sent anything.
                 _ => None,
             },
             StreamStage::Open(responses) => ready!(responses.poll(context)),

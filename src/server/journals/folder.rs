@@ -1,4 +1,4 @@
-//! The folder of journals: its lock, its files, and getting them to the disk.
+//! The folder of journals: its lock, its files, and syncing them to the disk.
 
 use std::fs::{DirBuilder, File, OpenOptions};
 use std::io::{ErrorKind, Write};
@@ -9,20 +9,20 @@ use std::time::Duration;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_session::journal;
 
-/// Who serves from the folder holds a lock on this file.
+/// Name of the file that the server using the folder locks.
 const LOCK: &str = "lock";
 
-/// A successor waits so often, and so long each time, for the lock of a server that is ending: 3 s in all.
+/// Number of tries for the lock of a server that is ending, and the pause between them: 3 s in total.
 const LOCK_TRIES: u32 = 150;
 const LOCK_PAUSE: Duration = Duration::from_millis(20);
 
-/// Less than this is no room, bytes.
+/// Free space below which the disk counts as full, bytes.
 const ROOM: u64 = 16 << 20;
 
-/// So many files are synced one by one; of more, the whole file system at once.
+/// Number of files up to which they are synced one by one; beyond it, the whole file system at once.
 const MAX_SINGLE: usize = 4;
 
-/// A folder that no other server uses while this lives.
+/// An open folder of journals, locked against other servers.
 pub(super) struct Folder {
     path: PathBuf,
     directory: File,
@@ -30,10 +30,10 @@ pub(super) struct Folder {
 }
 
 impl Folder {
-    /// Opens the folder, and makes it if it is not there.
+    /// Opens and locks the folder, and creates it if it is missing.
     ///
     /// # Errors
-    /// Refuses a path that is no folder or can't be written, and a folder that another server uses.
+    /// Refuses a path that is not a folder or can't be written, and a folder that another server uses.
     pub(super) fn open(path: &Path) -> Result<Self> {
         let refused =
             |reason, message: String| Refusal::new(reason, "journal", format!("{}: {message}", path.display()));
@@ -45,7 +45,7 @@ impl Folder {
         loop {
             match lock.try_lock() {
                 Ok(()) => break,
-                // The server before this one may still be ending.
+                // The previous server may still be ending.
                 Err(std::fs::TryLockError::WouldBlock) if tries < LOCK_TRIES => {
                     tries += 1;
                     std::thread::sleep(LOCK_PAUSE);
@@ -60,17 +60,17 @@ impl Folder {
         Ok(Folder { path: path.to_owned(), directory, _lock: lock })
     }
 
-    /// Its path.
+    /// Returns the folder's path.
     pub(super) fn path(&self) -> &Path {
         &self.path
     }
 
-    /// Whether some journals can grow for a while.
+    /// Returns whether the disk has room for journals to grow for a while.
     pub(super) fn has_room(&self) -> bool {
         rustix::fs::fstatvfs(&self.directory).is_ok_and(|found| found.f_bavail.saturating_mul(found.f_frsize) >= ROOM)
     }
 
-    /// Makes all that was written to `files` survive a power cut. `is_new`: some of them have just been made.
+    /// Makes all that was written to `files` survive a power failure. `is_new`: some of them were just created.
     ///
     /// # Errors
     /// Returns the system's error.
@@ -86,7 +86,7 @@ impl Folder {
     }
 }
 
-/// A file for its owner alone.
+/// Returns options that create a file which only its owner can access.
 fn private() -> OpenOptions {
     let mut options = File::options();
     options.write(true).create(true).mode(0o600);
@@ -101,7 +101,7 @@ pub(super) struct Grown {
 }
 
 impl Grown {
-    /// A file that is not there yet.
+    /// Creates the description of a file that does not exist yet.
     pub(super) fn new(path: PathBuf) -> Self {
         Grown { path, bytes: 0, file: None }
     }
@@ -110,12 +110,12 @@ impl Grown {
         &self.path
     }
 
-    /// How many bytes it has.
+    /// Returns its length in bytes.
     pub(super) fn bytes(&self) -> u64 {
         self.bytes
     }
 
-    /// Adds to its end. What can't be written whole is taken back.
+    /// Appends to its end. On an error, removes what was written partly.
     ///
     /// # Errors
     /// Returns the system's error.
@@ -137,12 +137,12 @@ impl Grown {
         Ok(())
     }
 
-    /// The file, while it is open.
+    /// Returns the file while it is open.
     pub(super) fn file(&self) -> Option<&File> {
         self.file.as_ref()
     }
 
-    /// It is complete: gives it the index by which all tools open it.
+    /// Closes a complete file and adds the index by which all tools open it.
     ///
     /// # Errors
     /// Returns the system's error.
@@ -151,7 +151,7 @@ impl Grown {
         journal::seal::seal(&mut File::options().read(true).write(true).open(&self.path)?)
     }
 
-    /// Closes it. The next addition opens it again.
+    /// Closes the file. The next append opens it again.
     pub(super) fn close(&mut self) {
         self.file = None;
     }

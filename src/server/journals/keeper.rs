@@ -1,5 +1,5 @@
-//! The thread that writes journals (`journal`): it takes what the tapes of all sessions hold, appends it to their files, and syncs
-//! all of them at once. No session waits for it.
+//! The thread that writes journals (`journal`): it takes the events that the event logs of all sessions hold, appends
+//! them to their files, and syncs these together. No session waits for it.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind;
@@ -18,70 +18,71 @@ use palpate_realtime::event_log::{About, Beginning, Event, EventLog, Noted, Tape
 use palpate_session::journal::signature::Key;
 use palpate_session::journal::{self, JournalWriter, Opening, pb};
 
-/// A round of syncs begins so long after the one before at the earliest: what happens meanwhile goes with it.
+/// Minimum interval between two rounds of syncs: what happens in between is written together.
 const ROUND: Duration = Duration::from_millis(20);
 
-/// Old journals are looked for so often.
+/// Interval between searches for old journals.
 const SWEEP: Duration = Duration::from_secs(60);
 
-/// A disk that was full is looked at so often.
+/// Interval at which a disk that was full is checked again.
 const RETRY: Duration = Duration::from_secs(2);
 
-/// What the thread counts of itself, for the metrics.
+/// The thread's counters of its own work, for the metrics.
 #[derive(Debug, Default)]
 pub(crate) struct KeeperTally {
     /// Bytes that were written.
     pub(crate) bytes: AtomicU64,
     /// Rounds of syncs.
     pub(crate) rounds: AtomicU64,
-    /// Journals that broke.
+    /// Journals that broke, because they could not be written.
     pub(crate) broken: AtomicU64,
-    /// From the newest of what happened to its being on disk, in the last round, ns.
+    /// Time from the newest event until it was on the disk, in the last round, ns.
     pub(crate) lag_ns: AtomicU64,
 }
 
-/// The journal of a session, while it is written.
+/// A session's journal while it is written.
 struct OpenJournal {
     event_log: Arc<EventLog>,
-    /// `None` when it is complete.
+    /// `None` once it is complete.
     writer: Option<JournalWriter>,
     file: Grown,
-    /// Nothing of it is on the disk yet.
+    /// Whether nothing of it is on the disk yet.
     is_new: bool,
 }
 
 pub(super) struct Keeper {
     folder: Arc<Folder>,
     keep: Keep,
-    /// Signs what is written.
+    /// The key that signs what is written, if any.
     key: Option<Key>,
     queue: Arc<TapeQueue>,
     tally: Arc<KeeperTally>,
-    /// The newest run of each session that was found in the folder, or has begun.
+    /// The newest run of each session that was found in the folder or has started. A session's runs are its
+    /// successive journals.
     runs: BTreeMap<String, u64>,
-    /// Journals that nobody could continue: they are left as they are.
+    /// Journals that could not be continued: they stay as they are.
     left_alone: BTreeSet<PathBuf>,
     entries: BTreeMap<String, OpenJournal>,
-    /// Tapes of sessions that have come back before the journal of when they left is complete.
+    /// Event logs of sessions that returned before their previous journal was complete.
     waiting: Vec<Arc<EventLog>>,
-    /// Tapes that broke because there was no room.
+    /// Event logs that broke because there was no space.
     without_room: Vec<Weak<EventLog>>,
-    /// Who mirrors journals is told of what was written.
+    /// Receives what was written, for the replication of journals.
     growth: Option<Arc<Growth>>,
-    /// Whether files tell how old they are.
+    /// Whether the ages of files can be trusted.
     ages: purge::Ages,
 }
 
-/// What a folder held at the beginning.
+/// What a folder contained at the start.
 #[derive(Debug, Default)]
 pub(super) struct FolderContent {
     /// The newest run of each session.
     pub(super) runs: BTreeMap<String, u64>,
-    /// Journals of sessions that were not continued, though they have not ended.
+    /// Journals of sessions that were not continued, although they have not ended.
     pub(super) left_alone: BTreeSet<PathBuf>,
 }
 
-/// What was written for a session in a round.
+/// What was written for one session in a round.
 struct Written {
     id: String,
     until_step: u64,
@@ -105,7 +106,7 @@ impl Keeper {
         Keeper { folder, keep, key, queue, tally, runs, left_alone, entries, waiting, without_room, growth, ages }
     }
 
-    /// Works until the queue is stopped, and everything in it is written.
+    /// Writes journals until the queue is stopped and everything in it is written.
     pub(super) fn work(mut self) {
         let (mut swept_ns, mut begun_ns, mut tried_ns) = (0, 0, 0);
         while let Some(mut event_logs) = self.queue.wait(Some(if self.without_room.is_empty() { SWEEP } else { RETRY }))
@@ -131,7 +132,7 @@ impl Keeper {
         self.finish();
     }
 
-    /// Writes what these tapes hold, and gets it to the disk: those of a session one after the other.
+    /// Writes the events of these logs and syncs them; several logs of one session one after another.
     fn round(&mut self, event_logs: &[Arc<EventLog>]) {
         let mut left = std::mem::take(&mut self.waiting);
         left.extend_from_slice(event_logs);
@@ -188,7 +189,7 @@ impl Keeper {
         }
     }
 
-    /// Writes what a tape holds. `None` if that is nothing, or can't be.
+    /// Writes the events of one log. `None` if there are none, or they can't be written.
     fn write(&mut self, event_log: &Arc<EventLog>) -> Option<Written> {
         let taken = event_log.take();
         if taken.is_broken {
@@ -251,7 +252,7 @@ impl Keeper {
         Some(())
     }
 
-    /// Begins the journal of a session: where its tape began, or does so anew.
+    /// Starts the journal of a session, at the beginning of its event log or where that started again.
     fn begin(&mut self, event_log: &Arc<EventLog>, anew: Option<Beginning>) {
         let About { id, owner, idle_timeout_s, first, begin_step, running, until_step, after_run, revision } =
             &event_log.about;
@@ -276,11 +277,11 @@ impl Keeper {
         self.entries.insert(id.clone(), entry);
         event_log.begins(u32::try_from(*run).unwrap_or(u32::MAX));
         if anew.is_some() {
-            tracing::info!(session = %id, run = *run, step = begin_step, "the journal of a session begins anew");
+            tracing::info!(session = %id, run = *run, step = begin_step, "the journal of a session starts again");
         }
     }
 
-    /// The journal of a session that is deleted is whole.
+    /// Completes the journal of a deleted session: removes it, or seals it with an index.
     fn complete(&mut self, id: &str) {
         let Some(mut entry) = self.entries.remove(id) else { return };
         self.runs.remove(id);
@@ -295,7 +296,7 @@ impl Keeper {
         entry.event_log.is_complete();
     }
 
-    /// A session that was coming does not: nothing of it is kept. Its run is not used again.
+    /// Removes the journal of a session that was expected and did not arrive. Its run is not used again.
     fn withdraw(&mut self, id: &str) {
         let Some(mut entry) = self.entries.remove(id) else { return };
         entry.file.close();
@@ -303,7 +304,7 @@ impl Keeper {
         entry.event_log.is_complete();
     }
 
-    /// Removes journals that are too old, or too much, and forgets those that have broken.
+    /// Removes journals that are too old or exceed the size limit, and forgets broken ones.
     fn sweep(&mut self) {
         self.entries.retain(|_, entry| entry.event_log.progress().borrow().broken.is_none());
         let current = |path: &Path| self.entries.values().any(|entry| entry.file.path() == path);
@@ -312,7 +313,7 @@ impl Keeper {
         });
     }
 
-    /// The server ends: says so at the end of every journal.
+    /// Ends every journal with the entry that the server ended, and syncs and seals them.
     fn finish(&mut self) {
         let mut ended = Vec::new();
         for (id, entry) in &mut self.entries {
@@ -327,7 +328,7 @@ impl Keeper {
         ended.retain(|(id, _, bytes)| self.append(id, bytes).is_some());
         let files: Vec<_> = ended.iter().filter_map(|(id, ..)| self.entries.get(id)?.file.file()).collect();
         if let Err(error) = self.folder.sync(files.into_iter(), false) {
-            tracing::error!(%error, "the last of the journals can't be brought to the disk");
+            tracing::error!(%error, "the ends of the journals can't be synced to the disk");
         }
         for (id, until_step, _) in ended {
             if let Some(entry) = self.entries.get_mut(&id) {
@@ -340,7 +341,7 @@ impl Keeper {
     fn break_off(&mut self, id: &str, what: &str, error: &std::io::Error) {
         self.tally.broken.fetch_add(1, Ordering::Relaxed);
         let Some(mut entry) = self.entries.remove(id) else { return };
-        // A run of which nothing is there is none.
+        // A run without any data does not count.
         if entry.file.bytes() == 0 {
             entry.file.close();
             purge::remove(entry.file.path());
@@ -352,7 +353,7 @@ impl Keeper {
         }
     }
 
-    /// Journals that broke because there was no room begin anew, if there is some now.
+    /// Restarts the journals that broke for lack of space, if there is some now.
     fn try_again(&mut self) {
         if !self.without_room.is_empty() && self.folder.has_room() {
             self.without_room
@@ -363,14 +364,14 @@ impl Keeper {
     }
 }
 
-/// Indexes a journal that is complete. Without an index, it is read from its beginning.
+/// Adds an index to a complete journal. Without one, it is read from its beginning.
 fn seal(file: &mut Grown) {
     if let Err(error) = file.seal() {
         tracing::warn!(path = %file.path().display(), %error, "a journal is complete, but can't be indexed");
     }
 }
 
-/// The time of day, ns since 1970.
+/// Returns the wall-clock time, ns since 1970.
 #[allow(clippy::disallowed_methods)]
 pub(super) fn unix_ns() -> u64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();

@@ -1,4 +1,4 @@
-//! Journals of a server's sessions: written while they go on, and continued from when the server is started again.
+//! The journals of a server's sessions: written while these run, and read to continue them when the server restarts.
 
 mod folder;
 mod keeper;
@@ -32,7 +32,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use progress::Growth;
 
-/// So long a call waits until a session is on the disk, or all of it.
+/// Longest time for which a call waits until a session, or all of it, is on the disk.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// The journals of a server, and the thread that writes them.
@@ -41,19 +41,18 @@ pub(super) struct Journals {
     queue: Arc<TapeQueue>,
     thread: std::sync::Mutex<Option<JoinHandle<()>>>,
     pub(super) tally: Arc<KeeperTally>,
-    /// Sessions that could not be continued.
+    /// Sessions that could not be continued when the server started.
     left_alone: BTreeSet<String>,
 }
 
 impl Journals {
-    /// Continues the sessions whose journals are in the configured folder, and keeps journals from then on. `None` if no folder is
-    /// configured.
+    /// Continues the sessions whose journals are in the configured folder, and records journals from then on. `None`
+    /// if no folder is configured. In a fleet, only the sessions in `own` are continued, each with its revision, and
+    /// `growth` is notified of what is written.
     ///
     /// # Errors
-    /// Refuses a folder that can't be used, or that another server uses. A journal that can't be continued is no error: that is
-    /// logged, and the file stays as it is.
-    ///
-    /// In a fleet only the sessions in `own` are continued, each with its revision, and `growth` is told what is written.
+    /// Refuses a folder that can't be used, or that another server uses. A journal that can't be continued is not an
+    /// error: it is logged, and the file stays as it is.
     pub(super) fn open(
         config: &Config,
         pacer: &Arc<Pacer>,
@@ -80,21 +79,21 @@ impl Journals {
         Ok(Some(Arc::new(Journals { folder, queue, thread: Some(keeping).into(), tally, left_alone })))
     }
 
-    /// Whether a session could not be continued when the server began.
+    /// Returns whether a session could not be continued when the server started.
     pub(super) fn has_left_alone(&self, id: &str) -> bool {
         self.left_alone.contains(id)
     }
 
-    /// Where they are.
+    /// Returns the path of their folder.
     pub(super) fn folder(&self) -> &Path {
         self.folder.path()
     }
 
-    /// Goes on with a session whose journal has come into the folder: from that run, or from the newest. Its owner is this server since
-    /// `revision`.
+    /// Continues a session whose journal was moved into the folder: from that run, or from the newest. This server
+    /// owns it since `revision`.
     ///
     /// # Errors
-    /// Refuses what can't be continued.
+    /// Refuses a session that can't be continued.
     pub(super) fn resume(
         &self,
         (id, run): (&str, Option<u64>),
@@ -105,12 +104,12 @@ impl Journals {
         resume::session(self.folder.path(), (id, run), revision, pacer, limits)
     }
 
-    /// Whether there is a journal from which a session, which is not here, can go on.
+    /// Returns whether there is a journal from which a session that is not here can continue.
     pub(super) fn can_go_on(&self, id: &str) -> bool {
         resume::can_go_on(self.folder.path(), id)
     }
 
-    /// Removes the journals of a session, which is not here, from a run on.
+    /// Removes the journals of a session that is not here, from `run` on.
     pub(super) fn remove_from(&self, id: &str, run: u64) {
         for file in palpate_session::journal::file::list(self.folder.path()).unwrap_or_default() {
             if file.session_id == id && file.run >= run {
@@ -119,7 +118,7 @@ impl Journals {
         }
     }
 
-    /// Writes what there still is, and ends. The stepping threads have ended before.
+    /// Writes the remaining events and stops. The stepping threads must have ended.
     pub(super) fn finish(&self) {
         self.queue.stop();
         if let Some(thread) = lock(&self.thread).take() {
@@ -128,7 +127,7 @@ impl Journals {
     }
 }
 
-/// The key in a file, for signatures.
+/// Reads the private key that signs the journals from a file.
 fn signing_key(path: &Path) -> Result<Key> {
     let refuse = |why: String| {
         let refusal = Refusal::new(Reason::Unreadable, "", why);
@@ -141,17 +140,19 @@ fn signing_key(path: &Path) -> Result<Key> {
     Ok(key)
 }
 
-/// Waits until a session is on the disk; if that takes too long, tells why.
+/// Waits until the session is durable as configured. Returns the reason if that takes too long or its journal broke.
 pub(super) async fn until_durable(handle: &SessionHandle) -> Option<String> {
     until(handle, |progress| progress.durable_step.is_some(), "the session is").await
 }
 
-/// Waits until a session is on the disk of this server, whatever others have; if that takes too long, tells why.
+/// Waits until the session is on the disk of this server. Returns the reason if that takes too long or its journal
+/// broke.
 pub(super) async fn until_on_disk(handle: &SessionHandle) -> Option<String> {
     until(handle, |progress| progress.local_step.is_some(), "the session is").await
 }
 
-/// Waits until all of a session that is deleted is on the disk; if that takes too long, tells why.
+/// Waits until all of a deleted session is on the disk. Returns the reason if that takes too long or its journal
+/// broke.
 pub(super) async fn until_complete(handle: &SessionHandle) -> Option<String> {
     until(handle, |progress| progress.is_complete, "the end of the session is").await
 }
@@ -162,7 +163,7 @@ async fn until(handle: &SessionHandle, is_there: impl Fn(&JournalProgress) -> bo
         tokio::time::timeout(WRITE_TIMEOUT, progress.wait_for(|now| is_there(now) || now.broken.is_some())).await;
     match waited {
         Ok(Ok(now)) => now.broken.as_ref().map(ToString::to_string),
-        // The tape is gone: nothing was to be written.
+        // The event log is gone: nothing was to be written.
         Ok(Err(_)) => None,
         Err(_) => {
             let seconds = WRITE_TIMEOUT.as_secs();

@@ -1,4 +1,4 @@
-//! The thread that reads ahead for sessions that play what was recorded (`player`).
+//! The thread that reads ahead for sessions that play back recordings (`player`).
 
 use std::io::{Read, Seek};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
@@ -10,10 +10,10 @@ use palpate_refusal::Result;
 use palpate_session::journal::inputs::Inputs;
 use palpate_tissue::lock::lock;
 
-/// It looks so often whether a session has played much of what was read.
+/// Interval between checks whether a session has played much of what was read.
 const LOOK: Duration = Duration::from_millis(100);
 
-/// What a journal is read from.
+/// The bytes that a journal is read from.
 pub(super) trait JournalBytes: Read + Seek + Send {}
 
 impl<T: Read + Seek + Send> JournalBytes for T {}
@@ -24,7 +24,7 @@ struct Played {
     inputs: Inputs<Box<dyn JournalBytes>>,
 }
 
-/// What it reads for.
+/// The sessions that play recordings, and the thread's wake-up.
 #[derive(Default)]
 pub(super) struct Player {
     state: Mutex<PlayerState>,
@@ -38,7 +38,7 @@ struct PlayerState {
 }
 
 impl Player {
-    /// Reads on for `handle` until it is deleted.
+    /// Reads ahead for `handle` until it is deleted.
     pub(super) fn play(
         &self,
         handle: &Arc<SessionHandle>,
@@ -54,7 +54,7 @@ impl Player {
         self.wake.notify_one();
     }
 
-    /// The thread's work.
+    /// Runs the thread's loop, until it is stopped.
     pub(super) fn work(&self) {
         let mut played: Vec<Played> = Vec::new();
         loop {
@@ -83,7 +83,7 @@ impl Player {
     }
 }
 
-/// Reads ahead of a session that has done `step` steps.
+/// Reads ahead for a session that has done `step` steps.
 pub(super) fn read_ahead(feed: &PlaybackSource, inputs: &mut Inputs<Box<dyn JournalBytes>>, step: u64) -> Result<()> {
     while feed.wants_more(step) == Some(true) {
         match inputs.next_batch()? {

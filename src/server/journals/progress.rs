@@ -1,4 +1,4 @@
-//! How far the journals of this server have grown, for who mirrors them.
+//! Tracks how far the journals of this server have grown and were replicated, for the fleet.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::PathBuf;
@@ -11,22 +11,23 @@ use super::folder::Grown as Growing;
 use palpate_realtime::event_log::EventLog;
 use palpate_tissue::lock::lock;
 
-/// Positions of a journal whose steps are remembered. Who is further behind is told of when it has caught up.
+/// Maximum number of positions per journal whose steps are remembered. A replica that is further behind is counted
+/// when it has caught up.
 const MAX_POSITIONS: usize = 256;
 
-/// The journal of a session.
+/// The journal of a session, with its progress.
 struct TrackedJournal {
     run: u32,
     path: PathBuf,
     bytes: u64,
-    /// At so many bytes the journal is complete up to that step.
+    /// Pairs of a length in bytes and the step up to which the journal is then complete.
     steps: VecDeque<(u64, u64)>,
     event_log: Arc<EventLog>,
-    /// So many bytes of it are mirrored, anywhere.
+    /// The most bytes of it that any other server has had.
     mirrored_bytes: u64,
 }
 
-/// Where a journal is, and how long.
+/// A growing journal: its place and length.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(in crate::server) struct Grown {
     pub(in crate::server) session_id: String,
@@ -35,17 +36,17 @@ pub(in crate::server) struct Grown {
     pub(in crate::server) bytes: u64,
 }
 
-/// The journals that grow.
+/// The growing journals of this server.
 #[derive(Default)]
 pub(in crate::server) struct Growth {
     files: Mutex<BTreeMap<String, TrackedJournal>>,
     news: Notify,
-    /// Of all journals so far.
+    /// Replicated bytes of all journals so far.
     mirrored_bytes: AtomicU64,
 }
 
 impl Growth {
-    /// A journal has so many bytes now, with which it is complete up to `step`.
+    /// Records that a journal has grown, and is complete up to `step`. Notifies those that wait for news.
     pub(super) fn grew(&self, event_log: &Arc<EventLog>, run: u64, file: &Growing, step: u64) {
         let (path, bytes) = (file.path(), file.bytes());
         let run = u32::try_from(run).unwrap_or(u32::MAX);
@@ -71,13 +72,13 @@ impl Growth {
         self.news.notify_waiters();
     }
 
-    /// Nothing more comes of a session.
+    /// Stops tracking a session's journal.
     pub(in crate::server) fn ended(&self, session_id: &str) {
         lock(&self.files).remove(session_id);
         self.news.notify_waiters();
     }
 
-    /// Nothing more comes of that run.
+    /// Stops tracking a session's journal if that run is the current one.
     pub(super) fn is_complete(&self, session_id: &str, run: u32) {
         let mut files = lock(&self.files);
         if files.get(session_id).is_some_and(|file| file.run == run) {
@@ -85,12 +86,12 @@ impl Growth {
         }
     }
 
-    /// Of what grew after this was called.
+    /// Returns a future that completes when a journal grows after this call.
     pub(in crate::server) fn news(&self) -> tokio::sync::futures::Notified<'_> {
         self.news.notified()
     }
 
-    /// The journals of sessions for which `chosen` holds.
+    /// Returns the journals of the sessions that `chosen` accepts.
     pub(in crate::server) fn chosen(&self, chosen: impl Fn(&str) -> bool) -> Vec<Grown> {
         let files = lock(&self.files);
         let theirs = files.iter().filter(|(id, _)| chosen(id));
@@ -104,11 +105,12 @@ impl Growth {
             .collect()
     }
 
-    /// So many bytes of a run are mirrored: the step up to which that is complete, and the tape to tell.
+    /// Records that `bytes` of a run are replicated. Returns the event log and the step up to which they are
+    /// complete.
     pub(in crate::server) fn mirrored(&self, session_id: &str, run: u32, bytes: u64) -> Option<(Arc<EventLog>, u64)> {
         let mut files = lock(&self.files);
         let file = files.get_mut(session_id).filter(|file| file.run == run)?;
-        // A server that has just come to stand by begins anew: what another had before is counted once.
+        // A new standby starts from the beginning: what another one had before is counted once.
         let more = bytes.min(file.bytes).saturating_sub(file.mirrored_bytes);
         file.mirrored_bytes += more;
         self.mirrored_bytes.fetch_add(more, Ordering::Relaxed);
@@ -117,13 +119,14 @@ impl Growth {
         Some((file.event_log.clone(), *step))
     }
 
-    /// Bytes that another server has had on its disk so far; and those of journals that grow, and that none has had.
+    /// Returns the bytes that other servers have had on their disks so far, and those of growing journals that none
+    /// has had.
     pub(in crate::server) fn mirrored_bytes(&self) -> (u64, u64) {
         let unmirrored = lock(&self.files).values().map(|file| file.bytes.saturating_sub(file.mirrored_bytes)).sum();
         (self.mirrored_bytes.load(Ordering::Relaxed), unmirrored)
     }
 
-    /// Whether all is mirrored.
+    /// Returns whether all journals are replicated in full.
     pub(in crate::server) fn is_mirrored(&self) -> bool {
         lock(&self.files).values().all(|file| file.mirrored_bytes >= file.bytes)
     }

@@ -7,7 +7,7 @@ use super::retention::Keep;
 use palpate_realtime::fence::boot_ns;
 use palpate_session::journal;
 
-/// Removes a journal. What can't be removed is told, and tried again.
+/// Removes a journal. Logs a failure; the next sweep tries again.
 pub(super) fn remove(path: &Path) {
     match std::fs::remove_file(path) {
         Ok(()) => tracing::info!(path = %path.display(), "journal removed"),
@@ -15,21 +15,21 @@ pub(super) fn remove(path: &Path) {
     }
 }
 
-/// The machine's clock counts as set forward if it is ahead by more than this, ns.
+/// Lead, in ns, above which the machine's clock counts as set forward.
 const JUMP_NS: i128 = 3_600_000_000_000;
 
-/// Whether the ages of files tell how old they are. They don't after the machine's clock was set forward: what was written before
-/// seems older than it is. Times are of that clock, and of one that nobody sets.
+/// Decides whether the ages of files can be trusted. They can't after the machine's clock was set forward: older
+/// files then seem older than they are. Compares that clock with one that nobody sets (the time since boot).
 #[derive(Debug, Default)]
 pub(super) struct Ages {
-    /// The first clock's lead on the other, ns.
+    /// The lead of the machine's clock on the time since boot, ns.
     lead_ns: Option<i128>,
-    /// By the other clock: from then on they tell it again, since all that was written before is old enough.
+    /// Time since boot from which ages can be trusted again, ns: everything written before is then old enough.
     blind_until_ns: u64,
 }
 
 impl Ages {
-    /// Whether they do now. Journals are kept for `age`.
+    /// Returns whether ages can be trusted now. Journals are kept for `age`.
     fn tell(&mut self, (wall_ns, boot_ns): (u64, u64), age: Duration) -> bool {
         let lead_ns = i128::from(wall_ns) - i128::from(boot_ns);
         let jump_ns = lead_ns - self.lead_ns.unwrap_or(lead_ns);
@@ -42,7 +42,7 @@ impl Ages {
                 age.as_secs() / 3600
             );
         }
-        // Small steps forward add up; one back counts at once.
+        // Small steps forward add up; a step back counts at once.
         if !(0..=JUMP_NS).contains(&jump_ns) || self.lead_ns.is_none() {
             self.lead_ns = Some(lead_ns);
         }
@@ -50,8 +50,8 @@ impl Ages {
     }
 }
 
-/// Removes the journals of `folder` that are too old, if `ages` tell that; then, while all together are too much, the oldest. What
-/// `is_needed` stays.
+/// Removes the journals of `folder` that are too old, if their ages can be trusted; then the oldest, while all
+/// together are too large. Keeps those that `is_needed` accepts.
 #[allow(clippy::disallowed_methods)]
 pub(super) fn sweep(folder: &Path, keep: Keep, ages: &mut Ages, is_needed: impl Fn(&Path) -> bool) {
     let now = SystemTime::now();
@@ -117,9 +117,9 @@ mod tests {
         let mut ages = Ages::default();
         let mut tell = |wall_h: u64, boot_h: u64| ages.tell((wall_h * HOUR_NS, boot_h * HOUR_NS), age);
         assert!(tell(1000, 5));
-        // The machine slept, and that counts.
+        // The machine slept: that time counts.
         assert!(tell(1500, 505));
-        // Ahead by forty days, corrected, and ahead once more.
+        // Set forward by forty days, corrected, and set forward again.
         assert!(!tell(2461, 506));
         assert!(!tell(1502, 507));
         assert!(!tell(1503, 508));
@@ -139,7 +139,7 @@ mod tests {
         let keep = Keep { age: Duration::from_secs(3600), bytes: u64::MAX };
         let file = std::fs::File::options().append(true).open(&path).unwrap();
         file.set_modified(std::time::UNIX_EPOCH + Duration::from_secs(1)).unwrap();
-        // As if the clock had been at 1970 a moment ago.
+        // As if the clock had been at 1970 a moment before.
         let mut ages = Ages { lead_ns: Some(-i128::from(boot_ns())), blind_until_ns: 0 };
         sweep(folder.path(), keep, &mut ages, |_| false);
         assert!(path.exists());

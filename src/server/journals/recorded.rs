@@ -1,5 +1,5 @@
-//! What was recorded, for calls: which journals there are, what is in one, those that clients send, and sessions that begin at a
-//! moment of one.
+//! Calls about recordings: lists journals, describes one, receives those that clients upload, and starts sessions at
+//! a moment of one.
 
 use std::io::{Cursor, Read, Seek};
 use std::path::Path;
@@ -28,17 +28,17 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::select::scheme_selection::{NEVER, given_up};
 
-/// Moments of a curve of forces.
+/// Maximum number of moments in a curve of forces.
 const MAX_MOMENTS: usize = 2000;
 
-/// The journals of a folder.
+/// Lists the journals of a folder.
 fn listed(folder: &Path) -> Result<Vec<JournalFile>> {
     file::list(folder).map_err(|error| {
         Refusal::new(Reason::Unreadable, "journal", format!("the folder of the journals can't be read: {error}"))
     })
 }
 
-/// The journal of a run of a session, open; of its newest if `run` is 0.
+/// Finds and opens the journal of a run of a session; its newest run if `run` is 0.
 fn find(
     folder: &Path,
     session_id: &str,
@@ -46,7 +46,7 @@ fn find(
     payer: Option<&Account>,
 ) -> Result<(JournalFile, JournalReader<Box<dyn JournalBytes>>)> {
     let unknown = |message: &str| Refusal::new(Reason::UnknownSession, "session_id", message.to_owned());
-    // A name that is none would be a path.
+    // A text that is not an ID would be a path.
     if file::parse(&file::name(session_id, 1)).is_none() {
         return Err(unknown("is not the ID of a session"));
     }
@@ -64,16 +64,16 @@ fn find(
 
 fn open(file: &JournalFile, payer: Option<&Account>) -> Result<JournalReader<Box<dyn JournalBytes>>> {
     let source: Box<dyn JournalBytes> = Box::new(journal::reader::file(&file.path).map_err(Refusal::without_folder)?);
-    // Callers are told what is wrong with it, and not where it is.
+    // Callers are sent what is wrong with it, and not its path.
     Ok(JournalReader::paid(&file::name(&file.session_id, file.run), source, paid_by(payer)?)?.up_to_damage())
 }
 
-/// Grows by what is read, from who pays for it.
+/// Returns a charge to `payer` that grows by what is read.
 fn paid_by(payer: Option<&Account>) -> Result<Option<Taken>> {
     payer.map(|payer| payer.take(Resource::Memory(Purpose::Journals), 0, "")).transpose()
 }
 
-/// A journal in a list: `reader` is it, open, or why it can't be opened.
+/// Returns the entry of a journal in a list. `reader` is the open journal, or the reason why it can't be opened.
 fn info(
     file: &JournalFile,
     reader: std::result::Result<&mut JournalReader<Box<dyn JournalBytes>>, String>,
@@ -100,13 +100,13 @@ fn info(
     begun.unwrap_or_else(|fault| pb::JournalInfo { fault, ..known })
 }
 
-/// What the server can play: the journals of its folder, and those that clients have sent.
+/// The recordings that the server can play: the journals of its folder, and those that clients have uploaded.
 pub(in crate::server) struct Recorded {
-    /// `None` if no journals are kept.
+    /// `None` if the server keeps no journals.
     folder: Option<Arc<Folder>>,
-    /// How long they stay.
+    /// How long they are kept.
     keep: Keep,
-    /// Sessions whose mesh a client has sent have journals too.
+    /// Whether sessions whose mesh a client has sent have journals too.
     with_meshes: bool,
     sent: Uploads<Vec<u8>>,
     player: Arc<Player>,
@@ -139,7 +139,7 @@ impl Recorded {
         Ok(Arc::new(Recorded { folder, keep, with_meshes, sent, player, thread: Some(playing).into() }))
     }
 
-    /// Ends. The stepping threads have ended before.
+    /// Stops the thread. The stepping threads must have ended.
     pub(in crate::server) fn finish(&self) {
         self.player.stop();
         if let Some(thread) = lock(&self.thread).take() {
@@ -147,7 +147,7 @@ impl Recorded {
         }
     }
 
-    /// Forgets the journals of clients that were not used for long.
+    /// Removes uploaded journals that were not used for too long.
     pub(in crate::server) fn forget_expired(&self, now_ns: u64) {
         self.sent.forget_expired(now_ns);
     }
@@ -160,7 +160,7 @@ impl Recorded {
         self.folder.as_ref().map(|folder| folder.path()).ok_or_else(none)
     }
 
-    /// What the server keeps of a mesh that a client sends, for people; empty if nothing.
+    /// Returns, as a sentence, what the server keeps of a mesh that a client sends; empty if nothing.
     pub(in crate::server) fn told_of_meshes(&self) -> String {
         match (&self.folder, self.with_meshes && !self.keep.age.is_zero()) {
             (Some(_), true) => format!(
@@ -171,10 +171,10 @@ impl Recorded {
         }
     }
 
-    /// Removes the journals of a session that is not here any more, all runs. Tells how many.
+    /// Removes all journals of a session that is not here any more. Returns their number.
     ///
     /// # Errors
-    /// Refuses a session that goes on or of which there is no journal, and tells which file can't be removed.
+    /// Refuses a session that still runs or has no journal, and names a file that can't be removed.
     pub(in crate::server) fn remove(&self, session_id: &str, pacer: &Pacer) -> Result<u32> {
         let folder = self.folder("session_id")?;
         if pacer.has(session_id) {
@@ -208,7 +208,7 @@ impl Recorded {
         Ok(removed)
     }
 
-    /// All journals of the folder, by session and run; none if there is no folder.
+    /// Returns all journals of the folder, by session and run; none if there is no folder.
     ///
     /// # Errors
     /// Refuses if the folder can't be read.
@@ -220,10 +220,10 @@ impl Recorded {
         Ok(pb::ListJournalsResponse { journals: listed.iter().map(info).collect() })
     }
 
-    /// What is in a journal: a pass over it.
+    /// Describes the contents of a journal, which takes a pass over it.
     ///
     /// # Errors
-    /// Refuses a journal that is not there, or can't be read.
+    /// Refuses a journal that does not exist or can't be read.
     pub(in crate::server) fn told(
         &self,
         request: &pb::GetJournalRequest,
@@ -234,10 +234,10 @@ impl Recorded {
         tell(reader, info, &NEVER)
     }
 
-    /// Adds a part of a journal that a client sends.
+    /// Adds a part of a journal that a client uploads.
     ///
     /// # Errors
-    /// As for [`Uploads::add`].
+    /// Returns the errors of [`Uploads::add`].
     pub(in crate::server) fn add(
         &self,
         request: &pb::UploadJournalRequest,
@@ -249,10 +249,10 @@ impl Recorded {
         Ok(pb::UploadJournalResponse { upload_id, received_bytes, journal: None })
     }
 
-    /// Reads a journal of which all parts have come. It can be used from then on.
+    /// Reads a completely received journal and describes it. It can be used from then on.
     ///
     /// # Errors
-    /// Refuses a journal that this caller is not sending, one that can't be read, and when `stop` is set.
+    /// Refuses a journal that this caller is not uploading, one that can't be read, and when `stop` is set.
     pub(in crate::server) fn read(
         &self,
         id: &str,
@@ -277,7 +277,7 @@ impl Recorded {
         Ok(told)
     }
 
-    /// The journal of a moment, and the session and run that it is of.
+    /// Opens the journal of a moment. Returns it with its session and run.
     fn open(&self, moment: &pb::JournalMoment, payer: &Account) -> Result<Opened> {
         if moment.upload_id.is_empty() {
             let (file, reader) = find(self.folder("journal")?, &moment.session_id, moment.run, Some(payer))?;
@@ -288,7 +288,7 @@ impl Recorded {
             return Err(Refusal::new(Reason::WrongKind, "session_id", message));
         }
         let bytes = self.sent.get(&moment.upload_id, payer)?;
-        // A session that plays it keeps it, also when the upload has expired.
+        // A session that plays it keeps it, even after the upload has expired.
         let taken = payer.take(Resource::Memory(Purpose::Journals), bytes.len() as u64, "upload_id")?;
         let source: Box<dyn JournalBytes> = Box::new(Cursor::new(UploadedJournal { bytes, _taken: taken }));
         let reader = JournalReader::paid(SENT, source, paid_by(Some(payer))?)?.without_files().up_to_damage();
@@ -296,11 +296,11 @@ impl Recorded {
         Ok((reader, session_id, run))
     }
 
-    /// A session that begins at a moment of a journal, and goes on live or plays what was recorded.
+    /// Creates a session that starts at a moment of a journal, and continues live or plays back the recording.
     ///
     /// # Errors
-    /// Refuses a journal that is not there, can't be read or simulated again here, a step that it does not have, a speed out of
-    /// range, and as [`Pacer::resume`] does; also when `stop` is set.
+    /// Refuses a journal that does not exist, can't be read or simulated again here, a step that it does not have,
+    /// and a speed out of range; returns the errors of [`Pacer::resume`]; refuses when `stop` is set.
     pub(in crate::server) fn begin(
         &self,
         moment: &pb::JournalMoment,
@@ -331,11 +331,11 @@ impl Recorded {
             revision,
             waiting: Vec::new(),
             frozen: false,
-            // What the server has a journal of is not kept out of them.
+            // A session started from a journal of this server may be recorded as well.
             recorded: self.with_meshes || moment.upload_id.is_empty() || !has_mesh,
         };
         if !moment.plays {
-            // With the memory that is taken for a journal which was sent.
+            // With the memory charged for an uploaded journal.
             drop(reader);
             return pacer.resume(
                 begin,
@@ -357,18 +357,18 @@ impl Recorded {
     }
 }
 
-/// A journal, and the session and run that it is of.
+/// An open journal, with its session and run.
 type Opened = (JournalReader<Box<dyn JournalBytes>>, String, u64);
 
-/// What refusals call a journal that a client has sent.
+/// The name of an uploaded journal in refusals.
 const SENT: &str = "the journal";
 
-/// A refusal of a journal that a client has sent.
+/// Sets the field of a refusal about an uploaded journal.
 fn within_upload(refusal: Refusal) -> Refusal {
     if refusal.field.is_empty() { Refusal { field: "part".to_owned(), ..refusal } } else { refusal }
 }
 
-/// A journal that a client has sent.
+/// The bytes of an uploaded journal, with the memory charged for them.
 struct UploadedJournal {
     bytes: Arc<Vec<u8>>,
     _taken: Taken,
@@ -380,7 +380,7 @@ impl AsRef<[u8]> for UploadedJournal {
     }
 }
 
-/// What is in a journal, of which `info` is known. One that is damaged is told up to there.
+/// Describes the contents of a journal, of which `info` is known; a damaged one up to the damage.
 fn tell<R: Read + Seek>(
     mut reader: JournalReader<R>,
     info: pb::JournalInfo,
@@ -410,11 +410,11 @@ fn tell<R: Read + Seek>(
     })
 }
 
-/// A curve of forces with at most [`MAX_MOMENTS`] moments, the largest of each while.
+/// A curve of forces with at most [`MAX_MOMENTS`] moments; each is the largest force of an interval.
 #[derive(Default)]
 struct Forces {
     moments: Vec<pb::ForceMoment>,
-    /// Moments that are one in the curve, as a power of 2; and how many of the newest are in already.
+    /// Power of 2 of the moments that are merged into one; and how many of them the newest contains already.
     halvings: u32,
     in_newest: u32,
 }
@@ -438,7 +438,7 @@ impl Forces {
     }
 }
 
-/// A journal of one moment: of a session of `handle` as it stood.
+/// Returns a journal with a single moment: the session of `handle` in the state `present`.
 pub(in crate::server) fn snapshot(handle: &SessionHandle, present: &Present) -> Result<Vec<u8>> {
     let Present { saved, copy, running, until_step } = present;
     let step = saved.step();

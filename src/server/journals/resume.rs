@@ -1,4 +1,5 @@
-//! Continues sessions from their journals, each at its last durable step: with the same ID, its tools let go, running if it ran.
+//! Continues sessions from their journals, each at its last durable step: with its ID, its tools released, and
+//! running if it was running.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -14,22 +15,21 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::select::scheme_selection::NEVER;
 
-/// What became of a session's journals.
+/// The result of continuing a session from its journals.
 enum ResumeOutcome {
-    /// It goes on.
+    /// It continues.
     Continued,
-    /// It was deleted, went to another server, or there was nothing yet to continue.
+    /// It was deleted, moved to another server, or had nothing to continue yet.
     Ended,
     /// It can't be continued.
     Refused(Refusal),
 }
 
-/// Continues all sessions whose journals are in `folder`, and have not ended. Those that can't be continued are logged.
+/// Continues all sessions whose journals are in `folder` and have not ended, and logs those that can't be continued.
+/// In a fleet, `own` holds the sessions that this server still owns, with their revisions; others stay as they are.
 ///
 /// # Errors
 /// Refuses a folder that can't be read.
-///
-/// In a fleet, `own` has those that are still this server's, and the revision of each; others are left as they are.
 pub(super) fn all(
     folder: &Path,
     own: Option<&BTreeMap<String, u64>>,
@@ -68,7 +68,7 @@ pub(super) fn all(
                 break;
             }
         }
-        // If no thread could be started, this one does it all.
+        // If no thread could be started, this one does all the work.
         work();
     });
     let found = found.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
@@ -81,7 +81,7 @@ fn list(folder: &Path) -> Result<Vec<JournalFile>> {
     })
 }
 
-/// Whether a session has a journal in `folder` from which it can go on. One that can't be read may be such.
+/// Returns whether `folder` has a journal from which a session can continue. An unreadable journal counts as one.
 pub(super) fn can_go_on(folder: &Path, id: &str) -> bool {
     let files = list(folder).unwrap_or_default().into_iter().rev().filter(|file| file.session_id == id);
     for file in files {
@@ -94,7 +94,7 @@ pub(super) fn can_go_on(folder: &Path, id: &str) -> bool {
     false
 }
 
-/// Whether the session was deleted, or went to another server.
+/// Returns whether the session was deleted or moved to another server.
 fn has_ended(survey: &Survey) -> bool {
     survey.end.as_ref().is_some_and(|end| [pb::Why::Deleted, pb::Why::Moved].contains(&end.why()))
 }
@@ -124,7 +124,7 @@ pub(super) fn session(
     }
 }
 
-/// Continues a session of which these are the journals, by ascending run.
+/// Continues the session with these journals, sorted by run. Returns the journal that decided the result.
 fn one<'f>(
     files: &'f [JournalFile],
     revision: u64,
@@ -136,7 +136,7 @@ fn one<'f>(
         newest = file;
         match continued(file, revision, pacer, limits) {
             Ok(outcome) => return (outcome, newest),
-            // The server ended before anything of this run was on the disk: the run before has all.
+            // The server ended before anything of this run was on the disk: the run before has everything.
             Err(refusal) if refusal.reason == Reason::Missing => {}
             Err(refusal) => return (ResumeOutcome::Refused(refusal), newest),
         }

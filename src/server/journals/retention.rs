@@ -1,4 +1,4 @@
-//! How long journals are kept.
+//! How long journals are kept, as configured.
 
 use std::str::FromStr;
 use std::time::Duration;
@@ -7,14 +7,14 @@ use serde::Deserialize;
 
 use palpate_session::budget::parse_bytes;
 
-/// How long the journals of sessions that have ended are kept, and how many bytes all journals may take before the oldest of these
-/// are removed. The newest of a session that goes on, and those that nobody has continued, are never removed.
+/// The age above which journals of ended sessions are removed, and the size of all journals above which the oldest of
+/// those are. The newest journal of a running session, and those that could not be continued, are never removed.
 #[derive(Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 pub struct Keep {
-    /// The age from which one is removed.
+    /// Age at which a journal is removed.
     pub age: Duration,
-    /// All together take at most so much.
+    /// Limit on the bytes of all journals together.
     pub bytes: u64,
 }
 
@@ -53,7 +53,7 @@ impl FromStr for Keep {
                 return Err(format!("`{text}` has two ages or two sizes"));
             }
         }
-        // What is not told has no bound.
+        // A missing value means no limit.
         Ok(Keep { age: age.unwrap_or(Duration::MAX), bytes: bytes.unwrap_or(u64::MAX) })
     }
 }
@@ -67,7 +67,7 @@ impl TryFrom<String> for Keep {
 }
 
 impl Keep {
-    /// For people: how long the journals of a session stay when it has ended.
+    /// Describes in words how long the journals of an ended session are kept.
     pub(super) fn in_words(self) -> String {
         let age = match self.age.as_secs() {
             _ if self.age == Duration::MAX => None,

@@ -1,10 +1,10 @@
-// The base of haptic devices. Not built by Palpate's tests: they have no Unity.
+// The base class of haptic devices. Palpate's tests do not build it, because they have no Unity.
 using UnityEngine;
 
 namespace Palpate
 {
-    /// <summary>A haptic device that libpalpate calls a thousand times a second, on a thread of its own. Derive from it, with your maker's
-    /// calls in Read and Write; these must touch nothing of Unity.</summary>
+    /// <summary>A haptic device that libpalpate calls a thousand times a second, on its own thread. Derive from it,
+    /// and call your device's SDK in Read and Write; these must not use any Unity object.</summary>
     public abstract class PalpateDevice : MonoBehaviour, IDevice
     {
         public PalpateTissue tissue;
@@ -14,7 +14,7 @@ namespace Palpate
         public abstract Reading Read();
         public abstract void Write(Vector force);
 
-        /// <summary>How the loop stands.</summary>
+        /// <summary>State of the loop.</summary>
         public BridgeState State { get { return bridge == null ? default(BridgeState) : bridge.Look(); } }
 
         protected virtual void Start()

@@ -1,10 +1,11 @@
-// The tissue of a session as a Mesh. Not built by Palpate's tests: they have no Unity.
+// The tissue of a session as a Mesh. Palpate's tests do not build it, because they have no Unity.
 using System.Collections.Generic;
 using UnityEngine;
 
 namespace Palpate
 {
-    /// <summary>Makes a session, and shows its surface as the mesh of this object, in its local coordinates.</summary>
+    /// <summary>Creates a session, and shows its surface as the mesh of this object, in its local
+    /// coordinates.</summary>
     [RequireComponent(typeof(MeshFilter))]
     public sealed class PalpateTissue : MonoBehaviour
     {
@@ -17,7 +18,7 @@ namespace Palpate
         /// <summary>The session; null while there is none.</summary>
         public Session Session { get; private set; }
 
-        /// <summary>The surface at rest, for rays.</summary>
+        /// <summary>The surface at rest, for ray casts.</summary>
         public MeshCollider Rest { get; private set; }
 
         Server server;
@@ -44,7 +45,7 @@ namespace Palpate
                 mesh.SetUVs(0, uv);
             }
             GetComponent<MeshFilter>().sharedMesh = mesh;
-            // The tissue at rest: what a ray meets, whatever the tool has done to it.
+            // The tissue at rest: rays hit this, whatever the tool has done to the tissue.
             var atRest = new Mesh { name = scene + " at rest", indexFormat = UnityEngine.Rendering.IndexFormat.UInt32 };
             atRest.SetVertices(positions);
             atRest.triangles = surface.Indices;

@@ -1,12 +1,12 @@
-// A tool at 1 kHz. Not built by Palpate's tests: they have no Unity.
+// A tool at 1 kHz. Palpate's tests do not build it, because they have no Unity.
 using System.Diagnostics;
 using System.Threading;
 using UnityEngine;
 
 namespace Palpate
 {
-    /// <summary>Leads a tool where this object is, on a thread of its own at 1 kHz, and tells the force. The object follows the
-    /// mouse over the tissue.</summary>
+    /// <summary>Moves a tool to the position of this object, on its own thread at 1 kHz, and provides the force. The
+    /// object follows the mouse over the tissue.</summary>
     public sealed class PalpateTool : MonoBehaviour
     {
         public PalpateTissue tissue;
@@ -16,7 +16,7 @@ namespace Palpate
         /// <summary>The force on the tool, N, in the coordinates of the tissue.</summary>
         public Vector3 Force { get; private set; }
 
-        // What the two threads exchange: whole values, the newest counts.
+        // Data that the two threads exchange, always as complete values; only the newest counts.
         readonly object exchange = new object();
         Reading wanted;
         Felt felt;
@@ -39,7 +39,7 @@ namespace Palpate
         void Update()
         {
             var ray = Camera.main.ScreenPointToRay(Input.mousePosition);
-            // Along the normal of the surface at rest, of a sheet or of a mesh, where the mouse is over it.
+            // Along the normal of the surface at rest, of a sheet or of a mesh, where the mouse points at it.
             RaycastHit hit;
             if (!tissue.Rest.Raycast(ray, out hit, Camera.main.farClipPlane)) return;
             var normal = tissue.transform.InverseTransformDirection(hit.normal);
@@ -53,7 +53,7 @@ namespace Palpate
             }
         }
 
-        // In place of `at`, a haptic device would be read here, and told the force.
+        // With a haptic device, read its position here instead of `at`, and send it the force.
         void Run()
         {
             var clock = Stopwatch.StartNew();
@@ -62,7 +62,7 @@ namespace Palpate
             {
                 Reading to;
                 lock (exchange) to = wanted;
-                // A mouse jumps sixty times a second; a hand does not.
+                // The mouse moves in jumps sixty times a second; a hand does not. So its movement is smoothed.
                 const double share = 0.02;
                 at.Position.X += share * (to.Position.X - at.Position.X);
                 at.Position.Y += share * (to.Position.Y - at.Position.Y);

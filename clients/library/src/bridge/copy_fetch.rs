@@ -1,4 +1,4 @@
-//! Fetches a session's tissue and makes a copy of it, beside the haptic stream.
+//! Fetches a session's tissue and builds a local copy of it, in parallel with the haptic stream.
 
 use std::sync::Arc;
 
@@ -15,11 +15,11 @@ use crate::snapshot;
 
 type Made = Result<Box<dyn Predictor>, Error>;
 
-/// A snapshot of more bytes is of a tissue that no client could step in time.
+/// Limit on the bytes of a snapshot: no client could step a larger tissue in time.
 const MAX_BYTES: usize = 64 << 20;
 
-/// Makes copies for a bridge, over all its connections: one at a time, because nothing stops the thread of one until its step
-/// ends.
+/// Builds copies for a bridge, over all its connections. One at a time, since nothing stops the thread of a copy
+/// until its step ends.
 #[derive(Clone)]
 pub(super) struct Copier {
     copies: Copies,
@@ -32,26 +32,26 @@ impl Copier {
     }
 }
 
-/// The copy of one connection.
+/// The copies of one connection.
 pub(super) struct Copying {
     channel: Channel,
     session_id: String,
     tip: Tip,
-    /// None: this tissue is not copied.
+    /// `None`: this tissue is not copied.
     copier: Option<Copier>,
-    /// At most one, which ends when this is dropped.
+    /// At most one task, which is aborted when this is dropped.
     under_way: JoinSet<Made>,
 }
 
 impl Copying {
-    /// Of a session's tissue, if that is of a kind to be copied.
+    /// Creates the copying of a session's tissue, if `copier` copies tissues of that kind.
     pub(super) fn new(copier: Option<&Copier>, session: &pb::Session, channel: Channel, tip: Tip) -> Self {
         let is_mesh = session.scene.as_ref().is_some_and(|scene| scene.mesh.is_some());
         let copier = copier.filter(|copier| is_mesh || copier.copies.of_sheets).cloned();
         Copying { channel, session_id: session.session_id.clone(), tip, copier, under_way: JoinSet::new() }
     }
 
-    /// Begins to make a copy of the tissue as it is now, in place of any that is under way.
+    /// Starts building a copy of the current tissue. Aborts an earlier one that is not finished.
     pub(super) fn begin(&mut self) {
         self.under_way.abort_all();
         self.under_way.detach_all();
@@ -70,7 +70,7 @@ impl Copying {
         });
     }
 
-    /// The copy, once it is made. None is lost if you drop the future.
+    /// Returns the copy, once it is built. Dropping the future loses nothing.
     pub(super) async fn next(&mut self) -> Made {
         match self.under_way.join_next().await {
             Some(made) => made.map_err(|_| Error::Internal("fetching the tissue panicked".to_owned())).flatten(),

@@ -1,6 +1,6 @@
-//! Makes and steps a copy of the tissue on a thread of its own. A server says what the copy is, so a step of it may take long:
-//! the loop of a device waits for none. It leaves its newest place in a slot and finds in another what the tool felt at an
-//! earlier one, usually that of the last tick.
+//! Builds and steps a copy of the tissue on a thread of its own. The server decides how large the tissue is, so a
+//! step may take long: the device's loop never waits for one. It leaves its newest place in one slot and finds in
+//! another what the tool felt at an earlier place, usually that of the last tick.
 
 use std::io;
 use std::sync::Arc;
@@ -13,32 +13,33 @@ use tokio::sync::{OwnedSemaphorePermit, oneshot};
 
 use crate::exchange::{NewestReader, NewestWriter, newest};
 
-/// What was felt longer ago than this is not rendered: local models know more, s.
+/// Age above which a result is not rendered, s: local models are more accurate then.
 const MAX_LATE_S: f64 = 0.0045;
 
-/// How often the thread looks whether there is a new place. A tick wakes nobody, because that would be a call of the system.
+/// Interval at which the thread checks for a new place. A tick wakes no thread, because that would be a call of the
+/// system.
 const ROUND: Duration = Duration::from_micros(200);
 
-/// After so many rounds without a new place it looks less often.
+/// Number of checks without a new place after which they become less frequent.
 const PATIENT_ROUNDS: u32 = 5000;
 const LONG_ROUND: Duration = Duration::from_millis(5);
 
-/// Where the tool is.
+/// The place of the tool at a time.
 #[derive(Clone, Copy)]
 struct ToolPlace {
     now_s: f64,
     place_m: DVec3,
 }
 
-/// What it felt at a place.
+/// What the tool felt at a place.
 #[derive(Clone, Copy)]
 struct Felt {
     now_s: f64,
     felt: Option<Predicted>,
 }
 
-/// A copy that another thread steps. A tick of it takes a fixed number of operations. The thread ends when this is dropped, after
-/// the step that it is in.
+/// A copy that another thread steps. Its method takes a fixed number of operations. The thread ends after its current
+/// step when this is dropped.
 struct Stepped {
     places: NewestWriter<ToolPlace>,
     felt: NewestReader<Felt>,
@@ -60,7 +61,7 @@ impl Drop for Stepped {
     }
 }
 
-/// The other end, of the thread.
+/// The end of the stepping thread.
 struct Stepper {
     places: NewestReader<ToolPlace>,
     felt: NewestWriter<Felt>,
@@ -68,7 +69,7 @@ struct Stepper {
 }
 
 impl Stepper {
-    /// Steps the copy to the newest place. Returns whether there was one.
+    /// Steps the copy to the newest place. Returns whether there was a new one.
     fn step(&mut self, copy: &mut dyn Predictor) -> bool {
         if !self.places.refresh() {
             return false;
@@ -97,7 +98,7 @@ impl Stepper {
     }
 }
 
-/// The two ends of a copy.
+/// Creates the two ends of a copy.
 fn ends() -> (Stepped, Stepper) {
     let (places, to_step) = newest(&ToolPlace { now_s: 0.0, place_m: DVec3::ZERO });
     let (told, felt) = newest(&Felt { now_s: f64::NEG_INFINITY, felt: None });
@@ -105,14 +106,14 @@ fn ends() -> (Stepped, Stepper) {
     (Stepped { places, felt, is_over: is_over.clone() }, Stepper { places: to_step, felt: told, is_over })
 }
 
-/// What `make` makes, on the thread that will step it; `permit` is given back when that thread ends. If nobody waits for the
-/// answer any more, the thread ends as soon as the copy is made.
+/// Runs `make` on the thread that will step its result, and returns the future result. Drops `permit` when that
+/// thread ends. If nobody waits for the result any longer, the thread ends as soon as the copy is built.
 pub(super) fn made_apart(
     make: impl FnOnce() -> Result<Box<dyn Predictor>, String> + Send + 'static,
     permit: OwnedSemaphorePermit,
 ) -> io::Result<oneshot::Receiver<Result<Box<dyn Predictor>, String>>> {
     let (tell, made) = oneshot::channel();
-    // Not a thread of the runtime's: the end of that would wait for it.
+    // Not a thread of the runtime: the runtime would wait for it when it ends.
     std::thread::Builder::new().name("copy".to_owned()).spawn(move || {
         let _permit = permit;
         match make() {
@@ -164,7 +165,7 @@ mod tests {
         let felt: Vec<bool> =
             (50..60).map(|tick| stepped.feel(f64::from(tick) * 1e-3, place_m(tick)).is_some()).collect();
         assert_eq!(felt, [true, true, true, true, false, false, false, false, false, false]);
-        // It goes on with the newest place.
+        // It continues with the newest place.
         assert!(stepper.step(&mut CopySpring));
         assert_eq!(stepped.feel(0.060, place_m(60)), Some(pressed(place_m(59))));
         drop(stepped);
@@ -190,11 +191,11 @@ mod tests {
             let permit = places.clone().acquire_owned().await.unwrap();
             let made = made_apart(move || Ok(Box::new(Endless(ended))), permit).unwrap();
             let mut copy = made.await.unwrap().unwrap();
-            // This thread comes past although no step ends.
+            // This thread gets past although no step ends.
             assert!((0..1000).all(|tick| copy.feel(f64::from(tick) * 1e-3, DVec3::ZERO).is_none()));
             drop(copy);
             drop(end);
-            // Once the step has ended there is room for another copy.
+            // Once the step has ended, another copy can be built.
             let permit = places.acquire_owned().await.unwrap();
             let refused = made_apart(|| Err("too large".to_owned()), permit).unwrap().await.unwrap();
             assert_eq!(refused.err().as_deref(), Some("too large"));

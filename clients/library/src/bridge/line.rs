@@ -1,5 +1,5 @@
-//! The network side of a bridge: connects, opens a haptic stream, and passes commands and models on. When the connection
-//! breaks, it connects again; in a fleet to whichever server has the session then.
+//! The network side of a bridge: connects, opens a haptic stream, and transfers commands and models. When the
+//! connection breaks, it connects again; in a fleet, to the server that has the session then.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -30,44 +30,44 @@ use crate::exchange::QueueReader;
 use crate::fleet::{AGAIN, At, Trail, follow};
 use crate::touch::Touch;
 
-/// What a bridge tells of itself. The loop of a device has no part in it.
+/// The state of the network side, for the program. The loop of a device does not access it.
 #[derive(Default)]
 pub(super) struct Shared {
     inbound: Mutex<Inbound>,
-    /// A connection has been opened.
+    /// Notified when a connection has been opened.
     pub(super) opened: Notify,
 }
 
-/// How the network's side stands.
+/// The state of the network side.
 #[derive(Default)]
 pub(super) struct Inbound {
     pub(super) traffic: Traffic,
-    /// Why the newest connection broke, or never came to be; `None` while one stands.
+    /// Why the newest connection broke or could not be opened; `None` while there is one.
     pub(super) failure: Option<Error>,
-    /// The session that was made for the target.
+    /// The session that was created for the target.
     pub(super) made: Option<String>,
-    /// Who had the session at last.
+    /// The server that last had the session.
     at: Option<Server>,
 }
 
-/// What went over the network, in all.
+/// Totals of what was sent and received over all connections of a bridge.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Traffic {
-    /// Connections that were opened.
+    /// Number of connections that were opened.
     pub connections: u64,
-    /// Samples that arrived.
+    /// Number of samples that arrived.
     pub samples: u64,
-    /// Their bytes, with the headers of the network.
+    /// Bytes of the samples, with the headers of the network.
     pub bytes: u64,
-    /// Commands that the server refused.
+    /// Number of commands that the server refused.
     pub refused: u64,
-    /// Attempts to connect that failed, and connections that broke.
+    /// Number of failed attempts to connect, and of connections that broke.
     pub failed: u64,
-    /// Poses that were sent, by whichever way.
+    /// Number of poses that were sent, by datagram or stream.
     pub poses: u64,
-    /// What went by datagram, and how often the stream took over again.
+    /// Messages sent and received by datagram, and how often the stream took over again.
     pub carried: Carried,
-    /// How far the tissue under the middle of the tip was moved at most, m, as samples told it.
+    /// Largest displacement of the tissue under the middle of the tip, as reported in samples, m.
     pub deepest_m: f64,
 }
 
@@ -77,15 +77,15 @@ impl Shared {
     }
 }
 
-/// The commands of a loop, for the network.
+/// The commands of a loop, for the network side.
 pub(super) struct Commands {
     pub(super) queue: QueueReader<ToolPose>,
-    /// Told when something is in the queue, or the loop is over.
+    /// Notified when the queue has a command, or the loop has ended.
     pub(super) news: Arc<Notify>,
 }
 
 impl Commands {
-    /// The next; `None` after the last. None is lost if you drop the future.
+    /// Returns the next command; `None` after the last. Dropping the future loses none.
     async fn recv(&mut self) -> Option<ToolPose> {
         loop {
             let is_over = self.queue.is_over();
@@ -100,23 +100,24 @@ impl Commands {
     }
 }
 
-/// First and longest pause before it connects again.
+/// First and longest pause before another connection, which doubles in between.
 const PAUSES: [Duration; 2] = [Duration::from_millis(100), Duration::from_secs(2)];
 
-/// A session that is sent on more often than this, with no sample in between, waits as after a break.
+/// Limit on redirections to other servers without a sample in between; beyond it, waits as after a break.
 const MAX_MOVES: u32 = 8;
 
-/// A connection on which the server is silent for longer than this is given up.
+/// Time without a message from the server after which the connection is given up.
 const SILENCE: Duration = Duration::from_secs(2);
 
-/// A stream is opened within this time, or given up. The server computes the first force law meanwhile: on a busy machine that takes
-/// seconds, and whoever gives up earlier begins it anew each time.
+/// Time limit for opening a stream. The server computes the first force law in that time, which takes seconds on a
+/// busy machine; a client that gives up earlier makes it start again each time.
 const OPENING: Duration = Duration::from_secs(8);
 
 /// Largest number of commands that wait for the stream.
 const COMMANDS: usize = 64;
 
-/// Keeps a connection until `commands` ends.
+/// Keeps a connection open until `commands` ends; connects again whenever it breaks. Ends early if the first attempt
+/// is refused.
 pub(super) async fn keep(
     target: Target,
     copies: Option<Copies>,
@@ -128,9 +129,9 @@ pub(super) async fn keep(
 ) {
     let copier = copies.map(Copier::new);
     let mut pause = PAUSES[0];
-    // Attempts in a row.
+    // Failed attempts in a row.
     let mut attempts = 0_u64;
-    // How often the session was elsewhere, in a row.
+    // Redirections to other servers in a row.
     let mut moves = 0;
     let mut trail = Trail::new(target.server.clone().within(SILENCE));
     loop {
@@ -138,7 +139,7 @@ pub(super) async fn keep(
         let ended =
             connect(&target, copier.as_ref(), &mut trail, &device, shared, &mut feed, &mut commands, warn).await;
         let Err(error) = ended else { return };
-        // After a move the tool is still in the tissue, and goes on by its lease; not after anything else.
+        // After a move the tool is still in the tissue, and continues with its lease; not after any other break.
         let went_on = moved_to(&error).is_none() && !std::mem::take(&mut trail.lease_id).is_empty();
         if went_on && is_of(&error, Reason::NotHolder) {
             continue;
@@ -160,7 +161,7 @@ pub(super) async fn keep(
             inbound.traffic.failed += 1;
             inbound.traffic
         };
-        // Another attempt would be refused too, or would wait for somebody who may hold the tool for hours.
+        // Another attempt would be refused too, or would wait for a user who may hold the tool for hours.
         let is_final = error.is_refusal() || error.is_denied() || is_of(&error, Reason::ToolHeld);
         if traffic.connections == 0 && is_final {
             shared.inbound().failure = Some(error);
@@ -185,7 +186,7 @@ pub(super) async fn keep(
             0 => format!("{error}; connecting again in {pause_s:.1} s"),
             _ => format!("{error}; attempt {attempts}, the next in {pause_s:.1} s"),
         });
-        // Commands of the meantime would be old later.
+        // Commands from this pause would be outdated later.
         let over = tokio::time::sleep(pause);
         tokio::pin!(over);
         loop {
@@ -198,7 +199,7 @@ pub(super) async fn keep(
     }
 }
 
-/// The server that has the session, if another said so.
+/// Returns the endpoint of the server that has the session, if the error names one.
 fn moved_to(error: &Error) -> Option<String> {
     let Error::Call(status) = error else { return None };
     elsewhere(status)
@@ -209,8 +210,8 @@ fn is_of(error: &Error, reason: Reason) -> bool {
     status.get_details_error_info().is_some_and(|info| info.reason == reason.as_str())
 }
 
-/// Deletes the session that was made for the target, if there is one. A server that can't be reached deletes it later by
-/// itself.
+/// Deletes the session that was created for the target, if there is one. A server that can't be reached deletes it
+/// later when it is idle.
 pub(super) async fn delete_made(server: &Server, shared: &Shared) {
     let (made, at) = {
         let mut inbound = shared.inbound();
@@ -226,7 +227,7 @@ pub(super) async fn delete_made(server: &Server, shared: &Shared) {
     let _ = tokio::time::timeout(SILENCE, deleting).await;
 }
 
-/// The session of a target, and who has it.
+/// Finds or creates the session of a target. Returns it with the server that has it.
 async fn session(target: &Target, trail: &mut Trail, shared: &Shared) -> Result<At<pb::Session>, Error> {
     let made = shared.inbound().made.clone();
     let (id, scene) = match &target.session {
@@ -256,7 +257,7 @@ async fn session(target: &Target, trail: &mut Trail, shared: &Shared) -> Result<
             inbound.at = Some(server.clone());
         }
         known = Some(match &created.ownership {
-            // A fleet may have made it at another server.
+            // A fleet may have created it on another server.
             Some(_) => trail.seek(&created.session_id).await?,
             None => At { server, channel, answer: created },
         });
@@ -266,9 +267,10 @@ async fn session(target: &Target, trail: &mut Trail, shared: &Shared) -> Result<
     Ok(known)
 }
 
-/// Where a device has its origin in a session's tissue, m: the top of its surface. A server that does not tell that has the middle.
+/// Returns the place of a device's origin in a session's tissue, m: the top of its surface; its middle if the server
+/// does not send the top.
 fn origin_m(session: &pb::Session) -> Result<DVec3, Error> {
-    let extent = session.extent.as_ref().ok_or_else(|| broken("the server does not tell where the tissue is"))?;
+    let extent = session.extent.as_ref().ok_or_else(|| broken("the server does not report where the tissue is"))?;
     Ok(from_vector(extent.top_m.as_ref().or(extent.middle_m.as_ref())))
 }
 
@@ -276,7 +278,7 @@ fn broken(why: &str) -> Error {
     Error::Connection(why.to_owned())
 }
 
-/// One connection, until it breaks or `commands` ends.
+/// Runs one connection, until it breaks or `commands` ends.
 #[allow(clippy::too_many_arguments)] // One caller, which has them all.
 async fn connect(
     target: &Target,
@@ -314,7 +316,7 @@ async fn connect(
     stream.opened().warnings.iter().for_each(|warning| warn(warning));
     let first = stream.opened().law.as_ref().ok_or_else(|| broken("the server sent no force law"))?;
     feed.begin(first, origin_m)?;
-    // The stream tells of every change of the tissue from now on.
+    // From now on the stream reports every change of the tissue.
     copying.begin();
     {
         let mut inbound = shared.inbound();
@@ -322,10 +324,10 @@ async fn connect(
         inbound.failure = None;
     }
     shared.opened.notify_one();
-    // Commands that waited while the stream was opened are old.
+    // Commands that waited while the stream was opened are outdated.
     while commands.queue.pop().is_some() {}
     let mut datagrams = Datagrams::dial(stream.opened().datagrams.as_ref(), &server);
-    // Those of earlier connections.
+    // Counts of earlier connections.
     let before = shared.inbound().traffic.carried;
     let take = |sample: &pb::Sample, datagrams: &mut Datagrams, feed: &mut LoopFeed| {
         let now = datagrams.carried();
@@ -333,7 +335,7 @@ async fn connect(
             let mut inbound = shared.inbound();
             inbound.traffic.samples += 1;
             inbound.traffic.bytes += touch::wire_bytes(sample);
-            // The mean over a tip, `displacement_m`, is beside the surface where that is curved, also at rest.
+            // The mean over a tip, `displacement_m`, lies off the surface where that is curved, even at rest.
             for moved_m in sample.tools.iter().filter_map(|tool| tool.surface_displacement_m) {
                 let deep_m = DVec3::new(moved_m.x, moved_m.y, moved_m.z).length();
                 inbound.traffic.deepest_m = inbound.traffic.deepest_m.max(deep_m);
@@ -374,9 +376,9 @@ async fn connect(
                     }
                     Heard::Rejection(rejection) => {
                         shared.inbound().traffic.refused += 1;
-                        // This side was silent for so long that the server released the tool.
+                        // This side was silent for so long that the server has released the tool.
                         if rejection.reason == Reason::NotHolder.as_str() {
-                            return Err(broken("the lease of the tool has lapsed"));
+                            return Err(broken("the lease of the tool has expired"));
                         }
                     }
                     Heard::Renewed(renewed) => renewed.datagrams.iter().for_each(|offer| datagrams.take_offer(offer)),
@@ -402,13 +404,13 @@ async fn connect(
                 let command = pb::Command { tool, sequence, client_time_ns, action, ..Default::default() };
                 shared.inbound().traffic.poses += 1;
                 if datagrams.asks() {
-                    // If it does not get through it is asked again.
+                    // If it does not get through, a later tick requests it again.
                     let _ = outbound.try_send(Say::Renew(pb::Renew { client_time_ns, datagrams: true }));
                 }
                 if datagrams.send(&command) {
                     continue;
                 }
-                // If the network does not keep up, this command is dropped; the next is newer.
+                // If the network does not keep up, this command is dropped; the next one replaces it.
                 if let Err(mpsc::error::TrySendError::Closed(_)) = outbound.try_send(Say::Command(command)) {
                     return Err(end_of(&mut stream).await);
                 }
@@ -417,7 +419,7 @@ async fn connect(
     }
 }
 
-/// Why the server has ended a stream that it does not listen to any more: the reason comes after what it has sent before.
+/// Returns why the server has ended a stream: reads the messages that it sent before the reason.
 async fn end_of(stream: &mut Touch) -> Error {
     let reason = async {
         loop {

@@ -1,10 +1,10 @@
-//! Connects a haptic device to a server: a loop at 1 kHz, and the network beside it.
+//! Connects a haptic device to a server: a loop at 1 kHz, and the network side in parallel.
 //!
-//! [`run`] has the loop on a thread of its own. Code that has such a thread gets the same as [`Ticker`] from [`begin`]; and
-//! [`Offline`] renders what was recorded, without a network.
+//! [`run`] runs the loop on a thread of its own. Code that has such a thread itself uses [`begin`] and calls
+//! [`Ticker`]. [`Offline`] renders recordings, without a network.
 //!
-//! When the connection breaks, the network side connects again. Forces return when the operator asks for them. Commands that
-//! were not sent by then are dropped: nothing old is replayed.
+//! When the connection breaks, the network side connects again. Forces return when the operator requests them.
+//! Commands that could not be sent in the meantime are dropped: outdated ones are never replayed.
 
 mod copy_fetch;
 mod copy_thread;
@@ -34,22 +34,24 @@ pub use offline::{Offline, OfflineNetwork};
 pub use tick::{TICK_S, Tick};
 pub use ticker::{PositionOrigin, Ticker};
 
-/// What a device is connected to.
+/// The server, session and tool that a device is connected to.
 #[derive(Debug, Clone)]
 pub struct Target {
-    /// The server.
+    /// The server's address and credentials.
     pub server: Server,
     /// The session to touch.
     pub session: SessionChoice,
-    /// The number of the tool that the device moves.
+    /// Number of the tool that the device moves.
     pub tool: u32,
     /// The tool's tip.
     pub tip: Tip,
-    /// A sample is sent only when the rendered force would be off by more than this fraction; 0: one per step.
+    /// The server sends a sample only when the force rendered without it would be wrong by more than this fraction;
+    /// 0: one per step.
     pub deadband: f64,
-    /// A pose is sent only when the server would be wrong about the tool by more than this fraction of the force; 0: one per tick.
+    /// The bridge sends a pose only when the server's prediction of the tool would be wrong by more than this
+    /// fraction of the force; 0: one per tick.
     pub up_deadband: f64,
-    /// Whether poses and samples go by datagram where the server has them.
+    /// Whether poses and samples go by datagram if the server offers datagrams.
     pub datagrams: bool,
     /// The holder's name, which other users of the server see.
     pub holder: String,
@@ -60,9 +62,9 @@ pub struct Target {
 pub enum SessionChoice {
     /// The session with this ID.
     Existing(String),
-    /// A new one, and again a new one if the server has forgotten it. It is deleted at the end.
+    /// A new session, created again if the server no longer has it. It is deleted at the end.
     New {
-        /// The name of a scene of the server.
+        /// The name of one of the server's scenes.
         scene: String,
     },
 }
@@ -70,22 +72,24 @@ pub enum SessionChoice {
 /// A function that shows a text to people.
 pub type Warn = Box<dyn Fn(&str) + Send + Sync>;
 
-/// A function that is told the priority of a loop.
+/// A function that is called with the priority of a loop before it starts.
 pub type Begun = Box<dyn FnOnce(&Priority) + Send>;
 
-/// Makes a copy of a tissue for a tool with this tip, out of the bytes of a snapshot (`SaveSnapshot`); or says why it can't.
+/// Builds a copy of a tissue for a tool with this tip from the bytes of a snapshot (`SaveSnapshot`), or returns why
+/// it can't.
 pub type MakeCopy = Arc<dyn Fn(&[u8], Tip) -> Result<Box<dyn Predictor>, String> + Send + Sync>;
 
-/// Of which tissues a loop keeps a copy, from which it renders without the delay of the network ([`palpate_haptics::prediction`]).
+/// Which tissues a loop copies, to render from the copy without the delay of the network
+/// ([`palpate_haptics::prediction`]).
 #[derive(Clone)]
 pub struct Copies {
-    /// Makes it.
+    /// The function that builds a copy.
     pub make: MakeCopy,
-    /// Also of sheets, which a local model knows well; otherwise of meshes alone.
+    /// Whether to copy sheets too, for which local models are accurate anyway; otherwise only meshes.
     pub of_sheets: bool,
 }
 
-/// Stops the forces of a loop, from any thread, until the operator asks for them again. Clones are of the same loop.
+/// Stops the forces of a loop, from any thread, until the operator requests them again. Clones control one loop.
 #[derive(Debug, Clone, Default)]
 pub struct Disable(Arc<AtomicBool>);
 
@@ -95,7 +99,7 @@ impl Disable {
         self.0.store(true, Ordering::Relaxed);
     }
 
-    /// Whether it was called for since the last time.
+    /// Returns whether it was called since the last time, and resets that.
     fn take(&self) -> bool {
         self.0.swap(false, Ordering::Relaxed)
     }
@@ -106,20 +110,22 @@ impl Disable {
 pub struct Options {
     /// Time after which [`run`] ends; `None`: no limit.
     pub lasts: Option<Duration>,
-    /// [`run`] keeps the course and the ages of the models, of at most an hour.
+    /// Whether [`run`] records the course and the ages of the models, at most an hour.
     pub remembers: bool,
-    /// The loop of [`run`] asks the system for real-time priority. [`BridgeReport::priority`] and `warn` tell what came of it.
+    /// Whether the loop of [`run`] requests real-time priority. [`BridgeReport::priority`] and `warn` report the
+    /// result.
     pub real_time: bool,
-    /// Keeps the session that was made for the target, for others; the server deletes it when nobody has used it for long.
+    /// Whether to keep the session that was created for the target; the server deletes it when it is idle for long.
     pub keeps_session: bool,
     /// Called when the connection breaks, with the server's warnings, and at the end of [`run`] if no force was felt.
     pub warn: Option<Warn>,
     /// Called by the loop of [`run`] before its first tick, with its priority.
     pub begun: Option<Begun>,
-    /// Keep a clone to stop the forces of [`run`]; of [`begin`], [`Ticker::disable`] does it.
+    /// Keep a clone to stop the forces of [`run`]; with [`begin`], use [`Ticker::disable`].
     pub disable: Disable,
-    /// Keeps a copy of these tissues, and renders from it as soon as it is there. A thread of its own makes and steps it,
-    /// whatever that costs: while it is late, and where it is refused, forces come from local models. `None`: from those alone.
+    /// Which tissues to copy; the loop renders from a copy as soon as there is one. Another thread builds and steps
+    /// it, however long that takes: while it is late, or if it can't be built, forces come from local models. `None`:
+    /// only from those.
     pub copies: Option<Copies>,
 }
 
@@ -137,40 +143,41 @@ impl fmt::Debug for Options {
 /// The results of [`run`].
 #[derive(Debug)]
 pub struct BridgeReport {
-    /// The ticks; empty unless they were to be remembered.
+    /// The ticks; empty unless [`Options::remembers`] was set.
     pub course: Vec<Tick>,
-    /// Age of the local model at each tick, s; empty unless it was to be remembered.
+    /// Age of the local model at each tick, s; empty unless [`Options::remembers`] was set.
     pub ages_s: Vec<f64>,
-    /// The renderer's envelope at the end.
+    /// The envelope at the end: the limits that act on the forces.
     pub envelope: Option<Envelope>,
-    /// Number of ticks that began more than a tick late.
+    /// Number of ticks that started more than a tick late.
     pub late_ticks: u64,
     /// Number of ticks that were skipped.
     pub missed_ticks: u64,
     /// Number of ticks that were rendered from a copy of the tissue.
     pub predicted_ticks: u64,
-    /// The largest force that was rendered, N.
+    /// The largest rendered force, N.
     pub most_force_n: f64,
-    /// With which priority the loop ran.
+    /// The priority with which the loop ran.
     pub priority: Priority,
-    /// What went over the network.
+    /// Totals of what was sent and received.
     pub traffic: Traffic,
-    /// The ID of the session that was made for the target, if one was.
+    /// The ID of the session that was created for the target, if any.
     pub made: Option<String>,
-    /// Why there was no connection any more at the end.
+    /// Why there was no connection at the end; `None` if there was one.
     pub lost: Option<Error>,
-    /// How the device failed, which has ended the loop; of [`run_told`] alone.
+    /// The error of the device that ended the loop; only set by [`run_told`].
     pub failure: Option<Error>,
 }
 
-/// No hand feels a smaller force, N.
+/// Force below which no hand feels anything, N.
 const MIN_FELT_N: f64 = 1e-3;
 
-/// A tool that moved the tissue by less has not touched it, m: what an earlier touch has left still moves.
+/// Displacement below which a tool counts as not having touched the tissue, m: motion left from an earlier touch is
+/// smaller.
 const MIN_MOVED_M: f64 = 1e-5;
 
 impl BridgeReport {
-    /// Returns why no force was felt at all, in words; `None` if one was.
+    /// Returns a sentence that explains why no force was felt at all; `None` if one was.
     pub fn unfelt(&self) -> Option<&'static str> {
         if self.most_force_n >= MIN_FELT_N {
             return None;
@@ -183,8 +190,8 @@ impl BridgeReport {
     }
 }
 
-/// Connects a device until its time is over or `stop` completes. Returns the device and the results. The last force written
-/// to the device is zero, also after an error and if you drop the future.
+/// Connects a device until its time has passed or `stop` completes. Returns the device and the results. The last
+/// force written to the device is zero, also after an error and if you drop the future.
 ///
 /// # Errors
 /// Returns an error if the device fails, if the server refuses the session or the tool at first, or if no connection
@@ -199,7 +206,8 @@ pub async fn run<D: HapticDevice + 'static>(
     report.failure.take().map_or(Ok((device, report)), Err)
 }
 
-/// Does what [`run`] does, but of a device that fails it tells what was done until then: [`BridgeReport::failure`].
+/// Runs like [`run`], but if the device fails, returns the results until then, with the error in
+/// [`BridgeReport::failure`].
 ///
 /// # Errors
 /// Returns an error if the server refuses the session or the tool at first, or if no connection succeeds.
@@ -263,7 +271,7 @@ fn silent() -> Error {
     Error::Connection("never connected: the server did not answer in time".to_owned())
 }
 
-/// Begins to connect.
+/// Starts to connect in a task. Returns the half of the loop and the connection.
 fn line(
     target: Target,
     copies: Option<Copies>,
@@ -281,11 +289,11 @@ fn line(
     network.spawn({
         let shared = shared.clone();
         async move {
-            // A server may have written a part of it.
+            // The text may contain parts that a server has written.
             let warn = |message: &str| warn.iter().for_each(|warn| warn(&printable(message)));
             tokio::select! {
                 () = line::keep(target, copies, device, &shared, feed, commands, &warn) => {}
-                // The loop then finds that it is over.
+                // The loop then detects that it is over.
                 () = stop => {}
             }
         }
@@ -293,17 +301,17 @@ fn line(
     (ticker, Connection { network, shared, news, server, keeps_session })
 }
 
-/// How often the courier of [`begin`] looks whether there is something to send.
+/// Interval at which the courier thread of [`begin`] checks for something to send.
 const ROUND: Duration = Duration::from_micros(250);
 
-/// Connects a loop of your own. Waits for the first connection; later ones are made without you. `device` is what the forces
-/// are limited to, and the server is told of it.
+/// Connects a loop of your own. Waits for the first connection; later ones are opened automatically. `device`
+/// describes the limits of the forces; it is also sent to the server.
 ///
-/// A tick wakes nobody, because that would be a call of the system. A thread, the courier, sees within a quarter of a
+/// A tick wakes no thread, because that would be a call of the system. A courier thread notices within a quarter of a
 /// millisecond that a tick has something to send.
 ///
 /// # Errors
-/// Returns the server's refusal, or why it can't be reached.
+/// Returns the server's refusal, or why it can't be reached within ten seconds.
 pub async fn begin(
     target: Target,
     device: Device,
@@ -326,7 +334,7 @@ pub async fn begin(
     let is_open = tokio::select! {
         () = line.shared.opened.notified() => true,
         _ = line.network.join_next() => false,
-        // A server that can't be reached may be so for long.
+        // A server may be unreachable for a long time.
         () = tokio::time::sleep(CONNECT_TIMEOUT) => false,
     };
     if is_open {
@@ -337,32 +345,33 @@ pub async fn begin(
     Err(error)
 }
 
-/// Time for the first connection of [`begin`].
+/// Time limit for the first connection of [`begin`].
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// The network's side of a [`Ticker`]. When this is dropped, the forces of the ticker fade.
+/// The network side of a [`Ticker`]. When you drop it, the forces of the ticker fade.
 pub struct Connection {
-    /// If this is dropped, the task is aborted; the loop then finds that it is over.
+    /// Dropping it aborts the task; the loop then detects that it is over.
     network: JoinSet<()>,
     shared: Arc<Shared>,
-    /// Told when the loop has something to send.
+    /// Notified when the loop has something to send.
     news: Arc<Notify>,
     server: Server,
     keeps_session: bool,
 }
 
 impl Connection {
-    /// Returns what went over the network.
+    /// Returns the totals of what was sent and received.
     pub fn traffic(&self) -> Traffic {
         self.shared.inbound().traffic
     }
 
-    /// Returns why there is no connection now; `None` while one stands.
+    /// Returns why there is no connection now; `None` while there is one.
     pub fn lost(&self) -> Option<String> {
         self.shared.inbound().failure.as_ref().map(ToString::to_string)
     }
 
-    /// Lets go of the tool, and deletes the session that was made for the target unless it was to be kept.
+    /// Releases the tool, and deletes the session that was created for the target unless [`Options::keeps_session`]
+    /// is set.
     pub async fn end(mut self) {
         self.close().await;
     }

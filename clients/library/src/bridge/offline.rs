@@ -1,4 +1,4 @@
-//! Rendering of what was recorded, without a network: the same laws, samples and places give the same forces, bit by bit.
+//! Renders recordings without a network: equal laws, samples and places give equal forces, bit by bit.
 
 use glam::DVec3;
 use palpate_haptics::{Device, Predictor};
@@ -10,16 +10,16 @@ use super::ticker::{self, LoopFeed, PositionOrigin, Ticker, ToolPose};
 use crate::Error;
 use crate::exchange::QueueReader;
 
-/// A loop whose server is a record.
+/// A loop that renders a recording instead of a server's messages.
 #[derive(Debug)]
 pub struct Offline {
     /// The half of the loop.
     pub ticker: Ticker,
-    /// The half of the network. It may be on another thread.
+    /// The half of the network, which you feed with the recording. It may be on another thread.
     pub record: OfflineNetwork,
 }
 
-/// The half of the network, of a record.
+/// The network half of an offline loop: delivers recorded messages to the ticker.
 pub struct OfflineNetwork {
     feed: LoopFeed,
     commands: QueueReader<ToolPose>,
@@ -33,8 +33,8 @@ impl std::fmt::Debug for OfflineNetwork {
 }
 
 impl Offline {
-    /// Creates a loop of a device whose forces stay within its limits, with the middle of its workspace on `origin_m`
-    /// of the tissue. `up_deadband` as in [`super::Target`]: it changes no force.
+    /// Creates a loop for a device whose forces stay within its limits, with the middle of its workspace at
+    /// `origin_m` of the tissue, m. `up_deadband` is that of [`super::Target`]; it changes no force.
     pub fn new(device: Device, origin: PositionOrigin, origin_m: DVec3, up_deadband: f64) -> Self {
         let (ticker, feed, commands) = ticker::ticker(device, origin, up_deadband);
         Offline { ticker, record: OfflineNetwork { feed, commands, origin_m } }
@@ -42,13 +42,13 @@ impl Offline {
 }
 
 impl OfflineNetwork {
-    /// Takes a copy of the tissue, which arrives now, until another connection begins.
+    /// Delivers a copy of the tissue, which is rendered until the next connection begins.
     pub fn predict(&mut self, copy: Box<dyn Predictor>) {
         self.feed.predict(Some(copy));
     }
 
-    /// Returns what a server has sent on a haptic stream arrives now: the bytes of a `TouchResponse`. The next tick
-    /// knows it. An `opened` begins another connection. What the ticks had to send until now goes nowhere.
+    /// Delivers a server message (`TouchResponse` bytes) to the bridge. The next tick uses it. An `opened` message
+    /// starts another connection. Discards the commands that the ticks have produced until now.
     ///
     /// # Errors
     /// Returns an error if the bytes are not a message, or if a force law can't be used.

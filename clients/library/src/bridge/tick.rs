@@ -1,4 +1,4 @@
-//! The loop of a device: a thousand times a second it reads the device, renders, and writes the force.
+//! The loop of a device: a thousand times per second it reads the device, renders, and writes the force.
 
 use std::time::{Duration, Instant};
 
@@ -13,48 +13,48 @@ use crate::device::HapticDevice;
 /// Period of the device's loop, s.
 pub const TICK_S: f64 = 1e-3;
 
-/// After a longer delay the loop skips the missed ticks: catching up would cause a burst.
+/// Delay above which the loop skips the missed ticks: catching up would cause a burst.
 const MAX_LATE: Duration = Duration::from_millis(5);
 
-/// Largest number of ticks that are remembered.
+/// Maximum number of ticks that are recorded.
 const MAX_REMEMBERED: usize = 3_600_000;
 
 /// One tick of a device's loop.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tick {
-    /// Time since the loop began, s.
+    /// Time since the loop started, s.
     pub time_s: f64,
-    /// Position in the sheet's frame, m; before the first connection in the device's.
+    /// Position in the tissue's frame, m; before the first connection, in the device's frame.
     pub place_m: DVec3,
     /// The rendered force, N.
     pub force_n: DVec3,
-    /// `None` before the first connection.
+    /// Whether forces are rendered; `None` before the first connection.
     pub state: Option<RenderingState>,
 }
 
-/// The results of a device's loop, until its end or until the device failed.
+/// The results of a device's loop, until it ended or the device failed.
 #[derive(Default)]
 pub(super) struct Served {
-    /// The remembered ticks; empty unless the loop was to remember them.
+    /// The recorded ticks; empty unless the loop was to record them.
     pub(super) course: Vec<Tick>,
     /// The renderer's envelope; `None` without a connection.
     pub(super) envelope: Option<Envelope>,
-    /// Number of ticks that began more than a tick late.
+    /// Number of ticks that started more than a tick late.
     pub(super) late_ticks: u64,
     /// Number of ticks that were skipped.
     pub(super) missed_ticks: u64,
     /// Number of ticks that were rendered from a copy of the tissue.
     pub(super) predicted_ticks: u64,
-    /// The largest force that was rendered, N.
+    /// The largest rendered force, N.
     pub(super) most_force_n: f64,
-    /// Age of the local model at each tick, s; empty unless the loop was to remember.
+    /// Age of the local model at each tick, s; empty unless the loop was to record it.
     pub(super) ages_s: Vec<f64>,
-    /// How the device failed, if it has.
+    /// The error of the device, if it failed.
     pub(super) failure: Option<std::io::Error>,
 }
 
-/// Runs the loop of a device for a time, or until the network's side is over, and then sets its force to zero, also after an
-/// error. `remember`: keeps the course and the models' ages. `news` is told when there is something to send.
+/// Runs the loop of a device for a time, or until the network side has ended. Then sets its force to zero, also after
+/// an error. `remember`: records the course and the models' ages. `news` is notified when there is something to send.
 pub(super) fn serve(
     device: &mut dyn HapticDevice,
     mut ticker: Ticker,
@@ -65,12 +65,12 @@ pub(super) fn serve(
 ) -> Served {
     let mut served = Served::default();
     served.failure = tick(device, &mut ticker, news, disable, lasts, remember, &mut served).err();
-    // A device holds its last force until it is told another.
+    // A device holds its last force until it gets another.
     let _ = device.write(DVec3::ZERO);
     served.envelope = ticker.envelope().cloned();
     served.predicted_ticks = ticker.predicted();
     drop(ticker);
-    // The network's side waits for the next place, or for the end.
+    // The network side waits for the next place, or for the end.
     news.notify_one();
     served
 }
@@ -89,7 +89,7 @@ fn tick(
     let Served { course, late_ticks, missed_ticks, ages_s, most_force_n, .. } = served;
     let start = Instant::now();
     let mut due = start;
-    // If it is much too late, the beat begins anew.
+    // If a tick is much too late, later ones are timed from it.
     let mut catch_up = |due: &mut Instant| {
         let now = Instant::now();
         let late = now.saturating_duration_since(*due);
@@ -105,8 +105,8 @@ fn tick(
         wait_until(due);
         *late_ticks += u64::from(catch_up(&mut due).1.as_secs_f64() > TICK_S);
         let reading = device.read()?;
-        // A device may have waited for its next position. The time that counts is that of the force: what came late must not be
-        // made up for by a step at the next tick.
+        // The device may have waited for its next position. The time of the force is what counts: a late tick must
+        // not be made up for by a step at the next one.
         let (now, _) = catch_up(&mut due);
         due += Duration::from_secs_f64(TICK_S);
         let time_s = now.duration_since(start).as_secs_f64();
@@ -151,7 +151,7 @@ mod tests {
     use crate::bridge::ticker::{PositionOrigin, ticker};
     use crate::device::Reading;
 
-    /// Fails to be read at its 20th tick; remembers what it was last told.
+    /// A device that fails at its 20th reading; records the last force.
     struct Failing {
         ticks: u32,
         force_n: DVec3,
@@ -178,7 +178,7 @@ mod tests {
         }
     }
 
-    /// Presses 2 mm deep, and its 40th reading takes a fifth of a second; ends soon after.
+    /// A device pressed 2 mm deep whose 40th reading takes a fifth of a second; ends soon after.
     struct Slow {
         ticks: u32,
         forces: Vec<(Instant, f64)>,
@@ -226,7 +226,7 @@ mod tests {
         feed.begin(&palpate_proto::touch::law(&Law::linear(400.0, 0.5), 0), DVec3::ZERO).unwrap();
         let served = serve(&mut device, ticker, &Notify::new(), &Disable::default(), None, true);
         assert_eq!(served.failure.map(|error| error.kind()), Some(std::io::ErrorKind::BrokenPipe));
-        // What was done until then is told.
+        // The results until then are returned.
         assert_eq!((served.course.len(), served.envelope.is_some()), (19, true));
         assert_eq!((device.ticks, device.force_n), (20, DVec3::ZERO));
     }

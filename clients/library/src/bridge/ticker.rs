@@ -1,7 +1,8 @@
-//! Rendering for a thread that ticks a thousand times a second, and what passes between it and the network.
+//! Rendering for a thread that ticks a thousand times per second, and the data exchanged with the network side.
 //!
-//! A tick does not wait: laws come by a queue, of models the newest, and places leave by a queue, each of a fixed length
-//! (`exchange`). It asks for no memory and gives none back: laws that are not needed any more go back to the network's side.
+//! A tick does not wait. Laws arrive and places leave by queues of fixed length; of the models only the newest is
+//! kept (`exchange`). A tick allocates and frees no memory: laws that are no longer needed go back to the network
+//! side.
 
 use glam::DVec3;
 use palpate_haptics::dead_reckoning::News;
@@ -15,28 +16,28 @@ use crate::Error;
 use crate::device::Reading;
 use crate::exchange::{NewestReader, NewestWriter, QueueReader, QueueView, QueueWriter, newest, queue};
 
-/// Where a tool was.
+/// The place of a tool at a time.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ToolPose {
-    /// By the client's clock.
+    /// Time of the client's clock, ns.
     pub(super) client_time_ns: u64,
-    /// m.
+    /// Position, m.
     pub(super) place_m: DVec3,
-    /// How it moved, m/s, if the server is to go on like that.
+    /// Velocity, m/s, if the server is to extrapolate the motion.
     pub(super) velocity_m_per_s: Option<DVec3>,
 }
 
-/// What a tick learns, in order.
+/// What the network side sends to the ticks, in order.
 enum LoopEvent {
-    /// A new connection, its first law and where the middle of the device's workspace is laid, m.
+    /// A new connection: its first law, and the place in the tissue of the middle of the device's workspace, m.
     Begin { connection: u64, law: Law, origin_m: DVec3 },
-    /// A further law of this connection, which is sound, and its number.
+    /// Another valid law of this connection, with its number.
     Learn { number: u32, law: Law },
-    /// A copy of this connection's tissue; none if that has become another.
+    /// A copy of this connection's tissue; `None` if the tissue has changed.
     Copy(Option<Prediction>),
 }
 
-/// What a tick does not need any more, to be dropped elsewhere.
+/// What a tick no longer needs, to be dropped on another thread.
 enum Used {
     #[allow(dead_code)] // Dropped.
     Law(Law),
@@ -44,40 +45,41 @@ enum Used {
     Copy(Prediction),
 }
 
-/// What of a connection only counts as it is now.
+/// State of a connection of which only the newest value counts.
 #[derive(Clone, Copy)]
 struct Newest {
     connection: u64,
     model: Option<LocalModel>,
-    /// The longest time between two poses that the server wants, s; 0 before it has said so.
+    /// The longest time between two poses that the server wants, s; 0 before it has sent one.
     wanted_s: f64,
 }
 
-/// Largest number of commands on their way to the network: more would be a backlog.
+/// Limit on the commands that wait for the network: more would be a backlog.
 const COMMANDS: usize = 64;
-/// Largest number of laws on their way to a tick. What does not fit waits on the network's side.
+/// Limit on the laws that wait for a tick. Others wait on the network side.
 const LAWS: usize = 2 * MAX_LAWS;
-/// Largest number of laws and copies on their way back: with as many as a renderer has, a tick can always take one more.
+/// Limit on laws and copies that wait to be dropped: at least as many as a renderer has, so that a tick can always
+/// replace one.
 const USED: usize = 4 * MAX_LAWS;
-/// A clock that jumps ahead by more than this did not do so because of a late tick, s.
+/// Jump of the clock above which it counts as set rather than a tick as late, s.
 const MAX_AHEAD_S: f64 = 3600.0;
 
-/// What positions of a device mean.
+/// The frame in which a device's positions are measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum PositionOrigin {
-    /// They are in the device's frame, whose origin is the middle of its workspace. That is laid on the top of the tissue: of a sheet, on
-    /// its middle.
+    /// The device's frame, whose origin is the middle of its workspace. It is placed on the top of the tissue, which
+    /// is the middle of a sheet.
     #[default]
     Workspace,
-    /// They are in the tissue's frame.
+    /// The tissue's frame.
     Tissue,
 }
 
-/// The half that a loop at 1 kHz owns, on whichever thread that runs.
+/// The loop's half of a bridge: renders forces. Call [`Ticker::tick`] at 1 kHz, on any thread.
 pub struct Ticker {
     told: QueueReader<LoopEvent>,
     newest: NewestReader<Newest>,
-    /// The newest was not shown to the renderer.
+    /// Whether the renderer has not seen the newest model yet.
     is_fresh: bool,
     used: QueueWriter<Used>,
     commands: QueueWriter<ToolPose>,
@@ -85,7 +87,7 @@ pub struct Ticker {
     device: Device,
     origin: PositionOrigin,
     up_deadband: f64,
-    /// Of [`LoopEvent::Begin`]; 0 before the first.
+    /// Number of the last [`LoopEvent::Begin`]; 0 before the first.
     connection: u64,
     origin_m: DVec3,
     renderer: Renderer,
@@ -95,19 +97,19 @@ pub struct Ticker {
     place_m: DVec3,
 }
 
-/// The other half, of the network.
+/// The network's half of a bridge: passes laws, models and copies to the ticks.
 pub(super) struct LoopFeed {
     told: QueueWriter<LoopEvent>,
     newest: NewestWriter<Newest>,
     used: QueueReader<Used>,
     connection: u64,
-    /// What did not fit yet.
+    /// Events that did not fit into the queue yet.
     waiting: VecDeque<LoopEvent>,
     model: Option<LocalModel>,
     wanted_s: f64,
 }
 
-/// Both halves, and the commands that the ticks send. The device is what the forces are limited to.
+/// Creates both halves, and the queue of commands that the ticks send. `device` describes the limits of the forces.
 pub(super) fn ticker(
     device: Device,
     origin: PositionOrigin,
@@ -129,7 +131,7 @@ pub(super) fn ticker(
         up_deadband,
         connection: 0,
         origin_m: DVec3::ZERO,
-        // Until the first connection this law is not used.
+        // This law is not used before the first connection.
         renderer: Renderer::new(Law::linear(0.0, 0.0), Envelope::new(device, DVec3::ZERO)),
         was_asked: false,
         news: News::default(),
@@ -148,16 +150,17 @@ pub(super) fn ticker(
     (ticker, feed, received)
 }
 
-/// The times of a caller, made such that they never go back.
+/// Converts the times of a caller so that they never run backwards.
 #[derive(Default)]
 struct Clock {
-    /// The caller's time at which this clock has 1 s; 0 means "no time" in the protocol.
+    /// The caller's time at which this clock shows 1 s; 0 means "no time" in the protocol.
     origin_s: Option<f64>,
     now_s: f64,
 }
 
 impl Clock {
-    /// The time now. A caller's clock that goes back, or ahead by more than an hour, was set: this one goes on from where it is.
+    /// Returns the current time, s. If the caller's clock goes back, or ahead by more than an hour, it was set: this
+    /// one continues from its last value.
     fn at(&mut self, time_s: f64) -> f64 {
         if !time_s.is_finite() {
             return f64::NAN;
@@ -176,11 +179,12 @@ impl Clock {
 }
 
 impl Ticker {
-    /// Returns the force to render from now on, N, for a device that reports `reading` at `time_s`, a time of any
-    /// origin that goes on between ticks. Returns zero before the first connection.
+    /// Returns the force to render from now on, N, for a device that reports `reading` at `time_s`. The times may
+    /// have any origin and must advance between ticks. Returns zero before the first connection.
     ///
-    /// It takes a bounded time: no lock, no call of the system, no memory asked for or given back. Another thread steps a copy of
-    /// the tissue. Ticks may be late, early or left out: the envelope knows how long ago the last one was.
+    /// Takes bounded time: no lock, no call of the system, no memory allocated or freed. Another thread steps a copy
+    /// of the tissue. Ticks may be late, early or missing: the envelope takes the time since the last one into
+    /// account.
     pub fn tick(&mut self, reading: Reading, time_s: f64) -> DVec3 {
         let now_s = self.clock.at(time_s);
         self.is_fresh |= self.newest.refresh();
@@ -191,7 +195,7 @@ impl Ticker {
             PositionOrigin::Tissue => reading.place_m,
         };
         let (was_asked, place_m) = (std::mem::replace(&mut self.was_asked, reading.enable), self.place_m);
-        // Before the first connection it is not known where the tissue is.
+        // Before the first connection the place of the tissue is not known.
         if self.connection == 0 {
             return DVec3::ZERO;
         }
@@ -223,7 +227,7 @@ impl Ticker {
         force_n
     }
 
-    /// Takes what was told since the last tick, as far as there is room for what it takes the place of.
+    /// Applies the events since the last tick, as long as there is room to give back what they replace.
     fn learn(&mut self) {
         for _ in 0..LAWS {
             if self.used.room() <= MAX_LAWS {
@@ -231,7 +235,7 @@ impl Ticker {
             }
             let Some(told) = self.told.pop() else { return };
             let used = &mut self.used;
-            // There is room.
+            // Checked above: there is room.
             let mut give_back = |value: Used| drop(used.push(value));
             match told {
                 LoopEvent::Begin { connection, law, origin_m } => {
@@ -240,8 +244,8 @@ impl Ticker {
                     if self.connection == 0 {
                         self.renderer.envelope = Envelope::new(self.device, origin_m);
                     }
-                    // The envelope of an earlier connection stays: what was paused stays paused, and a rendered force falls
-                    // at the slew limit.
+                    // The envelope of an earlier connection stays: a pause remains, and a rendered force falls at the
+                    // slew limit.
                     (self.connection, self.origin_m) = (connection, origin_m);
                 }
                 LoopEvent::Learn { number, law } => {
@@ -254,12 +258,12 @@ impl Ticker {
         }
     }
 
-    /// Returns how many ticks were rendered from a copy of the tissue ([`super::Options::copies`]).
+    /// Returns the number of ticks that were rendered from a copy of the tissue ([`super::Options::copies`]).
     pub fn predicted(&self) -> u64 {
         self.renderer.predicted()
     }
 
-    /// Stops rendering until it is enabled again. The force falls within a few ticks.
+    /// Stops rendering until the operator enables it again. The force falls to zero within a few ticks.
     pub fn disable(&mut self) {
         self.renderer.envelope.disable();
     }
@@ -269,14 +273,14 @@ impl Ticker {
         (self.connection > 0).then(|| self.renderer.state())
     }
 
-    /// Returns where the tool was at the last tick, in the tissue's frame, m; before the first connection in the
-    /// device's.
+    /// Returns the position of the tool at the last tick, in the tissue's frame, m; before the first connection, in
+    /// the device's frame.
     pub fn place_m(&self) -> DVec3 {
         self.place_m
     }
 
-    /// Returns how old the newest local model was at the last tick, s: how long ago the tool was at the place that it
-    /// tells of.
+    /// Returns the age of the newest local model at the last tick, s: the time since the tool was at the place that
+    /// it describes. `None` without a model.
     pub fn model_age_s(&self) -> Option<f64> {
         self.renderer.model_time_s().filter(|_| self.connection > 0).map(|time_s| self.clock.now_s - time_s)
     }
@@ -286,17 +290,17 @@ impl Ticker {
         (self.connection > 0).then_some(&self.renderer.envelope)
     }
 
-    /// Returns whether the network's side has ended for good. Forces then fade.
+    /// Returns whether the network side has ended for good. Forces then fade.
     pub fn is_over(&self) -> bool {
         self.commands.is_over()
     }
 
-    /// Whether the last tick had something to send.
+    /// Returns whether the last tick had something to send.
     pub(super) fn has_spoken(&self) -> bool {
         self.has_spoken
     }
 
-    /// To see from another thread whether something is to be sent.
+    /// Returns a view by which another thread sees whether there is something to send.
     pub(super) fn commands_view(&self) -> QueueView {
         self.commands.view()
     }
@@ -311,13 +315,13 @@ impl std::fmt::Debug for Ticker {
     }
 }
 
-/// The law in a message.
+/// Converts the law in a message, if it is valid.
 fn law(message: &pb::ForceLaw) -> Result<Law, Error> {
     touch::from_law(message).map_err(|refusal| Error::Connection(refusal.to_string()))
 }
 
 impl LoopFeed {
-    /// A new connection to a tissue; the middle of the device's workspace is laid on `origin_m`.
+    /// Starts a new connection to a tissue; the middle of the device's workspace is placed at `origin_m`, m.
     ///
     /// # Errors
     /// Returns an error if the law can't be used.
@@ -325,14 +329,14 @@ impl LoopFeed {
         let law = law(message)?;
         self.connection += 1;
         (self.model, self.wanted_s) = (None, 0.0);
-        // What a tick has not learned of the connection before.
+        // Drops what the ticks have not taken of the connection before.
         self.waiting.clear();
         self.waiting.push_back(LoopEvent::Begin { connection: self.connection, law, origin_m });
         self.pass_on();
         Ok(())
     }
 
-    /// A further law.
+    /// Adds another law. Drops the oldest waiting one if more than [`MAX_LAWS`] wait.
     ///
     /// # Errors
     /// Returns an error if the law can't be used.
@@ -348,15 +352,15 @@ impl LoopFeed {
         Ok(())
     }
 
-    /// A copy of the connection's tissue; none if that has become another.
+    /// Sets the copy of the connection's tissue; `None` if the tissue has changed.
     pub(super) fn predict(&mut self, copy: Option<Box<dyn Predictor>>) {
-        // Only the newest counts.
+        // Only the newest copy counts.
         self.waiting.retain(|told| !matches!(told, LoopEvent::Copy(_)));
         self.waiting.push_back(LoopEvent::Copy(copy.map(Prediction::new)));
         self.pass_on();
     }
 
-    /// What a sample tells of the tool, and how often the server wants to hear of it, s.
+    /// Takes the local model of the tool from a sample, and the interval at which the server wants poses, s.
     pub(super) fn receive(&mut self, sample: &pb::Sample, wanted_s: f64) {
         self.wanted_s = wanted_s;
         if let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) {
@@ -368,7 +372,7 @@ impl LoopFeed {
         self.pass_on();
     }
 
-    /// Passes on what fits. A model goes after the laws that were there before it.
+    /// Passes on what fits. A model goes after the laws that arrived before it.
     fn pass_on(&mut self) {
         while self.used.pop().is_some() {}
         while let Some(told) = self.waiting.pop_front() {

@@ -1,4 +1,4 @@
-//! The check of a device: some seconds without a force, and how well it keeps time.
+//! Checks a device: runs it for some seconds without a force, and measures its timing.
 
 use std::time::{Duration, Instant};
 
@@ -7,30 +7,30 @@ use glam::DVec3;
 use crate::bridge::TICK_S;
 use crate::device::HapticDevice;
 
-/// What the check of a device found.
+/// The results of a check of a device.
 #[derive(Debug, Clone, Default)]
 pub struct DeviceReport {
     /// Number of ticks.
     pub ticks: u64,
-    /// Ticks a second.
+    /// Ticks per second.
     pub rate_hz: f64,
-    /// Positions a second that differ from the one before: what the device itself gives, if it is moved.
+    /// Positions per second that differ from the one before: the device's own rate, if it is moved.
     pub changes_hz: f64,
     /// Time between two ticks, s: median, 99th percentile and longest.
     pub period_s: [f64; 3],
-    /// Time of a reading and of setting the force, s: median, 99th percentile and longest.
+    /// Duration of reading the device and setting its force, s: median, 99th percentile and longest.
     pub call_s: [f64; 3],
-    /// Positions from, to, m, in the device's frame.
+    /// Smallest and largest coordinates of the positions, m, in the device's frame; `None` without a position.
     pub place_m: Option<[DVec3; 2]>,
-    /// Buttons that were pressed, as bits.
+    /// Buttons that were pressed at any time, as bits.
     pub buttons: u32,
     /// Readings that were not finite.
     pub not_finite: u64,
-    /// Why it ended before its time.
+    /// Why the check ended early; `None` if it did not.
     pub failure: Option<String>,
 }
 
-/// Reads a device a thousand times a second, and sets a force of zero each time.
+/// Reads a device a thousand times per second for the given time, and sets a force of zero each time.
 pub fn check(device: &mut dyn HapticDevice, lasts: Duration) -> DeviceReport {
     let begun = Instant::now();
     let (mut checked, mut changes) = (DeviceReport::default(), 0_u32);
@@ -47,7 +47,7 @@ pub fn check(device: &mut dyn HapticDevice, lasts: Duration) -> DeviceReport {
         }
         let done = device.read().and_then(|reading| device.write(DVec3::ZERO).map(|()| reading));
         calls.push(now.elapsed().as_secs_f64());
-        // What was missed is not caught up.
+        // Missed ticks are not made up for.
         due = due.max(now) + Duration::from_secs_f64(TICK_S);
         checked.ticks += 1;
         match done {
@@ -74,7 +74,7 @@ pub fn check(device: &mut dyn HapticDevice, lasts: Duration) -> DeviceReport {
     checked
 }
 
-/// Median, 99th percentile and maximum; 0 of nothing.
+/// Returns median, 99th percentile and maximum; 0 if there are no values. Sorts the values.
 fn quantiles(values: &mut [f64]) -> [f64; 3] {
     values.sort_by(f64::total_cmp);
     let at = |hundredths: usize| values.get((values.len() * hundredths / 100).min(values.len().saturating_sub(1)));
@@ -89,7 +89,7 @@ mod tests {
     use super::*;
     use crate::device::Reading;
 
-    /// Moves by a millimetre at each reading, and is unplugged at the 40th.
+    /// A device that moves by a millimetre at each reading, and is unplugged at the 40th.
     struct CountingDevice(u32, Vec<DVec3>);
 
     impl HapticDevice for CountingDevice {

@@ -1,10 +1,11 @@
-//! Devices of Force Dimension, and the Falcon, by `libdhd` of its SDK (version 3).
+//! Devices of Force Dimension, and the Falcon, through `libdhd` of the SDK (version 3).
 //!
-//! The base's frame has x towards the operator, y to the right and z up, in metres and newtons; its origin is the middle of
-//! the workspace. A call returns a negative number when it failed. 1 (the time guard: the value is the one before) and 2 (a
-//! motor is at its limit) are no failures. Every call names the device: without it the SDK takes the one used last.
+//! The base's frame has x towards the operator, y to the right and z up, in metres and newtons; its origin is the
+//! middle of the workspace. A call returns a negative number when it failed. 1 (the time guard: the value is the
+//! previous one) and 2 (a motor is at its limit) are not failures. Every call names the device: without it the SDK
+//! uses the one used last.
 
-// Functions of a library that was written in C.
+// Functions of a C library.
 #![allow(unsafe_code)]
 
 use std::ffi::{c_char, c_int, c_uchar};
@@ -25,14 +26,14 @@ const NAMES: [&str; 2] = ["libdhd.3.dylib", "libdhd.dylib"];
 #[cfg(not(any(windows, target_os = "macos")))]
 const NAMES: [&str; 2] = ["libdhd.so.3", "libdhd.so"];
 
-/// The version of the SDK that is known here.
+/// The supported version of the SDK.
 const MAJOR: c_int = 3;
 
 /// `DHD_ON`, `DHD_OFF`.
 const ON: c_uchar = 1;
 const OFF: c_uchar = 0;
 
-/// Systems by the numbers of `dhdc.h`, as devices of our table.
+/// Numbers of systems in `dhdc.h`, and the device in our table that each is.
 const SYSTEMS: [(c_int, &str); 14] = [
     (33, "omega3"),
     (34, "omega3"),
@@ -50,7 +51,7 @@ const SYSTEMS: [(c_int, &str); 14] = [
     (109, "lambda7"),
 ];
 
-/// Buttons that are asked for at each tick.
+/// Number of buttons read at each tick.
 const BUTTONS: c_int = 2;
 
 type ByDevice = unsafe extern "system" fn(c_char) -> c_int;
@@ -58,7 +59,7 @@ type Text = unsafe extern "system" fn(c_char) -> *const c_char;
 type Get3 = unsafe extern "system" fn(*mut f64, *mut f64, *mut f64, c_char) -> c_int;
 type Set3 = unsafe extern "system" fn(f64, f64, f64, c_char) -> c_int;
 
-/// The functions in use.
+/// The functions of the SDK that are used.
 #[derive(Debug, Clone, Copy)]
 struct LibraryCalls {
     count: unsafe extern "system" fn() -> c_int,
@@ -103,7 +104,7 @@ impl LibraryCalls {
         Ok((calls, loaded))
     }
 
-    /// The SDK's version, if it tells; it must be one that is known here.
+    /// Returns the SDK's version, if it reports one. Refuses versions other than [`MAJOR`].
     fn version(&self, loaded: &Loaded) -> io::Result<String> {
         let Some(version) = self.version else { return Ok("of an unknown version".to_owned()) };
         let (mut major, mut minor, mut release, mut revision) = (0, 0, 0, 0);
@@ -117,7 +118,7 @@ impl LibraryCalls {
         Ok(text)
     }
 
-    /// What went wrong last, in the SDK's words.
+    /// Returns the SDK's description of its last error.
     fn last(&self) -> String {
         // SAFETY: the SDK's texts are constants.
         unsafe { text_of((self.last_error)()) }.unwrap_or_else(|| "no reason given".to_owned())
@@ -135,10 +136,10 @@ pub(super) struct ForceDimension {
 }
 
 impl ForceDimension {
-    /// Opens the device of that number, or the first one.
+    /// Opens the device with that number, or the first one.
     ///
     /// # Errors
-    /// Returns an error if library or device are missing, or of another version.
+    /// Returns an error if the library or the device is missing, or the library has another version.
     pub(super) fn open(which: Option<&str>, library: Option<&Path>) -> io::Result<Self> {
         let number = which.map(|text| {
             text.parse::<c_char>().ok().filter(|number| *number >= 0).ok_or_else(|| {
@@ -173,17 +174,17 @@ impl ForceDimension {
         }
         let model = model.unwrap_or_else(|| format!("system {system}"));
         let mut device = ForceDimension { calls, id, model, descriptor, buttons: 0 };
-        // A second limit, in the SDK, behind our envelope.
+        // A second limit, in the SDK, in addition to our envelope.
         // SAFETY: as above.
         calls.set_most.map(|set| unsafe { set(descriptor.most_n(), id) });
-        // From here on, dropping the device takes the force away and closes it.
+        // From here on, dropping the device sets its force to zero and closes it.
         // SAFETY: as above.
         device.hold(unsafe { (calls.enable_force)(ON, id) }, "its forces can't be enabled")?;
         device.write(DVec3::ZERO)?;
         Ok(device)
     }
 
-    /// An error if a call failed.
+    /// Returns an error if a call failed.
     fn hold(&self, returned: c_int, what: &str) -> io::Result<()> {
         if returned >= 0 {
             return Ok(());
@@ -203,7 +204,7 @@ impl HapticDevice for ForceDimension {
         // SAFETY: three numbers that live during the call, and the device is open.
         let returned = unsafe { (self.calls.position)(&raw mut x, &raw mut y, &raw mut z, self.id) };
         self.hold(returned, "its position can't be read")?;
-        // A device without that button returns an error, which is no button pressed.
+        // A device without that button returns an error, which counts as not pressed.
         // SAFETY: as above.
         let pressed = |index| unsafe { (self.calls.button)(index, self.id) } == 1;
         self.buttons = (0..BUTTONS).filter(|index| pressed(*index)).map(|index| 1 << index).sum();
@@ -228,7 +229,7 @@ impl HapticDevice for ForceDimension {
 impl Drop for ForceDimension {
     fn drop(&mut self) {
         let LibraryCalls { set_force, enable_force, close, .. } = self.calls;
-        // SAFETY: the device is open, and nobody uses it after this.
+        // SAFETY: the device is open, and nothing uses it after this.
         unsafe {
             set_force(0.0, 0.0, 0.0, self.id);
             enable_force(OFF, self.id);
@@ -237,10 +238,10 @@ impl Drop for ForceDimension {
     }
 }
 
-/// Whether there are devices, and what is there.
+/// Returns whether there are devices, and a description.
 ///
 /// # Errors
-/// Returns an error if the library is missing, or of another version.
+/// Returns an error if the library is missing or has another version.
 pub(super) fn tell(library: Option<&Path>) -> io::Result<(bool, String)> {
     let (calls, loaded) = LibraryCalls::load(library)?;
     let version = calls.version(&loaded)?;

@@ -1,8 +1,8 @@
-//! Haply's Inverse3, by the Inverse Service: JSON over a WebSocket, one state for each message sent.
+//! Haply's Inverse3, through the Inverse Service: JSON over a WebSocket, one state for each message sent.
 //!
-//! The service sends all that it knows when it is connected to, and from then on one state for each message. So each tick
-//! sends a force, and reads what has come since, without waiting for it. Positions are in metres from the device's base, x to
-//! the right, y forward and z up. Since version 3.5 the force is in the field `vector`, before that in `values`.
+//! The service sends its whole state when a client connects, and after that one state per message. So each tick sends
+//! a force, and reads what has arrived since, without waiting for it. Positions are in metres from the device's base,
+//! x to the right, y forward and z up. Since version 3.5 the force is in the field `vector`, before that in `values`.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{TcpStream, ToSocketAddrs};
@@ -17,52 +17,53 @@ use tungstenite::{Message, WebSocket};
 
 use crate::device::{HapticDevice, Reading};
 
-/// Where the service is unless it is told.
+/// Default address of the service.
 const ADDRESS: &str = "ws://localhost:10001";
 
-/// How long the service may take to answer at first.
+/// Time limit for each answer of the service while connecting.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// A service that leaves a message unanswered for longer has stopped; a device of which it says nothing for longer has gone.
+/// Time without an answer after which the service counts as stopped, and time without a position after which the
+/// device counts as unplugged.
 const SILENCE: Duration = Duration::from_millis(500);
 
-/// While a message is unanswered for longer, no force is asked for: the position is not known.
+/// Time without an answer after which the force is set to zero, since the position is not known.
 const STALE: Duration = Duration::from_millis(50);
 
-/// Messages that may be unanswered: a service that falls behind is not sent more.
+/// Limit on unanswered messages: a service that falls behind is sent no more.
 const UNANSWERED: u32 = 4;
 
-/// Largest message that is read, bytes.
+/// Limit on the bytes of a message.
 const MAX_BYTES: usize = 1 << 20;
 
-/// The versions of the service that are known here: from the first, before the last.
+/// The supported versions of the service: from the first, below the last.
 const VERSIONS: [(u32, u32); 2] = [(3, 1), (4, 0)];
 
 /// The version since which a force is a `vector`.
 const VECTOR_SINCE: (u32, u32) = (3, 5);
 
-/// About the middle of the workspace, m from the base; not measured on a device.
+/// Approximate middle of the workspace, m from the base; not measured on a device.
 const MIDDLE_M: DVec3 = DVec3::new(0.0, -0.12, 0.16);
 
-/// An Inverse3.
+/// An open Inverse3.
 pub(super) struct Inverse3 {
     socket: WebSocket<TcpStream>,
     id: String,
-    /// The field of a force.
+    /// The name of the field of a force.
     field: &'static str,
     place_m: DVec3,
     buttons: u32,
     unanswered: u32,
-    /// When the service last said anything, and when it last told where the device is.
+    /// When the service last answered, and when it last reported the device's position.
     heard: Instant,
     told: Instant,
-    /// Whether the newest message tells that.
+    /// Whether the newest message reports the position.
     is_told: bool,
-    /// The force that was sent last.
+    /// The force that was sent last, N.
     sent_n: DVec3,
 }
 
-/// An address as host and port.
+/// Returns host and port of an address.
 fn host_of(address: &str) -> io::Result<&str> {
     let host = address.strip_prefix("ws://").map(|rest| rest.split('/').next().unwrap_or(rest));
     host.filter(|host| host.contains(':')).ok_or_else(|| {
@@ -71,7 +72,7 @@ fn host_of(address: &str) -> io::Result<&str> {
     })
 }
 
-/// Connects, with a limit to every answer.
+/// Connects, with a time limit for every answer.
 fn connect(host: &str) -> io::Result<TcpStream> {
     let mut last = io::Error::new(ErrorKind::NotFound, "no address");
     for address in host.to_socket_addrs()? {
@@ -94,13 +95,13 @@ fn missing(host: &str, error: &io::Error) -> io::Error {
     io::Error::new(ErrorKind::NotFound, message)
 }
 
-/// The service's version by its own word, if it has one; asked by HTTP at the same port.
+/// Requests the service's version by HTTP at its port; `None` if it reports none.
 fn version(host: &str) -> io::Result<Option<String>> {
     let mut stream = connect(host).map_err(|error| missing(host, &error))?;
     let request = format!("GET /version HTTP/1.0\r\nHost: {host}\r\nAccept: application/json\r\n\r\n");
     stream.write_all(request.as_bytes())?;
     let mut answer = Vec::new();
-    // A service that keeps the connection, or resets it, has answered all the same.
+    // A service that keeps the connection open, or resets it, has answered all the same.
     let _ = stream.take(1 << 16).read_to_end(&mut answer);
     let answer = String::from_utf8_lossy(&answer);
     let body = answer.split_once("\r\n\r\n").map_or("", |parts| parts.1);
@@ -108,13 +109,13 @@ fn version(host: &str) -> io::Result<Option<String>> {
     Ok(told.and_then(|told| Some(told.get("project_version")?.as_str()?.to_owned())))
 }
 
-/// The first two numbers of a version.
+/// Parses the first two numbers of a version.
 fn numbers(version: &str) -> Option<(u32, u32)> {
     let mut parts = version.trim_start_matches('v').split(|c: char| !c.is_ascii_digit());
     Some((parts.next()?.parse().ok()?, parts.next().and_then(|part| part.parse().ok()).unwrap_or(0)))
 }
 
-/// The field of a force in messages to a service: by its version, or if it tells none, by its first message.
+/// Returns the name of the field of a force: by the service's version, or by its first message if it reports none.
 fn field(version: Option<&str>, first: &Value) -> io::Result<&'static str> {
     let known = match version.and_then(numbers) {
         Some(numbers) if numbers < VERSIONS[0] || numbers >= VERSIONS[1] => {
@@ -123,13 +124,13 @@ fn field(version: Option<&str>, first: &Value) -> io::Result<&'static str> {
             return Err(io::Error::new(ErrorKind::Unsupported, message));
         }
         Some(numbers) => numbers >= VECTOR_SINCE,
-        // A number of the session is in the first message since then.
+        // Since that version the first message contains a number of the session.
         None => first.get("session_id").is_some(),
     };
     Ok(if known { "vector" } else { "values" })
 }
 
-/// The devices of a kind in a message.
+/// Returns the devices of a kind in a message.
 fn devices<'v>(message: &'v Value, kind: &str) -> impl Iterator<Item = &'v Value> {
     message.get(kind).and_then(Value::as_array).into_iter().flatten()
 }
@@ -138,13 +139,13 @@ fn id_of(device: &Value) -> Option<&str> {
     device.get("device_id").and_then(Value::as_str)
 }
 
-/// A vector of a message.
+/// Parses a vector of a message.
 fn vector(value: &Value) -> Option<DVec3> {
     let part = |name: &str| value.get(name).and_then(Value::as_f64);
     Some(DVec3::new(part("x")?, part("y")?, part("z")?))
 }
 
-/// The buttons in a message, if it tells of any: those of a wireless grip, or the one of a wired grip.
+/// Returns the buttons in a message, if it contains any: those of a wireless grip, or the one of a wired grip.
 fn buttons(message: &Value) -> Option<u32> {
     let pressed = |state: &Value, name: &str| state.get(name).and_then(Value::as_bool);
     let wireless = devices(message, "wireless_verse_grip").filter_map(|grip| {
@@ -162,7 +163,7 @@ fn buttons(message: &Value) -> Option<u32> {
     wireless.chain(wired).reduce(|all: u32, one| all | one)
 }
 
-/// The state in a message; none in those of the WebSocket itself.
+/// Parses the state in a message; `None` for control messages of the WebSocket.
 fn state(message: &Message) -> io::Result<Option<Value>> {
     let text = match message {
         Message::Text(text) => text,
@@ -185,16 +186,16 @@ fn broken(error: &tungstenite::Error) -> io::Error {
     io::Error::new(ErrorKind::NotConnected, format!("Haply's Inverse Service is gone: {error}"))
 }
 
-/// Whether an error says that nothing is there yet.
+/// Returns whether an error means that nothing has arrived yet.
 fn waits(error: &tungstenite::Error) -> bool {
     matches!(error, tungstenite::Error::Io(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut))
 }
 
-/// Connects to a service; returns its first message, and the field of a force.
+/// Connects to a service. Returns the connection, its first message, and the name of the field of a force.
 fn begin(address: &str) -> io::Result<(WebSocket<TcpStream>, Value, &'static str)> {
     let host = host_of(address)?;
     let version = version(host)?;
-    // Before it is spoken to in words of a version that is not known here.
+    // Checked before anything is sent in the format of an unsupported version.
     field(version.as_deref(), &Value::Null)?;
     let stream = connect(host).map_err(|error| missing(host, &error))?;
     let bounds = WebSocketConfig::default().max_message_size(Some(MAX_BYTES)).max_frame_size(Some(MAX_BYTES));
@@ -221,7 +222,7 @@ impl Inverse3 {
     /// Opens the first Inverse3 of the service at an address.
     ///
     /// # Errors
-    /// Returns an error if the service or the device is missing, or of another version.
+    /// Returns an error if the service or the device is missing, or the service has another version.
     pub(super) fn open(which: Option<&str>) -> io::Result<Self> {
         let (socket, first, field) = begin(which.unwrap_or(ADDRESS))?;
         let id = devices(&first, "inverse3").find_map(id_of).ok_or_else(|| {
@@ -248,7 +249,7 @@ impl Inverse3 {
         Ok(device)
     }
 
-    /// Takes what a message tells. A value that is not told is as it was.
+    /// Applies a message. Values that it does not contain stay as they are.
     fn take(&mut self, message: &Value) {
         let ours = devices(message, "inverse3").find(|device| id_of(device) == Some(&self.id));
         let place_m = ours.and_then(|ours| vector(ours.get("state")?.get("cursor_position")?));
@@ -261,7 +262,7 @@ impl Inverse3 {
         }
     }
 
-    /// Sends a force; the first message tells who we are.
+    /// Sends a force, N; the first message also contains the name of this program.
     fn send(&mut self, force_n: DVec3, is_first: bool) -> io::Result<()> {
         let DVec3 { x, y, z } = force_n;
         let mut command = Map::new();
@@ -272,7 +273,7 @@ impl Inverse3 {
             message["session"] = json!({ "configure": { "profile": { "name": "palpate" } } });
         }
         match self.socket.send(Message::text(message.to_string())) {
-            // What does not fit now goes with the next.
+            // What does not fit now is sent with the next message.
             Err(error) if !waits(&error) => Err(broken(&error)),
             _ => {
                 if self.unanswered == 0 {
@@ -319,7 +320,7 @@ impl HapticDevice for Inverse3 {
         let is_lost = !self.is_told && self.told.elapsed() > STALE;
         let is_stale = is_lost || self.unanswered > 0 && self.heard.elapsed() > STALE;
         let force_n = if is_stale { DVec3::ZERO } else { force_n };
-        // That there is to be no force is said to a service that is behind, too.
+        // A force of zero is sent even to a service that is behind.
         let must = force_n == DVec3::ZERO && self.sent_n != DVec3::ZERO;
         if self.unanswered < UNANSWERED || must { self.send(force_n, false) } else { Ok(()) }
     }
@@ -335,7 +336,7 @@ impl HapticDevice for Inverse3 {
 
 impl Drop for Inverse3 {
     fn drop(&mut self) {
-        // Once more, and this time waiting for room.
+        // Sent once more, this time waiting for room.
         let _ = self.socket.get_ref().set_nonblocking(false);
         let _ = self.socket.get_ref().set_write_timeout(Some(SILENCE));
         let _ = self.send(DVec3::ZERO, false);
@@ -344,10 +345,10 @@ impl Drop for Inverse3 {
     }
 }
 
-/// Whether there is an Inverse3, and what is there.
+/// Returns whether there is an Inverse3, and a description.
 ///
 /// # Errors
-/// Returns an error if the service does not answer, or is of another version.
+/// Returns an error if the service does not answer or has another version.
 pub(super) fn tell() -> io::Result<(bool, String)> {
     let (_socket, first, field) = begin(ADDRESS)?;
     let ids: Vec<&str> = devices(&first, "inverse3").filter_map(id_of).collect();

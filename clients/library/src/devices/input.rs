@@ -1,8 +1,9 @@
-//! A SpaceMouse or a gamepad, by the events of Linux: position by rate, force by rumble, so that anybody can try touch.
+//! A SpaceMouse or a gamepad, through the input events of Linux: velocity control of the position, and forces as
+//! rumble, so that anybody can try touch.
 //!
-//! A deflection moves the position at a speed, within a ball of the workspace's radius. Nothing pushes the position back: the
-//! force is felt as rumble, if the device has that. So the position stops by itself where the force comes near the largest one.
-//! Events are read from a path as they are, so a pipe with recorded events does as well.
+//! A deflection moves the position at a speed, within a ball of the workspace's radius. No force acts on the hand: it
+//! is felt as rumble, if the device has that. So the position stops by itself when the force comes near the largest
+//! one. Events are read from a path, so a pipe with recorded events works as well.
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read};
@@ -17,7 +18,7 @@ use palpate_haptics::device::UNDECLARED;
 
 use crate::device::{HapticDevice, Reading};
 
-/// Bytes of `struct input_event`: two words of time, then type, code and value.
+/// Size of `struct input_event` in bytes: two words of time, then type, code and value.
 const TIME_BYTES: usize = 2 * size_of::<usize>();
 const EVENT_BYTES: usize = TIME_BYTES + 8;
 
@@ -29,25 +30,25 @@ const EV_ABS: u16 = 3;
 const EV_MAX: u16 = 0x1f;
 const SYN_DROPPED: u16 = 3;
 
-/// Axes that are kept: X, Y, Z, RX, RY, RZ, of the same numbers as EV_REL and EV_ABS.
+/// Axes that are used: X, Y, Z, RX, RY, RZ, with equal numbers in EV_REL and EV_ABS.
 const AXES: usize = 6;
 
 /// Speed at full deflection, m/s.
 const SPEED_M_PER_S: f64 = 0.05;
 
-/// Deflection that counts as none.
+/// Deflection, as a fraction of the largest, that counts as none.
 const DEAD: f64 = 0.08;
 
-/// A relative axis of which nothing was said for so long is at rest: such devices do not say 0.
+/// Time without an event after which a relative axis counts as at rest: such devices do not report 0.
 const RESTS: Duration = Duration::from_millis(100);
 
-/// Longest time that the position moves between two readings, s.
+/// Longest time by which the position is moved between two readings, s.
 const MAX_S: f64 = 0.02;
 
-/// Parts of the largest force between which a movement against it becomes slower, until it stops.
+/// Fractions of the largest force between which a movement against it becomes slower, until it stops.
 const STOPS: [f64; 2] = [0.6, 0.9];
 
-/// A movement, without what would make a force much larger that is near the largest one already.
+/// Returns the movement without the part that would increase a force that is already near the largest one.
 fn stopped(moved_m: DVec3, force_n: DVec3) -> DVec3 {
     let along = force_n.normalize_or_zero();
     let against_m = moved_m.dot(along).min(0.0);
@@ -56,16 +57,16 @@ fn stopped(moved_m: DVec3, force_n: DVec3) -> DVec3 {
     moved_m - (1.0 - left) * against_m * along
 }
 
-/// How often the rumble changes at most, and how long it lasts if it is not said anew.
+/// Minimum interval between changes of the rumble, and its duration if it is not renewed.
 const RUMBLE_EVERY: Duration = Duration::from_millis(20);
 const RUMBLE_MS: u16 = 100;
 
-/// What the axes and buttons of a device mean.
+/// The meaning of a device's axes and buttons.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Map {
-    /// A knob that is pushed and pulled: to the right, towards the operator, down.
+    /// A knob that is pushed and pulled; its axes point to the right, towards the operator, and down.
     SpaceMouse,
-    /// The left stick along the tissue, the right one up and down; the triggers as well.
+    /// The left stick moves along the tissue, the right one and the triggers up and down.
     Gamepad,
 }
 
@@ -77,7 +78,7 @@ impl Map {
         }
     }
 
-    /// The codes of the buttons that ask for forces, and of the clutch.
+    /// Returns the codes of the button that requests forces, and of the clutch.
     fn keys(self) -> [u16; 2] {
         match self {
             Map::SpaceMouse => [KeyCode::BTN_0.0, KeyCode::BTN_1.0],
@@ -85,7 +86,7 @@ impl Map {
         }
     }
 
-    /// The axes' ranges where the device does not tell them.
+    /// Returns the axes' ranges for devices that do not report them.
     fn ranges(self) -> [[f64; 2]; AXES] {
         match self {
             Map::SpaceMouse => [[-350.0, 350.0]; AXES],
@@ -96,13 +97,13 @@ impl Map {
         }
     }
 
-    /// The velocity of the position as a part of the largest, from the axes' values.
+    /// Returns the velocity of the position, as a fraction of the largest, from the axes' values.
     fn velocity(self, values: &[f64; AXES], ranges: &[[f64; 2]; AXES]) -> DVec3 {
         let centred = |axis: usize| {
             let [least, most] = ranges[axis];
             dead((2.0 * values[axis] - least - most) / (most - least))
         };
-        // Triggers rest at their least.
+        // Triggers rest at their smallest value.
         let pressed = |axis: usize| {
             let [least, most] = ranges[axis];
             dead((values[axis] - least) / (most - least))
@@ -132,19 +133,19 @@ impl Map {
     }
 }
 
-/// A deflection without its dead zone, from -1 to 1.
+/// Removes the dead zone from a deflection; the result is from -1 to 1.
 fn dead(deflection: f64) -> f64 {
     let beyond = (deflection.abs() - DEAD) / (1.0 - DEAD);
     if beyond > 0.0 { beyond.min(1.0).copysign(deflection) } else { 0.0 }
 }
 
-/// What events have told.
+/// The state of a device's axes and buttons after the events so far.
 #[derive(Debug)]
 struct InputState {
     map: Map,
     ranges: [[f64; 2]; AXES],
     values: [f64; AXES],
-    /// When a relative axis was last told of; `None` for an axis with absolute values.
+    /// When a relative axis was last reported; `None` for an axis with absolute values.
     relative: [Option<Instant>; AXES],
     buttons: u32,
 }
@@ -156,7 +157,7 @@ impl InputState {
         told
     }
 
-    /// Everything is where it rests.
+    /// Resets all axes to rest and releases all buttons.
     fn rest(&mut self) {
         let is_trigger = |axis: usize| self.map == Map::Gamepad && (axis == 2 || axis == 5);
         self.values = std::array::from_fn(|axis| {
@@ -166,20 +167,20 @@ impl InputState {
         (self.relative, self.buttons) = ([None; AXES], 0);
     }
 
-    /// Takes one event.
+    /// Applies one event.
     ///
     /// # Errors
-    /// Returns an error if it is no input event.
+    /// Returns an error if it is not an input event.
     fn take(&mut self, event: &[u8; EVENT_BYTES], now: Instant) -> io::Result<()> {
         let [a, b, c, d, rest @ ..] = std::array::from_fn::<u8, 8, _>(|index| event[TIME_BYTES + index]);
         let (kind, code, value) = (u16::from_ne_bytes([a, b]), u16::from_ne_bytes([c, d]), i32::from_ne_bytes(rest));
         let axis = usize::from(code);
         match kind {
-            // The kernel has dropped events: what is held is not known any more.
+            // The kernel has dropped events: which buttons are held is not known any more.
             EV_SYN if code == SYN_DROPPED => self.rest(),
             EV_REL if axis < AXES => {
                 (self.values[axis], self.relative[axis]) = (f64::from(value), Some(now));
-                // The three axes of a report come together: one that is not told of is at rest.
+                // The three axes of a report arrive together: one that is missing is at rest.
                 let others = if axis < 3 { 0..3 } else { 3..AXES };
                 for other in others.filter(|other| *other != axis) {
                     if self.relative[other].is_some_and(|told| now.duration_since(told) > RESTS / 4) {
@@ -195,7 +196,7 @@ impl InputState {
             }
             0..=EV_MAX => {}
             _ => {
-                let message = format!("what comes is not an event of an input device (type {kind})");
+                let message = format!("the data is not an event of an input device (type {kind})");
                 return Err(io::Error::new(ErrorKind::InvalidData, message));
             }
         }
@@ -215,7 +216,7 @@ impl InputState {
 /// The rumble of a gamepad.
 struct Rumble {
     effect: FFEffect,
-    /// What plays, and since when.
+    /// The current magnitude, and since when it plays.
     played: u16,
     since: Option<Instant>,
 }
@@ -236,7 +237,7 @@ impl Rumble {
         Some(Rumble { effect, played: 0, since: None })
     }
 
-    /// Plays a part of the largest rumble.
+    /// Plays a fraction of the largest rumble.
     fn play(&mut self, part: f64) {
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let magnitude = (part.clamp(0.0, 1.0) * f64::from(u16::MAX)) as u16;
@@ -244,7 +245,7 @@ impl Rumble {
         if magnitude == 0 && self.played == 0 || !is_due && magnitude != 0 {
             return;
         }
-        // A device that does not rumble any more is noticed by its events.
+        // A device that fails to rumble is noticed by its events.
         let _ = self.effect.update(effect(magnitude));
         let _ = if magnitude == 0 { self.effect.stop() } else { self.effect.play(1) };
         (self.played, self.since) = (magnitude, Some(Instant::now()));
@@ -255,19 +256,19 @@ impl Rumble {
 pub(super) struct InputDevice {
     path: PathBuf,
     events: File,
-    /// A part of an event that was read.
+    /// Bytes of an event that was read partly.
     part: Vec<u8>,
     has_told: bool,
     told: InputState,
     rumble: Option<Rumble>,
-    /// That was written last.
+    /// The force that was written last, N.
     force_n: DVec3,
     place_m: DVec3,
     moved: Option<Instant>,
 }
 
 impl InputDevice {
-    /// Opens the events at a path, or of the first device of that kind.
+    /// Opens the events at a path, or those of the first device of that kind.
     ///
     /// # Errors
     /// Returns an error if there is no such device, or if it can't be opened.
@@ -283,7 +284,7 @@ impl InputDevice {
             };
             io::Error::new(error.kind(), format!("{}: {error}{advice}", path.display()))
         };
-        // Opening must not wait for whoever writes to a pipe; reading never waits.
+        // Opening must not wait for a program that writes to a pipe; reading never waits.
         const NONBLOCK: i32 = 0o4000;
         let events = OpenOptions::new().read(true).custom_flags(NONBLOCK).open(&path).map_err(refused)?;
         let kind = events.metadata().map_err(refused)?.file_type();
@@ -306,14 +307,14 @@ impl InputDevice {
         Ok(InputDevice { path, events, part, has_told: false, told, rumble, force_n, place_m, moved: None })
     }
 
-    /// Reads what has come, without waiting.
+    /// Reads the events that have arrived, without waiting.
     fn take(&mut self, now: Instant) -> io::Result<()> {
         let named =
             |path: &PathBuf, error: io::Error| io::Error::new(error.kind(), format!("{}: {error}", path.display()));
         let mut bytes = [0; 64 * EVENT_BYTES];
         loop {
             match self.events.read(&mut bytes) {
-                // Nobody has opened the pipe yet.
+                // No program has opened the pipe yet.
                 Ok(0) if !self.has_told => return Ok(()),
                 Ok(0) => {
                     let ended = io::Error::new(ErrorKind::NotConnected, "no more events: it was unplugged");
@@ -347,7 +348,7 @@ impl HapticDevice for InputDevice {
         let passed_s =
             self.moved.replace(now).map_or(0.0, |before| now.duration_since(before).as_secs_f64().min(MAX_S));
         let moved_m = stopped(SPEED_M_PER_S * passed_s * self.told.velocity(now), self.force_n);
-        // Within the workspace: beyond it the envelope would take the force away.
+        // Stays within the workspace: beyond it the envelope would set the force to zero.
         self.place_m = (self.place_m + moved_m).clamp_length_max(0.95 * UNDECLARED.workspace_m);
         Ok(Reading { place_m: self.place_m, enable: self.told.buttons & 1 != 0 })
     }
@@ -369,7 +370,7 @@ impl HapticDevice for InputDevice {
     }
 }
 
-/// Why there is no device of that kind.
+/// Returns the error that explains why there is no device of that kind.
 fn none(map: Map) -> io::Error {
     let all = std::fs::read_dir("/dev/input").map_or(0, |entries| {
         entries.flatten().filter(|entry| entry.file_name().to_string_lossy().starts_with("event")).count()
@@ -385,7 +386,7 @@ fn none(map: Map) -> io::Error {
     io::Error::new(ErrorKind::NotFound, message)
 }
 
-/// The devices of that kind: path and name.
+/// Returns path and name of the devices of that kind.
 fn found(map: Map) -> Vec<(PathBuf, String)> {
     let devices = evdev::enumerate().filter(|(_, device)| map.is(device));
     let mut found: Vec<_> =
@@ -394,7 +395,7 @@ fn found(map: Map) -> Vec<(PathBuf, String)> {
     found
 }
 
-/// The devices of both kinds, as names for `open`, whether they are there, and about them.
+/// Returns the devices of both kinds: their names for `open`, whether they are there, and a description.
 pub(super) fn list() -> Vec<(String, bool, String)> {
     let of = |map: Map| {
         let found = found(map);
@@ -438,7 +439,7 @@ mod tests {
             assert!(velocity.x > 0.3 && velocity.y > 0.3 && velocity.z < -0.3, "{velocity}");
         }
         assert_eq!(mouse.velocity(later), DVec3::ZERO);
-        // A stick is where it was last said to be.
+        // A stick stays where it was last reported.
         assert!(pad.velocity(later).x > 0.3);
         // The right trigger goes down.
         let mut pad = InputState::new(Map::Gamepad, Map::Gamepad.ranges());
@@ -452,7 +453,7 @@ mod tests {
         let moved_m = DVec3::new(1e-5, 0.0, -2e-5);
         assert_eq!(stopped(moved_m, DVec3::ZERO), moved_m);
         assert_eq!(stopped(moved_m, DVec3::Z * 0.5 * most_n), moved_m);
-        // Half way it is half as fast, then it only slides, and it can always come out.
+        // Half way it is half as fast, then it only slides, and it can always move out.
         let half_m = stopped(moved_m, DVec3::Z * 0.75 * most_n);
         assert!((half_m - DVec3::new(1e-5, 0.0, -1e-5)).length() < 1e-12, "{half_m}");
         let slides_m = stopped(moved_m, DVec3::Z * 0.95 * most_n);

@@ -2,7 +2,7 @@
 //!
 //! A library stays loaded until the program ends: some have threads of their own, and crash when they are unloaded.
 
-// Functions of a library that was written in C.
+// Functions of a C library.
 #![allow(unsafe_code)]
 
 use std::ffi::{CStr, c_char};
@@ -11,7 +11,7 @@ use std::path::Path;
 
 use libloading::Library;
 
-/// A library of a maker.
+/// A loaded library of a device's maker.
 #[derive(Debug, Clone)]
 pub(super) struct Loaded {
     library: &'static Library,
@@ -19,10 +19,11 @@ pub(super) struct Loaded {
 }
 
 impl Loaded {
-    /// Loads `given`, or the first of `names` that the system finds. `what` it is and `how` to get it are for people.
+    /// Loads `given`, or the first of `names` that the system finds. `what` (the library) and `how` (to get it)
+    /// appear in the error.
     ///
     /// # Errors
-    /// Returns an error that says what was tried and what to do.
+    /// Returns an error that lists what was tried and what to do.
     pub(super) fn find(given: Option<&Path>, names: &[&str], what: &str, how: &str) -> io::Result<Self> {
         let mut tried = Vec::new();
         let given = given.map(|path| path.display().to_string());
@@ -33,7 +34,7 @@ impl Loaded {
             match unsafe { Library::new(&name) } {
                 Ok(library) => return Ok(Loaded { library: Box::leak(Box::new(library)), name }),
                 Err(error) => {
-                    // The system's own words name the file.
+                    // The system's message names the file.
                     let words =
                         std::error::Error::source(&error).map_or_else(|| error.to_string(), ToString::to_string);
                     tried.push(words);
@@ -45,15 +46,15 @@ impl Loaded {
         Err(io::Error::new(io::ErrorKind::NotFound, message))
     }
 
-    /// The name by which it was found.
+    /// Returns the name by which it was found.
     pub(super) fn name(&self) -> &str {
         &self.name
     }
 
-    /// The function of that name.
+    /// Returns the function with that name.
     ///
     /// # Safety
-    /// `F` must be a pointer to a function of the type that the maker's header tells of that name.
+    /// `F` must be a pointer to a function of the type that the maker's header declares for that name.
     ///
     /// # Errors
     /// Returns an error if the library has no such function.
@@ -66,20 +67,20 @@ impl Loaded {
         })
     }
 
-    /// The function of that name, if the library has it.
+    /// Returns the function with that name; `None` if the library has none.
     ///
     /// # Safety
-    /// As of [`Loaded::function`].
+    /// The condition of [`Loaded::function`] applies.
     pub(super) unsafe fn optional<F: Copy>(&self, symbol: &str) -> Option<F> {
         // SAFETY: as above.
         unsafe { self.library.get::<F>(symbol.as_bytes()) }.ok().map(|function| *function)
     }
 }
 
-/// A text of a library; `None` for a null pointer.
+/// Copies a text of a library; `None` for a null pointer.
 ///
 /// # Safety
-/// `text` must be null, or point to a text that ends with a zero and does not change during this call.
+/// `text` must be null, or point to a zero-terminated text that does not change during this call.
 pub(super) unsafe fn text_of(text: *const c_char) -> Option<String> {
     // SAFETY: as the caller promises.
     (!text.is_null()).then(|| unsafe { CStr::from_ptr(text) }.to_string_lossy().into_owned())

@@ -1,7 +1,7 @@
-//! Devices of makers, found and loaded at run time: no maker's kit is needed to build this library.
+//! Devices of several makers, found and loaded at run time: building this library needs no maker's SDK.
 //!
-//! [`open`] gives a device by its name, for [`crate::bridge::run`]. [`list`] tells what is there, [`check`] whether it keeps
-//! time. [`Placed`] lays the workspace of any device over the tissue.
+//! [`open`] opens a device by its name, for [`crate::bridge::run`]. [`list`] returns the devices that are there, and
+//! [`check`] measures the timing of one. [`Placed`] places the workspace of any device over the tissue.
 //!
 //! | name | what it is | how it is reached |
 //! |---|---|---|
@@ -30,18 +30,18 @@ use crate::device::HapticDevice;
 pub use check::{DeviceReport, check};
 pub use placement::{ENGAGED_N, Enables, Placed, Placement};
 
-/// A kind of device.
+/// A kind of device, by the library or service that connects it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum DeviceKind {
-    /// By `libdhd`.
+    /// Devices of Force Dimension, by `libdhd`.
     ForceDimension,
-    /// By `libHD`.
+    /// Devices of 3D Systems, by `libHD` of OpenHaptics.
     OpenHaptics,
-    /// By Haply's service.
+    /// Haply's Inverse3, by Haply's service.
     Haply,
-    /// A 3D mouse.
+    /// A 3D mouse, by input events of Linux.
     SpaceMouse,
-    /// A gamepad.
+    /// A gamepad, by input events of Linux.
     Gamepad,
 }
 
@@ -55,18 +55,18 @@ impl DeviceKind {
         (DeviceKind::Gamepad, "gamepad"),
     ];
 
-    /// Returns the kind that a name begins with, and what follows its `:`.
+    /// Returns the kind that a name begins with, and the text after its `:`. `None` if there is no such kind.
     pub fn of(name: &str) -> Option<(DeviceKind, Option<&str>)> {
         let (kind, which) = name.split_once(':').map_or((name, None), |(kind, which)| (kind, Some(which)));
         DeviceKind::ALL.iter().find(|entry| entry.1 == kind).map(|entry| (entry.0, which))
     }
 }
 
-/// Opens a device by its name. `library` is the maker's library, if it is not where the system looks for libraries.
+/// Opens a device by its name. `library` is the path of the maker's library, if the system does not find it.
 ///
 /// # Errors
-/// Returns [`Error::Argument`] if there is no such kind of device, and [`Error::Device`] with what to do if the library, the
-/// service or the device is missing, or of a version that is not known here.
+/// Returns [`Error::Argument`] if there is no such kind of device, and [`Error::Device`] with advice if the library,
+/// the service or the device is missing or has an unsupported version.
 pub fn open(name: &str, library: Option<&Path>) -> Result<Box<dyn HapticDevice>, Error> {
     let Some((kind, which)) = DeviceKind::of(name) else {
         let names: Vec<&str> = DeviceKind::ALL.iter().map(|entry| entry.1).collect();
@@ -88,19 +88,19 @@ pub fn open(name: &str, library: Option<&Path>) -> Result<Box<dyn HapticDevice>,
     })
 }
 
-/// What [`list`] found of a kind of device.
+/// A device, or a kind of device, that [`list`] looked for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Found {
-    /// The name for [`open`].
+    /// The name to pass to [`open`].
     pub name: String,
-    /// Whether it can be tried: the library or service answers, and does not say that there is no device.
+    /// Whether it can be tried: the library or service answers, and does not report that there is no device.
     pub is_there: bool,
-    /// For people: version and model, or what is missing and what to do.
+    /// A description for people: version and model, or what is missing and what to do.
     pub about: String,
 }
 
-/// Returns what devices of all kinds are there. Opens none of them. `library` is tried as the library of each kind that
-/// needs one.
+/// Lists the devices of all kinds that are there. Opens none of them. `library` is tried as the library of each kind
+/// that needs one.
 pub fn list(library: Option<&Path>) -> Vec<Found> {
     let told = |name: &str, told: std::io::Result<(bool, String)>| {
         let (is_there, about) = told.unwrap_or_else(|error| (false, error.to_string()));

@@ -1,10 +1,10 @@
-//! The Touch of 3D Systems, and its forerunners, by `libHD` of OpenHaptics (version 3).
+//! The Touch of 3D Systems, and its predecessors, through `libHD` of OpenHaptics (version 3).
 //!
-//! The library calls a function of ours a thousand times a second on a thread of its own: one frame reads the position and
-//! sets the force. It measures in millimetres, with x to the right, y up and z towards the operator. If our loop stands
-//! still, the frame takes the force away. The library is never unloaded.
+//! The library calls a function of ours a thousand times per second on its own thread: one frame reads the position
+//! and sets the force. It measures in millimetres, with x to the right, y up and z towards the operator. If our loop
+//! stops, the frame sets the force to zero. The library is never unloaded.
 
-// Functions of a library that was written in C.
+// Functions of a C library.
 #![allow(unsafe_code)]
 
 use std::ffi::{CString, c_char, c_int, c_uint, c_ulong, c_ushort, c_void};
@@ -41,23 +41,23 @@ const FORCE_OUTPUT: c_uint = 0x4000;
 const NEEDS_INKWELL: c_uint = 0x5002;
 const CALLBACK_DONE: c_uint = 0;
 const CALLBACK_CONTINUE: c_uint = 1;
-/// Errors of forces: warm motors, or a force or speed above the device's own limits. The device goes on.
+/// Errors about forces: warm motors, or a force or speed above the device's own limits. The device continues.
 const FORCE_ERRORS: std::ops::Range<c_uint> = 0x0200..0x0300;
-/// Errors that are asked for at a time.
+/// Number of errors that are read at once.
 const MAX_ERRORS: u32 = 16;
 /// `HD_MAX_SCHEDULER_PRIORITY`.
 const PRIORITY: c_ushort = c_ushort::MAX;
 
-/// When our loop has not written for so long, the frame sets no force.
+/// Time without a write of our loop after which the frame sets no force.
 const STILL: Duration = Duration::from_millis(50);
 
-/// When no frame came for so long, the device has gone.
+/// Time without a frame after which the device counts as gone.
 const GONE: Duration = Duration::from_millis(500);
 
-/// How long closing waits for frames that set no force.
+/// Longest time for which closing waits for frames that set no force.
 const CLOSES: Duration = Duration::from_millis(250);
 
-/// How long the first frame may take.
+/// Time limit for the first frame.
 const FIRST: Duration = Duration::from_secs(2);
 
 /// `HDErrorInfo`.
@@ -73,7 +73,7 @@ type SdkFrame = unsafe extern "system" fn(*mut c_void) -> c_uint;
 type OfHandle = unsafe extern "system" fn(c_uint);
 type Bare = unsafe extern "system" fn();
 
-/// The functions in use.
+/// The functions of the library that are used.
 #[derive(Debug, Clone, Copy)]
 struct OpenHapticsCalls {
     init: unsafe extern "system" fn(*const c_char) -> c_uint,
@@ -123,33 +123,33 @@ impl OpenHapticsCalls {
         Ok((calls, loaded))
     }
 
-    /// An error's name in the library's words.
+    /// Returns the library's name of an error.
     fn words(&self, code: c_uint) -> String {
         // SAFETY: the library's texts are constants.
         let words = unsafe { text_of((self.error_text)(code)) }.unwrap_or_default();
         format!("{words} (0x{code:04X})")
     }
 
-    /// An error since it was last asked for, if there is one other than of forces.
+    /// Returns the first error since the last call, other than those about forces; `None` if there is none.
     fn failure(&self) -> Option<c_uint> {
-        // The library keeps errors until they are asked for, one by one.
+        // The library keeps errors until they are read, one by one.
         // SAFETY: a function without arguments.
         let errors = (0..MAX_ERRORS).map(|_| unsafe { (self.error)() }.code).take_while(|code| *code != 0);
         errors.fold(None, |found, code| found.or(Some(code).filter(|code| !FORCE_ERRORS.contains(code))))
     }
 
-    /// Numbers of the current device; 0 where it does not tell.
+    /// Returns numeric parameters of the current device; 0 for those that it does not report.
     fn numbers<const N: usize>(&self, parameter: c_uint) -> [f64; N] {
         // More than any parameter has.
         let mut numbers = [0.0; 16];
         // SAFETY: room for as many numbers as any parameter has.
         unsafe { (self.get_numbers)(parameter, numbers.as_mut_ptr()) };
-        // What a device does not have is an error that is no failure.
+        // A missing parameter is reported as an error, which is not a failure.
         let _ = self.failure();
         std::array::from_fn(|index| numbers[index])
     }
 
-    /// The version, which must be one that is known here.
+    /// Returns the library's version. Refuses versions other than 3.
     fn version(&self, loaded: &Loaded) -> io::Result<String> {
         // SAFETY: the library's texts are constants.
         let version = unsafe { text_of((self.get_text)(VERSION)) }.unwrap_or_default();
@@ -163,16 +163,16 @@ impl OpenHapticsCalls {
     }
 }
 
-/// What frames and our loop tell each other.
+/// The data exchanged between frames and our loop.
 #[derive(Debug, Clone, Copy)]
 struct Exchange {
-    /// Millimetres, in the library's axes.
+    /// Position in the library's axes, mm.
     place_mm: [f64; 3],
     buttons: c_int,
-    /// N, in the library's axes.
+    /// Force in the library's axes, N.
     force_n: [f64; 3],
     written: Instant,
-    /// When the newest frame came; `None` before the first.
+    /// When the newest frame arrived; `None` before the first.
     came: Option<Instant>,
     frames: u64,
     /// The error that ended the frames.
@@ -191,13 +191,13 @@ impl SharedState {
         self.exchange.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// All of it, without the lock: the library may call us meanwhile.
+    /// Returns a copy, without holding the lock: the library may call us in the meantime.
     fn seen(&self) -> Exchange {
         *self.exchange()
     }
 }
 
-/// One frame, on the library's thread.
+/// Handles one frame, on the library's thread.
 unsafe extern "system" fn frame(shared: *mut c_void) -> c_uint {
     // SAFETY: `open` passes a `SharedState` that is never freed.
     let shared = unsafe { &*shared.cast::<SharedState>() };
@@ -226,7 +226,7 @@ unsafe extern "system" fn frame(shared: *mut c_void) -> c_uint {
     match calls.failure() {
         None => CALLBACK_CONTINUE,
         Some(code) => {
-            // If it hears anything at all, then that there is to be no force.
+            // Tries to set the force to zero, in case the device still accepts it.
             // SAFETY: as above.
             unsafe {
                 (calls.begin)(*handle);
@@ -246,7 +246,7 @@ pub(super) struct OpenHaptics {
     shared: &'static SharedState,
     task: c_ulong,
     descriptor: Device,
-    /// Middle of the workspace, mm, in the library's axes.
+    /// Middle of the workspace in the library's axes, mm.
     middle_mm: DVec3,
     buttons: u32,
 }
@@ -255,7 +255,8 @@ impl OpenHaptics {
     /// Opens the device of that configuration, or the default one.
     ///
     /// # Errors
-    /// Returns an error if library or device are missing, or of another version.
+    /// Returns an error if the library or the device is missing, the library has another version, or the device is
+    /// not calibrated.
     pub(super) fn open(which: Option<&str>, library: Option<&Path>) -> io::Result<Self> {
         let (calls, loaded) = OpenHapticsCalls::load(library)?;
         calls.version(&loaded)?;
@@ -288,10 +289,10 @@ impl OpenHaptics {
             frames: 0,
             fault: None,
         };
-        // Never freed: a frame of the library may be under way for as long as the program runs.
+        // Never freed: a frame of the library may be running as long as the program does.
         let shared: &'static SharedState =
             Box::leak(Box::new(SharedState { calls, handle, exchange: Mutex::new(exchange) }));
-        // SAFETY: the function has the type of a frame, and `shared` lives for ever.
+        // SAFETY: the function has the type of a frame, and `shared` is never freed.
         let task = unsafe {
             let task = (calls.schedule)(frame, std::ptr::from_ref(shared).cast_mut().cast(), PRIORITY);
             (calls.enable)(FORCE_OUTPUT);
@@ -310,7 +311,7 @@ impl OpenHaptics {
         }
     }
 
-    /// An error if frames have ended, or if none came for `most` since `came`.
+    /// Returns an error if frames have ended, or if none arrived for `most` since `came`.
     fn alive(&self, seen: &Exchange, came: Instant, most: Duration) -> io::Result<()> {
         let gone = |message: String| io::Error::new(io::ErrorKind::NotConnected, message);
         if let Some(code) = seen.fault {
@@ -323,7 +324,7 @@ impl OpenHaptics {
     }
 }
 
-/// The limits of the current device as it tells them, and the middle of its workspace, mm.
+/// Returns the limits of the current device, as it reports them, and the middle of its workspace, mm.
 fn describe(calls: &OpenHapticsCalls) -> (Device, DVec3) {
     // SAFETY: the library's texts are constants.
     let model = unsafe { text_of((calls.get_text)(MODEL)) }.unwrap_or_default().to_lowercase();
@@ -394,14 +395,14 @@ impl Drop for OpenHaptics {
         let (begun, before) = (Instant::now(), self.shared.seen().frames);
         loop {
             let Exchange { frames, fault, .. } = self.shared.seen();
-            // Two more frames: one of them is whole, and has set that force.
+            // Waits for two more frames: one of them is whole, and has set that force.
             if frames >= before + 2 || fault.is_some() || begun.elapsed() > CLOSES {
                 break;
             }
             std::thread::sleep(Duration::from_millis(1));
         }
         let OpenHapticsCalls { stop, unschedule, disable_device, .. } = self.shared.calls;
-        // SAFETY: the device is open, and nobody uses it after this.
+        // SAFETY: the device is open, and nothing uses it after this.
         unsafe {
             stop();
             unschedule(self.task);
@@ -410,10 +411,10 @@ impl Drop for OpenHaptics {
     }
 }
 
-/// Whether the library is there. It tells of devices only when they are opened.
+/// Returns whether the library is there, and a description. The library reports devices only when they are opened.
 ///
 /// # Errors
-/// Returns an error if the library is missing, or of another version.
+/// Returns an error if the library is missing or has another version.
 pub(super) fn tell(library: Option<&Path>) -> io::Result<(bool, String)> {
     let (calls, loaded) = OpenHapticsCalls::load(library)?;
     let version = calls.version(&loaded)?;

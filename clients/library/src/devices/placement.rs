@@ -1,10 +1,11 @@
-//! Where a device's workspace is laid over the tissue, and the clutch.
+//! Places a device's workspace over the tissue, and implements the clutch.
 //!
-//! A position p of the device, from the middle of its workspace, becomes `offset + scale·R·p` from the top of the tissue. A
-//! force f of the tissue goes back as `force_scale·R⁻¹·f`. So the work at the device is `force_scale/scale` of the work at the
-//! tissue: what the envelope keeps passive there is passive here, whatever the scale. A spring of the tissue is felt
-//! `scale·force_scale` times as stiff, and the device's limits are declared to the server divided by that. As `force_scale` is at
-//! most 1, the envelope's largest force is never exceeded.
+//! A position p of the device, from the middle of its workspace, becomes `offset + scale·R·p` from the top of the
+//! tissue. A force f of the tissue becomes `force_scale·R⁻¹·f` at the device. So the work at the device is
+//! `force_scale/scale` times the work at the tissue: if the envelope keeps the tissue side passive, the device side
+//! is passive too, for any scale. A spring of the tissue is felt `scale·force_scale` times as stiff, so the device's
+//! limits are declared to the server divided by that. As `force_scale` is at most 1, the envelope's largest force is
+//! never exceeded.
 
 use std::time::Instant;
 
@@ -15,44 +16,44 @@ use palpate_refusal::{Reason, Refusal, Result, finite_vector, legible, number};
 use crate::bridge::Tick;
 use crate::device::{HapticDevice, Reading};
 
-/// How far the clutch may shift the workspace, m.
+/// Limit on the shift by the clutch, m.
 const SHIFT_M: f64 = 1.0;
 
-/// Largest offset, m.
+/// Limit on the offset, m.
 const OFFSET_M: f64 = 10.0;
 
-/// After a clutch the device gets forces again when the envelope's force has once been below this, N.
+/// Force of the envelope below which the device gets forces again after a clutch, N.
 pub const ENGAGED_N: f64 = 0.01;
 
-/// Forces that return by themselves are asked for with this period, s.
+/// Interval at which [`Enables::Always`] requests forces, s.
 const ASKS_EVERY_S: f64 = 0.3;
 
-/// Who asks for forces.
+/// What enables forces.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Enables {
-    /// The operator, by the device's button of this number.
+    /// The operator, by the device's button with this number.
     Button(u32),
-    /// They return by themselves: for devices without a button.
+    /// Forces return by themselves: for devices without a button.
     Always,
-    /// The operator, by whatever the device takes for that.
+    /// The operator, as the device itself defines it.
     #[default]
     Device,
 }
 
-/// Where a device is laid over the tissue.
+/// Where a device's workspace is placed over the tissue, with its scales and buttons.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Placement {
-    /// The middle of the workspace, from the top of the tissue, m.
+    /// The middle of the workspace, from the top of the tissue, m; at most 10 m long.
     pub offset_m: DVec3,
-    /// The device is turned about the tissue's x, then y, then z axis by so much, degrees.
+    /// Rotation of the device about the tissue's x, then y, then z axis, degrees, -360 to 360 each.
     pub rotation_deg: DVec3,
-    /// Metres of the tissue for each metre of the device.
+    /// Metres of the tissue per metre of the device, 0.01 to 100.
     pub scale: f64,
-    /// Newtons at the device for each newton of the tissue.
+    /// Newtons at the device per newton of the tissue, 0.01 to 1.
     pub force_scale: f64,
-    /// Who asks for forces.
+    /// What enables forces.
     pub enable: Enables,
-    /// The number of the button that, while it is held, lets the device move without the tool; `None`: none.
+    /// Number of the clutch button, 0 to 31: while it is held, the device moves without the tool. `None`: no clutch.
     pub clutch_button: Option<u32>,
 }
 
@@ -70,10 +71,10 @@ impl Default for Placement {
 }
 
 impl Placement {
-    /// Refuses a value that is out of its range, by the name of its field.
+    /// Checks that all values are within their ranges.
     ///
     /// # Errors
-    /// Returns the first refusal.
+    /// Returns the refusal of the first wrong field, by its name.
     pub fn check(&self) -> Result<()> {
         let Placement { offset_m, rotation_deg, scale, force_scale, enable, clutch_button } = *self;
         finite_vector("offset_m", offset_m)?;
@@ -103,34 +104,34 @@ impl Placement {
 
     fn rotation(&self) -> DQuat {
         let [x, y, z] = (self.rotation_deg * (std::f64::consts::PI / 180.0)).to_array();
-        // The axes are the tissue's, which stand still: x first is the rightmost factor.
+        // The axes are the tissue's, which do not turn: x, applied first, is the rightmost factor.
         DQuat::from_euler(EulerRot::ZYX, z, y, x)
     }
 }
 
-/// A device that is laid over the tissue somewhere, turned and scaled, with a clutch.
+/// A device whose workspace is placed over the tissue, rotated and scaled, with a clutch.
 ///
-/// While the clutch is held the tool stays where it is and the device gets no force. When it is let go, the tool goes on from
-/// there, and forces come back once the tool is out of the tissue: none begins within it.
+/// While the clutch is held, the tool stays where it is and the device gets no force. When it is released, the tool
+/// continues from there, and forces return once the tool is out of the tissue: none starts within it.
 #[derive(Debug)]
 pub struct Placed<D> {
     device: D,
     placement: Placement,
     rotation: DQuat,
-    /// What the clutch has shifted, m, of the tissue.
+    /// Shift by the clutch, in the tissue's frame, m.
     shift_m: DVec3,
-    /// The tool while the clutch is held, m.
+    /// The tool's place while the clutch is held, m.
     held_m: Option<DVec3>,
-    /// Whether the clutch is held, or was let go and the envelope's force has not been small since.
+    /// Whether the clutch is held, or was released and the envelope's force has not been small since.
     is_shut: bool,
     begun: Option<Instant>,
 }
 
 impl<D: HapticDevice> Placed<D> {
-    /// Lays a device over the tissue.
+    /// Places a device over the tissue.
     ///
     /// # Errors
-    /// Refuses a placement that [`Placement::check`] refuses.
+    /// Returns the refusals of [`Placement::check`].
     pub fn new(device: D, placement: Placement) -> Result<Self> {
         placement.check()?;
         let rotation = placement.rotation();
@@ -181,7 +182,7 @@ impl<D: HapticDevice> HapticDevice for Placed<D> {
                 *self.held_m.insert(held_m.unwrap_or(laid_m + self.shift_m))
             }
             (false, Some(held_m)) => {
-                // It goes on from where it stood.
+                // It continues from where it stood.
                 self.shift_m = (held_m - laid_m).clamp_length_max(SHIFT_M);
                 self.held_m = None;
                 laid_m + self.shift_m
@@ -268,7 +269,7 @@ mod tests {
         let descriptor = placed.descriptor();
         assert!((descriptor.stiffness_n_per_m - UNDECLARED.stiffness_n_per_m / 0.4).abs() < 1e-9);
         assert_eq!(descriptor.force_n, UNDECLARED.force_n);
-        // About x, then y, then z, of axes that stand still: z goes to -y by the first, and on to x by the last.
+        // About x, then y, then z, of axes that do not turn: z goes to -y by the first, and on to x by the last.
         let turned = Placement { rotation_deg: DVec3::new(90.0, 0.0, 90.0), ..Placement::default() };
         assert!(near(turned.rotation() * DVec3::Z, DVec3::X), "{}", turned.rotation() * DVec3::Z);
     }
@@ -321,14 +322,14 @@ mod tests {
             let (reading, force_n) = tick(place_m, 2, DVec3::Z);
             assert!(near(reading.place_m, held_m) && force_n == DVec3::ZERO);
         }
-        // Let go: it goes on from where it stood, without a force for as long as it is in the tissue.
+        // Released: it continues from where it stood, without a force as long as it is in the tissue.
         for _ in 0..4 {
             let (reading, force_n) = tick(DVec3::new(0.018, 0.0, -0.001), 0, DVec3::Z);
             assert!(near(reading.place_m, held_m) && force_n == DVec3::ZERO, "{reading:?}");
         }
         let (reading, force_n) = tick(DVec3::new(0.018, 0.0, 0.001), 0, DVec3::ZERO);
         assert!(near(reading.place_m, held_m + 0.002 * DVec3::Z) && force_n == DVec3::ZERO);
-        // From then on the device gets what the envelope says.
+        // From then on the device gets the envelope's force.
         assert_eq!(tick(DVec3::new(0.018, 0.0, -0.001), 0, 0.3 * DVec3::Z).1, 0.3 * DVec3::Z);
     }
 

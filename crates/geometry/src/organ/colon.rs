@@ -1,5 +1,6 @@
 //! A segment of colon as an endoscope sees it: a wall that faces inward, with three bands along it and crescent folds
-//! between them. It is one layer, open at both ends: the outside of the wall is not touched, and would double the vertices.
+//! between them. It is one layer, open at both ends: the outside of the wall is not touched, and would double the
+//! vertices.
 
 use std::f64::consts::TAU;
 
@@ -12,19 +13,19 @@ use super::shape::{Chart, Shape};
 /// Its length along x, mm.
 const LENGTH: f64 = 200.0;
 
-/// A fold, from one band to the next.
+/// A fold between two bands.
 struct Fold {
-    /// Where it is along x.
+    /// Its position along x, mm.
     along: f64,
     /// The direction to its middle.
     side: DVec2,
-    /// How far its crest stands out of the wall, mm.
+    /// Height of its crest above the wall, mm.
     height: f64,
     /// Half its thickness at the foot, mm.
     half: f64,
 }
 
-/// It lies along x.
+/// Returns the shape of the colon. It lies along x.
 pub(super) fn shape(dice: &mut Dice) -> Shape {
     let radius = 25.0 * dice.factor(0.1);
     let (sway, phase) = (dice.within(2.0, 6.0), dice.within(0.0, TAU));
@@ -50,7 +51,7 @@ pub(super) fn shape(dice: &mut Dice) -> Shape {
     let uneven = Unevenness::new(0.4, 30.0, dice);
     let raised = move |place: DVec3| {
         let side = (DVec2::new(place.y, place.z) - centre(place.x)).normalize_or_zero();
-        // Crescents: highest in their middle, and gone at the bands.
+        // Crescents: highest in their middle, and vanishing at the bands.
         let crest = |fold: &Fold| {
             let near = bump((place.x - fold.along) / fold.half);
             if near > 0.0 { fold.height * near * step(0.4, 0.85, side.dot(fold.side)) } else { 0.0 }
@@ -76,8 +77,8 @@ pub(super) fn shape(dice: &mut Dice) -> Shape {
     }
 }
 
-/// Texture coordinates around an axis and along x: u from 0 to 1 is once around, v has the same scale. Where the wall closes,
-/// u goes on beyond 1.
+/// Returns texture coordinates around an axis and along x: u from 0 to 1 is one turn, v has an equal scale. Where the
+/// wall closes, u continues beyond 1.
 fn around(centre: impl Fn(f64) -> DVec2 + 'static, radius: f64) -> Chart {
     Box::new(move |corners| {
         let turns = corners.map(|place| {

@@ -1,15 +1,15 @@
-//! Numbers by a seed: the same on every machine and in every version.
+//! Pseudo-random numbers from a seed: equal on every machine and in every version.
 
-/// A sequence of numbers (`SplitMix64`).
+/// A sequence of pseudo-random numbers (`SplitMix64`).
 pub(super) struct Dice(u64);
 
 impl Dice {
-    /// The sequence of a seed.
+    /// Creates the sequence of a seed.
     pub(super) fn new(seed: u64) -> Dice {
         Dice(seed)
     }
 
-    /// The next number, from 0 to 1.
+    /// Returns the next number, from 0 to 1.
     fn unit(&mut self) -> f64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
@@ -20,12 +20,12 @@ impl Dice {
         (z >> 11) as f64 / (1_u64 << 53) as f64
     }
 
-    /// A number from `least` to `most`.
+    /// Returns a number from `least` to `most`.
     pub(super) fn within(&mut self, least: f64, most: f64) -> f64 {
         least + (most - least) * self.unit()
     }
 
-    /// A factor from 1 − `part` to 1 + `part`.
+    /// Returns a factor from 1 − `part` to 1 + `part`.
     pub(super) fn factor(&mut self, part: f64) -> f64 {
         self.within(1.0 - part, 1.0 + part)
     }

@@ -6,7 +6,7 @@ use super::dice::Dice;
 use super::field::{Spine, Unevenness, ball, intersection, union};
 use super::shape::{Shape, sides};
 
-/// The fundus is at x = 0, the duct beyond x = 60; the liver is above (z).
+/// Returns the shape of the gallbladder. The fundus is at x = 0, the duct beyond x = 60; the liver is above (z).
 pub(super) fn shape(dice: &mut Dice) -> Shape {
     let long = dice.factor(0.08);
     let wide = dice.factor(0.12);

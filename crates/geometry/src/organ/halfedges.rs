@@ -1,34 +1,35 @@
-//! A triangulation with neighbours, and the three operations that change it: split, collapse and flip. It knows no places.
+//! A triangulation with neighbours, and the three operations that change it: split, collapse and flip. It has no
+//! positions.
 
 use std::iter::once;
 
-/// No half-edge, or no vertex.
+/// Marks a missing half-edge or vertex.
 pub(super) const NONE: u32 = u32::MAX;
 
-/// A manifold of triangles, closed or with boundaries. Half-edges 3t, 3t + 1 and 3t + 2 go around triangle t. Vertices and
-/// triangles keep their numbers when others are removed.
+/// A manifold of triangles, closed or with boundaries. Half-edges 3t, 3t + 1 and 3t + 2 go around triangle t.
+/// Vertices and triangles keep their numbers when others are removed.
 pub(super) struct HalfEdges {
-    /// The vertex where each half-edge begins; `NONE` in a removed triangle.
+    /// The vertex where each half-edge starts; `NONE` in a removed triangle.
     start: Vec<u32>,
     /// The half-edge along the same edge in the neighbouring triangle; `NONE` at a boundary.
     twin: Vec<u32>,
-    /// A half-edge that begins at each vertex; `NONE` for a removed vertex.
+    /// A half-edge that starts at each vertex; `NONE` for a removed vertex.
     leaving: Vec<u32>,
 }
 
-/// The half-edge after `h` around its triangle.
+/// Returns the half-edge after `h` around its triangle.
 pub(super) fn next(h: u32) -> u32 {
     if h % 3 == 2 { h - 2 } else { h + 1 }
 }
 
-/// The half-edge before `h` around its triangle.
+/// Returns the half-edge before `h` around its triangle.
 pub(super) fn previous(h: u32) -> u32 {
     if h.is_multiple_of(3) { h + 2 } else { h - 1 }
 }
 
 impl HalfEdges {
-    /// The triangulation of `triangles`, if it is a manifold in which neighbours agree about the orientation, and if each of
-    /// the `vertices` vertices is in it.
+    /// Creates the triangulation of `triangles`. `None` unless it is a manifold in which neighbours have consistent
+    /// orientations and each of the `vertices` vertices is used.
     pub(super) fn new(vertices: usize, triangles: &[[u32; 3]]) -> Option<HalfEdges> {
         let start = triangles.concat();
         let edge = |h: u32| {
@@ -60,42 +61,42 @@ impl HalfEdges {
         (0..vertices as u32).all(is_manifold).then_some(mesh)
     }
 
-    /// How many numbers of half-edges there are, with those of removed triangles.
+    /// Returns the number of half-edges, including those of removed triangles.
     pub(super) fn half_edges(&self) -> u32 {
         self.start.len() as u32
     }
 
-    /// How many numbers of vertices there are, with those of removed vertices.
+    /// Returns the number of vertices, including removed ones.
     pub(super) fn vertices(&self) -> u32 {
         self.leaving.len() as u32
     }
 
-    /// Whether the triangle of a half-edge is still there.
+    /// Returns whether the triangle of a half-edge still exists.
     pub(super) fn lives(&self, h: u32) -> bool {
         self.start(h) != NONE
     }
 
-    /// The vertex where a half-edge begins.
+    /// Returns the vertex where a half-edge starts.
     pub(super) fn start(&self, h: u32) -> u32 {
         self.start[h as usize]
     }
 
-    /// The vertex where a half-edge ends.
+    /// Returns the vertex where a half-edge ends.
     pub(super) fn end(&self, h: u32) -> u32 {
         self.start(next(h))
     }
 
-    /// The vertex opposite to a half-edge in its triangle.
+    /// Returns the vertex opposite a half-edge in its triangle.
     pub(super) fn apex(&self, h: u32) -> u32 {
         self.start(previous(h))
     }
 
-    /// The half-edge along the same edge in the neighbouring triangle, or `NONE`.
+    /// Returns the half-edge along the same edge in the neighbouring triangle, or `NONE`.
     pub(super) fn twin(&self, h: u32) -> u32 {
         self.twin[h as usize]
     }
 
-    /// The half-edges that begin at a vertex, counterclockwise; none for a removed vertex.
+    /// Returns the half-edges that start at a vertex, counterclockwise; none for a removed vertex.
     pub(super) fn ring(&self, vertex: u32) -> impl Iterator<Item = u32> + '_ {
         let first = self.first(vertex);
         let mut following = first;
@@ -110,7 +111,7 @@ impl HalfEdges {
         })
     }
 
-    /// The half-edge with which a vertex's ring begins: at a boundary, the one without a twin.
+    /// Returns the half-edge with which a vertex's ring starts: at a boundary, the one without a twin.
     fn first(&self, vertex: u32) -> u32 {
         let begin = self.leaving[vertex as usize];
         let mut h = begin;
@@ -123,24 +124,24 @@ impl HalfEdges {
         h
     }
 
-    /// The vertices that an edge connects with a vertex, counterclockwise.
+    /// Returns the vertices that an edge connects with a vertex, counterclockwise.
     pub(super) fn neighbours(&self, vertex: u32) -> impl Iterator<Item = u32> + '_ {
-        // At a boundary, no half-edge goes from the vertex to its last neighbour.
+        // At a boundary, no half-edge runs from the vertex to its last neighbour.
         let last = |h: u32| (self.twin(previous(h)) == NONE).then(|| self.apex(h));
         self.ring(vertex).flat_map(move |h| once(self.end(h)).chain(last(h)))
     }
 
-    /// How many edges meet at a vertex.
+    /// Returns the number of edges at a vertex.
     pub(super) fn valence(&self, vertex: u32) -> usize {
         self.neighbours(vertex).count()
     }
 
-    /// Whether a vertex, which is not removed, is at a boundary.
+    /// Returns whether an existing vertex is at a boundary.
     pub(super) fn at_boundary(&self, vertex: u32) -> bool {
         self.twin(self.first(vertex)) == NONE
     }
 
-    /// Whether an edge connects two vertices.
+    /// Returns whether an edge connects two vertices.
     pub(super) fn are_connected(&self, one: u32, other: u32) -> bool {
         self.neighbours(one).any(|neighbour| neighbour == other)
     }
@@ -155,7 +156,7 @@ impl HalfEdges {
         }
     }
 
-    /// Divides an edge by a new vertex, and the triangles beside it. The new vertex has the highest number.
+    /// Splits an edge by a new vertex, and the triangles at it. The new vertex has the highest number.
     pub(super) fn split(&mut self, h: u32) {
         let (twin, middle) = (self.twin(h), self.vertices());
         self.leaving.push(NONE);
@@ -167,7 +168,8 @@ impl HalfEdges {
         }
     }
 
-    /// Divides the triangle (a, b, c) of h = a → b into (a, m, c) and (m, b, c). The half-edge m → b, without its twin yet.
+    /// Splits the triangle (a, b, c) of h = a → b into (a, m, c) and (m, b, c). Returns the half-edge m → b, without
+    /// its twin yet.
     fn bisect(&mut self, h: u32, middle: u32) -> u32 {
         let (forth, back) = (next(h), previous(h));
         let (second, b) = (self.half_edges(), self.start(forth));
@@ -181,7 +183,7 @@ impl HalfEdges {
         second
     }
 
-    /// Turns an edge that has two triangles, (a, b, c) and (b, a, d), into c – d.
+    /// Flips an edge that has two triangles, (a, b, c) and (b, a, d), to c – d.
     pub(super) fn flip(&mut self, h: u32) {
         let twin = self.twin(h);
         let (forth, back) = (next(h), previous(h));
@@ -199,14 +201,14 @@ impl HalfEdges {
         }
     }
 
-    /// Whether the surface stays a manifold when the edge of `h` collapses.
+    /// Returns whether the surface stays a manifold when the edge of `h` collapses.
     pub(super) fn may_collapse(&self, h: u32) -> bool {
         let (a, b, twin) = (self.start(h), self.end(h), self.twin(h));
-        // An inner edge between two vertices of the boundary: the surface would be pinched there.
+        // An inner edge between two boundary vertices: the surface would be pinched there.
         if twin != NONE && self.at_boundary(a) && self.at_boundary(b) {
             return false;
         }
-        // Any other common neighbour would become the end of two edges in one place.
+        // Any other common neighbour would become the end of two coinciding edges.
         let apexes = if twin == NONE { 1 } else { 2 };
         if self.neighbours(a).filter(|&neighbour| self.are_connected(b, neighbour)).count() != apexes {
             return false;
@@ -217,7 +219,8 @@ impl HalfEdges {
         })
     }
 
-    /// Collapses the edge of h = a → b: vertex a and the triangles beside the edge vanish, b takes what is around a.
+    /// Collapses the edge of h = a → b: removes vertex a and the triangles at the edge, and connects what was around
+    /// a with b.
     pub(super) fn collapse(&mut self, h: u32) {
         let (a, b, twin) = (self.start(h), self.end(h), self.twin(h));
         let around: Vec<u32> = self.ring(a).collect();
@@ -230,7 +233,7 @@ impl HalfEdges {
         }
     }
 
-    /// Removes the triangle of `h`, whose two ends are both vertex `b` now, and joins what was beside it.
+    /// Removes the triangle of `h`, both of whose ends are vertex `b` now, and joins its neighbours.
     fn remove(&mut self, h: u32, b: u32) {
         let apex = self.apex(h);
         let (from_apex, to_apex) = (self.twin(next(h)), self.twin(previous(h)));
@@ -242,7 +245,7 @@ impl HalfEdges {
         }
     }
 
-    /// The triangles, with vertices numbered anew without gaps, and the old number of each vertex.
+    /// Returns the triangles with vertices renumbered without gaps, and the old number of each vertex.
     pub(super) fn compact(&self) -> (Vec<[u32; 3]>, Vec<u32>) {
         let mut number = vec![NONE; self.leaving.len()];
         let mut kept = Vec::new();
@@ -289,7 +292,7 @@ mod tests {
                 if choice < 0.2 {
                     mesh.split(h);
                 } else if choice < 0.7 {
-                    // A vertex of the boundary stays on it.
+                    // A boundary vertex stays on the boundary.
                     let leaves = mesh.at_boundary(mesh.start(h)) && !mesh.at_boundary(mesh.end(h));
                     if !leaves && mesh.may_collapse(h) {
                         mesh.collapse(h);
@@ -303,7 +306,7 @@ mod tests {
             }
             let (triangles, kept) = mesh.compact();
             assert!(HalfEdges::new(kept.len(), &triangles).is_some());
-            // Vertices − edges + triangles: a torus, a disc.
+            // Vertices − edges + triangles, for a torus and a disc.
             let boundary = (0..mesh.half_edges()).filter(|&h| mesh.lives(h) && mesh.twin(h) == NONE).count();
             let edges = (3 * triangles.len() + boundary) / 2;
             assert_eq!(kept.len() + triangles.len() - edges, usize::from(!closed));

@@ -6,7 +6,8 @@ use super::dice::Dice;
 use super::field::{Spine, Unevenness, capsule, difference, ellipsoid, union};
 use super::shape::{Shape, sides};
 
-/// x goes from the upper to the lower pole, y outward from the spine, z to the front.
+/// Returns the shape of the kidney. x runs from the upper to the lower pole, y outward from the spine, z to the
+/// front.
 pub(super) fn shape(dice: &mut Dice) -> Shape {
     let long = dice.factor(0.07);
     let wide = dice.factor(0.08);

@@ -6,12 +6,12 @@ use super::dice::Dice;
 use super::field::{Unevenness, bump, capsule, difference, ellipsoid, intersection, union};
 use super::shape::{Shape, sides};
 
-/// x goes to the body's left, y to its back, z up.
+/// Returns the shape of the liver. x points to the body's left, y to its back, z up.
 pub(super) fn shape(dice: &mut Dice) -> Shape {
     let right = DVec3::new(58.0 * dice.factor(0.06), 62.0 * dice.factor(0.06), 58.0 * dice.factor(0.08));
     let left = DVec3::new(66.0 * dice.factor(0.1), 42.0 * dice.factor(0.1), 25.0 * dice.factor(0.1));
     let (right_centre, left_centre) = (DVec3::new(-34.0, 4.0, -12.0), DVec3::new(24.0, -6.0, 4.0));
-    // The underside is a large ball's: it faces down, back and left.
+    // The underside is part of a large ball's surface: it faces down, back and left.
     let down = DVec3::new(0.26 * dice.factor(0.2), 0.46 * dice.factor(0.12), -0.85).normalize_or_zero();
     let hollow = dice.within(170.0, 260.0);
     let under = DVec3::new(-30.0, 0.0, -24.0 + dice.within(-4.0, 4.0)) + down * hollow;

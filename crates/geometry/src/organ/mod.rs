@@ -1,8 +1,8 @@
-//! Organs without a scan: shapes blended from simple solids, varied by a seed, and meshed evenly with an edge length.
+//! Generated organs: shapes blended from simple solids, varied by a seed, and meshed evenly with a given edge length.
 //!
-//! A shape is a signed distance (`field`). Surface nets of a coarse grid give its first mesh (`net`), which decides how the
-//! surface is connected; `remesh` then makes it as fine and even as asked. Each organ is a file with one function; they are
-//! listed in [`Organ`]. The same organ, edge length and seed give the same bits on every machine.
+//! A shape is a signed distance (`field`). Surface nets of a coarse grid create its first mesh (`net`), which
+//! determines the surface's topology; `remesh` then makes it as fine and even as requested. Each organ is a file with
+//! one function; [`Organ`] lists them. An organ, edge length and seed give equal bits on every machine.
 
 mod colon;
 mod dice;
@@ -27,13 +27,13 @@ use shape::Shape;
 
 use crate::{Group, TriangleMesh};
 
-/// The most vertices of an organ.
+/// Limit on the vertices of an organ.
 pub const MAX_VERTICES: usize = 500_000;
 
-/// The area of an equilateral triangle, and so half the area a vertex, with edges of length 1: √3/4.
+/// Area of an equilateral triangle with edges of length 1, √3/4; a vertex has twice that.
 const EQUILATERAL: f64 = 0.433_012_701_892_219_3;
 
-/// An organ, or a part of one, that [`generate`] makes.
+/// An organ, or a part of one, that [`generate`] can create.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Organ {
     /// A gallbladder with its neck and the beginning of the cystic duct, 80 mm long. Groups: `bed` (the side at the liver),
@@ -58,7 +58,7 @@ impl Organ {
     pub const ALL: [Organ; 6] =
         [Organ::Gallbladder, Organ::Liver, Organ::Kidney, Organ::Stomach, Organ::Colon, Organ::Patch];
 
-    /// Returns its name, as [`FromStr`] reads it.
+    /// Returns the organ's name, which [`FromStr`] parses.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -71,7 +71,7 @@ impl Organ {
         }
     }
 
-    /// Returns what it is, in a line.
+    /// Returns a short description, without the name.
     #[must_use]
     pub fn description(self) -> &'static str {
         match self {
@@ -84,7 +84,7 @@ impl Organ {
         }
     }
 
-    /// The shape of a seed.
+    /// Returns the shape for a seed.
     fn shape(self, seed: u64) -> Shape {
         let dice = &mut Dice::new(seed);
         match self {
@@ -113,22 +113,22 @@ impl FromStr for Organ {
     }
 }
 
-/// Why an organ is not made.
+/// The reasons why an organ can't be generated.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum OrganError {
-    /// There is no organ of this name.
+    /// There is no organ with this name.
     #[error("there is no organ `{name}`; there are {}", Organ::ALL.map(Organ::name).join(", "))]
     Unknown {
-        /// The name that was asked for.
+        /// The requested name.
         name: String,
     },
     /// The edge length is not a number above 0.
     #[error("the edge length must be a number of metres above 0, but is {edge_m}")]
     NotALength {
-        /// The edge length that was asked for, m.
+        /// The requested edge length, m.
         edge_m: f64,
     },
-    /// The mesh would have more vertices than it may.
+    /// The mesh would have too many vertices.
     #[error(
         "with edges of {} mm the {organ} would have about {vertices} vertices, more than {most}: edges of {} mm fit",
         in_mm(*edge_m),
@@ -137,13 +137,13 @@ pub enum OrganError {
     TooFine {
         /// The organ.
         organ: Organ,
-        /// The edge length that was asked for, m.
+        /// The requested edge length, m.
         edge_m: f64,
-        /// How many vertices it would give.
+        /// Approximate number of vertices that it would have.
         vertices: u64,
-        /// How many it may have.
+        /// The limit on vertices.
         most: usize,
-        /// The least edge length that is accepted, m.
+        /// The smallest accepted edge length, m.
         fits_m: f64,
     },
     /// The edges are too long for the thinnest part of the organ.
@@ -155,12 +155,12 @@ pub enum OrganError {
     TooCoarse {
         /// The organ.
         organ: Organ,
-        /// The edge length that was asked for, m.
+        /// The requested edge length, m.
         edge_m: f64,
-        /// The greatest edge length that is accepted, m.
+        /// The largest accepted edge length, m.
         fits_m: f64,
     },
-    /// The shape of this seed can't be meshed.
+    /// The shape for this seed can't be meshed.
     #[error("the {organ} of seed {seed} touches itself and can't be meshed: take another seed")]
     NotAManifold {
         /// The organ.
@@ -170,14 +170,14 @@ pub enum OrganError {
     },
 }
 
-/// A length in millimetres, without the digits that rounding adds.
+/// Converts a length to millimetres, without the digits caused by rounding.
 fn in_mm(length_m: f64) -> f64 {
     (length_m * 1e6).round() / 1e3
 }
 
-/// Makes the mesh of an organ, in metres. Its edges are about `edge_m` long; `seed` varies its shape within what is usual in
-/// an adult. The mesh is in one part, a manifold, and, except for the colon and the patch, closed. Each group is the set of
-/// vertices of whole triangles, so that formats which group triangles can keep it.
+/// Generates the mesh of an organ, in metres. Its edges are about `edge_m` long; `seed` varies its shape within the
+/// usual range of adults. The mesh is a manifold in one part, and closed except for the colon and the patch. Each
+/// group is the set of vertices of whole triangles, so that formats that group triangles can store it.
 ///
 /// A surface of area A has about A/(½√3·l²) vertices with edges of length l: a triangle with equal sides has the area ¼√3·l², and
 /// there are two of them for each vertex.
@@ -196,16 +196,16 @@ fn in_mm(length_m: f64) -> f64 {
 /// ```
 ///
 /// # Errors
-/// Refuses an edge length that is not a number above 0, that would give more than [`MAX_VERTICES`], or that is too long for
-/// the thinnest part of the organ; the refusal tells the nearest one that fits.
+/// Refuses an edge length that is not a number above 0, that would give more than [`MAX_VERTICES`], or that is too
+/// long for the thinnest part of the organ; the refusal names the nearest accepted one.
 pub fn generate(organ: Organ, edge_m: f64, seed: u64) -> Result<TriangleMesh, OrganError> {
     generate_within(organ, edge_m, seed, MAX_VERTICES)
 }
 
-/// Does the same with another bound of the number of vertices, if it is less than [`MAX_VERTICES`].
+/// Like [`generate`], with at most `most` vertices, if that is less than [`MAX_VERTICES`].
 ///
 /// # Errors
-/// As for [`generate`].
+/// Returns the refusals of [`generate`].
 pub fn generate_within(organ: Organ, edge_m: f64, seed: u64, most: usize) -> Result<TriangleMesh, OrganError> {
     let most = most.min(MAX_VERTICES);
     if !(edge_m.is_finite() && edge_m > 0.0) {
@@ -213,13 +213,13 @@ pub fn generate_within(organ: Organ, edge_m: f64, seed: u64, most: usize) -> Res
     }
     let shape = organ.shape(seed);
     let edge = edge_m * 1e3;
-    // A tenth of a nanometre allows for how a length in metres is rounded.
+    // A tenth of a nanometre allows for the rounding of a length in metres.
     if edge > shape.coarsest + 1e-7 {
         return Err(OrganError::TooCoarse { organ, edge_m, fits_m: shape.coarsest * 1e-3 });
     }
     let net = Net::new(&shape);
     let vertices = |edge: f64| net.area() / (2.0 * EQUILATERAL * edge * edge);
-    // A tenth more than counted, because a mesh has some more or less; rounded up to what the message shows.
+    // A tenth more than computed, because the number of vertices varies; rounded up as in the message.
     let fits = (vertices(1.0) * 1.1 / most.max(1) as f64).sqrt();
     let fits = (fits * 1e3).ceil() / 1e3;
     if edge < fits - 1e-7 {
@@ -241,7 +241,7 @@ pub fn generate_within(organ: Organ, edge_m: f64, seed: u64, most: usize) -> Res
     })
 }
 
-/// The vertices of all triangles that have one of the marked vertices.
+/// Marks the vertices of all triangles that have a marked vertex.
 fn around(marked: &[bool], triangles: &[[u32; 3]]) -> Vec<bool> {
     let mut within = vec![false; marked.len()];
     for triangle in triangles.iter().filter(|triangle| triangle.iter().any(|&v| marked[v as usize])) {
@@ -250,7 +250,7 @@ fn around(marked: &[bool], triangles: &[[u32; 3]]) -> Vec<bool> {
     within
 }
 
-/// A group of the triangles that are wholly within.
+/// Returns the group of the vertices of triangles that are completely within.
 fn group(name: &str, within: &[bool], triangles: &[[u32; 3]]) -> Group {
     let whole = triangles.iter().filter(|triangle| triangle.iter().all(|&v| within[v as usize]));
     let mut vertices: Vec<u32> = whole.flatten().copied().collect();

@@ -1,5 +1,5 @@
-//! The first mesh of a shape: surface nets of a grid whose cells resolve its thinnest part. It decides how the surface is
-//! connected, whatever the edge length will be.
+//! The first mesh of a shape: surface nets of a grid whose cells resolve its thinnest part. It determines the
+//! surface's topology, independent of the edge length.
 
 use fast_surface_nets::ndshape::{RuntimeShape, Shape as _};
 use fast_surface_nets::{SurfaceNetsBuffer, surface_nets};
@@ -9,18 +9,18 @@ use super::shape::Shape;
 
 /// A mesh near the surface of a shape.
 pub(super) struct Net {
-    /// Where the vertices are, mm.
+    /// Positions of the vertices, mm.
     pub(super) places: Vec<DVec3>,
-    /// The axes along which each vertex must not move, because it is where the shape is cut.
+    /// The axes along which each vertex must not move, because the shape is cut there.
     pub(super) held: Vec<BVec3>,
-    /// Counterclockwise seen from the positive side.
+    /// Vertices of each triangle, counterclockwise seen from the positive side.
     pub(super) triangles: Vec<[u32; 3]>,
 }
 
 impl Net {
-    /// The net of a shape.
+    /// Creates the net of a shape.
     pub(super) fn new(shape: &Shape) -> Net {
-        // The first and last layer of cells have their middle at the ends of the box: vertices at a cut lie in them.
+        // The centres of the first and last layer of cells lie at the ends of the box: vertices at a cut lie in them.
         let [least, most] = shape.extent;
         let steps = ((most - least) / shape.cell).ceil().max(DVec3::ONE);
         let cell = (most - least) / steps;
@@ -49,7 +49,7 @@ impl Net {
         Net { places, held, triangles }.without_unused()
     }
 
-    /// Without vertices that no triangle has.
+    /// Removes vertices without triangles.
     fn without_unused(self) -> Net {
         let mut number = vec![u32::MAX; self.places.len()];
         let mut net = Net { places: Vec::new(), held: Vec::new(), triangles: self.triangles };
@@ -65,7 +65,7 @@ impl Net {
         net
     }
 
-    /// The area of all triangles, mm².
+    /// Returns the total area of the triangles, mm².
     pub(super) fn area(&self) -> f64 {
         let area = |corners: &[u32; 3]| {
             let [a, b, c] = corners.map(|v| self.places[v as usize]);
@@ -75,10 +75,11 @@ impl Net {
     }
 }
 
-/// The distance of a grid point that is filled, mm.
+/// Distance set at a grid point that is filled, mm.
 const FILLED: f32 = -1e-3;
 
-/// Corners 0 to 7 of a cell have x, y and z in bits 0 to 2. The two diagonals of each of its six faces, as sets of corners.
+/// Corners 0 to 7 of a cell have x, y and z in bits 0 to 2. The two diagonals of each of its six faces, as sets of
+/// corners.
 const FACES: [[u8; 2]; 6] = [
     [0b0000_1001, 0b0000_0110],
     [0b1001_0000, 0b0110_0000],
@@ -91,9 +92,10 @@ const FACES: [[u8; 2]; 6] = [
 /// The four diagonals through a cell, as sets of corners.
 const THROUGH: [u8; 4] = [0b1000_0001, 0b0100_0010, 0b0010_0100, 0b0001_1000];
 
-/// Makes grid points negative until the surface between negative and positive ones is a manifold: it is not where the signs
-/// of a face alternate, nor where two opposite corners of a cell differ from all others (Latecki, Eckhardt and Rosenfeld,
-/// "Well-composed sets", 1995). That happens where a surface grazes the grid. What is only ever filled comes to an end.
+/// Makes grid points negative until the surface between negative and positive ones is a manifold: it is not if the
+/// signs at a face alternate, or two opposite corners of a cell differ from all others (Latecki, Eckhardt and
+/// Rosenfeld, "Well-composed sets", 1995). That happens where a surface grazes the grid. Points are only ever filled,
+/// so this ends.
 fn fill_ambiguous(distances: &mut [f32], points: [usize; 3]) {
     let strides = [1, points[0], points[0] * points[1]];
     let corner = |origin: usize, corner: usize| {
@@ -116,7 +118,7 @@ fn fill_ambiguous(distances: &mut [f32], points: [usize; 3]) {
             let is_through = THROUGH.contains(&inside) || THROUGH.contains(&!inside);
             let Some(outside) = face.or(is_through.then_some(!inside)) else { continue };
             let candidates = (0..8).filter(|i| outside >> i & 1 == 1).map(|i| corner(origin, i));
-            // The one nearest to the surface.
+            // The candidate nearest to the surface.
             if let Some(nearest) = candidates.min_by(|&one, &other| distances[one].total_cmp(&distances[other])) {
                 distances[nearest] = FILLED;
                 is_manifold = false;

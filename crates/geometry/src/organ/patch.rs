@@ -1,4 +1,4 @@
-//! A square of tissue that is slightly curved, with the rises that lumps beneath make.
+//! A slightly curved square of tissue, raised by lumps beneath.
 
 use glam::{BVec3, DVec2, DVec3};
 
@@ -9,17 +9,17 @@ use super::shape::{Shape, sides};
 /// Half its side, mm.
 const HALF: f64 = 50.0;
 
-/// A rise over a lump.
+/// A rise above a lump.
 struct Lump {
     centre: DVec2,
     radius: f64,
     height: f64,
 }
 
-/// It lies in x and y; the side that is touched is above (z).
+/// Returns the shape of the patch. It extends along x and y; the side to touch is above (z).
 pub(super) fn shape(dice: &mut Dice) -> Shape {
     let curvature = dice.within(1.0 / 500.0, 1.0 / 260.0);
-    // One lump in each third of the patch: they stay apart.
+    // One lump in each third of the patch, so that they stay apart.
     let lumps = [-1.0, 0.0, 1.0].map(|third| Lump {
         centre: DVec2::new(27.0 * third + dice.within(-3.0, 3.0), dice.within(-28.0, 28.0)),
         radius: dice.within(8.0, 13.0),

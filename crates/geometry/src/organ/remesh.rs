@@ -1,6 +1,6 @@
-//! Even triangles on the surface of a shape. Long edges are split, short ones collapse, edges flip to Delaunay, vertices
-//! move along the surface to the middle of their neighbours (Botsch and Kobbelt, "A remeshing approach to multiresolution
-//! modeling", 2004).
+//! Remeshes the surface of a shape evenly: long edges are split, short ones collapse, edges flip to Delaunay,
+//! vertices move along the surface to the middle of their neighbours (Botsch and Kobbelt, "A remeshing approach to
+//! multiresolution modeling", 2004).
 
 use glam::{BVec3, DVec3};
 
@@ -8,29 +8,29 @@ use super::halfedges::{HalfEdges, NONE};
 use super::net::Net;
 use super::shape::Shape;
 
-/// Longer edges, as a part of the edge length, are split, and no collapse makes one. With 4/3 and 4/5 an edge that is split
-/// is not short, and one that collapses makes none long.
+/// Ratio to the edge length above which edges are split; no collapse creates such an edge. With 4/3 and 4/5 a split
+/// creates no short edge, and a collapse no long one.
 const LONG: f64 = 4.0 / 3.0;
 
-/// Shorter edges, as a part of the edge length, collapse.
+/// Ratio to the edge length below which edges collapse.
 const SHORT: f64 = 4.0 / 5.0;
 
-/// More rounds than the finest mesh needs: each halves what is too long.
+/// Maximum number of rounds, more than the finest mesh needs: each halves edges that are too long.
 const MAX_ROUNDS: usize = 24;
 
-/// Rounds in a row that change hardly anything before the mesh is taken for even.
+/// Number of rounds in succession with hardly any change after which the mesh counts as even.
 const CALM_ROUNDS: usize = 3;
 
-/// No collapse makes a vertex with more edges.
+/// Largest number of edges of a vertex that a collapse may create.
 const LARGEST_VALENCE: usize = 8;
 
-/// No collapse or flip leaves a vertex with fewer edges, except at a boundary.
+/// Smallest number of edges of a vertex that a collapse or flip may leave, except at a boundary.
 const SMALLEST_VALENCE: usize = 4;
 
-/// The mesh while it becomes even.
+/// The state of a remeshing.
 pub(super) struct Remesh<'s> {
     shape: &'s Shape,
-    /// The edge length to reach, mm.
+    /// The target edge length, mm.
     edge: f64,
     mesh: HalfEdges,
     places: Vec<DVec3>,
@@ -40,18 +40,18 @@ pub(super) struct Remesh<'s> {
     held: Vec<BVec3>,
 }
 
-/// A mesh that is even.
+/// An evenly remeshed surface.
 pub(super) struct Even {
-    /// Where the vertices are, mm.
+    /// Positions of the vertices, mm.
     pub(super) places: Vec<DVec3>,
-    /// Counterclockwise seen from the positive side.
+    /// Vertices of each triangle, counterclockwise seen from the positive side.
     pub(super) triangles: Vec<[u32; 3]>,
     /// Whether each vertex is on the boundary.
     pub(super) at_boundary: Vec<bool>,
 }
 
 impl<'s> Remesh<'s> {
-    /// The first mesh of a shape, if it is a manifold.
+    /// Starts from the first mesh of a shape; `None` unless it is a manifold.
     pub(super) fn new(shape: &'s Shape, net: &Net, edge: f64) -> Option<Remesh<'s>> {
         let mesh = HalfEdges::new(net.places.len(), &net.triangles)?;
         let settled = net.places.iter().zip(&net.held).map(|(&place, &held)| shape.settle(place, held, 3));
@@ -59,7 +59,7 @@ impl<'s> Remesh<'s> {
         Some(Remesh { shape, edge, mesh, places, normals, held: net.held.clone() })
     }
 
-    /// Makes the mesh even.
+    /// Remeshes until the mesh is even.
     pub(super) fn even(mut self) -> Even {
         let mut calm = 0;
         for _ in 0..MAX_ROUNDS {
@@ -80,24 +80,24 @@ impl<'s> Remesh<'s> {
         Even { places, triangles, at_boundary }
     }
 
-    /// Where a vertex is.
+    /// Returns the position of a vertex, mm.
     fn place(&self, vertex: u32) -> DVec3 {
         self.places[vertex as usize]
     }
 
-    /// The length of the edge of a half-edge, mm.
+    /// Returns the length of the edge of a half-edge, mm.
     fn length(&self, h: u32) -> f64 {
         (self.place(self.mesh.end(h)) - self.place(self.mesh.start(h))).length()
     }
 
-    /// One half-edge of each edge that is there now.
+    /// Returns whether `h` is the representative half-edge of an existing edge.
     fn is_edge(&self, h: u32) -> bool {
-        // Without a twin, the other number is the greatest one.
+        // Without a twin, the other number is the largest one.
         self.mesh.lives(h) && h < self.mesh.twin(h)
     }
 
-    /// Splits the edges that are long, the longest first; how many. A split gives its triangles other edges, which may have
-    /// to wait for the next round; the longest edge of a triangle does not wait.
+    /// Splits the long edges, the longest first. Returns their number. A split changes the edges of its triangles,
+    /// which may then have to wait for the next round; the longest edge of a triangle does not wait.
     fn split_long(&mut self) -> usize {
         let lengths = (0..self.mesh.half_edges()).filter(|&h| self.is_edge(h)).map(|h| (self.length(h), h));
         let mut long: Vec<(f64, u32)> = lengths.filter(|&(length, _)| length > LONG * self.edge).collect();
@@ -120,7 +120,8 @@ impl<'s> Remesh<'s> {
         count
     }
 
-    /// Collapses each edge that is short or at a vertex with only three edges, if the surface stays what it is; how many.
+    /// Collapses each edge that is short or at a vertex with only three edges, if the surface keeps its shape.
+    /// Returns their number.
     fn collapse_short(&mut self) -> usize {
         let mut count = 0;
         for h in 0..self.mesh.half_edges() {
@@ -136,12 +137,13 @@ impl<'s> Remesh<'s> {
         count
     }
 
-    /// Whether a vertex has too few edges: it vanishes without making new ones.
+    /// Returns whether a vertex has too few edges: removing it creates no new ones.
     fn is_spare(&self, vertex: u32) -> bool {
         !self.mesh.at_boundary(vertex) && self.mesh.valence(vertex) < SMALLEST_VALENCE
     }
 
-    /// Collapses the edge of h = a → b, if the surface stays what it is, no edge becomes long, and no valence large.
+    /// Collapses the edge of h = a → b, if the surface keeps its shape, no edge becomes long, and no valence large.
+    /// Returns whether.
     fn collapse(&mut self, h: u32) -> bool {
         let (a, b) = (self.mesh.start(h), self.mesh.end(h));
         let [held_a, held_b] = [a, b].map(|vertex| self.held[vertex as usize]);
@@ -178,12 +180,12 @@ impl<'s> Remesh<'s> {
         true
     }
 
-    /// The place of a vertex and the normal there.
+    /// Returns the position of a vertex and the normal there.
     fn corner(&self, vertex: u32) -> (DVec3, DVec3) {
         (self.place(vertex), self.normals[vertex as usize])
     }
 
-    /// Flips edges until the angles opposite to each have a sum of at most 180°, as far as the surface stays what it is.
+    /// Flips edges until the angles opposite each have a sum of at most 180°, if the surface keeps its shape.
     fn flip_to_delaunay(&mut self) {
         // Nearly all flips are done in the first two passes.
         for _ in 0..8 {
@@ -200,7 +202,7 @@ impl<'s> Remesh<'s> {
         }
     }
 
-    /// Whether an edge is not Delaunay and can be flipped.
+    /// Returns whether an edge is not Delaunay and can be flipped.
     fn is_to_flip(&self, h: u32) -> bool {
         let (a, b) = (self.mesh.start(h), self.mesh.end(h));
         let (c, d) = (self.mesh.apex(h), self.mesh.apex(self.mesh.twin(h)));
@@ -208,7 +210,7 @@ impl<'s> Remesh<'s> {
             let (to_a, to_b) = (self.place(a) - self.place(apex), self.place(b) - self.place(apex));
             to_a.dot(to_b) / to_a.cross(to_b).length()
         };
-        // A margin, so that rounding does not flip the diagonal of a square for ever.
+        // A margin, so that rounding does not flip the diagonal of a square without end.
         cotangent(c) + cotangent(d) < -1e-6
             && faces_outward([a, d, c].map(|vertex| self.corner(vertex)))
             && faces_outward([d, b, c].map(|vertex| self.corner(vertex)))
@@ -218,8 +220,8 @@ impl<'s> Remesh<'s> {
             && !self.mesh.are_connected(c, d)
     }
 
-    /// Moves each vertex along the surface to the middle of its neighbours, or of those along its boundary, then onto the
-    /// surface in `steps` steps.
+    /// Moves each vertex along the surface to the middle of its neighbours (of those along its boundary, if it is on
+    /// one), then onto the surface in `steps` steps.
     fn relax(&mut self, steps: usize) {
         let relaxed = |vertex: u32| {
             let (place, normal) = self.corner(vertex);
@@ -239,7 +241,7 @@ impl<'s> Remesh<'s> {
     }
 }
 
-/// Whether a triangle faces to the side of the normals at its corners, rather than along the surface or into it.
+/// Returns whether a triangle faces the side of the normals at its corners, rather than along the surface or into it.
 fn faces_outward(corners: [(DVec3, DVec3); 3]) -> bool {
     let [(a, at_a), (b, at_b), (c, at_c)] = corners;
     let normal = (b - a).cross(c - a);

@@ -1,34 +1,34 @@
-//! The shape of an organ, from which its mesh is made. Lengths are in millimetres.
+//! The shape of an organ, from which its mesh is generated. Lengths are in millimetres.
 
 use glam::{BVec3, DVec3};
 
 /// A function of a place.
 pub(super) type OfPlace<T> = Box<dyn Fn(DVec3) -> T>;
 
-/// Texture coordinates of the corners of a triangle, from their places.
+/// A function that returns texture coordinates of a triangle's corners, from their positions.
 pub(super) type Chart = Box<dyn Fn([DVec3; 3]) -> [[f32; 2]; 3]>;
 
-/// The shape of an organ: a surface, what its parts are called, and how a texture lies on it.
+/// The shape of an organ: its surface, its named parts, and its texture coordinates.
 pub(super) struct Shape {
-    /// The signed distance: 0 on the surface, positive on the side that is touched. It need not be exact, but its gradient at
-    /// the surface is about 1.
+    /// The signed distance: 0 on the surface, positive on the side to touch. It need not be exact, but its gradient
+    /// at the surface is about 1.
     pub(super) distance: OfPlace<f64>,
-    /// The box that contains the surface, least and most coordinates.
+    /// The box that contains the surface: smallest and largest coordinates.
     pub(super) extent: [DVec3; 2],
-    /// Axes at whose two ends the box cuts the surface, which is open there. Elsewhere the box is a few cells larger than
-    /// the surface.
+    /// Axes at both of whose ends the box cuts the surface, which is open there. Elsewhere the box is a few cells
+    /// larger than the surface.
     pub(super) cut: BVec3,
-    /// The size of grid cells that resolve the thinnest part.
+    /// Size of grid cells that resolves the thinnest part.
     pub(super) cell: f64,
-    /// The longest edges that still show the thinnest part.
+    /// Longest edge length that still shows the thinnest part.
     pub(super) coarsest: f64,
-    /// Names of parts, and where they are.
+    /// Names of parts, and whether a place is in each.
     pub(super) parts: Vec<(&'static str, OfPlace<bool>)>,
-    /// How a texture lies on it.
+    /// The texture coordinates.
     pub(super) chart: Chart,
 }
 
-/// The step of the differences that give the gradient, mm: small beside any radius of curvature.
+/// Step of the differences that compute the gradient, mm: much smaller than any radius of curvature.
 const STEP: f64 = 1e-3;
 
 /// The corners of a tetrahedron.
@@ -36,7 +36,7 @@ const CORNERS: [DVec3; 4] =
     [DVec3::new(1.0, -1.0, -1.0), DVec3::new(-1.0, -1.0, 1.0), DVec3::new(-1.0, 1.0, -1.0), DVec3::new(1.0, 1.0, 1.0)];
 
 impl Shape {
-    /// The distance at a place and its gradient.
+    /// Returns the distance at a place and its gradient.
     fn slope(&self, place: DVec3) -> (f64, DVec3) {
         let (mut sum, mut gradient) = (0.0, DVec3::ZERO);
         for corner in CORNERS {
@@ -47,8 +47,8 @@ impl Shape {
         (sum / 4.0, gradient / (4.0 * STEP))
     }
 
-    /// Moves a place near the surface onto it, by Newton's method in `times` steps, but not along the axes that are `held`.
-    /// The place, and the normal there.
+    /// Moves a place near the surface onto it, by `times` steps of Newton's method, but not along the `held` axes.
+    /// Returns the place, and the normal there.
     pub(super) fn settle(&self, mut place: DVec3, held: BVec3, times: usize) -> (DVec3, DVec3) {
         let mut normal = DVec3::ZERO;
         for _ in 0..times {
@@ -64,8 +64,8 @@ impl Shape {
     }
 }
 
-/// Texture coordinates by the six sides of a box: each triangle is seen along the axis nearest to its normal, so no part
-/// is stretched by more than 1.8. The image covers the longest side; all sides share it.
+/// Returns texture coordinates by the six sides of a box: each triangle is projected along the axis nearest to its
+/// normal, so no part is stretched by more than 1.8. The image covers the longest side; all sides share it.
 pub(super) fn sides(extent: [DVec3; 2]) -> Chart {
     let (least, side) = (extent[0], (extent[1] - extent[0]).max_element());
     Box::new(move |corners| {

@@ -1,4 +1,4 @@
-//! A stomach: the fundus, the body and the antrum along a curve like a J, from the oesophagus to the duodenum.
+//! A stomach: fundus, body and antrum along a J-shaped curve, from the oesophagus to the duodenum.
 
 use glam::{BVec3, DVec3};
 
@@ -6,7 +6,7 @@ use super::dice::Dice;
 use super::field::{Spine, Unevenness, step, union};
 use super::shape::{Shape, sides};
 
-/// x goes to the body's left, y up, z to the front.
+/// Returns the shape of the stomach. x points to the body's left, y up, z to the front.
 pub(super) fn shape(dice: &mut Dice) -> Shape {
     let wide = dice.factor(0.12);
     let flat = dice.within(0.68, 0.82);
@@ -33,7 +33,7 @@ pub(super) fn shape(dice: &mut Dice) -> Shape {
     ]);
     let uneven = Unevenness::new(0.9, 52.0, dice);
     let distance = move |place: DVec3| {
-        // It is flatter than round, but its ends are round.
+        // It is flattened, except at its ends.
         let flat = flat + (1.0 - flat) * step(-30.0, -66.0, place.x);
         let stomach = stomach.distance(DVec3::new(place.x, place.y, place.z / flat));
         union(stomach, oesophagus.distance(place), 9.0) - uneven.at(place)

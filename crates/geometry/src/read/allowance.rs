@@ -1,32 +1,32 @@
-//! The memory that reading a file takes: within a multiple of its bytes, and paid for before it is allocated.
+//! Limits the memory for reading a file to a multiple of its size, and has it paid for before it is allocated.
 
 use super::{MULTIPLE, ROOM};
 use crate::Problem;
 
-/// More is paid for in steps of so many bytes.
+/// Bytes that are paid in advance each time.
 const STEP: usize = 1 << 18;
 
-/// Counts what is taken.
+/// Counts the memory taken.
 pub(super) struct MemoryAllowance<'a> {
     most: usize,
     taken: usize,
     paid: usize,
-    /// Pays for so many bytes in all; `false` if it can't.
+    /// Called with the total number of bytes to pay; returns `false` if that is refused.
     pay: &'a mut dyn FnMut(u64) -> bool,
 }
 
 impl<'a> MemoryAllowance<'a> {
-    /// For a file of so many bytes.
+    /// Creates the allowance for a file of this many bytes.
     pub(super) fn new(bytes: usize, pay: &'a mut dyn FnMut(u64) -> bool) -> Self {
         MemoryAllowance { most: bytes.saturating_mul(MULTIPLE).saturating_add(ROOM), taken: 0, paid: 0, pay }
     }
 
-    /// Another file of so many bytes belongs to it.
+    /// Increases the allowance by another file of this many bytes.
     pub(super) fn add_file(&mut self, bytes: usize) {
         self.most = self.most.saturating_add(bytes.saturating_mul(MULTIPLE));
     }
 
-    /// Takes so many bytes.
+    /// Takes memory. Refuses above the allowance, or if it is not paid.
     pub(super) fn take(&mut self, bytes: usize) -> Result<(), Problem> {
         let sum = self.taken.saturating_add(bytes);
         if sum > self.most {
@@ -43,12 +43,12 @@ impl<'a> MemoryAllowance<'a> {
         Ok(())
     }
 
-    /// So many bytes are free again.
+    /// Gives memory back.
     pub(super) fn give_back(&mut self, bytes: usize) {
         self.taken = self.taken.saturating_sub(bytes);
     }
 
-    /// Appends to a list, with what that takes when it has to grow.
+    /// Appends to a list, and takes the memory when it has to grow.
     pub(super) fn push<T>(&mut self, list: &mut Vec<T>, value: T) -> Result<(), Problem> {
         if list.len() == list.capacity() {
             self.take(list.capacity().max(4).saturating_mul(size_of::<T>()))?;

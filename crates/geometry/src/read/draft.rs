@@ -1,4 +1,4 @@
-//! A mesh while it is read: vertices, faces and volume elements in the file's unit, within the limits.
+//! A mesh that is being read: vertices, faces and volume elements in the file's unit, within the limits.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,19 +11,19 @@ use super::{ReadLimits, ReadMesh};
 use crate::topology::Topology;
 use crate::{Element, Group, MeshError, Problem, TriangleMesh, Unit};
 
-/// Groups of a file; what has more of them is no organ.
+/// Maximum number of groups in a file.
 const GROUPS: usize = 4096;
 
-/// In the place of the number of a vertex that is dropped.
+/// Marks a vertex that is dropped.
 const NONE: u32 = u32::MAX;
 
-/// Comparisons that may be made to split the concave polygons of a file.
+/// Maximum number of comparisons for splitting the concave polygons of a file.
 const COMPARISONS: u64 = 1 << 26;
 
-/// Memory of splitting a polygon, for each of its corners, bytes.
+/// Memory for splitting a polygon, bytes per corner.
 const SPLITTING: usize = 320;
 
-/// Memory of finding out whether a surface is closed, for each of its triangles, bytes.
+/// Memory for finding out whether a surface is closed, bytes per triangle.
 const CLOSED: usize = 160;
 
 /// A mesh while it is read.
@@ -31,11 +31,11 @@ pub(super) struct Draft<'l> {
     pub(super) limits: &'l ReadLimits,
     pub(super) allowance: MemoryAllowance<'l>,
     pub(super) notes: Vec<String>,
-    /// Points and lines of the file, which are no surface.
+    /// Number of points and lines in the file, which are not part of a surface.
     pub(super) lines: usize,
-    /// Whether vertices that no triangle has are dropped: the inner ones of volumes and of curved elements.
+    /// Whether to drop vertices without triangles: the inner ones of volumes and of curved elements.
     pub(super) drops_unused: bool,
-    /// Whether triangles that repeat an earlier one are dropped.
+    /// Whether to drop triangles that repeat an earlier one.
     pub(super) drops_repeated: bool,
     vertices: Vec<DVec3>,
     triangles: Vec<[u32; 3]>,
@@ -43,11 +43,11 @@ pub(super) struct Draft<'l> {
     has_uv: bool,
     groups: Vec<Group>,
     groups_by_name: BTreeMap<String, usize>,
-    /// Polygons that were split, by how.
+    /// Number of polygons that were split, by the method.
     split: usize,
     concave: usize,
     folded: usize,
-    /// Comparisons that are left.
+    /// Number of comparisons left.
     comparisons: u64,
     volume: Volume,
 }
@@ -75,7 +75,7 @@ impl<'l> Draft<'l> {
         }
     }
 
-    /// How many vertices there are so far.
+    /// Returns the number of vertices so far.
     pub(super) fn vertices(&self) -> usize {
         self.vertices.len()
     }
@@ -88,7 +88,7 @@ impl<'l> Draft<'l> {
         self.allowance.push(&mut self.vertices, DVec3::from_array(at))
     }
 
-    /// The group of a name.
+    /// Returns the group with a name, and adds it if it is new.
     pub(super) fn group(&mut self, name: &str) -> Result<usize, Problem> {
         if let Some(group) = self.groups_by_name.get(name) {
             return Ok(*group);
@@ -103,7 +103,7 @@ impl<'l> Draft<'l> {
         Ok(group)
     }
 
-    /// The vertex of an index, if it exists.
+    /// Returns the vertex with an index, if it exists.
     fn index(&self, index: i64) -> Result<u32, Problem> {
         let vertices = self.vertices.len();
         u32::try_from(index)
@@ -112,14 +112,15 @@ impl<'l> Draft<'l> {
             .ok_or(Problem::IndexOutOfRange { index, vertices })
     }
 
-    /// Puts vertices into groups, and checks them.
+    /// Checks vertices and adds them to groups.
     pub(super) fn assign(&mut self, corners: &[i64], groups: &[usize]) -> Result<(), Problem> {
         for corner in corners {
             let vertex = self.index(*corner)?;
             for group in groups {
                 if let Some(group) = self.groups.get_mut(*group) {
                     self.allowance.push(&mut group.vertices, vertex)?;
-                    // Many faces share a vertex. So that none takes more than twice what it needs:
+                    // Many faces share a vertex; duplicates are removed so that no list takes more than twice what it
+                    // needs.
                     if group.vertices.len() > 2 * self.vertices.len() + 1024 {
                         group.vertices.sort_unstable();
                         group.vertices.dedup();
@@ -130,7 +131,7 @@ impl<'l> Draft<'l> {
         Ok(())
     }
 
-    /// Adds a polygon, split into triangles. `uv` has one place for each corner, or none.
+    /// Adds a polygon, split into triangles. `uv` has one entry per corner, or none.
     pub(super) fn polygon(&mut self, corners: &[i64], uv: &[[f32; 2]], groups: &[usize]) -> Result<(), Problem> {
         self.assign(corners, groups)?;
         let uv = if uv.len() == corners.len() { uv } else { &[] };
@@ -147,7 +148,7 @@ impl<'l> Draft<'l> {
     }
 
     fn split(&mut self, corners: &[i64], uv: &[[f32; 2]]) -> Result<(), Problem> {
-        // A corner twice in a row is one corner.
+        // A corner that is repeated in succession counts once.
         let is_last = |place: &usize| corners[*place] != corners[(*place + 1) % corners.len()];
         let places: Vec<usize> = (0..corners.len()).filter(is_last).collect();
         if places.len() < 3 {
@@ -183,10 +184,10 @@ impl<'l> Draft<'l> {
         Ok(())
     }
 
-    /// Adds a strip of triangles: each vertex makes one with the two before it, and every other triangle is the other way round.
-    /// Where a vertex is repeated, to go on elsewhere, there is none.
+    /// Adds a strip of triangles: each vertex forms one with the two before it, and every other triangle is reversed.
+    /// A repeated vertex, which starts the strip elsewhere, forms none.
     pub(super) fn strip(&mut self, corners: &[i64], uv: &[[f32; 2]]) -> Result<(), Problem> {
-        // Also those of triangles that are none.
+        // Checks the corners of skipped triangles too.
         self.assign(corners, &[])?;
         for first in 0..corners.len().saturating_sub(2) {
             let places = if first % 2 == 0 { [first, first + 1, first + 2] } else { [first + 1, first, first + 2] };
@@ -198,7 +199,7 @@ impl<'l> Draft<'l> {
         Ok(())
     }
 
-    /// Adds a volume element by its corners; further nodes of curved ones are left out.
+    /// Adds a volume element by its corners; further nodes of curved ones are ignored.
     pub(super) fn cell(&mut self, cell: Cell, nodes: &[i64], groups: &[usize]) -> Result<(), Problem> {
         if self.volume.len() >= self.limits.triangles {
             return Err(Problem::TooLarge { what: "volume elements", limit: self.limits.triangles });
@@ -212,14 +213,14 @@ impl<'l> Draft<'l> {
         self.volume.add(cell, &corners, &mut self.allowance)
     }
 
-    /// Whether the triangles so far are a closed surface.
+    /// Returns whether the triangles so far form a closed surface.
     pub(super) fn is_closed(&mut self) -> bool {
-        // Without the memory to find out, it is not known to be.
+        // Counts as not closed if there is no memory for finding out.
         let paid = self.allowance.take(CLOSED * self.triangles.len());
         paid.is_ok() && Topology::new(self.vertices.len(), &self.triangles).is_closed()
     }
 
-    /// Replaces triangles by the surface around the volume elements.
+    /// Replaces the triangles by the outer surface of the volume elements.
     fn take_outer_surface(&mut self) -> Result<(), Problem> {
         let volume = std::mem::take(&mut self.volume);
         if !self.triangles.is_empty() {
@@ -246,7 +247,7 @@ impl<'l> Draft<'l> {
         Ok(())
     }
 
-    /// Drops the triangles that have the vertices of an earlier one, in the same sense.
+    /// Drops triangles that repeat an earlier one with its orientation.
     fn drop_repeated(&mut self) -> Result<(), Problem> {
         // Twice a triangle, in a tree.
         const REPEATED: usize = 32;
@@ -271,7 +272,7 @@ impl<'l> Draft<'l> {
         Ok(())
     }
 
-    /// Drops the vertices that no triangle has.
+    /// Drops vertices without triangles.
     fn drop_unused(&mut self) {
         let mut number = vec![NONE; self.vertices.len()];
         for vertex in self.triangles.iter().flatten() {
@@ -301,7 +302,7 @@ impl<'l> Draft<'l> {
         ));
     }
 
-    /// The mesh in metres.
+    /// Returns the mesh in metres, with notes.
     pub(super) fn finish(mut self, file: &str, unit: Unit) -> Result<ReadMesh, MeshError> {
         let fail = |element, problem| MeshError { file: file.to_owned(), element, place_m: None, problem };
         if self.volume.len() > 0 {

@@ -1,7 +1,7 @@
-//! glTF 2.0, as JSON with buffers and as GLB: nodes with their transforms, primitives, indices of every type.
+//! glTF 2.0, as JSON with buffers and as GLB: nodes with their transforms, primitives, indices of all types.
 //!
-//! The JSON is read by `serde_json`. The crate `gltf` slices buffers without checks and panics where a file's offsets and
-//! counts are wrong.
+//! The JSON is parsed by `serde_json`. The crate `gltf` slices buffers without checks and panics on files with wrong
+//! offsets and counts.
 
 mod json;
 
@@ -19,11 +19,11 @@ use super::without_mark;
 use crate::{Element, MeshError, Problem};
 use json::{Head, MAX_NESTED, Root, other_extension, other_version};
 
-/// Memory of the short entries of lists in JSON, for each byte of its text, and at most, bytes: lists are short.
+/// Memory for the short entries of lists in JSON: bytes per byte of its text, and at most.
 const ENTRIES_MULTIPLE: usize = 24;
 const MAX_ENTRIES: usize = 16 << 20;
 
-/// A node that waits, with its place.
+/// Memory of a node that waits to be visited, with its transform.
 const WAITING: usize = 2 * size_of::<(usize, DMat4)>();
 
 /// A file that is being read.
@@ -31,11 +31,11 @@ struct GltfFile<'a> {
     name: &'a str,
     root: Root,
     buffers: Vec<Cow<'a, [u8]>>,
-    /// Primitives so far, counted again for each node that has them.
+    /// Number of primitives so far, counted for each node that has them.
     primitives: Cell<usize>,
 }
 
-/// The JSON and the binary part of a GLB file, or all of a glTF file.
+/// Returns the JSON and the binary part of a GLB file, or all of a glTF file.
 fn parts<'a>(name: &str, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]>), MeshError> {
     if !bytes.starts_with(b"glTF") {
         return Ok((bytes, None));
@@ -70,7 +70,7 @@ fn parts<'a>(name: &str, bytes: &'a [u8]) -> Result<(&'a [u8], Option<&'a [u8]>)
     Ok((json, binary))
 }
 
-/// A URI's name of a file: with `%20` and the like as the characters that they mean.
+/// Returns the file name in a URI, with escapes such as `%20` decoded.
 fn unescaped(uri: &str) -> String {
     let mut bytes = Vec::new();
     let mut rest = uri.as_bytes();
@@ -83,7 +83,7 @@ fn unescaped(uri: &str) -> String {
     String::from_utf8_lossy(&bytes).into_owned()
 }
 
-/// The JSON text as what is looked for in it.
+/// Parses JSON text to `T`. Refuses invalid text with its line.
 fn parsed<'a, T: Deserialize<'a>>(name: &str, json: &'a [u8]) -> Result<T, MeshError> {
     serde_json::from_slice(json).map_err(|e| MeshError {
         file: name.to_owned(),
@@ -103,11 +103,11 @@ pub(super) fn read(
     draft: &mut Draft<'_>,
 ) -> Result<(), MeshError> {
     let (json, binary) = parts(name, bytes)?;
-    // Some programs fill it with NULs, up to a multiple of four.
+    // Some programs pad it with NULs to a multiple of four.
     let end = json.iter().rposition(|byte| !matches!(byte, 0 | 0x1a)).map_or(0, |last| last + 1);
     let json = without_mark(&json[..end]);
     let fail_whole = |problem| MeshError { file: name.to_owned(), element: Element::Whole, place_m: None, problem };
-    // With texts, which are no longer in memory than in the file.
+    // Includes texts, which take no more memory than in the file.
     let entries = json.len().saturating_mul(ENTRIES_MULTIPLE).min(MAX_ENTRIES);
     draft.allowance.take(2 * json.len() + entries).map_err(fail_whole)?;
     let head: Head = parsed(name, json)?;
@@ -167,7 +167,7 @@ impl GltfFile<'_> {
         self.fail(part, number, Problem::Syntax { message: "it is named, but does not exist".to_owned() })
     }
 
-    /// Walks through the nodes of the scene.
+    /// Visits the nodes of the scene and adds their meshes.
     fn nodes(&self, draft: &mut Draft<'_>) -> Result<(), MeshError> {
         let root = &self.root;
         if root.nodes.0.is_empty() {
@@ -235,7 +235,7 @@ impl GltfFile<'_> {
                 continue;
             }
             let fail = |problem| self.fail("mesh", number, problem);
-            // Beside Draco's data there may be others, for who can't read them.
+            // Besides Draco's data there may be uncompressed data, for programs that can't read it.
             let position = self.root.accessors.0.get(primitive.attributes.position);
             if primitive.extensions.draco.is_some() && position.is_some_and(|list| list.buffer_view.is_none()) {
                 return Err(fail(other_extension("KHR_draco_mesh_compression")));
@@ -270,7 +270,7 @@ impl GltfFile<'_> {
                 }
                 None => (0..positions.len() as i64).collect(),
             };
-            // A mirrored node turns its triangles inside out.
+            // A mirrored node reverses the orientation of its triangles.
             let is_mirrored = place.determinant() < 0.0;
             draft.allowance.take(size_of_val(corners.as_slice())).map_err(fail)?;
             let triangles: Box<dyn Iterator<Item = [i64; 3]>> = match mode {
@@ -284,7 +284,7 @@ impl GltfFile<'_> {
                 _ => Box::new(corners.windows(2).skip(1).map(|c| [corners[0], c[0], c[1]])),
             };
             for [a, b, c] in triangles {
-                // Strips and fans go on elsewhere by a vertex twice.
+                // A repeated vertex starts a strip or fan elsewhere.
                 if mode != 4 && (a == b || b == c || c == a) {
                     continue;
                 }
@@ -306,7 +306,7 @@ impl GltfFile<'_> {
         Ok(())
     }
 
-    /// The bytes of a view from an offset on.
+    /// Returns the bytes of a buffer view from an offset on, and its stride.
     fn view(&self, number: usize, offset: usize) -> Result<(&[u8], Option<usize>), MeshError> {
         let view = self.root.buffer_views.0.get(number).ok_or_else(|| self.missing("bufferView", number))?;
         let buffer = self.buffers.get(view.buffer).ok_or_else(|| self.missing("buffer", view.buffer))?;
@@ -317,7 +317,7 @@ impl GltfFile<'_> {
         Ok((bytes.ok_or_else(missing)?, view.byte_stride))
     }
 
-    /// The numbers of an accessor, `N` in each entry, at most `most` of them.
+    /// Returns the numbers of an accessor, `N` per entry. Refuses more than `most` entries.
     fn numbers<const N: usize>(
         &self,
         draft: &mut Draft<'_>,
@@ -336,7 +336,7 @@ impl GltfFile<'_> {
         if accessor.count > most {
             return Err(fail(Problem::TooLarge { what, limit }));
         }
-        // Entries may be left out of the file, or overlap in it.
+        // Entries may be missing in the file, or overlap in it.
         draft.allowance.take(accessor.count.saturating_mul(size_of::<[f64; N]>())).map_err(fail)?;
         let known = |component: u32| scalar(component).ok_or_else(|| syntax(format!("component type {component}")));
         let component = known(accessor.component_type)?;
@@ -383,7 +383,7 @@ impl GltfFile<'_> {
     }
 }
 
-/// A vector turned by a quaternion that need not have unit length.
+/// Rotates a vector by a quaternion that need not have unit length.
 fn rotated(rotation: DQuat, vector: DVec3) -> DVec3 {
     let (axis, w) = (DVec3::new(rotation.x, rotation.y, rotation.z), rotation.w);
     let squared = axis.length_squared() + w * w;
@@ -402,7 +402,7 @@ fn scalar(component: u32) -> Option<Scalar> {
     })
 }
 
-/// What a normalized integer is multiplied with.
+/// Returns the factor of a normalized integer.
 fn normal_factor(component: Scalar) -> f64 {
     match component {
         Scalar::I8 => 1.0 / 127.0,

@@ -1,6 +1,6 @@
-//! Gmsh, formats 1, 2 and 4.1, text and binary; physical names and numbers as groups.
+//! Gmsh, formats 1, 2 and 4.1, text and binary; physical names and numbers become groups.
 //!
-//! No crate is used: `mshio` alone reads Gmsh, only format 4.1, and ends the program at what it does not know.
+//! No crate is used: only `mshio` reads Gmsh, only format 4.1, and it ends the program on unknown data.
 
 use std::collections::{BTreeMap, HashMap};
 
@@ -9,19 +9,19 @@ use super::source::{Order, Scalar, Source, named, parsed, shown};
 use super::volume::Cell;
 use crate::{MeshError, Problem};
 
-/// Physical tags of an entity that count.
+/// Maximum number of physical tags used per entity.
 const PHYSICAL: usize = 16;
 
-/// What an element is, by its corners.
+/// The kind of an element, with its corners.
 #[derive(Clone, Copy)]
 enum ElementKind {
-    /// A point or line: no surface.
+    /// A point or line, which is not part of a surface.
     Line,
     Face(usize),
     Cell(Cell),
 }
 
-/// An element type of Gmsh: how many nodes it has, the corners first, and its dimension.
+/// Returns an element type of Gmsh: the number of its nodes (corners first), its dimension and its kind.
 fn element_type(number: i64) -> Option<(usize, i64, ElementKind)> {
     use Cell::{Hexahedron, Prism, Pyramid, Tetrahedron};
     Some(match number {
@@ -31,7 +31,7 @@ fn element_type(number: i64) -> Option<(usize, i64, ElementKind)> {
         26 => (4, 1, ElementKind::Line),
         27 => (5, 1, ElementKind::Line),
         28 => (6, 1, ElementKind::Line),
-        // Curved ones have more nodes, up to the fifth order.
+        // Curved elements have more nodes, up to the fifth order.
         2 => (3, 2, ElementKind::Face(3)),
         9 => (6, 2, ElementKind::Face(3)),
         20 => (9, 2, ElementKind::Face(3)),
@@ -75,11 +75,11 @@ fn element_type(number: i64) -> Option<(usize, i64, ElementKind)> {
 struct GmshFile<'s, 'd, 'l> {
     source: Source<'s>,
     draft: &'d mut Draft<'l>,
-    /// Of binary files.
+    /// Byte order of binary files.
     order: Option<Order>,
-    /// What counts and tags are in a binary file of format 4.1.
+    /// The type of counts and tags in a binary file of format 4.1.
     size: Scalar,
-    /// Vertices by the tags of nodes. It is only looked up, so its order does not matter.
+    /// Vertices by the tags of nodes. Only looked up, so its order does not matter.
     nodes: HashMap<i64, i64>,
     /// Names by dimension and physical tag.
     names: BTreeMap<(i64, i64), String>,
@@ -97,7 +97,7 @@ pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), Mesh
         names: BTreeMap::new(),
         physical: BTreeMap::new(),
     };
-    // An element of several physical groups is there once for each of them.
+    // An element in several physical groups occurs once for each of them.
     file.draft.drops_repeated = true;
     let mut version = 1.0;
     let (mut has_nodes, mut has_elements) = (false, false);
@@ -120,7 +120,7 @@ pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), Mesh
             }
             _ if word.starts_with(b"$End") || word.starts_with(b"$END") => {}
             _ if word.starts_with(b"$") => {
-                // A section of results, say. Its text or bytes are skipped up to its end.
+                // An unused section, such as one of results: it is skipped up to its end.
                 let end = [b"$End".as_slice(), &word[1..]].concat();
                 let rest = file.source.rest();
                 let at = rest.windows(end.len()).position(|bytes| bytes == end);
@@ -137,7 +137,7 @@ pub(super) fn read(source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), Mesh
 }
 
 impl GmshFile<'_, '_, '_> {
-    /// The line of the version; whether the file is binary.
+    /// Reads the line of the version, and whether the file is binary.
     fn format(&mut self) -> Result<f64, MeshError> {
         let version: f64 = self.source.number("the version")?;
         let kind: i64 = self.source.number("0 or 1, whether the file is binary")?;
@@ -155,7 +155,7 @@ impl GmshFile<'_, '_, '_> {
         Ok(version)
     }
 
-    /// Goes to the first byte of a section: binary data begins with the next line.
+    /// Goes to the first byte of a section: binary data starts on the next line.
     fn begin_section(&mut self) {
         if self.order.is_some() {
             self.source.line();
@@ -163,7 +163,7 @@ impl GmshFile<'_, '_, '_> {
         self.source.is_binary = self.order.is_some();
     }
 
-    /// A number that is an `int` in binary files.
+    /// Reads a number that is an `int` in binary files.
     fn int(&mut self, what: &str) -> Result<i64, MeshError> {
         self.integer(Scalar::I32, what)
     }
@@ -175,12 +175,12 @@ impl GmshFile<'_, '_, '_> {
         }
     }
 
-    /// A number that is a `size_t` in binary files.
+    /// Reads a number that is a `size_t` in binary files.
     fn tag(&mut self, what: &str) -> Result<i64, MeshError> {
         self.integer(self.size, what)
     }
 
-    /// A count of records of at least so many bytes in binary files, and so many numbers in text.
+    /// Reads a count of records, each of at least `bytes` bytes in binary files and `numbers` numbers in text.
     fn count(&mut self, scalar: Scalar, numbers: usize, bytes: usize, what: &str) -> Result<usize, MeshError> {
         let count = self.integer(scalar, what)?;
         self.source.count(count, if self.order.is_some() { bytes } else { 2 * numbers }, what)
@@ -198,7 +198,7 @@ impl GmshFile<'_, '_, '_> {
     }
 
     fn physical_names(&mut self) -> Result<(), MeshError> {
-        // Text in binary files, too.
+        // Text also in binary files.
         let count: i64 = self.source.number("the count of names")?;
         let count = self.source.count(count, 6, "names")?;
         self.source.line();
@@ -232,7 +232,7 @@ impl GmshFile<'_, '_, '_> {
                 let tags = self.count(self.size, 1, 4, "physical tags")?;
                 let mut physical = Vec::new();
                 for _ in 0..tags {
-                    // Negative where the entity faces the other way.
+                    // Negative if the entity faces the other way.
                     physical.push(self.int("a physical tag")?.saturating_abs());
                 }
                 physical.sort_unstable();
@@ -254,7 +254,7 @@ impl GmshFile<'_, '_, '_> {
 
     fn node(&mut self, tag: i64, at: [f64; 3]) -> Result<(), MeshError> {
         let number = self.draft.vertices() as i64;
-        // In a table that grows.
+        // Memory in a growing hash table.
         self.draft.allowance.take(2 * size_of::<(i64, i64)>() + 2).map_err(|problem| self.source.fail(problem))?;
         if self.nodes.insert(tag, number).is_some() {
             return Err(self.source.syntax(format!("node {tag} is there twice")));
@@ -262,9 +262,9 @@ impl GmshFile<'_, '_, '_> {
         self.draft.vertex(at).map_err(|problem| self.source.fail(problem))
     }
 
-    /// The nodes of formats 1 and 2.
+    /// Reads the nodes of formats 1 and 2.
     fn node_list(&mut self) -> Result<(), MeshError> {
-        // The count is text in binary files, too.
+        // The count is text also in binary files.
         let count: i64 = self.source.number("the count of nodes")?;
         self.begin_section();
         let count = self.source.count(count, if self.order.is_some() { 28 } else { 8 }, "nodes")?;
@@ -277,7 +277,7 @@ impl GmshFile<'_, '_, '_> {
         Ok(())
     }
 
-    /// The nodes of format 4.1.
+    /// Reads the nodes of format 4.1.
     fn node_blocks(&mut self) -> Result<(), MeshError> {
         self.begin_section();
         let blocks = self.count(self.size, 4, 12, "blocks of nodes")?;
@@ -315,7 +315,7 @@ impl GmshFile<'_, '_, '_> {
         element_type(number).ok_or_else(|| self.source.fail(Problem::Unsupported { message: message() }))
     }
 
-    /// Adds an element of a type, with nodes by their tags, to the groups of its physical tags.
+    /// Adds an element with nodes by their tags, to the groups of its physical tags.
     fn element(
         &mut self,
         (_, dimension, kind): (usize, i64, ElementKind),
@@ -350,7 +350,7 @@ impl GmshFile<'_, '_, '_> {
         (0..count).map(|_| self.integer(scalar, "a node of an element")).collect()
     }
 
-    /// The elements of formats 1 and 2 in text.
+    /// Reads the elements of formats 1 and 2 in text.
     fn element_list(&mut self, version: f64) -> Result<(), MeshError> {
         let count: i64 = self.source.number("the count of elements")?;
         let count = self.source.count(count, 8, "elements")?;
@@ -376,7 +376,7 @@ impl GmshFile<'_, '_, '_> {
         Ok(())
     }
 
-    /// The elements of format 2 in binary.
+    /// Reads the elements of format 2 in binary.
     fn element_records(&mut self, order: Order) -> Result<(), MeshError> {
         let count: i64 = self.source.number("the count of elements")?;
         self.begin_section();
@@ -403,7 +403,7 @@ impl GmshFile<'_, '_, '_> {
         Ok(())
     }
 
-    /// The elements of format 4.1.
+    /// Reads the elements of format 4.1.
     fn element_blocks(&mut self) -> Result<(), MeshError> {
         self.begin_section();
         let blocks = self.count(self.size, 4, 12, "blocks of elements")?;

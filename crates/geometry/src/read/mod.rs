@@ -1,4 +1,4 @@
-//! Mesh files: OBJ, STL, PLY, glTF, Gmsh and VTK, read within bounds; whatever the bytes are, nothing here panics.
+//! Reads mesh files within limits: OBJ, STL, PLY, glTF, Gmsh and VTK. Never panics, for any bytes.
 
 mod allowance;
 mod draft;
@@ -18,21 +18,21 @@ use allowance::MemoryAllowance;
 use draft::Draft;
 use source::Source;
 
-/// Reading takes so many bytes of memory for each byte of a file, and [`ROOM`] beside; what would take more is refused. Meshes of
-/// programs take less than half of it.
+/// Memory that reading may take per byte of a file, in addition to [`ROOM`]; files that would take more are refused.
+/// Meshes written by programs take less than half of it.
 pub const MULTIPLE: usize = 32;
 
-/// What reading may take whatever the length of a file, bytes.
+/// Memory that reading may take for a file of any length, bytes.
 pub const ROOM: usize = 2 << 20;
 
-/// The upper bounds of what is read.
+/// Limits for reading a mesh.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ReadLimits {
-    /// Bytes of the file, and of all that it contains when unpacked.
+    /// Maximum bytes of the file, and of everything unpacked from it.
     pub bytes: usize,
-    /// Vertices of the file.
+    /// Maximum number of vertices.
     pub vertices: usize,
-    /// Triangles, and volume elements as well.
+    /// Maximum number of triangles, and of volume elements.
     pub triangles: usize,
 }
 
@@ -42,7 +42,7 @@ impl Default for ReadLimits {
     }
 }
 
-/// A mesh from a file.
+/// A mesh that was read from a file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReadMesh {
     /// The mesh: coordinates are finite, indices in range.
@@ -51,7 +51,7 @@ pub struct ReadMesh {
     pub notes: Vec<String>,
 }
 
-/// The formats that are read.
+/// The supported formats.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Format {
     Obj,
@@ -64,7 +64,7 @@ enum Format {
 }
 
 impl Format {
-    /// By how the file begins; OBJ has no such mark, and STL only a weak one.
+    /// Returns the format by the beginning of the file; OBJ has no signature, and STL only a weak one.
     fn of_content(bytes: &[u8]) -> Option<Self> {
         let text = bytes.trim_ascii_start();
         let starts =
@@ -101,12 +101,12 @@ impl Format {
     }
 }
 
-/// The bytes after a byte order mark, which says that a text is UTF-8.
+/// Returns the bytes after a byte order mark of UTF-8, if there is one.
 fn without_mark(bytes: &[u8]) -> &[u8] {
     bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes)
 }
 
-/// Whether a file is UTF-16: it has the byte order mark of that, or begins with Latin letters of two bytes each.
+/// Returns whether a file is UTF-16: it has such a byte order mark, or starts with Latin letters of two bytes each.
 fn is_utf16(bytes: &[u8]) -> bool {
     let is_wide = |zero: usize| {
         let pairs = bytes.get(..16).map(|bytes| bytes.chunks_exact(2));
@@ -115,8 +115,9 @@ fn is_utf16(bytes: &[u8]) -> bool {
     bytes.starts_with(b"\xff\xfe") || bytes.starts_with(b"\xfe\xff") || is_wide(0) || is_wide(1)
 }
 
-/// Reads a mesh file. The content decides the format, then the extension of `name`. Vertices keep the numbers of the file,
-/// from 0, unless a note tells otherwise. `neighbours` gives the content of a file in the same folder by its bare name.
+/// Reads a mesh file. Its content determines the format, or else the extension of `name`. Vertices keep their order
+/// in the file, numbered from 0, unless a note says otherwise. `neighbours` returns the content of another file in
+/// the same folder by its bare name. Memory is not charged.
 ///
 /// A file has no unit, so you tell it: here a corner of a cube with edges of 10 mm.
 ///
@@ -135,8 +136,8 @@ fn is_utf16(bytes: &[u8]) -> bool {
 /// ```
 ///
 /// # Errors
-/// Refuses what breaks its format, ends early, is above the limits, or has coordinates that are not finite or indices out
-/// of range, and says at which element.
+/// Refuses a file that violates its format, ends early, exceeds the limits, or has coordinates that are not finite or
+/// indices out of range, and names the element.
 pub fn read(
     name: &str,
     bytes: &[u8],
@@ -147,11 +148,11 @@ pub fn read(
     read_paid(name, bytes, unit, neighbours, limits, &mut |_| true)
 }
 
-/// Does the same, with `pay` for its memory: it is told how many bytes that is so far, before they are allocated, and
-/// returns `false` if they are too many.
+/// Like [`read`], with memory paid by `pay`: before memory is allocated, it is called with the total number of bytes,
+/// and returns `false` to refuse.
 ///
 /// # Errors
-/// As for [`read`], and if `pay` does not pay.
+/// Returns the refusals of [`read`], and one if `pay` refuses.
 pub fn read_paid(
     name: &str,
     bytes: &[u8],
@@ -164,7 +165,7 @@ pub fn read_paid(
     if bytes.len() > limits.bytes {
         return Err(fail(Problem::TooLarge { what: "bytes", limit: limits.bytes }));
     }
-    // A binary STL file may begin with anything.
+    // A binary STL file may start with any bytes.
     let is_free = stl::is_binary(bytes);
     if !is_free && is_utf16(bytes) {
         let message = "the text is UTF-16, which no mesh format is: save it as ASCII or UTF-8".to_owned();

@@ -1,20 +1,20 @@
-//! Wavefront OBJ: vertices, texture coordinates, faces, and groups, objects and materials as groups.
+//! Wavefront OBJ: vertices, texture coordinates, faces; groups, objects and materials become groups.
 //!
-//! No crate is used: they number vertices anew in each object and say no line.
+//! No crate is used: the existing ones renumber vertices in each object and report no line.
 
 use super::draft::Draft;
 use super::source::{Source, named, parsed, shown, words};
 use crate::{MeshError, Problem};
 
-/// Names of one `g` line that count.
+/// Maximum number of names used per `g` line.
 const NAMES: usize = 8;
 
-/// Which vertex an index means: from 1, or from the last backwards.
+/// Returns the vertex of an index, which counts from 1, or backwards from the last if negative.
 fn resolved(index: i64, count: usize) -> i64 {
     if index < 0 { index.saturating_add(i64::try_from(count).unwrap_or(i64::MAX)) } else { index - 1 }
 }
 
-/// Whether a backslash at the end of a line is its last letter, rather than that the line goes on: it may be of a path.
+/// Returns whether a backslash at the end of a line is part of it, as in a path, rather than a continuation.
 fn ends_with_path(line: &[u8]) -> bool {
     let keyword = words(line).next().unwrap_or_default();
     keyword.starts_with(b"#")
@@ -22,7 +22,7 @@ fn ends_with_path(line: &[u8]) -> bool {
         || [&b"mtllib"[..], b"maplib", b"usemtl", b"usemap", b"o"].iter().any(|text| keyword.eq_ignore_ascii_case(text))
 }
 
-/// The line without the spaces at its end and the backslash that continues it, if it goes on.
+/// Returns the line without its trailing spaces and backslash, if it continues on the next line.
 fn continued(line: &[u8]) -> Option<&[u8]> {
     line.trim_ascii_end().strip_suffix(b"\\").filter(|_| !ends_with_path(line))
 }
@@ -63,7 +63,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                 let place = [u, words.next().map_or(0.0, |v| parsed(v).unwrap_or(f32::NAN))];
                 draft.allowance.push(&mut places, place).map_err(|problem| source.fail(problem))?;
             }
-            // `fo` is the same in old files.
+            // `fo` means a face in old files.
             b"f" | b"fo" => {
                 corners.clear();
                 uv.clear();
@@ -84,7 +84,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                     }
                 }
                 draft.polygon(&corners, &uv, &active).map_err(|problem| {
-                    // As the file counts.
+                    // Numbered like in the file.
                     source.fail(match problem {
                         Problem::IndexOutOfRange { index, vertices } if index >= 0 => {
                             Problem::IndexOutOfRange { index: index.saturating_add(1), vertices }
@@ -113,7 +113,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
             b"l" | b"p" => draft.lines += 1,
             b"vn" | b"vp" | b"s" | b"mtllib" | b"usemap" | b"maplib" | b"lod" | b"mg" => {}
             b"curv" | b"curv2" | b"surf" | b"bzp" | b"bsp" => ignored += 1,
-            // Some programs begin comments with a dollar sign.
+            // Some programs start comments with a dollar sign.
             _ if keyword.starts_with(b"$") || keyword.iter().all(u8::is_ascii_alphabetic) => {}
             _ => return Err(source.syntax(format!("`{}` is not a keyword of OBJ", shown(keyword)))),
         }

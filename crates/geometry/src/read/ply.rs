@@ -1,22 +1,22 @@
-//! PLY, text and binary of both byte orders. In text, an element is a row of its own, as the format has it: columns that the
-//! header does not name are left out, and a row without enough of them is refused.
+//! PLY, text and binary in both byte orders. In text, each element is one row: columns that the header does not name
+//! are ignored, and a row with too few numbers is refused.
 //!
-//! `ply-rs-bw` is not used: it allocates what a header counts and panics at a count that is too long.
+//! `ply-rs-bw` is not used: it allocates as much memory as the header demands, and panics if a count is too large.
 
 use super::allowance::MemoryAllowance;
 use super::draft::Draft;
 use super::source::{Order, Scalar, Source, named, parsed, shown, words};
 use crate::{Element as Place, MeshError, Problem};
 
-/// How the numbers of a file are written; `None` is text.
+/// How the numbers of a file are encoded; `None` is text.
 type Encoding = Option<Order>;
 
-/// Properties of an element and elements of a file; no mesh has as many.
+/// Limit for the properties of an element and for the elements of a file. No real mesh has as many.
 const MAX_ELEMENTS: usize = 256;
 
 struct Property {
     name: String,
-    /// Of the count of a list.
+    /// Type of the count, if this is a list.
     count: Option<Scalar>,
     scalar: Scalar,
 }
@@ -106,14 +106,14 @@ fn integer(source: &mut Source<'_>, scalar: Scalar, encoding: Encoding, what: &s
     }
 }
 
-/// What an element is for.
+/// Purpose of an element.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Role {
     Vertex,
     Face,
     Strips,
     Edge,
-    /// It is left out.
+    /// Ignored.
     Other,
 }
 
@@ -128,7 +128,7 @@ impl PlyElement {
         }
     }
 
-    /// What its role needs and it does not have.
+    /// Returns the property that the element needs for its role but does not have.
     fn missing(&self) -> Option<&'static str> {
         let lacks = |name: &&str| !self.properties.iter().any(|own| own.count.is_none() && own.name == **name);
         match self.role() {
@@ -138,7 +138,7 @@ impl PlyElement {
         }
     }
 
-    /// Which property lists the vertices: the one of that name, or the only list.
+    /// Returns the property that lists the vertices: the one with that name, or the only list.
     fn corners(&self) -> Option<usize> {
         let is_named = |own: &Property| ["vertex_indices", "vertex_index"].contains(&own.name.as_str());
         let lists = || self.properties.iter().enumerate().filter(|(_, own)| own.count.is_some());
@@ -147,7 +147,7 @@ impl PlyElement {
     }
 }
 
-/// The next row of a table in text. Comments belong into the header, but may be here.
+/// Returns the next row of a table in text. Comments belong in the header, but are accepted here.
 fn next_row<'a>(source: &mut Source<'a>) -> Option<Source<'a>> {
     loop {
         let row = source.row()?;
@@ -157,19 +157,19 @@ fn next_row<'a>(source: &mut Source<'a>) -> Option<Source<'a>> {
     }
 }
 
-/// The numbers of one row that count here.
+/// The numbers of one row that are used.
 #[derive(Default)]
 struct PlyRow {
     at: [f64; 3],
-    /// Of a vertex.
+    /// Texture coordinates of a vertex.
     uv: [f32; 2],
     corners: Vec<i64>,
-    /// Of the corners.
+    /// Texture coordinates of the corners.
     corner_uv: Vec<[f32; 2]>,
 }
 
 impl PlyRow {
-    /// Reads the properties of an element; its lists of corners are in property number `corners`.
+    /// Reads the properties of an element. Its corners are listed in the property with the index `corners`.
     #[allow(clippy::cast_possible_truncation)]
     fn read(
         &mut self,
@@ -223,7 +223,7 @@ impl PlyRow {
 pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), MeshError> {
     let (encoding, elements) = header(&mut source)?;
     source.is_binary = encoding.is_some();
-    // Texture coordinates of the vertices, if they have any.
+    // Texture coordinates of the vertices, if there are any.
     let mut uv_of: Vec<[f32; 2]> = Vec::new();
     let (mut row, mut wider) = (PlyRow::default(), 0_usize);
     for element in &elements {
@@ -233,7 +233,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
         if let Some(property) = element.missing().filter(|_| element.count != 0) {
             return Err(source.syntax(format!("the element `{}` has no property `{property}`", element.name)));
         }
-        // What a row takes at least, in text a digit and a space for each number.
+        // Minimum size of a row; in text, a digit and a space for each number.
         let least = |property: &Property| match encoding {
             None => 2,
             Some(_) => property.count.unwrap_or(property.scalar).size(),
@@ -250,7 +250,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                     .ok_or_else(|| source.truncated(format!("row {number} of {count} of `{}`", element.name)))?;
                 row.read(&mut line, element, corners, encoding, &mut draft.allowance)?;
                 let is_wider = line.word().is_some();
-                // As of a row that does not begin with the length of its list.
+                // This happens if the row does not begin with the length of its list.
                 if is_wider && role == Role::Face && row.corners.len() < 3 {
                     return Err(line.syntax(format!(
                         "a face of {} vertices in a longer row: the length of its list is wrong, or a count of the header",
@@ -285,7 +285,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
     if encoding.is_none()
         && let Some(line) = next_row(&mut source)
     {
-        // Else rows of one element could have been taken for those of another.
+        // Otherwise, rows of one element could have been read as rows of another.
         let counts: Vec<String> = elements.iter().map(|own| format!("{} of `{}`", own.count, own.name)).collect();
         return Err(line.syntax(format!("a row more than the header counts: {}", counts.join(", "))));
     }
@@ -295,7 +295,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
     Ok(())
 }
 
-/// Adds strips of triangles. Where the vertex is −1, a new one begins; unsigned, that is the largest number.
+/// Adds triangle strips. The index −1 (the largest number if unsigned) begins a new strip.
 fn strips(corners: &[i64], uv_of: &[[f32; 2]], draft: &mut Draft<'_>) -> Result<(), Problem> {
     let is_end = |corner: &i64| *corner == -1 || *corner == i64::from(u32::MAX);
     for strip in corners.split(is_end) {

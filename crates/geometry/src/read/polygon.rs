@@ -1,12 +1,15 @@
-//! Polygons as triangles: a fan from the first corner where that is right, else by cutting off ears in the polygon's plane.
+//! Splits polygons into triangles: a fan from the first corner where this is correct, otherwise ear clipping in the
+//! polygon's plane.
 //!
-//! A list of triangles whose sides add up to the border of a polygon covers it once if the polygon does not cross itself and
-//! each triangle runs the same way around: at each place, the triangles counted with their sense are the turns of the border
-//! around it, 1 inside and 0 outside. So the sense of each triangle is all that must be looked at.
+//! A list of triangles whose sides add up to the border of a polygon covers it exactly once if the polygon does not
+//! cross itself and all triangles have the same orientation: the number of triangles at a point, counted with their
+//! sign, is the winding number of the border there, 1 inside and 0 outside. So only the orientation of each triangle
+//! has to be checked.
 
 use glam::{DVec2, DVec3};
 
-/// Heights of triangles below this part of their longest side are rounding.
+/// Triangles whose height is below this fraction of their longest side are treated as degenerate, because of
+/// rounding.
 const ROUNDING: f64 = 1e-10;
 
 /// How a polygon was split.
@@ -14,13 +17,13 @@ const ROUNDING: f64 = 1e-10;
 pub(super) enum Split {
     /// As a fan from its first corner.
     Fan,
-    /// By cutting off ears, since it is concave.
+    /// By ear clipping, because it is concave.
     Ears,
-    /// As a fan that may fold, since it crosses itself, has no plane or is too large.
+    /// As a fan that may fold, because the polygon crosses itself, has no plane or is too large.
     Folded,
 }
 
-/// The sense of a triangle in the plane.
+/// Orientation of a triangle in the plane.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Turn {
     Left,
@@ -29,7 +32,7 @@ enum Turn {
 }
 
 fn turn(a: DVec2, b: DVec2, c: DVec2) -> Turn {
-    // Twice the area; over the longest side it is the height.
+    // Twice the area. Divided by the longest side, it is the height.
     let double = (b - a).perp_dot(c - a);
     let longest = a.distance_squared(b).max(b.distance_squared(c)).max(c.distance_squared(a));
     match double {
@@ -39,7 +42,7 @@ fn turn(a: DVec2, b: DVec2, c: DVec2) -> Turn {
     }
 }
 
-/// The corners in the plane that fits them best, counterclockwise, or `None` if there is no such plane.
+/// Projects the corners onto the plane that fits them best, counterclockwise. `None` if there is no such plane.
 fn flattened(corners: &[DVec3]) -> Option<Vec<DVec2>> {
     let first = *corners.first()?;
     let size = corners.iter().map(|at| (*at - first).abs().max_element()).fold(0.0, f64::max);
@@ -55,8 +58,8 @@ fn flattened(corners: &[DVec3]) -> Option<Vec<DVec2>> {
     Some(scaled.iter().map(|at| DVec2::new(at.dot(x), at.dot(y))).collect())
 }
 
-/// The triangles of a polygon of at least three corners, as places in it, and how it was split. `work` is how many comparisons
-/// may be made, and is reduced.
+/// Returns the triangles of a polygon of at least three corners, as indices into `corners`, and how it was split.
+/// `work` is the number of comparisons that may be made, and is reduced.
 pub(super) fn triangles(corners: &[DVec3], work: &mut u64) -> (Vec<[usize; 3]>, Split) {
     let fan: Vec<[usize; 3]> = (2..corners.len()).map(|place| [0, place - 1, place]).collect();
     if fan.len() == 1 {
@@ -72,8 +75,8 @@ pub(super) fn triangles(corners: &[DVec3], work: &mut u64) -> (Vec<[usize; 3]>, 
     }
 }
 
-/// Cuts off one ear after the other: a corner whose triangle has no other corner in it. A corner in a straight line is cut off
-/// only where there is no ear. `None` if the polygon crosses itself, or there is too much work.
+/// Cuts off ears one after the other: an ear is a corner whose triangle contains no other corner. A corner on a
+/// straight line is cut off only if there is no ear. `None` if the polygon crosses itself, or if `work` is used up.
 fn ears(flat: &[DVec2], work: &mut u64) -> Option<Vec<[usize; 3]>> {
     let mut ring: Vec<usize> = (0..flat.len()).collect();
     let mut triangles = Vec::with_capacity(flat.len());
@@ -86,7 +89,7 @@ fn ears(flat: &[DVec2], work: &mut u64) -> Option<Vec<[usize; 3]>> {
             turn(a, b, c)
         };
         let turns: Vec<Turn> = (0..count).map(turn_at).collect();
-        // Of all corners, these are the first to reach into a triangle.
+        // If any corner is within a triangle, one of these is.
         let reflex: Vec<usize> =
             (0..count).filter(|place| turns[*place] != Turn::Left).map(|place| ring[place]).collect();
         *work = work.checked_sub(count as u64)?;
@@ -108,13 +111,13 @@ fn ears(flat: &[DVec2], work: &mut u64) -> Option<Vec<[usize; 3]>> {
         let place = ear.or(straight)?;
         triangles.push(triangle(place));
         ring.remove(place);
-        // The next corner comes next, so that no corner gets all triangles.
+        // Continues with the next corner, so that the triangles are not all at one corner.
         start = place % ring.len();
     }
     Some(triangles)
 }
 
-/// Whether a place is in a triangle or on its border, but for its corners.
+/// Returns whether a point is in a triangle or on its border, excluding its corners.
 fn is_within(place: DVec2, [a, b, c]: [DVec2; 3]) -> bool {
     ![a, b, c].contains(&place)
         && [(a, b), (b, c), (c, a)].into_iter().all(|(from, to)| turn(from, to, place) != Turn::Right)

@@ -1,4 +1,5 @@
-//! A file's bytes from front to back: words, lines and numbers, in text and binary, with the place for messages.
+//! Reads the bytes of a file from front to back: words, lines and numbers, in text and binary. Keeps the position for
+//! error messages.
 
 use crate::{Element, MeshError, Problem};
 
@@ -17,7 +18,7 @@ pub(super) enum Scalar {
     F64,
 }
 
-/// The order of a number's bytes.
+/// Byte order of a number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Order {
     Little,
@@ -34,7 +35,7 @@ impl Scalar {
         }
     }
 
-    /// The first `size` bytes as an unsigned number; missing ones are 0.
+    /// Returns the first `size` bytes as an unsigned number; missing bytes are 0.
     fn bits(self, bytes: &[u8], order: Order) -> u64 {
         let bytes = &bytes[..self.size().min(bytes.len())];
         let join = |bits: u64, byte: &u8| bits << 8 | u64::from(*byte);
@@ -44,7 +45,7 @@ impl Scalar {
         }
     }
 
-    /// The number that the first bytes are.
+    /// Decodes the number at the beginning of `bytes`.
     #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
     pub(super) fn real(self, bytes: &[u8], order: Order) -> f64 {
         match self {
@@ -54,7 +55,7 @@ impl Scalar {
         }
     }
 
-    /// The integer that the first bytes are; floating-point numbers are truncated.
+    /// Decodes the integer at the beginning of `bytes`; floating-point numbers are truncated.
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
     pub(super) fn integer(self, bytes: &[u8], order: Order) -> i64 {
         let bits = self.bits(bytes, order);
@@ -63,25 +64,25 @@ impl Scalar {
             Scalar::I16 => i64::from(bits as i16),
             Scalar::I32 => i64::from(bits as i32),
             Scalar::U8 | Scalar::U16 | Scalar::U32 | Scalar::I64 => bits as i64,
-            // What does not fit is out of every range.
+            // A larger number is out of every valid range in any case.
             Scalar::U64 => i64::try_from(bits).unwrap_or(i64::MAX),
             Scalar::F32 | Scalar::F64 => self.real(bytes, order) as i64,
         }
     }
 }
 
-/// The bytes of a file, and how far they are read.
+/// The bytes of a file, and the current position.
 #[derive(Clone)]
 pub(super) struct Source<'a> {
     pub(super) file: &'a str,
     bytes: &'a [u8],
     at: usize,
-    /// Whether messages give bytes rather than lines.
+    /// Whether messages give the byte rather than the line.
     pub(super) is_binary: bool,
-    /// Whether its first line ends in a carriage return alone. A line feed after one then belongs to what follows, which may be
-    /// binary.
+    /// Whether the first line ends in a carriage return alone. In this case, a line feed after a carriage return
+    /// belongs to the data that follows, which may be binary.
     ends_by_return: bool,
-    /// Whether it is one row of a table rather than a file.
+    /// Whether this is one row of a table rather than a file.
     is_row: bool,
 }
 
@@ -92,17 +93,18 @@ impl<'a> Source<'a> {
         Self { file, bytes, at: 0, is_binary: false, ends_by_return, is_row: false }
     }
 
-    /// The bytes that are not read yet.
+    /// Returns the bytes that have not been read yet.
     pub(super) fn rest(&self) -> &'a [u8] {
         &self.bytes[self.at..]
     }
 
-    /// An error at the next byte.
+    /// Creates an error at the current position.
     pub(super) fn fail(&self, problem: Problem) -> MeshError {
         let element = if self.is_binary {
             Element::Byte(self.at as u64)
         } else {
-            // What was read last ends here; its line counts, not the one that begins. A row is the last line of its bytes.
+            // Reports the line of what was read last, not the line that begins here. A row is the last line of its
+            // bytes.
             let end = if self.is_row { self.bytes.len() } else { self.at };
             let mut source = Source { bytes: &self.bytes[..end], at: 0, ..self.clone() };
             let mut line = 0;
@@ -130,7 +132,8 @@ impl<'a> Source<'a> {
         self.fail(Problem::Truncated { missing })
     }
 
-    /// The next line without its end, which is a line feed, a carriage return, or both; `None` at the end of the file.
+    /// Returns the next line without its line ending, which is a line feed, a carriage return, or both. `None` at the
+    /// end of the file.
     pub(super) fn line(&mut self) -> Option<&'a [u8]> {
         let rest = self.rest();
         if rest.is_empty() {
@@ -145,7 +148,7 @@ impl<'a> Source<'a> {
         Some(&rest[..end])
     }
 
-    /// The next line that has a word, as a source of its own; `None` at the end of the file.
+    /// Returns the next line that contains a word, as a separate source. `None` at the end of the file.
     pub(super) fn row(&mut self) -> Option<Source<'a>> {
         loop {
             let at = self.at;
@@ -156,7 +159,7 @@ impl<'a> Source<'a> {
         }
     }
 
-    /// The next characters up to a space or the end of a line; `None` at the end of the file.
+    /// Returns the next characters up to white space or the end of a line. `None` at the end of the file.
     pub(super) fn word(&mut self) -> Option<&'a [u8]> {
         let rest = self.rest();
         let Some(start) = rest.iter().position(|byte| !is_space(byte)) else {
@@ -169,41 +172,41 @@ impl<'a> Source<'a> {
         Some(&word[..end])
     }
 
-    /// The word that `word` would return.
+    /// Returns the next word without reading past it.
     pub(super) fn peek(&self) -> Option<&'a [u8]> {
         self.clone().word()
     }
 
-    /// The next word, read as a number.
+    /// Reads the next word as a number.
     pub(super) fn number<T: std::str::FromStr>(&mut self, what: &str) -> Result<T, MeshError> {
         let word = self.word().ok_or_else(|| self.truncated(what))?;
         parsed(word).ok_or_else(|| self.no_number(word, what))
     }
 
-    /// The error of a word in the place of a number.
+    /// Creates the error for a word that should have been a number.
     pub(super) fn no_number(&self, word: &[u8], what: &str) -> MeshError {
         self.fail(no_number(word, what))
     }
 
-    /// The next `count` bytes.
+    /// Reads the next `count` bytes.
     pub(super) fn take(&mut self, count: usize, what: &str) -> Result<&'a [u8], MeshError> {
         let taken = self.rest().get(..count).ok_or_else(|| self.truncated(what))?;
         self.at += count;
         Ok(taken)
     }
 
-    /// The next number of a binary file.
+    /// Reads the next number of a binary file as an integer.
     pub(super) fn integer(&mut self, scalar: Scalar, order: Order, what: &str) -> Result<i64, MeshError> {
         Ok(scalar.integer(self.take(scalar.size(), what)?, order))
     }
 
-    /// The next number of a binary file.
+    /// Reads the next number of a binary file as a floating-point number.
     pub(super) fn real(&mut self, scalar: Scalar, order: Order, what: &str) -> Result<f64, MeshError> {
         Ok(scalar.real(self.take(scalar.size(), what)?, order))
     }
 
-    /// A count that the file states, if that many records of at least `bytes` bytes can still follow. So nothing is
-    /// allocated or counted for what is not there.
+    /// Checks a count that the file states: so many records of at least `bytes` bytes must still follow. This way,
+    /// nothing is allocated for data that is not there.
     pub(super) fn count(&self, count: i64, bytes: usize, what: &str) -> Result<usize, MeshError> {
         let count = usize::try_from(count).map_err(|_| self.syntax(format!("{count} is not a count of {what}")))?;
         if count.checked_mul(bytes.max(1)).is_none_or(|bytes| bytes > self.rest().len() + 1) {
@@ -217,20 +220,21 @@ fn is_line_end(byte: &u8) -> bool {
     matches!(byte, b'\n' | b'\r')
 }
 
-/// Whether a byte separates words: white space, and the NUL and Ctrl-Z by which some programs end texts.
+/// Returns whether a byte separates words: white space, and the NUL and Ctrl-Z with which some programs end text
+/// files.
 fn is_space(byte: &u8) -> bool {
     byte.is_ascii_whitespace() || matches!(byte, 0 | 0x0b | 0x1a)
 }
 
-/// The words of a line.
+/// Splits a line into words.
 pub(super) fn words(line: &[u8]) -> impl Iterator<Item = &[u8]> {
     line.split(is_space).filter(|word| !word.is_empty())
 }
 
-/// What is wrong with a word in the place of a number.
+/// Describes a word that should have been a number.
 pub(super) fn no_number(word: &[u8], what: &str) -> Problem {
     let text = shown(word);
-    // 0,5 and 1.234,5: some programs write numbers as people do.
+    // Numbers such as 0,5 and 1.234,5: some programs write them in a local format.
     let parts = text.rsplit_once(',').filter(|(_, part)| part.starts_with(|digit: char| digit.is_ascii_digit()));
     let pointed = parts.map(|(whole, part)| format!("{}.{part}", whole.replace('.', "")));
     let message = match pointed.filter(|pointed| pointed.parse::<f64>().is_ok()) {
@@ -240,17 +244,17 @@ pub(super) fn no_number(word: &[u8], what: &str) -> Problem {
     Problem::Syntax { message }
 }
 
-/// A word as a number.
+/// Parses a word as a number.
 pub(super) fn parsed<T: std::str::FromStr>(word: &[u8]) -> Option<T> {
     std::str::from_utf8(word).ok()?.parse().ok()
 }
 
-/// A word for a message.
+/// Formats a word for a message: without control characters, at most 40 characters.
 pub(super) fn shown(word: &[u8]) -> String {
     String::from_utf8_lossy(word).chars().filter(|letter| !letter.is_control()).take(40).collect()
 }
 
-/// A name for a group; the first 256 characters.
+/// Formats the name of a group: at most 256 characters.
 pub(super) fn named(word: &[u8]) -> String {
     String::from_utf8_lossy(word).trim().chars().take(256).collect()
 }

@@ -1,6 +1,8 @@
-//! STL, text and binary. Each triangle has its own vertices there; those at one position become one vertex.
+//! STL, text and binary. In these files each triangle has its own vertices; vertices at exactly the same position are
+//! merged.
 //!
-//! `stl_io` is not used: it takes a binary file that begins with "solid" for text and says no triangle.
+//! `stl_io` is not used: it treats a binary file that begins with "solid" as text, and does not say which triangle is
+//! wrong.
 
 use std::collections::HashMap;
 
@@ -8,19 +10,20 @@ use super::draft::Draft;
 use super::source::{Order, Scalar, Source, parsed, shown, words};
 use crate::{Element, MeshError, Problem};
 
-/// Bytes before the triangles of a binary file, and of each triangle.
+/// Size of the header of a binary file, and of each triangle, bytes.
 const HEADER: usize = 84;
 const TRIANGLE: usize = 50;
 
-/// Whether the length of the file is that of its count of triangles.
+/// Returns whether the length of the file matches its triangle count.
 pub(super) fn is_binary(bytes: &[u8]) -> bool {
     let Some(count) = bytes.get(80..HEADER) else { return false };
     let count = u64::try_from(Scalar::U32.integer(count, Order::Little)).unwrap_or(0);
     bytes.len() as u64 == HEADER as u64 + TRIANGLE as u64 * count
 }
 
-/// Whether a file that begins with "solid" is text. Binary ones may begin so, too, and have more or fewer bytes than they
-/// count; then no keyword follows, and the first byte of a count below 2²⁴ is 0.
+/// Returns whether a file that begins with "solid" is text. Binary files may also begin with this word, and may have
+/// more or fewer bytes than their count demands; in this case no keyword follows, and the first byte of a count below
+/// 2²⁴ is 0.
 fn is_text(bytes: &[u8]) -> bool {
     let starts =
         |word: &[u8], text: &str| word.get(..text.len()).is_some_and(|s| s.eq_ignore_ascii_case(text.as_bytes()));
@@ -33,23 +36,23 @@ fn is_text(bytes: &[u8]) -> bool {
     starts(next, "facet") || starts(next, "end") || bytes.get(83) != Some(&0)
 }
 
-/// Vertices by the bits of their positions.
+/// Merges vertices whose positions have the same bits.
 struct Welder<'d, 'l> {
     draft: &'d mut Draft<'l>,
-    // It is only looked up, so its order does not matter.
+    // Used for lookups only, so its order does not matter.
     numbers: HashMap<[u64; 3], i64>,
 }
 
 impl Welder<'_, '_> {
-    /// The vertex at a position.
+    /// Returns the vertex at a position; adds it if it is new.
     fn vertex(&mut self, at: [f64; 3]) -> Result<i64, Problem> {
-        // -0 is 0.
+        // Turns -0 into 0.
         let at = at.map(|part| part + 0.0);
         let key = at.map(f64::to_bits);
         if let Some(number) = self.numbers.get(&key) {
             return Ok(*number);
         }
-        // In a table that grows.
+        // The hash table grows, so it may use twice the memory of its entries.
         self.draft.allowance.take(2 * size_of::<([u64; 3], i64)>() + 2)?;
         let number = self.draft.vertices() as i64;
         self.draft.vertex(at)?;
@@ -98,7 +101,7 @@ fn text(mut source: Source<'_>, welder: &mut Welder<'_, '_>) -> Result<usize, Me
     let mut corners: Vec<i64> = Vec::new();
     let (mut triangles, mut is_open) = (0, true);
     while let Some(line) = source.line() {
-        // By lines, since the names after `solid` and `endsolid` may be anything.
+        // Line by line, because the names after `solid` and `endsolid` may be any text.
         let mut words = words(line);
         let Some(keyword) = words.next() else { continue };
         let mut keyword = keyword.to_ascii_lowercase();

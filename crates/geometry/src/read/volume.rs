@@ -1,24 +1,25 @@
-//! Volume elements, and the surface around them: the faces that one element alone has.
+//! Volume elements, and the surface around them: the faces that belong to only one element.
 //!
-//! Files number elements in both senses, and faces of skewed ones are not flat. So an element is turned as a whole, by the sign
-//! of its volume: neighbours that are turned the same way then agree at the edges of the surface.
+//! Files number elements in both orientations, and the faces of skewed elements are not flat. So an element is
+//! reversed as a whole, according to the sign of its volume: neighbours with the same orientation then agree at the
+//! edges of the surface.
 
 use glam::DVec3;
 
 use super::allowance::MemoryAllowance;
 use crate::Problem;
 
-/// In the place of corners that a face or element does not have.
+/// Stands for corners that a face or element does not have.
 const NONE: u32 = u32::MAX;
 
-/// Volumes below this part of the cube of an element's size are rounding.
+/// Volumes below this fraction of the cube of an element's size are treated as zero, because of rounding.
 const ROUNDING: f64 = 1e-9;
 
-/// A quadrangle whose corners enclose less than this part of the cube of its diagonal is flat.
+/// A quadrilateral whose corners enclose less than this fraction of the cube of its diagonal is treated as flat.
 const FLAT: f64 = 1e-6;
 
-/// The kind of a volume element, by which its corners make faces. Corners are numbered as in Gmsh and VTK, which agree here but
-/// for the sense of prisms.
+/// Type of a volume element, which determines its faces. Corners are numbered as in Gmsh and VTK, which agree for
+/// these types except in the orientation of prisms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) enum Cell {
     Tetrahedron,
@@ -28,7 +29,7 @@ pub(super) enum Cell {
 }
 
 impl Cell {
-    /// How many corners it has.
+    /// Returns the number of corners.
     pub(super) fn corners(self) -> usize {
         match self {
             Cell::Tetrahedron => 4,
@@ -38,7 +39,7 @@ impl Cell {
         }
     }
 
-    /// Its faces, counterclockwise seen from outside.
+    /// Returns its faces, counterclockwise seen from outside.
     fn faces(self) -> &'static [&'static [usize]] {
         match self {
             Cell::Tetrahedron => &[&[0, 2, 1], &[0, 1, 3], &[1, 2, 3], &[0, 3, 2]],
@@ -51,13 +52,13 @@ impl Cell {
     }
 }
 
-/// A face of an element: its corners, sorted, the element, and which face of it.
+/// A face of an element: its sorted corners, the element, and the index of the face in the element.
 type Side = ([u32; 4], u32, u8);
 
-/// Memory of finding elements that are there twice, for each of them, bytes.
+/// Memory for finding repeated elements, bytes for each element.
 const SORTED: usize = 48;
 
-/// Memory of a face that one element alone has, bytes.
+/// Memory for a face that belongs to only one element, bytes.
 const OUTER: usize = 80;
 
 /// A volume element.
@@ -74,19 +75,19 @@ pub(super) struct Volume {
 
 /// The surface around volume elements.
 pub(super) struct OuterSurface {
-    /// Three or four vertices each, counterclockwise seen from outside.
+    /// Three or four vertices for each face, counterclockwise seen from outside.
     pub(super) faces: Vec<Vec<u32>>,
-    /// How many elements were left out because they have the corners of an earlier one.
+    /// Number of elements that were ignored because they have the corners of an earlier element.
     pub(super) repeated: usize,
 }
 
 impl Volume {
-    /// How many elements there are.
+    /// Returns the number of elements.
     pub(super) fn len(&self) -> usize {
         self.elements.len()
     }
 
-    /// Adds an element; `corners` are as many as its kind has.
+    /// Adds an element. `corners` has as many entries as its type has corners.
     pub(super) fn add(
         &mut self,
         kind: Cell,
@@ -98,7 +99,7 @@ impl Volume {
         allowance.push(&mut self.elements, VolumeElement { kind, corners: own })
     }
 
-    /// Whether each element has the corners of an earlier one.
+    /// Returns for each element whether it has the corners of an earlier element.
     fn repeated(&self) -> Vec<bool> {
         let sorted = |(number, element): (u32, &VolumeElement)| {
             let mut corners = element.corners;
@@ -114,7 +115,7 @@ impl Volume {
         is_repeated
     }
 
-    /// The faces that one element alone has, in the order of the elements.
+    /// Returns the faces that belong to only one element, in the order of the elements.
     pub(super) fn outer_surface(
         &self,
         vertices: &[DVec3],
@@ -124,7 +125,7 @@ impl Volume {
         allowance.take(SORTED * self.elements.len() + most_sides * size_of::<Side>())?;
         let is_repeated = self.repeated();
         let kept = || (0_u32..).zip(&self.elements).filter(|(number, _)| !is_repeated[*number as usize]);
-        // An element without volume is numbered as most others of its kind, one hopes.
+        // An element without volume is assumed to have the orientation of most others of its type.
         let mut senses = [0_i64; 4];
         let mut is_turned: Vec<Option<bool>> = vec![None; self.elements.len()];
         for (number, element) in kept() {
@@ -165,19 +166,20 @@ impl Volume {
     }
 }
 
-/// Whether a quadrangle is folded along its second diagonal. It is if it is not flat, so that the diagonal makes a difference, and
-/// that one is the shorter.
+/// Returns whether a quadrilateral is to be split along its second diagonal: if it is not flat, so that the choice
+/// makes a difference, and this diagonal is the shorter one.
 fn is_better_from_second(vertices: &[DVec3], face: &[u32]) -> bool {
     let [a, b, c, d] = *face else { return false };
     let [a, b, c, d] = [a, b, c, d].map(|vertex| vertices[vertex as usize]);
     let (first, second) = (a.distance(c), b.distance(d));
-    // Six times the volume between the four corners.
+    // Six times the volume of the tetrahedron of the four corners.
     let between = (b - a).cross(c - a).dot(d - a).abs();
     between > FLAT * first.max(second).powi(3) && second < first
 }
 
 impl VolumeElement {
-    /// The vertices of a face, each once: bricks are collapsed to wedges by naming a vertex twice. `None` if nothing is left.
+    /// Returns the vertices of a face without repetitions: hexahedra are collapsed to wedges by naming a vertex
+    /// twice. `None` if fewer than three vertices remain.
     fn face(&self, places: &[usize]) -> Option<Vec<u32>> {
         let mut face = Vec::with_capacity(4);
         for place in places {
@@ -189,11 +191,11 @@ impl VolumeElement {
         (face.len() > 2).then_some(face)
     }
 
-    /// Whether its faces look inwards; `None` if it has no volume.
+    /// Returns whether its faces point inwards. `None` if it has no volume.
     ///
-    /// The volume is a third of the sum of c·A over its faces, with c the middle of a face, from the middle of the element, and A
-    /// its area vector: of a triangle half of the cross product of two sides, of a quadrangle, flat or not, that of its
-    /// diagonals.
+    /// The volume is a third of the sum of c·A over its faces. c is the middle of the face relative to the middle of
+    /// the element; A is its area vector: half of the cross product of two sides for a triangle, and of the diagonals
+    /// for a quadrilateral, flat or not.
     fn is_turned(&self, vertices: &[DVec3]) -> Option<bool> {
         let count = self.kind.corners();
         let at = |place: usize| vertices[self.corners[place] as usize];
@@ -203,7 +205,7 @@ impl VolumeElement {
         for face in self.kind.faces() {
             let at = |place: usize| (at(face[place]) - middle) / size;
             let double = (at(2) - at(0)).cross(at(face.len() - 1) - at(1));
-            // Of a triangle, the second factor is another side.
+            // For a triangle, the second factor is another side.
             let mean = (0..face.len()).map(at).sum::<DVec3>() / face.len() as f64;
             sixfold += mean.dot(double);
         }

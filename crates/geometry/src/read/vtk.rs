@@ -1,6 +1,8 @@
-//! VTK's legacy format, text and binary: POLYDATA and UNSTRUCTURED_GRID; and what it shares with VTK's XML.
+//! VTK's legacy format, text and binary: POLYDATA and UNSTRUCTURED_GRID. Also contains what this format shares with
+//! VTK's XML formats.
 //!
-//! `vtkio` is not used: it reserves what a file counts, unpacks without bound and says no element.
+//! `vtkio` is not used: it allocates as much memory as the counts in a file demand, decompresses without a limit and
+//! does not say which element is wrong.
 
 use super::allowance::MemoryAllowance;
 use super::draft::Draft;
@@ -14,7 +16,7 @@ fn scalar(word: &[u8]) -> Option<Scalar> {
         b"unsigned_char" | b"vtktypeuint8" => Scalar::U8,
         b"short" | b"vtktypeint16" => Scalar::I16,
         b"unsigned_short" | b"vtktypeuint16" => Scalar::U16,
-        // Identifiers are written as `int`, whatever they are in memory.
+        // Identifiers are written as `int`, whatever their type in memory.
         b"int" | b"vtkidtype" | b"vtktypeint32" => Scalar::I32,
         b"unsigned_int" | b"vtktypeuint32" => Scalar::U32,
         b"long" | b"long_long" | b"vtktypeint64" => Scalar::I64,
@@ -25,25 +27,25 @@ fn scalar(word: &[u8]) -> Option<Scalar> {
     })
 }
 
-/// Lists of vertices: those of cell n are `connectivity[ends[n - 1]..ends[n]]`.
+/// Lists of vertices: the vertices of cell n are `connectivity[ends[n - 1]..ends[n]]`.
 #[derive(Default)]
 pub(super) struct Cells {
     pub(super) connectivity: Vec<i64>,
     pub(super) ends: Vec<i64>,
 }
 
-/// The surface of a POLYDATA or UNSTRUCTURED_GRID file, before the vertices are known to exist.
+/// The surface of a POLYDATA or UNSTRUCTURED_GRID file, before its vertex indices are checked.
 #[derive(Default)]
 pub(super) struct Faces {
     pub(super) polygons: Cells,
     pub(super) strips: Cells,
     pub(super) grid: Cells,
-    /// Of the cells of `grid`.
+    /// VTK cell types of `grid`.
     pub(super) types: Vec<i64>,
 }
 
 impl Cells {
-    /// The lists, each with its number.
+    /// Returns the lists with their indices.
     fn lists(&self) -> impl Iterator<Item = (u64, Result<&[i64], Problem>)> {
         let starts = std::iter::once(&0).chain(&self.ends);
         (0..).zip(starts.zip(&self.ends)).map(|(number, (start, end))| {
@@ -55,14 +57,14 @@ impl Cells {
 }
 
 impl Faces {
-    /// Memory of its lists, bytes.
+    /// Returns the memory of the lists, bytes.
     pub(super) fn bytes(&self) -> usize {
         let cells = [&self.polygons, &self.strips, &self.grid];
         let lists = cells.into_iter().flat_map(|cells| [&cells.connectivity, &cells.ends]).chain([&self.types]);
         lists.map(|list| size_of_val(list.as_slice())).sum()
     }
 
-    /// Adds the faces to a draft whose vertices from `first` on they count from 0.
+    /// Adds the faces to a draft. Their vertex indices are relative to the vertex `first` of the draft.
     pub(super) fn add(&self, file: &str, first: usize, draft: &mut Draft<'_>) -> Result<(), MeshError> {
         let fail = |number, problem| MeshError {
             file: file.to_owned(),
@@ -95,7 +97,7 @@ impl Faces {
     }
 }
 
-/// Adds a cell of a type of VTK.
+/// Adds a cell of a VTK cell type.
 fn cell(kind: i64, corners: &mut [i64], draft: &mut Draft<'_>) -> Result<(), Problem> {
     let mut face = |corners: &[i64], count: usize| {
         draft.drops_unused |= corners.len() > count;
@@ -106,14 +108,14 @@ fn cell(kind: i64, corners: &mut [i64], draft: &mut Draft<'_>) -> Result<(), Pro
         5 => face(corners, 3),
         7 => face(corners, corners.len()),
         9 => face(corners, 4),
-        // A pixel is a rectangle whose corners are numbered in rows.
+        // A pixel is a rectangle whose corners are numbered row by row.
         8 if corners.len() == 4 => {
             corners.swap(2, 3);
             face(corners, 4)
         }
         22 | 34 | 69 | 76 => face(corners, 3),
         23 | 28 | 30 | 70 | 77 => face(corners, 4),
-        // Of a polygon with curved sides, the corners come first.
+        // For a polygon with curved sides, the corners come first.
         36 => face(corners, corners.len() / 2),
         6 => draft.strip(corners, &[]),
         10 | 24 | 71 | 78 => draft.cell(Cell::Tetrahedron, corners, &[]),
@@ -135,7 +137,7 @@ fn cell(kind: i64, corners: &mut [i64], draft: &mut Draft<'_>) -> Result<(), Pro
     }
 }
 
-/// How a file writes its numbers: text, or binary with the most significant byte first.
+/// Reads integers in the encoding of the file: text, or binary with the most significant byte first.
 fn integers(
     source: &mut Source<'_>,
     is_binary: bool,
@@ -153,7 +155,7 @@ fn integers(
     (0..count).map(|_| source.number(what)).collect()
 }
 
-/// Goes to the data of a section, which begins with the next line.
+/// Moves to the data of a section, which begins on the next line.
 fn begin_data(source: &mut Source<'_>, is_binary: bool) {
     if is_binary {
         source.line();
@@ -161,7 +163,8 @@ fn begin_data(source: &mut Source<'_>, is_binary: bool) {
     source.is_binary = is_binary;
 }
 
-/// The lists of a section: `n size` and each list after its length, or since version 5 offsets and connectivity.
+/// Reads the lists of a section: `n size` and each list after its length, or, since version 5, offsets and
+/// connectivity.
 fn cells(source: &mut Source<'_>, is_binary: bool, allowance: &mut MemoryAllowance<'_>) -> Result<Cells, MeshError> {
     let what = "lists of vertices";
     let count: i64 = source.number("the count of cells")?;
@@ -205,7 +208,7 @@ fn cells(source: &mut Source<'_>, is_binary: bool, allowance: &mut MemoryAllowan
     Ok(cells)
 }
 
-/// Whether a word is a keyword, in capitals or not.
+/// Returns whether a word is a keyword, ignoring case.
 fn is_word(word: Option<&[u8]>, keyword: &str) -> bool {
     word.is_some_and(|word| word.eq_ignore_ascii_case(keyword.as_bytes()))
 }
@@ -226,14 +229,14 @@ fn skip_field(source: &mut Source<'_>, is_binary: bool) -> Result<(), MeshError>
     Ok(())
 }
 
-/// Skips a block METADATA: it ends with an empty line.
+/// Skips a METADATA block, which ends with an empty line.
 fn skip_metadata(source: &mut Source<'_>) {
     source.word();
     source.line();
     while source.line().is_some_and(|line| words(line).next().is_some()) {}
 }
 
-/// Skips an array of a field after its name: `components tuples type`, and then the values.
+/// Skips an array of a field after its name: `components tuples type`, followed by the values.
 fn skip_array(source: &mut Source<'_>, is_binary: bool) -> Result<(), MeshError> {
     let components: i64 = source.number("the count of components")?;
     let tuples: i64 = source.number("the count of tuples")?;
@@ -241,7 +244,7 @@ fn skip_array(source: &mut Source<'_>, is_binary: bool) -> Result<(), MeshError>
     let count = components.checked_mul(tuples).unwrap_or(i64::MAX);
     let what = "values of an array";
     match kind.as_slice() {
-        // Each has a line, with what is no letter written as %20.
+        // Each value is on its own line, with special characters encoded as %20 etc.
         b"string" | b"utf8_string" | b"variant" if !is_binary || kind == b"variant" => {
             source.line();
             for _ in 0..source.count(count, 1, what)? {
@@ -256,7 +259,7 @@ fn skip_array(source: &mut Source<'_>, is_binary: bool) -> Result<(), MeshError>
         }
         b"bit" if is_binary => {
             begin_data(source, is_binary);
-            // VTK packs all values, but writes a bit for each tuple only. What it writes ends a line.
+            // VTK packs all values, but writes only one bit per tuple. The data is followed by a line feed.
             let packed = |count: i64| usize::try_from(count / 8 + i64::from(count % 8 != 0)).unwrap_or(usize::MAX);
             let ends = |bytes: &usize| source.rest().get(*bytes) == Some(&b'\n');
             let bytes = Some(packed(tuples)).filter(|bytes| !ends(&packed(count)) && ends(bytes));
@@ -280,7 +283,8 @@ fn skip_array(source: &mut Source<'_>, is_binary: bool) -> Result<(), MeshError>
     Ok(())
 }
 
-/// Skips a text of a binary file. The first two bits say of how many bytes its length is, from 3, one byte, to 0, eight.
+/// Skips a string in a binary file. The first two bits give the number of bytes of its length: from 3 for one byte to
+/// 0 for eight.
 fn skip_text(source: &mut Source<'_>) -> Result<(), MeshError> {
     let what = "a text of an array";
     let first = source.rest().first().copied().ok_or_else(|| source.truncated(what))?;
@@ -292,7 +296,7 @@ fn skip_text(source: &mut Source<'_>) -> Result<(), MeshError> {
 }
 
 pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), MeshError> {
-    // The first line has the version; lists tell by themselves which one they are of.
+    // The first line contains the version, which is not needed: the lists show which version they use.
     source.line();
     source.line().ok_or_else(|| source.truncated("the title"))?;
     let is_binary = match source.word().ok_or_else(|| source.truncated("`ASCII` or `BINARY`"))? {
@@ -352,7 +356,7 @@ pub(super) fn read(mut source: Source<'_>, draft: &mut Draft<'_>) -> Result<(), 
                 source.is_binary = false;
             }
             b"FIELD" => skip_field(&mut source, is_binary)?,
-            // Values at points and cells come last.
+            // Values at points and cells come last, and are ignored.
             b"POINT_DATA" | b"CELL_DATA" => break,
             _ => return Err(source.syntax(format!("`{}`: a section such as POINTS is expected", shown(word)))),
         }

@@ -1,6 +1,7 @@
-//! VTK's XML formats `.vtp` and `.vtu`: arrays as text, base64 or appended, and compressed by zlib.
+//! VTK's XML formats `.vtp` and `.vtu`, with arrays as text, in base64 or appended, and compressed with zlib.
 //!
-//! `quick-xml` reads the XML as events, so that nested elements take no stack; `miniz_oxide` unpacks within a bound.
+//! `quick-xml` reads the XML as a stream of events, so nested elements use no stack; `miniz_oxide` decompresses with
+//! a limit.
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -13,13 +14,13 @@ use super::source::{Order, Scalar, Source, no_number, parsed, shown};
 use super::vtk::{Cells, Faces};
 use crate::{Element, MeshError, Problem};
 
-/// Arrays and pieces of a file; no mesh has as many.
+/// Limit for the arrays and for the pieces of a file. No real mesh has as many.
 const MAX_ARRAYS: usize = 1 << 12;
 
-/// Of what is unpacked, so many bytes for each that was packed count as bytes of the file.
+/// Decompressed data counts towards the file size up to this number of bytes for each compressed byte.
 const PACKED: usize = 4;
 
-/// The arrays that make a surface: section and name. The points may have any name.
+/// The arrays that describe the surface: section and name. The points may have any name.
 const WANTED: [(&str, &str); 8] = [
     ("Points", ""),
     ("Polys", "connectivity"),
@@ -39,23 +40,23 @@ enum ArrayFormat {
 }
 
 struct Array {
-    /// Which of `WANTED`.
+    /// Index in `WANTED`.
     role: usize,
     scalar: Scalar,
     format: ArrayFormat,
-    /// Within the appended data.
+    /// Position in the appended data.
     offset: usize,
     text: Vec<u8>,
-    /// Where it begins, for messages.
+    /// Position in the file where it begins, for error messages.
     byte: u64,
 }
 
-/// How the file writes binary arrays.
+/// How the file encodes binary arrays.
 struct Coding {
     order: Order,
     header: Scalar,
     is_compressed: bool,
-    /// Of the appended data.
+    /// Whether the appended data is raw rather than base64.
     is_raw: bool,
 }
 
@@ -80,11 +81,11 @@ fn scalar(name: &str) -> Option<Scalar> {
     })
 }
 
-/// The file's arrays, before they are decoded.
+/// The arrays of the file, before they are decoded.
 struct Document<'a> {
     file: &'a str,
     coding: Coding,
-    /// One list for each piece.
+    /// The arrays of each piece.
     pieces: Vec<Vec<Array>>,
     appended: &'a [u8],
 }
@@ -95,7 +96,7 @@ impl<'a> Document<'a> {
         let mut document = Self { file, coding, pieces: Vec::new(), appended: &[] };
         let mut reader = Reader::from_reader(bytes);
         let mut section = String::new();
-        // The array whose text follows.
+        // Whether the text of the last array follows.
         let mut is_open = false;
         let mut arrays = 0;
         let (mut has_begun, mut has_ended) = (false, false);
@@ -128,7 +129,7 @@ impl<'a> Document<'a> {
                         }
                         "AppendedData" => {
                             document.coding.is_raw = attribute(&element, "encoding").as_deref() != Some("base64");
-                            // What follows need not be XML.
+                            // The data that follows need not be valid XML.
                             let at = usize::try_from(reader.buffer_position()).unwrap_or(usize::MAX);
                             let rest = bytes.get(at..).unwrap_or_default();
                             let start = rest.iter().position(|byte| *byte == b'_').map_or(rest.len(), |at| at + 1);
@@ -193,7 +194,7 @@ impl<'a> Document<'a> {
         Ok(())
     }
 
-    /// An array, if it makes the surface.
+    /// Returns an array if it is part of the surface.
     fn array(&self, element: &BytesStart<'_>, section: &str, byte: u64) -> Result<Option<Array>, Problem> {
         let name = attribute(element, "Name").unwrap_or_default();
         let is_wanted = |wanted: &(&str, &str)| wanted.0 == section && (wanted.1.is_empty() || wanted.1 == name);
@@ -216,7 +217,7 @@ impl<'a> Document<'a> {
         MeshError { file: self.file.to_owned(), element: Element::Byte(array.byte), place_m: None, problem }
     }
 
-    /// The bytes of a binary array, taken from `allowance`. The caller gives them back.
+    /// Returns the bytes of a binary array. Their memory is taken from `allowance`; the caller gives it back.
     fn bytes(&self, array: &Array, allowance: &mut MemoryAllowance<'_>) -> Result<Vec<u8>, MeshError> {
         let fail = |problem| self.fail(array, problem);
         let text: Vec<u8> = array.text.iter().copied().filter(|byte| !byte.is_ascii_whitespace()).collect();
@@ -229,14 +230,15 @@ impl<'a> Document<'a> {
         let width = header.size();
         let size = |bytes: &[u8]| usize::try_from(header.integer(bytes, order)).unwrap_or(usize::MAX);
         if !is_compressed {
-            // The length and the data are coded together.
+            // The length and the data are encoded together.
             let length = size(&stored.peek(width).map_err(fail)?);
             allowance.take(length).map_err(fail)?;
             let mut bytes = stored.take(width + length).map_err(fail)?;
             bytes.drain(..width);
             return Ok(bytes);
         }
-        // Blocks, their size, the size of the last one if it differs, and the packed size of each; then the blocks.
+        // Number of blocks, block size, size of the last block if it differs, and the compressed size of each block;
+        // then the blocks.
         let start = stored.peek(3 * width).map_err(fail)?;
         let blocks = size(&start);
         let length = blocks.checked_add(3).and_then(|words| words.checked_mul(width)).unwrap_or(usize::MAX);
@@ -246,12 +248,12 @@ impl<'a> Document<'a> {
         let stored_bytes = length.saturating_add(all).saturating_mul(2);
         allowance.take(stored_bytes).map_err(fail)?;
         let data = stored.take(all).map_err(fail)?;
-        // What the header promises, and no more, is unpacked.
+        // Not more is decompressed than the header states.
         let (block_bytes, last_bytes) = (size(&start[width..]), size(&start[2 * width..]));
         let last_bytes = if last_bytes == 0 { block_bytes } else { last_bytes };
         let promised = block_bytes.saturating_mul(blocks.saturating_sub(1)).saturating_add(last_bytes);
         let promised = if blocks == 0 { 0 } else { promised };
-        // Packed volumes are files of some times their bytes.
+        // A compressed file counts as a few times its size.
         allowance.add_file(promised.min(all.saturating_mul(PACKED)));
         allowance.take(promised).map_err(fail)?;
         let (mut rest, mut bytes) = (data.as_slice(), Vec::with_capacity(promised));
@@ -288,7 +290,7 @@ impl<'a> Document<'a> {
         Ok(numbers)
     }
 
-    /// The numbers of an array, taken from `allowance`. The caller gives them back.
+    /// Returns the numbers of an array. Their memory is taken from `allowance`; the caller gives it back.
     fn numbers<T: std::str::FromStr>(
         &self,
         array: &Array,
@@ -307,14 +309,14 @@ impl<'a> Document<'a> {
     }
 }
 
-/// Bytes as they are or in base64.
+/// Bytes that are stored raw or in base64.
 struct Stored<'a> {
     bytes: &'a [u8],
     is_base64: bool,
 }
 
 impl Stored<'_> {
-    /// The first `count` bytes, and how much of the stored bytes they take.
+    /// Returns the first `count` bytes, and how many stored bytes they take up.
     fn first(&self, count: usize) -> Result<(Vec<u8>, usize), Problem> {
         let missing = || Problem::Truncated { missing: format!("a part of {count} bytes of an array") };
         let taken = if self.is_base64 { count.div_ceil(3).checked_mul(4) } else { Some(count) };
@@ -331,12 +333,12 @@ impl Stored<'_> {
         Ok((bytes, stored.len()))
     }
 
-    /// The first `count` bytes, of more that are coded together with them.
+    /// Returns the first `count` bytes; further bytes may be encoded together with them.
     fn peek(&self, count: usize) -> Result<Vec<u8>, Problem> {
         Ok(self.first(count)?.0)
     }
 
-    /// The first `count` bytes, which are coded by themselves.
+    /// Removes and returns the first `count` bytes, which are encoded separately.
     fn take(&mut self, count: usize) -> Result<Vec<u8>, Problem> {
         let (bytes, taken) = self.first(count)?;
         self.bytes = &self.bytes[taken..];

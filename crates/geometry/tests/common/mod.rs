@@ -1,4 +1,4 @@
-//! The same octahedron in every format that is read, for the tests of the readers and for bent inputs.
+//! An octahedron in every format that can be read, for the tests of the readers and as a seed for fuzzing.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
 
 mod others;
@@ -26,7 +26,7 @@ pub const VERTICES: [[f64; 3]; 6] = [
 pub const TRIANGLES: [[u32; 3]; 8] =
     [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]];
 
-/// The middle of the octahedron, with which its faces make eight tetrahedra.
+/// The middle of the octahedron. Together with it, the faces form eight tetrahedra.
 const MIDDLE: [f64; 3] = [0.0; 3];
 
 /// Its volume, m³.
@@ -36,7 +36,7 @@ pub const VOLUME_M3: f64 = 4.0 / 3.0 * 1e-3;
 pub struct SampleFile {
     pub name: &'static str,
     pub bytes: Vec<u8>,
-    /// Whether a file that ends early can be told from a whole one.
+    /// Whether a truncated file can be distinguished from a complete one.
     pub knows_its_end: bool,
 }
 
@@ -53,7 +53,7 @@ pub fn octahedron() -> TriangleMesh {
     }
 }
 
-/// A sphere of 0.1 m radius: the octahedron with its edges halved so often.
+/// A sphere with a radius of 0.1 m: the octahedron, subdivided `halvings` times.
 pub fn sphere(halvings: usize) -> TriangleMesh {
     let mut mesh = octahedron();
     for _ in 0..halvings {
@@ -74,7 +74,8 @@ pub fn sphere(halvings: usize) -> TriangleMesh {
     mesh
 }
 
-/// A flat sheet of `n` × `n` squares, 0.1 m wide, each vertex moved by what `jitter` returns, in parts of a square.
+/// A flat sheet of `n` × `n` squares, 0.1 m wide. Each vertex is displaced by the result of `jitter`, in units of a
+/// square's side.
 pub fn sheet(n: u32, mut jitter: impl FnMut() -> f64) -> TriangleMesh {
     let mut mesh = TriangleMesh::default();
     for y in 0..=n {
@@ -135,7 +136,7 @@ pub fn stl_text() -> String {
 }
 
 pub fn stl_binary() -> Vec<u8> {
-    // Many programs begin binary files so.
+    // Many programs begin binary files like this.
     let mut file = b"solid binary".to_vec();
     file.resize(80, 0);
     file.extend(8_u32.to_le_bytes());
@@ -188,7 +189,7 @@ fn gltf_buffer() -> Vec<u8> {
 }
 
 fn gltf_json(uri: &str) -> String {
-    // The node moves the octahedron, its child moves it back.
+    // A node moves the octahedron, and its child moves it back.
     format!(
         r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[1]}}],
 "nodes":[{{"mesh":0,"name":"organ","translation":[-1,0,0]}},{{"children":[0],"matrix":[1,0,0,0,0,1,0,0,0,0,1,0,1,0,0,1]}}],
@@ -205,7 +206,7 @@ pub fn gltf_embedded() -> String {
     gltf_json(&format!(r#","uri":"data:application/octet-stream;base64,{}""#, STANDARD.encode(gltf_buffer())))
 }
 
-/// With a buffer in the file `organ data.bin`.
+/// With a buffer in a separate file `organ data.bin`.
 pub fn gltf_apart() -> (String, Vec<u8>) {
     (gltf_json(r#","uri":"organ%20data.bin""#), gltf_buffer())
 }
@@ -270,7 +271,7 @@ pub fn gmsh_2(is_binary: bool) -> Vec<u8> {
     file
 }
 
-/// Tetrahedra in format 2.2, some numbered in the wrong sense.
+/// Tetrahedra in format 2.2, some with reversed orientation.
 pub fn gmsh_volume() -> String {
     let mut text = String::from("$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n7\n1 0 0 0\n");
     for (number, [x, y, z]) in VERTICES.iter().enumerate() {
@@ -346,7 +347,7 @@ pub fn vtk(is_binary: bool) -> Vec<u8> {
     file
 }
 
-/// Tetrahedra in VTK's version 5.1, with offsets and connectivity apart.
+/// Tetrahedra in VTK's version 5.1, with separate offsets and connectivity.
 pub fn vtk_volume(is_binary: bool) -> Vec<u8> {
     let kind = if is_binary { "BINARY" } else { "ASCII" };
     let mut file =
@@ -380,7 +381,7 @@ pub fn vtk_volume(is_binary: bool) -> Vec<u8> {
     file
 }
 
-/// How the arrays of a VTK XML file are written.
+/// Encoding of the arrays in a VTK XML file.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Xml {
     Text,
@@ -401,7 +402,7 @@ pub fn vtp(xml: Xml) -> Vec<u8> {
         (1..=8).map(|face| format!("{} ", 3 * face)).collect(),
     ];
     let word = |number: usize| u32::try_from(number).unwrap().to_le_bytes();
-    // Header and data, apart.
+    // Header and data, encoded separately.
     let stored = |data: &[u8]| -> [Vec<u8>; 2] {
         if is_zlib {
             // In two blocks.
@@ -477,7 +478,7 @@ pub fn samples() -> Vec<SampleFile> {
     obj.knows_its_end = false;
     let mut old = sample("old.obj", obj_of_old());
     old.knows_its_end = false;
-    // The first solid by itself is a whole file.
+    // The first solid alone is a complete file.
     let mut two = sample("two.stl", stl_of_two());
     two.knows_its_end = false;
     vec![

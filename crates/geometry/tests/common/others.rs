@@ -1,16 +1,17 @@
-//! The octahedron as other programs and hands write it, and solids with faces of more than three corners.
+//! The octahedron as other programs and people write it, and solids whose faces have more than three corners.
 
 use std::fmt::Write;
 
 use super::{TRIANGLES, VERTICES, bytes, coordinates, glb_of, gltf_json, lines, obj, ply_header, stl_binary, stl_text};
 
-/// An OBJ file of an old program: a byte order mark, lines that end in carriage returns alone, `$` before comments, NULs at the end.
+/// An OBJ file of an old program: a byte order mark, lines that end in carriage returns alone, `$` for comments, NULs
+/// at the end.
 pub fn obj_of_old() -> Vec<u8> {
     let text = obj().replace("# an octahedron", "$ an octahedron\n# of \\").replace('\n', "\r");
     [b"\xef\xbb\xbf", text.as_bytes(), b"\0\0\x1a"].concat()
 }
 
-/// Text of two solids, which end with a space.
+/// A text file of two solids, which end with a space.
 pub fn stl_of_two() -> String {
     let text = stl_text().to_uppercase().replace("ENDSOLID", "END SOLID");
     let half = text.match_indices(" FACET").nth(4).unwrap().0;
@@ -22,7 +23,7 @@ pub fn stl_with_more() -> Vec<u8> {
     [stl_binary(), b"made by hand\n".to_vec()].concat()
 }
 
-/// With columns that the header does not name, a list before the vertices, blank lines, and no line feed at all.
+/// With columns that the header does not name, a list before the vertices, blank lines, and no line feeds at all.
 pub fn ply_wide() -> String {
     let mut text =
         ply_header("ascii").replace("element face 8\n", "element face 8\nproperty list uchar float weights\n");
@@ -36,7 +37,7 @@ pub fn ply_wide() -> String {
     text.replace('\n', "\r")
 }
 
-/// Strips of triangles, one after the other in one list.
+/// Triangle strips, one after the other in one list.
 pub fn ply_strips(is_binary: bool) -> Vec<u8> {
     let header = ply_header(if is_binary { "binary_big_endian" } else { "ascii" });
     let header = header.replace("element face 8", "element tristrips 1").replace("list uchar int", "list int int");
@@ -59,7 +60,7 @@ pub fn ply_strips(is_binary: bool) -> Vec<u8> {
     file
 }
 
-/// Keywords in small letters, strips, and fields of texts, bits, and numbers of every kind.
+/// Keywords in lower case, strips, and fields with strings, bits, and numbers of every type.
 pub fn vtk_fields(is_binary: bool) -> Vec<u8> {
     let kind = if is_binary { "binary" } else { "ascii" };
     let mut file = format!("# vtk datafile version 4.2\n\n{kind}\nfield FieldData 5\n").into_bytes();
@@ -93,7 +94,7 @@ pub fn vtk_fields(is_binary: bool) -> Vec<u8> {
     file
 }
 
-/// Two pyramids on one square, one of them numbered in the wrong sense and given twice.
+/// Two pyramids with a common square, one of them with reversed orientation and written twice.
 pub fn vtk_pyramids() -> String {
     format!(
         "# vtk DataFile Version 3.0\npyramids\nASCII\nDATASET UNSTRUCTURED_GRID\nPOINTS 6 float\n{}CELLS 3 18\n\
@@ -102,7 +103,7 @@ pub fn vtk_pyramids() -> String {
     )
 }
 
-/// With extensions of textures required, and NULs after the JSON.
+/// Requires texture extensions, and has NULs after the JSON.
 pub fn glb_with_textures() -> Vec<u8> {
     let required = r#"{"extensionsRequired":["KHR_texture_transform","EXT_texture_webp","KHR_materials_unlit"],"#;
     let mut json = gltf_json("").replacen('{', required, 1).into_bytes();
@@ -112,18 +113,18 @@ pub fn glb_with_textures() -> Vec<u8> {
     glb_of(&json)
 }
 
-/// A file of a solid that is no octahedron.
+/// A file of another solid.
 pub struct Solid {
     pub name: &'static str,
     pub text: String,
-    /// Vertices of triangles, and triangles.
+    /// Number of vertices in triangles, and of triangles.
     pub counts: [usize; 2],
     /// cm² and ml, if lengths are mm.
     pub area_cm2: f64,
     pub volume_ml: f64,
 }
 
-/// Solids with faces of more than three corners.
+/// Solids whose faces have more than three corners.
 pub fn solids() -> Vec<Solid> {
     let solid = |name, text: &str, counts, area_cm2, volume_ml| Solid {
         name,

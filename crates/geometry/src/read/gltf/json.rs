@@ -1,4 +1,4 @@
-//! The JSON of glTF: what is looked for in it, in lists of bounded length.
+//! The parts of glTF's JSON that are used, with lists of limited length.
 
 use std::fmt;
 use std::marker::PhantomData;
@@ -9,10 +9,10 @@ use serde::de::{IgnoredAny, MapAccess, SeqAccess, Visitor};
 use crate::Problem;
 use crate::read::source::named;
 
-/// Nodes, meshes, accessors and so on of a file. They take more memory than the text that they are from.
+/// Maximum number of nodes, meshes, accessors and so on in a file. They take more memory than their text.
 pub(super) const MAX_NESTED: usize = 1 << 14;
 
-/// Extensions that are named in a refusal.
+/// Maximum number of extensions that are named in a refusal.
 const NAMED: usize = 8;
 
 /// A list of at most [`MAX_NESTED`] entries.
@@ -49,7 +49,7 @@ impl<'de, T: Deserialize<'de>> Deserialize<'de> for Few<T> {
     }
 }
 
-/// What is read first: it tells what all else means.
+/// The part that is read first: it decides how the rest is read.
 #[derive(Default, Deserialize)]
 #[serde(default, rename_all = "camelCase")]
 pub(super) struct Head {
@@ -66,7 +66,7 @@ struct Asset {
     version: Outline,
 }
 
-/// What a value is, without the parts of lists and tables: those may be many.
+/// The kind of a value, without the entries of lists and tables, which may be many.
 #[derive(Default)]
 enum Outline {
     Text(String),
@@ -117,8 +117,8 @@ impl<'de> Deserialize<'de> for Outline {
     }
 }
 
-/// Whether triangles are the same without an extension: it is of textures, materials, lights or texts. The normalized integers
-/// of `KHR_mesh_quantization` are read.
+/// Returns whether the triangles do not depend on an extension: one of textures, materials, lights or texts. The
+/// normalized integers of `KHR_mesh_quantization` are supported.
 fn is_harmless(extension: &str) -> bool {
     let parts =
         ["_texture", "_image", "_materials", "_lights", "_techniques", "MSFT_packing", "KHR_xmp", "KHR_animation"];
@@ -126,14 +126,14 @@ fn is_harmless(extension: &str) -> bool {
 }
 
 impl Head {
-    /// Why the file can't be read, if it can't.
+    /// Returns why the file can't be read, if so.
     pub(super) fn refusal(&self) -> Option<Problem> {
         let is_old = [&self.accessors, &self.meshes].into_iter().any(|list| matches!(list, Outline::Table));
         let version = match &self.asset.version {
             Outline::Text(version) => version.clone(),
-            // 2 and 1.5 as they are, 1 as 1.0.
+            // 2 and 1.5 are kept, 1 becomes 1.0.
             Outline::Number(version) => format!("{version:?}"),
-            // Version 1 need not say so.
+            // Version 1 need not be stated.
             _ if is_old => "1.0".to_owned(),
             _ => "2.0".to_owned(),
         };
@@ -146,19 +146,19 @@ impl Head {
     }
 }
 
-/// The problem of a file of another version than 2.
+/// Returns the problem of a file with a version other than 2.
 pub(super) fn other_version(version: &str) -> Problem {
     let version = named(version.as_bytes());
     Problem::Unsupported { message: format!("glTF {version} is not read: export the file as glTF 2.0") }
 }
 
-/// The problem of a file whose triangles are not there without an extension.
+/// Returns the problem of a file whose triangles require an unsupported extension.
 pub(super) fn other_extension(extension: &str) -> Problem {
     let extension = named(extension.as_bytes());
     Problem::Unsupported { message: format!("needs {extension}, which is not read: export the file without it") }
 }
 
-/// So many numbers.
+/// A list of exactly `N` numbers.
 pub(super) struct Numbers<const N: usize>(pub(super) [f64; N]);
 
 impl<'de, const N: usize> Deserialize<'de> for Numbers<N> {
@@ -258,7 +258,7 @@ pub(super) struct PrimitiveExtensions {
     pub(super) draco: Option<IgnoredAny>,
 }
 
-// Required, so that no short text makes many primitives.
+// Required, so that no short text creates many primitives.
 #[derive(Deserialize)]
 pub(super) struct Attributes {
     #[serde(rename = "POSITION")]
@@ -317,7 +317,7 @@ pub(super) struct Buffer {
     pub(super) extensions: BufferExtensions,
 }
 
-/// Extensions by which a buffer is filled.
+/// Extensions that provide the content of a buffer.
 #[derive(Default, Deserialize)]
 #[serde(default)]
 pub(super) struct BufferExtensions {
