@@ -13,9 +13,10 @@ mod report;
 mod server;
 
 use links::{by_seed, link, links, number};
+use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::response::tangent;
 use palpate_tissue::scene::{BUILT_IN, Scene};
-use palpate_tissue::{Model, tangent};
 use report::chart::{Look, Panel, Series};
 use report::{BenchReport, cells, digits, quick, rough};
 use serde_json::{Value, json};

@@ -8,8 +8,9 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate_haptics::{ContactState, Tip};
 use palpate_tissue::limits::Limits;
+use palpate_tissue::response::tangent;
 use palpate_tissue::scene::{Body, Mesh, MeshShape, Scene};
-use palpate_tissue::{Model, Tissue, ToolContact, at_rest, tangent};
+use palpate_tissue::{Model, Tissue, ToolContact, at_rest};
 
 /// Membrane and foundation of a liver: N/m along an edge, N/m³ beneath, kg/m², and the damping ratio of a point on the foundation.
 const EDGE_N_PER_M: f64 = 80.0;

@@ -11,7 +11,8 @@ use palpate_refusal::Reason;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::{PAPER, Precision, Scene};
 use palpate_tissue::scheme::Oscillator;
-use palpate_tissue::{Model, scheme_selection, stability};
+use palpate_tissue::select::scheme_selection;
+use palpate_tissue::{Model, stability};
 use random_scenes::{RandomScene, case, errors, mesh_case, play, truth};
 
 /// With the scheme that is chosen for each.

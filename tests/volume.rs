@@ -11,10 +11,11 @@ use glam::DVec3;
 use palpate_haptics::{Coupling, Tip};
 use palpate_refusal::Reason;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::response::tangent;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::{Body, Change, Scene};
 use palpate_tissue::shape::{PointId, RestShape};
-use palpate_tissue::{Model, Push, Tissue, at_rest, tangent};
+use palpate_tissue::{Model, Push, Tissue, at_rest};
 
 /// A ball of 162 vertices and 0.1 m.
 fn ball(sets: &[&str]) -> Scene {

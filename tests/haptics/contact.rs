@@ -6,8 +6,9 @@ use crate::common::{model, scene_with};
 use glam::{DVec2, DVec3};
 use palpate_haptics::{ContactState, Coupling, Tip};
 use palpate_tissue::response::force_law;
+use palpate_tissue::response::tangent;
 use palpate_tissue::scene::BUILT_IN;
-use palpate_tissue::{self as tissue, Model, Tissue, ToolContact, tangent};
+use palpate_tissue::{self as tissue, Model, Tissue, ToolContact};
 
 /// Flat punches of 5 mm radius, 2aE/(1 − ν²), N/m.
 const FLAT_PUNCH_N_PER_M: [(&str, f64); 3] = [("stomach", 25.3), ("liver", 71.1), ("fibrotic", 354.0)];

@@ -2,15 +2,10 @@
 
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
 use palpate_client::{Error, Server};
-use palpate_proto::pb::create_session_request::Source;
 use palpate_refusal::printable::{printable_json, printable_lines};
-use palpate_simulated::load::{
-    Deadbands, LoadOutcome, LoadPlan, LoadTrial, Objective, PreparedPlan, Second, TrialProgress, trial,
-};
-use palpate_simulated::scene_file::SceneFile;
+use palpate_simulated::load::{Deadbands, LoadOutcome, LoadPlan, LoadTrial, Objective, PreparedPlan, Second};
 
 use crate::credentials::CredentialOptions;
 use crate::{ClientFailure, interrupted, within};
@@ -96,32 +91,27 @@ fn rate(text: &str) -> Result<f64, String> {
 }
 
 /// The search ends when the bracket is narrower than this fraction of the limit (1/40).
-const RESOLUTION: usize = 40;
+const RESOLUTION: u32 = 40;
 
 /// Number of trials that must agree: two of three, because one stall of the machine can spoil a trial, and one lucky trial
 /// proves nothing.
 const AGREE: usize = 2;
 
 /// The largest number that is tried.
-const MAX_SESSIONS: usize = 1 << 16;
+const MAX_SESSIONS: u32 = 1 << 16;
 
 pub(crate) async fn load(arguments: &LoadArguments) -> Result<(), ClientFailure> {
     if let Some(path) = &arguments.plan {
         return by_plan(path, arguments).await;
     }
     let server = arguments.credentials.server(&arguments.server)?;
-    let file = SceneFile::read(&arguments.scene)?;
-    let source = file.source(server.connect().await.map_err(ClientFailure::from)?).await?;
-    let sessions = arguments.sessions as usize;
-    let ended = async {
-        match &arguments.find_limit {
-            None => measured(arguments, &server, &source, sessions).await.map(|outcome| (outcome, None)),
-            Some(objective) => find_limit(arguments, &server, &source, sessions, objective)
-                .await
-                .map(|(outcome, limit)| (outcome, Some(limit))),
+    let (outcome, limit) = match &arguments.find_limit {
+        None => (measured(arguments, &server, arguments.sessions).await?, None),
+        Some(objective) => {
+            let (outcome, limit) = find_limit(arguments, &server, objective).await?;
+            (outcome, Some(limit))
         }
     };
-    let (outcome, limit) = ended.await?;
     if arguments.json {
         crate::tell!("{}", printable_json(outcome.json(limit)));
     } else {
@@ -153,16 +143,16 @@ async fn agreed<T, E>(mut trial: impl AsyncFnMut() -> Result<(T, bool), E>) -> R
 async fn find_limit(
     arguments: &LoadArguments,
     server: &Server,
-    source: &Source,
-    first: usize,
     objective: &Objective,
-) -> Result<(LoadOutcome, usize), Error> {
+) -> Result<(LoadOutcome, u32), Error> {
+    // A server that can't be reached has no limit.
+    server.connect().await?;
     // 0 sessions meet every objective.
     let (mut best, mut low, mut high) = (None, 0, None);
-    let mut next = first;
+    let mut next = arguments.sessions;
     loop {
         let found = agreed(async || {
-            let (outcome, why) = match measured(arguments, server, source, next).await {
+            let (outcome, why) = match measured(arguments, server, next).await {
                 Ok(outcome) => {
                     let mut missed = objective.missed(&outcome).join(", ");
                     if outcome.broken > 0 {
@@ -192,7 +182,7 @@ async fn find_limit(
             None if low >= MAX_SESSIONS => break,
             None => 2 * low,
             Some(high) if high - low <= (low / RESOLUTION).max(1) => break,
-            Some(high) => usize::midpoint(low, high),
+            Some(high) => u32::midpoint(low, high),
         };
     }
     best.map(|outcome| (outcome, low)).ok_or_else(|| Error::Connection("the server gave not one session".to_owned()))
@@ -205,13 +195,9 @@ async fn called_off() {
 }
 
 /// A trial, with its progress and warnings.
-async fn measured(
-    arguments: &LoadArguments,
-    server: &Server,
-    source: &Source,
-    sessions: usize,
-) -> Result<LoadOutcome, Error> {
-    let of_all = LoadTrial {
+async fn measured(arguments: &LoadArguments, server: &Server, sessions: u32) -> Result<LoadOutcome, Error> {
+    let trial = LoadTrial {
+        scene: arguments.scene.clone(),
         clients_per_session: arguments.clients_per_session,
         viewers: arguments.viewers,
         seconds: arguments.seconds,
@@ -222,9 +208,18 @@ async fn measured(
         clients_per_connection: arguments.clients_per_connection,
         threads: arguments.threads,
     };
-    let mut shown = TrialProgressPrinter::new(arguments, sessions);
-    let outcome = trial(&of_all, server, source, sessions, |progress| shown.tell(progress), called_off()).await?;
-    shown.end();
+    let course = PreparedPlan::new(trial.plan(sessions)).map_err(|refusal| Error::Argument(refusal.to_string()))?;
+    // On a terminal, each line takes the place of the one before.
+    let (is_shown, is_terminal) = (!arguments.quiet, std::io::stderr().is_terminal());
+    let told = |second: &Second| match (is_shown, is_terminal) {
+        (false, _) => {}
+        (true, true) => eprint!("\r\x1b[K{}", second.trial_line()),
+        (true, false) => crate::say!("{}", second.trial_line()),
+    };
+    let outcome = course.run(server, told, crate::warn, called_off()).await?.outcome();
+    if is_shown && is_terminal {
+        eprint!("\r\x1b[K");
+    }
     if let Some(why) = &outcome.first_break {
         crate::warn(&format!("{} streams broke, the first because {why}", outcome.broken));
     }
@@ -239,9 +234,8 @@ async fn measured(
 async fn by_plan(path: &Path, arguments: &LoadArguments) -> Result<(), ClientFailure> {
     let course = PreparedPlan::new(LoadPlan::read(path)?)?;
     let server = arguments.credentials.server(&arguments.server)?;
-    let quiet = arguments.quiet;
-    let told = move |second: &Second| {
-        if !quiet {
+    let told = |second: &Second| {
+        if !arguments.quiet {
             crate::say!("{}", second.line());
         }
     };
@@ -256,46 +250,6 @@ async fn by_plan(path: &Path, arguments: &LoadArguments) -> Result<(), ClientFai
         print!("{}", printable_lines(report.table()));
     }
     report.verdict().map_or(Ok(()), |why| Err(ClientFailure::Failed(why)))
-}
-
-/// Prints the progress of a trial.
-struct TrialProgressPrinter {
-    quiet: bool,
-    sessions: usize,
-    /// Number of samples at the last report, and its time.
-    last: (u64, Instant),
-}
-
-impl TrialProgressPrinter {
-    fn new(arguments: &LoadArguments, sessions: usize) -> Self {
-        TrialProgressPrinter { quiet: arguments.quiet, sessions, last: (0, Instant::now()) }
-    }
-
-    fn tell(&mut self, progress: &TrialProgress) {
-        if self.quiet {
-            return;
-        }
-        let TrialProgress { at_s, samples, rejected, round_trip_p99_s } = *progress;
-        let elapsed_s = self.last.1.elapsed().as_secs_f64();
-        let text = format!(
-            "{at_s:.0} s  {} sessions  {:.0} samples/s  round trip p99 {:.2} ms  rejected {rejected}",
-            self.sessions,
-            (samples - self.last.0) as f64 / elapsed_s,
-            1e3 * round_trip_p99_s,
-        );
-        self.last = (samples, Instant::now());
-        if std::io::stderr().is_terminal() {
-            eprint!("\r\x1b[K{text}");
-        } else {
-            crate::say!("{text}");
-        }
-    }
-
-    fn end(&self) {
-        if !self.quiet && std::io::stderr().is_terminal() {
-            eprint!("\r\x1b[K");
-        }
-    }
 }
 
 #[cfg(test)]

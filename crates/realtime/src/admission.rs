@@ -25,10 +25,11 @@ use palpate_session::input::Input;
 use palpate_session::intake::Intake;
 use palpate_session::schedule::Schedule;
 use palpate_session::surface::Skin;
+use palpate_tissue::Model;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 use palpate_tissue::scene::{Body, Change, Scene};
-use palpate_tissue::{Model, scheme_selection};
+use palpate_tissue::select::scheme_selection;
 
 /// The state with which a session begins on this server.
 pub struct Begin {

@@ -6,9 +6,10 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use palpate_refusal::{Reason, Refusal, Result};
+use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Scene;
-use palpate_tissue::{Model, scheme_selection};
+use palpate_tissue::select::scheme_selection;
 
 /// Estimates before anything was measured: time of one point and substep, and of a step beside its points, ns.
 const GUESS_NS: f64 = 2.0;

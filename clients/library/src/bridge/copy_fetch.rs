@@ -8,7 +8,7 @@ use pb::session_service_client::SessionServiceClient;
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 
-use super::{Copies, stepping};
+use super::{Copies, copy_thread};
 use crate::Error;
 use crate::connect::Channel;
 use crate::snapshot;

@@ -49,7 +49,7 @@ impl Stage {
     }
 }
 
-/// What all clients of a thread share.
+/// What all clients and viewers of a user share.
 #[derive(Clone)]
 pub(crate) struct Common {
     pub(crate) clock: Instant,
@@ -141,6 +141,8 @@ pub(crate) struct Client {
     pub(crate) tool: u32,
     pub(crate) rate_hz: f64,
     pub(crate) stroke: Stroke,
+    /// Of its hand.
+    pub(crate) seed: u64,
     /// The middle of the tissue, m.
     pub(crate) middle_m: DVec3,
     /// Present if the session has viewers.
@@ -186,7 +188,7 @@ impl Client {
         let inbound = Touch::open(channel, open, commands.map(Say::Command)).await?;
         {
             let mut sent = lock(&sent);
-            sent.led = touches.and_then(|lead| LedTip::new(inbound.opened(), &lead, self.middle_m));
+            sent.led = touches.and_then(|lead| LedTip::new(inbound.opened(), &lead, self.seed, self.middle_m));
             if touches.is_some() && sent.led.is_none() {
                 return Err(tonic::Status::failed_precondition("the server tells no force law for --touch"));
             }

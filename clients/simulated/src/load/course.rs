@@ -1,61 +1,31 @@
 //! A plan as it runs: users arrive, stay and leave, and every second is counted by itself.
 
 use std::net::{SocketAddr, ToSocketAddrs};
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use palpate_client::bridge::Warn;
-use palpate_client::{Channel, Error, Server, describe, fleet};
-use palpate_proto::pb;
+use palpate_client::{Error, Server};
+use palpate_proto::pb::create_session_request::Source;
 use palpate_refusal::Refusal;
-use pb::create_session_request::Source;
-use pb::session_service_client::SessionServiceClient;
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 
-use super::client::{Arrivals, Client, Common, Stage, lock};
-use super::plan::{LoadPlan, Mover, User, Viewers};
+use super::client::{Stage, lock};
+use super::connections::Connections;
+use super::plan::{LoadPlan, User};
 use super::report::{LoadReport, Second};
-use super::stroke::Stroke;
-use super::swarm::{middle_m, rate_hz, view};
 use super::tally::Tally;
-use super::tip::Lead;
-use super::{PHASES, tick};
+use super::user::{Guest, World, visit};
+use super::{TURNS, tick};
 use crate::relay::RelayNetwork;
 use crate::scene_file::SceneFile;
 
 /// Flows of one network at a time.
 const MAX_FLOWS: u64 = 20_000;
 
-/// How long a user waits for the server before going away again.
-const SERVER_TIMEOUT: Duration = Duration::from_secs(20);
-
-/// The server deletes a session that nobody uses for so long, if this program dies, s.
-const IDLE_S: f64 = 10.0;
-
-/// Counts of users.
-#[derive(Default)]
-struct UserCounts {
-    here: AtomicU64,
-    arrived: AtomicU64,
-    left: AtomicU64,
-}
-
-/// What all users share.
-struct World {
-    plan: LoadPlan,
-    /// By the plan's networks.
-    servers: Vec<Server>,
-    /// By the plan's scenes.
-    sources: Vec<Source>,
-    clock: Instant,
-    tally: Arc<Mutex<Tally>>,
-    counts: UserCounts,
-    phases: Vec<watch::Receiver<u64>>,
-    /// Whether all are to leave.
-    over: watch::Receiver<bool>,
-}
+/// Between the last user's start and the beginning of the clock, if that waits for them.
+const SETTLE: Duration = Duration::from_millis(500);
 
 /// A plan with its scenes, ready to be run.
 pub struct PreparedPlan {
@@ -77,13 +47,14 @@ impl PreparedPlan {
     /// and `warn` what goes wrong with a network.
     ///
     /// # Errors
-    /// Returns an error if the server can't be reached or refuses a scene, or if a network can't stand before it.
+    /// Returns an error if the server can't be reached or refuses a scene, if a network can't stand before it, or if a session of
+    /// a trial is refused.
     pub async fn run(
         self,
         server: &Server,
-        told: impl FnMut(&Second) + Send + 'static,
+        told: impl FnMut(&Second),
         warn: impl Fn(&str) + Send + Sync + 'static,
-        stop: impl Future<Output = ()> + Send + 'static,
+        stop: impl Future<Output = ()>,
     ) -> Result<LoadReport, Error> {
         let PreparedPlan { plan, scenes } = self;
         let channel = server.connect().await?;
@@ -106,13 +77,7 @@ impl PreparedPlan {
                 }
             });
         }
-        // A thread of its own, so that what the users do is measured by who does nothing else.
-        let ran = tokio::task::spawn_blocking(move || {
-            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
-            let runtime = runtime.map_err(|error| Error::Internal(format!("can't start a thread: {error}")))?;
-            Ok::<_, Error>(runtime.block_on(run(plan, servers, sources, told, stop)))
-        });
-        ran.await.map_err(|error| Error::Internal(error.to_string()))?
+        run(plan, servers, sources, told, stop).await
     }
 }
 
@@ -129,203 +94,174 @@ fn address(url: &str) -> Result<SocketAddr, Error> {
     found.next().ok_or_else(|| refuse("has no address".to_owned()))
 }
 
-/// What a loop waits for next.
-enum NextEvent {
-    User(User),
-    Second,
-    Stop,
-}
-
 async fn run(
     plan: LoadPlan,
     servers: Vec<Server>,
     sources: Vec<Source>,
-    mut told: impl FnMut(&Second),
+    told: impl FnMut(&Second),
     stop: impl Future<Output = ()>,
-) -> LoadReport {
-    let (senders, phases): (Vec<_>, Vec<_>) = (0..PHASES).map(|_| watch::channel(0)).unzip();
+) -> Result<LoadReport, Error> {
+    let users = plan.users();
+    let mut course = Course { report: LoadReport::new(&plan, &users), tallies: Vec::new(), at_s: 0.0, users: 0 };
+    let (senders, turns): (Vec<_>, Vec<_>) = (0..TURNS).map(|_| watch::channel(0)).unzip();
     let (beating, beats) = watch::channel(());
-    let (leave, over) = watch::channel(false);
     let rate_hz = plan.rate_hz;
     let ticker = std::thread::spawn(move || tick(&senders, rate_hz, &beats));
-    let tally = Arc::new(Mutex::new(Tally::new()));
-    let (users, lasts_s) = (plan.users(), plan.lasts_s());
-    let mut report = LoadReport::new(&plan, &users);
-    let clock = Instant::now();
-    let counts = UserCounts::default();
-    let world = Arc::new(World { plan, servers, sources, clock, tally, counts, phases, over });
-    let mut tasks = JoinSet::new();
-    let mut coming = users.into_iter().peekable();
-    let mut stop = std::pin::pin!(stop);
-    let begun = tokio::time::Instant::now();
-    let mut second = 1.0_f64;
-    while second <= lasts_s.ceil() {
-        let user_s = coming.peek().map_or(f64::INFINITY, |user| user.at_s);
-        let due_s = user_s.min(second);
-        let next = tokio::select! {
-            biased;
-            () = &mut stop => NextEvent::Stop,
-            () = tokio::time::sleep_until(begun + Duration::from_secs_f64(due_s)) => {
-                coming.next_if(|user| user.at_s < second).map_or(NextEvent::Second, NextEvent::User)
-            }
+    let (telling, stages) = watch::channel(Stage::RAMP);
+    let (arrived, mut arrivals) = mpsc::unbounded_channel();
+    let (servers, sources): (Arc<[_]>, Arc<[_]>) = (servers.into(), sources.into());
+    let (plan, clock) = (Arc::new(plan), Instant::now());
+    let threads = (plan.threads as usize).min(users.len()).max(1);
+    let mut workers = Vec::new();
+    for index in 0..threads {
+        let tally = Arc::new(Mutex::new(Tally::new()));
+        course.tallies.push(tally.clone());
+        let world = World {
+            plan: plan.clone(),
+            servers: servers.clone(),
+            sources: sources.clone(),
+            clock,
+            tally,
+            turns: turns.clone(),
+            stages: stages.clone(),
+            asking: tokio::sync::Mutex::new(()),
         };
-        match next {
-            NextEvent::User(user) => {
-                world.counts.arrived.fetch_add(1, Ordering::Relaxed);
-                tasks.spawn(visit(world.clone(), user));
+        let (own, arrived) = (users.iter().skip(index).step_by(threads).copied().collect(), arrived.clone());
+        // A thread of its own, so that what the users do is measured by who does nothing else.
+        workers.push(std::thread::spawn(move || work(world, own, &arrived)));
+    }
+    drop(arrived);
+    let ended = tokio::select! {
+        ended = course.take(&plan, &mut arrivals, &telling, told) => ended,
+        () = stop => {
+            course.report.is_interrupted = true;
+            Ok(())
+        }
+    };
+    telling.send_replace(Stage::DRAIN);
+    let joined = tokio::task::spawn_blocking(move || {
+        let joined = workers.into_iter().try_for_each(std::thread::JoinHandle::join);
+        // Users are answered to the end.
+        drop(beating);
+        joined.and(ticker.join())
+    });
+    let joined = joined.await.map_err(|_| ()).and_then(|joined| joined.map_err(|_| ()));
+    joined.map_err(|()| Error::Internal("a thread of the generator failed".to_owned()))?;
+    ended?;
+    while let Some(arrived) = arrivals.recv().await {
+        arrived?;
+    }
+    // What came after the last second counts in the last phase.
+    let rest = course.count(course.at_s + 1.0);
+    course.report.add(rest);
+    Ok(course.report)
+}
+
+/// How far a load is.
+struct Course {
+    report: LoadReport,
+    /// By thread.
+    tallies: Vec<Arc<Mutex<Tally>>>,
+    /// Since the clock of the plan began, s.
+    at_s: f64,
+    users: u64,
+}
+
+impl Course {
+    /// Lets the clock of the plan run: it begins when those are there who gather.
+    async fn take(
+        &mut self,
+        plan: &LoadPlan,
+        arrivals: &mut mpsc::UnboundedReceiver<Result<(), Error>>,
+        telling: &watch::Sender<u8>,
+        mut told: impl FnMut(&Second),
+    ) -> Result<(), Error> {
+        let gathers = plan.gathers_over_s().is_some();
+        if gathers {
+            for _ in &self.tallies {
+                arrivals.recv().await.unwrap_or(Ok(()))?;
             }
-            NextEvent::Second => {
-                let counted = count(&world, second);
-                told(&counted);
-                report.add(counted);
-                second += 1.0;
-            }
-            NextEvent::Stop => {
-                report.is_interrupted = true;
+            tokio::time::sleep(SETTLE).await;
+        }
+        telling.send_replace(Stage::MEASURE);
+        let (begun, begun_cpu_s) = (tokio::time::Instant::now(), cpu_s());
+        let lasts_s = plan.lasts_s();
+        // Phases of parts of a second do not add up exactly.
+        while self.at_s < lasts_s - 1e-9 {
+            let at_s = (self.at_s + 1.0).min(lasts_s);
+            tokio::time::sleep_until(begun + Duration::from_secs_f64(at_s)).await;
+            let second = self.count(at_s);
+            told(&second);
+            self.report.add(second);
+            // Nothing is left to measure.
+            if gathers && self.users == 0 {
                 break;
             }
         }
+        if let (Some(from_s), Some(to_s)) = (begun_cpu_s, cpu_s()) {
+            self.report.generator_cores = (to_s - from_s) / begun.elapsed().as_secs_f64();
+        }
+        Ok(())
+    }
+
+    /// What was counted since the last time.
+    fn count(&mut self, at_s: f64) -> Second {
+        let mut all = Tally::new();
+        for tally in &self.tallies {
+            let anew = Tally::new();
+            let counted = std::mem::replace(&mut *lock(tally), anew);
+            all.add(&counted);
+        }
+        self.users = self.users + all.start_ns.len() - all.left;
+        let lasts_s = at_s - std::mem::replace(&mut self.at_s, at_s);
+        Second { at_s, lasts_s, users: self.users, tally: all }
+    }
+}
+
+/// The work of one thread; `arrived` hears when all of its users have come, or why they could not.
+fn work(world: World, users: Vec<User>, arrived: &mpsc::UnboundedSender<Result<(), Error>>) {
+    let all = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
+        Ok(runtime) => return runtime.block_on(play(Arc::new(world), users, arrived)),
+        Err(error) => Err(Error::Internal(format!("can't start a thread: {error}"))),
+    };
+    let _ = arrived.send(all);
+}
+
+async fn play(world: Arc<World>, users: Vec<User>, arrived: &mpsc::UnboundedSender<Result<(), Error>>) {
+    let (mut stages, mut staying) = (world.stages.clone(), JoinSet::new());
+    let all = tokio::select! {
+        all = arrive(&world, users, &mut staying) => all,
+        _ = stages.wait_for(|stage| *stage == Stage::DRAIN) => Ok(()),
+    };
+    let _ = arrived.send(all);
+    while staying.join_next().await.is_some() {}
+}
+
+/// Lets users arrive, each at its time. Those that gather come one after the other.
+async fn arrive(world: &Arc<World>, users: Vec<User>, staying: &mut JoinSet<()>) -> Result<(), Error> {
+    let gathers = world.plan.gathers_over_s().is_some();
+    let mut connections = Connections::new(&world.plan);
+    let begun = tokio::time::Instant::from_std(world.clock);
+    for user in users {
+        tokio::time::sleep_until(begun + Duration::from_secs_f64(user.at_s)).await;
+        lock(&world.tally).arrived += 1;
+        let world = world.clone();
+        if gathers {
+            let guest = Guest::arrive(&world, &user, &mut connections).await?;
+            staying.spawn(async move { guest.stay(&world, user.stays_s).await });
+        } else {
+            staying.spawn(visit(world, user));
+        }
         // Those who have gone.
-        while tasks.try_join_next().is_some() {}
+        while staying.try_join_next().is_some() {}
     }
-    leave.send_replace(true);
-    while tasks.join_next().await.is_some() {}
-    // What came after the last second counts in the last phase.
-    report.add(count(&world, second));
-    drop(beating);
-    let _ = ticker.join();
-    report
+    Ok(())
 }
 
-/// What was counted since the last time.
-fn count(world: &World, at_s: f64) -> Second {
-    let tally = std::mem::replace(&mut *lock(&world.tally), Tally::new());
-    let UserCounts { here, arrived, left } = &world.counts;
-    Second {
-        at_s,
-        users: here.load(Ordering::Relaxed),
-        arrived: arrived.swap(0, Ordering::Relaxed),
-        left: left.swap(0, Ordering::Relaxed),
-        tally,
-    }
-}
-
-/// Why a user could not start: the server's reason, or the code of a call, or what else it was.
-fn reason(error: &Error) -> String {
-    match error {
-        Error::Call(status) => {
-            let said = describe(status);
-            let last = said.rsplit_once('(').and_then(|parts| parts.1.strip_suffix(')'));
-            last.map_or_else(|| format!("{:?}", status.code()), str::to_owned)
-        }
-        _ => "UNREACHABLE".to_owned(),
-    }
-}
-
-/// The streams of a user.
-struct Streams {
-    sessions: SessionServiceClient<Channel>,
-    session_id: String,
-    stage: Arc<Stage>,
-    tasks: JoinSet<()>,
-}
-
-/// The life of a user.
-async fn visit(world: Arc<World>, user: User) {
-    let begun = Instant::now();
-    let starting = tokio::time::timeout(SERVER_TIMEOUT, start(&world, &user)).await;
-    let silent = || Error::Connection("the server is silent".to_owned());
-    let mut streams = match starting.map_err(|_| silent()).and_then(|started| started) {
-        Ok(streams) => streams,
-        Err(error) => {
-            let mut tally = lock(&world.tally);
-            *tally.turned_away.entry(reason(&error)).or_default() += 1;
-            tally.first_break.get_or_insert(error.to_string());
-            return;
-        }
-    };
-    #[allow(clippy::cast_possible_truncation)]
-    lock(&world.tally).start_ns.saturating_record(begun.elapsed().as_nanos() as u64);
-    world.counts.here.fetch_add(1, Ordering::Relaxed);
-    streams.stage.measure();
-    let mut over = world.over.clone();
-    tokio::select! {
-        () = tokio::time::sleep(Duration::from_secs_f64(user.stays_s)) => {}
-        _ = over.wait_for(|over| *over) => {}
-    }
-    #[allow(clippy::cast_possible_truncation)]
-    streams.stage.drain(world.clock.elapsed().as_nanos() as u64);
-    while streams.tasks.join_next().await.is_some() {}
-    world.counts.here.fetch_sub(1, Ordering::Relaxed);
-    world.counts.left.fetch_add(1, Ordering::Relaxed);
-    let request = pb::DeleteSessionRequest { session_id: streams.session_id };
-    let _ = tokio::time::timeout(SERVER_TIMEOUT, streams.sessions.delete_session(request)).await;
-}
-
-/// Makes a session, and opens the streams of its hand and viewers.
-async fn start(world: &World, user: &User) -> Result<Streams, Error> {
-    let server = &world.servers[user.wire];
-    let channel = server.connect().await?;
-    let mut sessions = SessionServiceClient::new(channel.clone());
-    let source = Some(world.sources[user.scene].clone());
-    let request = pb::CreateSessionRequest { source, paused: false, idle_timeout_s: Some(IDLE_S) };
-    let created = sessions.create_session(request).await?.into_inner().session.unwrap_or_default();
-    let session_id = created.session_id.clone();
-    // What stands for a network leads to one server only.
-    let home = match world.plan.wires[user.wire].what.conditions {
-        None => fleet::home(server, &created)?,
-        Some(_) => server.clone(),
-    };
-    let channel = if home.url() == server.url() { channel } else { home.connect().await? };
-    let mut sessions = SessionServiceClient::new(channel.clone());
-    let opened = open(world, user, &home, &created, channel).await;
-    match opened {
-        Ok((stage, tasks)) => Ok(Streams { sessions, session_id, stage, tasks }),
-        Err(error) => {
-            let _ = sessions.delete_session(pb::DeleteSessionRequest { session_id }).await;
-            Err(error)
-        }
-    }
-}
-
-async fn open(
-    world: &World,
-    user: &User,
-    server: &Server,
-    created: &pb::Session,
-    channel: Channel,
-) -> Result<(Arc<Stage>, JoinSet<()>), Error> {
-    let World { plan, clock, tally, phases, .. } = world;
-    let touches = match &plan.movers[user.mover].what {
-        Mover::Push => None,
-        Mover::Hand { hand, device, deadbands } => {
-            Some(Lead { deadbands: *deadbands, device: *device, hand: Some((*hand, user.seed)) })
-        }
-    };
-    let stage = Arc::new(Stage::new());
-    let common = Common { clock: *clock, stage: stage.clone(), tally: tally.clone(), rate_hz: plan.rate_hz, touches };
-    let rate_hz = rate_hz(created);
-    let Viewers { number, rate_hz: frames_hz } = plan.viewers[user.viewers].what;
-    let arrivals = (number > 0).then(|| Arc::new(Mutex::new(Arrivals::new())));
-    #[allow(clippy::cast_precision_loss)]
-    let turn = 0.618 * user.seed as f64;
-    let client = Client {
-        common: common.clone(),
-        session_id: created.session_id.clone(),
-        tool: 0,
-        rate_hz,
-        stroke: Stroke::new(created, turn.fract()),
-        middle_m: middle_m(created),
-        arrivals: arrivals.clone(),
-    };
-    #[allow(clippy::cast_possible_truncation)]
-    let ticks = phases[user.seed as usize % phases.len()].clone();
-    let mut tasks = JoinSet::new();
-    tasks.spawn(client.open(channel, ticks).await?);
-    for _ in 0..number {
-        // A connection of its own: on a shared one, frames would delay samples.
-        let (channel, id) = (server.connect().await?, created.session_id.clone());
-        tasks.spawn(view(common.clone(), channel, id, frames_hz.min(rate_hz), arrivals.clone()).await?);
-    }
-    Ok((stage, tasks))
+/// Processor time of this process, s; `None` without a /proc.
+fn cpu_s() -> Option<f64> {
+    let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
+    let ticks = stat[stat.rfind(')')? + 2..].split_whitespace().skip(11).take(2);
+    // Linux counts ticks of 10 ms here.
+    ticks.map(|field| field.parse::<f64>().ok()).sum::<Option<f64>>().map(|ticks| ticks / 100.0)
 }

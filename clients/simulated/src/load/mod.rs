@@ -1,17 +1,19 @@
 //! Loads of a server: sessions, users with tools, and viewers, and how it copes.
 //!
-//! A [`LoadTrial`] has a number of sessions that stay; by a [`LoadPlan`], users arrive, stay and leave in phases.
+//! By a [`LoadPlan`], users arrive, stay and leave in phases. A [`LoadTrial`] is a plan of one phase, to whose end all stay.
 
 mod client;
+mod connections;
 mod course;
 mod objective;
 mod plan;
 mod report;
 mod stroke;
-mod swarm;
 mod tally;
 mod tip;
 mod trial;
+mod user;
+mod viewer;
 
 pub use course::PreparedPlan;
 pub use objective::Objective;
@@ -19,19 +21,19 @@ pub use plan::LoadPlan;
 pub use report::{LoadReport, Second};
 pub use tally::LoadOutcome;
 pub use tip::Deadbands;
-pub use trial::{LoadTrial, TrialProgress, trial};
+pub use trial::LoadTrial;
 
 use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
 /// Clients send at this many moments of a period: not all at once, and without a wake-up for each.
-const PHASES: usize = 4;
+const TURNS: usize = 4;
 
-/// Tells each phase in turn that its clients are to send: by the clock, independent of the answers.
+/// Tells the clients of each turn that they are to send: by the clock, independent of the answers.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-fn tick(phases: &[watch::Sender<u64>], rate_hz: f64, over: &watch::Receiver<()>) {
-    let (begun, apart_s) = (Instant::now(), 1.0 / (rate_hz * phases.len() as f64));
+fn tick(turns: &[watch::Sender<u64>], rate_hz: f64, over: &watch::Receiver<()>) {
+    let (begun, apart_s) = (Instant::now(), 1.0 / (rate_hz * turns.len() as f64));
     let mut tick: u64 = 0;
     while over.has_changed().is_ok() {
         let due = Duration::from_secs_f64(tick as f64 * apart_s);
@@ -41,11 +43,11 @@ fn tick(phases: &[watch::Sender<u64>], rate_hz: f64, over: &watch::Receiver<()>)
                 continue;
             }
         }
-        // Ticks that are overdue by more than a turn are skipped, not caught up; clients count them.
-        let count = phases.len() as u64;
+        // Ticks that are overdue by more than a period are skipped, not caught up; clients count them.
+        let count = turns.len() as u64;
         let behind = ((begun.elapsed().as_secs_f64() / apart_s) as u64).saturating_sub(tick) / count * count;
         tick += behind;
-        phases[(tick % count) as usize].send_replace(tick / count + 1);
+        turns[(tick % count) as usize].send_replace(tick / count + 1);
         tick += 1;
     }
 }

@@ -10,7 +10,7 @@ use palpate_tissue::files::read_text;
 use palpate_tissue::scene::toml_document::{Document, Fields, Item};
 
 use super::objective::Objective;
-use super::tip::Deadbands;
+use super::tip::{Deadbands, Lead, default_device};
 use crate::network::Conditions;
 use crate::random::Random;
 
@@ -20,6 +20,9 @@ const MAX_BYTES: u64 = 1 << 20;
 /// Most users of a plan, in all.
 const MAX_USERS: usize = 10_000;
 
+/// How long a user stays who is not told, s: longer than any trial.
+pub(crate) const STAYS_S: f64 = 86_400.0;
+
 /// Most entries of a list.
 const MAX_ENTRIES: usize = 64;
 
@@ -28,6 +31,11 @@ const MAX_ENTRIES: usize = 64;
 pub(crate) struct Share<T> {
     share: f64,
     pub(crate) what: T,
+}
+
+/// A list of one thing, which everybody takes.
+pub(crate) fn only<T>(what: T) -> Vec<Share<T>> {
+    vec![Share { share: 1.0, what }]
 }
 
 /// The index of one of several parts, by their shares.
@@ -41,21 +49,18 @@ fn draw<T>(parts: &[Share<T>], random: &mut Random) -> usize {
     found.or_else(|| parts.iter().rposition(|part| part.share > 0.0)).unwrap_or(0)
 }
 
-/// What moves a tool.
-#[derive(Debug, Clone)]
-pub(crate) enum Mover {
-    /// Forces on the tissue, along a stroke.
-    Push,
-    /// A simulated device in a simulated hand, which feels the tissue.
-    Hand { hand: Hand, device: Device, deadbands: Deadbands },
-}
-
 /// A network between users and the server.
 #[derive(Debug, Clone)]
 pub(crate) struct Wire {
     pub(crate) name: String,
     /// `None`: the server as it is reached.
     pub(crate) conditions: Option<Conditions>,
+}
+
+impl Wire {
+    pub(crate) fn direct() -> Self {
+        Wire { name: "direct".to_owned(), conditions: None }
+    }
 }
 
 /// Who watches a session.
@@ -74,6 +79,9 @@ pub(crate) enum Arrivals {
     Poisson(f64),
     /// So many at once.
     Spike(u32),
+    /// So many, at even distances, before the clock of the plan begins: it waits until all are connected. A refusal of one
+    /// ends the load.
+    Gathering { users: u32, over_s: f64 },
     /// None: those who are there stay.
     None,
 }
@@ -85,7 +93,7 @@ pub(crate) struct Phase {
     pub(crate) seconds: f64,
     pub(crate) arrivals: Arrivals,
     /// How long a user stays; with random arrivals on average.
-    stays_s: f64,
+    pub(crate) stays_s: f64,
     pub(crate) objective: Option<Objective>,
 }
 
@@ -108,11 +116,18 @@ pub(crate) struct Phase {
 #[derive(Debug, Clone)]
 pub struct LoadPlan {
     pub(crate) name: String,
-    seed: u64,
-    /// Commands a second of each hand.
+    pub(crate) seed: u64,
+    /// Commands a second of each client.
     pub(crate) rate_hz: f64,
+    /// Clients of each user, with one tool each. With 0, commands sent beforehand keep the session awake.
+    pub(crate) clients_per_user: u32,
+    /// Clients that share a connection.
+    pub(crate) clients_per_connection: u32,
+    /// Threads of this generator.
+    pub(crate) threads: u32,
     pub(crate) scenes: Vec<Share<String>>,
-    pub(crate) movers: Vec<Share<Mover>>,
+    /// What leads the tools; `None`: forces push the tissue along a stroke.
+    pub(crate) leads: Vec<Share<Option<Lead>>>,
     pub(crate) wires: Vec<Share<Wire>>,
     pub(crate) viewers: Vec<Share<Viewers>>,
     pub(crate) phases: Vec<Phase>,
@@ -120,7 +135,7 @@ pub struct LoadPlan {
     pub(crate) objective: Option<Objective>,
 }
 
-/// One user: a session of its own, with a tool, and perhaps viewers.
+/// One user: a session of its own, with its clients and viewers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct User {
     /// Since the plan began, s.
@@ -128,7 +143,7 @@ pub(crate) struct User {
     pub(crate) stays_s: f64,
     // Indices in the lists of the plan.
     pub(crate) scene: usize,
-    pub(crate) mover: usize,
+    pub(crate) lead: usize,
     pub(crate) wire: usize,
     pub(crate) viewers: usize,
     /// Of its hand.
@@ -166,38 +181,47 @@ impl LoadPlan {
         self.phases.iter().map(|phase| phase.seconds).sum()
     }
 
+    /// The time over which users arrive before the clock begins, s; `None` if it waits for nobody.
+    pub(crate) fn gathers_over_s(&self) -> Option<f64> {
+        self.phases.iter().find_map(|phase| match phase.arrivals {
+            Arrivals::Gathering { over_s, .. } => Some(over_s),
+            _ => None,
+        })
+    }
+
     /// All users, by arrival: the same for the same plan. At most one more than [`MAX_USERS`].
     pub(crate) fn users(&self) -> Vec<User> {
         let (mut times, mut mix) = (Random::new(self.seed, 1), Random::new(self.seed, 2));
         let (mut users, mut from_s) = (Vec::new(), 0.0);
         for phase in &self.phases {
-            let mut moments = Vec::new();
-            let mut at_s = 0.0;
-            while at_s < phase.seconds && users.len() + moments.len() <= MAX_USERS {
-                match phase.arrivals {
-                    Arrivals::Steady(rate) => {
-                        moments.push((at_s, phase.stays_s));
-                        at_s += 1.0 / rate;
-                    }
-                    Arrivals::Poisson(rate) => {
-                        let waits = |random: &mut Random| -(1.0 - random.between(0.0, 1.0)).ln();
-                        at_s += waits(&mut times) / rate;
-                        if at_s < phase.seconds {
-                            moments.push((at_s, phase.stays_s * waits(&mut times)));
-                        }
-                    }
-                    Arrivals::Spike(number) => {
-                        moments = vec![(0.0, phase.stays_s); number as usize];
-                        break;
-                    }
-                    Arrivals::None => break,
+            let (seconds, stays_s, mut at_s) = (phase.seconds, phase.stays_s, 0.0);
+            let room = (MAX_USERS + 1).saturating_sub(users.len());
+            let moments: Vec<(f64, f64)> = match phase.arrivals {
+                Arrivals::Steady(rate) => std::iter::from_fn(|| {
+                    let moment = (at_s, stays_s);
+                    at_s += 1.0 / rate;
+                    (moment.0 < seconds).then_some(moment)
+                })
+                .take(room)
+                .collect(),
+                Arrivals::Poisson(rate) => std::iter::from_fn(|| {
+                    let mut waits = || -(1.0 - times.between(0.0, 1.0)).ln();
+                    at_s += waits() / rate;
+                    (at_s < seconds).then(|| (at_s, stays_s * waits()))
+                })
+                .take(room)
+                .collect(),
+                Arrivals::Spike(number) => vec![(0.0, stays_s); number as usize],
+                Arrivals::Gathering { users, over_s } => {
+                    (0..users).map(|user| (over_s * f64::from(user) / f64::from(users), stays_s)).collect()
                 }
-            }
+                Arrivals::None => Vec::new(),
+            };
             for (at_s, stays_s) in moments {
                 let (at_s, seed) = (from_s + at_s, self.seed.wrapping_add(users.len() as u64));
-                let (scene, mover) = (draw(&self.scenes, &mut mix), draw(&self.movers, &mut mix));
+                let (scene, lead) = (draw(&self.scenes, &mut mix), draw(&self.leads, &mut mix));
                 let (wire, viewers) = (draw(&self.wires, &mut mix), draw(&self.viewers, &mut mix));
-                users.push(User { at_s, stays_s, scene, mover, wire, viewers, seed });
+                users.push(User { at_s, stays_s, scene, lead, wire, viewers, seed });
             }
             from_s += phase.seconds;
         }
@@ -237,7 +261,7 @@ fn parts<T>(
     instead: T,
     read: impl Fn(&mut Fields<'_>) -> Result<T>,
 ) -> Result<Vec<Share<T>>> {
-    let Some(item) = fields.item(key) else { return Ok(vec![Share { share: 1.0, what: instead }]) };
+    let Some(item) = fields.item(key) else { return Ok(only(instead)) };
     let tables = item.tables()?;
     if tables.len() > MAX_ENTRIES {
         return Err(item.refuse(Reason::TooLarge, format!("has more than {MAX_ENTRIES} entries")));
@@ -255,9 +279,8 @@ fn plan(fields: &mut Fields<'_>) -> Result<LoadPlan> {
     let seed = fields.item("seed").map_or(Ok(1), |item| item.whole())?;
     let rate_hz = within(fields, "rate_hz", "from 1 to 4000", 1.0, 4000.0)?.unwrap_or(1000.0);
     let scenes = parts(fields, "scene", "liver".to_owned(), |fields| fields.required("name")?.text())?;
-    let movers = parts(fields, "hand", Mover::Push, mover)?;
-    let direct = Wire { name: "direct".to_owned(), conditions: None };
-    let wires = parts(fields, "network", direct, wire)?;
+    let leads = parts(fields, "hand", None, lead)?;
+    let wires = parts(fields, "network", Wire::direct(), wire)?;
     let viewers = parts(fields, "viewers", Viewers { number: 0, rate_hz: 60.0 }, |fields| {
         let number = count(&fields.required("number")?, 16)?;
         let rate_hz = within(fields, "rate_hz", "from 0.1 to 1000", 0.1, 1000.0)?.unwrap_or(60.0);
@@ -271,7 +294,21 @@ fn plan(fields: &mut Fields<'_>) -> Result<LoadPlan> {
     }
     let phases = tables.iter().enumerate().map(|(index, table)| table.table(|fields| phase(fields, index)));
     let phases = phases.collect::<Result<Vec<_>>>()?;
-    Ok(LoadPlan { name, seed, rate_hz, scenes, movers, wires, viewers, phases, objective })
+    let (clients_per_user, clients_per_connection, threads) = (1, 1, 1);
+    Ok(LoadPlan {
+        name,
+        seed,
+        rate_hz,
+        clients_per_user,
+        clients_per_connection,
+        threads,
+        scenes,
+        leads,
+        wires,
+        viewers,
+        phases,
+        objective,
+    })
 }
 
 /// One of several names, quoted for people.
@@ -280,7 +317,7 @@ fn quoted<'n>(names: impl Iterator<Item = &'n str>) -> String {
     names.join(", ")
 }
 
-fn mover(fields: &mut Fields<'_>) -> Result<Mover> {
+fn lead(fields: &mut Fields<'_>) -> Result<Option<Lead>> {
     let item = fields.required("hand")?;
     let name = item.text()?;
     let hand = Hand::named(&name);
@@ -304,15 +341,11 @@ fn mover(fields: &mut Fields<'_>) -> Result<Mover> {
             Some((key, _)) => {
                 Err(fields.refuse(Reason::WrongKind, key, "is for a hand: this one pushes, and feels nothing"))
             }
-            None => Ok(Mover::Push),
+            None => Ok(None),
         };
     };
     let deadbands = Deadbands { down: down.unwrap_or(0.0), up: up.unwrap_or(0.0) };
-    Ok(Mover::Hand {
-        hand,
-        device: device.or_else(|| Device::named(super::tip::DEVICE)).unwrap_or(UNDECLARED),
-        deadbands,
-    })
+    Ok(Some(Lead { deadbands, device: device.unwrap_or_else(default_device), hand: Some(hand) }))
 }
 
 fn wire(fields: &mut Fields<'_>) -> Result<Wire> {
@@ -360,12 +393,12 @@ fn phase(fields: &mut Fields<'_>, index: usize) -> Result<Phase> {
     let useless = match arrivals {
         Arrivals::Steady(_) | Arrivals::Poisson(_) => users.map(|_| "users"),
         Arrivals::Spike(_) => rate.map(|_| "rate_per_s"),
-        Arrivals::None => users.map(|_| "users").or(rate.map(|_| "rate_per_s")),
+        Arrivals::None | Arrivals::Gathering { .. } => users.map(|_| "users").or(rate.map(|_| "rate_per_s")),
     };
     if let Some(key) = useless {
         return Err(fields.refuse(Reason::WrongKind, key, format!("has no meaning where arrivals are `{kind}`")));
     }
-    let stays_s = within(fields, "stays_s", "from 0.1 to 86400", 0.1, 86_400.0)?.unwrap_or(86_400.0);
+    let stays_s = within(fields, "stays_s", "from 0.1 to 86400", 0.1, 86_400.0)?.unwrap_or(STAYS_S);
     let objective = objective(fields)?;
     Ok(Phase { name, seconds, arrivals, stays_s, objective })
 }
@@ -433,8 +466,8 @@ seconds = 5
         // Three of four are in the first scene.
         let first = users.iter().filter(|user| user.scene == 0).count() as f64 / users.len() as f64;
         assert!((0.68..0.82).contains(&first), "{first}");
-        assert!(matches!(&plan.movers[1].what, Mover::Hand { hand, device, deadbands }
-            if hand.name == "firm" && device.name == "touch" && deadbands.down == 0.1));
+        let lead = plan.leads[1].what.unwrap();
+        assert_eq!((lead.hand.unwrap().name, lead.device.name, lead.deadbands.down), ("firm", "touch", 0.1));
         assert!(plan.wires[0].what.conditions.is_none());
         assert!((plan.wires[1].what.conditions.unwrap().round_trip_s - 0.04).abs() < 1e-12);
     }

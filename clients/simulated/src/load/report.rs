@@ -6,31 +6,40 @@ use std::fmt::Write;
 use serde_json::{Value, json};
 
 use super::objective::Objective;
-use super::plan::{LoadPlan, Mover, User};
+use super::plan::{LoadPlan, User};
 use super::tally::{LoadOutcome, Tally, listed};
 
 /// What was counted within a second.
 pub struct Second {
     /// Its end, since the plan began, s.
     pub(crate) at_s: f64,
+    /// Its length, s: the last of a plan may be shorter.
+    pub(crate) lasts_s: f64,
     /// Users at its end.
     pub(crate) users: u64,
-    pub(crate) arrived: u64,
-    pub(crate) left: u64,
     pub(crate) tally: Tally,
 }
 
 impl Second {
     /// Returns a line for people who watch.
     pub fn line(&self) -> String {
-        let outcome = outcome(&self.tally, 0);
+        format!("{}  turned away {}", self.figures("users"), away(&self.tally.turned_away))
+    }
+
+    /// Returns a line for people who watch a trial: who is turned away ends it.
+    pub fn trial_line(&self) -> String {
+        format!("{}  rejected {}", self.figures("sessions"), self.tally.rejected.values().sum::<u64>())
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn figures(&self, users: &str) -> String {
+        let round_trip_us = self.tally.outcome(self.users).round_trip_us;
         format!(
-            "{:.0} s  {} users  {} samples/s  round trip p99 {}  turned away {}",
+            "{:.0} s  {} {users}  {:.0} samples/s  round trip p99 {}",
             self.at_s,
             self.users,
-            self.tally.samples,
-            milliseconds(outcome.round_trip_us.p99),
-            away(&self.tally.turned_away),
+            self.tally.samples as f64 / self.lasts_s,
+            milliseconds(round_trip_us.p99),
         )
     }
 }
@@ -48,8 +57,6 @@ struct Stretch {
     from_s: f64,
     to_s: f64,
     objective: Option<Objective>,
-    arrived: u64,
-    left: u64,
     most_users: u64,
     tally: Tally,
 }
@@ -63,6 +70,8 @@ pub struct LoadReport {
     /// How many users were made of what.
     mix: Value,
     pub(crate) is_interrupted: bool,
+    /// Processor time of this generator per second, cores.
+    pub(crate) generator_cores: f64,
 }
 
 /// Users that were turned away, by reason, for people.
@@ -74,13 +83,12 @@ fn away(reasons: &BTreeMap<String, u64>) -> String {
 fn mix(plan: &LoadPlan, users: &[User]) -> Value {
     let mut counts: [BTreeMap<String, u64>; 4] = Default::default();
     for user in users {
-        let mover = match &plan.movers[user.mover].what {
-            Mover::Push => "push".to_owned(),
-            Mover::Hand { hand, device, .. } => format!("{} {}", hand.name, device.name),
-        };
+        let hand = plan.leads[user.lead].what.map_or("push".to_owned(), |lead| {
+            format!("{} {}", lead.hand.map_or("stroke", |hand| hand.name), lead.device.name)
+        });
         let names = [
             plan.scenes[user.scene].what.clone(),
-            mover,
+            hand,
             plan.wires[user.wire].what.name.clone(),
             plan.viewers[user.viewers].what.number.to_string(),
         ];
@@ -96,7 +104,7 @@ fn mix(plan: &LoadPlan, users: &[User]) -> Value {
 fn outcome(tally: &Tally, users: u64) -> LoadOutcome {
     let dilation = tally.dilation_s_min;
     let dilation_min = if dilation.is_finite() { dilation } else { f64::NAN };
-    LoadOutcome { dilation_min, ..tally.outcome(usize::try_from(users).unwrap_or(usize::MAX)) }
+    LoadOutcome { dilation_min, ..tally.outcome(users) }
 }
 
 fn milliseconds(us: f64) -> String {
@@ -106,7 +114,7 @@ fn milliseconds(us: f64) -> String {
 impl Stretch {
     fn new(name: &str, from_s: f64, to_s: f64, objective: Option<Objective>) -> Self {
         let name = name.to_owned();
-        Stretch { name, from_s, to_s, objective, arrived: 0, left: 0, most_users: 0, tally: Tally::new() }
+        Stretch { name, from_s, to_s, objective, most_users: 0, tally: Tally::new() }
     }
 
     fn outcome(&self) -> LoadOutcome {
@@ -124,15 +132,15 @@ impl Stretch {
         let outcome = self.outcome();
         let mut told = outcome.json(None);
         if let Some(told) = told.as_object_mut() {
-            // These are of a load without a plan.
+            // These are of trials.
             told.remove("sessions");
             told.remove("generator_cores");
             for (key, value) in [
                 ("name", json!(self.name)),
                 ("from_s", json!(self.from_s)),
                 ("to_s", json!(self.to_s)),
-                ("users_arrived", json!(self.arrived)),
-                ("users_left", json!(self.left)),
+                ("users_arrived", json!(self.tally.arrived)),
+                ("users_left", json!(self.tally.left)),
                 ("users_most", json!(self.most_users)),
                 ("turned_away", json!(self.tally.turned_away)),
                 ("start_us", outcome.start_us.json()),
@@ -164,20 +172,19 @@ impl LoadReport {
             whole,
             mix: mix(plan, users),
             is_interrupted: false,
+            generator_cores: f64::NAN,
         }
     }
 
     /// Adds a second to the phase in which it ended.
     pub(crate) fn add(&mut self, second: Second) {
-        let Second { at_s, users, arrived, left, tally } = second;
+        let Second { at_s, users, tally, .. } = second;
         self.points.push(Point { at_s, users, outcome: outcome(&tally, users) });
         let phase = self.phases.iter().position(|phase| at_s <= phase.to_s + 1e-9);
         let last = self.phases.len().saturating_sub(1);
         let mut stretches = vec![&mut self.whole];
         stretches.extend(self.phases.get_mut(phase.unwrap_or(last)));
         for stretch in stretches {
-            stretch.arrived += arrived;
-            stretch.left += left;
             stretch.most_users = stretch.most_users.max(users);
             stretch.tally.add(&tally);
         }
@@ -185,6 +192,12 @@ impl LoadReport {
 
     fn stretches(&self) -> impl Iterator<Item = &Stretch> {
         self.phases.iter().chain([&self.whole])
+    }
+
+    /// Returns the summary of a trial: its dilation is that of whole stays, where those of phases are of the worst second.
+    pub fn outcome(&self) -> LoadOutcome {
+        let tally = &self.whole.tally;
+        LoadOutcome { generator_cores: self.generator_cores, ..tally.outcome(tally.arrived) }
     }
 
     /// Returns why the load failed; `None` if it did not.
@@ -195,7 +208,7 @@ impl LoadReport {
         }
         let first = |instead: &str| self.whole.tally.first_break.clone().unwrap_or_else(|| instead.to_owned());
         let mut whys = Vec::new();
-        if self.whole.arrived > 0 && whole.samples == 0 {
+        if self.whole.tally.arrived > 0 && whole.samples == 0 {
             whys.push(format!("no user could touch: {}", first("no sample arrived")));
         }
         for stretch in self.stretches() {
@@ -242,7 +255,7 @@ impl LoadReport {
             format!(
                 "{name:<18}  {:>5}  {:>7}  {:>11}  {:>24}  {:>11}  {:>9.5}   {}\n",
                 stretch.most_users,
-                stretch.arrived,
+                stretch.tally.arrived,
                 outcome.turned_away,
                 format!("{} / {}", milliseconds(outcome.round_trip_us.p50), milliseconds(outcome.round_trip_us.p99)),
                 milliseconds(outcome.start_us.p99),
@@ -401,7 +414,7 @@ fn page(report: &LoadReport) -> String {
                 stretch.from_s,
                 stretch.to_s,
                 stretch.most_users,
-                stretch.arrived,
+                stretch.tally.arrived,
                 outcome.turned_away,
                 escaped(&outcome.round_trip_us.text()),
                 milliseconds(outcome.start_us.p99),

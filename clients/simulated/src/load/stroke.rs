@@ -31,7 +31,7 @@ const VERTICES_PER_TURN: f64 = 20.0;
 
 impl Stroke {
     /// A stroke over a session's tissue as the server tells it, with all fields.
-    pub(crate) fn new(session: &pb::Session, begin: f64) -> Self {
+    pub(crate) fn new(session: &pb::Session) -> Self {
         let scene = session.scene.clone().unwrap_or_default();
         let (over, spacing_m) = match scene.sheet {
             Some(sheet) => {
@@ -56,7 +56,7 @@ impl Stroke {
             force_n: 0.3 * stiffness_n_per_m * spacing_m,
             depth_m: 0.3 * spacing_m,
             falloff_per_m: 4.0 / spacing_m,
-            begin,
+            begin: 0.0,
         }
     }
 

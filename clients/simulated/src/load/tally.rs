@@ -33,9 +33,12 @@ pub(crate) struct Tally {
     pub(crate) dilation_min: f64,
     /// Smallest dilation of a session within a second.
     pub(crate) dilation_s_min: f64,
-    /// From the arrival of a user of a plan until the streams are open.
+    /// Users that arrived, and those that left after they had started.
+    pub(crate) arrived: u64,
+    pub(crate) left: u64,
+    /// From the arrival of a user until the streams are open.
     pub(crate) start_ns: Histogram<u64>,
-    /// Users of a plan that could not start, by reason.
+    /// Users that could not start, by reason.
     pub(crate) turned_away: BTreeMap<String, u64>,
     /// Number of streams that broke.
     pub(crate) broken: u64,
@@ -61,6 +64,8 @@ impl Tally {
             awake_points: 0,
             dilation_min: f64::INFINITY,
             dilation_s_min: f64::INFINITY,
+            arrived: 0,
+            left: 0,
             start_ns: histogram(),
             turned_away: BTreeMap::new(),
             broken: 0,
@@ -90,6 +95,8 @@ impl Tally {
         self.awake_points += other.awake_points;
         self.dilation_min = self.dilation_min.min(other.dilation_min);
         self.dilation_s_min = self.dilation_s_min.min(other.dilation_s_min);
+        self.arrived += other.arrived;
+        self.left += other.left;
         for (reason, count) in &other.turned_away {
             *self.turned_away.entry(reason.clone()).or_default() += count;
         }
@@ -104,7 +111,7 @@ impl Tally {
 
     /// Summary of the counts.
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn outcome(&self, sessions: usize) -> LoadOutcome {
+    pub(crate) fn outcome(&self, sessions: u64) -> LoadOutcome {
         LoadOutcome {
             sessions,
             samples: self.samples,
@@ -167,7 +174,7 @@ pub(crate) fn listed(reasons: &BTreeMap<String, u64>) -> String {
 /// Summary of one load.
 #[derive(Debug, Clone)]
 pub struct LoadOutcome {
-    pub(crate) sessions: usize,
+    pub(crate) sessions: u64,
     /// Samples that came.
     pub samples: u64,
     pub(crate) frames: u64,
@@ -187,7 +194,6 @@ pub struct LoadOutcome {
     pub(crate) round_trip_us: Quantiles,
     pub(crate) sample_gap_us: Quantiles,
     pub(crate) frame_age_us: Quantiles,
-    /// Of a plan alone.
     pub(crate) start_us: Quantiles,
     pub(crate) turned_away: u64,
     /// Why the first of the streams broke.
@@ -198,7 +204,7 @@ pub struct LoadOutcome {
 
 impl LoadOutcome {
     /// Returns it as one JSON object; what was not measured is `null`.
-    pub fn json(&self, limit_sessions: Option<usize>) -> Value {
+    pub fn json(&self, limit_sessions: Option<u32>) -> Value {
         let mut object = json!({
             "sessions": self.sessions,
             "samples": self.samples,
@@ -225,7 +231,7 @@ impl LoadOutcome {
     }
 
     /// Returns it as a table for a terminal.
-    pub fn table(&self, limit_sessions: Option<usize>) -> String {
+    pub fn table(&self, limit_sessions: Option<u32>) -> String {
         let mut rows = vec![
             ("sessions", self.sessions.to_string()),
             (

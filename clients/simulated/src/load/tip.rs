@@ -4,6 +4,7 @@
 use glam::DVec3;
 use palpate_haptics::dead_reckoning::News;
 use palpate_haptics::deadband::HEARTBEAT_S;
+use palpate_haptics::device::UNDECLARED;
 use palpate_haptics::hand::{Hand, HandState};
 use palpate_haptics::{Device, Envelope, Renderer, RenderingState, Tip};
 use palpate_proto::geometry::vector;
@@ -28,12 +29,14 @@ pub struct Deadbands {
 pub(crate) struct Lead {
     pub(crate) deadbands: Deadbands,
     pub(crate) device: Device,
-    /// The hand that holds the device, and the seed of its movements; `None`: the tool follows the stroke exactly.
-    pub(crate) hand: Option<(Hand, u64)>,
+    /// The hand that holds the device; `None`: the tool follows the stroke exactly.
+    pub(crate) hand: Option<Hand>,
 }
 
 /// The device of clients that are told of none.
-pub(crate) const DEVICE: &str = "omega3";
+pub(crate) fn default_device() -> Device {
+    Device::named("omega3").unwrap_or(UNDECLARED)
+}
 
 /// Scale of the depths of a hand's presses, and how long it has something to do, s.
 const SCALE: f64 = 0.2;
@@ -70,7 +73,7 @@ struct Holding {
 }
 
 impl Holding {
-    fn new((hand, seed): (Hand, u64), middle_m: DVec3) -> Self {
+    fn new(hand: Hand, seed: u64, middle_m: DVec3) -> Self {
         let task = Task::new(middle_m, LEAD_S, LASTS_S, SCALE, &mut Random::new(seed, 0));
         let held = HandState { place_m: task.start_m(), velocity_m_per_s: DVec3::ZERO };
         let never = f64::NEG_INFINITY;
@@ -102,11 +105,11 @@ pub(crate) struct LedTip {
 }
 
 impl LedTip {
-    /// Of a stream that was opened, on a tissue with this middle; `None` if the server tells no law.
-    pub(crate) fn new(opened: &pb::TouchOpened, lead: &Lead, middle_m: DVec3) -> Option<Self> {
+    /// Of a stream that was opened, on a tissue with this middle; a hand moves by its seed. `None` if the server tells no law.
+    pub(crate) fn new(opened: &pb::TouchOpened, lead: &Lead, seed: u64, middle_m: DVec3) -> Option<Self> {
         let law = touch::from_law(opened.law.as_ref()?).ok()?;
         let renderer = Renderer::new(law, Envelope::new(lead.device, middle_m));
-        let holding = lead.hand.map(|hand| Holding::new(hand, middle_m));
+        let holding = lead.hand.map(|hand| Holding::new(hand, seed, middle_m));
         Some(LedTip { up: lead.deadbands.up, renderer, news: News::default(), holding })
     }
 

@@ -56,7 +56,8 @@ pub(super) fn course(Disc { radius_m, at_m }: Disc, rows: u32) -> Course {
 ///
 /// ```
 /// use palpate_tissue::scene::PAPER;
-/// use palpate_tissue::{Model, force_law};
+/// use palpate_tissue::{Model};
+/// use palpate_tissue::response::force_law;
 ///
 /// let model = Model::parse("paper", PAPER, &["sheet.points=[9, 9]"])?;
 /// let law = force_law::exact(&model, 2.0 * model.shape().edge_m());

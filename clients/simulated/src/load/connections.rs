@@ -1,0 +1,43 @@
+//! Connections that the clients of a load share.
+
+use std::collections::BTreeMap;
+
+use palpate_client::{Channel, Error, Server};
+
+use super::plan::LoadPlan;
+
+/// What a connection is for. Frames have their own: on a shared one, they would delay samples.
+#[derive(Clone, Copy, PartialEq)]
+pub(crate) enum Purpose {
+    Call,
+    Touch,
+    View,
+}
+
+/// Connections, of which each bears so many streams.
+pub(crate) struct Connections {
+    most: u32,
+    /// By whether it is for frames, and by the server: the newest, and the streams on it.
+    newest: BTreeMap<(bool, String), (Channel, u32)>,
+}
+
+impl Connections {
+    pub(crate) fn new(plan: &LoadPlan) -> Self {
+        Connections { most: plan.clients_per_connection, newest: BTreeMap::new() }
+    }
+
+    /// A connection to a server, with room for the stream of a client or viewer; a call needs none.
+    pub(crate) async fn to(&mut self, server: &Server, purpose: Purpose) -> Result<Channel, Error> {
+        let streams = u32::from(purpose != Purpose::Call);
+        let key = (purpose == Purpose::View, server.url().to_owned());
+        if let Some((channel, borne)) = self.newest.get_mut(&key)
+            && *borne + streams <= self.most
+        {
+            *borne += streams;
+            return Ok(channel.clone());
+        }
+        let channel = server.connect().await?;
+        self.newest.insert(key, (channel.clone(), streams));
+        Ok(channel)
+    }
+}

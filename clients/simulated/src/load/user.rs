@@ -1,0 +1,272 @@
+//! One user of a load: a session of its own, with its clients and viewers, from its arrival to its end.
+
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use palpate_client::{Channel, Error, Server, describe, fleet};
+use palpate_proto::geometry::from_vector;
+use palpate_proto::pb;
+use pb::create_session_request::Source;
+use pb::haptic_service_client::HapticServiceClient;
+use pb::session_service_client::SessionServiceClient;
+use tokio::sync::watch;
+use tokio::task::JoinSet;
+use tonic::{Response, Status};
+
+use super::client::{Arrivals, Client, Common, Stage, lock};
+use super::connections::{Connections, Purpose};
+use super::plan::{LoadPlan, User, Viewers};
+use super::stroke::Stroke;
+use super::tally::Tally;
+use super::viewer::view;
+
+/// How long a user waits for the server before going away again.
+const SERVER_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// The server deletes a session that nobody uses for so long, if this program dies, s.
+const IDLE_S: f64 = 10.0;
+
+/// Strokes begin at so many places.
+const MAX_PLACES: u64 = 1 << 16;
+
+/// What all users of a thread share.
+pub(crate) struct World {
+    pub(crate) plan: Arc<LoadPlan>,
+    /// By the plan's networks.
+    pub(crate) servers: Arc<[Server]>,
+    /// By the plan's scenes.
+    pub(crate) sources: Arc<[Source]>,
+    pub(crate) clock: Instant,
+    pub(crate) tally: Arc<Mutex<Tally>>,
+    /// The ticks of each turn, at which clients send.
+    pub(crate) turns: Vec<watch::Receiver<u64>>,
+    /// The stage of the whole load.
+    pub(crate) stages: watch::Receiver<u8>,
+    /// Held by who asks for a step: the time of an answer that waits behind others would not be that of its step.
+    pub(crate) asking: tokio::sync::Mutex<()>,
+}
+
+/// A user that is there.
+pub(crate) struct Guest {
+    /// The server that has made the session: of a fleet, any.
+    server: Server,
+    channel: Channel,
+    session_id: String,
+    rate_hz: f64,
+    stage: Arc<Stage>,
+    /// Its clients and viewers.
+    streams: JoinSet<()>,
+}
+
+/// Why a user could not start: the server's reason, or the code of a call, or what else it was.
+fn reason(error: &Error) -> String {
+    match error {
+        Error::Call(status) => {
+            let said = describe(status);
+            let last = said.rsplit_once('(').and_then(|parts| parts.1.strip_suffix(')'));
+            last.map_or_else(|| format!("{:?}", status.code()), str::to_owned)
+        }
+        _ => "UNREACHABLE".to_owned(),
+    }
+}
+
+fn silent() -> Error {
+    Error::Connection("the server is silent".to_owned())
+}
+
+/// The life of a user that comes by itself, and goes away again if it is not let in.
+pub(crate) async fn visit(world: Arc<World>, user: User) {
+    let mut connections = Connections::new(&world.plan);
+    let arriving = tokio::time::timeout(SERVER_TIMEOUT, Guest::arrive(&world, &user, &mut connections)).await;
+    match arriving.map_err(|_| silent()).and_then(|arrived| arrived) {
+        Ok(guest) => guest.stay(&world, user.stays_s).await,
+        Err(error) => {
+            let mut tally = lock(&world.tally);
+            *tally.turned_away.entry(reason(&error)).or_default() += 1;
+            tally.first_break.get_or_insert(error.to_string());
+        }
+    }
+}
+
+impl Guest {
+    /// Makes a session, and opens the streams of its clients and viewers.
+    pub(crate) async fn arrive(world: &World, user: &User, connections: &mut Connections) -> Result<Self, Error> {
+        let begun = Instant::now();
+        let server = &world.servers[user.wire];
+        let source = Some(world.sources[user.scene].clone());
+        let request = pb::CreateSessionRequest { source, paused: false, idle_timeout_s: Some(IDLE_S) };
+        let mut sessions = SessionServiceClient::new(connections.to(server, Purpose::Call).await?);
+        let created = sessions.create_session(request).await?.into_inner().session.unwrap_or_default();
+        // What stands for a network leads to one server only.
+        let server = match world.plan.wires[user.wire].what.conditions {
+            None => fleet::home(server, &created)?,
+            Some(_) => server.clone(),
+        };
+        let stepping = created.scene.as_ref().and_then(|scene| scene.stepping.as_ref());
+        let mut guest = Guest {
+            channel: connections.to(&server, Purpose::Call).await?,
+            server,
+            session_id: created.session_id.clone(),
+            rate_hz: stepping.and_then(|stepping| stepping.rate_hz).unwrap_or(1000.0),
+            stage: Arc::new(Stage::new()),
+            streams: JoinSet::new(),
+        };
+        if let Err(error) = guest.open(world, user, &created, connections).await {
+            guest.leave().await;
+            return Err(error);
+        }
+        #[allow(clippy::cast_possible_truncation)]
+        lock(&world.tally).start_ns.saturating_record(begun.elapsed().as_nanos() as u64);
+        Ok(guest)
+    }
+
+    async fn open(
+        &mut self,
+        world: &World,
+        user: &User,
+        created: &pb::Session,
+        connections: &mut Connections,
+    ) -> Result<(), Error> {
+        let World { plan, clock, tally, turns, .. } = world;
+        let common = Common {
+            clock: *clock,
+            stage: self.stage.clone(),
+            tally: tally.clone(),
+            rate_hz: plan.rate_hz,
+            touches: plan.leads[user.lead].what,
+        };
+        let Viewers { number, rate_hz: frames_hz } = plan.viewers[user.viewers].what;
+        let arrivals = (number > 0).then(|| Arc::new(Mutex::new(Arrivals::new())));
+        let whole = Stroke::new(created);
+        for tool in 0..plan.clients_per_user {
+            let place = user.seed.wrapping_add(u64::from(tool)) % MAX_PLACES;
+            #[allow(clippy::cast_precision_loss)]
+            let client = Client {
+                common: common.clone(),
+                session_id: self.session_id.clone(),
+                tool,
+                rate_hz: self.rate_hz,
+                stroke: whole.beginning(0.618 * place as f64),
+                seed: user.seed,
+                middle_m: from_vector(created.extent.as_ref().and_then(|extent| extent.middle_m.as_ref())),
+                arrivals: arrivals.clone(),
+            };
+            #[allow(clippy::cast_possible_truncation)]
+            let ticks = turns[place as usize % turns.len()].clone();
+            self.streams.spawn(client.open(connections.to(&self.server, Purpose::Touch).await?, ticks).await?);
+        }
+        if plan.clients_per_user == 0 {
+            self.keep_awake(plan, whole, created.step).await?;
+        }
+        for _ in 0..number {
+            let channel = connections.to(&self.server, Purpose::View).await?;
+            let (id, frames_hz) = (self.session_id.clone(), frames_hz.min(self.rate_hz));
+            self.streams.spawn(view(common.clone(), channel, id, frames_hz, arrivals.clone()).await?);
+        }
+        Ok(())
+    }
+
+    /// Sends a session without clients all its commands in advance, in one call: a new force every [`APART_S`], so that the
+    /// tissue never comes to rest.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    async fn keep_awake(&self, plan: &LoadPlan, stroke: Stroke, step: u64) -> Result<(), Error> {
+        /// Fewer than a session queues.
+        const MAX_COMMANDS: u64 = 4000;
+        const APART_S: f64 = 0.05;
+        let rate_hz = self.rate_hz;
+        let lasts_s = (plan.gathers_over_s().unwrap_or(0.0) + plan.lasts_s() + 30.0).min(600.0);
+        let steps = (lasts_s * rate_hz) as u64;
+        let apart = ((APART_S * rate_hz) as u64).max(steps / MAX_COMMANDS).max(1);
+        let mut haptics = HapticServiceClient::new(self.channel.clone());
+        let acquire = pb::AcquireToolRequest {
+            session_id: self.session_id.clone(),
+            tool: 0,
+            lease_s: Some(lasts_s),
+            holder: "palpate-client load".to_owned(),
+            // Nothing is said until the commands have acted, and silent connections are closed.
+            outlives_connection: true,
+        };
+        let lease_id = haptics.acquire_tool(acquire).await?.into_inner().lease_id;
+        let command = |index: u64| {
+            let at_step = step + index * apart;
+            let action = Some(stroke.at(at_step as f64 / rate_hz));
+            pb::Command { at_step: Some(at_step), sequence: Some(index + 1), action, ..Default::default() }
+        };
+        let commands = (0..steps.div_ceil(apart)).map(command).collect();
+        let session_id = self.session_id.clone();
+        haptics.send_commands(pb::SendCommandsRequest { session_id, lease_id, commands }).await?;
+        Ok(())
+    }
+
+    /// Stays until all are to leave, for a time at most, and as long as a stream is left; then leaves.
+    pub(crate) async fn stay(mut self, world: &World, stays_s: f64) {
+        let mut stages = world.stages.clone();
+        let _ = stages.wait_for(|stage| *stage != Stage::RAMP).await;
+        self.stage.measure();
+        let has_clients = world.plan.clients_per_user > 0;
+        let begin = if has_clients { None } else { self.ask(world).await };
+        let has_streams = !self.streams.is_empty();
+        tokio::select! {
+            () = tokio::time::sleep(Duration::from_secs_f64(stays_s)) => {}
+            _ = stages.wait_for(|stage| *stage == Stage::DRAIN) => {}
+            () = async { while self.streams.join_next().await.is_some() {} }, if has_streams => {}
+        }
+        #[allow(clippy::cast_possible_truncation)]
+        self.stage.drain(world.clock.elapsed().as_nanos() as u64);
+        if let Some((from_ns, from)) = begin
+            && let Some((to_ns, to)) = self.ask(world).await
+        {
+            #[allow(clippy::cast_precision_loss)]
+            let (simulated_s, real_s) =
+                (to.step.saturating_sub(from.step) as f64 / self.rate_hz, (to_ns - from_ns) as f64 * 1e-9);
+            let mut tally = lock(&world.tally);
+            tally.dilation_min = tally.dilation_min.min(simulated_s / real_s);
+            if to.resting {
+                tally.broke("a session came to rest although it was to be kept awake".to_owned());
+            }
+        }
+        while self.streams.join_next().await.is_some() {}
+        lock(&world.tally).left += 1;
+        self.leave().await;
+    }
+
+    /// The session as the server tells it, and when, ns: how far one without clients is, nothing else tells.
+    async fn ask(&self, world: &World) -> Option<(u64, pb::Session)> {
+        let _turn = world.asking.lock().await;
+        let request = pb::GetSessionRequest { session_id: self.session_id.clone() };
+        let answer = self.call(|mut sessions| {
+            let request = request.clone();
+            async move { sessions.get_session(request).await }
+        });
+        match answer.await {
+            #[allow(clippy::cast_possible_truncation)]
+            Ok(answer) => Some((world.clock.elapsed().as_nanos() as u64, answer.session.unwrap_or_default())),
+            Err(error) => {
+                lock(&world.tally).broke(error.to_string());
+                None
+            }
+        }
+    }
+
+    /// Deletes the session; if the server is gone, it is gone with it.
+    async fn leave(&mut self) {
+        self.streams.abort_all();
+        let request = pb::DeleteSessionRequest { session_id: self.session_id.clone() };
+        let deleted = self.call(|mut sessions| {
+            let request = request.clone();
+            async move { sessions.delete_session(request).await }
+        });
+        let _ = deleted.await;
+    }
+
+    /// Calls whichever server has the session by now.
+    async fn call<T, F>(&self, call: impl Fn(SessionServiceClient<Channel>) -> F) -> Result<T, Error>
+    where
+        F: Future<Output = Result<Response<T>, Status>>,
+    {
+        let called =
+            fleet::follow_from(&self.server, self.channel.clone(), |channel| call(SessionServiceClient::new(channel)));
+        let called = tokio::time::timeout(SERVER_TIMEOUT, called).await;
+        called.map_err(|_| silent())?.map(|at| at.answer.into_inner())
+    }
+}
