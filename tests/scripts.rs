@@ -16,7 +16,7 @@ use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::record::Summary;
 use palpate_tissue::scene::script::{Action, BUILT_IN, Script};
-use palpate_tissue::scene::{self, Scene, reader};
+use palpate_tissue::scene::{self, Scene, script_reader};
 
 fn built_in(scene: &str, sets: &[&str]) -> Scene {
     let (_, text) = scene::BUILT_IN.iter().find(|(name, _)| *name == scene).unwrap();
@@ -54,7 +54,7 @@ fn every_shipped_script_fits_the_scenes_that_it_is_made_for_and_says_so_elsewher
             assert_eq!(warned, !made_for.contains(&scene), "{name} on {scene}: {warnings:?}");
         }
     }
-    assert!(script_reader::fits("no TOML [", "liver") && reader::fits("duration_s = 1.0", "liver"));
+    assert!(script_reader::fits("no TOML [", "liver") && script_reader::fits("duration_s = 1.0", "liver"));
 }
 
 #[test]

@@ -8,11 +8,12 @@ mod cases;
 mod random_scenes;
 
 use palpate_refusal::Reason;
+use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::{PAPER, Precision, Scene};
 use palpate_tissue::scheme::Oscillator;
+use palpate_tissue::scheme::stability;
 use palpate_tissue::select::scheme_selection;
-use palpate_tissue::{Model, stability};
 use random_scenes::{RandomScene, case, errors, mesh_case, play, truth};
 
 /// With the scheme that is chosen for each.

@@ -783,7 +783,7 @@ fn journal_seeds() -> Vec<Vec<u8>> {
 /// it stays finite.
 pub fn snapshot(bytes: &[u8]) -> bool {
     let mut bytes = bytes.to_vec();
-    saved::seal(&mut bytes);
+    snapshot::seal(&mut bytes);
     let Ok(saved) = Saved::from_bytes(&bytes, &limits()) else { return false };
     let _ = Model::resumed(&model().scene, saved.tissue(), &limits());
     let Ok(mut session) = Session::restore(model(), &saved) else { return false };
