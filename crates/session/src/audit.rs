@@ -22,26 +22,28 @@ fn twin_of(model: &Model) -> Arc<Model> {
 /// A more accurate session beside another, and the differences between the two.
 pub struct Twin {
     session: Session,
+    /// The tissue of the other session.
+    of: Arc<Model>,
     records: VecDeque<Record>,
     differences: ErrorExtent,
     largest: ErrorExtent,
 }
 
 impl Twin {
-    /// Creates a twin of a session of `model` that has not begun.
-    pub fn new(model: &Model) -> Self {
-        let session = Session::new(&twin_of(model));
-        Twin { session, records: VecDeque::new(), differences: ErrorExtent::default(), largest: ErrorExtent::default() }
+    /// Creates a twin of a session of `model` that has not begun, in which the profiles of `script` act, if there is one.
+    pub fn new(model: &Arc<Model>, script: Option<&Script>) -> Self {
+        let mut session = Session::new(&twin_of(model));
+        script.iter().for_each(|script| session.play_script(script));
+        let (differences, largest) = (ErrorExtent::default(), ErrorExtent::default());
+        Twin { session, of: model.clone(), records: VecDeque::new(), differences, largest }
     }
 
-    /// Returns the twin's session, for inputs equal to those of the other session.
-    pub fn session(&mut self) -> &mut Session {
-        &mut self.session
-    }
-
-    /// Changes the tissue in the same way as the other session's.
-    pub fn change(&mut self, model: &Model) {
-        self.session.change(&twin_of(model));
+    /// Changes the tissue as that of the other session was changed, to `model`; does nothing if it is still that.
+    pub fn follow(&mut self, model: &Arc<Model>) {
+        if !Arc::ptr_eq(&self.of, model) {
+            self.session.change(&twin_of(model));
+            self.of = model.clone();
+        }
     }
 
     /// Advances one step, before the other session does it.

@@ -33,6 +33,7 @@ pub mod sampling;
 pub mod saved;
 mod scene_report;
 pub mod schedule;
+pub mod simulation;
 pub mod surface;
 mod tool_depth;
 pub mod wire;
