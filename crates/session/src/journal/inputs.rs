@@ -69,7 +69,7 @@ impl<R: Read + Seek> Inputs<R> {
 }
 
 /// What changes bits. Whether time went on, its viewer decides.
-fn input(message: &pb::Input, rules: &Rules, first: &Model, limits: &Limits) -> Result<Option<Input>> {
+pub(super) fn input(message: &pb::Input, rules: &Rules, first: &Model, limits: &Limits) -> Result<Option<Input>> {
     use pb::input::What;
     Ok(match message.what.as_ref() {
         Some(What::Command(command)) => Some(Input::Command(from_command(command, rules, first.len())?)),
