@@ -63,12 +63,7 @@ impl SceneRun {
 
     fn session(&self) -> Session {
         let mut session = Session::new(&self.model);
-        for (tool, profile) in self.script.forces.iter().enumerate() {
-            session.play_force(tool, profile.clone());
-        }
-        for (index, profile) in self.script.moves.iter().enumerate() {
-            session.play_move(self.script.forces.len() + index, profile.clone());
-        }
+        session.play_script(&self.script);
         session
     }
 

@@ -12,9 +12,8 @@ use std::sync::Arc;
 use chart::{Look, Panel, Series, svg};
 use glam::DVec3;
 use palpate::render::{Camera, Film, View};
+use palpate_session::Session;
 use palpate_session::surface::Refinement;
-use palpate_session::{Session, run};
-use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::tangent;
 use palpate_tissue::scene::script::Script;
@@ -59,7 +58,7 @@ fn depth(sets: &[String]) -> Vec<(f64, f64)> {
     let model = model(sets);
     let script = script("vertical-60", &model);
     let mut session = Session::new(&model);
-    run::play(&mut session, &script);
+    session.play_script(&script);
     let centre = model.scene.sheet().unwrap().point([15, 15]);
     let mut course = Vec::new();
     for _ in 0..script.steps {

@@ -15,8 +15,8 @@ use palpate_haptics::Tip;
 use palpate_proto::pb;
 use palpate_session::Session;
 use palpate_session::audit::Windows;
-use palpate_session::command::Due;
-use palpate_session::run::{self, command};
+use palpate_session::command::{Command, Due};
+use palpate_session::run::run;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::record::{AuditedError, Correction, Summary};
@@ -46,9 +46,8 @@ const GRASP: &str = "duration_s = 1.0\nsample_every_s = 0.02\nsample_points = [[
 fn play(scene: &Scene, text: &str, held: bool, audited: bool) -> (Summary, Vec<Value>) {
     let script = script(text, scene);
     let mut output = Vec::new();
-    let run = if audited { run::audited } else { run::run };
     let limits = Limits::default();
-    let summary = run(&model(scene), &script, held, &limits, &mut output, &|| 0.0, &mut |_| {}).unwrap();
+    let summary = run(&model(scene), &script, [held, audited], &limits, &mut output, &|| 0.0, &mut |_| {}).unwrap();
     let lines = String::from_utf8(output).unwrap();
     let lines = lines.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
     (summary, lines.filter(|line| line.get("time_s").is_some()).collect())
@@ -143,12 +142,7 @@ fn grasping(step: u64) -> Vec<(usize, Action)> {
 fn commanded(scene: &Scene, told: StepActions, steps: u64, mut look: impl FnMut(&mut Session)) -> Session {
     let mut session = Session::new(&model(scene));
     for step in 0..steps {
-        let due = |(tool, action)| Due {
-            command: command(tool, step, action),
-            late: false,
-            late_commands: 0,
-            ends_lease: false,
-        };
+        let due = |(tool, action)| Due::in_time(Command::new(tool as u32, Some(step + 1), action));
         session.advance(&mut told(step).into_iter().map(due).collect(), |_| {});
         assert_eq!(session.fault(), None);
         look(&mut session);

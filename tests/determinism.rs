@@ -41,7 +41,7 @@ fn hash(scene: &Scene, held: bool) -> String {
     let script = script(ALL_LAWS, scene);
     let model = common::model(scene);
     let mut output = Vec::new();
-    run(&model, &script, held, &Limits::default(), &mut output, &|| 0.0, &mut |_| {}).unwrap().final_hash
+    run(&model, &script, [held, false], &Limits::default(), &mut output, &|| 0.0, &mut |_| {}).unwrap().final_hash
 }
 
 #[test]

@@ -582,12 +582,12 @@ fn every_number_of_a_script_gives_the_same_bits_on_every_way_or_is_refused() {
         for step in 0..STEPS {
             let commands = script
                 .actions_at(step)
-                .map(|(tool, action)| Due::in_time(palpate_session::run::command(tool, step, action)));
+                .map(|(tool, action)| Due::in_time(Command::new(tool as u32, Some(step + 1), action)));
             acting.insert(step, commands.collect());
         }
         // And as functions of time.
         let mut session = Session::new(&model);
-        palpate_session::run::play(&mut session, &script);
+        session.play_script(&script);
         for _ in 0..STEPS {
             session.advance(&mut Vec::new(), |_| {});
             assert!(is_finite(&session), "{text}");

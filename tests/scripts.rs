@@ -10,8 +10,8 @@ use std::sync::Arc;
 use common::{model, scene_with, script};
 use glam::DVec3;
 use palpate_session::Session;
-use palpate_session::command::Command;
-use palpate_session::run;
+use palpate_session::command::{Command, Due};
+use palpate_session::run::run;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::record::Summary;
@@ -30,7 +30,7 @@ fn shipped(name: &str, scene: &Scene) -> Script {
 
 fn run_whole(model: &Arc<Model>, script: &Script, held: bool) -> (Vec<serde_json::Value>, Summary) {
     let (mut out, limits) = (Vec::new(), Limits::default());
-    let summary = run::run(model, script, held, &limits, &mut out, &|| 0.0, &mut |_| {}).unwrap();
+    let summary = run(model, script, [held, false], &limits, &mut out, &|| 0.0, &mut |_| {}).unwrap();
     let lines = String::from_utf8(out).unwrap();
     (lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect(), summary)
 }
@@ -89,12 +89,9 @@ fn records_tell_what_a_tip_feels_and_where_it_is() {
     let mut session = Session::new(&model);
     let mut told = Vec::new();
     for step in 0..script.steps {
-        let due = script.actions_at(step).map(|(tool, action)| palpate_session::command::Due {
-            command: run::command(tool, step, action),
-            late: false,
-            late_commands: 0,
-            ends_lease: false,
-        });
+        let due = script
+            .actions_at(step)
+            .map(|(tool, action)| Due::in_time(Command::new(tool as u32, Some(step + 1), action)));
         session.advance(&mut due.collect::<Vec<_>>(), |session| {
             if session.step_count().is_multiple_of(script.sample_every) {
                 let felt = session.sample(None).tools.into_iter().find(|tool| tool.tool == 1 && tool.feel.is_some());
@@ -294,8 +291,7 @@ fn told(session: &mut Session, sequence: u64, action: Action) -> palpate_session
         action,
         arrival_ns: 0,
     };
-    let due = palpate_session::command::Due { command, late: false, late_commands: 0, ends_lease: false };
-    session.advance(&mut vec![due], |_| {});
+    session.advance(&mut vec![Due::in_time(command)], |_| {});
     session.sample(None).tools[0].contact.unwrap()
 }
 

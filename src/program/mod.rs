@@ -21,6 +21,7 @@ use palpate::server::ServeError;
 use palpate::server::config::Config;
 use palpate_realtime::clock::now_ns;
 use palpate_refusal::Refusal;
+use palpate_session::simulation::SimulationFailure;
 
 /// Writes a line to the standard error, whatever names and messages of others are in it. A closed standard error does not end the
 /// program.
@@ -53,6 +54,15 @@ impl From<ServeError> for Failure {
         match error {
             ServeError::Refused(refusal) => refusal.into(),
             error => Failure::Failed(error.to_string()),
+        }
+    }
+}
+
+impl From<SimulationFailure> for Failure {
+    fn from(failure: SimulationFailure) -> Self {
+        match failure {
+            SimulationFailure::Refused(refusal) => refusal.into(),
+            failure => Failure::Failed(failure.to_string()),
         }
     }
 }

@@ -90,21 +90,17 @@ pub(crate) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     let refinement = Refinement::new(&model.scene, arguments.refine.unwrap_or(fine), &limits)?;
     let skin = if arguments.wireframe { None } else { Some(texture::image(&model.scene.appearance, &limits)?) };
     let view = View { camera, size, refinement, texture: skin };
-    let failed = |failure: render::FilmFailure| match failure {
-        render::FilmFailure::Refused(refusal) => Failure::from(refusal),
-        failure => Failure::Failed(failure.to_string()),
-    };
     if moves {
         let mut file = Vec::new();
         with_progress("step", script.steps, false, |progress| {
-            render::gif(&model, &script, &view, &limits, arguments.frames_hz, &mut file, progress).map_err(failed)
+            render::gif(&model, &script, &view, &limits, arguments.frames_hz, &mut file, progress)
         })?;
         return write_file(&arguments.output, &file);
     }
-    let mut film = Film::new(&model, &script, &limits).map_err(failed)?;
+    let mut film = Film::new(&model, &script, &limits)?;
     let still = match at_step {
         Some(step) => film.at(step),
         None => film.deepest(),
     };
-    write_file(&arguments.output, &still.map_err(failed)?.picture(&model, &view).png()?)
+    write_file(&arguments.output, &still?.picture(&model, &view).png()?)
 }

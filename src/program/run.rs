@@ -3,7 +3,8 @@
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
 
-use palpate_session::run;
+use palpate_session::run::run;
+use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::scene::collection::find_script;
 use palpate_tissue::scene::record::{self, Summary};
 
@@ -44,16 +45,14 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
         say!("palpate: warning: {warning}");
     }
     let mut output = record::output(arguments.output.as_deref(), arguments.plot)?;
-    let run = if arguments.audit { run::audited } else { run::run };
     let ended = with_progress("step", script.steps, arguments.quiet, |progress| {
-        run(&model, &script, arguments.held, &limits, &mut output, &clock_s, progress)
+        run(&model, &script, [arguments.held, arguments.audit], &limits, &mut output, &clock_s, progress)
     });
-    let ended = ended.and_then(|summary| output.flush().map(|()| summary).map_err(run::RunFailure::Output));
+    let ended = ended.and_then(|summary| output.flush().map(|()| summary).map_err(SimulationFailure::Output));
     match ended {
         // A reader that closed the pipe is not an error.
-        Err(run::RunFailure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
-        Err(run::RunFailure::Refused(refusal)) => Err(refusal.into()),
-        Err(failure) => Err(Failure::Failed(failure.to_string())),
+        Err(SimulationFailure::Output(e)) if e.kind() == std::io::ErrorKind::BrokenPipe => Ok(()),
+        Err(failure) => Err(failure.into()),
         Ok(summary) => {
             tell(arguments, &summary);
             for warning in &summary.warnings {

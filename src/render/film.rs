@@ -1,13 +1,11 @@
 //! Plays a script to make pictures and GIFs.
 
-use std::collections::VecDeque;
 use std::io::Write;
 use std::sync::Arc;
 
 use super::picture::{Arrow, View, picture};
-use palpate_refusal::Refusal;
 use palpate_session::Session;
-use palpate_session::run::{self, Player};
+use palpate_session::simulation::{Simulation, SimulationFailure};
 use palpate_session::surface::{Skin, Snapshot};
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
@@ -15,26 +13,10 @@ use palpate_tissue::scene::profile::{Moment, Poke};
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::texture::Image;
 
-/// The reasons why there is no picture.
-#[derive(Debug, thiserror::Error)]
-pub enum FilmFailure {
-    /// The guard has stopped the session because its motion grew unstable.
-    #[error("the run was stopped: {0}")]
-    Held(String),
-    /// The input was refused.
-    #[error("{0}")]
-    Refused(#[from] Refusal),
-    /// The file can't be written.
-    #[error("can't write the picture: {0}")]
-    Output(String),
-}
-
 /// A script that is played step by step to make pictures of it.
 pub struct Film<'a> {
-    session: Session,
-    player: Player<'a>,
+    simulation: Simulation,
     script: &'a Script,
-    changes: VecDeque<(u64, Arc<Model>)>,
     shown: Option<Arc<Skin>>,
 }
 
@@ -50,26 +32,8 @@ impl<'a> Film<'a> {
     ///
     /// # Errors
     /// Returns a failure if a change of the tissue is refused.
-    pub fn new(model: &Arc<Model>, script: &'a Script, limits: &Limits) -> Result<Self, FilmFailure> {
-        let changes = model.apply_changes(&script.changes, limits)?;
-        let mut session = Session::new(model);
-        let player = Player::new(model, script, false, limits)?;
-        player.begin(&mut session);
-        Ok(Film { session, player, script, changes, shown: Skin::of(model) })
-    }
-
-    /// Advances the session until `step` steps are done.
-    fn advance(&mut self, step: u64) -> Result<(), FilmFailure> {
-        while self.session.step_count() < step {
-            run::change(&mut self.session, &mut self.changes);
-            let mut due = Vec::new();
-            self.player.commands(self.session.step_count(), &mut due)?;
-            self.session.advance(&mut due, |_| {});
-            if let Some(reason) = self.session.fault() {
-                return Err(FilmFailure::Held(reason));
-            }
-        }
-        Ok(())
+    pub fn new(model: &Arc<Model>, script: &'a Script, limits: &Limits) -> Result<Self, SimulationFailure> {
+        Ok(Film { simulation: Simulation::playing(model, script, false, limits)?, script, shown: Skin::of(model) })
     }
 
     /// Plays the script until `step` steps are done, and returns the tissue then. It can't go back to an earlier
@@ -77,27 +41,28 @@ impl<'a> Film<'a> {
     ///
     /// # Errors
     /// Returns a failure if the guard stops the run or a change of the tissue is refused.
-    pub fn at(&mut self, step: u64) -> Result<Still, FilmFailure> {
-        self.advance(step)?;
-        let model = self.session.model();
+    pub fn at(&mut self, step: u64) -> Result<Still, SimulationFailure> {
+        self.simulation.run_to(step)?;
+        let session = &self.simulation.session;
+        let model = session.model();
         // The force of the step just done: at a jump, the value before it.
         let before = step.saturating_sub(1);
         let moment = Moment { step: before, fraction: if step > 0 { 1.0 } else { 0.0 } };
         let pokes = self.script.forces.iter().map(|profile| profile.at(moment, model.scene.stepping.rate_hz));
         let arrow = |poke: Poke| Arrow { point: model.shape().nearest(poke.centre_m), towards: poke.force_n };
         let arrows = pokes.filter(|poke| poke.force_n.length() > 0.0).map(arrow).collect();
-        Ok(Still::of(&self.session, self.shown.as_ref(), arrows))
+        Ok(Still::of(session, self.shown.as_ref(), arrows))
     }
 
     /// Plays the whole script. Returns the tissue at the sample time with the largest displacement.
     ///
     /// # Errors
     /// Returns the failures of [`Film::at`].
-    pub fn deepest(&mut self) -> Result<Still, FilmFailure> {
+    pub fn deepest(&mut self) -> Result<Still, SimulationFailure> {
         let (mut most_m, mut found) = (f64::NEG_INFINITY, None);
         for step in (0..=self.script.steps).step_by(self.script.sample_every.max(1) as usize) {
-            self.advance(step)?;
-            let far_m = self.session.tissue().largest_displacement_m();
+            self.simulation.run_to(step)?;
+            let far_m = self.simulation.session.tissue().largest_displacement_m();
             if far_m > most_m {
                 (most_m, found) = (far_m, Some(self.at(step)?));
             }
@@ -138,8 +103,8 @@ pub struct Gif<W: Write> {
     steps_a_frame: f64,
 }
 
-fn broken(e: &gif::EncodingError) -> FilmFailure {
-    FilmFailure::Output(e.to_string())
+fn broken(e: gif::EncodingError) -> SimulationFailure {
+    SimulationFailure::Output(std::io::Error::other(e))
 }
 
 impl<W: Write> Gif<W> {
@@ -148,10 +113,10 @@ impl<W: Write> Gif<W> {
     ///
     /// # Errors
     /// Returns a failure if the output can't be written.
-    pub fn new(output: W, view: &View, frames_hz: f64, rate_hz: f64) -> Result<Self, FilmFailure> {
+    pub fn new(output: W, view: &View, frames_hz: f64, rate_hz: f64) -> Result<Self, SimulationFailure> {
         let size = view.size.map(|pixels| pixels as u16);
-        let mut encoder = gif::Encoder::new(output, size[0], size[1], &[]).map_err(|e| broken(&e))?;
-        encoder.set_repeat(gif::Repeat::Infinite).map_err(|e| broken(&e))?;
+        let mut encoder = gif::Encoder::new(output, size[0], size[1], &[]).map_err(broken)?;
+        encoder.set_repeat(gif::Repeat::Infinite).map_err(broken)?;
         // A GIF measures delays in hundredths of a second.
         let delay = (100.0 / frames_hz).round().max(1.0);
         Ok(Gif { encoder, size, delay, steps_a_frame: 0.01 * delay * rate_hz })
@@ -166,10 +131,10 @@ impl<W: Write> Gif<W> {
     ///
     /// # Errors
     /// Returns a failure if the output can't be written.
-    pub fn add(&mut self, image: &Image) -> Result<(), FilmFailure> {
+    pub fn add(&mut self, image: &Image) -> Result<(), SimulationFailure> {
         let mut picture = gif::Frame::from_rgb_speed(self.size[0], self.size[1], &image.rgb, 10);
         picture.delay = self.delay as u16;
-        self.encoder.write_frame(&picture).map_err(|e| broken(&e))
+        self.encoder.write_frame(&picture).map_err(broken)
     }
 }
 
@@ -186,7 +151,7 @@ pub fn gif(
     frames_hz: f64,
     output: impl Write,
     progress: &mut dyn FnMut(u64),
-) -> Result<(), FilmFailure> {
+) -> Result<(), SimulationFailure> {
     let mut file = Gif::new(output, view, frames_hz, model.scene.stepping.rate_hz)?;
     let mut film = Film::new(model, script, limits)?;
     for frame in 0_u64.. {

@@ -6,5 +6,5 @@ mod film;
 mod picture;
 mod surface;
 
-pub use film::{Film, FilmFailure, Gif, Still, gif};
+pub use film::{Film, Gif, Still, gif};
 pub use picture::{Arrow, Camera, LARGEST_SIDE, View, picture};

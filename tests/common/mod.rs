@@ -43,12 +43,7 @@ pub fn schemes() -> impl Iterator<Item = &'static str> {
 /// A session with a script's profiles acting.
 pub fn playing(scene: &Scene, script: &Script) -> Session {
     let mut session = Session::new(&model(scene));
-    for (tool, profile) in script.forces.iter().enumerate() {
-        session.play_force(tool, profile.clone());
-    }
-    for (index, profile) in script.moves.iter().enumerate() {
-        session.play_move(script.forces.len() + index, profile.clone());
-    }
+    session.play_script(script);
     session
 }
 

@@ -191,7 +191,7 @@ pub fn compile(case: &RandomScene, assignments: &[String]) -> Result<(Arc<Model>
 pub fn audited_errors(case: &RandomScene, assignments: &[String]) -> Result<[f64; 2], String> {
     let (model, script) = compile(case, assignments)?;
     let (limits, mut output) = (Limits::default(), std::io::sink());
-    let summary = run::audited(&model, &script, false, &limits, &mut output, &|| 0.0, &mut |_| {});
+    let summary = run::run(&model, &script, [false, true], &limits, &mut output, &|| 0.0, &mut |_| {});
     let error = summary.map_err(|failure| failure.to_string())?.audited_error.ok_or("the run was not audited")?;
     Ok([error.displacement, error.force])
 }
@@ -200,7 +200,7 @@ pub fn audited_errors(case: &RandomScene, assignments: &[String]) -> Result<[f64
 pub fn play(case: &RandomScene, assignments: &[String], clock_s: &dyn Fn() -> f64) -> Result<Played, String> {
     let (model, script) = compile(case, assignments)?;
     let mut session = Session::new(&model);
-    run::play(&mut session, &script);
+    session.play_script(&script);
     let (mut course, begun_s) = (Vec::new(), clock_s());
     for _ in 0..script.steps {
         session.advance(&mut Vec::new(), |session| {

@@ -2,7 +2,7 @@
 
 use palpate_refusal::Refusal;
 use palpate_refusal::printable::printable;
-use palpate_session::run::RunFailure;
+use palpate_session::simulation::SimulationFailure;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyOSError};
 use pyo3::prelude::*;
 use pyo3::types::PyType;
@@ -37,14 +37,14 @@ pub(crate) fn failed(message: &str) -> PyErr {
 }
 
 /// Returns the exception for a run that ended early.
-pub(crate) fn of_run(failure: RunFailure) -> PyErr {
+pub(crate) fn of_run(failure: SimulationFailure) -> PyErr {
     match failure {
-        RunFailure::Refused(refusal) => refused(refusal),
-        RunFailure::Held(message) => failed(&message),
-        RunFailure::Output(error) if error.kind() == std::io::ErrorKind::Interrupted => {
+        SimulationFailure::Refused(refusal) => refused(refusal),
+        SimulationFailure::Held(message) => failed(&message),
+        SimulationFailure::Output(error) if error.kind() == std::io::ErrorKind::Interrupted => {
             PyKeyboardInterrupt::new_err(())
         }
-        RunFailure::Output(error) => PyOSError::new_err(error.to_string()),
+        SimulationFailure::Output(error) => PyOSError::new_err(error.to_string()),
     }
 }
 

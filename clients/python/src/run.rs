@@ -7,7 +7,8 @@ use std::sync::mpsc::channel;
 use std::time::Instant;
 
 use palpate_refusal::{Reason, Refusal};
-use palpate_session::run::{RunEvent, RunFailure, told};
+use palpate_session::run::{RunEvent, told};
+use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::Model;
 use palpate_tissue::scene;
 use palpate_tissue::scene::record::{Record, Run, Summary};
@@ -92,7 +93,12 @@ impl RunRecord {
 }
 
 /// Plays a script until it ends or `stop` is set.
-fn play(model: &Arc<Model>, script: &Script, how: [bool; 2], stop: &AtomicBool) -> Result<RunRecord, RunFailure> {
+fn play(
+    model: &Arc<Model>,
+    script: &Script,
+    how: [bool; 2],
+    stop: &AtomicBool,
+) -> Result<RunRecord, SimulationFailure> {
     let script = script.bound(&model.scene)?;
     let mut recorded = RunRecord::of(&script);
     let records = usize::try_from(script.steps / script.sample_every).unwrap_or(0).saturating_add(1).min(1 << 16);
@@ -195,7 +201,7 @@ pub(crate) fn study<'py>(
         Some(threads) => threads,
         None => std::thread::available_parallelism().map_or(1, Into::into),
     };
-    let mut found: Vec<Option<Result<RunRecord, RunFailure>>> = Vec::new();
+    let mut found: Vec<Option<Result<RunRecord, SimulationFailure>>> = Vec::new();
     found.resize_with(cases.len(), || None);
     let progress = progress.map(Bound::unbind);
     let (stop, next) = (AtomicBool::new(false), AtomicUsize::new(0));
@@ -211,7 +217,7 @@ pub(crate) fn study<'py>(
                         let Some((given, script)) = cases.get(case).filter(|_| !stop.load(Ordering::Relaxed)) else {
                             break;
                         };
-                        let played = given.model(stop).map_err(RunFailure::from);
+                        let played = given.model(stop).map_err(SimulationFailure::from);
                         let played = played.and_then(|model| play(&model, script, [held, false], stop));
                         if tell.send((case, played)).is_err() {
                             break;
@@ -262,11 +268,11 @@ pub(crate) fn study<'py>(
 }
 
 /// Returns whether a run failed by itself.
-fn is_cause(played: &Result<RunRecord, RunFailure>) -> bool {
+fn is_cause(played: &Result<RunRecord, SimulationFailure>) -> bool {
     match played {
-        Err(RunFailure::Output(error)) => error.kind() != ErrorKind::Interrupted,
-        Err(RunFailure::Refused(refusal)) => refusal.message != given_up().message,
-        Err(RunFailure::Held(_)) => true,
+        Err(SimulationFailure::Output(error)) => error.kind() != ErrorKind::Interrupted,
+        Err(SimulationFailure::Refused(refusal)) => refusal.message != given_up().message,
+        Err(SimulationFailure::Held(_)) => true,
         Ok(_) => false,
     }
 }

@@ -1,15 +1,14 @@
 //! A session in this process: a tissue and its tools, stepped as fast as the machine can.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use glam::DVec3;
 use palpate_refusal::Refusal;
-use palpate_session::command::{Command, Due};
-use palpate_session::intake::Intake;
+use palpate_session as session;
+use palpate_session::simulation::Simulation;
 use palpate_session::snapshot::Saved;
-use palpate_session::{self as session, run};
 use palpate_tissue::Model;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
@@ -31,37 +30,26 @@ struct PoseTarget {
     tip: palpate_haptics::Tip,
 }
 
-/// A session with the state that a client would keep.
+/// A simulation with the state that a client would keep.
 pub(crate) struct SessionState {
-    session: session::Session,
+    simulation: Simulation,
     /// The scene with which the session started: changes are based on it.
     first: scene::Scene,
-    intake: Intake,
-    held: BTreeSet<u32>,
     /// Tips of the tools that were in the tissue when the session was restored, until their next command.
     tips: BTreeMap<u32, palpate_haptics::Tip>,
     led: BTreeMap<u32, PoseTarget>,
-    due: Vec<Due>,
 }
 
 impl SessionState {
     pub(crate) fn of(session: session::Session, first: scene::Scene) -> Self {
-        let intake = Intake::new(&first, &limits()).continued(&session, None);
         let tips = session.tips().collect();
-        SessionState { session, first, intake, held: BTreeSet::new(), tips, led: BTreeMap::new(), due: Vec::new() }
+        let simulation = Simulation::of(session, &first, &limits());
+        SessionState { simulation, first, tips, led: BTreeMap::new() }
     }
 
     /// Gives a tool a command, which acts from the next step on.
     fn submit(&mut self, tool: u32, action: Action) -> Result<(), Refusal> {
-        let lease = 1 + u128::from(tool);
-        if !self.held.contains(&tool) {
-            self.intake.acquire(&[tool], "python", limits().lease_s, lease, 0)?;
-            self.held.insert(tool);
-        }
-        let step = self.session.step_count();
-        // Several commands may come for one step: the intake numbers them.
-        let command = Command { sequence: None, ..run::command(tool as usize, step, action.clone()) };
-        self.intake.submit(lease, vec![command], 0)?;
+        self.simulation.command(tool, action.clone())?;
         self.tips.remove(&tool);
         match action {
             Action::Pose { place_m, tip, .. } => self.led.insert(tool, PoseTarget { place_m, tip }),
@@ -71,16 +59,14 @@ impl SessionState {
     }
 
     fn step(&mut self) -> Result<(), Refusal> {
-        let step = self.session.step_count();
         // A tool without new poses would let go; these tools are to stay.
         let led: Vec<(u32, PoseTarget)> = self.led.iter().map(|(tool, led)| (*tool, *led)).collect();
         for (tool, PoseTarget { place_m, tip }) in led {
             self.submit(tool, Action::Pose { place_m, velocity_m_per_s: None, tip })?;
         }
-        self.intake.take_due(step, 0, &mut self.due);
-        let recoveries = self.session.recoveries().count();
-        self.session.advance(&mut self.due, |_| {});
-        if self.session.recoveries().count() > recoveries {
+        let recoveries = self.simulation.session.recoveries().count();
+        self.simulation.step(0)?;
+        if self.simulation.session.recoveries().count() > recoveries {
             self.led.clear();
         }
         Ok(())
@@ -139,11 +125,11 @@ impl Session {
         loop {
             let reason = self.with(py, |inner| {
                 let begun = Instant::now();
-                while left > 0 && inner.session.hold_reason().is_none() && begun.elapsed() < LOOK {
+                while left > 0 && inner.simulation.session.hold_reason().is_none() && begun.elapsed() < LOOK {
                     inner.step()?;
                     left -= 1;
                 }
-                Ok(inner.session.hold_reason().map(str::to_owned))
+                Ok(inner.simulation.session.hold_reason().map(str::to_owned))
             });
             if let Some(reason) = reason.map_err(refused)? {
                 return Err(failed(&reason));
@@ -158,44 +144,44 @@ impl Session {
     /// Number of steps done.
     #[getter]
     fn steps(&self, py: Python<'_>) -> u64 {
-        self.with(py, |inner| inner.session.step_count())
+        self.with(py, |inner| inner.simulation.session.step_count())
     }
 
     /// Simulated time, s.
     #[getter]
     fn time_s(&self, py: Python<'_>) -> f64 {
-        self.with(py, |inner| inner.session.time_s())
+        self.with(py, |inner| inner.simulation.session.time_s())
     }
 
     /// The tissue, with its current coefficients.
     #[getter]
     fn tissue(&self, py: Python<'_>) -> Tissue {
-        self.with(py, |inner| Tissue { model: inner.session.model().clone() })
+        self.with(py, |inner| Tissue { model: inner.simulation.session.model().clone() })
     }
 
     /// Number of points that the last step computed; the others are at rest.
     #[getter]
     fn awake_points(&self, py: Python<'_>) -> usize {
-        self.with(py, |inner| inner.session.tissue().awake_points())
+        self.with(py, |inner| inner.simulation.session.tissue().awake_points())
     }
 
     /// How often the guard went back to a checkpoint and halved the substep.
     #[getter]
     fn guard_events(&self, py: Python<'_>) -> u64 {
-        self.with(py, |inner| inner.session.tissue().guard_events())
+        self.with(py, |inner| inner.simulation.session.tissue().guard_events())
     }
 
     /// Why the tissue is not in the state that its tools caused, as a sentence: it is stopped, or has recovered. None
     /// if it is.
     #[getter]
     fn fault(&self, py: Python<'_>) -> Option<String> {
-        self.with(py, |inner| inner.session.fault())
+        self.with(py, |inner| inner.simulation.session.fault())
     }
 
     /// The hash of the state: equal for equal bits.
     #[getter]
     fn hash(&self, py: Python<'_>) -> String {
-        self.with(py, |inner| format!("{:032x}", inner.session.tissue().state_hash()))
+        self.with(py, |inner| format!("{:032x}", inner.simulation.session.tissue().state_hash()))
     }
 
     /// Pushes at a point or a place; at a distance r from there with force_n * exp(-falloff_per_m * r +
@@ -212,7 +198,7 @@ impl Session {
         falloff_per_m: f64,
         falloff_offset: f64,
     ) -> PyResult<()> {
-        let model = self.with(py, |inner| inner.session.model().clone());
+        let model = self.with(py, |inner| inner.simulation.session.model().clone());
         let force_n = vector("force_n", force_n)?;
         let (point, centre_m) = match (point, at_m) {
             (Some(point), None) => {
@@ -233,7 +219,7 @@ impl Session {
         point: &Bound<'_, PyAny>,
         displacement_m: &Bound<'_, PyAny>,
     ) -> PyResult<()> {
-        let model = self.with(py, |inner| inner.session.model().clone());
+        let model = self.with(py, |inner| inner.simulation.session.model().clone());
         let point = self::point(&model, point)?;
         let displacement_m = vector("displacement_m", displacement_m)?;
         self.submit(py, tool, Action::Grasp { point, displacement_m })
@@ -255,7 +241,7 @@ impl Session {
 
     /// Returns what a tool does and feels; None if it does nothing.
     fn tool<'py>(&self, py: Python<'py>, tool: u32) -> PyResult<Option<Bound<'py, PyAny>>> {
-        let sample = self.with(py, |inner| inner.session.sample(Some(&[tool])));
+        let sample = self.with(py, |inner| inner.simulation.session.sample(Some(&[tool])));
         let Some(contact) = sample.tools.first().and_then(|tool| tool.contact) else { return Ok(None) };
         let numbers = [
             contact.displacement_m,
@@ -282,8 +268,8 @@ impl Session {
     ) -> PyResult<()> {
         let change = Change { stiffness_n_per_m, damping_n_s_per_m, anchor_stiffness_n_per_m, volume_stiffness_pa };
         let changed = self.with(py, |inner| {
-            let model = inner.session.model().changed(&change, &inner.first, &limits())?;
-            inner.session.change(&model);
+            let model = inner.simulation.session.model().changed(&change, &inner.first, &limits())?;
+            inner.simulation.session.change(&model);
             Ok(())
         });
         changed.map_err(refused)
@@ -293,7 +279,9 @@ impl Session {
     /// has all digits. `out` is an array to write into.
     #[pyo3(signature = (out=None))]
     fn displacements<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
-        let read = |inner: &mut SessionState, into: &mut Vec<f64>| inner.session.tissue().whole_displacements_m(into);
+        let read = |inner: &mut SessionState, into: &mut Vec<f64>| {
+            inner.simulation.session.tissue().whole_displacements_m(into)
+        };
         self.read(py, out, &read)
     }
 
@@ -301,8 +289,8 @@ impl Session {
     #[pyo3(signature = (out=None))]
     fn positions<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
         let read = |inner: &mut SessionState, into: &mut Vec<f64>| {
-            inner.session.tissue().whole_displacements_m(into);
-            let model = inner.session.model();
+            inner.simulation.session.tissue().whole_displacements_m(into);
+            let model = inner.simulation.session.model();
             let shape = model.shape();
             let rest_m = model.points().flat_map(|point| shape.rest_m(point).to_array());
             into.iter_mut().zip(rest_m).for_each(|(to, rest_m)| *to += rest_m);
@@ -314,7 +302,7 @@ impl Session {
     #[pyo3(signature = (out=None))]
     fn velocities<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
         let read = |inner: &mut SessionState, into: &mut Vec<f64>| {
-            let (tissue, points) = (inner.session.tissue(), inner.session.model().points());
+            let (tissue, points) = (inner.simulation.session.tissue(), inner.simulation.session.model().points());
             into.clear();
             into.extend(points.flat_map(|point| (tissue.point(point).velocity_m_per_s + DVec3::ZERO).to_array()));
         };
@@ -324,12 +312,12 @@ impl Session {
     /// Returns records of all quantities of the given points, as in `Run.points`; of all points if None.
     #[pyo3(signature = (points=None))]
     fn records<'py>(&self, py: Python<'py>, points: Option<Vec<Bound<'py, PyAny>>>) -> PyResult<Bound<'py, PyAny>> {
-        let model = self.with(py, |inner| inner.session.model().clone());
+        let model = self.with(py, |inner| inner.simulation.session.model().clone());
         let points =
             points.map(|points| points.iter().map(|name| point(&model, name)).collect::<PyResult<Vec<PointId>>>());
         let points = points.transpose()?;
         let numbers = self.with(py, |inner| {
-            let record = inner.session.record(points.as_deref());
+            let record = inner.simulation.session.record(points.as_deref());
             let mut numbers = Vec::with_capacity(record.points.len() * OF_POINT);
             record.points.iter().for_each(|point| add_point(&mut numbers, point));
             numbers
@@ -341,7 +329,7 @@ impl Session {
     /// The energy of the tissue, J: kinetic, spring and virtual.
     #[getter]
     fn energy_j<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let energy = self.with(py, |inner| inner.session.energy());
+        let energy = self.with(py, |inner| inner.simulation.session.energy());
         let found = PyDict::new(py);
         found.set_item("kinetic", energy.kinetic)?;
         found.set_item("spring", energy.spring)?;
@@ -351,12 +339,12 @@ impl Session {
 
     /// Returns a snapshot, for `restore`.
     fn save<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
-        let bytes = self.with(py, |inner| inner.session.save().to_bytes());
+        let bytes = self.with(py, |inner| inner.simulation.session.save().to_bytes());
         PyBytes::new(py, &bytes)
     }
 
     fn __repr__(&self, py: Python<'_>) -> String {
-        let (name, steps) = self.with(py, |inner| (inner.first.name.clone(), inner.session.step_count()));
+        let (name, steps) = self.with(py, |inner| (inner.first.name.clone(), inner.simulation.session.step_count()));
         format!("<palpate.Session of {name:?}: {steps} steps>")
     }
 }

@@ -22,26 +22,29 @@ fn twin_of(model: &Model) -> Arc<Model> {
 /// A twin: a more accurate session that gets another session's inputs, with the differences between the two.
 pub struct Twin {
     session: Session,
+    /// The tissue of the other session.
+    of: Arc<Model>,
     records: VecDeque<Record>,
     differences: ErrorExtent,
     largest: ErrorExtent,
 }
 
 impl Twin {
-    /// Creates a twin of a session of `model` that has not begun.
-    pub fn new(model: &Model) -> Self {
-        let session = Session::new(&twin_of(model));
-        Twin { session, records: VecDeque::new(), differences: ErrorExtent::default(), largest: ErrorExtent::default() }
+    /// Creates a twin of a session of `model` that has not begun, in which the profiles of `script` act, if there is one.
+    pub fn new(model: &Arc<Model>, script: Option<&Script>) -> Self {
+        let mut session = Session::new(&twin_of(model));
+        script.iter().for_each(|script| session.play_script(script));
+        let (differences, largest) = (ErrorExtent::default(), ErrorExtent::default());
+        Twin { session, of: model.clone(), records: VecDeque::new(), differences, largest }
     }
 
-    /// Returns the twin's session, to give it the inputs of the other session.
-    pub fn session(&mut self) -> &mut Session {
-        &mut self.session
-    }
-
-    /// Changes the twin's tissue to a more accurate form of `model`, the other session's new tissue.
-    pub fn change(&mut self, model: &Model) {
-        self.session.change(&twin_of(model));
+    /// Changes the twin's tissue to a more accurate form of `model`, the other session's tissue. Does nothing if that has not
+    /// changed.
+    pub fn follow(&mut self, model: &Arc<Model>) {
+        if !Arc::ptr_eq(&self.of, model) {
+            self.session.change(&twin_of(model));
+            self.of = model.clone();
+        }
     }
 
     /// Advances the twin by one step, before the other session does that step, and keeps its record if one is due.

@@ -33,6 +33,7 @@ pub mod run;
 pub mod sample_selection;
 mod scene_report;
 pub mod schedule;
+pub mod simulation;
 pub mod snapshot;
 pub mod surface;
 pub mod tissue_copy;

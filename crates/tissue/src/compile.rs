@@ -261,23 +261,11 @@ impl Model {
         Ok(Arc::new(Model { sleep_tolerance, corrected, ..Arc::unwrap_or_clone(model) }))
     }
 
-    /// Returns what a script's changes make of this, each out of the one before it.
+    /// Returns what changes make of this, each out of the one before it, for a session that began with the scene `first`.
     ///
     /// # Errors
     /// Refuses the first change that [`Model::changed`] refuses.
     pub fn apply_changes(
-        self: &Arc<Self>,
-        changes: &[(u64, Change)],
-        limits: &Limits,
-    ) -> Result<VecDeque<(u64, Arc<Self>)>> {
-        self.course_of(&self.scene, changes, limits)
-    }
-
-    /// Does the same for a session that began with the scene `first`.
-    ///
-    /// # Errors
-    /// As for [`Model::apply_changes`].
-    pub fn course_of(
         self: &Arc<Self>,
         first: &Scene,
         changes: &[(u64, Change)],

@@ -41,13 +41,6 @@ pub(super) struct RenderArguments {
     frames_hz: f64,
 }
 
-fn failed(failure: render::FilmFailure) -> Failure {
-    match failure {
-        render::FilmFailure::Refused(refusal) => Failure::from(refusal),
-        failure => Failure::Failed(failure.to_string()),
-    }
-}
-
 /// The tissue as it stands, with an arrow for what each tool feels.
 fn still(session: &Session, shown: Option<&std::sync::Arc<Skin>>) -> Still {
     let felt = session.felt().into_iter().filter(|felt| felt.force_n.length() > 0.0);
@@ -127,7 +120,7 @@ pub(super) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     }
     let last = to.unwrap_or(u64::MAX).min(replay.survey().until_step);
     let mut file = Vec::new();
-    let mut film = Gif::new(&mut file, &view, *frames_hz, model.scene.stepping.rate_hz).map_err(failed)?;
+    let mut film = Gif::new(&mut file, &view, *frames_hz, model.scene.stepping.rate_hz)?;
     with_progress("step", last, false, |progress| -> Result<(), Failure> {
         for frame in 0.. {
             let step = begin.saturating_add(film.step(frame));
@@ -135,7 +128,7 @@ pub(super) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
                 break;
             }
             go_to(&mut replay, step)?;
-            film.add(&still(replay.session(), shown.as_ref()).picture(&model, &view)).map_err(failed)?;
+            film.add(&still(replay.session(), shown.as_ref()).picture(&model, &view))?;
             progress(step);
         }
         Ok(())

@@ -7,9 +7,10 @@ use std::sync::Arc;
 use glam::DVec3;
 use palpate_haptics::{ContactState, Tip};
 use palpate_session::Session;
-use palpate_session::command::{Command, Due};
-use palpate_session::intake::Intake;
+use palpate_session::command::Command;
+use palpate_session::input::Input;
 use palpate_session::lease::LeaseId;
+use palpate_session::simulation::Simulation;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{self, Task};
 use palpate_tissue::Model;
@@ -30,9 +31,7 @@ const SECOND_DEPTHS: f64 = 0.5;
 
 /// A tissue with its tools.
 pub(super) struct LinkTissue {
-    session: Session,
-    intake: Intake,
-    due: Vec<Due>,
+    simulation: Simulation,
     tip: Tip,
     spot: Spot,
     second: Option<Second>,
@@ -67,15 +66,13 @@ impl LinkTissue {
     /// Returns why the intake refuses the tools.
     pub(super) fn new(setup: &Setup) -> Result<Self, String> {
         let limits = Limits::default();
-        let mut intake = Intake::new(&setup.model.scene, &limits);
+        let mut simulation = Simulation::new(&setup.model, &limits);
         for (tool, lease) in [(TOOL, LEASE), (SECOND_TOOL, SECOND_LEASE)] {
-            let acquired = intake.acquire(&[tool], "palpate-client link", limits.lease_s, lease, 0);
+            let acquired = simulation.intake.acquire(&[tool], "palpate-client link", limits.lease_s, lease, 0);
             acquired.map_err(|refusal| refusal.to_string())?;
         }
         Ok(LinkTissue {
-            session: Session::new(&setup.model),
-            intake,
-            due: Vec::new(),
+            simulation,
             tip: setup.tip,
             spot: setup.spot,
             second: (setup.second_m > 0.0).then(|| Second::new(setup)),
@@ -85,7 +82,7 @@ impl LinkTissue {
 
     /// The session.
     pub(super) fn session(&self) -> &Session {
-        &self.session
+        &self.simulation.session
     }
 
     /// A command that leads the tool to a place of the hand's. Its client time 0 says: at once.
@@ -107,7 +104,7 @@ impl LinkTissue {
     /// # Errors
     /// Returns why the intake refuses them.
     pub(super) fn submit(&mut self, lease: LeaseId, commands: Vec<Command>, now_s: f64) -> Result<(), String> {
-        self.intake.submit(lease, commands, ns(now_s)).map_err(|refusal| refusal.to_string())
+        self.simulation.intake.submit(lease, commands, ns(now_s)).map_err(|refusal| refusal.to_string())
     }
 
     /// Does the steps of the tick that begins at `now_s`.
@@ -116,22 +113,17 @@ impl LinkTissue {
     /// Returns the reason if the guard stops the tissue, or why a command of the second tool is refused.
     pub(super) fn step(&mut self, now_s: f64) -> Result<(), String> {
         // Rounding must not make a step more of it.
-        while self.session.time_s() < now_s + TICK_S - 1e-9 {
-            let (step, begin_s) = (self.session.step_count(), self.session.time_s());
+        while self.session().time_s() < now_s + TICK_S - 1e-9 {
+            let begin_s = self.session().time_s();
             if let Some(second) = &self.second {
                 let pose = Command { tool: SECOND_TOOL, ..self.pose(second.place_m(&self.spot, begin_s)) };
                 self.submit(SECOND_LEASE, vec![pose], begin_s)?;
             }
             if let Some((_, model)) = self.change.take_if(|change| change.0 <= begin_s + 1e-9) {
-                let changed = self.intake.change(None, &model, None, ns(begin_s));
-                changed.map_err(|refusal| refusal.to_string())?;
+                self.simulation.apply(Input::Tissue(model));
             }
-            if let Some(model) = self.intake.take_change(step) {
-                self.session.change(&model);
-            }
-            self.intake.take_due(step, ns(begin_s), &mut self.due);
-            self.session.advance(&mut self.due, |_| {});
-            if let Some(reason) = self.session.fault() {
+            self.simulation.step(ns(begin_s)).map_err(|refusal| refusal.to_string())?;
+            if let Some(reason) = self.session().fault() {
                 return Err(reason);
             }
         }
@@ -145,7 +137,7 @@ impl LinkTissue {
     pub(super) fn truth(&mut self, place_m: DVec3, now_s: f64) -> Result<(DVec3, bool), String> {
         self.submit(LEASE, vec![self.pose(place_m)], now_s)?;
         self.step(now_s)?;
-        Ok(self.session.tissue().tool_contact(TOOL as usize).map_or((DVec3::ZERO, false), |feel| {
+        Ok(self.session().tissue().tool_contact(TOOL as usize).map_or((DVec3::ZERO, false), |feel| {
             (self.spot.direction(feel.force_on_tool_n), feel.contact_state != ContactState::Free)
         }))
     }

@@ -70,7 +70,7 @@ impl<R: Read + Seek> Inputs<R> {
 }
 
 /// Returns the input in a message, if it changes bits. Whether time advances is left to the viewer of a playback.
-fn input(message: &pb::Input, rules: &Rules, first: &Model, limits: &Limits) -> Result<Option<Input>> {
+pub(super) fn input(message: &pb::Input, rules: &Rules, first: &Model, limits: &Limits) -> Result<Option<Input>> {
     use pb::input::What;
     Ok(match message.what.as_ref() {
         Some(What::Command(command)) => Some(Input::Command(from_command(command, rules, first.len())?)),

@@ -9,12 +9,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use palpate_haptics::{Predictor, Tip};
 use palpate_proto::journal as pb;
 
-use super::message::{self, check_replays, from_command, from_hash, from_tissue};
+use super::inputs;
+use super::message::{self, check_replays, from_hash, from_tissue};
 use super::reader::{JournalBatch, JournalReader, SnapshotAt, Survey};
 use crate::Session;
-use crate::command::Due;
 use crate::input::Input;
-use crate::rules::Rules;
+use crate::simulation::Simulation;
 use crate::snapshot::{self, Saved};
 use crate::tissue_copy::{TICK_POINT_SUBSTEPS, TissueCopy};
 use palpate_refusal::{Reason, Refusal, Result};
@@ -95,12 +95,8 @@ pub struct Replay<R> {
     survey: Survey,
     limits: Limits,
     first: Arc<Model>,
-    rules: Rules,
-    session: Session,
+    simulation: Simulation,
     items: VecDeque<JournalItem>,
-    /// Commands and a change of the tissue that act at the next step.
-    commands: Vec<Due>,
-    change: Option<Arc<Model>>,
     running: bool,
     until: Option<u64>,
     hashes: u64,
@@ -168,7 +164,6 @@ impl<R: Read + Seek> Replay<R> {
         let first =
             known.map_or_else(|| message::model(reader.header(), &limits).map_err(placed), |known| Ok(known.1))?;
         reader.keep(2 * first.session_bytes()).map_err(placed)?;
-        let rules = Rules::new(&first.scene, &limits);
         let mut items = VecDeque::new();
         let begin_step = reader.header().begin_step;
         let (mut running, mut until) = (reader.header().running, reader.header().until_step);
@@ -191,16 +186,14 @@ impl<R: Read + Seek> Replay<R> {
             }
         };
         let equal_until = Some(session.step_count()).filter(|_| at.is_some());
+        let simulation = Simulation::of(session, &first.scene, &limits);
         let mut replay = Replay {
             reader,
             survey,
             limits,
             first,
-            rules,
-            session,
+            simulation,
             items,
-            commands: Vec::new(),
-            change: None,
             running,
             until,
             hashes: 0,
@@ -223,7 +216,7 @@ impl<R: Read + Seek> Replay<R> {
 
     /// Returns the session at the present step.
     pub fn session(&self) -> &Session {
-        &self.session
+        &self.simulation.session
     }
 
     /// Returns the tissue with which the session began.
@@ -238,8 +231,8 @@ impl<R: Read + Seek> Replay<R> {
 
     /// Returns whether time advances, and the step count at which it pauses, if any.
     pub fn running(&self) -> (bool, Option<u64>) {
-        let reached = self.until.is_some_and(|until| self.session.step_count() >= until);
-        (self.running && !reached && self.session.hold_reason().is_none(), self.until)
+        let reached = self.until.is_some_and(|until| self.session().step_count() >= until);
+        (self.running && !reached && self.session().hold_reason().is_none(), self.until)
     }
 
     /// Returns the number of hashes and of snapshots that were compared so far.
@@ -266,8 +259,8 @@ impl<R: Read + Seek> Replay<R> {
             if step > until || (step == until && is_input) {
                 break;
             }
-            if step < self.session.step_count() {
-                let text = format!("an input acts at step {step}, but {} steps are done", self.session.step_count());
+            if step < self.session().step_count() {
+                let text = format!("an input acts at step {step}, but {} steps are done", self.session().step_count());
                 return Err(self.reader.refuse(&text));
             }
             self.run_to(step, see)?;
@@ -290,26 +283,25 @@ impl<R: Read + Seek> Replay<R> {
     }
 
     fn run_to(&mut self, target: u64, see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()>) -> Result<()> {
-        while self.difference.is_none() && self.session.step_count() < target {
-            let step = self.session.step_count();
-            if let Some(model) = self.change.take() {
-                self.session.change(&model);
-            }
-            if let Some(reason) = self.session.hold_reason() {
+        while self.difference.is_none() && self.session().step_count() < target {
+            let step = self.session().step_count();
+            self.simulation.take_inputs(0)?;
+            if let Some(reason) = self.session().hold_reason() {
                 let what = format!("the session is held here, but continued when it was recorded: {reason}");
                 self.differ(step, what);
                 break;
             }
             self.check_work()?;
-            let rests = self.session.rests_until().filter(|until| self.commands.is_empty() && *until > step);
+            let Simulation { session, due, .. } = &mut self.simulation;
+            let rests = session.rests_until().filter(|until| due.is_empty() && *until > step);
             if let Some(rests) = rests {
                 let stop = (step + 1).checked_next_multiple_of(self.stops_every).unwrap_or(u64::MAX);
-                self.session.skip_to(target.min(rests).min(stop));
-                see(ReplayEvent::Step(&self.session))?;
+                session.skip_to(target.min(rests).min(stop));
+                see(ReplayEvent::Step(session))?;
                 continue;
             }
             let mut seen = Ok(());
-            self.session.advance(&mut self.commands, |session| {
+            session.advance(due, |session| {
                 if seen.is_ok() {
                     seen = see(ReplayEvent::Step(session));
                 }
@@ -321,7 +313,7 @@ impl<R: Read + Seek> Replay<R> {
 
     /// Refuses steps that no server would do, because the journal may come from an untrusted party.
     fn check_work(&self) -> Result<()> {
-        let (model, most) = (self.session.model(), self.limits.point_substeps_per_step);
+        let (model, most) = (self.session().model(), self.limits.point_substeps_per_step);
         let (points, substeps) = (model.swept_points(), model.plan.substeps);
         if (points as u64).saturating_mul(u64::from(substeps)) <= most {
             return Ok(());
@@ -369,9 +361,9 @@ impl<R: Read + Seek> Replay<R> {
     }
 
     fn compare(&mut self, recorded: &str, what: &str) -> Result<()> {
-        let computed = self.session.tissue().state_hash();
+        let computed = self.session().tissue().state_hash();
         if from_hash(recorded)? != computed {
-            let step = self.session.step_count();
+            let step = self.session().step_count();
             self.differ(step, format!("the recorded hash of the {what} is {recorded}, but here it is {computed:032x}"));
         }
         Ok(())
@@ -380,25 +372,19 @@ impl<R: Read + Seek> Replay<R> {
     fn act(&mut self, input: &pb::Input) -> Result<()> {
         use pb::input::What;
         match input.what.as_ref() {
-            Some(What::Command(command)) => {
-                self.commands.push(from_command(command, &self.rules, self.first.len())?);
-            }
-            Some(What::Tissue(tissue)) => self.change = Some(from_tissue(tissue, &self.first, &self.limits)?),
             Some(What::Start(start)) => (self.running, self.until) = (true, start.until_step),
             Some(What::Pause(_)) => self.running = false,
-            Some(What::Revive(_)) => {
-                let step = self.session.step_count();
-                if self.session.hold_reason().is_none() {
-                    self.differ(step, "the session was held when it was recorded, but is not held here".to_owned());
-                    return Ok(());
-                }
-                let mut session = Session::new(self.session.model());
-                session.skip_to(step);
-                (self.session, self.running, self.until) = (session, false, None);
-                self.commands.clear();
+            Some(What::Revive(_)) if self.session().hold_reason().is_none() => {
+                let what = "the session was held when it was recorded, but is not held here";
+                self.differ(self.session().step_count(), what.to_owned());
+                return Ok(());
             }
-            Some(What::Hold(hold)) => self.session.hold(hold.reason.clone()),
-            Some(What::DroppedSteps(_)) | None => {}
+            Some(What::Revive(_)) => (self.running, self.until) = (false, None),
+            _ => {}
+        }
+        let rules = self.simulation.intake.rules();
+        if let Some(input) = inputs::input(input, &rules, &self.first, &self.limits)? {
+            self.simulation.apply(input);
         }
         Ok(())
     }
@@ -414,7 +400,7 @@ impl<R: Read + Seek> Replay<R> {
             Some(difference) => Err(self.reader.refuse(&difference.to_string())),
             None => {
                 self.reader.let_go(2 * self.first.session_bytes());
-                Ok((self.session, self.first, self.reader))
+                Ok((self.simulation.session, self.first, self.reader))
             }
         }
     }
@@ -451,7 +437,7 @@ impl<R: Read + Seek> Replay<R> {
             let Some(item) = self.items.pop_front() else { break };
             let is_command =
                 matches!(&item, JournalItem::Input(pb::Input { what: Some(pb::input::What::Command(_)), .. }));
-            if !is_command && item.step() == self.session.step_count() && self.difference.is_none() {
+            if !is_command && item.step() == self.session().step_count() && self.difference.is_none() {
                 self.take(&item, see)?;
             }
         }
@@ -463,8 +449,8 @@ impl<R: Read + Seek> Replay<R> {
         Ok(Resumed {
             header: self.reader.header().clone(),
             first: self.first,
-            session: self.session,
-            pending: self.change,
+            session: self.simulation.session,
+            pending: self.simulation.changes.pop_back().map(|change| change.1),
             waiting,
             running,
             until_step,
@@ -474,8 +460,8 @@ impl<R: Read + Seek> Replay<R> {
 
     /// Returns the changes of the tissue that wait for a step after this one; none if the session is held.
     fn waiting(&self) -> Result<Vec<(u64, Input)>> {
-        let next = self.session.step_count() + u64::from(self.change.is_some());
-        let is_held = self.session.hold_reason().is_some();
+        let next = self.session().step_count() + u64::from(!self.simulation.changes.is_empty());
+        let is_held = self.session().hold_reason().is_some();
         let left = self.survey.waiting.iter().filter(|input| !is_held && input.step >= next);
         let mut waiting = Vec::new();
         for input in left.take(self.limits.queued_changes) {
