@@ -14,6 +14,7 @@ use glam::DVec3;
 use palpate::render::{Camera, Film, View};
 use palpate_session::Session;
 use palpate_session::surface::Refinement;
+use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::response::tangent;
 use palpate_tissue::scene::script::Script;
