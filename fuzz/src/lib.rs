@@ -439,11 +439,11 @@ const MAX_N: f64 = 3.3;
 /// What a client hears in a haptic stream, up to the force at the device.
 /// A datagram of a client, and one of a server.
 pub fn datagram(bytes: &[u8]) -> bool {
-    use palpate_haptics::datagram_health::Carrier;
-    let mut carrier = Carrier::default();
+    use palpate_haptics::datagram_health::DatagramHealth;
+    let mut carrier = DatagramHealth::default();
     let from_server = pb::SampleDatagram::decode(bytes).is_ok_and(|message| {
         carrier.arrive(message.number, message.acknowledges, 0.0);
-        assert!(!carrier.carries(0.0), "nothing was sent that could be confirmed");
+        assert!(!carrier.update(0.0), "nothing was sent that could be confirmed");
         message.sample.is_some()
     });
     let Ok(message) = pb::PosesDatagram::decode(bytes) else { return from_server };

@@ -26,7 +26,7 @@ use std::net::{Ipv4Addr, Ipv6Addr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use palpate_haptics::datagram_health::{Carried, Carrier, LIFE_S};
+use palpate_haptics::datagram_health::{Carried, DatagramHealth, LIFE_S};
 use palpate_haptics::dead_reckoning::{FASTEST_S, SendInterval};
 use palpate_haptics::deadband::HEARTBEAT_S;
 use palpate_proto::datagram::{self, MAX_BYTES, MAX_EARLIER, Posed};
@@ -58,7 +58,7 @@ pub struct Datagrams {
     asked_s: f64,
     opening: JoinSet<Option<Connection>>,
     connection: Option<Connection>,
-    carrier: Carrier,
+    carrier: DatagramHealth,
     pulse: SendInterval,
     begun: Instant,
     life: Interval,
@@ -80,7 +80,7 @@ impl Datagrams {
             asked_s: 0.0,
             opening: JoinSet::new(),
             connection: None,
-            carrier: Carrier::default(),
+            carrier: DatagramHealth::default(),
             pulse: SendInterval::default(),
             begun: Instant::now(),
             life,
@@ -145,7 +145,7 @@ impl Datagrams {
         recent.push_front(newest);
         recent.truncate(MAX_EARLIER);
         let now_s = self.now_s();
-        self.carrier.carries(now_s) && self.datagram(vec![message], now_s)
+        self.carrier.update(now_s) && self.datagram(vec![message], now_s)
     }
 
     /// Sends a datagram. Returns false if it is too long or the session has ended.
@@ -186,7 +186,7 @@ impl Datagrams {
                         self.datagram(Vec::new(), now_s);
                     }
                     // Detects that nothing is confirmed any longer, even while nothing is sent.
-                    self.carrier.carries(now_s);
+                    self.carrier.update(now_s);
                 }
             }
         }

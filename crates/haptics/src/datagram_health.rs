@@ -2,7 +2,7 @@
 //! knows whether it is heard, and what it says goes by datagram while it is; else by the reliable stream beside it.
 //!
 //! A network that blocks datagrams, or lets them pass one way only, is thus no error: datagrams are still tried
-//! ([`Carrier::is_silent`]), and carry again once they are confirmed.
+//! ([`DatagramHealth::is_silent`]), and carry again once they are confirmed.
 
 /// Datagrams carry while the other end has confirmed something new within this time, s: twice what each end waits before it
 /// holds what it does, so that a burst of losses does not change the way.
@@ -13,7 +13,7 @@ pub const LIFE_S: f64 = 0.04;
 
 /// One end's account of the datagrams between two ends.
 #[derive(Debug, Clone, Default)]
-pub struct Carrier {
+pub struct DatagramHealth {
     sent: u64,
     sent_s: Option<f64>,
     came: u64,
@@ -35,7 +35,7 @@ pub struct Carried {
     pub fell_back: u64,
 }
 
-impl Carrier {
+impl DatagramHealth {
     /// Returns the number of a datagram that is sent at `now_s`, and the newest of the other end's, which it
     /// acknowledges.
     pub fn send(&mut self, now_s: f64) -> (u64, u64) {
@@ -56,7 +56,7 @@ impl Carrier {
     }
 
     /// Returns whether what is to be said at `now_s` goes by datagram.
-    pub fn carries(&mut self, now_s: f64) -> bool {
+    pub fn update(&mut self, now_s: f64) -> bool {
         let carries = self.confirmed_s.is_some_and(|confirmed_s| now_s - confirmed_s <= CONFIRMED_S);
         if self.carries && !carries {
             self.fell_back += 1;
@@ -107,7 +107,8 @@ mod tests {
     /// Two ends that send each other a datagram every `every_ms`, which take 25 ms; `passes` tells whether one gets through, by
     /// its way and the time, ms. Returns when each end's datagrams carry, one entry a millisecond.
     fn play(every_ms: u32, passes: impl Fn(usize, u32) -> bool) -> [Vec<bool>; 2] {
-        let (mut ends, mut carries) = ([Carrier::default(), Carrier::default()], [Vec::new(), Vec::new()]);
+        let (mut ends, mut carries) =
+            ([DatagramHealth::default(), DatagramHealth::default()], [Vec::new(), Vec::new()]);
         let mut under_way: Vec<(u32, usize, (u64, u64))> = Vec::new();
         for now_ms in 0..3000_u32 {
             let now_s = f64::from(now_ms) * 1e-3;
@@ -124,7 +125,7 @@ mod tests {
                         under_way.push((now_ms + 25, 1 - from, datagram));
                     }
                 }
-                carries[from].push(ends[from].carries(now_s));
+                carries[from].push(ends[from].update(now_s));
             }
         }
         carries
@@ -157,12 +158,12 @@ mod tests {
 
     #[test]
     fn nobody_confirms_what_was_not_sent() {
-        let mut end = Carrier::default();
+        let mut end = DatagramHealth::default();
         end.arrive(1, 7, 0.0);
-        assert!(!end.carries(0.0));
+        assert!(!end.update(0.0));
         assert_eq!(end.send(0.0), (1, 1));
         end.arrive(2, 1, 0.01);
-        assert!(end.carries(0.1) && !end.carries(0.2));
+        assert!(end.update(0.1) && !end.update(0.2));
         assert_eq!(end.carried(), Carried { sent: 1, came: 2, fell_back: 1 });
     }
 

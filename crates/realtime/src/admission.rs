@@ -10,7 +10,7 @@ use super::audited::Audited;
 use super::clock::{Dilation, now_ns};
 use super::cost::{Cost, check_asked, check_work};
 use super::event_log::{About, EventLog};
-use super::law_cache::KeptLaws;
+use super::law_cache::LawCache;
 use super::pacer::Pacer;
 use super::playback::Playback;
 use super::session_handle::SessionHandle;
@@ -251,7 +251,7 @@ impl Pacer {
             status: Mutex::new(status),
             streams: Mutex::new(StreamSlots::new(&self.limits)),
             refused: AtomicU64::new(0),
-            laws: KeptLaws::default(),
+            laws: LawCache::default(),
             tissue: watch::Sender::new((step, model)),
             audited: Mutex::new(Audited::default()),
             model: first,

@@ -2,9 +2,9 @@
 //! reader; the thread that writes journals takes all events at once.
 //!
 //! An event log is bounded. If the writer of journals does not keep up or can't write, the log breaks: it discards
-//! its events, keeps the reason, and the session continues without a journal. If the disk was full and the writer
-//! reports that there is room again, the stepping thread restarts the log with a snapshot; that begins another run of
-//! the journal.
+//! its events, keeps the reason, and the session continues without a journal. If the disk was full or too slow and the
+//! writer reports that there is room again, the stepping thread restarts the log with a snapshot; that begins another run
+//! of the journal.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -21,6 +21,9 @@ use palpate_tissue::{Model, ReadCopy};
 
 /// Limit of events that an event log holds: half a minute of a tool at 1 kHz.
 const MAX_EVENTS: usize = 1 << 15;
+
+/// The reason of a break because events arrive faster than the disk takes them.
+const OVERFLOW: &str = "the disk is too slow: the number of events that wait for it reached the limit";
 
 /// Limit of bytes of tissue copies that an event log holds, beside the first copy. Further copies are left out
 /// while the disk is slow.
@@ -75,6 +78,8 @@ pub struct TakenEvents {
     pub anew: Option<Beginning>,
     /// Whether the log is broken, so that no events are kept.
     pub is_broken: bool,
+    /// Whether the log broke since it was last taken because it was full.
+    pub has_overflowed: bool,
 }
 
 /// State of a session at the beginning of its journal or of a further run.
@@ -98,6 +103,7 @@ struct HeldEvents {
     /// Whether the log waits in the queue to be taken.
     is_queued: bool,
     broken: Option<Arc<str>>,
+    has_overflowed: bool,
 }
 
 /// Progress of a journal: which steps are on disk.
@@ -148,7 +154,7 @@ pub struct EventLog {
     /// The session that the log belongs to.
     pub about: About,
     held: Mutex<HeldEvents>,
-    queue: Arc<TapeQueue>,
+    queue: Arc<EventLogQueue>,
     /// Whether only mirrored events are durable.
     needs_mirror: bool,
     /// Whether a broken log may restart because there is room again.
@@ -159,7 +165,7 @@ pub struct EventLog {
 }
 
 impl EventLog {
-    pub(super) fn new(queue: &Arc<TapeQueue>, about: About) -> Arc<Self> {
+    pub(super) fn new(queue: &Arc<EventLogQueue>, about: About) -> Arc<Self> {
         Arc::new(EventLog {
             about,
             held: Mutex::new(HeldEvents::default()),
@@ -181,19 +187,22 @@ impl EventLog {
         self.progress.subscribe()
     }
 
-    /// Sets that everything before `step` is on the disk of this server, and clears the reason of a break. `lag_s`
-    /// is the age of the newest of it, s.
-    pub fn is_durable(&self, step: u64, lag_s: f64) {
+    /// Sets that everything before `step` is on the disk of this server, and clears the reason of an earlier break
+    /// unless the log is broken now. `lag_s` is the age of the newest of it, s.
+    pub fn set_durable(&self, step: u64, lag_s: f64) {
         self.progress.send_modify(|progress| {
             (progress.local_step, progress.lag_s) = (Some(step), lag_s);
-            progress.broken = None;
+            // The log may have overflowed while the disk was busy.
+            if lock(&self.held).broken.is_none() {
+                progress.broken = None;
+            }
             self.tell_durable(progress);
         });
     }
 
     /// Sets that everything before `step` is on the disk of the standby server. A lower step than before is
     /// ignored.
-    pub fn is_mirrored(&self, step: u64) {
+    pub fn set_mirrored(&self, step: u64) {
         self.progress.send_modify(|progress| {
             progress.mirrored_step = progress.mirrored_step.max(Some(step));
             self.tell_durable(progress);
@@ -222,7 +231,7 @@ impl EventLog {
     }
 
     /// Marks the journal as complete: everything is on disk, and no event follows.
-    pub fn is_complete(&self) {
+    pub fn set_complete(&self) {
         self.progress.send_modify(|progress| progress.is_complete = true);
     }
 
@@ -285,7 +294,10 @@ impl EventLog {
         }
         if held.events.len() >= MAX_EVENTS {
             drop(held);
-            return self.break_off("the disk did not keep up: what waited to be written reached its bound");
+            self.break_off(OVERFLOW);
+            lock(&self.held).has_overflowed = true;
+            // The writer of journals must learn of it, to restart the log.
+            return self.queue.push(self.clone());
         }
         held.copied_bytes += bytes;
         held.events.push(noted);
@@ -293,7 +305,7 @@ impl EventLog {
     }
 
     /// Sets that all events before `step` have been added. `is_still`: no event follows for now.
-    pub(super) fn is_told_until(self: &Arc<Self>, step: u64, is_still: bool) {
+    pub(super) fn set_until(self: &Arc<Self>, step: u64, is_still: bool) {
         let mut held = lock(&self.held);
         let was_still = std::mem::replace(&mut held.is_still, is_still);
         held.until_step = step;
@@ -330,13 +342,14 @@ impl EventLog {
             is_still: held.is_still,
             anew: held.anew.take(),
             is_broken: held.broken.is_some(),
+            has_overflowed: std::mem::take(&mut held.has_overflowed),
         }
     }
 }
 
 /// Queue of the event logs that hold events.
 #[derive(Default)]
-pub struct TapeQueue {
+pub struct EventLogQueue {
     state: Mutex<Queued>,
     wake: Condvar,
     needs_mirror: AtomicBool,
@@ -348,7 +361,7 @@ struct Queued {
     stop: bool,
 }
 
-impl TapeQueue {
+impl EventLogQueue {
     /// Makes only mirrored events durable, in event logs that are created from now on.
     pub fn needs_mirror(&self) {
         self.needs_mirror.store(true, Ordering::Relaxed);
@@ -398,7 +411,7 @@ impl TapeQueue {
         lock(&self.state).stop
     }
 
-    /// Stops the queue: [`TapeQueue::wait`] returns `None` once it is empty.
+    /// Stops the queue: [`EventLogQueue::wait`] returns `None` once it is empty.
     pub fn stop(&self) {
         lock(&self.state).stop = true;
         self.wake.notify_all();
@@ -449,5 +462,49 @@ impl Cadence {
     /// Returns whether poses and forces are recorded at `step`.
     pub(super) fn wants_felt(&self, step: u64) -> bool {
         step.is_multiple_of(self.felt_steps)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used)]
+    use palpate_tissue::scene::PAPER;
+
+    use super::*;
+
+    #[test]
+    fn a_log_that_overflows_during_a_sync_stays_broken_and_is_reported_once() {
+        let first = Model::parse("paper", PAPER, &["sheet.points=[5, 5]"]).unwrap();
+        let (id, owner) = ("a".to_owned(), "b".to_owned());
+        let about = About {
+            id,
+            owner,
+            idle_timeout_s: 1.0,
+            first,
+            begin_step: 0,
+            running: true,
+            until_step: None,
+            after_run: 0,
+            revision: 0,
+        };
+        let log = EventLog::new(&Arc::default(), about);
+        let fill = |count: usize| (0..count).for_each(|_| log.note(1, Event::Left(Leaving::Deleted)));
+        fill(MAX_EVENTS);
+        assert!(!log.take().is_broken, "as many as it holds");
+        fill(MAX_EVENTS + 1);
+        log.set_durable(1, 0.0);
+        let reason = log.progress().borrow().broken.clone();
+        assert_eq!(reason.as_deref(), Some(OVERFLOW), "the events after that are lost");
+        let taken = log.take();
+        assert!(taken.is_broken && taken.has_overflowed && taken.events.is_empty());
+        assert!(!log.take().has_overflowed);
+        // The writer allows it to restart.
+        log.may_begin_anew();
+        assert!(log.begins_anew(|| Beginning { step: 2, running: true, until_step: None }));
+        fill(1);
+        let taken = log.take();
+        assert!(!taken.is_broken && taken.anew.is_some() && taken.events.len() == 1);
+        log.set_durable(2, 0.0);
+        assert_eq!(log.progress().borrow().broken, None);
     }
 }

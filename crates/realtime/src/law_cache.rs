@@ -23,7 +23,7 @@ const LAW_BYTES: u64 = 2 << 10;
 /// The force laws that a session keeps, at most 64. The least recently requested is removed when there are too
 /// many.
 #[derive(Default)]
-pub struct KeptLaws(Mutex<Option<TissueLaws>>);
+pub struct LawCache(Mutex<Option<TissueLaws>>);
 
 /// The laws of one tissue.
 struct TissueLaws {
@@ -42,7 +42,7 @@ pub fn have_same_laws(a: &Model, b: &Model) -> bool {
         && a.volume_stiffness_pa == b.volume_stiffness_pa
 }
 
-impl KeptLaws {
+impl LawCache {
     /// Returns the law of `model` under a disc, and creates it if it is not kept; nothing is computed. At most
     /// `most_work` springs times iterations may be spent on it. The laws of a different tissue are discarded first.
     /// The memory is charged to `payer`.
@@ -76,7 +76,7 @@ impl KeptLaws {
     }
 }
 
-impl KeptLaws {
+impl LawCache {
     /// Returns the laws of `model` that have been computed so far, exact ones where available; the most recently
     /// requested is the last.
     pub fn known(&self, model: &Model) -> Vec<(Disc, Arc<Law>)> {
@@ -204,7 +204,7 @@ mod tests {
                 },
             );
         let budget = Budget::new(&Limits { memory_bytes: 256 << 10, ..Limits::default() }, 1, 1);
-        let (account, kept) = (budget.account("one"), KeptLaws::default());
+        let (account, kept) = (budget.account("one"), LawCache::default());
         let disc = |radius_m: f64| Disc { radius_m, at_m: DVec3::ZERO };
         let of = |radius: u32, model: &Arc<Model>| kept.of(disc(f64::from(radius)), model, 1, &account);
         let taken = || budget.bytes_for(Purpose::Laws);

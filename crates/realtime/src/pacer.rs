@@ -8,7 +8,7 @@ use std::thread::JoinHandle;
 use super::audited::AuditTally;
 use super::auditor::{Auditor, Sessions};
 use super::clock::now_ns;
-use super::event_log::TapeQueue;
+use super::event_log::EventLogQueue;
 use super::fence::Fence;
 use super::frames::{Encoder, Viewer};
 use super::inbox::{Leaving, Request};
@@ -42,7 +42,7 @@ pub struct Pacer {
     auditor: Arc<Auditor>,
     viewers: Mutex<BTreeMap<String, Weak<Viewer>>>,
     pub(super) numbers: Mutex<u64>,
-    pub(super) event_logs: OnceLock<Arc<TapeQueue>>,
+    pub(super) event_logs: OnceLock<Arc<EventLogQueue>>,
     /// The moment until which the server may step its sessions and answer for them.
     pub fence: Arc<Fence>,
 }
@@ -127,7 +127,7 @@ impl Pacer {
 
     /// Makes each session that is created from now on write an event log. Returns the queue of the logs, which the
     /// caller must empty; a further call returns the same queue.
-    pub fn keep_tapes(&self) -> Arc<TapeQueue> {
+    pub fn record_events(&self) -> Arc<EventLogQueue> {
         self.event_logs.get_or_init(Arc::default).clone()
     }
 

@@ -24,7 +24,7 @@ impl Recorder {
         };
         recorder.cadence.wants_snapshot(step, false);
         recorder.snapshot(session);
-        event_log.is_told_until(step, true);
+        event_log.set_until(step, true);
         recorder
     }
 

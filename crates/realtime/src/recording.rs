@@ -53,7 +53,7 @@ impl SessionTask {
         let step = session.step_count();
         if session.hold_reason().is_some() {
             // The guard has held it; a replay of the same inputs is held at the same step.
-            return event_log.is_told_until(step, true);
+            return event_log.set_until(step, true);
         }
         let is_at_rest = session.rests_until().is_some();
         let comes_to_rest = is_at_rest && !std::mem::replace(&mut recorder.was_at_rest, is_at_rest);
@@ -69,14 +69,14 @@ impl SessionTask {
         if recorder.cadence.wants_snapshot(step, comes_to_rest) {
             recorder.snapshot(session);
         }
-        recorder.event_log.is_told_until(step, is_at_rest);
+        recorder.event_log.set_until(step, is_at_rest);
     }
 
     /// Writes that steps were skipped at rest.
     pub(super) fn note_rest(&mut self) {
         self.begin_anew();
         if let Some(recorder) = &self.recorder {
-            recorder.event_log.is_told_until(self.session.step_count(), true);
+            recorder.event_log.set_until(self.session.step_count(), true);
         }
     }
 
@@ -91,6 +91,6 @@ impl SessionTask {
     pub(super) fn note_the_end(&mut self) {
         let Some(recorder) = &self.recorder else { return };
         recorder.snapshot(&self.session);
-        recorder.event_log.is_told_until(self.session.step_count(), true);
+        recorder.event_log.set_until(self.session.step_count(), true);
     }
 }

@@ -11,7 +11,7 @@ use super::cost::{Cost, check_work};
 use super::event_log::{Event, EventLog};
 use super::frames::Viewer;
 use super::inbox::{Inbox, Present, Request};
-use super::law_cache::{KeptLaws, SoughtLaw};
+use super::law_cache::{LawCache, SoughtLaw};
 use super::playback::Playback;
 use super::queue::{Reader, queue};
 use super::reading::{Recipient, SharedRecord};
@@ -64,7 +64,7 @@ pub struct SessionHandle {
     pub(super) status: Mutex<Status>,
     pub(super) streams: Mutex<StreamSlots>,
     pub(super) refused: AtomicU64,
-    pub(super) laws: KeptLaws,
+    pub(super) laws: LawCache,
     pub(super) tissue: watch::Sender<(u64, Arc<Model>)>,
     pub(super) cost: Cost,
     pub(super) audited: Mutex<Audited>,
@@ -154,7 +154,7 @@ impl SessionHandle {
 
     /// Sets the revision at which this server became the session's owner or confirmed that it is. A lower revision
     /// is ignored.
-    pub fn is_owned_since(&self, revision: u64) {
+    pub fn set_owned_since(&self, revision: u64) {
         self.revision.fetch_max(revision, Ordering::AcqRel);
     }
 
@@ -278,7 +278,7 @@ impl SessionHandle {
     /// Makes this server the owner of a session that was handed over frozen: `revision` is that of its key. The
     /// session is stepped and served from now on.
     pub fn arrive(&self, revision: u64) {
-        self.is_owned_since(revision);
+        self.set_owned_since(revision);
         self.is_coming.store(false, Ordering::Release);
         self.thaw();
     }

@@ -60,7 +60,7 @@ impl TissueCopy {
     ///
     /// # Errors
     /// Refuses a tip that does not fit the tissue, or that is too large for a copy.
-    pub fn of_stranger(model: &Arc<Model>, tip: Tip) -> Result<Self> {
+    pub fn for_client(model: &Arc<Model>, tip: Tip) -> Result<Self> {
         let shape = model.shape();
         check_tip("tip", shape, &tip)?;
         let most_m = MAX_EDGES * shape.edge_m();

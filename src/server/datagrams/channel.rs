@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex};
 
-use palpate_haptics::datagram_health::Carrier;
+use palpate_haptics::datagram_health::DatagramHealth;
 use palpate_haptics::dead_reckoning::SendInterval;
 use palpate_proto::datagram::MAX_BYTES;
 use palpate_proto::pb;
@@ -28,7 +28,7 @@ pub(in crate::server) struct DatagramChannel {
 #[derive(Debug, Default)]
 struct Inner {
     connection: Option<Connection>,
-    carrier: Carrier,
+    carrier: DatagramHealth,
     pulse: SendInterval,
 }
 
@@ -89,7 +89,7 @@ impl DatagramChannel {
         let now_ns = now_ns();
         let mut inner = lock(&self.inner);
         inner.connection.is_some()
-            && inner.carrier.carries(seconds(now_ns))
+            && inner.carrier.update(seconds(now_ns))
             && inner.datagram(Some(sample.clone()), now_ns).is_some()
     }
 

@@ -231,7 +231,7 @@ impl Fleet {
                         .list()
                         .iter()
                         .filter(|handle| handle.id == id)
-                        .for_each(|handle| handle.is_owned_since(now));
+                        .for_each(|handle| handle.set_owned_since(now));
                     return true;
                 }
                 Ok(Err(Some((value, _)))) if value.node == self.node => return false,

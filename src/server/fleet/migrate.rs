@@ -251,7 +251,7 @@ impl Fleet {
         // The other server learns the revision at which it is handed over: a transaction at another one does not
         // concern it.
         let revision = self.revision(&handle.id).ok_or_else(|| broken("it is not this server's"))?;
-        handle.is_owned_since(revision);
+        handle.set_owned_since(revision);
         let last = self.state_of(handle, present).await?;
         handing.state(&last).await?;
         if !self.pacer.has(&handle.id) {
@@ -289,7 +289,7 @@ impl Fleet {
                         .list()
                         .iter()
                         .filter(|handle| handle.id == id)
-                        .for_each(|handle| handle.is_owned_since(now));
+                        .for_each(|handle| handle.set_owned_since(now));
                     return Some((SessionValue { node: self.node.clone(), standby }, now));
                 }
                 // Its lease has ended: the request may still take place when it has another.

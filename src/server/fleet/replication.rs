@@ -174,7 +174,7 @@ impl Fleet {
                 for grown in grown.iter().filter(|grown| !is_told(&grown.session_id)) {
                     let at = lock(&of_disk).of(&grown.session_id, grown.run);
                     if let Some(at) = at {
-                        self.is_mirrored(name, &at).await;
+                        self.record_mirrored(name, &at).await;
                     }
                 }
                 let behind = |grown: &Grown| sent.get(&grown.session_id) != Some(&(grown.run, grown.bytes));
@@ -200,7 +200,7 @@ impl Fleet {
             while let Some(answer) = heard.message().await.map_err(told)? {
                 for at in answer.mirrored {
                     if lock(&of_disk).hear(&at) {
-                        self.is_mirrored(name, &at).await;
+                        self.record_mirrored(name, &at).await;
                     }
                 }
             }
@@ -280,14 +280,14 @@ impl Fleet {
         let standbys = lock(&self.standbys);
         let counts = standbys.get(id).is_some_and(|standby| standby.is(name));
         if counts {
-            event_log.is_mirrored(step);
+            event_log.set_mirrored(step);
         }
         counts
     }
 
     /// Handles a report of how many bytes of a journal a server has on its disk. On the first one, names that server
     /// in etcd as the standby.
-    async fn is_mirrored(&self, name: &str, at: &pb::Mirrored) {
+    async fn record_mirrored(&self, name: &str, at: &pb::Mirrored) {
         let id = &at.session_id;
         let Some((event_log, step)) = self.growth.mirrored(id, at.run, at.durable_bytes) else { return };
         if self.counts(id, name, &event_log, step) {
@@ -302,7 +302,7 @@ impl Fleet {
             // A late answer says nothing: the key has been written since.
             Ok(Ok(now)) if self.owns_since(id, now) && self.is_named_now(id, name) => {
                 if let Ok(handle) = self.pacer.get(id) {
-                    handle.is_owned_since(now);
+                    handle.set_owned_since(now);
                 }
                 info!(session = %id, node = name, "standby server named");
                 self.counts(id, name, &event_log, step);

@@ -14,7 +14,7 @@ use super::purge;
 use super::retention::Keep;
 use palpate_realtime::Leaving;
 use palpate_realtime::clock::now_ns;
-use palpate_realtime::event_log::{About, Beginning, Event, EventLog, Noted, TapeQueue};
+use palpate_realtime::event_log::{About, Beginning, Event, EventLog, EventLogQueue, Noted};
 use palpate_session::journal::signature::Key;
 use palpate_session::journal::{self, JournalWriter, Opening, pb};
 
@@ -55,7 +55,7 @@ pub(super) struct Keeper {
     keep: Keep,
     /// The key that signs what is written, if any.
     key: Option<Key>,
-    queue: Arc<TapeQueue>,
+    queue: Arc<EventLogQueue>,
     tally: Arc<KeeperTally>,
     /// The newest run of each session that was found in the folder or has started. A session's runs are its
     /// successive journals.
@@ -65,7 +65,7 @@ pub(super) struct Keeper {
     entries: BTreeMap<String, OpenJournal>,
     /// Event logs of sessions that returned before their previous journal was complete.
     waiting: Vec<Arc<EventLog>>,
-    /// Event logs that broke because there was no space.
+    /// Event logs that broke because there was no space or because the disk was too slow.
     without_room: Vec<Weak<EventLog>>,
     /// Receives what was written, for the replication of journals.
     growth: Option<Arc<Growth>>,
@@ -95,7 +95,7 @@ impl Keeper {
     pub(super) fn new(
         folder: Arc<Folder>,
         (keep, key): (Keep, Option<Key>),
-        queue: Arc<TapeQueue>,
+        queue: Arc<EventLogQueue>,
         tally: Arc<KeeperTally>,
         found: FolderContent,
         growth: Option<Arc<Growth>>,
@@ -179,7 +179,7 @@ impl Keeper {
             let lag_ns = now.saturating_sub(noted_ns);
             self.tally.lag_ns.store(lag_ns, Ordering::Relaxed);
             #[allow(clippy::cast_precision_loss)]
-            entry.event_log.is_durable(until_step, lag_ns as f64 * 1e-9);
+            entry.event_log.set_durable(until_step, lag_ns as f64 * 1e-9);
             if is_still {
                 entry.file.close();
             }
@@ -192,10 +192,14 @@ impl Keeper {
     /// Writes the events of one log. `None` if there are none, or they can't be written.
     fn write(&mut self, event_log: &Arc<EventLog>) -> Option<Written> {
         let taken = event_log.take();
+        let id = event_log.about.id.clone();
+        if taken.has_overflowed {
+            self.forget(&id);
+            self.without_room.push(Arc::downgrade(event_log));
+        }
         if taken.is_broken {
             return None;
         }
-        let id = event_log.about.id.clone();
         if !self.entries.contains_key(&id) {
             self.begin(event_log, taken.anew);
         }
@@ -286,14 +290,14 @@ impl Keeper {
         let Some(mut entry) = self.entries.remove(id) else { return };
         self.runs.remove(id);
         if let Some(growth) = &self.growth {
-            growth.is_complete(id, entry.event_log.progress().borrow().run);
+            growth.complete(id, entry.event_log.progress().borrow().run);
         }
         if self.keep.age.is_zero() {
             purge::remove(entry.file.path());
         } else {
             seal(&mut entry.file);
         }
-        entry.event_log.is_complete();
+        entry.event_log.set_complete();
     }
 
     /// Removes the journal of a session that was expected and did not arrive. Its run is not used again.
@@ -301,7 +305,7 @@ impl Keeper {
         let Some(mut entry) = self.entries.remove(id) else { return };
         entry.file.close();
         purge::remove(entry.file.path());
-        entry.event_log.is_complete();
+        entry.event_log.set_complete();
     }
 
     /// Removes journals that are too old or exceed the size limit, and forgets broken ones.
@@ -332,28 +336,35 @@ impl Keeper {
         }
         for (id, until_step, _) in ended {
             if let Some(entry) = self.entries.get_mut(&id) {
-                entry.event_log.is_durable(until_step, 0.0);
+                entry.event_log.set_durable(until_step, 0.0);
                 seal(&mut entry.file);
             }
         }
     }
 
+    /// Breaks the journal of a session, whose file can't be written. It restarts if only space was missing.
     fn break_off(&mut self, id: &str, what: &str, error: &std::io::Error) {
-        self.tally.broken.fetch_add(1, Ordering::Relaxed);
-        let Some(mut entry) = self.entries.remove(id) else { return };
-        // A run without any data does not count.
-        if entry.file.bytes() == 0 {
-            entry.file.close();
-            purge::remove(entry.file.path());
-            self.runs.get_mut(id).into_iter().for_each(|run| *run = run.saturating_sub(1));
-        }
-        entry.event_log.break_off(&format!("{what}: {error}"));
+        let Some(event_log) = self.forget(id) else { return };
+        event_log.break_off(&format!("{what}: {error}"));
         if matches!(error.kind(), ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge) {
-            self.without_room.push(Arc::downgrade(&entry.event_log));
+            self.without_room.push(Arc::downgrade(&event_log));
         }
     }
 
-    /// Restarts the journals that broke for lack of space, if there is some now.
+    /// Counts a broken journal, and closes its file as it is. Returns its event log, if the journal had begun.
+    fn forget(&mut self, id: &str) -> Option<Arc<EventLog>> {
+        self.tally.broken.fetch_add(1, Ordering::Relaxed);
+        let mut entry = self.entries.remove(id)?;
+        entry.file.close();
+        // A run without any data does not count.
+        if entry.file.bytes() == 0 {
+            purge::remove(entry.file.path());
+            self.runs.get_mut(id).into_iter().for_each(|run| *run = run.saturating_sub(1));
+        }
+        Some(entry.event_log)
+    }
+
+    /// Restarts the journals that broke for lack of space or of time, if there is space now.
     fn try_again(&mut self) {
         if !self.without_room.is_empty() && self.folder.has_room() {
             self.without_room

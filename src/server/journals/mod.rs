@@ -22,7 +22,7 @@ use super::{journal_key, reload};
 use folder::Folder;
 use keeper::Keeper;
 pub(crate) use keeper::KeeperTally;
-use palpate_realtime::event_log::{JournalProgress, TapeQueue};
+use palpate_realtime::event_log::{EventLogQueue, JournalProgress};
 use palpate_realtime::priority::{give_way_a_little, thread};
 use palpate_realtime::{Pacer, SessionHandle};
 use palpate_refusal::{Reason, Refusal, Result};
@@ -38,7 +38,7 @@ const WRITE_TIMEOUT: Duration = Duration::from_secs(5);
 /// The journals of a server, and the thread that writes them.
 pub(super) struct Journals {
     folder: Arc<Folder>,
-    queue: Arc<TapeQueue>,
+    queue: Arc<EventLogQueue>,
     thread: std::sync::Mutex<Option<JoinHandle<()>>>,
     pub(super) tally: Arc<KeeperTally>,
     /// Sessions that could not be continued when the server started.
@@ -62,7 +62,7 @@ impl Journals {
         let (own, growth) = fleet.unzip();
         let key = config.journal_key.as_deref().map(signing_key).transpose()?;
         let folder = Arc::new(Folder::open(path)?);
-        let (queue, tally) = (pacer.keep_tapes(), Arc::new(KeeperTally::default()));
+        let (queue, tally) = (pacer.record_events(), Arc::new(KeeperTally::default()));
         let found = resume::all(folder.path(), own.as_ref(), pacer, &config.limits)?;
         let name = |path: &PathBuf| palpate_session::journal::file::parse(path.file_name()?.to_str()?);
         let left_alone = found.left_alone.iter().filter_map(|path| Some(name(path)?.0)).collect();

@@ -79,7 +79,7 @@ impl Growth {
     }
 
     /// Stops tracking a session's journal if that run is the current one.
-    pub(super) fn is_complete(&self, session_id: &str, run: u32) {
+    pub(super) fn complete(&self, session_id: &str, run: u32) {
         let mut files = lock(&self.files);
         if files.get(session_id).is_some_and(|file| file.run == run) {
             files.remove(session_id);

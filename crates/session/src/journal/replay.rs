@@ -572,7 +572,7 @@ pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predict
         let first = message::model(reader.header(), &limits)?;
         let (_, snapshot, _) = snapshot(&mut reader, at)?;
         let (_, model) = saved(&snapshot, &first, &limits)?;
-        TissueCopy::of_stranger(&model, tip)
+        TissueCopy::for_client(&model, tip)
     };
     let copy = memory::attempt("snapshot", copy).map_err(|refusal| refusal.to_string())?;
     Ok(Box::new(copy))

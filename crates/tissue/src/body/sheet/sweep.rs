@@ -99,37 +99,27 @@ impl<T: Real, S: Stage<T>> Sweep<'_, T, S> {
                         None => [zero; 3],
                     };
                     let span = (from..to, strip.awake && from == strip.columns.start, left);
-                    // The common rows have loops of their own, without the code that only other rows need. No code is
-                    // made for loops that can't be used: most of the build is this function's.
-                    if const { !V::IS_REGISTER } {
-                        if i + 1 < rows {
-                            self.row::<V, BENDING, true, false, ANY>(bending, i, span, &mut sums);
-                        } else {
-                            self.row::<V, BENDING, false, false, ANY>(bending, i, span, &mut sums);
-                        }
-                        continue;
-                    }
-                    if const { BENDING || S::ENERGY } {
-                        match (i + 1 < rows, whole) {
-                            (true, true) => self.row::<V, BENDING, true, true, ANY>(bending, i, span, &mut sums),
-                            (true, false) => self.row::<V, BENDING, true, false, ANY>(bending, i, span, &mut sums),
-                            (false, _) => self.row::<V, BENDING, false, false, ANY>(bending, i, span, &mut sums),
-                        }
-                        continue;
-                    }
-                    match (i + 1 < rows, whole, self.stage.duty(i)) {
-                        (true, true, ROW_UNLOADED) => {
+                    // The two most frequent kinds of rows have loops of their own, without the code that only other rows
+                    // need. Each loop is compiled for every scheme, width and number format, which is most of the build's
+                    // time: no others are worth it (measured), and none where the springs bend, for energies or in f64.
+                    let (has_below, duty) = (i + 1 < rows, self.stage.duty(i));
+                    if const { V::IS_REGISTER && !BENDING && !S::ENERGY && size_of::<T>() == size_of::<f32>() }
+                        && has_below
+                        && whole
+                    {
+                        if duty == ROW_UNLOADED {
                             self.row::<V, BENDING, true, true, ROW_UNLOADED>(bending, i, span, &mut sums);
+                            continue;
                         }
-                        (true, true, ROW_LOADED) => {
+                        if duty == ROW_LOADED {
                             self.row::<V, BENDING, true, true, ROW_LOADED>(bending, i, span, &mut sums);
+                            continue;
                         }
-                        (true, true, _) => self.row::<V, BENDING, true, true, ANY>(bending, i, span, &mut sums),
-                        (true, false, ROW_UNLOADED) => {
-                            self.row::<V, BENDING, true, false, ROW_UNLOADED>(bending, i, span, &mut sums);
-                        }
-                        (true, false, _) => self.row::<V, BENDING, true, false, ANY>(bending, i, span, &mut sums),
-                        (false, ..) => self.row::<V, BENDING, false, false, ANY>(bending, i, span, &mut sums),
+                    }
+                    if has_below {
+                        self.row::<V, BENDING, true, false, ANY>(bending, i, span, &mut sums);
+                    } else {
+                        self.row::<V, BENDING, false, false, ANY>(bending, i, span, &mut sums);
                     }
                 }
                 if let Some(edge) = edge {

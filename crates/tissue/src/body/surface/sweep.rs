@@ -172,13 +172,17 @@ impl<T: Real, S: Stage<T>> MeshSweep<'_, T, S> {
                 }
             }
             for row in tile * TILE_SLOTS / BLOCK..((tile + 1) * TILE_SLOTS / BLOCK).min(rows) {
-                let duty = if S::ENERGY || !V::IS_REGISTER { ANY } else { self.stage.duty(row) };
+                let duty = self.stage.duty(row);
                 for column in (0..BLOCK).step_by(V::LANES) {
                     let at = row * BLOCK + column;
                     // SAFETY: the caller's promise; all slots of a row are in the layout.
                     unsafe {
                         let x = load::<V>(x.add(at), plane);
                         let n = self.force(gather, at_hand, at, &x);
+                        if const { S::ENERGY || !V::IS_REGISTER || size_of::<T>() > size_of::<f32>() } {
+                            self.stage.finish::<V, ANY>(row, at, x, n, sums);
+                            continue;
+                        }
                         match duty {
                             ROW_UNLOADED => self.stage.finish::<V, ROW_UNLOADED>(row, at, x, n, sums),
                             ROW_LOADED => self.stage.finish::<V, ROW_LOADED>(row, at, x, n, sums),
