@@ -114,7 +114,7 @@ fn a_journal_of_a_stranger_names_no_file_of_this_machine() {
     let mut scene = Scene::parse("paper", PAPER, &["sheet.points=[7, 7]".to_owned()], &Limits::default()).unwrap();
     scene.appearance.texture = Some("/etc/passwd".into());
     let (file, _) = written(&Model::compile(&scene, &Limits::default()).unwrap(), 40, true);
-    let texture = |reader: JournalReader<Cursor<&[u8]>>| reader.header().appearance.clone().unwrap().texture;
+    let texture = |reader: JournalReader<'_>| reader.header().appearance.clone().unwrap().texture;
     let open = || JournalReader::new("a journal", Cursor::new(&file[..])).unwrap();
     assert_eq!(texture(open()), "/etc/passwd");
     assert_eq!(texture(open().without_files()), "");
@@ -254,7 +254,7 @@ fn a_long_touch_verifies() {
     println!("{steps} steps, {} bytes: verified in {seconds:.2} s", file.len());
 }
 
-fn reader(bytes: &[u8]) -> JournalReader<Cursor<&[u8]>> {
+fn reader(bytes: &[u8]) -> JournalReader<'_> {
     JournalReader::new("test", Cursor::new(bytes)).unwrap()
 }
 

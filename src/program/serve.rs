@@ -9,7 +9,11 @@ use palpate_realtime::priority::{NETWORK_TURN, take_short_turns};
 use palpate_session::budget;
 use palpate_tissue::check_processor;
 use tokio_util::sync::CancellationToken;
+use tracing_subscriber::Registry;
+use tracing_subscriber::filter::Targets;
 use tracing_subscriber::fmt::format::FmtSpan;
+use tracing_subscriber::layer::{Filter, SubscriberExt};
+use tracing_subscriber::util::SubscriberInitExt;
 
 use super::{Failure, load_config, log};
 
@@ -213,21 +217,21 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     config.check()?;
     // Clients don't choose lanes.
     check_processor()?;
-    let filter = tracing_subscriber::EnvFilter::try_new(&config.log)
-        .map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
-    let detailed = filter.max_level_hint().is_none_or(|level| level >= tracing::Level::DEBUG);
+    let filter: Targets = config.log.parse().map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
+    let detailed = Filter::<Registry>::max_level_hint(&filter).is_none_or(|level| level >= tracing::Level::DEBUG);
     budget::set_up_allocator();
     // Logging never blocks: lines that do not fit into the queue are dropped.
     let (writer, _flush) = tracing_appender::non_blocking(std::io::stderr());
     let subscriber = tracing_subscriber::fmt()
-        .with_env_filter(filter)
+        .with_max_level(tracing::Level::TRACE)
         // At level debug, the duration of each call and sampled step is logged when it ends.
         .with_span_events(if detailed { FmtSpan::CLOSE } else { FmtSpan::NONE })
         .with_ansi(std::io::stderr().is_terminal());
     if arguments.log_json {
-        subscriber.json().with_writer(move || log::JsonRecords(writer.clone())).init();
+        let subscriber = subscriber.json().with_writer(move || log::JsonRecords(writer.clone()));
+        subscriber.finish().with(filter).init();
     } else {
-        subscriber.fmt_fields(log::fields()).with_writer(writer).init();
+        subscriber.fmt_fields(log::fields()).with_writer(writer).finish().with(filter).init();
     }
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(config.serving_threads())

@@ -1,7 +1,9 @@
 //! Connections to a server: plain or TLS, with the caller's credentials.
 
 use std::error::Error as _;
+use std::future::Future;
 use std::net::IpAddr;
+use std::pin::Pin;
 use std::time::Duration;
 
 use palpate_refusal::printable::printable;
@@ -232,31 +234,34 @@ impl Server {
     ///
     /// # Errors
     /// Returns an error that explains why the server can't be reached.
-    pub async fn connect(&self) -> Result<Channel, Error> {
-        let unreached = |why: String| Error::Connection(format!("can't reach {}: {why}", self.url));
-        let connecting = async {
-            let channel = self.endpoint.connect().await.map_err(|e| (root(&e), in_words(&root(&e))))?;
-            // Any answer is sufficient, even a refusal.
-            match HealthClient::new(channel.clone()).check(HealthCheckRequest::default()).await {
-                Err(status) if status.source().is_some() => Err((root(&status), broken(&status))),
-                _ => Ok(channel),
-            }
-        };
-        let within_s = self.patience.as_secs_f64();
-        let silent = |_| unreached(format!("it accepts the connection but has not answered within {within_s} s"));
-        let connected = tokio::time::timeout(self.patience, connecting).await.map_err(silent)?;
-        let channel = match connected {
-            Ok(channel) => channel,
-            Err((root, _)) if self.is_secure && root.contains("InvalidContentType") => {
-                return Err(Error::Connection(self.other_scheme("does not speak TLS", "https", "http")));
-            }
-            Err((_, why)) => {
-                let speaks_tls = !self.is_secure && speaks_tls(&self.host).await;
-                let wrong = || Error::Connection(self.other_scheme("speaks TLS", "http", "https"));
-                return Err(if speaks_tls { wrong() } else { unreached(why) });
-            }
-        };
-        Ok(InterceptedService::new(channel, self.bearer.clone()))
+    pub fn connect(&self) -> Pin<Box<dyn Future<Output = Result<Channel, Error>> + Send + '_>> {
+        // Boxed so that it is compiled here, once, and not in every program that connects.
+        Box::pin(async move {
+            let unreached = |why: String| Error::Connection(format!("can't reach {}: {why}", self.url));
+            let connecting = async {
+                let channel = self.endpoint.connect().await.map_err(|e| (root(&e), in_words(&root(&e))))?;
+                // Any answer is sufficient, even a refusal.
+                match HealthClient::new(channel.clone()).check(HealthCheckRequest::default()).await {
+                    Err(status) if status.source().is_some() => Err((root(&status), broken(&status))),
+                    _ => Ok(channel),
+                }
+            };
+            let within_s = self.patience.as_secs_f64();
+            let silent = |_| unreached(format!("it accepts the connection but has not answered within {within_s} s"));
+            let connected = tokio::time::timeout(self.patience, connecting).await.map_err(silent)?;
+            let channel = match connected {
+                Ok(channel) => channel,
+                Err((root, _)) if self.is_secure && root.contains("InvalidContentType") => {
+                    return Err(Error::Connection(self.other_scheme("does not speak TLS", "https", "http")));
+                }
+                Err((_, why)) => {
+                    let speaks_tls = !self.is_secure && speaks_tls(&self.host).await;
+                    let wrong = || Error::Connection(self.other_scheme("speaks TLS", "http", "https"));
+                    return Err(if speaks_tls { wrong() } else { unreached(why) });
+                }
+            };
+            Ok(InterceptedService::new(channel, self.bearer.clone()))
+        })
     }
 
     /// Returns the message for a URL whose scheme is not that of the server.

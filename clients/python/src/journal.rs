@@ -1,8 +1,6 @@
 //! Journals as NumPy arrays.
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::BufReader;
 use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
@@ -78,7 +76,7 @@ impl CommandColumns {
 }
 
 impl Journal {
-    fn open(&self) -> Result<JournalReader<BufReader<File>>, Refusal> {
+    fn open(&self) -> Result<JournalReader<'static>, Refusal> {
         JournalReader::open(&self.path)
     }
 

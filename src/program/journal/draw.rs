@@ -72,7 +72,7 @@ fn strongest(source: &JournalSource) -> Result<u64, Failure> {
     Ok(found.1)
 }
 
-fn check(replay: &Replay<std::io::BufReader<std::fs::File>>, source: &JournalSource) -> Result<(), Failure> {
+fn check(replay: &Replay<'_>, source: &JournalSource) -> Result<(), Failure> {
     let differs = replay.difference().map(|difference| format!("{}: {difference}", source.file.display()));
     differs.map_or(Ok(()), |message| Err(Failure::Failed(message)))
 }
@@ -106,7 +106,7 @@ pub(super) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     let skin = if arguments.wireframe { None } else { Some(texture::image(&model.scene.appearance, &limits)?) };
     let view = View { camera: arguments.camera.parse()?, size, refinement, texture: skin };
     let shown = Skin::of(&model);
-    let go_to = |replay: &mut Replay<_>, step: u64| -> Result<(), Failure> {
+    let go_to = |replay: &mut Replay<'_>, step: u64| -> Result<(), Failure> {
         replay.advance(step, &mut |_: ReplayEvent<'_>| Ok(()))?;
         check(replay, source)
     };

@@ -12,8 +12,6 @@ mod recover;
 mod show;
 mod verify;
 
-use std::fs::File;
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use palpate_session::journal::{JournalReader, Replay};
@@ -75,7 +73,7 @@ impl JournalSource {
     }
 
     /// The journal, up to where it is damaged, if it is.
-    fn open(&self) -> Result<JournalReader<BufReader<File>>, Failure> {
+    fn open(&self) -> Result<JournalReader<'static>, Failure> {
         Ok(JournalReader::open(&self.file)?.up_to_damage())
     }
 
@@ -91,7 +89,7 @@ impl JournalSource {
     }
 
     /// A replay from the beginning, or from the newest snapshot before a step.
-    fn replay(&self, from: Option<u64>) -> Result<Replay<BufReader<File>>, Failure> {
+    fn replay(&self, from: Option<u64>) -> Result<Replay<'static>, Failure> {
         let mut reader = self.open()?;
         let length = reader.length();
         let survey = with_progress("byte", length, false, |progress| reader.survey(progress))?;

@@ -158,7 +158,7 @@ pub(super) fn replay(arguments: &ReplayArguments) -> Result<(), Failure> {
 
 #[allow(clippy::cast_precision_loss)]
 fn play(
-    replay: &mut Replay<std::io::BufReader<std::fs::File>>,
+    replay: &mut Replay<'_>,
     recorder: &mut Recorder<'_>,
     from: u64,
     to: u64,

@@ -192,7 +192,7 @@ pub(super) fn show(arguments: &ShowArguments) -> Result<(), Failure> {
 
 fn write(
     arguments: &ShowArguments,
-    reader: &mut JournalReader<std::io::BufReader<std::fs::File>>,
+    reader: &mut JournalReader<'_>,
     out: &mut dyn Write,
     failed: &mut Option<Failure>,
 ) -> std::io::Result<()> {

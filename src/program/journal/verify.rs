@@ -1,7 +1,5 @@
 //! `palpate journal verify`: simulates journals again, and compares every hash; checks signatures.
 
-use std::fs::File;
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
 use palpate::server::journal_key;
@@ -80,7 +78,7 @@ fn public_key(path: &Path) -> Result<PublicKey, Failure> {
 }
 
 /// Checks the signatures of a journal, which is read from its beginning and stands there afterwards.
-fn signed(reader: &mut JournalReader<BufReader<File>>, key: PublicKey) -> Result<Option<Signed>, Refusal> {
+fn signed(reader: &mut JournalReader<'_>, key: PublicKey) -> Result<Option<Signed>, Refusal> {
     let mut signatures = Signatures::of(key);
     reader.rewind();
     let mut check = || {

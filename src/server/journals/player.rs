@@ -1,6 +1,5 @@
 //! The thread that reads ahead for sessions that play back recordings (`player`).
 
-use std::io::{Read, Seek};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
@@ -13,15 +12,10 @@ use palpate_tissue::lock::lock;
 /// Interval between checks whether a session has played much of what was read.
 const LOOK: Duration = Duration::from_millis(100);
 
-/// The bytes that a journal is read from.
-pub(super) trait JournalBytes: Read + Seek + Send {}
-
-impl<T: Read + Seek + Send> JournalBytes for T {}
-
 struct Played {
     handle: Weak<SessionHandle>,
     feed: Arc<PlaybackSource>,
-    inputs: Inputs<Box<dyn JournalBytes>>,
+    inputs: Inputs<'static>,
 }
 
 /// The sessions that play recordings, and the thread's wake-up.
@@ -39,12 +33,7 @@ struct PlayerState {
 
 impl Player {
     /// Reads ahead for `handle` until it is deleted.
-    pub(super) fn play(
-        &self,
-        handle: &Arc<SessionHandle>,
-        feed: &Arc<PlaybackSource>,
-        inputs: Inputs<Box<dyn JournalBytes>>,
-    ) {
+    pub(super) fn play(&self, handle: &Arc<SessionHandle>, feed: &Arc<PlaybackSource>, inputs: Inputs<'static>) {
         lock(&self.state).new.push(Played { handle: Arc::downgrade(handle), feed: feed.clone(), inputs });
         self.wake.notify_one();
     }
@@ -84,7 +73,7 @@ impl Player {
 }
 
 /// Reads ahead for a session that has done `step` steps.
-pub(super) fn read_ahead(feed: &PlaybackSource, inputs: &mut Inputs<Box<dyn JournalBytes>>, step: u64) -> Result<()> {
+pub(super) fn read_ahead(feed: &PlaybackSource, inputs: &mut Inputs<'_>, step: u64) -> Result<()> {
     while feed.wants_more(step) == Some(true) {
         match inputs.next_batch()? {
             Some(piece) => feed.add(piece.inputs, piece.until_step),

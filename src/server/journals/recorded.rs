@@ -1,7 +1,7 @@
 //! Calls about recordings: lists journals, describes one, receives those that clients upload, and starts sessions at
 //! a moment of one.
 
-use std::io::{Cursor, Read, Seek};
+use std::io::Cursor;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -14,7 +14,7 @@ use super::super::config::Config;
 use super::super::uploads::{FilePart, UploadKind, Uploads};
 use super::folder::Folder;
 use super::keeper::unix_ns;
-use super::player::{JournalBytes, Player, read_ahead};
+use super::player::{Player, read_ahead};
 use super::{Journals, Keep};
 use palpate_realtime::playback::{Playback, PlaybackSource};
 use palpate_realtime::priority::thread;
@@ -44,7 +44,7 @@ fn find(
     session_id: &str,
     run: u32,
     payer: Option<&Account>,
-) -> Result<(JournalFile, JournalReader<Box<dyn JournalBytes>>)> {
+) -> Result<(JournalFile, JournalReader<'static>)> {
     let unknown = |message: &str| Refusal::new(Reason::UnknownSession, "session_id", message.to_owned());
     // A text that is not an ID would be a path.
     if file::parse(&file::name(session_id, 1)).is_none() {
@@ -62,8 +62,8 @@ fn find(
     Err(unknown("there is no journal of this session and run; ListJournals tells which there are"))
 }
 
-fn open(file: &JournalFile, payer: Option<&Account>) -> Result<JournalReader<Box<dyn JournalBytes>>> {
-    let source: Box<dyn JournalBytes> = Box::new(journal::reader::file(&file.path).map_err(Refusal::without_folder)?);
+fn open(file: &JournalFile, payer: Option<&Account>) -> Result<JournalReader<'static>> {
+    let source = Box::new(journal::reader::file(&file.path).map_err(Refusal::without_folder)?);
     // Callers are sent what is wrong with it, and not its path.
     Ok(JournalReader::paid(&file::name(&file.session_id, file.run), source, paid_by(payer)?)?.up_to_damage())
 }
@@ -76,7 +76,7 @@ fn paid_by(payer: Option<&Account>) -> Result<Option<Taken>> {
 /// Returns the entry of a journal in a list. `reader` is the open journal, or the reason why it can't be opened.
 fn info(
     file: &JournalFile,
-    reader: std::result::Result<&mut JournalReader<Box<dyn JournalBytes>>, String>,
+    reader: std::result::Result<&mut JournalReader<'_>, String>,
     pacer: &Pacer,
 ) -> pb::JournalInfo {
     let metadata = std::fs::metadata(&file.path).ok();
@@ -290,7 +290,7 @@ impl Recorded {
         let bytes = self.sent.get(&moment.upload_id, payer)?;
         // A session that plays it keeps it, even after the upload has expired.
         let taken = payer.take(Resource::Memory(Purpose::Journals), bytes.len() as u64, "upload_id")?;
-        let source: Box<dyn JournalBytes> = Box::new(Cursor::new(UploadedJournal { bytes, _taken: taken }));
+        let source = Box::new(Cursor::new(UploadedJournal { bytes, _taken: taken }));
         let reader = JournalReader::paid(SENT, source, paid_by(Some(payer))?)?.without_files().up_to_damage();
         let (session_id, run) = (reader.header().session_id.clone(), reader.header().run);
         Ok((reader, session_id, run))
@@ -358,7 +358,7 @@ impl Recorded {
 }
 
 /// An open journal, with its session and run.
-type Opened = (JournalReader<Box<dyn JournalBytes>>, String, u64);
+type Opened = (JournalReader<'static>, String, u64);
 
 /// The name of an uploaded journal in refusals.
 const SENT: &str = "the journal";
@@ -381,11 +381,7 @@ impl AsRef<[u8]> for UploadedJournal {
 }
 
 /// Describes the contents of a journal, of which `info` is known; a damaged one up to the damage.
-fn tell<R: Read + Seek>(
-    mut reader: JournalReader<R>,
-    info: pb::JournalInfo,
-    stop: &AtomicBool,
-) -> Result<pb::GetJournalResponse> {
+fn tell(mut reader: JournalReader<'_>, info: pb::JournalInfo, stop: &AtomicBool) -> Result<pb::GetJournalResponse> {
     let survey = reader.survey(&mut |_| {})?;
     let mut forces = Forces::default();
     while let Some(batch) = reader.next_batch()? {

@@ -23,6 +23,8 @@ mod options;
 mod store;
 mod watch;
 
+use std::future::Future;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -47,6 +49,9 @@ pub use watch::{Watch, WatchError, WatchEvent};
 
 /// Default time limit of an attempt at one member.
 pub const LIMIT: Duration = Duration::from_secs(1);
+
+/// A call under way. It is boxed so that it is compiled here, once, and not in every crate that makes calls.
+pub type Answer<'a, T> = Pin<Box<dyn Future<Output = EtcdResult<T>> + Send + 'a>>;
 
 /// Keys per answer to a list.
 const PAGE: i64 = 1000;
@@ -108,11 +113,13 @@ impl Etcd {
     ///
     /// # Errors
     /// Returns an error if no member can answer, or if etcd refuses.
-    pub async fn get(&self, key: &str) -> EtcdResult<(Option<KeyValue>, u64)> {
-        let request = RangeRequest { key: key.into(), ..Default::default() };
-        let response = self.range(&format!("read the key `{key}`"), request).await?;
-        let revision = revision(response.header.as_ref());
-        Ok((response.kvs.into_iter().next().and_then(key_value), revision))
+    pub fn get<'a>(&'a self, key: &'a str) -> Answer<'a, (Option<KeyValue>, u64)> {
+        Box::pin(async move {
+            let request = RangeRequest { key: key.into(), ..Default::default() };
+            let response = self.range(&format!("read the key `{key}`"), request).await?;
+            let revision = revision(response.header.as_ref());
+            Ok((response.kvs.into_iter().next().and_then(key_value), revision))
+        })
     }
 
     /// Reads all keys that begin with `prefix`, in order and at one revision. Returns them and that revision. The
@@ -120,16 +127,18 @@ impl Etcd {
     ///
     /// # Errors
     /// Returns an error if no member can answer, if etcd refuses, or if there are more than 1,048,576 keys.
-    pub async fn list(&self, prefix: &str) -> EtcdResult<(Vec<KeyValue>, u64)> {
-        let what = format!("list the keys `{prefix}…`");
-        let mut attempts = 1..=LIST_ATTEMPTS;
-        loop {
-            attempts.next();
-            match self.list_once(&what, prefix).await {
-                Err(EtcdError::Refused(why)) if why.contains("compacted") && !attempts.is_empty() => {}
-                listed => return listed,
+    pub fn list<'a>(&'a self, prefix: &'a str) -> Answer<'a, (Vec<KeyValue>, u64)> {
+        Box::pin(async move {
+            let what = format!("list the keys `{prefix}…`");
+            let mut attempts = 1..=LIST_ATTEMPTS;
+            loop {
+                attempts.next();
+                match self.list_once(&what, prefix).await {
+                    Err(EtcdError::Refused(why)) if why.contains("compacted") && !attempts.is_empty() => {}
+                    listed => return listed,
+                }
             }
-        }
+        })
     }
 
     async fn list_once(&self, what: &str, prefix: &str) -> EtcdResult<(Vec<KeyValue>, u64)> {
@@ -173,33 +182,37 @@ impl Etcd {
     /// # Errors
     /// Returns [`EtcdError::Unknown`] if the transaction may have been executed although there is no answer: read
     /// its keys again. With every other error it was not executed.
-    pub async fn transact(&self, transaction: Txn) -> EtcdResult<TransactionOutcome> {
-        let repeat = if transaction.only_reads() { Repeat::Freely } else { Repeat::Never };
-        let request = TxnRequest::from(transaction);
-        let attempt = |way: MemberCall| {
-            let request = way.request(request.clone());
-            let mut client = KvClient::new(way.channel).max_decoding_message_size(LARGEST_BYTES);
-            async move { client.txn(request).await.map(Response::into_inner) }
-        };
-        let _turn = self.turns.acquire().await;
-        let response = self.calls.call("do a transaction", repeat, attempt).await?;
-        self.calls.is_latest(response.header.as_ref());
-        Ok(response.into())
+    pub fn transact(&self, transaction: Txn) -> Answer<'_, TransactionOutcome> {
+        Box::pin(async move {
+            let repeat = if transaction.only_reads() { Repeat::Freely } else { Repeat::Never };
+            let request = TxnRequest::from(transaction);
+            let attempt = |way: MemberCall| {
+                let request = way.request(request.clone());
+                let mut client = KvClient::new(way.channel).max_decoding_message_size(LARGEST_BYTES);
+                async move { client.txn(request).await.map(Response::into_inner) }
+            };
+            let _turn = self.turns.acquire().await;
+            let response = self.calls.call("do a transaction", repeat, attempt).await?;
+            self.calls.is_latest(response.header.as_ref());
+            Ok(response.into())
+        })
     }
 
     /// Creates a lease of at least `ttl_s` seconds. If the answer is lost, the unused lease ends by itself.
     ///
     /// # Errors
     /// Returns an error if no member can answer, or if etcd refuses a time to live that long.
-    pub async fn grant(&self, ttl_s: u64) -> EtcdResult<Lease> {
-        let message = LeaseGrantRequest { ttl: signed(ttl_s), id: 0 };
-        let attempt = |way: MemberCall| {
-            let request = way.request(message);
-            async move { LeaseClient::new(way.channel).lease_grant(request).await.map(Response::into_inner) }
-        };
-        let granted = self.calls.call("grant a lease", Repeat::Freely, attempt).await?;
-        self.calls.is_latest(granted.header.as_ref());
-        Ok(Lease { id: granted.id, ttl_s: store::unsigned(granted.ttl) })
+    pub fn grant(&self, ttl_s: u64) -> Answer<'_, Lease> {
+        Box::pin(async move {
+            let message = LeaseGrantRequest { ttl: signed(ttl_s), id: 0 };
+            let attempt = |way: MemberCall| {
+                let request = way.request(message);
+                async move { LeaseClient::new(way.channel).lease_grant(request).await.map(Response::into_inner) }
+            };
+            let granted = self.calls.call("grant a lease", Repeat::Freely, attempt).await?;
+            self.calls.is_latest(granted.header.as_ref());
+            Ok(Lease { id: granted.id, ttl_s: store::unsigned(granted.ttl) })
+        })
     }
 
     /// Renews a lease. Returns the seconds that it lasts from now on, or `None` if it has ended. Leases of one
@@ -207,41 +220,45 @@ impl Etcd {
     ///
     /// # Errors
     /// Returns an error if no member can answer. The lease may have been renewed nevertheless.
-    pub async fn keep_alive(&self, lease: i64) -> EtcdResult<Option<u64>> {
-        let mut kept = self.pulse.lock().await;
-        // It is put back only with an answer: a caller that is cancelled drops the stream as well.
-        if let Some(mut pulse) = kept.take() {
-            let asked = timeout(self.calls.limit, pulse.ask(&self.calls, lease)).await;
-            if let Ok(Ok(ttl_s)) = asked {
-                *kept = Some(pulse);
-                return Ok(ttl_s);
+    pub fn keep_alive(&self, lease: i64) -> Answer<'_, Option<u64>> {
+        Box::pin(async move {
+            let mut kept = self.pulse.lock().await;
+            // It is put back only with an answer: a caller that is cancelled drops the stream as well.
+            if let Some(mut pulse) = kept.take() {
+                let asked = timeout(self.calls.limit, pulse.ask(&self.calls, lease)).await;
+                if let Ok(Ok(ttl_s)) = asked {
+                    *kept = Some(pulse);
+                    return Ok(ttl_s);
+                }
+                self.calls.pass_over(pulse.member);
+                if asked.is_err() {
+                    self.calls.members[pulse.member].give_up(pulse.number).await;
+                }
             }
-            self.calls.pass_over(pulse.member);
-            if asked.is_err() {
-                self.calls.members[pulse.member].give_up(pulse.number).await;
-            }
-        }
-        let attempt = |way: MemberCall| LeaseKeepAlive::open(way, &self.calls, lease);
-        let (pulse, ttl_s) = self.calls.call("keep a lease alive", Repeat::Freely, attempt).await?;
-        *kept = Some(pulse);
-        Ok(ttl_s)
+            let attempt = |way: MemberCall| LeaseKeepAlive::open(way, &self.calls, lease);
+            let (pulse, ttl_s) = self.calls.call("keep a lease alive", Repeat::Freely, attempt).await?;
+            *kept = Some(pulse);
+            Ok(ttl_s)
+        })
     }
 
     /// Ends a lease, and deletes its keys. A lease that has already ended is no error.
     ///
     /// # Errors
     /// Returns an error if no member can answer.
-    pub async fn revoke(&self, lease: i64) -> EtcdResult<()> {
-        let attempt = |way: MemberCall| {
-            let request = way.request(LeaseRevokeRequest { id: lease });
-            async move {
-                match LeaseClient::new(way.channel).lease_revoke(request).await {
-                    Err(status) if status.code() != Code::NotFound => Err(status),
-                    _ => Ok(()),
+    pub fn revoke(&self, lease: i64) -> Answer<'_, ()> {
+        Box::pin(async move {
+            let attempt = |way: MemberCall| {
+                let request = way.request(LeaseRevokeRequest { id: lease });
+                async move {
+                    match LeaseClient::new(way.channel).lease_revoke(request).await {
+                        Err(status) if status.code() != Code::NotFound => Err(status),
+                        _ => Ok(()),
+                    }
                 }
-            }
-        };
-        self.calls.call("revoke a lease", Repeat::Freely, attempt).await
+            };
+            self.calls.call("revoke a lease", Repeat::Freely, attempt).await
+        })
     }
 
     /// Returns a watch of the keys that begin with `prefix`, from revision `from_revision` on; 0 stands for the

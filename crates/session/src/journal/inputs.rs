@@ -4,7 +4,6 @@
 //! wait for their step.
 
 use std::collections::VecDeque;
-use std::io::{Read, Seek};
 use std::sync::Arc;
 
 use prost::Message;
@@ -20,8 +19,8 @@ use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 
 /// Reader of the inputs in a journal, from a step on.
-pub struct Inputs<R> {
-    reader: JournalReader<R>,
+pub struct Inputs<'s> {
+    reader: JournalReader<'s>,
     first: Arc<Model>,
     rules: Rules,
     limits: Limits,
@@ -36,10 +35,10 @@ pub struct Piece {
     pub until_step: u64,
 }
 
-impl<R: Read + Seek> Inputs<R> {
+impl<'s> Inputs<'s> {
     /// Creates a reader of the inputs that act at `step` and later. `survey` must be that of the journal, and
     /// `first` the tissue with which its session began.
-    pub fn new(mut reader: JournalReader<R>, survey: &Survey, first: &Arc<Model>, given: &Limits, step: u64) -> Self {
+    pub fn new(mut reader: JournalReader<'s>, survey: &Survey, first: &Arc<Model>, given: &Limits, step: u64) -> Self {
         // A batch with a snapshot of a step has all inputs that act at that step, or later batches have them.
         match survey.snapshots.iter().rev().find(|at| at.step <= step) {
             Some(at) => reader.go_to(at),

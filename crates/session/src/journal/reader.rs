@@ -248,10 +248,16 @@ enum NextRecord {
     Wrong(String),
 }
 
-/// Reader of a journal. It keeps one batch in memory at a time.
-pub struct JournalReader<R> {
+/// The bytes of a journal: a file, or memory.
+pub trait JournalBytes: Read + Seek + Send {}
+
+impl<T: Read + Seek + Send> JournalBytes for T {}
+
+/// Reader of a journal, whose bytes live for `'s`. It keeps one batch in memory at a time.
+pub struct JournalReader<'s> {
     place: String,
-    source: R,
+    // One reader for every kind of source: it is large, and reads through a buffer.
+    source: Box<dyn JournalBytes + 's>,
     length: u64,
     /// Position of the next record, and the numbers of the next batch and the next input.
     at: u64,
@@ -279,7 +285,7 @@ pub struct JournalReader<R> {
     batch_bytes: u64,
 }
 
-impl JournalReader<BufReader<File>> {
+impl JournalReader<'static> {
     /// Opens the file of a journal.
     ///
     /// # Errors
@@ -309,14 +315,14 @@ pub fn file(path: &Path) -> Result<BufReader<File>> {
     Ok(BufReader::with_capacity(1 << 16, file))
 }
 
-impl<R: Read + Seek> JournalReader<R> {
+impl<'s> JournalReader<'s> {
     /// Creates a reader and reads the beginning of the journal. `place` is the name of the file in refusals.
     ///
     /// # Errors
     /// Refuses a file that is no journal, and one without a whole batch ([`Reason::Missing`]): then its session was
     /// never reported as durable.
-    pub fn new(place: &str, source: R) -> Result<Self> {
-        JournalReader::paid(place, source, None)
+    pub fn new(place: &str, source: impl JournalBytes + 's) -> Result<Self> {
+        JournalReader::paid(place, Box::new(source), None)
     }
 
     /// Creates a reader as [`JournalReader::new`] does, whose memory is charged: `paid` grows by what the reader
@@ -324,7 +330,7 @@ impl<R: Read + Seek> JournalReader<R> {
     ///
     /// # Errors
     /// Refuses whatever [`JournalReader::new`] refuses, and memory beyond the account's part.
-    pub fn paid(place: &str, mut source: R, paid: Option<Taken>) -> Result<Self> {
+    pub fn paid(place: &str, mut source: Box<dyn JournalBytes + 's>, paid: Option<Taken>) -> Result<Self> {
         let length = source.seek(SeekFrom::End(0)).map_err(|e| unreadable(place, &e.to_string()))?;
         let mut reader = JournalReader {
             place: place.to_owned(),

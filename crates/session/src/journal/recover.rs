@@ -27,8 +27,8 @@ fn unwritten(e: &io::Error) -> Refusal {
 /// # Errors
 /// Refuses a journal that is damaged in the middle, unless `reader` stops there ([`JournalReader::up_to_damage`]),
 /// and an output that can't be written.
-pub fn recover<R: Read + Seek>(
-    mut reader: JournalReader<R>,
+pub fn recover(
+    mut reader: JournalReader<'_>,
     output: &mut (impl Read + Write + Seek),
     progress: &mut dyn FnMut(u64),
 ) -> Result<Survey> {
@@ -60,8 +60,8 @@ pub fn recover<R: Read + Seek>(
 /// # Errors
 /// Refuses steps that the journal does not have, a journal that can't be simulated, and an output that can't be
 /// written.
-pub fn cut<R: Read + Seek>(
-    mut reader: JournalReader<R>,
+pub fn cut(
+    mut reader: JournalReader<'_>,
     [from, to]: [u64; 2],
     limits: &Limits,
     output: &mut (impl Read + Write + Seek),

@@ -2,7 +2,7 @@
 //! on the way.
 
 use std::collections::VecDeque;
-use std::io::{Cursor, Read, Seek};
+use std::io::Cursor;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -90,8 +90,8 @@ pub enum ReplayEvent<'s> {
 }
 
 /// A journal that is being replayed, with the session at the present step.
-pub struct Replay<R> {
-    reader: JournalReader<R>,
+pub struct Replay<'s> {
+    reader: JournalReader<'s>,
     survey: Survey,
     limits: Limits,
     first: Arc<Model>,
@@ -107,12 +107,12 @@ pub struct Replay<R> {
     stops_every: u64,
 }
 
-impl<R: Read + Seek> Replay<R> {
+impl<'s> Replay<'s> {
     /// Begins a replay at the beginning of a journal.
     ///
     /// # Errors
     /// Refuses a journal of another generation, and one whose tissue or first snapshot is invalid.
-    pub fn new(reader: JournalReader<R>, survey: Survey, limits: &Limits) -> Result<Self> {
+    pub fn new(reader: JournalReader<'s>, survey: Survey, limits: &Limits) -> Result<Self> {
         let header = reader.header();
         let begins = |at: &&SnapshotAt| at.step == header.begin_step && at.batch == 0;
         let at = survey.snapshots.iter().find(begins).copied();
@@ -123,14 +123,14 @@ impl<R: Read + Seek> Replay<R> {
     ///
     /// # Errors
     /// Refuses a journal of another generation, an invalid tissue or snapshot, and a step outside the journal.
-    pub fn near(reader: JournalReader<R>, survey: Survey, limits: &Limits, step: u64) -> Result<Self> {
+    pub fn near(reader: JournalReader<'s>, survey: Survey, limits: &Limits, step: u64) -> Result<Self> {
         Replay::near_with(reader, survey, limits, step, None)
     }
 
     /// Begins a replay as [`Replay::near`] does. The tissue of `known` is reused if it belongs to a journal of that
     /// session.
     fn near_with(
-        reader: JournalReader<R>,
+        reader: JournalReader<'s>,
         survey: Survey,
         limits: &Limits,
         step: u64,
@@ -150,7 +150,7 @@ impl<R: Read + Seek> Replay<R> {
     }
 
     fn from_snapshot(
-        mut reader: JournalReader<R>,
+        mut reader: JournalReader<'s>,
         survey: Survey,
         given: &Limits,
         at: Option<&SnapshotAt>,
@@ -394,7 +394,7 @@ impl<R: Read + Seek> Replay<R> {
     ///
     /// # Errors
     /// Refuses whatever [`Replay::advance`] refuses, a journal whose hashes differ, and when `stop` is set.
-    pub fn reach(mut self, step: u64, stop: &AtomicBool) -> Result<(Session, Arc<Model>, JournalReader<R>)> {
+    pub fn reach(mut self, step: u64, stop: &AtomicBool) -> Result<(Session, Arc<Model>, JournalReader<'s>)> {
         self.advance(step, &mut |_| if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) })?;
         match self.difference {
             Some(difference) => Err(self.reader.refuse(&difference.to_string())),
@@ -487,8 +487,8 @@ impl std::fmt::Display for Difference {
 }
 
 /// Reads a snapshot. Returns its batch, the snapshot, and the items that follow it in the batch.
-fn snapshot<R: Read + Seek>(
-    reader: &mut JournalReader<R>,
+fn snapshot(
+    reader: &mut JournalReader<'_>,
     at: &SnapshotAt,
 ) -> Result<(JournalBatch, pb::Snapshot, VecDeque<JournalItem>)> {
     reader.go_to(at);
@@ -550,7 +550,7 @@ pub struct Resumed {
 ///
 /// # Errors
 /// Refuses a journal that is damaged in the middle, is of another generation, or gives other hashes.
-pub fn resume<R: Read + Seek>(reader: JournalReader<R>, limits: &Limits) -> Result<Resumed> {
+pub fn resume(reader: JournalReader<'_>, limits: &Limits) -> Result<Resumed> {
     resume_as(reader, limits, None)
 }
 
@@ -586,11 +586,7 @@ pub type Known = (pb::Header, Arc<Model>);
 ///
 /// # Errors
 /// Refuses a journal that is damaged in the middle, is of another generation, or gives other hashes.
-pub fn resume_as<R: Read + Seek>(
-    mut reader: JournalReader<R>,
-    limits: &Limits,
-    known: Option<Known>,
-) -> Result<Resumed> {
+pub fn resume_as(mut reader: JournalReader<'_>, limits: &Limits, known: Option<Known>) -> Result<Resumed> {
     let survey = reader.survey(&mut |_| {})?;
     let until = survey.until_step;
     Replay::near_with(reader, survey, limits, until, known)?.resume()
@@ -605,8 +601,8 @@ fn is_same_tissue(a: &pb::Header, b: &pb::Header) -> bool {
 ///
 /// # Errors
 /// Refuses a step that the journal does not have, a journal that [`resume`] refuses, and when `stop` is set.
-pub fn session_at<R: Read + Seek>(
-    mut reader: JournalReader<R>,
+pub fn session_at(
+    mut reader: JournalReader<'_>,
     limits: &Limits,
     step: u64,
     stop: &AtomicBool,
@@ -685,11 +681,7 @@ pub struct Verdict {
 ///
 /// # Errors
 /// Refuses a journal that can't be read or simulated.
-pub fn verify<R: Read + Seek>(
-    mut reader: JournalReader<R>,
-    limits: &Limits,
-    progress: &mut dyn FnMut(u64, u64),
-) -> Result<Verdict> {
+pub fn verify(mut reader: JournalReader<'_>, limits: &Limits, progress: &mut dyn FnMut(u64, u64)) -> Result<Verdict> {
     let survey = reader.survey(&mut |_| {})?;
     Replay::new(reader, survey, limits)?.verify(progress)
 }
