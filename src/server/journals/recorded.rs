@@ -63,7 +63,7 @@ fn find(
 }
 
 fn open(file: &JournalFile, payer: Option<&Account>) -> Result<JournalReader<'static>> {
-    let source = Box::new(journal::reader::file(&file.path).map_err(Refusal::without_folder)?);
+    let source = journal::reader::file(&file.path).map_err(Refusal::without_folder)?;
     // Callers are sent what is wrong with it, and not its path.
     Ok(JournalReader::paid(&file::name(&file.session_id, file.run), source, paid_by(payer)?)?.up_to_damage())
 }
@@ -290,7 +290,7 @@ impl Recorded {
         let bytes = self.sent.get(&moment.upload_id, payer)?;
         // A session that plays it keeps it, even after the upload has expired.
         let taken = payer.take(Resource::Memory(Purpose::Journals), bytes.len() as u64, "upload_id")?;
-        let source = Box::new(Cursor::new(UploadedJournal { bytes, _taken: taken }));
+        let source = Cursor::new(UploadedJournal { bytes, _taken: taken });
         let reader = JournalReader::paid(SENT, source, paid_by(Some(payer))?)?.without_files().up_to_damage();
         let (session_id, run) = (reader.header().session_id.clone(), reader.header().run);
         Ok((reader, session_id, run))

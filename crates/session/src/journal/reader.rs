@@ -322,7 +322,7 @@ impl<'s> JournalReader<'s> {
     /// Refuses a file that is no journal, and one without a whole batch ([`Reason::Missing`]): then its session was
     /// never reported as durable.
     pub fn new(place: &str, source: impl JournalBytes + 's) -> Result<Self> {
-        JournalReader::paid(place, Box::new(source), None)
+        JournalReader::paid(place, source, None)
     }
 
     /// Creates a reader as [`JournalReader::new`] does, whose memory is charged: `paid` grows by what the reader
@@ -330,7 +330,8 @@ impl<'s> JournalReader<'s> {
     ///
     /// # Errors
     /// Refuses whatever [`JournalReader::new`] refuses, and memory beyond the account's part.
-    pub fn paid(place: &str, mut source: Box<dyn JournalBytes + 's>, paid: Option<Taken>) -> Result<Self> {
+    pub fn paid(place: &str, source: impl JournalBytes + 's, paid: Option<Taken>) -> Result<Self> {
+        let mut source: Box<dyn JournalBytes + 's> = Box::new(source);
         let length = source.seek(SeekFrom::End(0)).map_err(|e| unreadable(place, &e.to_string()))?;
         let mut reader = JournalReader {
             place: place.to_owned(),

@@ -26,7 +26,7 @@ pub(super) unsafe fn with_avx2<T: Real>(program: &impl Run<T>) {
 #[target_feature(enable = "fma")]
 pub(super) unsafe fn with_fma<T: Real>(program: &impl Run<T>) {
     // SAFETY: the caller's promise.
-    unsafe { program.run::<super::Scalar<T>>() }
+    unsafe { program.run::<super::Pair<T>>() }
 }
 
 /// The operations that both widths and both formats have under the same name; the others follow in braces.
