@@ -17,7 +17,7 @@ const SLICE_MS = 8;
 const DENT = 0.28;
 /**
  * The server reports the mean force within this many falloff lengths of a push, but at least and at most this many
- * edge lengths (crates/tissue/src/interpolate.rs).
+ * edge lengths (crates/tissue/src/response/around_place.rs).
  */
 const TOLD_WITHIN = { lengths: 7, least: 1.5, most: 4 };
 /**

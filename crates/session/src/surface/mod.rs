@@ -1,7 +1,7 @@
 //! Frames for viewers: the points of a sheet, refined by bilinear interpolation, or the vertices of a mesh as they
 //! are; encoded in patches.
 //!
-//! Frames carry no normals; viewers compute them: `clients/library/src/shown.rs` and `src/render/surface.rs`.
+//! Frames carry no normals; viewers compute them: `clients/library/src/surface_view.rs` and `src/render/surface.rs`.
 
 mod displacements;
 pub mod encode;
