@@ -153,17 +153,25 @@ fn a_copy_that_is_not_the_whole_truth_does_no_harm() {
 #[test]
 fn a_bridge_renders_from_a_copy_of_a_mesh_and_of_a_sheet_only_when_asked_to() {
     let server = TestServer::start(&[]);
-    let predicted = |scene: &str, more: &str, seconds: u32| {
+    let run = |scene: &str, more: &str, seconds: u32| {
         let url = &server.url;
-        let output = client(&format!("bridge --json --server {url} --scene {scene} --seconds {seconds} {more}"));
+        client(&format!("bridge --json --server {url} --scene {scene} --seconds {seconds} {more}"))
+    };
+    let predicted = |output: &std::process::Output| {
         assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
         serde_json::from_slice::<Value>(&output.stdout).unwrap()["predicted_ticks"].as_u64().unwrap()
     };
-    assert_eq!(predicted("paper", "", 1), 0);
-    assert_eq!(predicted("gallbladder", "--prediction never", 4), 0);
-    // A copy is there when it is made: on a busy machine that may take more than a few seconds.
+    // On a busy machine, a connection or a copy may take more than a few seconds.
+    for (scene, more) in [("paper", ""), ("gallbladder", "--prediction never")] {
+        let output = [3, 30].iter().map(|seconds| run(scene, more, *seconds)).find(|output| output.status.success());
+        let output = output.unwrap_or_else(|| panic!("the bridge of {scene} does not connect"));
+        assert_eq!(predicted(&output), 0);
+    }
     for (scene, more) in [("paper", "--prediction always"), ("gallbladder", "")] {
-        assert!([3, 30].iter().any(|seconds| predicted(scene, more, *seconds) > 0), "{scene}");
+        assert!([3, 30].iter().any(|seconds| {
+            let output = run(scene, more, *seconds);
+            output.status.success() && predicted(&output) > 0
+        }));
     }
 }
 

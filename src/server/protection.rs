@@ -7,7 +7,7 @@ use std::time::Duration;
 use super::config::Config;
 use super::identity::KnownCallers;
 use super::reload::{Reloaded, of_file, warn_if_readable};
-use super::tls::{self, Tls};
+use super::tls::{self, Expiries, Tls};
 use palpate_refusal::{Reason, Refusal, Result};
 
 /// Interval between two checks of when certificates expire.
@@ -19,6 +19,8 @@ const MINUTES_OF_DAY: u32 = 24 * 60;
 /// TLS and the known callers of one server, both reloaded when their files change.
 pub(super) struct Protection {
     pub(super) tls: Option<Arc<Reloaded<Tls>>>,
+    /// When the certificates for etcd expire.
+    etcd: Arc<Reloaded<Expiries>>,
     pub(super) credentials: Arc<Reloaded<KnownCallers>>,
 }
 
@@ -64,7 +66,10 @@ impl Protection {
             _ if certified => Ok(KnownCallers::certified()),
             _ => Ok(KnownCallers::open()),
         })?;
-        Ok(Protection { tls, credentials: Arc::new(credentials) })
+        let cluster = &config.cluster;
+        let etcd = [&cluster.etcd_ca, &cluster.etcd_cert].into_iter().flatten().cloned();
+        let etcd = Arc::new(tls::load_expiries("certificates for etcd", etcd.collect())?);
+        Ok(Protection { tls, etcd, credentials: Arc::new(credentials) })
     }
 
     /// Returns the scheme of the server's URLs.
@@ -76,14 +81,16 @@ impl Protection {
     pub(super) async fn watch(&self) {
         let tls = async {
             let Some(tls) = &self.tls else { return std::future::pending().await };
-            let warning = async {
-                for minute in 1u32.. {
-                    tokio::time::sleep(MINUTE).await;
-                    tls.get().warn_of_expiry(minute % MINUTES_OF_DAY == 0);
-                }
-            };
-            tokio::join!(tls.clone().watch(), warning);
+            tls.clone().watch().await;
         };
-        tokio::join!(tls, self.credentials.clone().watch());
+        let warning = async {
+            for minute in 1u32.. {
+                tokio::time::sleep(MINUTE).await;
+                let again = minute % MINUTES_OF_DAY == 0;
+                self.tls.iter().for_each(|tls| tls.get().expiries.warn(again));
+                self.etcd.get().warn(again);
+            }
+        };
+        tokio::join!(tls, warning, self.etcd.clone().watch(), self.credentials.clone().watch());
     }
 }

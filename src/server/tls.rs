@@ -18,8 +18,11 @@ use palpate_tissue::lock::lock;
 /// The TLS configuration of new connections, and when its certificates expire.
 pub(super) struct Tls {
     pub(super) config: Arc<ServerConfig>,
-    expiries: Mutex<Vec<Expiry>>,
+    pub(super) expiries: Expiries,
 }
+
+/// When the certificates of some files expire.
+pub(super) struct Expiries(Mutex<Vec<Expiry>>);
 
 /// A certificate's expiry, and how urgently the log warned of it.
 struct Expiry {
@@ -40,7 +43,7 @@ impl Expiry {
         let urgency = URGENT_S.iter().filter(|urgent_s| left_s <= **urgent_s).count();
         let was = std::mem::replace(&mut self.urgency, urgency);
         let news = match left_s {
-            ..=0 => "has expired: clients and other servers refuse it".to_owned(),
+            ..=0 => "has expired: the other side refuses it".to_owned(),
             1..3600 => format!("expires in {} min", (left_s + 59) / 60),
             3600..DAY_S => format!("expires in {} h", left_s / 3600),
             DAY_S.. => format!("expires in {} days", left_s / DAY_S),
@@ -56,12 +59,12 @@ fn unix_s() -> i64 {
     i64::try_from(now.as_secs()).unwrap_or(i64::MAX)
 }
 
-impl Tls {
+impl Expiries {
     /// Logs a warning for each certificate that has expired or expires soon: when it has become more urgent, or if
     /// `again` is set.
-    pub(super) fn warn_of_expiry(&self, again: bool) {
+    pub(super) fn warn(&self, again: bool) {
         let now_s = unix_s();
-        for expiry in lock(&self.expiries).iter_mut() {
+        for expiry in lock(&self.0).iter_mut() {
             if again {
                 expiry.urgency = 0;
             }
@@ -88,9 +91,6 @@ pub(super) fn load(cert: &Path, key: &Path, client_ca: Option<&Path>, node_ca: O
 fn configure(paths: &[PathBuf], texts: &[String], everyone: bool) -> Result<Tls> {
     let unreadable = |what: &str| Refusal::new(Reason::Unreadable, "", what.to_owned());
     let chain = certificates(&paths[0], &texts[0])?;
-    let expiry = |path: &PathBuf, certificate: &CertificateDer<'_>| {
-        Some(Expiry { path: path.clone(), at_s: validity::expires_s(certificate)?, urgency: 0 })
-    };
     let mut expiries: Vec<_> = chain.iter().filter_map(|certificate| expiry(&paths[0], certificate)).collect();
     // The parser's error is dropped: no part of a key may appear in a log.
     let key = PrivateKeyDer::from_pem_slice(texts[1].as_bytes())
@@ -118,9 +118,31 @@ fn configure(paths: &[PathBuf], texts: &[String], everyone: bool) -> Result<Tls>
         of_file(&paths[0])(unreadable(&both))
     })?;
     config.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
-    let tls = Tls { config: Arc::new(config), expiries: Mutex::new(expiries) };
-    tls.warn_of_expiry(true);
+    let tls = Tls { config: Arc::new(config), expiries: Expiries(Mutex::new(expiries)) };
+    tls.expiries.warn(true);
     Ok(tls)
+}
+
+/// Returns when a certificate expires; `None` if it can't be parsed.
+fn expiry(path: &Path, certificate: &CertificateDer<'_>) -> Option<Expiry> {
+    Some(Expiry { path: path.to_owned(), at_s: validity::expires_s(certificate)?, urgency: 0 })
+}
+
+/// Loads when the certificates in `paths` expire, which the server presents to others or verifies them by.
+///
+/// # Errors
+/// Refuses a file without certificates in PEM.
+pub(super) fn load_expiries(name: &'static str, paths: Vec<PathBuf>) -> Result<Reloaded<Expiries>> {
+    let named = paths.clone();
+    Reloaded::load(name, paths, move |texts| {
+        let mut expiries = Vec::new();
+        for (path, text) in named.iter().zip(texts) {
+            expiries.extend(certificates(path, text)?.iter().filter_map(|certificate| expiry(path, certificate)));
+        }
+        let expiries = Expiries(Mutex::new(expiries));
+        expiries.warn(true);
+        Ok(expiries)
+    })
 }
 
 fn certificates(path: &Path, text: &str) -> Result<Vec<CertificateDer<'static>>> {
@@ -151,12 +173,34 @@ mod tests {
         for minute in 0..101 * 24 * 60 {
             told.extend(expiry.news(60 * minute));
         }
-        let expired = "has expired: clients and other servers refuse it";
+        let expired = "has expired: the other side refuses it";
         assert_eq!(told, ["expires in 14 days", "expires in 1 days", "expires in 1 h", expired].map(str::to_owned));
         // A clock that is set back and then forward again.
         assert_eq!(expiry.news(0), None);
         assert_eq!(expiry.news(99 * DAY_S + 3600 * 23 + 60 * 30), Some("expires in 30 min".to_owned()));
         assert_eq!(expiry.news(200 * DAY_S), Some(expired.to_owned()));
         assert_eq!(expiry.news(201 * DAY_S), None);
+    }
+
+    #[test]
+    fn certificates_for_others_are_watched_as_well_and_replaced_ones_count() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("etcd.pem");
+        let write = |year| {
+            let mut params = rcgen::CertificateParams::default();
+            params.not_after = rcgen::date_time_ymd(year, 1, 1);
+            let certificate = params.self_signed(&rcgen::KeyPair::generate().unwrap()).unwrap();
+            std::fs::write(&path, certificate.pem()).unwrap();
+        };
+        write(2024);
+        let expiries = load_expiries("certificates for etcd", vec![path.clone()]).unwrap();
+        assert_eq!(lock(&expiries.get().0)[0].at_s, 1_704_067_200);
+        // Reported when it was loaded.
+        assert_eq!(lock(&expiries.get().0)[0].news(1_704_067_200), None);
+        write(2049);
+        let later = load_expiries("certificates for etcd", vec![path.clone()]).unwrap();
+        assert_eq!(lock(&later.get().0)[0].at_s, 2_493_072_000);
+        std::fs::write(&path, "no certificate").unwrap();
+        assert!(load_expiries("certificates for etcd", vec![path]).is_err());
     }
 }
