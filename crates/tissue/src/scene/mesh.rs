@@ -97,7 +97,7 @@ pub struct MeshShape {
 /// Facts about a mesh that clients receive and the simulation does not need.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshMetadata {
-    /// How the scene says which vertices never move.
+    /// The vertices that never move, as the scene specifies them.
     pub fixed: FixedVertices,
     /// Texture coordinates of each vertex, if the file has them; at a seam, those of one side.
     pub uv: Option<Vec<[f32; 2]>>,

@@ -51,7 +51,7 @@ pub struct Poke {
 /// A surgical force over time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadProfile {
-    /// The control point over time.
+    /// Place of the control point over time.
     pub centre: CentreProfile,
     /// The exerting force over time.
     pub strength: StrengthProfile,
