@@ -120,7 +120,7 @@ pub trait Tissue: Send {
     /// Makes `tool` touch the tissue with `tip` from the next step on. The tip reaches `place_m`, m, at the
     /// step's end.
     fn pose(&mut self, tool: usize, place_m: DVec3, tip: Tip);
-    /// Returns the motion of a position-controlled tool and the force on it; `None` if `tool` is none.
+    /// Returns the motion of a position-controlled tool and the force on it; `None` for other tools.
     fn tool_contact(&self, tool: usize) -> Option<ToolContact>;
     /// Returns a copy of the tissue around a position-controlled tool, from which the stiffness there is
     /// computed; `None` if the tool neither touches nor holds.

@@ -47,7 +47,7 @@ pub struct Limits {
     /// Bytes that the server may use in all for its callers. 0 means half of the memory of the machine or of
     /// its control group.
     pub memory_bytes: u64,
-    /// Other tissues of a session that wait for their step.
+    /// Changes of tissue of a session that wait for their step.
     pub queued_changes: usize,
     /// Sessions of a server.
     pub sessions: usize,
@@ -99,7 +99,7 @@ pub struct Limits {
     /// Unread bytes of all streams of one connection. Beyond it, the transport holds the client back. This
     /// bounds the memory that a connection takes.
     pub connection_window_bytes: u32,
-    /// A connection that has not said what it wants to speak after so long is closed, the handshake of TLS included, s.
+    /// Time within which a new connection must choose its protocol, the TLS handshake included, s. Then it is closed.
     pub handshake_s: f64,
     /// Time within which a haptic stream must send its first message, and a call its complete message, s. Then
     /// it is ended.

@@ -30,7 +30,7 @@ impl PointId {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PointName {
-    /// Point [i, j] of a sheet: column i along x, row j along y.
+    /// Point [i, j] of a sheet: index i along x, index j along y.
     Point([usize; 2]),
     /// A vertex of a mesh, numbered from 0 as in its file.
     Vertex(u32),

@@ -1,6 +1,7 @@
-//! How a scheme's state is read as displacement and velocity, with the scheme chosen at run time.
+//! Reads displacement and velocity from a scheme's state, with the scheme chosen at run time.
 //!
-//! Steps are compiled once for each scheme. Surveys are rare: they ask an [`Observer`], and are compiled once for all schemes.
+//! Steps are compiled once for each scheme. Surveys are rare: they use an [`Observer`], and are compiled once
+//! for all schemes.
 
 use super::arithmetic::{Arithmetic, MAX_KEPT};
 use super::family::Family;
