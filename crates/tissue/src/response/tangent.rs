@@ -109,9 +109,9 @@ pub struct LinearPatch<'m> {
 /// The pressure of a volume on the points of a patch.
 #[derive(Debug)]
 struct SharedPressure {
-    /// a of each point that moves, m²; 0 of those held.
+    /// a of each point that moves, m²; 0 for held points.
     areas_m2: Vec<DVec3>,
-    /// The pressure that goes with a growth of the volume, Pa/m³: κ/V0, less by what the points beyond give way.
+    /// The pressure per growth of the volume, Pa/m³: κ/V0, reduced by what the points outside the patch yield.
     pa_per_m3: f64,
 }
 

@@ -128,7 +128,7 @@ pub(crate) struct Applied<T: Real> {
     pub(crate) terms: Vec<Term<T>>,
     /// The terms before they have tables. Kept, so that a step allocates nothing.
     wanted: Vec<Wanted>,
-    /// Whether the terms hold for the coming steps as well.
+    /// Whether the terms stay valid for the next steps.
     settled: bool,
 }
 

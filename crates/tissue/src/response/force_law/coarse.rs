@@ -17,8 +17,8 @@ use super::exact::{ROWS as EXACT_ROWS, course, follow, pressed};
 use crate::Model;
 use crate::response::tangent::{self, Accuracy, Course};
 
-/// The most work of a first law, springs times iterations: 46 ms of processor time, at the 27 ns that one takes on an AMD
-/// EPYC (family 26). Work is counted, not timed, so that every machine gives the same law.
+/// Largest work of a first law, springs times iterations: 46 ms of processor time, at 27 ns per unit on an AMD EPYC
+/// (family 26). Work is counted, not timed, so that every machine gives the same law.
 const WORK: u64 = 1_700_000;
 
 /// The part of it that an exact law may take before a coarse one is computed instead. If an exact law is begun
