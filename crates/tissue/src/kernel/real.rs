@@ -41,7 +41,7 @@ pub(crate) trait Real:
     /// The polynomial in q nearest to (1 − 1/√(1 + q))/q on |q| ≤ 1/8 in relative error: within 5.2e-8 (degree 5) for
     /// f32, 9e-18 (degree 13) for f64. From the Remez exchange algorithm.
     const SERIES: [f64; 14];
-    /// A poke's force is omitted where −c·r is below this. The omitted part is (1 + |c·r|)·e^−|c·r| of the whole:
+    /// The exponent −c·r below which a tool's force is omitted. The omitted part is (1 + |c·r|)·e^−|c·r| of the whole:
     /// e^−34.5 = 1e-15 of the force at the centre for f64, less than the worst sum loses; e^−22 for f32.
     const NEGLIGIBLE_EXPONENT: f64;
     /// The smallest number whose square is a normal number. Smaller values count as 0 in the state of a tissue.

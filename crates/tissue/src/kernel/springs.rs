@@ -14,7 +14,7 @@ use crate::kernel::lanes::{Scalar, Vector};
 use crate::kernel::real::Real;
 use crate::scene;
 
-/// Least 1 + q = (L/L0)². A spring pressed to zero length has no direction. Below a millionth of its rest length its
+/// The smallest 1 + q = (L/L0)². A spring pressed to zero length has no direction. Below a millionth of its rest length its
 /// force fades to 0 in proportion to its length, so nothing divides by 0.
 const MIN_LENGTH_SQUARED: f64 = 1e-12;
 
@@ -65,8 +65,9 @@ impl<T: Real> SpringCoefficients<T> {
         self.series(excess, Self::square(excess)).keep(Self::counts(excess))
     }
 
-    /// The same, and a square that tells where it does not hold ([`SpringCoefficients::is_square_far`]). Which springs are too little
-    /// strained to count is told by the square as well, so their bound is rounded otherwise than in [`SpringCoefficients::near`].
+    /// Returns stiffness × (1 − L0/L) for small Q, and a square that shows where it is not valid
+    /// ([`SpringCoefficients::is_square_far`]). The square also decides which springs have too little strain to count,
+    /// so their bound is rounded differently from [`SpringCoefficients::near`].
     #[inline(always)]
     pub(crate) fn near_and_square<V: Vector<Real = T>>(&self, excess: V) -> (V, V) {
         let square = Self::square(excess);

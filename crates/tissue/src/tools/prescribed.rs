@@ -63,7 +63,7 @@ struct Grasped {
 #[derive(Debug, Clone)]
 pub(crate) struct Prescribed {
     grasped: Vec<Grasped>,
-    /// Released points and their velocities, until the coming substep.
+    /// Released points and their velocities, m/s, until the next substep.
     released: Vec<(usize, DVec3)>,
 }
 

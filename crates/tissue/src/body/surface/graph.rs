@@ -6,7 +6,7 @@ use thiserror::Error;
 /// A spring between two points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeshSpring {
-    /// The points.
+    /// The numbers of the two points.
     pub ends: [u32; 2],
     /// Stiffness k, N/m.
     pub stiffness_n_per_m: f64,

@@ -62,7 +62,7 @@ pub(crate) struct Snapshot<T> {
 }
 
 impl<T: Real> Snapshot<T> {
-    /// For a mesh.
+    /// Allocates a snapshot for a mesh.
     pub(crate) fn of(slots: &MeshSlots) -> Self {
         let records = Field::of_length(record_place(slots.vertex_of().len()));
         Snapshot { records, copied: memory::filled(slots.tiles(), false, TABLES) }
