@@ -66,7 +66,7 @@ impl Model {
             parts.push("nothing damps the tissue, and errors grow for as long as it moves".to_owned());
         }
         if integrator != Integrator::Auto || substeps.is_some() || precision != Precision::Auto {
-            let given = "`palpate check` tells what `auto` would take for the integrator, substeps and precision given";
+            let given = "`palpate check` shows what `auto` would take for the integrator, substeps and precision given";
             parts.push(given.to_owned());
         } else if expected_error.is_finite() {
             parts.push(format!(
@@ -158,7 +158,7 @@ impl Model {
         let mut warnings = if let Body::Mesh(mesh) = &scene.body { mesh.warnings() } else { Vec::new() };
         if !plan.stable {
             warnings.push(format!(
-                "stepping.substeps: {} is above the stability bound of the scheme; the sheet may blow up \
+                "stepping.substeps: {} is above the stability bound of the scheme; the tissue may blow up \
                  (substep × fastest vibration = {:.3})",
                 plan.substeps,
                 plan.substep_s * omega_bound_per_s
@@ -365,7 +365,7 @@ mod tests {
         }
         let model = small(&[]);
         assert_eq!(advises(&model), Some(false), "{:?}", model.warnings);
-        // Another tissue keeps the format of the state, which nobody gave.
+        // A changed tissue keeps the format of the state, which the scene does not give.
         let change = Change { damping_n_s_per_m: Some(0.0), ..Change::default() };
         let changed = model.changed(&change, &model.scene, &Limits::default()).unwrap();
         assert_eq!(advises(&changed), Some(false), "{:?}", changed.warnings);

@@ -153,7 +153,7 @@ mod tests {
             let (into, bytes) = (path.clone(), vec![b'a'; sent]);
             let writing = std::thread::spawn(move || {
                 let written = File::options().write(true).open(into).unwrap().write_all(&bytes);
-                // Who reads may have had enough.
+                // The reader may have stopped at its bound.
                 drop(written);
             });
             match read_within(&path, most, PIPE_TIMEOUT) {

@@ -40,7 +40,8 @@ fn is_available(bytes: usize) -> bool {
 /// Checks that the system would give `bytes` for `what` now, and the headroom. Nothing is reserved: another
 /// thread may take them first.
 ///
-/// # Errors Refuses if the memory is not there.
+/// # Errors
+/// Refuses if the memory is not there.
 pub fn check(bytes: u64, what: &str) -> Result<()> {
     let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
     if bytes < LARGE_BYTES || is_available(bytes.saturating_add(HEADROOM_BYTES)) {

@@ -110,7 +110,8 @@ impl Model {
     /// Creates a model of a scene with a given plan. Nothing is checked, no error is predicted, and nothing
     /// sleeps.
     ///
-    /// # Errors Returns the fault of a mesh whose springs can't be laid out.
+    /// # Errors
+    /// Returns the fault of a mesh whose springs can't be laid out.
     pub(super) fn planned(scene: Scene, plan: Plan, precision: Precision, lanes: Lanes) -> Result<Self, GraphFault> {
         let (points, fixed, graph) = match &scene.body {
             Body::Sheet(sheet) => (sheet.points, sheet.fixed_indices(), None),

@@ -47,7 +47,7 @@ impl fmt::Display for CheckFailure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             CheckFailure::NotFinite { point } => {
-                write!(f, "point {point} was not finite (or a billion sheets away)")
+                write!(f, "point {point} was not finite (or a billion tissues away)")
             }
             CheckFailure::Energy { energy_j, before_j, work_j } => {
                 write!(
@@ -209,11 +209,11 @@ mod tests {
         assert_eq!({ touched }.survey(1.06, 0.0, EXACT, false), Ok(()));
         assert_eq!(touched.survey(1.0, 0.0, EXACT, true), Ok(()));
         assert_eq!(touched.survey(1.04, 0.0, EXACT, true), Ok(()));
-        // What is nothing but rounding is no energy.
+        // Rounding noise does not count as energy.
         let rounding = Noise { energy_j: 1e-27, ..EXACT };
         assert_eq!(Work::default().survey(1e-30, 0.0, rounding, true), Ok(()));
         assert!(Work::default().survey(1e-24, 0.0, rounding, true).is_err());
-        // It goes as it likes.
+        // Losing energy is always allowed.
         assert_eq!(worked.survey(0.01, 0.0, EXACT, false), Ok(()));
     }
 }

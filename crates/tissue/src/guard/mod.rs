@@ -255,7 +255,7 @@ pub(super) fn convert<T: Real>(
     // Compute all forces first: points are converted one by one, in place.
     let force =
         |index| springs.gather(layout, &state.u, volume_change, [index / layout.columns, index % layout.columns]);
-    let forces: Vec<[T; 3]> = memory::collected((0..points).map(force), "the forces of a sheet");
+    let forces: Vec<[T; 3]> = memory::collected((0..points).map(force), "the forces of a tissue");
     for (index, force) in forces.iter().enumerate() {
         let pushed = applied.force_at(layout, 0, [index / layout.columns, index % layout.columns]);
         for (c, n) in force.iter().enumerate() {
@@ -387,7 +387,7 @@ mod tests {
             let points = (0..sheet.model.len()).map(|index| sheet.point(PointId::new(index)));
             let kinetic_j: f64 = points.map(|point| 0.5 * mass_kg * point.velocity_m_per_s.length_squared()).sum();
             assert!((energy.kinetic_j - kinetic_j).abs() < 1e-9 * kinetic_j, "{integrator}: {energy:?} {kinetic_j}");
-            // And goes on so.
+            // And continues like this.
             (0..20).for_each(|_| sheet.step().unwrap());
             assert_eq!(sheet.guard_events(), 0);
         }

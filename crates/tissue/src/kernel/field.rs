@@ -14,7 +14,7 @@ pub(crate) const BLOCK: usize = crate::scene::MIN_WIDTH;
 /// Alignment of every row and plane, bytes: a cache line.
 const LINE: usize = 64;
 
-/// The length of a plane exceeds a multiple of a page by this many bytes. A processor treats a load as dependent on an
+/// Bytes by which the length of a plane exceeds a multiple of a page. A processor treats a load as dependent on an
 /// earlier store if their addresses agree in the last 12 bits. With planes whole pages apart, each store to x would
 /// seem to block the next load of y. (Measured at 31²: up to a quarter of a step.)
 const SKEW: usize = 1408;
@@ -178,7 +178,7 @@ impl<T: Real> Field<T> {
 
     /// Creates a field of `length` zeros.
     pub(crate) fn of_length(length: usize) -> Self {
-        let storage: Vec<T> = memory::zeroed(length + LINE / size_of::<T>(), "the state of a sheet");
+        let storage: Vec<T> = memory::zeroed(length + LINE / size_of::<T>(), "the state of a tissue");
         // `align_offset` need not succeed: alignment only affects speed.
         let from = storage.as_ptr().align_offset(LINE).min(LINE / size_of::<T>());
         Field { storage, from, length }

@@ -24,7 +24,7 @@ pub(crate) struct Marks {
 
 impl Marks {
     pub(crate) fn none_of(count: usize) -> Self {
-        Marks { members: Vec::new(), has: memory::zeroed(count, "the tiles of a sheet") }
+        Marks { members: Vec::new(), has: memory::zeroed(count, "the tiles of a tissue") }
     }
 
     /// Adds a tile. Returns whether it is new.

@@ -14,8 +14,8 @@ use crate::kernel::lanes::{Scalar, Vector};
 use crate::kernel::real::Real;
 use crate::scene;
 
-/// The smallest 1 + q = (L/L0)². A spring pressed to zero length has no direction. Below a millionth of its rest length its
-/// force fades to 0 in proportion to its length, so nothing divides by 0.
+/// The smallest 1 + q = (L/L0)². A spring pressed to zero length has no direction. Below a millionth of its
+/// rest length its force fades to 0 in proportion to its length, so nothing divides by 0.
 const MIN_LENGTH_SQUARED: f64 = 1e-12;
 
 /// The largest |q| for which the polynomial is valid.

@@ -250,7 +250,7 @@ mod tests {
         assert!(scenes.text("../paper", &scripts, &limits).is_err());
         assert!(scripts.text("vertical-60", &scenes, &limits).is_ok());
     }
-    /// Opening a pipe waits for somebody who writes into it: such a file, or one that a scene names, would hold a server's start.
+    /// Opening a pipe waits for a writer: such a file, or one that a scene names, would block a server's start.
     #[cfg(unix)]
     #[test]
     fn what_is_no_file_is_told_as_that_and_nobody_waits_for_it() {

@@ -773,7 +773,7 @@ impl RestShape for MeshShape {
         let nearest = surface.nearest(place_m)?;
         let (at_m, outward) = (surface.at_m(&nearest), nearest.frame[0].cross(nearest.frame[1]));
         let side = surface.side((place_m - at_m).dot(outward), radius_m);
-        // One that is beside a rim, or far enough off the surface, begins where it is.
+        // A tool beside a rim, or far enough off the surface, begins where it is.
         let is_off = (place_m - at_m).dot(side * outward) >= APPROACH_M;
         Some(if is_off { place_m } else { at_m + APPROACH_M * side * outward })
     }
@@ -954,7 +954,7 @@ mod tests {
             Mesh::of(mesh.clone(), 1e-3, FixedVertices::Balls(balls))
         });
         assert_eq!(made.unwrap().unwrap().stiffest.vertex, 0);
-        // What can't be is given up.
+        // An impossible amount of work is given up.
         let balls = vec![(DVec3::new(1.0, 1.0, 1.0), 0.1); 100_000];
         let made =
             palpate_geometry::work::within(&Arc::default(), most, || Mesh::of(mesh, 1e-3, FixedVertices::Balls(balls)));

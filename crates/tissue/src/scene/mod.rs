@@ -252,7 +252,8 @@ pub trait Named: Sized + Copy + PartialEq + 'static {
 
     /// Returns the value of a name; `field` is the key that a refusal gives.
     ///
-    /// # Errors Refuses a name that is not in the list.
+    /// # Errors
+    /// Refuses a name that is not in the list.
     fn named(field: &str, name: &str) -> Result<Self> {
         Self::NAMES.iter().find(|entry| entry.0 == name).map(|entry| entry.1).ok_or_else(|| {
             let names: Vec<_> = Self::NAMES.iter().map(|entry| entry.0).collect();
@@ -735,7 +736,7 @@ fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {
         let seed = fields.item("texture_seed").map(|item| item.whole()).transpose()?;
         let size = fields.item("texture_size").map(|item| item.whole()).transpose()?;
         if texture.is_some() && (surface.is_some() || seed.is_some() || size.is_some()) {
-            let message = "names an image: surface, texture_seed and texture_size are for one that is made";
+            let message = "names an image: surface, texture_seed and texture_size are for a generated image";
             return Err(fields.refuse(Reason::WrongKind, "texture", message));
         }
         let texture_size = match size {

@@ -185,9 +185,9 @@ pub struct MotionProfile {
     pub moves: Vec<Move>,
 }
 
-/// A smooth displacement: `by_m`·s((t − from)/(to − from)), s(x) = 10x³ − 15x⁴ + 6x⁵ clamped to 0…1. That is the movement of least
-/// jerk from rest to rest (Flash and Hogan, The coordination of arm movements, Journal of Neuroscience 5(7), 1985,
-/// doi:10.1523/JNEUROSCI.05-07-01688.1985).
+/// A smooth displacement: `by_m`·s((t − from)/(to − from)), s(x) = 10x³ − 15x⁴ + 6x⁵ clamped to 0…1. That is
+/// the movement of least jerk from rest to rest (Flash and Hogan, The coordination of arm movements, Journal of
+/// Neuroscience 5(7), 1985, doi:10.1523/JNEUROSCI.05-07-01688.1985).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Move {
     /// Time at which it begins, s.

@@ -76,11 +76,17 @@ pub struct Point {
     /// The name of the point: `"point": [i, j]` on a sheet, `"vertex": n` on a mesh.
     #[serde(flatten)]
     pub name: PointName,
+    /// Displacement from rest, m.
     pub displacement_m: [f64; 3],
+    /// Velocity, m/s.
     pub velocity_m_per_s: [f64; 3],
+    /// Force of all springs between points, and of an enclosed volume's pressure, N.
     pub spring_n: [f64; 3],
+    /// Force of the anchor spring, −K″·u, N.
     pub anchor_n: [f64; 3],
+    /// Damping force, −C·v, N.
     pub damping_n: [f64; 3],
+    /// Force of all pushing tools, N.
     pub applied_n: [f64; 3],
     /// Sum of the forces of springs, anchor spring and damping, N.
     pub reaction_n: [f64; 3],

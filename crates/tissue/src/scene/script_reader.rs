@@ -84,7 +84,7 @@ impl Binding<'_> {
         for (index, profile) in forces.iter().enumerate() {
             let end = profile.at(Moment::start_of(steps), self.scene.stepping.rate_hz);
             if matches!(profile.centre, CentreProfile::Path { .. }) && !self.scene.shape().is_near(end.centre_m) {
-                let message = "leaves the sheet; where the force is streamed (--held, a replay) it ends there";
+                let message = "leaves the tissue; if the force is streamed (--held, a replay), it ends there";
                 self.warnings.push(format!("force[{index}].path: {message}"));
             }
         }

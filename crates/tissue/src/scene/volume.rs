@@ -1,9 +1,10 @@
 //! The section `[volume]` of a scene on a mesh: the volume that a closed mesh encloses, and how it grows as
 //! vertices move.
 //!
-//! With V0 the volume at rest and a_i = ∂V/∂x_i there (a third of the area vectors of the triangles around vertex i), the
-//! volume grows by ΔV = Σ a_i·u_i to first order, and the pressure p = −κ·ΔV/V0 pushes vertex i by p·a_i. So the pressure is
-//! one spring that all vertices share: its energy is ½κ·ΔV²/V0, its stiffness κ·a·aᵀ/V0, and its forces sum up to zero.
+//! With V0 the volume at rest and a_i = ∂V/∂x_i there (a third of the area vectors of the triangles around
+//! vertex i), the volume grows by ΔV = Σ a_i·u_i to first order, and the pressure p = −κ·ΔV/V0 pushes vertex i
+//! by p·a_i. So the pressure is one spring that all vertices share: its energy is ½κ·ΔV²/V0, its stiffness
+//! κ·a·aᵀ/V0, and its forces sum up to zero.
 
 use glam::DVec3;
 
@@ -71,7 +72,7 @@ impl Volume {
     pub(super) fn of(vertices_m: &[DVec3], triangles: &[[u32; 3]]) -> Result<Self> {
         let refuse = |what: &str| {
             let message = format!(
-                "needs a closed mesh, of one part: {what} (`palpate mesh FILE` tells more, --repair may mend it)"
+                "needs a closed mesh, of one part: {what} (`palpate mesh FILE` shows more, --repair may mend it)"
             );
             Err(Refusal::new(Reason::WrongKind, "volume", message))
         };

@@ -20,7 +20,7 @@ pub struct TwoStep {
     pub a: f64,
 }
 
-/// Central differences.
+/// Fits central differences to a = K″·dt²/m and g = C·dt/m.
 pub(super) fn fit(a: f64, g: f64) -> TwoStep {
     TwoStep { p: (1.0 - g / 2.0) / (1.0 + g / 2.0), q: 1.0 / (1.0 + g / 2.0), a }
 }

@@ -196,7 +196,8 @@ impl Scheme {
         each!(self, |family| family.propagator(z))
     }
 
-    /// Returns the largest growth factor of a vibration z = (ω·dt)² in a substep: the spectral radius of its propagator.
+    /// Returns the largest growth factor of a vibration z = (ω·dt)² in a substep: the spectral radius of its
+    /// propagator.
     pub fn growth(&self, z: f64) -> f64 {
         self.propagator(z).spectral_radius()
     }

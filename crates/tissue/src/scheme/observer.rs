@@ -48,7 +48,7 @@ impl<T: Real> Observer<T> {
         }
     }
 
-    /// Returns how many fields the scheme keeps beside u and d.
+    /// Returns how many fields the scheme keeps besides u and d.
     pub(crate) fn kept(&self) -> usize {
         with!(self, |arithmetic| kept_of(arithmetic))
     }

@@ -188,7 +188,8 @@ mod tests {
         let cases = [(1.0, 1.0), (1.0, 0.0), (0.0, 2.0), (3.0, 0.2), (0.1, 5.0), (0.0, 0.0), (1.0, 2.2), (2.0, 4.8)];
         for (k, shear) in cases {
             for bending in [false, true] {
-                // Force on a point of u = e^{i(aj + bk)}: over all its springs, 1 − cos of the phase between their ends.
+                // Force on a point of u = e^{i(aj + bk)}: over all its springs, 1 − cos of the phase between
+                // their ends.
                 let wave = |a: f64, b: f64| {
                     let both_ways = |stiffness: f64, phase: f64| 2.0 * stiffness * (1.0 - phase.cos());
                     let bending = if bending { both_ways(k, 2.0 * a) + both_ways(k, 2.0 * b) } else { 0.0 };

@@ -361,12 +361,13 @@ mod tests {
             rehearsal.difference(&LOADS[2], &truth, &other)
         };
         let undamped = ["damping.coefficient_n_s_per_m=0.0"];
-        // A course of 0.5 s of an undamped sheet stands for 2 s.
+        // A course of 0.5 s of an undamped tissue represents 2 s.
         assert!((difference(&undamped, &|part| 1e-3 * part) / 8e-3 - 1.0).abs() < 0.01);
-        // An error that does not grow stays as it is, and so does one in a sheet whose vibrations die within the course.
+        // An error that does not grow stays as it is, and so does one in a tissue whose vibrations die within
+        // the course.
         assert!((difference(&undamped, &|_| 1e-3) - 2e-3).abs() < 1e-9);
         assert!((difference(&["damping.coefficient_n_s_per_m=0.5"], &|part| 1e-3 * part) - 2e-3).abs() < 1e-9);
-        // Where nothing moves nothing errs.
+        // Where nothing moves there is no error.
         let rehearsal =
             Rehearsal::new(&scene(&["sheet.points=[3, 3]"]), 1.0, 0, &crate::select::scheme_selection::NEVER);
         let still = course(rehearsal.steps, |_| 0.0);
@@ -389,7 +390,7 @@ mod tests {
         assert_eq!(2 * few - many, steps * STEP_POINTS);
         // The course of a force that swings is a quarter as long.
         assert_eq!(work(&LOADS[2], 5).0, few / steps * (steps / 4));
-        // What it would need more than there is, it is not begun for.
+        // A course that needs more work than is left is not begun.
         let rehearsal = Rehearsal::new(&scene, 1e-3, 0, never);
         rehearsal.left.set(few - 1);
         assert!(rehearsal.course(&LOADS[0], Integrator::Central, 5, Precision::F64).is_none() && rehearsal.is_cut());

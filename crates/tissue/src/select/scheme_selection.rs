@@ -359,18 +359,19 @@ pub fn by_auto(scene: &Scene, limits: &Limits) -> Option<Choice> {
 /// Chooses integrator, substeps and format for a scene's tolerance, as far as the scene leaves them open:
 ///
 /// 1. The cheapest choice that is expected to keep the tolerance.
-/// 2. If there is none: the cheapest whose error is at most twice the smallest that can be distinguished from none; if there
-///    is none either, the choice with the smallest expected error.
-/// 3. If no error can be predicted: the cheapest stable scheme, with as many substeps as let the fastest vibration turn by at
-///    most [`stability::THETA`] in each: at most 8 times those.
+/// 2. If there is none: the cheapest whose error is at most twice the smallest that can be distinguished from
+///    none; if there is none either, the choice with the smallest expected error.
+/// 3. If no error can be predicted: the cheapest stable scheme, with as many substeps as let the fastest
+///    vibration turn by at most [`stability::THETA`] in each: at most 8 times those.
 ///
 /// No choice has more than [`MAX_TIMES_STABLE`] times the substeps with which it is stable, except an
 /// integrator that the scene names and that keeps the tolerance with more.
 ///
 /// Also returns the work of the rehearsals in points × substeps.
 ///
-/// # Errors Refuses a scene for which that would take more work than the limits allow; and refuses when another
-/// thread sets `stop`.
+/// # Errors
+/// Refuses a scene for which that would take more work than the limits allow; and refuses when another thread
+/// sets `stop`.
 pub fn choose(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<(Choice, u64)> {
     let chooser = Chooser::new(scene, limits, stop);
     let choice = chooser.best(&chooser.open);

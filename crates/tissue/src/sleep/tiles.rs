@@ -65,7 +65,7 @@ const PULLING: [usize; 3] = [0, 1, 3];
 const SNAPSHOT: usize = NEIGHBOURS.len() * 3 * TILE;
 
 /// The name of the tables in messages.
-const TABLES: &str = "the tiles of a sheet";
+const TABLES: &str = "the tiles of a tissue";
 
 /// A copy of the tiles for a snapshot of a session.
 #[derive(Debug)]
@@ -279,7 +279,7 @@ impl<T: Real> SleepTiles<T> {
     /// ([`SleepTiles::remember_again`]).
     pub(crate) fn restore(&mut self, saved: &SavedTiles) -> Result<()> {
         let count = self.settled.len();
-        let is_tile = |tile: u32| ensure((tile as usize) < count, "a tile that the tissue has not");
+        let is_tile = |tile: u32| ensure((tile as usize) < count, "a tile that the tissue lacks");
         self.moved.clear();
         self.region.awake.clear();
         for tile in &saved.moved {

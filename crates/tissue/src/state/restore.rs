@@ -300,7 +300,7 @@ impl<T: Real> TissueState<T> {
 
         let from = sheet.checkpoint.as_ref().map_or(sheet.steps, |checkpoint| checkpoint.steps);
         for (step, tool, input) in &parts.inputs {
-            ensure((from..=sheet.steps).contains(step), "an input at a step that is over")?;
+            ensure((from..=sheet.steps).contains(step), "an input at a step before its checkpoint or after its end")?;
             sheet.inputs.push((*step, checks.tool(*tool)?, Input::restored(input, model, &checks)?));
         }
         ensure(sheet.inputs.is_sorted_by_key(|input| input.0), "inputs out of order")?;

@@ -417,7 +417,7 @@ impl Checks<'_> {
     /// Refuses a point that the tissue does not have.
     #[allow(clippy::cast_possible_truncation)]
     pub fn point(&self, point: u64) -> Result<PointId> {
-        ensure(point < self.shape.point_count() as u64, "a point that the tissue has not")?;
+        ensure(point < self.shape.point_count() as u64, "a point that the tissue lacks")?;
         Ok(PointId::new(point as usize))
     }
 

@@ -367,7 +367,7 @@ impl<T: Real> Pull<'_, T> {
     /// Returns the factors of a block of one of its rows.
     ///
     /// # Safety
-    /// The table belongs to the same sheet as the block and is still alive.
+    /// The table belongs to the same tissue as the block and is still alive.
     #[inline(always)]
     unsafe fn factor<V: Vector<Real = T>>(&self, at: usize) -> V {
         debug_assert!(self.places[0] <= at && at + V::LANES <= self.places[1]);
@@ -405,7 +405,7 @@ pub(crate) fn reaches<T>(pulls: &[Pull<'_, T>], row: usize, column: usize) -> bo
 /// is given twice.
 ///
 /// # Safety
-/// The table belongs to the same sheet as the block and is still alive.
+/// The table belongs to the same tissue as the block and is still alive.
 #[inline(always)]
 pub(crate) unsafe fn force_of<V: Vector, const FIELDS: usize>(pull: &Pull<'_, V::Real>, at: usize) -> [[V; 2]; 3] {
     // SAFETY: the caller's promise.
@@ -426,7 +426,7 @@ pub(crate) unsafe fn force_of<V: Vector, const FIELDS: usize>(pull: &Pull<'_, V:
 /// twice.
 ///
 /// # Safety
-/// The tables belong to the same sheet as the block and are still alive.
+/// The tables belong to the same tissue as the block and are still alive.
 #[inline(always)]
 pub(crate) unsafe fn force_on<V: Vector, const FIELDS: usize>(
     pulls: &[Pull<'_, V::Real>],

@@ -28,20 +28,21 @@
 //! **No energy from nowhere.** The tool's work is F·ẋ of the tool alone, and the guard counts that
 //! (`position_control`). The disc must agree with it, whatever the surface is like:
 //! - While it slides from w₀ to w₁, the points move by x̄ in the mean and the tool by Δs = Σ w̄·Δx + Δs̄ with
-//!   Δs̄ = Σ (w₁ − w₀)·x̄. The pressing force must not do work along Δs̄, or the tissue would gain F·Δs̄ more than the tool gives.
-//!   So the mean normal is taken perpendicular to Δs̄. On a smooth surface it is nearly so already; on one that is coarse, folded
-//!   or thin it is not. Friction may only remove energy.
-//! - A tool that meets the tissue presses it as deep as both have approached in this substep. If it is deeper, because its
-//!   disc has moved to another part of the tissue in which the tool already is, the rest stays as an offset. A new tool has no
-//!   path yet: it presses as deep as it is placed. In that substep it does not test whether the tissue pulls on it: the impulses
-//!   that move a surface at rest and stop it again cancel, and rounding would decide.
-//! - A disc that lags behind its tool is pressed by no more than the tool's movement along the normal ([`Tool::balance`]), and
-//!   it moves by no more than half its radius at once.
-//! - A disc that lags behind and stops sliding sticks where it is: the impulses that would draw it to its tool and stop it there
-//!   cancel, so that the tool would do no work.
-//! - If the disc would move over an edge so that its path leads along its normal, it stays, and pushes along its normal alone.
-//!   If friction would drive it against the tool's path, and farther, it stays, and friction acts: so a disc that slid and stops
-//!   is held.
+//!   Δs̄ = Σ (w₁ − w₀)·x̄. The pressing force must not do work along Δs̄, or the tissue would gain F·Δs̄ more
+//!   than the tool gives. So the mean normal is taken perpendicular to Δs̄. On a smooth surface it is nearly so
+//!   already; on one that is coarse, folded or thin it is not. Friction may only remove energy.
+//! - A tool that meets the tissue presses it as deep as both have approached in this substep. If it is deeper,
+//!   because its disc has moved to another part of the tissue in which the tool already is, the rest stays as
+//!   an offset. A new tool has no path yet: it presses as deep as it is placed. In that substep it does not
+//!   test whether the tissue pulls on it: the impulses that move a surface at rest and stop it again cancel,
+//!   and rounding would decide.
+//! - A disc that lags behind its tool is pressed by no more than the tool's movement along the normal
+//!   ([`Tool::balance`]), and it moves by no more than half its radius at once.
+//! - A disc that lags behind and stops sliding sticks where it is: the impulses that would draw it to its tool
+//!   and stop it there cancel, so that the tool would do no work.
+//! - If the disc would move over an edge so that its path leads along its normal, it stays, and pushes along
+//!   its normal alone. If friction would drive it against the tool's path, and farther, it stays, and friction
+//!   acts: so a disc that slid and stops is held.
 //!
 //! The force felt under a constraint is that of springs, anchor springs and damping on the disc, Σ w·f/Σ w²: F
 //! without the points' own inertia, which a hand would feel as a knock at each command.
@@ -299,8 +300,8 @@ impl Tool {
     fn restored(saved: &SavedContact, model: &Model, checks: &Checks<'_>) -> Result<Self> {
         let tip = saved.tip.restored(checks)?;
         let contact_state = CONTACT_STATES.get(usize::from(saved.contact_state)).copied();
-        ensure(contact_state.is_some(), "a state of contact that there is not")?;
-        ensure(saved.side.is_none_or(|side| side.abs() == 1.0), "a side of the tissue that there is not")?;
+        ensure(contact_state.is_some(), "an unknown state of contact")?;
+        ensure(saved.side.is_none_or(|side| side.abs() == 1.0), "an unknown side of the tissue")?;
         Ok(Tool {
             number: checks.tool(saved.number)?,
             tip,

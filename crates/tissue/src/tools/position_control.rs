@@ -237,8 +237,9 @@ mod tests {
         TissueState::new(&Model::paper(&[&always[..], &["sheet.points=[9, 9]", "sleep.tolerance=0.0"], sets].concat()))
     }
 
-    /// A force beside a tool or a held point that stand still does no work. The sweep alone would count that the points drift away
-    /// from the tool in each substep, which then puts them back: enough for the guard to stop a finger that rests beside a force.
+    /// A force next to a tool or held point at rest does no work. The sweep alone would count the drift of the points
+    /// away from the tool in each substep, which the tool then undoes: enough for the guard to stop a finger that rests
+    /// next to a force.
     #[test]
     fn a_force_beside_a_tool_at_rest_does_no_work() {
         for integrator in ["central", "exponential2", "exponential4", "rk4"] {
@@ -274,7 +275,7 @@ mod tests {
         }
     }
 
-    /// Without damping, all work that a tip has done is energy of the sheet, but for what friction takes as its disc slides.
+    /// Without damping, all work of a tip becomes energy of the tissue, except what friction takes as its disc slides.
     #[test]
     fn the_work_of_a_tip_that_slides_is_the_energy_of_the_sheet() {
         for friction in [0.0, 0.4] {
@@ -308,8 +309,8 @@ mod tests {
                 let (before_n, anchor_m, along) = before.replace(now).unwrap_or(now);
                 let way_m = now.1 - anchor_m;
                 heat_j += 0.25 * (before_n + across_n).dot(way_m.x * (along[0] + x) + way_m.y * (along[1] + y));
-                // The work of an impulse is counted by the speed after it, so a little too high; the heat is summed once a step,
-                // and the disc sticks and slips within one.
+                // The work of an impulse is counted by the speed after it, so a little too high; the heat is
+                // summed once a step, and the disc sticks and slips within one.
                 let part = (work_j - heat_j) / energy_j;
                 assert!(
                     step < 200 || (0.98..1.03).contains(&part),
@@ -319,8 +320,8 @@ mod tests {
         }
     }
 
-    /// Impulses that move a surface and stop it again cancel: by their sum no work is done, and the guard would take the energy for
-    /// a fault. Rounding of that sum decided whether such a tip touched at all.
+    /// Impulses that move a surface and stop it again cancel: their sum does no work, and the guard would take
+    /// the energy for a fault. Rounding of that sum decided whether such a tip touched at all.
     #[test]
     fn a_tip_that_is_put_into_tissue_at_rest_presses_and_does_the_work_that_the_tissue_gets() {
         for integrator in ["central", "exponential2", "exponential3", "exponential4", "rk4"] {
@@ -336,7 +337,8 @@ mod tests {
                         let Energy { kinetic_j, spring_j, anchor_j } = sheet.energies();
                         let (energy_j, work_j) = (kinetic_j + spring_j + anchor_j, sheet.work.done_j);
                         let part = work_j / energy_j;
-                        // Two-step schemes can't stop the surface at once: the tool takes that energy back in the next step.
+                        // Two-step schemes can't stop the surface at once: the tool takes that energy back in
+                        // the next step.
                         let is_right = part > 0.9 && (part < 1.1 || integrator == "central");
                         assert!(is_right, "{set:?}, {friction}, {step}: {work_j} J for {energy_j} J");
                         let is_free = sheet.tool_contact(0).unwrap().contact_state == ContactState::Free;

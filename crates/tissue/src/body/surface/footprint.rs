@@ -49,7 +49,7 @@ impl MeshDisc {
     pub(crate) fn restore(&mut self, saved: &SavedGeometry) -> Result<()> {
         let Some(place) = place_of(saved) else { return Ok(()) };
         let triangles = self.shape.triangles().len();
-        ensure((place.triangle as usize) < triangles, "a tool on a triangle that the tissue has not")?;
+        ensure((place.triangle as usize) < triangles, "a tool on a triangle that the tissue lacks")?;
         let hats = place.barycentric;
         let is_inside =
             hats.iter().all(|hat| (0.0..=1.0).contains(hat)) && (hats.iter().sum::<f64>() - 1.0).abs() < 1e-6;

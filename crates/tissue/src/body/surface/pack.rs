@@ -316,7 +316,7 @@ mod tests {
 
     use super::*;
 
-    /// Rows of a block of which so many lanes have a first spring, so many a second, and so on.
+    /// Returns the number of plain rows of a block in which `filled[k]` lanes have a k-th spring.
     fn plain_rows_of(filled: &[usize]) -> usize {
         let half = HalfSpring { to: 0, rest: DVec3::X, stiffness: 1.0 };
         let lanes: [Vec<HalfSpring>; BLOCK] =

@@ -230,8 +230,8 @@ pub(crate) trait Run<T> {
     unsafe fn run<V: Vector<Real = T>>(&self);
 }
 
-/// Returns whether the processor has fused multiply-add, which every width needs. Calls of the C library that emulate it
-/// would have the same bits, and take several times as long.
+/// Returns whether the processor has fused multiply-add, which every width needs. Calls of the C library that
+/// emulate it would have the same bits, and take several times as long.
 pub(crate) fn fuses() -> bool {
     #[cfg(target_arch = "x86_64")]
     let fuses = is_x86_feature_detected!("fma");
@@ -459,7 +459,7 @@ mod tests {
         assert!(places.into_iter().eq((0..48).map(|slot| 4 * slot)));
     }
 
-    /// What each lane picks of one to four vectors, and what those with a name do.
+    /// The values that each lane picks from one to four vectors, and those of the lanes with a name.
     struct Picks<'a, T> {
         from: &'a [T],
         names: Names,

@@ -156,7 +156,7 @@ plain! {
 }
 
 impl<T: Real> Scalar<T> {
-    /// Never needed: a single point has no neighbour in its vector.
+    /// Returns `before`. Nothing calls it for its result: a single point has no neighbour in its vector.
     #[inline(always)]
     fn shifted(self, before: Self, _: usize) -> Self {
         before

@@ -204,7 +204,7 @@ macro_rules! avx2 {
     };
 }
 
-/// Selects, from each 128 bits of two registers, the first pair of values; the other one, the last pair.
+/// Select, from each 128 bits of two registers, the first pair of values, or the last.
 const FIRST_PAIRS: i32 = 0b01_00_01_00;
 const LAST_PAIRS: i32 = 0b11_10_11_10;
 
