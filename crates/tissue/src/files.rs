@@ -21,7 +21,7 @@ pub fn read(path: &Path, most: u64) -> Result<Vec<u8>> {
     read_within(path, most, PIPE_TIMEOUT)
 }
 
-/// Reads at most `most` bytes of text from a path from a command line: a file, a device, or a pipe.
+/// Reads at most `most` bytes of text from a path of the command line: a file, a device, or a pipe.
 ///
 /// # Errors
 /// Refuses a path that can't be read, more than `most` bytes, a pipe into which nobody writes for 30 s, and

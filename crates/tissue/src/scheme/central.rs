@@ -12,9 +12,9 @@ use crate::kernel::real::Real;
 /// The two-step form d ← p·d + q·(N − a·u + F), u ← u + d, where d is the increment of the last substep.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TwoStep {
-    /// Coefficient p of d.
+    /// p: the part of the last increment that damping leaves.
     pub p: f64,
-    /// Coefficient q of the forces.
+    /// q: the increment per unit of force.
     pub q: f64,
     /// a = K″·dt²/m.
     pub a: f64,
