@@ -14,10 +14,10 @@ use crate::select::scheme_selection::{self, Choice};
 use crate::state::saved::{CorrectedPlan, TissueState};
 use palpate_refusal::{Reason, Refusal, Result, number, unsigned_zero};
 
-/// What sleeping tiles may add to the error, by default, as a part of it.
+/// What sleeping tiles may add to the error by default, as a fraction of it.
 const SLEEP_PART: f64 = 0.1;
 
-/// The refusal of a scene that needs more substeps than there may be.
+/// Returns the refusal of a scene that needs more substeps than the limit.
 fn too_many(scene: &Scene, substeps: u32, limits: &Limits) -> Refusal {
     let message = format!(
         "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
@@ -32,13 +32,13 @@ fn too_many(scene: &Scene, substeps: u32, limits: &Limits) -> Refusal {
     Refusal::new(Reason::TooLarge, "stepping.substeps", message)
 }
 
-/// What begins the warning of an error above the tolerance.
+/// The beginning of the warning of an error above the tolerance.
 const TOLERANCE: &str = "stepping.tolerance: ";
 
-/// Checks that the processor has what a step needs.
+/// Checks that the processor has the instructions that a step needs.
 ///
 /// # Errors
-/// Refuses a processor of x86-64 without fused multiply-add.
+/// Refuses a processor of x86-64 without fused multiply-add (FMA).
 pub fn check_processor() -> Result<()> {
     if lanes::fuses() {
         return Ok(());
@@ -48,8 +48,8 @@ pub fn check_processor() -> Result<()> {
 }
 
 impl Model {
-    /// Warns of an error above the tolerance: what is known of it, and what helps. `auto` is named only where the scene does
-    /// without.
+    /// Adds a warning if the expected error is above the tolerance: what is known of it, and what helps. It
+    /// suggests `auto` only if the scene gives its own choice.
     pub(super) fn warn_of_error(&mut self, limits: &Limits) {
         self.warnings.retain(|warning| !warning.starts_with(TOLERANCE));
         let (expected_error, undamped) = (self.expected_error, self.scene.damping_n_s_per_m == 0.0);
@@ -66,7 +66,7 @@ impl Model {
             parts.push("nothing damps the tissue, and errors grow for as long as it moves".to_owned());
         }
         if integrator != Integrator::Auto || substeps.is_some() || precision != Precision::Auto {
-            let given = "`palpate check` tells what `auto` would take for the integrator, substeps and precision given";
+            let given = "`palpate check` shows what `auto` would take for the integrator, substeps and precision given";
             parts.push(given.to_owned());
         } else if expected_error.is_finite() {
             parts.push(format!(
@@ -83,18 +83,19 @@ impl Model {
 }
 
 impl Model {
-    /// Reads the text of a scene (TOML), replaces `sets` in it (`"sheet.spacing_m=0.01"`, as `--set` does), and compiles it under
-    /// the default limits.
+    /// Reads the text of a scene (TOML), applies the assignments `sets` (`"sheet.spacing_m=0.01"`, as `--set`
+    /// does), and compiles it under the default limits. Refusals call the text `name`.
     ///
     /// # Errors
-    /// Refuses a text that is not a valid scene, and what [`Model::compile`] refuses.
+    /// Refuses a text that is not a valid scene, and every scene that [`Model::compile`] refuses.
     pub fn parse(name: &str, text: &str, sets: &[&str]) -> Result<Arc<Self>> {
         let sets: Vec<_> = sets.iter().map(|set| (*set).to_owned()).collect();
         let limits = Limits::default();
         Model::compile(&Scene::parse(name, text, &sets, &limits)?, &limits)
     }
 
-    /// Compiles a scene, after checking it.
+    /// Checks a scene and compiles it: chooses the scheme and the substep, which may take some tenths of a
+    /// second.
     ///
     /// The substep follows from the stability bound: here one of a millisecond or less, within the step of 1 ms.
     ///
@@ -119,18 +120,19 @@ impl Model {
         Model::compile_until(scene, limits, &scheme_selection::NEVER)
     }
 
-    /// Does the same, given up when `stop` is set.
+    /// Compiles a scene as [`Model::compile`] does, but gives up when another thread sets `stop`.
     ///
     /// # Errors
-    /// As for [`Model::compile`]; and refuses when `stop` is set.
+    /// Refuses a scene that is not valid, that no scheme can step within the limits, or that this machine can't
+    /// run; and refuses when `stop` is set.
     pub fn compile_until(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
         scene.check(limits)?;
-        // Before anything is rehearsed: rehearsals run sweeps.
+        // Before the rehearsals, which run sweeps.
         check_processor()?;
         let scene = &scene.clone().with_unsigned_zeros();
         let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
-        // Nothing is rehearsed that no scheme could do.
+        // No rehearsals for a scene that no scheme can step.
         let least = scheme_selection::least_substeps(scene.stepping.integrator, step_s, &sheet);
         if scene.stepping.substeps.is_none() && least > limits.substeps {
             return Err(too_many(scene, least, limits));
@@ -139,7 +141,7 @@ impl Model {
         Model::chosen(scene, choice, rehearsed, limits, stop)
     }
 
-    /// Compiles a scene with a choice that was made.
+    /// Compiles a scene with a given choice of scheme, substeps and format.
     fn chosen(scene: &Scene, choice: Choice, rehearsed: u64, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
         let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
@@ -156,7 +158,7 @@ impl Model {
         let mut warnings = if let Body::Mesh(mesh) = &scene.body { mesh.warnings() } else { Vec::new() };
         if !plan.stable {
             warnings.push(format!(
-                "stepping.substeps: {} is above the stability bound of the scheme; the sheet may blow up \
+                "stepping.substeps: {} is above the stability bound of the scheme; the tissue may blow up \
                  (substep × fastest vibration = {:.3})",
                 plan.substeps,
                 plan.substep_s * omega_bound_per_s
@@ -168,7 +170,7 @@ impl Model {
             return Err(Refusal::new(Reason::NotAvailable, "stepping.lanes", message));
         };
         let sleep_tolerance = scene.sleep_tolerance.unwrap_or_else(|| {
-            // Who chooses the scheme may want it better than the tolerance.
+            // A user who chooses the scheme may want an error below the tolerance.
             let chosen = scene.stepping.integrator != Integrator::Auto || scene.stepping.substeps.is_some();
             SLEEP_PART * if chosen { expected_error.min(scene.stepping.tolerance) } else { scene.stepping.tolerance }
         });
@@ -180,19 +182,22 @@ impl Model {
         Ok(Arc::new(model))
     }
 
-    /// Returns the same sheet with another tissue: integrator and substeps as its tolerance asks for, in the number format
-    /// that a state of this model has. `first` is the scene that the session began with.
+    /// Returns the model with some coefficients changed, for the same state. The number format stays;
+    /// integrator and substeps are chosen again for the tolerance. `first` is the scene that the session began
+    /// with.
     ///
     /// # Errors
-    /// Refuses a change of nothing, and as [`Model::compile`] does.
+    /// Refuses an empty change, and every scene that [`Model::compile`] refuses.
     pub fn changed(&self, change: &Change, first: &Scene, limits: &Limits) -> Result<Arc<Self>> {
         self.changed_until(change, first, limits, &scheme_selection::NEVER)
     }
 
-    /// Does the same, given up when `stop` is set.
+    /// Returns the model with some coefficients changed, as [`Model::changed`] does, but gives up when another
+    /// thread sets `stop`.
     ///
     /// # Errors
-    /// As for [`Model::changed`]; and refuses when `stop` is set.
+    /// Refuses an empty change, and every scene that [`Model::compile`] refuses; and refuses when `stop` is
+    /// set.
     pub fn changed_until(
         &self,
         change: &Change,
@@ -212,8 +217,8 @@ impl Model {
         Ok(Arc::new(model))
     }
 
-    /// Returns how this model is stepped, and its coefficients: all that [`Model::resumed`] needs beside the scene that
-    /// the session began with.
+    /// Returns the coefficients and the plan of this model: everything that [`Model::resumed`] needs besides
+    /// the scene that the session began with.
     pub fn tissue_state(&self) -> TissueState {
         let Model { scene, plan, precision, expected_error, sleep_tolerance, corrected, .. } = self;
         TissueState {
@@ -232,11 +237,11 @@ impl Model {
         }
     }
 
-    /// Returns the model that changes and corrections had made of the scene `first`, with which a session began: the
-    /// same plan and the same bits. Nothing is chosen anew.
+    /// Rebuilds the model that changes and corrections had made of `first`, the scene that the session began
+    /// with. It has the same plan and gives the same bits; nothing is chosen again.
     ///
     /// # Errors
-    /// Refuses what no model has, and as [`Model::compile`] does.
+    /// Refuses values that no model has, and every scene that [`Model::compile`] refuses.
     pub fn resumed(first: &Scene, state: &TissueState, limits: &Limits) -> Result<Arc<Self>> {
         let TissueState { integrator, substeps, precision, sleep_tolerance, expected_error, .. } = *state;
         let mut scene = first.clone();
@@ -261,7 +266,8 @@ impl Model {
         Ok(Arc::new(Model { sleep_tolerance, corrected, ..Arc::unwrap_or_clone(model) }))
     }
 
-    /// Returns what changes make of this, each out of the one before it, for a session that began with the scene `first`.
+    /// Compiles the models of successive changes. Each change builds on the one before it and keeps its step.
+    /// `first` is the scene that the session began with.
     ///
     /// # Errors
     /// Refuses the first change that [`Model::changed`] refuses.
@@ -279,7 +285,7 @@ impl Model {
         compiled.collect()
     }
 
-    /// Returns the processor time that a step is expected to take while all of the sheet moves, s: t₀ + t₁·P·n, with P points, n
+    /// Returns the predicted processor time of a step with all points awake, s: t₀ + t₁·P·n, with P points, n
     /// substeps, and t₀ and t₁ measured.
     #[allow(clippy::cast_precision_loss)]
     pub fn predicted_step_s(&self) -> f64 {
@@ -288,8 +294,8 @@ impl Model {
         1e-9 * (scheme_selection::STEP_NS + point_ns * self.swept_points() as f64 * f64::from(self.plan.substeps))
     }
 
-    /// Compiles another tissue from this one's scene, with the scheme and at least the substeps of the correction in
-    /// force.
+    /// Compiles another scene for this tissue, with the scheme and at least the substeps of the last
+    /// correction.
     fn compile_corrected(&self, scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Self> {
         let Some((integrator, least)) = self.corrected else {
             return Ok(Arc::unwrap_or_clone(Model::compile_until(scene, limits, stop)?));
@@ -307,12 +313,12 @@ impl Model {
 
 #[cfg(test)]
 impl Model {
-    /// Compiles the paper's scene, with some values set.
+    /// Compiles the paper's scene with some values set.
     pub(crate) fn paper(sets: &[&str]) -> Arc<Self> {
         Model::parse("paper", crate::scene::PAPER, sets).unwrap()
     }
 
-    /// Compiles a small organ whose points are heavy and light.
+    /// Compiles a small organ that has heavy and light points.
     pub(crate) fn gallbladder(sets: &[&str]) -> Arc<Self> {
         let text = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\n[material]\nyoungs_modulus_pa = 2e4\n\
                     thickness_m = 0.003\nfoundation_n_per_m3 = 5e6\n[stepping]\nsubsteps = 8\n";
@@ -359,7 +365,7 @@ mod tests {
         }
         let model = small(&[]);
         assert_eq!(advises(&model), Some(false), "{:?}", model.warnings);
-        // Another tissue keeps the format of the state, which nobody gave.
+        // A changed tissue keeps the format of the state, which the scene does not give.
         let change = Change { damping_n_s_per_m: Some(0.0), ..Change::default() };
         let changed = model.changed(&change, &model.scene, &Limits::default()).unwrap();
         assert_eq!(advises(&changed), Some(false), "{:?}", changed.warnings);

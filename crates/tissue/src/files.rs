@@ -1,4 +1,4 @@
-//! Files that users name: read up to a bound, and never waited for without end.
+//! Reads files that users name, up to a bound and without waiting forever.
 
 use std::fs::File;
 use std::io::{ErrorKind, Read};
@@ -7,42 +7,45 @@ use std::time::Duration;
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Who writes into a pipe may be silent for so long.
+/// How long the writer of a pipe may be silent.
 const PIPE_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// Bytes of a key, a certificate, a password or a file of tokens, at most.
+/// Largest size of a file with a key, a certificate, a password or tokens, bytes.
 pub const MAX_SECRET_BYTES: u64 = 1 << 20;
 
-/// Reads at most `most` bytes of what a user names on a command line: a file, a device, or a pipe such as `<(…)` makes.
+/// Reads at most `most` bytes of a path from a command line: a file, a device, or a pipe such as `<(…)`.
 ///
 /// # Errors
-/// Refuses a path that can't be read, what has more bytes, and a pipe into which nobody writes for 30 s.
+/// Refuses a path that can't be read, more than `most` bytes, and a pipe into which nobody writes for 30 s.
 pub fn read(path: &Path, most: u64) -> Result<Vec<u8>> {
     read_within(path, most, PIPE_TIMEOUT)
 }
 
-/// Does the same as text.
+/// Reads at most `most` bytes of text from a path of the command line: a file, a device, or a pipe.
 ///
 /// # Errors
-/// As for [`read`], and refuses what is not UTF-8.
+/// Refuses a path that can't be read, more than `most` bytes, a pipe into which nobody writes for 30 s, and
+/// bytes that are not UTF-8.
 pub fn read_text(path: &Path, most: u64) -> Result<String> {
     text(path, read(path, most)?)
 }
 
-/// Reads at most `most` bytes of a regular file. What a server reads by itself, or another file names, is nothing else: nobody is there to
-/// write into a pipe.
+/// Reads at most `most` bytes of a regular file. Use it for files that a server reads by itself or that another
+/// file names: nobody is there to write into a pipe.
 ///
 /// # Errors
-/// Refuses a path that can't be read or is no regular file, and a file that has more bytes.
+/// Refuses a path that can't be read or is not a regular file, and a file with more bytes.
 pub fn read_regular(path: &Path, most: u64) -> Result<Vec<u8>> {
     let (file, is_regular) = open(path)?;
     if is_regular { bytes_of(path, file, most) } else { Err(refuse(path, "is not a regular file")) }
 }
 
-/// Does the same as text.
+/// Reads at most `most` bytes of text from a regular file. Use it for files that a server reads by itself or
+/// that another file names.
 ///
 /// # Errors
-/// As for [`read_regular`], and refuses what is not UTF-8.
+/// Refuses a path that can't be read or is not a regular file, a file with more bytes, and bytes that are not
+/// UTF-8.
 pub fn read_regular_text(path: &Path, most: u64) -> Result<String> {
     text(path, read_regular(path, most)?)
 }
@@ -60,7 +63,8 @@ fn text(path: &Path, bytes: Vec<u8>) -> Result<String> {
     String::from_utf8(bytes).map_err(|e| refuse(path, format!("is not UTF-8 text: {e}")))
 }
 
-/// Opens a file without blocking, which an open of a pipe without a writer would do. Tells whether it is a regular one.
+/// Opens a file without blocking, which would happen for a pipe without a writer. Also returns whether it is a
+/// regular file.
 fn open(path: &Path) -> Result<(File, bool)> {
     let mut options = File::options();
     options.read(true);
@@ -74,7 +78,7 @@ fn open(path: &Path) -> Result<(File, bool)> {
     if data.is_dir() { Err(refuse(path, "is a folder")) } else { Ok((file, data.is_file())) }
 }
 
-/// All that is in a file, at most `most` bytes.
+/// Reads all bytes of a regular file, at most `most`.
 fn bytes_of(path: &Path, file: File, most: u64) -> Result<Vec<u8>> {
     if file.metadata().is_ok_and(|data| data.len() > most) {
         return Err(too_large(path, most));
@@ -103,7 +107,7 @@ fn read_within(path: &Path, most: u64, patience: Duration) -> Result<Vec<u8>> {
     }
 }
 
-/// Waits until there is something to read, or nobody writes any more.
+/// Waits until there is something to read, or no writer is left.
 #[cfg(unix)]
 fn await_bytes(path: &Path, file: &File, patience: Duration) -> Result<()> {
     use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -111,7 +115,7 @@ fn await_bytes(path: &Path, file: &File, patience: Duration) -> Result<()> {
     let patience = Timespec::try_from(patience).map_err(|_| nothing())?;
     match poll(&mut [PollFd::new(file, PollFlags::IN)], Some(&patience)) {
         Ok(0) => Err(nothing()),
-        // What is wrong, reading tells.
+        // Reading reports other errors.
         Ok(_) | Err(_) => Ok(()),
     }
 }
@@ -149,7 +153,7 @@ mod tests {
             let (into, bytes) = (path.clone(), vec![b'a'; sent]);
             let writing = std::thread::spawn(move || {
                 let written = File::options().write(true).open(into).unwrap().write_all(&bytes);
-                // Who reads may have had enough.
+                // The reader may have stopped at its bound.
                 drop(written);
             });
             match read_within(&path, most, PIPE_TIMEOUT) {

@@ -1,4 +1,4 @@
-//! The trait of a tissue in motion, and the types that it speaks in.
+//! The trait of a tissue in motion, and the types of its methods.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -18,63 +18,64 @@ use crate::tools::contact::{TangentInput, ToolContact};
 use crate::tools::prescribed::Grasp;
 use palpate_haptics::Tip;
 
-/// One mass point at the end of a step: displacement, velocity, and the forces on it. Where the applied force jumps,
-/// the value just before the jump; at step 0, just after.
+/// One mass point at the end of a step: displacement, velocity, and the forces on it. Where the applied force
+/// jumps, this is the value just before the jump; at step 0, just after it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointState {
     /// Displacement from rest, m.
     pub displacement_m: DVec3,
     /// Velocity, m/s.
     pub velocity_m_per_s: DVec3,
-    /// Force of all springs, N.
+    /// Force of all springs between points, and of an enclosed volume's pressure, N.
     pub spring_n: DVec3,
-    /// −K″·u, N.
+    /// Force of the anchor spring, −K″·u, N.
     pub anchor_n: DVec3,
-    /// −C·v, N.
+    /// Damping force, −C·v, N.
     pub damping_n: DVec3,
     /// Force of all pushing tools, N.
     pub applied_n: DVec3,
-    /// For a prescribed point, the force that holds it: m·a − spring − virtual − damping − applied, N.
+    /// The force that holds a prescribed point, N: m·a − spring − anchor − damping − applied. `None` for other
+    /// points.
     pub constraint_n: Option<DVec3>,
 }
 
 impl PointState {
-    /// Returns the force of the tissue on a tool at the point: spring + virtual + damping, N.
+    /// Returns the force of the tissue on a tool at the point, N: spring + anchor + damping.
     pub fn reaction_n(&self) -> DVec3 {
         self.spring_n + self.anchor_n + self.damping_n
     }
 }
 
-/// Energies of the whole sheet, J: sums over all points, and over all springs.
+/// Energies of the whole tissue, J: sums over all points and over all springs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Energy {
-    /// ½m·v².
+    /// Kinetic energy, Σ ½m·v².
     pub kinetic_j: f64,
-    /// ½k(L − L0)² of all springs.
+    /// Energy of the springs between points, Σ ½k(L − L0)², and of an enclosed volume.
     pub spring_j: f64,
-    /// ½K″·u².
+    /// Energy of the anchor springs, Σ ½K″·u².
     pub anchor_j: f64,
 }
 
-/// A failure that the guard could not repair.
+/// An instability of the motion that the guard could not repair with shorter substeps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BlowUp {
     /// Steps done when the guard found it.
     pub step: u64,
-    /// The cause.
+    /// The check that failed.
     pub cause: CheckFailure,
 }
 
-/// How a sheet continues after a blow-up.
+/// How a tissue continues after a blow-up.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Released {
-    /// The tools that acted in the state that it went back to, ascending. They do no longer.
+    /// The tools that acted in the state that the tissue went back to, ascending. They are released.
     pub tools: Vec<usize>,
-    /// Whether it continues at rest.
+    /// Whether the tissue continues at rest.
     pub at_rest: bool,
 }
 
-/// A sheet in motion, in any precision.
+/// A tissue in motion, in any number format.
 ///
 /// A force of 0.1 N on one point, which an anchor spring of 5 N/m holds, brings it 20 mm down (Hooke: u = F/K″):
 ///
@@ -108,131 +109,144 @@ pub struct Released {
 /// # Ok::<(), palpate_refusal::Refusal>(())
 /// ```
 pub trait Tissue: Send {
-    /// The model that it was made from.
+    /// Returns the model of the tissue.
     fn model(&self) -> &Arc<Model>;
-    /// Steps done.
+    /// Returns the number of steps done.
     fn step_count(&self) -> u64;
-    /// From the coming step on `tool` exerts `push`, or no force.
+    /// Sets the force of `tool` from the next step on; `None` ends it. The tool no longer grasps or touches.
     fn push(&mut self, tool: usize, push: Option<Push>);
-    /// From the coming step on `tool` moves `point`.
+    /// Makes `tool` move `point` from the next step on. The tool no longer pushes or touches.
     fn grasp(&mut self, tool: usize, point: PointId, grasp: Grasp);
-    /// From the coming step on `tool` meets the sheet with `tip` and is at `place_m` at the step's end.
+    /// Makes `tool` touch the tissue with `tip` from the next step on. The tip reaches `place_m`, m, at the
+    /// step's end.
     fn pose(&mut self, tool: usize, place_m: DVec3, tip: Tip);
-    /// The motion of a position-controlled tool and the force on it.
+    /// Returns the motion of a position-controlled tool and the force on it; `None` for other tools.
     fn tool_contact(&self, tool: usize) -> Option<ToolContact>;
-    /// A copy of the sheet around such a tool, if it touches or holds, to compute the stiffness there.
+    /// Returns a copy of the tissue around a position-controlled tool, from which the stiffness there is
+    /// computed; `None` if the tool neither touches nor holds.
     fn tangent_input(&self, tool: usize) -> Option<TangentInput>;
-    /// From the coming step on `tool` no longer pushes, grasps or touches.
+    /// Releases `tool`: from the next step on it no longer pushes, grasps or touches.
     fn release(&mut self, tool: usize);
-    /// From the coming step on springs, anchor springs and damping are those of `model` (from [`Model::changed`] of
-    /// this sheet's model). Displacements and velocities stay; all tiles wake.
+    /// Exchanges springs, anchor springs and damping for those of `model` from the next step on. The model
+    /// comes from [`Model::changed`] of this tissue's model. Displacements and velocities stay; all tiles wake.
     fn change(&mut self, model: &Arc<Model>);
-    /// Requests an audit of a window of steps, which begins at the next checkpoint.
+    /// Requests an audit of a window of steps, which begins at the next checkpoint. `inputs` is the memory in
+    /// which the tools' inputs are recorded; it is emptied.
     fn request_audit(&mut self, inputs: WindowInputs);
-    /// Takes the report on that window after a step, once.
+    /// Takes the report on the requested window after a step: begun, ended or dropped. Returns each report
+    /// once, otherwise `None`.
     fn take_mark(&mut self) -> Option<Mark>;
-    /// The result of [`Tissue::change`] if `model` has another number format, as after a correction to f64.
+    /// Returns a new tissue under `model` if that is in f64 and this one is not, as after a correction;
+    /// otherwise `None`: then [`Tissue::change`] applies.
     fn changed(&self, model: &Arc<Model>) -> Option<Box<dyn Tissue>>;
-    /// The present scheme. The guard may have halved the model's substep.
+    /// Returns the present scheme and substep. The guard may have halved the model's substep.
     fn plan(&self) -> &Plan;
-    /// How often the guard went back to a checkpoint and continued with half the substep.
+    /// Returns how many times the guard went back to a checkpoint and continued with half the substep.
     fn guard_events(&self) -> u64;
-    /// The step whose state a blow-up would go back to.
+    /// Returns the step of the state that a blow-up would go back to.
     fn checkpoint_step(&self) -> u64;
-    /// Substeps done, including those that the guard repeated.
+    /// Returns the number of substeps done, including those that the guard repeated.
     fn substeps_done(&self) -> u64;
-    /// Points that a step computes now; the others are at rest.
+    /// Returns the number of points that a step computes now; the others are at rest.
     fn awake_points(&self) -> usize;
-    /// Whether a step changes only the time, until a tool gets a command.
+    /// Returns whether a step changes only the time, until a tool gets a command.
     fn is_still(&self) -> bool;
-    /// Skips `steps` steps of a still sheet. The result is the same as that of single steps.
+    /// Skips `steps` steps of a still tissue ([`Tissue::is_still`]). The result is the same as that of single
+    /// steps.
     fn skip_steps(&mut self, steps: u64);
-    /// The fraction of all points in all substeps that was computed.
+    /// Returns the fraction of all points in all substeps that were computed.
     fn computed_fraction(&self) -> f64;
     /// Advances one step.
     ///
     /// # Errors
-    /// Returns a blow-up that the guard could not repair. The state is then that of the last checkpoint, which is
-    /// finite.
+    /// Returns a blow-up that the guard could not repair. The state is then that of the last checkpoint, which
+    /// is finite.
     fn step(&mut self) -> Result<(), BlowUp> {
         while !self.step_while(&mut || true)? {}
         Ok(())
     }
-    /// Advances one step, but stops in what the guard repeats for it where it may not go on: then the result is false, the state is that
-    /// of no step, and only this may be called, again. What comes of it does not depend on where it stops.
+    /// Advances one step. If the guard has to repeat substeps, it calls `may_go_on` in between and stops when
+    /// that returns false. The result is then false, and the state belongs to no step: you may only call this
+    /// function again. The result of the step does not depend on where it stops.
     ///
     /// # Errors
-    /// As `step`.
+    /// Returns a blow-up that the guard could not repair, as [`Tissue::step`] does.
     fn step_while(&mut self, may_go_on: &mut dyn FnMut() -> bool) -> Result<bool, BlowUp>;
-    /// Whether a step is not done yet, because `step_while` has stopped.
+    /// Returns whether a step is unfinished because `step_while` stopped.
     fn is_within_step(&self) -> bool;
-    /// After a blow-up: continues at step `step` (of the blow-up) from the state of the last checkpoint, or at rest if
-    /// `to_rest` or if that state has passed no check, with all tools released and the model's own substep.
+    /// Continues after a blow-up at step `step` (that of the blow-up), from the state of the last checkpoint.
+    /// If `to_rest`, or if that state has passed no check, it continues at rest. Releases all tools and
+    /// restores the model's own substep.
     fn recover(&mut self, step: u64, to_rest: bool) -> Released;
-    /// A point.
+    /// Returns the state of a point.
     fn point(&self, point: PointId) -> PointState;
-    /// How far the surface is moved at a place of the rest shape, m: interpolated between points as in frames.
+    /// Returns the displacement of the surface at a place of the rest shape, m, interpolated between points as
+    /// in frames.
     fn surface_displacement_m(&self, place_m: DVec3) -> DVec3;
-    /// The force of the tissue on a tool whose force acts around a place, N: the mean of the points' reactions r by the
-    /// weights w of the force, Σ w·r/Σ w. It changes smoothly while the place moves.
+    /// Returns the force of the tissue on a tool whose force acts around a place, N: the mean of the points'
+    /// reactions r with the force's weights w, Σ w·r/Σ w. It changes smoothly while the place moves.
     fn reaction_around_n(&self, poke: &Poke) -> DVec3;
-    /// The energies. A pass over what is awake; sleeping tiles use cached values. Earlier calls do not affect the
-    /// result.
+    /// Returns the energies. It computes the awake points; sleeping tiles use stored values. Earlier calls do
+    /// not affect the result.
     fn energy(&self) -> Energy;
-    /// Length of the largest displacement, m.
+    /// Returns the length of the largest displacement, m.
     fn largest_displacement_m(&self) -> f64;
-    /// Writes the displacements, m, with x, y and z in separate vectors, in the order of the points.
+    /// Writes the displacements, m, in the order of the points, with x, y and z in separate vectors. Replaces
+    /// their content.
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]);
-    /// The same in full, x, y and z of each point after the other.
+    /// Writes the displacements, m, in f64, in the order of the points: x, y and z of each point together.
+    /// Replaces the content.
     fn whole_displacements_m(&self, into: &mut Vec<f64>);
-    /// Displacements in the order in which frames show them ([`Model::shown_order`]), with x, y and z in separate vectors and zeros where a frame of a mesh has
-    /// places without a vertex.
+    /// Writes the displacements, m, in the order of frames ([`Model::shown_order`]), with x, y and z in
+    /// separate vectors. Replaces their content. A frame of a mesh has zeros at places without a vertex.
     fn shown_displacements_m(&self, into: &mut [Vec<f32>; 3]);
-    /// Blocks of at most 16 points, in the order in which they are hashed.
+    /// Returns the number of blocks of at most 16 points, in which the state is hashed.
     fn hash_block_count(&self) -> usize;
-    /// Adds some of these blocks to a hash: all that the future of each point depends on.
+    /// Adds some of these blocks to a hash: everything that the future of their points depends on.
     fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3);
-    /// XXH3-128 of the state of every point.
+    /// Returns the XXH3-128 hash of the state of every point.
     fn state_hash(&self) -> u128 {
         Hashing::default().add(self, usize::MAX).unwrap_or_default()
     }
-    /// A copy of all that the next steps depend on, from which another thread makes a snapshot. An audit under way is left out.
+    /// Returns a copy of everything that the next steps depend on, from which another thread makes a snapshot.
+    /// It leaves out a running audit.
     fn save(&self) -> SavedTissue;
-    /// A copy of the sheet as it is now, to be read by another thread.
+    /// Returns a copy of the present tissue that another thread can read.
     fn copy(&self) -> ReadCopy;
 }
 
-/// A sheet that stays as it was.
+/// A copy of a tissue at one moment, for reading.
 pub struct ReadCopy(Box<dyn Tissue>);
 
 impl ReadCopy {
-    /// `copy` is not stepped any more.
+    /// Wraps a tissue that nobody steps any more.
     pub(super) fn of(copy: Box<dyn Tissue>) -> Self {
         ReadCopy(copy)
     }
 
-    /// Returns what it was copied from.
+    /// Returns the model of the copied tissue.
     pub fn model(&self) -> &Model {
         self.0.model()
     }
 
-    /// Returns a point.
+    /// Returns the state of a point.
     pub fn point(&self, point: PointId) -> PointState {
         self.0.point(point)
     }
 
-    /// Returns XXH3-128 of the state of every point.
+    /// Returns the XXH3-128 hash of the state of every point.
     pub fn state_hash(&self) -> u128 {
         self.0.state_hash()
     }
 
-    /// Adds so many points, or a few more, to the hash. Returns it when all are in.
+    /// Adds the next `points` points, rounded up to a block of 16, to an unfinished hash. Returns the hash once
+    /// all points are in.
     pub fn hash(&self, hashing: &mut Hashing, points: usize) -> Option<u128> {
         hashing.add(&*self.0, points)
     }
 }
 
-/// A hash of a state that is not finished.
+/// An unfinished hash of a tissue's state, which is computed in slices.
 pub struct Hashing {
     hasher: Box<Xxh3>,
     /// The next block of points.
@@ -246,7 +260,8 @@ impl Default for Hashing {
 }
 
 impl Hashing {
-    /// Adds at least one and at most so many points of a tissue, rounded up to a block. Returns the hash when all are in.
+    /// Adds at least one and at most `points` points of a tissue, rounded up to a block. Returns the hash once
+    /// all points are in.
     fn add(&mut self, tissue: &(impl Tissue + ?Sized), points: usize) -> Option<u128> {
         let blocks = tissue.hash_block_count();
         let end = self.next.saturating_add(points.div_ceil(BLOCK).max(1)).min(blocks);

@@ -1,8 +1,10 @@
-//! The tissue: an immutable model, a state, and the step that advances it. No clock, no socket.
+//! Simulates the tissue: an immutable model, a state, and the step that advances the state. It uses no clock
+//! and no socket.
 //!
-//! The state is u, the displacement from rest, and d, what a substep adds to it, both in spacings. Positions are not stored: so
-//! small movements keep their digits in f32. Each substep is one sweep over the springs (`body`), in which a scheme
-//! (`scheme`) advances each point. A sheet at rest costs almost nothing: tiles sleep (`sleep`).
+//! The state is u, the displacement from rest, and d, what a substep adds to it, both in units of the spacing.
+//! Positions are not stored, so that small movements keep their digits in f32. Each substep is one sweep over
+//! the springs (`body`), in which a scheme (`scheme`) advances each point. A tissue at rest costs almost
+//! nothing: its tiles sleep (`sleep`).
 
 pub mod body;
 mod compile;

@@ -1,74 +1,75 @@
-//! The limits of the configuration, in one place: what one scene, session or stream may ask for. Each queue
-//! of the server has its bound here.
+//! The limits of the configuration: what one scene, session or stream may ask for. The bound of each queue of
+//! the server is here.
 
 use serde::Deserialize;
 
-/// Upper bounds. Every one can be set in the section `[limits]` of the configuration file.
+/// Upper bounds, each set by its name in the section `[limits]` of the configuration file. Whatever exceeds one
+/// is refused, unless its text says otherwise.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
-    /// Mass points of a sheet.
+    /// Mass points of a tissue.
     pub points: usize,
-    /// Substeps of a step.
+    /// Substeps per step.
     pub substeps: u32,
-    /// Force of a tool on any one point, N: |force|·e^{c′}.
+    /// Force of a tool on any one point, |force|·e^{c′}, N.
     pub point_force_n: f64,
-    /// How far a grasped point may be brought from its rest position, as a multiple of the sheet's longer side.
+    /// How far a grasped point may be moved from its rest position, as a multiple of the tissue's longest side.
     pub reach_in_sheets: f64,
     /// Bytes of a scene or script file.
     pub file_bytes: u64,
     /// Bytes of a trace file.
     pub trace_bytes: u64,
-    /// Bytes of a file with a mesh.
+    /// Bytes of a mesh file.
     pub mesh_bytes: u64,
     /// Vertices of a mesh that a client sends.
     pub mesh_vertices: usize,
-    /// Meshes that a caller has sent, and that have not expired.
+    /// Meshes that one caller has sent and that have not expired.
     pub meshes_per_caller: usize,
-    /// A mesh that a client has sent is forgotten so long after its last part, s.
+    /// Time after the last part of a mesh that a client sent until the server forgets it, s.
     pub mesh_s: f64,
     /// Bytes of a journal that a client sends.
     pub journal_bytes: u64,
-    /// Journals that a caller has sent, and that have not expired.
+    /// Journals that one caller has sent and that have not expired.
     pub journals_per_caller: usize,
-    /// A journal that a client has sent is forgotten so long after it was last used, s.
+    /// Time after the last use of a journal that a client sent until the server forgets it, s.
     pub journal_s: f64,
-    /// Tools of a session: their numbers are below this.
+    /// Tools of a session. Their numbers are below this.
     pub tools: u32,
-    /// Commands that wait for their step, per tool.
+    /// Commands per tool that wait for their step.
     pub queued_commands_per_tool: usize,
-    /// Samples that wait for a reader before the oldest is dropped.
+    /// Samples that wait for one reader. Beyond it, the oldest is dropped.
     pub queued_samples: usize,
-    /// Probe records that wait for a reader before the oldest is dropped.
+    /// Probe records that wait for one reader. Beyond it, the oldest is dropped.
     pub queued_records: usize,
-    /// Bytes that wait for one reader, of records or of frames; at least one record or frame may.
+    /// Bytes of records or frames that wait for one reader. One record or frame may wait whatever its size.
     pub queued_bytes: usize,
-    /// Bytes that the server may take in all for what its callers ask for; half of what the machine or its control group
-    /// has, if 0.
+    /// Bytes that the server may use in all for its callers. 0 means half of the memory of the machine or of
+    /// its control group.
     pub memory_bytes: u64,
-    /// Other tissues of a session that wait for their step.
+    /// Changes of tissue of a session that wait for their step.
     pub queued_changes: usize,
     /// Sessions of a server.
     pub sessions: usize,
     /// Mass points of all sessions of a server.
     pub points_in_all: usize,
-    /// Points times substeps of a session: what one step may cost its thread.
+    /// Points times substeps of a session: the work of one step.
     pub point_substeps_per_step: u64,
-    /// Triangles that a step of a session may look up under all tips: a tip of 5 mm on a mesh whose edges are 2 mm long looks up
-    /// about 1000 in each substep.
+    /// Triangles that one step of a session may search under all tips. A tip of 5 mm on a mesh with edges of 2
+    /// mm searches about 1000 in each substep.
     pub contact_work: u64,
-    /// How long a step of a session may take, predicted with all points awake, in periods of its rate.
+    /// Predicted time of a session's step with all points awake, in periods of its rate.
     pub periods_per_step: f64,
-    /// Points times substeps that may be computed to find out which scheme and how many substeps keep a scene's tolerance;
-    /// offline 32 times as many. With the rest, some tenths of a second.
+    /// Points times substeps of the rehearsals that choose the scheme and the number of substeps for a scene's
+    /// tolerance. Offline, 32 times as many. With the default, they take some tenths of a second.
     pub rehearsal_work: u64,
     /// Streams that read one session.
     pub streams_per_session: usize,
-    /// Of those, kept for streams that hold a tool.
+    /// How many of these streams are reserved for streams that hold a tool.
     pub streams_for_holders: usize,
     /// Streams of a server.
     pub streams: usize,
-    /// Tools that are held, of all sessions of a server.
+    /// Held tools of all sessions of a server.
     pub leases: usize,
     /// Step rate of a session, Hz.
     pub session_rate_hz: f64,
@@ -76,46 +77,50 @@ pub struct Limits {
     pub frame_vertices: usize,
     /// Pixels along a side of a texture.
     pub texture_side: u32,
-    /// Points of a probe that is not of all points.
+    /// Points of a probe, unless it is of all points.
     pub probe_points: usize,
     /// Longest lease of a tool, s.
     pub lease_s: f64,
-    /// Longest lease of a tool that was taken by a call over HTTP/1.1 or gRPC-web, unless it is to outlive its connection,
-    /// s: the end of such a connection says nothing of who holds the tool.
+    /// Longest lease of a tool that was taken by a call over HTTP/1.1 or gRPC-web, s, unless the lease is to
+    /// outlive its connection. The end of such a connection says nothing about the holder of the tool.
     pub browser_lease_s: f64,
-    /// Share of a stepping thread's time that sessions may take before no further one is let in, 0 to 1.
+    /// Share of a stepping thread's time that sessions may use, 0 to 1. Beyond it, the thread accepts no
+    /// further session.
     pub thread_share: f64,
-    /// Connections; what comes above that is closed at once. Fewer, if the process may not open as many files.
+    /// Open connections. Further ones are closed at once. The bound is lower if the process may not open as
+    /// many files.
     pub connections: usize,
-    /// Connections from one address, of IPv6 from one network of 64 bits; what comes above that is closed at once.
+    /// Open connections from one IPv4 address or one IPv6 network of 64 bits. Further ones are closed at once.
     pub connections_per_address: usize,
-    /// Streams and calls at once on a connection.
+    /// Streams and calls at the same time on one connection.
     pub streams_per_connection: u32,
     /// Bytes of a message from a client.
     pub message_bytes: usize,
-    /// Bytes of a connection that wait to be read, in all its streams, before the transport holds the client back: what a
-    /// connection can take of the server's memory.
+    /// Unread bytes of all streams of one connection. Beyond it, the transport holds the client back. This
+    /// bounds the memory that a connection takes.
     pub connection_window_bytes: u32,
-    /// A connection that has not said what it wants to speak after so long is closed, the handshake of TLS included, s.
+    /// Time within which a new connection must choose its protocol, the TLS handshake included, s. Then it is closed.
     pub handshake_s: f64,
-    /// A haptic stream without its first message after so long is ended, and so is a call whose message has not come in
-    /// full, s.
+    /// Time within which a haptic stream must send its first message, and a call its complete message, s. Then
+    /// it is ended.
     pub open_s: f64,
-    /// A connection is asked whether it lives when it was silent so long, and closed if it does not answer for as long, s.
+    /// Time of silence after which a connection is tested, and time for its answer, s. Without an answer it is
+    /// closed.
     pub keepalive_s: f64,
-    /// Commands of a haptic stream, per tool and step of the session: what comes faster for long is refused.
+    /// Commands of a haptic stream per tool and step of the session. Commands that stay faster are refused.
     pub commands_per_step: f64,
-    /// Springs times iterations that an exact force law may take; where they don't suffice, the coarse one stays.
+    /// Springs times iterations of an exact force law. If they do not suffice, the coarse law stays.
     pub law_work: u64,
-    /// Operations, of some nanoseconds each, that a piece of heavy work may take on a mesh.
+    /// Operations, of some nanoseconds each, of one piece of heavy work on a mesh.
     pub mesh_work: u64,
-    /// Pieces of heavy work (a session laid out, another tissue, a force law) of one caller that wait.
+    /// Pieces of heavy work (creating a session, changing a tissue, computing a force law) of one caller that
+    /// wait.
     pub queued_work: usize,
-    /// Such a piece has to be done within so long after it was asked for, s.
+    /// Time from the request of such a piece of work until it must be done, s.
     pub work_s: f64,
-    /// Sessions made over one connection, per minute, and at once.
+    /// Sessions created over one connection per minute; as many may be created at once.
     pub sessions_per_minute: f64,
-    /// Calls made over one connection, of any kind, per second, and at once.
+    /// Calls of any kind over one connection per second; as many may come at once.
     pub calls_per_s: f64,
 }
 
@@ -178,12 +183,12 @@ impl Default for Limits {
     }
 }
 
-/// Factor by which compiling a scene may take more work for one user alone than on a server: reference solutions need a
-/// tolerance of 1e-10.
+/// Factor of the work for compiling a scene offline, relative to a server: reference solutions need a tolerance
+/// of 1e-10.
 const OFFLINE_WORK: u64 = 32;
 
 impl Limits {
-    /// Returns the limits for a process in which no other caller waits.
+    /// Returns the limits for a process that serves a single user: 32 times the `rehearsal_work`.
     #[must_use]
     pub fn offline(self) -> Self {
         Limits { rehearsal_work: self.rehearsal_work.saturating_mul(OFFLINE_WORK), ..self }

@@ -1,11 +1,11 @@
-//! Memory that the system may refuse.
+//! Allocates memory that the system may refuse.
 //!
-//! An allocation that fails ends the process. What grows with a request or a session is therefore laid out here, where a
-//! failure is a [`Refusal`]. Code that returns a `Result` calls `check`. Code deep in a computation calls `zeroed`,
-//! `filled`, `with_room`, `collected` or `require`: these unwind with the refusal, as a fault of the program would, and
-//! [`attempt`] returns it where the call or session is known.
+//! A failed allocation ends the process. Memory that grows with a request or a session is therefore allocated
+//! here, where a failure is a [`Refusal`]. Code that returns a `Result` calls `check`. Code deep in a
+//! computation calls `zeroed`, `filled`, `with_room`, `collected` or `require`: these unwind with the refusal,
+//! like a panic, and [`attempt`] returns it where the call or session is known.
 //!
-//! Allocations below [`LARGE_BYTES`] and those inside libraries can't be refused. So each large one has to leave
+//! Allocations below [`LARGE_BYTES`] and those inside libraries can't be refused. So each large one must leave
 //! [`HEADROOM_BYTES`] for them.
 
 use std::any::Any;
@@ -16,11 +16,11 @@ use bytemuck::allocation::try_zeroed_vec;
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Below this an allocation is not checked.
+/// Smallest allocation that is checked, bytes.
 pub const LARGE_BYTES: usize = 64 << 10;
 
-/// What a large allocation has to leave to small ones. More than 32 MiB, because the GNU allocator returns such memory to
-/// the system at once and changes none of its thresholds.
+/// Bytes that a large allocation must leave for small ones. More than 32 MiB, because the GNU allocator returns
+/// such memory to the system at once and changes none of its thresholds.
 pub const HEADROOM_BYTES: usize = 64 << 20;
 
 fn refused(bytes: usize, what: &str) -> Refusal {
@@ -28,7 +28,7 @@ fn refused(bytes: usize, what: &str) -> Refusal {
     Refusal::new(Reason::Overloaded, "", message)
 }
 
-/// Whether the system would give so many bytes now.
+/// Returns whether the system would give `bytes` now.
 fn is_available(bytes: usize) -> bool {
     let mut memory = Vec::<u8>::new();
     let reserved = memory.try_reserve_exact(bytes).is_ok();
@@ -37,7 +37,11 @@ fn is_available(bytes: usize) -> bool {
     reserved
 }
 
-/// Refuses if the system would not give `bytes` now. Nothing is kept: another may take them first.
+/// Checks that the system would give `bytes` for `what` now, and the headroom. Nothing is reserved: another
+/// thread may take them first.
+///
+/// # Errors
+/// Refuses if the memory is not there.
 pub fn check(bytes: u64, what: &str) -> Result<()> {
     let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
     if bytes < LARGE_BYTES || is_available(bytes.saturating_add(HEADROOM_BYTES)) {
@@ -47,16 +51,16 @@ pub fn check(bytes: u64, what: &str) -> Result<()> {
     }
 }
 
-/// Does what [`check`] does where no `Result` is returned: for many small allocations.
+/// Checks that the system would give `bytes` for `what` now, and the headroom: for many small allocations.
 ///
-/// Unwinds with the refusal.
+/// Unwinds with the refusal ([`attempt`]) if the memory is not there.
 pub fn require(bytes: u64, what: &str) {
     if let Err(refusal) = check(bytes, what) {
         resume_unwind(Box::new(refusal));
     }
 }
 
-/// Returns `values` if they could be had and leave the headroom.
+/// Returns `values` if their allocation succeeded and leaves the headroom; otherwise unwinds with a refusal.
 fn kept<T, E>(values: std::result::Result<Vec<T>, E>, length: usize, what: &str) -> Vec<T> {
     let bytes = length.saturating_mul(size_of::<T>());
     match values {
@@ -65,43 +69,44 @@ fn kept<T, E>(values: std::result::Result<Vec<T>, E>, length: usize, what: &str)
     }
 }
 
-/// Returns so many zeros. The system supplies their pages at the first write.
+/// Returns `length` zeros. The system supplies their pages at the first write.
 ///
 /// Unwinds with a refusal if there is no memory for `what`.
 pub fn zeroed<T: Zeroable>(length: usize, what: &str) -> Vec<T> {
     kept(try_zeroed_vec(length), length, what)
 }
 
-/// Returns so many copies of `value`. Unwinds as [`zeroed`] does.
+/// Returns `length` copies of `value`. Unwinds with a refusal if there is no memory for `what`.
 pub fn filled<T: Clone>(length: usize, value: T, what: &str) -> Vec<T> {
     let mut values = with_room(length, what);
     values.resize(length, value);
     values
 }
 
-/// Returns an empty vector with room for `capacity` values. Unwinds as [`zeroed`] does.
+/// Returns an empty vector with room for `capacity` values. Unwinds with a refusal if there is no memory for
+/// `what`.
 pub fn with_room<T>(capacity: usize, what: &str) -> Vec<T> {
     let mut values = Vec::new();
     let reserved = values.try_reserve_exact(capacity).map(|()| values);
     kept(reserved, capacity, what)
 }
 
-/// Returns all of `values`. Unwinds as [`zeroed`] does.
+/// Collects `values` into a vector. Unwinds with a refusal if there is no memory for `what`.
 pub fn collected<T>(values: impl ExactSizeIterator<Item = T>, what: &str) -> Vec<T> {
     let mut vector = with_room(values.len(), what);
     vector.extend(values);
     vector
 }
 
-/// Returns the refusal with which a thread unwound, if it was one of memory.
+/// Returns the refusal with which a thread unwound; `None` if the panic had another cause.
 pub fn refusal_of(panic: &(dyn Any + Send)) -> Option<&Refusal> {
     panic.downcast_ref()
 }
 
-/// Does something. If there is no memory for it, refuses in the name of `field`; another panic goes on.
+/// Runs `work` and catches an unwinding refusal of memory, which it returns for `field`. Other panics continue.
 ///
 /// # Errors
-/// Refuses as `work` does, and if there is no memory for it.
+/// Returns the refusal of `work`, and refuses if there is no memory for it.
 pub fn attempt<T>(field: &str, work: impl FnOnce() -> Result<T>) -> Result<T> {
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| match panic.downcast::<Refusal>() {
         Ok(refusal) => Err(refusal.within(field)),

@@ -1,4 +1,4 @@
-//! The immutable half of a sheet: its scene, its points, and the scheme with its substep.
+//! The immutable half of a tissue: its scene, its points, and the scheme with its substep.
 
 use std::sync::Arc;
 
@@ -9,56 +9,59 @@ use crate::scheme::stability;
 use crate::scheme::{Oscillator, QuadratureNode, Scheme};
 use crate::shape::{self, PointId, RestShape};
 
-/// The immutable half of a sheet.
+/// The immutable half of a tissue, compiled from a scene: points, springs, and the scheme with its substep.
 #[derive(Debug, Clone)]
 pub struct Model {
-    /// What it was compiled from.
+    /// The scene that the model was compiled from.
     pub scene: Scene,
-    /// Rows and columns in memory: those of a sheet, or slots of a mesh in rows of [`BLOCK`].
+    /// Rows and columns in memory: those of a sheet, or the slots of a mesh in rows of [`BLOCK`] (a slot is a
+    /// vertex's place in memory).
     pub(super) points: [usize; 2],
     /// Row-major indices of the fixed points, ascending.
     pub(super) fixed: Vec<usize>,
     /// The unit of length: the distance between neighbours, m.
     pub(super) unit_m: f64,
-    /// Where the points of a mesh are in memory, and its springs; none for a sheet.
+    /// The places in memory of a mesh's points, and its springs; `None` for a sheet.
     pub(super) graph: Option<Arc<MeshPlaces>>,
-    /// ω_b = √((largest spring stiffness + K″)/m): no vibration is faster, under any deformation, rad/s.
+    /// ω_b = √((largest spring stiffness + K″)/m), rad/s. No vibration is faster, under any deformation.
     pub omega_bound_per_s: f64,
-    /// The scheme.
+    /// The scheme and the substep.
     pub plan: Plan,
-    /// What `auto` became.
+    /// The number format; never `Auto`.
     pub precision: Precision,
-    /// Expected error of displacement and force, relative to the largest of each (`choice`).
+    /// Expected error of displacement and force, relative to the largest of each (see
+    /// `select::scheme_selection`). Infinite if it is unknown.
     pub expected_error: f64,
-    /// Error that leaving out tiles at rest may cost, relative to the largest displacement.
+    /// Largest error that leaving out tiles at rest may add, relative to the largest displacement.
     pub sleep_tolerance: f64,
-    /// What `auto` became on this machine.
+    /// How many numbers this machine works on at once; never `Auto`.
     pub lanes: Lanes,
-    /// What a user should know, in words.
+    /// Warnings for the user, as sentences.
     pub warnings: Vec<String>,
-    /// What a correction asked for, also with another tissue: the scheme, and no fewer substeps than this.
+    /// The scheme and the least substeps that a correction asked for. Later changes of the tissue keep to them.
     pub corrected: Option<(Integrator, u32)>,
-    /// Points × substeps of the rehearsals by which it was chosen: at most `limits.rehearsal_work`.
+    /// Points × substeps of the rehearsals that chose the plan: at most `limits.rehearsal_work`.
     pub rehearsed: u64,
-    /// By how much each place in memory lets a volume grow under a pressure, m³/Pa; empty if nobody has found out, or without a
-    /// volume.
+    /// By how much each place in memory lets a volume grow under a pressure, m³/Pa. Empty without a volume, or
+    /// before it was computed.
     pub(super) volume_compliance: Arc<[f64]>,
 }
 
-/// A scheme with its substep.
+/// A scheme fitted to a substep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
-    /// What `auto` became.
+    /// The integrator; never `Auto`.
     pub integrator: Integrator,
-    /// Substeps a step.
+    /// Substeps per step.
     pub substeps: u32,
     /// Length of a substep, s.
     pub substep_s: f64,
-    /// The scheme, fitted to the substep.
+    /// The scheme's coefficients, fitted to the substep.
     pub scheme: Scheme,
-    /// How the tools' force enters a substep.
+    /// The moments of a substep at which the tools' force is evaluated, with their weights.
     pub nodes: Vec<QuadratureNode>,
-    /// Whether the substep is within the stability bound. It always is if the number was not given.
+    /// Whether the substep is within the stability bound. Only a number of substeps that the scene gives can be
+    /// beyond it.
     pub stable: bool,
 }
 
@@ -69,7 +72,7 @@ impl Plan {
         Plan { stable, ..plan }
     }
 
-    /// The same without a look at its stability, which a rehearsal sees for itself.
+    /// Creates a plan without checking its stability; a rehearsal detects an instability itself.
     pub(super) fn unjudged(integrator: Integrator, substeps: u32, step_s: f64, sheet: &Oscillator) -> Self {
         let substep_s = step_s / f64::from(substeps);
         let (a, g) = sheet.scaled(substep_s);
@@ -78,19 +81,21 @@ impl Plan {
         Plan { integrator, substeps, substep_s, scheme, nodes, stable: true }
     }
 
-    /// The same scheme with a shorter substep.
+    /// Returns the same scheme with `by` times the substeps.
     pub(super) fn divided(&self, scene: &Scene, by: u32) -> Self {
         Plan::new(self.integrator, self.substeps * by, scene.stepping.rate_hz.recip(), &Oscillator::of(scene))
     }
 
-    /// What turns newtons on a point of the mass of reference into the scheme's unit of force: dt²/(m·h), 1/N.
+    /// Returns the factor from newtons on a point of the reference mass to the scheme's unit of force:
+    /// dt²/(m·h), 1/N.
     pub(super) fn force_scale(&self, scene: &Scene) -> f64 {
         self.substep_s * self.substep_s / (scene.point_mass_kg() * scene.shape().edge_m())
     }
 }
 
 impl Oscillator {
-    /// Returns the coefficients of a scene. A zero is positive here, whatever its sign was: what is divided by it is infinite, not below all.
+    /// Returns the coefficients of a scene. Zeros are positive here, whatever their sign was, so that a
+    /// division by one gives +∞.
     pub fn of(scene: &Scene) -> Self {
         Oscillator {
             mass_kg: scene.point_mass_kg(),
@@ -102,10 +107,11 @@ impl Oscillator {
 }
 
 impl Model {
-    /// Of a scene with a scheme that somebody else has chosen: nothing is checked, nothing expected, nothing sleeps.
+    /// Creates a model of a scene with a given plan. Nothing is checked, no error is predicted, and nothing
+    /// sleeps.
     ///
     /// # Errors
-    /// What is wrong with the springs of a mesh.
+    /// Returns the fault of a mesh whose springs can't be laid out.
     pub(super) fn planned(scene: Scene, plan: Plan, precision: Precision, lanes: Lanes) -> Result<Self, GraphFault> {
         let (points, fixed, graph) = match &scene.body {
             Body::Sheet(sheet) => (sheet.points, sheet.fixed_indices(), None),
@@ -136,14 +142,14 @@ impl Model {
         })
     }
 
-    /// The tolerance of the sheet's tiles. Without anchor springs nothing bounds how far an omitted force would move a
-    /// sheet, so then only what does not move at all may sleep.
+    /// Returns the sleep tolerance of the tiles. Without anchor springs, nothing bounds how far an omitted
+    /// force would move a tissue; then only tiles that do not move at all may sleep.
     pub(super) fn tile_tolerance(&self) -> f64 {
         let bounded = self.scene.anchor_stiffness_n_per_m > 0.0;
         if bounded { self.sleep_tolerance } else { self.sleep_tolerance.min(f64::MIN_POSITIVE) }
     }
 
-    /// Returns what the model itself takes, bytes.
+    /// Returns the memory of the model itself, bytes.
     pub fn bytes(&self) -> u64 {
         let fixed = self.fixed.len() * (size_of::<usize>() + size_of::<[usize; 2]>());
         let vectors =
@@ -151,8 +157,8 @@ impl Model {
         (size_of::<Model>() + fixed + vectors) as u64 + self.mesh_bytes()
     }
 
-    /// What the tables of a mesh take, bytes, about: places, neighbours, and each spring from both of its ends, as the file of
-    /// the scene has it and as the kernel reads it.
+    /// Returns the approximate memory of a mesh's tables, bytes: places, neighbours, and each spring from both
+    /// of its ends, as the scene has it and as the kernel reads it.
     fn mesh_bytes(&self) -> u64 {
         const OF_A_VERTEX: usize = 256;
         const OF_A_SPRING: usize = 192;
@@ -168,13 +174,15 @@ impl Model {
         }
     }
 
-    /// Returns what a session of it may take, bytes: its state, the checkpoint, and one more that an audit begins from.
+    /// Returns the memory that a session of this model may take, bytes: its state, the checkpoint, and the
+    /// state at which an audit begins.
     pub fn session_bytes(&self) -> u64 {
         const STATES: u64 = 3;
         STATES * self.state_bytes() + self.bytes()
     }
 
-    /// Returns what the state of a sheet takes, bytes: three components of u, d and what the scheme keeps, of each place in memory.
+    /// Returns the memory of a tissue's state, bytes: three components of u, d and the scheme's kept values for
+    /// each place in memory.
     pub fn state_bytes(&self) -> u64 {
         let fields = 2 + self.plan.scheme.kept(self.precision == Precision::Compensated);
         let plane_bytes = match self.precision {
@@ -201,78 +209,78 @@ impl Model {
         self.shape().point_count()
     }
 
-    /// Places of points in memory; some of those of a mesh are empty.
+    /// Returns the number of places in memory; some places of a mesh are empty.
     pub(super) fn places(&self) -> usize {
         self.points[0] * self.points[1]
     }
 
-    /// The place of a point in memory, by rows.
+    /// Returns the row-major place of a point in memory.
     pub(super) fn place_of(&self, point: PointId) -> usize {
         self.graph.as_ref().map_or(point.index(), |graph| graph.slot_of(point))
     }
 
-    /// Returns the vertices of a mesh in the order in which frames show them, that of memory, which keeps neighbours
-    /// together; and the place of each vertex in that order. `None` for a sheet, which is shown in the order of its
-    /// points.
+    /// Returns the order in which frames show a mesh: its vertices in the order of memory, which keeps
+    /// neighbours together, and the place of each vertex in that order. `None` for a sheet, which frames show
+    /// in the order of its points.
     pub fn shown_order(&self) -> Option<[&[u32]; 2]> {
         let slots = &self.graph.as_ref()?.slots;
-        // What is empty is at the end.
+        // Empty places are at the end.
         Some([&slots.vertex_of()[..self.len()], slots.slot_of()])
     }
 
-    /// The point at a place in memory; of an empty one, any.
+    /// Returns the point at a place in memory; for an empty place, any point.
     pub(super) fn point_at(&self, index: usize) -> PointId {
         self.graph.as_ref().map_or(PointId::new(index), |graph| graph.point_in(index))
     }
 
-    /// Returns the mass of a point, that of reference times the point's factor, kg.
+    /// Returns the mass of a point, kg.
     pub fn mass_kg(&self, point: PointId) -> f64 {
         self.scene.point_mass_kg() * self.scene.relative_mass(point)
     }
 
-    /// Returns K″ of a point, N/m.
+    /// Returns K″ of a point's anchor spring, N/m.
     pub fn anchor_stiffness_n_per_m(&self, point: PointId) -> f64 {
         self.scene.anchor_stiffness_n_per_m * self.scene.relative_anchor_stiffness(point)
     }
 
-    /// Returns C of a point, N·s/m: C/m is the same at every point.
+    /// Returns C of a point, N·s/m. C/m is the same at every point.
     pub fn damping_n_s_per_m(&self, point: PointId) -> f64 {
         self.scene.damping_n_s_per_m * self.scene.relative_mass(point)
     }
 
-    /// The mass at a place in memory over that of reference: what divides a force on it in the scheme's units
-    /// ([`Plan::force_scale`]), and multiplies C.
+    /// Returns the mass at a place in memory divided by the reference mass. It divides a force there in the
+    /// scheme's units ([`Plan::force_scale`]), and multiplies C.
     pub(super) fn relative_mass_at(&self, index: usize) -> f64 {
         self.graph.as_ref().map_or(1.0, |graph| graph.slots.mass(index))
     }
 
-    /// K″/m at a place in memory over that of reference, minus 1.
+    /// Returns K″/m at a place in memory divided by the reference value, minus 1.
     pub(super) fn extra_anchor_at(&self, index: usize) -> f64 {
         self.graph.as_ref().map_or(0.0, |graph| graph.slots.extra_at(index))
     }
 
-    /// K″ at a place in memory over that of reference.
+    /// Returns K″ at a place in memory divided by the reference value.
     pub(super) fn relative_anchor_stiffness_at(&self, index: usize) -> f64 {
         self.relative_mass_at(index) * (1.0 + self.extra_anchor_at(index))
     }
 
-    /// Returns what a substep computes, in points: rows are padded, and a short one costs what one of a vector's width
-    /// does.
+    /// Returns the number of points that a substep computes, padding included: a short row costs as much as one
+    /// of a vector's width.
     pub fn swept_points(&self) -> usize {
         self.points[0] * self.points[1].max(BLOCK)
     }
 
-    /// Returns false: a sheet has at least one point.
+    /// Returns false: a tissue has at least one point.
     pub fn is_empty(&self) -> bool {
         false
     }
 
-    /// Row and column of the point with a row-major index.
+    /// Returns the row and column of a row-major index.
     pub(super) fn point_of(&self, index: usize) -> [usize; 2] {
         [index / self.points[1], index % self.points[1]]
     }
 
-    /// The row-major index of the point at a row and column of the sheet.
+    /// Returns the row-major index of a row and column.
     pub(super) fn index_of(&self, [i, j]: [usize; 2]) -> usize {
         i * self.points[1] + j
     }

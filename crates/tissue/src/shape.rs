@@ -1,5 +1,6 @@
-//! The rest shape of a tissue: its mass points, where they rest, and how they lie together. Everything above `sheet` sees a
-//! tissue this way and no other, so that it does not matter whether its points form a grid.
+//! The rest shape of a tissue: its mass points, where they rest, and how they are joined. Code outside
+//! `scene::sheet` and `scene::mesh` uses a tissue only through this interface, so that it works for grids and
+//! meshes.
 
 use std::fmt;
 use std::str::FromStr;
@@ -9,27 +10,27 @@ use serde::Serialize;
 
 use palpate_refusal::{Reason, Refusal, Result, finite, legible};
 
-/// A mass point of a tissue. Which one it is, its shape tells.
+/// A mass point of a tissue, as an index into arrays over all points. The rest shape gives its name and place.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct PointId(usize);
 
 impl PointId {
-    /// Returns the point at place `index` in arrays over all points of the tissue.
+    /// Returns the point with this index in arrays over all points of the tissue.
     pub fn new(index: usize) -> Self {
         PointId(index)
     }
 
-    /// Returns its place in such arrays.
+    /// Returns the point's index in arrays over all points of the tissue.
     pub fn index(self) -> usize {
         self.0
     }
 }
 
-/// What people call a point, in scripts, records and messages.
+/// The name of a point in scripts, records and messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PointName {
-    /// Point [i, j] of a sheet: column i along x, row j along y.
+    /// Point [i, j] of a sheet: index i along x, index j along y.
     Point([usize; 2]),
     /// A vertex of a mesh, numbered from 0 as in its file.
     Vertex(u32),
@@ -56,7 +57,7 @@ impl FromStr for PointName {
     }
 }
 
-/// The box around a shape at rest.
+/// The box around a shape at rest, parallel to the axes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Extent {
     /// The least of each coordinate, m.
@@ -66,18 +67,18 @@ pub struct Extent {
 }
 
 impl Extent {
-    /// Returns the box around places; of none, its ends are infinite.
+    /// Returns the box around places, m. Without places, its ends are infinite.
     pub fn around(places_m: impl Iterator<Item = DVec3> + Clone) -> Self {
         let least_m = places_m.clone().fold(DVec3::INFINITY, DVec3::min);
         Extent { least_m, most_m: places_m.fold(DVec3::NEG_INFINITY, DVec3::max) }
     }
 
-    /// Returns its middle, m.
+    /// Returns the middle of the box, m.
     pub fn middle_m(&self) -> DVec3 {
         (self.least_m + self.most_m) / 2.0
     }
 
-    /// Returns its length along each axis, m.
+    /// Returns the length of the box along each axis, m.
     pub fn size_m(&self) -> DVec3 {
         self.most_m - self.least_m
     }
@@ -92,58 +93,61 @@ impl fmt::Display for Extent {
 
 /// The rest shape of a tissue. Its points are numbered from 0 without a gap.
 pub trait RestShape: fmt::Debug + Send + Sync {
-    /// Its size in points, for people.
+    /// Returns the size in points as text, for people.
     fn describe(&self) -> String;
-    /// The number of points, at least 1.
+    /// Returns the number of points, at least 1.
     fn point_count(&self) -> usize;
-    /// What people call a point.
+    /// Returns the name of a point.
     fn name(&self, point: PointId) -> PointName;
-    /// The point that is called so.
+    /// Returns the point of a name.
     ///
     /// # Errors
-    /// Refuses a name that no point has; `field` is the name that the refusal gives.
+    /// Refuses a name that no point has; `field` is the key that the refusal gives.
     fn find(&self, field: &str, name: PointName) -> Result<PointId>;
-    /// Where a point rests, m.
+    /// Returns the rest position of a point, m.
     fn rest_m(&self, point: PointId) -> DVec3;
-    /// The unit normal of the surface at a point at rest, out of the tissue.
+    /// Returns the unit normal of the surface at a point at rest, out of the tissue.
     fn normal(&self, point: PointId) -> DVec3;
-    /// Whether a point never moves.
+    /// Returns whether a point never moves.
     fn is_fixed(&self, point: PointId) -> bool;
-    /// The points to which springs lead that keep lengths and angles in the surface, ascending.
+    /// Returns the points that are joined to a point by springs within the surface (structural and shear
+    /// springs, or edges), ascending.
     fn neighbours(&self, point: PointId) -> Vec<PointId>;
-    /// The point that rests nearest to a place.
+    /// Returns the point that rests nearest to a place, m.
     fn nearest(&self, place_m: DVec3) -> PointId;
-    /// The points that rest within a distance of a place, ascending; a sheet also gives some beyond it.
+    /// Returns the points that rest within a distance of a place, ascending. A sheet also returns some beyond
+    /// it.
     fn around(&self, place_m: DVec3, radius_m: f64) -> Vec<PointId>;
-    /// The box around all points.
+    /// Returns the box around all points.
     fn extent(&self) -> Extent;
-    /// The usual distance between neighbours, m.
+    /// Returns the usual distance between neighbours, m.
     fn edge_m(&self) -> f64;
 
-    /// The highest place of the surface in line with the middle of the box, m: devices have their origin there, so that a tip
-    /// that comes down meets the tissue.
+    /// Returns the highest place of the surface in line with the middle of the box, m. Haptic devices have
+    /// their origin there, so that a tip that comes down meets the tissue.
     fn top_m(&self) -> DVec3 {
         self.extent().middle_m()
     }
 
-    /// Where a tool with a tip of `radius_m` begins that comes new and is to be at a place, if not above that: outside the
-    /// tissue or within it, but not in the surface, which it meets as a hand does.
+    /// Returns the place, m, where a newly placed tool with a tip of `radius_m` begins on its way to a place:
+    /// outside the tissue or within it, but not in the surface, so that it meets the surface as a hand does.
+    /// `None` means above that place (on a sheet).
     fn approach_m(&self, _place_m: DVec3, _radius_m: f64) -> Option<DVec3> {
         None
     }
 
-    /// How many numbers give a place on it: 3, or 2 if all of it rests in the plane z = 0.
+    /// Returns how many numbers give a place: 3, or 2 if the whole shape rests in the plane z = 0.
     fn dimensions(&self) -> usize {
         3
     }
 
-    /// Its longest side, or the distance between neighbours if it has a single point, m.
+    /// Returns the longest side of the box, or the distance between neighbours if that is longer, m.
     fn longest_side_m(&self) -> f64 {
         self.extent().size_m().max_element().max(self.edge_m())
     }
 
-    /// Whether a place is within the box around the shape, or off it by at most a tenth of its longest side: a tool that
-    /// strokes over the edge is still felt.
+    /// Returns whether a place is within the box around the shape, or beside it by at most a tenth of its
+    /// longest side: a tool that strokes over the edge is still felt.
     fn is_near(&self, place_m: DVec3) -> bool {
         let Extent { least_m, most_m } = self.extent();
         let margin_m = DVec3::splat(0.1 * self.longest_side_m());
@@ -153,7 +157,8 @@ pub trait RestShape: fmt::Debug + Send + Sync {
     /// Checks the place of a force.
     ///
     /// # Errors
-    /// Refuses a place that is not finite or not near ([`RestShape::is_near`]); `field` is the name that the refusal gives.
+    /// Refuses a place that is not finite or not near ([`RestShape::is_near`]); `field` is the key that the
+    /// refusal gives.
     fn check_place(&self, field: &str, place_m: DVec3) -> Result<()> {
         for component in place_m.to_array() {
             finite(field, component)?;

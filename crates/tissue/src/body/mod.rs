@@ -1,4 +1,5 @@
-//! The kinds of tissue: one folder a kind. Each has its layout, its sweep over the springs, and the way a disc meets it.
+//! The kinds of tissue, with one folder each: `sheet` and `surface` (meshes). Each has its layout, its sweep
+//! over the springs, and the contact of a disc with it.
 
 pub(crate) mod sheet;
 pub mod surface;

@@ -1,4 +1,4 @@
-//! The buffers and tables of a sheet's sweeps, and the calls that run a sweep at the machine's vector width.
+//! The buffers and tables of a tissue's sweeps, and the calls that run a sweep at the machine's vector width.
 #![allow(unsafe_code)]
 
 use std::cell::RefCell;
@@ -22,18 +22,18 @@ use crate::tools::applied_force::{self, Pull, Term};
 /// Number of tool forces that need no heap memory.
 const FEW: usize = 4;
 
-/// The springs of a tissue, their forces in a scheme's terms.
+/// The springs of a tissue, with forces in a scheme's units.
 #[derive(Debug, Clone)]
 pub(crate) enum Elastic<T> {
     Sheet(Springs<T>),
-    /// The places of a mesh; a spring of length 1 with the k of reference, of which those of the mesh are multiples; and what
-    /// the extra anchor stiffness multiplies; and what the growth of a volume multiplies.
+    /// A mesh: its places; a spring of length 1 with the reference k, of which those of the mesh are multiples;
+    /// the factor of the extra anchor stiffness; and the factor of the growth of a volume.
     Mesh(Arc<MeshPlaces>, SpringCoefficients<T>, T, f64),
 }
 
 impl<T: Real> Elastic<T> {
-    /// The force of all springs, of the extra anchor stiffness and of the pressure on a point, over its relative mass; gathered:
-    /// for the few points that a caller asks about. `volume_change`: by how much the volume has grown.
+    /// Returns the force of all springs, of the extra anchor stiffness and of the pressure on a point, divided
+    /// by its relative mass. For a few single points. `volume_change` is the growth of the volume.
     pub(crate) fn gather(&self, layout: &Layout, u: &[T], volume_change: f64, point: [usize; 2]) -> [T; 3] {
         match self {
             Elastic::Sheet(springs) => springs.gather(layout, u, point),
@@ -48,22 +48,22 @@ impl<T: Real> Elastic<T> {
     }
 }
 
-/// The springs of a mesh as its sweeps read them, and room for a snapshot.
+/// The springs of a mesh as its sweeps read them, and memory for a snapshot of the displacements.
 #[derive(Debug)]
 struct MeshTables<T> {
     springs: MeshSprings<T>,
     snapshot: RefCell<Snapshot<T>>,
 }
 
-/// The buffers and tables that a sweep needs beside the state. One for each sheet, made once.
+/// The buffers and tables that a sweep needs besides the state. Each tissue has one.
 #[derive(Debug)]
 pub(crate) struct SweepTables<T> {
     width: Width,
     pub(crate) layout: Layout,
     pub(crate) springs: Elastic<T>,
-    /// None of a sheet.
+    /// `None` for a sheet.
     mesh: Option<MeshTables<T>>,
-    /// None without a volume.
+    /// `None` without a volume.
     pub(crate) pressure: Option<Pressure<T>>,
     /// 1 where a point moves, 0 where it is fixed: one plane. `None` if every point moves.
     pub(crate) free: Option<Field<T>>,
@@ -99,7 +99,7 @@ impl<T: Real> SweepTables<T> {
         }
     }
 
-    /// Of a copy that stays as it is: without what a sweep needs.
+    /// Returns the tables of a copy for reading, without those for sweeps.
     pub(crate) fn for_copy(&self) -> Self {
         SweepTables {
             width: self.width,
@@ -114,18 +114,19 @@ impl<T: Real> SweepTables<T> {
         }
     }
 
-    /// The relative mass of each place, and its extra K″/m; null if all are 1, or 0.
+    /// Returns the relative mass of each place, and its extra K″/m; null if all masses are 1, or all extra
+    /// values 0.
     pub(crate) fn masses_and_extra(&self) -> [*const T; 2] {
         self.mesh.as_ref().map_or([std::ptr::null(); 2], |mesh| mesh.springs.masses_and_extra())
     }
 
-    /// By how much the volume has grown, in cubes of the unit of length, after the points of `tiles` have moved to `u`; 0 without
-    /// a volume.
+    /// Returns the growth of the volume, in cubes of the unit of length, after the points of `tiles` have moved
+    /// to `u`; 0 without a volume.
     pub(crate) fn volume_change(&self, u: &Field<T>, tiles: &[usize]) -> f64 {
         self.pressure.as_ref().map_or(0.0, |pressure| pressure.volume_change(self.width, &self.layout, u, tiles))
     }
 
-    /// Sets the pressure of the coming sweeps by how much the volume has grown.
+    /// Sets the pressure of the next sweeps for a growth of the volume.
     pub(crate) fn apply_volume_pressure(&self, volume_change: f64) {
         if let (Some(pressure), Elastic::Mesh(.., factor)) = (&self.pressure, &self.springs) {
             pressure.set(push_of(*factor, volume_change));
@@ -209,18 +210,18 @@ impl<T: Real> SweepTables<T> {
                 // SAFETY: the caller's promise.
                 unsafe { lanes::run(self.width, &Sweep { grid, over, stage }) };
             }
-            // A copy that stays as it is has no tables, and is not swept.
+            // A copy for reading has no tables, and is not swept.
             (Elastic::Mesh(..), None) => {}
         }
     }
 
-    /// Whether all increments since the last call were finite and below `farthest`. False may also come from a sum of
-    /// many.
+    /// Returns whether all increments since the last call were finite and below `farthest`, and resets the sum.
+    /// It may be false because the sum of many increments is large.
     pub(crate) fn is_settled(&mut self, farthest: f64) -> bool {
         std::mem::take(&mut self.probe).iter().all(|sum| sum.wide() < farthest * farthest)
     }
 
-    /// Σ force · travel of the tools since the last call, in the scheme's terms.
+    /// Returns Σ force · travel of the tools since the last call, in the scheme's units, and resets the sum.
     pub(crate) fn take_work(&mut self) -> f64 {
         let work = std::mem::take(&mut self.work);
         // Four chains of additions at once, in a fixed order.

@@ -1,4 +1,4 @@
-//! What the guard goes back to and what it checks by: checkpoints, the tools' inputs, and the account of work.
+//! The guard's data: checkpoints to go back to, the tools' inputs, and the account of work.
 
 use std::fmt;
 
@@ -15,18 +15,19 @@ use crate::tools::prescribed::{Grasp, Prescribed, restored_index};
 use palpate_haptics::Tip;
 use palpate_refusal::Result;
 
-/// Tolerance of the energy balance, as a fraction of energy and of work: errors of the schemes at the stability bound.
+/// Tolerance of the energy balance, as a fraction of energy and of work: errors of the schemes at the stability
+/// bound.
 pub const MARGIN: f64 = 0.05;
 
-/// Why a check of the guard failed.
+/// The reason why a check of the guard failed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CheckFailure {
-    /// A point is not finite, or is displaced by a billion times the sheet's size.
+    /// A point is not finite, or is displaced by a billion times the tissue's size.
     NotFinite {
         /// The point.
         point: PointName,
     },
-    /// Energy from nowhere.
+    /// The energy rose more than the tools' work.
     Energy {
         /// Energy of springs, anchor springs and motion, J.
         energy_j: f64,
@@ -46,7 +47,7 @@ impl fmt::Display for CheckFailure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             CheckFailure::NotFinite { point } => {
-                write!(f, "point {point} was not finite (or a billion sheets away)")
+                write!(f, "point {point} was not finite (or a billion tissues away)")
             }
             CheckFailure::Energy { energy_j, before_j, work_j } => {
                 write!(
@@ -89,7 +90,7 @@ impl Input {
     }
 }
 
-/// The complete state that a sheet goes back to.
+/// The complete state that a tissue goes back to.
 #[derive(Debug)]
 pub(crate) struct Checkpoint<T: Real> {
     pub(crate) steps: u64,
@@ -101,16 +102,16 @@ pub(crate) struct Checkpoint<T: Real> {
     pub(crate) work: Work,
     /// The recent largest displacement, spacings. Sleep is relative to it.
     pub(crate) largest: f64,
-    /// Whether the motion that led here has passed the checks, under the present tissue.
+    /// Whether the motion that led here has passed the checks, under the present springs.
     pub(crate) passed_checks: bool,
 }
 
 /// Steps that the guard repeats from its checkpoint.
 #[derive(Debug)]
 pub(crate) struct Repetition {
-    /// Where a check failed, steps.
+    /// The step at which a check failed.
     pub(crate) target: u64,
-    /// Of these steps, from the checkpoint on.
+    /// The inputs of these steps, from the checkpoint on.
     pub(crate) inputs: Vec<(u64, usize, Input)>,
     pub(crate) next_input: usize,
     pub(crate) halvings: u32,
@@ -119,12 +120,12 @@ pub(crate) struct Repetition {
 /// By how much an energy may rise without a cause.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Noise {
-    /// Part of the largest energy so far.
+    /// Part of the largest energy so far that counts as noise.
     pub(crate) part: f64,
     pub(crate) energy_j: f64,
 }
 
-/// Work of the tools, J, and energies at the last survey.
+/// The account of the tools' work, J, and of energies at the last survey.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct Work {
     /// Work since the last survey, plus what its `present_j` subtracted.
@@ -133,7 +134,7 @@ pub(crate) struct Work {
     energy_j: f64,
     /// The largest energy at any survey.
     largest_j: f64,
-    /// What the energy has risen by beyond the work since the tools touch or hold, less what it has lost since.
+    /// How much the energy has risen beyond the work while tools touch or hold, minus its losses since.
     excess_j: f64,
 }
 
@@ -155,14 +156,14 @@ impl Work {
         Ok(Work { done_j, energy_j, largest_j, excess_j })
     }
 
-    /// An account that begins with the given energy.
+    /// Creates an account that begins with the given energy.
     pub(crate) fn begun(energy_j: f64, present_j: f64) -> Self {
         Work { done_j: present_j, energy_j, largest_j: energy_j, excess_j: 0.0 }
     }
 
-    /// Checks an energy; a rise by `noise` does not count. `present_j` is subtracted from the work so
-    /// far and belongs to the next interval. The account begins anew, but for what was too much while tools touch or hold
-    /// (`is_touched`): what gains a little in every interval must not go on for ever.
+    /// Checks an energy; a rise by `noise` does not count. `present_j` is subtracted from the work so far and
+    /// belongs to the next interval. The account then begins anew. Only the excess while tools touch or hold
+    /// (`is_touched`) is kept, so that a small gain in every interval can't continue forever.
     pub(crate) fn survey(
         &mut self,
         energy_j: f64,
@@ -172,7 +173,7 @@ impl Work {
     ) -> std::result::Result<(), CheckFailure> {
         let (work_j, before_j) = (self.done_j - present_j, self.energy_j);
         let excess_j = if is_touched { self.excess_j } else { 0.0 } + energy_j - before_j - work_j;
-        // What is not a number is not within it.
+        // NaN is not within it.
         let is_within = excess_j <= MARGIN * (before_j + work_j.abs()) + noise.part * self.largest_j + noise.energy_j;
         if !is_within {
             return Err(CheckFailure::Energy { energy_j, before_j, work_j });
@@ -208,11 +209,11 @@ mod tests {
         assert_eq!({ touched }.survey(1.06, 0.0, EXACT, false), Ok(()));
         assert_eq!(touched.survey(1.0, 0.0, EXACT, true), Ok(()));
         assert_eq!(touched.survey(1.04, 0.0, EXACT, true), Ok(()));
-        // What is nothing but rounding is no energy.
+        // Rounding noise does not count as energy.
         let rounding = Noise { energy_j: 1e-27, ..EXACT };
         assert_eq!(Work::default().survey(1e-30, 0.0, rounding, true), Ok(()));
         assert!(Work::default().survey(1e-24, 0.0, rounding, true).is_err());
-        // It goes as it likes.
+        // Losing energy is always allowed.
         assert_eq!(worked.survey(0.01, 0.0, EXACT, false), Ok(()));
     }
 }

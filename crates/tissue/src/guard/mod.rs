@@ -1,14 +1,14 @@
-//! The guard: periodic checks of a sheet's motion, and the checkpoint to go back to.
+//! The guard: periodic checks of a tissue's motion, and the checkpoint to go back to.
 //!
-//! Numbers must be finite; energy must not appear from nowhere; the springs' force must be near its prediction from its
-//! history. Every [`INTERVAL_SUBSTEPS`] substeps a survey of the sheet (a sweep, about twice the cost of a substep)
-//! checks them: E − E₀ ≤ W + [`MARGIN`]·(E₀ + |W|), with E₀ the energy at the last survey and W the work of all tools
-//! since. Damping only removes energy, so it is on the safe side. Increments are summed in every substep, so a value
-//! that is not finite shows at once.
+//! Numbers must be finite; energy must not appear from nowhere; the springs' force must be near its prediction
+//! from its history. Every [`INTERVAL_SUBSTEPS`] substeps a survey of the tissue (a sweep, about twice the cost
+//! of a substep) checks them: E − E₀ ≤ W + [`MARGIN`]·(E₀ + |W|), with E₀ the energy at the last survey and W
+//! the work of all tools since. Damping only removes energy, so the check stays valid. Increments are summed in
+//! every substep, so a value that is not finite shows at once.
 //!
-//! If a check fails, the sheet goes back to the last checkpoint and repeats the tools' inputs since then with half the
-//! substep; observers never see time go back. It keeps the shorter substep. After [`MAX_HALVINGS`] halvings it gives
-//! up, at the checkpoint.
+//! If a check fails, the tissue goes back to the last checkpoint and repeats the tools' inputs since then with
+//! half the substep; observers never see time go back. It keeps the shorter substep. After [`MAX_HALVINGS`]
+//! halvings the guard gives up, at the checkpoint.
 
 pub(crate) mod checkpoint;
 pub(crate) mod recovery;
@@ -32,26 +32,26 @@ use crate::tools::applied_force::Applied;
 /// Substeps between two surveys.
 pub const INTERVAL_SUBSTEPS: u64 = 256;
 
-/// Largest error of a prediction, as a fraction of the largest displacement.
+/// Largest error of a predicted displacement, as a fraction of the largest displacement.
 pub const MAX_PREDICTION_ERROR: f64 = 0.5;
 
-/// Number of times a substep is halved before the guard gives up.
+/// Largest number of times that a substep is halved before the guard gives up.
 pub const MAX_HALVINGS: u32 = 4;
 
-/// Most inputs kept since the last checkpoint. More bring the next checkpoint forward.
+/// Largest number of inputs kept since the last checkpoint. With more, the next checkpoint is taken earlier.
 pub(super) const MAX_INPUTS: usize = 1024;
 
-/// A rise of energy below this fraction of the largest so far is rounding noise in a sheet that has come to rest. So is
-/// a rise below the square of ten times the error that sleeping tiles may have.
+/// A rise of energy below this fraction of the largest so far is rounding noise in a tissue that has come to
+/// rest. So is a rise below the square of ten times the error that sleeping tiles may have.
 const NOISE: f64 = 1e-10;
 
-/// Tools that hold what can't move, or rest on what is at rest, move points by less than this part of a spacing: where it is computed
-/// how far they are apart, numbers of the size of the tissue cancel.
+/// Largest movement, in spacings, of points under tools that hold fixed points or rest on points at rest. Their
+/// distances are differences of numbers of the size of the tissue.
 const ROUNDING: f64 = 1e-12;
 
 impl<T: Real> TissueState<T> {
-    /// Returns the cause of a failure, if there is one. Checks in every step that all is finite; the full check is
-    /// periodic, and takes a checkpoint.
+    /// Checks the motion after a step. Every step, all numbers must be finite; the full check is periodic, and
+    /// takes a checkpoint. Returns the cause if a check fails.
     pub(super) fn check(&mut self) -> Result<(), CheckFailure> {
         let interval = (INTERVAL_SUBSTEPS / u64::from(self.plan.substeps)).max(1);
         let due = self.steps.is_multiple_of(interval) || self.inputs.len() >= MAX_INPUTS;
@@ -88,7 +88,8 @@ impl<T: Real> TissueState<T> {
         Ok(())
     }
 
-    /// The part of the work done that belongs to the next interval: half of the last increment's (`central`).
+    /// Returns the part of the work done that belongs to the next interval: half of the last increment's
+    /// (`central`), J.
     pub(super) fn present_work_j(&self, survey: &Survey) -> f64 {
         if self.plan.scheme.takes_means() { 0.5 * survey.power * self.unit_of_work_j() } else { 0.0 }
     }
@@ -101,7 +102,7 @@ impl<T: Real> TissueState<T> {
             self.checkpoint = None;
         }
         let checkpoint = self.checkpoint.get_or_insert_with(|| {
-            // Most of a large sheet has never moved. That part is neither copied nor given memory.
+            // Most of a large tissue has never moved. That part is neither copied nor given memory.
             tiles.touch_all();
             state.part_history(|to, from| tiles.copy_moved(to, from));
             let state = State::zero(&tables.layout, state.kept.len());
@@ -123,7 +124,7 @@ impl<T: Real> TissueState<T> {
         self.mark();
     }
 
-    /// Frees the checkpoint of a still sheet: nothing can go wrong until a tool gets a command.
+    /// Frees the checkpoint of a still tissue: nothing can go wrong until a tool gets a command.
     pub(super) fn forget_checkpoint(&mut self) {
         self.checkpoint = None;
         self.audit_window.give_up();
@@ -137,7 +138,7 @@ impl<T: Real> TissueState<T> {
         let Some(checkpoint) = &self.checkpoint else { return };
         self.audit_window.give_up();
         self.steps = checkpoint.steps;
-        // Those of a repetition that failed: the next one gives them again.
+        // Inputs of a repetition that failed: the next one repeats them.
         self.inputs.clear();
         self.tiles.wake_all();
         self.state.copy_from(&checkpoint.state);
@@ -173,7 +174,7 @@ impl<T: Real> TissueState<T> {
         self.tell(tool, input);
     }
 
-    /// Begins to repeat from the checkpoint to the present step, after a check has failed, with half the substep.
+    /// Begins to repeat from the checkpoint to the present step with half the substep, after a check failed.
     pub(super) fn begin_repetition(&mut self, cause: CheckFailure) -> Result<(), BlowUp> {
         let (target, inputs) = (self.steps, std::mem::take(&mut self.inputs));
         let mut repetition = Repetition { target, inputs, next_input: 0, halvings: self.halvings };
@@ -182,7 +183,7 @@ impl<T: Real> TissueState<T> {
         Ok(())
     }
 
-    /// Begins anew with half the substep; fails if that is the shortest.
+    /// Begins again with half the substep; fails if that is the shortest.
     fn repeat_shorter(&mut self, repetition: &mut Repetition, cause: CheckFailure) -> Result<(), BlowUp> {
         if repetition.halvings >= MAX_HALVINGS {
             self.go_back(self.halvings);
@@ -190,13 +191,14 @@ impl<T: Real> TissueState<T> {
         }
         repetition.halvings += 1;
         self.go_back(repetition.halvings);
-        // A repetition that went well for a while has left a later checkpoint.
+        // A repetition that succeeded for a while has left a later checkpoint.
         repetition.next_input = repetition.inputs.partition_point(|(step, ..)| *step < self.steps);
         Ok(())
     }
 
-    /// Goes on with a repetition, if there is one, while it `may_go_on`, by one step at least. It ends when the checks pass up to where
-    /// it began, or fail with the shortest substep. Tells whether it has ended.
+    /// Continues a repetition, if there is one, by at least one step and until `may_go_on` returns false. It
+    /// ends when the checks pass up to where it began, or fail with the shortest substep. Returns whether it
+    /// has ended.
     pub(super) fn go_on_repeating(&mut self, may_go_on: &mut dyn FnMut() -> bool) -> Result<bool, BlowUp> {
         let Some(mut repetition) = self.repetition.take() else { return Ok(true) };
         loop {
@@ -222,12 +224,13 @@ impl<T: Real> TissueState<T> {
     }
 }
 
-/// Displacements beyond this are a blow-up: far beyond any tissue, and far below what f32 can square.
+/// Returns the displacement, in spacings, beyond which a motion is a blow-up: far beyond any tissue, and far
+/// below the root of the largest f32.
 pub(super) fn farthest_in_spacings(model: &Model) -> f64 {
     1e9 * model.shape().longest_side_m() / model.unit_m
 }
 
-/// The number of a point that is not finite or beyond the bound, if there is one.
+/// Returns the place of a point whose values are not finite or beyond the bound, if there is one.
 pub(super) fn broken_point<T: Real>(model: &Model, layout: &Layout, state: &State<T>) -> Option<usize> {
     let farthest = T::of(farthest_in_spacings(model));
     let is_good = |field: &Field<T>, at: usize| field[at].is_finite() && field[at].magnitude() < farthest;
@@ -237,8 +240,8 @@ pub(super) fn broken_point<T: Real>(model: &Model, layout: &Layout, state: &Stat
     })
 }
 
-/// Converts a state from one substep to another: `from` and `to` are plans of the same scheme, `springs` of `from`; `volume_change` is
-/// that of the volume.
+/// Converts a state from one substep to another. `from` and `to` are plans of the same scheme; `springs` are
+/// those of `from`; `volume_change` is the growth of the volume.
 pub(super) fn convert<T: Real>(
     layout: &Layout,
     springs: &Elastic<T>,
@@ -252,7 +255,7 @@ pub(super) fn convert<T: Real>(
     // Compute all forces first: points are converted one by one, in place.
     let force =
         |index| springs.gather(layout, &state.u, volume_change, [index / layout.columns, index % layout.columns]);
-    let forces: Vec<[T; 3]> = memory::collected((0..points).map(force), "the forces of a sheet");
+    let forces: Vec<[T; 3]> = memory::collected((0..points).map(force), "the forces of a tissue");
     for (index, force) in forces.iter().enumerate() {
         let pushed = applied.force_at(layout, 0, [index / layout.columns, index % layout.columns]);
         for (c, n) in force.iter().enumerate() {
@@ -384,7 +387,7 @@ mod tests {
             let points = (0..sheet.model.len()).map(|index| sheet.point(PointId::new(index)));
             let kinetic_j: f64 = points.map(|point| 0.5 * mass_kg * point.velocity_m_per_s.length_squared()).sum();
             assert!((energy.kinetic_j - kinetic_j).abs() < 1e-9 * kinetic_j, "{integrator}: {energy:?} {kinetic_j}");
-            // And goes on so.
+            // And continues like this.
             (0..20).for_each(|_| sheet.step().unwrap());
             assert_eq!(sheet.guard_events(), 0);
         }

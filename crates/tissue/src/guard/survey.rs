@@ -1,7 +1,7 @@
-//! A survey of the sheet: energies, the largest displacement, and the error of predicted forces. It is a sweep that
-//! advances nothing.
+//! A survey of the tissue: energies, the largest displacement, and the error of predicted forces. It is a sweep
+//! that advances nothing.
 //!
-//! Sums are kept apart for each of 16 columns, row by row, so that they too are the same at every width.
+//! Sums are separate for each of 16 columns, row by row, so that they too are the same at every vector width.
 #![allow(unsafe_code)]
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions, ten
 // times slower.
@@ -22,14 +22,14 @@ use crate::scheme::observer::Observer;
 use crate::state::tissue_state::TissueState;
 use crate::tools::applied_force::{self, Pull, Term};
 
-/// The result of a survey, in the scheme's units (`integrate`).
+/// The result of a survey, in the scheme's units (`scheme`).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Survey {
-    /// Σ w², each point by its relative mass.
+    /// Σ w² (w is the velocity times the substep), each point weighted by its relative mass.
     pub(crate) speed_squared: f64,
-    /// The same, in the form that the scheme's conserved energy uses.
+    /// Σ w² in the form that the scheme's conserved energy uses.
     pub(crate) conserved_speed_squared: f64,
-    /// Σ u², each point by its relative K″.
+    /// Σ u², each point weighted by its relative K″.
     pub(crate) displacement_squared: f64,
     /// Energy of all springs.
     pub(crate) spring_energy: f64,
@@ -39,13 +39,14 @@ pub(crate) struct Survey {
     pub(crate) prediction_error: f64,
     /// The largest component of any w.
     pub(crate) speed: f64,
-    /// The largest component of the force imbalance of any free point over its relative mass: N − a·u + F.
+    /// The largest component of the force imbalance of any free point divided by its relative mass: N − a·u +
+    /// F.
     pub(crate) imbalance: f64,
     /// Σ F·d of the tools.
     pub(crate) power: f64,
 }
 
-/// The sums w², u², spring energy, conserved w², F·d; and the maxima.
+/// The sums of w², u², spring energy, conserved w² and F·d; and the maxima.
 #[derive(Debug)]
 struct Sums<T> {
     row: [[T; BLOCK]; 5],
@@ -53,7 +54,7 @@ struct Sums<T> {
     largest: [[T; BLOCK]; 4],
 }
 
-/// The forces on a state other than the springs', and how to scale them to the springs' units.
+/// The forces on a state besides those of the springs, and how to scale them to the springs' units.
 #[derive(Clone, Copy)]
 pub(crate) struct Forces<'a, T: Real> {
     /// The tools' forces.
@@ -62,7 +63,7 @@ pub(crate) struct Forces<'a, T: Real> {
     pub(crate) field: usize,
     /// The factor that converts that field to the springs' units.
     pub(crate) part: f64,
-    /// a, from the anchor springs.
+    /// a = K″·dt²/m of the anchor springs.
     pub(crate) pull: f64,
 }
 
@@ -75,9 +76,9 @@ pub(crate) enum Write {
     Rest,
     /// Replaces the scheme's internal values by the observed u and w.
     Seen,
-    /// Replaces the observed u and w by the scheme's internal values, as if the springs had always pulled as they do
-    /// now. (In a two-step scheme, w is half a change ahead of d: d = w − (next − w)/2, and the scheme observes
-    /// (d + next)/2 as w.)
+    /// Replaces the observed u and w by the scheme's internal values, as if the springs had always pulled as
+    /// they do now. (In a two-step scheme, w is half a change ahead of d: d = w − (next − w)/2, and the scheme
+    /// observes (d + next)/2 as w.)
     Begin,
 }
 
@@ -92,7 +93,7 @@ struct SurveyStage<'a, T: Real> {
     /// d and the kept fields.
     d: *const T,
     kept: [*const T; MAX_KEPT],
-    /// What to write, and where to: u, d and the kept fields. Null if nothing is written.
+    /// What to write, and where: u, d and the kept fields. Null if nothing is written.
     write: Write,
     to: [*mut T; 2],
     to_kept: [*mut T; MAX_KEPT],
@@ -100,7 +101,7 @@ struct SurveyStage<'a, T: Real> {
     /// The same forces in the form that the sweep uses.
     pulls: &'a [Pull<'a, T>],
     free: *const T,
-    /// Relative mass and extra K″/m of each point; null if all are 1, or 0.
+    /// Relative mass and extra K″/m of each point; null if all masses are 1, or all extra values 0.
     masses: *const T,
     extra: *const T,
     sums: &'a UnsafeCell<Sums<T>>,
@@ -120,7 +121,7 @@ impl Survey {
         Survey::by(tables, scheme, (from, [std::ptr::null_mut(); FIELDS]), forces, over, Write::Nothing)
     }
 
-    /// Surveys it and rewrites it.
+    /// Surveys the awake part of a state in `over` and rewrites it.
     pub(crate) fn write<T: Real>(
         tables: &SweepTables<T>,
         scheme: &Scheme,
@@ -302,8 +303,8 @@ impl<T: Real> Stage<T> for SurveyStage<'_, T> {
 }
 
 impl<T: Real> TissueState<T> {
-    /// The tools' force at the end of the last step, as the springs' force, if the scheme needs it to observe a
-    /// velocity.
+    /// Returns the tools' force at the end of the last step, in the springs' units, if the scheme needs it to
+    /// observe a velocity; otherwise nothing.
     pub(crate) fn present_terms(&self) -> Vec<Term<T>> {
         let TissueState { model, plan, tables, .. } = self;
         if !plan.scheme.takes_means() || self.steps == 0 {
@@ -312,8 +313,8 @@ impl<T: Real> TissueState<T> {
         self.applied.until_now(model, &tables.layout, plan.scheme.spring_scale() * plan.force_scale(&model.scene))
     }
 
-    /// Surveys part of the sheet. Returns the survey, the energies, and the energy that the scheme conserves; both with that of
-    /// the pressure, which is of the whole.
+    /// Surveys part of the tissue. Returns the survey, the energies, and the energy that the scheme conserves;
+    /// both energies include that of the pressure, which belongs to the whole tissue.
     pub(crate) fn survey(&self, over: &Region) -> (Survey, Energy, f64) {
         let TissueState { model, plan, tables, state, .. } = self;
         let terms = self.present_terms();
@@ -332,7 +333,7 @@ impl<T: Real> TissueState<T> {
         (survey, energy, kept_j + grasped_j + pressure_j)
     }
 
-    /// The energies of a survey, and the energy that the scheme conserves.
+    /// Returns the energies of a survey, and the energy that the scheme conserves.
     pub(crate) fn energy_of(&self, survey: &Survey) -> (Energy, f64) {
         let TissueState { model, plan, .. } = self;
         // Twice the energy of a point that moves by a spacing in a substep.

@@ -1,8 +1,9 @@
-//! Whether what tools have done at the end of a step is sound: the part of the guard that is about tools.
+//! Checks what tools have done at the end of a step: the part of the guard for tools.
 //!
-//! The sums by which the guard sees a point go astray are of sweeps. Tools move points after the last sweep of a step, which those sums
-//! show a step later; a snapshot between would have it. So the points under tools are looked at themselves, as few as they are, and the
-//! tools' own numbers: at the end of each step that the guard lets pass, all that a snapshot has is finite.
+//! The sums in which the guard detects a faulty point are those of sweeps. Tools move points after the last
+//! sweep of a step, which these sums show one step later; a snapshot in between would contain it. So the few
+//! points under tools are checked directly, and so are the tools' own numbers: at the end of each step that the
+//! guard lets pass, everything in a snapshot is finite.
 
 use glam::DVec3;
 
@@ -15,13 +16,13 @@ use palpate_haptics::ContactState;
 fn is_sound(tool: &Tool) -> bool {
     let Tool { from_m, to_m, normal, offset_m, gap_m, force_n, steady_n, velocity_m_per_s, .. } = tool;
     let vectors = [from_m, to_m, normal, offset_m, gap_m, force_n, steady_n, velocity_m_per_s];
-    // What is not a number is not below it.
+    // NaN is not below the bound.
     vectors.into_iter().all(|v: &DVec3| v.to_array().into_iter().all(|part| part.abs() < LARGEST))
 }
 
 impl<T: Real> TissueState<T> {
-    /// The place in memory of a point that a tool has brought `farthest` or farther, in spacings, or where a tool is whose own numbers
-    /// are none; `None` if all is well.
+    /// Returns the place in memory of a point that a tool has moved by `farthest` spacings or more, or of a
+    /// point under a tool whose own numbers are not finite. `None` if all is well.
     pub(crate) fn broken_by_tools(&self, farthest: f64) -> Option<usize> {
         let layout = &self.tables.layout;
         let is_good = |index: &usize| {

@@ -1,4 +1,4 @@
-//! The memory of a sheet: values per point, laid out so that vectors of any width can sweep the rows.
+//! The memory of a tissue's state: values per point, laid out so that vectors of any width can sweep the rows.
 
 use std::ops::{Deref, DerefMut, Range};
 use std::sync::Arc;
@@ -14,21 +14,21 @@ pub(crate) const BLOCK: usize = crate::scene::MIN_WIDTH;
 /// Alignment of every row and plane, bytes: a cache line.
 const LINE: usize = 64;
 
-/// The length of a plane exceeds a multiple of a page by this many bytes. A processor treats a load as dependent on an
+/// Bytes by which the length of a plane exceeds a multiple of a page. A processor treats a load as dependent on an
 /// earlier store if their addresses agree in the last 12 bits. With planes whole pages apart, each store to x would
 /// seem to block the next load of y. (Measured at 31²: up to a quarter of a step.)
 const SKEW: usize = 1408;
 
-/// Where the values of a point are: component c of point [i, j] at c·plane + i·stride + j.
+/// Where the values of a point are in a field: component c of point [i, j] is at c·plane + i·stride + j.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Layout {
-    /// Along x.
+    /// Rows: points along x, or blocks of a mesh.
     pub(crate) rows: usize,
-    /// Along y.
+    /// Columns: points along y, or the 16 slots of a block.
     pub(crate) columns: usize,
-    /// From one row to the next.
+    /// Distance from one row to the next, values.
     pub(crate) stride: usize,
-    /// From one component to the next.
+    /// Distance from one component to the next, values.
     pub(crate) plane: usize,
 }
 
@@ -45,43 +45,44 @@ impl Layout {
         Layout { rows, columns, stride, plane }
     }
 
-    /// Whether `count` values from `offset` on lie within one plane.
+    /// Returns whether `count` values from `offset` on lie within one plane.
     pub(crate) fn holds(&self, offset: usize, count: usize) -> bool {
         offset + count <= self.plane
     }
 
-    /// The offset of the x component of the point with row-major number `index`.
+    /// Returns the offset of the x component of the point with row-major number `index`.
     pub(crate) fn offset(&self, index: usize) -> usize {
         index / self.columns * self.stride + index % self.columns
     }
 }
 
-/// The state that a step advances. Lengths are in spacings (`integrate`).
+/// The state that a step advances. Lengths are in spacings (see `scheme`).
 #[derive(Debug)]
 pub(crate) struct State<T> {
     /// Displacement from rest. For a multistep scheme, as predicted for the present.
     pub(crate) u: Field<T>,
     /// The increment of the last substep, or the velocity times the substep.
     pub(crate) d: Field<T>,
-    /// The other values that the scheme keeps. In a sheet at rest, some of them share memory.
+    /// The other values that the scheme keeps. In a tissue at rest, some of them share memory.
     pub(crate) kept: Vec<Arc<Field<T>>>,
 }
 
 impl<T: Real> State<T> {
     pub(crate) fn at_rest(layout: &Layout, kept: usize) -> Self {
         let zero = || Field::zero(layout);
-        // The history of a sheet at rest is the same at all times, so it shares memory until the first write.
+        // The history of a tissue at rest is the same at all times, so it shares memory until the first write.
         let past = Arc::new(zero());
         State { u: zero(), d: zero(), kept: vec![past; kept] }
     }
 
-    /// The same, with separate memory for each field. The system supplies zeroed pages at the first write.
+    /// Creates a state of zeros with separate memory for each field. The system supplies zeroed pages at the
+    /// first write.
     pub(crate) fn zero(layout: &Layout, kept: usize) -> Self {
         let zero = || Field::zero(layout);
         State { u: zero(), d: zero(), kept: std::iter::repeat_with(|| Arc::new(zero())).take(kept).collect() }
     }
 
-    /// All fields.
+    /// Returns all fields: u, d and the kept ones.
     pub(crate) fn fields(&self) -> impl Iterator<Item = &Field<T>> {
         [&self.u, &self.d].into_iter().chain(self.kept.iter().map(|field| &**field))
     }
@@ -90,20 +91,21 @@ impl<T: Real> State<T> {
         [&mut self.u, &mut self.d].into_iter().chain(self.kept.iter_mut().map(Arc::make_mut))
     }
 
-    /// The last values of the springs' force at a place, newest first: `now`, and the `count` values that a multistep
-    /// scheme keeps.
+    /// Returns the last values of the springs' force at a place, newest first: `now`, and the `count` values
+    /// that a multistep scheme keeps.
     pub(crate) fn history(&self, now: f64, count: usize, at: usize) -> Vec<f64> {
         std::iter::once(now).chain(self.kept[..count].iter().map(|field| field[at].wide())).collect()
     }
 
-    /// Makes the last `count` spring forces share memory until the next write. They are equal in a sheet at rest.
+    /// Makes the last `count` spring forces share memory until the next write. They are equal in a tissue at
+    /// rest.
     pub(crate) fn share_history(&mut self, count: usize) {
         if let Some((first, rest)) = self.kept[..count].split_first_mut() {
             rest.fill(first.clone());
         }
     }
 
-    /// Makes them share memory if they have the same bits.
+    /// Makes the last `count` spring forces share memory if they have the same bits.
     pub(crate) fn share_equal_history(&mut self, count: usize) {
         let is_same = |a: &T, b: &T| a.wide().to_bits() == b.wide().to_bits();
         let equals = |a: &Field<T>, b: &Field<T>| a.iter().zip(b.iter()).all(|(a, b)| is_same(a, b));
@@ -112,7 +114,7 @@ impl<T: Real> State<T> {
         }
     }
 
-    /// Gives fields that share memory their own; `copy` copies the nonzero part.
+    /// Gives fields that share memory their own memory; `copy` copies the nonzero part.
     pub(crate) fn part_history(&mut self, copy: impl Fn(&mut Field<T>, &Field<T>)) {
         for field in &mut self.kept {
             if Arc::get_mut(field).is_none() {
@@ -123,9 +125,9 @@ impl<T: Real> State<T> {
         }
     }
 
-    /// Adds to a hash the values of each point of some blocks of [`BLOCK`] points (the last of a row may be shorter), which
-    /// are counted by rows: for each field x, y and z, little-endian. Points for which `has_moved` is false are known to
-    /// be 0.
+    /// Adds the values of some blocks of [`BLOCK`] points (the last of a row may be shorter) to a hash: point
+    /// by point, for each field x, y and z, little-endian. Blocks are counted by rows. Points for which
+    /// `has_moved` is false are known to be 0.
     pub(crate) fn hash_blocks(
         &self,
         layout: &Layout,
@@ -174,9 +176,9 @@ impl<T: Real> Field<T> {
         Field::of_length(3 * layout.plane)
     }
 
-    /// All zeros.
+    /// Creates a field of `length` zeros.
     pub(crate) fn of_length(length: usize) -> Self {
-        let storage: Vec<T> = memory::zeroed(length + LINE / size_of::<T>(), "the state of a sheet");
+        let storage: Vec<T> = memory::zeroed(length + LINE / size_of::<T>(), "the state of a tissue");
         // `align_offset` need not succeed: alignment only affects speed.
         let from = storage.as_ptr().align_offset(LINE).min(LINE / size_of::<T>());
         Field { storage, from, length }

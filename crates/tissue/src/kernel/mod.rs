@@ -1,4 +1,5 @@
-//! The kernel: vectors, number formats, fields, springs, and the stage that a sweep runs for each block of points.
+//! The kernel: vectors, number formats, fields, springs, and the stage that a sweep runs for each block of
+//! points.
 
 pub(crate) mod field;
 pub(crate) mod lanes;

@@ -4,7 +4,8 @@ use std::ops::{Add, AddAssign, Mul, Neg, Sub, SubAssign};
 
 use crate::kernel::lanes::Vector;
 
-/// f32 or f64. Only operations that IEEE 754 rounds exactly, so the bits do not depend on the machine.
+/// The number format f32 or f64. It has only operations that IEEE 754 rounds exactly, so the bits do not depend
+/// on the machine.
 pub(crate) trait Real:
     Copy
     + bytemuck::Zeroable
@@ -23,7 +24,7 @@ pub(crate) trait Real:
     + AddAssign
     + SubAssign
 {
-    /// The widest vector of this format, and the next.
+    /// The widest vector of this format, and the next narrower one.
     #[cfg(target_arch = "x86_64")]
     type Avx512: Vector<Real = Self>;
     #[cfg(target_arch = "x86_64")]
@@ -33,36 +34,36 @@ pub(crate) trait Real:
     type Neon: Vector<Real = Self>;
     /// An integer with the same number of bits.
     type Bits;
-    /// Whether sums in it can be compensated: there is no need in the widest format, and no code is made for it.
+    /// Whether sums can be compensated. The widest format does not need it, and no code is generated for it.
     const COMPENSATES: bool;
     /// Number of terms of [`Real::SERIES`], even.
     const TERMS: usize;
     /// The polynomial in q nearest to (1 − 1/√(1 + q))/q on |q| ≤ 1/8 in relative error: within 5.2e-8 (degree 5) for
     /// f32, 9e-18 (degree 13) for f64. From the Remez exchange algorithm.
     const SERIES: [f64; 14];
-    /// A poke's force is omitted where −c·r is below this. The omitted part is (1 + |c·r|)·e^−|c·r| of the whole:
+    /// The exponent −c·r below which a tool's force is omitted. The omitted part is (1 + |c·r|)·e^−|c·r| of the whole:
     /// e^−34.5 = 1e-15 of the force at the centre for f64, less than the worst sum loses; e^−22 for f32.
     const NEGLIGIBLE_EXPONENT: f64;
-    /// The smallest number whose square is a normal number. Smaller values count as 0 in the state of a sheet.
+    /// The smallest number whose square is a normal number. Smaller values count as 0 in the state of a tissue.
     const MIN_MAGNITUDE: f64;
-    /// Sums of squares of some numbers below this, and of their differences, are numbers.
+    /// Sums of squares of several numbers below this, and of their differences, are finite.
     const LARGEST: f64;
     /// Numbers from [`Real::MIN_MAGNITUDE`] on have at least one of these bits: the two highest of the exponent.
     const MIN_BITS: Self::Bits;
     /// The smallest |Q| of a spring that pulls; half of it is a strain. The force across the spring's direction is a
     /// product of Q and a difference of displacements, and with this bound it is seldom subnormal.
     const MIN_EXCESS: f64;
-    /// Far below any Q that counts, and its square; far above the subnormal range.
+    /// A number far below any Q that counts and its square, and far above the subnormal range.
     const FAINT: f64;
-    /// The nearest value to an f64.
+    /// Returns the nearest value to an f64.
     fn of(value: f64) -> Self;
-    /// The same value as an f64.
+    /// Returns the same value as an f64.
     fn wide(self) -> f64;
-    /// 1.5 times the bits of 1, minus the constant that makes the error of the rough inverse root smallest.
+    /// 1.5 times the bits of 1, minus the constant that minimises the error of the rough inverse root.
     const INVERSE_ROOT: Self::Bits;
-    /// Newton steps from there to a few parts in 10⁶ (f32) or 10¹¹ (f64).
+    /// Number of Newton steps from there to a few parts in 10⁶ (f32) or 10¹¹ (f64).
     const NEWTON: usize;
-    /// 1/√self within 4 %.
+    /// Returns 1/√self within 4 %.
     fn approximate_inverse_root(self) -> Self;
     /// The last digit of 1.
     const EPSILON: f64;
@@ -70,23 +71,23 @@ pub(crate) trait Real:
     const UNIT: f64;
     /// The number whose last digit is 1, and the exponent's bias.
     const POWER: f64;
-    /// 2^self, for integers.
+    /// Returns 2^self, for integers.
     fn power_of_two(self) -> Self;
     /// ln 2 in two parts: the first ends in enough zeros that its product with an integer is exact.
     const LN_2: [f64; 2];
     /// Degree of the polynomial of e^r, |r| ≤ ½ln 2.
     const EXPONENTIAL_DEGREE: usize;
-    /// Square root, correctly rounded.
+    /// Returns the square root, correctly rounded.
     fn root(self) -> Self;
-    /// self·b + c, rounded once.
+    /// Returns self·b + c, rounded once.
     fn fused(self, b: Self, c: Self) -> Self;
-    /// |x|.
+    /// Returns |self|.
     fn magnitude(self) -> Self;
-    /// Neither infinite nor NaN.
+    /// Returns whether the number is neither infinite nor NaN.
     fn is_finite(self) -> bool;
     /// Writes the value's bytes, little-endian, to `bytes`, which has the value's size.
     fn write(self, bytes: &mut [u8]);
-    /// The value of bytes that [`Real::write`] wrote; 0 of any other number of bytes.
+    /// Returns the value of bytes that [`Real::write`] wrote; 0 for any other number of bytes.
     fn read(bytes: &[u8]) -> Self;
 }
 
@@ -124,7 +125,7 @@ macro_rules! real {
             const TERMS: usize = $terms;
             const SERIES: [f64; 14] = $series;
             const NEGLIGIBLE_EXPONENT: f64 = $negligible;
-            // The kernel asks for its constants here; a call within a loop costs 6 %.
+            // The kernel reads its constants here; a call within a loop costs 6 %.
             #[inline(always)]
             #[allow(clippy::cast_possible_truncation)]
             fn of(value: f64) -> Self {

@@ -1,6 +1,6 @@
-//! The part of a sheet that a sweep goes over: whole tiles, and the strips of rows and columns that cover them.
+//! The part of a tissue that a sweep covers: whole tiles, and the strips of rows and columns that cover them.
 //!
-//! Every operation costs as much as the part holds, not as much as the sheet.
+//! Every operation costs as much as the part holds, not as much as the tissue.
 
 use std::ops::Range;
 
@@ -10,12 +10,12 @@ use crate::memory;
 /// Points along a side of a tile.
 pub(crate) const TILE: usize = BLOCK;
 
-/// Number of tiles that cover `points` points.
+/// Returns the number of tiles that cover `points` points.
 pub(crate) fn tiles(points: usize) -> usize {
     points.div_ceil(TILE)
 }
 
-/// A set of tiles. Iterating and clearing cost as much as the set holds, whatever the size of the sheet.
+/// A set of tiles. Iterating and clearing cost as much as the set holds, whatever the size of the tissue.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Marks {
     pub(crate) members: Vec<usize>,
@@ -24,7 +24,7 @@ pub(crate) struct Marks {
 
 impl Marks {
     pub(crate) fn none_of(count: usize) -> Self {
-        Marks { members: Vec::new(), has: memory::zeroed(count, "the tiles of a sheet") }
+        Marks { members: Vec::new(), has: memory::zeroed(count, "the tiles of a tissue") }
     }
 
     /// Adds a tile. Returns whether it is new.
@@ -46,14 +46,14 @@ impl Marks {
     }
 }
 
-/// Part of a sheet that a sweep goes over.
+/// Part of a tissue that a sweep covers.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Region {
     /// Ordered for the sweep: no strip reads what an earlier strip has overwritten.
     pub(crate) strips: Vec<Strip>,
     /// [`Region::cover`] sorts the members and removes those that are no longer awake.
     pub(crate) awake: Marks,
-    /// Tiles along y.
+    /// Number of tiles along y.
     columns: usize,
 }
 
@@ -61,25 +61,25 @@ pub(crate) struct Region {
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Strip {
     pub(crate) rows: Range<usize>,
-    /// Whole tiles, the last of which may reach beyond the sheet.
+    /// Whole tiles, the last of which may reach beyond the grid.
     pub(crate) columns: Range<usize>,
     /// Whether all of it is awake.
     pub(crate) awake: bool,
 }
 
 impl Region {
-    /// A region without tiles.
+    /// Creates a region without tiles.
     pub(crate) fn none(layout: &Layout) -> Self {
         let columns = tiles(layout.columns);
         Region { strips: Vec::new(), awake: Marks::none_of(tiles(layout.rows) * columns), columns }
     }
 
-    /// The awake tiles, ascending.
+    /// Returns the awake tiles, ascending.
     pub(crate) fn tiles(&self) -> &[usize] {
         &self.awake.members
     }
 
-    /// Makes the strips cover the awake tiles; springs reach `reach` rows on.
+    /// Makes the strips cover the awake tiles; springs reach over `reach` rows.
     pub(crate) fn cover(&mut self, layout: &Layout, reach: usize) {
         let Region { strips, awake, columns } = self;
         let Marks { members, has } = awake;
@@ -108,21 +108,22 @@ impl Region {
         }
     }
 
-    /// Whether the strip lies within the memory of `layout`: it may reach beyond the columns, but not beyond the rows.
+    /// Returns whether the strips lie within the memory of `layout`: they may reach beyond the columns, but not
+    /// beyond the rows.
     pub(crate) fn is_within(&self, layout: &Layout) -> bool {
         let is_within =
             |strip: &Strip| strip.rows.end <= layout.rows && strip.columns.end <= tiles(layout.columns) * TILE;
         self.strips.iter().all(is_within)
     }
 
-    /// Whether the tile of a point is awake.
+    /// Returns whether the tile of a point is awake.
     #[inline(always)]
     pub(crate) fn is_awake(&self, row: usize, column: usize) -> bool {
         self.awake.has[row / TILE * self.columns + column / TILE]
     }
 }
 
-/// Adds the strips over `rows` of two ascending rows of tiles, joined where they meet. The first row is awake.
+/// Adds the strips over `rows` for two ascending rows of tiles, joined where they meet. The first row is awake.
 fn push_strips(strips: &mut Vec<Strip>, rows: Range<usize>, columns: usize, [mut own, mut below]: [&[usize]; 2]) {
     if rows.is_empty() {
         return;

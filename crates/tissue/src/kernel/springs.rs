@@ -14,28 +14,29 @@ use crate::kernel::lanes::{Scalar, Vector};
 use crate::kernel::real::Real;
 use crate::scene;
 
-/// Least 1 + q = (L/L0)². A spring pressed to zero length has no direction. Below a millionth of its rest length its
-/// force fades to 0 in proportion to its length, so nothing divides by 0.
+/// The smallest 1 + q = (L/L0)². A spring pressed to zero length has no direction. Below a millionth of its
+/// rest length its force fades to 0 in proportion to its length, so nothing divides by 0.
 const MIN_LENGTH_SQUARED: f64 = 1e-12;
 
-/// The largest |q| for which the polynomial holds.
+/// The largest |q| for which the polynomial is valid.
 const NEAR: f64 = 0.125;
 
 /// Springs of the same rest length and stiffness.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SpringCoefficients<T> {
-    /// k times the factor that puts forces in the scheme's units.
+    /// k times the factor to the scheme's units of force.
     stiffness: T,
-    /// Polynomial in Q for the stiffness times (1 − L0/L)/Q.
+    /// Polynomial in Q of the stiffness times (1 − L0/L)/Q.
     series: [T; 14],
-    /// The largest |Q| for which the polynomial holds.
+    /// The largest |Q| for which the polynomial is valid.
     near: T,
     /// 1/L0².
     per_length_squared: T,
 }
 
 impl<T: Real> SpringCoefficients<T> {
-    /// `stiffness` is k times any factor; `length_squared` is L0², in spacings squared.
+    /// Computes the coefficients. `stiffness` is k times any factor; `length_squared` is L0², in spacings
+    /// squared.
     pub(crate) fn new(stiffness: f64, length_squared: f64) -> Self {
         let mut power = stiffness;
         let series = T::SERIES.map(|coefficient| {
@@ -50,21 +51,23 @@ impl<T: Real> SpringCoefficients<T> {
         }
     }
 
-    /// Lanes where [`SpringCoefficients::near`] does not hold, given the magnitude of Q.
+    /// Returns the lanes in which [`SpringCoefficients::near`] is not valid, given the magnitude of Q.
     #[inline(always)]
     pub(crate) fn is_far<V: Vector<Real = T>>(&self, magnitude: V) -> V::Mask {
         magnitude.above(magnitude.splat(self.near))
     }
 
-    /// Stiffness × (1 − L0/L) for small Q. Even and odd powers are summed apart, which halves the dependency chain. A
-    /// spring whose strain is too small to count does not pull: at rest, the force is exactly 0.
+    /// Returns stiffness × (1 − L0/L) for small Q. Even and odd powers are summed separately, which halves the
+    /// dependency chain. A spring whose strain is too small to count does not pull: at rest, the force is
+    /// exactly 0.
     #[inline(always)]
     pub(crate) fn near<V: Vector<Real = T>>(&self, excess: V) -> V {
         self.series(excess, Self::square(excess)).keep(Self::counts(excess))
     }
 
-    /// The same, and a square that tells where it does not hold ([`SpringCoefficients::is_square_far`]). Which springs are too little
-    /// strained to count is told by the square as well, so their bound is rounded otherwise than in [`SpringCoefficients::near`].
+    /// Returns stiffness × (1 − L0/L) for small Q, and a square that shows where it is not valid
+    /// ([`SpringCoefficients::is_square_far`]). The square also decides which springs have too little strain to count,
+    /// so their bound is rounded differently from [`SpringCoefficients::near`].
     #[inline(always)]
     pub(crate) fn near_and_square<V: Vector<Real = T>>(&self, excess: V) -> (V, V) {
         let square = Self::square(excess);
@@ -72,13 +75,14 @@ impl<T: Real> SpringCoefficients<T> {
         (self.series(excess, square).keep(square.above(excess.splat(least))), square)
     }
 
-    /// Lanes where [`SpringCoefficients::near_and_square`] does not hold, given its square or the largest of several.
+    /// Returns the lanes in which [`SpringCoefficients::near_and_square`] is not valid, given its square or the
+    /// largest of several.
     #[inline(always)]
     pub(crate) fn is_square_far<V: Vector<Real = T>>(&self, square: V) -> V::Mask {
         square.above(square.splat(self.near * self.near))
     }
 
-    /// The same for the springs of `mask`; the others do not pull.
+    /// Returns stiffness × (1 − L0/L) for small Q for the springs of `mask`; the others do not pull.
     #[inline(always)]
     pub(crate) fn near_of<V: Vector<Real = T>>(&self, mask: V::Mask, excess: V) -> V {
         self.series(excess, Self::square(excess)).keep(V::both(Self::counts(excess), mask))
@@ -89,7 +93,7 @@ impl<T: Real> SpringCoefficients<T> {
         excess.beyond(excess.splat(T::of(T::MIN_EXCESS)))
     }
 
-    /// Q², but never below the normal range.
+    /// Returns Q², but never below the normal range.
     #[inline(always)]
     fn square<V: Vector<Real = T>>(excess: V) -> V {
         excess.mul_add(excess, excess.splat(T::of(T::FAINT)))
@@ -105,10 +109,10 @@ impl<T: Real> SpringCoefficients<T> {
         odd.mul_add(excess, even).mul(excess)
     }
 
-    /// Stiffness × (1 − L0/L) for any Q, most accurate away from 0: with r near 1/s, e = 1 − r²(1 + q) is small, and
-    /// 1 − 1/s = (1 − r) − r·e/2 up to e², where 1 − r is exact for r from ½ to 2. A rough r from the bits of the number
-    /// and a few Newton steps cost a quarter of a root and a division, whose throughput does not grow with the vector
-    /// width.
+    /// Returns stiffness × (1 − L0/L) for any Q, most accurate away from 0. With r near 1/s, e = 1 − r²(1 + q)
+    /// is small, and 1 − 1/s = (1 − r) − r·e/2 up to e², where 1 − r is exact for r from ½ to 2. A rough r from
+    /// the bits of the number and a few Newton steps cost a quarter of a root and a division, whose throughput
+    /// does not grow with the vector width.
     #[inline(always)]
     pub(crate) fn far<V: Vector<Real = T>>(&self, excess: V) -> V {
         let (one, half) = (excess.splat(T::of(1.0)), excess.splat(T::of(0.5)));
@@ -126,7 +130,7 @@ impl<T: Real> SpringCoefficients<T> {
         excess.splat(self.stiffness).mul(one.sub(r).minus(half.mul(r), e))
     }
 
-    /// Stiffness × (1 − L0/L), by the form that holds for each lane.
+    /// Returns stiffness × (1 − L0/L), in each lane by the form that is valid there.
     #[inline(always)]
     pub(crate) fn weight<V: Vector<Real = T>>(&self, excess: V) -> V {
         let far = excess.beyond(excess.splat(self.near));
@@ -134,7 +138,7 @@ impl<T: Real> SpringCoefficients<T> {
         if V::any(far) { V::select(far, self.far(excess), near) } else { near }
     }
 
-    /// Energy: stiffness × ½(L − L0)².
+    /// Returns the energy, stiffness × ½(L − L0)².
     #[inline(always)]
     pub(crate) fn energy<V: Vector<Real = T>>(&self, excess: V) -> V {
         let (q, s) = self.stretch(excess);
@@ -143,7 +147,7 @@ impl<T: Real> SpringCoefficients<T> {
         excess.splat(T::of(0.5 * self.stiffness.wide() / self.per_length_squared.wide())).mul(extension.mul(extension))
     }
 
-    /// q and s.
+    /// Returns q and s.
     #[inline(always)]
     fn stretch<V: Vector<Real = T>>(&self, excess: V) -> (V, V) {
         let q = excess.mul(excess.splat(self.per_length_squared));
@@ -152,7 +156,7 @@ impl<T: Real> SpringCoefficients<T> {
     }
 }
 
-/// The springs of a sheet, their forces scaled for a scheme.
+/// The springs of a sheet, with forces scaled for a scheme.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Springs<T> {
     pub(crate) structural: SpringCoefficients<T>,
@@ -161,7 +165,7 @@ pub(crate) struct Springs<T> {
 }
 
 impl<T: Real> Springs<T> {
-    /// Forces are in newtons × `scale` / spacing.
+    /// Computes the coefficients; forces are in newtons × `scale` / spacing.
     pub(crate) fn new(springs: &scene::Springs, scale: f64) -> Self {
         let structural = springs.stiffness_n_per_m * scale;
         Springs {
@@ -171,7 +175,7 @@ impl<T: Real> Springs<T> {
         }
     }
 
-    /// The force of all springs on the point [i, j], gathered: for the few points that a caller asks about.
+    /// Returns the force of all springs on the point [i, j]. For a few single points.
     pub(crate) fn gather(&self, layout: &Layout, u: &[T], [i, j]: [usize; 2]) -> [T; 3] {
         let mut sum = [T::default(); 3];
         let at = |i: usize, j: usize, c: usize| u[c * layout.plane + i * layout.stride + j];

@@ -4,27 +4,27 @@
 use crate::kernel::lanes::Vector;
 use crate::kernel::real::Real;
 
-/// What to do with the force on a block of points.
+/// What a sweep does with the springs' force on a block of points.
 pub(crate) trait Stage<T: Real> {
     /// Whether the sweep also reports the energies of the springs.
     const ENERGY: bool = false;
 
-    /// The duty of a row (see [`ROW_UNLOADED`]). `finish` gets it at compile time.
+    /// Returns the duty of a row (see [`ROW_UNLOADED`]). `finish` gets it at compile time.
     fn duty(&self, _row: usize) -> u8 {
         ROW_UNLOADED
     }
 
-    /// The initial values of the sums.
+    /// Returns the initial values of the sums.
     ///
     /// # Safety
-    /// As for `finish`.
+    /// The pointers of the stage are valid, and the processor has the instructions.
     #[inline(always)]
     unsafe fn begin<V: Vector<Real = T>>(&self) -> [V; 2] {
         [unsafe { V::of(T::default()) }; 2]
     }
 
-    /// `x`: displacements of the block of row `row` that begins at place `at`; `n`: the springs' forces on it. Adds to
-    /// `sums`; the stage gets the totals at the end.
+    /// Handles a block of row `row` that begins at place `at`. `x` are its displacements, `n` the springs'
+    /// forces on it. Adds to `sums`; the stage gets the totals at the end.
     ///
     /// # Safety
     /// The pointers of the stage are valid.
@@ -37,22 +37,22 @@ pub(crate) trait Stage<T: Real> {
         sums: &mut [V; 2],
     );
 
-    /// Takes the energies of the springs that begin in the block at `column`.
+    /// Receives the energies of the springs that begin in the block at `column`.
     ///
     /// # Safety
-    /// As for `finish`.
+    /// The pointers of the stage are valid.
     unsafe fn energy<V: Vector<Real = T>>(&self, _column: usize, _energy: V) {}
 
     /// Ends a row.
     ///
     /// # Safety
-    /// As for `finish`.
+    /// The pointers of the stage are valid.
     unsafe fn end_row(&self) {}
 
-    /// Ends the sweep.
+    /// Ends the sweep; `_sums` are the totals.
     ///
     /// # Safety
-    /// As for `finish`.
+    /// The pointers of the stage are valid.
     unsafe fn end<V: Vector<Real = T>>(&self, _sums: [V; 2]) {}
 }
 

@@ -1,5 +1,5 @@
-//! What a sheet tells about the surroundings of a place that need not be a mass point: how far the surface is moved there,
-//! and the reaction to a force around it.
+//! Reads the surroundings of a place that need not be a mass point: the displacement of the surface there, and
+//! the reaction to a force around it.
 
 use glam::DVec3;
 
@@ -9,16 +9,16 @@ use crate::scene::profile::Poke;
 use crate::state::tissue_state::TissueState;
 use crate::tools::contact::displacement_m;
 
-/// The exponent of a weight below which a point does not count.
+/// The exponent of a weight beyond which a point does not count.
 const MIN_EXPONENT: f64 = 7.0;
 
-/// The largest and the least radius of the surroundings, in spacings: the largest bounds the work, within the least there
-/// is always a point.
+/// The smallest and the largest radius of the surroundings, in spacings. The largest bounds the work; within
+/// the smallest there is always a point.
 const RADIUS: [f64; 2] = [1.5, 4.0];
 
 impl<T: Real> TissueState<T> {
-    /// On a sheet bilinear between the four points around the place, beyond the rim that of the rim; on a mesh that of the
-    /// nearest point.
+    /// Returns the displacement of the surface at a place, m. On a sheet it is bilinear between the four points
+    /// around the place, and beyond the rim that of the rim; on a mesh it is that of the nearest point.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub(crate) fn surface_displacement(&self, place_m: DVec3) -> DVec3 {
         let Some(sheet) = self.model.scene.sheet() else {
@@ -35,7 +35,8 @@ impl<T: Real> TissueState<T> {
         at(i, j).lerp(at(i, right), t).lerp(at(above, j).lerp(at(above, right), t), s)
     }
 
-    /// The weights are those of the force, tapered to 0 at a radius, so that no point comes or goes with a jump.
+    /// Returns the weighted mean reaction around the centre of a force, N. The weights are those of the force,
+    /// reduced smoothly to 0 at a radius, so that no point enters or leaves with a jump.
     pub(crate) fn reaction_around(&self, poke: &Poke) -> DVec3 {
         let shape = self.model.shape();
         let [least, most] = RADIUS.map(|spacings| spacings * shape.edge_m());

@@ -1,4 +1,4 @@
-//! How a tissue responds at a place: tangent, force law, and what lies around a point.
+//! The response of a tissue at a place: tangent stiffness, force law, and the surroundings of a place.
 
 pub(crate) mod around_place;
 pub mod force_law;

@@ -1,9 +1,11 @@
-//! Which place of a tissue is like another to a disc, so that what is known of the one need not be computed for the other.
+//! Finds the representative of a place: a place where a disc meets the tissue in the same way, so that results
+//! for the one serve the other.
 //!
-//! On a mesh that is the nearest vertex. A sheet is the same everywhere but for its rim and its fixed points, so there it is the
-//! place that lies as far from the nearer rim along each side. What a disc does to a rim comes back to the disc, and so
-//! goes the way twice: from half as far as a disc is noticed (`tangent::half_window_m`), the rim makes no difference, and
-//! the middle stands for all places, as they lie in a cell of the grid.
+//! On a mesh this is the nearest vertex. A sheet is the same everywhere except near its rim and its fixed
+//! points, so its representative has the same distance to the nearer rim along each side. The effect of a disc
+//! on a rim travels back to the disc, so the distance counts twice. From half the distance at which a disc is
+//! noticed (`tangent::half_window_m`), the rim makes no difference, and the middle represents all places, as
+//! they lie in a cell of the grid.
 
 use glam::{DVec2, DVec3};
 
@@ -12,11 +14,13 @@ use crate::response::tangent;
 use crate::scene::{FixedPoints, Sheet};
 use crate::shape::RestShape;
 
-/// Places on a raster of this part of the radius have laws of their own. It has the points of the sheet in it, or some of them.
+/// Places on a raster of this part of the radius have force laws of their own. The raster contains the points
+/// of the sheet, or some of them.
 const APART_IN_RADII: f64 = 0.5;
 
-/// Returns the place at rest that is to a disc of `radius_m` as `at_m` is. On a sheet a rim counts that is nearer than ½(a + r), with a
-/// the radius and r how far the disc is noticed ([`tangent::half_window_m`]).
+/// Returns the representative, at rest, of the place `at_m` for a disc of `radius_m`, m. On a sheet, a rim
+/// nearer than ½(a + r) counts, with a the radius and r the distance at which the disc is noticed
+/// ([`tangent::half_window_m`]).
 pub fn place_alike(model: &Model, radius_m: f64, at_m: DVec3) -> DVec3 {
     let Some(sheet) = model.scene.sheet() else {
         let shape = model.shape();
@@ -25,7 +29,7 @@ pub fn place_alike(model: &Model, radius_m: f64, at_m: DVec3) -> DVec3 {
     let far_m = 0.5 * (radius_m + tangent::half_window_m(model, radius_m));
     let at_m = on_sheet(sheet, radius_m, at_m.truncate());
     let folded_m = folded(sheet, radius_m, far_m, at_m);
-    // Fixed points that are named lie anyhow: near them each place has its own law.
+    // Listed fixed points are irregular: near them each place has its own law.
     let is_plain = |at_m: DVec2| match &sheet.fixed {
         FixedPoints::Edges | FixedPoints::Corners => true,
         FixedPoints::Points(points) => points.as_slice().iter().all(|place| {
@@ -37,15 +41,16 @@ pub fn place_alike(model: &Model, radius_m: f64, at_m: DVec3) -> DVec3 {
     at_m.extend(0.0)
 }
 
-/// The place where a disc is that does not hang over the rim, as far as there is one. Over a fixed rim a tip slides off: the law
-/// of a disc that sticks there would be many times too stiff.
+/// Returns the nearest place where a disc does not extend over the rim, if there is one. Over a fixed rim a tip
+/// slides off: the law of a disc that sticks there would be many times too stiff.
 fn on_sheet(sheet: &Sheet, radius_m: f64, at_m: DVec2) -> DVec2 {
     let middle_m = 0.5 * sheet.extent_m();
     let most_m = (middle_m - radius_m).max(DVec2::ZERO);
     middle_m + (at_m - middle_m).clamp(-most_m, most_m)
 }
 
-/// The place that lies as `at_m` to the rims within `far_m`, as near to the middle as one can.
+/// Returns the place with the same distances to the rims within `far_m` as `at_m`, as near to the middle as
+/// possible.
 fn folded(sheet: &Sheet, radius_m: f64, far_m: f64, at_m: DVec2) -> DVec2 {
     let (extent_m, spacing_m) = (sheet.extent_m(), sheet.spacing_m);
     let middle_m = 0.5 * extent_m;
@@ -57,12 +62,12 @@ fn folded(sheet: &Sheet, radius_m: f64, far_m: f64, at_m: DVec2) -> DVec2 {
         }
     }
     let folded_m = middle_m - inward_m;
-    // Of a square both sides are alike.
+    // Both sides of a square are alike.
     let is_square = sheet.points[0] == sheet.points[1];
     if is_square { DVec2::new(folded_m.min_element(), folded_m.max_element()) } else { folded_m }
 }
 
-/// A place on the raster about the middle, on which all points of the sheet lie alike.
+/// Returns the nearest place on the raster around the middle. All points of the sheet lie alike on it.
 fn rounded(sheet: &Sheet, radius_m: f64, at_m: DVec2) -> DVec2 {
     let points = APART_IN_RADII * radius_m / sheet.spacing_m;
     let raster_m = sheet.spacing_m * if points >= 1.0 { points.floor() } else { points.recip().ceil().recip() };

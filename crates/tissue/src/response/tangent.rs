@@ -1,16 +1,18 @@
-//! How stiff the sheet is under a disc: its tangent stiffness around the present place, and the force law of a slow press.
+//! Computes how stiff the tissue is under a disc: its tangent stiffness around the present state, and the force
+//! law of a slow press.
 //!
-//! With E the weights of the disc (`footprint`), one column a direction, and K the tangent stiffness of the sheet, a
-//! disc that is moved by ds quasi-statically is pushed back by S·ds, S = (Eᵀ K⁻¹ E)⁻¹: three solutions K·φ = E. The shape
-//! φ̂ = φ·S, the displacement of all points for a unit of the disc's, tells the damping and the mass that go with it:
-//! B = C·φ̂ᵀφ̂, the derivative of the disc's impedance at rest, and M = m·φ̂ᵀφ̂. A disc that slides carries its dimple
-//! along, and each point is moved by −∂u/∂x·v: drag D = C·Σ ∂u·∂u.
+//! Let E be the weights of the disc (`footprint`), one column per direction, and K the tangent stiffness of the
+//! tissue. A disc that moves quasi-statically by ds is pushed back by S·ds, S = (Eᵀ K⁻¹ E)⁻¹: three solutions
+//! K·φ = E. The shape φ̂ = φ·S, the displacement of all points per unit of the disc's, also gives damping and
+//! mass: B = C·φ̂ᵀφ̂, the derivative of the disc's impedance at rest, and M = m·φ̂ᵀφ̂. A disc that slides
+//! carries its dimple along, and moves each point by −∂u/∂x·v: drag D = C·Σ ∂u·∂u.
 //!
-//! K of a spring along n is k[nnᵀ + max(0, 1 − L0/L)(I − nnᵀ)]: without the clamp a pressed spring would make it
-//! indefinite. The pressure of a volume adds κ/V0·a·aᵀ, of all points: those far away are held too, so κ is less by what they
-//! would give way ([`volume_compliance`]). Conjugate gradients (Hestenes and Stiefel, Journal of Research of the National Bureau of
-//! Standards 49(6), 1952, doi:10.6028/jres.049.044), the three systems side by side, preconditioned by the points' own blocks. Points far
-//! enough away not to notice are held: a press reaches √(k/K″) spacings.
+//! K of a spring along n is k[nnᵀ + max(0, 1 − L0/L)(I − nnᵀ)]: without the clamp a compressed spring would
+//! make it indefinite. The pressure of a volume adds κ/V0·a·aᵀ over all points: those far away are held too, so
+//! κ is reduced by what they would yield ([`volume_compliance`]). The solver is conjugate gradients (Hestenes
+//! and Stiefel, Journal of Research of the National Bureau of Standards 49(6), 1952, doi:10.6028/jres.049.044),
+//! the three systems side by side, preconditioned by the points' own blocks. Points too far away to notice are
+//! held: a press reaches √(k/K″) spacings.
 
 use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -28,14 +30,14 @@ mod window;
 use window::{Spring, Triple};
 pub use window::{Window, half_window_m};
 
-/// When a solution is good enough.
+/// The accuracy of a solution: when the solvers stop.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Accuracy {
     /// Residual of the linear systems of a tangent, relative to the right-hand side.
     residual: f64,
-    /// The same of those on the way of Newton's method.
+    /// Residual of the linear systems within Newton's method, relative to the right-hand side.
     approximate_residual: f64,
-    /// Newton's method has arrived when no point moves farther, in spacings.
+    /// Newton's method stops when no point moves farther than this, in spacings.
     arrived: f64,
 }
 
@@ -49,7 +51,7 @@ impl Accuracy {
 /// Most iterations of conjugate gradients.
 const MAX_ITERATIONS: u32 = 400;
 
-/// How much may be computed, and whether it is still wanted.
+/// The work that may still be done, and whether the result is still wanted.
 #[derive(Debug, Clone)]
 struct Allowance<'a> {
     /// Springs times iterations that are left.
@@ -64,12 +66,12 @@ impl Default for Allowance<'_> {
 }
 
 impl<'a> Allowance<'a> {
-    /// So many springs times iterations, as long as `stop` is not set.
+    /// Allows `work` springs times iterations, until `stop` is set.
     fn of(work: u64, stop: &'a AtomicBool) -> Self {
         Allowance { left: Cell::new(work), stop: Some(stop) }
     }
 
-    /// Takes some of it, if there is so much.
+    /// Takes some work from it. Returns false if not that much is left or `stop` is set; then nothing is left.
     fn take(&self, work: usize) -> bool {
         let is_wanted = self.stop.is_none_or(|stop| !stop.load(Ordering::Relaxed));
         let left = if is_wanted { self.left.get().checked_sub(work as u64) } else { None };
@@ -77,24 +79,24 @@ impl<'a> Allowance<'a> {
         left.is_some()
     }
 
-    /// Something had to be left undone.
+    /// Returns whether some work had to be left out.
     fn is_spent(&self) -> bool {
         self.left.get() == 0
     }
 }
 
-/// The sheet around a disc, linearised where it is.
+/// The tissue around a disc, linearised at its present displacements.
 #[derive(Debug)]
 pub struct LinearPatch<'m> {
     model: &'m Model,
     window: Window,
-    /// From rest, m.
+    /// Displacement from rest, m.
     displacement_m: Vec<DVec3>,
     /// Whether a point moves.
     free: Vec<bool>,
-    /// E, by points.
+    /// E, one weight per point.
     weights: Vec<f64>,
-    /// Mass and K″ of each point over those of reference.
+    /// Mass and K″ of each point divided by the reference values.
     masses: Vec<f64>,
     stiffness: Vec<f64>,
     springs: Vec<Spring>,
@@ -107,9 +109,9 @@ pub struct LinearPatch<'m> {
 /// The pressure of a volume on the points of a patch.
 #[derive(Debug)]
 struct SharedPressure {
-    /// a of each point that moves, m²; 0 of those held.
+    /// a of each point that moves, m²; 0 for held points.
     areas_m2: Vec<DVec3>,
-    /// The pressure that goes with a growth of the volume, Pa/m³: κ/V0, less by what the points beyond give way.
+    /// The pressure per growth of the volume, Pa/m³: κ/V0, reduced by what the points outside the patch yield.
     pa_per_m3: f64,
 }
 
@@ -128,41 +130,42 @@ impl SharedPressure {
         Some(SharedPressure { areas_m2, pa_per_m3: pa_per_m3 / (1.0 + pa_per_m3 * beyond) })
     }
 
-    /// By how much the volume grows, m³.
+    /// Returns the growth of the volume, m³.
     fn growth_m3<'x>(&self, moved_m: impl Iterator<Item = &'x DVec3>) -> f64 {
         self.areas_m2.iter().zip(moved_m).map(|(area, moved_m)| area.dot(*moved_m)).sum()
     }
 }
 
-/// What a disc feels of slow and small movements.
+/// The resistance that a disc feels against slow and small movements. Matrices are in the directions x, y, z
+/// (or turned so that z is the normal).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tangent {
     /// S = (Eᵀ K⁻¹ E)⁻¹, with the weights E of the disc and the tangent stiffness K of the tissue, N/m.
     pub stiffness_n_per_m: DMat3,
     /// B = C·φ̂ᵀφ̂ of movements with the tissue, φ̂ = K⁻¹·E·S, N·s/m.
     pub damping_n_s_per_m: DMat3,
-    /// D = C·Σ ∂u·∂u of sliding, in the rest plane, N·s/m.
+    /// D = C·Σ ∂u·∂u of sliding within the surface, N·s/m.
     pub drag_n_s_per_m: f64,
-    /// M = m·φ̂ᵀφ̂, kg.
+    /// Mass M = m·φ̂ᵀφ̂ that moves along the normal, kg.
     pub mass_kg: f64,
-    /// Iterations that it took.
+    /// Iterations of the solver.
     pub iterations: u32,
 }
 
-/// One depth of a slow press by a disc, straight down into a sheet that is otherwise at rest.
+/// The result at one depth of a slow press by a disc, straight into a tissue that is otherwise at rest.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pressed {
-    /// m.
+    /// Depth, m.
     pub depth_m: f64,
-    /// Of the tissue on the disc, outward, N.
+    /// Force of the tissue on the disc, outward, N.
     pub force_n: f64,
-    /// What goes with it.
+    /// Stiffness, damping and drag at this depth.
     pub tangent: Tangent,
 }
 
 impl<'m> LinearPatch<'m> {
-    /// A window around a footprint, its points displaced so, in their order. Displacements and all that is found are in
-    /// directions turned by `turn`.
+    /// Creates the patch of a window around a footprint, with the displacements of its points in their order.
+    /// Displacements and results are in directions turned by `turn`.
     fn turned(
         model: &'m Model,
         footprint: &Footprint,
@@ -179,7 +182,7 @@ impl<'m> LinearPatch<'m> {
         Self::weighted(model, weights, window, displacement_m, turn)
     }
 
-    /// The same with the weights of the points.
+    /// Creates the patch of a window with given weights of the points. Directions are turned by `turn`.
     fn weighted(model: &'m Model, weights: Vec<f64>, window: Window, displacement_m: Vec<DVec3>, turn: &DMat3) -> Self {
         let free = window.free(model);
         let springs = window.springs(model, &free, turn);
@@ -203,12 +206,13 @@ impl<'m> LinearPatch<'m> {
         patch
     }
 
-    /// Returns the same, not turned.
+    /// Creates the patch of a window around a footprint. `displacement_m` has the displacement of each point in
+    /// the order of [`Window::points`].
     pub fn new(model: &'m Model, footprint: &Footprint, window: Window, displacement_m: Vec<DVec3>) -> Self {
         Self::turned(model, footprint, window, displacement_m, &DMat3::IDENTITY)
     }
 
-    /// Forms the springs' tangents and forces where the points are.
+    /// Computes the springs' tangents and forces at the present displacements.
     fn linearise(&mut self) {
         let own = self.model.scene.anchor_stiffness_n_per_m;
         self.inverses.clear();
@@ -236,12 +240,12 @@ impl<'m> LinearPatch<'m> {
             }
         }
         for block in &mut self.inverses {
-            // A point that nothing holds is left alone.
+            // A point that nothing holds does not move.
             *block = if block.determinant() > 0.0 { block.inverse() } else { DMat3::ZERO };
         }
     }
 
-    /// K·x of three vectors at once.
+    /// Writes K·x for three vectors at once to `product`.
     fn times(&self, x: &[Triple], product: &mut [Triple]) {
         let own = self.model.scene.anchor_stiffness_n_per_m;
         for ((product, x), part) in product.iter_mut().zip(x).zip(&self.stiffness) {
@@ -269,7 +273,8 @@ impl<'m> LinearPatch<'m> {
         }
     }
 
-    /// Solves K·x = `right` for three systems, to a residual of `good` parts. Iterations of the slowest.
+    /// Solves K·x = `right` for three systems, to a relative residual of `good`. Also returns the iterations of
+    /// the slowest.
     fn solve(&self, right: &[Triple], good: f64) -> (Vec<Triple>, u32) {
         let dot = |a: &[Triple], b: &[Triple]| {
             let mut sum = [0.0; 3];
@@ -319,7 +324,7 @@ impl<'m> LinearPatch<'m> {
         (x, MAX_ITERATIONS)
     }
 
-    /// Stiffness, damping, drag and mass under the disc.
+    /// Computes stiffness, damping, drag and mass under the disc.
     pub fn tangent(&self) -> Tangent {
         let axes = [DVec3::X, DVec3::Y, DVec3::Z];
         let right: Vec<Triple> = self.weights.iter().map(|weight| axes.map(|axis| *weight * axis)).collect();
@@ -343,7 +348,7 @@ impl<'m> LinearPatch<'m> {
         }
     }
 
-    /// Σ |∂u/∂x|², the mean of both directions.
+    /// Returns Σ |∂u/∂x|², the mean of both directions of the surface.
     fn slopes(&self) -> f64 {
         match &self.window {
             Window::Grid { size, .. } => self.slopes_of_grid(*size),
@@ -364,7 +369,7 @@ impl<'m> LinearPatch<'m> {
         sum / (8.0 * spacing_m * spacing_m)
     }
 
-    /// At each point the mean over its springs.
+    /// Returns the sum of squared slopes; at each point the mean over its springs.
     fn slopes_along_springs(&self) -> f64 {
         let mut of_points = vec![(0.0, 0.0); self.free.len()];
         for Spring { ends: [a, b], rest_m, .. } in &self.springs {
@@ -378,7 +383,7 @@ impl<'m> LinearPatch<'m> {
         with_mass.map(|((slopes, count), mass)| mass * slopes / count).sum()
     }
 
-    /// Brings the disc's z to `-depth_m` quasi-statically (Newton's method); the force on the disc, N.
+    /// Moves the disc's z to `-depth_m` quasi-statically (Newton's method). Returns the force on the disc, N.
     fn press(&mut self, depth_m: f64) -> f64 {
         let own = self.model.scene.anchor_stiffness_n_per_m;
         let mut force_n = 0.0;
@@ -423,11 +428,12 @@ impl<'m> LinearPatch<'m> {
     }
 }
 
-/// Springs times iterations that may be spent on what gives way under a pressure: 3 s on the machine of the benchmarks. A mesh
-/// beyond takes what was found by then.
+/// Springs times iterations for the yielding of a volume's points under a pressure: 3 s on the machine of the
+/// benchmarks. A larger mesh uses the approximation reached by then.
 const YIELDING: u64 = 100_000_000;
 
-/// By how much each place of a mesh that encloses a volume lets it grow under a pressure, at rest, m³/Pa.
+/// Returns by how much each place of a mesh that encloses a volume lets it grow under a pressure, at rest,
+/// m³/Pa. Empty without a volume.
 pub(crate) fn volume_compliance(model: &Model, stop: &AtomicBool) -> Vec<f64> {
     let Some(volume) = model.graph.as_ref().and_then(|graph| graph.volume.as_ref()) else { return Vec::new() };
     let (window, unit_m2) = (Window::Ball((0..model.len()).collect()), model.unit_m * model.unit_m);
@@ -440,19 +446,19 @@ pub(crate) fn volume_compliance(model: &Model, stop: &AtomicBool) -> Vec<f64> {
     moved.iter().enumerate().map(|(slot, [moved_m, ..])| moved_m.dot(area_m2(slot))).collect()
 }
 
-/// Most steps of Newton's method for one depth.
+/// Largest number of steps of Newton's method for one depth.
 const MAX_NEWTON: u32 = 30;
 
-/// A matrix of a symmetric function of two indices.
+/// Returns the matrix of a symmetric function of two indices.
 fn symmetric(of: impl Fn(usize, usize) -> f64) -> DMat3 {
     let both = |a: usize, b: usize| 0.5 * (of(a, b) + of(b, a));
     let column = |b: usize| DVec3::new(both(0, b), both(1, b), both(2, b));
     DMat3::from_cols(column(0), column(1), column(2))
 }
 
-/// Presses slowly by a disc of `radius_m` at `centre_m` (a place at rest), at `count` depths, `step_m` apart,
-/// from 0 on. At each depth d Newton's method finds the displacements at which the springs are in balance with the disc's
-/// force along the normal, while Σ w·u = −d along it.
+/// Computes a slow press by a disc of `radius_m` at `centre_m` (a place at rest), at `count` depths from 0 on,
+/// `step_m` apart. At each depth d Newton's method finds the displacements at which the springs balance the
+/// disc's force along the normal, while Σ w·u = −d along it.
 pub fn press(model: &Model, radius_m: f64, centre_m: DVec3, step_m: f64, count: u32) -> Vec<Pressed> {
     let course = Course { radius_m, centre_m, step_m, count, points: usize::MAX };
     let mut press = Press::new(model, course, Accuracy::EXACT);
@@ -461,55 +467,55 @@ pub fn press(model: &Model, radius_m: f64, centre_m: DVec3, step_m: f64, count: 
     press.pressed
 }
 
-/// What is pressed, where and how deep.
+/// A disc, where it presses, and the depths.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Course {
-    /// Of the disc.
+    /// Radius of the disc, m.
     pub radius_m: f64,
-    /// The middle of the disc at rest, m: the place of the surface that is nearest to this.
+    /// Middle of the disc at rest, m: the place of the surface nearest to this.
     pub centre_m: DVec3,
-    /// From one depth to the next; the first is 0.
+    /// Distance between depths, m; the first depth is 0.
     pub step_m: f64,
     /// Number of depths.
     pub count: u32,
-    /// About how many points of a mesh are looked at; those beyond are held.
+    /// Approximate number of points of a mesh that are computed; those beyond are held.
     pub points: usize,
 }
 
-/// A slow press under way, one depth after another: between two of them whoever computes it may do something else.
+/// A slow press under computation, one depth after another, so that its thread can do other work in between.
 #[derive(Debug)]
 pub struct Press {
     footprint: Footprint,
     window: Window,
-    /// Turns the outward normal under the disc to z.
+    /// Rotates the outward normal under the disc to z.
     turn: DMat3,
     course: Course,
     accuracy: Accuracy,
-    /// Springs times iterations that are left.
+    /// Springs times iterations that may still be computed.
     left: u64,
     displacement_m: Vec<DVec3>,
     pressed: Vec<Pressed>,
 }
 
-/// What became of a press.
+/// The result of computing one depth of a press.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Deepened {
     /// Further depths are left.
     Further,
     /// All depths are computed.
     Done,
-    /// The work was used up, or it was stopped: the press can't go on.
+    /// The work was used up, or the press was stopped: it can't continue.
     GivenUp,
 }
 
 impl Press {
-    /// Creates a press by a disc with any amount of work.
+    /// Creates a press by a disc with unlimited work.
     pub fn new(model: &Model, course: Course, accuracy: Accuracy) -> Self {
         let (footprint, window) = Self::laid(model, &course);
         Self::begun(footprint, window, course, accuracy)
     }
 
-    /// The disc at its place, and what notices it.
+    /// Returns the disc at its place, and the window of points that notice it.
     fn laid(model: &Model, course: &Course) -> (Footprint, Window) {
         let footprint = Footprint::new(model, course.radius_m, course.centre_m);
         let window = Window::at(model, course.radius_m, footprint.anchor_m(), course.points);
@@ -525,26 +531,27 @@ impl Press {
         Press { footprint, window, turn, course, accuracy, left, displacement_m, pressed }
     }
 
-    /// Returns the same with at most `work` springs times iterations; none if that can't suffice.
+    /// Creates a press by a disc with at most `work` springs times iterations. `None` if they can't suffice.
     pub fn within(model: &Model, course: Course, accuracy: Accuracy, work: u64) -> Option<Self> {
-        // A solution takes as many iterations as there are points from the middle to where nothing is noticed, or nearly
-        // so, and each depth some solutions: what can't be done is not begun, and no memory is taken for it.
+        // A solution takes about as many iterations as there are points from the middle to where nothing is
+        // noticed, and each depth some solutions. A press that can't be completed is not begun, and takes no
+        // memory.
         let (footprint, window) = Self::laid(model, &course);
         let least = window.len() as u64 * 4 * u64::from(course.count) * (window.across() as u64);
         (least <= work).then(|| Press { left: work, ..Self::begun(footprint, window, course, accuracy) })
     }
 
-    /// Returns the springs times iterations that are left.
+    /// Returns the springs times iterations that may still be computed.
     pub fn left(&self) -> u64 {
         self.left
     }
 
-    /// Returns what was found at the depths so far.
+    /// Returns the results at the depths computed so far.
     pub fn pressed(&self) -> &[Pressed] {
         &self.pressed
     }
 
-    /// Computes the next depth, unless `stop` is set. `model` is the one that the press was made for.
+    /// Computes the next depth, unless `stop` is set. `model` must be the one that the press was created with.
     pub fn deepen(&mut self, model: &Model, stop: &AtomicBool) -> Deepened {
         if self.left == 0 {
             return Deepened::GivenUp;
@@ -557,7 +564,7 @@ impl Press {
         let tangent = patch.tangent();
         self.left = patch.allowance.left.get();
         if patch.allowance.is_spent() {
-            // What was computed last is not complete, and nothing follows from it.
+            // The last computation is incomplete, and nothing follows from it.
             return Deepened::GivenUp;
         }
         self.displacement_m = patch.displacement_m;
@@ -572,15 +579,16 @@ impl Press {
     }
 }
 
-/// Returns the same tissue in points `spacing_m` apart, each of which stands for several; as far as `half_m` from the
-/// middle, where it is held, or all of it. What holds a membrane is in the springs whatever their length; mass, damping
-/// and anchor springs are of an area: m, C and K″ are multiplied by (`spacing_m`/h)², with h the distance between points, k stays.
+/// Returns a sheet of the same tissue with points `spacing_m` apart, each of which replaces several. It reaches
+/// `half_m` from the middle, where it is held, or covers the whole sheet. The k of springs does not depend on
+/// their length; mass, damping and anchor springs belong to an area: m, C and K″ are multiplied by
+/// (`spacing_m`/h)², with h the distance between points. A mesh is returned as it is.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 pub fn stand_in(model: &Model, spacing_m: f64, half_m: f64) -> Model {
     let Some(fine) = model.scene.sheet() else { return model.clone() };
     let times = spacing_m / fine.spacing_m;
     let is_cut = fine.longest_side_m() > 2.0 * half_m;
-    // As many on either side of the middle.
+    // As many on both sides of the middle.
     let points = [0, 1].map(|axis| {
         let extent_m = fine.extent_m()[axis];
         2 * (extent_m.min(2.0 * half_m) / (2.0 * spacing_m)).round() as usize + 1

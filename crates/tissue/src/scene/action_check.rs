@@ -1,4 +1,4 @@
-//! Checks of what a tool is asked to do on a tissue, in scripts and in commands.
+//! Checks of tool actions, in scripts and in commands.
 
 use glam::DVec3;
 use palpate_haptics::{Coupling, Tip};
@@ -8,7 +8,8 @@ use crate::limits::Limits;
 use crate::shape::{PointId, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, finite, finite_vector, legible, not_negative, number};
 
-/// Squares and products of what a scene holds stay within single precision for values in this range.
+/// Checks a physical value of a scene. Squares and products of values in this range stay within single
+/// precision.
 pub(super) fn physical(field: &str, value: f64) -> Result<f64> {
     number(field, value, "from 1e-12 to 1e12", |v| (1e-12..=1e12).contains(&v))
 }
@@ -26,10 +27,10 @@ pub(super) fn check_force(field: &str, force_n: DVec3, factor: f64, limit_n: f64
     Ok(())
 }
 
-/// Checks a poke.
+/// Checks a force: its values, its place and its strength.
 ///
 /// # Errors
-/// Refuses a poke that is not finite, too strong, or off the tissue.
+/// Refuses a force that is not finite, above the limit `point_force_n`, or not near the tissue.
 pub fn check_poke(poke: &Poke, shape: &dyn RestShape, limits: &Limits) -> Result<()> {
     not_negative("force.falloff_per_m", poke.falloff_per_m)?;
     finite("force.falloff_offset", poke.falloff_offset)?;
@@ -37,10 +38,11 @@ pub fn check_poke(poke: &Poke, shape: &dyn RestShape, limits: &Limits) -> Result
     check_force("force.force_n", poke.force_n, libm::exp(poke.falloff_offset), limits.point_force_n)
 }
 
-/// Checks a displacement of a grasped point.
+/// Checks the length of a displacement of a grasped point, m.
 ///
 /// # Errors
-/// Refuses one beyond the limit.
+/// Refuses a length above the limit `reach_in_sheets` times the tissue's longest side; `field` is the key that
+/// the refusal gives.
 pub fn check_reach(field: &str, shape: &dyn RestShape, displacement_m: f64, limits: &Limits) -> Result<()> {
     let limit_m = shape.longest_side_m() * limits.reach_in_sheets;
     let range = format!("at most {} m from the rest position", legible(limit_m));
@@ -48,7 +50,8 @@ pub fn check_reach(field: &str, shape: &dyn RestShape, displacement_m: f64, limi
     Ok(())
 }
 
-/// Asks, behind the refusal of a length, whether it is in millimetres: it would be right if it were.
+/// Adds to the refusal of a length the question whether it is in millimetres, if it would then be within the
+/// limit.
 fn in_millimetres(length_m: f64, limit_m: f64) -> impl Fn(Refusal) -> Refusal {
     let might_be = length_m > limit_m && length_m * 1e-3 <= limit_m;
     move |refusal| {
@@ -57,10 +60,10 @@ fn in_millimetres(length_m: f64, limit_m: f64) -> impl Fn(Refusal) -> Refusal {
     }
 }
 
-/// Checks whether a point can be grasped.
+/// Checks that a point can be grasped.
 ///
 /// # Errors
-/// Refuses a point that is fixed.
+/// Refuses a fixed point; `field` is the key that the refusal gives.
 pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<()> {
     if shape.is_fixed(point) {
         let message = format!("{} is fixed, and can't be grasped", shape.name(point));
@@ -69,13 +72,14 @@ pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<
     Ok(())
 }
 
-/// The largest radius of a tip on a mesh, in lengths of an edge.
+/// The largest radius of a tip on a mesh, in edge lengths.
 const MAX_EDGES: f64 = 32.0;
 
-/// Checks whether a tool with this tip fits the tissue.
+/// Checks that a tip suits the tissue: radius, friction and coupling.
 ///
 /// # Errors
-/// Refuses a value that is not finite or out of range; `field` is the name that the refusal gives.
+/// Refuses a value that is not finite or out of range; `field` is the key that the refusal gives. The radius
+/// may be at most the tissue's longest side, and on a mesh at most 32 edge lengths.
 pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
     let longest_m = shape.longest_side_m();
     let (most_m, what) = match MAX_EDGES * shape.edge_m() {

@@ -1,4 +1,4 @@
-//! Scenes and scripts by name: the files `NAME.toml` of a folder, and the built-in texts.
+//! Finds scenes and scripts by name: the files `NAME.toml` of a folder, and the built-in texts.
 
 use std::path::{Path, PathBuf};
 
@@ -11,18 +11,18 @@ use crate::scene::script_reader::made_for;
 use crate::scene::toml_document::Document;
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt};
 
-/// Texts by name.
+/// The scenes or the scripts that can be given by name: those of a folder and the built-in ones.
 #[derive(Debug, Clone)]
 pub struct Collection {
     folder: PathBuf,
     built_in: &'static [(&'static str, &'static str)],
     kind: TextKind,
-    /// Whether refusals may name files of the present folder.
+    /// Whether refusals may suggest files of the working directory.
     names_files: bool,
 }
 
 impl Collection {
-    /// Returns the scenes or scripts of a folder, which may be missing, and the built-in ones.
+    /// Creates the collection of a folder, which need not exist, and the built-in texts of that kind.
     pub fn new(kind: TextKind, folder: &Path) -> Self {
         let built_in: &'static [_] = match kind {
             TextKind::Scene => &BUILT_IN,
@@ -31,24 +31,25 @@ impl Collection {
         Collection { folder: folder.to_owned(), built_in, kind, names_files: false }
     }
 
-    /// The same for a user of the program in whose folder it runs, not for clients: an unknown name may be meant as a file
-    /// of that folder.
+    /// Returns the collection for a user of a command-line program, not for clients: refusals may suggest a
+    /// file of the working directory.
     #[must_use]
     fn for_user(self) -> Self {
         Collection { names_files: true, ..self }
     }
 
-    /// Returns the folder.
+    /// Returns the folder that is searched first.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// Returns every name, sorted, but for those of files that belong into the folder of the other kind.
+    /// Returns every name, sorted, without those of files that belong in the folder of the other kind.
     pub fn names(&self, limits: &Limits) -> Vec<String> {
         self.files_and_built_in().into_iter().filter(|name| self.misplaced(name, limits).is_none()).collect()
     }
 
-    /// Returns of these the names whose text is wanted, by name and text, and those that can't be read. Each file is read once.
+    /// Returns the names, sorted, whose name and text `is_wanted` accepts, and the names of files that can't be
+    /// read. Files of the other kind are left out. Each file is read once.
     pub fn names_where(
         &self,
         others: &Collection,
@@ -63,7 +64,7 @@ impl Collection {
         self.files_and_built_in().into_iter().filter(stays).collect()
     }
 
-    /// Returns the refusals of files that belong into the folder of the other kind, by their names.
+    /// Returns a refusal for each file that belongs in the folder of the other kind, sorted by name.
     pub fn all_misplaced(&self, limits: &Limits) -> Vec<Refusal> {
         self.files_and_built_in().iter().filter_map(|name| self.misplaced(name, limits)).collect()
     }
@@ -73,7 +74,7 @@ impl Collection {
         self.refuse_other_kind(&format!("{name}.toml"), &text).err()
     }
 
-    /// Refuses the text of a file of the folder that is of the other kind.
+    /// Refuses the text of a file of this folder if it is of the other kind.
     fn refuse_other_kind(&self, file: &str, text: &str) -> Result<()> {
         if Document::parse(file, text).is_ok_and(|document| self.kind.check(&document).is_err()) {
             let refusal = Refusal::new(Reason::WrongKind, "", self.kind.misplaced());
@@ -98,7 +99,7 @@ impl Collection {
         names
     }
 
-    /// The file of that name in the folder, whatever it is: who reads it tells what is wrong with it.
+    /// Returns the path of that name in the folder, if something is there. Reading it may still fail.
     fn file(&self, name: &str) -> Option<PathBuf> {
         let path = self.folder.join(format!("{name}.toml"));
         (is_name(name) && path.symlink_metadata().is_ok()).then_some(path)
@@ -108,12 +109,12 @@ impl Collection {
         self.file(name).is_some() || self.built_in.iter().any(|text| text.0 == name)
     }
 
-    /// Returns the text of that name, after the name that refusals use for it. A file of the folder overrides a
-    /// built-in text. Refusals name the file without its folder: clients do not learn the server's paths. `others` are
-    /// the texts of the other kind, for the refusal of a name that is one of theirs.
+    /// Returns the text of that name, preceded by the name that refusals use for it. A file in the folder
+    /// overrides a built-in text. Refusals name the file without its folder, so that clients do not learn the
+    /// server's paths. `others` is the collection of the other kind: a name found there gets a hint.
     ///
     /// # Errors
-    /// Refuses a name that it does not have, and a file that can't be read.
+    /// Refuses an unknown name, a file that can't be read, and a file of the other kind.
     pub fn text(&self, name: &str, others: &Collection, limits: &Limits) -> Result<(String, String)> {
         if let Some(path) = self.file(name) {
             let file = format!("{name}.toml");
@@ -150,24 +151,24 @@ impl Collection {
     }
 }
 
-/// Whether `name` is a plain word, which can't lead out of the folder.
+/// Returns whether `name` is a plain word, which can't lead out of the folder.
 fn is_name(name: &str) -> bool {
     !name.is_empty() && name.chars().all(|c| c.is_ascii_alphanumeric() || c == '-' || c == '_')
 }
 
-/// The name in a path that a user gave, if it is one: a plain word that is not a file.
+/// Returns the name that a user gave as a path: a plain word that is not a file.
 fn name_in(path: &Path) -> Option<&str> {
     path.to_str().filter(|name| is_name(name) && !path.is_file())
 }
 
-/// Where the scripts are that a user of the programs can give by name.
+/// Folder of the scripts that a user of the programs can give by name.
 const SCRIPTS: &str = "scripts";
 
-/// Reads the scene that a user gave: a file, or the name of one in `folder` or built in. `--set` assignments override its
-/// keys.
+/// Reads the scene that a user gave: the path of a file, or the name of a scene in `folder` or of a built-in
+/// one. `--set` assignments override its keys.
 ///
 /// # Errors
-/// Refuses what is no scene, and as [`Scene::parse`] does.
+/// Refuses a text that is not a scene, and every text or assignment that [`Scene::parse`] refuses.
 pub fn find_scene(path: &Path, folder: &Path, assignments: &[String], limits: &Limits) -> Result<Scene> {
     let Some(name) = name_in(path) else { return Scene::load(path, assignments, limits) };
     let scenes = Collection::new(TextKind::Scene, folder).for_user();
@@ -175,8 +176,8 @@ pub fn find_scene(path: &Path, folder: &Path, assignments: &[String], limits: &L
     Scene::parse_in(folder, &file, &text, assignments, limits)
 }
 
-/// The text of the script that a user gave, a file or the name of one in ./scripts or built in, after the name that refusals
-/// use for it; and the folder of its traces.
+/// Returns the script that a user gave (a file, or the name of one in ./scripts or of a built-in one): the name
+/// that refusals use for it, its text, and the folder of its traces.
 fn script_text(path: &Path, limits: &Limits) -> Result<(String, String, PathBuf)> {
     let of_file = |path: &Path| {
         let folder = path.parent().unwrap_or(Path::new("")).to_owned();
@@ -191,19 +192,20 @@ fn script_text(path: &Path, limits: &Limits) -> Result<(String, String, PathBuf)
     Ok((file, text, PathBuf::from(SCRIPTS)))
 }
 
-/// Reads the script that a user gave, and binds it to `scene`.
+/// Reads the script that a user gave (a file, or the name of one in ./scripts or of a built-in one) and binds
+/// it to `scene`.
 ///
 /// # Errors
-/// Refuses what is no script, and as [`Script::parse`] does.
+/// Refuses a text that is not a script, and every text that [`Script::parse`] refuses.
 pub fn find_script(path: &Path, scene: &Scene, limits: &Limits) -> Result<Script> {
     let (name, text, folder) = script_text(path, limits)?;
     Script::parse(&name, &text, &folder, scene, limits)
 }
 
-/// Returns the scenes that the script that a user gave is made for; none, if it names none.
+/// Returns the names of the scenes that a user's script is made for; empty if it names none.
 ///
 /// # Errors
-/// Refuses what can't be read.
+/// Refuses a script that can't be read.
 pub fn scenes_of(path: &Path, limits: &Limits) -> Result<Vec<String>> {
     Ok(made_for(&script_text(path, limits)?.1))
 }
@@ -248,7 +250,7 @@ mod tests {
         assert!(scenes.text("../paper", &scripts, &limits).is_err());
         assert!(scripts.text("vertical-60", &scenes, &limits).is_ok());
     }
-    /// Opening a pipe waits for somebody who writes into it: such a file, or one that a scene names, would hold a server's start.
+    /// Opening a pipe waits for a writer: such a file, or one that a scene names, would block a server's start.
     #[cfg(unix)]
     #[test]
     fn what_is_no_file_is_told_as_that_and_nobody_waits_for_it() {

@@ -1,23 +1,24 @@
-//! The largest eigenvalue of the Laplacian of a weighted graph with masses, from above, by the method of Lanczos.
+//! Bounds the largest eigenvalue of the Laplacian of a weighted graph with masses from above, by the method of
+//! Lanczos.
 
 use palpate_geometry::work::spend;
 
-/// Steps of Lanczos.
+/// Steps of the method of Lanczos.
 const STEPS: usize = 100;
 
-/// By what part the largest eigenvalue found may be short. From a start at random, the method is short by more with a
-/// probability of at most 1.648·√n·e^(−√SHORT·(2·STEPS − 1)) for n points (Kuczyński and Woźniakowski, Estimating the largest
-/// eigenvalue by the power and Lanczos algorithms with a random start, SIAM Journal on Matrix Analysis and Applications 13(4), 1992,
-/// doi:10.1137/0613066): 10⁻⁹ for a million.
+/// The relative amount by which the largest eigenvalue found may be too small. From a random start, the
+/// shortfall is larger with a probability of at most 1.648·√n·e^(−√SHORT·(2·STEPS − 1)) for n points (Kuczyński
+/// and Woźniakowski, Estimating the largest eigenvalue by the power and Lanczos algorithms with a random start,
+/// SIAM Journal on Matrix Analysis and Applications 13(4), 1992, doi:10.1137/0613066): 10⁻⁹ for a million.
 const SHORT: f64 = 0.02;
 
-/// An upper bound of the largest λ with Σ k_ij/m_i·(x_i − x_j) = λ·x_i. `around` has k_ij/m_i of each point, by its other ends, and
-/// `mass` the m_i.
+/// Returns an upper bound of the largest λ with Σ k_ij/m_i·(x_i − x_j) = λ·x_i. `around` has, for each point i,
+/// its neighbours j with k_ij/m_i; `mass` returns m_i.
 pub(super) fn largest_of_laplacian(around: &[Vec<(u32, f64)>], mass: impl Fn(u32) -> f64) -> f64 {
     #[allow(clippy::cast_possible_truncation)]
     let roots: Vec<f64> = (0..around.len() as u32).map(|point| mass(point).sqrt()).collect();
     let degrees: Vec<f64> = around.iter().map(|others| others.iter().map(|(_, k)| k).sum()).collect();
-    // With √m·x in place of x it is symmetric.
+    // With √m·x in place of x, the operator is symmetric.
     let applied = |x: &[f64], into: &mut [f64]| {
         for (point, others) in around.iter().enumerate() {
             spend(1 + others.len());
@@ -38,7 +39,7 @@ pub(super) fn largest_of_laplacian(around: &[Vec<(u32, f64)>], mass: impl Fn(u32
         matrix.diagonal.push(along);
         let length = dot(&next, &next).sqrt();
         matrix.beside.push(length);
-        // All that the start has a part of has been found.
+        // The Krylov space of the start is exhausted.
         if length <= 1e-12 * along.abs() {
             break;
         }
@@ -53,10 +54,11 @@ fn dot(a: &[f64], b: &[f64]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
 }
 
-/// A direction that has nothing to do with any graph, and is the same every time; of length 1.
+/// Returns a unit vector that is independent of any graph and the same on every call.
 #[allow(clippy::cast_possible_truncation)]
 fn start(count: usize) -> Vec<f64> {
-    // SplitMix64 (Steele, Lea and Flood 2014). A sum of four even numbers is nearly a normal one, so that no direction is likelier.
+    // SplitMix64 (Steele, Lea and Flood 2014). A sum of four uniform numbers is nearly normal, so that no
+    // direction is more likely.
     let even = |n: u64| {
         let mut bits = n.wrapping_mul(0x9E37_79B9_7F4A_7C15);
         bits = (bits ^ (bits >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -69,16 +71,16 @@ fn start(count: usize) -> Vec<f64> {
     x
 }
 
-/// A symmetric matrix of a diagonal and what is beside it.
+/// A symmetric tridiagonal matrix: its diagonal and the entries beside it.
 #[derive(Default)]
 struct Tridiagonal {
     diagonal: Vec<f64>,
-    /// The last one is not of the matrix.
+    /// The last entry is not part of the matrix.
     beside: Vec<f64>,
 }
 
 impl Tridiagonal {
-    /// By bisection, from above.
+    /// Returns the largest eigenvalue, by bisection, rounded up.
     fn largest_eigenvalue(&self) -> f64 {
         let reach = |at: usize| {
             let before = if at > 0 { self.beside[at - 1] } else { 0.0 };
@@ -93,14 +95,15 @@ impl Tridiagonal {
         high
     }
 
-    /// Whether an eigenvalue is above a value: whether a pivot of the matrix minus that is positive.
+    /// Returns whether an eigenvalue is above a value: whether a pivot of the matrix minus that value is
+    /// positive.
     fn has_above(&self, value: f64) -> bool {
         let mut pivot = f64::INFINITY;
         let mut before = 0.0;
         self.diagonal.iter().zip(&self.beside).any(|(along, beside)| {
             pivot = along - value - before * before / pivot;
             before = *beside;
-            // A pivot of 0 is as good as one just below.
+            // A pivot of 0 may be replaced by one just below 0.
             if pivot == 0.0 {
                 pivot = -f64::MIN_POSITIVE;
             }

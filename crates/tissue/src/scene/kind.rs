@@ -1,22 +1,22 @@
-//! Scenes and scripts are told apart by their keys, because people give one where the other is wanted.
+//! Distinguishes scenes from scripts by their keys, because users often give one where the other is wanted.
 
 use crate::scene::toml_document::Document;
 use palpate_refusal::{Reason, Result};
 
-/// What a text is about.
+/// The kind of a TOML text: scene or script.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TextKind {
-    /// A tissue.
+    /// Describes a tissue.
     Scene,
-    /// What is done to it.
+    /// Describes what is done to a tissue.
     Script,
 }
 
-/// How to give both.
+/// Hint in refusals: the order of scene and script on the command line.
 pub(super) const ORDER: &str = "give the scene first, then the script (of `replay`: the script, then --scene)";
 
 impl TextKind {
-    /// Returns what it is called.
+    /// Returns the word for this kind in messages: `"scene"` or `"script"`.
     pub fn name(self) -> &'static str {
         match self {
             TextKind::Scene => "scene",
@@ -24,7 +24,7 @@ impl TextKind {
         }
     }
 
-    /// Returns the other one.
+    /// Returns the other kind.
     #[must_use]
     pub fn other(self) -> Self {
         match self {
@@ -33,7 +33,7 @@ impl TextKind {
         }
     }
 
-    /// Keys that the other does not have.
+    /// Returns top-level keys that only this kind has.
     fn keys(self) -> &'static [&'static str] {
         match self {
             TextKind::Scene => &["sheet", "mesh", "springs", "anchor_springs", "damping", "volume", "stepping"],
@@ -41,13 +41,13 @@ impl TextKind {
         }
     }
 
-    /// The refusal of a text of the other kind in a folder of this kind, where nobody has mixed up the order of arguments.
+    /// Returns the message for a text of the other kind that lies in the folder of this kind.
     pub(super) fn misplaced(self) -> String {
         let other = self.other().name();
         format!("is a {other} in the folder of {}s: move it to the folder of {other}s", self.name())
     }
 
-    /// Refuses a document that has keys of the other kind and none of this one.
+    /// Refuses a document that has keys of the other kind and none of this kind.
     pub(super) fn check(self, document: &Document) -> Result<()> {
         let has_keys_of = |kind: TextKind| kind.keys().iter().any(|key| document.has(key));
         if has_keys_of(self) || !has_keys_of(self.other()) {

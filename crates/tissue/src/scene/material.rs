@@ -1,4 +1,5 @@
-//! The sections `[material]` and `[[inclusion]]` of a scene on a mesh: what the tissue is made of, and where it differs.
+//! The sections `[material]` and `[[inclusion]]` of a scene on a mesh: the material of the tissue, and regions
+//! where it differs.
 
 use std::sync::Arc;
 
@@ -17,47 +18,47 @@ const EQUAL_SIDES: f64 = 0.866_025_403_784_438_6;
 /// ν of a membrane of springs.
 const POISSON: f64 = 1.0 / 3.0;
 
-/// A third of what is beneath the surface moves along: its displacement falls linearly with depth.
+/// A third of the mass beneath the surface counts: its displacement falls linearly with depth.
 const MOVES_ALONG: f64 = 1.0 / 3.0;
 
-/// What a tissue on a mesh is made of.
+/// The material of a tissue on a mesh: an elastic capsule on a soft foundation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Material {
     /// E of the capsule, Pa. Its ν is 1/3.
     pub youngs_modulus_pa: f64,
     /// Thickness t of the capsule, m.
     pub thickness_m: f64,
-    /// ρ of what moves along, kg/m³.
+    /// Density ρ of the tissue that moves along with the capsule, kg/m³.
     pub density_kg_per_m3: f64,
-    /// How deep that is, m.
+    /// Depth of the tissue that moves along, m.
     pub depth_m: f64,
-    /// What pulls back to the rest shape, N/m for each m² of surface.
+    /// Stiffness of the foundation, which pulls back to the rest shape, N/m for each m² of surface.
     pub foundation_n_per_m3: f64,
-    /// Damping of a point on its anchor spring, over the critical.
+    /// Damping ratio of a point on its anchor spring alone; 1 is critical.
     pub damping_ratio: f64,
 }
 
-/// A tissue of a material: the mesh, and the coefficients of reference.
+/// A tissue made of a material: the mesh, and the reference coefficients.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MadeOf {
-    /// The mesh.
+    /// The mesh, with the factors of its points and springs.
     pub mesh: Mesh,
-    /// k of an edge between triangles with equal sides, N/m.
+    /// Reference k, N/m: that of an edge between triangles with equal sides.
     pub stiffness_n_per_m: f64,
-    /// K″ of a vertex of mean area, N/m.
+    /// Reference K″, N/m: that of a vertex of mean area.
     pub anchor_stiffness_n_per_m: f64,
-    /// C of a vertex of mean area, N·s/m.
+    /// Reference C, N·s/m: that of a vertex of mean area.
     pub damping_n_s_per_m: f64,
 }
 
 impl Material {
-    /// Why a coefficient is refused beside a material.
+    /// Message of the refusal of a coefficient beside a material.
     pub const FOLLOWS: &str = "does not go with [material], from which it follows";
 
-    /// Why a sheet has no material and no inclusions.
+    /// Message of the refusal of a material or an inclusion on a sheet.
     pub const OF_A_MESH: &str = "is for a mesh: a sheet has the same points and springs all over";
 
-    /// Creates a material of the usual density, depth and damping.
+    /// Creates a material of usual soft tissue: density 1060 kg/m³, depth 0.03 m, damping ratio 0.5.
     pub fn new(youngs_modulus_pa: f64, thickness_m: f64, foundation_n_per_m3: f64) -> Self {
         let (density_kg_per_m3, depth_m, damping_ratio) = (1060.0, 0.03, 0.5);
         Material { youngs_modulus_pa, thickness_m, density_kg_per_m3, depth_m, foundation_n_per_m3, damping_ratio }
@@ -92,23 +93,26 @@ impl Material {
         Ok(())
     }
 
-    /// Returns a tissue of this material, with springs of bending whose k is the part `bending` of that of the edge
-    /// they cross.
+    /// Returns a tissue of this material. `bending` is the k of the bending springs relative to that of the
+    /// edge they cross; 0 creates none.
     ///
-    /// A vertex has a third of the area of its triangles, A, and mass, K″ and C by that (one without an edge those of the mean):
+    /// A vertex has the area A, a third of that of its triangles. Mass, K″ and C follow from it (a vertex
+    /// without an edge gets the mean values):
     ///
     /// m = ρ·H·A/3,  K″ = k″·A,  C = 2ζ·√(K″·m),
     ///
-    /// with H how deep the tissue moves along: of displacements that fall linearly with depth, the kinetic energy is that of a third
-    /// of the mass. ζ is the damping ratio of a point on its anchor spring alone.
+    /// where H is the depth of the tissue that moves along. If displacements fall linearly with depth, the
+    /// kinetic energy is that of a third of the mass. ζ is the damping ratio of a point on its anchor spring
+    /// alone.
     ///
-    /// An edge of length L between triangles of areas A₁ and A₂ has k = E·t·(A₁ + A₂)/L² (Van Gelder, Approximate simulation of elastic
-    /// membranes by triangulated spring meshes, Journal of Graphics Tools 3(2), 1998), times one factor for the mesh that makes its
-    /// springs, those of bending included, store what the material does when it is stretched alike to all sides: E·t/(1 − ν) on each m²
-    /// for a strain of 1, with ν = 1/3 (`membrane`).
+    /// An edge of length L between triangles of areas A₁ and A₂ has k = E·t·(A₁ + A₂)/L² (Van Gelder,
+    /// Approximate simulation of elastic membranes by triangulated spring meshes, Journal of Graphics Tools
+    /// 3(2), 1998), times one factor for the whole mesh. With this factor, all springs, those of bending
+    /// included, store the energy of the material when it is stretched equally in all directions: E·t/(1 − ν)
+    /// on each m² for a strain of 1, with ν = 1/3 (module `membrane`).
     ///
     /// # Errors
-    /// Refuses a number out of its range, and a mesh with a vertex without area.
+    /// Refuses a value out of its range, and a mesh with a vertex that has edges but no area.
     pub fn applied(&self, bending: f64, shape: Arc<MeshShape>) -> Result<MadeOf> {
         self.check()?;
         let Spread { of_vertices_m2, beside_edges_m2 } = Spread::of(&shape);
@@ -154,8 +158,8 @@ impl Material {
     }
 }
 
-/// E·t of a membrane of the springs of a mesh, where an edge between triangles with equal sides has k = √3/2: a strain of 1
-/// to all sides stores E·t/(1 − ν) on each m².
+/// Returns E·t of the membrane that a mesh's springs form, where an edge between triangles with equal sides has
+/// k = √3/2. A strain of 1 in all directions stores E·t/(1 − ν) on each m².
 fn modulus(mesh: &Mesh, whole_m2: f64) -> f64 {
     let shape = &mesh.shape;
     let springs = mesh.springs().map(|(ends, k)| (ends, EQUAL_SIDES * k));
@@ -166,11 +170,11 @@ fn modulus(mesh: &Mesh, whole_m2: f64) -> f64 {
     if modulus > 0.1 { modulus } else { 1.0 }
 }
 
-/// How the area of a mesh is spread.
+/// How the area of a mesh is distributed over vertices and edges.
 struct Spread {
-    /// A third of the area of each vertex's triangles.
+    /// A third of the area of each vertex's triangles, m².
     of_vertices_m2: Vec<f64>,
-    /// The area of the triangles beside each edge.
+    /// The area of the triangles beside each edge, m².
     beside_edges_m2: Vec<f64>,
 }
 
@@ -196,36 +200,37 @@ impl Spread {
 /// A region of a mesh that is stiffer or softer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Inclusion {
-    /// Where it is.
+    /// Where the region is.
     pub region: Region,
-    /// k of the springs there over that around.
+    /// k of the springs inside divided by k outside.
     pub stiffness_factor: f64,
-    /// K″ of the points there over that around.
+    /// K″ of the points inside divided by K″ outside.
     pub anchor_stiffness_factor: f64,
-    /// So far beyond the region the factors fall to 1, m: a factor f acts as 1 + (f − 1)·p, with p = 1 within the region and
-    /// p = 1 − x²·(3 − 2x) at x times this distance beyond it. A spring has the mean p of its ends.
+    /// Width of the transition around the region, in which the factors fall to 1, m. A factor f acts as 1 + (f
+    /// − 1)·p, with p = 1 within the region and p = 1 − x²·(3 − 2x) at x times this distance beyond it. A
+    /// spring has the mean p of its ends.
     pub edge_m: f64,
 }
 
-/// Some of a surface.
+/// A part of a surface.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Region {
-    /// What is within a ball.
+    /// The part within a ball.
     Ball {
         /// Its centre, m.
         centre_m: DVec3,
         /// Its radius, m.
         radius_m: f64,
     },
-    /// The group of the mesh that has this name.
+    /// The vertices of the mesh's group with this name.
     Group(String),
 }
 
 impl Region {
-    /// Creates a region: a ball or a group.
+    /// Creates a region from either a ball (centre and radius, m) or the name of a group.
     ///
     /// # Errors
-    /// Refuses both, neither, and half a ball.
+    /// Refuses both, neither, and a ball without centre or radius.
     pub fn of(centre_m: Option<DVec3>, radius_m: Option<f64>, group: Option<String>) -> Result<Self> {
         let refuse = |reason, key, message| Err(Refusal::new(reason, key, message));
         match (centre_m, radius_m, group) {
@@ -244,7 +249,8 @@ impl Region {
         }
     }
 
-    /// How far each vertex is beyond it, m: 0 or less within, any number above `most_m` farther away than that.
+    /// Returns how far each vertex is beyond the region, m: 0 or less within it. Where the distance is above
+    /// `most_m`, any number above `most_m`.
     fn beyond_m(&self, shape: &MeshShape, most_m: f64) -> Vec<f64> {
         match self {
             Region::Ball { centre_m, radius_m } => {
@@ -258,14 +264,14 @@ impl Region {
     }
 }
 
-/// Inclusions of a scene at most.
+/// Largest number of inclusions in a scene.
 const MAX_INCLUSIONS: usize = 256;
 
-/// Vertices that all of them together look at, at most: each looks at every one.
+/// Largest number of inclusions times vertices: each inclusion examines every vertex.
 const MAX_LOOKED_AT: usize = 8_000_000;
 
 impl Inclusion {
-    /// Creates an inclusion whose factors make no difference.
+    /// Creates an inclusion whose factors are 1, so that it changes nothing.
     pub fn even(region: Region) -> Self {
         Inclusion { region, stiffness_factor: 1.0, anchor_stiffness_factor: 1.0, edge_m: 0.0 }
     }
@@ -292,7 +298,7 @@ impl Inclusion {
         })
     }
 
-    /// Checks one that refusals call `field`.
+    /// Checks an inclusion; `field` is its key in refusals.
     fn check(&self, field: &str, shape: &MeshShape) -> Result<()> {
         let named = |key: &str| format!("{field}.{key}");
         let factors =
@@ -319,14 +325,14 @@ impl Inclusion {
         Ok(())
     }
 
-    /// How much each vertex belongs to it: 1 within, 0 beyond its edge, smooth between.
+    /// Returns how much each vertex belongs to the inclusion: 1 within, 0 beyond its edge, smooth between.
     fn parts(&self, shape: &MeshShape) -> Vec<f64> {
         let mut parts = self.region.beyond_m(shape, self.edge_m);
         for part in &mut parts {
             *part = if *part <= 0.0 {
                 1.0
             } else {
-                // Of an edge of 0, this is infinite; of one of −0 it must not be below all.
+                // With an edge of 0, this is infinite; an edge of −0 must not give minus infinity.
                 let x = *part / unsigned_zero(self.edge_m);
                 if x < 1.0 { 1.0 - x * x * (3.0 - 2.0 * x) } else { 0.0 }
             };
@@ -334,11 +340,12 @@ impl Inclusion {
         parts
     }
 
-    /// Returns the same mesh with some inclusions; where several are, their factors multiply. `field` is what refusals
-    /// call the list.
+    /// Returns the mesh with inclusions applied; where several overlap, their factors multiply. `field` is the
+    /// key of the list in refusals.
     ///
     /// # Errors
-    /// Refuses too many, a number out of its range, a group that the mesh has not got, and a ball without a vertex.
+    /// Refuses too many inclusions (256, fewer on a very large mesh), a value out of its range, a group that
+    /// the mesh does not have, and a ball without a vertex.
     pub fn put_into(inclusions: &[Inclusion], field: &str, mesh: &Mesh) -> Result<Mesh> {
         let shape = &mesh.shape;
         let count = shape.vertices_m().len();

@@ -1,21 +1,21 @@
-//! What a membrane of springs stores when it is strained, once its points have settled: by that the stiffness of a material's
-//! springs is set.
+//! Computes the energy that a membrane of springs stores under strain, once its points have settled. It
+//! determines the stiffness of a material's springs.
 //!
-//! Springs along the edges of a mesh that is uneven give way: points move a little within the surface, and the membrane is
-//! softer than the sum of its springs says. (Measured: 10 % on jittered points.) So the springs are strained by a given
-//! amount, the points move within their tangent planes until the energy is least, and that energy is compared with the
-//! material's. A surface without border can't shrink as a whole by such movements, so all of it is looked at, whatever its
-//! shape; points on a border are held.
+//! The springs along the edges of an uneven mesh give way: points move a little within the surface, and the
+//! membrane is softer than the sum of its springs. (Measured: 10 % on jittered points.) So the springs are
+//! strained by a given amount, the points move within their tangent planes until the energy is least, and that
+//! energy is compared with the material's. A surface without a border can't shrink as a whole by such
+//! movements, so the computation covers all of it, whatever its shape; points on a border are held.
 
 use glam::{DMat3, DVec3};
 use palpate_geometry::work::spend;
 
-/// Steps of the conjugate gradients at most, and the part of the first residual at which they end. (What is left is then some
-/// ten thousandths of the energy.)
+/// Largest number of conjugate-gradient steps, and the fraction of the first residual at which they end. (The
+/// remaining error is then some ten thousandths of the energy.)
 const MAX_STEPS: usize = 120;
 const RESIDUAL: f64 = 1e-5;
 
-/// A spring with what it gains by the strain, and by movements of its ends along two tangents each.
+/// A spring, with what it gains in length by the strain and by movements of its ends along two tangents each.
 struct Strained {
     ends: [usize; 2],
     stiffness: f64,
@@ -24,7 +24,7 @@ struct Strained {
 }
 
 impl Strained {
-    /// What movements of the ends add to its length.
+    /// Returns what movements of the ends add to its length.
     fn gained(&self, moved: &[[f64; 2]]) -> f64 {
         let of = |end: usize| {
             let ([a, b], [c, d]) = (self.along[end], moved[self.ends[end]]);
@@ -33,7 +33,7 @@ impl Strained {
         of(0) + of(1)
     }
 
-    /// Adds a force along it.
+    /// Adds a force along the spring to both ends.
     fn add(&self, force: f64, to: &mut [[f64; 2]]) {
         for (end, along) in self.ends.iter().zip(self.along) {
             to[*end][0] += force * along[0];
@@ -42,8 +42,8 @@ impl Strained {
     }
 }
 
-/// The least energy of springs, given by ends and k, that are strained and whose points, unless held, move within their
-/// tangent planes; J.
+/// Returns the least energy of strained springs, J. Springs are given by their ends and k; points that are not
+/// held move within their tangent planes.
 pub(super) fn settled_energy_j(
     [vertices_m, normals]: [&[DVec3]; 2],
     springs: impl Iterator<Item = ([u32; 2], f64)>,

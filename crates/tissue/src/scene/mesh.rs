@@ -23,57 +23,62 @@ use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, po
 /// A triangle mesh with a mass point at each vertex and a spring along each edge.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mesh {
-    /// Mass of each point, or that of reference, kg.
+    /// The reference mass, kg: the mass of each point, unless `differences` has others.
     pub point_mass_kg: f64,
-    /// k of the springs between the two vertices opposite an edge, as a part of that of an edge; 0 without such springs.
+    /// k of the bending springs relative to k of the edge that they cross; 0 without such springs. A bending
+    /// spring joins the two vertices opposite an edge.
     pub bending: f64,
-    /// Where the points rest and how they lie together.
+    /// Where the points rest and how they are joined.
     pub shape: Arc<MeshShape>,
-    /// How its points and springs differ from each other.
+    /// How the points and springs differ from the reference values.
     pub differences: Arc<PerNodeFactors>,
-    /// The largest stiffness of its springs.
+    /// An upper bound of the stiffness of the springs, which limits the substep.
     pub stiffest: StiffnessBound,
-    /// What it encloses, if that resists.
+    /// The enclosed volume, if it resists changes (section `[volume]`).
     pub volume: Option<Arc<Volume>>,
 }
 
-/// How points and springs of a mesh differ from those of reference. A list is empty where none does. C/m is the same at every
-/// point.
+/// Masses and stiffnesses of single points and springs, relative to the reference values of the scene. A list
+/// is empty if all of its points or springs have the reference value. C/m is the same at every point.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PerNodeFactors {
-    /// Mass of each point over that of reference.
+    /// Mass of each point divided by the reference mass.
     pub relative_mass: Vec<f64>,
-    /// K″/m of each point over that of reference, minus 1.
+    /// K″/m of each point divided by the reference value, minus 1.
     pub extra_anchor: Vec<f64>,
-    /// k of each edge over that of reference.
+    /// k of each edge divided by the reference k, in the order of [`MeshShape::edges`].
     pub edges: Vec<f64>,
-    /// k of each spring of bending over the part `bending` of that of reference.
+    /// k of each bending spring divided by `bending` times the reference k, in the order of
+    /// [`MeshShape::opposite`].
     pub bending: Vec<f64>,
 }
 
-/// The largest eigenvalue of the stiffness of springs under any deformation, and where it comes from.
+/// An upper bound of the largest eigenvalue of the springs' stiffness under any deformation, and the place of
+/// that vibration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StiffnessBound {
-    /// The eigenvalue, with the masses of reference, is at most this, over the k of reference: that of the Laplacian of the weighted
-    /// graph, Σ k_ij/m_i·(x_i − x_j) = λ·x_i, since a spring along n contributes at most k·I to the stiffness under any deformation.
+    /// Upper bound of the eigenvalue, with the reference masses, divided by the reference k. It bounds the
+    /// Laplacian of the weighted graph, Σ k_ij/m_i·(x_i − x_j) = λ·x_i, since a spring along n contributes at
+    /// most k·I to the stiffness under any deformation.
     pub bound: f64,
-    /// The vertex that has most of it.
+    /// The vertex that moves most in the fastest vibration.
     pub vertex: u32,
-    /// What the bound would be by half of the springs.
+    /// The bound for the median spring: half of the springs have at most this.
     pub usual: f64,
-    /// The largest of what K″/m of a point is above that of reference, over that, at least 0.
+    /// The largest excess of K″/m of a point over the reference value, divided by that value; at least 0.
     pub extra_anchor: f64,
 }
 
-/// The rest shape of a mesh: point n is vertex n of the file, unless another mesh is shown.
+/// The rest shape of a mesh. Point n is vertex n of the file, unless the simulated mesh is not the mesh of the
+/// file.
 #[derive(Debug, PartialEq)]
 pub struct MeshShape {
     vertices_m: Vec<DVec3>,
     triangles: Vec<[u32; 3]>,
     normals: Vec<DVec3>,
-    /// The vertices of each edge, ascending; edges ascending.
+    /// The two vertices of each edge, ascending; edges ascending.
     edges: Vec<[u32; 2]>,
-    /// The vertices opposite each edge that has two triangles, ascending, and that edge.
+    /// The two vertices opposite each edge that has two triangles, ascending. `crossed` has that edge.
     opposite: Vec<[u32; 2]>,
     crossed: Vec<[u32; 2]>,
     neighbours: Neighbours,
@@ -89,24 +94,25 @@ pub struct MeshShape {
     shown: Option<Shown>,
 }
 
-/// What clients are told of a mesh, and the tissue does not need.
+/// Facts about a mesh that clients receive and the simulation does not need.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshMetadata {
-    /// How the scene says which vertices never move.
+    /// The vertices that never move, as the scene specifies them.
     pub fixed: FixedVertices,
     /// Texture coordinates of each vertex, if the file has them; at a seam, those of one side.
     pub uv: Option<Vec<[f32; 2]>>,
-    /// Vertices with a name.
+    /// Named groups of vertices.
     pub groups: Vec<Group>,
-    /// What was done with the mesh of the file, and what is doubtful about it, in words.
+    /// What was done with the mesh of the file, and doubts about it, as sentences for the user.
     pub findings: Vec<String>,
 }
 
 impl Mesh {
-    /// Why the mass of a point is refused beside a material.
+    /// Message of the refusal of a point mass beside a material.
     pub const WEIGHED: &str = "does not go with [material], which says what a point weighs";
 
-    /// Reads the section `[mesh]`; with a material, which says what a point weighs, its edges are flipped to Delaunay.
+    /// Reads the section `[mesh]`. `of_material` says that a section `[material]` gives the masses; then the
+    /// edges are flipped to Delaunay.
     pub(super) fn read(fields: &mut Fields<'_>, files: Files<'_>, of_material: bool, limits: &Limits) -> Result<Self> {
         let (source_mesh, source) = files.mesh(fields, limits)?;
         let point_mass_kg = match fields.item("point_mass_kg") {
@@ -139,18 +145,20 @@ impl Mesh {
         made.map_err(|refusal| source.refuse(refusal.reason, refusal.message))
     }
 
-    /// Returns the stiffness of a mesh without springs of bending.
+    /// Creates a tissue on a mesh with equal springs along its edges, without bending springs. `point_mass_kg`
+    /// is the mass of each point.
     ///
     /// # Errors
-    /// As for [`MeshShape::new`].
+    /// Refuses every mesh that [`MeshShape::new`] refuses.
     pub fn of(mesh: TriangleMesh, point_mass_kg: f64, fixed: FixedVertices) -> Result<Self> {
         Self::simulating(Simulated { mesh, shown: None, findings: Vec::new() }, point_mass_kg, fixed)
     }
 
-    /// Does the same of a mesh that another may be shown for.
+    /// Creates a tissue on a simulated mesh, for which the mesh of the file may be shown. It has equal springs
+    /// along its edges and no bending springs.
     ///
     /// # Errors
-    /// As for [`MeshShape::new`].
+    /// Refuses every mesh that [`MeshShape::new`] refuses.
     pub fn simulating(simulated: Simulated, point_mass_kg: f64, fixed: FixedVertices) -> Result<Self> {
         let Simulated { mesh, shown, mut findings } = simulated;
         let balls = if let FixedVertices::Balls(balls) = &fixed { balls.as_slice() } else { &[] };
@@ -186,13 +194,14 @@ impl Mesh {
         Ok(Mesh::new(point_mass_kg, 0.0, Arc::new(shape)))
     }
 
-    /// Creates a mesh of a shape, a mass and the stiffness of its springs of bending relative to that of its edges; all points and all edges
-    /// are alike.
+    /// Creates a tissue in which all points and all edges are alike. `bending` is the k of the bending springs
+    /// relative to that of the edges; 0 creates none.
     pub fn new(point_mass_kg: f64, bending: f64, shape: Arc<MeshShape>) -> Self {
         Self::uneven(point_mass_kg, bending, shape, PerNodeFactors::default())
     }
 
-    /// Returns the same where points and springs differ.
+    /// Creates a tissue whose points and springs differ by the factors in `differences`. `bending` is the k of
+    /// the bending springs relative to that of the edges; 0 creates none.
     pub fn uneven(point_mass_kg: f64, bending: f64, shape: Arc<MeshShape>, differences: PerNodeFactors) -> Self {
         let stiffest = StiffnessBound { bound: 0.0, vertex: 0, usual: 0.0, extra_anchor: 0.0 };
         let differences = Arc::new(differences);
@@ -201,7 +210,7 @@ impl Mesh {
         mesh
     }
 
-    /// Returns the same mesh, closed, with the volume that it encloses.
+    /// Adds the volume that the mesh encloses. The mesh must be closed.
     ///
     /// # Errors
     /// Refuses a mesh that encloses no volume, or several.
@@ -212,23 +221,24 @@ impl Mesh {
         Ok(self)
     }
 
-    /// Returns the mass of a point over that of reference.
+    /// Returns the mass of a point divided by the reference mass.
     pub fn relative_mass(&self, point: PointId) -> f64 {
         self.differences.relative_mass.get(point.index()).copied().unwrap_or(1.0)
     }
 
-    /// Returns K″/m of a point over that of reference, minus 1.
+    /// Returns K″/m of a point divided by the reference value, minus 1.
     pub fn extra_anchor(&self, point: PointId) -> f64 {
         self.differences.extra_anchor.get(point.index()).copied().unwrap_or(0.0)
     }
 
-    /// Returns the mass of all points that have an edge, kg: Σ m_i.
+    /// Returns the total mass of the points that have an edge, kg.
     pub fn mass_kg(&self) -> f64 {
         let used = (0..self.shape.vertices_m.len()).filter(|vertex| self.shape.is_used(*vertex));
         self.point_mass_kg * used.map(|vertex| self.relative_mass(PointId::new(vertex))).sum::<f64>()
     }
 
-    /// Returns every spring: its ends, and its k over that of reference.
+    /// Returns every spring as its two ends and its k divided by the reference k: first edges, then bending
+    /// springs.
     pub fn springs(&self) -> impl Iterator<Item = ([u32; 2], f64)> + '_ {
         let (shape, part) = (&self.shape, self.bending);
         let PerNodeFactors { edges, bending: bending_factors, .. } = &*self.differences;
@@ -238,8 +248,9 @@ impl Mesh {
         along.chain(bending.iter().enumerate().map(move |(which, ends)| (*ends, part * of(bending_factors, which))))
     }
 
-    /// The vertices around the one that the fastest vibration has most of, at most so many, turned so that its normal is
-    /// along z; and three of them: that one, one about half way to the rim of the part, and one at the rim.
+    /// Returns a part of at most `most` vertices around the one that moves most in the fastest vibration,
+    /// turned so that its normal is along z. Also returns three of its points: that vertex, one about half way
+    /// to the rim of the part, and one at the rim.
     #[allow(clippy::cast_possible_truncation)]
     pub(super) fn part(&self, most: usize) -> (Self, [PointId; 3]) {
         let shape = &self.shape;
@@ -294,17 +305,20 @@ impl Mesh {
         }
     }
 
-    /// A spring along n contributes at most k·I to the stiffness matrix, whatever the deformation (`tissue::stability`), so
-    /// the matrix is at most the weighted Laplacian of the graph. Over the masses, its largest eigenvalue is at most the
-    /// largest of
+    /// Finds an upper bound of the stiffness and the vertex where it is largest.
+    ///
+    /// A spring along n contributes at most k·I to the stiffness matrix under any deformation
+    /// (`scheme::stability`), so the matrix is at most the weighted Laplacian of the graph. Divided by the
+    /// masses, its largest eigenvalue is at most the largest of
     ///
     /// w_i + w_j − Σ min(k_il/m_i, k_jl/m_j) over the common neighbours l of i and j,  w_i = Σ k_il/m_i,
     ///
-    /// over all springs i–j (Das and Bapat, A sharp upper bound on the largest Laplacian eigenvalue of weighted graphs,
-    /// 2005, for masses of 1). For of all springs, take the one with the largest difference d = x_i − x_j of an eigenvector:
-    /// λ·d = Σ k_il/m_i·(x_i − x_l) + Σ k_jl/m_j·(x_l − x_j), where no difference is above d, and the two of a common neighbour
-    /// are d together. On a mesh of equal triangles that bound is 10 k/m, where 9 k/m is true and Gershgorin's bound says
-    /// 12 k/m. It tells the vertex; the bound is closer by the method of Lanczos.
+    /// over all springs i–j (Das and Bapat, A sharp upper bound on the largest Laplacian eigenvalue of weighted
+    /// graphs, 2005, for masses of 1). Proof: take the spring with the largest difference d = x_i − x_j of an
+    /// eigenvector: λ·d = Σ k_il/m_i·(x_i − x_l) + Σ k_jl/m_j·(x_l − x_j). No difference is above d, and the
+    /// two differences of a common neighbour add up to d. On a mesh of equal triangles this bound is 10 k/m;
+    /// the true value is 9 k/m, and Gershgorin's bound is 12 k/m. The vertex comes from this bound; the method
+    /// of Lanczos then gives a closer bound.
     fn find_stiffest(&self) -> StiffnessBound {
         let count = self.shape.vertices_m.len();
         let mass = |vertex: u32| self.relative_mass(PointId::new(vertex as usize));
@@ -360,13 +374,13 @@ impl Mesh {
         stiffest
     }
 
-    /// Returns where the fastest vibration is, in words that end a message.
+    /// Returns the place of the fastest vibration as the end of a message.
     pub fn fastest_place(&self) -> String {
         let point = PointId::new(self.stiffest.vertex as usize);
         format!(", most of all at {}, {:.4} m", self.shape.name(point), self.shape.rest_m(point))
     }
 
-    /// Returns what a user should know of the mesh, in words.
+    /// Returns warnings about the mesh for the user, as sentences.
     pub fn warnings(&self) -> Vec<String> {
         let shape = &self.shape;
         let mut warnings = shape.told.findings.clone();
@@ -390,12 +404,13 @@ impl Mesh {
         warnings
     }
 
-    /// How many times as fast the fastest vibration is as those of half of the mesh.
+    /// Returns how many times as fast the fastest vibration is as those of half of the mesh.
     fn fastest_ratio(&self) -> f64 {
         (self.stiffest.bound / self.stiffest.usual).sqrt()
     }
 
-    /// Returns whether a few vertices vibrate so fast that they alone make the substeps many.
+    /// Returns whether a few vertices vibrate so fast that they alone require many substeps: more than 2.5
+    /// times as fast as half of the mesh.
     pub fn has_fast_vertex(&self) -> bool {
         self.fastest_ratio() > MUCH_FASTER
     }
@@ -412,26 +427,26 @@ impl Mesh {
     }
 }
 
-/// A new tool begins at least this far off the surface at rest, m.
+/// Smallest distance from the surface at rest at which a new tool begins, m.
 const APPROACH_M: f64 = 0.002;
 
-/// So many balls of `mesh.fixed` that hold no vertex are told one by one.
+/// Number of empty balls of `mesh.fixed` with a message each; one message counts the others.
 const EMPTY_BALLS_TOLD: usize = 4;
 
-/// A vertex that vibrates so much faster than half of a mesh is warned of.
+/// The ratio of speeds above which a warning names the fastest vertex.
 const MUCH_FASTER: f64 = 2.5;
 
-/// Which vertices never move.
+/// The vertices of a mesh that never move.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub enum FixedVertices {
-    /// None.
+    /// No vertex.
     #[default]
     None,
-    /// Those of edges with a single triangle.
+    /// The vertices on edges with a single triangle.
     Rim,
-    /// Those of a group of the file.
+    /// The vertices of a group of the file.
     Group(Group),
-    /// Those within balls: centre and radius, m.
+    /// The vertices within balls, each given by centre and radius, m.
     Balls(Vec<(DVec3, f64)>),
 }
 
@@ -460,19 +475,19 @@ impl FixedVertices {
         })
     }
 
-    /// Returns the vertices of the group of that name.
+    /// Returns the vertices of the group `name` as fixed vertices.
     ///
     /// # Errors
-    /// Refuses a name that no group has; `field` is the name that the refusal gives.
+    /// Refuses a name that no group has; `field` is the key that the refusal gives.
     pub fn group(field: &str, name: &str, mesh: &TriangleMesh) -> Result<Self> {
         group_named(field, name, &mesh.groups).map(|group| FixedVertices::Group(group.clone()))
     }
 }
 
-/// The group of that name.
+/// Returns the group `name`.
 ///
 /// # Errors
-/// Refuses a name that no group has; `field` is the name that the refusal gives.
+/// Refuses a name that no group has; `field` is the key that the refusal gives.
 pub(super) fn group_named<'g>(field: &str, name: &str, groups: &'g [Group]) -> Result<&'g Group> {
     groups.iter().find(|group| group.name == name).ok_or_else(|| {
         let meant = did_you_mean(name, groups.iter().map(|group| group.name.as_str()));
@@ -484,12 +499,12 @@ pub(super) fn group_named<'g>(field: &str, name: &str, groups: &'g [Group]) -> R
 }
 
 impl MeshShape {
-    /// Creates the shape of vertices and triangles; `is_fixed` says whether a vertex never moves: whether it is on a rim, where it rests, and
-    /// its number.
+    /// Creates the shape from vertices, m, and triangles. `is_fixed` decides whether a vertex never moves. Its
+    /// arguments are whether the vertex is on a rim, where it rests, and its number.
     ///
     /// # Errors
-    /// Refuses a mesh without an edge, with an edge of no length, with an edge of more than two triangles, and with numbers
-    /// of vertices or places that are no good.
+    /// Refuses a mesh without an edge, with an edge of length 0, with an edge of more than two triangles, and
+    /// with vertex numbers or places that are out of range or not finite.
     pub fn new(
         vertices_m: Vec<DVec3>,
         triangles: Vec<[u32; 3]>,
@@ -498,11 +513,11 @@ impl MeshShape {
         Self::braced(vertices_m, triangles, &[], is_fixed)
     }
 
-    /// Does the same with `braces`: springs like those of edges between other vertices, as along both diagonals of a
-    /// square.
+    /// Creates the shape from vertices, m, and triangles, with additional springs `braces` between other pairs
+    /// of vertices, like those of edges; for example along both diagonals of a square.
     ///
     /// # Errors
-    /// As for [`MeshShape::new`].
+    /// Refuses every mesh that [`MeshShape::new`] refuses.
     pub fn braced(
         vertices_m: Vec<DVec3>,
         triangles: Vec<[u32; 3]>,
@@ -593,7 +608,7 @@ impl MeshShape {
         })
     }
 
-    /// That a ball of `mesh.fixed` fixes nothing, in words.
+    /// Returns the warning that a ball of `mesh.fixed` fixes nothing.
     fn empty_ball(&self, number: usize, (centre_m, radius_m): (DVec3, f64)) -> String {
         let nearest = self.nearest(centre_m);
         let off_m = self.rest_m(nearest).distance(centre_m);
@@ -604,60 +619,61 @@ impl MeshShape {
         )
     }
 
-    /// Returns what clients are told of it.
+    /// Returns the facts about the mesh that clients receive.
     pub fn told(&self) -> &MeshMetadata {
         &self.told
     }
 
-    /// Returns where each vertex rests, m.
+    /// Returns the rest position of each vertex, m.
     pub fn vertices_m(&self) -> &[DVec3] {
         &self.vertices_m
     }
 
-    /// Returns three vertices each, counterclockwise seen from outside.
+    /// Returns the triangles as three vertices each, counterclockwise seen from outside.
     pub fn triangles(&self) -> &[[u32; 3]] {
         &self.triangles
     }
 
-    /// Returns its triangles, to walk on: made when somebody first asks.
+    /// Returns the triangles as a surface on which a tip can move. The first call builds it.
     pub fn surface(&self) -> &Surface {
         self.surface.get_or_init(|| Surface::new(&self.vertices_m, &self.triangles))
     }
 
-    /// Returns the two vertices of each edge, ascending.
+    /// Returns the two vertices of each edge, ascending; edges ascending.
     pub fn edges(&self) -> &[[u32; 2]] {
         &self.edges
     }
 
-    /// Returns the vertices opposite each edge that has two triangles, ascending.
+    /// Returns the two vertices opposite each edge that has two triangles, ascending: the ends of the bending
+    /// springs.
     pub fn opposite(&self) -> &[[u32; 2]] {
         &self.opposite
     }
 
-    /// Returns the edge that the spring of bending between each two of these crosses.
+    /// Returns the edge that each bending spring crosses, in the order of [`MeshShape::opposite`].
     pub fn crossed(&self) -> &[[u32; 2]] {
         &self.crossed
     }
 
-    /// Returns the normal at each vertex.
+    /// Returns the unit normal at each vertex, out of the tissue.
     pub fn normals(&self) -> &[DVec3] {
         &self.normals
     }
 
-    /// Returns whether a vertex has an edge. One that has none is no part of the tissue: it counts neither for its size
-    /// nor for its mass, and is the nearest to no place.
+    /// Returns whether a vertex has an edge. A vertex without one is not part of the tissue: size and mass do
+    /// not count it, and it is never the nearest to a place.
     pub fn is_used(&self, vertex: usize) -> bool {
         !self.neighbours.of(vertex).is_empty()
     }
 
-    /// Returns whether a vertex is at an edge that has a single triangle.
+    /// Returns whether a vertex is on an edge with a single triangle.
     pub fn is_on_rim(&self, vertex: usize) -> bool {
         self.on_rim[vertex]
     }
 
-    /// How far each vertex is from the nearest of `members`, m; infinite where that is `most_m` or more. Which of them is the
-    /// nearest is handed on along the edges, so that the work is bounded by the size of the mesh; now and then it is another
-    /// that is farther away by a part of an edge.
+    /// Returns how far each vertex is from the nearest of `members`, m; infinite where that is `most_m` or
+    /// more. The nearest member passes from vertex to vertex along the edges, so that the work is bounded by
+    /// the size of the mesh. Sometimes it finds a member that is farther away by a fraction of an edge.
     pub(super) fn away_m(&self, members: &[u32], most_m: f64) -> Vec<f64> {
         let count = self.vertices_m.len();
         let (mut away_m, mut is_done) = (vec![f64::INFINITY; count], vec![false; count]);
@@ -684,12 +700,12 @@ impl MeshShape {
         away_m
     }
 
-    /// Returns whether no edge has a single triangle.
+    /// Returns whether every edge has two triangles.
     pub fn is_closed(&self) -> bool {
         !self.on_rim.contains(&true)
     }
 
-    /// Returns the mesh that is shown, if it is another: that of the file, of which this is a coarser one.
+    /// Returns the mesh of the file, if it is shown in place of the simulated mesh.
     pub fn shown(&self) -> Option<&Shown> {
         self.shown.as_ref()
     }
@@ -757,7 +773,7 @@ impl RestShape for MeshShape {
         let nearest = surface.nearest(place_m)?;
         let (at_m, outward) = (surface.at_m(&nearest), nearest.frame[0].cross(nearest.frame[1]));
         let side = surface.side((place_m - at_m).dot(outward), radius_m);
-        // One that is beside a rim, or far enough off the surface, begins where it is.
+        // A tool beside a rim, or far enough off the surface, begins where it is.
         let is_off = (place_m - at_m).dot(side * outward) >= APPROACH_M;
         Some(if is_off { place_m } else { at_m + APPROACH_M * side * outward })
     }
@@ -779,10 +795,10 @@ impl RestShape for MeshShape {
     }
 }
 
-/// The ends of the edges at each vertex, ascending.
+/// The other ends of the edges at each vertex, ascending.
 #[derive(Debug, PartialEq)]
 struct Neighbours {
-    /// Where each vertex's begin; one more for the end.
+    /// Where each vertex's members begin; one more entry for the end.
     from: Vec<u32>,
     members: Vec<u32>,
 }
@@ -803,19 +819,19 @@ impl Neighbours {
     }
 }
 
-/// The vertices by cells of space, to find those near a place.
+/// The vertices sorted into cells of space, to find those near a place.
 #[derive(Debug, PartialEq)]
 struct Cells {
     least_m: DVec3,
     most_m: DVec3,
     side_m: f64,
     counts: [usize; 3],
-    /// Where each cell's members begin; one more for the end.
+    /// Where each cell's members begin; one more entry for the end.
     from: Vec<u32>,
     members: Vec<u32>,
 }
 
-/// Cells at most, for each vertex: a mesh far larger than its edges has larger cells.
+/// Largest number of cells per vertex. A mesh that is far larger than its edges gets larger cells.
 const CELLS_PER_VERTEX: f64 = 4.0;
 
 impl Cells {
@@ -844,7 +860,7 @@ impl Cells {
         found
     }
 
-    /// The cell of a place within the extent.
+    /// Returns the cell of a place within the extent.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn cell(&self, place_m: DVec3) -> [usize; 3] {
         let at = ((place_m - self.least_m) / self.side_m).to_array();
@@ -855,7 +871,7 @@ impl Cells {
         (i * self.counts[1] + j) * self.counts[2] + k
     }
 
-    /// The vertices within a distance of a place, ascending.
+    /// Returns the vertices within a distance of a place, ascending.
     fn around(&self, vertices_m: &[DVec3], place_m: DVec3, radius_m: f64) -> Vec<usize> {
         let [from, to] = [place_m - radius_m, place_m + radius_m].map(|corner_m| self.cell(corner_m.max(self.least_m)));
         let mut found = Vec::new();
@@ -873,7 +889,7 @@ impl Cells {
         found
     }
 
-    /// The vertex nearest to a place; of several, that with the least number.
+    /// Returns the vertex nearest to a place; of several, the one with the lowest number.
     #[allow(clippy::cast_precision_loss)]
     fn nearest(&self, vertices_m: &[DVec3], place_m: DVec3) -> usize {
         let inside_m = place_m.clamp(self.least_m, self.most_m);
@@ -938,7 +954,7 @@ mod tests {
             Mesh::of(mesh.clone(), 1e-3, FixedVertices::Balls(balls))
         });
         assert_eq!(made.unwrap().unwrap().stiffest.vertex, 0);
-        // What can't be is given up.
+        // An impossible amount of work is given up.
         let balls = vec![(DVec3::new(1.0, 1.0, 1.0), 0.1); 100_000];
         let made =
             palpate_geometry::work::within(&Arc::default(), most, || Mesh::of(mesh, 1e-3, FixedVertices::Balls(balls)));

@@ -1,5 +1,5 @@
-//! What a scene is: the tissue, its springs, and how time advances. Read from TOML (or from a protobuf
-//! message, in `wire`), checked, then never changed.
+//! A scene describes the tissue, its springs, and how time advances. The server reads it from TOML (or from a
+//! protobuf message, in the crate `wire`), checks it, and never changes it afterwards.
 
 pub mod action;
 pub mod action_check;
@@ -39,10 +39,10 @@ use source::Files;
 use toml_document::{Document, Fields, Item};
 pub use volume::{Swelling, Volume};
 
-/// The scene of the paper's figures, built in.
+/// The text of the built-in scene `paper`, which the paper's figures use.
 pub const PAPER: &str = include_str!("../../../../scenes/paper.toml");
 
-/// Every scene that is built in, by its name.
+/// The built-in scenes: name and TOML text, by ascending name.
 pub const BUILT_IN: [(&str, &str); 7] = [
     ("colon", include_str!("../../../../scenes/colon.toml")),
     ("fibrotic", include_str!("../../../../scenes/fibrotic.toml")),
@@ -53,9 +53,9 @@ pub const BUILT_IN: [(&str, &str); 7] = [
     ("stomach", include_str!("../../../../scenes/stomach.toml")),
 ];
 
-/// A tissue and how it is stepped. The fields are those of a scene file; SI units.
+/// A tissue and how it is stepped. The fields are those of a scene file, in SI units.
 ///
-/// A scene is a text in TOML. What is wrong in it is refused with its place:
+/// A scene is a text in TOML. Reading refuses every error with its file, line and key:
 ///
 /// ```
 /// use palpate_refusal::Reason;
@@ -75,32 +75,34 @@ pub const BUILT_IN: [(&str, &str); 7] = [
 /// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
-    /// Any name, for people.
+    /// Display name; any text.
     pub name: String,
-    /// The mass points, and how they lie together.
+    /// The mass points, and how they are arranged.
     pub body: Body,
-    /// What gave masses and coefficients at the beginning.
+    /// The material that the masses and coefficients were computed from; `None` if the scene gives them
+    /// directly.
     pub material: Option<Material>,
-    /// Regions whose springs in `body` differ.
+    /// Regions of a mesh that are stiffer or softer. Their factors are already applied to the springs of
+    /// `body`.
     pub inclusions: Arc<[Inclusion]>,
     /// Springs between neighbours.
     pub springs: Springs,
     /// K″ of the springs of zero rest length that pull each point to its rest position, N/m (the paper's eq. 4).
     pub anchor_stiffness_n_per_m: f64,
-    /// C of the damping force −C·v, N·s/m.
+    /// C of the damping force −C·v, N·s/m. On a mesh, C of a point of the reference mass.
     pub damping_n_s_per_m: f64,
     /// κ of the pressure −κ·ΔV/V0 on a mesh that encloses a volume, Pa; 0 on any other tissue.
     pub volume_stiffness_pa: f64,
     /// How time advances.
     pub stepping: Stepping,
-    /// Error that leaving out regions at rest may cost, relative to the largest displacement; 0 leaves out nothing. Not
-    /// given, it is a tenth of the error of the rest (`Model`).
+    /// Largest error that leaving out regions at rest may add, relative to the largest displacement; 0 turns
+    /// sleeping off. If `None`, it is a tenth of the wanted error (`stepping.tolerance`; see `Model`).
     pub sleep_tolerance: Option<f64>,
-    /// What viewers see.
+    /// How viewers draw the tissue.
     pub appearance: Appearance,
 }
 
-/// What a tissue is made of.
+/// The mass points of a tissue and how they are arranged.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Body {
     /// A rectangular grid.
@@ -110,8 +112,9 @@ pub enum Body {
 }
 
 impl Body {
-    /// Returns a part that moves like the whole where vibrations are fastest, of at most `side`² points, not all of
-    /// them fixed; and three of its points, the first of which is free: to be pushed.
+    /// Returns a small part of the tissue that vibrates as fast as the whole, for test runs: at most `side`²
+    /// points, not all of them fixed. Also returns three points of the part to push or to watch; the first one
+    /// is free to move.
     pub fn part(&self, side: usize) -> (Body, [PointId; 3]) {
         match self {
             Body::Sheet(sheet) => {
@@ -126,19 +129,19 @@ impl Body {
     }
 }
 
-/// Smallest side of a texture that is made, pixels.
+/// Smallest side of a generated texture, pixels.
 pub const SMALLEST_TEXTURE: u32 = 16;
 
-/// What a tissue looks like. Clients cannot set it: the file is on the server.
+/// How a tissue looks. Clients cannot set it, because it names a file on the server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Appearance {
-    /// A PNG image for the surface; one is made if `None`.
+    /// A PNG image for the surface. If `None`, the server generates one.
     pub texture: Option<PathBuf>,
-    /// What the one that is made shows.
+    /// What a generated image shows.
     pub surface: PaintedSurface,
-    /// Which one of these is made.
+    /// Seed of the generated image: another seed gives another pattern.
     pub texture_seed: u64,
-    /// Pixels along each side of that.
+    /// Pixels along each side of the generated image.
     pub texture_size: u32,
 }
 
@@ -149,23 +152,23 @@ impl Default for Appearance {
 }
 
 impl Appearance {
-    /// With the image's path from `folder`, where the scene's file is.
+    /// Returns the appearance with the image's path resolved from `folder`, the folder of the scene file.
     fn within(mut self, folder: &Path) -> Self {
         self.texture = self.texture.map(|path| folder.join(path));
         self
     }
 }
 
-/// Surfaces that can be painted (`texture`).
+/// Surfaces that the server can paint (see the module `texture`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PaintedSurface {
     /// The lining of a stomach.
     Mucosa,
     /// The capsule of a liver.
     Liver,
-    /// A fibrotic liver: nodules in a net of scar.
+    /// A fibrotic liver: nodules in a network of scars.
     Nodular,
-    /// The outside of a gallbladder, grey-green by the bile in it.
+    /// The outside of a gallbladder, grey-green from the bile inside.
     Serosa,
 }
 
@@ -178,21 +181,21 @@ impl Named for PaintedSurface {
     ];
 }
 
-/// What of a tissue may change while it is in use. What is `None` stays.
+/// Coefficients of a tissue to change while it is in use. `None` leaves a coefficient as it is.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Change {
-    /// k of the structural springs, N/m. Those of shear and bending keep their ratio to it.
+    /// k of the structural springs, N/m. The k of shear and bending springs changes in proportion.
     pub stiffness_n_per_m: Option<f64>,
-    /// C, N·s/m.
+    /// C of the damping force −C·v, N·s/m.
     pub damping_n_s_per_m: Option<f64>,
-    /// K″, N/m.
+    /// K″ of the springs that pull each point to its rest position, N/m.
     pub anchor_stiffness_n_per_m: Option<f64>,
-    /// κ of a tissue that encloses a volume, Pa.
+    /// κ of the pressure in a mesh that encloses a volume, Pa.
     pub volume_stiffness_pa: Option<f64>,
 }
 
 impl Change {
-    /// Why one that changes nothing is refused.
+    /// Message of the refusal of a change that changes nothing.
     pub const NOTHING: &str = "names nothing to change: stiffness_n_per_m, damping_n_s_per_m, anchor_stiffness_n_per_m or \
                                volume_stiffness_pa";
 }
@@ -200,30 +203,31 @@ impl Change {
 /// Springs between neighbours: the force on a from a spring a–b is k (L − L0)(x_b − x_a)/L (Hooke's law).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Springs {
-    /// k of (1,0) and (0,1), N/m.
+    /// k of the structural springs, (1,0) and (0,1) on a sheet, N/m; on a mesh, k of a reference edge.
     pub stiffness_n_per_m: f64,
-    /// k of (1,1) and (1,−1), N/m.
+    /// k of the shear springs (1,1) and (1,−1) of a sheet, N/m.
     pub shear_stiffness_n_per_m: f64,
-    /// Whether there are springs (2,0) and (0,2), with the structural k.
+    /// Whether a sheet has bending springs (2,0) and (0,2), with the structural k. (On a mesh, see
+    /// [`Mesh::bending`].)
     pub bending: bool,
 }
 
-/// How time advances.
+/// How time advances: rate, accuracy, scheme and number format.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stepping {
-    /// The fixed rate at which commands enter and samples leave, Hz.
+    /// Steps per second, Hz. Commands take effect and samples are taken once per step.
     pub rate_hz: f64,
     /// Wanted error of displacement and force, relative to their largest.
     pub tolerance: f64,
-    /// The scheme.
+    /// The scheme that advances the points in time.
     pub integrator: Integrator,
-    /// Substeps a step; chosen from the stability bound if `None`.
+    /// Substeps per step. If `None`, they are chosen from the stability bound.
     pub substeps: Option<u32>,
-    /// The number format.
+    /// The number format of the state.
     pub precision: Precision,
-    /// How many numbers are worked on at once.
+    /// How many numbers the processor works on at once.
     pub lanes: Lanes,
-    /// Where an audit finds an error above the tolerance, the tissue is stepped more accurately from then on.
+    /// Whether the tissue is stepped more accurately after an audit finds an error above the tolerance.
     pub correct: bool,
 }
 
@@ -241,12 +245,15 @@ impl Default for Stepping {
     }
 }
 
-/// A value that a scene gives by a name out of a list.
+/// A value that a scene gives by a name from a list.
 pub trait Named: Sized + Copy + PartialEq + 'static {
-    /// Every name and what it means.
+    /// Every name and its value.
     const NAMES: &'static [(&'static str, Self)];
 
-    /// The value of a name.
+    /// Returns the value of a name; `field` is the key that a refusal gives.
+    ///
+    /// # Errors
+    /// Refuses a name that is not in the list.
     fn named(field: &str, name: &str) -> Result<Self> {
         Self::NAMES.iter().find(|entry| entry.0 == name).map(|entry| entry.1).ok_or_else(|| {
             let names: Vec<_> = Self::NAMES.iter().map(|entry| entry.0).collect();
@@ -256,7 +263,7 @@ pub trait Named: Sized + Copy + PartialEq + 'static {
         })
     }
 
-    /// The name of a value.
+    /// Returns the name of a value.
     fn name(self) -> &'static str {
         Self::NAMES.iter().find(|entry| entry.1 == self).map_or("", |entry| entry.0)
     }
@@ -278,21 +285,21 @@ macro_rules! named {
 }
 
 named! {
-    /// The schemes (`tissue::integrate`).
+    /// The schemes that advance the points in time (see the module `scheme`).
     pub enum Integrator {
-        /// Palpate's choice.
+        /// Palpate chooses.
         Auto = "auto",
         /// Central differences, damping implicit: second order.
         Central = "central",
-        /// The paper's: damping with the velocity of the last step, first order.
+        /// The paper's scheme: damping with the velocity of the last step, first order.
         Lagged = "lagged",
-        /// The classical scheme of Runge and Kutta: fourth order, four evaluations a substep.
+        /// The classical scheme of Runge and Kutta: fourth order, four evaluations of the forces per substep.
         Rk4 = "rk4",
-        /// Exponential multistep with the springs' last 2 forces: third order.
+        /// Exponential multistep with the last 2 forces of the springs: third order.
         Exponential2 = "exponential2",
-        /// With the last 3: fourth order.
+        /// Exponential multistep with the last 3 forces of the springs: fourth order.
         Exponential3 = "exponential3",
-        /// With the last 4: fifth order.
+        /// Exponential multistep with the last 4 forces of the springs: fifth order.
         Exponential4 = "exponential4",
     }
 }
@@ -300,54 +307,55 @@ named! {
 named! {
     /// The number format of the state.
     pub enum Precision {
-        /// Palpate's choice.
+        /// Palpate chooses.
         Auto = "auto",
-        /// 4 bytes.
+        /// 4 bytes per number.
         F32 = "f32",
-        /// 4 bytes, and 4 for what a displacement loses in rounding: for exponential schemes.
+        /// 4 bytes per number, and 4 more that keep the rounding error of a displacement: for exponential
+        /// schemes.
         Compensated = "compensated",
-        /// 8 bytes.
+        /// 8 bytes per number.
         F64 = "f64",
     }
 }
 
 named! {
-    /// How many numbers the processor works on at once. The results have the same bits whichever it is.
+    /// How many numbers the processor works on at once. The bits of the results do not depend on it.
     pub enum Lanes {
-        /// The most that the machine has.
+        /// The widest that the machine has.
         Auto = "auto",
-        /// 64 bytes.
+        /// Vectors of 64 bytes.
         Avx512 = "avx512",
-        /// 32 bytes.
+        /// Vectors of 32 bytes.
         Avx2 = "avx2",
-        /// 16 bytes: on ARM.
+        /// Vectors of 16 bytes, on ARM.
         Neon = "neon",
-        /// One by one: on any machine.
+        /// One number at a time, on any machine.
         Plain = "plain",
     }
 }
 
 impl Scene {
-    /// Reads a scene file, with `--set` assignments over it.
+    /// Reads a scene file and applies the `--set` assignments (`key.path=value`), which override its keys.
     ///
     /// # Errors
-    /// Refuses a file that can't be read, and as [`Scene::parse`] does.
+    /// Refuses a file that can't be read, and every text or assignment that [`Scene::parse`] refuses.
     pub fn load(path: &Path, assignments: &[String], limits: &Limits) -> Result<Self> {
         let text = files::read_text(path, limits.file_bytes)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         Self::parse_in(folder, &path.display().to_string(), &text, assignments, limits)
     }
 
-    /// Reads a scene whose paths of other files are from `folder`; `name` is what refusals call the text.
+    /// Reads a scene from text. Paths of other files start from `folder`; refusals call the text `name`.
     ///
     /// # Errors
-    /// As for [`Scene::parse`]; refuses a file that can't be read.
+    /// Refuses a text or an assignment that is not a valid scene, and a mesh file that can't be read.
     pub fn parse_in(folder: &Path, name: &str, text: &str, assignments: &[String], limits: &Limits) -> Result<Self> {
         let scene = Self::parse_with(name, text, assignments, Files::In(folder), limits)?;
         Ok(Scene { appearance: scene.appearance.within(folder), ..scene })
     }
 
-    /// Reads a scene that names no other files, except for images; `name` is what refusals call the text.
+    /// Reads a scene from text. It may name no other files, except for an image; refusals call the text `name`.
     ///
     /// # Errors
     /// Refuses a text or an assignment that is not a valid scene.
@@ -355,11 +363,12 @@ impl Scene {
         Self::parse_with(name, text, assignments, Files::None, limits)
     }
 
-    /// Reads a scene whose `[mesh]` names one file, `mesh_name`, of which the bytes are given; it names no other files, except for
-    /// images.
+    /// Reads a scene from text, with the mesh file that its `[mesh]` names: the file's name and bytes. The
+    /// scene may name no other files, except for an image; refusals call the text `name`.
     ///
     /// # Errors
-    /// As for [`Scene::parse`]; refuses a mesh that can't be read, and a scene that names another.
+    /// Refuses a text that is not a valid scene, a mesh that can't be read, and a scene that names another mesh
+    /// file.
     pub fn parse_given(name: &str, text: &str, (mesh_name, mesh): (&str, &[u8]), limits: &Limits) -> Result<Self> {
         Self::parse_with(name, text, &[], Files::Given(mesh_name, mesh), limits)
     }
@@ -396,8 +405,8 @@ impl Scene {
         Ok(scene)
     }
 
-    /// Returns the same with another tissue. `first` is the scene that the session began with: it tells the ratio of
-    /// shear to structural springs, which a k of 0 in between would lose.
+    /// Returns the scene with some coefficients changed. `first` is the scene that the session began with. Its
+    /// ratio of shear to structural springs applies, because a k of 0 in between would lose the ratio.
     pub fn changed(&self, change: &Change, first: &Scene) -> Self {
         let mut scene = self.clone();
         if let Some(k) = change.stiffness_n_per_m {
@@ -417,7 +426,7 @@ impl Scene {
         scene
     }
 
-    /// Returns the rest shape of the tissue.
+    /// Returns the rest shape of the tissue: a borrowed sheet or mesh.
     pub fn shape(&self) -> &dyn RestShape {
         match &self.body {
             Body::Sheet(sheet) => sheet,
@@ -425,7 +434,7 @@ impl Scene {
         }
     }
 
-    /// Returns the grid, if the tissue is a sheet.
+    /// Returns the grid; `None` if the tissue is a mesh.
     pub fn sheet(&self) -> Option<&Sheet> {
         match &self.body {
             Body::Sheet(sheet) => Some(sheet),
@@ -433,7 +442,7 @@ impl Scene {
         }
     }
 
-    /// Does the same, to change it.
+    /// Returns the grid, mutable; `None` if the tissue is a mesh.
     pub fn sheet_mut(&mut self) -> Option<&mut Sheet> {
         match &mut self.body {
             Body::Sheet(sheet) => Some(sheet),
@@ -441,7 +450,7 @@ impl Scene {
         }
     }
 
-    /// Returns what the tissue encloses, if that resists.
+    /// Returns the volume that a mesh encloses; `None` if the scene has no `[volume]`.
     pub fn volume(&self) -> Option<&Volume> {
         match &self.body {
             Body::Sheet(_) => None,
@@ -449,7 +458,8 @@ impl Scene {
         }
     }
 
-    /// Returns whether nothing vibrates as fast as a volume that swells and shrinks.
+    /// Returns whether the fastest vibration is the one in which the enclosed volume swells and shrinks. False
+    /// without a volume.
     pub fn volume_is_fastest(&self) -> bool {
         let Body::Mesh(mesh) = &self.body else { return false };
         let fastest = |Swelling { by_pressure_m, by_springs, .. }: Swelling| {
@@ -459,7 +469,7 @@ impl Scene {
         mesh.volume.as_ref().is_some_and(|volume| fastest(volume.swelling))
     }
 
-    /// Returns the mass of each point, or on a mesh that of reference, kg.
+    /// Returns the mass of each point of a sheet, or the reference mass of a mesh, kg.
     pub fn point_mass_kg(&self) -> f64 {
         match &self.body {
             Body::Sheet(sheet) => sheet.point_mass_kg,
@@ -467,8 +477,8 @@ impl Scene {
         }
     }
 
-    /// Returns the mass of a point over that of reference, which [`Scene::point_mass_kg`] is. C of a point is
-    /// `damping_n_s_per_m` times this.
+    /// Returns the mass of a point divided by the reference mass [`Scene::point_mass_kg`]; 1 on a sheet. C of
+    /// the point is `damping_n_s_per_m` times this ratio.
     pub fn relative_mass(&self, point: PointId) -> f64 {
         match &self.body {
             Body::Sheet(_) => 1.0,
@@ -476,7 +486,7 @@ impl Scene {
         }
     }
 
-    /// Returns K″ of a point over that of reference, which is `anchor_stiffness_n_per_m`.
+    /// Returns K″ of a point divided by the reference value `anchor_stiffness_n_per_m`; 1 on a sheet.
     pub fn relative_anchor_stiffness(&self, point: PointId) -> f64 {
         match &self.body {
             Body::Sheet(_) => 1.0,
@@ -493,7 +503,7 @@ impl Scene {
         }
     }
 
-    /// Returns the rest shape, for who keeps it without the scene.
+    /// Returns a copy of the rest shape that can outlive the scene.
     pub fn shared_shape(&self) -> Arc<dyn RestShape> {
         match &self.body {
             Body::Sheet(sheet) => Arc::new(sheet.clone()),
@@ -501,10 +511,11 @@ impl Scene {
         }
     }
 
-    /// Returns everything that a scene promises, wherever it came from.
+    /// Checks that every value is in its range and within the limits. It holds for scenes from files and from
+    /// messages.
     ///
     /// # Errors
-    /// Refuses a value out of its range, and what is above the limits.
+    /// Refuses a value that is out of its range or above a limit.
     pub fn check(&self, limits: &Limits) -> Result<()> {
         palpate_refusal::label("name", &self.name)?;
         match &self.body {
@@ -541,30 +552,31 @@ impl Scene {
     }
 }
 
-/// What a tissue consists of: a part of a [`Scene`].
+/// The physical part of a [`Scene`]: points, springs and coefficients, without stepping and appearance.
 pub struct Substance {
     /// The mass points.
     pub body: Body,
-    /// What gave masses and coefficients.
+    /// The material that the masses and coefficients were computed from, if any.
     pub material: Option<Material>,
-    /// Regions whose springs in `body` differ.
+    /// Regions of a mesh that are stiffer or softer. Their factors are already applied to the springs of
+    /// `body`.
     pub inclusions: Arc<[Inclusion]>,
     /// Springs between neighbours.
     pub springs: Springs,
-    /// K″, N/m.
+    /// K″ of the springs that pull each point to its rest position, N/m.
     pub anchor_stiffness_n_per_m: f64,
-    /// C, N·s/m.
+    /// C of the damping force −C·v, N·s/m.
     pub damping_n_s_per_m: f64,
-    /// κ, Pa; 0 without a volume.
+    /// κ of the pressure in a mesh that encloses a volume, Pa; 0 without a volume.
     pub volume_stiffness_pa: f64,
 }
 
 impl Substance {
-    /// Creates a mesh of a material, with springs of bending whose k is the part `bending` of that of the edge they
-    /// cross.
+    /// Creates a mesh of a material. `bending` is the k of each bending spring relative to the k of the edge
+    /// that it crosses; 0 creates none.
     ///
     /// # Errors
-    /// As for [`Material::applied`].
+    /// Refuses a value of the material that is out of its range, and a mesh with a vertex without area.
     pub fn of_material(material: Material, bending: f64, shape: Arc<MeshShape>) -> Result<Self> {
         let made = material.applied(bending, shape)?;
         let stiffness_n_per_m = made.stiffness_n_per_m;
@@ -579,10 +591,11 @@ impl Substance {
         })
     }
 
-    /// Does the same with inclusions, if it is a mesh. `field` is what refusals call the list.
+    /// Applies inclusions, if this is a mesh; a sheet stays as it is. `field` is the key of the list in
+    /// refusals.
     ///
     /// # Errors
-    /// As for [`Inclusion::put_into`].
+    /// Refuses too many inclusions, a value out of its range, an unknown group, and a ball without a vertex.
     pub fn with(mut self, inclusions: Vec<Inclusion>, field: &str) -> Result<Self> {
         if let Body::Mesh(mesh) = &mut self.body {
             *mesh = Inclusion::put_into(&inclusions, field, mesh)?;
@@ -591,10 +604,10 @@ impl Substance {
         Ok(self)
     }
 
-    /// Does the same with the volume that it encloses, if it is a mesh.
+    /// Adds the volume that the mesh encloses, with the stiffness κ, Pa.
     ///
     /// # Errors
-    /// Refuses a stiffness that is not above 0, and a mesh that encloses no volume, or several.
+    /// Refuses a stiffness that is not above 0, a sheet, and a mesh that encloses no volume, or several.
     pub fn enclosing(mut self, stiffness_pa: f64) -> Result<Self> {
         physical("volume.stiffness_pa", positive("volume.stiffness_pa", stiffness_pa)?)?;
         self.volume_stiffness_pa = stiffness_pa;
@@ -606,7 +619,7 @@ impl Substance {
     }
 }
 
-/// Reads the section `[sheet]` or `[mesh]`, and what says how stiff, heavy and damped it is.
+/// Reads the section `[sheet]` or `[mesh]`, and the sections that give stiffness, mass and damping.
 fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) -> Result<Substance> {
     let (sheet, mesh) = (fields.item("sheet"), fields.item("mesh"));
     let (material, inclusions, volume) = (fields.item("material"), fields.item("inclusion"), fields.item("volume"));
@@ -646,7 +659,7 @@ fn read_substance(fields: &mut Fields<'_>, files: Files<'_>, limits: &Limits) ->
     substance.enclosing(volume.table(|fields| fields.required_number("stiffness_pa"))?)
 }
 
-/// Reads the sections that give the coefficients as in the paper.
+/// Reads the sections that give the coefficients directly, as in the paper.
 fn read_coefficients(fields: &mut Fields<'_>, mut body: Body) -> Result<Substance> {
     Ok(Substance {
         springs: fields.required("springs")?.table(|fields| read_springs(fields, &mut body))?,
@@ -663,7 +676,8 @@ fn read_coefficients(fields: &mut Fields<'_>, mut body: Body) -> Result<Substanc
     })
 }
 
-/// Reads the section `[material]`, and of `[springs]` what it leaves open.
+/// Reads the section `[material]`, and from `[springs]` only the bending, which the material does not
+/// determine.
 fn read_material(fields: &mut Fields<'_>, item: &Item<'_>, mesh: &Mesh) -> Result<Substance> {
     let material = item.table(Material::read)?;
     let (anchor_springs, damping) = (fields.item("anchor_springs"), fields.item("damping"));
@@ -683,13 +697,13 @@ fn read_material(fields: &mut Fields<'_>, item: &Item<'_>, mesh: &Mesh) -> Resul
     Substance::of_material(material, bending, mesh.shape.clone())
 }
 
-/// k of springs of bending on a mesh, as a part of that of edges.
+/// Reads `springs.bending` of a mesh: k of the bending springs relative to that of the edges.
 fn read_bending(item: &Item<'_>) -> Result<f64> {
     let part = item.flag().map(|flag| if flag { 1.0 } else { 0.0 }).or_else(|_| item.number())?;
     number("springs.bending", part, "from 0 to 10", |v| (0.0..=10.0).contains(&v))
 }
 
-/// Reads the section `[springs]`. A mesh has springs along its edges; those of bending may be a part as stiff.
+/// Reads the section `[springs]`. A mesh has springs along its edges and, if wanted, bending springs.
 fn read_springs(fields: &mut Fields<'_>, body: &mut Body) -> Result<Springs> {
     let stiffness_n_per_m = fields.required_number("stiffness_n_per_m")?;
     let (shear, bending) = (fields.item("shear_stiffness_n_per_m"), fields.item("bending"));
@@ -722,7 +736,7 @@ fn read_appearance(item: &Item<'_>, limits: &Limits) -> Result<Appearance> {
         let seed = fields.item("texture_seed").map(|item| item.whole()).transpose()?;
         let size = fields.item("texture_size").map(|item| item.whole()).transpose()?;
         if texture.is_some() && (surface.is_some() || seed.is_some() || size.is_some()) {
-            let message = "names an image: surface, texture_seed and texture_size are for one that is made";
+            let message = "names an image: surface, texture_seed and texture_size are for a generated image";
             return Err(fields.refuse(Reason::WrongKind, "texture", message));
         }
         let texture_size = match size {

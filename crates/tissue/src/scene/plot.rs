@@ -1,4 +1,4 @@
-//! Displacement and force of a run over time, drawn as text for a terminal.
+//! Draws displacement and force of a run over time, as text for a terminal.
 
 use std::fmt;
 
@@ -7,11 +7,12 @@ use textplots::{Chart, LabelBuilder, LabelFormat, Plot, Shape};
 
 use crate::shape::RestShape;
 
-/// The number of values from which on every second one is left out. A terminal shows 140 dots side by side.
+/// Number of values from which every second one is left out. A terminal shows 140 dots side by side.
 const MAX_KEPT: usize = 4096;
 
-/// Displacement and force of one tool or point over time: of a sheet along z, as in the paper's figures; of a mesh, which is
-/// pressed from any side, their lengths. The memory does not grow with the length of a run.
+/// Displacement and force of one tool or point over time. On a sheet they are components along z, as in the
+/// paper's figures; on a mesh, which is pressed from any side, they are lengths. The memory does not grow with
+/// the length of a run.
 #[derive(Debug, Clone, Default)]
 pub struct Curves {
     of_lengths: bool,
@@ -21,17 +22,17 @@ pub struct Curves {
     force: Vec<(f32, f32)>,
     /// Values added so far.
     added: u64,
-    /// Of 2 to this power values one is kept.
+    /// One of every 2^`halvings` values is kept.
     halvings: u32,
 }
 
 impl Curves {
-    /// Creates the curves of a tissue of this shape.
+    /// Creates empty curves for a tissue of this shape.
     pub fn of(shape: &dyn RestShape) -> Self {
         Curves { of_lengths: shape.dimensions() > 2, ..Curves::default() }
     }
 
-    /// Adds the displacement, m, and the force of the tissue, N, at a time, s. Times ascend.
+    /// Adds the displacement, m, and the force of the tissue, N, at a time, s. Times must ascend.
     #[allow(clippy::cast_possible_truncation)]
     pub fn add(&mut self, time_s: f64, displacement_m: DVec3, force_n: DVec3) {
         if self.displacement.len() == MAX_KEPT {
@@ -68,7 +69,7 @@ impl fmt::Display for Curves {
     }
 }
 
-/// Draws `points` (time in s, value) under a title.
+/// Returns the chart of `points` (time in s, value) under a title.
 fn draw(title: &str, points: &[(f32, f32)]) -> String {
     let (Some(first), Some(last)) = (points.first(), points.last()) else { return format!("{title}: nothing") };
     let values = points.iter().map(|point| point.1);

@@ -1,7 +1,7 @@
-//! Forces and tool movements as functions of time: a script's meaning, bound to a sheet and a step rate.
+//! Forces and tool movements as functions of time: the content of a script, bound to a tissue and a step rate.
 //!
-//! Time is counted in whole steps and a fraction of the present step, so that a profile that jumps has a value on either
-//! side: just before the jump at (n − 1, 1), just after it at (n, 0).
+//! Time is a number of whole steps and a fraction of the present step, so that a profile that jumps has a value
+//! on both sides: just before the jump at (n − 1, 1), just after it at (n, 0).
 
 use glam::DVec3;
 
@@ -9,12 +9,12 @@ use palpate_haptics::Tip;
 
 use crate::shape::{self, PointId, RestShape};
 
-/// A moment within a step: `fraction` from 0 (its beginning) to 1 (its end).
+/// A moment within a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moment {
-    /// The present step.
+    /// The present step, counted from 0.
     pub step: u64,
-    /// The part of it that has passed.
+    /// The part of the step that has passed: from 0 (its beginning) to 1 (its end).
     pub fraction: f64,
 }
 
@@ -24,21 +24,21 @@ impl Moment {
         Moment { step, fraction: 0.0 }
     }
 
-    /// Returns the time in seconds, at `rate_hz` steps a second.
+    /// Returns the time since the beginning of step 0, s, at `rate_hz` steps per second.
     #[allow(clippy::cast_precision_loss)]
     pub fn time_s(self, rate_hz: f64) -> f64 {
         (self.step as f64 + self.fraction) / rate_hz
     }
 }
 
-/// A surgical force at one moment (the paper's exerting force and its falloff): point p gets
-/// `force_n`·exp(−`falloff_per_m`·r + `falloff_offset`), where r is the straight distance from where p rests to `centre_m`.
+/// A surgical force at one moment (the paper's exerting force and its falloff). Point p gets the force
+/// `force_n`·exp(−`falloff_per_m`·r + `falloff_offset`), where r is the distance at rest from p to `centre_m`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Poke {
-    /// The mass point at the centre, if it is given by one. Then that point's reaction is told, otherwise the mean of the
-    /// reactions around the centre.
+    /// The mass point at the centre, if the force was given by a point. Then its reaction is reported;
+    /// otherwise the mean of the reactions around the centre.
     pub point: Option<PointId>,
-    /// The control point at rest, m. On a sheet z is 0.
+    /// Place of the control point at rest, m. On a sheet z is 0.
     pub centre_m: DVec3,
     /// The exerting force, N.
     pub force_n: DVec3,
@@ -51,7 +51,7 @@ pub struct Poke {
 /// A surgical force over time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadProfile {
-    /// The control point over time.
+    /// Place of the control point over time.
     pub centre: CentreProfile,
     /// The exerting force over time.
     pub strength: StrengthProfile,
@@ -61,14 +61,15 @@ pub struct LoadProfile {
     pub falloff_offset: f64,
 }
 
-/// The control point over time.
+/// The place of a force's control point over time.
 #[derive(Debug, Clone, PartialEq)]
 pub enum CentreProfile {
-    /// The place from each step on. Before the first there is no force.
+    /// Places, m, each with the step from which it applies. There is no force before the first.
     Hops(Vec<(u64, DVec3)>),
-    /// The same for mass points and where they rest.
+    /// Mass points and their rest positions, m, each with the step from which it applies. There is no force
+    /// before the first.
     Points(Vec<(u64, (PointId, DVec3))>),
-    /// A straight line.
+    /// A straight line at constant velocity.
     Path {
         /// Place at time 0, m.
         from_m: DVec3,
@@ -82,16 +83,16 @@ pub enum CentreProfile {
 pub enum StrengthProfile {
     /// A fixed vector times a profile.
     Scaled(DVec3, Profile),
-    /// The vector from each step on, N. Before the first there is no force.
+    /// Forces, N, each with the step from which it applies. There is no force before the first.
     Recorded(Vec<(u64, DVec3)>),
 }
 
-/// A factor over time.
+/// A factor over time, which scales a force.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Profile {
-    /// 1.
+    /// Always 1.
     Constant,
-    /// 1 for `on` ≤ step < `off`.
+    /// 1 for `on` ≤ step < `off`, otherwise 0.
     Pulse {
         /// First step of the pulse.
         on: u64,
@@ -112,7 +113,7 @@ pub enum Profile {
     },
 }
 
-/// The last of `entries` that has begun at `step`.
+/// Returns the last of `entries` that has begun at `step`.
 fn begun<T: Copy>(entries: &[(u64, T)], step: u64) -> Option<T> {
     let after = entries.partition_point(|entry| entry.0 <= step);
     after.checked_sub(1).map(|index| entries[index].1)
@@ -130,14 +131,14 @@ impl Profile {
     }
 }
 
-/// Returns Σ exp(−c·r) over all points of a shape: what a force on all of them together is divided by. r is the
-/// distance at rest to `centre_m`, c is `falloff_per_m`.
+/// Returns Σ exp(−c·r) over all points of a shape, where r is the distance at rest to `centre_m`, m, and c is
+/// `falloff_per_m`, 1/m. A force given for all points together is divided by this sum.
 pub fn weights(shape: &dyn RestShape, centre_m: DVec3, falloff_per_m: f64) -> f64 {
     shape::points(shape).map(|point| libm::exp(-falloff_per_m * shape.rest_m(point).distance(centre_m))).sum()
 }
 
 impl CentreProfile {
-    /// Returns the first place, m.
+    /// Returns the first place of the control point at rest, m.
     pub fn begins_at_m(&self) -> DVec3 {
         match self {
             CentreProfile::Hops(hops) => hops.first().map_or(DVec3::ZERO, |hop| hop.1),
@@ -148,7 +149,7 @@ impl CentreProfile {
 }
 
 impl LoadProfile {
-    /// Returns the force at a moment.
+    /// Returns the force at a moment, at `rate_hz` steps per second; zero before it begins.
     pub fn at(&self, moment: Moment, rate_hz: f64) -> Poke {
         let force_n = match &self.strength {
             StrengthProfile::Scaled(force, profile) => *force * profile.at(moment, rate_hz),
@@ -175,18 +176,18 @@ impl LoadProfile {
     }
 }
 
-/// The movement of a grasped point.
+/// The movement of a grasped point over time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionProfile {
     /// The point.
     pub point: PointId,
-    /// Displacements, which add up.
+    /// Displacements from the rest position, which add up.
     pub moves: Vec<Move>,
 }
 
-/// A smooth displacement: `by_m`·s((t − from)/(to − from)), s(x) = 10x³ − 15x⁴ + 6x⁵ clamped to 0…1. That is the movement of least
-/// jerk from rest to rest (Flash and Hogan, The coordination of arm movements, Journal of Neuroscience 5(7), 1985,
-/// doi:10.1523/JNEUROSCI.05-07-01688.1985).
+/// A smooth displacement: `by_m`·s((t − from)/(to − from)), s(x) = 10x³ − 15x⁴ + 6x⁵ clamped to 0…1. That is
+/// the movement of least jerk from rest to rest (Flash and Hogan, The coordination of arm movements, Journal of
+/// Neuroscience 5(7), 1985, doi:10.1523/JNEUROSCI.05-07-01688.1985).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Move {
     /// Time at which it begins, s.
@@ -200,18 +201,18 @@ pub struct Move {
 /// The movement of a tool with a tip, from pose to pose.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PoseProfile {
-    /// How it meets the tissue.
+    /// The tip: its radius, friction and coupling to the tissue.
     pub tip: Tip,
-    /// Times, s, and places of the tip, m, by ascending time; at least one. Between two of them the tip moves on a straight
-    /// line as smoothly as in a [`Move`].
+    /// Times, s, and places of the tip, m, by ascending time; at least one. Between two of them the tip moves
+    /// on a straight line with the smooth profile of a [`Move`].
     pub poses: Vec<(f64, DVec3)>,
-    /// When the tool is taken away, s.
+    /// Time at which the tool is taken away, s.
     pub until_s: f64,
 }
 
 impl PoseProfile {
-    /// Returns the place of the tip at a time, m; none before the first pose and from the end on. Between two poses it is
-    /// x₀ + (x₁ − x₀)·s(x), with s as in a [`Move`].
+    /// Returns the place of the tip at a time, m; `None` before the first pose and from `until_s` on. Between
+    /// two poses it is x₀ + (x₁ − x₀)·s(x), with the function s of a [`Move`].
     pub fn at(&self, time_s: f64) -> Option<DVec3> {
         let after = self.poses.partition_point(|pose| pose.0 <= time_s);
         let (begun_s, from_m) = *self.poses.get(after.checked_sub(1)?)?;
@@ -236,9 +237,9 @@ pub struct Motion {
 }
 
 impl MotionProfile {
-    /// Returns the displacement, velocity and acceleration at a time: the sum of those of all moves. With x the part of a move's
-    /// time T that has passed, they are `by_m` times s(x) ([`Move`]), s′(x)/T = 30x²(1 − x)²/T and
-    /// s″(x)/T² = 60x(1 − x)(1 − 2x)/T².
+    /// Returns displacement, velocity and acceleration at a time, s: the sums over all moves. With x the part
+    /// of a move's duration T that has passed, they are `by_m` times s(x) ([`Move`]), s′(x)/T = 30x²(1 − x)²/T
+    /// and s″(x)/T² = 60x(1 − x)(1 − 2x)/T².
     pub fn at(&self, time_s: f64) -> Motion {
         let mut motion = Motion::default();
         for Move { from_s, to_s, by_m } in &self.moves {

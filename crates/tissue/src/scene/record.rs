@@ -1,4 +1,4 @@
-//! The records of `palpate run` and of a replay: JSON Lines, one schema.
+//! The records of `palpate run` and of a replay, as JSON Lines with one schema.
 
 use std::io::{BufWriter, IsTerminal, Write};
 use std::path::Path;
@@ -11,18 +11,18 @@ use crate::shape::{PointName, RestShape};
 use palpate_refusal::printable::printable_json;
 use palpate_refusal::{Reason, Refusal};
 
-/// The first line of a file of records.
+/// The first line of a file of records: what was run, and how.
 #[derive(Debug, Clone, Serialize)]
 pub struct Run {
     /// Name of the scene.
     pub scene: String,
     /// Name of the script.
     pub script: String,
-    /// The scheme that `auto` selected.
+    /// The integrator used; with `auto`, the one that was selected.
     pub integrator: String,
     /// Substeps per step.
     pub substeps: u32,
-    /// The precision that `auto` selected.
+    /// The precision used; with `auto`, the one that was selected.
     pub precision: String,
     /// Steps per second.
     pub rate_hz: f64,
@@ -30,26 +30,27 @@ pub struct Run {
     pub version: String,
 }
 
-/// One line per sample time. Forces on points are those on the tissue, N.
+/// The state at one sample time, on one line. Forces on points are those on the tissue, N.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Record {
-    /// Simulated time.
+    /// Simulated time, s.
     pub time_s: f64,
     /// The points, in the order requested.
     pub points: Vec<Point>,
-    /// The tools with a tip, by ascending number.
+    /// The tools with a tip that are at the tissue, by ascending number.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub tools: Vec<ToolRecord>,
-    /// Energies of the whole sheet.
+    /// Energies of the whole tissue, J.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub energy_j: Option<EnergyJ>,
-    /// Points computed in the step.
+    /// Points computed in this step; sleeping points are not counted.
     pub awake_points: usize,
 }
 
 impl Record {
-    /// Returns the displacement, m, and force of the tissue, N, of the script's first tool with a tip; without such
-    /// tools, of the first point. `None` while that tool is away: a point's force is not the tip's.
+    /// Returns the displacement, m, and the force of the tissue, N, of the first tool with a tip, whose number
+    /// is `tip`. Returns `None` while that tool is away. Without such tools (`tip` is `None`), returns those of
+    /// the first point.
     pub fn first(&self, tip: Option<usize>) -> Option<([f64; 3], [f64; 3])> {
         let Some(tip) = tip else {
             return self.points.first().map(|point| (point.displacement_m, point.reaction_n));
@@ -58,8 +59,8 @@ impl Record {
         tool.map(|tool| (tool.displacement_m, tool.force_on_tool_n))
     }
 
-    /// Returns the largest force of the tissue on a tool with a tip, 0 while all are away; if the script has no such
-    /// tools, at a point. N.
+    /// Returns the largest force of the tissue on a tool with a tip, N; 0 while all are away. If `has_tips` is
+    /// false, the largest force at a point counts too.
     pub fn peak_n(&self, has_tips: bool) -> f64 {
         let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
         let tools = self.tools.iter().map(|tool| length(tool.force_on_tool_n));
@@ -68,97 +69,108 @@ impl Record {
     }
 }
 
-/// One mass point.
+/// The state of one mass point: displacement, velocity, and the forces on it.
 #[derive(Debug, Clone, Serialize)]
 #[allow(missing_docs)]
 pub struct Point {
-    /// What the point is called: `"point": [i, j]` on a sheet.
+    /// The name of the point: `"point": [i, j]` on a sheet, `"vertex": n` on a mesh.
     #[serde(flatten)]
     pub name: PointName,
+    /// Displacement from rest, m.
     pub displacement_m: [f64; 3],
+    /// Velocity, m/s.
     pub velocity_m_per_s: [f64; 3],
+    /// Force of all springs between points, and of an enclosed volume's pressure, N.
     pub spring_n: [f64; 3],
+    /// Force of the anchor spring, −K″·u, N.
     pub anchor_n: [f64; 3],
+    /// Damping force, −C·v, N.
     pub damping_n: [f64; 3],
+    /// Force of all pushing tools, N.
     pub applied_n: [f64; 3],
-    /// springs + anchor spring + damping.
+    /// Sum of the forces of springs, anchor spring and damping, N.
     pub reaction_n: [f64; 3],
-    /// For a prescribed point, the force that holds it.
+    /// The force that holds a prescribed point, N; `None` for other points.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub constraint_n: Option<[f64; 3]>,
 }
 
-/// A tool with a tip, which is led by poses.
+/// The state of a tool with a tip, which a client moves by poses.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ToolRecord {
-    /// The tool's number: forces come first, then grasped points, then tools with a tip.
+    /// The tool's number: a script numbers its forces first, then its grasped points, then its tools with a
+    /// tip.
     pub tool: u32,
-    /// Place of the tip in the frame of the sheet at rest, m.
+    /// Place of the tip in the frame of the tissue at rest, m.
     pub place_m: [f64; 3],
-    /// Displacement of the tissue under the tip, the mean over its disc, m.
+    /// Displacement of the tissue under the tip, averaged over the tip's disc, m.
     pub displacement_m: [f64; 3],
-    /// Force of the tissue on the tool, N: what a device gets. 0 while the tip does not touch.
+    /// Force of the tissue on the tool, N, as a haptic device receives it. 0 while the tip does not touch.
     pub force_on_tool_n: [f64; 3],
 }
 
-/// Energies, J.
+/// Energies of the whole tissue, J.
 #[derive(Debug, Clone, Copy, Serialize)]
 #[allow(missing_docs)]
 pub struct EnergyJ {
+    /// Σ ½m·v² of the points.
     pub kinetic: f64,
+    /// Energy stored in the springs between points.
     pub spring: f64,
+    /// Energy stored in the anchor springs, which pull each point to its rest position. Records call it
+    /// `virtual`.
     #[serde(rename = "virtual")]
     pub anchor_springs: f64,
 }
 
-/// The last line of a record.
+/// The last line of a file of records: counts, speed and accuracy of the run. Some fields are only for display.
 #[derive(Debug, Clone, Serialize)]
 pub struct Summary {
     /// Steps done.
     pub steps: u64,
     /// Substeps done.
     pub substeps: u64,
-    /// Points of the sheet.
+    /// Points of the tissue.
     pub points: usize,
-    /// Wall time of the stepping alone.
+    /// Wall time spent on stepping alone, s.
     pub wall_s: f64,
-    /// `wall_s`/(`substeps`·`points`).
+    /// `wall_s`/(`substeps`·`points`), ns.
     pub ns_per_point_substep: f64,
-    /// Point-substeps computed, as a fraction of all.
+    /// Fraction of all point-substeps that were computed; the rest slept.
     pub computed_fraction: f64,
-    /// How often the guard acted.
+    /// How many times the guard acted.
     pub guard_events: u64,
-    /// XXH3-128 of the state, in hexadecimal.
+    /// XXH3-128 hash of the final state, in hexadecimal.
     pub final_hash: String,
-    /// The result of an audit, over all sample points and times.
+    /// The errors that an audit measured, over all sample points and times.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub audited_error: Option<AuditedError>,
-    /// Corrections of an audit, by ascending step.
+    /// Corrections after an audit, by ascending step.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub corrections: Vec<Correction>,
     /// The newest recoveries, by ascending step.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub recoveries: Vec<Recovery>,
-    /// What a user should know of the run, in words. Not written.
+    /// Warnings for the user. Not written.
     #[serde(skip)]
     pub warnings: Vec<String>,
-    /// Length of the largest displacement, m: of a run, of all points at the times of the records; of a replay, of what the
-    /// server sent. Not written.
+    /// Length of the largest displacement, m. For a run: of all points at the times of the records; for a
+    /// replay: in what the server sent. Not written.
     #[serde(skip)]
     pub largest_displacement_m: f64,
     /// The largest force of the tissue in the records, N. Not written.
     #[serde(skip)]
     pub peak_reaction_n: f64,
-    /// What the first tool or point felt over time. Not written.
+    /// Displacement and force of the first tool or point over time. Not written.
     #[serde(skip)]
     pub curves: Curves,
-    /// The additional measurements of a replay.
+    /// The additional measurements of a replay; `None` for a run.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub network: Option<Network>,
 }
 
 impl Summary {
-    /// Returns why the records are not those of the script, if they are not.
+    /// Returns a message if the records are not those of the script, because the guard released the tools.
     pub fn fault(&self) -> Option<String> {
         let Recovery { step, reason, .. } = self.recoveries.first()?;
         Some(format!(
@@ -167,7 +179,7 @@ impl Summary {
     }
 }
 
-/// Warns if a point moved farther than the tissue is long: then a unit is probably wrong.
+/// Returns a warning if a point moved farther than the tissue is long: then a unit is probably wrong.
 pub fn far_warning(largest_m: f64, shape: &dyn RestShape) -> Option<String> {
     let longest_m = shape.longest_side_m();
     (largest_m > longest_m).then(|| {
@@ -178,34 +190,35 @@ pub fn far_warning(largest_m: f64, shape: &dyn RestShape) -> Option<String> {
     })
 }
 
-/// A measured error. Each part is relative to the largest component of its kind.
+/// A measured error. Each part is relative to the largest component of its quantity.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct AuditedError {
     /// Largest difference of any component of a displacement.
     pub displacement: f64,
-    /// The same for the tissue's force on a tool: springs, anchor springs and damping.
+    /// Largest difference of any component of the tissue's force on a tool (springs, anchor springs and
+    /// damping).
     pub force: f64,
 }
 
 impl AuditedError {
-    /// Returns the larger of the two.
+    /// Returns the larger of the two errors.
     pub fn largest(&self) -> f64 {
         self.displacement.max(self.force)
     }
 
-    /// Returns the larger of each part.
+    /// Returns the larger displacement error and the larger force error of two measurements.
     pub fn max(self, other: Self) -> Self {
         AuditedError { displacement: self.displacement.max(other.displacement), force: self.force.max(other.force) }
     }
 }
 
-/// A correction: from a step on the tissue is stepped more accurately, because an audited error was above the
-/// tolerance.
+/// A correction: from this step on, the tissue is stepped more accurately, because an audited error was above
+/// the tolerance.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Correction {
     /// The step at whose beginning it takes effect.
     pub step: u64,
-    /// The error that was found.
+    /// The measured error.
     pub audited_error: AuditedError,
     /// The main source of the error.
     pub reason: String,
@@ -221,22 +234,22 @@ pub struct Correction {
     pub sleep_tolerance: f64,
 }
 
-/// A recovery: the guard found the tissue's motion wrong, and shorter substeps did not help. The tissue went back to the
-/// last state that passed the guard's checks, and continued without tools.
+/// A recovery by the guard. The tissue's motion was wrong, and shorter substeps did not help. The tissue went
+/// back to the last state that passed the guard's checks, and continued without tools.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Recovery {
-    /// Steps done when it was found. Time continues from there.
+    /// Steps done when the guard found the error. Time continues from there.
     pub step: u64,
-    /// The step whose state the tissue went back to.
+    /// The step of the state that the tissue went back to.
     pub state_of_step: u64,
-    /// Whether that state had passed no check of the guard, and the tissue continued at rest instead.
+    /// Whether no such state existed, so that the tissue continued at rest.
     pub at_rest: bool,
-    /// Commands whose effect was lost: those that had taken effect since that state.
+    /// Number of commands whose effect was lost, because they took effect after that state.
     pub undone_commands: u64,
-    /// The step before which commands to the tools that acted have no effect, if there were too many recoveries.
+    /// After too many recoveries: until this step, commands to the tools that acted have no effect.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub paused_until_step: Option<u64>,
-    /// What the guard found.
+    /// What the guard found, in words.
     pub reason: String,
 }
 
@@ -253,24 +266,27 @@ pub struct Network {
     pub rejected_commands: u64,
     /// Steps that the server dropped.
     pub overruns: u64,
-    /// Simulated time over real time, from the first sample to the last.
+    /// Simulated time divided by real time, from the first sample to the last.
     pub time_dilation: f64,
-    /// From sending a message to its answer, which does not wait for a step.
+    /// Time from sending a message to its answer, µs. The answer does not wait for a step.
     pub round_trip_us: Percentiles,
-    /// Time that the server held that message.
+    /// Time that the server held that message, µs.
     pub server_hold_us: Percentiles,
 }
 
-/// Percentiles of a distribution.
+/// Percentiles of a distribution, in the unit of the field that has them.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
 #[allow(missing_docs)]
+/// The median.
 pub struct Percentiles {
+    /// 99 % of the values are at most this.
     pub p50: f64,
+    /// The largest value.
     pub p99: f64,
     pub max: f64,
 }
 
-/// `{"run": …}` and `{"summary": …}`.
+/// The first or the last line of a file of records: `{"run": …}` or `{"summary": …}`.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Line<'a> {
@@ -280,8 +296,8 @@ pub enum Line<'a> {
     Summary(&'a Summary),
 }
 
-/// Returns the output of the records: `file`, or else the standard output. A terminal that is to show a plot gets no
-/// records.
+/// Opens the output of the records: `file` (created or overwritten), or else the standard output. If the
+/// standard output is a terminal and `plots` is true, the records are discarded.
 ///
 /// # Errors
 /// Refuses a file that can't be written.
@@ -297,10 +313,10 @@ pub fn output(file: Option<&Path>, plots: bool) -> Result<Box<dyn Write>, Refusa
     Ok(Box::new(BufWriter::new(file)))
 }
 
-/// Writes one JSON object on one line.
+/// Writes one value as a JSON object on one line.
 ///
 /// # Errors
-/// Returns the error of `output`.
+/// Returns the error of writing to `output`.
 pub fn write_line(output: &mut dyn Write, line: &impl Serialize) -> std::io::Result<()> {
     let line = printable_json(serde_json::to_string(line)?);
     writeln!(output, "{line}")

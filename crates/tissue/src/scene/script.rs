@@ -1,4 +1,5 @@
-//! Scripts: forces, tool movements and samples over time, bound to a scene: times are whole steps, points are places.
+//! Scripts: forces, tool movements and samples over time, bound to a scene. Times are whole steps, and points
+//! are places.
 
 use std::sync::Arc;
 
@@ -9,7 +10,7 @@ pub use super::action::Action;
 use super::profile::{LoadProfile, Moment, MotionProfile, PoseProfile};
 use crate::shape::{PointId, RestShape};
 
-/// The built-in scripts: name and text.
+/// The built-in scripts: name and TOML text, by ascending name.
 pub const BUILT_IN: [(&str, &str); 7] = [
     ("grasp", include_str!("../../../../scripts/grasp.toml")),
     ("oblique-100", include_str!("../../../../scripts/oblique-100.toml")),
@@ -20,41 +21,41 @@ pub const BUILT_IN: [(&str, &str); 7] = [
     ("vertical-60", include_str!("../../../../scripts/vertical-60.toml")),
 ];
 
-/// A script bound to a scene.
+/// A script bound to a scene: what tools do over time, and what is recorded.
 #[derive(Debug, Clone)]
 pub struct Script {
-    /// Any name, for people.
+    /// Display name; any text.
     pub name: String,
     /// Length in steps.
     pub steps: u64,
-    /// Steps between two records, the first of which is at step 0.
+    /// Steps between two records. The first record is at step 0.
     pub sample_every: u64,
-    /// Points of the records.
+    /// The points that records contain, in this order.
     pub sample_points: Vec<PointId>,
-    /// Surgical forces.
+    /// Surgical forces. Force k is tool k.
     pub forces: Vec<LoadProfile>,
-    /// Grasped points.
+    /// Grasped points; their tool numbers follow those of the forces.
     pub moves: Vec<MotionProfile>,
-    /// Tools with a tip.
+    /// Tools with a tip; their numbers follow those of the grasped points.
     pub poses: Vec<PoseProfile>,
-    /// Changes of the tissue and the step at whose beginning each takes effect, by ascending step.
+    /// Changes of the tissue, each with the step at whose beginning it takes effect, by ascending step.
     pub changes: Vec<(u64, Change)>,
-    /// Warnings for the user: rounded values, forces that leave the sheet.
+    /// Warnings for the user: rounded values, forces that leave the tissue.
     pub warnings: Vec<String>,
-    /// Steps per second, from the scene.
+    /// Steps per second, from the scene, Hz.
     pub rate_hz: f64,
-    /// The rest shape of the tissue that it is bound to.
+    /// The rest shape of the tissue that the script is bound to.
     pub shape: Arc<dyn RestShape>,
 }
 
 impl Script {
-    /// Returns the actions that a client streaming this script commands at step `step`: only differences from the step
-    /// before. Force k is tool k; the grasped points and then the tools with a tip follow. A force is held for the
+    /// Returns the actions that a client sends at step `step` to play this script, with their tool numbers.
+    /// Forces and grasps are only returned if they differ from the step before. A force acts for the whole
     /// step, from its beginning; a grasped point reaches its target at the step's end.
     pub fn actions_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
         let poke = move |profile: &LoadProfile, step: u64| {
             let poke = profile.at(Moment::start_of(step), self.rate_hz);
-            // A force that has left the sheet can no longer be commanded.
+            // A force that has left the tissue can no longer be commanded.
             (poke.force_n != DVec3::ZERO && self.shape.is_near(poke.centre_m)).then_some(poke)
         };
         let pushes = self.forces.iter().enumerate().filter_map(move |(tool, profile)| {
@@ -71,8 +72,9 @@ impl Script {
         pushes.chain(grasps).chain(self.poses_at(step))
     }
 
-    /// Returns of these the poses: at every step, because a tool of which nothing is heard is taken away. A tip reaches its place
-    /// at the step's end.
+    /// Returns the poses that a client sends at step `step`, with their tool numbers: one for each tool with a
+    /// tip at every step, because the server takes away a silent tool. A tip reaches its place at the step's
+    /// end.
     #[allow(clippy::cast_precision_loss)]
     pub fn poses_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
         let first = self.first_tip().unwrap_or_default();
@@ -86,7 +88,7 @@ impl Script {
         })
     }
 
-    /// Returns the number of the first tool with a tip, if the script has one.
+    /// Returns the number of the first tool with a tip; `None` if the script has none.
     pub fn first_tip(&self) -> Option<usize> {
         (!self.poses.is_empty()).then_some(self.forces.len() + self.moves.len())
     }

@@ -20,7 +20,7 @@ use crate::shape::{self, PointId};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, legible, not_negative, number, positive, unsigned_zero};
 
 impl Script {
-    /// Reads a script's file and binds it to `scene`.
+    /// Reads a script file and binds it to `scene`. Its traces are in the file's folder.
     ///
     /// # Errors
     /// Refuses a script that can't be read, parsed or bound to the scene.
@@ -30,7 +30,8 @@ impl Script {
         Self::parse(&path.display().to_string(), &text, folder, scene, limits)
     }
 
-    /// Reads a script from TOML. Refusals call the text `name`; its traces are in `folder`.
+    /// Reads a script from TOML text and binds it to `scene`. Refusals call the text `name`; its traces are in
+    /// `folder`.
     ///
     /// # Errors
     /// Refuses a script that can't be parsed or bound to the scene.
@@ -41,13 +42,13 @@ impl Script {
     }
 }
 
-/// A shorter move would need accelerations beyond the number range.
+/// Shortest move, s. A shorter one would need accelerations beyond the number range.
 const SHORTEST_MOVE_S: f64 = 1e-6;
 
-/// The least sum of the weights of a force with a radius.
+/// The smallest allowed sum of the weights of a force with a radius.
 const MIN_WEIGHT: f64 = 1e-3;
 
-/// Beyond this a phase has no digits left.
+/// Highest frequency, Hz. Beyond it, a phase has no digits left.
 const HIGHEST_HZ: f64 = 1e6;
 
 /// The inputs of reading a script.
@@ -83,7 +84,7 @@ impl Binding<'_> {
         for (index, profile) in forces.iter().enumerate() {
             let end = profile.at(Moment::start_of(steps), self.scene.stepping.rate_hz);
             if matches!(profile.centre, CentreProfile::Path { .. }) && !self.scene.shape().is_near(end.centre_m) {
-                let message = "leaves the sheet; where the force is streamed (--held, a replay) it ends there";
+                let message = "leaves the tissue; if the force is streamed (--held, a replay), it ends there";
                 self.warnings.push(format!("force[{index}].path: {message}"));
             }
         }
@@ -134,7 +135,7 @@ impl Binding<'_> {
         })
     }
 
-    /// A time in whole steps, with a warning where rounding moves it by more than a millionth of a step.
+    /// Returns a time as whole steps. Adds a warning if rounding moves it by more than a millionth of a step.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn steps(&mut self, field: &str, time_s: f64) -> Result<u64> {
         let exact = not_negative(field, time_s)? * self.scene.stepping.rate_hz;
@@ -147,12 +148,13 @@ impl Binding<'_> {
         Ok(whole as u64)
     }
 
-    /// A point of the tissue.
+    /// Returns the point of the tissue that an item names.
     fn point(&self, item: &Item<'_>) -> Result<PointId> {
         self.scene.shape().find("", item.point_name()?).map_err(|refusal| item.refuse(refusal.reason, refusal.message))
     }
 
-    /// The point that a table names: `point` on a sheet, `vertex` on a mesh, or the one nearest to `at_m`.
+    /// Returns the point that a table names: `point` on a sheet, `vertex` on a mesh, or the one nearest to
+    /// `at_m`.
     fn point_of(&self, fields: &mut Fields<'_>) -> Result<PointId> {
         if let Some(at) = fields.item("at_m") {
             let at_m = self.place(&at)?;
@@ -165,12 +167,12 @@ impl Binding<'_> {
         }
     }
 
-    /// A place on the tissue: [x, y] on a sheet, [x, y, z] on a mesh, m.
+    /// Returns a place on the tissue, m: [x, y] on a sheet, [x, y, z] on a mesh.
     fn place(&self, item: &Item<'_>) -> Result<DVec3> {
         if self.scene.shape().dimensions() == 2 { Ok(item.place()?.extend(0.0)) } else { item.vector() }
     }
 
-    /// Changes of the tissue. Each is checked with those before it.
+    /// Reads changes of the tissue. Each is checked together with those before it.
     fn changes(&mut self, list: &[Item<'_>]) -> Result<Vec<(u64, Change)>> {
         let mut scene = self.scene.clone();
         let mut changes: Vec<(u64, Change)> = Vec::new();
@@ -233,8 +235,9 @@ impl Binding<'_> {
         })
     }
 
-    /// How a force spreads: as in the paper by `falloff_per_m` and `falloff_offset`, or by `radius_m`, where the weight is
-    /// 1/e; then what is given is the force on all points together, at the first place.
+    /// Reads how a force spreads: as in the paper by `falloff_per_m` and `falloff_offset`, or by `radius_m`, at
+    /// which the weight is 1/e. With `radius_m`, the script gives the total force on all points, at the first
+    /// place.
     fn field(&self, fields: &mut Fields<'_>, centre: &CentreProfile) -> Result<ForceSpread> {
         let Some(radius_m) = fields.number("radius_m")? else {
             let falloff_per_m = not_negative(&fields.path("falloff_per_m"), fields.required_number("falloff_per_m")?)?;
@@ -309,7 +312,7 @@ impl Binding<'_> {
         }
     }
 
-    /// A profile, or the rows of a trace.
+    /// Reads a profile, or the rows of a trace.
     #[allow(clippy::type_complexity)]
     fn profile(&mut self, fields: &mut Fields<'_>) -> Result<std::result::Result<Profile, Vec<(u64, DVec3)>>> {
         let kind = fields.required("type")?;
@@ -437,7 +440,7 @@ impl Binding<'_> {
         })
     }
 
-    /// A tool with a tip.
+    /// Reads a tool with a tip.
     fn poses(&mut self, fields: &mut Fields<'_>, list: &Item<'_>) -> Result<PoseProfile> {
         let shape = self.scene.shape();
         let tip = fields.item("tip").map_or(Ok(Tip::default()), |item| item.table(read_tip))?;
@@ -484,7 +487,7 @@ impl Binding<'_> {
     }
 }
 
-/// A `[[tool]]`.
+/// A table `[[tool]]`.
 enum ToolTable {
     Moves(MotionProfile),
     Poses(PoseProfile),
@@ -492,9 +495,9 @@ enum ToolTable {
 
 /// How a force spreads over the points.
 struct ForceSpread {
-    /// What the given vector is multiplied by.
+    /// The factor of the given force vector.
     unit: f64,
-    /// The name of that vector.
+    /// The key of that vector.
     key: &'static str,
     falloff_per_m: f64,
     falloff_offset: f64,
@@ -518,7 +521,7 @@ fn read_tip(fields: &mut Fields<'_>) -> Result<Tip> {
     })
 }
 
-/// The scenes that a script is made for: all, if it names none.
+/// Reads the names of the scenes that a script is made for; empty means all.
 fn read_scenes(fields: &mut Fields<'_>) -> Result<Vec<String>> {
     let Some(item) = fields.item("scenes") else { return Ok(Vec::new()) };
     item.list()?.iter().map(Item::text).collect()
@@ -528,25 +531,25 @@ fn is_made_for(scenes: &[String], name: &str) -> bool {
     scenes.is_empty() || scenes.iter().any(|scene| scene == name)
 }
 
-/// Returns the scenes that the script of a text is made for. None is named by a script for all of them, and by a text
-/// that can't be read: whoever plays it learns why.
+/// Returns the names of the scenes that a script's text is made for. Empty if the script is for all scenes, or
+/// if the text can't be parsed: playing the script reports the error.
 pub fn made_for(text: &str) -> Vec<String> {
     let Ok(table) = text.parse::<toml::Table>() else { return Vec::new() };
     let scenes = table.get("scenes").and_then(|scenes| scenes.as_array());
     scenes.into_iter().flatten().filter_map(|name| name.as_str().map(str::to_owned)).collect()
 }
 
-/// Returns whether the script of a text is made for the scene of that name.
+/// Returns whether a script's text is made for the scene of that name.
 pub fn fits(text: &str, scene: &str) -> bool {
     is_made_for(&made_for(text), scene)
 }
 
-/// The entries of `[[key]]`; empty if the key is absent.
+/// Returns the entries of `[[key]]`; empty if the key is absent.
 fn items<'a>(fields: &mut Fields<'a>, key: &'static str) -> Result<Vec<Item<'a>>> {
     fields.item(key).map_or(Ok(Vec::new()), |item| item.tables())
 }
 
-/// Requires ascending times. Of two that round to one step, the later one applies.
+/// Requires ascending times. If two entries round to the same step, the later one applies.
 fn rising<T>(list: &Item<'_>, key: &str, entries: &mut Vec<(u64, T)>) -> Result<()> {
     if entries.is_empty() {
         return Err(list.refuse(Reason::Missing, "must have at least one entry"));

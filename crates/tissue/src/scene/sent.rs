@@ -1,4 +1,4 @@
-//! The file with the mesh of a scene file, as a client sends it to a server.
+//! The mesh file of a scene, as a client sends it to a server.
 
 use std::path::{Path, PathBuf};
 
@@ -12,21 +12,22 @@ use crate::limits::Limits;
 use crate::scene::toml_document::{Document, Fields};
 use palpate_refusal::Result;
 
-/// What the section `[mesh]` of a scene file says of its mesh.
+/// The mesh that the section `[mesh]` of a scene file names.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshFile {
-    /// The file; `None` for a mesh that is generated.
+    /// The path of the file; `None` if the mesh is generated.
     pub path: Option<PathBuf>,
-    /// The metres of its unit, or the unit's name.
+    /// The unit's name, or its length in metres.
     pub unit: String,
-    /// So many vertices are simulated, if fewer than the file has.
+    /// Wanted number of simulated vertices, if fewer than the file has.
     pub vertices: Option<u64>,
 }
 
-/// Returns the mesh file of a scene file that is valid; `None` if its tissue is no mesh.
+/// Returns the mesh file that a valid scene file names, with its path resolved from the scene's folder; `None`
+/// if the tissue is not a mesh.
 ///
 /// # Errors
-/// Refuses a file that can't be read.
+/// Refuses a scene file that can't be read or is not TOML.
 pub fn mesh_file(scene: &Path, limits: &Limits) -> Result<Option<MeshFile>> {
     let text = files::read_text(scene, limits.file_bytes)?;
     let folder = scene.parent().unwrap_or(Path::new(""));
@@ -34,7 +35,8 @@ pub fn mesh_file(scene: &Path, limits: &Limits) -> Result<Option<MeshFile>> {
         .map(|said| MeshFile { path: said.path.map(|path| folder.join(path)), ..said }))
 }
 
-/// Does the same of the text of a scene, whose files are named as it does.
+/// Returns the mesh file that the text of a valid scene names, with the path as it is written; `None` if the
+/// tissue is not a mesh. Refusals call the text `name`.
 ///
 /// # Errors
 /// Refuses a text that is not TOML.
@@ -50,12 +52,12 @@ pub fn said(name: &str, text: &str) -> Result<Option<MeshFile>> {
         });
         Ok(())
     };
-    // Other keys are no matter of this: who reads the scene checks them.
+    // Other errors do not matter here: reading the scene checks them.
     let _ = document.read(|fields| fields.item("mesh").map_or(Ok(()), |item| item.table(read)));
     Ok(found)
 }
 
-/// Returns the mesh of a scene, before it was made coarser.
+/// Returns the mesh of a scene before it was made coarser.
 pub fn written(mesh: &Mesh) -> TriangleMesh {
     if let Some(shown) = mesh.shape.shown() {
         return shown.mesh.clone();
@@ -68,7 +70,8 @@ pub fn written(mesh: &Mesh) -> TriangleMesh {
     }
 }
 
-/// Returns the same as a file, to be sent: its name, its bytes and its unit.
+/// Returns the mesh of a scene before it was made coarser, as a file to send: its name, its bytes (OBJ) and its
+/// unit, `"m"`.
 pub fn file(mesh: &Mesh) -> (&'static str, Vec<u8>, &'static str) {
     ("mesh.obj", write(&written(mesh), Format::Obj), "m")
 }

@@ -1,5 +1,4 @@
-//! The section `[sheet]` of a scene: a rectangular grid of points, and what everything else needs to know of it, which is its
-//! rest shape.
+//! The section `[sheet]` of a scene: a rectangular grid of points. It is also the rest shape of the tissue.
 #![allow(clippy::cast_precision_loss)]
 
 use std::sync::Arc;
@@ -13,15 +12,15 @@ use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{Extent, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, positive};
 
-/// Points of a row that are computed at least: the lanes of the widest vector.
+/// Smallest number of points per row in memory: the lanes of the widest vector. Shorter rows are padded.
 pub const MIN_WIDTH: usize = 16;
 
-/// The grid: point [i, j] rests at (i·spacing, j·spacing, 0).
+/// A rectangular grid of points: point [i, j] rests at (i·spacing, j·spacing, 0).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sheet {
     /// Points along x and along y.
     pub points: [usize; 2],
-    /// Distance of structural neighbours at rest, m.
+    /// Distance between structural neighbours at rest, m.
     pub spacing_m: f64,
     /// Mass of each point, kg.
     pub point_mass_kg: f64,
@@ -29,29 +28,28 @@ pub struct Sheet {
     pub fixed: FixedPoints,
 }
 
-/// Points that never move.
+/// The points of a grid that never move.
 #[derive(Debug, Clone, PartialEq)]
 pub enum FixedPoints {
     /// Every point of the rim.
     Edges,
     /// The four corners.
     Corners,
-    /// Just these; an empty list fixes none.
+    /// The listed points; an empty list fixes none.
     Points(PointSet),
 }
 
-/// Points of a grid, each once, in order. One in memory for all clones: a scene may name many, and is shared by all that
-/// know it.
+/// A sorted set of grid points [i, j]. Clones share one list in memory, because a scene may name many points.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct PointSet(Arc<[[usize; 2]]>);
 
 impl PointSet {
-    /// Returns whether a point is one of them.
+    /// Returns whether a point is in the set.
     pub fn contains(&self, point: [usize; 2]) -> bool {
         self.0.binary_search(&point).is_ok()
     }
 
-    /// Returns all of them.
+    /// Returns all points, ascending.
     pub fn as_slice(&self) -> &[[usize; 2]] {
         &self.0
     }
@@ -100,7 +98,7 @@ impl Sheet {
             let message = format!("are {nx} × {ny}, above the limit of {} points in all", limits.points);
             return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
         }
-        // A narrow sheet takes the memory and the time of one of this width, which may be sixteen times its own.
+        // A narrow sheet takes the memory and time of one of this width, which may be sixteen times its own.
         if nx.checked_mul(ny.max(MIN_WIDTH)).is_none_or(|points| points > limits.points) {
             let message = format!(
                 "are {nx} × {ny}: rows of fewer than {MIN_WIDTH} points are computed as if they had so many, and \
@@ -119,12 +117,12 @@ impl Sheet {
         Ok(())
     }
 
-    /// Returns the point [i, j] of the grid, which must have it: [`RestShape::find`] checks that.
+    /// Returns the point [i, j], which must be on the grid: [`RestShape::find`] checks that.
     pub fn point(&self, [i, j]: [usize; 2]) -> PointId {
         PointId::new(i * self.points[1] + j)
     }
 
-    /// Returns the row and column [i, j] of a point.
+    /// Returns the indices [i, j] of a point: i along x, j along y.
     pub fn place_of(&self, point: PointId) -> [usize; 2] {
         [point.index() / self.points[1], point.index() % self.points[1]]
     }
@@ -134,8 +132,8 @@ impl Sheet {
         self.spacing_m * DVec2::new((self.points[0] - 1) as f64, (self.points[1] - 1) as f64)
     }
 
-    /// A corner of at most `side` points along each side; and three of its points: one that is free, its middle, and one at
-    /// a corner, where springs are fewer.
+    /// Returns a corner of the grid with at most `side` points along each side. Also returns three of its
+    /// points: a free one, its middle, and one at a corner, where there are fewer springs.
     pub(super) fn part(&self, side: usize) -> (Self, [PointId; 3]) {
         let points @ [nx, ny] = self.points.map(|points| points.min(side));
         let mut part = Sheet { points, ..self.clone() };
@@ -150,7 +148,7 @@ impl Sheet {
         (part, [pushed, others[0], others[1]])
     }
 
-    /// Returns row-major indices of the fixed points, ascending.
+    /// Returns the row-major indices of the fixed points, ascending.
     pub fn fixed_indices(&self) -> Vec<usize> {
         let [nx, ny] = self.points;
         let mut indices: Vec<usize> = match &self.fixed {
@@ -216,7 +214,7 @@ impl RestShape for Sheet {
         }
     }
 
-    /// Those of the structural and the shear springs.
+    /// Returns the points at the other ends of the structural and the shear springs.
     fn neighbours(&self, point: PointId) -> Vec<PointId> {
         let ([nx, ny], [i, j]) = (self.points, self.place_of(point));
         let around = |at: usize, count: usize| at.saturating_sub(1)..(at + 2).min(count);
@@ -231,7 +229,7 @@ impl RestShape for Sheet {
         self.point([along(0), along(1)])
     }
 
-    /// Those of the square around the circle.
+    /// Returns the points of the square around the circle.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn around(&self, place_m: DVec3, radius_m: f64) -> Vec<PointId> {
         let within = |axis: usize| {

@@ -1,7 +1,7 @@
-//! From the mesh of a file to the one that is simulated, and the other one that is shown.
+//! Prepares the mesh of a file for simulation, and binds the mesh that is shown to it.
 //!
-//! What is shown has the vertices of the file. The simulated mesh is another one if it is coarser, or if vertices of the file are
-//! joined: then each shown vertex moves with a place on it.
+//! The shown mesh has the vertices of the file. The simulated mesh differs from it if it is coarser, or if
+//! vertices of the file were joined: then each shown vertex moves with a place on the simulated mesh.
 
 use glam::DVec3;
 use palpate_geometry::decimate::{MeshPlace, decimate};
@@ -12,49 +12,50 @@ use palpate_geometry::{FileMesh, TriangleMesh, prepare};
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// The mesh of the file, and how it is bound to the simulated one.
+/// The mesh of the file, and how its vertices follow the simulated mesh.
 #[derive(Debug, PartialEq)]
 pub struct Shown {
-    /// The mesh of the file, with its own numbers of vertices. One that several simulated ones stand for has copies behind the
-    /// last.
+    /// The mesh of the file, with its own vertex numbers. If one vertex stands for several simulated ones,
+    /// copies of it are at the end.
     pub mesh: TriangleMesh,
-    /// For each of its vertices, the place on the simulated mesh.
+    /// For each of its vertices, the place on the simulated mesh that it follows.
     pub places: Vec<BoundPlace>,
-    /// For each of its vertices, the nearest simulated one.
+    /// For each of its vertices, the nearest simulated vertex.
     pub(super) nearest: Vec<u32>,
-    /// For each simulated vertex, a vertex of the file whose nearest one it is, the closest of them, and of several as close the
-    /// first; if there is none, the closest of all that are bound to a triangle of it.
+    /// For each simulated vertex, a vertex of the file: the closest of those whose nearest simulated vertex it
+    /// is, and of several equally close ones the first. If there are none, the closest of all that are bound to
+    /// one of its triangles.
     pub(super) names: Vec<u32>,
 }
 
-/// A place at a height over a triangle. It turns with the triangle.
+/// A place at a height above a triangle. It moves and turns with the triangle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BoundPlace {
     /// The triangle of the simulated mesh.
     pub triangle: u32,
-    /// Weights of its vertices; their sum is 1.
+    /// Barycentric weights of the triangle's three vertices; their sum is 1.
     pub barycentric: [f64; 3],
-    /// How far the place is off the triangle, along its normal, m.
+    /// Height of the place above the triangle, along its normal, m.
     pub height_m: f64,
 }
 
-/// The mesh of a scene as it is simulated.
+/// The mesh of a scene as it is simulated, and the mesh that is shown.
 #[derive(Debug, PartialEq)]
 pub struct Simulated {
-    /// The mesh, whose edges are Delaunay if they were flipped.
+    /// The simulated mesh. Its edges are Delaunay if they were flipped.
     pub mesh: TriangleMesh,
-    /// That of the file, if it has other vertices.
+    /// The mesh of the file, if it has other vertices than the simulated one.
     pub shown: Option<Shown>,
-    /// What was done with the mesh of the file, and what is doubtful about it, in words.
+    /// What was done with the mesh of the file, and doubts about it, as sentences for the user.
     pub findings: Vec<String>,
 }
 
 impl Simulated {
-    /// Prepares the mesh of a file: joins what has the same position, and turns closed parts outward. It has at most so many
-    /// vertices, if it can, and edges flipped to Delaunay if `flips`.
+    /// Prepares the mesh of a file: joins vertices with the same position and turns closed parts outward. Then
+    /// it reduces the mesh to at most `vertices`, if possible, and flips edges to Delaunay if `flips`.
     ///
     /// # Errors
-    /// Refuses a mesh that is no surface, by element and place.
+    /// Refuses a mesh that is not a surface; the message names the element and place.
     pub fn of(mesh: TriangleMesh, vertices: Option<usize>, flips: bool) -> Result<Self> {
         let prepared = prepare(mesh);
         let report = prepared.report();
@@ -63,7 +64,7 @@ impl Simulated {
             return Err(Refusal::new(Reason::Unreadable, "mesh", message));
         }
         let mut findings: Vec<String> = prepared.notes.iter().map(|note| format!("mesh: {note}")).collect();
-        // Of each kind the first.
+        // The first finding of each kind.
         for (kind, count) in &report.counts {
             let of_kind = report.problems.iter().find(|finding| finding.problem.name() == *kind);
             let more = if *count > 1 { format!(" ({count} of this kind: `palpate mesh FILE`)") } else { String::new() };
@@ -72,7 +73,8 @@ impl Simulated {
         Ok(Self { findings, ..Self::bound(prepared.mesh, prepared.file, vertices, flips) })
     }
 
-    /// Returns the same of a mesh that was made, and needs no preparation.
+    /// Prepares a generated mesh, which needs no repair: reduces it to at most `vertices`, if possible, and
+    /// flips edges to Delaunay if `flips`.
     pub fn made(mesh: TriangleMesh, vertices: Option<usize>, flips: bool) -> Self {
         Self::bound(mesh, None, vertices, flips)
     }
@@ -95,7 +97,8 @@ impl Simulated {
     }
 }
 
-/// A mesh of at most so many vertices, if it can be, whose triangles are Delaunay if `flips`; and what is shown in its place.
+/// Returns a mesh of at most `vertices`, if possible, with Delaunay edges if `flips`; and the mesh that is
+/// shown in its place.
 fn coarser(mesh: TriangleMesh, file: Option<FileMesh>, vertices: usize, flips: bool) -> (TriangleMesh, Shown) {
     let decimated = decimate(&mesh, vertices);
     let (mut coarse, before) = (decimated.mesh.clone(), decimated.mesh.triangles);
@@ -109,7 +112,7 @@ fn coarser(mesh: TriangleMesh, file: Option<FileMesh>, vertices: usize, flips: b
 }
 
 impl Shown {
-    /// Binds a mesh to one whose vertices stand for some of its own each.
+    /// Binds a mesh to the simulated one, each of whose vertices stands for one or more of its own.
     #[allow(clippy::cast_possible_truncation)]
     fn joined(FileMesh { mesh, vertex_of }: FileMesh, simulated: &TriangleMesh) -> Self {
         let mut corners = vec![(0, 0); simulated.vertices_m.len()];
@@ -124,7 +127,7 @@ impl Shown {
         };
         let places = vertex_of.iter().map(bind).collect();
         let mut names = vec![0; simulated.vertices_m.len()];
-        // Backwards, so that the least is written last.
+        // In reverse, so that the lowest number is written last.
         for (number, (vertex, place_m)) in vertex_of.iter().zip(&mesh.vertices_m).enumerate().rev() {
             if simulated.vertices_m[*vertex as usize] == *place_m {
                 names[*vertex as usize] = number as u32;
@@ -133,8 +136,8 @@ impl Shown {
         Shown { mesh, places, nearest: vertex_of, names }
     }
 
-    /// Binds a mesh to a coarser one, given places on its triangles before edges were flipped; `vertices_m` are those that were
-    /// decimated.
+    /// Binds a mesh to a coarser one. `places` are on the coarser mesh's triangles `before` edges were flipped;
+    /// `vertices_m` are the vertices that were decimated.
     #[allow(clippy::cast_possible_truncation)]
     fn decimated(
         FileMesh { mesh, vertex_of }: FileMesh,

@@ -1,4 +1,4 @@
-//! Where the mesh of a scene comes from: a file beside the scene, or an organ that is generated.
+//! Reads or generates the mesh of a scene: a file beside the scene, or an organ.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex};
@@ -12,27 +12,28 @@ use crate::lock::lock;
 use crate::scene::toml_document::{Fields, Item};
 use palpate_refusal::{Reason, Result, excerpt};
 
-/// What files a scene may name.
+/// The files that a scene may name.
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Files<'a> {
-    /// None: it came from a client.
+    /// No file: the scene came from a client.
     None,
-    /// Those in a folder.
+    /// The files in a folder.
     In(&'a Path),
-    /// One mesh, by its name and its bytes.
+    /// One mesh file, given by its name and bytes.
     Given(&'a str, &'a [u8]),
 }
 
-/// A mesh, by where it is from.
+/// A mesh and its origin.
 pub(super) enum SourceMesh {
-    /// It was generated, without a flaw.
+    /// A generated mesh, which is free of defects.
     Made(TriangleMesh),
-    /// It is that of a file.
+    /// The mesh of a file.
     Read(TriangleMesh),
 }
 
 impl Files<'_> {
-    /// Reads the mesh that a section names by `organ`, or by `file` and `unit`; returns also the key, for refusals.
+    /// Reads the mesh that a section names by `organ`, or by `file` and `unit`. Also returns the key, for
+    /// refusals.
     pub(super) fn mesh<'a>(self, fields: &mut Fields<'a>, limits: &Limits) -> Result<(SourceMesh, Item<'a>)> {
         if let Some(organ) = fields.item("organ") {
             if let Some(file) = fields.item("file") {
@@ -47,9 +48,10 @@ impl Files<'_> {
         Ok((SourceMesh::Read(self.read(&file, unit, limits)?), file))
     }
 
-    /// Reads the mesh that an item names. The files that this names in turn have bare names, in the same folder.
+    /// Reads the mesh file that an item names. Files that this file names in turn must have bare names and be
+    /// in the same folder.
     fn read(self, item: &Item<'_>, unit: Unit, limits: &Limits) -> Result<TriangleMesh> {
-        // Refusals name it as the scene does: clients do not learn where the server's files are.
+        // Refusals use the name in the scene, so that clients do not learn where the server's files are.
         let name = item.text()?;
         let refuse = |message: String| Err(item.refuse(Reason::WrongKind, message));
         let (bytes, path) = match self {
@@ -77,22 +79,23 @@ impl Files<'_> {
     }
 }
 
-/// The unit that an item gives: a name, or the metres of it.
+/// Returns the unit that an item gives: its name, or its length in metres.
 pub(super) fn unit_text(item: &Item<'_>) -> Result<String> {
     item.as_text().map_or_else(|| item.number().map(|metres| metres.to_string()), |text| Ok(text.to_owned()))
 }
 
-/// An organ: which one, the bits of its edge length, its seed.
+/// What determines a generated organ: its name, the bits of its edge length, its seed.
 type Recipe = (&'static str, u64, u64);
 
-/// The organs made last, newest last. To make one may take a second, and scenes are read again and again.
+/// The organs generated last, newest last. Generating one may take a second, and scenes are read again and
+/// again.
 static KEPT: Mutex<Vec<(Recipe, Arc<TriangleMesh>)>> = Mutex::new(Vec::new());
 
-/// Organs that are kept, and their vertices in all, at most.
+/// Largest number of organs that are kept, and of their vertices in all.
 const MAX_KEPT: usize = 4;
 const MAX_VERTICES_KEPT: usize = 200_000;
 
-/// Makes the organ of a table.
+/// Generates the organ that a table describes, or copies it from those kept.
 fn made(item: &Item<'_>, limits: &Limits) -> Result<TriangleMesh> {
     item.table(|fields| {
         let name = fields.required("name")?;

@@ -1,4 +1,4 @@
-//! TOML with line numbers, the source of scenes and scripts, so that every refusal can name the file, the line and the
+//! TOML with line numbers, the format of scenes and scripts. Every refusal can name the file, the line and the
 //! key. `--set` overrides values before they are read.
 
 use std::collections::BTreeMap;
@@ -9,7 +9,7 @@ use toml::de::{DeTable, DeValue};
 use crate::shape::PointName;
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, nearest, unsigned_zero};
 
-/// A parsed text.
+/// A parsed TOML text with its name and line numbers.
 #[derive(Debug)]
 pub struct Document {
     name: String,
@@ -49,7 +49,7 @@ impl Value {
 }
 
 impl Document {
-    /// Parses `text`; refusals call it `name`.
+    /// Parses TOML text; refusals call it `name`.
     ///
     /// # Errors
     /// Refuses text that is not TOML, with its line.
@@ -66,7 +66,8 @@ impl Document {
         Ok(Document { name: name.to_owned(), root })
     }
 
-    /// Applies `key.path=value`: a TOML value, or a bare string.
+    /// Sets a value by `key.path=value`; the value is TOML or a bare string. Creates missing tables on the
+    /// path.
     ///
     /// # Errors
     /// Refuses an assignment without `=`, an empty part of the path, and a path through a value that is not a table.
@@ -99,17 +100,17 @@ impl Document {
         Ok(())
     }
 
-    /// Returns whether it has this key.
+    /// Returns whether the document has this top-level key.
     pub fn has(&self, key: &str) -> bool {
         matches!(&self.root.value, Value::Table(entries) if entries.contains_key(key))
     }
 
-    /// Returns a refusal of the whole document.
+    /// Returns a refusal of the whole document, located at its name.
     pub fn refuse(&self, reason: Reason, message: impl Into<String>) -> Refusal {
         Refusal { place: Some(self.name.clone()), ..Refusal::new(reason, "", message) }
     }
 
-    /// Reads the whole document as fields.
+    /// Reads the whole document by `read`, which asks for its keys.
     ///
     /// # Errors
     /// Returns the refusal of `read`, with its file and line, and refuses keys that `read` did not ask for.
@@ -117,7 +118,7 @@ impl Document {
         Item { path: String::new(), node: &self.root }.table(read).map_err(|refusal| self.locate(refusal))
     }
 
-    /// Adds file and line to a refusal that names a field.
+    /// Adds file and line to a refusal that names a field, unless it has a place already.
     pub fn locate(&self, mut refusal: Refusal) -> Refusal {
         if refusal.place.is_none() {
             let mut node = &self.root;
@@ -187,7 +188,7 @@ fn value_of(value: &DeValue<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
     }
 }
 
-/// The keys of one table. `read` asks for each by name; a key that it never asks for is unknown.
+/// The keys of one table, while it is read. A key that the reader never asks for counts as unknown.
 #[derive(Debug)]
 pub struct Fields<'a> {
     path: String,
@@ -195,7 +196,7 @@ pub struct Fields<'a> {
     known: Vec<&'static str>,
 }
 
-/// One value, with its path.
+/// One value of a document, with its path.
 #[derive(Debug)]
 pub struct Item<'a> {
     path: String,
@@ -203,27 +204,27 @@ pub struct Item<'a> {
 }
 
 impl<'a> Fields<'a> {
-    /// Returns the full path of `key`.
+    /// Returns the full path of `key`, for example `stepping.rate_hz`.
     pub fn path(&self, key: &str) -> String {
         if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
     }
 
-    /// Returns a refusal of `key`.
+    /// Returns a refusal of `key`; of the table itself if `key` is empty.
     pub fn refuse(&self, reason: Reason, key: &str, message: impl Into<String>) -> Refusal {
         let path = if key.is_empty() { self.path.clone() } else { self.path(key) };
         Refusal::new(reason, path, message)
     }
 
-    /// Returns the value of `key`, if present.
+    /// Returns the value of `key`, or `None` if it is absent. Marks the key as known.
     pub fn item(&mut self, key: &'static str) -> Option<Item<'a>> {
         self.known.push(key);
         self.entries.get(key).map(|node| Item { path: self.path(key), node })
     }
 
-    /// Returns the value of `key`.
+    /// Returns the value of `key`. Marks the key as known.
     ///
     /// # Errors
-    /// Refuses the table if the key is missing.
+    /// Refuses a missing key; if a similar unknown key is there, the refusal names it.
     pub fn required(&mut self, key: &'static str) -> Result<Item<'a>> {
         let unknown: Vec<&String> = self.entries.keys().filter(|there| !self.known.contains(&there.as_str())).collect();
         self.item(key).ok_or_else(|| match unknown.into_iter().find(|there| meant(there, [key]).is_some()) {
@@ -244,31 +245,31 @@ impl<'a> Fields<'a> {
         self.refuse(Reason::UnknownKey, there, message)
     }
 
-    /// Returns a finite number, if present.
+    /// Returns the value of `key` as a finite number; `None` if it is absent.
     ///
     /// # Errors
-    /// Refuses any other value.
+    /// Refuses a value of another kind, and one that is not finite.
     pub fn number(&mut self, key: &'static str) -> Result<Option<f64>> {
         self.item(key).map(|item| item.number()).transpose()
     }
 
-    /// Returns a finite number.
+    /// Returns the value of `key` as a finite number.
     ///
     /// # Errors
-    /// Refuses a missing key and any other value.
+    /// Refuses a missing key, a value of another kind, and one that is not finite.
     pub fn required_number(&mut self, key: &'static str) -> Result<f64> {
         self.required(key)?.number()
     }
 
-    /// Returns a string, if present.
+    /// Returns the value of `key` as a string; `None` if it is absent.
     ///
     /// # Errors
-    /// Refuses any other value.
+    /// Refuses a value of another kind.
     pub fn text(&mut self, key: &'static str) -> Result<Option<String>> {
         self.item(key).map(|item| item.text()).transpose()
     }
 
-    /// Refuses every key that was not asked for.
+    /// Refuses a key that the reader did not ask for.
     fn done(&self) -> Result<()> {
         let Some(key) = self.entries.keys().find(|key| !self.known.contains(&key.as_str())) else { return Ok(()) };
         let absent = self.known.iter().copied().filter(|known| !self.entries.contains_key(*known));
@@ -282,8 +283,8 @@ impl<'a> Fields<'a> {
     }
 }
 
-/// Returns what serde says of a name that it does not know, with the nearest of those that it knows in place of all of
-/// them, if one is near.
+/// Rewrites serde's message about an unknown key: it names the most similar known key, or else all known keys.
+/// Other messages are returned as they are.
 pub fn nearest_name(message: &str) -> String {
     // As in "unknown field `lissen`, expected one of `listen`, `tls_cert`".
     let mut names = message.split('`').skip(1).step_by(2);
@@ -299,7 +300,7 @@ pub fn nearest_name(message: &str) -> String {
     }
 }
 
-/// The key that `there` is without its unit, or misspelt.
+/// Returns the key that `there` probably stands for: the same without its unit, or misspelt.
 fn meant<'k>(there: &str, keys: impl IntoIterator<Item = &'k str>) -> Option<&'k str> {
     let keys: Vec<&str> = keys.into_iter().collect();
     let unit_is_missing = |key: &&&str| key.strip_prefix(there).is_some_and(|rest| rest.starts_with('_'));
@@ -307,13 +308,13 @@ fn meant<'k>(there: &str, keys: impl IntoIterator<Item = &'k str>) -> Option<&'k
 }
 
 impl<'a> Item<'a> {
-    /// Returns a refusal of this value.
+    /// Returns a refusal of this value, with its path.
     pub fn refuse(&self, reason: Reason, message: impl Into<String>) -> Refusal {
         Refusal::new(reason, &self.path, message)
     }
 
-    /// Returns a refusal that says what was expected, and what was probably meant. Words that are allowed are in
-    /// quotation marks.
+    /// Returns a refusal that says what was expected, and what was probably meant. Words in quotation marks in
+    /// `expected` are the allowed words.
     pub fn wrong(&self, expected: &str) -> Refusal {
         let words: Vec<&str> = expected.split('"').skip(1).step_by(2).collect();
         let is = match &self.node.value {
@@ -336,10 +337,10 @@ impl<'a> Item<'a> {
         self.refuse(Reason::WrongKind, format!("must be {expected}, but is {is}"))
     }
 
-    /// Returns a finite number.
+    /// Returns the value as a finite number.
     ///
     /// # Errors
-    /// Refuses any other value.
+    /// Refuses a value of another kind, and one that is not finite.
     pub fn number(&self) -> Result<f64> {
         match self.node.value {
             Value::Number(number) => finite(&self.path, number),
@@ -349,10 +350,10 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Returns an integer, 0 or more.
+    /// Returns the value as an integer, 0 or more.
     ///
     /// # Errors
-    /// Refuses any other value.
+    /// Refuses a value of another kind, and a negative one.
     pub fn whole(&self) -> Result<u64> {
         match self.node.value {
             Value::Whole(whole) => u64::try_from(whole)
@@ -361,10 +362,10 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Returns a string.
+    /// Returns the value as a string.
     ///
     /// # Errors
-    /// Refuses any other value.
+    /// Refuses a value of another kind.
     pub fn text(&self) -> Result<String> {
         match &self.node.value {
             Value::Text(text) => Ok(text.clone()),
@@ -372,7 +373,7 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Returns the string, if this is one.
+    /// Returns the string, or `None` if the value is of another kind.
     pub fn as_text(&self) -> Option<&'a str> {
         match &self.node.value {
             Value::Text(text) => Some(text),
@@ -380,10 +381,10 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Returns true or false.
+    /// Returns the value as true or false.
     ///
     /// # Errors
-    /// Refuses any other value.
+    /// Refuses a value of another kind.
     pub fn flag(&self) -> Result<bool> {
         match self.node.value {
             Value::Flag(flag) => Ok(flag),
@@ -391,10 +392,10 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Returns a list of values.
+    /// Returns the value as a list.
     ///
     /// # Errors
-    /// Refuses any other value.
+    /// Refuses a value of another kind.
     pub fn list(&self) -> Result<Vec<Item<'a>>> {
         match &self.node.value {
             Value::List(items) => Ok(items
@@ -406,10 +407,10 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Returns a list of tables.
+    /// Returns the value as a list, whose items should be tables (`[[key]]`).
     ///
     /// # Errors
-    /// Refuses any other value. For a single table the message says how to write the list.
+    /// Refuses a value of another kind. For a single table the message says how to write the list.
     pub fn tables(&self) -> Result<Vec<Item<'a>>> {
         self.list().map_err(|refusal| match &self.node.value {
             Value::Table(_) => Refusal { message: format!("{}: write [[{}]]", refusal.message, self.path), ..refusal },
@@ -423,26 +424,26 @@ impl<'a> Item<'a> {
         numbers.try_into().map_err(|_| self.refuse(Reason::WrongKind, format!("must be {expected}")))
     }
 
-    /// Returns `[x, y, z]`.
+    /// Returns the value as `[x, y, z]`.
     ///
     /// # Errors
-    /// Refuses anything but three finite numbers.
+    /// Refuses a value that is not a list of three finite numbers.
     pub fn vector(&self) -> Result<DVec3> {
         Ok(DVec3::from_array(self.numbers("a list of three numbers")?))
     }
 
-    /// Returns `[x, y]`.
+    /// Returns the value as `[x, y]`.
     ///
     /// # Errors
-    /// Refuses anything but two finite numbers.
+    /// Refuses a value that is not a list of two finite numbers.
     pub fn place(&self) -> Result<DVec2> {
         Ok(DVec2::from_array(self.numbers("a list of two numbers")?))
     }
 
-    /// Returns `[i, j]`, both 0 or more.
+    /// Returns the value as `[i, j]`, both 0 or more.
     ///
     /// # Errors
-    /// Refuses anything but two such integers.
+    /// Refuses a value that is not a list of two such integers.
     pub fn point(&self) -> Result<[usize; 2]> {
         let expected = "a list of two whole numbers";
         let items = self.list().map_err(|_| self.wrong(expected))?;
@@ -455,10 +456,10 @@ impl<'a> Item<'a> {
         Ok([index(i)?, index(j)?])
     }
 
-    /// Returns the name of a point of a tissue, of whichever kind.
+    /// Returns the value as the name of a point: `[i, j]` of a sheet or the number of a vertex.
     ///
     /// # Errors
-    /// Refuses any other value.
+    /// Refuses a value of another kind, and a negative number.
     pub fn point_name(&self) -> Result<PointName> {
         match self.node.value {
             Value::List(_) => Ok(PointName::Point(self.point()?)),
@@ -469,10 +470,10 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Reads this as a table.
+    /// Reads the value as a table by `read`, which asks for its keys.
     ///
     /// # Errors
-    /// Refuses any other value and unknown keys; returns the refusal of `read`.
+    /// Refuses a value of another kind and unknown keys; returns the refusal of `read`.
     pub fn table<T>(&self, read: impl FnOnce(&mut Fields<'a>) -> Result<T>) -> Result<T> {
         let Value::Table(entries) = &self.node.value else { return Err(self.wrong("a table")) };
         let mut fields = Fields { path: self.path.clone(), entries, known: Vec::new() };

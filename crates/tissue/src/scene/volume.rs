@@ -1,46 +1,51 @@
-//! The section `[volume]` of a scene on a mesh: what a closed mesh encloses, and how that grows as its vertices move.
+//! The section `[volume]` of a scene on a mesh: the volume that a closed mesh encloses, and how it grows as
+//! vertices move.
 //!
-//! With V0 the volume at rest and a_i = ∂V/∂x_i there (a third of the area vectors of the triangles around vertex i), the
-//! volume grows by ΔV = Σ a_i·u_i to first order, and the pressure p = −κ·ΔV/V0 pushes vertex i by p·a_i. So the pressure is
-//! one spring that all vertices share: its energy is ½κ·ΔV²/V0, its stiffness κ·a·aᵀ/V0, and its forces sum up to zero.
+//! With V0 the volume at rest and a_i = ∂V/∂x_i there (a third of the area vectors of the triangles around
+//! vertex i), the volume grows by ΔV = Σ a_i·u_i to first order, and the pressure p = −κ·ΔV/V0 pushes vertex i
+//! by p·a_i. So the pressure is one spring that all vertices share: its energy is ½κ·ΔV²/V0, its stiffness
+//! κ·a·aᵀ/V0, and its forces sum up to zero.
 
 use glam::DVec3;
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// What a closed mesh encloses.
+/// The volume that a closed mesh encloses.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Volume {
     /// V0 = Σ x_a·(x_b × x_c)/6 over the triangles, m³.
     pub volume_m3: f64,
-    /// a of each vertex, m².
+    /// a = ∂V/∂x of each vertex at rest, m²: a third of the area vectors of its triangles.
     pub areas_m2: Vec<DVec3>,
-    /// What bounds its part of the stiffness.
+    /// What bounds the volume's part of the stiffness.
     pub swelling: Swelling,
 }
 
-/// The vibration in which all vertices go along their a/√m, and what the springs do to it.
+/// The vibration in which the volume swells and shrinks: all vertices move along a/√m. Contains its stiffness
+/// by pressure and by springs.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Swelling {
-    /// Σ a²/m over V0, in masses of reference, m: times κ its stiffness by the pressure alone, N/m.
+    /// Σ a²/m over V0, in reference masses, m. Times κ, it is the vibration's stiffness by the pressure alone,
+    /// N/m.
     pub by_pressure_m: f64,
-    /// Its stiffness by the springs, over the k of reference.
+    /// The vibration's stiffness by the springs, divided by the reference k.
     pub by_springs: f64,
-    /// What the springs pass on from it to other vibrations, over the k of reference.
+    /// How strongly the springs couple this vibration to others, divided by the reference k.
     pub passed_on: f64,
 }
 
 impl Swelling {
-    /// Returns the largest eigenvalue of pressure and springs together, with the masses of reference, N/m. `springs`
-    /// bounds that of the springs alone, over the k of reference.
+    /// Returns an upper bound of the largest eigenvalue of pressure and springs together, with the reference
+    /// masses, N/m. `springs` bounds that of the springs alone, divided by the reference k.
     ///
-    /// That is ½(p + q) + √(¼(p − q)² + r²), the larger eigenvalue of [[p, r], [r, q]], with p = κ·σ + k·s the stiffness of the
-    /// vibration itself ([`Swelling::by_pressure_m`], [`Swelling::by_springs`]), q the bound of the springs, and r = k·j
-    /// ([`Swelling::passed_on`]).
+    /// The bound is ½(p + q) + √(¼(p − q)² + r²), the larger eigenvalue of [[p, r], [r, q]], with p = κ·σ + k·s
+    /// the stiffness of the vibration itself ([`Swelling::by_pressure_m`], [`Swelling::by_springs`]), q the
+    /// bound of the springs, and r = k·j ([`Swelling::passed_on`]).
     ///
-    /// With v the unit vector of the vibration, any other unit vector is c·v + s·w, w across v, and the springs' form is at
-    /// most that of their Laplacian L. So the eigenvalue is at most that of the matrix of κ·σ + vᵀLv and the bound of L,
-    /// joined by the length of what of L·v is across v.
+    /// Proof: let v be the unit vector of the vibration. Any other unit vector is c·v + s·w with w
+    /// perpendicular to v, and the springs' quadratic form is at most that of their Laplacian L. So the
+    /// eigenvalue is at most that of the matrix with κ·σ + vᵀLv and the bound of L on the diagonal, coupled by
+    /// the length of the part of L·v perpendicular to v.
     pub fn bound_n_per_m(&self, pressure_pa: f64, springs: f64, stiffness_n_per_m: f64) -> f64 {
         let own = pressure_pa * self.by_pressure_m + stiffness_n_per_m * self.by_springs;
         let (other, joined) = (stiffness_n_per_m * springs, stiffness_n_per_m * self.passed_on);
@@ -49,31 +54,33 @@ impl Swelling {
     }
 }
 
-/// A mesh whose volume is less than this part of that of a ball of its area is flat.
+/// A mesh counts as flat if its volume is less than this part of the volume of a ball with the same area.
 const FLAT: f64 = 1e-4;
 
 impl Volume {
-    /// Why a sheet has none.
+    /// Message of the refusal of a volume on a sheet.
     pub const OF_A_MESH: &str = "is for a closed mesh: a sheet encloses nothing";
 
-    /// Why another tissue can't have one.
+    /// Message of the refusal of a volume stiffness for a tissue without `[volume]`.
     pub const FROM_THE_BEGINNING: &str = "is for scenes that have [volume] from the beginning";
 
-    /// What the triangles of a mesh enclose.
+    /// Returns the volume that the triangles of a mesh enclose.
     ///
     /// # Errors
-    /// Refuses a mesh with a hole, with triangles that do not agree on what is outside, of several parts, and a flat one.
+    /// Refuses a mesh with a hole, with triangles of inconsistent orientation, of several parts, and a flat
+    /// mesh.
     pub(super) fn of(vertices_m: &[DVec3], triangles: &[[u32; 3]]) -> Result<Self> {
         let refuse = |what: &str| {
             let message = format!(
-                "needs a closed mesh, of one part: {what} (`palpate mesh FILE` tells more, --repair may mend it)"
+                "needs a closed mesh, of one part: {what} (`palpate mesh FILE` shows more, --repair may mend it)"
             );
             Err(Refusal::new(Reason::WrongKind, "volume", message))
         };
         let at =
             |[a, b]: [u32; 2]| format!("at the edge between vertices {a} and {b}, {:.4} m", vertices_m[a as usize]);
         let sides = || triangles.iter().flat_map(|[a, b, c]| [[*a, *b], [*b, *c], [*c, *a]]);
-        // Each edge, and whether a triangle goes along it from its lower vertex: once it should, and once not.
+        // Each edge, and whether a triangle follows it from its lower vertex: of its two triangles, one should
+        // and one should not.
         let mut ways: Vec<([u32; 2], bool)> = sides().map(|[a, b]| ([a.min(b), a.max(b)], a < b)).collect();
         ways.sort_unstable();
         for of_edge in ways.chunk_by(|a, b| a.0 == b.0) {
@@ -83,7 +90,7 @@ impl Volume {
                 more => return refuse(&format!("triangles do not agree on what is outside {}", at(more[0].0))),
             }
         }
-        // The vertices that triangles join, as trees.
+        // The vertices that triangles join, as trees of a union-find.
         #[allow(clippy::cast_possible_truncation)]
         let mut above: Vec<u32> = (0..vertices_m.len() as u32).collect();
         let root = |above: &mut Vec<u32>, mut vertex: u32| {
@@ -104,7 +111,7 @@ impl Volume {
         }
         let (mut volume_m3, mut whole_m2) = (0.0, 0.0);
         let mut areas_m2 = vec![DVec3::ZERO; vertices_m.len()];
-        // Small numbers keep their digits near the origin.
+        // Relative to an origin nearby, small numbers keep their digits.
         let origin_m = vertices_m.first().copied().unwrap_or_default();
         for triangle in triangles {
             let [a, b, c] = triangle.map(|vertex| vertices_m[vertex as usize] - origin_m);
@@ -114,7 +121,7 @@ impl Volume {
             triangle.iter().for_each(|vertex| areas_m2[*vertex as usize] += area / 3.0);
         }
         let ball_m3 = whole_m2 * (whole_m2 / (36.0 * std::f64::consts::PI)).sqrt();
-        // Also if it is no number.
+        // Or if the volume is not finite.
         let is_flat = volume_m3.abs() <= FLAT * ball_m3 || !(volume_m3 * ball_m3).is_finite();
         if is_flat {
             return refuse("it encloses nothing");
@@ -125,8 +132,8 @@ impl Volume {
         Ok(Volume { volume_m3: volume_m3.abs(), areas_m2, swelling: Swelling::default() })
     }
 
-    /// The same with what bounds its stiffness: by springs (their ends, and k over that of reference), and by masses over that
-    /// of reference.
+    /// Fills in what bounds the volume's stiffness. `springs` has each spring's ends and its k divided by the
+    /// reference k; `mass` gives a vertex's mass divided by the reference mass.
     pub(super) fn among(mut self, springs: impl Iterator<Item = ([u32; 2], f64)>, mass: impl Fn(usize) -> f64) -> Self {
         let along = |vertex: usize| self.areas_m2[vertex] / mass(vertex);
         let square: f64 = self.areas_m2.iter().enumerate().map(|(vertex, area)| area.dot(along(vertex))).sum();
@@ -149,8 +156,8 @@ impl Volume {
         self
     }
 
-    /// Of some of its vertices, turned, with masses over that of reference: a volume that swells as fast as the whole. `None` if
-    /// they have no area.
+    /// Returns a volume for some of the vertices, turned, that swells as fast as the whole. `mass` gives a
+    /// vertex's mass divided by the reference mass. `None` if they have no area.
     pub(super) fn part(&self, areas_m2: Vec<DVec3>, mass: impl Fn(usize) -> f64) -> Option<Self> {
         let square: f64 = areas_m2.iter().enumerate().map(|(vertex, area)| area.length_squared() / mass(vertex)).sum();
         let volume_m3 = square / self.swelling.by_pressure_m;

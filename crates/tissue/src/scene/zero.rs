@@ -1,9 +1,10 @@
-//! Zeros without a sign: what a scene and an action become where they enter a tissue and a session, whichever way they came.
+//! Removes the sign of zeros where a scene enters a model or an action enters a session, whatever its origin.
 //!
-//! −0 and 0 are equal in all that they mean, but not in their bits, and the promise of a session is bits: its hashes, its journal and
-//! its snapshots. Protobuf leaves out a field that equals 0, so that a journal gives 0 back for −0; a program that subtracts a depth
-//! of 0 sends −0. So there is one zero on the inside: a model takes its scene, and a session its actions, by these functions. (What a
-//! tissue computes may be −0 for all that: no snapshot writes it as anything else.)
+//! −0 and 0 are equal as values, but not as bits, and a session guarantees bits: its hashes, its journal and
+//! its snapshots. Protobuf leaves out a field that equals 0, so that a journal returns 0 for −0; and a program
+//! that subtracts a depth of 0 sends −0. So there is only one zero inside: models take their scene, and
+//! sessions their actions, through these functions. (A value that a tissue computes may still be −0: snapshots
+//! keep its bits.)
 
 use glam::DVec3;
 use palpate_haptics::{Coupling, Tip};
@@ -18,8 +19,8 @@ fn unsigned(v: DVec3) -> DVec3 {
 }
 
 impl Scene {
-    /// Returns the same scene, its zeros without a sign: of what must be above 0, there are none. Each field is named
-    /// here, so that a new one is thought of.
+    /// Returns the scene with every −0 replaced by 0. Values that must be above 0 need no replacement. Each
+    /// field is named here, so that a new field can't be forgotten.
     #[must_use]
     pub fn with_unsigned_zeros(self) -> Self {
         let Scene {
@@ -56,7 +57,7 @@ impl Scene {
 }
 
 impl Action {
-    /// Returns the same action, its zeros without a sign.
+    /// Returns the action with every −0 replaced by 0.
     #[must_use]
     pub fn with_unsigned_zeros(self) -> Self {
         match self {

@@ -13,7 +13,7 @@ use crate::kernel::stage::{ANY, ROW_LOADED, ROW_UNLOADED, Stage};
 use crate::scheme::arithmetic::{Arithmetic, MAX_KEPT};
 use crate::tools::applied_force::{self, Pull};
 
-/// The stage that advances every point.
+/// The stage of a sweep that advances every point.
 pub(crate) struct AdvanceStage<'a, T: Real, C> {
     pub(crate) layout: Layout,
     pub(crate) scheme: &'a C,
@@ -21,16 +21,17 @@ pub(crate) struct AdvanceStage<'a, T: Real, C> {
     pub(crate) u: *mut T,
     pub(crate) d: *mut T,
     pub(crate) kept: [*mut T; MAX_KEPT],
-    /// The tools' forces, in rows `forced`.
+    /// The tools' forces, which act in rows `forced`.
     pub(crate) pulls: &'a [Pull<'a, T>],
     pub(crate) forced: Range<usize>,
     /// 1 where a point moves, 0 where it is fixed; null if every point moves.
     pub(crate) free: *const T,
-    /// The mass of each point over that of reference; null if all are 1.
+    /// The mass of each point divided by the reference mass; null if all are equal to it.
     pub(crate) masses: *const T,
-    /// A block that sums the squares of increments: finite and small only if all of them are.
+    /// A block that sums the squares of increments: it is finite and small only if all of them are.
     pub(crate) probe: *mut T,
-    /// A block that sums the work of the tools, kept apart for each of 16 columns: the same at every width.
+    /// A block that sums the work of the tools, separately for each of 16 columns, so that it is the same at
+    /// every vector width.
     pub(crate) work: *mut T,
 }
 
@@ -147,7 +148,7 @@ impl<T: Real, C: Arithmetic<T>> AdvanceStage<'_, T, C> {
                 }
                 sums[0] = d.mul_add(d, sums[0]);
                 if let Some([_, force]) = force {
-                    // What moves a point is its force over its mass.
+                    // A force divided by the mass moves a point.
                     let force = if let Some(mass) = mass { force.mul(mass) } else { force };
                     work = force.mul_add(self.scheme.travel(before, [x, d]), work);
                 }

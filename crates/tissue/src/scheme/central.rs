@@ -12,15 +12,15 @@ use crate::kernel::real::Real;
 /// The two-step form d ← p·d + q·(N − a·u + F), u ← u + d, where d is the increment of the last substep.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TwoStep {
-    /// p.
+    /// p: the part of the last increment that damping leaves.
     pub p: f64,
-    /// q.
+    /// q: the increment per unit of force.
     pub q: f64,
-    /// K″·dt²/m.
+    /// a = K″·dt²/m.
     pub a: f64,
 }
 
-/// Central differences.
+/// Fits central differences to a = K″·dt²/m and g = C·dt/m.
 pub(super) fn fit(a: f64, g: f64) -> TwoStep {
     TwoStep { p: (1.0 - g / 2.0) / (1.0 + g / 2.0), q: 1.0 / (1.0 + g / 2.0), a }
 }
@@ -45,7 +45,7 @@ impl Family for TwoStep {
         0
     }
 
-    /// The scheme sees the beginning only, and takes the mean of both sides where the force jumps.
+    /// The scheme evaluates only the beginning, and takes the mean of both sides where the force jumps.
     fn nodes(&self) -> Vec<QuadratureNode> {
         vec![QuadratureNode { fraction: 0.0, weights: [self.q, 0.0, 0.0] }]
     }
@@ -67,10 +67,11 @@ impl Family for TwoStep {
         Matrix::of(2, |i, j| [[1.0 + pull, self.p], [pull, self.p]][i][j])
     }
 
-    /// A release is a jump: before it the whole force on the point without damping was m·a + C·v with the tool's a and
-    /// v; after it, the force is F = spring + applied − K″·u. At a jump the scheme needs the mean of both (see
-    /// `applied`), and it uses F with the mean of the applied force. The tool moved at constant velocity, so a = 0: the
-    /// point gets ½(C·v + F) less that. In terms of the increment, this is q times the difference.
+    /// A release is a jump. Before it, the whole force on the point without damping was m·a + C·v with the
+    /// tool's a and v; after it, the force is F = spring + applied − K″·u. At a jump the scheme needs the mean
+    /// of both (see `applied_force`), and it uses F with the mean of the applied force. The tool moved at
+    /// constant velocity, so a = 0: the point gets ½(C·v + F) minus that. In terms of the increment, this is q
+    /// times the difference.
     fn release(&self, at: Release<'_>) -> Option<[f64; 2]> {
         let elastic = at.springs[0] - self.q * self.a * at.u;
         let used = elastic + at.used;
@@ -86,12 +87,12 @@ impl Family for TwoStep {
     }
 }
 
-/// The same in the format of the state; q is in the scale of the springs and the tools.
+/// The scheme in the number format of the state; q is in the scale of the springs and the tools.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct CentralAdvance<T> {
     p: T,
     pull: T,
-    /// Damping is almost zero, so d·d₊ is twice the kinetic energy that the scheme conserves.
+    /// Whether damping is almost zero, so that d·d₊ is twice the kinetic energy that the scheme conserves.
     keeps: bool,
 }
 
@@ -99,7 +100,7 @@ impl<T: Real> Arithmetic<T> for CentralAdvance<T> {
     const KEPT: usize = 0;
     const WRITTEN: usize = 0;
     const FORCES: usize = 1;
-    /// Cuts d only: u is a sum of values that were not cut, and gets smaller only where two of them cancel.
+    /// Cuts only d: u is a sum of values that were not cut, and gets smaller only where two of them cancel.
     const CUTS: bool = true;
 
     #[inline(always)]
@@ -112,8 +113,8 @@ impl<T: Real> Arithmetic<T> for CentralAdvance<T> {
 
     #[inline(always)]
     fn travel<V: Vector<Real = T>>(&self, _: [V; 2], [_, next]: [V; 2]) -> V {
-        // The force acts from half a substep before the substep's beginning to half a substep after: the mean of d and
-        // this. The guard subtracts half of the last at each survey.
+        // The force acts from half a substep before the substep's beginning to half a substep after it: the
+        // mean of d and this. The guard subtracts half of the last at each survey.
         next
     }
 

@@ -1,5 +1,6 @@
-//! Exponential multistep schemes: anchor springs, damping and tools exactly, springs by extrapolation. The springs
-//! follow the polynomial through their last p values, with one evaluation a substep. Order p + 1 for p = 2, 3, 4.
+//! Exponential multistep schemes: exact for anchor springs, damping and tools; they extrapolate the springs'
+//! force. It follows the polynomial through its last p values, with one evaluation per substep. Order p + 1 for
+//! p = 2, 3, 4.
 //!
 //! With y = (u, w), w = u̇·dt, A = [[0, 1], [−a, −g]] and b = (0, 1) (times in substeps, see `super`):
 //!
@@ -34,14 +35,15 @@ use crate::kernel::real::Real;
 /// The largest p.
 const ORDER_MAX: usize = 4;
 
-/// The weights of the scheme that keeps p = `ORDER` values of the springs' force, each for u and for w.
+/// The weights of the scheme that keeps p = `ORDER` values of the springs' force. Each weight has a part for u
+/// and one for w.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Multistep<const ORDER: usize> {
     /// E − 1, by rows.
     linear: [[f64; 2]; 2],
     /// Weights of N₀, N₋₁, … N₋p.
     springs: Vec<[f64; 2]>,
-    /// γ.
+    /// γ: the weights with which the error of the predicted force corrects u and w.
     pub correction: [f64; 2],
     /// e: weights of N₋₁, … N₋p in the prediction of N₀.
     pub extrapolation: Vec<f64>,
@@ -49,7 +51,7 @@ pub struct Multistep<const ORDER: usize> {
     moments: Vec<[f64; 2]>,
 }
 
-/// Coefficients, in rising powers, of the polynomial that is 1 at `one` and 0 at the `roots`.
+/// Returns the coefficients, in rising powers, of the polynomial that is 1 at `one` and 0 at the `roots`.
 fn basis(one: f64, roots: impl Iterator<Item = f64>) -> Vec<f64> {
     roots.fold(vec![1.0], |polynomial, root| {
         let mut product = vec![0.0; polynomial.len() + 1];
@@ -61,7 +63,7 @@ fn basis(one: f64, roots: impl Iterator<Item = f64>) -> Vec<f64> {
     })
 }
 
-/// ∫ e^{A(1−s)}·b·polynomial(s) ds.
+/// Returns ∫ e^{A(1−s)}·b·polynomial(s) ds.
 fn integral(moments: &[[f64; 2]], polynomial: &[f64]) -> [f64; 2] {
     std::array::from_fn(|row| polynomial.iter().zip(moments).map(|(c, moment)| c * moment[row]).sum())
 }
@@ -115,8 +117,8 @@ pub(super) fn fit<const ORDER: usize>(a: f64, g: f64) -> Multistep<ORDER> {
 }
 
 impl<const ORDER: usize> Multistep<ORDER> {
-    /// Returns the difference between the springs' force and its prediction: `history` has p + 1 values, at 0, −1, …,
-    /// −p.
+    /// Returns the difference between the springs' force and its prediction. `history` has p + 1 values of the
+    /// force, at 0, −1, …, −p.
     pub fn prediction_error(&self, history: &[f64]) -> f64 {
         history[0] - self.extrapolation.iter().zip(&history[1..]).map(|(weight, past)| weight * past).sum::<f64>()
     }
@@ -194,8 +196,8 @@ impl<const ORDER: usize> Family for Multistep<ORDER> {
         })
     }
 
-    /// u and d are predictions that the next substep corrects. The tool's values are already right, so the correction is
-    /// subtracted.
+    /// u and d are predictions that the next substep corrects. The tool's values are already right, so the
+    /// correction is subtracted in advance.
     fn release(&self, at: Release<'_>) -> Option<[f64; 2]> {
         let prediction_error = self.prediction_error(at.springs);
         Some(self.correction.map(|weight| -weight * prediction_error))
@@ -212,7 +214,7 @@ impl<const ORDER: usize> Family for Multistep<ORDER> {
     }
 }
 
-/// The value at `s` of the polynomial that is `values[i]` at −i.
+/// Returns the value at `s` of the polynomial that is `values[i]` at −i.
 #[allow(clippy::cast_precision_loss)]
 fn through(values: &[f64], s: f64) -> f64 {
     let weight = |i: usize| -> f64 {
@@ -222,10 +224,11 @@ fn through(values: &[f64], s: f64) -> f64 {
     values.iter().enumerate().map(|(i, value)| value * weight(i)).sum()
 }
 
-/// The same in the format of the state.
+/// The scheme in the number format of the state.
 ///
-/// With `COMPENSATED`, the rounding loss of each sum u + increment is kept and added to the next increment (Kahan
-/// 1965). Without it, a displacement that creeps by less than half its last digit per substep stands still.
+/// With `COMPENSATED`, the rounding error of each sum u + increment is kept and added to the next increment
+/// (Kahan 1965). Without it, a displacement that creeps by less than half its last digit per substep stands
+/// still.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ExponentialAdvance<T, const ORDER: usize, const COMPENSATED: bool> {
     linear: [[T; 2]; 2],
@@ -235,7 +238,7 @@ pub(crate) struct ExponentialAdvance<T, const ORDER: usize, const COMPENSATED: b
 }
 
 impl<T: Real, const ORDER: usize, const COMPENSATED: bool> ExponentialAdvance<T, ORDER, COMPENSATED> {
-    /// The change of u (`row` 0) or w without the tools.
+    /// Returns the change of u (`row` 0) or w (`row` 1) without the tools.
     #[inline(always)]
     fn increment<V: Vector<Real = T>>(&self, row: usize, x: V, d: V, n: V, kept: &[V; MAX_KEPT]) -> V {
         // Two independent sums shorten the dependency chain.
@@ -256,8 +259,8 @@ impl<T: Real, const ORDER: usize, const COMPENSATED: bool> ExponentialAdvance<T,
 
 impl<T: Real, const ORDER: usize, const COMPENSATED: bool> Arithmetic<T> for ExponentialAdvance<T, ORDER, COMPENSATED> {
     const KEPT: usize = ORDER + COMPENSATED as usize;
-    /// The newest value replaces the oldest, and the others move by renumbering. Beside it, the rounding loss is
-    /// written.
+    /// The newest value replaces the oldest, and the others move by renumbering. The rounding error is written
+    /// as well.
     const WRITTEN: usize = 1 + COMPENSATED as usize;
     const FORCES: usize = 2;
 

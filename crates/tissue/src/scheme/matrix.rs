@@ -3,7 +3,7 @@
 /// Rows of the largest matrix: u, d and the kept values; or u, d and the powers that give a scheme's weights.
 const LONGEST: usize = 7;
 
-/// A square matrix, by rows, without heap memory: choosing a scheme makes many thousands of them.
+/// A small square matrix, by rows, without heap memory: choosing a scheme creates many thousands.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Matrix {
     n: usize,
@@ -11,7 +11,7 @@ pub struct Matrix {
 }
 
 impl Matrix {
-    /// Builds the matrix from the value at each row and column.
+    /// Creates an n × n matrix from the value at each row and column; n is at most 7.
     pub fn of(n: usize, value: impl Fn(usize, usize) -> f64) -> Self {
         let mut values = [0.0; LONGEST * LONGEST];
         for (i, row) in values[..n * n].chunks_exact_mut(n).enumerate() {
@@ -37,10 +37,10 @@ impl Matrix {
         self.values.iter().fold(0.0, |largest, value| value.abs().max(largest))
     }
 
-    /// Returns e to the matrix: a Taylor series of the matrix halved until it is small, then squared as often,
-    /// e^A = (e^{A/2ᵏ})^{2ᵏ} (scaling and squaring: Moler and Van Loan, Nineteen dubious ways to compute the exponential of a matrix,
-    /// twenty-five years later, SIAM Review 45(1), 2003, doi:10.1137/S00361445024180). The result for a matrix that is not finite is
-    /// NaN.
+    /// Returns the exponential of the matrix, by scaling and squaring: a Taylor series of the matrix, halved
+    /// until it is small, then squared as many times, e^A = (e^{A/2ᵏ})^{2ᵏ} (Moler and Van Loan, Nineteen
+    /// dubious ways to compute the exponential of a matrix, twenty-five years later, SIAM Review 45(1), 2003,
+    /// doi:10.1137/S00361445024180). For a matrix that is not finite, the result is NaN.
     pub fn exponential(&self) -> Matrix {
         if !self.values.iter().all(|value| value.is_finite()) {
             return Matrix::of(self.n, |_, _| f64::NAN);
@@ -63,8 +63,8 @@ impl Matrix {
         sum
     }
 
-    /// Returns the largest magnitude among the eigenvalues: the 2ᵏ-th root of the size of the 2ᵏ-th power (Gelfand's formula,
-    /// ρ(A) = lim ‖Aⁿ‖^{1/n}).
+    /// Returns the largest magnitude among the eigenvalues: the 2ᵏ-th root of the size of the 2ᵏ-th power
+    /// (Gelfand's formula, ρ(A) = lim ‖Aⁿ‖^{1/n}).
     pub fn spectral_radius(&self) -> f64 {
         let (mut power, mut logarithm, mut exponent) = (*self, 0.0, 1.0);
         for _ in 0..36 {

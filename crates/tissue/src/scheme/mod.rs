@@ -1,9 +1,9 @@
-//! The schemes that advance the sheet: one file each, and one line each in the register.
+//! The schemes that advance a tissue in time. Each has a file and a line in the register.
 //!
-//! Units in this module: lengths are in spacings h, time in substeps dt. u is a displacement over h, d is (nearly) the
-//! amount a scheme adds to it in a substep, forces are times dt²/(m·h). The coefficients of the equation of motion are
-//! then a = K″·dt²/m and g = C·dt/m: u̇̇ = N − a·u − g·u̇ + F, with N from the springs and F from the tools. Small
-//! numbers stay small and keep their digits in f32.
+//! Units in this module: lengths are in spacings h, time in substeps dt. u is a displacement divided by h, d is
+//! (nearly) what a scheme adds to it in a substep, and forces are multiplied by dt²/(m·h). The coefficients of
+//! the equation of motion are then a = K″·dt²/m and g = C·dt/m: u̇̇ = N − a·u − g·u̇ + F, with N from the
+//! springs and F from the tools. Small numbers stay small and keep their digits in f32.
 
 pub(crate) mod advance;
 pub(crate) mod arithmetic;
@@ -29,16 +29,16 @@ use crate::scene::Integrator;
 use family::{Family, Release};
 use matrix::Matrix;
 
-/// A scheme, fitted to a sheet and a substep: one variant for each arithmetic.
+/// A scheme with its coefficients for a tissue and a substep: one variant for each arithmetic.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Scheme {
     /// `central` and `lagged`.
     TwoStep(TwoStep),
-    /// The exponential multistep scheme that keeps 2 values.
+    /// The exponential multistep scheme that keeps 2 earlier forces of the springs.
     Exponential2(Multistep<2>),
-    /// The same with 3.
+    /// The exponential multistep scheme that keeps 3 earlier forces of the springs.
     Exponential3(Multistep<3>),
-    /// The same with 4.
+    /// The exponential multistep scheme that keeps 4 earlier forces of the springs.
     Exponential4(Multistep<4>),
     /// The classical fourth-order Runge–Kutta scheme.
     Rk4(Rk4),
@@ -59,29 +59,29 @@ macro_rules! each {
 }
 pub(crate) use each;
 
-/// What the substep of an integrator must satisfy when its number of substeps is not chosen by rehearsals.
+/// The condition for a substep of an integrator when rehearsals do not choose the number of substeps.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Bound {
     /// Stability.
     Stable,
     /// A small turn of the fastest vibration ([`THETA`](crate::scheme::stability::THETA)).
     Turn,
-    /// The same, and half of the damping at which it is stable.
+    /// A small turn of the fastest vibration, and at most half of the damping at which the scheme is stable.
     TurnAndLag,
 }
 
-/// What the register says of an integrator.
+/// An integrator's entry in the register.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Entry {
-    /// The power of the substep with which its error falls.
+    /// The power of the substep with which the error falls.
     pub(crate) order: f64,
-    /// The cost of a substep, in those of `central`. Measured (`make tables-kernel`).
+    /// The cost of a substep relative to `central`. Measured (`make tables-kernel`).
     pub(crate) cost: f64,
-    /// What its substep must satisfy.
+    /// The condition for its substep.
     pub(crate) bound: Bound,
     /// Whether it can compensate the rounding of f32.
     pub(crate) compensates: bool,
-    /// Fits it to a = K″·dt²/m and g = C·dt/m.
+    /// Fits the scheme to a = K″·dt²/m and g = C·dt/m.
     fit: fn(f64, f64) -> Scheme,
 }
 
@@ -89,7 +89,7 @@ pub(crate) struct Entry {
 pub(crate) const CANDIDATES: [Integrator; 4] =
     [Integrator::Exponential4, Integrator::Exponential3, Integrator::Exponential2, Integrator::Central];
 
-/// The register of integrators.
+/// Returns the entry of an integrator in the register.
 pub(crate) fn entry(integrator: Integrator) -> Entry {
     type Fit = fn(f64, f64) -> Scheme;
     let exponential =
@@ -108,39 +108,40 @@ pub(crate) fn entry(integrator: Integrator) -> Entry {
     }
 }
 
-/// `to`, if it is of the same type as `_from`.
+/// Returns `to` if it has the same type as `_from`.
 fn like<'t, F: 'static>(_from: &F, to: &'t dyn Any) -> Option<&'t F> {
     to.downcast_ref()
 }
 
-/// Returns the power p of the substep with which the error of an integrator falls, as dtᵖ. The file of each scheme has its equations.
+/// Returns the power p of the substep with which the error of an integrator falls, as dtᵖ.
 pub fn order(integrator: Integrator) -> f64 {
     entry(integrator).order
 }
 
 impl Scheme {
-    /// Fits a scheme to a = K″·dt²/m and g = C·dt/m.
+    /// Creates an integrator's scheme with coefficients for a = K″·dt²/m and g = C·dt/m.
     pub fn fit(integrator: Integrator, a: f64, g: f64) -> Self {
         (entry(integrator).fit)(a, g)
     }
 
-    /// Sweeps over the springs in a substep.
+    /// Returns the number of sweeps over the springs in a substep.
     pub(crate) fn sweeps(&self) -> usize {
         each!(self, |family| family.sweeps())
     }
 
-    /// The first field of the tools' force that sweep number `sweep` reads.
+    /// Returns the first field of the tools' force that sweep number `sweep` reads.
     pub(crate) fn field(&self, sweep: usize) -> usize {
         each!(self, |family| family.field(sweep))
     }
 
-    /// The fraction of the substep that the state after sweep number `sweep` belongs to; `None` after the last.
+    /// Returns the fraction of the substep to which the state after sweep number `sweep` belongs; `None` after
+    /// the last.
     pub(crate) fn fraction_after(&self, sweep: usize) -> Option<f64> {
         each!(self, |family| family.fraction_after(sweep))
     }
 
-    /// Returns how the tools' force enters a substep: the moments (0 to 1) at which it is evaluated, and the weights
-    /// with which each value adds to the scheme's force fields.
+    /// Returns how the tools' force enters a substep: the moments (0 to 1) at which it is evaluated, and the
+    /// weights with which each value adds to the scheme's force fields.
     pub fn nodes(&self) -> Vec<QuadratureNode> {
         each!(self, |family| family.nodes())
     }
@@ -150,23 +151,24 @@ impl Scheme {
         each!(self, |family| family.takes_means())
     }
 
-    /// Returns the factor that scales the springs' forces beyond dt²/(m·h).
+    /// Returns the factor that scales the springs' forces in addition to dt²/(m·h).
     pub fn spring_scale(&self) -> f64 {
         each!(self, |family| family.spring_scale())
     }
 
-    /// Returns the velocity that a constant force of 1 adds in a substep (nearly), through the last of its fields.
+    /// Returns the velocity that a constant force of 1 adds in a substep (nearly), through the last of its
+    /// fields. Units as in the scheme: d per substep.
     pub fn impulse(&self) -> f64 {
         self.constant()[1]
     }
 
-    /// Returns the field of the tools' force that adds to the velocity.
+    /// Returns the index of the field of the tools' force that adds to the velocity.
     pub fn last_field(&self) -> usize {
         each!(self, |family| family.last_field())
     }
 
-    /// Returns the u and d that a constant force of 1 adds in a substep. Exact where the scheme is exponential:
-    /// ∫₀¹ e^{A(1−s)}·b ds, in the terms of its file.
+    /// Returns the u and d that a constant force of 1 adds in a substep. Exact for exponential schemes: ∫₀¹
+    /// e^{A(1−s)}·b ds (see `exponential.rs`).
     pub fn constant(&self) -> [f64; 2] {
         each!(self, |family| family.constant())
     }
@@ -176,12 +178,14 @@ impl Scheme {
         each!(self, |family| family.kick())
     }
 
-    /// Returns the fields that the scheme keeps beside u and d.
+    /// Returns the number of fields that the scheme keeps besides u and d. `compensated` adds one for the
+    /// rounding errors of u in f32.
     pub fn kept(&self, compensated: bool) -> usize {
         each!(self, |family| family.kept(compensated))
     }
 
-    /// Returns how many of those, from the first, are the springs' forces of earlier substeps, newest first.
+    /// Returns how many of the kept fields, from the first, are the springs' forces of earlier substeps, newest
+    /// first.
     pub fn history(&self) -> usize {
         each!(self, |family| family.history())
     }
@@ -192,18 +196,20 @@ impl Scheme {
         each!(self, |family| family.propagator(z))
     }
 
-    /// Returns the largest growth factor of a vibration z = (ω·dt)² in a substep: the spectral radius of its propagator.
+    /// Returns the largest growth factor of a vibration z = (ω·dt)² in a substep: the spectral radius of its
+    /// propagator.
     pub fn growth(&self, z: f64) -> f64 {
         self.propagator(z).spectral_radius()
     }
 
-    /// What a point's u and d must change by when a tool releases it ([`Family::release`]).
+    /// Returns the changes of a point's u and d when a tool releases it ([`Family::release`]); `None` if
+    /// nothing changes.
     pub(crate) fn release(&self, at: Release<'_>) -> Option<[f64; 2]> {
         each!(self, |family| family.release(at))
     }
 
-    /// Converts u and d of one component of a point to the same scheme with another substep ([`Family::resample`]), or to
-    /// another scheme.
+    /// Converts u and d of one component of a point to the same scheme with another substep
+    /// ([`Family::resample`]), or to another scheme. Also converts `springs`, the springs' forces.
     pub(crate) fn resample(
         &self,
         to: &Self,

@@ -1,6 +1,7 @@
-//! How a scheme's state is read as displacement and velocity, with the scheme chosen at run time.
+//! Reads displacement and velocity from a scheme's state, with the scheme chosen at run time.
 //!
-//! Steps are compiled once for each scheme. Surveys are rare: they ask an [`Observer`], and are compiled once for all schemes.
+//! Steps are compiled once for each scheme. Surveys are rare: they use an [`Observer`], and are compiled once
+//! for all schemes.
 
 use super::arithmetic::{Arithmetic, MAX_KEPT};
 use super::family::Family;
@@ -47,7 +48,7 @@ impl<T: Real> Observer<T> {
         }
     }
 
-    /// Returns how many fields the scheme keeps beside u and d.
+    /// Returns how many fields the scheme keeps besides u and d.
     pub(crate) fn kept(&self) -> usize {
         with!(self, |arithmetic| kept_of(arithmetic))
     }

@@ -1,13 +1,13 @@
-//! The properties of a sheet that a scheme is fitted to.
+//! The properties of a tissue that a scheme is fitted to.
 
-/// The properties of a sheet that a scheme depends on.
+/// The properties of a tissue that a scheme depends on, for a point of the reference mass.
 #[derive(Debug, Clone, Copy)]
 pub struct Oscillator {
-    /// Mass of a point, kg.
+    /// Mass of the point, kg.
     pub mass_kg: f64,
-    /// C, N·s/m.
+    /// C of its damping force, N·s/m.
     pub damping_n_s_per_m: f64,
-    /// K″, N/m.
+    /// K″ of its anchor spring, N/m.
     pub anchor_stiffness_n_per_m: f64,
     /// The largest eigenvalue of the springs' stiffness under any deformation, N/m.
     pub spring_stiffness_n_per_m: f64,
@@ -20,13 +20,15 @@ impl Oscillator {
         (a, self.damping_n_s_per_m * substep_s / self.mass_kg)
     }
 
-    /// Returns the springs' largest stiffness in a substep's terms, (ω·dt)² = λ·dt²/m, with λ their largest eigenvalue.
+    /// Returns the springs' largest stiffness in units of a substep, (ω·dt)² = λ·dt²/m, with λ their largest
+    /// eigenvalue.
     pub fn scaled_spring_stiffness(&self, substep_s: f64) -> f64 {
         self.spring_stiffness_n_per_m * substep_s * substep_s / self.mass_kg
     }
 
-    /// Returns ω_b = √((λ + K″)/m), rad/s: an upper bound of every vibration's frequency, under any deformation, since ω² is an
-    /// eigenvalue of stiffness over mass and that of a sum is at most the sum of the largest ones.
+    /// Returns ω_b = √((λ + K″)/m), rad/s: an upper bound of the frequency of every vibration, under any
+    /// deformation. (ω² is an eigenvalue of stiffness divided by mass, and that of a sum is at most the sum of
+    /// the largest ones.)
     pub fn omega_bound_per_s(&self) -> f64 {
         ((self.spring_stiffness_n_per_m + self.anchor_stiffness_n_per_m) / self.mass_kg).sqrt()
     }

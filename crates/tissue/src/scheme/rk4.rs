@@ -1,4 +1,5 @@
-//! The classical fourth-order Runge–Kutta scheme: four evaluations a substep. A reference for comparison.
+//! The classical fourth-order Runge–Kutta scheme: four evaluations of the forces per substep. A reference for
+//! comparison.
 //!
 //! y′ = f(y), y = (u, w): k₁ = f(y), k₂ = f(y + k₁/2), k₃ = f(y + k₂/2), k₄ = f(y + k₃),
 //! y₊ = y + (k₁ + 2k₂ + 2k₃ + k₄)/6. Each stage is a sweep that evaluates the springs at the u of the stage before,
@@ -13,10 +14,10 @@ use crate::kernel::real::Real;
 /// Kept fields: u and w at the beginning, and the sums of the slopes so far.
 const KEPT: usize = 4;
 
-/// The four stages: how far the next one goes along this slope, and the weight of the slope in the sum.
+/// The four stages: how far the next stage follows this slope, and the weight of the slope in the sum.
 const STAGES: [(f64, f64); 4] = [(0.5, 1.0 / 6.0), (0.5, 1.0 / 3.0), (1.0, 1.0 / 3.0), (0.0, 1.0 / 6.0)];
 
-/// One substep of a single vibration.
+/// Advances a single vibration by one substep.
 fn step(pull: f64, g: f64, force: f64, y: [f64; 2]) -> [f64; 2] {
     let slope = |y: [f64; 2]| [y[1], force - pull * y[0] - g * y[1]];
     let along = |k: [f64; 2], far: f64| [y[0] + far * k[0], y[1] + far * k[1]];
@@ -30,9 +31,9 @@ fn step(pull: f64, g: f64, force: f64, y: [f64; 2]) -> [f64; 2] {
 /// The scheme for y′ = (w, N − a·u − g·w + F).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rk4 {
-    /// K″·dt²/m.
+    /// a = K″·dt²/m.
     pub a: f64,
-    /// C·dt/m.
+    /// g = C·dt/m.
     pub g: f64,
 }
 
@@ -88,7 +89,7 @@ impl Family for Rk4 {
         Matrix::of(2, |i, j| columns[j][i])
     }
 
-    /// u and w are the point's own: it continues with the tool's velocity.
+    /// u and w are the point's own values: it continues with the tool's velocity.
     fn release(&self, _: Release<'_>) -> Option<[f64; 2]> {
         None
     }
@@ -98,7 +99,7 @@ impl Family for Rk4 {
     }
 }
 
-/// One stage, in the format of the state.
+/// One stage, in the number format of the state.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Rk4Advance<T> {
     a: T,

@@ -1,35 +1,37 @@
-//! How fast the sheet can vibrate, and how many substeps that asks for.
+//! Computes how fast a tissue can vibrate, and how many substeps that requires.
 
 use crate::scene::{Body, Integrator, Scene, Springs, StiffnessBound};
 use crate::scheme::{Bound, Oscillator, Scheme, entry};
 
-/// Largest phase of the fastest vibration per substep of central differences, rad: dt·ω_b ≤ θ. The scheme is stable
-/// below 2; its error falls with θ². At 0.25 the force of the stiffest scenes is within 5e-3.
+/// Largest turn of the fastest vibration per substep of central differences, rad: dt·ω_b ≤ θ. The scheme is
+/// stable below 2; its error falls with θ². At 0.25 the force of the stiffest scenes is within 5e-3.
 pub const THETA: f64 = 0.25;
 
-/// Returns by how much smaller than [`THETA`] a turn has to be where vibrations last, from 1 to 8.
+/// Returns the factor, from 1 to 8, by which a turn must be smaller than [`THETA`] because vibrations last.
+/// `decay_s` is τ = 2m/C.
 ///
-/// A vibration ω of central differences is fast by ω(dt·ω)²/24, and the phase that it loses so adds up for as long as
-/// the vibration lasts, τ = 2m/C: to (ω·τ)(dt·ω)²/24. The same error then asks for a turn smaller by √(ω·τ). Up to
-/// ω_b·τ = 27 the turn of `THETA` itself does; beyond 27·8² one runs for a given time, not until all is still, and no
-/// scheme of second order is the right one. (Measured on scenes with C = 0 and k/K″ from 4 to 100 for 1 to 2 s: errors of
-/// 2e-2 of the largest displacement without this, 3e-4 with it.)
+/// Central differences make a vibration ω faster by ω(dt·ω)²/24. The phase error adds up for as long as the
+/// vibration lasts, τ, to (ω·τ)(dt·ω)²/24. The same error then requires a turn smaller by √(ω·τ). Up to ω_b·τ =
+/// 27 the turn `THETA` itself suffices. Beyond 27·8² a run ends before the motion does, and no scheme of second
+/// order is suitable. (Measured on scenes with C = 0 and k/K″ from 4 to 100 for 1 to 2 s: errors of 2e-2 of the
+/// largest displacement without this factor, 3e-4 with it.)
 pub fn endurance(omega_per_s: f64, decay_s: f64) -> f64 {
     let turns = omega_per_s * decay_s;
     // Nothing vibrates, and nothing damps it.
     if turns.is_nan() { 1.0 } else { (turns / 27.0).sqrt().clamp(1.0, 8.0) }
 }
 
-/// Returns the largest eigenvalue of the springs' stiffness matrix under any deformation, with the masses of reference,
-/// N/m.
+/// Returns an upper bound of the largest eigenvalue of the springs' stiffness matrix under any deformation,
+/// with the reference masses, N/m.
 ///
-/// On a sheet that is [`largest_stiffness_of_a_sheet_n_per_m`]. On a mesh it is at most k·β + K″·ε, with β the bound of
-/// the graph's Laplacian over k ([`StiffnessBound`]) and ε what K″/m of a point is at most above that of reference. A volume replaces k·β by
+/// On a sheet this is [`largest_stiffness_of_a_sheet_n_per_m`]. On a mesh it is k·β + K″·ε, with β the bound of
+/// the graph's Laplacian divided by k ([`StiffnessBound`]) and ε the largest excess of K″/m of a point over the
+/// reference value. A volume replaces k·β by
 /// [`Swelling::bound_n_per_m`](crate::scene::Swelling::bound_n_per_m).
 pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
     match &scene.body {
         Body::Sheet(_) => largest_stiffness_of_a_sheet_n_per_m(&scene.springs),
-        // What pulls back beyond the K″ of reference counts among the springs.
+        // Anchor stiffness beyond the reference K″ counts among the springs.
         Body::Mesh(mesh) => {
             let StiffnessBound { bound, extra_anchor, .. } = mesh.stiffest;
             let k = scene.springs.stiffness_n_per_m;
@@ -42,7 +44,8 @@ pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
     }
 }
 
-/// Returns the same without the pressure of a volume, k·β + K″·ε, N/m.
+/// Returns an upper bound of the springs' stiffness without the pressure of a volume, k·β + K″·ε on a mesh, N/m
+/// ([`largest_stiffness_n_per_m`]).
 pub fn stiffness_of_springs_n_per_m(scene: &Scene) -> f64 {
     match &scene.body {
         Body::Mesh(mesh) if mesh.volume.is_some() => {
@@ -53,8 +56,8 @@ pub fn stiffness_of_springs_n_per_m(scene: &Scene) -> f64 {
     }
 }
 
-/// Returns what turns the rounding of displacements into force, N/m. That of many points hardly adds up to a change of
-/// the volume: λ + κ·σ/√n, with λ that of the springs, σ = Σ a²/(m·V0) and n points.
+/// Returns the factor from rounding errors of displacements to force, N/m. The errors of many points hardly add
+/// up to a change of the volume: λ + κ·σ/√n, with λ the springs' stiffness, σ = Σ a²/(m·V0) and n points.
 #[allow(clippy::cast_precision_loss)]
 pub fn approximate_stiffness_n_per_m(scene: &Scene) -> f64 {
     let of_springs = stiffness_of_springs_n_per_m(scene);
@@ -63,7 +66,8 @@ pub fn approximate_stiffness_n_per_m(scene: &Scene) -> f64 {
     of_springs + scene.volume().map_or(0.0, |volume| of_pressure(volume.swelling.by_pressure_m))
 }
 
-/// Returns the same of the springs of a sheet, N/m.
+/// Returns an upper bound of the largest eigenvalue of the stiffness matrix of a sheet's springs under any
+/// deformation, N/m.
 ///
 /// A spring with unit direction n contributes k(nnᵀ + (1 − L0/L)(I − nnᵀ)) to the tangent stiffness, which is at
 /// most k·I: so no deformation makes the matrix larger than the graph Laplacian with weights k. On the unbounded
@@ -93,14 +97,15 @@ pub fn largest_stiffness_of_a_sheet_n_per_m(springs: &Springs) -> f64 {
     candidates.into_iter().filter(inside).map(|(x, y)| eigenvalue(x, y)).fold(0.0, f64::max)
 }
 
-/// Vibrations between the slowest and the fastest at which stability is looked at: it may fail in between.
+/// Number of vibrations between the slowest and the fastest at which stability is tested: a scheme may fail in
+/// between.
 const VIBRATIONS: u32 = 48;
 
 /// Largest growth factor of a vibration per substep that counts as stable: 1 plus rounding error.
 const NO_GROWTH: f64 = 1.0 + 1e-7;
 
-/// Returns whether no vibration grows, of springs up to `stiffness` = (ω·dt)²: whether each eigenvalue of the scheme's propagator
-/// has at most size 1, at 49 stiffnesses z = `stiffness`·(k/48)².
+/// Returns whether no vibration grows, for springs up to `stiffness` = (ω·dt)². It tests that each eigenvalue
+/// of the scheme's propagator has at most size 1, at 49 stiffnesses z = `stiffness`·(k/48)².
 pub fn is_stable(scheme: &Scheme, stiffness: f64) -> bool {
     (0..=VIBRATIONS).all(|k| {
         // Dense towards the stiff end, where schemes fail first.
@@ -109,16 +114,17 @@ pub fn is_stable(scheme: &Scheme, stiffness: f64) -> bool {
     })
 }
 
-/// Returns the fewest substeps of `step_s` with which any scheme is stable. Saturates for absurd scenes.
+/// Returns the fewest substeps in a step of `step_s` with which any scheme is stable. Saturates for absurd
+/// scenes.
 ///
-/// That is dt·ω_b ≤ 2, the bound of central differences: u₊ − (2 − W)·u + u₋ = 0 with W = (dt·ω)² has the solutions zⁿ with
-/// z² − (2 − W)·z + 1 = 0, and both are on the unit circle as long as |2 − W| ≤ 2.
+/// This is dt·ω_b ≤ 2, the bound of central differences: u₊ − (2 − W)·u + u₋ = 0 with W = (dt·ω)² has the
+/// solutions zⁿ with z² − (2 − W)·z + 1 = 0, and both are on the unit circle if |2 − W| ≤ 2.
 pub fn least_substeps(step_s: f64, sheet: &Oscillator) -> u32 {
     substeps_of_turn(step_s, sheet.omega_bound_per_s(), 2.0)
 }
 
-/// Returns the fewest substeps of `step_s` with which a scheme is stable ([`is_stable`]). Tried upwards from [`least_substeps`], an
-/// eighth more each time. Saturates for absurd scenes.
+/// Returns the fewest substeps in a step of `step_s` with which a scheme is stable ([`is_stable`]). It tries
+/// upwards from [`least_substeps`], an eighth more each time. Saturates for absurd scenes.
 pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     let mut substeps = least_substeps(step_s, sheet);
     let stable = |substeps: u32| {
@@ -126,8 +132,8 @@ pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) 
         let (a, g) = sheet.scaled(substep_s);
         is_stable(&Scheme::fit(integrator, a, g), sheet.scaled_spring_stiffness(substep_s))
     };
-    // The limit of all is above dt·ω = 0.3 even without damping, and above dt·C/m = 2 (that of `rk4` is 2.785); rounding
-    // may tell otherwise for ever.
+    // All schemes are stable up to dt·ω = 0.3 even without damping, and up to dt·C/m = 2 (`rk4` to 2.785);
+    // because of rounding, the test may never succeed.
     let fastest_per_s = (sheet.omega_bound_per_s() / 0.1).max(sheet.damping_n_s_per_m / sheet.mass_kg);
     let most = (step_s * fastest_per_s).min(f64::from(u32::MAX));
     while !stable(substeps) && f64::from(substeps) < most {
@@ -136,11 +142,11 @@ pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) 
     substeps
 }
 
-/// Returns the fewest substeps of `step_s` with which a yardstick is stable, and as accurate as it promises. Saturates
-/// for absurd scenes.
+/// Returns the fewest substeps in a step of `step_s` with which an integrator for comparison is stable, and as
+/// accurate as it promises. Saturates for absurd scenes.
 ///
-/// For `central` that is dt·ω_b ≤ [`THETA`]/e, with e = [`endurance`] at τ = 2m/C; for `lagged` also C·dt/m ≤ 1, half of its
-/// bound 2 (W + 2g < 4 with W = 0).
+/// For `central` this is dt·ω_b ≤ [`THETA`]/e, with e = [`endurance`] at τ = 2m/C; for `lagged` also C·dt/m ≤
+/// 1, half of its bound 2 (W + 2g < 4 with W = 0).
 pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
     let omega = sheet.omega_bound_per_s();
@@ -154,7 +160,8 @@ pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 
     }
 }
 
-/// Returns the fewest substeps with dt·`omega_per_s` ≤ `theta`, dt = `step_s` / substeps. Saturates for absurd scenes.
+/// Returns the fewest substeps with dt·`omega_per_s` ≤ `theta` (rad), dt = `step_s` / substeps. Saturates for
+/// absurd scenes.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn substeps_of_turn(step_s: f64, omega_per_s: f64, theta: f64) -> u32 {
     (step_s * omega_per_s / theta).ceil().clamp(1.0, f64::from(u32::MAX)) as u32
@@ -181,7 +188,8 @@ mod tests {
         let cases = [(1.0, 1.0), (1.0, 0.0), (0.0, 2.0), (3.0, 0.2), (0.1, 5.0), (0.0, 0.0), (1.0, 2.2), (2.0, 4.8)];
         for (k, shear) in cases {
             for bending in [false, true] {
-                // Force on a point of u = e^{i(aj + bk)}: over all its springs, 1 − cos of the phase between their ends.
+                // Force on a point of u = e^{i(aj + bk)}: over all its springs, 1 − cos of the phase between
+                // their ends.
                 let wave = |a: f64, b: f64| {
                     let both_ways = |stiffness: f64, phase: f64| 2.0 * stiffness * (1.0 - phase.cos());
                     let bending = if bending { both_ways(k, 2.0 * a) + both_ways(k, 2.0 * b) } else { 0.0 };

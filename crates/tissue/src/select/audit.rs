@@ -1,15 +1,17 @@
-//! The audit: it repeats a window of steps in f64 with a quarter of the substep and compares the two results.
+//! The audit repeats a window of steps in f64 with a quarter of the substep and compares the two results.
 //!
-//! The sheet marks where a window begins and ends. Both are checkpoints of the guard, which are shared for this, not
-//! copied. Between them the sheet records its tools' inputs. The slow work happens on copies, in any thread:
-//! [`SharedCheckpoint::open`] copies the beginning and releases the checkpoint, [`WindowOpening::close`] does the same with
-//! the end, and [`Audit::work`] repeats the window in slices.
+//! The tissue marks where a window begins and ends. Both are checkpoints of the guard, which are shared for
+//! this, not copied. In between, the tissue records its tools' inputs. The slow work happens on copies, in any
+//! thread: [`SharedCheckpoint::open`] copies the beginning and releases the checkpoint,
+//! [`WindowOpening::close`] does this with the end, and [`Audit::work`] repeats the window in slices. The
+//! repeating tissue is called the twin.
 //!
-//! The result is the error that the window added. Two errors stay unseen: that of the state in which the window began,
-//! and the error that the twin shares with the sheet, which for a scheme of order p is 4^−p of the error.
+//! The result is the error that the window added. Two errors stay unseen: that of the state in which the window
+//! began, and the error that the twin shares with the tissue, which for a scheme of order p is 4^−p of the
+//! error.
 //!
-//! An error is relative to the largest displacement and force of the window, or of earlier windows if those were
-//! larger: in a sheet that comes to rest, what is left of a poke is measured relative to the poke.
+//! An error is relative to the largest displacement and force of the window, or of earlier windows if those
+//! were larger: in a tissue that comes to rest, the remains of a poke are measured relative to the poke.
 
 use std::sync::Arc;
 
@@ -30,13 +32,13 @@ pub use crate::select::audit_window::{Mark, SharedCheckpoint, WindowInputs};
 use crate::state::tissue_state::{TissueState, springs_of};
 use crate::tools::applied_force::Applied;
 
-/// The twin's substep is 1/`FINER` of the sheet's.
+/// How many substeps of the twin (the repetition in f64) replace one of the tissue.
 pub const FINER: u32 = 4;
 
 /// Longest window, s, before it is rounded up to the next checkpoint.
 const LONGEST_S: f64 = 0.25;
 
-/// Points times substeps in a slice of an audit: some milliseconds.
+/// Points times substeps in a slice of an audit, which takes some milliseconds.
 const SLICE: u64 = 1 << 20;
 
 /// The main source of an error.
@@ -61,32 +63,33 @@ impl Origin {
     }
 }
 
-/// The result of an audit of a window.
+/// The result of an audit of a window of steps.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AuditFinding {
     /// Steps done at the end of the window.
     pub step: u64,
     /// The error that the window added.
     pub error: AuditedError,
-    /// The main source of the error, if it is above the scene's tolerance.
+    /// The main source of the error; `None` if the error is within the scene's tolerance.
     pub origin: Option<Origin>,
-    /// Substeps per step in the window, after the guard's halvings.
+    /// Substeps per step in the window, including the guard's halvings.
     pub substeps: u32,
-    /// The largest extent of this and earlier windows, to which the next window's error is relative.
+    /// The largest displacement and force of this and earlier windows, to which the next window's error is
+    /// relative.
     pub largest: ErrorExtent,
 }
 
-/// Largest components over the points of a sheet.
+/// Largest components of displacement and force over the points of a tissue.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct ErrorExtent {
-    /// Displacements, m.
+    /// Largest component of a displacement, m.
     pub displacement_m: f64,
-    /// Forces of the tissue on tools, N.
+    /// Largest component of a force of the tissue on a tool, N.
     pub force_n: f64,
 }
 
 impl ErrorExtent {
-    /// Returns the larger of each component.
+    /// Returns the larger value of each quantity.
     pub fn max(self, other: Self) -> Self {
         ErrorExtent {
             displacement_m: self.displacement_m.max(other.displacement_m),
@@ -96,7 +99,8 @@ impl ErrorExtent {
 }
 
 impl ErrorExtent {
-    /// Returns these as differences, relative to the largest values: max|Δu|/max|u| and max|Δf|/max|f|; 0 where nothing differs.
+    /// Returns these differences relative to the largest values: max|Δu|/max|u| and max|Δf|/max|f|; 0 where
+    /// nothing differs.
     pub fn relative_to(self, largest: ErrorExtent) -> AuditedError {
         let part = |difference: f64, largest: f64| if difference == 0.0 { 0.0 } else { difference / largest };
         AuditedError {
@@ -106,7 +110,7 @@ impl ErrorExtent {
     }
 }
 
-/// A copy of a window's beginning.
+/// A copy of the tissue at the beginning of a window.
 #[derive(Debug)]
 pub struct WindowOpening(Box<dyn Replay>);
 
@@ -150,7 +154,8 @@ impl Observed {
 }
 
 impl Model {
-    /// Returns the same tissue in another format, with `by` times the substeps and without sleep.
+    /// Returns the model in another number format, with `by` times the substeps and without sleep: for the
+    /// repetition of a window.
     pub fn twin(&self, by: u32, precision: Precision) -> Arc<Self> {
         let mut model = self.clone();
         model.plan = self.plan.divided(&self.scene, by);
@@ -159,11 +164,11 @@ impl Model {
         Arc::new(model)
     }
 
-    /// Steps in a window: until the slowest vibration has lost half its amplitude, at most `LONGEST_S` s.
+    /// Returns the steps in a window: until the slowest vibration has lost half its amplitude, at most 0.25 s.
     ///
-    /// The amplitude of m·ü + C·u̇ + K·u = 0 falls as e^(−γt), with γ = C/2m, or in the overdamped case
-    /// γ = (C − √(C² − 4mK))/2m for the slower part. K is that of the anchor springs alone: the slowest vibration of a
-    /// sheet bends it least.
+    /// The amplitude of m·ü + C·u̇ + K·u = 0 falls as e^(−γt), with γ = C/2m, or in the overdamped case γ = (C
+    /// − √(C² − 4mK))/2m for the slower part. K is that of the anchor springs alone: the slowest vibration
+    /// bends the tissue least.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn window_steps(&self) -> u64 {
         let Oscillator { mass_kg, damping_n_s_per_m: c, anchor_stiffness_n_per_m: k, .. } = Oscillator::of(&self.scene);
@@ -221,7 +226,7 @@ impl<T: Real> TissueState<T> {
         }
     }
 
-    /// A sheet in the state of a checkpoint of a sheet with `model`.
+    /// Returns a tissue in the state of a checkpoint of a tissue with `model`.
     fn resumed(model: &Model, checkpoint: &Checkpoint<T>) -> Box<Self> {
         let mut sheet = Box::new(TissueState::new(&model.twin(1 << checkpoint.halvings, model.precision)));
         sheet.steps = checkpoint.steps;
@@ -233,7 +238,8 @@ impl<T: Real> TissueState<T> {
         sheet
     }
 
-    /// The same state in f64. `model` differs from this sheet's only in the format and in what may sleep.
+    /// Returns the same state in f64. `model` may differ from this tissue's only in the format and in what may
+    /// sleep.
     pub(crate) fn widened(&self, model: &Arc<Model>) -> TissueState<f64> {
         let mut sheet = TissueState::<f64>::new(model);
         sheet.steps = self.steps;
@@ -246,7 +252,7 @@ impl<T: Real> TissueState<T> {
             for index in 0..self.model.places() {
                 for c in 0..3 {
                     let at = c * from.plane + from.offset(index);
-                    // The rounding loss of a compensated displacement belongs to it.
+                    // The rounding error of a compensated displacement belongs to it.
                     let lost = lost.filter(|_| number == 0).map_or(0.0, |lost| lost[at].wide());
                     wide[c * to.plane + to.offset(index)] = narrow[at].wide() + lost;
                 }
@@ -258,7 +264,7 @@ impl<T: Real> TissueState<T> {
         sheet
     }
 
-    /// The same sheet under `model`, if that is in f64 and this one is not.
+    /// Returns the tissue under `model`, if that is in f64 and this one is not.
     pub(crate) fn changed(&self, model: &Arc<Model>) -> Option<Box<TissueState<f64>>> {
         if self.model.precision == Precision::F64 || model.precision != Precision::F64 {
             return None;
@@ -276,7 +282,7 @@ impl<T: Real> TissueState<T> {
         Some(sheet)
     }
 
-    /// Continues with another substep of the same scheme. The tissue and the scheme's history stay.
+    /// Continues with another substep of the same scheme. The springs and the scheme's history stay.
     pub(crate) fn resample(&mut self, model: &Arc<Model>) {
         let (was, plan) = (self.plan.clone(), model.plan.clone());
         // The present force as an acceleration; the scheme's own terms may be the mean of both sides of a jump.
@@ -346,14 +352,14 @@ impl<T: Real> Replay for TissueState<T> {
 }
 
 impl SharedCheckpoint {
-    /// Copies the beginning and releases the shared checkpoint.
+    /// Copies the tissue at the beginning of a window and releases the shared checkpoint.
     pub fn open(self) -> WindowOpening {
         WindowOpening(self.checkpoint.resume(&self.model))
     }
 }
 
-/// An extent at least as large as the one that the sleep of `sheet` is relative to: the recent largest displacement, and
-/// a force in proportion.
+/// Returns an extent at least as large as the one to which the sleep of `sheet` is relative: the recent largest
+/// displacement, and a force in proportion.
 fn since_rest(sheet: &dyn Replay, extent: ErrorExtent) -> ErrorExtent {
     let ratio = (sheet.largest() * sheet.model().unit_m / extent.displacement_m).max(1.0);
     let ratio = if ratio.is_finite() { ratio } else { 1.0 };
@@ -361,7 +367,8 @@ fn since_rest(sheet: &dyn Replay, extent: ErrorExtent) -> ErrorExtent {
 }
 
 impl WindowOpening {
-    /// Ends the window at `end` and releases its shared checkpoint.
+    /// Ends the window at `end`, whose shared checkpoint it releases. `inputs` are those recorded in the
+    /// window.
     pub fn close(self, end: SharedCheckpoint, inputs: WindowInputs) -> Audit {
         let WindowOpening(end) = end.open();
         Audit { begin: self.0, inputs, end: Observed::of(&*end), until: end.steps() }
@@ -369,16 +376,16 @@ impl WindowOpening {
 }
 
 impl Audit {
-    /// Returns what an audit of a sheet takes beside the copy of its beginning ([`Model::session_bytes`]), bytes: two
-    /// twins in f64, and what is observed of at most six states.
+    /// Returns the memory of an audit besides the copy of its beginning ([`Model::session_bytes`]), bytes: two
+    /// repetitions in f64, and what is compared of at most six states.
     pub fn bytes(model: &Model) -> u64 {
         let observed = 6 * model.len() * size_of::<[DVec3; 2]>();
         2 * model.twin(1, Precision::F64).state_bytes() + observed as u64
     }
 
-    /// Repeats the window with `finer` times the substeps ([`FINER`]). `largest` is the result of earlier windows;
-    /// `go_on` is called between slices of some milliseconds. `None` if it returned false, if nothing moved, or if the
-    /// twin did not stay finite.
+    /// Repeats the window in f64 with `finer` times the substeps ([`FINER`]) and returns the error. `largest`
+    /// is that of earlier windows. It calls `go_on` between slices of some milliseconds. `None` if that
+    /// returned false, if nothing moved, or if the repetition did not stay finite.
     pub fn work(self, finer: u32, largest: ErrorExtent, go_on: &mut dyn FnMut() -> bool) -> Option<AuditFinding> {
         let Audit { mut begin, inputs, end, until } = self;
         let first = Observed::of(&*begin);
@@ -409,7 +416,7 @@ impl Audit {
         if found.largest() <= tolerance {
             return Some(finding);
         }
-        // From the sheet to the twin, one change at a time: awake, then f64, then the shorter substep.
+        // From the tissue to the twin, one change at a time: awake, then f64, then the shorter substep.
         let mut wide = begin.twin(1);
         if !begin.repeat(&inputs, until, go_on) || !wide.repeat(&inputs, until, go_on) {
             return None;

@@ -1,4 +1,4 @@
-//! What a sheet records of a window of steps that is to be audited.
+//! What a tissue records of a window of steps that is to be audited.
 
 use std::fmt;
 use std::sync::Arc;
@@ -8,11 +8,11 @@ use glam::DVec3;
 use crate::guard::checkpoint::Input;
 use crate::model::Model;
 
-/// Most inputs in a window. With more it ends without a result.
+/// Largest number of inputs in a window. With more, the window ends without a result.
 const MAX_INPUTS: usize = 4096;
 
-/// The tools' inputs in a window: step they precede, tool, input. Its memory is allocated at the beginning, so that the
-/// sheet need not allocate.
+/// The inputs of the tools in a window of steps: the step that each precedes, its tool, and the input. Its
+/// memory is allocated at the beginning, so that stepping allocates none.
 #[derive(Debug)]
 pub struct WindowInputs(pub(crate) Vec<(u64, usize, Input)>);
 
@@ -22,19 +22,19 @@ impl Default for WindowInputs {
     }
 }
 
-/// What a sheet reports about the requested window.
+/// What a tissue reports about the requested window of steps.
 #[derive(Debug)]
 pub enum Mark {
     /// The window has begun.
     Begin(SharedCheckpoint),
     /// The window has ended.
     End(SharedCheckpoint, WindowInputs),
-    /// The window can't be audited: the guard went back, the tissue changed, everything came to rest, or there were too
-    /// many inputs.
+    /// The window can't be audited: the guard went back, the tissue changed, everything came to rest, or there
+    /// were too many inputs.
     Dropped,
 }
 
-/// A sheet's state at a checkpoint, shared with the sheet.
+/// The state of a tissue at a checkpoint of the guard, shared with the tissue.
 #[derive(Debug)]
 pub struct SharedCheckpoint {
     pub(crate) model: Arc<Model>,
@@ -42,36 +42,36 @@ pub struct SharedCheckpoint {
 }
 
 impl SharedCheckpoint {
-    /// Returns the tissue in the window.
+    /// Returns the model of the tissue in the window.
     pub fn model(&self) -> &Arc<Model> {
         &self.model
     }
 }
 
-/// A checkpoint in any number format, from which a sheet can be made.
+/// A checkpoint in any number format, from which a tissue can be made.
 pub(crate) trait Resume: fmt::Debug + Send + Sync {
-    /// A sheet in the state of the checkpoint, of a sheet with `model`. None of it sleeps.
+    /// Returns a tissue in the state of the checkpoint, of a tissue with `model`. None of it sleeps.
     fn resume(&self, model: &Model) -> Box<dyn Replay>;
 }
 
-/// A sheet in any number format that repeats a window.
+/// A tissue in any number format that repeats a window.
 pub(crate) trait Replay: fmt::Debug + Send {
-    /// The model.
+    /// Returns the model.
     fn model(&self) -> &Arc<Model>;
-    /// Steps done.
+    /// Returns the number of steps done.
     fn steps(&self) -> u64;
-    /// The recent largest displacement, spacings, to which sleep is relative.
+    /// Returns the recent largest displacement, spacings, to which sleep is relative.
     fn largest(&self) -> f64;
-    /// For each point the displacement, m, and the tissue's force on a tool, N.
+    /// Returns the displacement, m, and the tissue's force on a tool, N, of each point.
     fn observed(&self) -> Vec<[DVec3; 2]>;
-    /// The same state in f64, with 1/`by` of the substep.
+    /// Returns a tissue in the same state in f64, with 1/`by` of the substep.
     fn twin(&self, by: u32) -> Box<dyn Replay>;
-    /// Repeats the recorded inputs up to step `until`, in slices. Calls `go_on` between slices; returns false if that
-    /// did.
+    /// Repeats the recorded inputs up to step `until`, in slices. Calls `go_on` between slices; stops and
+    /// returns false if that did.
     fn repeat(&mut self, inputs: &WindowInputs, until: u64, go_on: &mut dyn FnMut() -> bool) -> bool;
 }
 
-/// How far a sheet is with a requested window.
+/// How far a tissue is with a requested window.
 #[derive(Debug, Default)]
 pub(crate) enum AuditWindow {
     /// No window is requested.
@@ -98,7 +98,7 @@ impl AuditWindow {
         }
     }
 
-    /// Drops the window after an event that a twin can't repeat.
+    /// Drops the window after an event that a repetition can't follow.
     pub(crate) fn give_up(&mut self) {
         if matches!(self, AuditWindow::Open(..) | AuditWindow::Closed(_)) {
             *self = AuditWindow::Dropped;

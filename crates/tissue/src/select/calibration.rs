@@ -1,13 +1,13 @@
-//! A rehearsal: a small sheet of a scene's tissue, pushed hard, to measure by how much a scheme errs.
+//! A rehearsal: it pushes a small tissue of a scene hard and measures the error of a scheme.
 //!
-//! The error of a scheme depends on the spectrum of the sheet, on its geometry once springs turn and stretch, and on the
-//! rounding of a number format. A formula knows the first alone: on random scenes its estimate was between 0.04 and
-//! 10,000 times the true error. So the scheme itself is run, on at most [`SIDE`]² points for half a second, under a few
-//! loads that are harder than most scripts ([`LOADS`]). The truth is the same in f64 with a substep so short that half of it
-//! changes nothing. The true error of a script on the whole sheet is then at most [`MARGIN`] times the rehearsed one
-//! (`make bench-tolerance`), and on a whole mesh [`MARGIN_OF_MESH`] times (`tests/tolerance.rs`). Forces that change
-//! smoothly err by 10 to 1000 times less than those that jump, and a choice that is made before the script is known can't
-//! use that.
+//! The error of a scheme depends on the spectrum of the tissue, on its geometry once springs turn and stretch,
+//! and on the rounding of a number format. A formula knows only the first: on random scenes its estimate was
+//! between 0.04 and 10,000 times the true error. So the scheme itself runs, on at most [`SIDE`]² points for
+//! half a second, under a few loads that are harder than most scripts ([`LOADS`]). The reference ("truth") is a
+//! run in f64 with a substep so short that half of it changes nothing. The true error of a script on the whole
+//! sheet is then at most [`MARGIN`] times the rehearsed one (`make bench-tolerance`), and on a whole mesh
+//! [`MARGIN_OF_MESH`] times (`tests/tolerance.rs`). Forces that change smoothly have errors 10 to 1000 times
+//! smaller than those that jump, but a choice that is made before the script is known can't use that.
 
 use std::cell::Cell;
 use std::sync::Arc;
@@ -25,62 +25,64 @@ use crate::shape::PointId;
 use crate::state::tissue_state::at_rest;
 use crate::tools::applied_force::Push;
 
-/// Points along a side at most. Larger sheets err alike: a force spreads over some points.
+/// Largest number of points along a side. Larger tissues have similar errors: a force spreads over some points.
 const SIDE: usize = 12;
 
-/// How long a rehearsal lasts, s. Rounding and phase errors grow with time where little damps them.
+/// Length of a rehearsal, s. Rounding and phase errors grow with time where little damps them.
 const COURSE_S: f64 = 0.5;
 
-/// Least and largest number of steps of a rehearsal. The least applies to slow steps.
+/// Smallest and largest number of steps of a rehearsal. The smallest applies to slow steps.
 const STEPS: (f64, f64) = (40.0, 4000.0);
 
-/// Substeps of a rehearsal with the longest stable substep, at most: bounds the work for absurd scenes.
+/// Largest number of substeps of a rehearsal with the longest stable substep: bounds the work for absurd
+/// scenes.
 const SUBSTEPS: f64 = 8000.0;
 
-/// Where each step needs more substeps than this to be stable, a rehearsal looks at parts of steps.
+/// If each step needs more substeps than this to be stable, a rehearsal treats parts of steps as steps.
 const SUBSTEPS_A_LOOK: u32 = 8;
 
 /// Time over which undamped, growing errors are predicted, s.
 pub(crate) const LASTING_S: f64 = 2.0;
 
-/// By how much the true error of a script may exceed the rehearsed one.
+/// Largest factor by which the true error of a script may exceed the rehearsed one, on a sheet.
 const MARGIN: f64 = 5.0;
 
-/// The same on a mesh, where the vertex that vibrates fastest is pushed: all others err less. (56 random meshes at 5 tolerances:
-/// at most 1.4 times, half of them 0.05 times.)
+/// Largest factor by which the true error of a script may exceed the rehearsed one, on a mesh. There the vertex
+/// that vibrates fastest is pushed; all others have smaller errors. (56 random meshes at 5 tolerances: at most
+/// 1.4 times, half of them 0.05 times.)
 const MARGIN_OF_MESH: f64 = 2.0;
 
-/// For so long after a force jumps its error may be [`ALLOWANCE`] times the tolerance, s: a jump starts the fastest
-/// vibrations, which no substep follows exactly and which are over before anybody feels them.
+/// Time after a jump of a force in which the error may be [`ALLOWANCE`] times the tolerance, s. A jump starts
+/// the fastest vibrations, which no substep follows exactly and which are over before anybody feels them.
 const SOON_S: f64 = 0.02;
 
-/// See [`SOON_S`].
+/// Factor of the tolerance in the time [`SOON_S`] after a jump.
 const ALLOWANCE: f64 = 10.0;
 
-/// Substeps of the truth at most: bounds the work for absurd scenes and tolerances.
+/// Largest number of substeps of the reference: bounds the work for absurd scenes and tolerances.
 const MAX_SUBSTEPS: u64 = 400_000;
 
-/// How often the truth's substep is halved before it counts as good as it gets.
+/// How many times the substep of the reference is halved at most.
 const MAX_HALVINGS: u32 = 6;
 
-/// A truth that halving its substep still changes by more than this part of the largest value is none. Neighbouring courses
-/// of such a motion part: no substep follows it.
+/// Largest uncertainty of a reference, as a fraction of the largest value. If halving the substep still changes
+/// more, neighbouring motions diverge, and no substep follows them.
 const MAX_UNCERTAINTY: f64 = 0.1;
 
-/// What pushes the small sheet, from its first step on.
+/// A force that pushes the small tissue, from its first step on.
 struct CalibrationLoad {
     profile: Profile,
-    /// Part of the course that it takes to show its errors.
+    /// Part of the course in which the load shows its errors.
     part: f64,
     /// c of the falloff, in 1/spacing.
     falloff: f64,
-    /// The force, in (K″ + 0.3·k)·spacing: what bends a point by about so many spacings.
+    /// The force, in (K″ + 0.3·k)·spacing: it moves a point by about as many spacings.
     force: DVec3,
 }
 
-/// A sharp one excites every vibration. Under a wide one the springs' forces are small differences of large displacements,
-/// which is where rounding shows; along the sheet it makes folds, and rounding grows as they do. One that swings as fast as
-/// scripts usually do shows how well a scheme follows a force.
+/// A sharp force excites every vibration. Under a wide one, the springs' forces are small differences of large
+/// displacements, which is where rounding shows; along the surface it makes folds, and rounding grows with
+/// them. A force that oscillates as fast as in usual scripts shows how well a scheme follows a force.
 const LOADS: [CalibrationLoad; 3] = [
     CalibrationLoad { profile: Profile::Constant, part: 1.0, falloff: 3.0, force: DVec3::new(0.3, 0.15, -0.37) },
     CalibrationLoad { profile: Profile::Constant, part: 1.0, falloff: 0.3, force: DVec3::new(0.2, 0.15, -0.05) },
@@ -92,41 +94,42 @@ const LOADS: [CalibrationLoad; 3] = [
     },
 ];
 
-/// What a substep and a step of a rehearsal cost beside their points, in points: small sheets have a fixed cost too.
+/// Fixed cost of a substep and of a step of a rehearsal, in points.
 const SUBSTEP_POINTS: u64 = 32;
 const STEP_POINTS: u64 = 500;
 
-/// Displacement and reaction of the points that are looked at, step by step.
+/// Displacement and reaction of the compared points, step by step.
 type Trajectory = Vec<[[DVec3; 2]; 3]>;
 
-/// How the small sheet truly moves under a load.
+/// The reference motion of the small tissue under a load.
 struct Truth {
     course: Trajectory,
-    /// By how much the course may be wrong, as far as that is above the tolerance; else 0.
+    /// Estimated error of the course if that is above the tolerance; otherwise 0.
     uncertainty: f64,
 }
 
-/// The small sheet, and how it truly moves.
+/// The small tissue and its reference motion.
 pub(crate) struct Rehearsal<'s> {
     scene: Scene,
     /// The points that are compared; the first is pushed.
     looked_at: [PointId; 3],
     sheet: Oscillator,
-    /// Parts of the scene's step that count as a step here.
+    /// Number of parts of the scene's step, each of which counts as a step here.
     parts: u32,
     steps: usize,
-    /// None: the motion is chaotic, or beyond every bound.
+    /// `None`: the motion is chaotic, or beyond every bound.
     truth: [Option<Truth>; LOADS.len()],
-    /// Points × substeps that may still be computed, and whether something was left out for want of them.
+    /// Points × substeps that may still be computed, and whether something was left out because they did not
+    /// suffice.
     left: Cell<u64>,
     is_cut: Cell<bool>,
-    /// When set, nothing more is computed.
+    /// When set by another thread, nothing more is computed.
     stop: &'s AtomicBool,
 }
 
 impl<'s> Rehearsal<'s> {
-    /// Of a scene, with a truth that is good enough to judge schemes by `tolerance`. All courses together compute at most
-    /// `most_work` points × substeps, and nothing more once `stop` is set.
+    /// Creates the rehearsal of a scene, with a reference that is good enough to judge schemes by `tolerance`.
+    /// All courses together compute at most `most_work` points × substeps, and nothing more once `stop` is set.
     pub(crate) fn new(scene: &Scene, tolerance: f64, most_work: u64, stop: &'s AtomicBool) -> Self {
         let sheet = Oscillator::of(scene);
         let step_s = scene.stepping.rate_hz.recip();
@@ -153,7 +156,7 @@ impl<'s> Rehearsal<'s> {
         };
         for (load, at) in LOADS.iter().zip(0..) {
             rehearsal.truth[at] = rehearsal.true_course(load, least, tolerance);
-            // Without one of them nothing can be judged.
+            // Without one of the references, nothing can be judged.
             if rehearsal.truth[at].is_none() {
                 break;
             }
@@ -161,24 +164,24 @@ impl<'s> Rehearsal<'s> {
         rehearsal
     }
 
-    /// Points × substeps that may still be computed.
+    /// Returns the points × substeps that may still be computed.
     pub(crate) fn left(&self) -> u64 {
         self.left.get()
     }
 
-    /// Some course was left out because it would have taken more work than there was left.
+    /// Returns whether a course was left out because it would have needed more work than was left.
     pub(crate) fn is_cut(&self) -> bool {
         self.is_cut.get()
     }
 
-    /// Whether nobody waits for the result.
+    /// Returns whether the caller no longer waits for the result.
     pub(crate) fn is_stopped(&self) -> bool {
         self.stop.load(Ordering::Relaxed)
     }
 
-    /// Halves the substep until that changes less than the tolerance: an error of fifth order is then 32 times smaller.
-    /// Where rounding or a sensitive motion lets it never change so little, the course that changed least is the truth, and
-    /// may be wrong by that.
+    /// Computes the reference: halves the substep until that changes less than the tolerance; an error of fifth
+    /// order is then 32 times smaller. If rounding or a sensitive motion prevents that, the course that changed
+    /// least is the reference, and this change is its uncertainty.
     fn true_course(&self, load: &CalibrationLoad, least: u32, tolerance: f64) -> Option<Truth> {
         let mut substeps = least;
         let mut coarse = self.course(load, Integrator::Exponential4, substeps, Precision::F64);
@@ -202,20 +205,21 @@ impl<'s> Rehearsal<'s> {
         best.filter(|truth| truth.uncertainty <= MAX_UNCERTAINTY)
     }
 
-    /// The margin by which the true error of a script may exceed the rehearsed one.
+    /// Returns the factor by which the true error of a script may exceed the rehearsed one.
     fn margin(&self) -> f64 {
         if self.scene.sheet().is_some() { MARGIN } else { MARGIN_OF_MESH }
     }
 
-    /// No scheme can be expected to err by less: by so much the truth itself may be wrong. 0 if that is within the tolerance;
-    /// infinite if nothing can be estimated.
+    /// Returns the smallest error that can be expected of any scheme, given the uncertainty of the reference. 0
+    /// if that is within the tolerance; infinite if nothing can be estimated.
     pub(crate) fn least_error(&self) -> f64 {
         let uncertainty = |truth: &Option<Truth>| truth.as_ref().map_or(f64::INFINITY, |truth| truth.uncertainty);
         self.margin() * self.truth.iter().map(uncertainty).fold(0.0, f64::max)
     }
 
-    /// What to expect of a scheme with so many substeps in a step of the scene, in a format: the error of displacement and
-    /// force, the larger, each relative to its largest. Infinite if the motion can't be followed.
+    /// Returns the expected error of a scheme with `substeps` in a step of the scene and a format: the larger
+    /// of the errors of displacement and force, each relative to its largest. Infinite if the motion can't be
+    /// followed.
     pub(crate) fn error(&self, integrator: Integrator, substeps: u32, precision: Precision) -> f64 {
         if self.truth.iter().any(Option::is_none) {
             return f64::INFINITY;
@@ -225,22 +229,23 @@ impl<'s> Rehearsal<'s> {
             let Truth { course, uncertainty } = truth.as_ref()?;
             Some(self.difference(load, course, &self.course(load, integrator, substeps, precision)?) + uncertainty)
         };
-        // The first that can't be followed is enough.
+        // The first course that can't be followed is enough.
         let largest = LOADS.iter().zip(&self.truth).try_fold(0.0, |largest: f64, pair| Some(largest.max(error(pair)?)));
         self.margin() * largest.unwrap_or(f64::INFINITY)
     }
 
-    /// How many substeps a scheme takes in whole rehearsed steps: no fewer than `substeps`.
+    /// Returns `substeps` rounded up to whole rehearsed steps.
     pub(crate) fn whole(&self, substeps: u32) -> u32 {
         substeps.div_ceil(self.parts).saturating_mul(self.parts)
     }
 
-    /// The same, no more than `substeps`.
+    /// Returns `substeps` rounded down to whole rehearsed steps.
     pub(crate) fn whole_within(&self, substeps: u32) -> u32 {
         substeps / self.parts * self.parts
     }
 
-    /// The course of a scheme; none if the guard finds fault with it, if it would be too much work, or if it is stopped.
+    /// Returns the course of a scheme; `None` if the guard rejects it, if it would be too much work, or if it
+    /// is stopped.
     fn course(
         &self,
         load: &CalibrationLoad,
@@ -265,7 +270,7 @@ impl<'s> Rehearsal<'s> {
         let model = Arc::new(Model::planned(scene.clone(), plan, precision, lanes).ok()?);
         let (spacing_m, [pushed, ..]) = (scene.shape().edge_m(), self.looked_at);
         let stiffness = scene.anchor_stiffness_n_per_m + 0.3 * scene.springs.stiffness_n_per_m;
-        // Without any spring, what brings a point about as far within a step.
+        // Without any spring, a force that moves a point about as far within a step.
         let free = scene.point_mass_kg() * scene.stepping.rate_hz * scene.stepping.rate_hz;
         let newtons = spacing_m * if stiffness > 0.0 { stiffness } else { free };
         let mut tissue = at_rest(&model);
@@ -285,17 +290,18 @@ impl<'s> Rehearsal<'s> {
                 [point.displacement_m, point.reaction_n()]
             }));
         }
-        // What the guard repeated counts as well.
+        // Substeps that the guard repeated count as well.
         self.left.set(self.left.get().saturating_sub(work(tissue.substeps_done())));
         is_sound.then_some(course)
     }
 
-    /// The largest difference of two courses, of displacement and force, relative to the largest of each. What grows in
-    /// the second half of the course is expected to go on growing for as long as vibrations last.
+    /// Returns the largest difference of two courses, of displacement and force, relative to the largest of
+    /// each. An error that grows in the second half of the course is expected to keep growing for as long as
+    /// vibrations last.
     fn difference(&self, load: &CalibrationLoad, truth: &Trajectory, other: &Trajectory) -> f64 {
         #[allow(clippy::cast_precision_loss)]
         let course_s = self.steps as f64 / self.scene.stepping.rate_hz;
-        // A short course has no time to wait.
+        // In a short course, less time is excluded.
         let soon_s = if load.profile == Profile::Constant { SOON_S.min(0.04 * course_s) } else { 0.0 };
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let soon = (soon_s * self.scene.stepping.rate_hz).ceil() as usize;
@@ -316,7 +322,7 @@ impl<'s> Rehearsal<'s> {
         let halves_to_come = ((decay_s.min(LASTING_S) - course_s) / (0.5 * course_s)).max(0.0);
         let relative = |which: usize| {
             let growth = if error[which] > 1.5 * early[which] { error[which] - early[which] } else { 0.0 };
-            // Where nothing moves nothing errs.
+            // Where nothing moves, there is no error.
             if largest[which] > 0.0 { (error[which] + growth * halves_to_come) / largest[which] } else { 0.0 }
         };
         relative(0).max(relative(1))
@@ -355,12 +361,13 @@ mod tests {
             rehearsal.difference(&LOADS[2], &truth, &other)
         };
         let undamped = ["damping.coefficient_n_s_per_m=0.0"];
-        // A course of 0.5 s of an undamped sheet stands for 2 s.
+        // A course of 0.5 s of an undamped tissue represents 2 s.
         assert!((difference(&undamped, &|part| 1e-3 * part) / 8e-3 - 1.0).abs() < 0.01);
-        // An error that does not grow stays as it is, and so does one in a sheet whose vibrations die within the course.
+        // An error that does not grow stays as it is, and so does one in a tissue whose vibrations die within
+        // the course.
         assert!((difference(&undamped, &|_| 1e-3) - 2e-3).abs() < 1e-9);
         assert!((difference(&["damping.coefficient_n_s_per_m=0.5"], &|part| 1e-3 * part) - 2e-3).abs() < 1e-9);
-        // Where nothing moves nothing errs.
+        // Where nothing moves there is no error.
         let rehearsal =
             Rehearsal::new(&scene(&["sheet.points=[3, 3]"]), 1.0, 0, &crate::select::scheme_selection::NEVER);
         let still = course(rehearsal.steps, |_| 0.0);
@@ -383,7 +390,7 @@ mod tests {
         assert_eq!(2 * few - many, steps * STEP_POINTS);
         // The course of a force that swings is a quarter as long.
         assert_eq!(work(&LOADS[2], 5).0, few / steps * (steps / 4));
-        // What it would need more than there is, it is not begun for.
+        // A course that needs more work than is left is not begun.
         let rehearsal = Rehearsal::new(&scene, 1e-3, 0, never);
         rehearsal.left.set(few - 1);
         assert!(rehearsal.course(&LOADS[0], Integrator::Central, 5, Precision::F64).is_none() && rehearsal.is_cut());

@@ -1,6 +1,7 @@
-//! A correction: the same tissue, stepped more accurately, because an audit found an error above the tolerance.
+//! A correction: after an audit found an error above the tolerance, the same tissue is stepped more accurately.
 //!
-//! It is an input like a change of tissue: a recorded correction, applied at the same step, gives the same bits.
+//! It is an input like a change of tissue: a recorded correction, applied at the same step, gives the same
+//! bits.
 
 use std::sync::Arc;
 
@@ -13,13 +14,14 @@ use crate::select::audit::{AuditFinding, Origin};
 use crate::select::scheme_selection::{self, Choice};
 use palpate_refusal::Result;
 
-/// A correction aims at this part of the tolerance, so that the next window is not just above it again.
+/// The fraction of the tolerance at which a correction aims, so that the next window is not just above it
+/// again.
 const AIM: f64 = 0.5;
 
 impl Model {
-    /// Returns the correction that keeps the error of `finding` below the tolerance from step `step` on: another scheme
-    /// or more substeps, a better number format, or less sleep. `None` if the error is within the tolerance, or if
-    /// nothing better exists.
+    /// Returns the correction that should keep the error of `finding` below the tolerance from step `step` on:
+    /// another scheme or more substeps, a better number format, or less sleep. `None` if the error is within
+    /// the tolerance, or if nothing better exists. May run rehearsals.
     pub fn correction(&self, finding: &AuditFinding, step: u64, limits: &Limits) -> Option<Correction> {
         let origin = finding.origin?;
         let excess = finding.error.largest() / (AIM * self.scene.stepping.tolerance);
@@ -64,8 +66,8 @@ impl Model {
         Some(correction)
     }
 
-    /// The scheme that the tolerance would choose, if it differs and takes fewer substeps than `needed` of the present
-    /// one.
+    /// Returns the scheme that the tolerance would choose, if it differs from the present one and needs fewer
+    /// substeps than `needed`.
     fn better_scheme(&self, needed: u32, limits: &Limits) -> Option<Choice> {
         let stepping = &self.scene.stepping;
         let mut open = self.scene.clone();
@@ -77,7 +79,7 @@ impl Model {
         (keeps && fits && choice.integrator != self.plan.integrator).then_some(choice)
     }
 
-    /// Returns the same tissue, stepped as `correction` says.
+    /// Compiles the same tissue, stepped as `correction` says.
     ///
     /// # Errors
     /// Refuses a correction that this model can't be compiled with.

@@ -1,4 +1,4 @@
-//! Which scheme a tissue is stepped with: calibration, selection, audit, and correction.
+//! Chooses the scheme of a tissue: rehearsal, selection, audit, and correction.
 
 pub mod audit;
 pub(crate) mod audit_window;

@@ -1,4 +1,5 @@
-//! What a tolerance asks for: integrator, substeps and number format, the cheapest that keep to it in a rehearsal.
+//! Chooses what a tolerance requires: the cheapest integrator, substeps and number format that keep the
+//! tolerance in a rehearsal.
 
 use std::cell::RefCell;
 use std::sync::atomic::AtomicBool;
@@ -13,17 +14,18 @@ use palpate_refusal::{Reason, Refusal, Result};
 /// Time over which undamped, growing errors are predicted, s.
 pub const LASTING_S: f64 = calibration::LASTING_S;
 
-/// The number formats and what each costs, in f32.
+/// The number formats and their costs relative to f32.
 const FORMATS: [(Precision, f64); 3] = [(Precision::F32, 1.0), (Precision::Compensated, 1.1), (Precision::F64, 2.6)];
 
-/// A point in a substep of `central` in f32 with the widest lanes, and a step beside its points, ns: measured.
+/// Measured times, ns: of a point in a substep of `central` in f32 with the widest lanes, and of a step besides
+/// its points.
 const POINT_SUBSTEP_NS: f64 = 1.7;
 pub(crate) const STEP_NS: f64 = 2000.0;
 
-/// What a vertex of a mesh takes over a point of a sheet: measured.
+/// Cost of a vertex of a mesh relative to a point of a sheet: measured.
 const VERTEX: f64 = 2.8;
 
-/// The processor time that a point of a scene is expected to take in a substep, ns.
+/// Returns the predicted processor time of a point of a scene in a substep, ns.
 pub(crate) fn point_substep_ns(scene: &Scene, integrator: Integrator, precision: Precision, lanes: Lanes) -> f64 {
     let scheme = entry(integrator).cost;
     let format = FORMATS.iter().find(|format| format.0 == precision).map_or(1.0, |found| found.1);
@@ -38,47 +40,51 @@ pub(crate) fn point_substep_ns(scene: &Scene, integrator: Integrator, precision:
     POINT_SUBSTEP_NS * scheme * format * width * kind
 }
 
-/// What rounding may add to a sheet that is at rest, as a part of the tolerance: a rehearsal is over before that shows.
+/// Part of the tolerance that rounding may add to a tissue at rest. A rehearsal is too short to show that
+/// error.
 const RESTING_PART: f64 = 0.5;
 
-/// The flag of a caller who waits to the end.
+/// A stop flag that nobody sets: for callers who wait to the end.
 pub static NEVER: AtomicBool = AtomicBool::new(false);
 
-/// Returns the refusal of work whose caller's flag is set.
+/// Returns the refusal of work whose stop flag was set.
 pub fn given_up() -> Refusal {
     Refusal::new(Reason::TimedOut, "", "was given up, because nobody waits for it")
 }
 
-/// Rehearsals of one integrator in one format at most.
+/// Largest number of rehearsals of one integrator in one format.
 const MAX_ROUNDS: u32 = 6;
 
-/// `auto` takes at most so many times the substeps with which an integrator is stable. `central` is stable while the fastest
-/// vibration turns by less than 2 in a substep, and follows it for as long as it lasts while that turns by
-/// [`stability::THETA`] over at most 8 ([`stability::endurance`]): this is the quotient. (Of 700 random scenes at tolerances from
-/// 1e-14 to 1e-2, the choices that keep them have at most 32 times as many.)
+/// Largest number of substeps that `auto` chooses, as a multiple of the number with which an integrator is
+/// stable. `central` is stable while the fastest vibration turns by less than 2 rad in a substep. It follows
+/// that vibration for as long as it lasts while the turn is [`stability::THETA`] divided by at most 8
+/// ([`stability::endurance`]): this limit is the quotient. (Of 700 random scenes at tolerances from 1e-14 to
+/// 1e-2, the choices that keep them have at most 32 times as many.)
 pub const MAX_TIMES_STABLE: u32 = 64;
 
-/// An error that says nothing: courses that have nothing in common differ by so much or more.
+/// Error from which courses have nothing in common, so that its size says nothing.
 const SATURATED: f64 = 0.1;
 
-/// An integrator, how often it is used in a step, in which format, and what to expect of that.
+/// A choice of integrator, substeps and number format, with its expected error.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Choice {
     /// The integrator.
     pub integrator: Integrator,
-    /// Substeps a step.
+    /// Substeps per step.
     pub substeps: u32,
-    /// The format.
+    /// The number format.
     pub precision: Precision,
-    /// Expected error of displacement and force, the larger, relative to the largest of each.
+    /// The larger of the expected errors of displacement and force, each relative to its largest. Infinite if
+    /// it is unknown.
     pub expected_error: f64,
 }
 
-/// What rounding adds to the state of a sheet that has come to rest, relative to its displacement: measured.
+/// Returns what rounding adds to the state of a tissue that has come to rest, relative to its displacement:
+/// measured.
 fn rounding(precision: Precision, sheet: &Oscillator, substep_s: f64) -> f64 {
     let unit = f64::from(f32::EPSILON) / 2.0;
-    // A displacement that creeps by less than half its last digit in a substep stands still: short by so many digits as
-    // the damping takes substeps to let go of one.
+    // A displacement that creeps by less than half its last digit in a substep stands still. What is missing
+    // then grows with the number of substeps that the damping takes to release one digit.
     let stiffness = sheet.anchor_stiffness_n_per_m + 0.05 * sheet.spring_stiffness_n_per_m;
     if stiffness == 0.0 {
         return if precision == Precision::F64 { 1e-12 } else { 4.0 * unit };
@@ -93,48 +99,52 @@ fn rounding(precision: Precision, sheet: &Oscillator, substep_s: f64) -> f64 {
     }
 }
 
-/// An integrator that the scene leaves open, and how many substeps a step of it may have.
+/// An integrator that the scene allows, and the substeps per step that it may have.
 #[derive(Debug, Clone, Copy)]
 struct OpenChoice {
     integrator: Integrator,
-    /// With fewer it is not stable, or is not what the scene gives.
+    /// With fewer it is unstable, or differs from what the scene gives.
     least: u32,
     /// With more it is chosen only if the scene names it, and if it then keeps the tolerance.
     most: u32,
 }
 
-/// The choice for a scene, and what it is made from.
+/// Makes the choice for a scene from rehearsals.
 struct Chooser<'a> {
     stepping: &'a Stepping,
     sheet: Oscillator,
-    /// The same without the pressure of a volume, which lets nothing creep less.
+    /// The oscillator without the pressure of a volume, which does not reduce creep.
     unpressed: Oscillator,
     rehearsal: Rehearsal<'a>,
-    /// The error to keep: the tolerance or, where that can't be found out or no format keeps it, what can be.
+    /// The error to keep: the tolerance or, if that can't be verified or no format keeps it, the smallest that
+    /// can.
     aim: f64,
     most_substeps: u32,
     open: Vec<OpenChoice>,
-    /// All that was tried, in this order.
+    /// All choices tried so far, in this order.
     tried: RefCell<Vec<Choice>>,
 }
 
-/// How the search for the fewest substeps of an integrator in a format ended.
+/// The result of the search for the fewest substeps of an integrator in a format.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Search {
-    /// These are few and keep what is aimed at.
+    /// The choice has few substeps and keeps the aim.
     Keeps(Choice),
-    /// More substeps did not help: the rounding of the format errs, or the truth itself.
+    /// More substeps did not help: the error comes from the rounding of the format, or from the reference
+    /// itself.
     Stalls,
-    /// It would take more than there may be.
+    /// It would need more substeps than allowed.
     Beyond,
 }
 
-/// Whether a search takes a hint for a proof.
+/// How much a search tries before it gives up.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Effort {
-    /// Where one integrator stalls, so do all in its format; an error that does not fall will not.
+    /// If one integrator stalls, all are taken to stall in this format; an error that does not fall at once is
+    /// taken not to fall.
     Quick,
-    /// Each integrator is tried in each format, from the most exact on; there it goes on from errors that say nothing.
+    /// Tries each integrator in each format, from the most exact on, and continues after errors whose size says
+    /// nothing.
     Thorough,
 }
 
@@ -145,7 +155,7 @@ impl Chooser<'_> {
         let spring_stiffness_n_per_m = stability::stiffness_of_springs_n_per_m(scene);
         let unpressed = Oscillator { spring_stiffness_n_per_m, ..sheet };
         let (stepping, most_substeps) = (&scene.stepping, limits.substeps);
-        // What comes near to the least error that can be told from none is as good as any.
+        // An error near the smallest that can be distinguished from none is as good as any.
         let aim = stepping.tolerance.max(2.0 * rehearsal.least_error());
         let mut chooser = Chooser {
             stepping,
@@ -162,8 +172,8 @@ impl Chooser<'_> {
         chooser
     }
 
-    /// A choice is never less accurate for want of work: it is refused. Whoever gives the number of substeps answers for
-    /// it, and is warned of an error that is not known.
+    /// Refuses a choice that ran out of work, so that a choice is never less accurate for lack of work. A user
+    /// who gives the number of substeps gets a warning instead.
     fn check_work(&self, limits: &Limits) -> Result<()> {
         if self.rehearsal.is_stopped() {
             return Err(given_up());
@@ -179,7 +189,7 @@ impl Chooser<'_> {
         Err(Refusal::new(Reason::TooLarge, "stepping.tolerance", message))
     }
 
-    /// Integrators that the scene leaves open.
+    /// Returns the integrators that the scene allows.
     fn integrators(&self) -> impl Iterator<Item = Integrator> + use<> {
         let (asked, compensates) = (self.stepping.integrator, self.stepping.precision == Precision::Compensated);
         let candidates =
@@ -191,7 +201,7 @@ impl Chooser<'_> {
 
     fn opened(&self, integrator: Integrator) -> OpenChoice {
         let step_s = self.stepping.rate_hz.recip();
-        // A yardstick has as many substeps as it has to have.
+        // An integrator for comparison has exactly the substeps that it needs.
         let needed =
             || (!CANDIDATES.contains(&integrator)).then(|| stability::substeps(integrator, step_s, &self.sheet));
         if let Some(substeps) = self.stepping.substeps.or_else(needed) {
@@ -203,8 +213,8 @@ impl Chooser<'_> {
         OpenChoice { integrator, least, most: self.rehearsal.whole_within(most).max(least) }
     }
 
-    /// What to expect of an integrator with so many substeps in a format. Of what keeps the tolerance while it moves and
-    /// not at rest, it is the error at rest.
+    /// Rehearses an integrator with `substeps` in a format, once, and returns the expected error. If it keeps
+    /// the aim while the tissue moves but not at rest, the error at rest counts.
     fn tried(&self, integrator: Integrator, substeps: u32, precision: Precision) -> Choice {
         let is_this =
             |tried: &&Choice| (tried.integrator, tried.substeps, tried.precision) == (integrator, substeps, precision);
@@ -223,8 +233,8 @@ impl Chooser<'_> {
         choice.expected_error <= self.aim
     }
 
-    /// What to expect at rest of a format that the scene does not give: rounding alone, which may be [`RESTING_PART`] of the
-    /// tolerance.
+    /// Returns the expected error at rest of a format that the scene does not give: rounding alone, which may
+    /// be [`RESTING_PART`] of the tolerance.
     fn resting_error(&self, precision: Precision, substeps: u32) -> f64 {
         if self.stepping.precision != Precision::Auto {
             return 0.0;
@@ -233,7 +243,7 @@ impl Chooser<'_> {
         rounding(precision, &self.unpressed, substep_s) / RESTING_PART
     }
 
-    /// Formats that the scene leaves open to an integrator, by rising cost.
+    /// Returns the formats that the scene allows for an integrator, by rising cost.
     fn formats(&self, integrator: Integrator) -> Vec<(Precision, f64)> {
         let is_open = |format: &(Precision, f64)| match self.stepping.precision {
             Precision::Auto => format.0 != Precision::Compensated || entry(integrator).compensates,
@@ -242,8 +252,9 @@ impl Chooser<'_> {
         FORMATS.into_iter().filter(is_open).collect()
     }
 
-    /// The fewest substeps, at most `most`, with which an integrator keeps what is aimed at in a format. The search goes up as
-    /// the order of the integrator says, at most to 3^[`MAX_ROUNDS`] times the stable number.
+    /// Finds the fewest substeps, at most `most`, with which an integrator keeps the aim in a format. The
+    /// search goes up as the order of the integrator predicts, at most to 3^[`MAX_ROUNDS`] times the stable
+    /// number.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn fewest(&self, open: &OpenChoice, precision: Precision, most: u32, effort: Effort) -> Search {
         let OpenChoice { integrator, least, .. } = *open;
@@ -261,7 +272,7 @@ impl Chooser<'_> {
             if self.keeps(&now) {
                 break;
             }
-            // As many more as the order says; an infinite error says nothing.
+            // As many more as the order predicts; an infinite error says nothing.
             let excess = now.expected_error / self.aim;
             let ratio = libm::pow(excess, order.recip()).min(3.0);
             let more = (f64::from(now.substeps) * ratio).ceil().max(f64::from(now.substeps + 1));
@@ -278,7 +289,7 @@ impl Chooser<'_> {
             }
             (before, now) = (Some(now), next);
         }
-        // The last leap may have gone too far: fewer, by the slope between the two.
+        // The last step may have gone too far: try fewer, by the slope between the last two.
         if let Some(before) =
             before.filter(|before| self.keeps(&now) && self.rehearsal.whole(before.substeps + 1) < now.substeps)
         {
@@ -296,14 +307,14 @@ impl Chooser<'_> {
         or_beyond(now)
     }
 
-    /// Whether the number of substeps is no choice.
+    /// Returns whether the number of substeps is fixed.
     fn is_given(&self, open: &OpenChoice) -> bool {
         self.stepping.substeps.is_some() || !CANDIDATES.contains(&open.integrator)
     }
 }
 
-/// The fewest substeps of `step_s` with which an integrator can do, or the best of those that `auto` may become. Saturates
-/// for absurd scenes.
+/// Returns the fewest substeps of a step of `step_s` with which an integrator is stable (or the best of those
+/// that `auto` may choose). Saturates for absurd scenes.
 pub(crate) fn least_substeps(asked: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     let is_open = |integrator: Integrator| asked == Integrator::Auto || asked == integrator;
     let open = CANDIDATES.into_iter().filter(|integrator| is_open(*integrator));
@@ -311,8 +322,9 @@ pub(crate) fn least_substeps(asked: Integrator, step_s: f64, sheet: &Oscillator)
     least.unwrap_or_else(|| stability::substeps(asked, step_s, sheet))
 }
 
-/// Returns the fewest substeps that a scene can do with, or those that it gives, and the time that a step of the
-/// cheapest kind takes with them while all of the sheet moves, s: as [`Model::predicted_step_s`](crate::Model::predicted_step_s).
+/// Returns the fewest substeps that a scene needs for stability, or those that it gives; and the processor time
+/// of a step of the cheapest kind with them and all points awake, s (see
+/// [`Model::predicted_step_s`](crate::Model::predicted_step_s)).
 #[allow(clippy::cast_precision_loss)]
 pub fn least_step(scene: &Scene) -> (u32, f64) {
     let Stepping { integrator, substeps, precision, rate_hz, lanes, .. } = scene.stepping;
@@ -324,15 +336,16 @@ pub fn least_step(scene: &Scene) -> (u32, f64) {
     (substeps, 1e-9 * (STEP_NS + point_ns * points as f64 * f64::from(substeps)))
 }
 
-/// Returns every integrator that the scene leaves open, each with what would be chosen if it were the only one.
+/// Returns every integrator that the scene allows, each with the choice that would be made if it were the only
+/// one. Runs rehearsals.
 pub fn candidates(scene: &Scene, limits: &Limits) -> Vec<Choice> {
     let chooser = Chooser::new(scene, limits, &NEVER);
     let possible = chooser.open.iter().filter(|open| open.least <= limits.substeps);
     possible.map(|open| chooser.best(std::slice::from_ref(open))).collect()
 }
 
-/// Returns what would be chosen for a scene if it gave no integrator, no substeps and no precision. `None` if it gives
-/// none, or if no such choice can be made within the limits.
+/// Returns the choice for a scene if it gave no integrator, no substeps and no precision. Runs rehearsals.
+/// `None` if the scene gives none of them anyway, or if no such choice can be made within the limits.
 pub fn by_auto(scene: &Scene, limits: &Limits) -> Option<Choice> {
     let given = &scene.stepping;
     let auto = Stepping { integrator: Integrator::Auto, substeps: None, precision: Precision::Auto, ..given.clone() };
@@ -343,41 +356,42 @@ pub fn by_auto(scene: &Scene, limits: &Limits) -> Option<Choice> {
     choose(&Scene { stepping: auto, ..scene.clone() }, limits, &NEVER).ok().map(|(choice, _)| choice)
 }
 
-/// Returns what a scene's tolerance asks for, of what the scene leaves open:
+/// Chooses integrator, substeps and format for a scene's tolerance, as far as the scene leaves them open:
 ///
-/// 1. The cheapest that is expected to keep the tolerance.
-/// 2. If none is: the cheapest whose error is at most twice the least that could be told from none or, if there is none either,
-///    what is expected to err least.
-/// 3. If nothing can be expected of any, what is stable at the least cost, with as many substeps as let the fastest vibration
-///    turn by at most [`stability::THETA`] in each: at most 8 times those.
+/// 1. The cheapest choice that is expected to keep the tolerance.
+/// 2. If there is none: the cheapest whose error is at most twice the smallest that can be distinguished from
+///    none; if there is none either, the choice with the smallest expected error.
+/// 3. If no error can be predicted: the cheapest stable scheme, with as many substeps as let the fastest
+///    vibration turn by at most [`stability::THETA`] in each: at most 8 times those.
 ///
-/// None has more than [`MAX_TIMES_STABLE`] times the substeps with which it is stable, but for an integrator that the scene
-/// names, and that keeps the tolerance with more.
+/// No choice has more than [`MAX_TIMES_STABLE`] times the substeps with which it is stable, except an
+/// integrator that the scene names and that keeps the tolerance with more.
 ///
-/// Also returns the work: points × substeps of rehearsals.
+/// Also returns the work of the rehearsals in points × substeps.
 ///
 /// # Errors
-/// Refuses a scene for which that would take more work than the limits allow, and when `stop` is set.
+/// Refuses a scene for which that would take more work than the limits allow; and refuses when another thread
+/// sets `stop`.
 pub fn choose(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<(Choice, u64)> {
     let chooser = Chooser::new(scene, limits, stop);
     let choice = chooser.best(&chooser.open);
     chooser.check_work(limits).map(|()| (choice, limits.rehearsal_work - chooser.rehearsal.left()))
 }
 
-/// What an integrator costs in a format for each substep, in substeps of `central` in f32.
+/// Returns the cost of a substep of an integrator in a format, in substeps of `central` in f32.
 fn cost(integrator: Integrator, format_cost: f64) -> f64 {
     entry(integrator).cost * format_cost
 }
 
 impl Chooser<'_> {
-    /// What [`choose`] tells, of some integrators. Where one of them alone keeps the tolerance, what is chosen of all does: a
-    /// thorough search leaves out none.
+    /// Makes the choice of [`choose`] among some integrators. If one of them alone keeps the tolerance, the
+    /// overall choice does too: a thorough search leaves none out.
     fn best(&self, open: &[OpenChoice]) -> Choice {
         let cheapest = self.cheapest(open, Effort::Quick).or_else(|| self.cheapest(open, Effort::Thorough));
         cheapest.or_else(|| self.nearest(open)).unwrap_or_else(|| self.unpredicted(open))
     }
 
-    /// The cheapest that keeps what is aimed at.
+    /// Returns the cheapest choice that keeps the aim.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn cheapest(&self, open: &[OpenChoice], effort: Effort) -> Option<Choice> {
         if self.aim.is_infinite() {
@@ -397,7 +411,7 @@ impl Chooser<'_> {
                     continue;
                 }
                 let cost = cost(open.integrator, format_cost);
-                // What is not cheaper than the best so far need not be tried.
+                // A choice that is not cheaper than the best so far need not be tried.
                 let most = best.as_ref().map_or(u32::MAX, |(least, _)| (least / cost - 1e-9).floor() as u32);
                 let bound = if may_go_beyond { self.most_substeps } else { open.most.min(self.most_substeps) };
                 let is_exact = of_this.last().is_some_and(|last| last.0 == format);
@@ -413,7 +427,7 @@ impl Chooser<'_> {
                     Search::Stalls | Search::Beyond => {}
                 }
             }
-            // What rounds more hardly keeps what this one does.
+            // A format that rounds more will hardly keep what this one does.
             if effort == Effort::Thorough && best.is_some() {
                 break;
             }
@@ -421,8 +435,8 @@ impl Chooser<'_> {
         best.map(|(_, choice)| choice)
     }
 
-    /// What errs least, of what was tried with at most [`OpenChoice::most`] substeps, and of the most exact format with the fewest
-    /// substeps. `None` if nothing is known of any.
+    /// Returns the choice with the smallest error among those tried with at most [`OpenChoice::most`] substeps,
+    /// and the most exact format with the fewest substeps. `None` if no error is known.
     fn nearest(&self, open: &[OpenChoice]) -> Option<Choice> {
         if self.aim.is_infinite() {
             return None;
@@ -443,14 +457,14 @@ impl Chooser<'_> {
         finite.min_by(|a, b| a.expected_error.total_cmp(&b.expected_error)).copied()
     }
 
-    /// What to do where nothing is known of the error.
+    /// Returns the choice if no error can be predicted.
     fn unpredicted(&self, open: &[OpenChoice]) -> Choice {
         let step_s = self.stepping.rate_hz.recip();
         let stable_cost = |integrator: Integrator| {
             cost(integrator, f64::from(stability::stable_substeps(integrator, step_s, &self.sheet)))
         };
         let cheapest = open.iter().min_by(|a, b| stable_cost(a.integrator).total_cmp(&stable_cost(b.integrator)));
-        // A scene leaves one open at least.
+        // A scene always allows at least one.
         let open = cheapest.copied().unwrap_or_else(|| self.opened(Integrator::Central));
         let turn = stability::substeps_of_turn(step_s, self.sheet.omega_bound_per_s(), stability::THETA);
         let substeps = turn.clamp(open.least, open.most);

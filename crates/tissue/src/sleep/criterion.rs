@@ -1,4 +1,5 @@
-//! How a sheet puts tiles to sleep, and how changes of the tools' forces wake them: the physics behind `tiles`.
+//! The physics of sleep: when tiles may sleep, and when changes of the tools' forces wake them. `tiles` keeps
+//! the sets.
 
 use crate::guard::survey::{Forces, Survey, Write};
 use crate::interface::Energy;
@@ -10,12 +11,12 @@ use crate::scheme::stability;
 use crate::state::tissue_state::TissueState;
 
 impl<T: Real> TissueState<T> {
-    /// Wakes tiles whose force changes in the coming step.
+    /// Wakes tiles on which the tools' force changes in the next step.
     pub(crate) fn wake_what_is_pushed(&mut self) {
         let TissueState { model, applied, tiles, steps, .. } = self;
         let spacing_m = model.unit_m;
         for change in applied.changes(model, *steps) {
-            // No force moves its centre less than it would if all springs held the centre.
+            // A force moves its centre at least as far as if all springs held the centre.
             let heaviest = model.graph.as_ref().map_or(1.0, |graph| graph.largest_mass);
             let stiffness = model.omega_bound_per_s.powi(2) * model.scene.point_mass_kg() * heaviest;
             if stiffness > 0.0 {
@@ -26,9 +27,9 @@ impl<T: Real> TissueState<T> {
         }
     }
 
-    /// Wakes tiles around grasped points that tools move by more than `far` spacings in the substep from `moment` to the fraction
-    /// `end` of the step. The points beside a sleeping tile are compared between substeps only (`tiles`): a scheme of several
-    /// sweeps would pull at it where the tool was before.
+    /// Wakes tiles around grasped points that tools move by more than `far` spacings in the substep from
+    /// `moment` to the fraction `end` of the step. The points beside a sleeping tile are compared only between
+    /// substeps (`tiles`): a scheme of several sweeps would pull at it where the tool was before.
     pub(crate) fn wake_what_is_moved(&mut self, moment: Moment, end: f64, far: f64) {
         let TissueState { model, plan, tables, state, prescribed, tiles, .. } = self;
         for (index, displacement_m, _) in prescribed.at(model, moment.step, end) {
@@ -40,8 +41,9 @@ impl<T: Real> TissueState<T> {
         }
     }
 
-    /// The energies of the whole sheet: the awake part, and the springs and anchor springs of sleeping tiles. The
-    /// latter follow from the positions of their points alone, so it does not matter when they were computed.
+    /// Returns the energies of the whole tissue: the awake part, and the springs and anchor springs of sleeping
+    /// tiles. The latter follow from the positions of their points alone, so it does not matter when they were
+    /// computed.
     pub(crate) fn energies(&self) -> Energy {
         let TissueState { plan, tables, state, tiles, .. } = self;
         let (_, mut energy, _) = self.survey(&tiles.region);
@@ -49,7 +51,7 @@ impl<T: Real> TissueState<T> {
         let mut region = tiles.no_region();
         for (tile, known) in tiles.sleeping() {
             let [spring_j, anchor_j] = known.unwrap_or_else(|| {
-                // By the pressure that it rests under, which does not change while it sleeps.
+                // With the pressure under which the tile rests, which does not change while it sleeps.
                 tables.apply_volume_pressure(tiles.volume_change_then(tile));
                 tiles.cover(&mut region, std::iter::once(tile));
                 let survey = Survey::of(tables, &plan.scheme, state, forces, &region);
@@ -80,10 +82,10 @@ impl<T: Real> TissueState<T> {
         // In the scheme's units of force and velocity.
         let sheet = Oscillator::of(&model.scene);
         let (anchor_stiffness, drag) = sheet.scaled(plan.substep_s);
-        // A displacement is known to half its last digit. The spring force that this rounding causes moves nothing: it
-        // differs from point to point, and a point between its neighbours gives way by as little. Nor does a substep
-        // move anything by less than that digit, unless the scheme keeps the rounding loss. (Without anchor springs
-        // all of it may matter.)
+        // A displacement is known to half its last digit. The spring force that this rounding causes moves
+        // nothing: it differs from point to point, and a point between its neighbours yields by as little. Nor
+        // does a substep move anything by less than that digit, unless the scheme keeps the rounding error.
+        // (Without anchor springs all of it may matter.)
         let half_digit = if anchor_stiffness > 0.0 { 0.5 * T::EPSILON } else { 0.0 };
         let creep = if model.precision == Precision::Compensated { 0.0 } else { half_digit };
         let rough =
@@ -100,7 +102,7 @@ impl<T: Real> TissueState<T> {
             part: scale / plan.scheme.impulse(),
             pull: anchor_stiffness * scale,
         };
-        // Where K″ is less, the same imbalance moves a point farther.
+        // Where K″ is smaller, the same imbalance moves a point farther.
         let least = model.graph.as_ref().map_or(anchor_stiffness, |graph| anchor_stiffness * (1.0 + graph.least_extra));
         let balanced = |survey: &Survey| survey.imbalance <= scale * (epsilon * least + unknown * survey.largest);
         let mut region = tiles.no_region();
@@ -118,7 +120,7 @@ impl<T: Real> TissueState<T> {
         tiles.cover(&mut region, sleepers.iter().map(|(tile, _)| *tile));
         Survey::write(tables, &plan.scheme, state, forces, &region, Write::Rest);
         let sleepers: Vec<_> = sleepers.into_iter().map(|(tile, survey)| (tile, self.energy_of(&survey).1)).collect();
-        // What they add to the volume is summed up for the last time.
+        // Their contribution to the volume is summed up for the last time.
         self.tables.volume_change(&self.state.u, self.tiles.region.tiles());
         self.tiles.sleep(&sleepers, &self.state.u, volume_change);
     }

@@ -1,4 +1,4 @@
-//! Sleep: parts of a tissue at rest are not computed.
+//! Sleep: parts of a tissue that are at rest are not computed.
 
 pub(crate) mod criterion;
 pub(crate) mod tiles;

@@ -1,25 +1,28 @@
 //! Sleeping tiles: points at rest are not computed.
 //!
-//! **Falling asleep.** Let ε be a length, a part of the scene's tolerance times the recent largest displacement. A tile
-//! may sleep if |v|·√(m/K″) ≤ ε and |F + N − K″·u|/K″ ≤ ε for each of its points (F of the tools, N of the springs),
-//! and again [`CHECK_STEPS`] later. Then it is within ε of its rest position. It stays where it is, and the scheme's
-//! history becomes that of constant forces.
+//! **Falling asleep.** Let ε be a length, a part of the scene's tolerance times the recent largest
+//! displacement. A tile may sleep if |v|·√(m/K″) ≤ ε and |F + N − K″·u|/K″ ≤ ε for each of its points (F of the
+//! tools, N of the springs), and again [`CHECK_STEPS`] later. Then it is within ε of its rest position. It
+//! stays where it is, and the scheme's history becomes that of constant forces.
 //!
-//! **Waking.** A sleeping tile remembers where the points around it were when it fell asleep, and wakes when one of
-//! them is more than ε_w from there. (A comparison with the step before would miss a slow creep.) ε_w is ε, or less
-//! where springs are much stiffer than the virtual ones and so pass on more of an omitted force. A tile also wakes when
-//! the tools' force on it may have changed by more than ε_w·K″ since (`rest`), or the pressure (`swelling`), when a point of it is
-//! grasped (`motion`), and when a position-controlled tool pushes on it (`touch`). What moves by more than ε_w in one substep would
-//! get past that comparison where springs reach two rows, or a scheme has several sweeps: so it wakes all tiles that it reaches in the
-//! sweeps of a substep, be it led by a tool (`rest`, `touch`) or moving by itself. All tiles wake when the tissue
-//! changes (`change`), after a recovery (`recovery`), and when the guard goes back to a checkpoint (`guard`).
+//! **Waking.** A sleeping tile remembers where the points around it were when it fell asleep, and wakes when
+//! one of them is more than ε_w from there. (A comparison with the step before would miss a slow creep.) ε_w is
+//! ε, or less if springs are much stiffer than the anchor springs and so pass on more of an omitted force. A
+//! tile also wakes when the tools' force on it may have changed by more than ε_w·K″ since (`criterion`), or the
+//! pressure (`volume_change`), when one of its points is grasped (`tissue_state`), and when a
+//! position-controlled tool pushes on it (`position_control`). A point that moves by more than ε_w in one
+//! substep would escape that comparison if springs reach two rows, or a scheme has several sweeps: so it wakes
+//! all tiles that it reaches in the sweeps of a substep, whether a tool moves it (`criterion`,
+//! `position_control`) or it moves by itself. All tiles wake when the tissue changes (`change`), after a
+//! recovery (`recovery`), and when the guard goes back to a checkpoint (`guard`).
 //!
-//! **Cost.** A step's cost follows what is awake, not the size of the sheet: sets of tiles are lists, memory that nothing has
-//! moved in is never written, a checkpoint copies what was awake since the last one, a record adds the energies that sleeping
-//! tiles store, and a hash knows which tiles are 0.
+//! **Cost.** The cost of a step depends on the awake part, not on the size of the tissue: sets of tiles are
+//! lists, memory in which nothing has ever moved is never written, a checkpoint copies what was awake since the
+//! last one, a record adds the energies that sleeping tiles store, and a hash knows which tiles are 0.
 //!
-//! ε is a quarter of `[sleep] tolerance`, because errors of tiles add up, to 3.4 ε in a sheet that creeps all one way. Without
-//! anchor springs (K″ = 0) nothing bounds the effect of an omitted force, and only what does not move at all sleeps.
+//! ε is a quarter of `[sleep] tolerance`, because errors of tiles add up, to 3.4 ε in a sheet that creeps in
+//! one direction. Without anchor springs (K″ = 0) nothing bounds the effect of an omitted force, and only tiles
+//! that do not move at all sleep.
 
 use std::cell::Cell;
 use std::ops::Range;
@@ -36,39 +39,39 @@ use crate::state::saved::{SavedTile, SavedTiles, ensure, unsound};
 use crate::tools::applied_force::ForceChange;
 use palpate_refusal::Result;
 
-/// Steps between two checks whether tiles may sleep.
+/// Steps between two checks of which tiles may sleep.
 pub(crate) const CHECK_STEPS: u64 = 16;
 
-/// Consecutive checks at which a tile must be calm.
+/// Number of consecutive checks at which a tile must be calm.
 const CALM_CHECKS: u8 = 2;
 
-/// Part of the tolerance that a tile may be from its rest: errors of neighbours add up. (Measured: up to three and a
-/// half times the ε of a tile, where a whole sheet creeps one way.)
+/// Part of the tolerance by which a tile may be off its rest position: errors of neighbours add up. (Measured:
+/// up to three and a half times the ε of a tile, where a whole sheet creeps in one direction.)
 const PART: f64 = 0.25;
 
-/// The bound of the stiffness of an even mesh, over k (`StiffnessBound`).
+/// The bound of the stiffness of an even mesh, divided by k (`StiffnessBound`).
 const EVEN: f64 = 12.0;
 
-/// The recent largest displacement decays by this factor from one check to the next.
+/// Factor by which the recent largest displacement decays from one check to the next.
 const FORGET: f64 = 0.99;
 
 /// Offsets of a tile's neighbours: along x, along y.
 const NEIGHBOURS: [[isize; 2]; 8] = [[-1, -1], [-1, 0], [-1, 1], [0, -1], [0, 1], [1, -1], [1, 0], [1, 1]];
 
-/// Indices of the neighbours where springs begin that reach the tile.
+/// Indices of the neighbours in which springs begin that reach the tile.
 const PULLING: [usize; 3] = [0, 1, 3];
 
-/// Values of a snapshot: three for each of 16 points, for each side and corner.
+/// Number of values in a snapshot: three for each of 16 points, for each side and corner.
 const SNAPSHOT: usize = NEIGHBOURS.len() * 3 * TILE;
 
 /// The name of the tables in messages.
-const TABLES: &str = "the tiles of a sheet";
+const TABLES: &str = "the tiles of a tissue";
 
-/// A copy of what a snapshot has of the tiles.
+/// A copy of the tiles for a snapshot of a session.
 #[derive(Debug)]
 pub(crate) struct TakenTiles<T> {
     awake: Vec<bool>,
-    /// In the order in which their energies are added.
+    /// The tiles that have moved, in the order in which their energies are added.
     pub(crate) moved: Vec<usize>,
     settled: Vec<u8>,
     drift_n: Vec<f64>,
@@ -76,12 +79,12 @@ pub(crate) struct TakenTiles<T> {
     volume_change: Vec<f64>,
     asleep_j: f64,
     largest: f64,
-    /// What sleeping tiles that have moved remember, in their order.
+    /// The positions that sleeping tiles which have moved remember, in their order.
     pub(crate) remembered: Vec<T>,
 }
 
 impl<T: Real> TakenTiles<T> {
-    /// As plain data, without what is remembered.
+    /// Converts the tiles to plain data, without the remembered positions.
     #[allow(clippy::cast_possible_truncation)]
     pub(crate) fn plain(&self) -> SavedTiles {
         let each = (0..self.settled.len()).map(|tile| SavedTile {
@@ -105,7 +108,7 @@ impl<T: Real> TakenTiles<T> {
     }
 }
 
-/// The rows and columns of a tile.
+/// Returns the rows and columns of a tile.
 pub(crate) fn sides_of(layout: &Layout, tile: usize) -> [Range<usize>; 2] {
     let columns = tiles(layout.columns);
     let side = |from: usize, points: usize| from..(from + TILE).min(points);
@@ -116,7 +119,7 @@ pub(crate) fn sides_of(layout: &Layout, tile: usize) -> [Range<usize>; 2] {
 #[derive(Debug, Clone, Copy)]
 struct EdgeWatch {
     tile: usize,
-    /// On which side of it, by number in [`NEIGHBOURS`].
+    /// The side of the tile, as an index into [`NEIGHBOURS`].
     side: usize,
     /// The first point, and the distance to the next.
     first: usize,
@@ -125,25 +128,25 @@ struct EdgeWatch {
 }
 
 impl EdgeWatch {
-    /// Where the snapshots have the earlier positions of its points.
+    /// Returns where the snapshots have the earlier positions of its points.
     fn then(&self) -> usize {
         self.tile * SNAPSHOT + self.side * 3 * TILE
     }
 }
 
-/// Which tiles of a sheet sleep, and the values kept for waking them.
+/// Which tiles of a tissue sleep, and the values kept for waking them.
 #[derive(Debug)]
 pub(crate) struct SleepTiles<T> {
     layout: Layout,
     /// Tiles along x and along y.
     counts: [usize; 2],
-    /// Number of rows that a spring reaches on.
+    /// Number of rows over which a spring reaches.
     reach: usize,
-    /// Which tiles of a mesh have springs between them; none of a sheet.
+    /// Which tiles of a mesh have springs between them; `None` for a sheet.
     graph: Option<Arc<MeshPlaces>>,
     /// Number of points.
     points: usize,
-    /// Without a tolerance, nothing sleeps.
+    /// The sleep tolerance; at 0 nothing sleeps.
     tolerance: f64,
     pub(crate) region: Region,
     pub(crate) awake_points: usize,
@@ -153,28 +156,29 @@ pub(crate) struct SleepTiles<T> {
     drift_n: Vec<f64>,
     /// The energy of each tile when it fell asleep.
     energy_j: Vec<f64>,
-    /// The sum over all sleeping tiles.
+    /// The sum over all sleeping tiles, J.
     pub(crate) asleep_j: f64,
     /// The elastic energies of each tile, cached until it, or a tile that its springs reach, wakes.
     elastic_j: Vec<Cell<Option<[f64; 2]>>>,
-    /// By how much the volume had grown when each tile fell asleep; empty until one does, and without a volume.
+    /// By how much the volume had grown when each tile fell asleep. Empty before that, and without a volume.
     volume_change: Vec<f64>,
     /// Positions of the points around each tile; allocated when the first tile sleeps.
     snapshots: Vec<T>,
-    /// The comparisons of the sleeping tiles next to awake ones, on a sheet.
+    /// The comparisons of sleeping tiles next to awake ones, on a sheet.
     watches: Vec<EdgeWatch>,
     /// The sleeping tiles that have springs to awake ones, on a mesh.
     watched: Vec<usize>,
     /// Tiles that were awake since the last checkpoint.
     touched: Marks,
-    /// Tiles that were ever awake, or whose springs reach such a tile. In all others nothing has ever moved: all is 0.
+    /// Tiles that were ever awake, or whose springs reach such a tile. In all others nothing has ever moved:
+    /// their values are 0.
     moved: Marks,
     /// The recent largest displacement, spacings.
     pub(crate) largest: f64,
 }
 
 impl<T: Real> SleepTiles<T> {
-    /// All asleep if there is a tolerance (a sheet at rest). Otherwise all awake, for good.
+    /// Creates the tiles of a tissue at rest: all asleep if there is a tolerance, otherwise all awake forever.
     pub(crate) fn new(layout: Layout, model: &Model) -> Self {
         let reach = if model.scene.springs.bending { 2 } else { 1 };
         let joined = (model.graph.clone(), model.len());
@@ -212,7 +216,7 @@ impl<T: Real> SleepTiles<T> {
         tiles
     }
 
-    /// Of a copy that stays as it is: what is awake and what has moved, without what a step needs.
+    /// Returns the tiles of a copy for reading: what is awake and what has moved, without the data for steps.
     pub(crate) fn for_copy(&self) -> Self {
         SleepTiles {
             region: self.region.clone(),
@@ -231,13 +235,13 @@ impl<T: Real> SleepTiles<T> {
         }
     }
 
-    /// A copy for a snapshot.
+    /// Returns a copy for a snapshot of a session.
     pub(crate) fn taken(&self) -> TakenTiles<T> {
         let mut remembered = Vec::new();
         for range in self.places_remembered() {
             match self.snapshots.get(range.clone()) {
                 Some(values) => remembered.extend_from_slice(values),
-                // Nothing has slept yet since anything moved.
+                // Nothing has slept since anything moved.
                 None => remembered.resize(remembered.len() + range.len(), T::default()),
             }
         }
@@ -254,7 +258,7 @@ impl<T: Real> SleepTiles<T> {
         }
     }
 
-    /// Where sleeping tiles that have moved remember what was around them, in their order.
+    /// Returns where sleeping tiles that have moved remember the points around them, in their order.
     fn places_remembered(&self) -> impl Iterator<Item = Range<usize>> + '_ {
         let asleep = self.moved.members.iter().filter(|tile| !self.region.awake.has[**tile]);
         asleep.map(|tile| match &self.graph {
@@ -266,15 +270,16 @@ impl<T: Real> SleepTiles<T> {
         })
     }
 
-    /// Tiles in all.
+    /// Returns the number of tiles.
     pub(crate) fn tile_count(&self) -> usize {
         self.settled.len()
     }
 
-    /// Becomes what was saved; `self` is new. What is remembered follows ([`SleepTiles::remember_again`]).
+    /// Restores the saved tiles; `self` must be new. The remembered positions follow
+    /// ([`SleepTiles::remember_again`]).
     pub(crate) fn restore(&mut self, saved: &SavedTiles) -> Result<()> {
         let count = self.settled.len();
-        let is_tile = |tile: u32| ensure((tile as usize) < count, "a tile that the tissue has not");
+        let is_tile = |tile: u32| ensure((tile as usize) < count, "a tile that the tissue lacks");
         self.moved.clear();
         self.region.awake.clear();
         for tile in &saved.moved {
@@ -309,7 +314,7 @@ impl<T: Real> SleepTiles<T> {
         Ok(())
     }
 
-    /// Restores what sleeping tiles remember.
+    /// Restores the positions that sleeping tiles remember.
     pub(crate) fn remember_again(&mut self, values: &mut impl Iterator<Item = T>) -> Result<()> {
         let places: Vec<Range<usize>> = self.places_remembered().collect();
         if places.iter().any(|place| !place.is_empty()) {
@@ -328,17 +333,17 @@ impl<T: Real> SleepTiles<T> {
         self.tolerance > 0.0
     }
 
-    /// ε, in spacings.
+    /// Returns ε, the error that a sleeping tile may have, in spacings.
     pub(crate) fn epsilon(&self) -> f64 {
         self.epsilon_of(self.largest)
     }
 
-    /// ε_w, in spacings.
+    /// Returns ε_w, the movement of a neighbour that wakes a tile, in spacings.
     pub(crate) fn wake_threshold(&self, scene: &Scene) -> f64 {
         let epsilon = self.epsilon();
         let mut ratio = scene.anchor_stiffness_n_per_m / scene.springs.stiffness_n_per_m;
         if let Body::Mesh(mesh) = &scene.body {
-            // As far as its springs are stiffer than those of a mesh that is even.
+            // In proportion to how much its springs are stiffer than those of an even mesh.
             ratio /= (mesh.stiffest.bound / EVEN).max(1.0);
         }
         // Without springs nothing passes from tile to tile.
@@ -351,7 +356,7 @@ impl<T: Real> SleepTiles<T> {
         PART * self.tolerance * largest
     }
 
-    /// The tile of a point.
+    /// Returns the tile of a point.
     pub(crate) fn of(&self, [i, j]: [usize; 2]) -> usize {
         i / TILE * self.counts[1] + j / TILE
     }
@@ -366,7 +371,7 @@ impl<T: Real> SleepTiles<T> {
         from..(from + TILE).min(self.layout.columns)
     }
 
-    /// Updates everything to the set of awake tiles. Costs as much as those, not as much as the sheet.
+    /// Updates everything to the set of awake tiles. Costs as much as those, not as much as the tissue.
     fn settle(&mut self) {
         self.region.cover(&self.layout, self.reach);
         self.awake_points = 0;
@@ -395,14 +400,14 @@ impl<T: Real> SleepTiles<T> {
         self.awake_points = self.awake_points.min(self.points);
     }
 
-    /// The tiles that springs join to a tile.
+    /// Returns the tiles that springs join to a tile.
     fn beside(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
         let of_mesh = self.graph.iter().flat_map(move |graph| graph.beside(tile));
         let sides = if self.graph.is_some() { 0 } else { NEIGHBOURS.len() };
         of_mesh.chain((0..sides).filter_map(move |side| self.neighbour(tile, side)))
     }
 
-    /// The tiles where springs begin that reach a tile: all that are joined to it, on a mesh.
+    /// Returns the tiles in which springs begin that reach a tile: on a mesh, all that are joined to it.
     fn pulling(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
         let of_mesh = self.graph.iter().flat_map(move |graph| graph.beside(tile));
         let sides = if self.graph.is_some() { &[][..] } else { &PULLING };
@@ -415,7 +420,8 @@ impl<T: Real> SleepTiles<T> {
         (i < self.counts[0] && j < self.counts[1]).then_some(i * self.counts[1] + j)
     }
 
-    /// The points beyond a side or corner: the first offset, the distance to the next, and their number.
+    /// Returns the points beyond a side or corner: the first offset, the distance to the next, and their
+    /// number.
     fn beyond(&self, tile: usize, side: usize) -> (usize, usize, usize) {
         let Layout { stride, .. } = self.layout;
         let (rows, columns) = (self.rows(tile), self.columns(tile));
@@ -433,12 +439,12 @@ impl<T: Real> SleepTiles<T> {
         (i * stride + j, if x == 0 { stride } else { 1 }, count_x.max(count_y))
     }
 
-    /// How many rows on motion comes in so many sweeps; no further than into the tiles beside it.
+    /// Returns how many rows motion travels in `sweeps` sweeps; not beyond the neighbouring tiles.
     fn front(&self, sweeps: usize) -> usize {
         (self.reach * sweeps).min(TILE)
     }
 
-    /// The rows and columns beyond a side or corner, as many as `front`.
+    /// Returns up to `front` rows and columns beyond a side or corner.
     fn near(&self, tile: usize, side: usize, front: usize) -> [Range<usize>; 2] {
         let beyond = |own: Range<usize>, way: isize, count: usize| match way {
             -1 => own.start.saturating_sub(front)..own.start,
@@ -449,7 +455,7 @@ impl<T: Real> SleepTiles<T> {
         [beyond(self.rows(tile), x, self.layout.rows), beyond(self.columns(tile), y, self.layout.columns)]
     }
 
-    /// Wakes the sleeping ones among `which`.
+    /// Wakes the sleeping tiles among `which`.
     pub(crate) fn wake(&mut self, which: impl IntoIterator<Item = usize>) {
         let mut any = false;
         for tile in which {
@@ -474,7 +480,7 @@ impl<T: Real> SleepTiles<T> {
         self.wake(points.into_iter().map(|[i, j]| i / TILE * columns + j / TILE));
     }
 
-    /// Wakes the tile of a point and those that its springs reach into in so many sweeps.
+    /// Wakes the tile of a point and those that its springs reach in `sweeps` sweeps.
     pub(crate) fn wake_around(&mut self, point: [usize; 2], sweeps: usize) {
         if let Some(graph) = self.graph.clone() {
             let tile = self.of(point);
@@ -499,8 +505,8 @@ impl<T: Real> SleepTiles<T> {
         self.settled.fill(0);
     }
 
-    /// Wakes tiles whose neighbours have moved by more than `far`: those next to them since they fell asleep, and of a sheet those
-    /// whose motion reaches them in the `sweeps` of a substep in the substep before.
+    /// Wakes tiles whose neighbours have moved by more than `far`: points next to a tile since it fell asleep,
+    /// and on a sheet also points whose motion reaches it in the `sweeps` of a substep, in the substep before.
     pub(crate) fn wake_beside_moved(&mut self, [u, d]: [&Field<T>; 2], sweeps: usize, far: f64) {
         if self.watches.is_empty() && self.watched.is_empty() {
             return;
@@ -545,8 +551,8 @@ impl<T: Real> SleepTiles<T> {
         self.wake(waking);
     }
 
-    /// Wakes tiles on which the pressure has changed too much since they fell asleep: `stiffness` times the change of the volume's
-    /// growth, times the reach of the tile, is more than `least`.
+    /// Wakes tiles on which the pressure has changed too much since they fell asleep: `stiffness` times the
+    /// change of the volume's growth, times the reach of the tile, is above `least`.
     pub(crate) fn wake_pressed(&mut self, volume_change: f64, reaches: &[f64], stiffness: f64, least: f64) {
         let pressed = |tile: &usize| {
             !self.region.awake.has[*tile]
@@ -556,7 +562,7 @@ impl<T: Real> SleepTiles<T> {
         self.wake(waking);
     }
 
-    /// By how much the volume had grown when a tile fell asleep.
+    /// Returns by how much the volume had grown when a tile fell asleep.
     pub(crate) fn volume_change_then(&self, tile: usize) -> f64 {
         self.volume_change.get(tile).copied().unwrap_or(0.0)
     }
@@ -569,10 +575,10 @@ impl<T: Real> SleepTiles<T> {
         }
     }
 
-    /// Adds a change of the tools' force, and wakes tiles for which all changes since they fell asleep may exceed
-    /// `least_n`. `change` gives the bound for a tile by its distance from the centres. Beyond the points it reaches,
-    /// nothing has changed. With `least_n` = 0 it wakes the whole sheet: anything that moves must not meet a sleeping
-    /// tile.
+    /// Adds a change of the tools' force, and wakes tiles for which all changes since they fell asleep may
+    /// exceed `least_n`. `change` gives the bound for a tile by its distance from the centres. Beyond the
+    /// points it reaches, nothing has changed. With `least_n` = 0 it wakes all tiles: a moving point must not
+    /// meet a sleeping tile.
     pub(crate) fn pushed(&mut self, change: &ForceChange, spacing_m: f64, least_n: f64) {
         let mut waking = Vec::new();
         if let Some(graph) = self.graph.clone() {
@@ -614,8 +620,8 @@ impl<T: Real> SleepTiles<T> {
         self.settled[tile] >= CALM_CHECKS
     }
 
-    /// Samples a few points of each awake tile: updates the largest displacement, and returns the tiles that may be
-    /// calm because all sampled increments are at most `slow`.
+    /// Samples a few points of each awake tile. Updates the largest displacement, and returns the tiles that
+    /// may be calm because all sampled increments are at most `slow`.
     pub(crate) fn quiescent_tiles(&mut self, u: &Field<T>, d: &Field<T>, slow: impl Fn(f64) -> f64) -> Vec<usize> {
         let Layout { stride, plane, .. } = self.layout;
         let most = |field: &Field<T>, tile: usize| {
@@ -640,19 +646,19 @@ impl<T: Real> SleepTiles<T> {
         settled
     }
 
-    /// Makes `region`, which belongs to this sheet, cover the tiles of `which`.
+    /// Makes `region`, which belongs to this tissue, cover the tiles of `which`.
     pub(crate) fn cover(&self, region: &mut Region, which: impl Iterator<Item = usize>) {
         region.awake.clear();
         which.for_each(|tile| _ = region.awake.add(tile));
         region.cover(&self.layout, self.reach);
     }
 
-    /// A region of this sheet without tiles.
+    /// Returns a region of this tissue without tiles.
     pub(crate) fn no_region(&self) -> Region {
         Region::none(&self.layout)
     }
 
-    /// The sleeping tiles that are not at 0, and their energies if cached.
+    /// Returns the sleeping tiles that are not at 0, with their energies if cached.
     pub(crate) fn sleeping(&self) -> impl Iterator<Item = (usize, Option<[f64; 2]>)> {
         let asleep = self.moved.members.iter().filter(|tile| !self.region.awake.has[**tile]);
         asleep.map(|tile| (*tile, self.elastic_j[*tile].get()))
@@ -666,7 +672,7 @@ impl<T: Real> SleepTiles<T> {
         }
     }
 
-    /// Puts tiles to sleep, and stores their energies. `volume_change`: by how much the volume has grown.
+    /// Puts tiles to sleep, and stores their energies. `volume_change` is the growth of the volume.
     pub(crate) fn sleep(&mut self, which: &[(usize, f64)], u: &Field<T>, volume_change: f64) {
         self.remember();
         if self.volume_change.is_empty() && volume_change != 0.0 {
@@ -711,7 +717,7 @@ impl<T: Real> SleepTiles<T> {
         self.moved.members.iter().for_each(|tile| _ = self.touched.add(*tile));
     }
 
-    /// Copies from `from` to `to` what was awake since the last call.
+    /// Copies from `from` to `to` the tiles that were awake since the last call.
     pub(crate) fn copy_touched<'a>(&mut self, fields: impl Iterator<Item = (&'a mut Field<T>, &'a Field<T>)>) {
         for (to, from) in fields {
             self.copy(&self.touched, to, from);
@@ -741,7 +747,7 @@ impl<T: Real> SleepTiles<T> {
         }
     }
 
-    /// Whether a tile may have values other than 0.
+    /// Returns whether the tile of a point may have values other than 0.
     pub(crate) fn has_moved(&self, point: [usize; 2]) -> bool {
         self.moved.has[self.of(point)]
     }

@@ -1,9 +1,9 @@
-//! A change of tissue under way: between two steps, springs, anchor springs and damping become those of another model.
+//! A change of tissue: between two steps, springs, anchor springs and damping become those of another model.
 //!
-//! Displacements and velocities stay. The scheme's kept values belong to the old springs and are rebuilt as if the new
-//! springs had always pulled as they do now: a constant force history, so nothing jumps. The energy does jump, because
-//! the new springs store another energy. So the guard's account begins anew, and its checkpoint becomes the state just
-//! after the change.
+//! Displacements and velocities stay. The scheme's kept values belong to the old springs and are rebuilt as if
+//! the new springs had always pulled as they do now: a constant force history, so nothing jumps. The energy
+//! does jump, because the new springs store another energy. So the guard's account of energy begins anew, and
+//! its checkpoint becomes the state just after the change.
 
 use std::sync::Arc;
 
@@ -16,13 +16,13 @@ use crate::scene::Precision;
 use crate::state::tissue_state::{TissueState, springs_of};
 
 impl<T: Real> TissueState<T> {
-    /// From the coming step on, uses `model`, which has the same points and number format.
+    /// Uses `model`, which has the same points and number format, from the next step on.
     pub(crate) fn change(&mut self, model: &Arc<Model>) {
         self.tiles.begin_anew(model.tile_tolerance());
         self.audit_window.give_up();
         if self.is_same_tissue(model) {
             self.resample(model);
-            // A newly allocated rounding loss begins at 0.
+            // A newly allocated field of rounding errors begins at 0.
             let layout = self.tables.layout;
             let kept = self.plan.scheme.kept(model.precision == Precision::Compensated);
             self.state.kept.resize_with(kept, || Arc::new(Field::zero(&layout)));
@@ -32,7 +32,7 @@ impl<T: Real> TissueState<T> {
         self.begin_account();
     }
 
-    /// Begins the guard's account and checkpoint anew, after the state or the springs have become others.
+    /// Begins the guard's account and checkpoint anew, after the state or the springs were exchanged.
     pub(crate) fn begin_account(&mut self) {
         self.halvings = 0;
         self.tables.is_settled(0.0);
@@ -46,7 +46,7 @@ impl<T: Real> TissueState<T> {
         }
     }
 
-    /// Whether `model` has the same springs, damping and scheme, so that the kept history stays valid.
+    /// Returns whether `model` has the same springs, damping and scheme, so that the kept history stays valid.
     fn is_same_tissue(&self, model: &Model) -> bool {
         let tissue = |model: &Model| {
             let scene = &model.scene;

@@ -1,8 +1,8 @@
-//! A copy of a sheet at one moment. Another thread reads it in slices while the sheet goes on.
+//! A copy of a tissue at one moment. Another thread reads it in slices while the tissue continues.
 //!
-//! A copy reads and writes each field once, which is the memory traffic of one substep; and only what has ever moved is
-//! copied. So it is made in one go, between two steps. What takes long is worked out from the copy: forces take hundreds
-//! of nanoseconds a point, and a hash takes tens.
+//! Copying reads and writes each field once, which is the memory traffic of one substep, and only copies what
+//! has ever moved. So it happens at once, between two steps. Slow results are computed from the copy: forces
+//! take hundreds of nanoseconds per point, and a hash takes tens.
 
 use std::cell::Cell;
 use std::ops::Range;
@@ -19,8 +19,8 @@ use crate::tools::applied_force::Applied;
 use crate::tools::contact::Contacts;
 
 impl<T: Real> TissueState<T> {
-    /// A copy whose points and hash are those of this sheet. It is not for steps or surveys: it has no tables of fixed
-    /// points and forces.
+    /// Returns a copy whose points and hash are those of this tissue. It can't be stepped or surveyed: it has
+    /// no tables of fixed points and forces.
     pub(crate) fn copy(&self) -> ReadCopy {
         let TissueState { model, plan, tables, state, tiles, .. } = self;
         let mut state_copy = State::zero(&tables.layout, state.kept.len());

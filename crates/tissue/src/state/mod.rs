@@ -1,4 +1,4 @@
-//! The state of a tissue: advanced, copied, saved, restored, and changed to another model.
+//! The state of a tissue: stepping, copying, saving, restoring, and changing to another model.
 
 pub(crate) mod change;
 pub(crate) mod copy;

@@ -1,7 +1,8 @@
-//! Takes the whole state of a sheet for a snapshot, and makes a sheet of it again that goes on with the same bits.
+//! Saves the whole state of a tissue for a snapshot, and restores a tissue from it that continues with the same
+//! bits.
 //!
-//! Taking copies memory and no more, as a copy for readers does (`copy`). Restoring believes nothing: lengths, indices,
-//! numbers and what belongs together are checked, and tables are made anew.
+//! Saving only copies memory, as a copy for readers does (`copy`). Restoring trusts nothing: it checks lengths,
+//! indices, numbers and their consistency, and rebuilds all tables.
 
 use std::sync::Arc;
 
@@ -27,10 +28,11 @@ use crate::tools::contact::Contacts;
 use crate::tools::prescribed::Prescribed;
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Restores a tissue under its model, from its parts and the values at its points ([`PlainTissue`]).
+/// Restores a tissue under its model, from its parts and the bytes of the values at its points
+/// ([`PlainTissue`]).
 ///
 /// # Errors
-/// Refuses a tissue of another model, and what no session has.
+/// Refuses a tissue of another model, and values that no session produces.
 pub fn restored(model: &Arc<Model>, parts: &TissueParts, values: &[u8], limits: &Limits) -> Result<Box<dyn Tissue>> {
     fits(model, parts)?;
     memory::attempt(SNAPSHOT, || {
@@ -43,7 +45,7 @@ pub fn restored(model: &Arc<Model>, parts: &TissueParts, values: &[u8], limits: 
     })
 }
 
-/// Refuses what was saved under another model.
+/// Refuses a tissue that was saved under another model.
 fn fits(model: &Model, saved: &TissueParts) -> Result<()> {
     let refuse = |what: String| Err(Refusal::new(Reason::WrongKind, SNAPSHOT, what));
     if saved.points != model.len() as u64 {
@@ -73,8 +75,9 @@ fn fits(model: &Model, saved: &TissueParts) -> Result<()> {
 }
 
 impl Model {
-    /// Returns XXH3-128 of all that a step depends on: the points and their order in memory, masses, springs,
-    /// coefficients, scheme, substeps and format. The width of vectors is not part of it, nor is what is only shown.
+    /// Returns the XXH3-128 hash of everything that a step depends on: the points and their order in memory,
+    /// masses, springs, coefficients, scheme, substeps and number format. Vector width and appearance do not
+    /// count.
     pub fn fingerprint(&self) -> u128 {
         let mut hasher = Xxh3::new();
         let mut add = |bytes: &[u8]| hasher.update(bytes);
@@ -126,7 +129,7 @@ impl Model {
     }
 }
 
-/// A copy of a sheet.
+/// A copy of a tissue, with values in one number format.
 #[derive(Debug)]
 struct TypedState<T: Real> {
     model: Arc<Model>,
@@ -193,7 +196,7 @@ impl<T: Real> SavedState for TypedState<T> {
     }
 }
 
-/// Where the values of a tile are in a field, row by row: those of x, then of y and z.
+/// Returns where the values of a tile are in a field, row by row: those of x, then of y and z.
 fn rows_of(layout: &Layout, tile: usize) -> impl Iterator<Item = std::ops::Range<usize>> + use<> {
     let Layout { stride, plane, .. } = *layout;
     let [rows, columns] = sides_of(layout, tile);
@@ -206,13 +209,14 @@ fn rows_of(layout: &Layout, tile: usize) -> impl Iterator<Item = std::ops::Range
     })
 }
 
-/// The model's plan after some halvings of the substep.
+/// Returns the model's plan after `halvings` halvings of the substep.
 fn halved(model: &Model, halvings: u32) -> Plan {
     if halvings == 0 { model.plan.clone() } else { model.plan.divided(&model.scene, 1 << halvings) }
 }
 
 impl<T: Real> TissueState<T> {
-    /// A copy of all that the next steps depend on. Shares the checkpoint, so that the next one takes new memory.
+    /// Returns a copy of everything that the next steps depend on. It shares the checkpoint, so that the next
+    /// checkpoint takes new memory.
     pub(crate) fn save(&self) -> SavedTissue {
         let TissueState { model, tables, state, tiles, .. } = self;
         let mut state_copy = State::zero(&tables.layout, state.kept.len());
@@ -245,7 +249,7 @@ impl<T: Real> TissueState<T> {
         sheet.plan = halved(model, parts.halvings);
         sheet.tables.springs = springs_of(model, &sheet.plan);
         sheet.guard_events = checks.count(parts.guard_events)?;
-        // Points times substeps: more than steps are.
+        // Points times substeps may exceed the limit of steps.
         ensure(parts.substeps_done.max(parts.points_done) < u64::MAX / 4, "a count beyond what any session has")?;
         (sheet.substeps_done, sheet.points_done) = (parts.substeps_done, parts.points_done);
 
@@ -261,7 +265,8 @@ impl<T: Real> TissueState<T> {
         ensure(values.len().is_multiple_of(size), "part of a value")?;
         let mut values = values.chunks_exact(size).map(T::read);
         let moved: Vec<usize> = parts.tiles.moved.iter().map(|tile| *tile as usize).collect();
-        // Far beyond what the guard lets a point do in an interval; what is not bearable, it finds at the next step.
+        // Far beyond what the guard allows a point in an interval. The guard finds an impossible state at the
+        // next step.
         let most = T::of(T::LARGEST);
         let mut fill = |state: &mut State<T>| -> Result<bool> {
             let mut any = false;
@@ -281,7 +286,7 @@ impl<T: Real> TissueState<T> {
         let mut state = State::zero(&layout, sheet.state.kept.len());
         let is_moved = fill(&mut state)?;
         sheet.state = state;
-        // What each tile adds to a volume; those asleep are not added up again.
+        // Computes what each tile adds to the volume; sleeping tiles are not added up again later.
         let tiles: Vec<usize> = (0..sheet.tiles.tile_count()).collect();
         sheet.tables.volume_change(&sheet.state.u, &tiles);
         let checkpoint = parts.checkpoint.as_ref().map(|saved| {
@@ -295,12 +300,12 @@ impl<T: Real> TissueState<T> {
 
         let from = sheet.checkpoint.as_ref().map_or(sheet.steps, |checkpoint| checkpoint.steps);
         for (step, tool, input) in &parts.inputs {
-            ensure((from..=sheet.steps).contains(step), "an input at a step that is over")?;
+            ensure((from..=sheet.steps).contains(step), "an input at a step before its checkpoint or after its end")?;
             sheet.inputs.push((*step, checks.tool(*tool)?, Input::restored(input, model, &checks)?));
         }
         ensure(sheet.inputs.is_sorted_by_key(|input| input.0), "inputs out of order")?;
         if sheet.checkpoint.is_none() {
-            // What moves has a state to go back to, from its first input on.
+            // A moving tissue has a state to go back to, from its first input on.
             let is_idle = sheet.is_still() || !is_moved && sheet.applied.is_settled() && sheet.contacts.is_empty();
             ensure(is_idle && sheet.prescribed.is_empty() && sheet.inputs.is_empty(), "no state to go back to")?;
             sheet.state.share_equal_history(sheet.plan.scheme.history());

@@ -1,16 +1,17 @@
-//! A saved tissue as plain data: what a snapshot has of a sheet, in a form that does not follow the program's own types.
+//! A saved tissue as plain data: the content of a snapshot, in a form that is independent of the program's own
+//! types.
 //!
-//! Each type that has a part of the state turns itself into these and back, beside its private fields: `applied`,
-//! `prescribed`, `contact`, `tiles`. `restore` puts them together. A change of any type here is another format of snapshots
-//! (`session::saved`).
+//! Each type that has a part of the state converts itself to these types and back, next to its private fields:
+//! `applied_force`, `prescribed`, `contact`, `tiles`. `restore` combines them. A change of any type here
+//! changes the format of snapshots (`session::saved`).
 //!
-//! **What is saved** is all that the next steps depend on, and nothing that follows from it. Tables (of falloffs, discs, strips
-//! of a sweep) are made again from what they were made of. The large part, the values at the points, is apart from these
-//! types, as little-endian bytes: only tiles that have ever moved have any, in the order of memory. That order is the same on
-//! every machine; the padding of rows is left out.
+//! **What is saved** is everything that the next steps depend on, and nothing that follows from it. Tables (of
+//! falloffs, discs, strips of a sweep) are rebuilt. The large part, the values at the points, is separate from
+//! these types, as little-endian bytes: only tiles that have ever moved have values, in the order of memory.
+//! That order is the same on every machine; the padding of rows is left out.
 //!
-//! **What lists take**: who sends a snapshot says how long its lists are. What an entry may leave out is a box in it, so that no entry
-//! takes many times its bytes in memory (`session::saved::memory_of`).
+//! **Memory of lists**: the sender of a snapshot decides how long its lists are. Optional parts of an entry are
+//! boxed, so that no entry takes many times its bytes in memory (`session::saved::memory_of`).
 
 use std::fmt;
 use std::sync::Arc;
@@ -29,54 +30,57 @@ use palpate_refusal::{Reason, Refusal, Result};
 /// A vector.
 pub(crate) type Vector = [f64; 3];
 
-/// Numbers in a snapshot are below this, so that their squares are numbers. No tissue goes so far: the guard ends its motion long before.
+/// Numbers in a snapshot are below this, so that their squares are finite. No tissue reaches it: the guard ends
+/// its motion long before.
 pub(crate) const LARGEST: f64 = 1e150;
 
-/// Steps and counts in a snapshot are below this. Sums of many are numbers, and all are exact as f64.
+/// Steps and counts in a snapshot are below this, so that sums of many do not overflow and all are exact as
+/// f64.
 const MAX_COUNT: u64 = 1 << 48;
 
-/// How a tissue is stepped, and its coefficients: what [`Model::resumed`] makes the same model from, with the scene that the
-/// session began with. Changes and corrections of the tissue have led to it; nothing is chosen or rehearsed again, so that it
-/// gives the same bits on every machine, under any limits and with any later version that has the scheme.
+/// How a tissue is stepped, and its coefficients. [`Model::resumed`] rebuilds the same model from this and the
+/// scene that the session began with. Changes and corrections of the tissue are included; nothing is chosen or
+/// rehearsed again, so that the model gives the same bits on every machine, under any limits and with any later
+/// version that has the scheme.
 ///
 /// [`Model::resumed`]: crate::Model::resumed
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TissueState {
     /// k of the structural springs, N/m.
     pub stiffness_n_per_m: f64,
-    /// k of the springs of shear, N/m.
+    /// k of the shear springs, N/m.
     pub shear_stiffness_n_per_m: f64,
-    /// K″, N/m.
+    /// K″ of the anchor springs, N/m.
     pub anchor_stiffness_n_per_m: f64,
-    /// C, N·s/m.
+    /// C of the damping force, N·s/m.
     pub damping_n_s_per_m: f64,
-    /// κ of the pressure, Pa; 0 without a volume.
+    /// κ of the pressure in an enclosed volume, Pa; 0 without a volume.
     pub volume_stiffness_pa: f64,
-    /// The scheme.
+    /// The integrator; never `Auto`.
     #[serde(serialize_with = "name", deserialize_with = "named")]
     pub integrator: Integrator,
-    /// Substeps of a step, without the halvings of the guard.
+    /// Substeps per step, without the halvings of the guard.
     pub substeps: u32,
-    /// The number format.
+    /// The number format; never `Auto`.
     #[serde(serialize_with = "name", deserialize_with = "named")]
     pub precision: Precision,
-    /// Error that leaving out tiles at rest may cost.
+    /// Largest error that leaving out tiles at rest may add, relative to the largest displacement.
     pub sleep_tolerance: f64,
-    /// That of the scene, of which another tissue is made.
+    /// The scene's own sleep tolerance, from which later changes of the tissue are compiled.
     pub sleep_tolerance_of_scene: Option<f64>,
-    /// Expected error of displacement and force.
+    /// Expected error of displacement and force, relative to the largest of each.
     pub expected_error: f64,
-    /// What a correction asked for, also of another tissue.
+    /// The requirements of a correction, which later changes of the tissue keep.
     pub corrected: Option<CorrectedPlan>,
 }
 
-/// What a correction asked for: a scheme, and no fewer substeps than this.
+/// The requirements of a correction: a scheme, and at least this many substeps.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct CorrectedPlan {
-    /// The scheme.
+    /// The integrator.
     #[serde(serialize_with = "name", deserialize_with = "named")]
     pub integrator: Integrator,
-    /// The fewest substeps of a step.
+    /// The fewest substeps per step.
     pub least_substeps: u32,
 }
 
@@ -89,42 +93,42 @@ fn named<'d, N: Named, D: Deserializer<'d>>(deserializer: D) -> std::result::Res
     N::named("", &name).map_err(serde::de::Error::custom)
 }
 
-/// A tissue that was copied, and may be turned into plain data in any thread.
+/// A copied tissue that any thread can convert to plain data.
 #[derive(Debug, Clone)]
 pub struct SavedTissue(pub(crate) Arc<dyn SavedState>);
 
 impl SavedTissue {
-    /// Returns the tissue as plain data: takes as long as to read all of it several times.
+    /// Converts the tissue to plain data. That takes as long as reading all of it several times.
     pub fn plain(&self) -> PlainTissue {
         self.0.plain()
     }
 }
 
-/// A copy of a sheet in any number format.
+/// A copy of a tissue in any number format.
 pub(crate) trait SavedState: fmt::Debug + Send + Sync {
     fn plain(&self) -> PlainTissue;
 }
 
-/// A saved tissue.
+/// A saved tissue as plain data: parts and values.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlainTissue {
-    /// All but the values at the points.
+    /// Everything but the values at the points.
     pub parts: TissueParts,
-    /// The values at the points, little-endian: of each tile that has moved, then the same of the checkpoint, then what
-    /// sleeping tiles remember.
+    /// The values at the points, little-endian: those of each tile that has moved, then those of the
+    /// checkpoint, then those that sleeping tiles remember.
     pub values: Vec<u8>,
 }
 
 /// A saved tissue without the values at its points.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TissueParts {
-    /// Points of the tissue.
+    /// Number of points of the tissue.
     pub points: u64,
-    /// How it is stepped.
+    /// The model's plan and coefficients.
     pub tissue: TissueState,
-    /// XXH3-128 of all of the model that a step depends on (`Model::fingerprint`).
+    /// XXH3-128 hash of everything in the model that a step depends on (`Model::fingerprint`).
     pub fingerprint: u128,
-    /// Steps done.
+    /// Number of steps done.
     pub steps: u64,
     pub(crate) halvings: u32,
     pub(crate) forces: SavedForces,
@@ -139,7 +143,7 @@ pub struct TissueParts {
     pub(crate) points_done: u64,
 }
 
-/// What the guard goes back to.
+/// The state that the guard goes back to.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct SavedCheckpoint {
     pub(crate) steps: u64,
@@ -152,7 +156,7 @@ pub(crate) struct SavedCheckpoint {
     pub(crate) passed_checks: bool,
 }
 
-/// The guard's account.
+/// The guard's account of work and energy.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub(crate) struct SavedWork {
     pub(crate) done_j: f64,
@@ -161,18 +165,18 @@ pub(crate) struct SavedWork {
     pub(crate) excess_j: f64,
 }
 
-/// Which tiles sleep, and what is kept for waking them.
+/// Which tiles sleep, and the data for waking them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct SavedTiles {
     /// Tiles that may have values other than 0, in the order in which their energies are added.
     pub(crate) moved: Vec<u32>,
-    /// What is not 0 of each tile, ascending.
+    /// The tiles with a value other than the default, ascending.
     pub(crate) each: Vec<SavedTile>,
     pub(crate) asleep_j: f64,
     pub(crate) largest: f64,
 }
 
-/// A tile.
+/// The state of a tile.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub(crate) struct SavedTile {
     pub(crate) tile: u32,
@@ -180,7 +184,7 @@ pub(crate) struct SavedTile {
     pub(crate) settled: u8,
     pub(crate) drift_n: f64,
     pub(crate) energy_j: f64,
-    /// By how much the volume had grown when it fell asleep.
+    /// By how much the volume had grown when the tile fell asleep.
     pub(crate) volume_change: f64,
 }
 
@@ -208,7 +212,7 @@ pub(crate) struct SavedSlot {
     pub(crate) compared: Option<Box<SavedPoke>>,
 }
 
-/// Forces of equal falloff.
+/// Forces with the same falloff.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct SavedTerm {
     pub(crate) poke: SavedPoke,
@@ -233,7 +237,7 @@ pub(crate) struct SavedGrasped {
     pub(crate) held: bool,
 }
 
-/// A position-controlled tool.
+/// A position-controlled tool and its state of contact.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct SavedContact {
     pub(crate) number: u64,
@@ -253,14 +257,14 @@ pub(crate) struct SavedContact {
     pub(crate) velocity_m_per_s: Vector,
 }
 
-/// The place of a disc.
+/// The place of a tip's disc on the tissue.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub(crate) enum SavedGeometry {
     Grid([f64; 2]),
     Mesh { triangle: u32, barycentric: Vector, frame: [Vector; 2] },
 }
 
-/// [`Poke`].
+/// A saved [`Poke`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SavedPoke {
     point: Option<u64>,
@@ -270,14 +274,14 @@ pub struct SavedPoke {
     falloff_offset: f64,
 }
 
-/// [`Push`](crate::Push).
+/// A saved [`Push`](crate::Push).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) enum SavedPush {
     Constant(SavedPoke),
     Profile(SavedLoad),
 }
 
-/// [`LoadProfile`].
+/// A saved [`LoadProfile`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) struct SavedLoad {
     centre: SavedCentre,
@@ -286,7 +290,7 @@ pub(crate) struct SavedLoad {
     falloff_offset: f64,
 }
 
-/// [`CentreProfile`].
+/// A saved [`CentreProfile`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 enum SavedCentre {
     Hops(Vec<(u64, Vector)>),
@@ -294,14 +298,14 @@ enum SavedCentre {
     Path { from_m: Vector, velocity_m_per_s: Vector },
 }
 
-/// [`StrengthProfile`].
+/// A saved [`StrengthProfile`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 enum SavedStrength {
     Scaled(Vector, SavedProfile),
     Recorded(Vec<(u64, Vector)>),
 }
 
-/// [`Profile`].
+/// A saved [`Profile`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 enum SavedProfile {
     Constant,
@@ -310,48 +314,48 @@ enum SavedProfile {
     Sine { frequency_hz: f64 },
 }
 
-/// [`Grasp`](crate::Grasp).
+/// A saved [`Grasp`](crate::Grasp).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(crate) enum SavedGrasp {
     Target(Vector),
     Profile { point: u64, moves: Vec<(f64, f64, Vector)> },
 }
 
-/// [`Tip`].
+/// A saved [`Tip`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SavedTip {
     radius_m: f64,
     friction: f64,
     grasps: bool,
-    /// Stiffness, N/m, and damping, N·s/m.
+    /// Stiffness, N/m, and damping, N·s/m, of a spring coupling; `None` for a constraint.
     spring: Option<(f64, f64)>,
 }
 
-/// What a part of a snapshot is checked by when it is restored.
+/// Checks the parts of a snapshot when it is restored, against a tissue and the limits.
 #[derive(Clone, Copy)]
 pub struct Checks<'a> {
     /// The rest shape of the tissue.
     pub shape: &'a dyn RestShape,
-    /// The limits.
+    /// The limits of forces and tools.
     pub limits: &'a Limits,
 }
 
-/// The name of a snapshot in refusals.
+/// The field name of a snapshot in refusals.
 pub const SNAPSHOT: &str = "snapshot";
 
-/// Returns a refusal of what no session has.
+/// Returns the refusal of a snapshot that has `what`, which no session produces.
 pub fn unsound(what: &str) -> Refusal {
     let message = format!("has {what}: it is damaged, or was not written by Palpate");
     Refusal::new(Reason::OutOfRange, SNAPSHOT, message)
 }
 
-/// Returns a refusal of a tool above the limit.
+/// Returns the refusal of a tool number above the limit `tools`.
 pub fn tool_above(tool: u64, limits: &Limits) -> Refusal {
     let message = format!("has tool {tool}, but tools are numbered below {} (limits.tools)", limits.tools);
     Refusal::new(Reason::TooLarge, SNAPSHOT, message)
 }
 
-/// Refuses unless it holds.
+/// Returns an error unless `holds`.
 ///
 /// # Errors
 /// Refuses a snapshot that has `what`.
@@ -360,25 +364,26 @@ pub fn ensure(holds: bool, what: &str) -> Result<()> {
 }
 
 impl Checks<'_> {
-    /// Returns a length, time, speed or force: any that a session may have come to, however unlikely it is. Whether it
-    /// is bearable, the guard finds out at the next step, as it does in the session that was saved.
+    /// Checks a length, time, speed or force and returns it. Any value that a session may reach is allowed,
+    /// however unlikely. The guard detects an impossible motion at the next step, as it does in the session
+    /// that was saved.
     ///
     /// # Errors
-    /// Refuses a number that is not finite, or whose square is not.
+    /// Refuses a number that is not finite or whose square is not.
     pub fn number(&self, value: f64) -> Result<f64> {
         ensure(value.abs() < LARGEST, "a number that is not finite or out of range").map(|()| value)
     }
 
-    /// Returns a vector of lengths, speeds or forces.
+    /// Checks a vector of lengths, speeds or forces and returns it.
     ///
     /// # Errors
-    /// As for [`Checks::number`].
+    /// Refuses a vector with a number that is not finite or whose square is not.
     pub fn vector(&self, value: Vector) -> Result<DVec3> {
         value.into_iter().try_for_each(|part| self.number(part).map(drop))?;
         Ok(DVec3::from(value))
     }
 
-    /// Returns a time of a script, which may be as late as it likes.
+    /// Checks a time of a script, which may be arbitrarily late, and returns it.
     ///
     /// # Errors
     /// Refuses a number that is not finite.
@@ -386,18 +391,18 @@ impl Checks<'_> {
         ensure(value.is_finite(), "a time that is not finite").map(|()| value)
     }
 
-    /// Returns a step, or a number of steps or of anything.
+    /// Checks a step or a count and returns it.
     ///
     /// # Errors
-    /// Refuses one beyond what any session has.
+    /// Refuses 2⁴⁸ and more.
     pub fn count(&self, count: u64) -> Result<u64> {
         ensure(count < MAX_COUNT, "a count beyond what any session has").map(|()| count)
     }
 
-    /// Returns a number of a tool.
+    /// Checks the number of a tool and returns it.
     ///
     /// # Errors
-    /// Refuses one above the limit.
+    /// Refuses a number that is not below the limit `tools`.
     #[allow(clippy::cast_possible_truncation)]
     pub fn tool(&self, tool: u64) -> Result<usize> {
         if tool < u64::from(self.limits.tools) {
@@ -406,17 +411,17 @@ impl Checks<'_> {
         Err(tool_above(tool, self.limits))
     }
 
-    /// Returns a point.
+    /// Checks the index of a point and returns the point.
     ///
     /// # Errors
-    /// Refuses one that the tissue has not.
+    /// Refuses a point that the tissue does not have.
     #[allow(clippy::cast_possible_truncation)]
     pub fn point(&self, point: u64) -> Result<PointId> {
-        ensure(point < self.shape.point_count() as u64, "a point that the tissue has not")?;
+        ensure(point < self.shape.point_count() as u64, "a point that the tissue lacks")?;
         Ok(PointId::new(point as usize))
     }
 
-    /// A force over the points.
+    /// Checks a force with a falloff over the points and returns it.
     fn force(&self, force_n: Vector, falloff_per_m: f64, falloff_offset: f64) -> Result<DVec3> {
         let is_falloff = (0.0..f64::INFINITY).contains(&falloff_per_m) && falloff_offset.is_finite();
         ensure(is_falloff, "a falloff that is not finite or below 0")?;
@@ -432,7 +437,7 @@ impl Checks<'_> {
 }
 
 impl SavedPoke {
-    /// Returns it as plain data.
+    /// Converts a force to plain data.
     pub fn of(poke: &Poke) -> Self {
         let Poke { point, centre_m, force_n, falloff_per_m, falloff_offset } = *poke;
         SavedPoke {
@@ -444,10 +449,10 @@ impl SavedPoke {
         }
     }
 
-    /// Returns the poke.
+    /// Checks a saved force and returns it.
     ///
     /// # Errors
-    /// Refuses what no tool exerts.
+    /// Refuses a force that no tool may exert.
     pub fn restored(&self, checks: &Checks<'_>) -> Result<Poke> {
         let SavedPoke { point, centre_m, force_n, falloff_per_m, falloff_offset } = *self;
         Ok(Poke {
@@ -529,29 +534,29 @@ impl SavedLoad {
     }
 }
 
-/// A movement of a point.
+/// Converts the movement of a grasped point to plain data.
 pub(crate) fn saved_moves(profile: &MotionProfile) -> SavedGrasp {
     let moves = profile.moves.iter().map(|Move { from_s, to_s, by_m }| (*from_s, *to_s, (*by_m).into()));
     SavedGrasp::Profile { point: profile.point.index() as u64, moves: moves.collect() }
 }
 
-/// A movement of a point.
+/// Checks the saved movement of a grasped point and returns it.
 pub(crate) fn restored_moves(checks: &Checks<'_>, point: u64, moves: &[(f64, f64, Vector)]) -> Result<MotionProfile> {
     let moves = moves.iter().map(|(from_s, to_s, by_m)| {
         let (from_s, to_s) = (checks.time(*from_s)?, checks.time(*to_s)?);
-        // Accelerations are over its square.
+        // Accelerations are divided by the square of this time.
         ensure(to_s - from_s > 1e-9, "a movement that takes no time")?;
         Ok(Move { from_s, to_s, by_m: checks.vector(*by_m)? })
     });
     Ok(MotionProfile { point: checks.point(point)?, moves: moves.collect::<Result<_>>()? })
 }
 
-/// A motion.
+/// Converts a motion to plain data: displacement, velocity and acceleration.
 pub(crate) fn saved_motion(motion: &Motion) -> [Vector; 3] {
     [motion.displacement_m, motion.velocity_m_per_s, motion.acceleration_m_per_s2].map(Into::into)
 }
 
-/// A motion.
+/// Checks a saved motion and returns it.
 pub(crate) fn restored_motion(checks: &Checks<'_>, motion: &[Vector; 3]) -> Result<Motion> {
     let [displacement_m, velocity_m_per_s, acceleration_m_per_s2] = motion.map(|v| checks.vector(v));
     Ok(Motion {
@@ -562,7 +567,7 @@ pub(crate) fn restored_motion(checks: &Checks<'_>, motion: &[Vector; 3]) -> Resu
 }
 
 impl SavedTip {
-    /// Returns it as plain data.
+    /// Converts a tip to plain data.
     pub fn of(tip: &Tip) -> Self {
         let Tip { radius_m, friction, grasps, coupling } = *tip;
         let spring = match coupling {
@@ -572,10 +577,10 @@ impl SavedTip {
         SavedTip { radius_m, friction, grasps, spring }
     }
 
-    /// Returns the tip.
+    /// Checks a saved tip and returns it.
     ///
     /// # Errors
-    /// Refuses one that does not fit the tissue.
+    /// Refuses a tip that does not suit the tissue.
     pub fn restored(&self, checks: &Checks<'_>) -> Result<Tip> {
         let SavedTip { radius_m, friction, grasps, spring } = *self;
         let coupling = spring.map_or(Coupling::Constraint, |(stiffness_n_per_m, damping_n_s_per_m)| Coupling::Spring {

@@ -1,4 +1,4 @@
-//! Test of a sheet that rings down: no value becomes so small that the processor handles it slowly.
+//! Tests that a tissue which rings down has no values so small that the processor handles them slowly.
 #![allow(clippy::unwrap_used)]
 
 use glam::DVec3;

@@ -1,4 +1,4 @@
-//! A sheet in motion: its state, the step that advances it, and what can be read of it.
+//! A tissue in motion: its state, the step that advances it, and what can be read from it.
 
 use std::cell::Cell;
 use std::ops::Range;
@@ -30,7 +30,7 @@ use crate::tools::contact::{Contacts, TangentInput, ToolContact};
 use crate::tools::prescribed::{Grasp, Prescribed};
 use palpate_haptics::Tip;
 
-/// Creates a sheet at rest.
+/// Creates a tissue at rest, in the number format of the model.
 pub fn at_rest(model: &Arc<Model>) -> Box<dyn Tissue> {
     match model.precision {
         Precision::F64 => Box::new(TissueState::<f64>::new(model)),
@@ -51,11 +51,11 @@ pub(crate) struct TissueState<T: Real> {
     pub(crate) contacts: Contacts,
     pub(crate) steps: u64,
     pub(crate) work: Work,
-    /// `None` means the present state. A sheet at rest needs no copy.
+    /// `None` means the present state. A tissue at rest needs no copy.
     pub(crate) checkpoint: Option<Arc<Checkpoint<T>>>,
     /// The inputs of the tools since the checkpoint: step they precede, tool, input.
     pub(crate) inputs: Vec<(u64, usize, Input)>,
-    /// What the guard repeats: the present step is not done before.
+    /// A repetition by the guard; until it ends, the present step is unfinished.
     pub(crate) repetition: Option<Repetition>,
     pub(crate) audit_window: AuditWindow,
     /// Whether the beginning of the window is still to be reported.
@@ -65,7 +65,7 @@ pub(crate) struct TissueState<T: Real> {
     pub(crate) substeps_done: u64,
     /// Points computed, summed over all substeps.
     pub(crate) points_done: u64,
-    /// By how much a volume has grown, if that was asked for since the last change of the state.
+    /// By how much a volume has grown, if it was computed since the last change of the state.
     pub(crate) known_volume_change: Cell<Option<f64>>,
 }
 
@@ -135,7 +135,8 @@ impl<T: Real> TissueState<T> {
             .into_iter()
             .filter_map(|(index, v)| Some((index, self.change_at_release(index, v, moment)?)))
             .collect();
-        // A scheme that takes means adds the change to the substep's increment, another to its initial state.
+        // A scheme that takes means adds the change to the substep's increment; other schemes add it to the
+        // initial state.
         let takes_means = self.plan.scheme.takes_means();
         if !takes_means {
             released.iter().for_each(|(index, change)| self.shift(*index, change));
@@ -163,11 +164,11 @@ impl<T: Real> TissueState<T> {
         self.solve_contact(end, far);
     }
 
-    /// Sweep number `sweep` of a substep.
+    /// Runs sweep number `sweep` of a substep.
     fn sweep(&mut self, sweep: usize) {
         let TissueState { model, plan, tables, state, applied, tiles, .. } = self;
         let (field, terms, region) = (plan.scheme.field(sweep), &applied.terms, &tiles.region);
-        // Apart, so that the compiler leaves out what no format needs.
+        // Separate calls, so that the compiler leaves out what a format does not need.
         #[allow(clippy::collapsible_if)]
         if const { T::COMPENSATES } {
             if model.precision == Precision::Compensated {
@@ -179,7 +180,7 @@ impl<T: Real> TissueState<T> {
         each!(&plan.scheme, |family| tables.advance(&family.plain::<T>(sweep), state, terms, field, region));
     }
 
-    /// Puts the grasped points at their places at `fraction` of the step, and counts the work if `counted`.
+    /// Moves the grasped points to their places at `fraction` of the step, and counts the work if `counted`.
     fn apply_prescribed(&mut self, step: u64, fraction: f64, counted: bool) {
         let unit_j = self.unit_of_work_j();
         let TissueState { model, plan, tables, state, applied, prescribed, work, .. } = self;
@@ -206,7 +207,8 @@ impl<T: Real> TissueState<T> {
         }
     }
 
-    /// The change of u and d of a point that is released with `velocity_m_per_s`, if there must be one.
+    /// Returns the change of u and d of a point that is released with `velocity_m_per_s`; `None` if nothing
+    /// must change.
     fn change_at_release(&self, index: usize, velocity_m_per_s: DVec3, moment: Moment) -> Option<[[f64; 2]; 3]> {
         let TissueState { model, plan, tables, state, applied, .. } = self;
         let (point, scene) = (model.point_of(index), &model.scene);
@@ -228,7 +230,7 @@ impl<T: Real> TissueState<T> {
         Some(changes)
     }
 
-    /// Adds to u and d of a point.
+    /// Adds `change` to u and d of a point.
     fn shift(&mut self, index: usize, change: &[[f64; 2]; 3]) {
         let TissueState { tables, state, .. } = self;
         for (c, change) in change.iter().enumerate() {
@@ -238,13 +240,14 @@ impl<T: Real> TissueState<T> {
         }
     }
 
-    /// The work of a force of 1 in the fields of the tools along a displacement of 1, J.
+    /// Returns the work of a force of 1 in the fields of the tools along a displacement of 1, J.
     pub(crate) fn unit_of_work_j(&self) -> f64 {
         let TissueState { model, plan, .. } = self;
         model.unit_m / (plan.scheme.impulse() * plan.force_scale(&model.scene))
     }
 
-    /// Displacement, velocity and springs' force of a free point, under the applied force `applied_n` and that of tips.
+    /// Returns displacement, velocity and springs' force of a free point, under the applied force `applied_n`
+    /// and that of tips.
     pub(crate) fn free_point(&self, index: usize, applied_n: DVec3) -> [DVec3; 3] {
         let TissueState { model, plan, tables, state, .. } = self;
         let (spacing_m, scale) = (model.unit_m, plan.force_scale(&model.scene));
@@ -253,7 +256,8 @@ impl<T: Real> TissueState<T> {
         let [i, j] = model.point_of(index);
         let mass = model.relative_mass_at(index);
         let still = self.steps == 0 || !self.tiles.region.is_awake(i, j);
-        // Without all forces of the present a two-step scheme would tell a velocity of a point that rests under a tip.
+        // Without all present forces, a two-step scheme would report a velocity for a point that rests under a
+        // tip.
         let tips_n = if plan.scheme.takes_means() { self.contacts.steady_on(model, index) } else { DVec3::ZERO };
         let pushed_n = applied_n + tips_n;
         let observer = Observer::<f64>::of(&plan.scheme);
@@ -297,18 +301,19 @@ impl<T: Real> TissueState<T> {
     }
 }
 
-/// The force of the springs on a point along an axis, N, of what they are in the tables and how far the point is, spacings.
+/// Returns the force of the springs on a point along an axis, N, from the gathered value of the tables and the
+/// displacement in spacings.
 pub(crate) fn spring_force_n(model: &Model, plan: &Plan, index: usize, gathered: f64, u: f64) -> f64 {
     let force_n = gathered / (plan.scheme.spring_scale() * plan.force_scale(&model.scene));
     if model.graph.is_none() {
         return force_n;
     }
-    // What pulls beyond the K″ of reference is none of the springs.
+    // Anchor stiffness beyond the reference K″ is not part of the springs.
     let pulled_n = model.scene.anchor_stiffness_n_per_m * model.extra_anchor_at(index) * u * model.unit_m;
     model.relative_mass_at(index) * (force_n + pulled_n)
 }
 
-/// The springs of a model, in the terms of a plan.
+/// Returns the springs of a model in the units of a plan.
 pub(crate) fn springs_of<T: Real>(model: &Model, plan: &Plan) -> Elastic<T> {
     let unit = plan.substep_s * plan.substep_s / model.scene.point_mass_kg() * plan.scheme.spring_scale();
     match &model.graph {
@@ -528,7 +533,7 @@ impl<T: Real> Tissue for TissueState<T> {
         }
     }
 
-    /// Blocks of a row, by rows.
+    /// Counts the blocks of all rows.
     fn hash_block_count(&self) -> usize {
         let Layout { rows, columns, .. } = self.tables.layout;
         rows * columns.div_ceil(BLOCK)

@@ -2,7 +2,7 @@
 
 use crate::memory;
 
-/// sRGB, 0 to 1.
+/// A colour in sRGB; each part is from 0 to 1.
 pub(super) type Colour = [f32; 3];
 
 pub(super) const fn srgb(r: u8, g: u8, b: u8) -> Colour {
@@ -13,13 +13,14 @@ pub(super) fn mix(a: Colour, b: Colour, t: f32) -> Colour {
     std::array::from_fn(|c| a[c] + (b[c] - a[c]) * t)
 }
 
-/// The seed of an image's noises: the parts of an image add small numbers to it.
+/// Returns the seed of an image's noises. The parts of an image add small numbers to it.
 pub(super) fn base(seed: u64) -> u32 {
     let seed = (seed as u32) ^ (seed >> 32) as u32;
     super::noise::bits(seed, 1, 2) & 0xffff_ff00
 }
 
-/// Rows of `size` × `size` pixels, sRGB. `colour` gets the middle of a pixel, in sides of the image, and its index.
+/// Returns rows of `size` × `size` pixels, sRGB. `colour` gets the middle of a pixel, in sides of the image,
+/// and its index.
 pub(super) fn image(size: usize, colour: impl Fn(f32, f32, usize) -> Colour + Sync) -> Vec<u8> {
     let mut pixels = memory::zeroed(3 * size * size, "a texture");
     // Pixels are independent, so the result does not depend on which thread paints them.

@@ -1,5 +1,5 @@
-//! The capsule of a liver: smooth and red-brown, with lobules as a faint mosaic beneath, and few vessels. On a sheet of
-//! 75 mm a lobule is 1.5 mm wide. Only colour: shine and shade are the light's.
+//! The capsule of a liver: smooth and red-brown, with lobules as a faint mosaic beneath, and few vessels. On a
+//! sheet of 75 mm a lobule is 1.5 mm wide. Only colour: viewers add gloss and shading.
 
 use super::colour::{self, Colour, mix, srgb};
 use super::noise::{fractal, gradient, mosaic, step, unit};
@@ -15,7 +15,7 @@ const PORTAL: Colour = srgb(184, 122, 98);
 const VEIN: Colour = srgb(78, 32, 48);
 const ARTERY: Colour = srgb(128, 22, 26);
 
-/// Rows of `size` × `size` pixels, sRGB.
+/// Paints the image. Returns rows of `size` × `size` pixels, sRGB.
 pub(super) fn paint(seed: u64, size: usize) -> Vec<u8> {
     let seed = colour::base(seed);
     let veins = Habit { trees: 4, radius: 0.0075, thinnest: 0.0020, taper: 1.2, branches: 7.0 };

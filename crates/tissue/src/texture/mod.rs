@@ -1,6 +1,6 @@
-//! The appearance of a tissue: an image of its surface, generated from a seed or supplied by the user. The same seed
-//! and size give the same bytes on any machine. A painted image has colour only, no relief and no light: viewers shade the
-//! surface by its true shape.
+//! The appearance of a tissue: an image of its surface, painted from a seed or supplied by the user. The same
+//! seed and size give the same bytes on any machine. A painted image has only colour, no relief and no light:
+//! viewers shade the surface by its true shape.
 
 mod colour;
 mod liver;
@@ -21,27 +21,27 @@ use crate::memory;
 use crate::scene::{Appearance, PaintedSurface, SMALLEST_TEXTURE};
 use palpate_refusal::{Reason, Refusal, Result, number};
 
-/// An image: rows of pixels from the top, sRGB.
+/// An image: rows of pixels from the top, in sRGB.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Image {
-    /// Pixels in a row.
+    /// Pixels per row.
     pub width: usize,
-    /// Rows.
+    /// Number of rows.
     pub height: usize,
     /// Red, green and blue of each pixel: 3·`width`·`height` bytes.
     pub rgb: Vec<u8>,
 }
 
-/// An image in the form that the server sends.
+/// An image as a PNG file, in the form that the server sends.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Texture {
-    /// The file.
+    /// The bytes of the PNG file.
     pub png: Bytes,
-    /// An identifier that differs between different images; a quoted string, for HTTP.
+    /// The ETag for HTTP, a quoted string: different images have different ones.
     pub etag: String,
 }
 
-/// Returns an image of a kind of surface, `size` × `size` pixels.
+/// Paints an image of a surface, `size` × `size` pixels.
 ///
 /// The same seed and size give the same bytes on any machine:
 ///
@@ -59,7 +59,7 @@ pub struct Texture {
 /// ```
 ///
 /// # Errors
-/// Refuses a size outside the limits.
+/// Refuses a size below 16 or above the limit `texture_side`.
 pub fn painted(surface: PaintedSurface, seed: u64, size: u32, limits: &Limits) -> Result<Image> {
     let range = format!("from {SMALLEST_TEXTURE} to {} pixels", limits.texture_side);
     let holds = |v| v >= f64::from(SMALLEST_TEXTURE) && v <= f64::from(limits.texture_side);
@@ -74,7 +74,7 @@ pub fn painted(surface: PaintedSurface, seed: u64, size: u32, limits: &Limits) -
     Ok(Image { width: side, height: side, rgb })
 }
 
-/// Returns the image of a scene's tissue.
+/// Returns the image of a scene's tissue: the user's file decoded, or a painted one.
 ///
 /// # Errors
 /// Refuses a size beyond the limits, and a file that can't be read as a PNG image within the limits.
@@ -85,10 +85,10 @@ pub fn image(appearance: &Appearance, limits: &Limits) -> Result<Image> {
     }
 }
 
-/// Does the same as a PNG file. A user's own file is checked and passed on unchanged.
+/// Returns the image of a scene's tissue as a PNG file. A user's own file is checked and passed on unchanged.
 ///
 /// # Errors
-/// As for [`image`].
+/// Refuses a size beyond the limits, and a file that can't be read as a PNG image within the limits.
 pub fn texture(appearance: &Appearance, limits: &Limits) -> Result<Texture> {
     let png = match &appearance.texture {
         Some(path) => {
@@ -140,7 +140,7 @@ impl Image {
     /// Returns the image as a PNG file.
     ///
     /// # Errors
-    /// Returns an error if the encoder refuses the image.
+    /// Refuses an image that the encoder rejects.
     pub fn png(&self) -> Result<Vec<u8>> {
         let mut file = Vec::new();
         #[allow(clippy::cast_possible_truncation)]

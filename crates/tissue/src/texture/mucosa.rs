@@ -14,7 +14,7 @@ const PALE: Colour = srgb(242, 182, 152);
 const VEIN: Colour = srgb(126, 52, 76);
 const ARTERY: Colour = srgb(158, 30, 34);
 
-/// Rows of `size` × `size` pixels, sRGB.
+/// Paints the image. Returns rows of `size` × `size` pixels, sRGB.
 pub(super) fn paint(seed: u64, size: usize) -> Vec<u8> {
     let seed = colour::base(seed);
     let veins = Habit { trees: 6, radius: 0.0095, thinnest: 0.0022, taper: 1.0, branches: 9.0 };

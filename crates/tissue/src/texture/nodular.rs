@@ -1,5 +1,5 @@
-//! A fibrotic liver: nodules, tan to rust, in a net of pale scar with fine vessels. On a sheet of 75 mm a nodule is 5 to
-//! 15 mm wide. Only colour: shine and shade are the light's.
+//! A fibrotic liver: nodules, tan to rust, in a network of pale scars with fine vessels. On a sheet of 75 mm a
+//! nodule is 5 to 15 mm wide. Only colour: viewers add gloss and shading.
 
 use super::colour::{self, Colour, mix, srgb};
 use super::noise::{bits, fractal, mosaic, step, unit};
@@ -7,14 +7,14 @@ use super::vessels::{self, Habit};
 
 const TAN: Colour = srgb(186, 120, 82);
 const RUST: Colour = srgb(150, 80, 58);
-/// With bile.
+/// Tan, stained with bile.
 const OLIVE: Colour = srgb(170, 124, 74);
 const SCAR: Colour = srgb(206, 164, 142);
 const FLUSHED: Colour = srgb(176, 96, 84);
 const ARTERY: Colour = srgb(140, 30, 32);
 const VEIN: Colour = srgb(104, 50, 66);
 
-/// Rows of `size` × `size` pixels, sRGB.
+/// Paints the image. Returns rows of `size` × `size` pixels, sRGB.
 pub(super) fn paint(seed: u64, size: usize) -> Vec<u8> {
     let seed = colour::base(seed);
     let veins = Habit { trees: 5, radius: 0.0050, thinnest: 0.0014, taper: 1.2, branches: 9.0 };
@@ -29,7 +29,7 @@ pub(super) fn paint(seed: u64, size: usize) -> Vec<u8> {
         let [own, other] = [unit(nodule.name), unit(bits(nodule.name, 3, 5))];
         let mut colour = mix(TAN, RUST, 0.85 * own);
         colour = mix(colour, OLIVE, 0.65 * step(0.55, 0.95, other));
-        // What is left of lobules, and blood in patches.
+        // Remains of lobules, and blood in patches.
         let lobule = mosaic(seed + 36, 42.0 * u, 42.0 * v, 1.0, 0.5);
         colour = mix(colour, RUST, 0.16 * step(0.10, 0.45, lobule.middle));
         colour = mix(colour, RUST, 0.50 * step(-0.2, 0.9, fractal(seed + 50, 15.0 * x, 15.0 * y, 3)));

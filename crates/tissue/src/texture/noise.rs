@@ -1,5 +1,5 @@
-//! Noise over the plane: values that look random but are functions of a place and a seed. All operations are arithmetic
-//! that IEEE 754 rounds exactly, so the values are the same on every machine.
+//! Noise over the plane: values that look random but are functions of a place and a seed. All operations are
+//! arithmetic that IEEE 754 rounds exactly, so the values are the same on every machine.
 
 /// Hashes a lattice point by multiplying and mixing (the finalizer of MurmurHash3).
 pub(super) fn bits(seed: u32, x: i32, y: i32) -> u32 {
@@ -11,18 +11,18 @@ pub(super) fn bits(seed: u32, x: i32, y: i32) -> u32 {
     h ^ h >> 16
 }
 
-/// A number from 0 to 1 from hash bits.
+/// Returns a number from 0 to 1 from hash bits.
 pub(super) fn unit(bits: u32) -> f32 {
     (bits >> 8) as f32 / (1 << 24) as f32
 }
 
-/// 0 up to `from`, 1 beyond `to`, smooth between; `to` may be below `from`.
+/// Returns 0 up to `from`, 1 beyond `to`, and a smooth value between; `to` may be below `from`.
 pub(super) fn step(from: f32, to: f32, x: f32) -> f32 {
     let t = ((x - from) / (to - from)).clamp(0.0, 1.0);
     t * t * (3.0 - 2.0 * t)
 }
 
-/// Gradient noise (Perlin noise), from −1 to 1: smooth, and 0 at integers.
+/// Returns gradient noise (Perlin noise), from −1 to 1: smooth, and 0 at integers.
 pub(super) fn gradient(seed: u32, x: f32, y: f32) -> f32 {
     let (left, top) = (x.floor(), y.floor());
     let (i, j) = (left as i32, top as i32);
@@ -38,7 +38,7 @@ pub(super) fn gradient(seed: u32, x: f32, y: f32) -> f32 {
     1.4 * mix(mix(corner(0, 0), corner(1, 0), u), mix(corner(0, 1), corner(1, 1), u), v)
 }
 
-/// Gradient noise in `octaves` of twice the frequency and half the amplitude each.
+/// Returns gradient noise in `octaves` of twice the frequency and half the amplitude each.
 pub(super) fn fractal(seed: u32, x: f32, y: f32, octaves: u32) -> f32 {
     let (mut sum, mut scale, mut height) = (0.0, 1.0, 1.0);
     for octave in 0..octaves {
@@ -55,7 +55,8 @@ pub(super) fn fractal(seed: u32, x: f32, y: f32, octaves: u32) -> f32 {
     sum
 }
 
-/// Distances to the nearest and the second nearest of scattered points, one in each square of side 1 (Worley noise).
+/// Returns the distances to the nearest and the second nearest of scattered points, one in each square of side
+/// 1 (Worley noise).
 pub(super) fn cells(seed: u32, x: f32, y: f32) -> [f32; 2] {
     let (i, j) = (x.floor() as i32, y.floor() as i32);
     let mut nearest = [f32::MAX; 2];
@@ -78,16 +79,16 @@ pub(super) fn cells(seed: u32, x: f32, y: f32) -> [f32; 2] {
 /// A tile of a mosaic.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Tile {
-    /// Distance to its middle.
+    /// Distance to the tile's middle.
     pub(super) middle: f32,
     /// How much farther the next tile's middle is: 0 on the edge.
     pub(super) edge: f32,
-    /// Bits that are its own.
+    /// Hash bits of this tile.
     pub(super) name: u32,
 }
 
-/// A mosaic of hexagons, their middles 1 apart. `disorder` moves the middles by up to half of itself along each axis;
-/// `spread` makes tiles larger and smaller.
+/// Returns the tile at a place of a mosaic of hexagons with middles 1 apart. `disorder` moves the middles by up
+/// to half of itself along each axis; `spread` varies the size of tiles.
 pub(super) fn mosaic(seed: u32, x: f32, y: f32, disorder: f32, spread: f32) -> Tile {
     /// Distance of two rows: half the square root of 3.
     const ROW: f32 = 0.866_025_4;

@@ -1,5 +1,5 @@
-//! The outside of a gallbladder: bile shines grey-green through a thin wall, which is yellower where fat lies on it. Fine
-//! arteries branch over it. Only colour: shine and shade are the light's.
+//! The outside of a gallbladder: bile shines grey-green through a thin wall, which is yellower where fat lies
+//! on it. Fine arteries branch over it. Only colour: viewers add gloss and shading.
 
 use super::colour::{self, Colour, mix, srgb};
 use super::noise::{fractal, gradient, step};
@@ -12,7 +12,7 @@ const FAT: Colour = srgb(182, 168, 112);
 const VEIN: Colour = srgb(66, 66, 82);
 const ARTERY: Colour = srgb(140, 60, 52);
 
-/// Rows of `size` × `size` pixels, sRGB.
+/// Paints the image. Returns rows of `size` × `size` pixels, sRGB.
 pub(super) fn paint(seed: u64, size: usize) -> Vec<u8> {
     let seed = colour::base(seed);
     let veins = Habit { trees: 4, radius: 0.0070, thinnest: 0.0020, taper: 1.2, branches: 7.0 };

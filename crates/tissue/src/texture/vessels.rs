@@ -1,4 +1,4 @@
-//! Vessels: trees of strokes that wander, taper and branch.
+//! Vessels: trees of strokes that meander, taper and branch.
 
 use super::noise::{bits, gradient, unit};
 use crate::memory;
@@ -11,7 +11,7 @@ struct Stroke {
     radius: [f32; 2],
 }
 
-/// A stream of numbers from 0 to 1.
+/// A stream of pseudo-random numbers from 0 to 1.
 struct Numbers {
     seed: u32,
     count: i32,
@@ -42,7 +42,7 @@ pub(super) struct Habit {
     pub(super) branches: f32,
 }
 
-/// The coverage of each pixel by vessels, 0 to 1: `size` × `size` values, by rows.
+/// Paints vessels. Returns the coverage of each pixel, 0 to 1: `size` × `size` values, by rows.
 pub(super) fn paint(seed: u32, size: usize, habit: Habit) -> Vec<f32> {
     let mut map = memory::zeroed(size * size, "a texture");
     for stroke in grow(seed, habit) {
@@ -51,10 +51,10 @@ pub(super) fn paint(seed: u32, size: usize, habit: Habit) -> Vec<f32> {
     map
 }
 
-/// Most strokes of all trees together.
+/// Largest number of strokes of all trees together.
 const MAX_SEGMENTS: usize = 40_000;
 
-/// Length of a stroke.
+/// Length of a stroke, in sides of the image.
 const PIECE: f32 = 0.006;
 
 fn grow(seed: u32, habit: Habit) -> Vec<Stroke> {

@@ -1,13 +1,14 @@
 //! Surgical forces: how the forces of all tools act on the points.
 //!
-//! A scheme says at which moments of a substep it evaluates a force, and with which weights the values add to its fields.
-//! A two-step scheme sees the substep's beginning only. Where the force jumps there, it must see the mean of the values
-//! just before and just after (as if the substep before had ended, and this one begun, with a half kick each): with the
-//! new value alone the error is first order, with the mean second. The other schemes take the new value.
+//! A scheme determines at which moments of a substep it evaluates a force, and with which weights the values
+//! add to its fields. A two-step scheme evaluates only the substep's beginning. If the force jumps there, it
+//! must use the mean of the values just before and just after (as if the substep before had ended, and this one
+//! begun, with half an impulse each): with the new value alone the error is first order, with the mean second.
+//! The other schemes use the new value.
 //!
-//! A force is a vector times a falloff over the points. The falloff is a table, made when a poke is placed, and only
-//! where it counts; the sweep multiplies. So a changing force costs as little as a constant one, and only a moving
-//! force needs new tables.
+//! A force is a vector times a falloff over the points. The falloff is a table, computed when a force is
+//! placed, and only where it counts; the sweep multiplies. So a changing force costs as little as a constant
+//! one, and only a moving force needs new tables.
 #![allow(unsafe_code)]
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions, ten
 // times slower.
@@ -33,7 +34,7 @@ use palpate_refusal::Result;
 pub enum Push {
     /// Constant until the next command.
     Constant(Poke),
-    /// A function of time, exact within the step.
+    /// A function of time, evaluated exactly within the step.
     Profile(LoadProfile),
 }
 
@@ -60,20 +61,20 @@ impl Push {
     }
 }
 
-/// One tool's force: what it is now, and what it was at the end of the last step.
+/// One tool's force: the present one, and that at the end of the last step.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Slot {
     pub(crate) push: Option<Push>,
     before: Option<Poke>,
-    /// The force that the sleeping tiles were last compared with.
+    /// The force with which the sleeping tiles were last compared.
     compared: Option<Poke>,
 }
 
-/// The steepest falloff of a table, over a spacing: what is steeper reaches no second point either. In any format it is a number, so
-/// that its product with the distance 0 is 0.
+/// The steepest falloff of a table, per spacing: a steeper one does not reach a second point either. It is
+/// finite in any format, so that its product with the distance 0 is 0.
 const STEEPEST: f64 = 1e30;
 
-/// Most terms that the force of one tool becomes: two at each moment at which a scheme asks for it.
+/// Largest number of terms of one tool's force: two at each moment at which a scheme evaluates it.
 const MAX_TERMS: usize = 8;
 
 /// A change of a tool's force.
@@ -85,7 +86,8 @@ pub(crate) struct ForceChange {
 }
 
 impl ForceChange {
-    /// Upper bound of the change of force on any point of a rectangle or box, N; `sides`: its ends along each axis, m.
+    /// Returns an upper bound of the change of force on any point of a rectangle or box, N. `sides` has its
+    /// ends along each axis, m.
     pub(crate) fn most_n(&self, sides: &[[f64; 2]]) -> f64 {
         let nearest = |poke: &Poke| {
             let away = sides.iter().enumerate().map(|(axis, [from, to])| {
@@ -107,12 +109,12 @@ impl ForceChange {
         both.min((new.force_n - old.force_n).length() * q + old.force_n.length() * moved * p.max(q))
     }
 
-    /// The points that the old force reaches, and those that the new one reaches: along x and along y.
+    /// Returns the points that the old force reaches, and those that the new one reaches, along x and along y.
     pub(crate) fn reached(&self) -> [[Range<usize>; 2]; 2] {
         self.reached.map(|sides| sides.map(|[from, to]| from..to))
     }
 
-    /// The new force at its centre, N.
+    /// Returns the new force at its centre, N.
     pub(crate) fn peak_n(&self) -> f64 {
         self.new.map_or(0.0, |poke| poke.force_n.length() * factor_of(poke.falloff_offset))
     }
@@ -126,14 +128,14 @@ pub(crate) struct Applied<T: Real> {
     pub(crate) terms: Vec<Term<T>>,
     /// The terms before they have tables. Kept, so that a step allocates nothing.
     wanted: Vec<Wanted>,
-    /// Whether the terms hold for the coming steps as well.
+    /// Whether the terms stay valid for the next steps.
     settled: bool,
 }
 
-/// Forces of equal falloff: for each of the scheme's fields a weighted sum, N.
+/// Forces with the same falloff: a weighted sum for each of the scheme's fields, N.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Wanted {
-    /// Defines the falloff; its force is not used.
+    /// Defines the falloff; its force vector is not used.
     poke: Poke,
     forces_n: [DVec3; 3],
 }
@@ -144,28 +146,28 @@ pub(crate) struct Term<T: Real> {
     wanted: Wanted,
     /// e^{c′}.
     gain: f64,
-    /// For each of the scheme's fields, in its terms.
+    /// The force in each of the scheme's fields, in the scheme's units.
     forces: [[T; 3]; 3],
     /// The rows where the force counts.
     rows: Range<usize>,
     columns: Range<usize>,
     /// The columns in each of those rows, in whole blocks.
     spans: Vec<Range<usize>>,
-    /// e^{−c·r} over the relative mass for those rows, each as long as a row of the sheet; 0 elsewhere.
+    /// e^{−c·r} divided by the relative mass for those rows, each as long as a row of the layout; 0 elsewhere.
     factors: Field<T>,
 }
 
-/// e^x, or the largest number: a force of 0 may have any factor, and 0 times what is infinite is no number.
+/// Returns e^x, at most the largest number: a force of 0 may have any factor, and 0 times infinity is NaN.
 fn factor_of(exponent: f64) -> f64 {
     libm::exp(exponent).min(f64::MAX)
 }
 
-/// Whether two pokes differ only in the force.
+/// Returns whether two forces differ only in the vector.
 fn same_falloff(a: &Poke, b: &Poke) -> bool {
     Poke { force_n: b.force_n, point: b.point, ..*a } == *b
 }
 
-/// The points that a force reaches, along x and along y. Beyond them its factor is 0.
+/// Returns the points that a force reaches, along x and along y. Beyond them its factor is 0.
 fn reached<T: Real>(poke: &Poke, model: &Model) -> [[usize; 2]; 2] {
     let spacing_m = model.unit_m;
     let reach_m = -T::NEGLIGIBLE_EXPONENT / poke.falloff_per_m;
@@ -198,7 +200,8 @@ impl<T: Real> Term<T> {
         }
     }
 
-    /// Writes the falloff of `poke` to the table. Costs as much as the points that the old falloff and the new one reach.
+    /// Writes the falloff of `poke` to the table. Costs as much as the points that the old and the new falloff
+    /// reach.
     fn place(&mut self, poke: &Poke, model: &Model, layout: &Layout) {
         let spacing_m = model.unit_m;
         // Beyond its spans the table is 0, also where it was longer before.
@@ -235,14 +238,14 @@ impl<T: Real> Term<T> {
         }));
     }
 
-    /// The same for points anywhere in space: a row is a block of slots.
+    /// Writes the falloff for points anywhere in space: a row is a block of slots (places in memory).
     fn place_on_mesh(&mut self, poke: &Poke, graph: &MeshPlaces, layout: &Layout) {
         self.spans.clear();
         for (factors, row) in self.factors.chunks_exact_mut(layout.stride).zip(self.rows.clone()) {
             let mut any = false;
             for ((factor, place_m), slot) in factors.iter_mut().zip(graph.rest_in_row(row)).zip(row * BLOCK..) {
                 let exponent = -poke.falloff_per_m * place_m.distance(poke.centre_m);
-                // An empty slot is nowhere.
+                // An empty slot has no place.
                 let reaches = exponent >= T::NEGLIGIBLE_EXPONENT && place_m.is_finite();
                 let moves = || libm::exp(exponent) / graph.slots.mass(slot);
                 *factor = if reaches { T::of(moves()) } else { T::default() };
@@ -257,13 +260,13 @@ impl<T: Real> Term<T> {
         self.wanted = wanted;
     }
 
-    /// e^{−c·r} over the relative mass at a point.
+    /// Returns e^{−c·r} divided by the relative mass at a point.
     fn factor(&self, layout: &Layout, [i, j]: [usize; 2]) -> T {
         if self.rows.contains(&i) { self.factors[(i - self.rows.start) * layout.stride + j] } else { T::default() }
     }
 }
 
-/// Fills a table.
+/// Fills a table with a falloff.
 struct Falloff<T> {
     /// In spacings, from the first point.
     centre: [f64; 2],
@@ -275,7 +278,7 @@ struct Falloff<T> {
 }
 
 impl<T> Falloff<T> {
-    /// The places of a row that are written, in blocks of `length`.
+    /// Returns the places of a row that are written, in blocks of `length`.
     #[inline(always)]
     fn written(&self, length: usize) -> Range<usize> {
         self.columns.start / length * length..self.columns.end.next_multiple_of(length)
@@ -302,7 +305,7 @@ impl<T: Real> Run<T> for Falloff<T> {
                     let exponent = slope.mul(y.mul_add(y, x).root());
                     let far = exponent.beyond(farthest);
                     let factor = V::select(far, zero, exponential(exponent)).keep(zero.first(self.columns.end - at));
-                    // The columns bound the reach more exactly than this format can.
+                    // The columns bound the reach more exactly than this format.
                     let factor = V::select(zero.first(self.columns.start.saturating_sub(at)), zero, factor);
                     debug_assert!(at + V::LANES <= self.stride);
                     factor.store(self.factors.add((i - self.rows.start) * self.stride + at));
@@ -312,8 +315,8 @@ impl<T: Real> Run<T> for Falloff<T> {
     }
 }
 
-/// e^x for x from [`Real::NEGLIGIBLE_EXPONENT`] to 0, within two units of the last place: 2^k·e^r, |r| ≤ ½ln 2. Unlike
-/// the platform's function, it has the same bits on every machine.
+/// Returns e^x for x from [`Real::NEGLIGIBLE_EXPONENT`] to 0, within two units of the last place: 2^k·e^r, |r|
+/// ≤ ½ln 2. Unlike the platform's function, it has the same bits on every machine.
 #[inline(always)]
 fn exponential<V: Vector>(x: V) -> V {
     let of = |value: f64| x.splat(V::Real::of(value));
@@ -361,10 +364,10 @@ impl<T: Real> Pull<'_, T> {
         Pull { factors: std::ptr::null(), from: 0, to: 0, places: [0; 2], spans: &[], forces: [[T::default(); 3]; 2] }
     }
 
-    /// The factors of a block of one of its rows.
+    /// Returns the factors of a block of one of its rows.
     ///
     /// # Safety
-    /// The table belongs to the same sheet as the block and is still alive.
+    /// The table belongs to the same tissue as the block and is still alive.
     #[inline(always)]
     unsafe fn factor<V: Vector<Real = T>>(&self, at: usize) -> V {
         debug_assert!(self.places[0] <= at && at + V::LANES <= self.places[1]);
@@ -374,7 +377,7 @@ impl<T: Real> Pull<'_, T> {
 }
 
 impl<T: Real> Term<T> {
-    /// The fields from `field` on.
+    /// Returns the term for the fields from `field` on.
     pub(crate) fn pull(&self, field: usize, stride: usize) -> Pull<'_, T> {
         let factors = self.factors.as_ptr().wrapping_sub(self.rows.start * stride);
         let forces = [self.forces[field], self.forces[(field + 1).min(2)]];
@@ -389,7 +392,7 @@ impl<T: Real> Term<T> {
     }
 }
 
-/// Whether any force acts on a block of a row that has a force.
+/// Returns whether any force acts on a block of a row that has a force.
 #[inline(always)]
 pub(crate) fn reaches<T>(pulls: &[Pull<'_, T>], row: usize, column: usize) -> bool {
     match pulls {
@@ -398,10 +401,11 @@ pub(crate) fn reaches<T>(pulls: &[Pull<'_, T>], row: usize, column: usize) -> bo
     }
 }
 
-/// The force of one term on a block that it reaches, by component, for `FIELDS` fields; a single field is given twice.
+/// Returns the force of one term on a block that it reaches, by component, for `FIELDS` fields; a single field
+/// is given twice.
 ///
 /// # Safety
-/// The table belongs to the same sheet as the block and is still alive.
+/// The table belongs to the same tissue as the block and is still alive.
 #[inline(always)]
 pub(crate) unsafe fn force_of<V: Vector, const FIELDS: usize>(pull: &Pull<'_, V::Real>, at: usize) -> [[V; 2]; 3] {
     // SAFETY: the caller's promise.
@@ -418,10 +422,11 @@ pub(crate) unsafe fn force_of<V: Vector, const FIELDS: usize>(pull: &Pull<'_, V:
     forces
 }
 
-/// The forces of all terms on a block, by component, for `FIELDS` fields; a single field is given twice.
+/// Returns the forces of all terms on a block, by component, for `FIELDS` fields; a single field is given
+/// twice.
 ///
 /// # Safety
-/// The tables belong to the same sheet as the block and are still alive.
+/// The tables belong to the same tissue as the block and are still alive.
 #[inline(always)]
 pub(crate) unsafe fn force_on<V: Vector, const FIELDS: usize>(
     pulls: &[Pull<'_, V::Real>],
@@ -456,13 +461,13 @@ pub(crate) unsafe fn force_on<V: Vector, const FIELDS: usize>(
     sum
 }
 
-/// The rows on which any force acts.
+/// Returns the rows on which any force acts.
 pub(crate) fn rows<T: Real>(terms: &[Term<T>]) -> Range<usize> {
     let rows = terms.iter().map(|term| term.rows.clone());
     rows.reduce(|a, b| a.start.min(b.start)..a.end.max(b.end)).unwrap_or(0..0)
 }
 
-/// How far the point in a place in memory rests from a control point, m.
+/// Returns the distance at rest of the point at a place in memory from a control point, m.
 #[allow(clippy::cast_precision_loss)]
 fn away_m(model: &Model, index: usize, centre_m: DVec3) -> f64 {
     match &model.graph {
@@ -475,7 +480,7 @@ fn away_m(model: &Model, index: usize, centre_m: DVec3) -> f64 {
     }
 }
 
-/// e^{−c·r + c′} at a distance, 0 where it is negligible.
+/// Returns e^{−c·r + c′} at a distance, m; 0 where it is negligible.
 fn factor(poke: &Poke, away_m: f64, negligible: f64) -> f64 {
     let exponent = -poke.falloff_per_m * away_m;
     if exponent < negligible { 0.0 } else { libm::exp(exponent + poke.falloff_offset) }
@@ -486,12 +491,12 @@ impl<T: Real> Applied<T> {
         Applied { slots: Vec::new(), terms: Vec::new(), wanted: Vec::new(), settled: true }
     }
 
-    /// The same forces, taken from a sheet of either format.
+    /// Returns the same forces for a tissue in this number format, without tables.
     pub(crate) fn like<S: Real>(other: &Applied<S>) -> Self {
         Applied { slots: other.slots.clone(), settled: false, ..Applied::new() }
     }
 
-    /// As plain data, without tables.
+    /// Converts the forces to plain data, without tables.
     pub(crate) fn saved(&self) -> SavedForces {
         let slot = |Slot { push, before, compared }: &Slot| SavedSlot {
             push: push.as_ref().map(Push::saved).map(Box::new),
@@ -509,7 +514,7 @@ impl<T: Real> Applied<T> {
         }
     }
 
-    /// The forces of a sheet whose plan has the scale of forces `scale`, with their tables.
+    /// Restores the forces of a tissue whose plan has the scale of forces `scale`, and their tables.
     pub(crate) fn restored(
         saved: &SavedForces,
         model: &Model,
@@ -521,7 +526,7 @@ impl<T: Real> Applied<T> {
             checks.tool(last as u64)?;
         }
         ensure(saved.terms.len() <= MAX_TERMS * saved.slots.len(), "more forces than its tools exert")?;
-        // In the scheme's terms it is a number of this format, as far as it acts.
+        // In the scheme's units it must be a finite number of this format, unless it is 0.
         let is_sound = |poke: &Poke, forces_n: &[DVec3]| {
             let gain = libm::exp(poke.falloff_offset) * scale;
             let in_terms = |force_n: &DVec3| T::of(gain * force_n.length()).is_finite();
@@ -541,7 +546,7 @@ impl<T: Real> Applied<T> {
         let mut terms = Vec::new();
         for saved in &saved.terms {
             let wanted = Wanted { poke: saved.poke.restored(checks)?, forces_n: saved.forces_n.map(DVec3::from) };
-            // One of 0 has no factor that is not finite: the sweep multiplies.
+            // A force of 0 needs a finite factor too: the sweep multiplies.
             ensure(libm::exp(wanted.poke.falloff_offset).is_finite(), "a force that is not finite")?;
             is_sound(&wanted.poke, &wanted.forces_n)?;
             let mut term = Term::new();
@@ -552,7 +557,7 @@ impl<T: Real> Applied<T> {
         Ok(Applied { slots, terms, wanted: Vec::new(), settled: saved.settled })
     }
 
-    /// From the coming step on `tool` exerts `push`.
+    /// Sets the force of `tool` from the next step on.
     pub(crate) fn set(&mut self, tool: usize, push: Option<Push>) {
         if self.slots.len() <= tool {
             self.slots.resize(tool + 1, Slot::default());
@@ -561,12 +566,12 @@ impl<T: Real> Applied<T> {
         self.settled = false;
     }
 
-    /// Whether the forces stay constant until a tool gets another command.
+    /// Returns whether the forces stay constant until a tool gets another command.
     pub(crate) fn is_settled(&self) -> bool {
         self.settled
     }
 
-    /// The changes of force since the last call, up to the end of step `step`.
+    /// Returns the changes of force since the last call, up to the end of step `step`.
     pub(crate) fn changes(&mut self, model: &Model, step: u64) -> impl Iterator<Item = ForceChange> {
         let end = Moment { step, fraction: 1.0 };
         let change = move |slot: &mut Slot| {
@@ -621,8 +626,8 @@ impl<T: Real> Applied<T> {
         }
     }
 
-    /// Makes `terms` equal `wanted`. Keeps each table whose falloff is wanted again and reuses the memory of the
-    /// others.
+    /// Makes `terms` equal `wanted`. Keeps each table whose falloff is wanted again and reuses the memory of
+    /// the others.
     fn put(&mut self, model: &Model, layout: &Layout, scale: f64) {
         for place in 0..self.wanted.len() {
             let wanted = self.wanted[place];
@@ -643,7 +648,7 @@ impl<T: Real> Applied<T> {
         self.terms.truncate(self.wanted.len());
     }
 
-    /// The forces at the end of the last step, in the scale of a scheme, as a field of its own.
+    /// Returns the forces at the end of the last step, in the scale of a scheme, as a field of their own.
     pub(crate) fn until_now(&self, model: &Model, layout: &Layout, scale: f64) -> Vec<Term<T>> {
         let pokes = self.slots.iter().filter_map(|slot| slot.before).filter(|poke| poke.force_n != DVec3::ZERO);
         let term = |poke: Poke| {
@@ -655,7 +660,7 @@ impl<T: Real> Applied<T> {
         pokes.map(term).collect()
     }
 
-    /// The force that the present substep adds to a point in one field, over its relative mass.
+    /// Returns the force that the present substep adds to a point in one field, divided by its relative mass.
     pub(crate) fn force_at(&self, layout: &Layout, field: usize, point: [usize; 2]) -> [f64; 3] {
         let mut sum = [0.0; 3];
         for term in &self.terms {
@@ -665,8 +670,8 @@ impl<T: Real> Applied<T> {
         sum
     }
 
-    /// The work of the forces where something else than a sweep moves a point, in `Sheet::unit_of_work_j`. A sweep counts only
-    /// how it would have moved.
+    /// Returns the work of the forces when something other than a sweep moves a point, in units of
+    /// `TissueState::unit_of_work_j`. A sweep counts only the movement that it would have made.
     pub(crate) fn work_along(
         &self,
         model: &Model,
@@ -683,7 +688,7 @@ impl<T: Real> Applied<T> {
         product * model.relative_mass_at(model.index_of(point))
     }
 
-    /// Forgets the terms and their scale.
+    /// Discards the terms and their scale.
     pub(crate) fn forget(&mut self) {
         self.terms.clear();
         self.settled = false;
@@ -697,14 +702,14 @@ impl<T: Real> Applied<T> {
         }
     }
 
-    /// The force on a point just after a moment.
+    /// Returns the force on a point just after a moment, N.
     pub(crate) fn from(&self, model: &Model, index: usize, moment: Moment) -> DVec3 {
         let rate_hz = model.scene.stepping.rate_hz;
         let pokes = self.slots.iter().filter_map(|slot| slot.push.as_ref().map(|push| push.at(moment, rate_hz)));
         sum_at(model, index, pokes, T::NEGLIGIBLE_EXPONENT)
     }
 
-    /// The force on a point at the end of the last step.
+    /// Returns the force on a point at the end of the last step, N.
     pub(crate) fn until(&self, model: &Model, index: usize) -> DVec3 {
         sum_at(model, index, self.slots.iter().filter_map(|slot| slot.before), T::NEGLIGIBLE_EXPONENT)
     }

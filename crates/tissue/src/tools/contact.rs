@@ -1,47 +1,51 @@
 //! Position-controlled tools of finite size: a touch, which only pushes, and a grasp, which holds.
 //!
-//! A tool meets the sheet with a disc (`footprint`), whose place s(c) = Σ w·x follows from the material place c under
-//! the tool. In each substep the sheet first moves under the force F₀ of the last. Then the step finds an impulse P at the
-//! substep's beginning and a force F over it that take s to the tool, as fast as the tool: two unknowns for place and speed,
-//! with what a kick and a constant force do to both (`Scheme::kick`, `Scheme::constant`) and Σ w²·dt²/m. So this is a
-//! division, not an iteration, and stable however stiff the coupling. (A force alone rings: a disc that must be at its place
-//! at the end of each substep oscillates within them. Its speed, and with it the damping that is felt, then err by what
-//! the tool's speed changes in a step.)
+//! A tool meets the tissue with a disc (`footprint`), whose place s(c) = Σ w·x follows from the material place
+//! c under the tool. In each substep the tissue first moves under the force F₀ of the last one. Then the step
+//! finds an impulse P at the substep's beginning and a force F over it that take s to the tool with the tool's
+//! velocity: two unknowns for place and velocity, with the effects of an impulse and of a constant force on
+//! both (`Scheme::kick`, `Scheme::constant`) and Σ w²·dt²/m. So this is a division, not an iteration, and
+//! stable however stiff the coupling. (A force alone rings: a disc that must be at its place at the end of each
+//! substep oscillates within them. Its velocity, and with it the damping that is felt, then have an error of
+//! the change of the tool's velocity in a step.)
 //!
-//! With a spring as coupling, F is its force at the substep's end, F = (Kc·g + Bc·(v_tool − ṡ))/(1 + A·(Kc + Bc/dt)), with the
-//! gap g = x_tool − s + A·F₀, and F − F₀ is an impulse. A two-step scheme moves a point by what it changes its speed by: under a
-//! constraint it has one unknown, F = g/A.
+//! With a spring as coupling, F is its force at the substep's end, F = (Kc·g + Bc·(v_tool − ṡ))/(1 + A·(Kc +
+//! Bc/dt)), with the gap g = x_tool − s + A·F₀, and F − F₀ is an impulse. A two-step scheme moves a point by
+//! the change of its velocity: under a constraint it has one unknown, F = g/A.
 //!
-//! Between steps the tool's speed jumps, since its path is known at their ends alone. Such a jump is an impulse m·Δv where
-//! the disc then is. Whether a tool lets go, and how much friction it has, is judged as if it lasted for the step: else
-//! shorter substeps would see a tool that jumps off at every step ([`ToolSubstep`]).
+//! Between steps the tool's velocity jumps, since its path is known only at their ends. Such a jump is an
+//! impulse m·Δv at the disc's place at that time. Whether a tool loses contact, and how much friction it has,
+//! is decided as if the impulse lasted for the step: otherwise, shorter substeps would see a tool that jumps
+//! off at every step ([`ToolSubstep`]).
 //!
-//! A touch is unilateral: with n the outward normal of the surface under the disc, N = −F·n must be positive, or the
-//! tool is free; |F_t| may be at most μN, or the disc slides: F_t is shortened, and c follows the tool. With μ = 0 it
-//! always follows. While it slides, the force acts half where the disc was and half where it is, along the mean of both
-//! normals: with either alone the error would fall with the first power of the substep. So c is the proxy: the place of the
-//! tool on the surface. n = ∂s/∂c_x × ∂s/∂c_y is the only choice whose work equals what the sheet gets when the disc slides
-//! over a slope.
+//! A touch is unilateral: with n the outward normal of the surface under the disc, N = −F·n must be positive,
+//! or the tool is free; |F_t| may be at most μN, or the disc slides: F_t is shortened, and c follows the tool.
+//! With μ = 0 it always follows. While it slides, the force acts half at the old and half at the new place of
+//! the disc, along the mean of both normals: with either alone the error would fall only with the first power
+//! of the substep. So c is the proxy: the place of the tool on the surface. n = ∂s/∂c_x × ∂s/∂c_y is the only
+//! choice whose work equals the energy that the tissue gains when the disc slides over a slope.
 //!
-//! **No energy from nowhere.** The tool's work is F·ẋ of the tool alone, and the guard counts that (`touch`). So what a disc
-//! does must agree with it, whatever the surface is like:
+//! **No energy from nowhere.** The tool's work is F·ẋ of the tool alone, and the guard counts that
+//! (`position_control`). The disc must agree with it, whatever the surface is like:
 //! - While it slides from w₀ to w₁, the points move by x̄ in the mean and the tool by Δs = Σ w̄·Δx + Δs̄ with
-//!   Δs̄ = Σ (w₁ − w₀)·x̄. What pushes must not do work along Δs̄, else the tissue gets F·Δs̄ more than the tool gives. So the
-//!   mean normal is taken perpendicular to Δs̄. On a smooth surface it is nearly so already; on one that is coarse, folded or
-//!   thin it is not. Friction may only take.
-//! - A tool that meets the tissue presses it as deep as both have come together in this substep. If it is deeper, because its
-//!   disc has come over to another part of the tissue in which it already is, the rest stays as an offset. A new tool has no
-//!   way yet: it presses as deep as it is put. In that substep it does not ask whether the tissue pulls on it: what moves a
-//!   surface at rest and what stops it again cancel, and rounding would decide.
-//! - A disc that lags behind its tool is pressed by no more than what the tool moves along the normal ([`Tool::balance`]), and
-//!   it moves by no more than half its radius at once.
-//! - A disc that lags behind and stops sliding sticks where it is: the impulses that would draw it to its tool and stop it there cancel,
-//!   so that the tool would do no work.
-//! - Where the disc would come over an edge so that its way leads along its normal, it stays, and pushes along its normal alone.
-//!   Where friction would drive it against the tool's way, and farther, it stays, and friction acts: so what slid and stops is held.
+//!   Δs̄ = Σ (w₁ − w₀)·x̄. The pressing force must not do work along Δs̄, or the tissue would gain F·Δs̄ more
+//!   than the tool gives. So the mean normal is taken perpendicular to Δs̄. On a smooth surface it is nearly so
+//!   already; on one that is coarse, folded or thin it is not. Friction may only remove energy.
+//! - A tool that meets the tissue presses it as deep as both have approached in this substep. If it is deeper,
+//!   because its disc has moved to another part of the tissue in which the tool already is, the rest stays as
+//!   an offset. A new tool has no path yet: it presses as deep as it is placed. In that substep it does not
+//!   test whether the tissue pulls on it: the impulses that move a surface at rest and stop it again cancel,
+//!   and rounding would decide.
+//! - A disc that lags behind its tool is pressed by no more than the tool's movement along the normal
+//!   ([`Tool::balance`]), and it moves by no more than half its radius at once.
+//! - A disc that lags behind and stops sliding sticks where it is: the impulses that would draw it to its tool
+//!   and stop it there cancel, so that the tool would do no work.
+//! - If the disc would move over an edge so that its path leads along its normal, it stays, and pushes along
+//!   its normal alone. If friction would drive it against the tool's path, and farther, it stays, and friction
+//!   acts: so a disc that slid and stops is held.
 //!
-//! The force felt under a constraint is that of springs, anchor springs and damping on the disc, Σ w·f/Σ w²: F without
-//! the points' own inertia, which a hand would feel as a knock at each command.
+//! The force felt under a constraint is that of springs, anchor springs and damping on the disc, Σ w·f/Σ w²: F
+//! without the points' own inertia, which a hand would feel as a knock at each command.
 
 use std::sync::Arc;
 
@@ -56,44 +60,47 @@ use crate::tools::footprint::{Footprint, RestSurface, WeightedNode};
 use palpate_haptics::{ContactState, Coupling, Tip};
 use palpate_refusal::Result;
 
-/// Below this determinant of its kick and its constant force a scheme has one unknown, not two.
+/// If the determinant of a scheme's impulse and constant force is below this, the scheme has one unknown, not
+/// two.
 const MIN_DETERMINANT: f64 = 1e-6;
 
-/// The offset of a disc that slides vanishes by this part of the tool's way.
+/// The offset of a sliding disc decreases by this part of the tool's movement.
 const RELAXATION: f64 = 1.0 / 64.0;
 
-/// What a disc lags behind its tool counts from this part of its radius on. On a smooth surface none does.
+/// A disc's lag behind its tool counts from this part of its radius on. On a smooth surface there is none.
 const MIN_LAG: f64 = 1.0 / 64.0;
 
-/// A disc slides on while its mean normal, taken perpendicular to its way, has at least this part along the normal where it is.
+/// A disc continues to slide while its mean normal, taken perpendicular to its path, has at least this part
+/// along the normal at its place.
 const MIN_STRAIGHTNESS: f64 = 0.9;
 
-/// The motion of a tool and the force on it at the end of a step.
+/// The motion of a position-controlled tool and the force on it at the end of a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ToolContact {
-    /// Place of the tool, m; z points up, out of the tissue.
+    /// Place of the tool, m. On a sheet, z points out of the tissue.
     pub place_m: DVec3,
-    /// Velocity in the last step, m/s.
+    /// Velocity of the tool in the last step, m/s.
     pub velocity_m_per_s: DVec3,
-    /// The state of contact.
+    /// Whether the tool is free, sticks, slides or holds.
     pub contact_state: ContactState,
     /// Force of the tissue on the tool, N.
     pub force_on_tool_n: DVec3,
     /// Place of the surface under the tool, m.
     pub surface_m: DVec3,
-    /// Where the material point there rests, m.
+    /// Rest position of the material point under the tool, m.
     pub anchor_m: DVec3,
-    /// Unit normal out of the tissue.
+    /// Unit normal of the surface under the tool, on the tool's side of it.
     pub normal: DVec3,
-    /// The surface at rest there; none of a sheet, which is a plane at rest.
+    /// The surface at rest there; `None` on a sheet, which is a plane at rest.
     pub rest: Option<RestSurface>,
-    /// μ of the tool's tip.
+    /// Coefficient of friction μ of the tool's tip.
     pub friction: f64,
-    /// Whether the disc is almost wholly on fixed points ([`Footprint::is_on_fixed`]): its force is not that of free tissue.
+    /// Whether the disc lies almost wholly on fixed points ([`Footprint::is_on_fixed`]), so that its force is
+    /// not that of free tissue.
     pub is_on_fixed: bool,
 }
 
-/// A copy of the data from which the stiffness under a tool is computed, for another thread.
+/// A copy of the tissue around a tool, from which another thread computes the stiffness there.
 #[derive(Debug)]
 pub struct TangentInput {
     pub(crate) model: Arc<Model>,
@@ -103,13 +110,13 @@ pub struct TangentInput {
 }
 
 impl TangentInput {
-    /// Computes the stiffness. Takes some milliseconds for a thousand points.
+    /// Computes stiffness, damping and drag under the tool. Takes some milliseconds for a thousand points.
     pub fn tangent(self) -> Tangent {
         LinearPatch::new(&self.model, &self.footprint, self.window, self.displacement_m).tangent()
     }
 }
 
-/// A tool and its disc.
+/// A position-controlled tool and its disc.
 #[derive(Debug, Clone)]
 pub(crate) struct Tool {
     pub(crate) number: usize,
@@ -119,17 +126,19 @@ pub(crate) struct Tool {
     pub(crate) from_m: DVec3,
     pub(crate) to_m: DVec3,
     pub(crate) contact_state: ContactState,
-    /// Out of the tissue, on the side where the tool is.
+    /// Normal of the surface under the disc, on the tool's side.
     pub(crate) normal: DVec3,
-    /// That side: 1 outside, -1 inside; none while the tool is beside the tissue.
+    /// That side: 1 outside, -1 inside; `None` while the tool is beside the tissue.
     pub(crate) side: Option<f64>,
-    /// The offset that a grasp, or a touch that began within the tissue, keeps between the tool and the surface, m.
+    /// The offset that a grasp, or a touch that began within the tissue, keeps between the tool and the
+    /// surface, m.
     pub(crate) offset_m: DVec3,
-    /// The gap between the tool and its disc at the end of a substep in which that slid, m: a disc may lag behind.
+    /// The gap between the tool and its disc at the end of a substep in which the disc slid, m: a disc may lag
+    /// behind.
     pub(crate) gap_m: DVec3,
-    /// Whether it has not yet been compared with the surface, with this tip.
+    /// Whether the tool has not yet been compared with the surface with this tip.
     pub(crate) is_new: bool,
-    /// Force on the sheet in the last substep, N.
+    /// Force on the tissue in the last substep, N.
     pub(crate) force_n: DVec3,
     /// The part of that force that continues in the next substep, without the impulse of meeting.
     pub(crate) steady_n: DVec3,
@@ -148,7 +157,7 @@ pub(crate) struct Contacts {
 }
 
 impl Contacts {
-    /// From the coming step on the tool is at `to_m` at the step's end. A new tool begins there.
+    /// Makes the tool reach `to_m` at the next step's end. A new tool begins there.
     pub(crate) fn pose(&mut self, model: &Model, number: usize, to_m: DVec3, tip: Tip) {
         if let Some(tool) = self.tools.iter_mut().find(|tool| tool.number == number) {
             let is_other = tool.tip.radius_m != tip.radius_m;
@@ -195,17 +204,17 @@ impl Contacts {
         self.tools.is_empty()
     }
 
-    /// The numbers of these tools.
+    /// Returns the numbers of these tools.
     pub(crate) fn tools(&self) -> impl Iterator<Item = usize> {
         self.tools.iter().map(|tool| tool.number)
     }
 
-    /// The points under tools that touch or hold. Some occur more than once.
+    /// Returns the points under tools that touch or hold. Some occur more than once.
     pub(crate) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
         self.tools.iter().filter(|tool| tool.contact_state != ContactState::Free).flat_map(Tool::points)
     }
 
-    /// The force that goes on on a point, N.
+    /// Returns the continuing force of these tools on a point, N.
     pub(crate) fn steady_on(&self, model: &Model, index: usize) -> DVec3 {
         let pressing = self.tools.iter().filter(|tool| tool.steady_n != DVec3::ZERO);
         pressing.map(|tool| tool.footprint.weight_of(model, index) * tool.steady_n).sum()
@@ -215,7 +224,7 @@ impl Contacts {
         self.tools.retain(|tool| tool.number != number);
     }
 
-    /// Ends a step.
+    /// Ends a step: updates the velocities and begins the next path at the present place.
     pub(crate) fn finish(&mut self, rate_hz: f64) {
         for tool in &mut self.tools {
             tool.velocity_m_per_s = (tool.to_m - tool.from_m) * rate_hz;
@@ -224,15 +233,15 @@ impl Contacts {
     }
 }
 
-/// The displacement of a point from rest, m. For a multistep scheme, as predicted.
+/// Returns the displacement of a point from rest, m. For a multistep scheme, it is the predicted one.
 pub(crate) fn displacement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, [i, j]: [usize; 2]) -> DVec3 {
     let at = i * layout.stride + j;
     let component = |c: usize| state.u[c * layout.plane + at].wide() * model.unit_m;
     DVec3::new(component(0), component(1), component(2))
 }
 
-/// Adds to u and d of the disc's points the effect of `force_n` with `[of_u, of_d]` (`Scheme::kick`,
-/// `Scheme::constant`).
+/// Adds to u and d of the disc's points the effect of `force_n` with the factors `[of_u, of_d]`
+/// (`Scheme::kick`, `Scheme::constant`).
 pub(crate) fn push<T: Real>(
     model: &Model,
     plan: &Plan,
@@ -255,7 +264,7 @@ pub(crate) fn push<T: Real>(
     }
 }
 
-/// The movement of the disc in a substep, Σ w·d, m.
+/// Returns the movement of the disc in a substep, Σ w·d, m.
 pub(crate) fn movement_m<T: Real>(model: &Model, layout: &Layout, state: &State<T>, footprint: &Footprint) -> DVec3 {
     let mut moved = DVec3::ZERO;
     for WeightedNode { point: [i, j], weight, .. } in footprint.reached().iter().copied() {
@@ -291,8 +300,8 @@ impl Tool {
     fn restored(saved: &SavedContact, model: &Model, checks: &Checks<'_>) -> Result<Self> {
         let tip = saved.tip.restored(checks)?;
         let contact_state = CONTACT_STATES.get(usize::from(saved.contact_state)).copied();
-        ensure(contact_state.is_some(), "a state of contact that there is not")?;
-        ensure(saved.side.is_none_or(|side| side.abs() == 1.0), "a side of the tissue that there is not")?;
+        ensure(contact_state.is_some(), "an unknown state of contact")?;
+        ensure(saved.side.is_none_or(|side| side.abs() == 1.0), "an unknown side of the tissue")?;
         Ok(Tool {
             number: checks.tool(saved.number)?,
             tip,
@@ -311,7 +320,7 @@ impl Tool {
         })
     }
 
-    /// The points of the disc.
+    /// Returns the points of the disc.
     pub(crate) fn points(&self) -> impl Iterator<Item = [usize; 2]> {
         self.footprint.reached().iter().map(|reached| reached.point)
     }
@@ -320,8 +329,8 @@ impl Tool {
         if fraction >= 1.0 { self.to_m } else { self.from_m.lerp(self.to_m, fraction) }
     }
 
-    /// Finds the state of contact, and the force of the tool on the sheet, N. `state` already has the effect of the steady
-    /// force; where the disc slides, half of that goes with it.
+    /// Determines the state of contact and the force of the tool on the tissue, N. `state` already includes the
+    /// effect of the steady force; if the disc slides, half of that moves with it.
     pub(crate) fn solve_contact<T: Real>(
         &mut self,
         model: &Model,
@@ -342,7 +351,7 @@ impl Tool {
         self.normal = side * outward;
         match self.contact_state {
             ContactState::Free => {
-                // Beside the tissue it may go over to the other side.
+                // Beside the tissue it may change to the other side.
                 let is_beside = self.footprint.is_beside(gap_m, outward);
                 self.side = (!is_beside).then_some(side);
                 if is_beside {
@@ -363,7 +372,8 @@ impl Tool {
             }
             ContactState::Holding | ContactState::Sticking | ContactState::Sliding => {}
         }
-        // A lag is across the normal that the surface had when the tool was there: that it has turned since moves nothing.
+        // A lag is perpendicular to the normal that the surface had when the tool was there: its rotation since
+        // then moves nothing.
         let normal_before = leg.normal.unwrap_or(self.normal);
         let lag_m = match before {
             ContactState::Free => self.lag_m(gap_m, normal_before),
@@ -372,7 +382,7 @@ impl Tool {
         };
         gap_m -= self.offset_m;
         place_m -= self.offset_m;
-        // What sticks goes with the tool from where it is.
+        // A sticking disc moves with the tool from its own place.
         let thrust = self.thrust(model, plan, layout, state, gap_m - lag_m);
         if self.contact_state == ContactState::Holding {
             return thrust;
@@ -397,7 +407,7 @@ impl Tool {
             return thrust;
         }
         if before == ContactState::Sticking {
-            // What it lagged behind when it began to stick, it lags behind again.
+            // It lags behind again by as much as when it began to stick.
             let lag_m = self.lag_m(self.offset_m, normal_before);
             self.offset_m -= lag_m;
             self.gap_m += lag_m;
@@ -405,7 +415,7 @@ impl Tool {
             place_m += lag_m;
         }
         self.contact_state = ContactState::Sliding;
-        // What its normal was when the gap was what it is kept as.
+        // The normal at the time of the stored gap.
         let reference = if self.is_new { None } else { leg.normal.or(Some(self.normal)) };
         if leg.normal.is_none() {
             self.gap_m = gap_m;
@@ -428,19 +438,20 @@ impl Tool {
         thrust
     }
 
-    /// What of a gap is across a normal, if a constraint would close it and it is too much for a disc that follows its tool, m.
+    /// Returns the part of a gap perpendicular to a normal if a constraint would close it and it is too large
+    /// for a disc that follows its tool, m; otherwise 0.
     fn lag_m(&self, gap_m: DVec3, normal: DVec3) -> DVec3 {
         let across_m = gap_m - gap_m.dot(normal) * normal;
         let lags = across_m.length() > MIN_LAG * self.footprint.radius_m();
         if lags && self.tip.coupling == Coupling::Constraint && !self.tip.grasps { across_m } else { DVec3::ZERO }
     }
 
-    /// The movement of the tool in a substep, m.
+    /// Returns the movement of the tool in a substep, m.
     pub(crate) fn own_movement_m(&self, model: &Model, plan: &Plan) -> DVec3 {
         (self.to_m - self.from_m) * (model.scene.stepping.rate_hz * plan.substep_s)
     }
 
-    /// The tool's way in the substep that ends at `fraction` of the step.
+    /// Returns the tool's path in the substep that ends at `fraction` of the step.
     pub(crate) fn leg(&self, model: &Model, plan: &Plan, fraction: f64) -> ToolSubstep {
         let moves_m_per_n = self.moves_m_per_n(model, plan);
         let met = self.contact_state != ContactState::Free;
@@ -462,7 +473,7 @@ impl Tool {
         let (across_n, substeps) = (jump_n - pressing_n, f64::from(plan.substeps));
         let is_first = fraction * substeps < 1.5;
         leg.spread_n = pressing_n / substeps;
-        // A disc that slides takes no more of the part along the surface than friction gives it.
+        // A sliding disc takes no more of the part along the surface than friction allows.
         if self.contact_state == ContactState::Sticking {
             leg.spread_n += if is_first { across_n / substeps - across_n } else { across_n / substeps };
         }
@@ -472,7 +483,7 @@ impl Tool {
         leg
     }
 
-    /// Moves the disc to where it is under the tool once `force_n` has acted, and finds the force there.
+    /// Moves the disc to its place under the tool once `force_n` has acted, and determines the force there.
     fn slide<T: Real>(
         &mut self,
         model: &Model,
@@ -491,7 +502,7 @@ impl Tool {
         }
         beside_m -= beside_m.dot(self.normal) * self.normal;
         let beside_m = beside_m.clamp_length_max(self.footprint.stride_m());
-        // Of a force that travels, half acts where it was, and half where it is.
+        // A moving force acts half at its old place, and half at the new one.
         let half = plan.scheme.constant().map(|of| 0.5 * of);
         let mean_place = |footprint: &Footprint, state: &State<T>| {
             let (surface_m, along) = footprint.surface(|point| displacement_m(model, layout, state, point));
@@ -503,8 +514,8 @@ impl Tool {
         let (went_m, along) = mean_place(&self.footprint, state);
         let travelled_m = went_m - stayed_m;
         let normal = self.side.unwrap_or(1.0) * self.footprint.outward(&along);
-        // What acts over the substep is along the mean normal, and does no work along the way of the disc; a spring's force is that
-        // at its end.
+        // The force over the substep is along the mean normal, and does no work along the disc's path; a
+        // spring's force is the one at its end.
         let mean = match (self.tip.coupling, before) {
             (Coupling::Constraint, Some(before)) => before + normal,
             _ => normal,
@@ -514,7 +525,8 @@ impl Tool {
         let is_straight = mean.dot(normal) >= MIN_STRAIGHTNESS;
         let mean = if self.tip.coupling == Coupling::Constraint { mean } else { normal };
         let across = (across_n - across_n.dot(mean) * mean).normalize_or_zero();
-        // Friction takes energy from a disc that moves: it does not drive one against the tool's way, farther than that.
+        // Friction removes energy from a moving disc: it does not drive it against the tool's path, farther
+        // than that path.
         let is_driven = across.dot(travelled_m) < -self.own_movement_m(model, plan).length();
         if !is_straight || is_driven {
             self.footprint.return_to(model, &ground);
@@ -531,7 +543,7 @@ impl Tool {
         let thrust = self.thrust(model, plan, layout, state, gap_m);
         let pressing_n = -(thrust.force_n() + spread_n).dot(self.normal);
         if pressing_n <= 0.0 {
-            // There is nothing to press where it would come to. What acts in this substep is all where it was.
+            // Nothing presses at the new place. All that acts in this substep acts at the old one.
             push(model, plan, layout, state, &self.footprint, -self.steady_n, half);
             self.footprint.return_to(model, &ground);
             (self.normal, self.offset_m) = stays;
@@ -546,13 +558,14 @@ impl Tool {
         Slide::Went(ContactForce { kick_n, steady_n, goes_on_n })
     }
 
-    /// Keeps the offset such that closing the gap along the mean normal moves the surface as far as the tool has moved along it,
-    /// `own_m` in this substep.
+    /// Keeps the offset such that closing the gap along the mean normal moves the surface as far as the tool
+    /// has moved along it, `own_m` in this substep.
     ///
-    /// With q the gap along the normal (0 under a constraint), a disc that follows its tool closes q₀ + n̄·(g₁ − g₀). Where it lags
-    /// behind, or the surface is not smooth, the turning of the normal alone changes what is to be closed, as if the tool had moved.
-    /// That goes into the offset, which vanishes again by a small part of the tool's way: so what a smooth surface leaves of second
-    /// order never counts, and a tool at rest gives nothing.
+    /// With q the gap along the normal (0 under a constraint), a disc that follows its tool closes q₀ + n̄·(g₁
+    /// − g₀). If it lags behind, or the surface is not smooth, the rotation of the normal alone changes the gap
+    /// to close, as if the tool had moved. That part goes into the offset, which decreases by a small part of
+    /// the tool's movement: so the second-order remainder on a smooth surface never counts, and a tool at rest
+    /// adds nothing.
     fn balance(&mut self, gap_m: &mut DVec3, mean: DVec3, reference: Option<DVec3>, own_m: DVec3) {
         let Some(before) = reference else { return };
         let along_m = gap_m.dot(self.normal) / mean.dot(self.normal);
@@ -564,34 +577,35 @@ impl Tool {
         *gap_m += (kept_m - offset_m) * mean;
     }
 
-    /// Whether a spring couples it to the tissue at present.
+    /// Returns whether a spring couples the tool to the tissue at present.
     pub(crate) fn is_coupled(&self) -> bool {
         self.contact_state != ContactState::Free && matches!(self.tip.coupling, Coupling::Spring { .. })
     }
 
-    /// The energy of that spring while the disc is at `surface_m` and the tool at `place_m`, J.
+    /// Returns the energy of that spring, J, while the disc is at `surface_m` and the tool at `place_m`.
     pub(crate) fn stored_j(&self, surface_m: DVec3, place_m: DVec3) -> f64 {
         match self.tip.coupling {
             Coupling::Spring { stiffness_n_per_m, .. } if self.is_coupled() => {
                 let stretched_j = 0.5 * stiffness_n_per_m * (place_m - self.offset_m - surface_m).length_squared();
-                // A disc that lags behind stretches nothing along its way.
+                // A disc that lags behind stretches nothing along its path.
                 stretched_j.min(0.5 * self.force_n.length_squared() / stiffness_n_per_m)
             }
             _ => 0.0,
         }
     }
 
-    /// How far the disc moves in the substep under an impulse of 1 N times the substep.
+    /// Returns how far the disc moves in the substep under an impulse of 1 N times the substep, m/N.
     fn moves_m_per_n(&self, model: &Model, plan: &Plan) -> f64 {
         plan.scheme.kick()[0] * plan.force_scale(&model.scene) * model.unit_m * self.footprint.relative_inverse_mass()
     }
 
-    /// The steady force, and an impulse for what `force_n` is beyond it; the next substep begins with that force.
+    /// Returns the steady force with an impulse for the rest of `force_n`; the next substep begins with
+    /// `force_n`.
     fn kicked_to(&self, force_n: DVec3) -> ContactForce {
         ContactForce { kick_n: force_n - self.steady_n, steady_n: self.steady_n, goes_on_n: force_n }
     }
 
-    /// What closes a gap, and makes the disc as fast as the tool, if the scheme can do both.
+    /// Returns the force that closes a gap, and gives the disc the tool's velocity if the scheme can do both.
     fn thrust<T: Real>(
         &self,
         model: &Model,
@@ -610,7 +624,7 @@ impl Tool {
         match self.tip.coupling {
             Coupling::Constraint => {
                 let determinant = kick_u * of_d - kick_d * of_u;
-                // A two-step scheme moves a point by what it changes its speed by: it can only close the gap.
+                // A two-step scheme moves a point by the change of its velocity: it can only close the gap.
                 if determinant.abs() < MIN_DETERMINANT {
                     return self.kicked_to(self.steady_n + gap_m / moves_m_per_n);
                 }
@@ -631,63 +645,65 @@ impl Tool {
     }
 }
 
-/// A tool's way in a substep. Its speed jumps at the beginning of a step, because its path is known at the ends of steps alone.
-/// Forces are impulses over the substep.
+/// A tool's path in a substep. Its velocity jumps at the beginning of a step, because its path is known only at
+/// the ends of steps. Forces are impulses over the substep.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ToolSubstep {
-    /// Where it ends, m.
+    /// Place at the substep's end, m.
     place_m: DVec3,
-    /// The normal of the surface where it begins, if the tool touches there.
+    /// Normal of the surface at the substep's beginning, if the tool touches there.
     normal: Option<DVec3>,
-    /// What the normal was when the gap was what the tool keeps; none of a new tool.
+    /// Normal at the time of the gap that the tool keeps; `None` for a new tool.
     reference: Option<DVec3>,
-    /// What the jump of speed takes across the surface, in the first substep: it acts where the disc is then, N.
+    /// Force of the jump of velocity in the first substep, at the disc's place then, N.
     pub(crate) jump_n: DVec3,
-    /// What to add to the force of the substep, so that a jump counts as spread over the step. Then whether the tool lets go or
-    /// slides does not depend on the length of a substep, N.
+    /// Force to add to that of the substep, N, so that a jump counts as spread over the step. Whether the tool
+    /// loses contact or slides then does not depend on the length of a substep.
     spread_n: DVec3,
 }
 
-/// What becomes of a disc that friction does not hold.
+/// What a disc does that friction does not hold.
 enum Slide {
     /// It follows the tool.
     Went(ContactForce),
-    /// It stays: its way would lead along its normal, or friction would drive it. Friction acts this way, with length 1 or 0.
+    /// It stays, because its path would lead along its normal, or friction would drive it. Friction acts in
+    /// this direction (a vector of length 1 or 0).
     Stays(DVec3),
-    /// It stays, and the tool lets go: where it would come to, nothing presses.
+    /// It stays, and the tool loses contact: nothing presses at the new place.
     Leaves,
 }
 
-/// What a tool does to its disc in a substep, N.
+/// The force of a tool on its disc in a substep, N.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct ContactForce {
-    /// An impulse at the substep's beginning, over the substep.
+    /// An impulse at the substep's beginning, divided by the substep.
     pub(crate) kick_n: DVec3,
-    /// A force throughout.
+    /// A constant force during the substep.
     pub(crate) steady_n: DVec3,
     /// The force with which the next substep begins.
     pub(crate) goes_on_n: DVec3,
 }
 
 impl ContactForce {
-    /// What of it is along a normal.
+    /// Returns the part along a normal.
     fn along(&self, normal: DVec3) -> Self {
         let along = |force_n: DVec3| force_n.dot(normal) * normal;
         ContactForce { kick_n: along(self.kick_n), steady_n: along(self.steady_n), goes_on_n: along(self.goes_on_n) }
     }
 
-    /// The same, and a steady force.
+    /// Returns this force with a steady force added.
     fn with(&self, steady_n: DVec3) -> Self {
         ContactForce { kick_n: self.kick_n, steady_n: self.steady_n + steady_n, goes_on_n: self.goes_on_n + steady_n }
     }
 
-    /// Both together.
+    /// Returns the sum of the impulse and the steady force.
     pub(crate) fn force_n(&self) -> DVec3 {
         self.kick_n + self.steady_n
     }
 }
 
-/// A force on the sheet within the friction cone about −`normal`, and whether it was already inside.
+/// Returns a force on the tissue limited to the friction cone around −`normal`, preceded by whether it was
+/// already inside.
 pub(crate) fn within_cone(force_n: DVec3, normal: DVec3, friction: f64) -> (bool, DVec3) {
     let pressing_n = force_n.dot(normal) * normal;
     let across_n = force_n - pressing_n;

@@ -1,14 +1,17 @@
-//! Where a tool of finite size meets the tissue: a disc of stated radius, spread over the mass points around it.
+//! The footprint of a tool: a disc of given radius where its tip meets the tissue, distributed over the mass
+//! points around it.
 //!
-//! The surface between points is given by hats N_p: the material place c is at Σ N_p(c)·x_p. A disc of radius a about c
-//! averages that over its area, s(c) = Σ w_p·x_p with w_p = ⨍ N_p; the weights add up to 1. A tool moves s, and its force
-//! goes to the points with the same weights, so its work is force · ds. With a single point instead, the stiffness would
-//! fall without limit as the grid gets finer; with the disc it converges.
+//! The surface between points is given by hat functions N_p: the material place c is at Σ N_p(c)·x_p. A disc of
+//! radius a around c averages that over its area, s(c) = Σ w_p·x_p with w_p = ⨍ N_p; the weights add up to 1. A
+//! tool moves s, and its force goes to the points with the same weights, so its work is force · ds. With a
+//! single point instead, the stiffness would fall without limit as the grid gets finer; with the disc it
+//! converges.
 //!
-//! The hats blur the disc: under even pressure it would act as if larger, by much where the points are far apart. The area
-//! that matters is the A = 1/Σ(w²/A_p) that shares a force, A_p the area of a point: a foundation of k″ N/m³ has the
-//! stiffness k″·A under the disc. So the hats are averaged over a smaller disc, chosen so that A is that of the requested
-//! disc: on a sheet in the mean over places (`grid`), on a mesh at each place (`palpate_geometry::surface`).
+//! The hats blur the disc: under even pressure it would act as if larger, by much where the points are far
+//! apart. The relevant area is A = 1/Σ(w²/A_p), which shares a force, with A_p the area of a point: a
+//! foundation of k″ N/m³ has the stiffness k″·A under the disc. So the hats are averaged over a smaller disc,
+//! chosen so that A is that of the requested disc: on a sheet in the mean over places
+//! (`body::sheet::footprint`), on a mesh at each place (`palpate_geometry::surface`).
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -19,33 +22,33 @@ use crate::scene::Body;
 use crate::state::saved::{SavedGeometry, ensure, unsound};
 use palpate_refusal::Result;
 
-/// A disc on a mesh does not move by a smaller part of its radius: to lay it takes as long as to step some thousand points,
-/// and the tool is off its place by no more than this.
+/// Smallest movement of a disc on a mesh, as a part of its radius. Computing its weights costs as much as
+/// stepping some thousand points, and the disc is at most this far from the tool's place.
 const MIN_PART: f64 = 1e-6;
 
-/// The points that can move bear at least this part of a disc. Where fewer do, near what is fixed, they would have to move
+/// The smallest part of a disc that movable points carry. Near fixed points they would otherwise have to move
 /// farther than the tool by one over their part, and the stiffness would grow with its square.
 const MIN_FREE_PART: f64 = 0.25;
 
-/// A disc of which the points that can move bear less than this part lies on what is fixed, and moves nothing.
+/// If movable points carry less than this part of a disc, it lies on fixed points and moves nothing.
 const FIXED_PART: f64 = 0.02;
 
-/// A disc on a tissue, at a place. Lengths in m.
+/// The disc with which a tool touches a tissue, at a place: the points that it covers and their weights.
 #[derive(Debug, Clone)]
 pub struct Footprint {
     radius_m: f64,
     ground: FootprintGeometry,
     reached: Vec<WeightedNode>,
-    /// What the weights of points that can move were multiplied with ([`MIN_FREE_PART`]).
+    /// Factor of the weights of movable points ([`MIN_FREE_PART`]).
     free_factor: f64,
-    /// Where the disc rests: Σ w·X, and how that changes with the place.
+    /// Rest position of the disc, Σ w·X, m, and its derivative by the place.
     rest_m: DVec3,
     along: [DVec3; 2],
-    /// Σ w²/mass over the points that can move.
+    /// Σ w²/mass over the movable points.
     relative_inverse_mass: f64,
 }
 
-/// What the disc lies on.
+/// The geometry that the disc lies on.
 #[derive(Debug, Clone)]
 enum FootprintGeometry {
     Grid(GridDisc),
@@ -55,21 +58,21 @@ enum FootprintGeometry {
 /// A mass point that a disc covers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WeightedNode {
-    /// Its row and column in memory; of a sheet, its indices in the grid.
+    /// Row and column in memory; on a sheet, the indices in the grid.
     pub point: [usize; 2],
-    /// Whether it is not fixed.
+    /// Whether the point can move.
     pub free: bool,
-    /// Its mass, over that of the scene's points.
+    /// Mass divided by the reference mass.
     pub mass: f64,
-    /// w.
+    /// Weight w of the point; the weights of a disc add up to 1.
     pub weight: f64,
-    /// ∂w/∂c, 1/m, in two perpendicular directions of the surface: of a sheet x and y.
+    /// ∂w/∂c, 1/m, in two perpendicular directions of the surface: x and y on a sheet.
     pub gradient: DVec2,
 }
 
 impl Footprint {
-    /// Creates a disc of `radius_m` about the place of the rest surface that is nearest to `at_m`; of a sheet, above or
-    /// below it.
+    /// Creates a disc of `radius_m` around the place of the rest surface nearest to `at_m`; on a sheet, above
+    /// or below it.
     pub fn new(model: &Model, radius_m: f64, at_m: DVec3) -> Self {
         let ground = match &model.scene.body {
             Body::Sheet(sheet) => FootprintGeometry::Grid(GridDisc::new(sheet, radius_m)),
@@ -88,7 +91,7 @@ impl Footprint {
         footprint
     }
 
-    /// Its place.
+    /// Returns the place of the disc as plain data.
     pub(crate) fn saved(&self) -> SavedGeometry {
         match &self.ground {
             FootprintGeometry::Grid(disc) => SavedGeometry::Grid(disc.centre_m.to_array()),
@@ -96,7 +99,7 @@ impl Footprint {
         }
     }
 
-    /// A disc at a place of another.
+    /// Restores a disc of `radius_m` at a saved place.
     pub(crate) fn restored(model: &Model, radius_m: f64, saved: &SavedGeometry) -> Result<Self> {
         match (saved, &model.scene.body) {
             (SavedGeometry::Grid(centre_m), Body::Sheet(sheet)) => {
@@ -125,7 +128,7 @@ impl Footprint {
         }
     }
 
-    /// Goes back to a place where it was ([`Footprint::saved`]).
+    /// Moves the disc back to an earlier place ([`Footprint::saved`]).
     pub(crate) fn return_to(&mut self, model: &Model, place: &SavedGeometry) {
         match (&mut self.ground, place) {
             (FootprintGeometry::Grid(_), SavedGeometry::Grid(centre_m)) => {
@@ -139,18 +142,18 @@ impl Footprint {
         }
     }
 
-    /// Whether all of it is finite.
+    /// Returns whether all values are finite.
     fn is_sound(&self) -> bool {
         let is_sound = |point: &WeightedNode| point.weight.is_finite() && point.gradient.is_finite();
         self.rest_m.is_finite() && self.relative_inverse_mass.is_finite() && self.reached.iter().all(is_sound)
     }
 
-    /// Returns the radius, m.
+    /// Returns the radius of the disc, m.
     pub fn radius_m(&self) -> f64 {
         self.radius_m
     }
 
-    /// Returns where the material place of the centre rests, m.
+    /// Returns the rest position of the material place at the centre, m.
     pub fn anchor_m(&self) -> DVec3 {
         match &self.ground {
             FootprintGeometry::Grid(disc) => disc.centre_m.extend(0.0),
@@ -158,7 +161,7 @@ impl Footprint {
         }
     }
 
-    /// Moves the disc to another material place: the nearest of the rest surface.
+    /// Moves the disc to another material place: the place of the rest surface nearest to `at_m`.
     pub fn move_to(&mut self, model: &Model, at_m: DVec3) {
         match &mut self.ground {
             FootprintGeometry::Grid(_) => self.move_on_grid(model, at_m.truncate()),
@@ -169,8 +172,8 @@ impl Footprint {
         }
     }
 
-    /// Moves the disc by `beside_m`, a vector along the moved surface, where `along` is how that changes with the place
-    /// ([`Footprint::surface`]).
+    /// Moves the disc by `beside_m`, a vector along the displaced surface. `along` is the derivative of the
+    /// surface by the place ([`Footprint::surface`]).
     pub(crate) fn shift(&mut self, model: &Model, beside_m: DVec3, along: &[DVec3; 2]) {
         match &mut self.ground {
             FootprintGeometry::Grid(disc) => {
@@ -187,7 +190,8 @@ impl Footprint {
         }
     }
 
-    /// How far a disc that touches may move at once, m. A sheet is a plane at rest.
+    /// Returns how far a touching disc may move at once, m. On a sheet there is no bound, because it is a plane
+    /// at rest.
     pub(crate) fn stride_m(&self) -> f64 {
         match &self.ground {
             FootprintGeometry::Grid(_) => f64::INFINITY,
@@ -195,8 +199,8 @@ impl Footprint {
         }
     }
 
-    /// Moves the disc of a tool that touches nothing to the place of the moved surface nearest to `place_m`, or towards it.
-    /// A contraction, as long as the surface is not folded.
+    /// Moves the disc of a tool that touches nothing to the place of the displaced surface nearest to
+    /// `place_m`, or towards it. This converges if the surface is not folded.
     pub(crate) fn seek(&mut self, model: &Model, place_m: DVec3, displacement_m: impl Fn([usize; 2]) -> DVec3) {
         if let FootprintGeometry::Mesh(disc) = &mut self.ground
             && disc.leap(model, place_m, &displacement_m)
@@ -210,7 +214,7 @@ impl Footprint {
                 let outward = self.outward(&along);
                 let away_m = beside_m.dot(outward).abs();
                 beside_m -= beside_m.dot(outward) * outward;
-                // Far from a curved surface a whole step would lead past the place.
+                // Far from a curved surface, a whole step would lead past the place.
                 beside_m *= self.radius_m / (self.radius_m + away_m + beside_m.length());
             }
             self.shift(model, beside_m, &along);
@@ -230,7 +234,7 @@ impl Footprint {
         self.weigh(model);
     }
 
-    /// Takes what the disc covers on a mesh.
+    /// Takes over the vertices that the disc covers on a mesh.
     fn lay(&mut self, model: &Model) {
         let (FootprintGeometry::Mesh(disc), Some(graph)) = (&mut self.ground, &model.graph) else { return };
         self.reached.clear();
@@ -246,7 +250,7 @@ impl Footprint {
         self.weigh(model);
     }
 
-    /// Finds how the disc moves under a force, and makes it lean on the points that can move if these are few.
+    /// Computes how the disc moves under a force. If few of its points can move, gives these more weight.
     fn weigh(&mut self, model: &Model) {
         self.lean(model);
         let of = |point: &WeightedNode| point.weight * point.weight / point.mass;
@@ -255,8 +259,8 @@ impl Footprint {
             if moves { self.reached.iter().filter(|point| point.free).map(of).sum() } else { 0.0 };
     }
 
-    /// Gives the points that can move at least [`MIN_FREE_PART`] of the disc: with p their part and q that which they get,
-    /// w becomes w·q/p for them and w·(1 − q)/(1 − p) for the others, and ∂w what that changes by.
+    /// Gives the movable points at least [`MIN_FREE_PART`] of the disc. With p their part and q the part they
+    /// get, w becomes w·q/p for them and w·(1 − q)/(1 − p) for the others; ∂w changes accordingly.
     fn lean(&mut self, model: &Model) {
         let (mut part, mut change) = (0.0, DVec2::ZERO);
         for point in self.reached.iter().filter(|point| point.free) {
@@ -288,39 +292,39 @@ impl Footprint {
         }
     }
 
-    /// Returns whether the disc lies so much on what is fixed that it leans on the few points that can move, or moves
-    /// nothing.
+    /// Returns whether the disc lies on fixed points so much that its movable points get more weight, or that
+    /// it moves nothing.
     pub fn is_on_fixed(&self) -> bool {
         self.free_factor != 1.0
     }
 
-    /// Returns the points that the disc covers.
+    /// Returns the points that the disc covers, with their weights.
     pub fn reached(&self) -> &[WeightedNode] {
         &self.reached
     }
 
-    /// w of a point: 0 of one that the disc does not cover. Does not go through all that it covers: a tip may be as large as
-    /// the tissue, and this is asked of each of its points.
+    /// Returns the weight w of a point; 0 for a point that the disc does not cover. It does not search all
+    /// covered points: a tip may be as large as the tissue, and this is called for each of its points.
     pub(crate) fn weight_of(&self, model: &Model, index: usize) -> f64 {
         match &self.ground {
             FootprintGeometry::Grid(_) => {
-                // They are by rows.
+                // They are sorted by rows.
                 let found = self.reached.binary_search_by_key(&model.point_of(index), |reached| reached.point);
                 found.map_or(0.0, |place| self.reached[place].weight)
             }
-            // Asked of points that can move.
+            // Only called for movable points.
             FootprintGeometry::Mesh(disc) => self.free_factor * disc.weight_of(model.point_at(index)),
         }
     }
 
-    /// Returns Σ w²/mass over the points that can move: the movement of s per unit force, relative to that of one free
-    /// point.
+    /// Returns Σ w²/mass over the movable points: the movement of the disc per unit of force, relative to that
+    /// of one free point.
     pub fn relative_inverse_mass(&self) -> f64 {
         self.relative_inverse_mass
     }
 
-    /// Returns s, the place of the disc, in m, and ∂s/∂c, for points displaced by `displacement_m`: s = Σ w·(X + u) and
-    /// ∂s/∂c = Σ ∂w/∂c·(X + u), with X where the points rest.
+    /// Returns the place of the disc, s, m, and ∂s/∂c, for points displaced by `displacement_m`: s = Σ w·(X +
+    /// u) and ∂s/∂c = Σ ∂w/∂c·(X + u), with X the rest positions.
     pub fn surface(&self, displacement_m: impl Fn([usize; 2]) -> DVec3) -> (DVec3, [DVec3; 2]) {
         let (mut place, mut along) = (self.rest_m, self.along);
         for WeightedNode { point, weight, gradient, .. } in &self.reached {
@@ -332,22 +336,22 @@ impl Footprint {
         (place, along)
     }
 
-    /// Returns where the disc is on the tissue at rest, Σ w·X, m, and the unit normal out of the tissue there, along
-    /// ∂s/∂c₁ × ∂s/∂c₂.
+    /// Returns the place of the disc on the tissue at rest, Σ w·X, m, and the unit normal out of the tissue
+    /// there, along ∂s/∂c₁ × ∂s/∂c₂.
     pub fn at_rest(&self) -> (DVec3, DVec3) {
         (self.rest_m, self.outward(&self.along))
     }
 
-    /// The surface at rest about the disc, as a tool sees it that is on this side of it (1 outside, -1 inside); `None` on a
-    /// sheet, which is a plane.
+    /// Returns the surface at rest around the disc, as seen by a tool on this side of it (1 outside, -1
+    /// inside); `None` on a sheet, which is a plane.
     pub(crate) fn rest_surface(&self, side: f64) -> Option<RestSurface> {
         let FootprintGeometry::Mesh(disc) = &self.ground else { return None };
         let (normal, curvature_per_m) = (side * self.outward(&self.along), side * disc.curvature_per_m());
         Some(RestSurface { place_m: self.rest_m, normal, curvature_per_m })
     }
 
-    /// The unit normal out of the tissue: ∂s/∂c₁ × ∂s/∂c₂ is the only choice whose work equals what the tissue gets when
-    /// the disc slides over a slope.
+    /// Returns the unit normal out of the tissue. ∂s/∂c₁ × ∂s/∂c₂ is the only choice whose work equals the
+    /// energy that the tissue gains when the disc slides over a slope.
     pub(crate) fn outward(&self, along: &[DVec3; 2]) -> DVec3 {
         along[0].cross(along[1]).try_normalize().unwrap_or_else(|| match &self.ground {
             FootprintGeometry::Grid(_) => DVec3::Z,
@@ -355,7 +359,8 @@ impl Footprint {
         })
     }
 
-    /// Whether a tool whose gap from the disc is `gap_m` is beside the tissue: farther off its edge than the radius.
+    /// Returns whether a tool whose gap from the disc is `gap_m` is beside the tissue: farther off its edge
+    /// than the radius.
     pub(crate) fn is_beside(&self, gap_m: DVec3, outward: DVec3) -> bool {
         let across_m = match &self.ground {
             FootprintGeometry::Grid(_) => gap_m.truncate().length(),
@@ -364,8 +369,8 @@ impl Footprint {
         across_m > self.radius_m
     }
 
-    /// The side of the surface on which a tool is that comes new, `height_m` above the surface: 1 outside, -1 inside. One
-    /// that is below a sheet presses on it from above.
+    /// Returns the side of the surface of a newly placed tool that is `height_m` above the surface: 1 outside,
+    /// -1 inside. A tool below a sheet presses on it from above.
     pub(crate) fn side(&self, height_m: f64) -> f64 {
         match &self.ground {
             FootprintGeometry::Grid(_) => 1.0,
@@ -374,15 +379,15 @@ impl Footprint {
     }
 }
 
-/// The surface at rest about a tool's place.
+/// The surface at rest around a tool's place, to second order.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RestSurface {
-    /// The place where the disc is, m.
+    /// The place of the disc, m.
     pub place_m: DVec3,
     /// The unit normal there, towards the tool.
     pub normal: DVec3,
-    /// How the normal changes per metre along the surface, 1/m: symmetric, 1/R on a sphere of radius R. Valid for ways
-    /// across the normal.
+    /// The change of the normal per metre along the surface, 1/m: symmetric, 1/R on a sphere of radius R. Valid
+    /// for displacements perpendicular to the normal.
     pub curvature_per_m: DMat3,
 }
 
@@ -390,7 +395,7 @@ fn is_free(model: &Model, index: usize) -> bool {
     model.fixed.is_empty() || model.fixed.binary_search(&index).is_err()
 }
 
-/// The change of place that moves a surface by `beside_m`, as far as it can: least squares.
+/// Returns the change of place that moves a surface by `beside_m`, as far as possible: least squares.
 fn within(beside_m: DVec3, [one, other]: &[DVec3; 2]) -> DVec2 {
     let [a, b, d] = [one.dot(*one), one.dot(*other), other.dot(*other)];
     let right = DVec2::new(one.dot(beside_m), other.dot(beside_m));

@@ -1,4 +1,4 @@
-//! What tools do to a tissue: forces, prescribed displacements, and contact of discs.
+//! What tools do to a tissue: forces, prescribed displacements, and contact of a tip's disc.
 
 pub(crate) mod applied_force;
 pub(crate) mod contact;

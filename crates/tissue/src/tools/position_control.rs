@@ -1,4 +1,4 @@
-//! Position-controlled tools on a sheet: how they act in a substep, and what they feel.
+//! Position-controlled tools: how they act in a substep, and the forces on them.
 
 use glam::DVec3;
 
@@ -18,8 +18,9 @@ use crate::tools::footprint::WeightedNode;
 use palpate_haptics::Coupling;
 
 impl<T: Real> TissueState<T> {
-    /// Makes position-controlled tools act at the end of a substep that ends at `fraction` of the step. One that moves points by
-    /// more than `far` spacings wakes the tiles that these pull at in the next substep.
+    /// Makes position-controlled tools act at the end of a substep, which ends at `fraction` of the step. A
+    /// tool that moves points by more than `far` spacings wakes the tiles that these points pull at in the next
+    /// substep.
     pub(crate) fn solve_contact(&mut self, fraction: f64, far: f64) {
         let unit_j = self.unit_of_work_j();
         let TissueState { model, plan, tables, state, applied, contacts, tiles, work, .. } = self;
@@ -40,7 +41,7 @@ impl<T: Real> TissueState<T> {
             tool.force_n = thrust.force_n();
             tool.steady_n = if met { thrust.goes_on_n } else { DVec3::ZERO };
             if tool.contact_state == ContactState::Free {
-                // The tool has let go: undo what acted in this substep.
+                // The tool has lost contact: undo what acted in this substep.
                 if before_n != DVec3::ZERO {
                     push(model, plan, layout, state, &tool.footprint, -before_n, plan.scheme.constant());
                 }
@@ -52,15 +53,15 @@ impl<T: Real> TissueState<T> {
             if thrust == ContactForce::default() && before_n == DVec3::ZERO && leg.jump_n == DVec3::ZERO {
                 continue;
             }
-            // Tiles that slept were at rest in this substep, as if they had been computed.
+            // Sleeping tiles were at rest in this substep, as if they had been computed.
             tiles.wake_under(tool.points());
             let change_n = thrust.steady_n - before_n;
             let is_put = is_new && !met;
             let is_put_at_once = is_put && tool.tip.coupling == Coupling::Constraint;
-            // The volume changes too little by that to ask for it twice.
+            // The volume changes too little to compute it twice.
             let volume_change = if is_put_at_once { tables.volume_change(&state.u, tiles.region.tiles()) } else { 0.0 };
             let before = is_put_at_once.then(|| states(model, plan, tables, state, volume_change, tool));
-            // At once, or by the speed that they have now.
+            // Moves at once, or by the speed that the points have now.
             let moved_n =
                 |c: usize| plan.scheme.kick()[c] * (leg.jump_n + thrust.kick_n) + plan.scheme.constant()[c] * change_n;
             let most = plan.force_scale(&model.scene) * moved_n(0).abs().max(moved_n(1).abs()).max_element();
@@ -76,7 +77,7 @@ impl<T: Real> TissueState<T> {
                 ContactState::Sliding => tool.place_m(fraction) - tool.offset_m - surface_m(),
                 _ => DVec3::ZERO,
             };
-            // Forces of other tools on these points do work along this movement as well.
+            // Forces of other tools on these points also do work along this movement.
             if !applied.terms.is_empty() {
                 let moved =
                     plan.scheme.kick()[0] * (leg.jump_n + thrust.kick_n) + plan.scheme.constant()[0] * thrust.steady_n;
@@ -90,21 +91,22 @@ impl<T: Real> TissueState<T> {
             }
             let all_n = leg.jump_n + thrust.kick_n + thrust.steady_n;
             if let Some(before) = before {
-                // Who puts a tool into the tissue presses it as deep at once. What moves the surface and what stops it again
-                // cancel, so their work is what the tissue has got.
+                // A tool placed within the tissue presses at once to its depth. The impulses that move the
+                // surface and stop it cancel, so the work is the energy that the tissue gained.
                 let after = states(model, plan, tables, state, volume_change, tool);
                 work.add(before.iter().zip(&after).map(|(before, after)| gained_j(before, after, unit_j)).sum());
             } else if is_put {
                 work.add(all_n.dot(movement_m(model, layout, state, &tool.footprint)));
                 work.add(tool.stored_j(surface_m(), tool.place_m(fraction)));
             } else {
-                // By the tool's own way, and not by that of the disc: what a disc does wrong is not the tool's work.
+                // The work is counted along the tool's own path, not along that of the disc: errors of the
+                // disc's movement are not the tool's work.
                 work.add(all_n.dot(tool.own_movement_m(model, plan)));
             }
         }
     }
 
-    /// The energy of couplings by springs, J.
+    /// Returns the energy of spring couplings, J.
     pub(crate) fn coupling_j(&self) -> f64 {
         let TissueState { model, tables, state, contacts, .. } = self;
         let stored_j = |tool: &Tool| {
@@ -114,7 +116,7 @@ impl<T: Real> TissueState<T> {
         contacts.tools.iter().filter(|tool| tool.is_coupled()).map(stored_j).sum()
     }
 
-    /// The motion of a position-controlled tool and the force on it.
+    /// Returns the motion of a position-controlled tool and the force on it; `None` for other tools.
     pub(crate) fn tool_contact(&self, number: usize) -> Option<ToolContact> {
         let model = &self.model;
         let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
@@ -148,14 +150,15 @@ impl<T: Real> TissueState<T> {
         })
     }
 
-    /// The disc of such a tool, if it touches or holds, and the displacements of the points around it.
+    /// Returns a copy of the tool's disc and of the displacements of the points around it; `None` if the tool
+    /// neither touches nor holds, or if there is no memory.
     pub(crate) fn tangent_input(&self, number: usize) -> Option<TangentInput> {
         let tool = self.contacts.tools.iter().find(|tool| tool.number == number)?;
         if tool.contact_state == ContactState::Free {
             return None;
         }
         let window = Window::around(&self.model, &tool.footprint);
-        // Without memory for it, the stiffness of the force law has to do.
+        // Without memory for it, the stiffness from the force law must suffice.
         memory::check(window.bytes(), "the stiffness under a tool").ok()?;
         let displacement =
             |index: usize| displacement_m(&self.model, &self.tables.layout, &self.state, self.model.point_of(index));
@@ -163,8 +166,8 @@ impl<T: Real> TissueState<T> {
         Some(TangentInput { model: self.model.clone(), footprint: tool.footprint.clone(), window, displacement_m })
     }
 
-    /// Σ(w·f/mass)/Σ(w²/mass): the force under which the disc is not accelerated. f is that of springs, anchor springs,
-    /// damping and force-controlled tools.
+    /// Returns Σ(w·f/mass)/Σ(w²/mass), N: the force under which the disc is not accelerated. f is that of
+    /// springs, anchor springs, damping and force-controlled tools.
     fn without_inertia(&self, tool: &Tool) -> DVec3 {
         let (model, footprint) = (&self.model, &tool.footprint);
         let scene = &model.scene;
@@ -185,14 +188,14 @@ impl<T: Real> TissueState<T> {
 /// A free point under a tip.
 struct UnderTip {
     mass: f64,
-    /// Its displacement, m, and its way in a substep by its speed, spacings.
+    /// Its displacement, m, and its movement in a substep, spacings.
     u_m: DVec3,
     d: DVec3,
-    /// The force of springs and anchor springs on it, N.
+    /// Force of springs and anchor springs on it, N.
     pull_n: DVec3,
 }
 
-/// The free points under a tip.
+/// Returns the states of the free points under a tip.
 fn states<T: Real>(
     model: &Model,
     plan: &Plan,
@@ -214,7 +217,8 @@ fn states<T: Real>(
     tool.footprint.reached().iter().copied().filter(|point| point.free).map(of).collect()
 }
 
-/// By how much the energy of a point, and of the springs at it, has grown, J: springs are linear, so they resist with the mean force.
+/// Returns the gain in energy of a point and of its springs, J. Springs are taken as linear, so they resist
+/// with the mean force.
 fn gained_j(before: &UnderTip, after: &UnderTip, unit_j: f64) -> f64 {
     let stored_j = -0.5 * (before.pull_n + after.pull_n).dot(after.u_m - before.u_m);
     stored_j + 0.5 * unit_j * before.mass * (after.d.length_squared() - before.d.length_squared())
@@ -233,8 +237,9 @@ mod tests {
         TissueState::new(&Model::paper(&[&always[..], &["sheet.points=[9, 9]", "sleep.tolerance=0.0"], sets].concat()))
     }
 
-    /// A force beside a tool or a held point that stand still does no work. The sweep alone would count that the points drift away
-    /// from the tool in each substep, which then puts them back: enough for the guard to stop a finger that rests beside a force.
+    /// A force next to a tool or held point at rest does no work. The sweep alone would count the drift of the points
+    /// away from the tool in each substep, which the tool then undoes: enough for the guard to stop a finger that rests
+    /// next to a force.
     #[test]
     fn a_force_beside_a_tool_at_rest_does_no_work() {
         for integrator in ["central", "exponential2", "exponential4", "rk4"] {
@@ -270,7 +275,7 @@ mod tests {
         }
     }
 
-    /// Without damping, all work that a tip has done is energy of the sheet, but for what friction takes as its disc slides.
+    /// Without damping, all work of a tip becomes energy of the tissue, except what friction takes as its disc slides.
     #[test]
     fn the_work_of_a_tip_that_slides_is_the_energy_of_the_sheet() {
         for friction in [0.0, 0.4] {
@@ -304,8 +309,8 @@ mod tests {
                 let (before_n, anchor_m, along) = before.replace(now).unwrap_or(now);
                 let way_m = now.1 - anchor_m;
                 heat_j += 0.25 * (before_n + across_n).dot(way_m.x * (along[0] + x) + way_m.y * (along[1] + y));
-                // The work of an impulse is counted by the speed after it, so a little too high; the heat is summed once a step,
-                // and the disc sticks and slips within one.
+                // The work of an impulse is counted by the speed after it, so a little too high; the heat is
+                // summed once a step, and the disc sticks and slips within one.
                 let part = (work_j - heat_j) / energy_j;
                 assert!(
                     step < 200 || (0.98..1.03).contains(&part),
@@ -315,8 +320,8 @@ mod tests {
         }
     }
 
-    /// Impulses that move a surface and stop it again cancel: by their sum no work is done, and the guard would take the energy for
-    /// a fault. Rounding of that sum decided whether such a tip touched at all.
+    /// Impulses that move a surface and stop it again cancel: their sum does no work, and the guard would take
+    /// the energy for a fault. Rounding of that sum decided whether such a tip touched at all.
     #[test]
     fn a_tip_that_is_put_into_tissue_at_rest_presses_and_does_the_work_that_the_tissue_gets() {
         for integrator in ["central", "exponential2", "exponential3", "exponential4", "rk4"] {
@@ -332,7 +337,8 @@ mod tests {
                         let Energy { kinetic_j, spring_j, anchor_j } = sheet.energies();
                         let (energy_j, work_j) = (kinetic_j + spring_j + anchor_j, sheet.work.done_j);
                         let part = work_j / energy_j;
-                        // Two-step schemes can't stop the surface at once: the tool takes that energy back in the next step.
+                        // Two-step schemes can't stop the surface at once: the tool takes that energy back in
+                        // the next step.
                         let is_right = part > 0.9 && (part < 1.1 || integrator == "central");
                         assert!(is_right, "{set:?}, {friction}, {step}: {work_j} J for {energy_j} J");
                         let is_free = sheet.tool_contact(0).unwrap().contact_state == ContactState::Free;

@@ -14,9 +14,9 @@ use palpate_refusal::Result;
 /// How a tool moves its grasped point.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Grasp {
-    /// To this displacement by the end of the step, at constant velocity; then it stays.
+    /// Moves the point to this displacement, m, by the end of the step, at constant velocity; then it stays.
     Target(DVec3),
-    /// A function of time, exact within the step.
+    /// A function of time, evaluated exactly within the step.
     Profile(MotionProfile),
 }
 
@@ -36,13 +36,13 @@ impl Grasp {
     }
 }
 
-/// The place in memory of a point that a snapshot says is grasped.
+/// Checks the place in memory of a point that a snapshot lists as grasped, and returns it.
 #[allow(clippy::cast_possible_truncation)]
 pub(crate) fn restored_index(model: &Model, index: u64, checks: &Checks<'_>) -> Result<usize> {
-    ensure(index < model.places() as u64, "a grasped point that the tissue has not")?;
+    ensure(index < model.places() as u64, "a grasped point that the tissue lacks")?;
     let index = index as usize;
     let point = model.point_at(index);
-    ensure(model.place_of(point) == index, "a grasped point that the tissue has not")?;
+    ensure(model.place_of(point) == index, "a grasped point that the tissue lacks")?;
     check_free("snapshot", checks.shape, point)?;
     Ok(index)
 }
@@ -63,7 +63,7 @@ struct Grasped {
 #[derive(Debug, Clone)]
 pub(crate) struct Prescribed {
     grasped: Vec<Grasped>,
-    /// Released points and their velocities, until the coming substep.
+    /// Released points and their velocities, m/s, until the next substep.
     released: Vec<(usize, DVec3)>,
 }
 
@@ -84,7 +84,8 @@ impl Prescribed {
         SavedPrescribed { grasped: grasped.collect(), released: released.collect() }
     }
 
-    /// `most_m`: no point is displaced or moves in a step by as much, in a state that the guard has let pass.
+    /// Restores grasped points. In a state that passed the guard, no point is displaced, or moves in a step, by
+    /// `most_m` or more.
     pub(crate) fn restored(saved: &SavedPrescribed, model: &Model, most_m: f64, checks: &Checks<'_>) -> Result<Self> {
         let step_s = model.scene.stepping.rate_hz.recip();
         let is_within = |v: DVec3| ensure(v.abs().max_element() < most_m, "a motion that no point has");
@@ -106,13 +107,13 @@ impl Prescribed {
         Ok(Prescribed { grasped, released: released.collect::<Result<_>>()? })
     }
 
-    /// Whether no point is grasped and none was released just now.
+    /// Returns whether no point is grasped and none was just released.
     pub(crate) fn is_empty(&self) -> bool {
         self.grasped.is_empty() && self.released.is_empty()
     }
 
-    /// From the coming step on `tool` moves the point at `index`, which now moves like `now`, and releases the point it
-    /// held before. A point that another tool holds is taken over.
+    /// Makes `tool` move the point at `index` from the next step on, and release the point it held before.
+    /// `now` is the present motion of the point. A point that another tool holds is taken over.
     pub(crate) fn grasp(&mut self, tool: usize, index: usize, grasp: Grasp, now: Motion) {
         if let Some(at) = self.grasped.iter().position(|g| g.index == index) {
             let taken = Grasped { tool, grasp, ..self.grasped.remove(at) };
@@ -127,7 +128,7 @@ impl Prescribed {
         self.grasped.push(Grasped { tool, index, grasp, now, held: false });
     }
 
-    /// `tool` releases its point. The point keeps its velocity.
+    /// Releases the point of `tool`. The point keeps its velocity.
     pub(crate) fn release(&mut self, tool: usize) {
         let Some(at) = self.grasped.iter().position(|g| g.tool == tool) else { return };
         let grasped = self.grasped.remove(at);
@@ -137,17 +138,18 @@ impl Prescribed {
         }
     }
 
-    /// The tools that grasp a point.
+    /// Returns the tools that grasp a point.
     pub(crate) fn tools(&self) -> impl Iterator<Item = usize> {
         self.grasped.iter().map(|grasped| grasped.tool)
     }
 
-    /// The points released since the last call, and their velocities, m/s.
+    /// Returns the points released since the last call, and their velocities, m/s. Empties the list.
     pub(crate) fn take_released(&mut self) -> Vec<(usize, DVec3)> {
         std::mem::take(&mut self.released)
     }
 
-    /// The grasped points at `fraction` of step `step`: index, displacement and velocity.
+    /// Returns the grasped points at `fraction` of step `step`: place in memory, displacement, m, and velocity,
+    /// m/s.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn at(&self, model: &Model, step: u64, fraction: f64) -> impl Iterator<Item = (usize, DVec3, DVec3)> {
         let rate_hz = model.scene.stepping.rate_hz;
@@ -185,12 +187,12 @@ impl Prescribed {
         }
     }
 
-    /// The grasped points and how they moved at the end of the last step.
+    /// Returns the places of the grasped points and their motions at the end of the last step.
     pub(crate) fn grasped(&self) -> impl Iterator<Item = (usize, Motion)> {
         self.grasped.iter().map(|grasped| (grasped.index, grasped.now))
     }
 
-    /// The imposed motion of a point at the end of the last step, if it has one.
+    /// Returns the imposed motion of a point at the end of the last step; `None` for a free point.
     pub(crate) fn motion(&self, model: &Model, index: usize) -> Option<Motion> {
         let fixed = || model.fixed.binary_search(&index).is_ok().then(Motion::default);
         self.grasped.iter().find(|g| g.index == index).map(|g| g.now).or_else(fixed)

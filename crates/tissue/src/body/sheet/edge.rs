@@ -23,12 +23,13 @@ pub(crate) struct Edge<V: Vector> {
     to: usize,
     /// The force that each row passes to the right, in the sweep's order.
     across: [[V::Real; BLOCK]; 3],
-    /// The forces of the diagonals that each row leaves to the row below.
+    /// The forces of the diagonals on the row below.
     leaves: [V; 3],
 }
 
 impl<V: Vector> Edge<V> {
-    /// Begins a strip whose first row is `row`. The force from the strip above is in the carry, if there is one.
+    /// Begins a strip whose first row is `row`. The force from the strip above is in the carry, if there is
+    /// one.
     ///
     /// # Safety
     /// As for `Sweep::rows`; `column` is not 0.
@@ -44,7 +45,8 @@ impl<V: Vector> Edge<V> {
         Edge { column, from: row, to: row, across: [[V::Real::default(); BLOCK]; 3], leaves }
     }
 
-    /// The force that the column passes to the right in row `i`, in the last lane. Call it for consecutive rows.
+    /// Returns the force that the column passes to the right in row `i`, in the last lane. Call it for
+    /// consecutive rows.
     ///
     /// # Safety
     /// As for `Sweep::rows`; the strip's rows from `i` on have not been advanced.
@@ -105,7 +107,8 @@ impl<V: Vector> Edge<V> {
         (self.from, self.to) = (row, row + V::LANES);
     }
 
-    /// Leaves to the strip below, which begins at row `end`, the forces that a block of this column would have left.
+    /// Stores the forces for the strip below, which begins at row `end`, as a block of this column would have
+    /// left them.
     ///
     /// # Safety
     /// As for `Sweep::rows`.

@@ -1,15 +1,16 @@
-//! A disc on a rectangular sheet.
+//! The disc of a tool on a rectangular sheet.
 //!
-//! The surface between points is bilinear: the material place c (in the rest plane) is at Σ N_p(c)·x_p, N_p the bilinear
-//! hats. The hats are averaged over a smaller disc, chosen so that the area that shares a force (`super`) is that of the
-//! requested disc, in the mean over its places in a cell. From two spacings across on that is exact; below, the hats alone
-//! are too large.
+//! The surface between points is bilinear: the material place c (in the rest plane) is at Σ N_p(c)·x_p, with
+//! N_p the bilinear hat functions. The hats are averaged over a smaller disc, chosen so that the area that
+//! shares a force (`tools::footprint`) is that of the requested disc, in the mean over its places in a cell.
+//! From two spacings across on this is exact; below, the hats alone are too large.
 //!
-//! The integral is a sum over rings of equal area, each with points at equal angles: sums of first powers vanish, and
-//! sums of second powers are the same in every direction.
+//! The integral is a sum over rings of equal area, each with points at equal angles: sums of first powers
+//! vanish, and sums of second powers are the same in every direction.
 //!
-//! A disc has at most 1024 such places, and a place lies among four points. So no disc covers more than 4096 points, however
-//! large it is and however fine the sheet: its memory and the work to make, lay or press it are bounded by that.
+//! A disc has at most 1024 sample places, and a place lies among four points. So no disc covers more than 4096
+//! points, however large it is and however fine the sheet: this bounds its memory and the work of creating,
+//! moving and pressing it.
 
 use std::cell::RefCell;
 use std::f64::consts::TAU;
@@ -19,42 +20,43 @@ use glam::DVec2;
 
 use crate::scene::Sheet;
 
-/// Least number of rings in a disc; larger discs have two per spacing.
+/// Smallest number of rings in a disc; larger discs have two per spacing.
 const MIN_RINGS: f64 = 6.0;
 
-/// Each ring is rotated against the one before, so that hardly two places cross a grid line at once. The slope of the
-/// surface jumps at each crossing; this makes the sum change smoothly.
+/// Rotation of each ring against the one before, so that hardly two sample places cross a grid line at once.
+/// The slope of the surface jumps at each crossing; this makes the sum change smoothly.
 const GOLDEN: f64 = 0.618_033_988_749_895;
 
-/// Most rings. Beyond, a spacing has fewer than two, which makes no difference to a disc that large.
+/// Largest number of rings. Beyond, a spacing has fewer than two, which makes no difference to a disc that
+/// large.
 const MAX_RINGS: f64 = 16.0;
 
-/// Places in a ring, for each ring of its disc.
+/// Sample places in a ring, for each ring of its disc.
 const PLACES_PER_RING: u32 = 4;
 
-/// Each place has at least a quarter of its own square left to it: with n places, Σ w² is at least 1/(4·n), so the area of a
-/// drawn disc is at most 4·n, in spacings squared. A little more, for rounding.
+/// Upper bound of a disc's area, in spacings squared. Each sample place has at least a quarter of a square to
+/// itself: with n places, Σ w² is at least 1/(4·n), so the area is at most 4·n. A little more, for rounding.
 const MAX_AREA: f64 = 4.0 * PLACES_PER_RING as f64 * MAX_RINGS * MAX_RINGS * (1.0 + 1e-6);
 
-/// A rectangle of more points than this is not laid out as a whole, but by the points that are met.
+/// A rectangle of more points than this is not stored as a whole, but only the points that are met.
 const MAX_LAID_OUT: usize = 1 << 14;
 
-/// A disc on a sheet, at a place. Lengths in m.
+/// The disc of a tool on a sheet, at a place. Lengths in m.
 #[derive(Debug, Clone)]
 pub(crate) struct GridDisc {
-    /// Radius of the disc that the hats are averaged over.
+    /// Radius of the disc over which the hats are averaged.
     drawn_m: f64,
-    /// Sample places of the sum, from the centre.
+    /// Sample places of the sum, relative to the centre.
     offsets_m: Vec<DVec2>,
     pub(crate) centre_m: DVec2,
-    /// Scratch memory: what each point has of the places, by rows.
+    /// Scratch memory: the sums of each point, by rows.
     sums: Vec<(f64, DVec2)>,
-    /// The points of these sums, where the rectangle around them is too large to be laid out.
+    /// The points of these sums, if the rectangle around them is too large to be stored.
     met: Vec<[usize; 2]>,
 }
 
 impl GridDisc {
-    /// A disc that has no place yet.
+    /// Creates a disc without a place.
     pub(crate) fn new(sheet: &Sheet, radius_m: f64) -> Self {
         let spacing_m = sheet.spacing_m;
         let drawn = drawn_radius(radius_m / spacing_m);
@@ -67,8 +69,9 @@ impl GridDisc {
         }
     }
 
-    /// Moves the disc to a place, onto the sheet if that is beside it. Tells the points that it covers then, by rows, their
-    /// weights and how these change with the place, 1/m; nothing if it was there already.
+    /// Moves the disc to a place, or to the edge of the sheet if the place is beside it. Returns the points
+    /// that it then covers, by rows, with their weights and the derivatives of these by the place, 1/m; `None`
+    /// if it was there already.
     pub(crate) fn move_to(
         &mut self,
         sheet: &Sheet,
@@ -116,7 +119,7 @@ impl GridDisc {
         }))
     }
 
-    /// Finds the points around the places.
+    /// Finds the points around the sample places.
     fn intersect(&mut self, sheet: &Sheet) {
         let GridDisc { offsets_m, met, centre_m, .. } = self;
         for_each_share(sheet, *centre_m, offsets_m, |point, _, _| met.push(point));
@@ -125,8 +128,9 @@ impl GridDisc {
     }
 }
 
-/// Calls `add` for each place and each of the four points around it, with the place's part of the point's weight and how that
-/// changes with the centre, 1/m. A point may be beyond the last of a row or column, where its part is 0.
+/// Calls `add` for each sample place and each of the four points around it, with the place's part of the
+/// point's weight and its derivative by the centre, 1/m. A point may be beyond the last of a row or column;
+/// then its part is 0.
 fn for_each_share(sheet: &Sheet, centre_m: DVec2, offsets_m: &[DVec2], mut add: impl FnMut([usize; 2], f64, DVec2)) {
     #[allow(clippy::cast_precision_loss)]
     let share = 1.0 / offsets_m.len() as f64;
@@ -147,7 +151,7 @@ fn for_each_share(sheet: &Sheet, centre_m: DVec2, offsets_m: &[DVec2], mut add: 
     }
 }
 
-/// The directions from the centre to the places of a disc of so many rings, ring by ring.
+/// Returns the directions from the centre to the sample places of a disc with `rings` rings, ring by ring.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn directions(rings: u32) -> &'static [DVec2] {
     static KNOWN: [OnceLock<Vec<DVec2>>; MAX_RINGS as usize + 1] = [const { OnceLock::new() }; MAX_RINGS as usize + 1];
@@ -161,7 +165,7 @@ fn directions(rings: u32) -> &'static [DVec2] {
     })
 }
 
-/// Places spread evenly over a disc. All lengths in spacings.
+/// Returns sample places spread evenly over a disc. All lengths in spacings.
 fn disc(radius: f64) -> Vec<DVec2> {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     let rings = (2.0 * radius).ceil().clamp(MIN_RINGS, MAX_RINGS) as u32;
@@ -170,16 +174,16 @@ fn disc(radius: f64) -> Vec<DVec2> {
     (0..rings).zip(of_rings).flat_map(|(ring, of_ring)| of_ring.iter().map(move |way| out(ring) * *way)).collect()
 }
 
-/// So many radii a thread remembers.
+/// Number of radii that a thread remembers.
 const REMEMBERED: usize = 256;
 
 thread_local! {
-    /// Radii, and those of the discs that are drawn for them: a tool that touches again, or another with the same tip, costs
-    /// a look here.
+    /// Radii, and those of the discs that the hats are averaged over: a tool that touches again, or another
+    /// with the same tip, only costs a lookup.
     static DRAWN: RefCell<Vec<[f64; 2]>> = RefCell::new(vec![[f64::NAN; 2]; REMEMBERED]);
 }
 
-/// The radius, in spacings, of the disc whose blurred weights have the area of a disc of `radius`.
+/// Returns the radius, in spacings, of the disc whose blurred weights have the area of a disc of `radius`.
 fn drawn_radius(radius: f64) -> f64 {
     #[allow(clippy::cast_possible_truncation)]
     let slot = (radius.to_bits().wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 56) as usize % REMEMBERED;
@@ -197,24 +201,26 @@ fn find_drawn_radius(radius: f64) -> f64 {
     let mut scratch = Vec::new();
     for _ in 0..24 {
         let middle = 0.5 * (low + high);
-        // What is surely smaller need not be computed; of a large disc that is every one.
+        // Skip the computation if the area is certainly smaller; for a large disc it always is.
         let is_smaller = most_area(middle) < target || shared_area(middle, &mut scratch) < target;
         if is_smaller { low = middle } else { high = middle }
     }
     0.5 * (low + high)
 }
 
-/// No area that [`shared_area`] finds for a radius is above this. By the inequality of Cauchy and Schwarz it is at most the number
-/// of points with a weight: those within √2 of a place, each in a square of its own.
+/// Returns an upper bound of the area that [`shared_area`] finds for a radius. By the inequality of Cauchy and
+/// Schwarz it is at most the number of points with a weight: those within √2 of a place, each in a square of
+/// its own.
 fn most_area(radius: f64) -> f64 {
     let reach = radius + 2.2;
     (std::f64::consts::PI * reach * reach).min(MAX_AREA)
 }
 
-/// Places in a cell at which the weights are taken together, so that the processor need not wait for one sum after another.
+/// Places in a cell whose weights are computed together, so that the processor need not wait for one sum after
+/// another.
 const TOGETHER: usize = 4;
 
-/// 1/Σ w² on an infinite grid, in the mean over places in a cell, in spacings squared.
+/// Returns 1/Σ w² on an infinite grid, in the mean over places in a cell, in spacings squared.
 fn shared_area(radius: f64, weights: &mut Vec<[f64; TOGETHER]>) -> f64 {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     let (reach, offsets) = (radius.ceil() as usize + 2, disc(radius));
@@ -228,7 +234,7 @@ fn shared_area(radius: f64, weights: &mut Vec<[f64; TOGETHER]>) -> f64 {
             for offset in &offsets {
                 #[allow(clippy::cast_precision_loss)]
                 let at = DVec2::new(x, y) + *offset + (reach as f64 - 1.0);
-                // None is negative: the whole part is what is below.
+                // No coordinate is negative, so the cast rounds down.
                 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
                 let [i, j] = [at.x as usize, at.y as usize];
                 #[allow(clippy::cast_precision_loss)]
@@ -251,7 +257,8 @@ fn shared_area(radius: f64, weights: &mut Vec<[f64; TOGETHER]>) -> f64 {
     samples * samples * count / sum
 }
 
-/// The cell of a coordinate and the position in it, from 0 to 1. Coordinates outside the sheet are clamped to its edge.
+/// Returns the cell of a coordinate and the position in it, from 0 to 1. Coordinates outside the sheet are
+/// clamped to its edge.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 fn cell(sheet: &Sheet, axis: usize, at_m: f64) -> (usize, f64) {
     let last = sheet.points[axis].saturating_sub(2);

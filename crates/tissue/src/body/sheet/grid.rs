@@ -19,8 +19,9 @@ pub(crate) struct Grid<'a, T> {
 /// Rows of the carry: two for the row before, and two for bending springs, which reach two rows on.
 pub(crate) const CARRY_ROWS: usize = 4;
 
-/// Q of a spring whose rest vector is `rest` times the unit vector along it: 2·along + Δ·Δ, where `along` is D0·Δ. The
-/// added [`Real::FAINT`] keeps the squares of small Δ across the spring above the subnormal range.
+/// Returns Q of a spring whose rest vector is `rest` times the unit vector along it: 2·along + Δ·Δ, where
+/// `along` is D0·Δ. The added [`Real::FAINT`] keeps the squares of small Δ across the spring above the
+/// subnormal range.
 #[inline(always)]
 pub(crate) fn excess<V: Vector>(along: V, delta: &[V; 3], [first, second, third]: [usize; 3]) -> V {
     let faint = along.mul_add(along.splat(V::Real::of(2.0)), along.splat(V::Real::of(V::Real::FAINT)));

@@ -12,19 +12,19 @@
 //!
 //! A lane's result depends on the same operations in the same order at every width: the bits are the same.
 //!
-//! Where only part of the sheet is awake (`tiles`), the sweep goes over strips: rectangles of rows and columns that
-//! cover the awake part, plus the springs above that its forces need. The stage gets awake blocks only. The springs of
-//! the column to the left of a strip are evaluated along the column, a vector of rows at a time ([`Edge`]): a block of
-//! columns for each row would cost as much as an awake block. (Bending springs begin two columns to the left and do use
-//! that block.)
+//! If only part of the sheet is awake (`sleep::tiles`), the sweep covers strips: rectangles of rows and columns
+//! that cover the awake part, plus the springs above that its forces need. The stage gets awake blocks only.
+//! The springs of the column to the left of a strip are evaluated along the column, a vector of rows at a time
+//! ([`Edge`]): a block of columns for each row would cost as much as an awake block. (Bending springs begin two
+//! columns to the left and do use that block.)
 //!
-//! **Small numbers.** Arithmetic below the normal range is tens of times slower, and fields decay in time and space without
-//! end. So the sweep stores 0 for a value whose square is below that range; springs with too little strain do not pull
-//! (`Real::MIN_EXCESS`); squares are added to a number that nothing notices. Two-step schemes cut increments alone: a
-//! displacement is their sum, and cutting it as well would take 5 % of a step.
+//! **Small numbers.** Arithmetic below the normal range is tens of times slower, and fields decay in time and
+//! space without end. So the sweep stores 0 for a value whose square is below that range; springs with too
+//! little strain do not pull (`Real::MIN_EXCESS`); squares are added to a negligible number. Two-step schemes
+//! cut only increments: a displacement is their sum, and cutting it as well would take 5 % of a step.
 //!
-//! **Speed.** Calls that the compiler does not inline lose their caller's vector instructions. Hot code therefore uses no
-//! iterators and closures over vectors, which are ten times slower.
+//! **Speed.** Calls that the compiler does not inline lose their caller's vector instructions. Hot code
+//! therefore uses no iterators and closures over vectors, which are ten times slower.
 #![allow(unsafe_code)]
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions, ten
 // times slower.

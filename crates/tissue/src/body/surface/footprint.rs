@@ -1,4 +1,5 @@
-//! A disc on a mesh: its place, found by walking, and by a search where a tool may have come near another part.
+//! The disc of a tool on a mesh. It moves by walking over the surface; a search finds another part that the
+//! tool may have reached.
 
 use std::sync::Arc;
 
@@ -11,17 +12,17 @@ use crate::shape::PointId;
 use crate::state::saved::{SavedGeometry, ensure};
 use palpate_refusal::Result;
 
-/// A tool that touches nothing goes over to another place of the surface if that is nearer by this part of the radius: it
-/// must not hop to and fro between two.
+/// A tool that touches nothing moves to another place of the surface if that is nearer by this part of the
+/// radius, so that it does not jump back and forth between two places.
 const NEARER: f64 = 0.1;
 
-/// The place on a mesh that a snapshot has; none of one on a sheet.
+/// Returns the place on a mesh that a snapshot has; `None` for one on a sheet.
 fn place_of(saved: &SavedGeometry) -> Option<Place> {
     let SavedGeometry::Mesh { triangle, barycentric, frame } = saved else { return None };
     Some(Place { triangle: *triangle, barycentric: *barycentric, frame: frame.map(DVec3::from) })
 }
 
-/// A disc on a mesh, at a place.
+/// The disc of a tool on a mesh, at a place.
 #[derive(Debug, Clone)]
 pub(crate) struct MeshDisc {
     shape: Arc<MeshShape>,
@@ -30,7 +31,7 @@ pub(crate) struct MeshDisc {
 }
 
 impl MeshDisc {
-    /// A disc anywhere.
+    /// Creates a disc at an arbitrary place.
     pub(crate) fn new(shape: &Arc<MeshShape>, radius_m: f64) -> Self {
         let surface = shape.surface();
         let nowhere = Place { triangle: 0, barycentric: [1.0 / 3.0; 3], frame: [DVec3::X, DVec3::Y] };
@@ -38,17 +39,17 @@ impl MeshDisc {
         MeshDisc { shape: shape.clone(), disc: SurfaceDisc::new(radius_m, surface.edge_m()), place }
     }
 
-    /// Its place.
+    /// Returns the place as plain data.
     pub(crate) fn saved(&self) -> SavedGeometry {
         let Place { triangle, barycentric, frame } = self.place;
         SavedGeometry::Mesh { triangle, barycentric, frame: frame.map(Into::into) }
     }
 
-    /// Takes the place of another.
+    /// Checks a saved place and moves the disc there.
     pub(crate) fn restore(&mut self, saved: &SavedGeometry) -> Result<()> {
         let Some(place) = place_of(saved) else { return Ok(()) };
         let triangles = self.shape.triangles().len();
-        ensure((place.triangle as usize) < triangles, "a tool on a triangle that the tissue has not")?;
+        ensure((place.triangle as usize) < triangles, "a tool on a triangle that the tissue lacks")?;
         let hats = place.barycentric;
         let is_inside =
             hats.iter().all(|hat| (0.0..=1.0).contains(hat)) && (hats.iter().sum::<f64>() - 1.0).abs() < 1e-6;
@@ -56,7 +57,7 @@ impl MeshDisc {
         let corners_m = self.shape.surface().triangle(&place).map(|vertex| self.shape.vertices_m()[vertex as usize]);
         let normal = (corners_m[1] - corners_m[0]).cross(corners_m[2] - corners_m[0]).normalize_or_zero();
         let [along, across] = place.frame;
-        // Of a triangle like a needle, the normal is known to the ratio of its sides times a rounding error.
+        // The normal of a needle-like triangle is accurate to the ratio of its sides times a rounding error.
         let is_square = |a: DVec3, b: DVec3| a.dot(b).abs() < 1e-3;
         let is_one = |v: DVec3| (v.length() - 1.0).abs() < 1e-3;
         let is_frame = is_one(along)
@@ -69,51 +70,51 @@ impl MeshDisc {
         Ok(())
     }
 
-    /// Goes to a place where it was.
+    /// Moves the disc back to an earlier place.
     pub(crate) fn go_to(&mut self, saved: &SavedGeometry) {
         self.place = place_of(saved).unwrap_or(self.place);
     }
 
-    /// Where the place rests, m.
+    /// Returns the rest position of the place, m.
     pub(crate) fn anchor_m(&self) -> DVec3 {
         self.shape.surface().at_m(&self.place)
     }
 
-    /// The outward normal of its triangle at rest.
+    /// Returns the outward normal of its triangle at rest.
     pub(crate) fn outward(&self) -> DVec3 {
         let [along, across] = self.place.frame;
         along.cross(across)
     }
 
-    /// How the outward normal changes along the surface at rest, 1/m: the mean over the disc.
+    /// Returns the change of the outward normal along the surface at rest, 1/m: the mean over the disc.
     pub(crate) fn curvature_per_m(&self) -> DMat3 {
         let surface = self.shape.surface();
         let of = |covered: &Covered| covered.weight * surface.curvature_per_m(covered.vertex as usize);
         self.disc.covered().iter().map(of).fold(DMat3::ZERO, |sum, part| sum + part)
     }
 
-    /// The side on which it is ([`palpate_geometry::surface::Surface::side`]).
+    /// Returns the side on which a tool is ([`palpate_geometry::surface::Surface::side`]).
     pub(crate) fn side(&self, height_m: f64) -> f64 {
         self.shape.surface().side(height_m, self.disc.radius_m())
     }
 
-    /// Goes to the place of the rest surface that is nearest to `at_m`.
+    /// Moves the disc to the place of the rest surface nearest to `at_m`.
     pub(crate) fn put(&mut self, at_m: DVec3) {
         self.place = self.shape.surface().nearest(at_m).unwrap_or(self.place);
     }
 
-    /// How far it may move at once, m.
+    /// Returns how far the disc may move at once, m.
     pub(crate) fn stride_m(&self) -> f64 {
         self.disc.stride_m()
     }
 
-    /// Walks by `by_m` in the directions of the place.
+    /// Walks over the surface by `by_m` in the directions of the place.
     pub(crate) fn walk(&mut self, by_m: DVec2) {
         self.place = self.shape.surface().walk(&self.place, by_m);
     }
 
-    /// Goes over to the place that is nearest to `place_m` by the rest surface, if the moved surface is nearer there than
-    /// where the disc is. Tells whether it did.
+    /// Moves the disc to the place of the rest surface nearest to `place_m`, if the displaced surface is nearer
+    /// there than at the disc. Returns whether it moved.
     pub(crate) fn leap(&mut self, model: &Model, place_m: DVec3, displacement_m: impl Fn([usize; 2]) -> DVec3) -> bool {
         let (surface, Some(graph)) = (self.shape.surface(), &model.graph) else { return false };
         let Some(other) = surface.nearest(place_m) else { return false };
@@ -134,13 +135,14 @@ impl MeshDisc {
         is_nearer
     }
 
-    /// The weight of a vertex.
+    /// Returns the weight of a vertex.
     #[allow(clippy::cast_possible_truncation)]
     pub(crate) fn weight_of(&self, vertex: PointId) -> f64 {
         self.disc.weight_of(vertex.index() as u32)
     }
 
-    /// The vertices that the disc covers, their weights, how these change with the place, and where they rest.
+    /// Returns the vertices that the disc covers, with their weights, the derivatives of these by the place,
+    /// and their rest positions.
     pub(crate) fn cover(&mut self) -> impl Iterator<Item = (PointId, f64, DVec2, DVec3)> + '_ {
         let surface = self.shape.surface();
         self.disc.lay(surface, &self.place);

@@ -1,4 +1,4 @@
-//! What a tissue on a mesh consists of: points, and springs between any two of them, as the caller numbers them.
+//! The input of the mesh kernel: points, and springs between any two of them, in the caller's numbering.
 
 use glam::DVec3;
 use thiserror::Error;
@@ -6,76 +6,78 @@ use thiserror::Error;
 /// A spring between two points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeshSpring {
-    /// The points.
+    /// The numbers of the two points.
     pub ends: [u32; 2],
-    /// k, N/m.
+    /// Stiffness k, N/m.
     pub stiffness_n_per_m: f64,
 }
 
-/// Points and springs. Several springs may join the same points.
+/// Points and springs of a tissue on a mesh. Several springs may join the same points.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshGraph {
-    /// Where each point is at rest, m.
+    /// Rest position of each point, m.
     pub rest_m: Vec<DVec3>,
     /// The springs, each once.
     pub springs: Vec<MeshSpring>,
     /// The unit of length h of the state, m: about the length of a spring.
     pub spacing_m: f64,
-    /// The mass of each point over the mass of reference. Empty if all are 1.
+    /// The mass of each point divided by the reference mass. Empty if all are 1.
     pub relative_mass: Vec<f64>,
-    /// K″/m of each point over that of reference, minus 1: above 0 where the tissue is stiffer. Empty if all are 0.
+    /// K″/m of each point divided by the reference value, minus 1: above 0 where the tissue is stiffer. Empty
+    /// if all are 0.
     pub extra_anchor: Vec<f64>,
 }
 
-/// Why a graph can't be computed.
+/// The reason why a graph can't be computed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 pub enum GraphFault {
-    /// No point, or more than there can be.
+    /// No point, or too many points or springs. Contains the number of points.
     #[error("has {0} points: must have 1 to {most}", most = MAX_POINTS)]
     Count(usize),
-    /// A list has neither no value nor one for each point.
+    /// A list has some values, but not one for each point. Contains its length.
     #[error("has {0} masses or extra stiffnesses, not one for each point")]
     Length(usize),
     /// The unit of length is not a positive number.
     #[error("has a unit of length that is not a positive number")]
     Spacing,
-    /// A place, mass or extra stiffness of this point is not finite, or the mass not positive.
+    /// The place, mass or extra stiffness of this point is not finite, or its mass is not positive.
     #[error("point {0} has a place, mass or extra stiffness that is not a number in its range")]
     Point(usize),
-    /// A spring joins a point to itself or to none.
+    /// This spring joins a point to itself or to a missing point.
     #[error("spring {0} does not join two points")]
     Ends(usize),
-    /// A stiffness is negative or not finite.
+    /// The stiffness of this spring is negative or not finite.
     #[error("spring {0} has a stiffness that is negative or not finite")]
     Stiffness(usize),
-    /// A spring is so short, or so long, that its strain can't be computed.
+    /// This spring is too short or too long for its strain to be computed.
     #[error("spring {0} is shorter than a millionth of the unit of length, or longer than a million")]
     Rest(usize),
 }
 
-/// Records are counted by values in 32 bits.
+/// Largest number of points and of springs: records are counted in 32 bits.
 pub(super) const MAX_POINTS: usize = 1 << 28;
 
 /// The range of rest lengths, in spacings: the squares of tiny strains stay in the normal range (`Real::FAINT`).
 const LENGTHS: [f64; 2] = [1e-6, 1e6];
 
 impl MeshGraph {
-    /// The mass of a point over the mass of reference.
+    /// Returns the mass of a point divided by the reference mass.
     pub(super) fn mass(&self, point: u32) -> f64 {
         self.relative_mass.get(point as usize).copied().unwrap_or(1.0)
     }
 
-    /// The extra K″/m of a point.
+    /// Returns the extra K″/m of a point.
     pub(super) fn extra(&self, point: u32) -> f64 {
         self.extra_anchor.get(point as usize).copied().unwrap_or(0.0)
     }
 
-    /// The vector from one point to another at rest, in spacings. With the ends exchanged it is exactly the opposite.
+    /// Returns the vector from one point to another at rest, in spacings. With the ends exchanged it is exactly
+    /// the opposite.
     pub(super) fn rest(&self, from: u32, to: u32) -> DVec3 {
         (self.rest_m[to as usize] - self.rest_m[from as usize]) / self.spacing_m
     }
 
-    /// Whether it can be computed.
+    /// Checks that the graph can be computed. Returns the first fault.
     pub(super) fn check(&self) -> Result<(), GraphFault> {
         let count = self.rest_m.len();
         if !(1..=MAX_POINTS).contains(&count) || self.springs.len() > MAX_POINTS {

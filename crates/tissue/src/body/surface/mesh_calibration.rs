@@ -1,4 +1,4 @@
-//! A mesh in free motion by central differences: the kernel alone, for benches and tests.
+//! A mesh in free motion by central differences: only the kernel, for benchmarks and tests.
 #![allow(unsafe_code)]
 
 use std::cell::RefCell;
@@ -20,26 +20,26 @@ use crate::scheme::advance::AdvanceStage;
 use crate::scheme::arithmetic::MAX_KEPT;
 use crate::scheme::family::Family;
 
-/// A mesh of f32 in free motion, all of it awake.
+/// A mesh in free motion in f32, all of it awake: for benchmarks and tests of the kernel.
 #[derive(Debug)]
 pub struct MeshTrial(FreeMotion<f32>);
 
 impl MeshTrial {
-    /// Creates the mesh at rest. `turn`: the phase per step of a point's anchor spring alone, rad; `scale`: dt²/m of the mass of
-    /// reference, m/N.
+    /// Creates the mesh at rest. `turn` is the phase per step of a point's anchor spring alone, rad; `scale` is
+    /// dt²/m with the reference mass, m/N.
     ///
     /// # Errors
-    /// What is wrong with the graph.
+    /// Returns the first fault of the graph.
     pub fn new(graph: &MeshGraph, turn: f64, scale: f64, lanes: Lanes) -> Result<Self, GraphFault> {
         Ok(MeshTrial(FreeMotion::new(MeshSlots::new(graph)?, turn, scale, lanes)))
     }
 
-    /// Displaces each vertex, spacings.
+    /// Sets the displacement of each vertex, spacings; `of_vertex` gets the vertex number.
     pub fn displace(&mut self, of_vertex: impl Fn(usize) -> DVec3) {
         self.0.displace(of_vertex);
     }
 
-    /// Advances all points by so many steps.
+    /// Advances all points by `steps` steps.
     pub fn step(&mut self, steps: usize) {
         (0..steps).for_each(|_| self.0.step());
     }
@@ -57,7 +57,7 @@ impl MeshTrial {
     }
 }
 
-/// The same in any number format, with any part awake.
+/// A mesh in free motion in any number format, with any part awake.
 #[derive(Debug)]
 pub(super) struct FreeMotion<T: Real> {
     pub(super) slots: MeshSlots,

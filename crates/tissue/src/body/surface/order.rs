@@ -1,9 +1,9 @@
-//! The order of a mesh's points: points that are near along the mesh come near to each other, whatever its shape in
-//! space.
+//! The order of a mesh's points in memory: points that are near along the mesh are near in the order, whatever
+//! the shape in space.
 //!
-//! A set of points is split in two again and again, down to blocks. Each time two of its points are found that are far
-//! apart along the mesh, and those nearer to the one are put before those nearer to the other. (Orders in space, such as
-//! curves that fill it, fail where two parts of a surface lie close.)
+//! A set of points is split in two again and again, down to blocks. Each time, two of its points that are far
+//! apart along the mesh are found, and the points nearer to the one are put before those nearer to the other.
+//! (Orders in space, such as space-filling curves, fail where two parts of a surface are close.)
 
 use std::cmp::Reverse;
 
@@ -14,20 +14,20 @@ use crate::kernel::field::BLOCK;
 use crate::kernel::region::TILE;
 use crate::memory;
 
-/// Slots of a tile.
+/// Slots (places of vertices in memory) of a tile.
 pub(super) const TILE_SLOTS: usize = TILE * BLOCK;
 
 /// The name of the tables in messages.
 pub(super) const TABLES: &str = "the points of a mesh";
 
-/// For each point its springs, and the points at their other ends.
+/// The springs of each point, and the points at their other ends.
 pub(super) struct Adjacency {
     firsts: Vec<u32>,
     others: Vec<(u32, u32)>,
 }
 
 impl Adjacency {
-    /// Of a graph whose springs join existing points.
+    /// Collects the springs of a graph, which must join existing points.
     #[allow(clippy::cast_possible_truncation)]
     pub(super) fn of(graph: &MeshGraph) -> Self {
         let mut firsts: Vec<u32> = memory::zeroed(graph.rest_m.len() + 2, TABLES);
@@ -50,14 +50,14 @@ impl Adjacency {
         Adjacency { firsts, others }
     }
 
-    /// (other end, spring) for each spring of a point, ascending by springs.
+    /// Returns (other end, spring) for each spring of a point, ascending by springs.
     pub(super) fn of_point(&self, point: u32) -> &[(u32, u32)] {
         let [from, to] = [0, 1].map(|next| self.firsts[point as usize + next] as usize);
         &self.others[from..to]
     }
 }
 
-/// The points in their new order.
+/// Returns the points in their new order.
 #[allow(clippy::cast_possible_truncation)]
 pub(super) fn order(count: usize, adjacency: &Adjacency) -> Vec<u32> {
     let mut order = memory::collected(0..count as u32, TABLES);
@@ -67,7 +67,7 @@ pub(super) fn order(count: usize, adjacency: &Adjacency) -> Vec<u32> {
         let length = to - from;
         if length > BLOCK {
             walks.sort(&mut order[from..to]);
-            // Whole tiles as long as there are several, then whole blocks.
+            // Whole tiles while there are several, then whole blocks.
             let unit = if length > TILE_SLOTS { TILE_SLOTS } else { BLOCK };
             let half = (length / 2 + unit / 2) / unit * unit;
             let middle = from + half.clamp(unit, (length - 1) / unit * unit);
@@ -81,13 +81,13 @@ pub(super) fn order(count: usize, adjacency: &Adjacency) -> Vec<u32> {
     order
 }
 
-/// Walks over sets of points, breadth first.
+/// Breadth-first walks over sets of points.
 struct Walks<'a> {
     adjacency: &'a Adjacency,
-    /// The last set that each point was in, and the last walk that came to it.
+    /// The last set that contained each point, and the last walk that reached it.
     set: Vec<u32>,
     walk: Vec<u32>,
-    /// Of each point, in the first of two walks.
+    /// The distance of each point in the first of two walks.
     distance: Vec<u32>,
     /// The points of the last walk and their distances.
     came: Vec<(u32, u32)>,
@@ -125,7 +125,7 @@ impl<'a> Walks<'a> {
             let distance = self.distance[point as usize];
             self.ranks.push((i64::from(distance) - i64::from(away), distance, point));
         }
-        // No two are equal.
+        // All ranks differ.
         self.ranks.sort_unstable();
         points.iter_mut().zip(&self.ranks).for_each(|(point, rank)| *point = rank.2);
     }

@@ -1,8 +1,8 @@
-//! The springs of a mesh as the vectors of a width read them.
+//! The springs of a mesh in the arrangement that the vectors of a width read.
 //!
-//! A spring has five coefficients: the three components of the rest vector D0, 1/L0², and the stiffness over the relative
-//! mass of its own end. A row holds one spring for each lane, coefficient by coefficient; where a lane has none, all
-//! are 0. There are two arrangements of rows:
+//! A spring has five coefficients: the three components of the rest vector D0, 1/L0², and the stiffness divided
+//! by the relative mass of its own end. A row holds one spring for each lane, coefficient by coefficient; if a
+//! lane has none, all are 0. There are two arrangements of rows:
 //!
 //! - [`Rows`], for any width: row k of a vector of slots has the k-th spring of each. The neighbours are loaded from
 //!   their records, wherever these are.
@@ -20,20 +20,20 @@ use crate::kernel::lanes::{LaneShape, Names, record_place};
 use crate::kernel::real::Real;
 use crate::memory;
 
-/// Coefficients of a spring.
+/// Number of coefficients of a spring.
 pub(super) const COEFFICIENTS: usize = 5;
 
 /// The springs of a mesh for a number format and a width. Independent of substep and scheme.
 #[derive(Debug)]
 pub(crate) struct MeshSprings<T> {
-    /// The vectors that they are arranged for.
+    /// The shape of the vectors that they are arranged for.
     pub(super) shape: LaneShape,
     /// The number of slots.
     pub(super) slots: usize,
     pub(super) arrangement: Arrangement<T>,
     /// The relative mass of each slot. `None` if all are 1.
     pub(super) masses: Option<Field<T>>,
-    /// The extra K″/m of each slot over that of reference. `None` if all are 0.
+    /// The extra K″/m of each slot divided by the reference value. `None` if all are 0.
     pub(super) extra: Option<Field<T>>,
 }
 
@@ -43,40 +43,40 @@ pub(super) enum Arrangement<T> {
     Halo(Halo<T>),
 }
 
-/// The k-th springs of each vector of slots in row k.
+/// The springs of each vector of slots: the k-th springs in row k.
 #[derive(Debug)]
 pub(super) struct Rows<T> {
-    /// For each vector of slots, its first row; then the number of all.
+    /// The first row of each vector of slots; then the number of all rows.
     pub(super) firsts: Vec<u32>,
-    /// For each row and lane, where the record of the other end begins.
+    /// Where the record of the other end begins, for each row and lane.
     pub(super) places: Vec<u32>,
     pub(super) coefficients: Field<T>,
 }
 
-/// The springs of each block in one part or more.
+/// The springs of each block, in one or more parts.
 #[derive(Debug)]
 pub(super) struct Halo<T> {
-    /// For each block, its first part; then the number of all.
+    /// The first part of each block; then the number of all parts.
     pub(super) firsts: Vec<u32>,
     pub(super) parts: Vec<Part>,
-    /// Where the records of the halos begin: each has whole vectors.
+    /// Where the records of the halos begin: each halo has whole vectors.
     pub(super) places: Vec<u32>,
-    /// For each row, the other ends: among the block's own points, and then in its halo.
+    /// The other ends of each row: first the block's own points, then those of its halo.
     pub(super) others: Vec<Names>,
     pub(super) coefficients: Field<T>,
-    /// For each packed row, the lanes of the springs' own ends, and the number of passes that move its forces.
+    /// The lanes of the springs' own ends in each packed row, and the number of passes that move its forces.
     pub(super) owners: Vec<Names>,
     pub(super) passes: Vec<u8>,
-    /// For each pass, the lane whose force comes to each lane.
+    /// For each pass, the lane whose force moves to each lane.
     pub(super) returns: Vec<Names>,
 }
 
-/// Part of a block's springs.
+/// A part of a block's springs.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Part {
     /// The first row.
     pub(super) row: u32,
-    /// Plain rows, and packed rows after these.
+    /// Number of plain rows, and of the packed rows after them.
     pub(super) plain: u32,
     pub(super) packed: u32,
     /// The first packed row among all packed rows, and the first pass.
@@ -92,24 +92,25 @@ pub(super) struct Part {
 /// The most common size of a halo: 17 to 24 points around a block.
 pub(super) const ONE_AND_A_HALF: u32 = 3;
 
-/// Half vectors that hold a halo.
+/// Returns the number of half vectors that hold a halo.
 fn halves_of(around: &[u32]) -> usize {
     around.len().div_ceil(BLOCK / 2).max(1)
 }
 
-/// The lane of a point of a halo, counted over its vectors.
+/// Returns the lane of a point of a halo, counted over its vectors.
 fn halo_lane(number: usize, halves: usize) -> usize {
     let beyond = number.checked_sub(BLOCK).filter(|_| halves == ONE_AND_A_HALF as usize);
     beyond.map_or(number, |beyond| BLOCK + beyond / 2 * 4 + beyond % 2)
 }
 
 impl<T: Real> MeshSprings<T> {
-    /// The relative mass of each slot, and the extra K″/m of each; null if all are 1, or 0.
+    /// Returns the relative mass of each slot, and the extra K″/m of each; null if all masses are 1, or all
+    /// extra values 0.
     pub(crate) fn masses_and_extra(&self) -> [*const T; 2] {
         [&self.masses, &self.extra].map(|field| field.as_ref().map_or(std::ptr::null(), |field| field.as_ptr()))
     }
 
-    /// Arranges the springs of a mesh.
+    /// Arranges the springs of a mesh for vectors of a shape.
     pub(crate) fn new(slots: &MeshSlots, shape: LaneShape) -> Self {
         let of_slots = |values: &[f64]| {
             (!values.is_empty()).then(|| {
@@ -128,7 +129,7 @@ impl<T: Real> MeshSprings<T> {
     }
 }
 
-/// The coefficients of a spring.
+/// Returns the coefficients of a spring.
 pub(super) fn coefficients<T: Real>(half: &HalfSpring) -> [T; COEFFICIENTS] {
     // A component below the normal range of squares would be slow, and changes nothing.
     let rest =
@@ -174,7 +175,7 @@ impl<T: Real> Rows<T> {
     }
 }
 
-/// The springs of a lane in a row, if it has one, and the lane of its own end.
+/// The spring of each lane in a row, if it has one, and the lane of its own end.
 type Lanes<'a> = [Option<(usize, &'a HalfSpring)>; BLOCK];
 
 /// A halo under construction.
@@ -186,7 +187,7 @@ struct Packing<T> {
 #[allow(clippy::cast_possible_truncation)]
 impl<T: Real> Halo<T> {
     fn new(slots: &MeshSlots) -> Self {
-        // About as much as it takes. (A third of the lanes may be empty.)
+        // Approximate memory. (A third of the lanes may be empty.)
         let bytes = slots.count() * (COEFFICIENTS * size_of::<T>() + 4) * 3 / 2;
         memory::require(bytes as u64, TABLES);
         let halo = Halo {
@@ -226,7 +227,7 @@ impl<T: Real> Halo<T> {
 
 #[allow(clippy::cast_possible_truncation)]
 impl<T: Real> Packing<T> {
-    /// Adds springs of a block that end in it or in `around`.
+    /// Adds the springs of a block that end in it or in `around`.
     fn push_part(&mut self, block: usize, around: &[u32], springs: &[&[HalfSpring]; BLOCK]) {
         let plain = plain_rows(springs);
         let packed = beyond(springs, plain);
@@ -286,20 +287,21 @@ impl<T: Real> Packing<T> {
     }
 }
 
-/// (lane, number) of the springs beyond the first `plain` ones of each lane, in the order of their numbers.
+/// Returns (lane, number) of the springs beyond the first `plain` ones of each lane, in the order of their
+/// numbers.
 fn beyond(springs: &[&[HalfSpring]; BLOCK], plain: usize) -> Vec<(usize, usize)> {
     let most = springs.iter().map(|springs| springs.len()).max().unwrap_or(0);
     let of = |k: usize| (0..BLOCK).filter(move |lane| k < springs[*lane].len()).map(move |lane| (lane, k));
     (plain..most).flat_map(of).collect()
 }
 
-/// Passes that move the forces of a packed row: the most springs that any lane has there.
+/// Returns the number of passes that move the forces of a packed row: the most springs that any lane has there.
 fn passes(row: &[(usize, usize)]) -> usize {
     (0..BLOCK).map(|lane| row.iter().filter(|spring| spring.0 == lane).count()).max().unwrap_or(0)
 }
 
-/// The number of plain rows that costs least, if a packed row takes 1.5 times as long as a plain one and a quarter more
-/// for each pass. (Estimates; with 1.1 or 2.2 a step takes as long.)
+/// Returns the cheapest number of plain rows, if a packed row takes 1.5 times as long as a plain one and a
+/// quarter more for each pass. (Estimates; with 1.1 or 2.2 a step takes equally long.)
 #[allow(clippy::cast_precision_loss)]
 fn plain_rows(springs: &[&[HalfSpring]; BLOCK]) -> usize {
     let most = springs.iter().map(|springs| springs.len()).max().unwrap_or(0);
@@ -314,7 +316,7 @@ mod tests {
 
     use super::*;
 
-    /// Rows of a block of which so many lanes have a first spring, so many a second, and so on.
+    /// Returns the number of plain rows of a block in which `filled[k]` lanes have a k-th spring.
     fn plain_rows_of(filled: &[usize]) -> usize {
         let half = HalfSpring { to: 0, rest: DVec3::X, stiffness: 1.0 };
         let lanes: [Vec<HalfSpring>; BLOCK] =

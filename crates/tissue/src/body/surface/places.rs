@@ -1,4 +1,5 @@
-//! Where the points of a mesh rest, by slots, and what its tiles border on: what forces and sleep ask of a mesh.
+//! The rest positions of a mesh's points by slots (places in memory), and the neighbours of its tiles: for
+//! forces and sleep.
 
 use std::ops::Range;
 
@@ -12,36 +13,38 @@ use crate::memory;
 use crate::scene::Mesh;
 use crate::shape::{Extent, PointId, RestShape};
 
-/// The slots of a mesh, and where they are in space.
+/// The slots of a mesh, and their positions in space.
 #[derive(Debug)]
 pub(crate) struct MeshPlaces {
     pub(crate) slots: MeshSlots,
-    /// Where the point of each slot rests, m; not a number where there is none.
+    /// Rest position of the point of each slot, m; NaN for an empty slot.
     rest_m: Vec<DVec3>,
     /// The middle of each row's points, m, and the radius of the ball around them.
     balls: Vec<(DVec3, f64)>,
     /// The ends of the box around each tile's points, m.
     boxes: Vec<[[f64; 2]; 3]>,
-    /// The slots beyond each tile that its springs lead to, ascending; and where each tile's begin, and the last end.
+    /// The slots beyond each tile that its springs reach, ascending; and where each tile's slots begin, with
+    /// the end of the last.
     around: Vec<u32>,
     firsts_around: Vec<usize>,
-    /// For each tile, the least K″ of a point over that of reference. Empty if all are 1.
+    /// The smallest K″ of a point of each tile divided by the reference value. Empty if all are 1.
     least_pulls: Vec<f64>,
-    /// The least extra K″/m of any point, at most 0; and the largest relative mass.
+    /// The smallest extra K″/m of any point, at most 0; and the largest relative mass.
     pub(crate) least_extra: f64,
     pub(crate) largest_mass: f64,
-    /// What the mesh encloses, if that resists.
+    /// The enclosed volume, if it resists changes.
     pub(crate) volume: Option<VolumePlaces>,
 }
 
-/// A volume by slots.
+/// An enclosed volume, by slots.
 #[derive(Debug)]
 pub(crate) struct VolumePlaces {
     /// a of each slot, in squares of the unit of length.
     pub(crate) areas: Vec<DVec3>,
-    /// The fourth power of the unit of length over the volume, m: times κ the stiffness of the growth of the volume.
+    /// The fourth power of the unit of length divided by the volume, m. Times κ, it is the stiffness of the
+    /// volume's growth.
     pub(crate) stretch_m: f64,
-    /// For each tile, the largest a of a point that moves over its K″ over that of reference.
+    /// For each tile, the largest a of a movable point divided by its relative K″.
     pub(crate) reaches: Vec<f64>,
 }
 
@@ -64,7 +67,7 @@ impl VolumePlaces {
         Some(VolumePlaces { stretch_m: unit_m.powi(4) / volume.volume_m3, reaches, areas })
     }
 
-    /// a of a slot over its relative mass, in squares of the unit of length.
+    /// Returns a of a slot divided by its relative mass, in squares of the unit of length.
     pub(crate) fn over_mass(&self, slots: &MeshSlots, slot: usize) -> DVec3 {
         let area = self.areas[slot];
         if area == DVec3::ZERO { area } else { area / slots.mass(slot) }
@@ -72,10 +75,10 @@ impl VolumePlaces {
 }
 
 impl MeshPlaces {
-    /// Of the mesh of a scene. The k of a spring is that over the k of an edge.
+    /// Lays out the mesh of a scene. The k of a spring is relative to the reference k.
     ///
     /// # Errors
-    /// What is wrong with its springs.
+    /// Returns the fault of its springs.
     pub(crate) fn of(mesh: &Mesh) -> Result<Self, GraphFault> {
         let springs = mesh.springs();
         let graph = MeshGraph {
@@ -136,40 +139,40 @@ impl MeshPlaces {
         })
     }
 
-    /// Rows of memory.
+    /// Returns the number of rows in memory.
     pub(crate) fn rows(&self) -> usize {
         self.slots.blocks()
     }
 
-    /// The slot of a point.
+    /// Returns the slot of a point.
     pub(crate) fn slot_of(&self, point: PointId) -> usize {
         self.slots.slot_of()[point.index()] as usize
     }
 
-    /// The point in a slot; in an empty one, the first.
+    /// Returns the point in a slot; for an empty slot, the first point.
     pub(crate) fn point_in(&self, slot: usize) -> PointId {
         let vertex = self.slots.vertex_of()[slot];
         PointId::new(if vertex == NO_VERTEX { 0 } else { vertex as usize })
     }
 
-    /// The springs of a slot: the slot of the other end, the vector to it at rest in units of length, and k over that of an
-    /// edge.
+    /// Returns the springs of a slot: the slot of the other end, the vector to it at rest in units of length,
+    /// and k divided by the reference k.
     pub(crate) fn joined(&self, slot: usize) -> impl Iterator<Item = (usize, DVec3, f64)> + '_ {
         let mass = self.slots.mass(slot);
         self.slots.springs(slot).iter().map(move |half| (half.to as usize, half.rest, half.stiffness * mass))
     }
 
-    /// Where the point of a slot rests, m.
+    /// Returns the rest position of a slot's point, m.
     pub(crate) fn rest_m(&self, slot: usize) -> DVec3 {
         self.rest_m[slot]
     }
 
-    /// Where the points of a row rest, m.
+    /// Returns the rest positions of a row's points, m.
     pub(crate) fn rest_in_row(&self, row: usize) -> &[DVec3] {
         &self.rest_m[row * BLOCK..(row + 1) * BLOCK]
     }
 
-    /// The rows from the first to the last that may have a point within a ball.
+    /// Returns the rows from the first to the last that may have a point within a ball.
     pub(crate) fn rows_within(&self, centre_m: DVec3, radius_m: f64) -> Range<usize> {
         let is_near = |(middle_m, ball_m): &(DVec3, f64)| middle_m.distance(centre_m) - ball_m <= radius_m;
         match (self.balls.iter().position(is_near), self.balls.iter().rposition(is_near)) {
@@ -178,28 +181,29 @@ impl MeshPlaces {
         }
     }
 
-    /// The ends of the box around the points of a tile along each axis, m.
+    /// Returns the ends of the box around the points of a tile along each axis, m.
     pub(crate) fn box_of(&self, tile: usize) -> &[[f64; 2]; 3] {
         &self.boxes[tile]
     }
 
-    /// The least K″ of a tile's points over that of reference.
+    /// Returns the smallest K″ of a tile's points divided by the reference value.
     pub(crate) fn least_pull(&self, tile: usize) -> f64 {
         self.least_pulls.get(tile).copied().unwrap_or(1.0)
     }
 
-    /// The tiles that springs join to a tile, ascending.
+    /// Returns the tiles that springs join to a tile, ascending.
     pub(crate) fn beside(&self, tile: usize) -> impl Iterator<Item = usize> + '_ {
         self.slots.neighbours(tile).iter().map(|other| *other as usize)
     }
 
-    /// The slots beyond a tile that its springs lead to, ascending, and the place of the first in the list of all tiles.
+    /// Returns the slots beyond a tile that its springs reach, ascending, and the place of the first in the
+    /// list of all tiles.
     pub(crate) fn around(&self, tile: usize) -> (&[u32], usize) {
         let [from, to] = [self.firsts_around[tile], self.firsts_around[tile + 1]];
         (&self.around[from..to], from)
     }
 
-    /// The length of that list.
+    /// Returns the length of the list of all tiles' outside slots.
     pub(crate) fn watched_slots(&self) -> usize {
         self.around.len()
     }

@@ -1,11 +1,13 @@
-//! The pressure of a mesh that encloses a volume, as its sweeps need it: by how much the volume has grown, and what that pushes.
+//! The pressure of a mesh that encloses a volume, for its sweeps: the growth of the volume, and the resulting
+//! forces.
 //!
-//! The volume grows by Σ a·u over all points, and each point is pushed by −κ/V0 times that, times its own a (`scene::volume`).
-//! So before each sweep the sum is formed, over the tiles that are awake; what those asleep add is known. Then the force of a
-//! point is that of its springs minus one number times its a: every scheme treats it as it does the springs.
+//! The volume grows by Σ a·u over all points, and each point is pushed by −κ/V0 times that, times its own a
+//! (`scene::volume`). So before each sweep the sum is computed over the awake tiles; the contribution of
+//! sleeping tiles is known. Then the force on a point is that of its springs minus one number times its a:
+//! every scheme treats it like the springs.
 //!
-//! Tiles are added up apart, columns apart within them, in f64 and in one order: the sum has the same bits at every width, and
-//! does not depend on what was asleep before.
+//! Tiles are summed separately, and columns separately within them, in f64 and in a fixed order: the sum has
+//! the same bits at every width, and does not depend on what slept before.
 #![allow(unsafe_code)]
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions, ten
 // times slower.
@@ -25,16 +27,17 @@ use crate::memory;
 pub(crate) struct Pressure<T> {
     /// a of each place, h²: three planes.
     areas: Field<T>,
-    /// The same over the relative mass, if that is not 1 everywhere.
+    /// a of each place divided by its relative mass, if masses differ.
     over_masses: Option<Field<T>>,
     /// What each tile adds to the volume, h³.
     tiles: RefCell<Vec<f64>>,
-    /// What times a over the relative mass is taken from the springs' force in the coming sweep.
+    /// The factor whose product with a, divided by the relative mass, is subtracted from the springs' force in
+    /// the next sweep.
     push: Cell<f64>,
 }
 
 impl<T: Real> Pressure<T> {
-    /// Of a mesh at rest; none if it encloses no volume.
+    /// Creates the tables of a mesh at rest; `None` if it encloses no volume.
     pub(crate) fn new(graph: &MeshPlaces, layout: &Layout) -> Option<Self> {
         let volume = graph.volume.as_ref()?;
         let field = |mass: &dyn Fn(usize) -> f64| {
@@ -51,7 +54,7 @@ impl<T: Real> Pressure<T> {
         Some(Pressure { areas: field(&|_| 1.0), over_masses, tiles, push: Cell::new(0.0) })
     }
 
-    /// By how much the volume has grown, h³, after the points of `tiles` have moved to `u`.
+    /// Returns the growth of the volume, h³, after the points of `tiles` have moved to `u`.
     pub(crate) fn volume_change(&self, width: Width, layout: &Layout, u: &Field<T>, tiles: &[usize]) -> f64 {
         let mut known = self.tiles.borrow_mut();
         debug_assert!(u.len() == 3 * layout.plane && self.areas.len() == u.len());
@@ -62,25 +65,25 @@ impl<T: Real> Pressure<T> {
         known.iter().sum()
     }
 
-    /// From the coming sweep on, what was pushed by `push`.
+    /// Sets the factor of the pressure from the next sweep on.
     pub(crate) fn set(&self, push: T) {
         self.push.set(push.wide());
     }
 
-    /// What the coming sweep multiplies, and by what.
+    /// Returns the factor of the pressure and the planes that it multiplies.
     pub(crate) fn at_hand(&self) -> (T, *const T) {
         (T::of(self.push.get()), self.over_masses.as_ref().unwrap_or(&self.areas).as_ptr())
     }
 }
 
-/// What takes the pressure off the springs' force, for a growth of the volume (h³) and what is the factor of it.
+/// Returns the factor of the pressure for a growth of the volume (h³); `factor` converts the growth to it.
 pub(crate) fn push_of<T: Real>(factor: f64, volume_change: f64) -> T {
     let push = factor * volume_change;
-    // Products with smaller ones may be below the normal range.
+    // Products with smaller factors may be below the normal range.
     if push.abs() < T::MIN_MAGNITUDE { T::default() } else { T::of(push) }
 }
 
-/// Forms the sums of some tiles.
+/// Computes the sums of some tiles.
 struct Sums<'a, T> {
     layout: Layout,
     areas: *const T,

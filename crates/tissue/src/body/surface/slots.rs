@@ -1,4 +1,5 @@
-//! Where the points of a mesh are in the state, and the springs of each place in the order in which forces are summed.
+//! The slots of a mesh: a slot is a place of a vertex in the blocks that vectors sweep. Also the springs of
+//! each slot, in the order in which forces are summed.
 
 use glam::DVec3;
 
@@ -8,10 +9,11 @@ use crate::kernel::field::{BLOCK, Layout};
 use crate::kernel::real::Real;
 use crate::memory;
 
-/// The place of no point.
+/// The vertex number of an empty slot.
 pub const NO_VERTEX: u32 = u32::MAX;
 
-/// Outside neighbours that a block takes up at once. If it has more, its springs are in several parts.
+/// Largest number of outside neighbours that a block handles at once. If it has more, its springs are in
+/// several parts.
 pub(super) const HALO: usize = 3 * BLOCK;
 
 /// A spring, seen from one of its ends.
@@ -19,34 +21,35 @@ pub(super) const HALO: usize = 3 * BLOCK;
 pub(super) struct HalfSpring {
     /// The slot of the other end.
     pub(super) to: u32,
-    /// The vector to it at rest, spacings.
+    /// The vector to the other end at rest, spacings.
     pub(super) rest: DVec3,
-    /// k over the relative mass of this end, N/m.
+    /// k divided by the relative mass of this end, N/m.
     pub(super) stiffness: f64,
 }
 
-/// The points of a mesh in slots, and their springs. Independent of substep, scheme, number format and vector width.
+/// The vertices of a mesh in slots, and their springs. A slot is a place of a vertex in the blocks that vectors
+/// sweep. Independent of substep, scheme, number format and vector width.
 #[derive(Debug)]
 pub struct MeshSlots {
     slot_of: Vec<u32>,
     vertex_of: Vec<u32>,
-    /// For each slot, the number of its first spring; then the number of all.
+    /// The number of each slot's first spring; then the number of all.
     firsts: Vec<u32>,
     halves: Vec<HalfSpring>,
-    /// For each slot, the relative mass; 0 without a point. Empty if all are 1.
+    /// The relative mass of each slot; 0 if it is empty. The list is empty if all are 1.
     masses: Vec<f64>,
-    /// For each slot, the extra K″/m over that of reference. Empty if all are 0.
+    /// The extra K″/m of each slot divided by the reference value. Empty if all are 0.
     extra: Vec<f64>,
-    /// For each tile, the number of its first neighbour; then the number of all.
+    /// The number of each tile's first neighbour; then the number of all.
     first_neighbours: Vec<u32>,
     neighbours: Vec<u32>,
 }
 
 impl MeshSlots {
-    /// Places the points of a graph.
+    /// Assigns the vertices of a graph to slots: vertices that are near along the mesh come near to each other.
     ///
     /// # Errors
-    /// What is wrong with the graph.
+    /// Returns the first fault of the graph.
     #[allow(clippy::cast_possible_truncation)]
     pub fn new(graph: &MeshGraph) -> Result<Self, GraphFault> {
         graph.check()?;
@@ -112,22 +115,23 @@ impl MeshSlots {
         }
     }
 
-    /// Returns the slot of each vertex.
+    /// Returns the slot of each vertex, by vertex.
     pub fn slot_of(&self) -> &[u32] {
         &self.slot_of
     }
 
-    /// Returns the vertex of each slot; [`NO_VERTEX`] where there is none.
+    /// Returns the vertex of each slot, by slot; [`NO_VERTEX`] for an empty one. Their number is a multiple of
+    /// 16.
     pub fn vertex_of(&self) -> &[u32] {
         &self.vertex_of
     }
 
-    /// Returns the blocks of 16 slots: the rows of the layout.
+    /// Returns the number of blocks of 16 slots, the rows of the layout.
     pub fn blocks(&self) -> usize {
         self.vertex_of.len() / BLOCK
     }
 
-    /// Returns the tiles of 256 slots, the last of which may have fewer.
+    /// Returns the number of tiles of 256 slots; the last tile may have fewer.
     pub fn tiles(&self) -> usize {
         self.vertex_of.len().div_ceil(TILE_SLOTS)
     }
@@ -138,57 +142,57 @@ impl MeshSlots {
         &self.neighbours[from..to]
     }
 
-    /// The layout of a state: 16 columns, and the offset of a slot is its number.
+    /// Returns the layout of a state: 16 columns, and the offset of a slot is its number.
     pub(crate) fn layout<T: Real>(&self) -> Layout {
         let layout = Layout::new::<T>([self.blocks(), BLOCK]);
         debug_assert_eq!(layout.stride, BLOCK);
         layout
     }
 
-    /// The springs of a slot, in the order in which their forces are summed.
+    /// Returns the springs of a slot, in the order in which their forces are summed.
     pub(super) fn springs(&self, slot: usize) -> &[HalfSpring] {
         &self.halves[self.firsts[slot] as usize..self.firsts[slot + 1] as usize]
     }
 
-    /// The number of all halves of springs.
+    /// Returns the number of all halves of springs.
     pub(super) fn count(&self) -> usize {
         self.halves.len()
     }
 
-    /// The slots outside a block that its springs reach, ascending.
+    /// Returns the slots outside a block that its springs reach, ascending.
     pub(super) fn outside(&self, block: usize) -> Vec<u32> {
         let slots = block * BLOCK..(block + 1) * BLOCK;
         let halves = &self.halves[self.firsts[slots.start] as usize..self.firsts[slots.end] as usize];
         outside(halves.iter().map(|half| half.to), block)
     }
 
-    /// The relative masses of the slots. Empty if all are 1.
+    /// Returns the relative masses of the slots. Empty if all are 1.
     pub(super) fn masses(&self) -> &[f64] {
         &self.masses
     }
 
-    /// Whether masses differ.
+    /// Returns whether masses differ.
     pub(crate) fn has_masses(&self) -> bool {
         !self.masses.is_empty()
     }
 
-    /// The mass of a slot over that of reference; 0 without a point, if not all are 1.
+    /// Returns the mass of a slot divided by the reference mass; 0 for an empty slot, if masses differ.
     pub(crate) fn mass(&self, slot: usize) -> f64 {
         self.masses.get(slot).copied().unwrap_or(1.0)
     }
 
-    /// K″/m of a slot over that of reference, minus 1.
+    /// Returns K″/m of a slot divided by the reference value, minus 1.
     pub(crate) fn extra_at(&self, slot: usize) -> f64 {
         self.extra.get(slot).copied().unwrap_or(0.0)
     }
 
-    /// The extra K″/m of the slots over that of reference. Empty if all are 0.
+    /// Returns the extra K″/m of the slots divided by the reference value. Empty if all are 0.
     pub(super) fn extra(&self) -> &[f64] {
         &self.extra
     }
 }
 
-/// Those of some slots that are outside a block, ascending, each once.
+/// Returns those of some slots that are outside a block, ascending, each once.
 fn outside(slots: impl Iterator<Item = u32>, block: usize) -> Vec<u32> {
     let mut outside: Vec<u32> = slots.filter(|slot| *slot as usize / BLOCK != block).collect();
     outside.sort_unstable();
@@ -196,8 +200,8 @@ fn outside(slots: impl Iterator<Item = u32>, block: usize) -> Vec<u32> {
     outside
 }
 
-/// The part of a block's springs to which a spring to slot `to` belongs: those within the block, and those to the first
-/// [`HALO`] slots `outside`, are part 0.
+/// Returns the part of a block's springs to which a spring to slot `to` belongs. Part 0 has those within the
+/// block, and those to the first [`HALO`] slots `outside`.
 pub(super) fn part(outside: &[u32], block: usize, to: u32) -> usize {
     if to as usize / BLOCK == block { 0 } else { outside.partition_point(|slot| *slot < to) / HALO }
 }

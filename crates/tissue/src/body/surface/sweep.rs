@@ -4,9 +4,9 @@
 //! this end is stiffness·weight(q)·e, with the weight of `springs` for a rest length of 1. Small numbers are treated as
 //! there.
 //!
-//! **Large strains.** The polynomial holds up to |q| = 1/8. A block is first computed as if it did everywhere, keeping
-//! the largest q², which costs one operation a spring and no branch. Where a spring is beyond, the block is computed
-//! again with the form that holds for each lane.
+//! **Large strains.** The polynomial is valid up to |q| = 1/8. A block is first computed as if it were valid
+//! everywhere, while the largest q² is kept, which costs one operation per spring and no branch. If a spring is
+//! beyond, the block is computed again with the form that is valid for each lane.
 #![allow(unsafe_code)]
 // The compiler does not always inline iterators over vectors. They then run without the caller's instructions, ten
 // times slower.
@@ -29,29 +29,30 @@ use crate::memory;
 /// Bytes of a cache line.
 const LINE: usize = 64;
 
-/// How far ahead coefficients are asked for, bytes: about two blocks. (Measured: saves a tenth at 10,000 points.)
+/// How far ahead coefficients are prefetched, bytes: about two blocks. (Measured: saves a tenth at 10,000
+/// points.)
 const AHEAD: usize = 4096;
 
-/// What a sweep reads, and where it keeps its snapshot.
+/// What a sweep reads, and where it keeps its snapshot of the displacements.
 pub(crate) struct MeshGrid<'a, T> {
     pub(crate) layout: Layout,
     pub(crate) slots: &'a MeshSlots,
     pub(crate) springs: &'a MeshSprings<T>,
-    /// A spring of length 1, whose stiffness is the factor that puts N/m over the mass of reference in the scheme's
-    /// units.
+    /// A spring of length 1, whose stiffness is the factor from N/m, divided by the reference mass, to the
+    /// scheme's units.
     pub(crate) unit: &'a SpringCoefficients<T>,
-    /// a in the scheme's units of force: what the extra anchor stiffness multiplies.
+    /// a = K″·dt²/m in the scheme's units of force: the factor of the extra anchor stiffness.
     pub(crate) pull: T,
-    /// What times three planes is taken from the force, over the relative mass: the pressure. The planes are null if there is
-    /// none.
+    /// The pressure: a factor and three planes, whose product is subtracted from the force divided by the
+    /// relative mass. The planes are null without a volume.
     pub(crate) push: (T, *const T),
     /// Displacements: three planes, spacings.
     pub(crate) x: *const T,
-    /// Room of this mesh's size.
+    /// Memory of this mesh's size.
     pub(crate) snapshot: &'a RefCell<Snapshot<T>>,
 }
 
-/// Room for the displacements before a sweep. Nothing in it is kept from one sweep to the next.
+/// Memory for the displacements before a sweep. Nothing in it is kept from one sweep to the next.
 #[derive(Debug)]
 pub(crate) struct Snapshot<T> {
     /// A record for each slot.
@@ -61,13 +62,13 @@ pub(crate) struct Snapshot<T> {
 }
 
 impl<T: Real> Snapshot<T> {
-    /// For a mesh.
+    /// Allocates a snapshot for a mesh.
     pub(crate) fn of(slots: &MeshSlots) -> Self {
         let records = Field::of_length(record_place(slots.vertex_of().len()));
         Snapshot { records, copied: memory::filled(slots.tiles(), false, TABLES) }
     }
 
-    /// Overwrites what no sweep may need.
+    /// Overwrites the values, which no sweep may need.
     #[cfg(test)]
     pub(super) fn fill(&mut self, value: T) {
         self.records.fill(value);
@@ -81,12 +82,12 @@ pub(crate) struct MeshSweep<'a, T, S> {
     pub(crate) stage: S,
 }
 
-/// What a sweep has at hand. The compiler keeps in registers what it knows that no store changes: so the numbers are
-/// copies.
+/// What a sweep uses in its inner loop. The compiler keeps values in registers if it knows that no store
+/// changes them: so the numbers are copies.
 struct AtHand<T> {
     unit: SpringCoefficients<T>,
     pull: T,
-    /// As in [`MeshGrid`].
+    /// The pressure, as in [`MeshGrid`].
     push: T,
     areas: *const T,
     plane: usize,
@@ -95,12 +96,12 @@ struct AtHand<T> {
     masses: *const T,
 }
 
-/// What the springs do to a vector of slots.
+/// The sums over the springs of a vector of slots.
 struct Sum<V> {
     force: [V; 3],
     /// The largest q².
     farthest: V,
-    /// The energies of the springs over the relative mass of this end, each spring whole.
+    /// The energies of the springs divided by the relative mass of this end, each spring whole.
     energy: V,
 }
 
@@ -122,7 +123,7 @@ impl<T: Real, S: Stage<T>> Run<T> for MeshSweep<'_, T, S> {
         // SAFETY: the caller's promise, and the springs and records are those of the slots.
         unsafe {
             let mut sums = self.stage.begin::<V>();
-            // Each width has one of both, and needs no code for the other.
+            // Each width uses one arrangement, and needs no code for the other.
             match &springs.arrangement {
                 Arrangement::Rows(rows) if !V::PICKS => {
                     self.tiles::<V>(&ByRows::of(rows, records), &at_hand, (records, copied), &mut sums);
@@ -163,7 +164,7 @@ impl<T: Real, S: Stage<T>> MeshSweep<'_, T, S> {
     ) {
         let MeshGrid { layout: Layout { rows, plane, .. }, slots, x, .. } = self.grid;
         for &tile in self.over.tiles() {
-            // Copies as late as possible, while the values are still needed soon.
+            // Copies as late as possible, while the values are still in the cache.
             // SAFETY: the caller's promise.
             unsafe {
                 self.copy_tile::<V>(tile, (records, &mut *copied));
@@ -196,7 +197,8 @@ impl<T: Real, S: Stage<T>> MeshSweep<'_, T, S> {
         }
     }
 
-    /// The force of the springs, and of the extra anchor stiffness, on the slots from `at` on.
+    /// Returns the force of the springs, of the extra anchor stiffness and of the pressure on the slots from
+    /// `at` on.
     #[inline(always)]
     unsafe fn force<V: Vector<Real = T>>(
         &self,
@@ -243,7 +245,7 @@ impl<T: Real, S: Stage<T>> MeshSweep<'_, T, S> {
 
 /// An arrangement of springs that can be summed for a vector of slots.
 trait Gather<V: Vector> {
-    /// What the springs do to the slots from `at` on. With `NEAR` it holds where no |q| is too far.
+    /// Sums the springs of the slots from `at` on. With `NEAR` the result is valid if no |q| is too large.
     ///
     /// # Safety
     /// The records have been written, and belong to the same mesh.
@@ -255,7 +257,7 @@ trait Gather<V: Vector> {
     ) -> Sum<V>;
 }
 
-/// Where the tables of [`Rows`] begin.
+/// Pointers to the tables of [`Rows`].
 struct ByRows<T> {
     records: *const T,
     firsts: *const u32,
@@ -290,7 +292,7 @@ impl<V: Vector> Gather<V> for ByRows<V::Real> {
     }
 }
 
-/// Where the tables of [`Halo`] begin.
+/// Pointers to the tables of [`Halo`].
 struct ByHalo<T> {
     records: *const T,
     firsts: *const u32,
@@ -407,7 +409,7 @@ impl<T: Real> ByHalo<T> {
 }
 
 impl<V: Vector> Sum<V> {
-    /// Of no spring; `proof` is that of vectors.
+    /// Returns the sum of no springs; `proof` proves that the processor has the instructions.
     #[inline(always)]
     fn zero(proof: &[V; 3]) -> Self {
         let zero = proof[0].splat(V::Real::default());
@@ -440,7 +442,7 @@ impl<V: Vector> Sum<V> {
 
 /// The other ends of the springs of a row.
 trait Ends<V: Vector> {
-    /// The displacements of the other ends.
+    /// Returns the displacements of the other ends.
     ///
     /// # Safety
     /// There is such a row.
@@ -476,7 +478,7 @@ impl<V: Vector, const G: usize> Ends<V> for Around<'_, V, G> {
     }
 }
 
-/// Adds the springs of `rows` (from, to), each of which belongs to its own lane.
+/// Adds the springs of the rows from `row` to `end`, each of which belongs to its own lane.
 ///
 /// # Safety
 /// There are such rows.
@@ -531,7 +533,8 @@ impl<V: Vector> Strain<V> {
         }
     }
 
-    /// What times e is the force. With `NEAR` it holds for small |q|, and `farthest` becomes the largest.
+    /// Returns the factor of e that gives the force. With `NEAR` it is valid for small |q|, and `farthest`
+    /// keeps the largest q².
     ///
     /// # Safety
     /// As for [`Strain::of`].
@@ -571,8 +574,8 @@ impl<V: Vector> Strain<V> {
     }
 }
 
-/// The force of the springs and of the extra anchor stiffness on one slot, for the few that a caller asks about, minus
-/// `pressed`. `unit` and `pull` as in [`MeshGrid`].
+/// Returns the force of the springs and of the extra anchor stiffness on one slot, minus the pressure
+/// `pressed`. For a few single points. `unit` and `pull` as in [`MeshGrid`].
 pub(crate) fn gather<T: Real>(
     slots: &MeshSlots,
     unit: &SpringCoefficients<T>,

@@ -29,12 +29,12 @@ pub(crate) trait Vector: Copy {
     /// # Safety
     /// `LANES` values can be written at `to`.
     unsafe fn store(self, to: *mut Self::Real);
-    /// `value` in every lane.
+    /// Returns `value` in every lane.
     ///
     /// # Safety
     /// The processor has the instructions.
     unsafe fn of(value: Self::Real) -> Self;
-    /// `value` in every lane; `self` only proves that the processor has such vectors.
+    /// Returns `value` in every lane; `self` only proves that the processor has such vectors.
     #[inline(always)]
     fn splat(self, value: Self::Real) -> Self {
         // SAFETY: `self` is such a vector.
@@ -45,43 +45,45 @@ pub(crate) trait Vector: Copy {
     fn mul(self, other: Self) -> Self;
     fn div(self, other: Self) -> Self;
     fn root(self) -> Self;
-    /// self·b + c, rounded once.
+    /// Returns self·b + c, rounded once.
     fn mul_add(self, b: Self, c: Self) -> Self;
-    /// self·b − c, rounded once.
+    /// Returns self·b − c, rounded once.
     fn mul_sub(self, b: Self, c: Self) -> Self;
-    /// self − a·b, rounded once.
+    /// Returns self − a·b, rounded once.
     fn minus(self, a: Self, b: Self) -> Self;
-    /// 1/√self within 4 %, from half the exponent: the bits of a positive number are nearly its logarithm.
+    /// Returns 1/√self within 4 %, from half the exponent: the bits of a positive number are nearly its
+    /// logarithm.
     fn approximate_inverse_root(self) -> Self;
-    /// 2^self, for integers from -100 to 100.
+    /// Returns 2^self, for integers from -100 to 100.
     fn power_of_two(self) -> Self;
-    /// `first`, `first` + 1, …; `self` is the proof.
+    /// Returns `first`, `first` + 1, …; `self` is the proof.
     fn count(self, first: usize) -> Self;
-    /// The larger; `other` if one is NaN.
+    /// Returns the larger value; `other` if one is NaN.
     fn larger(self, other: Self) -> Self;
-    /// The value of larger magnitude; either if one is NaN.
+    /// Returns the value of larger magnitude; either if one is NaN.
     fn farther(self, other: Self) -> Self;
-    /// Lanes where |self| > `bound`.
+    /// Returns the lanes where |self| > `bound`.
     fn beyond(self, bound: Self) -> Self::Mask;
-    /// Lanes where self > `bound`.
+    /// Returns the lanes where self > `bound`.
     fn above(self, bound: Self) -> Self::Mask;
-    /// Lanes where |self| is not below [`Real::MIN_MAGNITUDE`].
+    /// Returns the lanes where |self| is not below [`Real::MIN_MAGNITUDE`].
     fn counts(self) -> Self::Mask;
     fn any(mask: Self::Mask) -> bool;
     fn either(a: Self::Mask, b: Self::Mask) -> Self::Mask;
     fn both(a: Self::Mask, b: Self::Mask) -> Self::Mask;
-    /// `a` where the mask is set, else `b`.
+    /// Returns `a` where the mask is set, otherwise `b`.
     fn select(mask: Self::Mask, a: Self, b: Self) -> Self;
-    /// The first `count` lanes; `self` is the proof.
+    /// Returns the first `count` lanes; `self` is the proof.
     fn first(self, count: usize) -> Self::Mask;
-    /// 0 where the mask is not set.
+    /// Returns the value with 0 where the mask is not set.
     fn keep(self, mask: Self::Mask) -> Self;
     /// Shifts each lane up by one; the last lane of `before` comes in.
     fn shift(self, before: Self) -> Self;
     /// Shifts each lane up by two; the last two lanes of `before` come in.
     fn shift_two(self, before: Self) -> Self;
 
-    /// x, y and z of the records whose places, counted in values from `from`, stand at `places`, one for each lane.
+    /// Returns x, y and z of records. `places` has their places, counted in values from `from`, one for each
+    /// lane.
     ///
     /// # Safety
     /// The processor has the instructions; `LANES` places can be read, and the four values of each record.
@@ -121,19 +123,20 @@ pub(crate) trait Vector: Copy {
         }
     }
 
-    /// The same for every fourth lane and the one after it, in which records are that few vectors need. The others are
-    /// not specified, and their places not used.
+    /// Returns x, y and z of the records of every fourth lane and the one after it, which few vectors need. The
+    /// other lanes are not specified, and their places not used.
     ///
     /// # Safety
-    /// As for [`Vector::records`].
+    /// The processor has the instructions; `LANES` places can be read, and the four values of each record in
+    /// use.
     #[inline(always)]
     unsafe fn half_of_records(from: *const Self::Real, places: *const u32) -> [Self; 3] {
         // SAFETY: the caller's promise.
         unsafe { Self::records(from, places) }
     }
 
-    /// For each lane, the lane that `names` tells of each of N vectors: of `own` below `LANES`, of `others[0]` below
-    /// 2·`LANES`, and so on.
+    /// Returns, for each of N vectors, the lanes that `names` selects: of `own` below `LANES`, of `others[0]`
+    /// below 2·`LANES`, and so on.
     ///
     /// # Safety
     /// The names can be read.
@@ -161,7 +164,7 @@ pub(crate) trait Vector: Copy {
         picked
     }
 
-    /// The lanes that have a name ([`Names::of_some`]).
+    /// Returns the lanes that have a name ([`Names::of_some`]).
     ///
     /// # Safety
     /// The processor has the instructions, and the names can be read.
@@ -177,42 +180,44 @@ pub(crate) trait Vector: Copy {
         }
     }
 
-    /// Asks for the cache line at `at`, which need not exist.
+    /// Prefetches the cache line at `at`, which need not exist.
     #[inline(always)]
     fn prefetch(_at: *const Self::Real) {}
 }
 
-/// For each lane of a vector, a lane of one of several vectors ([`Vector::pick`]).
+/// For each lane of a vector, the number of a lane of one of several vectors ([`Vector::pick`]).
 #[derive(Debug, Clone, Copy)]
 #[repr(C)]
 pub(crate) struct Names {
     lanes: [u8; MAX_LANES],
-    /// Lanes that pick from the third vector or a later one; or, if some have no name, those that have.
+    /// Lanes that pick from the third vector or a later one; or, if some lanes have no name, those that have
+    /// one.
     mask: u16,
 }
 
 impl Names {
-    /// Names for vectors of `count` lanes.
+    /// Creates names for vectors of `count` lanes.
     pub(crate) fn of(lanes: [u8; MAX_LANES], count: usize) -> Self {
         Names { lanes, mask: mask(|lane| usize::from(lanes[lane]) >= 2 * count) }
     }
 
-    /// Names for some lanes.
+    /// Creates names for some lanes.
     pub(crate) fn of_some(lanes: [Option<u8>; MAX_LANES]) -> Self {
         Names { lanes: lanes.map(Option::unwrap_or_default), mask: mask(|lane| lanes[lane].is_some()) }
     }
 }
 
-/// The lanes for which something holds.
+/// Returns the lanes for which `holds` is true, as bits.
 fn mask(holds: impl Fn(usize) -> bool) -> u16 {
     (0..MAX_LANES).map(|lane| u16::from(holds(lane)) << lane).sum()
 }
 
-/// Lanes of the widest vector.
+/// Number of lanes of the widest vector.
 const MAX_LANES: usize = 16;
 
-/// Where the record (x, y, z and one value more) of a slot begins, in values. Within 16 slots, records are in the order in which
-/// registers hold them while they are transposed: those of slots 0, 4, 8 and 12, then those of 1, 5, 9 and 13, …
+/// Returns where the record (x, y, z and one more value) of a slot begins, in values. Within 16 slots, records
+/// are in the order in which registers hold them while they are transposed: those of slots 0, 4, 8 and 12, then
+/// those of 1, 5, 9 and 13, …
 #[inline(always)]
 pub(crate) const fn record_place(slot: usize) -> usize {
     4 * (slot & !15 | (slot & 3) << 2 | slot >> 2 & 3)
@@ -225,8 +230,8 @@ pub(crate) trait Run<T> {
     unsafe fn run<V: Vector<Real = T>>(&self);
 }
 
-/// Returns whether the processor has fused multiply-add, which every width needs. Calls of the C library that emulate it
-/// would have the same bits, and take several times as long.
+/// Returns whether the processor has fused multiply-add, which every width needs. Calls of the C library that
+/// emulate it would have the same bits, and take several times as long.
 pub(crate) fn fuses() -> bool {
     #[cfg(target_arch = "x86_64")]
     let fuses = is_x86_feature_detected!("fma");
@@ -264,13 +269,13 @@ pub(crate) fn available(lanes: Lanes) -> Option<Lanes> {
 pub(crate) struct Width(Lanes);
 
 impl Width {
-    /// The requested lanes if this machine has them, else those of `auto`.
+    /// Returns the requested lanes if this machine has them, otherwise those of `auto`.
     pub(crate) fn of(lanes: Lanes) -> Self {
         Width(available(lanes).or_else(|| available(Lanes::Auto)).unwrap_or(Lanes::Plain))
     }
 }
 
-/// What a width means for a number format: the lanes of its vectors, and [`Vector::PICKS`].
+/// The shape of a width's vectors for a number format: their lanes, and [`Vector::PICKS`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct LaneShape {
     pub(crate) lanes: usize,
@@ -283,7 +288,7 @@ impl LaneShape {
     }
 }
 
-/// The shape of a width's vectors of `T`.
+/// Returns the shape of a width's vectors of `T`.
 pub(crate) fn shape<T: Real>(width: Width) -> LaneShape {
     struct ShapeProbe(Cell<LaneShape>);
     impl<T: Real> Run<T> for ShapeProbe {
@@ -313,7 +318,8 @@ pub(crate) unsafe fn run<T: Real>(width: Width, program: &impl Run<T>) {
             Lanes::Neon => program.run::<T::Neon>(),
             #[cfg(target_arch = "x86_64")]
             _ => {
-                // `Width::of` has nothing else to fall back on, and no tissue is made for a machine without the instruction.
+                // `Width::of` has no alternative, and no tissue is created on a machine without the
+                // instruction.
                 assert!(fuses(), "the processor has no fused multiply-add");
                 x86::with_fma(program);
             }
@@ -453,7 +459,7 @@ mod tests {
         assert!(places.into_iter().eq((0..48).map(|slot| 4 * slot)));
     }
 
-    /// What each lane picks of one to four vectors, and what those with a name do.
+    /// The values that each lane picks from one to four vectors, and those of the lanes with a name.
     struct Picks<'a, T> {
         from: &'a [T],
         names: Names,

@@ -4,7 +4,7 @@
 
 use super::{Real, Vector};
 
-/// The operations that both formats have under the same name.
+/// The operations that have the same name in both formats.
 macro_rules! vector {
     ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $i:ident, |$self:ident, $before:ident| $shift_two:expr) => {
         /// A register.

@@ -1,7 +1,8 @@
-//! Vectors without instructions of their own: one lane for single points, two for processors without a wider set.
+//! Vectors without instructions of their own: one lane for single points, two for processors without a wider
+//! set.
 //!
-//! Each lane is a field, and each operation is written out by lanes: closures over arrays gave the same machine code, and more than half of
-//! what the compiler had to read of all sweeps.
+//! Each lane is a field, and each operation is written out by lanes: closures over arrays gave the same machine
+//! code, and were more than half of what the compiler had to read for all sweeps.
 
 use super::Vector;
 use crate::kernel::real::Real;
@@ -155,7 +156,7 @@ plain! {
 }
 
 impl<T: Real> Scalar<T> {
-    /// Nobody needs it: a single point has no neighbour in its vector.
+    /// Returns `before`. Nothing calls it for its result: a single point has no neighbour in its vector.
     #[inline(always)]
     fn shifted(self, before: Self, _: usize) -> Self {
         before

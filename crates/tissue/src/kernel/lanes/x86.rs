@@ -29,7 +29,7 @@ pub(super) unsafe fn with_fma<T: Real>(program: &impl Run<T>) {
     unsafe { program.run::<super::Pair<T>>() }
 }
 
-/// The operations that both widths and both formats have under the same name; the others follow in braces.
+/// The operations that have the same name in both widths and both formats; the others follow in braces.
 macro_rules! vector {
     ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $mask:ty, $i:ident, { $($own:tt)* }) => {
         /// A register.
@@ -75,8 +75,8 @@ macro_rules! vector {
     };
 }
 
-/// AVX-512 operations for a format: masks of their own type, and shifts across the register. Those of one format alone
-/// follow in braces.
+/// AVX-512 operations for a format: masks of their own type, and shifts across the register. Those of only one
+/// format follow in braces.
 macro_rules! avx512 {
     ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $mask:ty, $i:ident, { $($own:tt)* }) => {
         vector!($name, $real, $lanes, $mantissa, $mask, $i, {
@@ -134,8 +134,8 @@ macro_rules! avx512 {
     };
 }
 
-/// AVX2 operations for a format: masks are registers, and a shift first joins both halves. Those of one format alone
-/// follow in braces.
+/// AVX2 operations for a format: masks are registers, and a shift first joins both halves. Those of only one
+/// format follow in braces.
 macro_rules! avx2 {
     ($name:ident, $real:ty, $lanes:literal, $mantissa:literal, $i:ident, |$high:ident, $mid:ident| $shift:expr,
      |$high2:ident, $mid2:ident| $shift_two:expr, { $($own:tt)* }) => {
@@ -204,7 +204,7 @@ macro_rules! avx2 {
     };
 }
 
-/// Of each 128 bits of two registers, the first pair of values, and the last.
+/// Select, from each 128 bits of two registers, the first pair of values, or the last.
 const FIRST_PAIRS: i32 = 0b01_00_01_00;
 const LAST_PAIRS: i32 = 0b11_10_11_10;
 
@@ -224,7 +224,7 @@ mod wide_f32 {
         __m512i, _mm_loadu_ps as load_record, _mm_loadu_si128, _mm512_castps128_ps512 as begin, _mm512_cvtepu8_epi32,
         _mm512_insertf32x4 as insert,
     };
-    /// The records at every fourth of the places.
+    /// Returns the records at every fourth of the places.
     ///
     /// # Safety
     /// The processor has AVX-512; the places and their records can be read.
@@ -239,7 +239,7 @@ mod wide_f32 {
             insert::<3>(three, load_record(from.add(*places.add(12) as usize)))
         }
     }
-    /// The bytes as integers.
+    /// Returns the bytes as integers.
     ///
     /// # Safety
     /// The processor has AVX-512; 16 bytes can be read.
@@ -273,7 +273,7 @@ mod narrow_f32 {
     use std::arch::x86_64::{
         _mm_loadu_ps as load_record, _mm256_castps128_ps256 as begin, _mm256_insertf128_ps as insert,
     };
-    /// The records at every fourth of the places.
+    /// Returns the records at every fourth of the places.
     ///
     /// # Safety
     /// The processor has AVX2; the places and their records can be read.

@@ -1,11 +1,12 @@
-//! A coarse law: what a client is given at once where the exact law takes longer than it should wait.
+//! A coarse force law: what a client receives at once if the exact law takes longer than it should wait.
 //!
-//! It is put together from small sheets of the same tissue (`tangent::stand_in`). The first is all of the sheet, or as much
-//! of it as notices the disc, in few points: it knows the rim. Then come smaller and smaller ones around the disc, whose
-//! points are half as far apart each time. Under a given force, each of these lets the disc go deeper than the same piece
-//! of tissue does in the points before; these differences are added to the depth in the first.
+//! It is combined from small sheets of the same tissue (`tangent::stand_in`). The first is all of the sheet, or
+//! the part that notices the disc, with few points: it includes the rim. Then follow smaller and smaller ones
+//! around the disc, with half the spacing each time. Under a given force, each of these lets the disc go deeper
+//! than the same piece of tissue with the coarser points; these differences are added to the depth in the
+//! first.
 //!
-//! On a mesh it is that of the points around the disc, as many as time allows: those beyond are held.
+//! On a mesh, it is the law of the points around the disc, as many as time allows: those beyond are held.
 
 use std::sync::atomic::AtomicBool;
 
@@ -16,29 +17,29 @@ use super::exact::{ROWS as EXACT_ROWS, course, follow, pressed};
 use crate::Model;
 use crate::response::tangent::{self, Accuracy, Course};
 
-/// The most work of a first law, springs times iterations: 46 ms of processor time, at the 27 ns that one takes on an AMD
-/// EPYC (family 26). Work is counted, not timed, so that every machine gives the same law.
+/// Largest work of a first law, springs times iterations: 46 ms of processor time, at 27 ns per unit on an AMD EPYC
+/// (family 26). Work is counted, not timed, so that every machine gives the same law.
 const WORK: u64 = 1_700_000;
 
-/// The part of it that an exact law may take before a coarse one is made instead. A sheet whose exact law is begun in vain
-/// is a small one, for which the rest suffices.
+/// The part of it that an exact law may take before a coarse one is computed instead. If an exact law is begun
+/// in vain, the sheet is small, and the rest suffices for it.
 const EXACT_WORK: u64 = 1_000_000;
 
-/// Rows of a coarse law: cubics between them follow the exact one to a per cent.
+/// Rows of a coarse law: cubics between them follow the exact law to one per cent.
 const ROWS: u32 = 6;
 
-/// Half the intervals along the longer side of each small sheet, and the work that is left to those with fewer: they are made
-/// where the work for many does not suffice.
+/// Half the intervals along the longer side of each small sheet, and the work reserved for the choices with
+/// fewer: they are tried if the work for many does not suffice.
 const HALF_INTERVALS: [(u32, u64); 2] = [(6, 400_000), (4, 0)];
 
-/// Points of a mesh that are looked at, and the work that is left to those with fewer.
+/// Number of points of a mesh that are computed, and the work reserved for the choices with fewer.
 const POINTS: [(usize, u64); 3] = [(500, 650_000), (250, 200_000), (120, 0)];
 
-/// Points so many radii of the disc apart know what is under it.
+/// Distance of points, in radii of the disc, that is fine enough under the disc.
 const FINE_ENOUGH: f64 = 0.7;
 
-/// Returns the law to begin with: the exact one if it takes little work, else a coarse one. None if that takes more
-/// than 50 ms as well, or if `stop` is set.
+/// Computes the first force law of a disc: the exact one if it takes little work, otherwise a coarse one.
+/// `None` if that would take more than about 50 ms as well, or if another thread sets `stop`.
 pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
     let mut work = EXACT_WORK;
     let exact = pressed(model, disc, EXACT_ROWS, Accuracy::EXACT, &mut work, stop);
@@ -63,18 +64,19 @@ pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
     })
 }
 
-/// A law of so many points of a mesh; the work is taken from `work`.
+/// Computes a law with `points` of a mesh, and subtracts its work from `work`.
 fn on_mesh(model: &Model, disc: Disc, points: usize, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
     let course = Course { points, ..course(disc, ROWS) };
     let law = follow(model, course, Accuracy::COARSE, work, stop)?;
     law.is_sound().then_some(Law { is_coarse: true, ..law })
 }
 
-/// The law `first`, where by each force the disc goes deeper as `fine` gives way more than `coarse`.
+/// Returns the law `first`, in which the disc goes deeper under each force by as much as `fine` yields more
+/// than `coarse`.
 #[allow(clippy::cast_precision_loss)]
 fn refined(first: &Law, fine: &Law, coarse: &Law) -> Law {
     let parts = [(first, 1.0), (fine, 1.0), (coarse, -1.0)];
-    // The depth under a force, and how it rises with the force, m/N.
+    // The depth under a force, m, and its derivative by the force, m/N.
     let yields = |force_n: f64| {
         parts.iter().fold((0.0, 0.0), |(depth_m, rise), (law, sign)| {
             let at_m = law.depth_of(force_n);
@@ -91,8 +93,8 @@ fn refined(first: &Law, fine: &Law, coarse: &Law) -> Law {
     Law { rows: rows.collect(), ..first.clone() }
 }
 
-/// The force under which `yields` tells `depth_m`, N, and how the depth rises there: Newton's method, kept between two
-/// bounds. `largest_n` is of the order of the largest force.
+/// Returns the force under which `yields` gives `depth_m`, N, and the slope of the depth there: Newton's
+/// method, kept between two bounds. `largest_n` is of the order of the largest force.
 fn force_at(depth_m: f64, largest_n: f64, yields: &dyn Fn(f64) -> (f64, f64)) -> (f64, f64) {
     let (mut low, mut high) = (0.0, largest_n);
     for _ in 0..8 {
@@ -116,12 +118,13 @@ fn force_at(depth_m: f64, largest_n: f64, yields: &dyn Fn(f64) -> (f64, f64)) ->
     (force_n, yields(force_n).1)
 }
 
-/// A coarse law, out of sheets with about twice `half` intervals along the longer side; the work is taken from `work`.
+/// Computes a coarse law from sheets with about twice `half` intervals along the longer side, and subtracts its
+/// work from `work`.
 fn coarse(model: &Model, radius_m: f64, half: u32, work: &mut u64, stop: &AtomicBool) -> Option<Law> {
     let mut of = |model: &Model| pressed(model, Disc::in_middle(model, radius_m), ROWS, Accuracy::COARSE, work, stop);
     let (size_m, edge_m) = (model.shape().extent().size_m(), model.shape().edge_m());
     let half_m = tangent::half_window_m(model, radius_m).min(0.5 * model.shape().longest_side_m());
-    // Intervals that end at the rim of the shorter side as well.
+    // Choose intervals that also end at the rim of the shorter side.
     let shorter_m = half_m.min(0.5 * size_m.x.min(size_m.y));
     let fitting = if shorter_m > 0.0 { best_half(half, half_m / shorter_m) } else { half };
     let mut spacing_m = half_m / f64::from(fitting);
@@ -137,8 +140,8 @@ fn coarse(model: &Model, radius_m: f64, half: u32, work: &mut u64, stop: &Atomic
     law.is_sound().then_some(Law { is_coarse: true, ..law })
 }
 
-/// The number of intervals near `half` at which a sheet of points that are `ratio` times as far apart ends nearly where the
-/// finer one does.
+/// Returns the number of intervals near `half` at which a sheet whose points are `ratio` times as far apart
+/// ends nearly where the finer one does.
 fn best_half(half: u32, ratio: f64) -> u32 {
     let misses = |half: u32| {
         let intervals = f64::from(half) / ratio;

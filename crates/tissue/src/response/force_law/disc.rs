@@ -1,41 +1,43 @@
-//! What a tissue is pressed with, and where.
+//! The disc that presses on a tissue, and its place.
 
 use glam::DVec3;
 
 use crate::response::representative_place::place_alike;
 use crate::{Model, ToolContact};
 
-/// A tool so many radii away from the surface wants no law of the place.
+/// Distance from the surface, in radii, beyond which a tool needs no law of its place.
 const NEAR_IN_RADII: f64 = 4.0;
 
-/// The law of a place serves a tool as far as this from it.
+/// Distance, in radii, up to which the law of a place serves a tool.
 const SERVES_IN_RADII: f64 = 0.5;
 
-/// What a tissue is pressed with, and where.
+/// A disc that presses on a tissue, and the place at rest where it presses.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Disc {
-    /// Its radius, m.
+    /// Radius of the disc, m.
     pub radius_m: f64,
-    /// Its middle at rest: the place of the surface that is nearest to this, m.
+    /// Middle of the disc at rest, m: the place of the surface nearest to this.
     pub at_m: DVec3,
 }
 
 impl Disc {
-    /// Returns the disc in the middle of a sheet; on a mesh at the place of the surface that is nearest to the middle of the box around it.
+    /// Returns the disc in the middle of a sheet, or at the place of a mesh nearest to the middle of the box
+    /// around it.
     pub fn in_middle(model: &Model, radius_m: f64) -> Self {
         Disc { radius_m, at_m: model.shape().extent().middle_m() }
     }
 
-    /// Returns where the tissue rests that a tool with this disc presses, or is about to press, m; none if it is far
-    /// from the tissue. That is not the place nearest to the tool: deep in a tissue that is curved or folded, another
-    /// part of it may be nearer.
+    /// Returns the rest position of the tissue that a tool with this disc presses or is about to press, m;
+    /// `None` if the tool is far from the tissue. This is not the place nearest to the tool: deep in a curved
+    /// or folded tissue, another part may be nearer.
     pub fn pressed_m(&self, feel: &ToolContact) -> Option<DVec3> {
         let is_near = feel.place_m.distance(feel.surface_m) <= NEAR_IN_RADII * self.radius_m;
         is_near.then_some(feel.anchor_m)
     }
 
-    /// Returns the disc whose law serves a tool that presses what rests at `rest_m`: this one still, unless the law
-    /// there is another. What moves to and fro between two places has the law of the first.
+    /// Returns the disc whose law serves a tool that presses the tissue resting at `rest_m`. This is `self`
+    /// unless the law there differs. A tool that moves back and forth between two places keeps the law of the
+    /// first.
     #[must_use]
     pub fn follow(self, model: &Model, rest_m: DVec3) -> Self {
         let at_m = place_alike(model, self.radius_m, rest_m);

@@ -1,4 +1,5 @@
-//! The exact force law of a tissue under a disc: the whole sheet is pressed in, depth after depth (`tissue::tangent`).
+//! The exact force law of a tissue under a disc: the whole tissue is pressed in, depth after depth
+//! (`response::tangent`).
 
 use std::sync::atomic::AtomicBool;
 
@@ -11,31 +12,33 @@ use crate::response::tangent::{self, Accuracy, Course, Deepened, Press, Pressed}
 /// Rows of an exact law.
 pub(super) const ROWS: u32 = 21;
 
-/// How many radii of the disc a law reaches.
+/// Largest depth of a law, in radii of the disc.
 const REACH_IN_RADII: f64 = 4.0;
 
-/// An exact law under way, one depth after another.
+/// An exact force law under computation, one depth after another.
 #[derive(Debug)]
 pub struct Computation(Box<Press>);
 
-/// What became of a computation.
+/// The result of one step of a computation.
 #[derive(Debug)]
 pub enum LawProgress {
-    /// It can go on.
+    /// Further depths are left; continue with this.
     UnderWay(Computation),
-    /// The law.
+    /// The complete law.
     Done(Law),
-    /// It would take more work than it may, or it was stopped.
+    /// The computation would exceed its work, or it was stopped.
     GivenUp,
 }
 
 impl Computation {
-    /// Begins the computation of the law under a disc, with at most `most_work` springs times iterations; none if they can't suffice.
+    /// Begins the computation of the law under a disc, with at most `most_work` springs times iterations.
+    /// `None` if they can't suffice.
     pub fn new(model: &Model, disc: Disc, most_work: u64) -> Option<Self> {
         Press::within(model, course(disc, ROWS), Accuracy::EXACT, most_work).map(|press| Computation(Box::new(press)))
     }
 
-    /// Computes the next depth, unless `stop` is set. `model` is the one that it was begun for.
+    /// Computes the next depth, unless `stop` is set. `model` must be the one that the computation was begun
+    /// with.
     pub fn advance(mut self, model: &Model, stop: &AtomicBool) -> LawProgress {
         match self.0.deepen(model, stop) {
             Deepened::Further => LawProgress::UnderWay(self),
@@ -50,9 +53,10 @@ pub(super) fn course(Disc { radius_m, at_m }: Disc, rows: u32) -> Course {
     Course { radius_m, centre_m: at_m, step_m, count: rows, points: usize::MAX }
 }
 
-/// Returns the exact law of a disc of `radius_m` in the middle of a sheet: some tenths of a second of work for a
-/// thousand points. It has 21 rows, from 0 to four radii deep, each a solution at rest with its tangent
-/// ([`Tangent`](crate::tangent::Tangent)): k = S_zz, k_t = ½(S_xx + S_yy), B = B_zz, B_t = ½(B_xx + B_yy), and D.
+/// Computes the exact law of a disc of `radius_m` in the middle of a tissue. It takes some tenths of a second
+/// for a thousand points. The law has 21 rows, from 0 to four radii deep, each a solution at rest with its
+/// tangent ([`Tangent`](crate::response::tangent::Tangent)): k = S_zz, k_t = ½(S_xx + S_yy), B = B_zz, B_t =
+/// ½(B_xx + B_yy), and D.
 ///
 /// ```
 /// use palpate_tissue::scene::PAPER;
@@ -74,12 +78,13 @@ pub fn exact(model: &Model, radius_m: f64) -> Law {
     from_pressed(&tangent::press(model, radius_m, centre_m, step_m, count))
 }
 
-/// Returns the same with at most `most_work` springs times iterations; none if they don't suffice, or if `stop` is set.
+/// Computes the exact law of a disc with at most `most_work` springs times iterations. `None` if they do not
+/// suffice, or if another thread sets `stop`.
 pub fn exact_within(model: &Model, disc: Disc, most_work: u64, stop: &AtomicBool) -> Option<Law> {
     pressed(model, disc, ROWS, Accuracy::EXACT, &mut { most_work }, stop)
 }
 
-/// A law of so many rows, whose work is taken from `work`.
+/// Computes a law with `rows` rows, and subtracts its work from `work`.
 pub(super) fn pressed(
     model: &Model,
     disc: Disc,
@@ -91,7 +96,7 @@ pub(super) fn pressed(
     follow(model, course(disc, rows), accuracy, work, stop)
 }
 
-/// The law of a course.
+/// Computes the law of a course of depths, and subtracts its work from `work`.
 pub(super) fn follow(
     model: &Model,
     course: Course,

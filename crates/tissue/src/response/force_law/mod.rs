@@ -1,6 +1,7 @@
 //! Computes the force law of a tissue under a disc from the tissue's model. The crate `palpate-haptics` evaluates it.
 //!
-//! An exact law takes seconds for a large sheet, so [`first`] gives a coarse law where the exact one takes too much work.
+//! An exact law takes seconds for a large sheet, so [`first`] gives a coarse law if the exact one takes too
+//! much work.
 
 mod coarse;
 mod disc;

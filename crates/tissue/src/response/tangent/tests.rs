@@ -1,4 +1,4 @@
-//! Linearised springs beside the springs themselves, and what follows from them in closed form.
+//! Tests that compare linearised springs with the springs themselves, and with closed forms.
 #![allow(clippy::unwrap_used)]
 
 use std::sync::Arc;
@@ -15,7 +15,7 @@ fn model(sets: &[&str]) -> Arc<Model> {
     Model::paper(&[&always[..], sets].concat())
 }
 
-/// The whole sheet around a disc of some spacings near its middle, its points displaced so.
+/// Returns the patch of a whole sheet around a disc of some spacings near its middle, with displaced points.
 fn patch<'m>(model: &'m Model, radius: f64, displacement_m: impl Fn([usize; 2]) -> DVec3) -> LinearPatch<'m> {
     let sheet = model.scene.sheet().unwrap();
     let centre_m = 0.5 * sheet.extent_m() + DVec2::new(0.13, -0.21) * sheet.spacing_m;

@@ -1,4 +1,4 @@
-//! The part of a tissue around a disc that notices what the disc does: its points and the springs between them.
+//! The part of a tissue around a disc that notices the disc: its points and the springs between them.
 
 use glam::{DMat3, DVec2, DVec3};
 
@@ -6,25 +6,25 @@ use crate::body::surface::MeshPlaces;
 use crate::model::Model;
 use crate::tools::footprint::Footprint;
 
-/// How many times its reach around a disc the sheet is looked at: e⁻⁶ is left.
+/// Size of the window around a disc, in lengths of decay: e⁻⁶ is left at its edge.
 pub(super) const REACHES: f64 = 6.0;
 
-/// A point of a patch with six springs, and the vectors of a solution. The work of a force law is bounded, and so is its memory:
-/// 20 MB for the 116² points that 2^27 springs times iterations allow.
+/// Memory of a point of a patch with six springs, and of the vectors of a solution. The work of a force law is
+/// bounded, and so is its memory: 20 MB for the 116² points that 2^27 springs times iterations allow.
 const BYTES_PER_POINT: usize =
     6 * size_of::<Spring>() + size_of::<DMat3>() + size_of::<DVec3>() + 8 * size_of::<Triple>() + 16;
 
-/// Three vectors a point: one of each system.
+/// Three vectors per point: one of each system.
 pub(super) type Triple = [DVec3; 3];
 
-/// A spring of the part, linearised where it is.
+/// A spring of the part, linearised at the present displacements.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Spring {
     pub(super) ends: [usize; 2],
     pub(super) rest_m: DVec3,
     pub(super) stiffness_n_per_m: f64,
     pub(super) tangent: DMat3,
-    /// On the first end, N.
+    /// Force on the first end, N.
     pub(super) force_n: DVec3,
 }
 
@@ -34,17 +34,17 @@ impl Spring {
     }
 }
 
-/// The points around a disc that notice what it does.
+/// The points around a disc that notice it.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Window {
     /// A rectangle of a sheet.
     Grid {
-        /// Its first row and column.
+        /// First row and first column.
         origin: [usize; 2],
-        /// Rows and columns.
+        /// Number of rows and of columns.
         size: [usize; 2],
     },
-    /// A ball of a mesh: slots, ascending.
+    /// A ball of a mesh, as places in memory, ascending.
     Ball(Vec<usize>),
 }
 
@@ -54,7 +54,8 @@ impl Window {
         Self::at(model, footprint.radius_m(), footprint.anchor_m(), usize::MAX)
     }
 
-    /// Around a place of the rest surface; on a mesh with `most` points or a few more.
+    /// Returns the window around a place of the rest surface; on a mesh, the radius shrinks until it has at
+    /// most `most` points.
     pub(super) fn at(model: &Model, radius_m: f64, centre_m: DVec3, most: usize) -> Self {
         match &model.graph {
             None => Self::of_sheet(model, radius_m, centre_m.truncate()),
@@ -78,7 +79,7 @@ impl Window {
         let half = half_window(model, radius_m);
         let (mut origin, mut size) = ([0; 2], [0; 2]);
         for axis in 0..2 {
-            // Saturating casts: no anchor springs, no end.
+            // Saturating casts: without anchor springs, the window has no bound.
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
             let [low, high] = [centre[axis] - half, centre[axis] + half].map(|edge| edge.round().max(0.0) as usize);
             origin[axis] = low.min(model.points[axis] - 1);
@@ -87,7 +88,7 @@ impl Window {
         Window::Grid { origin, size }
     }
 
-    /// Returns the number of its points.
+    /// Returns the number of points.
     pub fn len(&self) -> usize {
         match self {
             Window::Grid { size, .. } => size[0] * size[1],
@@ -95,12 +96,12 @@ impl Window {
         }
     }
 
-    /// Returns whether it has no point: a place far from every point of a mesh.
+    /// Returns whether the window has no point, as far from every point of a mesh.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
 
-    /// How many points there are from the middle to where nothing is noticed, or nearly so.
+    /// Returns the approximate number of points from the middle to where nothing is noticed.
     pub(super) fn across(&self) -> usize {
         match self {
             Window::Grid { size, .. } => size[0].max(size[1]),
@@ -108,12 +109,12 @@ impl Window {
         }
     }
 
-    /// What a patch of it and a solution take, bytes.
+    /// Returns the memory of a patch of this window and of a solution, bytes.
     pub(crate) fn bytes(&self) -> u64 {
         (self.len() * BYTES_PER_POINT) as u64
     }
 
-    /// Returns the places of its points in memory, ascending.
+    /// Returns the places of the points in memory, ascending.
     pub fn points(&self, model: &Model) -> impl Iterator<Item = usize> {
         let columns = model.points[1];
         (0..self.len()).map(move |at| match self {
@@ -122,7 +123,7 @@ impl Window {
         })
     }
 
-    /// Which of its points is at a row and column of memory.
+    /// Returns the index in the window of the point at a row and column of memory, if it is in the window.
     pub(super) fn find(&self, model: &Model, point @ [i, j]: [usize; 2]) -> Option<usize> {
         match self {
             Window::Grid { origin, size } => {
@@ -133,7 +134,8 @@ impl Window {
         }
     }
 
-    /// Which of its points move. Those at its border, whose springs lead out of it, are held.
+    /// Returns which of the points can move. Points at the border, whose springs lead out of the window, are
+    /// held.
     pub(super) fn free(&self, model: &Model) -> Vec<bool> {
         let is_fixed = |index: usize| model.fixed.binary_search(&index).is_ok();
         match (self, &model.graph) {
@@ -156,7 +158,8 @@ impl Window {
         }
     }
 
-    /// The springs that join its points, at least one of which is `free`. Rest lengths are turned by `turn`.
+    /// Returns the springs that join points of the window, at least one of which is `free`. Rest vectors are
+    /// turned by `turn`.
     pub(super) fn springs(&self, model: &Model, free: &[bool], turn: &DMat3) -> Vec<Spring> {
         let mut springs = match (self, &model.graph) {
             (Window::Ball(slots), Some(graph)) => of_mesh(model, graph, slots, free),
@@ -212,9 +215,9 @@ fn of_mesh(model: &Model, graph: &MeshPlaces, slots: &[usize], free: &[bool]) ->
     found
 }
 
-/// How far from the middle of a disc of `radius_m` points notice what it does, in spacings h; infinite without anchor
-/// springs: a/h + `REACHES`·√(k/K″) + 2. Beyond a disc displacements fall as e^{−r/l} with l = h·√(k/K″), at which a membrane
-/// of springs and its foundation are in balance, k·h²·u″ = K″·u.
+/// Returns the distance from the middle of a disc of `radius_m` at which points still notice it, in spacings h:
+/// a/h + `REACHES`·√(k/K″) + 2; infinite without anchor springs. Beyond a disc displacements fall as e^{−r/l}
+/// with l = h·√(k/K″), at which a membrane of springs and its foundation are in balance, k·h²·u″ = K″·u.
 fn half_window(model: &Model, radius_m: f64) -> f64 {
     let scene = &model.scene;
     let springs = &scene.springs;
@@ -223,8 +226,9 @@ fn half_window(model: &Model, radius_m: f64) -> f64 {
     radius_m / model.unit_m + REACHES * reach + 2.0
 }
 
-/// Returns how far from the middle of a disc of `radius_m` points notice what it does, m: a + `REACHES`·h·√(k/K″) + 2h, with h the
-/// distance between points and k the larger one of structural and shear springs; the root counts as at least 1.
+/// Returns the distance from the middle of a disc of `radius_m` at which points still notice it, m: a +
+/// 6·h·√(k/K″) + 2h, with h the distance between points and k the larger one of structural and shear springs;
+/// the root counts as at least 1. Infinite without anchor springs.
 pub fn half_window_m(model: &Model, radius_m: f64) -> f64 {
     half_window(model, radius_m) * model.unit_m
 }

@@ -1,4 +1,4 @@
-//! Windows, and sheets that go on from a checkpoint.
+//! Tests of windows, and of tissues that continue from a checkpoint.
 #![allow(clippy::unwrap_used)]
 
 use glam::DVec3;
@@ -28,7 +28,7 @@ fn a_window_lasts_until_the_slowest_vibration_has_lost_half() {
     }
 }
 
-/// A sheet that a constant force has moved for some steps.
+/// Returns a tissue that a constant force has moved for some steps.
 fn moving(sets: &[&str], steps: u64) -> TissueState<f64> {
     let always = ["stepping.integrator=exponential3", "stepping.precision=f64", "sleep.tolerance=0.0"];
     let model = Model::paper(&[&always[..], sets].concat());
@@ -47,7 +47,7 @@ fn moving(sets: &[&str], steps: u64) -> TissueState<f64> {
     sheet
 }
 
-/// Steps a sheet until it reports on the window that it watches.
+/// Steps a tissue until it reports on the requested window.
 fn next_mark(sheet: &mut TissueState<f64>) -> Mark {
     for _ in 0..1000 {
         sheet.step().unwrap();

@@ -1,4 +1,4 @@
-//! Choices beside all others that could have been made.
+//! Tests that compare choices with all others that could have been made.
 #![allow(clippy::unwrap_used, clippy::panic)]
 
 use super::*;
@@ -9,12 +9,12 @@ fn scene(sets: &[&str]) -> Scene {
     Scene::parse("paper", PAPER, &sets, &Limits::default()).unwrap()
 }
 
-/// What a chooser knows of an integrator that is open.
+/// Returns the chooser's entry of an allowed integrator.
 fn open(chooser: &Chooser<'_>, integrator: Integrator) -> OpenChoice {
     *chooser.open.iter().find(|open| open.integrator == integrator).unwrap()
 }
 
-/// What a search in a format finds with at most 1000 substeps.
+/// Returns what a search in a format finds with at most 1000 substeps.
 fn found(chooser: &Chooser<'_>, integrator: Integrator, precision: Precision) -> Choice {
     match chooser.fewest(&open(chooser, integrator), precision, 1000, Effort::Quick) {
         Search::Keeps(choice) => choice,
@@ -22,7 +22,7 @@ fn found(chooser: &Chooser<'_>, integrator: Integrator, precision: Precision) ->
     }
 }
 
-/// The cost of a choice, in substeps of `central` in f32.
+/// Returns the cost of a choice, in substeps of `central` in f32.
 fn cost(choice: &Choice) -> f64 {
     let format = FORMATS.iter().find(|format| format.0 == choice.precision).map(|found| found.1);
     entry(choice.integrator).cost * format.unwrap() * f64::from(choice.substeps)
@@ -75,7 +75,7 @@ fn the_choice_keeps_its_tolerance_and_nothing_that_keeps_it_is_much_cheaper() {
 
 #[test]
 fn an_integrator_takes_hardly_more_substeps_than_it_needs() {
-    // Of those that `auto` may become.
+    // Of those that `auto` may choose.
     for (integrator, tolerance) in [
         (Integrator::Central, "3e-3"),
         (Integrator::Exponential2, "1e-4"),
@@ -185,7 +185,7 @@ fn a_leap_that_went_too_far_is_taken_back() {
     assert!(chooser.keeps(&found) && !chooser.keeps(&fewer), "{found:?}, {fewer:?}");
 }
 
-/// Sheets whose motion is hard to predict: nothing damps them, nothing holds them, or both; a tolerance that f64 can't keep.
+/// Scenes whose motion is hard to predict: no damping, no anchor springs, or neither; a tolerance that f64 can't keep.
 const HARD: [&[&str]; 8] = [
     &["damping.coefficient_n_s_per_m=0.0"],
     &["anchor_springs.stiffness_n_per_m=0.0"],
@@ -204,7 +204,7 @@ fn the_choice_is_above_the_tolerance_only_if_every_integrator_alone_is() {
         let scene = scene(&[sets, &[format!("stepping.tolerance={tolerance:e}").as_str()][..]].concat());
         let chosen = choose(&scene, &limits, &NEVER);
         let Ok((choice, work)) = chosen else {
-            // In as much work as there may be, for whoever repeats it.
+            // Within the allowed work, so that others can repeat it.
             let refusal = chosen.unwrap_err();
             assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "stepping.tolerance"));
             continue;
@@ -284,7 +284,7 @@ fn what_auto_would_take_is_told_only_where_the_scene_gives_something_itself() {
     for given in ["stepping.integrator=lagged", "stepping.substeps=7", "stepping.precision=f64"] {
         assert_eq!(by_auto(&scene(&[given]), &limits), Some(open), "{given}");
     }
-    // What no integrator can do, and what takes too much work, is no advice.
+    // A choice that no integrator can keep, or that takes too much work, is not advised.
     let light = scene(&["sheet.point_mass_kg=1e-12", "springs.stiffness_n_per_m=1e12", "stepping.substeps=1"]);
     assert_eq!(by_auto(&light, &limits), None);
     assert_eq!(by_auto(&scene(&["stepping.substeps=7"]), &Limits { rehearsal_work: 0, ..limits }), None);

@@ -1,4 +1,4 @@
-//! A sheet of three by three tiles, of which the last ones are not whole.
+//! Tests on a sheet of three by three tiles, the last of which are not whole.
 #![allow(clippy::unwrap_used)]
 
 use glam::DVec3;

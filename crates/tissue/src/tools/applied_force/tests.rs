@@ -1,4 +1,4 @@
-//! Falloffs at every width, and the bound of a change of force.
+//! Tests of falloffs at every width, and of the bound of a change of force.
 
 use super::*;
 use crate::limits::Limits;
@@ -17,7 +17,7 @@ fn factors<T: Real>(lanes: Lanes, centre: f64) -> Vec<f64> {
     factors.into_iter().map(Real::wide).collect()
 }
 
-/// A table that is placed again, elsewhere and with another reach, is that of a fresh one.
+/// A table placed again elsewhere, with another reach, equals a fresh one.
 #[test]
 fn a_table_keeps_nothing_of_the_place_before() {
     let scene = Scene::parse("test", PAPER, &["sheet.points=[70, 90]".to_owned()], &Limits::default()).unwrap();
