@@ -30,8 +30,8 @@ impl ForceDeadband {
     }
 
     /// Returns whether the client's force is wrong by too much at the tool's present place, which `model` describes:
-    /// |f − f_r| > max(δ·|f|, [`MIN_N`]), with f the tissue's force and f_r the force that the client renders there. True before
-    /// the first sample. Call it at each step: it also moves the client's simulated touch along the path.
+    /// |f − f_r| > max(δ·|f|, [`MIN_N`]), with f the tissue's force and f_r the force that the client renders there.
+    /// True before the first sample. Call it at each step: it also moves the client's simulated touch along the path.
     pub fn is_exceeded(&mut self, model: &LocalModel, law: &Law) -> bool {
         let Some((sent, touching)) = &mut self.sent else { return true };
         touching.move_to(sent, law, model.place_m);
