@@ -1,4 +1,4 @@
-//! The figures of a run as they are printed: a table for people, and JSON.
+//! Output of a run's figures: a table for people, and JSON.
 
 use palpate_haptics::datagram_health::Carried;
 use palpate_simulated::network::Conditions;
@@ -8,7 +8,7 @@ use super::measure::LinkOutcome;
 use super::setup::{Rendering, Setup};
 use crate::table;
 
-/// The figures of a run for people; `server` is that of a run in real time.
+/// Prints the figures of a run as a table; `server` is the server of a run in real time.
 pub(super) fn rows(setup: &Setup, outcome: &LinkOutcome, server: Option<&str>) -> Vec<(&'static str, String)> {
     let (scene, hand, device) = (&setup.model.scene.name, setup.hand.name, setup.device.name);
     let scheme = format!("{:?}", setup.scheme).to_lowercase();
@@ -144,7 +144,7 @@ pub(super) fn rows(setup: &Setup, outcome: &LinkOutcome, server: Option<&str>) -
     rows
 }
 
-/// The figures of a run that are printed: what was asked for, and what was found.
+/// The printed figures of a run: its parameters and its results.
 pub(super) fn figures(setup: &Setup, outcome: &LinkOutcome) -> Value {
     let (Value::Object(mut all), Value::Object(found)) = (asked(setup), found(outcome)) else { return Value::Null };
     all.extend(found);
