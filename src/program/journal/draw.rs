@@ -41,7 +41,7 @@ pub(super) struct RenderArguments {
     frames_hz: f64,
 }
 
-/// Draws the tissue at the present step, with an arrow for the force on each tool.
+/// Returns the tissue at the present step to draw, with an arrow for the force on each tool.
 fn still(session: &Session, shown: Option<&std::sync::Arc<Skin>>) -> Still {
     let felt = session.felt().into_iter().filter(|felt| felt.force_n.length() > 0.0);
     let shape = session.model().shape();

@@ -8,7 +8,7 @@ use super::measure::LinkOutcome;
 use super::setup::{Rendering, Setup};
 use crate::table;
 
-/// Prints the figures of a run as a table; `server` is the server of a run in real time.
+/// Returns the figures of a run as rows of a table; `server` is the server of a run in real time.
 pub(super) fn rows(setup: &Setup, outcome: &LinkOutcome, server: Option<&str>) -> Vec<(&'static str, String)> {
     let (scene, hand, device) = (&setup.model.scene.name, setup.hand.name, setup.device.name);
     let scheme = format!("{:?}", setup.scheme).to_lowercase();
@@ -144,7 +144,7 @@ pub(super) fn rows(setup: &Setup, outcome: &LinkOutcome, server: Option<&str>) -
     rows
 }
 
-/// The printed figures of a run: its parameters and its results.
+/// Returns the figures of a run as JSON: its parameters and its results.
 pub(super) fn figures(setup: &Setup, outcome: &LinkOutcome) -> Value {
     let (Value::Object(mut all), Value::Object(found)) = (asked(setup), found(outcome)) else { return Value::Null };
     all.extend(found);

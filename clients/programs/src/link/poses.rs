@@ -35,10 +35,10 @@ pub(super) struct Down {
 const FIRST_BYTES: u64 = 66 + 100;
 const FURTHER_BYTES: u64 = 24;
 
-/// Places in a datagram.
+/// Largest number of places in a datagram.
 const PLACES: usize = 8;
 
-/// A time that has come back from the server is off by no more than the rounding to nanoseconds, s.
+/// Largest error of a time that the server returns, from rounding to nanoseconds, s.
 const ROUNDING_S: f64 = 5e-7;
 
 /// The tool's places on their way to the server.
@@ -51,7 +51,7 @@ pub(super) struct Poses {
     count: u64,
     /// Places that the server may not have received, the newest last.
     unanswered: VecDeque<(u64, MotionState)>,
-    /// Of the samples.
+    /// Arrivals of samples.
     pulse: SendInterval,
     heartbeat_s: f64,
 }
@@ -69,7 +69,7 @@ impl Poses {
         }
     }
 
-    /// Returns the message with a place, if it must be sent.
+    /// Sends a place to the server, if the server's estimate is wrong or a heartbeat is due.
     pub(super) fn tell(&mut self, now_s: f64, place_m: DVec3, client: &LinkClient, up: &mut Direction<Up>) {
         let told = if self.deadband > 0.0 {
             let most_m = match client {

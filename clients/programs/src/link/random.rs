@@ -124,7 +124,7 @@ pub(super) fn print(arguments: &LinkArguments, runs: u64) -> Result<(), ClientFa
     report(arguments, &results)
 }
 
-/// Performs the run of a seed.
+/// Returns the setup of the run of a seed.
 fn drawn(arguments: &LinkArguments, tissues: &BTreeMap<&str, Choice>, tip: Tip, seed: u64) -> Setup {
     let mut random = Random::new(seed, 3);
     let choice = &tissues[random.one_of(&TISSUES)];

@@ -30,7 +30,7 @@ pub(super) struct Other {
     pub(super) changed: Option<Arc<Model>>,
 }
 
-/// A tissue behind a network.
+/// The server's tissue behind a network.
 pub(super) struct LinkServer {
     tissue: LinkTissue,
     spot: Spot,
@@ -38,8 +38,8 @@ pub(super) struct LinkServer {
     laws: Arc<Laws>,
     /// Deadband and interval of the samples that the client requested.
     wanted: Arc<WantedHeartbeat>,
-    /// Of the tissue, and where the law of the tool's place is of; those of the tissue to come, and when they are
-    /// told, s.
+    /// The laws of the tissue; the disc whose law is in use; and the laws of the next tissue with the time when they
+    /// are sent, s.
     place_laws: Arc<PlaceLaws>,
     disc: Disc,
     next_laws: Option<(f64, Arc<PlaceLaws>)>,
@@ -49,9 +49,9 @@ pub(super) struct LinkServer {
     transport: Transport,
     /// Whether places contain velocities.
     is_moving: bool,
-    /// Of the commands: a datagram repeats what is not acknowledged.
+    /// Numbers of the commands that were received: a datagram repeats what is not acknowledged.
     seen: ReceiveWindow,
-    /// Of what arrives.
+    /// Arrivals of messages.
     pulse: SendInterval,
     refused: u64,
 }
@@ -132,7 +132,7 @@ impl LinkServer {
         Ok(Some(tool.and_then(|tool| tool.local).map(|model| self.spot.of_hand(model))))
     }
 
-    /// The law is that of what the tool presses.
+    /// Changes the law to that of the tissue under the tool, if it presses at another place.
     fn follow(&mut self, rest_m: DVec3) {
         let disc = self.disc.follow(&self.place_laws.model, rest_m);
         self.is_other |= disc != self.disc;
