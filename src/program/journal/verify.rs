@@ -53,7 +53,7 @@ pub(super) fn verify(arguments: &VerifyArguments) -> Result<(), Failure> {
             Some(difference) => differs.push(format!("{name}: {difference}")),
             None => say!("{name}: {}, in {:.2} s", proved(&verdict), clock_s() - begun_s),
         }
-        unread.extend(damage.map(|damage| format!("{name}: {damage}; what follows was not looked at")));
+        unread.extend(damage.map(|damage| format!("{name}: {damage}; the rest was not checked")));
         match signed {
             Ok(None) => {}
             Ok(Some(signed)) => match of_signature(signed) {

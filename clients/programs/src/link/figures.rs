@@ -27,7 +27,7 @@ pub(super) fn rows(setup: &Setup, outcome: &LinkOutcome, server: Option<&str>) -
                 text += &format!(", {} in a row", table::rounded(burst));
             }
             if outage_s > 0.0 {
-                text += &format!(", {} ms once a second nothing", table::rounded(1e3 * outage_s));
+                text += &format!(", an outage of {} ms once a second", table::rounded(1e3 * outage_s));
             }
             if rate_bit_per_s > 0.0 {
                 let [rate, queue] = [1e-3 * rate_bit_per_s, 1e3 * queue_s].map(table::rounded);

@@ -54,7 +54,7 @@ impl Second {
         Second { apart_m: DVec3::new(setup.second_m, 0.0, 0.0), task }
     }
 
-    /// The tissue in the hand's frame.
+    /// Returns the place of the second tool in the hand's frame, m.
     fn place_m(&self, spot: &Spot, now_s: f64) -> DVec3 {
         spot.at_m + self.apart_m + self.task.at(now_s).z * DVec3::Z
     }

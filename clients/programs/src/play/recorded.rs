@@ -45,7 +45,7 @@ pub(super) struct Compared {
 impl Compared {
     /// Returns the result as a text.
     pub(super) fn told(&self) -> String {
-        let missed = if self.missed == 0 { String::new() } else { format!(", {} not told in time", self.missed) };
+        let missed = if self.missed == 0 { String::new() } else { format!(", {} not reported in time", self.missed) };
         match self.equal + self.missed {
             0 => "none between these steps".to_owned(),
             _ => format!("{} equal{missed}", self.equal),

@@ -191,7 +191,7 @@ impl Client {
             let mut sent = lock(&sent);
             sent.led = touches.and_then(|lead| LedTip::new(inbound.opened(), &lead, self.seed, self.middle_m));
             if touches.is_some() && sent.led.is_none() {
-                return Err(tonic::Status::failed_precondition("the server tells no force law for --touch"));
+                return Err(tonic::Status::failed_precondition("the server sent no force law for --touch"));
             }
             sent.is_open = true;
         }

@@ -85,7 +85,7 @@ impl PreparedPlan {
 fn address(url: &str) -> Result<SocketAddr, Error> {
     let refuse = |why: String| Error::Argument(format!("{url}: {why}"));
     let host = url.strip_prefix("http://").ok_or_else(|| {
-        let why = "must begin with http:// for a plan with networks: a certificate is not for what stands before it";
+        let why = "must begin with http:// for a plan with networks: a certificate is not valid for a relay";
         refuse(why.to_owned())
     })?;
     let host = host.split('/').next().unwrap_or(host);

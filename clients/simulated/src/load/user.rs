@@ -222,7 +222,7 @@ impl Guest {
             let mut tally = lock(&world.tally);
             tally.dilation_min = tally.dilation_min.min(simulated_s / real_s);
             if to.resting {
-                tally.broke("a session came to rest although it was to be kept awake".to_owned());
+                tally.broke("a session came to rest although commands should keep it awake".to_owned());
             }
         }
         while self.streams.join_next().await.is_some() {}
