@@ -1,5 +1,5 @@
-//! The cost of accuracy: every scheme, number format and step on seven sheets and two organs, run time against error. Writes
-//! docs/benchmarks/error.{md,svg}; `-- --quick` tries fewer steps and measures each once.
+//! The cost of accuracy: every scheme, number format and step on seven sheets and two organs, run time against error.
+//! Writes docs/benchmarks/error.{md,svg}; `-- --quick` tries fewer steps and measures each once.
 
 #![allow(
     clippy::unwrap_used,
@@ -30,7 +30,7 @@ use scenes::{CASES, Case};
 use serde_json::json;
 use subject::{INTEGRATOR, PRECISION, PRECISIONS, integrators, known, set};
 
-/// How far the steps are refined, and how often each run is timed.
+/// Number of refinements of the step, and of timings of each run.
 struct Effort {
     rounds: usize,
     /// Longest time of a run, s.

@@ -26,7 +26,7 @@ use serde_json::json;
 const SIDES: [usize; 2] = [31, 331];
 const REFINEMENTS: [u32; 4] = [0, 1, 3, 10];
 
-/// How long each case is measured, and the least number of times.
+/// Duration of the measurement of each case, and the smallest number of repetitions.
 const DURATION: Duration = Duration::from_millis(1000);
 const MIN_TURNS: u32 = 25;
 

@@ -1,7 +1,7 @@
 //! Touch over a network, in virtual time: the accuracy, stability and passivity of the force on a simulated hand, by
 //! delay, tissue, hand, network and scheme. It first compares two results with theory: the delay at which hand and
-//! spring become unstable, and the stiffness of the tissues under a disc (a flat punch). Runs `palpate-client link`, as
-//! a user can.
+//! spring become unstable, and the stiffness of the tissues under a disc (a flat punch). Runs `palpate-client link`,
+//! as a user can.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
@@ -255,7 +255,7 @@ fn others(report: &mut BenchReport, seeds: u64) {
     table(report, "stalls", &["tissue", "stops for, ms"], runs);
 }
 
-/// The same hand and task in real time, over gRPC with a delay, to validate virtual time.
+/// Runs a hand and task of virtual time in real time, over gRPC with a delay, for validation.
 fn live(report: &mut BenchReport) {
     report.heading("In real time: medium hand, omega3");
     report.say(
@@ -289,7 +289,7 @@ fn live(report: &mut BenchReport) {
     report.figure("real time", Value::Array(figures));
 }
 
-/// What the tables of both transports show, by title.
+/// Columns of the tables of both transports, by title.
 const BOTH: [(&str, &str); 11] = [
     ("force error, % RMS", "force_error_rms_percent"),
     ("after outages, % RMS", "force_error_after_outages_percent"),
@@ -434,7 +434,7 @@ fn organs(report: &mut BenchReport, seeds: u64) {
     report.figure("organs", Value::Array(found));
 }
 
-/// What the table of organs shows, by title.
+/// Columns of the table of organs, by title.
 const ORGANS: [(&str, &str); 5] = [
     ("force error, % RMS", "force_error_rms_percent"),
     ("p99, N", "force_error_p99_n"),

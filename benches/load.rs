@@ -1,8 +1,9 @@
-//! How many sessions does a core bear, each with a haptic client at 1 kHz or none, what does each cost beside the kernel
-//! alone? The server is kept to one core, the generator (`palpate-client load`) to the others. Writes
-//! docs/benchmarks/load.{md,svg}. `-- --quick` tries few numbers for a short time; `-- profile` prints that part alone.
-//! `-- attacks` shows what one honest client notices of clients that attack, and writes docs/benchmarks/attacks.{md,svg};
-//! `-- attacks NAME` prints one attack's row alone. Linux only: times are read from /proc.
+//! How many sessions does a core bear, each with a haptic client at 1 kHz or none, what does each cost beside the
+//! kernel alone? The server is kept to one core, the generator (`palpate-client load`) to the others. Writes
+//! docs/benchmarks/load.{md,svg}. `-- --quick` tries few numbers for a short time; `-- profile` prints that part
+//! alone. `-- attacks` shows what one honest client notices of clients that attack, and writes
+//! docs/benchmarks/attacks.{md,svg}; `-- attacks NAME` prints one attack's row alone. Linux only: times are read from
+//! /proc.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
@@ -144,8 +145,8 @@ fn start(arguments: &[&str]) -> Arc<TestServer> {
     kept_to(true, || Arc::new(TestServer::start(&[&common[..], arguments].concat())))
 }
 
-/// How many sessions take a core for themselves, by what one takes among so many (µs a step of 1 ms): the more there are,
-/// the less of their states the caches hold.
+/// Number of sessions that fill a core, from the time of one among many (µs a step of 1 ms): the more there
+/// are, the less of their states the caches hold.
 fn most_by(line: &[(f64, f64)]) -> f64 {
     let load = |(count, us): (f64, f64)| count * us;
     let over = line.windows(2).find(|pair| load(pair[1]) > 1e3);
@@ -160,7 +161,7 @@ fn most_by(line: &[(f64, f64)]) -> f64 {
     }
 }
 
-/// How many sessions there may be, with clients and without, and what each costs.
+/// Largest numbers of sessions with and without clients, and the cost of each.
 fn crowds(report: &mut BenchReport, figures: &mut Vec<Value>, seconds: f64) -> Vec<Series> {
     let counts: &[usize] = if quick() { &[1, 25, 100] } else { &[1, 10, 25, 50, 75, 100, 150, 200, 300] };
     // Also those that a server would not let in.
@@ -250,7 +251,7 @@ fn crowds(report: &mut BenchReport, figures: &mut Vec<Value>, seconds: f64) -> V
 /// Sessions, each with a client, that a profile is made of: as many as a core bears with ease.
 const PROFILED: usize = 50;
 
-/// Where the time goes beside the kernel.
+/// Time spent outside of the kernel of the simulation.
 fn profile(report: &mut BenchReport) {
     report.heading("Distribution of the time");
     eprintln!("a profile of {PROFILED} sessions");
@@ -301,7 +302,7 @@ fn runs() -> usize {
     arguments.next().map_or(3, |count| count.parse().unwrap_or_else(|_| panic!("--runs {count}: not a number")))
 }
 
-/// What an honest client notices of clients that are not: of the attack of that name, or of all of them.
+/// Effects of attackers on an honest client: of the attack of that name, or of all attacks.
 fn attacks(report: &mut BenchReport, name: Option<&str>) -> Panel {
     let runs = runs().max(1);
     report.say(&format!(
@@ -315,7 +316,7 @@ fn attacks(report: &mut BenchReport, name: Option<&str>) -> Panel {
     ));
     let kinds: Vec<Option<&'static AttackKind>> = match name {
         Some(name) => vec![Some(attack::named(name).unwrap_or_else(|| unknown_attack(name)))],
-        // Quiet before and after: the two tell how far one row can be trusted.
+        // Quiet before and after: the two show how far one row can be trusted.
         None => std::iter::once(None).chain(attack::KINDS.iter().map(Some)).chain([None]).collect(),
     };
     let (mut table, mut figures, mut pictured) = (Vec::new(), Vec::new(), Vec::new());

@@ -1,7 +1,7 @@
-//! The time of a step on triangle meshes: `central` in f32, all awake, at every width, on spheres of even and of uneven
-//! triangles; beside it a plain loop, implementations in numba and Taichi, and a sheet of as many points. Writes
-//! docs/benchmarks/mesh.{md,svg}. The peers run if PEERS names a Python that has them, as `make bench-mesh` ensures.
-//! `-- --quick` measures the two smaller sizes, with fewer rounds.
+//! The time of a step on triangle meshes: `central` in f32, all awake, at every width, on spheres of even and of
+//! uneven triangles; beside it a plain loop, implementations in numba and Taichi, and a sheet of as many points.
+//! Writes docs/benchmarks/mesh.{md,svg}. The peers run if PEERS names a Python that has them, as `make bench-mesh`
+//! ensures. `-- --quick` measures the two smaller sizes, with fewer rounds.
 
 #![allow(
     clippy::unwrap_used,
@@ -148,12 +148,12 @@ impl Sphere {
     }
 }
 
-/// Where the motion of a vertex begins, spacings.
+/// Initial displacement of a vertex, spacings.
 fn displaced(graph: &MeshGraph, vertex: usize) -> DVec3 {
     0.01 * DVec3::from_array((graph.rest_m[vertex] / graph.spacing_m).to_array().map(f64::sin))
 }
 
-/// What somebody writes first: springs in compressed rows, each evaluated from both ends, one vertex after the other.
+/// The simplest implementation: springs in compressed rows, each evaluated from both ends, one vertex after the other.
 /// Lengths are in spacings.
 struct PlainLoop {
     starts: Vec<u32>,
@@ -211,7 +211,7 @@ impl PlainLoop {
         }
     }
 
-    /// What `Mesh` of benches/peers/common.py reads.
+    /// Writes the input of `Mesh` in benches/peers/common.py.
     fn write(&self, graph: &MeshGraph, path: &Path) {
         let places = graph.rest_m.iter().flat_map(|place| (*place / graph.spacing_m).as_vec3().to_array());
         let head = [graph.rest_m.len() as u32, self.to.len() as u32];
@@ -239,7 +239,7 @@ fn sheet(points: usize) -> Box<dyn Tissue> {
     tissue
 }
 
-/// What is measured on a mesh.
+/// Measurements on a mesh.
 // There are three of them.
 #[allow(clippy::large_enum_variant)]
 enum Subject {

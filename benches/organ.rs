@@ -169,7 +169,8 @@ fn across_a_lump(report: &mut BenchReport, model: &Arc<Model>) -> Panel {
     }
 }
 
-/// Stiffness of a slow press of 1 mm all over the organ, seen from above. Places are `apart_m` or more from each other.
+/// Stiffness of a slow press of 1 mm all over the organ, seen from above. Places are `apart_m` or more from each
+/// other.
 fn map(report: &mut BenchReport, model: &Arc<Model>) -> Panel {
     report.heading("Only the lumps are stiffer: the whole organ");
     let apart_m: f64 = if quick() { 0.012 } else { 0.004 };
@@ -220,7 +221,8 @@ fn map(report: &mut BenchReport, model: &Arc<Model>) -> Panel {
     }
 }
 
-/// A square of `size_m` with edges of about `edge_m`, its vertices moved by up to `jitter` edges, as an OBJ file in metres.
+/// A square of `size_m` with edges of about `edge_m`, its vertices moved by up to `jitter` edges, as an OBJ file in
+/// metres.
 fn jittered(edge_m: f64, size_m: f64, jitter: f64) -> String {
     let mut dice = fastrand::Rng::with_seed(8);
     let count = |of_edge: f64| (size_m / of_edge).round() as u32;
@@ -275,7 +277,7 @@ fn spread(values: &[f64]) -> (f64, f64) {
     (mean, 100.0 * squares.sqrt() / mean)
 }
 
-/// The same press at many places between the vertices, and a tip that slides.
+/// One press at many places between the vertices, and a tip that slides.
 fn evenness(report: &mut BenchReport) {
     report.heading("The force does not depend on the place between vertices");
     report.say(

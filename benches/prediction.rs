@@ -1,5 +1,6 @@
-//! Touch on organs over a network, from local models and from a copy of the tissue that the client simulates: in virtual time and
-//! through a real server; and what a copy costs. Writes docs/benchmarks/prediction.{md,json}. `-- --quick` measures less.
+//! Touch on organs over a network, from local models and from a copy of the tissue that the client simulates: in
+//! virtual time and through a real server; and what a copy costs. Writes docs/benchmarks/prediction.{md,json}.
+//! `-- --quick` measures less.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 
@@ -30,7 +31,7 @@ const ROUND_TRIP_MS: u32 = 50;
 
 const SCHEMES: [&str; 2] = ["prediction", "model"];
 
-/// What is touched: a title, a scene, and where.
+/// The cases: a title, a scene, and the place of touch.
 const PLACES: [(&str, &str, &str); 5] = [
     ("liver-organ, away from lumps", "liver-organ", ""),
     ("liver-organ, over the larger lump", "liver-organ", "--place -0.040,-0.026,0.037"),
@@ -39,7 +40,7 @@ const PLACES: [(&str, &str, &str); 5] = [
     ("colon", "colon", ""),
 ];
 
-/// What of a run the tables show.
+/// Figures of a run that the tables show.
 const COLUMNS: [(&str, &str); 6] = [
     ("force error, % RMS", "force_error_rms_percent"),
     ("p99, N", "force_error_p99_n"),
@@ -118,7 +119,7 @@ fn places(report: &mut BenchReport, seeds: u64) {
     table(report, "where", "places", &PLACES.iter().map(run).collect::<Vec<_>>(), seeds);
 }
 
-/// What makes the copy another tissue than the server's.
+/// Differences of the copy from the server's tissue.
 fn disturbed(report: &mut BenchReport, seeds: u64) {
     report.heading("When the copy is incomplete: liver-organ");
     report.say(
@@ -204,7 +205,7 @@ fn live(report: &mut BenchReport) {
     report.figure("real time", Value::Array(figures));
 }
 
-/// What a copy takes of a tick, in memory, and to be made.
+/// Cost of a copy: time of a tick, memory, and time to create it.
 fn cost(report: &mut BenchReport) {
     report.heading("The cost of a copy");
     report.say(

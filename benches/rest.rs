@@ -71,7 +71,7 @@ async fn poke(haptics: &mut HapticServiceClient<Channel>, session_id: &str) {
     haptics.send_commands(request).await.unwrap();
 }
 
-/// Whether all sessions come to rest within a minute.
+/// Returns whether all sessions come to rest within a minute.
 async fn settle(sessions: &mut SessionServiceClient<Channel>, ids: &[String]) -> bool {
     let begun = Instant::now();
     for id in ids {

@@ -1,4 +1,4 @@
-//! How much time sleep saves, and how much accuracy it costs. Sizes, springs and kinds of poke against the tolerance of
+//! Time saved by sleep, and its cost in accuracy. Sizes, springs and kinds of poke against the tolerance of
 //! `[sleep]`; the truth is the same run with everything awake. Writes docs/benchmarks/skip.{md,svg}. `-- --quick`
 //! measures the small sheets.
 

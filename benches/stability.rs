@@ -327,7 +327,7 @@ impl Organ {
         Model::compile(&scene, &Limits { rehearsal_work: 0, ..Limits::default() }).unwrap()
     }
 
-    /// What the scheme promises by the bound of the graph, and what is observed.
+    /// The limit of the scheme by the bound of the graph, and the observed limit.
     fn limit(&self, integrator: &'static str) -> OrganLimit {
         let Body::Mesh(mesh) = &self.scene.body else { panic!("{} is on a mesh", self.name) };
         let kicked = PointId::new(mesh.stiffest.vertex as usize);
@@ -348,7 +348,8 @@ impl Organ {
     }
 }
 
-/// The fastest vibration of a mesh at rest, rad/s: of its springs along themselves and its anchor springs, by the power method.
+/// The fastest vibration of a mesh at rest, rad/s: of its springs along themselves and its anchor springs, by the
+/// power method.
 fn fastest_of_mesh_per_s(scene: &Scene, mesh: &Mesh) -> f64 {
     let shape = scene.shape();
     let mass_kg = |vertex: usize| mesh.point_mass_kg * mesh.relative_mass(PointId::new(vertex));

@@ -1,7 +1,7 @@
-//! Whether the chosen scheme keeps a scene's tolerance, and by how much. Random scenes with random scripts against f64
-//! at 1e-10. Writes docs/benchmarks/tolerance.{md,svg}. `-- --scenes 1000 --seed 1 --tolerances 1e-3,1e-5`; exit
-//! status 1 if a tolerance was broken. `--audit` also compares an audit's result with the true error, which takes ten
-//! times as long.
+//! Check whether the chosen scheme keeps a scene's tolerance, and by how much. Random scenes with random scripts
+//! against f64 at 1e-10. Writes docs/benchmarks/tolerance.{md,svg}.
+//! `-- --scenes 1000 --seed 1 --tolerances 1e-3,1e-5`; exit status 1 if a tolerance was broken. `--audit` also
+//! compares an audit's result with the true error, which takes ten times as long.
 
 #![allow(clippy::unwrap_used, clippy::disallowed_methods, clippy::cast_precision_loss, missing_docs)]
 #![allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]

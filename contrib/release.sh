@@ -18,7 +18,7 @@ target=${PALPATE_TARGET:-$(uname -m)-unknown-linux-musl}
 missing=''
 
 say() { echo "release: $*" >&2; }
-# What is not made, and why.
+# The files that were not made, with the reasons.
 skip() {
     say "not made: $1: $2"
     missing="$missing $1"

@@ -1,4 +1,4 @@
-//! What Agones is told, by a server of gRPC that imitates its SDK.
+//! Reports to Agones, received by a gRPC server that imitates its SDK.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/etcd.rs"]
@@ -26,7 +26,7 @@ use tonic::{Request, Response, Status, Streaming};
 use etcd::EtcdMembers;
 use server::{TEST_TIMEOUT, TestServer};
 
-/// How far the counter goes.
+/// The capacity of the counter.
 const CAPACITY: i64 = 70;
 
 /// The SDK of a pod, as far as servers call it.
@@ -34,7 +34,7 @@ const CAPACITY: i64 = 70;
 struct Imitation {
     calls: Arc<Mutex<Vec<String>>>,
     beats: Arc<AtomicUsize>,
-    /// So many calls are not answered.
+    /// Number of calls that are not answered.
     hangs: Arc<AtomicUsize>,
 }
 

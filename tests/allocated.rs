@@ -1,6 +1,6 @@
-//! What decoders take in memory is measured before, and paid for: every message of the protocol, of journals and of etcd, with
-//! entries that say nothing, many of them; journals and snapshots that say much in few bytes. And every session that may be goes
-//! to another server.
+//! What decoders take in memory is measured before, and paid for: every message of the protocol, of journals and of
+//! etcd, with entries that say nothing, many of them; journals and snapshots that say much in few bytes. And every
+//! session that may be goes to another server.
 //!
 //! Ten thousand messages in every run of the tests; `PALPATE_FUZZ_INPUTS` says how many instead.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
@@ -39,7 +39,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::{BUILT_IN, PAPER, Scene};
 use prost::Message;
 
-/// What is not counted: short texts of refusals, and the least that an allocation is.
+/// Bytes that are not counted: short texts of refusals, and the smallest allocation.
 const SLACK: usize = 64 << 10;
 
 fn account(memory_bytes: u64) -> Account {
@@ -279,7 +279,8 @@ fn a_snapshot_takes_no_more_than_its_header_says() {
     println!("a snapshot takes {most:.1} times its bytes");
 }
 
-/// A mesh of a sheet's shape whose texture coordinates are all 0: each of its corners is bytes that look like messages.
+/// A mesh of a sheet's shape whose texture coordinates are all 0: each of its corners is bytes that look like
+/// messages.
 fn flat(side: u32) -> TriangleMesh {
     let at = |x: u32, y: u32| glam::DVec3::new(f64::from(x), f64::from(y), 0.0) * 1e-3;
     let number = |x: u32, y: u32| y * side + x;

@@ -5,7 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// The crates of more than a few files, and the order of their modules: each may use those before it. `*` is all others.
+/// The crates of more than a few files, and the order of their modules: each may use those before it. `*` is all
+/// others.
 const MODULES: [(&str, &[&str]); 4] = [
     ("crates/tissue", &["limits", "lock", "memory", "files", "shape", "scene", "texture", "kernel", "*"]),
     ("crates/session", &["budget", "*", "surface", "wire", "journal"]),
@@ -237,7 +238,7 @@ fn files_make_no_circle_of_imports() {
     assert!(imports > 300);
 }
 
-/// How many imports there are among the files of a crate; panics if they make a circle.
+/// Returns the number of imports among the files of a crate; panics if they form a circle.
 fn imports_without_circle(source: &Path) -> usize {
     let is_program = |path: &PathBuf| path.ends_with("main.rs") || path.starts_with(source.join("program"));
     let files: Vec<(Module, String)> = rust_files(source)
@@ -254,7 +255,7 @@ fn imports_without_circle(source: &Path) -> usize {
         imports.entry(from).or_default().extend(all);
     }
     let count = imports.values().map(BTreeSet::len).sum();
-    // What imports nothing that is left is in no circle.
+    // A file without remaining imports is in no circle.
     loop {
         let left: BTreeSet<Module> = imports.keys().cloned().collect();
         imports.values_mut().for_each(|used| used.retain(|module| left.contains(module)));
@@ -345,7 +346,8 @@ fn split_outside<'t>(text: &'t str, by: &str) -> Vec<&'t str> {
     parts
 }
 
-/// Whether an SPDX expression can be met by licences that are `allowed`. `AND` binds closer than `OR`, for which some write `/`.
+/// Returns whether an SPDX expression can be met by licences that are `allowed`. `AND` binds closer than `OR`, for
+/// which some write `/`.
 fn is_met(expression: &str, allowed: &dyn Fn(&str) -> bool) -> bool {
     let text = expression.replace('/', " OR ");
     let is_one_met = |one: &str| match one.trim().strip_prefix('(').and_then(|inner| inner.strip_suffix(')')) {
@@ -433,7 +435,7 @@ const GRID: [&str; 5] = ["scene.sheet", "scene::Sheet", "place_of(", "GridPoint"
 
 #[test]
 fn above_the_sheet_a_tissue_is_its_rest_shape() {
-    // What scripts say of a tissue, too.
+    // Also the parts of scripts that describe a tissue.
     let of_tissue =
         ["force_law/", "scene/action", "scene/check", "scene/profile", "scene/reader", "scene/record", "scene/script"];
     let of_server = ["server/", "render/"];
@@ -458,7 +460,7 @@ fn above_the_sheet_a_tissue_is_its_rest_shape() {
     }
 }
 
-/// What a function of its arguments has no use for.
+/// Names that a pure function does not use.
 const IMPURE: [&str; 7] = ["Instant", "SystemTime", "tokio", "std::thread", "std::net", "getrandom", "HashMap"];
 
 #[test]

@@ -173,8 +173,8 @@ fn findings(scene: &Scene, told: StepActions, steps: u64, finer: u32) -> Vec<Aud
 
 #[test]
 fn a_window_agrees_with_one_of_a_much_shorter_substep() {
-    // The error of a tool that meets the sheet falls more slowly with the substep than the scheme's: contact begins and
-    // ends within a substep, and a tip that sticks or slips a substep earlier ends elsewhere. So a quarter of the
+    // The error of a tool that meets the sheet falls more slowly with the substep than the scheme's: contact begins
+    // and ends within a substep, and a tip that sticks or slips a substep earlier ends elsewhere. So a quarter of the
     // substep reveals less of that error, and in some windows much less.
     let tools: [(&str, f64, f64, StepActions); 4] = [
         ("push", 2.0, 1.0, pushing),
@@ -406,7 +406,7 @@ async fn a_correction_that_would_take_longer_than_a_scene_may_is_refused_and_tol
     // Without rehearsals, which would find another scheme, a correction is more substeps of this one.
     let limits = Limits { rehearsal_work: 1, ..Limits::default() };
     let model = Model::compile(&palpate_session::wire::scene::from_scene(&scene, None).unwrap(), &limits).unwrap();
-    // As long as the scene's own steps are predicted to take, and no longer.
+    // Only for the predicted duration of the scene's own steps.
     let periods = 1.000_001 * model.predicted_step_s() * model.scene.stepping.rate_hz;
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");

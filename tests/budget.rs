@@ -62,12 +62,12 @@ async fn sessions_above_the_budget_are_refused_and_what_went_makes_room() {
     };
     assert_eq!(told(&refused), (Code::ResourceExhausted, "OVERLOADED".into(), "sheet.points".into()));
     assert!(kept.len() > 2 && metric(&metrics, TAKEN) <= f64::from(48 << 20));
-    // Who has what they need is served.
+    // Clients that have their memory are served.
     touch.command(server::force(0, 1, -1.0)).await;
     touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == 1).await;
     drop(touch);
     kept.push(other);
-    // What could never fit is told so.
+    // A request that could never fit is refused as such.
     let refused = server.create(sheet(1024, 1024), true).await.unwrap_err();
     assert_eq!(told(&refused).1, "TOO_LARGE");
     let mut sessions = server.sessions().await;
@@ -94,7 +94,7 @@ async fn viewers_above_the_budget_are_refused_and_what_they_were_shown_is_forgot
         }
         assert!(unread.len() < 100, "nobody is refused");
     };
-    // What does not fit is the viewer, or already what its stream may hold.
+    // The viewer does not fit, or already the buffer of its stream.
     let (code, reason, field) = told(&refused);
     assert_eq!((code, reason.as_str()), (Code::ResourceExhausted, "OVERLOADED"));
     assert!(["refinement", ""].contains(&field.as_str()), "{field}");

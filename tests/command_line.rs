@@ -1,4 +1,4 @@
-//! What people mistype: each program says what is wrong and what would be right.
+//! Mistyped arguments: each program reports the mistake and the correction.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, missing_docs)]
 
 use std::path::Path;

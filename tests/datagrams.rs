@@ -1,5 +1,5 @@
-//! Touch by datagram: that it goes by them while they get through and by the stream else, and that nobody gets in without a
-//! ticket.
+//! Touch by datagram: it uses datagrams while they get through and the stream otherwise, and no client is admitted
+//! without a ticket.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/server.rs"]
@@ -111,7 +111,7 @@ fn pose(tool: u32, sequence: u64) -> pb::Command {
     }
 }
 
-/// A touch that goes on, one pose a millisecond.
+/// A continuous touch, one pose a millisecond.
 struct DatagramClient {
     touch: TestTouch,
     datagrams: Datagrams,
@@ -120,7 +120,7 @@ struct DatagramClient {
     poses: u64,
     samples: [u64; 2],
     newest: Option<pb::Sample>,
-    /// How often another session was asked for.
+    /// Number of requests for another session.
     asked: u64,
 }
 
@@ -306,7 +306,7 @@ async fn a_session_needs_a_ticket_that_is_good_and_a_page_that_may_call_and_ends
         let refused = in_time(dial(to, &hash, &ticket, Some(origin))).await;
         assert!(matches!(refused, Err(ConnectingError::SessionRejected)), "{origin}: {refused:?}");
     }
-    // Another server's certificate is none of this one's.
+    // The certificate of another server is not accepted.
     assert!(in_time(dial(to, &[7; 32], &ticket, None)).await.is_err());
     let connection = in_time(dial(to, &hash, &ticket, Some("https://good.example"))).await.unwrap();
     let again = in_time(dial(to, &hash, &ticket, None)).await;
@@ -360,7 +360,7 @@ async fn a_session_leads_the_tools_of_its_own_stream_alone_and_bears_nonsense() 
         let _ = connection.send_datagram(bytes);
         tokio::time::sleep(Duration::from_micros(200)).await;
     }
-    // The stream goes on, and so does the other.
+    // The stream continues, and so does the other.
     touch.command(pose(0, 1_000_000)).await;
     loop {
         match touch.hear().await.unwrap().unwrap() {
@@ -401,7 +401,7 @@ async fn a_client_that_cant_open_a_stream_has_datagrams_for_its_lease() {
     let offer = haptics.open_datagrams(request(&lease_id)).await.unwrap().into_inner().offer.unwrap();
     let connection =
         in_time(dial(address(&server), &offer.certificate_sha256, &hex(&offer.ticket), None)).await.unwrap();
-    // What is not confirmed comes by the session's stream.
+    // Unconfirmed data comes by the session's stream.
     let mut stream = in_time(connection.accept_uni()).await.unwrap();
     let mut length = [0; 4];
     in_time(stream.read_exact(&mut length)).await.unwrap();
@@ -495,7 +495,7 @@ fn a_pose_that_was_overtaken_by_a_release_begins_no_touch() {
     assert!(forces[499] > 0.2 && forces[502..].iter().all(|force_n| force_n.abs() < 0.1 * forces[499]), "{forces:?}");
 }
 
-/// What a stream answers when it is asked for another session, which is once a second at most.
+/// Answer of a stream to a request for another session, at most once a second.
 async fn another_offer(touch: &mut TestTouch) -> pb::DatagramOffer {
     loop {
         touch.say(Say::Renew(pb::Renew { client_time_ns: 1, datagrams: true })).await;

@@ -1,4 +1,4 @@
-//! The same scene, commands and steps give the same bits.
+//! Equal scenes, commands and steps give equal bits.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 mod common;

@@ -1,5 +1,5 @@
-//! Devices of makers, imitated: a whole bridge between each of them and a real server, its forces and units, and what happens
-//! when something is wrong. No device was touched for this; docs/devices.md says so.
+//! Devices of makers, imitated: a whole bridge between each of them and a real server, its forces and units, and what
+//! happens when something is wrong. No device was touched for this; docs/devices.md says so.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, clippy::type_complexity)]
 
@@ -53,7 +53,7 @@ impl Imitation {
     }
 }
 
-/// What an imitation was asked.
+/// Requests to an imitation.
 #[derive(Clone)]
 struct Log(PathBuf);
 
@@ -107,7 +107,7 @@ async fn touch(
     report
 }
 
-/// A device that notes where it was last and what it was told.
+/// A device that records its last place and the forces that it was given.
 struct Noting<D> {
     device: D,
     noted: Arc<Mutex<(DVec3, Vec<DVec3>)>>,
@@ -130,7 +130,7 @@ impl<D: HapticDevice> HapticDevice for Noting<D> {
     }
 }
 
-/// Whether a force was above a twentieth of a newton often enough.
+/// Returns whether a force was above a twentieth of a newton often enough.
 fn is_felt(forces: &[DVec3]) -> bool {
     forces.iter().filter(|force_n| force_n.length() > 0.05).count() > 50
 }
@@ -255,7 +255,7 @@ async fn an_inverse3_is_spoken_to_in_the_words_of_its_services_version() {
         let heard = service.heard();
         until("no force at the end", || heard.forces_n().last() == Some(&DVec3::ZERO));
         assert_eq!(heard.fields(), [field]);
-        // Whoever speaks 3.5 says who it is, once.
+        // A client of version 3.5 identifies itself once.
         assert_eq!(heard.profiles(), if field == "vector" { vec!["palpate".to_owned()] } else { vec![] });
         let (ours, forces) = (report.course, heard.forces_n());
         for asked in &forces {
@@ -287,8 +287,8 @@ fn pipe(folder: &Path) -> PathBuf {
     path
 }
 
-/// Writes events into a pipe for as long as they are wanted: a press of the button every now and then, and down or up. `last` is
-/// what it says at the end.
+/// Writes events into a pipe for as long as they are wanted: a press of the button every now and then, and down or
+/// up. `last` is what it says at the end.
 fn play(
     path: &Path,
     kind: u16,
@@ -360,7 +360,7 @@ fn client(arguments: &[&str]) -> Output {
     program.args(arguments).stdin(Stdio::null()).output().unwrap()
 }
 
-/// What goes wrong with a device, how the bridge ends, and what it says.
+/// Faults of a device, the bridge's exit status, and its message.
 struct DeviceFaultCase {
     device: String,
     library: Option<PathBuf>,
@@ -495,7 +495,7 @@ fn what_goes_wrong_with_haplys_service_ends_the_bridge_within_the_envelope() {
         let forces = service.heard().forces_n();
         assert_eq!(is_felt(&forces), is_touched, "{wrong:?}");
         assert!(forces.iter().all(|force_n| force_n.length() <= SAFE_FORCE_N), "{wrong:?}");
-        // Who still listens is told that there is to be no force.
+        // A service that still listens is told to render no force.
         if ![Wrong::Killed, Wrong::Silent].contains(&wrong) && is_touched {
             until("no force at the end", || service.heard().forces_n().last() == Some(&DVec3::ZERO));
         }

@@ -1,4 +1,5 @@
-//! The client of etcd against real members: each call, and what comes of calls when members die, freeze or ask who we are.
+//! The client of etcd against real members: each call, and what comes of calls when members die, freeze or ask who we
+//! are.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
@@ -20,7 +21,7 @@ use rcgen::{BasicConstraints, CertificateParams, DistinguishedName, ExtendedKeyU
 /// Long enough for any machine.
 const ETCD_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// So long may an attempt take where members die: longer than on a busy machine, shorter than a test's patience.
+/// Timeout of an attempt while members die: longer than on a busy machine, shorter than that of a test.
 const LIMIT: Duration = Duration::from_secs(1);
 
 fn started(members: usize) -> EtcdMembers {
@@ -89,7 +90,7 @@ async fn each_call() {
     lists(&client).await;
     leases(&client).await;
 
-    // What etcd refuses is not tried again, and not unknown.
+    // A refusal of etcd is not tried again, and its result is known.
     let twice = client.transact(of(vec![put("b", "1", None), put("b", "2", None)])).await;
     assert!(matches!(&twice, Err(EtcdError::Refused(why)) if why.contains("duplicate key")), "{twice:?}");
     assert_eq!(client.get("b").await.unwrap().0, None);
@@ -103,7 +104,8 @@ async fn each_call() {
     etcd.restart_all();
     assert_eq!(client.get("c").await.unwrap().0, None);
 
-    // One that accepts a transaction and says nothing may do it later, or not. It gets no other before it answers again.
+    // One that accepts a transaction and says nothing may do it later, or not. It gets no other before it answers
+    // again.
     etcd.pause(0);
     let frozen = client.transact(of(vec![put("c", "1", None)])).await;
     assert!(matches!(&frozen, Err(EtcdError::Unknown(why)) if why.contains("read")), "{frozen:?}");
@@ -213,7 +215,7 @@ async fn a_watch_begins_where_it_is_told_to_and_says_what_is_lost() {
     let [WatchEvent::Put(put), WatchEvent::Delete { key, revision: deleted }] = &batch[..] else { panic!("{batch:?}") };
     assert_eq!((put.key.as_str(), put.mod_revision, key.as_str(), *deleted), ("w/3", revision, "w/1", revision));
 
-    // Who gives up waiting loses nothing, and a watch outlives its own silence.
+    // A caller that stops waiting loses nothing, and a watch outlives its own silence.
     let silence = 3 * LIMIT;
     assert!(tokio::time::timeout(silence, watch.next()).await.is_err());
     let fourth = make(&client, "w/4").await;
@@ -232,7 +234,7 @@ async fn a_watch_begins_where_it_is_told_to_and_says_what_is_lost() {
     for _ in 0..2 {
         assert_eq!(next(&mut late).await, Err(WatchError::Compacted { since: first }));
     }
-    // The list goes on from where the history begins.
+    // The list continues from where the history begins.
     let (listed, at) = client.list("w/").await.unwrap();
     assert_eq!(listed.len(), 4);
     let mut anew = client.watch("w/", at + 1);
@@ -357,7 +359,7 @@ async fn a_thousand_transactions_at_once_are_done_once_each_though_members_die()
     eprintln!("{} of {TASKS} transactions had no answer", unknown.load(Ordering::Relaxed));
 }
 
-/// Adds one to a counter, and makes a key that tells so.
+/// Adds one to a counter, and creates a key that records it.
 async fn increment(client: &Client, counter: &str, mark: &str, unknown: &AtomicUsize) {
     let read = vec![Op::Get(counter.to_owned()), Op::Get(mark.to_owned())];
     let mut txn = of(read.clone());
@@ -470,7 +472,7 @@ async fn certificates_and_passwords() {
     assert!(matches!(&batch[..], [WatchEvent::Put(kv)] if kv.key == "mine/3"), "{batch:?}");
     assert_eq!(at_last(|| client.keep_alive(lease.id)).await, Some(lease.ttl_s));
 
-    // A wrong password, which no message tells.
+    // A wrong password, which no message contains.
     std::fs::write(&secret, "wrong-horse").unwrap();
     let client = Client::open_within(&named, LIMIT).unwrap();
     let wrong = client.get("mine/1").await;

@@ -1,5 +1,5 @@
-//! A fleet of real servers on a real etcd: who has a session, what becomes of it when its server dies, freezes, loses etcd, or hands
-//! it over.
+//! A fleet of real servers on a real etcd: who has a session, what becomes of it when its server dies, freezes, loses
+//! etcd, or hands it over.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
@@ -51,7 +51,7 @@ async fn any_server_creates_sessions_and_tells_where_they_are() {
         let session = create(&nodes[index % 3]).await;
         let ownership = session.ownership.unwrap();
         made.insert(session.session_id, ownership.node);
-        // The others are told of it twice a second.
+        // It is sent to the others twice a second.
         tokio::time::sleep(Duration::from_millis(600)).await;
     }
     let of = |name: &str| made.values().filter(|node| *node == name).count();
@@ -76,7 +76,7 @@ async fn any_server_creates_sessions_and_tells_where_they_are() {
     for unknown in ["0123456789abcdef0123456789abcdef", "../nodes/n0", ""] {
         assert_eq!(nodes[0].session(unknown).await.unwrap_err().code(), Code::NotFound, "{unknown}");
     }
-    // What is deleted is known nowhere.
+    // A deleted session is known nowhere.
     let (id, name) = made.first_key_value().unwrap();
     let there = nodes.iter().find(|node| node.name == *name).unwrap();
     let request = pb::DeleteSessionRequest { session_id: id.clone() };
@@ -141,7 +141,7 @@ async fn a_frozen_server_says_nothing_for_its_sessions_when_it_thaws() {
     assert!(taken.ownership.as_ref().unwrap().revision > session.ownership.as_ref().unwrap().revision);
     assert_eq!(nodes[there].name, session.ownership.as_ref().unwrap().standby);
     nodes[at].thaw();
-    // What was on its way is of the old revision. Then the stream ends with the reason.
+    // Samples under way have the old revision. Then the stream ends with the reason.
     let ended = loop {
         match touch.hear().await {
             Ok(Some(Heard::Sample(sample))) => {
@@ -254,7 +254,7 @@ async fn a_session_moves_with_its_tools_and_the_same_bits() {
             }
         };
         assert_eq!(elsewhere(&ended), Some(nodes[to].url.clone()), "{ended}");
-        // The tool is still in the tissue, and whoever held it goes on.
+        // The tool is still in the tissue, and its holder continues.
         let open = pb::TouchOpen { lease_id, ..server::open(&id, &[0]) };
         touch = TestTouch::open(nodes[to].there(), open).await.unwrap();
         let sample = touch.sample_with(|sample| !sample.tools.is_empty()).await;
@@ -269,7 +269,7 @@ async fn a_session_moves_with_its_tools_and_the_same_bits() {
         session.scene.unwrap().springs.unwrap().stiffness_n_per_m == Some(40.0)
     })
     .await;
-    // A lease that is none, and an unknown server.
+    // An invalid lease, and an unknown server.
     let open = pb::TouchOpen { lease_id: "0".repeat(32), ..server::open(&id, &[0]) };
     assert_eq!(TestTouch::open(nodes[at].there(), open).await.err().unwrap().code(), Code::PermissionDenied);
     let request = pb::MoveSessionRequest { session_id: id.clone(), node: "nowhere".into() };
@@ -383,7 +383,7 @@ async fn servers_know_each_other_by_certificates_and_clients_by_tokens() {
     let request = pb::MoveSessionRequest { session_id: id.clone(), node };
     let moved = admin.move_session(request).await.unwrap().into_inner().ownership.unwrap();
     assert_eq!(moved.node, ownership.standby);
-    // What is between servers is for servers: neither a token that administers is enough, nor a client without one.
+    // Calls between servers are for servers only: a token that administers is not enough, nor a client without one.
     let create_here = || pb::CreateHereRequest::default();
     let mut calls = pb::node_service_client::NodeServiceClient::with_interceptor(there.clone(), authorized);
     let refused = calls.create_here(create_here()).await.unwrap_err();
@@ -396,13 +396,13 @@ async fn servers_know_each_other_by_certificates_and_clients_by_tokens() {
     assert_eq!(calls.create_here(create_here()).await.unwrap_err().code(), Code::Unauthenticated);
     let trust = authority.trust().identity(of(Authority::new().sign_node("node-1")).unwrap());
     let endpoint = tonic::transport::Channel::from_shared(urls[0].clone()).unwrap();
-    // TLS 1.3 tells a client of its certificate only after the handshake.
+    // In TLS 1.3 a client learns about its refused certificate only after the handshake.
     if let Ok(channel) = endpoint.tls_config(trust).unwrap().connect().await {
         let mut calls = pb::node_service_client::NodeServiceClient::new(channel);
         assert!(calls.create_here(create_here()).await.is_err());
     }
-    // Both get another certificate while they run, and the names of the first have no role any more: what they show each other from
-    // then on are the new ones.
+    // Both get another certificate while they run, and the names of the first have no role any more: what they show
+    // each other from then on are the new ones.
     (0..2).for_each(|at| drop(certify(at, "renewed")));
     std::fs::write(&tokens, std::fs::read_to_string(&tokens).unwrap().replace("\"node-", "\"renewed-")).unwrap();
     let source = pb::create_session_request::Source::SceneName("paper".into());

@@ -1,5 +1,5 @@
-//! A fleet of real servers on a real etcd, under clients at 1 kHz that follow their sessions, while servers are killed, frozen and
-//! cut off from etcd, etcd loses its leader or is gone altogether, and sessions move.
+//! A fleet of real servers on a real etcd, under clients at 1 kHz that follow their sessions, while servers are
+//! killed, frozen and cut off from etcd, etcd loses its leader or is gone altogether, and sessions move.
 //!
 //! `make chaos` does it all at length, and gathers the figures:
 //!
@@ -91,12 +91,12 @@ struct Ward {
 }
 
 impl Ward {
-    /// So many sessions with clients, which get a sample every so many steps, and so many at rest. Each server reaches etcd by its own
-    /// addresses.
+    /// So many sessions with clients, which get a sample every so many steps, and so many at rest. Each server
+    /// reaches etcd by its own addresses.
     async fn open(etcd: &[Vec<String>], sessions: u64, every: u32, resting: u64) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let config = folder.path().join("palpate.toml");
-        // Nothing is refused because the machine is slow, or deleted because nobody has asked for it.
+        // Nothing is refused because the machine is slow, or deleted because it was idle.
         std::fs::write(&config, "idle_session_s = 86400.0\n[limits]\nthread_share = 1000.0\n").unwrap();
         let more = ["--durable", "two", "--log", "error", "--config", config.to_str().unwrap()];
         let nodes: Vec<Node> =
@@ -116,7 +116,8 @@ impl Ward {
         ward
     }
 
-    /// Waits until all sessions have an owner and another server that stands by, and all clients touch. Tells who has what.
+    /// Waits until all sessions have an owner and another server that stands by, and all clients touch. Tells who has
+    /// what.
     async fn until_well(&self) -> BTreeMap<String, pb::Ownership> {
         let mut found = BTreeMap::new();
         until("all is well", async || {
@@ -149,7 +150,8 @@ impl Ward {
         .await;
     }
 
-    /// Ends all; the journals are those of offline runs, and whatever a client was told was told by one server at a time.
+    /// Ends all; the journals are those of offline runs, and whatever a client was told was told by one server at a
+    /// time.
     async fn close(mut self) -> Vec<follower::FollowerObservation> {
         let mut seen = Vec::new();
         for follower in self.followers.drain(..) {
@@ -164,18 +166,19 @@ impl Ward {
     }
 }
 
-/// What becomes of a server.
+/// Fate of a server.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Debug)]
 enum ServerFault {
     Killed,
     Frozen,
     /// Its connections to etcd break.
     Cut,
-    /// Nothing goes between it and etcd, and nobody is told.
+    /// Silently blocks all data between it and etcd.
     Silenced,
 }
 
-/// The runs of a session before its newest are those of offline runs. They are removed but for the one before: room for many rounds.
+/// The runs of a session before its newest are those of offline runs. They are removed but for the one before: room
+/// for many rounds.
 fn check_runs(nodes: &[Node], id: &str) -> u64 {
     let mut runs: Vec<_> = nodes.iter().flat_map(|node| node.runs(id)).collect();
     runs.sort_by_key(|file| file.run);
@@ -300,7 +303,8 @@ async fn rounds() {
     ));
 }
 
-/// Waits until the sessions of the server that fails are back at others. Tells how long that took for those under touch and at rest, s.
+/// Waits until the sessions of the server that fails are back at others. Tells how long that took for those under
+/// touch and at rest, s.
 async fn until_back(
     ward: &Ward,
     at: usize,
@@ -357,7 +361,7 @@ async fn etcds_leader_is_killed() {
         etcd.kill(leader);
         until("another leads", async || etcd.leader().is_some_and(|other| other != leader)).await;
         let led_s = begun.elapsed().as_secs_f64();
-        // Whoever would lose its lease does so now.
+        // A server that would lose its lease loses it now.
         tokio::time::sleep(Duration::from_secs_f64(2.0 * TTL_S).saturating_sub(begun.elapsed())).await;
         tokio::task::block_in_place(|| {
             etcd.restart(leader);

@@ -1,6 +1,7 @@
-//! A fleet in virtual time: nodes with clocks, pauses, crashes and partitions, etcd by its promises, and clients. The histories of
-//! seeded random runs are checked: never two owners at once, no durable input lost, no revision goes back, an owner soon after
-//! faults stop, and what is deleted stays so. The rules are those of `palpate_cluster`; each of them broken on purpose is found.
+//! A fleet in virtual time: nodes with clocks, pauses, crashes and partitions, etcd by its promises, and clients. The
+//! histories of seeded random runs are checked: never two owners at once, no durable input lost, no revision goes
+//! back, an owner soon after faults stop, and what is deleted stays so. The rules are those of `palpate_cluster`;
+//! each of them broken on purpose is found.
 #![allow(unreachable_pub, clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "fleet_model/broken.rs"]
@@ -41,8 +42,8 @@ type S = usize;
 const MS: Ns = 1_000_000;
 const TTL_S: u64 = 3;
 
-/// So long after faults have stopped every session that can go on does: the lease's time to live, and what etcd, its watches and
-/// calls that hang at that moment add.
+/// Time after the end of the faults within which every session that can continue does: the lease's time to live, and
+/// what etcd, its watches and calls that hang at that moment add.
 const BOUND: Ns = (TTL_S * 1_000 + 4_000) * MS;
 
 /// Rounds of faults and calm of one seed.
@@ -92,7 +93,7 @@ fn histories_of_many_seeds_keep_what_the_fleet_promises() {
     );
 }
 
-/// What some seed finds, from `first` on; the seed with it.
+/// Returns the first finding of a seed, from `first` on, with the seed.
 fn found(broken: Broken, first: u64) -> Option<(u64, String)> {
     let seeds = std::env::var("PALPATE_FLEET_SEEDS").ok().and_then(|text| text.parse().ok()).unwrap_or(SEEDS);
     (first..first + seeds).find_map(|seed| {
@@ -101,8 +102,9 @@ fn found(broken: Broken, first: u64) -> Option<(u64, String)> {
     })
 }
 
-/// Each is found by one of so many seeds; the seed that finds it now is tried first. When a change of the model makes other
-/// histories, `PALPATE_FLEET_SEEDS=100000 cargo test --release --test fleet_model NAME -- --nocapture` finds another.
+/// Each is found by one of so many seeds; the seed that finds it now is tried first. When a change of the model makes
+/// other histories, `PALPATE_FLEET_SEEDS=100000 cargo test --release --test fleet_model NAME -- --nocapture` finds
+/// another.
 const SEEDS: u64 = 400;
 
 macro_rules! is_found {

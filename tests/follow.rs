@@ -1,5 +1,5 @@
-//! A device goes on with a session that moves between the servers of a fleet, by the same lease of its tool; and rests until its
-//! user asks for forces when the server of its session has died.
+//! A device continues with a session that moves between the servers of a fleet, by the same lease of its tool; and
+//! rests until its user asks for forces when the server of its session has died.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
@@ -34,11 +34,11 @@ static ONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
 /// The name by which servers know the hand.
 const HOLDER: &str = "the hand";
 
-/// Heights over the tissue to which a hand is told to go, µm.
+/// Target heights of a hand over the tissue, µm.
 const OUT_UM: i64 = 4000;
 const IN_UM: i64 = -3000;
 
-/// Where a hand is to go, and what it has felt.
+/// Target of a hand, and the forces that it has felt.
 #[derive(Default)]
 struct HandPath {
     ticks: Mutex<Vec<Tick>>,
@@ -82,7 +82,8 @@ impl HandPath {
         until("the hand ticks", async || self.len() >= end).await;
     }
 
-    /// Brings the hand out of the tissue, asks for forces, and presses until they are felt in full: they ramp in for half a second.
+    /// Brings the hand out of the tissue, asks for forces, and presses until they are felt in full: they ramp in for
+    /// half a second.
     async fn press(&self) {
         self.ask(false);
         self.go(OUT_UM);
@@ -97,7 +98,7 @@ impl HandPath {
     }
 }
 
-/// A hand that goes where it is told by 20 mm/s.
+/// A hand that moves to its target at 20 mm/s.
 struct SlowHand {
     course: Arc<HandPath>,
     z_m: f64,
@@ -132,7 +133,7 @@ struct Bridge {
 }
 
 impl Bridge {
-    /// It is told of one server only.
+    /// It knows one server only.
     fn begin(node: &Node, session_id: &str) -> Self {
         let course = Arc::new(HandPath { goal_um: AtomicI64::new(OUT_UM), ..HandPath::default() });
         let hand = SlowHand { course: course.clone(), z_m: 0.004 };
@@ -158,7 +159,8 @@ impl Bridge {
     }
 }
 
-/// No force changes faster than the envelope lets it: 0.1 N in a tick of 1 ms. A loop that was late may catch up with ten ticks.
+/// No force changes faster than the envelope lets it: 0.1 N in a tick of 1 ms. A loop that was late may catch up with
+/// ten ticks.
 fn assert_smooth(ticks: &[Tick]) {
     for pair in ticks.windows(2) {
         let elapsed_s = (pair[1].time_s - pair[0].time_s).clamp(0.0, 0.01);
@@ -182,7 +184,7 @@ async fn create(node: &Node) -> String {
     node.there().create(source, false).await.unwrap().session_id
 }
 
-/// How many commands have acted at this server. `None`: it does not serve the session.
+/// Returns the number of commands that have acted at this server; `None` if it does not serve the session.
 async fn applied(node: &Node, id: &str) -> Option<u64> {
     node.session(id).await.ok().map(|session| session.commands.unwrap().applied)
 }
@@ -197,7 +199,7 @@ async fn until_led(node: &Node, id: &str, more: u64) {
     .await;
 }
 
-/// How often the lease of a tool has ended in the newest run of a session's journal at this server.
+/// Returns how often the lease of a tool has ended in the newest run of a session's journal at this server.
 fn ended_leases(node: &Node, id: &str) -> usize {
     let newest = file::list(&node.journals).unwrap().into_iter().filter(|file| file.session_id == id);
     let newest = newest.max_by_key(|file| file.run).expect("it has a journal");
@@ -215,7 +217,7 @@ fn ended_leases(node: &Node, id: &str) -> usize {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_hand_goes_on_with_a_session_that_moves_and_feels_no_jump() {
     const MOVES: u32 = 4;
-    /// A busy machine may be silent for longer than a hand goes on by itself.
+    /// A busy machine may be silent for longer than a hand continues by itself.
     const MAX_MOVES: u32 = 16;
     if !EtcdMembers::is_there() {
         return;
@@ -226,7 +228,7 @@ async fn a_hand_goes_on_with_a_session_that_moves_and_feels_no_jump() {
     let nodes = two(folder.path(), &etcd.endpoints()).await;
     let id = create(&nodes[0]).await;
     let mut at = fleet::owner(&nodes, &id).await.unwrap();
-    // The other one: it has to be told where the session is.
+    // The other server redirects it to the session.
     let bridge = Bridge::begin(&nodes[1 - at], &id);
     until_led(&nodes[at], &id, 100).await;
     let course = bridge.course.clone();
@@ -247,7 +249,7 @@ async fn a_hand_goes_on_with_a_session_that_moves_and_feels_no_jump() {
         assert_smooth(&ticks);
         // Nobody else can have had the tool, as its lease has not ended.
         assert_eq!(ended_leases(&nodes[to], &id), 0);
-        // It was enabled once, and nobody has asked since. A pause comes only when nothing was heard for as long as it takes a force
+        // It was enabled only once. A pause comes only when nothing was heard for as long as it takes a force
         // to fade.
         match ticks.iter().position(|tick| tick.state != Some(RenderingState::Enabled)) {
             None => {

@@ -1,5 +1,5 @@
-//! Every decoder under inputs that are nearly right: valid ones, bent, cut, spliced, with the numbers that hurt. The same
-//! functions as under libFuzzer (`fuzz/`); here without instrumentation, and the same inputs in every run.
+//! Every decoder under inputs that are nearly right: valid ones, bent, cut, spliced, with the numbers that hurt. The
+//! same functions as under libFuzzer (`fuzz/`); here without instrumentation, and the same inputs in every run.
 //!
 //! Twenty thousand for each decoder in every run of the tests; `make fuzz` tries a million (`PALPATE_FUZZ_INPUTS`).
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
@@ -28,7 +28,8 @@ const CORPUS: usize = 512;
 /// Longest input, bytes.
 const LONGEST: usize = 1 << 14;
 
-/// What an input may take beside, bytes: that of a message, and of a small tissue that is compiled and rehearsed.
+/// Additional memory that an input may take, bytes: for a message, and for a small tissue that is compiled and
+/// rehearsed.
 const MAX_ROOM: usize = 3 * ROOM;
 
 /// Pieces of text and of protobuf at which readers stumble.

@@ -1,4 +1,4 @@
-//! Who may do what: TLS, tokens, certificates, and what a server does not start without.
+//! Authorization: TLS, tokens, certificates, and the settings without which a server does not start.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/authority.rs"]
@@ -119,7 +119,7 @@ async fn every_call_is_refused_without_a_token_with_a_wrong_one_and_with_too_wea
     let reason = |status: &Status| status.get_details_error_info().map(|info| info.reason).unwrap_or_default();
     for path in served() {
         let Some(Access::Role(needed)) = access(&path) else {
-            // What is open may be refused for what it asks, not for who asks.
+            // An open call may be refused for its content, not for its caller.
             if let Err(status) = call(&channel, &path, None).await {
                 assert!(
                     ![Code::Unauthenticated, Code::PermissionDenied].contains(&status.code()),
@@ -138,7 +138,7 @@ async fn every_call_is_refused_without_a_token_with_a_wrong_one_and_with_too_wea
             assert_eq!(reason(&status), "UNAUTHENTICATED", "{path}, {authorization:?}");
         }
         for (role, token) in &tokens {
-            // What servers of a fleet ask of each other is for no other role.
+            // Calls between servers of a fleet are for no other role.
             let administers = *role == Role::Administer && needed != Role::Node;
             let enough = needed == Role::Watch || *role == needed || administers;
             let called = call(&channel, &path, Some(&format!("bearer {token}"))).await;
@@ -154,7 +154,7 @@ async fn every_call_is_refused_without_a_token_with_a_wrong_one_and_with_too_wea
             }
         }
     }
-    // A call of the protocol's package that the server has not got is not let through either.
+    // A call of the protocol's package that the server does not implement is refused too.
     let status = call(&channel, "/palpate.v1.SessionService/Forgotten", Some(&format!("Bearer {}", tokens[3].1))).await;
     assert_eq!(told(&status.unwrap_err()), (Code::PermissionDenied, "ROLE_MISSING".into(), String::new()));
 }
@@ -271,7 +271,7 @@ async fn who_loses_a_token_loses_the_streams_and_tools_that_it_opened() {
         }
     };
     assert_eq!(ended.code(), Code::Unauthenticated, "{ended}");
-    // Whoever may takes the tool, and who was not meant goes on.
+    // A caller with the right takes the tool, and other callers continue.
     let mut haptics = server.haptics().await;
     let begun = std::time::Instant::now();
     loop {
@@ -309,7 +309,7 @@ async fn who_loses_a_token_loses_the_tools_that_outlive_its_calls() {
     let told = server.sessions().await.get_session(with_token(request, &stays)).await.unwrap();
     let held: Vec<u32> = told.into_inner().session.unwrap().held_tools.iter().map(|held| held.tool).collect();
     assert_eq!(held, [1]);
-    // The lease is of no use to anybody, and the other one is.
+    // The lease is useless to others, and the other lease works.
     assert_eq!(send(0, 2, &lost, &stays).await.unwrap_err().code(), Code::PermissionDenied);
     send(1, 1, &kept, &stays).await.unwrap();
 }
@@ -340,7 +340,7 @@ async fn who_loses_a_token_and_does_not_read_commands_nothing_more() {
         let told = server.sessions().await.get_session(with_token(request, &stays)).await.unwrap();
         told.into_inner().session.unwrap()
     };
-    // What is not read fills the window; commands go on.
+    // Unread data fills the window; commands continue.
     let (sender, _channel, _unread) = touch_with(&server, &goes, &session, 1).await;
     let mut sequence = 0;
     let command = async |sequence: u64| {
@@ -383,7 +383,7 @@ async fn tokens_that_can_not_be_read_are_told_of_and_the_old_ones_hold() {
     let mut health = HealthClient::new(channel.clone());
     let request = |service: &str| HealthCheckRequest { service: service.into() };
     let mut watching = health.watch(request("palpate.tokens")).await.unwrap().into_inner();
-    // Between two changes of the file the server may see a third state, and tells that too.
+    // Between two changes of the file the server may see a third state, and logs that too.
     let mut tells = async |status: ServingStatus, when: &str| {
         let told = async { while watching.message().await.unwrap().unwrap().status != status as i32 {} };
         tokio::time::timeout(TEST_TIMEOUT, told).await.unwrap_or_else(|_| panic!("{status:?} is not told {when}"));
@@ -410,7 +410,7 @@ async fn tokens_that_can_not_be_read_are_told_of_and_the_old_ones_hold() {
         std::fs::write(&file, &text).unwrap();
         tells(Serving, &format!("after {what}")).await;
     }
-    // What can be read and has no token in it lets nobody in.
+    // A readable file without tokens admits no caller.
     std::fs::write(&file, "# nobody\n").unwrap();
     let waited = tokio::time::timeout(TEST_TIMEOUT, async { while is_known().await {} });
     waited.await.expect("a token that is not in the file is known");
@@ -456,11 +456,11 @@ async fn a_certificate_near_its_end_is_warned_of() {
     }
 }
 
-/// What a server logs, as it does.
+/// Log of a running server.
 struct Log(mpsc::Receiver<String>);
 
 impl Log {
-    /// Whether it has such a line before none comes for `silence`.
+    /// Returns whether it contains such a line before a silence of `silence`.
     fn tells(&self, text: &str, silence: std::time::Duration) -> bool {
         std::iter::from_fn(|| self.0.recv_timeout(silence).ok()).any(|line| line.contains(text))
     }
@@ -478,7 +478,7 @@ fn start_logged(arguments: &[&str]) -> (TestServer, Log) {
     (server, Log(log))
 }
 
-/// Writes files of a folder; tells their paths.
+/// Writes files of a folder. Returns their paths.
 fn write<const N: usize>(folder: &Path, files: [(&str, &str); N]) -> [String; N] {
     files.map(|(name, text)| {
         let path = folder.join(name);
@@ -518,7 +518,7 @@ async fn a_client_certificate_that_is_missing_or_of_somebody_else_is_refused() {
         connect(&server.url, stranger.trust().identity(identity(&authority, "anybody"))).await,
         Channel::from_shared(server.url.replace("https", "http")).unwrap().connect().await,
     ];
-    // TLS 1.3 tells a client of its certificate only after the handshake.
+    // In TLS 1.3 a client learns about its refused certificate only after the handshake.
     for channel in refused.into_iter().flatten() {
         let status = call(&channel, "/grpc.health.v1.Health/Check", None).await.unwrap_err();
         assert!(status.get_details_error_info().is_none(), "{status:?}");
@@ -550,7 +550,7 @@ async fn new_certificates_are_shown_without_a_restart_and_bad_ones_are_not() {
     std::fs::write(&key, &new_key).unwrap();
     log.wait_for("new files are in use");
     assert!(connect(&server.url, old.trust()).await.is_err() && connect(&server.url, new.trust()).await.is_ok());
-    // Connections that were there go on.
+    // Existing connections continue.
     call(&kept, SCENES, None).await.unwrap();
 }
 
@@ -716,7 +716,7 @@ async fn no_secret_gets_into_the_log_however_much_is_logged() {
     }
 }
 
-/// What a server answers to a request in HTTP/1.1.
+/// Returns a server's answer to a request in HTTP/1.1.
 fn ask(url: &str, head: &str) -> String {
     let mut stream = std::net::TcpStream::connect(url.trim_start_matches("http://")).unwrap();
     stream.set_read_timeout(Some(TEST_TIMEOUT)).unwrap();

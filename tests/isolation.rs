@@ -47,7 +47,7 @@ fn is_closed(mut socket: TcpStream) -> bool {
     }
 }
 
-/// So many commands are taken and act, each of them.
+/// Sends this many commands; each is accepted and acts.
 async fn all_act(server: &TestServer, session: &str, count: u64) {
     let mut touch = TestTouch::hold(server, session).await;
     for sequence in 1..=count {
@@ -112,7 +112,7 @@ async fn a_server_without_file_descriptors_waits_for_some() {
     let session = server.paper(false).await;
     let mut touch = TestTouch::hold(&server, &session).await;
     let held: Vec<TcpStream> = (0..100).map(|_| connect(&server)).collect();
-    // Who is there already is served on.
+    // Clients that are connected are still served.
     for sequence in 1..=50 {
         touch.command(force(0, sequence, -1.0)).await;
         touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
@@ -155,7 +155,7 @@ async fn a_call_whose_message_does_not_come_is_ended() {
             }
         }
     }
-    // A browser's call that says how long it is, and no more.
+    // A browser's call that contains its length and nothing else.
     let mut socket = connect(&server);
     let head = "POST /palpate.v1.SessionService/ListScenes HTTP/1.1\r\nHost: localhost\r\n\
                 Content-Type: application/grpc-web+proto\r\nContent-Length: 5\r\n\r\n";
@@ -207,7 +207,7 @@ async fn connections_that_show_no_token_leave_room_for_who_does() {
     let known = server.channel().await;
     list(known.clone()).await.unwrap();
     let silent: Vec<TcpStream> = (0..100).map(|_| connect(&server)).collect();
-    // Who is known stays, and who comes now is let in.
+    // Known clients stay, and new ones are admitted.
     list(known).await.unwrap();
     list(server.channel().await).await.unwrap();
     let closed = tokio::task::spawn_blocking(move || {
@@ -322,7 +322,7 @@ async fn sessions_made_without_end_are_refused_to_who_makes_them_alone() {
 async fn calls_without_end_are_refused_to_who_makes_them_alone() {
     let server = limited("calls_per_s = 20.0", &[]);
     let mut greedy = server.sessions().await;
-    // Together: what is refused is told so when the next would be let in, and the bucket fills meanwhile.
+    // Together: a refusal contains when the next call would be admitted, and the bucket fills meanwhile.
     let calls = (0..200).map(|_| {
         let mut sessions = greedy.clone();
         async move { sessions.list_scenes(pb::ListScenesRequest {}).await }
@@ -336,7 +336,7 @@ async fn calls_without_end_are_refused_to_who_makes_them_alone() {
     }
     // Over a connection of its own.
     server.paper(false).await;
-    // And who asks no more than it may is served again, if it waits as long as it was kept waiting.
+    // A caller within its limits is served again after the time that the refusal contained.
     while let Err(status) = greedy.list_scenes(pb::ListScenesRequest {}).await {
         assert_eq!(told(&status).1, "RATE_LIMITED");
     }
@@ -346,7 +346,7 @@ async fn calls_without_end_are_refused_to_who_makes_them_alone() {
 async fn who_does_not_read_loses_samples_and_delays_nobody() {
     let server = limited("queued_samples = 8", &["--log", "error"]);
     let session = server.paper(false).await;
-    // What its transport takes in unread is little.
+    // Its transport buffers little unread data.
     let endpoint = tonic::transport::Channel::from_shared(server.url.clone()).unwrap();
     let channel = endpoint.initial_stream_window_size(16_384).connect().await.unwrap();
     let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
@@ -375,7 +375,7 @@ fn frequent(points_x: u32, points_y: u32) -> Source {
     Source::Scene(scene)
 }
 
-/// The same force everywhere: all of a tissue moves.
+/// One force everywhere, so that all of a tissue moves.
 fn everywhere(sequence: u64) -> pb::Command {
     let mut command = force(0, sequence, -1.0);
     let Some(pb::command::Action::Force(force)) = &mut command.action else { unreachable!() };
@@ -386,7 +386,7 @@ fn everywhere(sequence: u64) -> pb::Command {
 #[tokio::test]
 async fn heavy_sessions_slow_themselves_and_let_no_further_one_in() {
     let server = limited("periods_per_step = 20.0", &["--threads", "1"]);
-    // What no machine does so often on one core, while all of them move.
+    // More work than any machine can do on one core, while all of them move.
     let mut heavy = Vec::new();
     for _ in 0..12 {
         heavy.push(server.create(frequent(200, 100), false).await.unwrap().session_id);
@@ -404,7 +404,8 @@ async fn heavy_sessions_slow_themselves_and_let_no_further_one_in() {
         quick.command(force(0, sequence, -1.0 - 0.001 * sequence as f64)).await;
         quick.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
     }
-    // Steps of the heavy ones were dropped, commands of the light one were not. Who goes first: `realtime::thread`.
+    // Steps of the heavy ones were dropped, commands of the light one were not. `realtime::thread` sets the
+    // priorities.
     let (heavy_now, light_now) = (server.status(&heavy[0]).await, server.status(&light).await);
     assert!(heavy_now.overrun_count > 0, "{heavy_now:?}");
     let commands = light_now.commands.unwrap();
@@ -435,7 +436,7 @@ async fn a_session_whose_steps_are_too_long_for_others_leaves_the_thread_to_them
         quick.command(force(0, sequence, -1.0 - 0.001 * sequence as f64)).await;
         quick.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
     }
-    // It is late, and nobody else: another session is let in, after some of its steps.
+    // Only it is late: another session is admitted, after some of its steps.
     while server.status(&heavy).await.overrun_count == 0
         || server.create(Source::SceneName("paper".into()), false).await.is_err()
     {

@@ -49,8 +49,8 @@ fn pose(model: &Model, sequence: u64) -> Action {
 /// Steps of a session in each batch, and in all.
 const BATCH_STEPS: u64 = 20;
 
-/// A session that is written as it goes: a tool that strokes, another tissue, a release. Each batch is durable when the next one is
-/// written. Tells the file, and where each batch ends.
+/// A session that is written as it goes: a tool that strokes, another tissue, a release. Each batch is durable when
+/// the next one is written. Tells the file, and where each batch ends.
 fn written(first: &Arc<Model>, steps: u64, ends: bool) -> (Vec<u8>, Vec<(u64, u64)>) {
     let mut writer = JournalWriter::new(&opening(first), BEGUN_NS);
     let mut session = Session::new(first);
@@ -240,10 +240,10 @@ fn a_sealed_file_opens_with_the_reader_of_mcap() {
     assert!(JournalReader::open(Path::new("nowhere.1.mcap")).is_err());
 }
 
-/// Ten minutes with PALPATE_LONG, and then it tells how long that took: of a journal with more hashes and snapshots than a
-/// server writes.
+/// Ten minutes with PALPATE_LONG, and then it prints how long that took: for a journal with more hashes and snapshots
+/// than a server writes.
 #[test]
-#[allow(clippy::disallowed_methods)] // The time is told, and decides nothing.
+#[allow(clippy::disallowed_methods)] // The time is only printed.
 fn a_long_touch_verifies() {
     let steps = cases::short_or_long(3000, 600_000);
     let (file, _) = written(&model(&["sheet.points=[31, 31]"]), steps, true);
@@ -372,8 +372,8 @@ fn golden(replays: u32) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/journal/golden.{replays}.mcap"))
 }
 
-/// Each golden file is of the first version with its number, and stays as it is: until bits change, every later version gives its
-/// bits, and then it is refused.
+/// Each golden file is of the first version with its number, and stays as it is: until bits change, every later
+/// version gives its bits, and then it is refused.
 #[test]
 fn the_journal_of_an_older_version_gives_the_same_bits_or_is_refused_with_both_versions() {
     for replays in 1..=journal::REPLAYS {

@@ -1,9 +1,9 @@
-//! A server with journals is killed at random moments under load (`kill -9`), and started again: every session is there, not before
-//! the last step that a client was told to be durable, with the bits of an offline run of the same inputs; of the commands that
-//! were told to be durable none is lost, and none acts twice.
+//! A server with journals is killed at random moments under load (`kill -9`), and started again: every session is
+//! there, not before the last step that a client was told to be durable, with the bits of an offline run of the same
+//! inputs; of the commands that were told to be durable none is lost, and none acts twice.
 //!
-//! Twice in every run of the tests; `make soak` does it JOURNAL_KILLS=200 times with 20 sessions (PALPATE_JOURNAL_KILLS,
-//! PALPATE_JOURNAL_SESSIONS, PALPATE_SEED), and tells how soon clients touch again.
+//! Twice in every run of the tests; `make soak` does it JOURNAL_KILLS=200 times with 20 sessions
+//! (PALPATE_JOURNAL_KILLS, PALPATE_JOURNAL_SESSIONS, PALPATE_SEED), and tells how soon clients touch again.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
@@ -25,7 +25,7 @@ use pb::touch_response::Message as Heard;
 use random::TestRandom;
 use server::{TestServer, TestTouch, force};
 
-/// What a client was told of a session.
+/// Reports to a client about a session.
 #[derive(Debug, Clone, Copy, Default)]
 struct ClientHistoryBeforeKill {
     durable_step: u64,
@@ -90,7 +90,7 @@ fn sequences(path: &Path) -> Vec<u64> {
     sequences
 }
 
-/// The run goes on from the one before with the bits of an offline run of its inputs.
+/// The run continues the one before with the bits of an offline run of its inputs.
 fn goes_on(before: &JournalFile, after: &JournalFile) {
     let resumed = replay::resume(JournalReader::open(&before.path).unwrap(), &Limits::default()).unwrap();
     let mut session = resumed.session;
@@ -129,7 +129,7 @@ async fn whatever_was_told_to_be_durable_survives_a_kill_at_any_moment() {
         let begun = Instant::now();
         let clients: Vec<_> =
             ids.iter().map(|id| tokio::spawn(press(server.clone(), id.clone(), told.clone()))).collect();
-        // Whoever is pressed has been told something, whatever the machine does meanwhile.
+        // A client has received a report before a kill, whatever the load of the machine.
         while told.lock().unwrap().len() < ids.len() {
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
@@ -156,7 +156,7 @@ async fn whatever_was_told_to_be_durable_survives_a_kill_at_any_moment() {
         };
         for id in &ids {
             let mut session = server.status(id).await;
-            // The journal of this run begins a little after the session goes on.
+            // The journal of this run begins a little after the session continues.
             while session.journal.as_ref().unwrap().durable_step.is_none() {
                 tokio::time::sleep(Duration::from_millis(5)).await;
                 session = server.status(id).await;

@@ -1,4 +1,5 @@
-//! Journals of a real server: what is on the disk goes on after a kill, with the same bits; and what happens when the disk fails.
+//! Journals of a real server: sessions on the disk continue after a kill, with the same bits; and what happens when
+//! the disk fails.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
@@ -208,7 +209,7 @@ async fn nothing_is_kept_where_it_is_not_wanted() {
     std::io::Read::read_to_string(&mut second.stderr.take().unwrap(), &mut said).unwrap();
     assert_eq!(second.wait().unwrap().code(), Some(2), "{said}");
     assert!(said.contains("another server keeps its journals here"), "{said}");
-    // Without a journal nothing is told of one.
+    // Without a journal nothing is reported about one.
     let without = TestServer::start(&["--log", "error"]);
     let id = without.paper(false).await;
     assert_eq!(without.status(&id).await.journal, None);
@@ -238,12 +239,12 @@ async fn a_full_disk_breaks_the_journal_and_not_the_session_and_the_journal_begi
     });
     let fault = fault.await.unwrap();
     assert!(fault.contains("can't be written"), "{fault}");
-    // The session goes on, and what was told to be durable is there.
+    // The session continues, and the steps that were reported as durable are there.
     let durable = server.status(&id).await.journal.unwrap().durable_step.unwrap();
     sequence += 1;
     touch.command(force(0, sequence, -0.2)).await;
     touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
-    // In another file there is room: the journal goes on there, from a snapshot, and then there is no fault any more.
+    // Another file has room: the journal continues there from a snapshot, and then the fault is over.
     let anew = async {
         loop {
             let journal = server.status(&id).await.journal.unwrap();
@@ -374,7 +375,7 @@ async fn what_was_recorded_is_played_with_the_same_bits_and_gone_on_from() {
     }
 }
 
-/// What a client sends in parts; the answer to the last one.
+/// Sends a request in parts. Returns the answer to the last one.
 async fn send(server: &TestServer, bytes: &[u8]) -> Result<pb::UploadJournalResponse, tonic::Status> {
     let at = palpate_client::Server::new(&server.url, &palpate_client::Credentials::default()).unwrap();
     let (channel, mut sent) = (at.connect().await.unwrap(), 0);
@@ -464,7 +465,7 @@ async fn a_journal_is_replayed_through_a_server_that_keeps_none() {
     assert!(status == Some(0) && out.contains("100 to 120"), "{out}{told}");
     let (status, _, told) = run(palpate(), &["journal", "replay", "--from", "151"]);
     assert!(status == Some(2) && told.contains("--from: must be from 0 to 150"), "{told}");
-    // Nothing is left behind, except what goes on live.
+    // Nothing is left, except the session that continues live.
     let (status, out, told) = run(server::client_program(), &["play", "--live", "--json"]);
     assert_eq!(status, Some(0), "{told}");
     let live: serde_json::Value = serde_json::from_str(&out).unwrap();
@@ -546,7 +547,7 @@ struct Disk(PathBuf);
 
 #[cfg(target_os = "linux")]
 impl Disk {
-    /// `None` if nobody may mount one here.
+    /// `None` if mounting is not allowed here.
     fn mount(folder: &Path) -> Option<Self> {
         let [image, at] = ["disk", "mounted"].map(|name| folder.join(name));
         std::fs::create_dir(&at).unwrap();
@@ -557,7 +558,7 @@ impl Disk {
         is_there.then_some(Disk(at))
     }
 
-    /// Whoever writes to it waits, till what is returned is dropped.
+    /// Blocks writers until the returned guard is dropped.
     fn freeze(&self) -> Frozen<'_> {
         assert!(run("fsfreeze", &["-f".as_ref(), &self.0]));
         Frozen(&self.0)
@@ -587,7 +588,8 @@ fn run(program: &str, arguments: &[&Path]) -> bool {
     ran.is_ok_and(|status| status.success())
 }
 
-/// Presses for so long, each command after the one before has acted. Tells the steps that were done and those that were dropped.
+/// Presses for so long, each command after the one before has acted. Tells the steps that were done and those that
+/// were dropped.
 #[cfg(target_os = "linux")]
 async fn pressed(
     server: &TestServer,
@@ -629,7 +631,7 @@ async fn no_step_waits_for_a_disk_that_stalls() {
     let journal = told.journal.unwrap();
     drop(frozen);
     eprintln!("5 s each: {usual:?} steps done and dropped with the disk, {stalled:?} while it stalled");
-    // What was done meanwhile is not on the disk, and comes there afterwards: nothing is lost.
+    // Steps done meanwhile reach the disk later: nothing is lost.
     assert!(journal.fault.is_empty() && journal.durable_step.unwrap() + stalled[0] / 2 < told.step, "{journal:?}");
     let after = pressed(&server, &id, &mut touch, &mut sequence, Duration::from_millis(500)).await;
     assert!(after[0] > 0);

@@ -1,5 +1,5 @@
-//! `palpate journal` of damaged, cut and signed journals: what is whole is used, what was proved is told, and who changed a file
-//! is found.
+//! `palpate journal` of damaged, cut and signed journals: what is whole is used, what was proved is told, and who
+//! changed a file is found.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, missing_docs)]
 
 #[path = "common/journal_opening.rs"]
@@ -28,7 +28,8 @@ fn palpate(folder: &Path, arguments: &[&str]) -> (i32, String) {
     (output.status.code().unwrap(), text)
 }
 
-/// A session of 400 steps at rest: a hash every 100 steps, a batch every 40, each durable when the next one is written.
+/// A session of 400 steps at rest: a hash every 100 steps, a batch every 40, each durable when the next one is
+/// written.
 fn journal(key: Option<&Key>, ends: bool) -> Vec<u8> {
     let limits = Limits::default();
     let scene = Scene::parse("paper", PAPER, &["sheet.points=[7, 7]".to_owned()], &limits).unwrap();
@@ -52,7 +53,7 @@ fn journal(key: Option<&Key>, ends: bool) -> Vec<u8> {
     file
 }
 
-/// Where each batch begins.
+/// Returns the beginning of each batch.
 fn batches(file: &[u8]) -> Vec<usize> {
     let mut reader = JournalReader::new("test", std::io::Cursor::new(file)).unwrap();
     std::iter::from_fn(|| reader.next_batch().unwrap()).map(|batch| usize::try_from(batch.offset).unwrap()).collect()
@@ -138,7 +139,8 @@ fn a_signature_finds_who_changed_a_journal() {
     assert!(status == 1 && text.contains("has no signature"), "{text}");
     let (status, text) = verify(&whole, "a.key");
     assert!(status == 2 && text.contains("has no public key in PEM"), "{text}");
-    // A file that ends behind a signature: nobody has changed it, but its end is not there. A second passes in 100 steps.
+    // A file that ends behind a signature: nobody has changed it, but its end is not there. A second passes in 100
+    // steps.
     let at_batch = batches(&whole);
     let (status, text) = verify(&whole[..at_batch[4]], "a.key.pub");
     assert!(status == 0 && text.contains("signed up to step 160") && text.contains("it has no end"), "{text}");
@@ -161,7 +163,7 @@ fn a_signature_finds_who_changed_a_journal() {
 fn every_bit_that_decides_something_is_signed() {
     let key = "-----BEGIN PRIVATE KEY-----\nMC4CAQAwBQYDK2VwBCIEIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f\n\
         -----END PRIVATE KEY-----\n";
-    // As openssl writes it, without the public part.
+    // A key as openssl writes it, without the public part.
     let key = journal_key::private(key).unwrap();
     let whole = journal(Some(&key), true);
     let signed = |bytes: &[u8]| {

@@ -1,7 +1,8 @@
-//! Clients and servers are killed at random moments under load (`kill -9`): who is left goes on, tools are let go, clients
-//! come back by themselves, and what a device renders stays within its envelope throughout.
+//! Clients and servers are killed at random moments under load (`kill -9`): the remaining ones continue, tools are
+//! released, clients come back by themselves, and what a device renders stays within its envelope throughout.
 //!
-//! Twice in every run of the tests; `make soak` does it KILLS=50 times (PALPATE_KILLS, and PALPATE_SEED for other moments).
+//! Twice in every run of the tests; `make soak` does it KILLS=50 times (PALPATE_KILLS, and PALPATE_SEED for other
+//! moments).
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
@@ -28,7 +29,8 @@ use server::{TEST_TIMEOUT, TestServer, client_program};
 /// Sessions of a load, each with a client that holds its tool 0.
 const SESSIONS: usize = 4;
 
-/// So many commands, one a tick, a device is left alone for after its server was killed: it touches, and is enabled again.
+/// So many commands, one a tick, a device is left alone for after its server was killed: it touches, and is enabled
+/// again.
 const TOUCHES: u64 = 1000;
 
 /// A server that lets everybody in: on a busy machine steps take long, and a session more would make others late.
@@ -92,7 +94,7 @@ async fn who_is_killed_holds_nothing_and_who_is_left_comes_back() {
     let proxy = Proxy::start(address(&server), Duration::from_millis(2)).await;
     let file = folder.path().join("course.csv");
     let begun = Instant::now();
-    // Ended when it has been killed often enough: how long that takes, nobody knows before.
+    // It ends after enough kills, whose duration is not known before.
     let mut bridge = Program(
         Command::new(client_program())
             .args(["bridge", "--scene", "liver", "--server", &proxy.url(), "--course"])

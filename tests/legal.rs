@@ -1,5 +1,5 @@
-//! Whatever a legal scene says, to look at it, to make a session of it and to step that is bounded work, or it is refused
-//! with a reason.
+//! Whatever a legal scene says, to look at it, to make a session of it and to step that is bounded work, or it is
+//! refused with a reason.
 //!
 //! Fifty scenes in every run of the tests; `make stress` draws ten thousand (`PALPATE_STRESS_SCENES`). What decides is
 //! the work, counted in points × substeps; the processor time is shown.
@@ -102,7 +102,7 @@ fn every_legal_scene_is_bounded_work_or_refused() {
             }
             Ok(live) => {
                 let model = &live.model;
-                // What a course repeats after the guard stopped it is bounded by the course.
+                // Repetitions after the guard has stopped a run are bounded by the length of the run.
                 assert!(model.rehearsed <= limits.rehearsal_work, "{seed}: {}", model.rehearsed);
                 assert!(model.predicted_step_s() * scene.stepping.rate_hz <= limits.periods_per_step, "{seed}");
                 let mut tissue = tissue::at_rest(model);
@@ -140,7 +140,8 @@ fn what_no_number_of_substeps_can_do_is_refused_at_once_with_the_figure() {
     let refusal = compile(&[]).unwrap_err();
     assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "stepping.substeps"));
     assert!(refusal.message.contains("above the limit of 100000"), "{refusal}");
-    // Who gives a number gets that without a rehearsal, and is told that it is not stable, and of an error not known.
+    // A scene that gives a number gets it without a rehearsal, with a warning that it is unstable or that its error
+    // is unknown.
     let model = compile(&["stepping.substeps=1"]).unwrap();
     assert!(!model.plan.stable && model.rehearsed == 0 && model.warnings.len() == 2, "{:?}", model.warnings);
     // Damping that only `lagged` can't bear.

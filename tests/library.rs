@@ -204,13 +204,13 @@ struct Clutched {
     place_m: DVec3,
 }
 
-/// What the hand is told to do, and what became of it.
+/// Target of the hand, and its result.
 #[derive(Default)]
 struct Orders {
     goal_m: Mutex<DVec3>,
     buttons: AtomicU32,
     newest: Mutex<Option<Tick>>,
-    /// The force that the device itself was told.
+    /// The force that was set on the device.
     force_n: Mutex<DVec3>,
 }
 
@@ -295,7 +295,7 @@ async fn a_clutch_leaves_the_tool_in_the_tissue_and_takes_the_force_off_the_hand
     let sample = samples.next().await.unwrap().expect("samples go on");
     let pushed_m = from_vector(sample.tools[0].displacement_m.as_ref()).z;
     assert!(pushed_m < -0.002, "the tool has left the tissue: {pushed_m} m");
-    // It goes on from where it stood: what was 4 mm above the tissue for the hand is where the tool is.
+    // It continues from its place: the hand's place 4 mm above the tissue is the tool's place.
     orders.buttons.store(ENABLE, Ordering::Relaxed);
     orders.go(DVec3::new(0.005, 0.0, 0.003));
     let lower = orders.until("it goes on", |tick, _| tick.place_m.z < after.place_m.z - 9e-4).await;

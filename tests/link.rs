@@ -129,12 +129,13 @@ fn a_copy_of_the_tissue_knows_the_lump_that_comes_next() {
     assert!(number(&found, "force_error_rms_percent") > 3.0, "{found}");
 }
 
-/// What only the server knows comes by samples, and where that makes the copy worse than the local model, that is rendered.
+/// What only the server knows comes by samples, and where that makes the copy worse than the local model, that is
+/// rendered.
 #[test]
 fn a_copy_that_is_not_the_whole_truth_does_no_harm() {
     for (what, most_percent) in [
         ("--second-tool-mm 10", 5.0),
-        // For 100 ms nobody at the client knows of it.
+        // For 100 ms the client does not know of it.
         ("--tissue-change-s 3 --tissue-change-factor 1.5", 10.0),
         ("--deadband 0.1 --up-deadband 0.05", 2.0),
     ] {
@@ -237,7 +238,8 @@ fn an_outage_lets_go_of_the_force_and_gives_no_energy() {
     }
 }
 
-/// The tool lets go on the server meanwhile, and rendering pauses. What comes after it is another touch, which is felt.
+/// The tool lets go on the server meanwhile, and rendering pauses. What comes after it is another touch, which is
+/// felt.
 #[test]
 fn after_a_long_outage_touch_is_enabled_again_without_a_jump() {
     let found = link("--scene liver --transport datagram --rtt-ms 50 --outage-ms 400 --seconds 8");
@@ -329,7 +331,7 @@ async fn a_bridge_to_what_the_server_does_not_have_ends() {
 
 #[test]
 fn a_bridge_to_nobody_fails_and_says_how_often_it_tried() {
-    // A port on which nobody listens any more.
+    // A port without a listener.
     let address = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap();
     let output = client(&format!("bridge --server http://{address} --seconds 0.5"));
     let told = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -429,8 +431,8 @@ async fn a_bridge_outlives_a_cut() {
     assert!(found["interventions_ticks"]["stale"].as_u64().unwrap() > 0, "the cut was not noticed: {found}");
 }
 
-/// The server is killed, the client is frozen: what leaves the client stays within the envelope, and comes back when the
-/// device's owner asks for it.
+/// The server is killed, the client is frozen: what leaves the client stays within the envelope, and comes back when
+/// the device's owner asks for it.
 #[cfg(unix)]
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn forces_stay_within_the_envelope_whatever_breaks() {

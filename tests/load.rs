@@ -1,4 +1,4 @@
-//! `palpate-client load`: what it tells is true, and it leaves nothing behind.
+//! `palpate-client load`: its report is true, and it leaves nothing behind.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/server.rs"]
@@ -47,7 +47,8 @@ async fn every_command_of_a_load_is_accounted_for_and_no_session_stays() {
     assert!(sessions(&server).await.is_empty());
 }
 
-/// 400,000 points 10,000 times a second, which no core does: its time goes on slower than ours, and that is told.
+/// 400,000 points 10,000 times a second, which no core can do: its time runs slower than real time, and the report
+/// says so.
 #[tokio::test(flavor = "multi_thread")]
 async fn the_dilation_of_sessions_that_are_too_heavy_is_told() {
     let folder = tempfile::tempdir().unwrap();
@@ -81,7 +82,7 @@ fn the_limit_is_the_largest_number_that_meets_the_objective() {
     let server = TestServer::start(&["--config", config.to_str().unwrap()]);
     let told = told(&server, "--sessions 2 --seconds 0.2 --rate-hz 100 --find-limit lost<1");
     assert_eq!((number(&told, "/limit_sessions"), number(&told, "/sessions")), (6.0, 6.0));
-    // What nothing meets.
+    // An objective that cannot be met.
     let told = self::told(&server, "--sessions 2 --seconds 0.2 --rate-hz 100 --find-limit dilation>2");
     assert_eq!(number(&told, "/limit_sessions"), 0.0);
 }
@@ -143,7 +144,7 @@ async fn clients_that_are_killed_leave_no_tool_held_and_no_session() {
     waited.await.expect("the sessions of a load that was killed stay");
 }
 
-/// Every part that a plan may have. Who is far away waits 20 ms at least.
+/// Every part that a plan may have. Users that are far away wait at least 20 ms.
 const PLAN: &str = r#"
 name = "<all> & more"
 seed = 5
@@ -225,7 +226,7 @@ async fn a_plan_is_played_by_its_users_and_told_by_second_phase_and_page() {
     }
     assert!(number(&told, "/all/commands") > 100.0 && number(&told, "/all/frames") > 0.0, "{told}");
     assert_eq!(sum("/samples"), number(&told, "/all/samples"));
-    // What the proxy adds is there at least: 10 ms each way, give or take the jitter.
+    // At least the proxy's delay: 10 ms each way, give or take the jitter.
     assert!(number(&told, "/all/round_trip_us/p50") > 18_000.0, "{told}");
     assert!(number(&told, "/all/dilation_min") > 0.0 && number(&told, "/all/start_us/p50") > 0.0);
     assert_eq!(told["seconds"].as_array().unwrap().len(), 11);
@@ -248,7 +249,7 @@ async fn a_plan_that_misses_an_objective_or_is_wrong_says_so_by_its_status() {
     assert_eq!(missed.status.code(), Some(1), "{said}");
     assert!(said.contains("`brief` misses p50<1us"), "{said}");
     assert!(String::from_utf8_lossy(&missed.stdout).contains("misses p50<1us"));
-    // The server has no such scene: nobody comes in, and why is told.
+    // The server has no such scene: no user is admitted, and the report gives the reason.
     let nowhere = planned(&server, folder.path(), &format!("{short}[[scene]]\nname = \"nowhere\"\n"), &[]);
     let said = String::from_utf8_lossy(&nowhere.stderr);
     assert_eq!(nowhere.status.code(), Some(1), "{said}");

@@ -1,5 +1,6 @@
-//! A server to which the system gives no more memory: what needs much is refused with a reason, or ends the session that
-//! needs it; the process lives and serves others. Linux only: elsewhere the limit of a process can't be set by another.
+//! A server to which the system gives no more memory: what needs much is refused with a reason, or ends the session
+//! that needs it; the process lives and serves others. Linux only: elsewhere the limit of a process can't be set by
+//! another.
 #![cfg(target_os = "linux")]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
@@ -35,7 +36,7 @@ fn assert_no_memory(refused: &Status, field: &str) {
     assert!(refused.message().contains("the system has no memory for"), "{refused:?}");
 }
 
-/// Who reads a session that is held, or commands it, is told so.
+/// Readers and commands of a session that is held get that state.
 async fn assert_is_held(server: &TestServer, session: &str, mut touch: TestTouch) {
     let ended = loop {
         match tokio::time::timeout(TEST_TIMEOUT, touch.hear()).await.expect("the stream goes on") {
@@ -103,7 +104,7 @@ async fn without_address_space_requests_are_refused_sessions_end_and_others_are_
     let change = pb::UpdateTissueRequest { session_id: large, stiffness_n_per_m: Some(11.0), ..Default::default() };
     assert_no_memory(&sessions.update_tissue(change).await.unwrap_err(), "");
 
-    // A session that needs more to go on is held with the reason.
+    // A session that needs more memory to continue is held with the reason.
     doomed_touch.command(force(0, 1, -1.0)).await;
     let waited = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
@@ -125,7 +126,7 @@ async fn without_address_space_requests_are_refused_sessions_end_and_others_are_
     }
     assert_eq!(server.status(&small).await.state(), pb::SessionState::Running);
 
-    // What goes makes room.
+    // A deleted session frees its memory.
     for session_id in kept {
         sessions.delete_session(pb::DeleteSessionRequest { session_id }).await.unwrap();
     }
@@ -148,7 +149,7 @@ async fn a_server_with_few_addresses_serves_its_first_requests() {
     for _ in 0..3 {
         create(&mut sessions, 101, false).await.unwrap();
     }
-    // What has no room is refused, and the server goes on.
+    // A request without room is refused, and the server continues.
     let refused = create(&mut sessions, 2000, true).await.unwrap_err();
     assert_eq!(refused.code(), Code::ResourceExhausted, "{refused:?}");
     assert_eq!(server.status(&first).await.state(), pb::SessionState::Running);

@@ -28,7 +28,8 @@ fn tissue(scene: &Scene) -> Box<dyn Tissue> {
     at_rest(&Model::compile(scene, &Limits::default()).unwrap())
 }
 
-/// A sphere of `rings` × 2·`rings` vertices and two poles, dented a little here and there so that no two edges are alike.
+/// A sphere of `rings` × 2·`rings` vertices and two poles, dented a little here and there so that no two edges are
+/// alike.
 fn sphere(rings: u32, radius_m: f64) -> MeshShape {
     let mut dice = fastrand::Rng::with_seed(5);
     let around = 2 * rings;
@@ -146,7 +147,7 @@ fn a_flat_mesh_with_the_springs_of_a_sheet_is_that_sheet() {
     }
 }
 
-/// The same shape once more.
+/// The shape once more.
 fn shape_of(shape: &MeshShape) -> MeshShape {
     let known: std::collections::BTreeSet<[u32; 2]> = shape
         .triangles()

@@ -1,4 +1,4 @@
-//! `palpate mesh`: what it tells of a mesh file, what it mends and writes, and how it ends.
+//! `palpate mesh`: its report on a mesh file, its repairs, its output, and its exit status.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, missing_docs)]
 
 use std::path::Path;
@@ -132,7 +132,7 @@ fn repair_that_is_not_what_was_asked_for_ends_with_1() {
     for volume in [&json["volume_m3"], &json["before"]["volume_m3"]] {
         assert!((volume.as_f64().unwrap() / hollow - 1.0).abs() < 1e-9, "{json}");
     }
-    // Another organ beside it is dropped, and that is told.
+    // Another organ beside it is dropped, and the report says so.
     let (status, json, told) = ends(&other(20, 100), &["--repair"]);
     assert_eq!((status, json["components"].as_u64()), (1, Some(1)), "{told}");
     assert!(
@@ -176,7 +176,8 @@ fn holes_and_what_is_wrong_are_told_with_their_place_in_the_unit_of_the_file() {
     let (_, json, _) = palpate(folder.path(), &["organ.obj", "--unit", "mm", "--json"]);
     let border = serde_json::from_str::<Value>(&json).unwrap()["borders"][0].take();
     assert_eq!((border["edges"].as_u64(), border["is_rim"].as_bool()), (Some(3), Some(true)), "{border}");
-    // A place that is 0 but for rounding, and a stray vertex that does not count. An edge of three triangles is refused.
+    // A place that is 0 but for rounding, and a stray vertex that does not count. An edge of three triangles is
+    // refused.
     let fin = OCTAHEDRON.replace("v 0 50 0", "v 0 50 1e-14") + "v 0 0 1e5\nv 10 10 0\nf 1 3 8\n";
     std::fs::write(folder.path().join("organ.obj"), fin).unwrap();
     let (status, table, told) = palpate(folder.path(), &["organ.obj", "--unit", "mm"]);

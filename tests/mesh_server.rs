@@ -1,4 +1,5 @@
-//! Tissue on meshes over the network: sessions, commands by vertex, samples, records, frames, meshes that clients send.
+//! Tissue on meshes over the network: sessions, commands by vertex, samples, records, frames, meshes that clients
+//! send.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/server.rs"]
@@ -30,7 +31,7 @@ use tonic::{Code, Status};
 
 const ICOSPHERE: &str = include_str!("reference/icosphere.obj");
 
-/// The same ball of a material, with two lumps.
+/// A ball of a material, with two lumps.
 const LUMPS: &str = r#"
 name = "lumps"
 [mesh]
@@ -250,7 +251,7 @@ async fn a_session_on_a_mesh_is_told_pushed_grasped_sampled_probed_and_shown() {
         assert!(state.displacement_m.length() > 1e-6);
     }
 
-    // What is shown is the file's mesh, in an order of its own.
+    // The file's mesh is shown, in another order.
     let all = shown(&server, id).await;
     assert_eq!((all.rest_m.len(), all.size, all.triangles.len()), (162, [11, 16], 960));
     assert!((all.edge_m - scene.shape().edge_m()).abs() < 1e-12);
@@ -524,7 +525,7 @@ async fn a_material_and_inclusions_are_told_and_what_is_wrong_with_them_is_named
     let material = told_scene.material.unwrap();
     assert_eq!((material.youngs_modulus_pa, material.density_kg_per_m3), (Some(2000.0), Some(1060.0)));
     assert_eq!(told_scene.inclusions[1].group.as_deref(), Some("lump"));
-    // What is changed is k of reference.
+    // The reference stiffness k is changed.
     let request =
         pb::UpdateTissueRequest { session_id: own.session_id, stiffness_n_per_m: Some(11.0), ..Default::default() };
     let changed = server.sessions().await.update_tissue(request).await.unwrap().into_inner().session.unwrap();
@@ -584,14 +585,14 @@ async fn a_mesh_that_is_none_is_refused_by_element_and_place() {
         let refused = upload(&server, whole, 1 << 19, unit, false).await.unwrap_err();
         assert_eq!(told(&refused), (Code::InvalidArgument, reason.into(), "unit".into()));
     }
-    // A hole is told, and is no reason to refuse; repair fills it.
+    // A hole is reported but not refused; repair fills it.
     let with_hole = ICOSPHERE.trim_end().rsplit_once('\n').unwrap().0;
     let report = upload(&server, with_hole.as_bytes(), 1 << 19, "m", false).await.unwrap().report.unwrap();
     assert_eq!((report.holes, report.volume_m3, report.refused), (1, None, false), "{report:?}");
     let report = upload(&server, with_hole.as_bytes(), 1 << 19, "m", true).await.unwrap().report.unwrap();
     assert_eq!((report.holes, report.refused), (0, false), "{report:?}");
     assert!(!report.problems.is_empty());
-    // An edge with three triangles can't be used, and is told with its place.
+    // An edge with three triangles can't be used, and is reported with its place.
     let bad = format!("{ICOSPHERE}v 0 0 0\nf 1 43 163\n");
     let sent = upload(&server, bad.as_bytes(), 1 << 19, "m", false).await.unwrap();
     let report = sent.report.unwrap();

@@ -1,7 +1,8 @@
-//! Every number that comes in, by the protocol, a journal or TOML: −0, subnormal numbers and extremes are refused with a reason, or
-//! they give the same bits whichever way the session then takes: on from where it is, again from its journal, or from its snapshot.
+//! Every number that comes in, by the protocol, a journal or TOML: −0, subnormal numbers and extremes are refused
+//! with a reason, or they give the same bits whichever way the session then takes: on from where it is, again from
+//! its journal, or from its snapshot.
 //!
-//! Which numbers there are, the descriptors of the protocol tell: a new field is tried as soon as it is there.
+//! The descriptors of the protocol list the numbers, so a new field is tried as soon as it exists.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod common;
@@ -34,7 +35,8 @@ use prost::Message;
 use prost_types::field_descriptor_proto::{Label, Type};
 use prost_types::{DescriptorProto, FileDescriptorSet};
 
-/// What hurts: zeros, subnormal numbers of both formats, numbers that f32 has not, and those whose squares are none.
+/// Difficult values: zeros, subnormal numbers of both formats, numbers beyond f32, and those whose squares overflow
+/// or vanish.
 const NUMBERS: [f64; 14] = [
     -0.0,
     0.0,
@@ -111,7 +113,8 @@ fn varint(mut value: u64) -> Vec<u8> {
 }
 
 impl Number {
-    /// A message with this number alone. Behind the bytes of another message it takes the place of what that has there.
+    /// A message with this number alone. Behind the bytes of another message it takes the place of what that has
+    /// there.
     fn set_to(&self, value: f64) -> Vec<u8> {
         let (last, outer) = self.tags.split_last().unwrap();
         let (wire, bytes) =
@@ -136,7 +139,7 @@ fn is_finite(session: &Session) -> bool {
     })
 }
 
-/// What is told of a session, but when commands came by the server's clock.
+/// The description of a session, without the server's times of commands.
 fn told(session: &Session) -> (u128, String) {
     let tools = session.sample(None).tools;
     let tools: Vec<_> =
@@ -156,8 +159,8 @@ fn opening(first: &Arc<Model>, begin_step: u64) -> Opening<'_> {
 /// Steps with what a test has them do.
 const STEPS: u64 = 24;
 
-/// Lets a session of a scene go every way, if it is not held at once. Returns whether there is one: else it was refused, with a
-/// reason.
+/// Lets a session of a scene go every way, if it is not held at once. Returns whether there is one: else it was
+/// refused, with a reason.
 fn is_taken_on_every_way(scene: palpate_refusal::Result<Scene>, about: &str) -> bool {
     match scene.and_then(|scene| Model::compile(&scene, &limits())) {
         Err(refusal) => {
@@ -174,8 +177,8 @@ fn is_taken_on_every_way(scene: palpate_refusal::Result<Scene>, about: &str) -> 
     }
 }
 
-/// Goes on with a session under commands, and compares the ways: it is verified from its journal, resumed from that as after a
-/// kill, and restored from its own snapshot in the middle.
+/// Goes on with a session under commands, and compares the ways: it is verified from its journal, resumed from that
+/// as after a kill, and restored from its own snapshot in the middle.
 fn goes_every_way(mut session: Session, first: &Arc<Model>, mut acting: BTreeMap<u64, Vec<Due>>, about: &str) {
     let begin = session.step_count();
     let mut writer = JournalWriter::new(&opening(first, begin), 1);

@@ -46,7 +46,7 @@ fn with_page() -> (TestServer, tempfile::TempDir) {
     with_page_and(|_| Vec::new())
 }
 
-/// The same, with options that may name files of the folder.
+/// Starts a server with options that may name files of the folder.
 fn with_page_and(options: impl Fn(&Path) -> Vec<String>) -> (TestServer, tempfile::TempDir) {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("secret.txt"), "not for you").unwrap();
@@ -96,14 +96,14 @@ fn pipelined_requests_are_answered_in_order_and_unread_answers_share_one_file() 
     std::fs::write(folder.path().join("page/picture.bin"), &picture).unwrap();
     let before = cores::resident(server.child.id());
     let mut connections: Vec<_> = (0..24).map(|_| pipelined(&server, "/picture.bin", 8)).collect();
-    // The first part of an answer has come to each, so that each has its file; nobody reads on.
+    // The first part of an answer has come to each, so that each has its file; no client reads on.
     for stream in &mut connections {
         stream.read_exact(&mut [0; 1 << 16]).unwrap();
     }
     let more = cores::resident(server.child.id()) - before;
     assert!(more < 96 << 20, "{more} bytes for unread answers of one file of {BYTES}");
     drop(connections);
-    // Who reads gets each answer whole.
+    // A client that reads gets each whole answer.
     let mut stream = std::io::BufReader::new(pipelined(&server, "/picture.bin", 3));
     for _ in 0..3 {
         let mut head = Vec::new();
@@ -131,7 +131,7 @@ fn nothing_leads_out_of_the_pages_folder() {
     }
     let (head, _) = ask(&server, "POST", "/", "", b"x");
     assert!(head.starts_with("http/1.1 405") && head.contains("allow: get, head"), "{head}");
-    // A scene's picture; and that there is none of a name is no error.
+    // A scene's picture; a name without a picture is not an error.
     let (head, body) = get(&server, "/textures/paper.png", "");
     assert!(head.starts_with("http/1.1 200") && head.contains("image/png") && body.contains("IHDR"), "{head}");
     assert!(get(&server, "/textures/nowhere.png", "").0.starts_with("http/1.1 204"));
@@ -158,7 +158,7 @@ fn without_a_page_it_says_how_to_get_one_and_serves_all_the_same() {
 fn grpc_web_is_answered_on_the_same_port() {
     let (server, _folder) = with_page();
     scenes_over_grpc_web(&server);
-    // What is no service is refused in the words of gRPC.
+    // An unknown service is refused with a gRPC status.
     let (head, _) =
         ask(&server, "POST", "/palpate.v1.Nothing/Call", "Content-Type: application/grpc-web+proto\r\n", b"");
     assert!(head.contains("grpc-status: 12"), "{head}");
@@ -185,7 +185,7 @@ fn a_page_is_for_everybody_and_its_calls_for_those_with_a_token() {
             ("ListScenes", "", 16),
             ("ListScenes", "Authorization: Bearer palpate_guess\r\n", 16),
             ("CreateSession", &known, 7),
-            // What looks like a page is none.
+            // A file that looks like a page is not served as one.
             ("ListScenes/index.html", "", 7),
         ] {
             let head = call(method, content_type, authorization);

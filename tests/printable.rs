@@ -18,7 +18,7 @@ use palpate_tissue::scene::{PAPER, Scene};
 /// ESC, CR, LF, BEL, DEL, controls C1, controls of direction, a separator of lines.
 const HOSTILE: &str = "a\x1b[2J\r\nFORGED\x07\x7f\u{9b}2J\u{85}\u{202e}\u{2066}\u{200f}\u{2028}z";
 
-/// What a program prints on both outputs.
+/// Returns the text of a program on both outputs.
 fn printed(folder: &Path, arguments: &[&str]) -> String {
     let mut command = Command::new(env!("CARGO_BIN_EXE_palpate"));
     let output = command.args(arguments).current_dir(folder).output().unwrap();

@@ -1,4 +1,4 @@
-//! A session whose tissue blows up goes back to the last state that passed the guard's checks, and goes on.
+//! A session whose tissue blows up goes back to the last state that passed the guard's checks, and continues.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 use std::sync::Arc;
@@ -14,7 +14,7 @@ use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::scene::{Change, PAPER, Scene};
 
-/// What the holder of tools 0 and 1 sends, and when.
+/// Commands of the holder of tools 0 and 1, with their steps.
 type Order = (u64, u32, Action);
 
 /// The course of a session.
@@ -121,7 +121,7 @@ fn too_many_recoveries_in_a_short_time_pause_the_tool_that_caused_them() {
     let end = paused[0].step + WINDOW_STEPS;
     let told: Vec<_> = paused.iter().map(|recovery| (recovery.at_rest, recovery.paused_until_step)).collect();
     assert_eq!(told, [(false, None), (false, None), (false, None), (true, Some(end))]);
-    // What comes during the pause has no effect, to the last step; another tool is not paused.
+    // Commands during the pause have no effect, to the last step; another tool is not paused.
     let late = [420, 5000, end - 1, end];
     let again = play(&model, &pushed(0, &[&few[..], &late[..]].concat()), end + 100);
     let session = &again.session;
@@ -135,7 +135,7 @@ fn too_many_recoveries_in_a_short_time_pause_the_tool_that_caused_them() {
         (other.hold_reason(), other.recoveries().count(), other.paused_commands()),
         (None, MAX_RECOVERIES as u64 + 1, 0)
     );
-    // The same commands give the same bits.
+    // Equal commands give equal bits.
     let repeated = play(&model, &pushed(0, &[&few[..], &late[..]].concat()), end + 100);
     assert_eq!(again.hashes, repeated.hashes);
     // As many, and the last when the first is long over.

@@ -161,7 +161,7 @@ fn a_picture_is_the_same_on_every_run_and_width_of_vectors() {
     let first = poke(&[]);
     assert_eq!(first, poke(&[]));
     assert_eq!(first, poke(&["--set", "stepping.lanes=plain"]));
-    // The deepest moment is none of rest.
+    // The deepest moment is not one of rest.
     assert_ne!(first, poke(&["--at-s", "0"]));
     assert_ne!(first, poke(&["--camera", "-40,60,2"]));
     assert_ne!(first, poke(&["--wireframe"]));

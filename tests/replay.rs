@@ -156,7 +156,7 @@ fn hammer(url: String) -> Hammer {
 
 #[test]
 fn a_replay_is_exact_while_another_client_hammers_another_session() {
-    // Built before anybody hammers.
+    // Built before the load begins.
     server::client_program();
     let server = TestServer::start(&["--log", "error"]);
     let hammer = hammer(server.url.clone());

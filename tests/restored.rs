@@ -1,5 +1,5 @@
-//! What `save` writes, `restore` takes: random sessions are driven to states that no surgeon would reach, by whatever a server
-//! accepts, and each goes on from its own snapshot with the same bits.
+//! `restore` accepts the output of `save`: random sessions are driven to states that no surgeon would reach, by
+//! whatever a server accepts, and each continues from its own snapshot with the same bits.
 //!
 //! Some 200 snapshots in every run of the tests; `PALPATE_SNAPSHOTS=5000` takes as many as that.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
@@ -43,12 +43,12 @@ fn limits() -> Limits {
     Limits { rehearsal_work: 1 << 20, ..Limits::default() }
 }
 
-/// How many snapshots are tried.
+/// Number of snapshots that are tried.
 fn wanted() -> usize {
     cases::count("PALPATE_SNAPSHOTS", 80, 1000)
 }
 
-/// What acts before a step.
+/// Actions before a step.
 #[derive(Debug, Clone, Default)]
 struct StepInputs {
     change: Option<Change>,
@@ -146,7 +146,7 @@ fn tip(scene: &Scene, random: &mut Rng) -> Tip {
     }
 }
 
-/// Whoever holds a tool: what it does now, and where.
+/// A holder of a tool: its present action and place.
 struct RandomHand {
     tool: u32,
     place_m: DVec3,
@@ -251,7 +251,7 @@ fn step(session: &mut Session, first: &Scene, inputs: &StepInputs) {
     session.advance(&mut inputs.due.clone(), |_| {});
 }
 
-/// All that is told of a session after a step.
+/// All output of a session after a step.
 fn told(session: &Session) -> (u128, String) {
     let tissue = session.tissue();
     let counts = (session.late_commands(), session.paused_commands(), session.path_counts());
@@ -299,7 +299,7 @@ fn course(seed: u64) -> RandomSession {
         let mut inputs = StepInputs { change: change(&first, &mut random), due: Vec::new() };
         for hand in hands.iter_mut().filter(|_| (begin..end).contains(&now)) {
             if let Some(command) = hand.command(&first, now, &mut random) {
-                // What a server refuses, it refuses.
+                // It refuses the commands that a server refuses.
                 let _ = intake.submit(LEASE, vec![command], 0);
             }
         }

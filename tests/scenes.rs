@@ -386,7 +386,7 @@ fn a_scene_and_a_script_that_are_swapped_are_told_apart() {
     refused(&palpate(&["run", "paper", "liver"]), &["there is no script `liver`", "`liver` is a scene: ", order]);
 }
 
-/// What `palpate check` prints.
+/// Returns the output of `palpate check`.
 fn checked(folder: &Path, arguments: &[&str]) -> String {
     let mut program = Command::new(env!("CARGO_BIN_EXE_palpate"));
     let output = program.arg("check").args(arguments).current_dir(folder).output().unwrap();

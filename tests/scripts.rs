@@ -1,5 +1,5 @@
-//! Scripts in people's terms: tools with a tip, forces in newtons in all, scripts made for a scene, and what a moving force
-//! feels.
+//! Scripts in people's terms: tools with a tip, forces in newtons in all, scripts made for a scene, and what a moving
+//! force feels.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 mod common;
@@ -85,7 +85,7 @@ fn records_tell_what_a_tip_feels_and_where_it_is() {
                 [[tool]]\npoint = [2, 2]\nmoves = [{ from_s = 0.0, to_s = 0.2, by_m = [0.0, 0.0, -0.001] }]\n";
     let script = script(text, &scene);
     let (records, _) = run_whole(&model, &script, true);
-    // The same steps, and what a stream tells at the same times.
+    // The same steps, and the content of a stream at the same times.
     let mut session = Session::new(&model);
     let mut told = Vec::new();
     for step in 0..script.steps {
@@ -184,7 +184,7 @@ fn a_force_in_all_is_that_force_wherever_the_points_are() {
             let points = records[1]["points"].as_array().unwrap();
             points.iter().map(|point| point["applied_n"][c].as_f64().unwrap()).sum()
         };
-        // What f32 leaves of it.
+        // The remaining precision of f32.
         assert!((applied(2) + 0.5).abs() < 1e-6 && (applied(0) - 0.1).abs() < 1e-6, "{} {}", applied(0), applied(2));
     }
 }
@@ -202,7 +202,8 @@ fn finer(scene: &Scene) -> Scene {
 
 #[test]
 fn a_force_in_all_means_the_same_at_half_the_spacing() {
-    // A deep and steep dent is another matter: there the points of the tissue themselves are too few (5 % at 0.3 N and 5 mm).
+    // A deep and steep dent is another matter: there the points of the tissue themselves are too few (5 % at 0.3 N
+    // and 5 mm).
     let liver = built_in("liver", &[]);
     for (total_n, radius_m) in [(0.03, 0.005), (0.3, 0.01), (0.3, 0.015)] {
         let text = format!(

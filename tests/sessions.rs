@@ -34,7 +34,7 @@ async fn sessions_are_made_listed_and_deleted() {
     let listed = sessions.list_sessions(pb::ListSessionsRequest {}).await.unwrap().into_inner().sessions;
     let ids: Vec<_> = listed.iter().map(|session| session.session_id.clone()).collect();
     assert_eq!(ids, [by_name.session_id.clone(), own.session_id.clone()]);
-    // Deleting tells every stream.
+    // A deletion ends every stream with a reason.
     let mut touch = TestTouch::hold(&server, &own.session_id).await;
     let request = pb::DeleteSessionRequest { session_id: own.session_id.clone() };
     sessions.delete_session(request.clone()).await.unwrap();
@@ -208,7 +208,7 @@ async fn a_session_too_heavy_for_its_rate_slows_its_own_time_and_says_so() {
     let session = server.create(Source::Scene(heavy), false).await.unwrap().session_id;
     let request = pb::WatchSamplesRequest { session_id: session.clone(), ..Default::default() };
     let mut samples = server.haptics().await.watch_samples(request).await.unwrap().into_inner();
-    // The same force everywhere: all of it moves. At rest it would cost nothing.
+    // One force everywhere, so that all of it moves. At rest it would cost nothing.
     let touch = TestTouch::hold(&server, &session).await;
     let mut everywhere = force(0, 1, -1.0);
     let Some(pb::command::Action::Force(force)) = &mut everywhere.action else { unreachable!() };
@@ -323,7 +323,7 @@ async fn a_command_wakes_a_session_at_the_step_that_is_next() {
     for at_step in [None, Some(0)] {
         let before = rested(&server, &session).await;
         sequence += 1;
-        // A release changes nothing: the session goes on resting.
+        // A release changes nothing: the session continues to rest.
         let release = Some(pb::command::Action::Release(pb::Release {}));
         touch.command(pb::Command { sequence: Some(sequence), at_step, action: release, ..Default::default() }).await;
         let sample = touch.sample_with(|sample| sample.tools[0].acknowledged_sequence == sequence).await;
@@ -461,7 +461,7 @@ async fn health_is_served() {
 #[cfg(unix)]
 #[tokio::test]
 async fn shutdown_tells_open_streams_and_ends_before_the_deadline() {
-    // Who waits for the deadline waits for longer than anybody here.
+    // The deadline is longer than any wait of this test.
     let mut server = TestServer::start(&["--shutdown-deadline-s", "3600"]);
     let session = server.paper(false).await;
     let mut touch = TestTouch::hold(&server, &session).await;
@@ -528,7 +528,7 @@ fn the_example_of_a_configuration_has_every_key_with_its_default() {
     let text = std::fs::read_to_string(root.join("docs/palpate.toml")).unwrap();
     for key in format!("{example:#?}").lines().filter_map(|line| line.trim().split_once(": ").map(|field| field.0)) {
         let has = |line: &str| line.starts_with(&format!("{key} = ")) || line.starts_with(&format!("[{key}]"));
-        // What is nothing by default is shown in a comment.
+        // Keys without a default are shown in a comment.
         assert!(text.lines().any(|line| has(line.trim_start_matches("# "))), "docs/palpate.toml lacks {key}");
     }
 }

@@ -1,6 +1,7 @@
-//! Eight callers who do all that is known to hurt a server, and what is merely legal, at random by seed, against four honest
-//! clients at 1 kHz. No honest command is lost, memory stays within its budget, and all is given back. Here for 30 s of a
-//! fixed seed; `make siege SECONDS=1800 SEED=7` goes on for as long as you like, and tells the honest clients' times.
+//! Eight callers who do all that is known to hurt a server, and what is merely legal, at random by seed, against four
+//! honest clients at 1 kHz. No honest command is lost, memory stays within its budget, and all is given back. Here
+//! for 30 s of a fixed seed; `make siege SECONDS=1800 SEED=7` runs for as long as you like, and prints the honest
+//! clients' times.
 #![cfg(target_os = "linux")]
 #![allow(
     clippy::unwrap_used,
@@ -37,8 +38,8 @@ use server::{TEST_TIMEOUT, TestServer};
 const ATTACKERS: u64 = 8;
 const HONEST: u64 = 4;
 
-/// What the server may take for all callers together, and what it may need beside: code, threads, and what an allocator
-/// keeps.
+/// What the server may take for all callers together, and what it may need beside: code, threads, and what an
+/// allocator keeps.
 const BUDGET: u64 = 256 << 20;
 const BESIDE: u64 = 64 << 20;
 
@@ -60,7 +61,7 @@ fn mixable() -> Vec<&'static AttackKind> {
 struct Besieged {
     server: TestServer,
     keys: Arc<TokenFile>,
-    /// Where the metrics are.
+    /// Address of the metrics.
     metrics: String,
     /// Descriptors and threads of a server that has nothing to do.
     before: [u64; 2],
@@ -68,7 +69,7 @@ struct Besieged {
 
 impl Besieged {
     fn start(keys: TokenFile) -> Self {
-        // What nobody uses any more goes soon.
+        // Unused sessions are removed soon.
         let config = keys.beside("palpate.toml", "idle_session_s = 2.0\n");
         let mut arguments = vec!["--tokens", keys.file(), "--metrics", "127.0.0.1:0", "--threads", "1"];
         arguments.extend(["--log", "error", "--config", &config]);
@@ -76,7 +77,7 @@ impl Besieged {
         arguments.extend(["--memory", &budget]);
         // Attackers do not take the server's core from it, but only its time.
         let mut server = kept_to(true, || TestServer::start(&arguments));
-        // A log that nobody reads would hold the server up.
+        // A log that is not read would block the server.
         let mut log = server.child.stderr.take().unwrap();
         std::thread::spawn(move || std::io::copy(&mut log, &mut std::io::stderr()));
         let metrics = metrics::url(&mut server.out);
@@ -233,7 +234,7 @@ fn honest_clients_outlive_a_siege_and_all_is_given_back() {
             failures.push(what);
         }
     };
-    // That there was a siege.
+    // The attacks took place.
     let strikes: u64 = tolls.iter().map(|toll| toll.strikes).sum();
     let mut refusals = std::collections::BTreeMap::<String, u64>::new();
     for (reason, count) in tolls.iter().flat_map(|toll| &toll.refusals) {
@@ -253,7 +254,7 @@ fn honest_clients_outlive_a_siege_and_all_is_given_back() {
     );
     let silent = welcome.reasons.get("DeadlineExceeded: no answer").copied().unwrap_or(0);
     must(silent == 0, format!("{silent} newcomers had no answer in {TEST_TIMEOUT:?}"));
-    // What attackers have left goes; then there is room.
+    // The attackers' remains are removed; then there is room.
     let given_back = besieged.until(|besieged| besieged.gauge("palpate_sessions") == Some(HONEST as f64));
     must(given_back, format!("{:?} sessions stay, of {HONEST} that are in use", besieged.gauge("palpate_sessions")));
     let late = Newcomers::start(TestCaller::new(&url, &newcomer), clients[1].session_id.clone(), TEST_TIMEOUT).end();
@@ -268,7 +269,7 @@ fn honest_clients_outlive_a_siege_and_all_is_given_back() {
         let counts = verdict.counts.unwrap_or_default();
         let kept = account.broken.is_empty() && account.lost == 0 && account.refused == 0;
         must(kept, format!("honest {number} was cut, lost commands, or had some refused"));
-        // What was cut is not accounted for by any one stream.
+        // Data of streams that were cut is not counted by any stream.
         // Newcomers' commands count in the first two sessions, which they visit.
         let told = |count: u64| count == account.sent || count > account.sent && number < 2;
         let all = account.answered == account.sent && told(counts.accepted) && told(counts.applied);

@@ -1,7 +1,7 @@
-//! Clients and a session in virtual time, over a network that delays, cuts off, and brings what two clients sent in any
-//! order; clients crash and come back. The intake, the session and the queues are the server's own; threads and sockets,
-//! which run by a real clock, are not in it (those are in tests/isolation.rs). Each seed is a course of its own, and the
-//! same course each time.
+//! Clients and a session in virtual time, over a network that delays, cuts off, and brings what two clients sent in
+//! any order; clients crash and come back. The intake, the session and the queues are the server's own; threads and
+//! sockets, which run by a real clock, are not in it (those are in tests/isolation.rs). Each seed is a course of its
+//! own, and the same course each time.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod common;
@@ -33,7 +33,7 @@ const TOOLS: u64 = 3;
 const LEASE_MS: u64 = 60;
 const QUEUED_SAMPLES: usize = 8;
 
-/// What a client says to the server.
+/// Messages of a client to the server.
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Said {
     Acquire(u32, LeaseId),
@@ -183,7 +183,7 @@ fn course(seed: u64) -> ClientHistory {
                 let known = [Reason::ToolHeld, Reason::NotHolder, Reason::StaleSequence, Reason::QueueFull];
                 assert!(known.contains(&refusal.reason), "{refusal:?}");
                 *found.refused.entry(refusal.reason.as_str()).or_default() += 1;
-                // It believes no longer what it is told is not so.
+                // It no longer assumes that it holds a tool.
                 if refusal.reason != Reason::QueueFull && clients[number].cut_until <= step {
                     clients[number].held = None;
                 }
@@ -194,7 +194,7 @@ fn course(seed: u64) -> ClientHistory {
         intake.rest(session.step_count(), session.step_count(), &schedule);
         assert_eq!(session.fault(), None, "seed {seed}, step {step}");
 
-        // What came is accounted for, and no queue is above its bound.
+        // Every arrival is counted, and no queue exceeds its bound.
         let counts = intake.counts();
         assert_eq!(counts.accepted + refused, submitted, "seed {seed}, step {step}: {counts:?}");
         assert_eq!(counts.accepted, counts.applied + counts.superseded + counts.dropped + counts.waiting);

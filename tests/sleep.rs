@@ -26,7 +26,8 @@ use thin_mesh::thread;
 
 const STEPS: u64 = 400;
 
-/// A disturbance of the tolerance has to change a course by this part of what sleep does, where that is beyond the tolerance.
+/// A disturbance of the tolerance has to change a course by this part of what sleep does, where that is beyond the
+/// tolerance.
 const AS_SENSITIVE: f64 = 0.3;
 
 /// The most disturbances tried: whether a tip touches, slides or lets go may hang on one of them.
@@ -72,7 +73,7 @@ fn scene(folder: &std::path::Path, dice: &mut fastrand::Rng, sleep_tolerance: f6
     })
 }
 
-/// What a tool does from a step on.
+/// Action of a tool from a step on.
 enum ToolChange {
     /// Holds a point and takes it along at a speed, m/s, after a jump, m.
     Grasp(PointId, DVec3, DVec3),
@@ -83,7 +84,7 @@ enum ToolChange {
 }
 
 impl ToolChange {
-    /// Where it acts, m.
+    /// Place of the action, m.
     fn place_m(&self, model: &Model) -> Option<DVec3> {
         match self {
             ToolChange::Grasp(point, ..) => Some(model.scene.shape().rest_m(*point)),
@@ -132,7 +133,7 @@ fn random_act(model: &Model, dice: &mut fastrand::Rng) -> ToolChange {
     }
 }
 
-/// What acts on both of a pair of tissues.
+/// Actions on both of a pair of tissues.
 struct Hands {
     acts: Vec<(u64, usize, ToolChange)>,
 }
@@ -158,8 +159,8 @@ impl Hands {
     }
 }
 
-/// The largest displacement of a course without sleep, and the largest difference of another to it at the end of any step, m.
-/// Stops at a blow-up.
+/// The largest displacement of a course without sleep, and the largest difference of another to it at the end of any
+/// step, m. Stops at a blow-up.
 fn compared(
     hands: &Hands,
     model: &Arc<Model>,
@@ -190,7 +191,7 @@ fn compared(
     Some((largest_m, difference_m))
 }
 
-/// What came of a seed.
+/// Result of a seed.
 enum SeedOutcome {
     /// The scene needs too many substeps, or the guard acted.
     Left,
@@ -218,8 +219,8 @@ fn play(seed: u64) -> SeedOutcome {
     if difference_m <= tolerance * largest_m {
         return SeedOutcome::Within;
     }
-    // Forces for good that move the points where tools act, and one more, by no more than the tolerance. A tip that is put just
-    // between two places of its disc may take either, so the forces go three ways.
+    // Permanent forces that move the points where tools act, and one more, by no more than the tolerance. A tip that
+    // is put just between two places of its disc may take either, so the forces go three ways.
     let shape = awake.scene.shape();
     let mut places_m = vec![shape.rest_m(PointId::new(dice.usize(0..shape.point_count())))];
     places_m.extend(hands.acts.iter().filter_map(|(_, _, act)| act.place_m(&awake)));

@@ -1,4 +1,4 @@
-//! A session that was saved, and restored from bytes, goes on with the same bits as one that never stopped.
+//! A session that was saved, and restored from bytes, continues with the same bits as one that never stopped.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
 
 mod common;
@@ -28,7 +28,7 @@ fn limits() -> Limits {
 const GALLBLADDER: &str = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.0035 }\n[material]\nyoungs_modulus_pa = 2e4\n\
                            thickness_m = 0.003\nfoundation_n_per_m3 = 5e6\n";
 
-/// What happens to a session before a step.
+/// Events of a session before a step.
 #[derive(Debug, Clone)]
 enum SessionEvent {
     Command(Box<Due>),
@@ -49,7 +49,7 @@ struct SnapshotCase {
 /// Steps from one comparison to the next: what differs once, differs from then on.
 const TOLD_EVERY: u64 = 5;
 
-/// What is told of a session after a step.
+/// Output of a session after a step.
 #[derive(PartialEq, Debug)]
 struct StepOutput {
     hash: u128,
@@ -283,7 +283,7 @@ fn hand(case: &mut SnapshotCase, random: &mut Rng, tool: u32) {
         let mut last = command(tool, sequence, Action::Release);
         last.ends_lease = random.u8(0..4) == 0;
         match random.u8(0..3) {
-            // It goes on as it is, and ends for lack of commands or never.
+            // It continues unchanged, and ends for lack of commands or never.
             0 => {}
             _ => put(&mut case.events, step.max(until), last),
         }
@@ -291,8 +291,8 @@ fn hand(case: &mut SnapshotCase, random: &mut Rng, tool: u32) {
     }
 }
 
-/// Leads a tool onto the tissue and along it, by poses of a thousandth of a second that come in bursts. Returns the step after
-/// the last.
+/// Leads a tool onto the tissue and along it, by poses of a thousandth of a second that come in bursts. Returns the
+/// step after the last.
 fn pose(case: &mut SnapshotCase, random: &mut Rng, tool: u32, [from, until]: [u64; 2], sequence: &mut u64) -> u64 {
     let shape = case.first.shape();
     let edge_m = shape.edge_m();
@@ -385,7 +385,7 @@ fn tissues(case: &mut SnapshotCase, random: &mut Rng, on_mesh: bool) {
     }
 }
 
-/// What a snapshot had in it, over all cases: so that none of it goes untried.
+/// Contents of the snapshots of all cases, to check that every part was tried.
 #[derive(Default)]
 struct Coverage(BTreeMap<&'static str, u32>);
 
@@ -437,7 +437,7 @@ fn a_hundred_random_sessions_go_on_with_the_same_bits() {
         let mut random = Rng::with_seed(!seed);
         let mut session = case.begin();
         let stops: BTreeSet<u64> = (0..3).map(|_| random.u64(0..case.steps)).collect();
-        // What was told, and the bytes at the stops.
+        // The outputs, and the bytes at the stops.
         let (mut course, mut saved) = (Vec::new(), Vec::new());
         while session.step_count() < case.steps && session.hold_reason().is_none() {
             if stops.contains(&session.step_count()) {
@@ -572,7 +572,7 @@ fn a_snapshot_of_another_model_is_refused_by_what_differs() {
     );
     refused(&|scene| scene.stepping.integrator = Integrator::Exponential2, "but this one is stepped by exponential2");
     refused(&|scene| scene.damping_n_s_per_m *= 2.0, "other coefficients");
-    // What is only shown, and what the machine has, is no part of it.
+    // Values that are only shown, and properties of the machine, are not part of it.
     let mut other = first.clone();
     (other.name, other.appearance.texture_seed, other.stepping.lanes) = ("other".into(), 9, Lanes::Plain);
     assert!(Session::restore(&Model::compile(&other, &limits()).unwrap(), &saved).is_ok());
@@ -596,7 +596,7 @@ fn another_version_and_what_is_above_the_limits_is_refused() {
         (Limits { tools: 2, ..limits() }, "tool 2, but tools are numbered below 2"),
         (Limits { point_force_n: 0.01, ..limits() }, "above the limit of 0.01 N"),
     ] {
-        // How many tools there are is known before any of them is laid out.
+        // The number of tools is known before any of them is built.
         let restored = Saved::from_bytes(&bytes, &limits).and_then(|saved| Session::restore(session.model(), &saved));
         let refusal = restored.map(drop).unwrap_err();
         assert!(refusal.message.contains(what), "{refusal}");

@@ -15,7 +15,7 @@ use pb::touch_response::Message as Heard;
 use random::TestRandom;
 use server::{TEST_TIMEOUT, TestServer, TestTouch, force, position};
 
-/// What one client has sent and heard.
+/// Messages that one client has sent and received.
 #[derive(Default)]
 struct SoakLedger {
     sent: u64,
@@ -68,7 +68,7 @@ async fn life(server: &TestServer, random: &mut TestRandom) -> SoakLedger {
             let _ = tokio::time::timeout(Duration::from_millis(1), frames.message()).await;
         }
     }
-    // What was sent before has been taken in once this is answered.
+    // Earlier messages have been processed once this is answered.
     let settled = pb::touch_request::Message::Renew(pb::Renew { client_time_ns: 1, datagrams: false });
     touch.say(settled).await;
     loop {
@@ -134,7 +134,7 @@ fn nothing_grows_and_no_command_is_lost() {
             let (lives, account) = runtime.block_on(client).unwrap();
             sum = (sum.0 + lives, sum.1 + account.sent, sum.2 + account.refused, sum.3 + account.seen);
         }
-        // What ended last is put away.
+        // The last ended session is removed.
         let quiet = Instant::now();
         while weight(&server)[1] > 40 && quiet.elapsed() < TEST_TIMEOUT {
             std::thread::sleep(Duration::from_millis(50));

@@ -38,7 +38,7 @@ fn pose(tool: u32, sequence: u64, place_m: DVec3, client_time_ns: u64) -> pb::Co
 /// As long as either side stands still, s.
 const STALL: Duration = Duration::from_secs(5);
 
-/// What an unoptimized server steps in time.
+/// A scene that an unoptimized server steps in time.
 fn small() -> Source {
     let text = "name = \"small\"\n[sheet]\npoints = [9, 9]\nspacing_m = 0.01\npoint_mass_kg = 0.002\n\
                 [springs]\nstiffness_n_per_m = 30.0\n[anchor_springs]\nstiffness_n_per_m = 5.0\n\
@@ -85,7 +85,7 @@ impl Led {
         }
     }
 
-    /// A thousand times a second for so long, whatever is heard.
+    /// Sends a thousand times a second for this time, whatever arrives.
     async fn lead(&mut self, lasts: Duration) {
         let mut ticks = tokio::time::interval(Duration::from_millis(1));
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Burst);
@@ -95,7 +95,7 @@ impl Led {
         }
     }
 
-    /// Listens until all that was said is acknowledged by a sample; tells how many commands were refused, by reason.
+    /// Listens until a sample acknowledges all commands. Returns the numbers of refused commands by reason.
     async fn acknowledged(&mut self) -> HashMap<String, u64> {
         let mut refused = HashMap::new();
         loop {
@@ -175,8 +175,8 @@ async fn a_tool_far_away_outlives_a_server_that_stands_still() {
     the_server_stands_still(proxy.url(), &server, 1, STALL).await;
 }
 
-/// A client in a thread of its own that stands still with all it has, its transport too; then it says on, as long as `lease_s`
-/// lets it.
+/// A client in a thread of its own that stands still with all it has, its transport too; then it says on, as long as
+/// `lease_s` lets it.
 fn a_client_that_stands_still(url: String, session: String, lease_s: f64) -> std::thread::JoinHandle<()> {
     std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
@@ -284,7 +284,7 @@ fn no_program_waits_for_who_says_nothing() {
         assert_eq!(ended.status.code(), Some(1), "{program}: {said}");
         assert!(said.contains("has not answered") || said.contains("never connected"), "{program}: {said}");
     }
-    // And nobody who hears what went wrong is no reason to break down.
+    // A missing listener for the error must not break it.
     let shell = format!("'{}' health 127.0.0.1:1 2>&-", client.display());
     let ended = std::process::Command::new("sh").args(["-c", &shell]).status().unwrap();
     assert_eq!(ended.code(), Some(1));
@@ -307,7 +307,7 @@ async fn a_cut_by_the_transport_is_logged_and_counted() {
     let mut told = String::new();
     scrape.read_to_string(&mut told).unwrap();
     let counted = "palpate_transport_cuts_total{side=\"server\",reason=\"PROTOCOL_ERROR\"} 1";
-    // What it logs is written when it ends.
+    // Its log is written when it ends.
     signal(&server, "-TERM");
     server.child.wait().unwrap();
     let log = server.log();

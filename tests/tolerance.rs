@@ -1,5 +1,5 @@
-//! Schemes chosen for a scene's tolerance keep it, also on random scenes. `make bench-tolerance` tries a thousand; of random
-//! meshes there are 8 here, and more by `PALPATE_TOLERANCE_MESHES`.
+//! Schemes chosen for a scene's tolerance keep it, also on random scenes. `make bench-tolerance` tries a thousand; of
+//! random meshes there are 8 here, and more by `PALPATE_TOLERANCE_MESHES`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/cases.rs"]
@@ -74,14 +74,14 @@ fn a_scene_that_needs_endless_substeps_is_refused() {
     assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "stepping.substeps"));
 }
 
-/// Stable substeps times this, where nothing keeps the tolerance; docs/accuracy.md tells it.
+/// Returns the largest number of substeps where nothing keeps the tolerance, as docs/accuracy.md states it.
 fn most_substeps(model: &Model) -> u32 {
     let (scene, plan) = (&model.scene, &model.plan);
     scheme_selection::MAX_TIMES_STABLE
         * stability::stable_substeps(plan.integrator, scene.stepping.rate_hz.recip(), &Oscillator::of(scene))
 }
 
-/// Bodies that float freely, that nothing damps, or both: what moves them moves them for ever.
+/// Bodies that float freely, are undamped, or both: a movement never ends.
 #[test]
 fn a_body_whose_error_nothing_bounds_takes_few_substeps_or_is_refused_at_once() {
     let limits = Limits::default();

@@ -106,7 +106,7 @@ async fn every_refinement_and_encoding_shows_the_same_tissue() {
     let depth_m = touch.sample_with(|sample| sample.step == 200).await.tools[0].displacement_m.unwrap().z;
     for refinement in 0..=10 {
         for encoding in [pb::Encoding::F32, pb::Encoding::I16] {
-            // Who joins late gets a full frame first, also when time stands.
+            // A viewer that joins late gets a full frame first, also while time is paused.
             let request = watch(&session, refinement, encoding);
             let mut frames = server.views().await.watch_frames(request).await.unwrap().into_inner();
             let (last, vertices) = frame(&mut frames).await;
@@ -255,7 +255,7 @@ async fn frames_of_changes_make_the_same_picture_as_full_ones() {
                 *last = next;
             }
             check(&server, &session, last, vertices).await;
-            // Who joins late sees the same at once.
+            // A viewer that joins late sees the same at once.
             let request = changes(&session, last.refinement, last.encoding());
             let mut late = Vec::new();
             let (first, _) = show(&mut views.watch_frames(request).await.unwrap().into_inner(), &mut late).await;
@@ -264,7 +264,7 @@ async fn frames_of_changes_make_the_same_picture_as_full_ones() {
         }
     }
     assert!(some_but_not_all);
-    // The ones that had no credit were told so.
+    // The viewers without credit were informed.
     assert!(streams.iter().any(|(_, _, last)| last.skipped_frames > 0));
 }
 
@@ -329,7 +329,7 @@ async fn a_viewer_chooses_its_rate() {
         let mut steps = Vec::new();
         loop {
             let (last, _) = frame(&mut frames).await;
-            // A frame's number tells its step: at this rate, whatever was skipped.
+            // A frame's number gives its step: at this rate, whatever was skipped.
             assert_eq!(last.frame_id, (last.step as f64 * rate_hz / 1000.0) as u64);
             steps.push(last.step);
             if last.step == 1000 {

@@ -1,4 +1,5 @@
-//! Tissue that encloses a volume: the laws of its pressure, what it does to a touch, sleep, bits, and changes under way.
+//! Tissue that encloses a volume: the laws of its pressure, what it does to a touch, sleep, bits, and changes under
+//! way.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 mod common;
@@ -50,7 +51,7 @@ fn growth_m3(tissue: &dyn Tissue) -> f64 {
     points(tissue).iter().zip(areas_m2).map(|(point, area)| area.dot(tissue.point(*point).displacement_m)).sum()
 }
 
-/// What the moved triangles enclose, over what they do at rest, minus 1.
+/// Returns the volume of the moved triangles over that at rest, minus 1.
 fn true_growth(tissue: &dyn Tissue) -> f64 {
     let Body::Mesh(mesh) = &tissue.model().scene.body else { panic!("no mesh") };
     let enclosed = |places_m: &[DVec3]| -> f64 {
@@ -158,7 +159,7 @@ fn the_stiffer_its_volume_the_better_a_pressed_ball_keeps_it_and_the_more_its_ot
             assert!(bulges_m > bulges_before_m && force_n > force_before_n, "{stiffness_pa}: {bulges_m} {force_n}");
         }
         before = Some((lost, bulges_m, force_n));
-        // What first order leaves out.
+        // Terms beyond first order.
         assert!((-true_growth(&*tissue) - lost).abs() < 3e-4, "{stiffness_pa}");
     }
     assert!(before.unwrap().0 < 1e-3);

@@ -1,4 +1,4 @@
-//! What those see who look after a server: metrics, `palpate top`, and the files that come with it.
+//! Tools of an operator: metrics, `palpate top`, and the files that come with the server.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/metrics.rs"]
@@ -70,7 +70,7 @@ fn the_dashboard_shows_what_is_there_and_asks_for_nothing_else() {
         let query = target["expr"].as_str().unwrap();
         for (at, _) in query.match_indices("palpate_") {
             let name: String = query[at..].chars().take_while(|c| c.is_ascii_alphanumeric() || *c == '_').collect();
-            // Those of a fleet are compared where they are told, in src/server/metrics.rs.
+            // Those of a fleet are compared in src/server/metrics.rs, where they are defined.
             if name.starts_with("palpate_fleet_") {
                 continue;
             }
@@ -160,7 +160,7 @@ fn a_server_says_that_it_is_well_and_one_that_is_gone_does_not() {
     assert_eq!(health(&url), Some(1));
 }
 
-/// Options in a text that `palpate serve` has not got.
+/// Returns options in a text that `palpate serve` does not have.
 fn unknown_options(text: &str) -> Vec<String> {
     let help = Command::new(env!("CARGO_BIN_EXE_palpate")).args(["serve", "--help"]).output().unwrap();
     let client = Command::new(client_program()).args(["health", "--help"]).output().unwrap();
@@ -188,7 +188,8 @@ fn the_packaged_files_start_servers_as_they_are() {
     ] {
         assert!(unit.contains(line), "the unit lacks {line}");
     }
-    // Where systemd is, it says whether it understands the unit, with this build's program in the place of the installed.
+    // Where systemd is, it says whether it understands the unit, with this build's program in the place of the
+    // installed.
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("palpate.service");
     std::fs::write(&path, unit.replace("/usr/local/bin/palpate", env!("CARGO_BIN_EXE_palpate"))).unwrap();

@@ -9,7 +9,7 @@ use tonic::Status;
 
 use super::Ground;
 
-/// What any client of HTTP/2 begins with: the preface, and settings as they are.
+/// The beginning of an HTTP/2 connection: the preface, and default settings.
 pub const GREETING: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0";
 
 /// One byte more for the connection.
@@ -65,7 +65,7 @@ pub async fn page_gets(ground: &Ground) -> Result<(), Status> {
     pour(ground, b"", request, request.len()).await
 }
 
-/// Lets a process go on that was stopped, whatever happens.
+/// Guard that lets a stopped process continue, whatever happens.
 struct Stopped(Pid);
 
 impl Drop for Stopped {
@@ -85,7 +85,7 @@ pub async fn stall_server(ground: &Ground, seconds: f64) -> Result<(), Status> {
     std::future::pending().await
 }
 
-/// The same of the honest client.
+/// Guard that lets the honest client continue.
 pub async fn stall_client(ground: &Ground, seconds: f64) -> Result<(), Status> {
     if let Some(freezer) = &ground.freezer {
         freezer.freeze(Duration::from_secs_f64(seconds));

@@ -145,7 +145,7 @@ pub async fn empty_commands(ground: &Ground) -> Result<(), Status> {
     }
 }
 
-/// So many probes of all points of a sheet, each step, that nobody reads.
+/// Opens probes of all points of a sheet at each step, and reads none of them.
 pub async fn unread_probes(ground: &Ground, probes: u32, side: u32) -> Result<(), Status> {
     let session_id = create(&ground.caller.door().await?, sheet(side, side), false).await?;
     let mut unread = Vec::new();

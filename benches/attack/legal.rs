@@ -18,7 +18,7 @@ const STREAMS: usize = 24;
 /// No call is waited for any longer.
 const CALL_TIMEOUT: Duration = Duration::from_secs(3);
 
-/// What is open, and perhaps read.
+/// Open streams, which may be read.
 enum OpenStream {
     Samples(Streaming<pb::WatchSamplesResponse>),
     Records(Streaming<pb::ProbeResponse>),
@@ -93,7 +93,7 @@ pub async fn calls(ground: &Ground) -> Result<(), Status> {
         let called = call(ground, &door, &mut random, &mut mine, &mut streams, sequence);
         let called = tokio::time::timeout(CALL_TIMEOUT, called).await;
         let called = called.unwrap_or_else(|_| Err(Status::deadline_exceeded("no answer")));
-        // Who has lost its connection makes another.
+        // A caller that has lost its connection opens another.
         if called.as_ref().is_err_and(|status| status.code() == tonic::Code::Unavailable) {
             return called;
         }

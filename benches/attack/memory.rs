@@ -12,7 +12,7 @@ use crate::caller::{Door, MIDDLE, SIDE, create, haptics, push, push_all, session
 /// A step that is never done.
 const NEVER: u64 = 1 << 40;
 
-/// So many fixed points in a scene, all of them the same one.
+/// Number of fixed points in a scene, all of them the same one.
 pub fn fixed(points: u32) -> pb::Scene {
     let mut scene = sheet(SIDE, SIDE);
     let points = vec![pb::GridPoint { x: 0, y: 0 }; points as usize];
@@ -120,7 +120,7 @@ pub async fn stalled_viewer(ground: &Ground) -> Result<(), Status> {
     std::future::pending().await
 }
 
-/// As many commands as may wait in a session, by all of its tools.
+/// Sends as many commands as may wait in a session, with all of its tools.
 pub async fn fill(ground: &Ground, door: &Door, session_id: &str) -> Result<(), Status> {
     for tool in 0..ground.count(64) {
         let lease_id = lease(door, session_id, tool).await?;

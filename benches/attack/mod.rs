@@ -24,9 +24,9 @@ use tonic::Status;
 use crate::caller::{SIDE, TestCaller, TokenFile, why};
 use crate::honest::Freezer;
 
-/// Where an attack takes place.
+/// The server, the attackers and the amounts of an attack.
 pub struct Ground {
-    /// Who attacks.
+    /// The attackers.
     pub caller: TestCaller,
     /// A session of an honest client, whose id got about. It holds tool 0 there.
     pub shared: String,
@@ -36,7 +36,7 @@ pub struct Ground {
     pub keys: Arc<TokenFile>,
     /// The honest client itself, where an attack has it stand still.
     pub freezer: Option<Freezer>,
-    /// How much of everything: 1 is all that the attack is known for.
+    /// Factor of all amounts: 1 is the full attack.
     pub scale: f64,
     pub seed: u64,
     strikes: AtomicU64,
@@ -58,7 +58,7 @@ impl Ground {
         }
     }
 
-    /// So many of something, one at least.
+    /// Returns a scaled number, at least one.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn count(&self, all: u32) -> u32 {
         ((f64::from(all) * self.scale) as u32).max(1)
@@ -144,7 +144,7 @@ pub const KINDS: &[AttackKind] = &[
         round_trip_ms: 50,
         ..kind("stall-client-16-far", "the same, 50 ms away", |g| Box::pin(bytes::stall_client(g, 1.0)))
     },
-    // What one call makes the server do.
+    // Work that one call causes on the server.
     kind("fixed-positions", "4096 positions per call to a sheet with 500,000 fixed points", |g| {
         Box::pin(cpu::fixed_positions(g))
     }),
@@ -167,7 +167,7 @@ pub const KINDS: &[AttackKind] = &[
         Box::pin(memory::waiting_commands(g))
     }),
     kind("thin-sheet", "a sheet of 4,194,304 × 1, all of it awake", |g| Box::pin(memory::thin_sheet(g))),
-    // What a request costs.
+    // Cost of a request.
     kind("unread-probes", "20 probes of all points that nobody reads", |g| Box::pin(cpu::unread_probes(g, 20, SIDE))),
     AttackKind {
         same_caller: true,
@@ -209,7 +209,7 @@ pub const KINDS: &[AttackKind] = &[
     kind("command-flood", "a client that sends 100 times as many commands", |g| Box::pin(cpu::command_flood(g))),
     kind("create-and-drop", "sessions made and dropped without end", |g| Box::pin(cpu::create_and_drop(g))),
     kind("legal-calls", "random legal calls to sessions of its own", |g| Box::pin(legal::calls(g))),
-    // What tools and meshes cost.
+    // Cost of tools and meshes.
     kind("tip-strip", "64 tips of half of a sheet of 2000 × 1, again and again", |g| Box::pin(tools::strip(g, 2000))),
     kind("tip-strip-60000", "the same on 60,000 × 1", |g| Box::pin(tools::strip(g, 60_000))),
     kind("tips-organ", "64 tips of 25 mm that press a gallbladder and are released", |g| {
@@ -234,7 +234,7 @@ pub const KINDS: &[AttackKind] = &[
     kind("mesh-empty-accessor", "a glTF file of 300 bytes with 10,000,000 vertices", |g| {
         Box::pin(meshes::empty_accessor(g))
     }),
-    // Who is locked out.
+    // Attacks that lock out others.
     kind("watchers", "256 streams of samples of the honest client's session", |g| Box::pin(slots::watchers(g))),
     kind("kept-leases", "every other tool of the honest client's session taken for 600 s, then hung up", |g| {
         Box::pin(slots::kept_leases(g))
@@ -254,13 +254,13 @@ pub fn named(name: &str) -> Option<&'static AttackKind> {
     KINDS.iter().find(|kind| kind.name == name)
 }
 
-/// What an attack came to.
+/// Result of an attack.
 #[derive(Default)]
 pub struct Toll {
     pub strikes: u64,
     /// By reason.
     pub refusals: BTreeMap<String, u64>,
-    /// What the attacker itself took, s of a core.
+    /// Processor time of the attacker itself, s of a core.
     pub processor_s: f64,
 }
 
@@ -284,7 +284,7 @@ impl Attack {
                     while !over.is_cancelled() {
                         tokio::select! {
                             () = over.cancelled() => {}
-                            // What was opened is dropped, and opened again.
+                            // Open streams are dropped, and opened again.
                             done = run(&ground) => {
                                 ground.heard(done);
                                 tokio::time::sleep(Duration::from_millis(20)).await;

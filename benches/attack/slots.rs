@@ -1,4 +1,4 @@
-//! Attacks that take the room that others need, or go on where they may not.
+//! Attacks that occupy the room that others need, or continue where they may not.
 
 use std::time::Duration;
 
@@ -14,8 +14,8 @@ use tonic::Status;
 use super::Ground;
 use crate::caller::{MIDDLE, SIDE, TestCaller, create, haptics, push, sessions, sheet};
 
-/// A stream whose client never reads, and whose token is struck out after a second of commands. Strikes are commands that
-/// were taken more than 2 s later.
+/// A stream whose client never reads, and whose token is struck out after a second of commands. Strikes are commands
+/// that were taken more than 2 s later.
 pub async fn revoked_unread(ground: &Ground) -> Result<(), Status> {
     let name = format!("prey-{:x}", ground.seed);
     let token = ground.keys.admit(&name, &[Role::Touch, Role::Create]);
@@ -118,7 +118,7 @@ pub async fn all_slots(ground: &Ground) -> Result<(), Status> {
     ended.into_iter().collect()
 }
 
-/// Connections that say no more than `greeting`. Those that were closed are opened again.
+/// Opens connections that send only `greeting`, and opens closed ones again.
 pub async fn connections(ground: &Ground, greeting: &[u8]) -> Result<(), Status> {
     let most = ground.count(if greeting.is_empty() { 1000 } else { 1500 }) as usize;
     let mut open: Vec<TcpStream> = Vec::new();

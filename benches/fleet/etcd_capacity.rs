@@ -1,4 +1,4 @@
-//! What one etcd bears of a fleet: transactions on sessions, keys, leases, and nodes that follow each other.
+//! Capacity of one etcd for a fleet: transactions on sessions, keys, leases, and nodes that follow each other.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -91,7 +91,7 @@ async fn transact(
     (revisions, rate)
 }
 
-/// How fast something went.
+/// Rate of an operation.
 struct Rate {
     per_s: f64,
     /// ms
@@ -246,7 +246,7 @@ async fn keep_alive(etcd: &EtcdMembers, keys: &Keys, nodes: usize) -> Rate {
     Rate { per_s: times.0.len() as f64 / elapsed_s, cores: (etcd_s(etcd) - before_s) / elapsed_s, times }
 }
 
-/// The times until the last of so many watches has what a node tells, ms, and etcd's time for each that gets it, µs.
+/// Returns the times until the last of this many watches has a node's report, ms, and etcd's time for each watch, µs.
 async fn follow(etcd: &EtcdMembers, keys: &Keys, counts: &[usize]) -> Vec<(usize, FleetTimes, f64)> {
     let puts = if quick() { 10 } else { 200 };
     let own = client(etcd);

@@ -1,4 +1,4 @@
-//! How evenly a fleet spreads sessions.
+//! Evenness of the distribution of sessions over a fleet.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};

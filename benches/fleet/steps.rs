@@ -1,4 +1,5 @@
-//! What the steps of a server of a fleet cost, with its journals on their way to another server, beside those of one server.
+//! Cost of the steps of a server in a fleet, which sends its journals to another server, compared with a single
+//! server.
 
 use std::collections::VecDeque;
 use std::sync::Arc;

@@ -38,13 +38,13 @@ impl SchemeTrial {
     }
 }
 
-/// Whether no other trial takes less time for an error that is smaller, or larger by at most a 50th: f32 and f64 at one
-/// step differ by less, which is not worth a cost.
+/// Whether no other trial takes less time for an error that is smaller, or larger by at most a 50th: f32 and f64 at
+/// one step differ by less, which is not worth a cost.
 pub fn is_best(trial: &SchemeTrial, curves: &[Curve]) -> bool {
     !curves.iter().flatten().any(|other| other.error() < 1.02 * trial.error() && other.cost < trial.cost)
 }
 
-/// Whether a scheme has a trial on the frontier of any scene.
+/// Returns whether a scheme has a trial on the frontier of any scene.
 pub fn on_any_frontier(integrator: &str, precision: &str, results: &[(&Case, Vec<Curve>)]) -> bool {
     results.iter().any(|(_, curves)| {
         let mut own = curves.iter().flatten().filter(|t| t.integrator == integrator && t.precision == precision);

@@ -37,7 +37,7 @@ pub(crate) fn links(runs: &[String]) -> Vec<Value> {
     results.into_inner().unwrap()
 }
 
-/// The same run with each of so many seeds.
+/// Performs one run with each of several seeds.
 pub(crate) fn by_seed(run: &str, seeds: u64) -> Vec<String> {
     (1..=seeds).map(|seed| format!("{run} --seed {seed}")).collect()
 }

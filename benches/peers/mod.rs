@@ -7,7 +7,7 @@ use std::process::Command;
 
 use serde_json::Value;
 
-/// The Python of the peers; tells where it has to come from if there is none.
+/// Returns the Python of the peers. Prints how to install it if it is missing.
 pub fn python() -> Option<PathBuf> {
     let python = std::env::var_os("PEERS").map(PathBuf::from).filter(|path| path.exists());
     if python.is_none() {

@@ -1,4 +1,4 @@
-//! Where a running server spends its time: samples of all its threads from `perf`, grouped by activity.
+//! Profile of a running server: samples of all its threads from `perf`, grouped by activity.
 #![allow(unreachable_pub)]
 
 use std::collections::BTreeMap;
@@ -57,8 +57,8 @@ fn place(thread: &str, stack: &[&str]) -> Activity {
     (thread, doing.unwrap_or_else(elsewhere))
 }
 
-/// The fraction of time that process `id` spends in each place, over `seconds` from now, largest first. `None` if there
-/// is no `perf` with permission to sample.
+/// The fraction of time that process `id` spends in each place, over `seconds` from now, largest first. `None` if
+/// there is no `perf` with permission to sample.
 pub fn parts(id: u32, seconds: u32) -> Option<Vec<(Activity, f64)>> {
     let folder = tempfile::tempdir().unwrap();
     let data = folder.path().join("perf.data");

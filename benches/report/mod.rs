@@ -1,4 +1,5 @@
-//! The output of a benchmark: tables and charts in docs/benchmarks, figures for programs in target/benchmarks; and its clock.
+//! The output of a benchmark: tables and charts in docs/benchmarks, figures for programs in target/benchmarks; and
+//! its clock.
 // Each benchmark uses only a part of this module.
 #![allow(dead_code, unreachable_pub)]
 
@@ -60,7 +61,8 @@ impl BenchReport {
         print!("{}", self.text);
     }
 
-    /// Writes the page and the picture to docs/benchmarks, the figures to target/benchmarks, and the page to standard output.
+    /// Writes the page and the picture to docs/benchmarks, the figures to target/benchmarks, and the page to standard
+    /// output.
     pub fn write(self, columns: usize, panels: &[Panel]) {
         let write = |folder: &str, extension: &str, text: String| {
             let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);
@@ -110,7 +112,7 @@ pub fn least<J>(rounds: usize, jobs: &[J], mut run: impl FnMut(&J) -> f64) -> Ve
     least
 }
 
-/// Whether to run quickly and roughly: `cargo bench --bench NAME -- --quick`.
+/// Returns whether to run quickly and roughly: `cargo bench --bench NAME -- --quick`.
 pub fn quick() -> bool {
     std::env::args().any(|argument| argument == "--quick")
 }

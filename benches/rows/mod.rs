@@ -18,16 +18,16 @@ use crate::proxy::Proxy;
 use crate::report::{cells, digits, quick};
 use crate::server::TestServer;
 
-/// A newcomer gives up.
+/// Timeout of a newcomer.
 const NEWCOMER_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// A session that nobody uses is deleted soon.
+/// Configuration of the server: it deletes idle sessions soon.
 const CONFIGURATION: &str = "idle_session_s = 4.0\n";
 
-/// Of everything: a server that was not optimized shows that rows work, and no more.
+/// Factor of the amounts of all attacks: a server that was not optimized only shows that rows work.
 const SCALE: f64 = if cfg!(debug_assertions) { 0.01 } else { 1.0 };
 
-/// The attack is called off here, whatever the server: a machine that swaps measures nothing.
+/// Resident memory at which an attack is stopped: a machine that swaps measures nothing.
 const MAX_RESIDENT: u64 = 6 << 30;
 
 /// One row.
@@ -60,13 +60,13 @@ fn server(keys: &TokenFile, kind: Option<&AttackKind>) -> TestServer {
             .args(["-c", &format!("{limit}exec \"$0\" \"$@\""), env!("CARGO_BIN_EXE_palpate")])
             .args(arguments)
             .args(["--tokens", keys.file()])
-            // A log that nobody reads would hold the server up.
+            // A log that is not read would block the server.
             .stderr(Stdio::null());
         TestServer::spawn(&mut command)
     })
 }
 
-/// Watches for so long; the most that was resident.
+/// Watches for this time. Returns the largest resident memory.
 fn watch(process: u32, time: Duration) -> u64 {
     let (begun, mut most) = (Instant::now(), 0);
     while begun.elapsed() < time && most < MAX_RESIDENT {
@@ -76,7 +76,7 @@ fn watch(process: u32, time: Duration) -> u64 {
     most
 }
 
-/// What one honest client notices of `kind`, or of nobody.
+/// Measures what one honest client notices of `kind`, or of no attack.
 pub fn run(kind: Option<&'static AttackKind>) -> AttackRow {
     let part = |seconds: f64| Duration::from_secs_f64(if quick() { seconds / 3.0 } else { seconds });
     let keys = Arc::new(TokenFile::new());
@@ -117,7 +117,7 @@ pub fn run(kind: Option<&'static AttackKind>) -> AttackRow {
     let welcome = newcomers.take();
     let toll = attack.map(Attack::end).unwrap_or_default();
     let processor_s = processor_s(process) - processor_before;
-    // What the attacker left is put away; the last of it is quiet.
+    // The attacker's remains are removed; the last part is quiet.
     let most = most.max(watch(process, part(6.0)));
     let settling = client.take();
     std::thread::sleep(part(2.0));
@@ -175,7 +175,7 @@ impl AttackRow {
         self.name
     }
 
-    /// What a picture shows of it, and how bad that is, from 0 to 1.
+    /// Values for the chart, and their severity from 0 to 1.
     #[allow(clippy::cast_precision_loss)]
     pub fn pictured(&self) -> Vec<(String, f64)> {
         let (times, lost, most) = (self.times_quiet(), self.whole.lost, self.resident[1] >> 20);
@@ -188,7 +188,7 @@ impl AttackRow {
     }
 
     pub fn times_quiet(&self) -> f64 {
-        // Two quiet windows: their mean tells more than either.
+        // The mean of two quiet windows is a better estimate than either.
         let quiet_ms = 0.5 * (self.quiet.quantile_ms(0.99) + self.after.quantile_ms(0.99));
         self.besieged.quantile_ms(0.99) / quiet_ms
     }

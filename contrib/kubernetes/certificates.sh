@@ -39,9 +39,9 @@ if [ "${2:-}" = client ]; then
     certificate palpate "client-$3" "DNS:$3"
     exit
 fi
-# One for all servers: `node.palpate` is what tokens.toml knows them by.
+# One for all servers: tokens.toml knows them as `node.palpate`.
 certificate palpate node "DNS:*.$inside,DNS:palpate-entry.palpate.svc,DNS:palpate-entry.palpate.svc.cluster.local,DNS:localhost,DNS:node.palpate$outside"
-# By their names, not by `*.`: members look up where these lead to know each other.
+# Full names, not `*.`: members resolve these names to recognize each other.
 members=
 for member in 0 1 2; do members=${members}DNS:etcd-$member.etcd.palpate.svc.cluster.local,; done
 certificate etcd member "${members}DNS:etcd.palpate.svc.cluster.local,DNS:localhost,IP:127.0.0.1"

@@ -1,5 +1,6 @@
-//! What reads bytes of others: one function each. libFuzzer calls them, and so does `tests/fuzz.rs` with inputs of its own.
-//! None may panic, whatever it is given; what it takes must be finite and within its bounds. True: the input was taken.
+//! The readers of bytes of others, one function each. libFuzzer calls them, and so does `tests/fuzz.rs` with inputs
+//! of its own. None may panic on any input; the values of an accepted input must be finite and within bounds. Each
+//! returns whether it accepted the input.
 #![allow(
     missing_docs,
     unreachable_pub,
@@ -37,14 +38,14 @@ use palpate_tissue::scene::{FixedVertices, Mesh, MeshShape, PAPER, Scene};
 use palpate_tissue::shape::RestShape;
 use prost::Message;
 
-/// Whether an input is taken.
+/// Whether an input was accepted.
 pub type Taker = fn(&[u8]) -> bool;
 
 /// A decoder.
 pub struct FuzzTarget {
     pub name: &'static str,
     pub run: Taker,
-    /// Inputs that it takes, to begin with.
+    /// Valid inputs to begin with.
     pub seeds: fn() -> Vec<Vec<u8>>,
 }
 
@@ -61,7 +62,7 @@ pub const TARGETS: [FuzzTarget; 10] = [
     FuzzTarget { name: "snapshot", run: snapshot, seeds: snapshot_seeds },
 ];
 
-/// What is read at all is read under these; what is compiled is smaller still.
+/// Limits for reading an input; only smaller inputs are compiled.
 fn limits() -> Limits {
     Limits { points: 1 << 12, substeps: 1000, ..Limits::default() }
 }
@@ -91,7 +92,7 @@ fn scene_seeds() -> Vec<Vec<u8>> {
     vec![PAPER.into(), small.clone().into(), include_str!("../../scenes/liver.toml").into(), (small + more).into()]
 }
 
-/// 5 × 5 points, and what of them never changes.
+/// A tissue of 5 × 5 points, and the parts of it that never change.
 fn model() -> &'static Arc<Model> {
     static MODEL: OnceLock<Arc<Model>> = OnceLock::new();
     MODEL.get_or_init(|| {
@@ -116,7 +117,7 @@ fn script_seeds() -> Vec<Vec<u8>> {
     scripts.iter().map(|text| text.as_bytes().to_vec()).collect()
 }
 
-/// The requests of the protocol with which more can be done without a server than to decode them.
+/// Requests of the protocol that can be processed further than decoding without a server.
 pub const REQUESTS: &[(&str, Taker)] = &[
     ("CreateSessionRequest", |bytes| {
         use pb::create_session_request::Source;
@@ -189,7 +190,7 @@ pub const REQUESTS: &[(&str, Taker)] = &[
             model().changed(&change, &model().scene, &limits()).is_ok()
         })
     }),
-    // Of a client that writes what no request is.
+    // From a client that sends bytes that are not a request.
     ("", |bytes| pb::Scene::decode(bytes).is_ok_and(|scene| wire::scene::from_scene(&scene, None).is_ok())),
 ];
 
@@ -203,7 +204,7 @@ pub fn requests() -> &'static [(&'static str, Taker)] {
     })
 }
 
-/// The first byte says which request the others are.
+/// The first byte selects the request that the others encode.
 pub fn request(bytes: &[u8]) -> bool {
     let all = requests();
     bytes.split_first().is_some_and(|(which, bytes)| all[usize::from(*which) % all.len()].1(bytes))
@@ -236,14 +237,14 @@ fn tetrahedron() -> &'static TriangleMesh {
     })
 }
 
-/// Its shape, as a tissue.
+/// Its shape as a tissue.
 fn ball() -> &'static MeshShape {
     static SHAPE: OnceLock<Mesh> = OnceLock::new();
     let made = || Mesh::of(tetrahedron().clone(), 0.01, FixedVertices::None).expect("the mesh is sound");
     &SHAPE.get_or_init(made).shape
 }
 
-/// All of them at one session, all or none, and two steps after them.
+/// Submits all of them to one session, all or none, and does two steps after them.
 fn command_all(messages: &[pb::Command]) -> bool {
     let scene = &model().scene;
     let on_mesh: Vec<_> = messages.iter().map(|message| wire::command::from_command(message, ball(), 1)).collect();
@@ -433,10 +434,10 @@ fn request_seeds() -> Vec<Vec<u8>> {
     seeds.into_iter().map(|(name, bytes)| [vec![which(name)], bytes].concat()).collect()
 }
 
-/// What a device would render of whatever a server sends, N: finite, and never above this.
+/// Largest force that a device renders from any bytes of a server, N.
 const MAX_N: f64 = 3.3;
 
-/// What a client hears in a haptic stream, up to the force at the device.
+/// Reads messages to a client in a haptic stream, up to the force at the device.
 /// A datagram of a client, and one of a server.
 pub fn datagram(bytes: &[u8]) -> bool {
     use palpate_haptics::datagram_health::DatagramHealth;
@@ -454,7 +455,7 @@ pub fn datagram(bytes: &[u8]) -> bool {
     let mut session = Session::new(model());
     let mut taken = false;
     for command in &commands {
-        // One by one, as the server does: what comes late is no reason to refuse the others.
+        // One by one, as the server does: a late one does not cause the others to be refused.
         let Ok(command) = wire::command::from_command(command, model().scene.shape(), 1) else { continue };
         taken |= intake.submit(1, vec![Command { by_datagram: true, ..command }], 1).is_ok();
     }
@@ -557,7 +558,7 @@ fn sample_seeds() -> Vec<Vec<u8>> {
     messages.into_iter().map(|message| pb::TouchResponse { message: Some(message) }.encode_to_vec()).collect()
 }
 
-/// A part of a record on its way to the file of a replay.
+/// Reads a part of a record for the file of a replay.
 pub fn record(bytes: &[u8]) -> bool {
     let Ok(message) = pb::ProbeResponse::decode(bytes) else { return false };
     let mut record = Record::default();
@@ -584,12 +585,12 @@ fn record_seeds() -> Vec<Vec<u8>> {
     vec![last.encode_to_vec(), pb::ProbeResponse { last: false, ..last }.encode_to_vec()]
 }
 
-/// A frame, a mesh or a session as a client reads them: what was read is written and read again as the same.
+/// Reads a frame, a mesh or a session as a client does: the result is written and read again as the same.
 pub fn frame(bytes: &[u8]) -> bool {
     fn again<M: Message + Default + PartialEq>(bytes: &[u8]) -> bool {
         let Ok(message) = M::decode(bytes) else { return false };
         let written = message.encode_to_vec();
-        // NaN is not the same as itself; its bytes are.
+        // NaN does not equal itself, but its bytes do.
         let read = M::decode(&*written).expect("what was written can be read");
         assert_eq!(read.encode_to_vec(), written);
         true
@@ -626,7 +627,7 @@ fn frame_seeds() -> Vec<Vec<u8>> {
     messages.into_iter().enumerate().map(|(which, bytes)| [vec![which as u8], bytes].concat()).collect()
 }
 
-/// A configuration, or a file of tokens.
+/// Reads a configuration, or a file of tokens.
 pub fn config(bytes: &[u8]) -> bool {
     let Ok(text) = std::str::from_utf8(bytes) else { return false };
     let known = KnownCallers::parse(Path::new("fuzz"), text).is_ok();
@@ -641,7 +642,7 @@ fn config_seeds() -> Vec<Vec<u8>> {
     vec![config.into(), format!("{token}{certificate}").into()]
 }
 
-/// Messages of a journal, around which a file is made whose checksums are right: what is behind them is to be tried.
+/// Messages of a journal, in a file with valid checksums, so that the code behind the checksums is tested.
 #[derive(Clone, PartialEq, Message)]
 struct JournalParts {
     #[prost(bytes = "vec", tag = "1")]
@@ -654,7 +655,7 @@ struct JournalParts {
     snapshot: Vec<u8>,
     #[prost(bytes = "vec", tag = "5")]
     end: Vec<u8>,
-    /// What is appended to the file as it is.
+    /// Bytes appended to the file unchanged.
     #[prost(bytes = "vec", tag = "6")]
     more: Vec<u8>,
     #[prost(bytes = "vec", tag = "7")]
@@ -697,10 +698,10 @@ impl JournalParts {
     }
 }
 
-/// A journal is simulated if it has no more steps than this.
+/// Largest number of steps of a journal that is simulated.
 const SIMULATED_STEPS: u64 = 50;
 
-/// A file as it is, or after a 1 the parts of one.
+/// Reads a file unchanged, or, after a byte of 1, made from parts.
 pub fn journal(bytes: &[u8]) -> bool {
     let made;
     let file = match bytes.split_first() {
@@ -779,8 +780,8 @@ fn journal_seeds() -> Vec<Vec<u8>> {
     vec![parts.file(), bytes(&parts), bytes(&torn)]
 }
 
-/// A snapshot, with the checksum that goes with its bytes: what is behind that is tried. What is restored steps on, and all of
-/// it stays finite.
+/// Restores a snapshot with a valid checksum, so that the code behind the checksum is tested. The restored session
+/// continues, and all values stay finite.
 pub fn snapshot(bytes: &[u8]) -> bool {
     let mut bytes = bytes.to_vec();
     snapshot::seal(&mut bytes);
@@ -794,7 +795,7 @@ pub fn snapshot(bytes: &[u8]) -> bool {
         })
     };
     assert!(is_finite(&session));
-    // What was read is written, and read again as the same.
+    // The result is written, and read again as the same.
     let again = session.save().to_bytes();
     let same = Saved::from_bytes(&again, &limits()).and_then(|saved| Session::restore(model(), &saved));
     assert_eq!(same.expect("what was restored can be saved").save().to_bytes(), again);

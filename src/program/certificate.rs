@@ -25,7 +25,7 @@ pub(crate) struct CertificateArguments {
     force: bool,
 }
 
-/// Clocks of clients may be behind by so much.
+/// Time by which the clocks of clients may be behind.
 const EARLIER: Duration = Duration::from_secs(3600);
 
 const DAY: Duration = Duration::from_secs(86_400);
@@ -46,7 +46,7 @@ pub(crate) fn certificate(arguments: &CertificateArguments) -> Result<(), Failur
     written.map_err(|e| Failure::Failed(e.to_string()))
 }
 
-/// Certificate and key in PEM.
+/// Returns certificate and key in PEM.
 // Certificates expire by the wall clock.
 #[allow(clippy::disallowed_methods)]
 fn pair(names: &[String], days: u32) -> Result<[String; 2], Failure> {
@@ -87,7 +87,7 @@ pub(crate) fn write_key(path: &Path, pem: &str) -> Result<(), Failure> {
     options.open(path).and_then(|mut file| file.write_all(pem.as_bytes())).map_err(failed)
 }
 
-/// What was made, and the commands that use it.
+/// Returns the names of the new files, and the commands that use them.
 fn next(names: &[String], days: u16, cert: &Path, key: &Path) -> String {
     let is_here = |name: &String| name == "localhost" || name.parse::<IpAddr>().is_ok_and(|ip| ip.is_loopback());
     let (cert, key) = (cert.display(), key.display());
@@ -100,7 +100,7 @@ fn next(names: &[String], days: u16, cert: &Path, key: &Path) -> String {
     let host = if name.contains(':') { format!("[{name}]") } else { name.to_owned() };
     let (listen, first, tokens, token) = match others {
         None => ("127.0.0.1:7117", String::new(), "", ""),
-        // Others can reach such a server, so that it asks for tokens.
+        // Others can reach such a server, so it requires tokens.
         Some(_) => (
             "0.0.0.0:7117",
             "A token for the client:\n  (umask 077; palpate token --name me --role create,touch --tokens tokens.toml > me.token)\n\n"

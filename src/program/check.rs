@@ -1,4 +1,4 @@
-//! `palpate check`: reports what a scene needs, and what to expect of it.
+//! `palpate check`: reports the cost and the expected behaviour of a scene.
 
 use std::io::Write;
 use std::path::PathBuf;
@@ -20,13 +20,13 @@ pub(crate) struct CheckArguments {
     script: Option<PathBuf>,
 }
 
-/// Parts of the vertices that are tried, from the one that changes least. One vertex fewer leaves out the worst.
+/// Fractions of the vertices that are tried, from the smallest change. One vertex less leaves out the worst.
 const TRIED: [f64; 6] = [1.0, 0.99, 0.95, 0.9, 0.75, 0.5];
 
-/// A step has to take at most this part of its time before.
+/// Largest duration of a step, as a fraction of its duration before.
 const WORTH_IT: f64 = 0.8;
 
-/// What makes the steps of a mesh with a few fast vertices cheaper, as tried; `None` if it has none.
+/// Returns a tested change that makes the steps of a mesh with a few fast vertices cheaper; `None` if there is none.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 fn advice(arguments: &SceneArguments, model: &Model) -> Option<String> {
     let Body::Mesh(mesh) = &model.scene.body else { return None };
@@ -55,7 +55,7 @@ fn advice(arguments: &SceneArguments, model: &Model) -> Option<String> {
     Some(format!("none of vertices = {} in [mesh] makes a step much cheaper", tried.join(", ")))
 }
 
-/// Reports what a scene needs, and what to expect of it.
+/// Reports the cost and the expected behaviour of a scene.
 pub(crate) fn check(arguments: &CheckArguments) -> Result<(), Failure> {
     let (model, limits) = compile(&arguments.scene)?;
     let script = arguments.script.as_ref().map(|path| find_script(path, &model.scene, &limits)).transpose()?;

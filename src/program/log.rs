@@ -1,4 +1,4 @@
-//! What `palpate serve` logs: names and messages of others can neither act on a terminal nor begin a line.
+//! Log of `palpate serve`: names and messages of others can neither control a terminal nor begin a line.
 
 use std::io::{Result, Write};
 
@@ -6,7 +6,7 @@ use palpate_refusal::printable::{printable, printable_json};
 use tracing_subscriber::field::MakeExt;
 use tracing_subscriber::fmt::format::{FormatFields, debug_fn};
 
-/// How the fields of a record are written: all that is not the log's own, colours included.
+/// Format of a record's fields, which come from others, including the message.
 pub(super) fn fields() -> impl for<'w> FormatFields<'w> + 'static {
     let write = |writer: &mut tracing_subscriber::fmt::format::Writer<'_>,
                  field: &tracing::field::Field,
@@ -17,7 +17,7 @@ pub(super) fn fields() -> impl for<'w> FormatFields<'w> + 'static {
     debug_fn(write).delimited(" ")
 }
 
-/// Writes records that are JSON, each of which is one call and ends in a new line of its own.
+/// Writer of records in JSON. Each record is one call and ends in a new line.
 pub(super) struct JsonRecords<W>(pub(super) W);
 
 impl<W: Write> Write for JsonRecords<W> {
@@ -51,7 +51,7 @@ mod tests {
         }
     }
 
-    /// What a server logs of a hostile name: in the message, as fields, and as a field of a span.
+    /// Returns the log of a hostile name: in the message, as fields, and as a field of a span.
     fn logged(json: bool, colours: bool) -> String {
         let (sent, received) = channel();
         let builder = tracing_subscriber::fmt().with_ansi(colours);

@@ -1,4 +1,4 @@
-//! `palpate mesh`: reads a mesh file, reports what it is and what is wrong with it, mends it and writes it.
+//! `palpate mesh`: reads a mesh file, reports its properties and errors, repairs it and writes it.
 
 use std::fmt::{self, Display};
 use std::io::{ErrorKind, Write};
@@ -36,23 +36,23 @@ pub(crate) struct MeshArguments {
     output: Option<PathBuf>,
 }
 
-/// What is told of a mesh.
+/// Report on a mesh.
 #[derive(Default, Serialize)]
 struct MeshDescription {
     file: String,
-    /// What reading changed or left out.
+    /// Changes and omissions of reading.
     notes: Vec<String>,
-    /// What was done with it, as every scene does, and by mending and decimation.
+    /// Changes that every scene makes, and those of repair and decimation.
     done: Vec<String>,
-    /// How large it was, if it was mended or made coarser.
+    /// Its size before, if it was repaired or made coarser.
     before: Option<SurfaceMeasure>,
-    /// Why that is not what was asked for.
+    /// Reason why the result differs from the request.
     faults: Vec<String>,
     #[serde(flatten)]
     report: MeshReport,
     /// Vertices with a name, which `fixed` of a scene may give.
     groups: Vec<ToldGroup>,
-    /// Of the file; places are told in it.
+    /// Unit of the file, in which places are printed.
     #[serde(skip)]
     unit: Unit,
 }
@@ -64,7 +64,7 @@ struct ToldGroup {
     vertices: usize,
 }
 
-/// Checks a mesh; mends and writes it if asked to.
+/// Checks a mesh; repairs and writes it if requested.
 pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     let name = arguments.file.display().to_string();
     let Some(unit) = &arguments.unit else {
@@ -105,7 +105,7 @@ pub(crate) fn mesh(arguments: &MeshArguments) -> Result<(), Failure> {
     Err(Failure::Failed(format!("{}: not as asked for: {}", told.file, told.faults.join("; "))))
 }
 
-/// Mends a mesh and makes it coarser, if asked to, and reports what comes out.
+/// Repairs a mesh and makes it coarser, if requested, and reports the result.
 fn treat(arguments: &MeshArguments, mesh: TriangleMesh, mut told: MeshDescription) -> (MeshDescription, TriangleMesh) {
     let mut mesh = if arguments.repair {
         let repaired = repair(&mesh, &Repair::default());
@@ -138,7 +138,7 @@ fn write_mesh(path: &Path, mesh: &TriangleMesh, format: Format) -> Result<(), Fa
     write_file(path, &write(mesh, format))
 }
 
-/// Refuses a file that can't be read as a mesh; as JSON, too, if that was asked for.
+/// Reports a file that can't be read as a mesh; also as JSON, if requested.
 fn refuse(arguments: &MeshArguments, name: &str, error: MeshError, unit: Unit) -> Result<(), Failure> {
     let message = error.to_string();
     if arguments.json {
@@ -161,7 +161,7 @@ fn print(arguments: &MeshArguments, told: &MeshDescription) -> Result<(), Failur
     }
 }
 
-/// So many groups are listed in the table.
+/// Largest number of groups that the table lists.
 const GROUPS_TOLD: usize = 20;
 
 /// The width of the names in the table.

@@ -1,4 +1,4 @@
-//! The program `palpate`: one file for each subcommand, and what they share.
+//! The program `palpate`: one file for each subcommand, and shared functions.
 
 pub(crate) mod certificate;
 pub(crate) mod check;
@@ -23,8 +23,8 @@ use palpate_realtime::clock::now_ns;
 use palpate_refusal::Refusal;
 use palpate_session::simulation::SimulationFailure;
 
-/// Writes a line to the standard error, whatever names and messages of others are in it. A closed standard error does not end the
-/// program.
+/// Writes a line to the standard error, with names and messages of others made printable. A closed standard error
+/// does not end the program.
 macro_rules! say {
     ($($text:tt)*) => {{
         let text = palpate_refusal::printable::printable(format_args!($($text)*));
@@ -33,13 +33,13 @@ macro_rules! say {
 }
 pub(crate) use say;
 
-/// Why the program ends early.
+/// Reason why the program ends early.
 pub(crate) enum Failure {
     /// Exit status 1.
     Failed(String),
     /// Exit status 2.
     Refused(String),
-    /// A program that was run in its place ended with this exit status, and has told why.
+    /// A program that was run in its place ended with this exit status, and has reported the reason.
     Told(u8),
 }
 
@@ -67,23 +67,24 @@ impl From<SimulationFailure> for Failure {
     }
 }
 
-/// Does something that may need more memory than there is.
+/// Runs work that may need more memory than is available.
 pub(crate) fn within_memory(work: impl FnOnce() -> Result<(), Failure>) -> Result<(), Failure> {
     palpate_tissue::memory::attempt("", || Ok(work()))?
 }
 
-/// The configuration of a file, or the default one.
+/// Returns the configuration in a file, or the default.
 fn load_config(path: Option<&Path>) -> Result<Config, Refusal> {
     path.map_or_else(|| Ok(Config::default()), Config::load)
 }
 
-/// The time by the server's clock, s.
+/// Returns the time by the server's clock, s.
 #[allow(clippy::cast_precision_loss)]
 fn clock_s() -> f64 {
     now_ns() as f64 * 1e-9
 }
 
-/// Runs `work` and, unless `quiet`, shows its progress; `work` reports the steps that it has done, or what else `unit` says.
+/// Runs `work` and, unless `quiet`, shows its progress; `work` reports the number of steps done, or of what `unit`
+/// names.
 fn with_progress<T>(unit: &str, steps: u64, quiet: bool, work: impl FnOnce(&mut dyn FnMut(u64)) -> T) -> T {
     let (begun_s, watched) = (clock_s(), !quiet && std::io::stderr().is_terminal());
     let done = work(&mut |step| {
@@ -98,7 +99,7 @@ fn with_progress<T>(unit: &str, steps: u64, quiet: bool, work: impl FnOnce(&mut 
     done
 }
 
-/// Writes a file whole.
+/// Writes a whole file.
 fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Failure> {
     std::fs::write(path, bytes).map_err(|e| Failure::Failed(format!("{}: can't be written: {e}", path.display())))
 }

@@ -42,7 +42,7 @@ pub(crate) struct RenderArguments {
     frames_hz: f64,
 }
 
-/// Draws a picture, or a film of the whole script.
+/// Draws a picture or a film of the whole script.
 pub(crate) fn render(arguments: &RenderArguments) -> Result<(), Failure> {
     let refused = |option: &str, message: String| Failure::Refused(format!("--{option}: {message}"));
     let extension = arguments.output.extension().and_then(|extension| extension.to_str()).map(str::to_lowercase);

@@ -23,13 +23,14 @@ pub(crate) struct RunArguments {
     /// Hold forces and paths constant within each step, like a client that sends one command per step
     #[arg(long)]
     held: bool,
-    /// Play the script a second time in parallel, in f64 with a quarter of the substep and all points awake. The summary
-    /// then has audited_error: the largest difference of displacement and of force at the sample points and times, each
-    /// relative to its largest. With [stepping] correct = true, the run is corrected where an error exceeds the tolerance
+    /// Play the script a second time in parallel, in f64 with a quarter of the substep and all points awake. The
+    /// summary then has audited_error: the largest difference of displacement and of force at the sample points and
+    /// times, each relative to its largest. With [stepping] correct = true, the run is corrected where an error
+    /// exceeds the tolerance
     #[arg(long)]
     audit: bool,
-    /// Plot displacement and force of the first tool with a tip, or of the first point, in the terminal: on a sheet along z,
-    /// on a mesh their magnitudes; without --output the records are then not written to a terminal
+    /// Plot displacement and force of the first tool with a tip, or of the first point, in the terminal: on a sheet
+    /// along z, on a mesh their magnitudes; without --output the records are then not written to a terminal
     #[arg(long)]
     plot: bool,
     /// Show no progress and no summary
@@ -63,8 +64,8 @@ pub(crate) fn run_script(arguments: &RunArguments) -> Result<(), Failure> {
     }
 }
 
-/// Shows the plot and the summary where the records do not go. Without a file for the records, the summary is for a terminal
-/// only: a program that reads the records does not want it.
+/// Prints the plot and the summary on the output that the records do not use. Without a file for the records, the
+/// summary is printed only on a terminal, not to a program that reads the records.
 fn tell(arguments: &RunArguments, summary: &Summary) {
     let to_file = arguments.output.is_some();
     let mut text = if arguments.plot { format!("{}\n", summary.curves) } else { String::new() };

@@ -1,4 +1,4 @@
-//! The scene that several subcommands take.
+//! The scene argument of several subcommands.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -30,12 +30,13 @@ pub(super) fn compile(arguments: &SceneArguments) -> Result<(Arc<Model>, Limits)
     compile_with(arguments, &[])
 }
 
-/// The same with further keys overridden, `KEY=VALUE` each.
+/// Compiles the scene that the arguments name with further keys overridden, `KEY=VALUE` each. Returns it with the
+/// limits in force.
 pub(super) fn compile_with(arguments: &SceneArguments, further: &[String]) -> Result<(Arc<Model>, Limits), Failure> {
     let limits = load_config(arguments.config.as_deref())?.limits.offline();
     let path = &arguments.scene;
     let scene = find_scene(path, &arguments.scenes, &[&arguments.set, further].concat(), &limits)?;
-    // An error of compilation belongs to no single line.
+    // An error of compilation has no line.
     let in_scene = |refusal: Refusal| Refusal { place: Some(path.display().to_string()), ..refusal };
     Ok((Model::compile(&scene, &limits).map_err(in_scene)?, limits))
 }

@@ -108,8 +108,8 @@ pub(crate) struct ServeArguments {
     /// Time for streams to end at shutdown before the server cuts them, s [default: 5]
     #[arg(long, value_name = "SECONDS")]
     shutdown_deadline_s: Option<f64>,
-    /// Memory that the server may use for all callers together, such as 512MiB or 2GiB [default: half of the machine's, or
-    /// of its control group's]
+    /// Memory that the server may use for all callers together, such as 512MiB or 2GiB [default: half of the
+    /// machine's, or of its control group's]
     #[arg(long, value_name = "BYTES", value_parser = budget::parse_bytes)]
     memory: Option<u64>,
     /// Level of the log on the standard error: error, warn, info, debug, or palpate=debug,tonic=warn, … [default:
@@ -121,13 +121,13 @@ pub(crate) struct ServeArguments {
     log_json: bool,
 }
 
-/// Whether one of a folder's own files is a page. The client library's examples have no index.html.
+/// Returns whether a folder contains a page. The client library's examples have no index.html.
 fn has_page(folder: &Path) -> bool {
     let mut files = folder.read_dir().into_iter().flatten().flatten();
     files.any(|file| file.path().extension().is_some_and(|extension| extension == "html"))
 }
 
-/// Serves until it is told to stop.
+/// Serves until a signal stops it.
 pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let mut config = load_config(arguments.config.as_deref())?;
     if let Some(listen) = &arguments.listen {
@@ -236,8 +236,8 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(config.serving_threads())
         .thread_name("network")
-        // Blocking threads read files, twice a second. With the default keep-alive of 10 s these checks would wake every
-        // idle thread in turn before it ends, so that none ever would.
+        // Blocking threads read files, twice a second. With the default keep-alive of 10 s these checks would wake
+        // every idle thread in turn before it ends, so that none ever would.
         .max_blocking_threads(16)
         .thread_keep_alive(Duration::from_secs(1))
         .on_thread_start(|| take_short_turns(NETWORK_TURN))

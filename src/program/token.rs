@@ -34,7 +34,7 @@ pub(crate) fn token(arguments: &TokenArguments) -> Result<(), Failure> {
         );
         return printed.map_err(|e| Failure::Failed(e.to_string()));
     };
-    // The file with the entry has to be one that a server takes: another of that name is refused here, with its reason.
+    // A server must be able to read the file with the new entry; otherwise it is refused here, with the reason.
     if path.symlink_metadata().is_ok() {
         let text = files::read_regular_text(path, files::MAX_SECRET_BYTES)?;
         identity::KnownCallers::parse(path, &format!("{text}\n{entry}"))?;
@@ -45,7 +45,7 @@ pub(crate) fn token(arguments: &TokenArguments) -> Result<(), Failure> {
     #[cfg(unix)]
     std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
     let mut file = options.open(path).map_err(refuse)?;
-    // In one write: a server may read the file at any moment.
+    // One write, because a server may read the file at any moment.
     file.write_all(format!("\n{entry}").as_bytes()).map_err(refuse)?;
     writeln!(std::io::stdout(), "{token}").map_err(|e| Failure::Failed(e.to_string()))
 }

@@ -35,7 +35,7 @@ impl TokenFile {
         keys
     }
 
-    /// What `palpate serve --tokens` is told.
+    /// Returns the file for `palpate serve --tokens`.
     pub fn file(&self) -> &str {
         self.file.to_str().unwrap()
     }
@@ -47,7 +47,7 @@ impl TokenFile {
         file.to_str().unwrap().to_owned()
     }
 
-    /// The file is replaced as a whole, so that nobody reads half of it.
+    /// Replaces the whole file at once, so that no reader sees half of it.
     fn change(&self, change: impl FnOnce(&mut BTreeMap<String, String>)) {
         let mut entries = self.entries.lock().unwrap();
         change(&mut entries);
@@ -84,7 +84,7 @@ impl Interceptor for TestBearer {
 /// A connection over which a token is shown.
 pub type Door = InterceptedService<Channel, TestBearer>;
 
-/// Who calls a server, and by which token.
+/// A caller of a server, with its token.
 #[derive(Clone)]
 pub struct TestCaller {
     pub url: String,
@@ -96,7 +96,7 @@ impl TestCaller {
         TestCaller { url: url.to_owned(), bearer: TestBearer(format!("Bearer {token}").parse().unwrap()) }
     }
 
-    /// The same caller by another way, such as a proxy.
+    /// Returns this caller with another route, such as a proxy.
     pub fn by(&self, url: &str) -> Self {
         TestCaller { url: url.to_owned(), ..self.clone() }
     }
@@ -166,7 +166,7 @@ pub fn push(tool: u32, sequence: u64, [x, y]: [u32; 2], z_n: f64) -> pb::Command
     pb::Command { tool, sequence, action: Some(pb::command::Action::Force(force)), ..Default::default() }
 }
 
-/// The same force on every point: all of a tissue moves.
+/// One force on every point, so that all of a tissue moves.
 pub fn push_all(tool: u32, sequence: u64, z_n: f64) -> pb::Command {
     let mut command = push(tool, sequence, [0, 0], z_n);
     if let Some(pb::command::Action::Force(force)) = &mut command.action {

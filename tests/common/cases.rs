@@ -1,4 +1,4 @@
-//! How many cases a test tries: few in `make test`, many in `make test-long`. docs/tests.md lists both.
+//! Number of cases that a test tries: few in `make test`, many in `make test-long`. docs/tests.md lists both.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used)]
 
 /// Returns `short`, or with `PALPATE_LONG=1` `long`.

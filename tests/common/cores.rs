@@ -1,4 +1,4 @@
-//! Where threads and programs run, and what a server takes: Linux only, as times and memory are read from /proc.
+//! Cores of threads and programs, and the resources of a server. Linux only: times and memory are read from /proc.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::disallowed_methods)]
 
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};

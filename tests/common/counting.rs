@@ -8,7 +8,8 @@ thread_local! {
     /// Bytes that this thread has, and the most that it has had; what other threads free for it is not known.
     static NOW: Cell<isize> = const { Cell::new(0) };
     static PEAK: Cell<isize> = const { Cell::new(0) };
-    /// A large piece that was asked for last. If it goes back at once, it was a question (`palpate_tissue::memory`) and never had a page.
+    /// A large piece that was asked for last. If it goes back at once, it was a question (`palpate_tissue::memory`)
+    /// and never had a page.
     static ASKED: Cell<isize> = const { Cell::new(0) };
 }
 
@@ -61,7 +62,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// What `work` returns, and the most bytes that it had at once, its result included.
+/// Returns the result of `work`, and the largest number of bytes that it had at once, including the result.
 pub fn counted<T>(work: impl FnOnce() -> T) -> (T, usize) {
     let before = NOW.get();
     PEAK.set(before);

@@ -1,4 +1,5 @@
-//! What a bridge rendered, tick by tick (`palpate-client bridge --course FILE`), and what must hold for it whatever breaks.
+//! Forces that a bridge rendered, tick by tick (`palpate-client bridge --course FILE`), and the checks that hold in
+//! every failure.
 #![allow(unreachable_pub, clippy::unwrap_used, clippy::panic)]
 
 use std::path::Path;
@@ -30,8 +31,8 @@ impl DeviceTrace {
         DeviceTrace(text.lines().skip(1).map(tick).collect())
     }
 
-    /// Every force is within the envelope: its size, its slew, what is left of it 0.3 s after a pause, and that it never
-    /// rises while paused. Tells when the device was paused.
+    /// Every force is within the envelope: its size, its slew, what is left of it 0.3 s after a pause, and that it
+    /// never rises while paused. Tells when the device was paused.
     pub fn keeps_to_the_envelope(&self) -> Vec<f64> {
         let mut pauses = Vec::new();
         for pair in self.0.windows(2) {
@@ -59,7 +60,7 @@ impl DeviceTrace {
         pauses
     }
 
-    /// Whether the device is enabled at some time after `time_s`.
+    /// Returns whether the device is enabled at some time after `time_s`.
     pub fn comes_back_after(&self, time_s: f64) -> bool {
         self.0.iter().any(|tick| tick.time_s > time_s && tick.state == "enabled")
     }

@@ -17,17 +17,17 @@ use std::time::{Duration, Instant};
 
 use rustix::process::{Pid, Signal, kill_process};
 
-/// Long enough for any machine; a test that waits so long has failed.
+/// Timeout of a test: long enough for any machine.
 const ETCD_TIMEOUT: Duration = Duration::from_secs(60);
 
-/// How soon members notice that their leader is gone.
+/// Time after which members notice that their leader is gone.
 #[derive(Debug, Clone, Copy)]
 pub struct FailoverTimes {
     pub heartbeat_ms: u32,
     pub election_ms: u32,
 }
 
-/// What etcd has by default.
+/// The default times of etcd.
 pub const DEFAULT_TIMES: FailoverTimes = FailoverTimes { heartbeat_ms: 100, election_ms: 1000 };
 
 /// For tests of what happens without a leader.
@@ -57,7 +57,7 @@ struct Member {
 }
 
 impl EtcdMembers {
-    /// Whether etcd is on this machine. It says so if not, and fails where CI is set.
+    /// Returns whether etcd is on this machine. Prints a message if not, and fails where CI is set.
     pub fn is_there() -> bool {
         // Without arguments, etcd would serve.
         let programs = [("etcd", "--version"), ("etcdctl", "version")];
@@ -69,12 +69,13 @@ impl EtcdMembers {
         is_there
     }
 
-    /// So many members, with etcd's default times.
+    /// Starts this many members, with etcd's default times.
     pub fn start(members: usize) -> Self {
         EtcdMembers::start_with(members, DEFAULT_TIMES, &[], |_| None)
     }
 
-    /// So many members, with these times, more arguments, and certificates if `certify` makes some for their addresses.
+    /// Starts this many members, with these times, more arguments, and certificates if `certify` makes some for their
+    /// addresses.
     pub fn start_with(
         members: usize,
         times: FailoverTimes,
@@ -184,7 +185,7 @@ impl EtcdMembers {
         self.signal(index, Signal::STOP);
     }
 
-    /// Has a frozen member go on.
+    /// Lets a frozen member continue.
     pub fn resume(&self, index: usize) {
         self.signal(index, Signal::CONT);
     }
@@ -248,8 +249,8 @@ impl Drop for EtcdMembers {
     }
 }
 
-/// An address of this machine. Where every address of 127.0.0.0/8 is, that is one of our own: nobody else's port, nor the
-/// near end of anybody's connection, can be one of a member that is to start again.
+/// An address of this machine. Where every address of 127.0.0.0/8 is, that is one of our own: nobody else's port, nor
+/// the near end of anybody's connection, can be one of a member that is to start again.
 fn host() -> String {
     static COUNT: AtomicU8 = AtomicU8::new(0);
     if !cfg!(target_os = "linux") {
@@ -259,7 +260,7 @@ fn host() -> String {
     format!("127.{}.{low}.{}", 1 + high % 254, 1 + COUNT.fetch_add(1, Ordering::Relaxed) % 254)
 }
 
-/// What is at a path of a member's port for metrics; nothing if it does not answer.
+/// Returns the answer at a path of a member's port for metrics; nothing if it does not answer.
 fn get(address: SocketAddr, path: &str) -> String {
     let asked = || -> std::io::Result<String> {
         let patience = Duration::from_secs(1);

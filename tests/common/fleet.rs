@@ -111,7 +111,7 @@ impl Node {
         Ok(answer.into_inner().session.unwrap())
     }
 
-    /// The sessions of the fleet, as etcd says; nothing if this server does not tell.
+    /// Returns the sessions of the fleet from etcd, by ID; none if this server does not answer.
     pub async fn fleet_sessions(&self) -> BTreeMap<String, pb::FleetSession> {
         let mut found = BTreeMap::new();
         let mut admin = self.admin().await;
@@ -194,9 +194,10 @@ pub async fn until_stood_by(nodes: &[Node], id: &str) -> (usize, pb::Session) {
     found.unwrap()
 }
 
-/// The bits with which the run of a session at `after` begins are those of an offline run of the journal before it, wherever that is.
+/// The bits with which the run of a session at `after` begins are those of an offline run of the journal before it,
+/// wherever that is.
 pub async fn goes_on(nodes: &[Node], id: &str, after: &Node, lets_go: bool) {
-    // It is written a little after the session goes on.
+    // It is written a little after the session continues.
     let mut begun = None;
     until("the journal has begun", async || {
         let session = after.session(id).await.ok();

@@ -1,5 +1,5 @@
-//! Who a server is there for: a client that commands 1000 times a second and keeps account of every answer, and newcomers
-//! who want to be let in, touch something, and go. Each has a thread of its own, so that nobody else's work delays it.
+//! Honest clients: one that sends 1000 commands a second and checks every answer, and newcomers that connect, touch
+//! something and leave. Each has a thread of its own, so that other work does not delay it.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::panic, clippy::disallowed_methods)]
 
 use std::collections::{BTreeMap, VecDeque};
@@ -23,7 +23,7 @@ fn alone<T>(work: impl Future<Output = T>) -> T {
     tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap().block_on(work)
 }
 
-/// What an honest client has seen.
+/// Record of an honest client.
 #[derive(Clone)]
 pub struct ClientLedger {
     pub sent: u64,
@@ -78,7 +78,7 @@ impl ClientLedger {
 #[derive(Default)]
 struct Shared {
     over: AtomicBool,
-    /// Stand still for so long, ms.
+    /// Time for which the client stands still, ms.
     freeze_ms: AtomicU64,
     account: Mutex<ClientLedger>,
 }
@@ -100,11 +100,11 @@ pub struct Honest {
     thread: JoinHandle<Option<pb::CommandCounts>>,
 }
 
-/// What a client that has ended its work can say of all of it.
+/// Final record of a client that has ended its work.
 pub struct ClientVerdict {
     /// Since it was last asked.
     pub account: ClientLedger,
-    /// What the server says of the session's commands, if there is a server and a session.
+    /// The server's counts of the session's commands, if there is a server and a session.
     pub counts: Option<pb::CommandCounts>,
 }
 
@@ -125,7 +125,7 @@ impl Honest {
         Freezer(self.shared.clone())
     }
 
-    /// What it has seen since it was last asked.
+    /// Returns its record since the last call.
     pub fn take(&self) -> ClientLedger {
         std::mem::take(&mut self.shared.account.lock().unwrap())
     }
@@ -168,7 +168,7 @@ async fn work(
             }
         }
         if !shared.over.load(Ordering::Relaxed) {
-            // As a program does that wants to go on.
+            // As a program does that wants to continue.
             tokio::time::sleep(Duration::from_millis(100)).await;
             door = caller.door().await;
         }
@@ -180,7 +180,7 @@ async fn work(
     counts
 }
 
-/// What has become of the session's commands.
+/// Results of the session's commands.
 async fn counts(door: &Door, session_id: &str) -> Result<Option<pb::CommandCounts>, Status> {
     let request = pb::GetSessionRequest { session_id: session_id.to_owned() };
     Ok(sessions(door).get_session(request).await?.into_inner().session.and_then(|session| session.commands))
@@ -224,7 +224,7 @@ async fn visit(
                     #[allow(clippy::cast_precision_loss)]
                     let force_n = -0.1 - 0.02 * (0.003 * *sequence as f64 + f64::from(*tool)).sin();
                     let command = push(*tool, *sequence, MIDDLE, force_n);
-                    // A stream that has ended is told by what is heard.
+                    // The receiving side notices a stream that has ended.
                     let _ = say.send(pb::TouchRequest { message: Some(Say::Command(command)) });
                 }
                 shared.account.lock().unwrap().sent += tools.len() as u64;
@@ -281,7 +281,7 @@ async fn open(door: &Door, session_id: &str, tools: &[u32]) -> Result<Stream, St
 /// A newcomer's tool: none of those that an honest client has in its own session.
 pub const GUEST: u32 = 40;
 
-/// How newcomers fared.
+/// Record of newcomers.
 #[derive(Clone, Default)]
 pub struct Welcome {
     pub rounds: u64,
@@ -312,8 +312,8 @@ pub struct Newcomers {
 }
 
 impl Newcomers {
-    /// Each makes a session, feels one command in it and one in the session `shared`, and deletes its own. Who is not done
-    /// within `patience` gives up.
+    /// Each makes a session, feels one command in it and one in the session `shared`, and deletes its own. Who is not
+    /// done within `patience` gives up.
     pub fn start(caller: TestCaller, shared: String, patience: Duration) -> Self {
         let (over, welcome) = (Arc::new(AtomicBool::new(false)), Arc::new(Mutex::new(Welcome::default())));
         let thread = std::thread::spawn({
@@ -333,7 +333,7 @@ impl Newcomers {
         Newcomers { over, welcome, thread }
     }
 
-    /// How they fared since this was last asked.
+    /// Returns their record since the last call.
     pub fn take(&self) -> Welcome {
         self.welcome.lock().unwrap().take()
     }

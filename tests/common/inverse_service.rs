@@ -19,7 +19,7 @@ use glam::DVec3;
 use serde_json::{Value, json};
 use tungstenite::Message;
 
-/// What goes wrong.
+/// Faults of the service.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Wrong {
     Nothing,
@@ -30,7 +30,7 @@ pub enum Wrong {
     NoGrip,
     // The others happen while it is pressed.
     Unplugged,
-    /// The device is told of, and not where it is.
+    /// The message names the device, but has no place.
     Placeless,
     Killed,
     Silent,
@@ -39,7 +39,7 @@ pub enum Wrong {
     Far,
 }
 
-/// What it was told.
+/// The messages that it received.
 #[derive(Clone, Default)]
 pub struct Heard(Arc<Mutex<ServiceState>>);
 
@@ -132,7 +132,7 @@ fn serve(mut stream: TcpStream, version: Option<&str>, wrong: Wrong, told: &Hear
         return;
     }
     let Ok(mut socket) = tungstenite::accept(stream) else { return };
-    // As the service's own: the base is the origin.
+    // As in the real service, the base is the origin.
     let state = |tick: u32| {
         let z_m = 0.16 - 0.001 + 0.004 * (TAU * f64::from(tick) / 2000.0).cos();
         json!({ "cursor_position": { "x": 0.003, "y": -0.118, "z": z_m }, "cursor_velocity": { "x": 0, "y": 0, "z": 0 } })

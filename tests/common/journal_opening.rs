@@ -1,4 +1,4 @@
-//! How a session begins whose journal a test writes.
+//! Opening of a session whose journal a test writes.
 #![allow(unreachable_pub)]
 
 use std::sync::Arc;

@@ -1,18 +1,18 @@
-//! What a server tells Prometheus.
+//! Metrics of a server for Prometheus.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::panic, clippy::disallowed_methods)]
 
 use std::collections::BTreeMap;
 use std::io::{BufRead, Read, Write};
 use std::time::Duration;
 
-/// Where a server that was started with `--metrics` says that they are, in the line after that of its own address.
+/// Returns the address of the metrics, which a server with `--metrics` prints in the line after its own address.
 pub fn url(out: &mut impl BufRead) -> String {
     let mut line = String::new();
     out.read_line(&mut line).unwrap();
     line.split_whitespace().last().unwrap().to_owned()
 }
 
-/// The whole answer; nothing if there is none.
+/// Returns the whole answer; `None` without one.
 fn answer(url: &str) -> Option<String> {
     let (host, path) = url.trim_start_matches("http://").split_once('/')?;
     let mut stream = std::net::TcpStream::connect(host).ok()?;
@@ -32,7 +32,7 @@ pub fn scrape(url: &str) -> BTreeMap<String, f64> {
     values(body)
 }
 
-/// The same; nothing if the server does not answer.
+/// Returns the metrics; nothing if the server does not answer.
 pub fn try_scrape(url: &str) -> Option<BTreeMap<String, f64>> {
     Some(values(answer(url)?.split_once("\r\n\r\n")?.1))
 }

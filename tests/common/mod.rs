@@ -1,4 +1,4 @@
-//! What several test files need.
+//! Shared parts of the tests.
 #![allow(
     dead_code,
     unreachable_pub,

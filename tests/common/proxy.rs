@@ -1,4 +1,5 @@
-//! A wire that delays: what goes in at one end comes out at the other so much later, in order. And it can be cut, or fall silent.
+//! A wire that delays: what goes in at one end comes out at the other so much later, in order. And it can be cut, or
+//! fall silent.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::disallowed_methods)]
 
 use std::net::SocketAddr;
@@ -66,7 +67,7 @@ impl Proxy {
         self.state.store(CUT, Ordering::Relaxed);
     }
 
-    /// Loses all that comes, and nobody is told: as when a switch dies. Connections of which something was lost end when it is mended.
+    /// Loses all data silently, as when a switch dies. Connections of which data was lost end when it is repaired.
     pub fn silence(&self) {
         self.state.store(SILENT, Ordering::Relaxed);
     }
@@ -89,7 +90,7 @@ async fn carry(
 ) {
     let (sender, mut waiting) = mpsc::unbounded_channel::<(Instant, Vec<u8>)>();
     let has_lost = AtomicBool::new(false);
-    // Whether what has come is to go on; `None` if the connection ends.
+    // Whether received data is relayed; `None` if the connection ends.
     let passes = || match state.load(Ordering::Relaxed) {
         WHOLE => (!has_lost.load(Ordering::Relaxed)).then_some(true),
         SILENT => {
@@ -127,7 +128,7 @@ async fn carry(
             tokio::time::sleep(Duration::from_millis(5)).await;
         }
     };
-    // Whoever ends first ends the connection.
+    // The first end that closes ends the connection.
     tokio::select! {
         () = reading => {}
         () = writing => {}

@@ -25,9 +25,10 @@ pub struct RandomScene {
     pub about: String,
 }
 
-/// Sheets of 4 to 33 points a side, spacing 1 mm to 0.1 m, points of 10⁻⁵ to 0.1 kg, fastest vibration × 1 ms from 0.02 to
-/// 1.5, k/K″ from 0.3 to 200, ζ from 0.02 to 5 (of a point on its anchor spring), in part with bending and fixed points;
-/// forces that strain springs by 1 to 50 %, constant, as a pulse, a ramp or a sine of 0.5 to 20 Hz, some of which move.
+/// Sheets of 4 to 33 points a side, spacing 1 mm to 0.1 m, points of 10⁻⁵ to 0.1 kg, fastest vibration × 1 ms from
+/// 0.02 to 1.5, k/K″ from 0.3 to 200, ζ from 0.02 to 5 (of a point on its anchor spring), in part with bending and
+/// fixed points; forces that strain springs by 1 to 50 %, constant, as a pulse, a ramp or a sine of 0.5 to 20 Hz,
+/// some of which move.
 pub fn case(seed: u64) -> RandomScene {
     let mut random = fastrand::Rng::with_seed(seed);
     let mut uniform = |from: f64, to: f64| from + (to - from) * random.f64();
@@ -95,9 +96,8 @@ pub fn case(seed: u64) -> RandomScene {
     }
 }
 
-/// The same on closed meshes of uneven triangles: fastest vibration × 1 ms from about 0.02 to 1.5, k/K″ of an even edge from 0.3
-/// to 200; forces inward that strain its
-/// springs by 1 to 50 %.
+/// The same on closed meshes of uneven triangles: fastest vibration × 1 ms from about 0.02 to 1.5, k/K″ of an even
+/// edge from 0.3 to 200; forces inward that strain its springs by 1 to 50 %.
 pub fn mesh_case(seed: u64) -> RandomScene {
     let mut random = fastrand::Rng::with_seed(seed);
     let mesh = closed_mesh(&mut random);
@@ -157,7 +157,7 @@ pub type PointHistory = Vec<Vec<[[f64; 3]; 2]>>;
 pub struct Played {
     pub course: PointHistory,
     pub model: Arc<Model>,
-    /// What a step took on average, if a clock was given, s.
+    /// Mean duration of a step, if a clock was given, s.
     pub step_s: f64,
 }
 
@@ -177,7 +177,7 @@ pub fn scene(case: &RandomScene, assignments: &[String], limits: &Limits) -> Res
     }
 }
 
-/// The same, compiled with its script.
+/// The case compiled with its script.
 pub fn compile(case: &RandomScene, assignments: &[String]) -> Result<(Arc<Model>, Script), String> {
     // Offline, as `palpate run`: the truth takes more than a server would do.
     let limits = Limits { rehearsal_work: 1 << 32, ..Limits::default() };
@@ -187,7 +187,7 @@ pub fn compile(case: &RandomScene, assignments: &[String]) -> Result<(Arc<Model>
     Ok((Model::compile(&scene, &limits).map_err(text)?, script))
 }
 
-/// The errors of displacement and force that `palpate run --audit` tells of a case.
+/// Returns the errors of displacement and force that `palpate run --audit` reports for a case.
 pub fn audited_errors(case: &RandomScene, assignments: &[String]) -> Result<[f64; 2], String> {
     let (model, script) = compile(case, assignments)?;
     let (limits, mut output) = (Limits::default(), std::io::sink());
@@ -216,7 +216,7 @@ pub fn play(case: &RandomScene, assignments: &[String], clock_s: &dyn Fn() -> f6
     Ok(Played { course, model, step_s: (clock_s() - begun_s) / script.steps as f64 })
 }
 
-/// The same in f64 at a tolerance of 1e-10, with everything awake.
+/// The case in f64 at a tolerance of 1e-10, with everything awake.
 pub fn truth(case: &RandomScene) -> Result<Played, String> {
     let settings = ["stepping.precision=f64", "stepping.tolerance=1e-10", "sleep.tolerance=0"];
     play(case, &settings.map(str::to_owned), &|| 0.0)

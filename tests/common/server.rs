@@ -27,7 +27,7 @@ use tonic::transport::Channel;
 use tonic::{Code, Status, Streaming};
 use tonic_types::StatusExt;
 
-/// Long enough for any machine; a test that waits so long has failed.
+/// Timeout of a test: long enough for any machine.
 pub const TEST_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// The client program, built if it is not there or not new.
@@ -36,10 +36,11 @@ pub fn client_program() -> PathBuf {
     BUILT
         .get_or_init(|| {
             let mut build = Command::new(env!("CARGO"));
-            // All programs, as `make build` does: a part of them might want other features of what both use, and so all
-            // of that once more.
+            // All programs, as `make build` does: a part of them might want other features of what both use, and so
+            // all of that once more.
             build.args(["build", "--quiet", "--workspace", "--bins"]).current_dir(env!("CARGO_MANIFEST_DIR"));
-            // What cargo tells a test of its package is news to build scripts: libraries would be built once more.
+            // Cargo's variables for a test would change the input of build scripts, and libraries would be built once
+            // more.
             let of_package = |key: &str| {
                 let starts = ["CARGO_MANIFEST_", "CARGO_PKG_", "CARGO_BIN_"].iter().any(|start| key.starts_with(start));
                 starts || key == "CARGO_CRATE_NAME" || key == "CARGO_PRIMARY_PACKAGE"
@@ -68,7 +69,7 @@ pub fn palpate(arguments: &[&str]) -> Output {
 pub struct TestServer {
     pub child: Child,
     pub url: String,
-    /// What it prints after the line with its address.
+    /// Its output after the line with its address.
     pub out: BufReader<ChildStdout>,
 }
 
@@ -77,7 +78,7 @@ impl TestServer {
         TestServer::start_at("127.0.0.1:0", arguments)
     }
 
-    /// The same, at that address.
+    /// Starts a server at that address.
     pub fn start_at(listen: &str, arguments: &[&str]) -> Self {
         let mut command = Command::new(env!("CARGO_BIN_EXE_palpate"));
         command.args(["serve", "--listen", listen]).args(arguments);
@@ -87,7 +88,8 @@ impl TestServer {
         TestServer::spawn(command.stderr(Stdio::piped()))
     }
 
-    /// A server that a script of the shell starts, such as one that sets limits: `$0` is the program, `$1` and so on `arguments`.
+    /// A server that a script of the shell starts, such as one that sets limits: `$0` is the program, `$1` and so on
+    /// `arguments`.
     pub fn by_script(script: &str, arguments: &[&std::ffi::OsStr]) -> Self {
         let mut command = Command::new("sh");
         command.args(["-c", script, env!("CARGO_BIN_EXE_palpate")]).args(arguments);
@@ -153,8 +155,8 @@ impl TestServer {
         self.sessions().await.get_session(request).await.unwrap().into_inner().session.unwrap()
     }
 
-    /// Waits until `more` commands have acted in the sessions of a scene, all together, since it was asked; tells whose
-    /// sessions they are.
+    /// Waits until `more` commands have acted in the sessions of a scene, all together, since it was asked; tells
+    /// whose sessions they are.
     pub async fn until_applied(&self, scene_name: &str, more: u64) -> Vec<pb::Session> {
         let mut sessions = self.sessions().await;
         let waited = tokio::time::timeout(TEST_TIMEOUT, async {
@@ -172,7 +174,7 @@ impl TestServer {
         waited.await.unwrap_or_else(|_| panic!("{more} commands to {scene_name} do not come"))
     }
 
-    /// Waits until nobody holds a tool of any session.
+    /// Waits until no tool of any session is held.
     pub async fn until_let_go(&self) {
         let mut sessions = self.sessions().await;
         let waited = tokio::time::timeout(TEST_TIMEOUT, async {
@@ -187,7 +189,7 @@ impl TestServer {
         waited.await.expect("a tool is held by nobody");
     }
 
-    /// What it logged; ends it.
+    /// Ends the server. Returns its log.
     pub fn log(mut self) -> String {
         let _ = self.child.kill();
         let _ = self.child.wait();

@@ -71,7 +71,8 @@ pub fn thin_mesh(dice: &mut fastrand::Rng, kind: usize) -> ThinMesh {
 }
 
 impl ThinMesh {
-    /// Rings around a middle line, which tells its place and two directions across, closed by a pole at each end or open.
+    /// Rings around a middle line, which gives its place and two directions across, closed by a pole at each end or
+    /// open.
     fn tube(
         &mut self,
         around: u32,

@@ -1,4 +1,5 @@
-//! What becomes of a session when something ends in the middle: a move whose target can't keep it, or dies; a deletion without etcd.
+//! What becomes of a session when something ends in the middle: a move whose target can't keep it, or dies; a
+//! deletion without etcd.
 
 use std::path::Path;
 use std::time::Duration;
@@ -53,7 +54,8 @@ async fn patient(folder: &Path, etcd: &EtcdMembers) -> Vec<Node> {
     nodes
 }
 
-/// A new session, and which server has it. etcd is silent since it was created, and is about to be told who stands by for it.
+/// A new session, and which server has it. etcd is silent since it was created, and is about to be told who stands by
+/// for it.
 async fn being_named(nodes: &[Node], etcd: &EtcdMembers) -> (String, usize) {
     let session = create(&nodes[0]).await;
     etcd.pause(0);
@@ -109,7 +111,7 @@ async fn a_move_is_refused_with_the_reason_if_etcd_does_not_say_who_stands_by() 
         let early = tokio::time::timeout(Duration::from_secs(10), &mut moving).await;
         etcd.resume(0);
         let Ok(moved) = early else {
-            // The one that stands by was named before etcd was silent: the session stands till etcd is back.
+            // The standby was named before etcd was silent: the session is paused until etcd is back.
             let _ = moving.await.unwrap();
             continue;
         };
@@ -171,7 +173,7 @@ async fn a_deletion_is_confirmed_only_when_etcd_has_done_it() {
         until("it is deleted", async || node.session(&id).await.is_err_and(|refused| refused.code() == Code::NotFound))
             .await;
     }
-    // Nor does anybody stand by for it any more.
+    // It has no standby either.
     until("its journals are forgotten", async || {
         nodes.iter().all(|node| {
             let left = file::list(&node.journals.join("standby")).unwrap();

@@ -1,5 +1,5 @@
-//! Clients that follow their sessions from server to server: one that presses at 1 kHz, one that looks. They keep account of who
-//! spoke for a session, from when to when, and of what they were told.
+//! Clients that follow their sessions from server to server: one that presses at 1 kHz, one that looks. They keep
+//! account of who spoke for a session, from when to when, and of what they were told.
 #![allow(unreachable_pub, clippy::unwrap_used, clippy::panic, clippy::disallowed_methods)]
 
 use std::collections::BTreeMap;
@@ -24,13 +24,14 @@ use tonic::transport::Channel;
 use crate::fleet::Node;
 use crate::server::{force, open};
 
-/// A server that is silent for so long is left: samples come at least every 50 ms.
+/// Silence after which a client leaves a server: samples come at least every 50 ms.
 const SILENCE: Duration = Duration::from_millis(500);
 
 /// Time between two questions to a server that has no answer.
 const AGAIN: Duration = Duration::from_millis(20);
 
-/// Whoever was left because of its silence is not tried again for so long, unless the session has another revision.
+/// Time for which a server that was left because of its silence is not tried again, unless the session has another
+/// revision.
 const SHY: Duration = Duration::from_secs(1);
 
 /// The clocks of streams are compared as well as this: by the fastest message of each.
@@ -53,7 +54,7 @@ impl Doors {
         Arc::new(Doors { channels: urls.iter().map(channel).collect(), urls, begun: Instant::now() })
     }
 
-    /// Who serves a session, and since which revision: what the first server says that knows.
+    /// Returns the server of a session and its revision, from the first server that knows.
     async fn locate(&self, id: &str) -> (usize, u64) {
         let mut asking = JoinSet::new();
         for channel in &self.channels {
@@ -121,7 +122,7 @@ pub struct FollowerObservation {
     pub durable_step: u64,
     /// The newest step of all samples.
     pub newest_step: u64,
-    /// The newest sample in which the tool does what it is told.
+    /// The newest sample in which the tool follows its command.
     pub newest: Option<Instant>,
     pub returns: Vec<Return>,
     /// Samples of a revision older than one that was seen: on their way while the session went elsewhere.
@@ -185,7 +186,7 @@ impl Follower {
         self.seen.lock().unwrap().longest_silence = Duration::ZERO;
     }
 
-    /// Whether its tool has done what it was told within the last moments.
+    /// Returns whether its tool has followed its commands recently.
     pub fn acts(&self) -> bool {
         self.seen.lock().unwrap().newest.is_some_and(|newest| newest.elapsed() < SILENCE)
     }
@@ -195,7 +196,7 @@ impl Follower {
         self.seen.lock().unwrap().returns.iter().find(|back| back.acts > moment).copied()
     }
 
-    /// Works no more; what it has seen.
+    /// Stops. Returns what it has seen.
     pub async fn end(mut self) -> FollowerObservation {
         self.over.store(true, Ordering::Relaxed);
         if timeout(2 * SILENCE, &mut self.task).await.is_err() {
@@ -222,7 +223,7 @@ struct Press {
     last: Option<(Instant, [f64; 3])>,
 }
 
-/// What a stream has told under one revision, by its own clock.
+/// Content of a stream under one revision, by its own clock.
 struct Words {
     revision: u64,
     first_ns: u64,
@@ -295,7 +296,7 @@ impl Press {
                         break Left::Ended(None);
                     }
                     *sequence += 1;
-                    // A bounded queue that is full: the server does not read. That is told by its silence.
+                    // A bounded queue is full because the server does not read; its silence shows that.
                     let _ = say.try_send(message(Say::Command(force(0, *sequence, pressure_n(*sequence)))));
                     continue;
                 }

@@ -45,7 +45,8 @@ fn advance(session: &mut Session, step: u64, commands: &mut Vec<Due>) {
     }
 }
 
-/// Compares all hashes of the runs, in their order, with those of a session that has done all of it in one place. Tells how many.
+/// Compares all hashes of the runs, in their order, with those of a session that has done all of it in one place.
+/// Tells how many.
 pub fn compare(runs: &[PathBuf]) -> u64 {
     let first = JournalReader::open(&runs[0]).unwrap();
     let model = message::model(first.header(), &Limits::default()).unwrap();
@@ -54,7 +55,7 @@ pub fn compare(runs: &[PathBuf]) -> u64 {
     let (mut compared, mut commands) = (0, Vec::new());
     for (index, run) in runs.iter().enumerate() {
         let mut reader = JournalReader::open(run).unwrap();
-        // From there on the next run tells.
+        // From there on the next run has the steps.
         let end = begins.get(index + 1).copied().unwrap_or(u64::MAX);
         while let Some(batch) = reader.next_batch().unwrap() {
             let hashes = batch.hashes().unwrap().into_iter().map(|at| (at.step, at.hash));

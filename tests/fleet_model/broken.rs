@@ -15,7 +15,7 @@ pub(crate) enum Broken {
     DeleteBlind,
     /// What the other node has is called durable before etcd names that node.
     DurableEarly,
-    /// A session goes on while it is handed over.
+    /// A session runs while it is handed over.
     MoveRunning,
     /// A client takes samples of any revision.
     ClientTakesAll,
@@ -23,11 +23,11 @@ pub(crate) enum Broken {
     StaleRevision,
     /// After a handing over whose end is unknown, the owner only reads who has the session.
     HandOverLate,
-    /// Who is handed a session reads once who has it, when nobody tells.
+    /// A node that is handed a session reads the owner only once when it gets no message.
     TakeReadsOnce,
-    /// Who is handed a session asks etcd only when the stream has ended.
+    /// A node that is handed a session asks etcd only when the stream has ended.
     TakeWaits,
-    /// Who is handed a session says so before it is on the disk.
+    /// A node that is handed a session confirms before it is on the disk.
     TakeInMemory,
     /// After a crash a node looks only at its own journals, not at those for which it stood by.
     RestartIgnoresStandby,
@@ -41,11 +41,11 @@ pub(crate) enum Broken {
     ClaimForgotten,
     /// Journals of runs that have ended otherwise count when a session is claimed.
     OldRunsCount,
-    /// etcd is told who stands by only when the journal grows.
+    /// The standby is written to etcd only when the journal grows.
     StandbyToldOnce,
-    /// A node claims only what nobody sends to it.
+    /// A node claims only sessions that no node sends to it.
     ClaimAwaitsStream,
-    /// Who stands by forgets what it has as soon as etcd names another.
+    /// A standby forgets its journal as soon as etcd names another.
     ForgetSoon,
     /// What the old standby has counts while another is being named.
     CountsBoth,
@@ -55,12 +55,12 @@ pub(crate) enum Broken {
     CountsEnded,
     /// A deletion is confirmed whether or not etcd has done it.
     DeleteUnsure,
-    /// A node that joins deletes what it has not got, also what came since.
+    /// A node that joins deletes entries of sessions that it does not have, also those that came since.
     SettleAll,
     /// A node that has another lease lists the nodes anew, beside its watch.
     ListOverWatch,
-    /// Who stands by takes journals of older runs than it has.
+    /// A standby accepts journals of older runs than it has.
     OlderRuns,
-    /// What a node tells of itself may bring its key under an older lease.
+    /// A node's report on itself may put its key under an older lease.
     TellAnyLease,
 }

@@ -59,7 +59,7 @@ impl Check {
         self.of(sid).deleted = true;
     }
 
-    /// It was claimed by the standby while only one disk counts: it goes on from there.
+    /// The standby claimed it while only one disk counts: it continues from there.
     pub(crate) fn may_lose(&mut self, sid: S, count: u64) {
         let truth = self.of(sid);
         truth.durable = truth.durable.min(Some(count));

@@ -15,7 +15,7 @@ pub(crate) enum ModelFault {
     Resume(N, u32),
     Heal(N, N, u32),
     EtcdBack(u32),
-    /// Nothing came over a stream for so long that an end gives it up.
+    /// An end gives up a stream after a long silence.
     Silence(u64, N, u32),
 }
 
@@ -61,7 +61,7 @@ impl FaultCounts {
     }
 }
 
-/// Faults are made for so long, and then none for so long.
+/// Duration of the faults, and of the time without faults that follows.
 const CHAOS: Ns = 40_000 * MS;
 const CALM: Ns = 16_000 * MS;
 
@@ -261,7 +261,7 @@ impl World {
         (0..self.nodes.len()).find(|n| self.nodes[*n].can_act(self.now, sid))
     }
 
-    /// Some time after faults have stopped, every session that anybody can go on with has an owner.
+    /// Some time after faults have stopped, every session that some node can continue has an owner.
     fn check_served(&mut self) {
         for (sid, value) in self.owners() {
             let can_go_on = self.is_up(&value.node) || self.is_up(&value.standby);

@@ -182,7 +182,7 @@ impl World {
         let memory = &mut self.nodes[n].memory;
         (memory.lease, memory.key_revision) = (lease, revision);
         self.note(|| format!("n{n} has lease {lease}"));
-        // A list that comes late would undo what the watch has told since, for ever.
+        // A late list would permanently undo the events that the watch has delivered since.
         if self.nodes[n].memory.rejoining && !self.is(Broken::ListOverWatch) {
             return self.is_of_the_fleet(n);
         }

@@ -182,7 +182,7 @@ impl World {
         self.say_after(n, from, stream, Say::Confirm(sid, run, to), sync);
     }
 
-    /// A node has so much of a journal on its disk. etcd is told that it stands by.
+    /// A node has this much of a journal on its disk, and writes to etcd that it is the standby.
     fn is_mirrored(&mut self, n: N, to: N, sid: S, run: u32, bytes: u64) {
         let (once, early) = (self.is(Broken::StandbyToldOnce), self.is(Broken::DurableEarly));
         let counts_both = self.is(Broken::CountsBoth);

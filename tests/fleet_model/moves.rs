@@ -1,4 +1,4 @@
-//! Sessions that move while they go on, as `src/server/fleet/{hand_over,service}.rs` do it.
+//! Sessions that move while they run, as `src/server/fleet/{hand_over,service}.rs` do it.
 
 use palpate_cluster::key::{SessionValue, decode};
 use palpate_cluster::rules;
@@ -156,7 +156,8 @@ impl World {
         }
     }
 
-    /// Whether the other node has the session is not known. This node writes the key once more: so what is under way can't be done.
+    /// Whether the other node has the session is not known. This node writes the key once more: so what is under way
+    /// can't be done.
     pub(crate) fn be_certain(&mut self, n: N, id: u64) {
         let Some(moving) = self.nodes[n].memory.moving.get(&id).cloned() else { return };
         if self.is(Broken::HandOverLate) {

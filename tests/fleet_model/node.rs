@@ -69,7 +69,7 @@ pub(crate) struct ReplicationStream {
     pub(crate) sent: BTreeMap<S, (u32, u64)>,
     /// What it has confirmed.
     pub(crate) confirmed: BTreeMap<S, (u32, u64)>,
-    /// How often it was told to forget a session, and has not said yet that it has.
+    /// Number of requests to forget a session that it has not confirmed.
     pub(crate) ending: BTreeMap<S, u32>,
 }
 
@@ -83,7 +83,7 @@ pub(crate) struct Moving {
     pub(crate) stands: bool,
     /// etcd was asked.
     pub(crate) is_asked: bool,
-    /// Who has it is being found out.
+    /// The node is finding the owner.
     pub(crate) unsure: bool,
 }
 
@@ -195,12 +195,12 @@ impl ModelNode {
         is_newer && self.hand_out(sid, false)
     }
 
-    /// Whether it has a journal from which a session can go on.
+    /// Returns whether it has a journal from which a session can continue.
     pub(crate) fn has_any(&self, sid: S) -> bool {
         self.kept.get(&sid).is_some_and(|kept| kept.bytes >= WHOLE) || self.newest(sid).is_ok()
     }
 
-    /// The newest of its own journals from which a session can go on: run and count.
+    /// Returns the newest of its own journals from which a session can continue: run and count.
     pub(crate) fn newest(&self, sid: S) -> Result<(u32, u64), &'static str> {
         let Some(files) = self.folder.get(&sid) else { return Err("no journal") };
         for (run, file) in files.iter().rev() {

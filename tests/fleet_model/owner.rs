@@ -1,4 +1,4 @@
-//! Who owns a session: made, kept, claimed, deleted, as `src/server/fleet/{mod,take_over}.rs` do it.
+//! Ownership of a session: created, kept, claimed and deleted, as `src/server/fleet/{mod,take_over}.rs` do it.
 
 use palpate_cluster::etcd::{Compare, Txn};
 use palpate_cluster::key::{SessionValue, decode};
@@ -9,7 +9,7 @@ use crate::node::{Growth, Owned, OwnedSession, WHOLE};
 use crate::world::{Ask, KeyChange, ModelAnswer, Then, Timer, World};
 use crate::{MS, N, S};
 
-/// Who stood by and is not needed keeps what it has for so long: a transaction that names it may be under way.
+/// Time for which a former standby keeps its journal: a transaction that names it may be under way.
 const KEEPS: u64 = 30_000 * MS;
 
 pub(crate) type KeyState = Option<(SessionValue, u64)>;
@@ -101,7 +101,7 @@ impl World {
             (KeyChange::OwnKept | KeyChange::Regained, Some((value, _))) => {
                 value.node == *me && value.standby.is_empty()
             }
-            // That it was done can't be told from what is there: it is done again.
+            // The present state does not show whether it was done, so it is done again.
             (KeyChange::Fixed(_), _) => false,
             (_, Some((value, _))) => value.node == *me,
         };
@@ -232,7 +232,7 @@ impl World {
         }
     }
 
-    /// A session goes on here, after `after_run` with `count` inputs.
+    /// Continues a session here, after `after_run` with `count` inputs.
     pub(crate) fn run_session(&mut self, n: N, sid: S, after_run: u32, count: u64, revision: u64) {
         self.begin_session(n, sid, after_run, count, revision, false);
         self.note(|| format!("n{n} s{sid} goes on at {count}, revision {revision}"));
@@ -367,7 +367,7 @@ impl World {
             if memory.owned.contains_key(&sid) || memory.live.contains_key(&sid) {
                 return done(self);
             }
-            // What was read may be old by now: it counts when it is written again.
+            // The read state may be old: it counts when it is written again.
             let txn = self.keep(n, sid, revision, "");
             return self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::Claimed));
         }
@@ -398,7 +398,7 @@ impl World {
         self.ask(n, Ask::Txn(txn), Then::Txn(sid, KeyChange::Claimed));
     }
 
-    /// A claimed session goes on from the journal that is here.
+    /// Continues a claimed session from the journal that is here.
     pub(crate) fn go_on(&mut self, n: N, sid: S, revision: u64) {
         self.nodes[n].memory.claiming.remove(&sid);
         let with_old = self.is(Broken::OldRunsCount);
@@ -417,7 +417,7 @@ impl World {
         }
     }
 
-    /// Sessions that etcd says are this node's, and that it has not got.
+    /// Returns the sessions that etcd assigns to this node and that it does not have.
     pub(crate) fn settle(&mut self, n: N, answer: ModelAnswer) {
         let ModelAnswer::Listed(found, _) = answer else { return self.timer(n, 500 * MS, Timer::Settle) };
         let prefix = self.keys.sessions();

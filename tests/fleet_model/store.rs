@@ -6,7 +6,7 @@ use palpate_cluster::etcd::{Compare, KeyValue, Op, TransactionOutcome, Txn};
 
 use crate::Ns;
 
-/// A change of a key, as a watch tells it.
+/// A change of a key, as a watch reports it.
 #[derive(Debug, Clone)]
 pub(crate) struct Change {
     pub(crate) key: String,

@@ -99,7 +99,7 @@ pub(crate) enum Move {
     Last,
 }
 
-/// What nodes tell each other.
+/// Messages between nodes.
 #[derive(Debug, Clone)]
 pub(crate) enum Say {
     Open,
@@ -130,7 +130,7 @@ pub(crate) enum KeyChange {
     Fixed(u64),
 }
 
-/// What a node goes on with when it gets an answer.
+/// The step with which a node continues when it gets an answer.
 #[derive(Debug, Clone)]
 pub(crate) enum Then {
     KeptAlive(Ns),
@@ -176,7 +176,7 @@ pub(crate) struct World {
     watches: Vec<(N, u32, u64)>,
     pub(crate) doomed: BTreeSet<u64>,
     arrives: BTreeMap<(u64, N), Ns>,
-    /// Who has opened each stream, and to whom.
+    /// The two ends of each stream; the first has opened it.
     pub(crate) opened: BTreeMap<u64, (N, N)>,
     pub(crate) log: VecDeque<(Ns, String)>,
     pub(crate) ids: Vec<String>,
@@ -339,7 +339,7 @@ impl World {
         }
         let patience = self.now + self.nodes[n].lasting(ETCD_TIMEOUT);
         self.at(patience, ModelEvent::Node(n, epoch, NodeInput::Timeout(call)));
-        // It waits in etcd, or on the way there, and is done when nobody waits for it any more.
+        // It waits in etcd, or on the way there, and is done even when no node waits for it.
         let is_late = is_txn && self.is_chaos && self.now + 7_000 * MS < self.chaos_ends && self.chance(0.02);
         let delay = if is_late { self.between(900, 6_000) } else { self.delay() };
         if is_late {
@@ -464,7 +464,8 @@ impl World {
         self.at(time, ModelEvent::Node(to, epoch, NodeInput::Peer(from, stream, say)));
     }
 
-    /// A stream is broken. Who opened it notices by his keepalive of 1 s, the other by his of 10 s; both at once if the other has died.
+    /// Breaks a stream. Its opener notices by a keepalive of 1 s, the other end by one of 10 s; both at once if the
+    /// other has died.
     pub(crate) fn doom(&mut self, stream: u64) {
         let Some((client, server)) = self.opened.get(&stream).copied() else { return };
         if !self.doomed.insert(stream) {

@@ -113,7 +113,7 @@ async fn every_refused_command_of_a_burst_is_told_of_or_counted() {
     let session = server.paper(true).await;
     let mut touch = TestTouch::hold(&server, &session).await;
     for sequence in 1..=1000 {
-        // Tool 1 is nobody's.
+        // Tool 1 is free.
         touch.command(force(1, sequence, -1.0)).await;
     }
     let (mut told, mut last) = (0, pb::Rejection::default());
@@ -698,7 +698,7 @@ async fn a_session_that_blows_up_again_and_again_goes_on_without_the_tool_and_se
         let request = pb::GetStateHashRequest { session_id: session.clone(), at_step: Some(5000) };
         async move { sessions.get_state_hash(request).await }
     });
-    // It recovers, and the holder is told each time what became of its command.
+    // It recovers, and the holder gets the result of its command each time.
     let (mut told_of, mut last_step) = (0, 0);
     let paused = loop {
         let sample = match touch.hear().await.unwrap().unwrap() {
@@ -708,7 +708,7 @@ async fn a_session_that_blows_up_again_and_again_goes_on_without_the_tool_and_se
                 assert_eq!((&*rejection.reason, rejection.tool, rejection.sequence), ("RECOVERED", 0, told_of));
                 assert!(rejection.message.contains("1 commands were undone"), "{rejection:?}");
                 assert_eq!(rejection.message.contains("have no effect before step"), told_of == 4, "{rejection:?}");
-                // The same again.
+                // Once more.
                 touch.command(force(0, told_of + 1, -1.0)).await;
                 continue;
             }
@@ -725,7 +725,7 @@ async fn a_session_that_blows_up_again_and_again_goes_on_without_the_tool_and_se
             break sample.tools[0];
         }
     };
-    // The fifth command has no effect, and the session goes on.
+    // The fifth command has no effect, and the session continues.
     let status = server.status(&session).await;
     let end = status.recoveries[0].step + 10_000;
     assert_eq!((told_of, paused.expired, paused.paused_until_step), (4, true, Some(end)));

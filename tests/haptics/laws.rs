@@ -16,8 +16,8 @@ use palpate_tissue::response::force_law::{self, Disc};
 use palpate_tissue::scene::BUILT_IN;
 use pb::touch_response::Message as Heard;
 
-/// The number of the law that a sample's local model names, if it has a model. Server and client mean the same: under a
-/// touch the law passes through the sample.
+/// The number of the law that a sample's local model names, if it has a model. Server and client mean the same: under
+/// a touch the law passes through the sample.
 fn law_of(sample: &pb::Sample, laws: &[Law]) -> Option<usize> {
     let model = touch::from_local_model(sample.tools.first()?.local_model.as_ref()?, sample.step);
     let law = laws.get(model.law as usize).expect("the law comes before the model that names it");
@@ -66,8 +66,8 @@ fn a_first_law_is_within_a_tenth_of_the_exact_one() {
             first.is_coarse
         );
         assert!(first.is_sound(), "{name} {sets:?}: {first:?}");
-        // A membrane without springs below it hardly resists at first: there a coarse grid is off by more than a tenth of
-        // very little.
+        // A membrane without springs below it hardly resists at first: there a coarse grid is off by more than a
+        // tenth of very little.
         assert!(if sets.is_empty() { force } else { of_largest } < 0.1, "{name} {sets:?}: {force}, {of_largest}");
         assert!(stiffness < 0.15, "{name} {sets:?}: {stiffness}");
     }
@@ -176,7 +176,7 @@ async fn a_coarse_law_is_changed_for_the_exact_one_by_a_model_that_names_it() {
     })
     .await
     .unwrap_or_else(|_| panic!("models that named each law: {named:?}"));
-    // Whoever comes later begins with the exact law, and is told nothing more.
+    // A client that comes later begins with the exact law, and gets no other.
     let mut later = TestTouch::open(&server, with_device(&session, &[1])).await.unwrap();
     let law = later.opened.take().unwrap().law.unwrap();
     assert!(!law.coarse && law.number == 0);
@@ -269,8 +269,8 @@ async fn a_tool_that_goes_to_the_rim_gets_the_law_of_the_rim_and_none_on_the_way
     let at_rim = in_middle.follow(&model, DVec3::new(0.005, 0.0375, 0.0));
     let [middle, rim] = [in_middle, at_rim]
         .map(|disc| force_law::exact_within(&model, disc, u64::MAX, &AtomicBool::new(false)).unwrap());
-    // The middle, a place that is as the middle, one radius from the fixed rim, and a place with that distance elsewhere.
-    // The tool is above them: the law comes before it touches.
+    // The middle, a place that is as the middle, one radius from the fixed rim, and a place with that distance
+    // elsewhere. The tool is above them: the law comes before it touches.
     let course = [(0.0375, 0.0375, &middle), (0.03, 0.045, &middle), (0.005, 0.0375, &rim), (0.045, 0.07, &rim)];
     for (at, (x_m, y_m, law)) in course.into_iter().enumerate() {
         let mut named = 0_u32;

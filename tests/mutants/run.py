@@ -236,7 +236,7 @@ def met_by_tests(found):
                 used_s, clock_s = children_s() - begun_s, time.time() - begun
                 test = {"program": program, "name": name, "seconds": used_s, "clock_s": clock_s, "met": met}
                 if failed:
-                    # It tells nothing then.
+                    # Its result means nothing then.
                     test["met"] = []
                     print(f"left out, because it is too slow or fails without a mutant: {program}: {name}", flush=True)
                 tests.append(test)

@@ -1,4 +1,4 @@
-"""What README and guide show is done to the letter: every block of code that is not marked with `not-run: REASON`."""
+"""Runs every block of code in README and guide literally, except those that are marked with `not-run: REASON`."""
 
 import json
 import pathlib

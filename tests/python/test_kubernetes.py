@@ -278,7 +278,7 @@ class Alerts(unittest.TestCase):
                 expression = rule["expr"]
                 for opening, closing in ("()", "[]", "{}"):
                     self.assertEqual(expression.count(opening), expression.count(closing))
-                # Metrics and functions that there are; src/server/metrics.rs compares the metrics with those that it tells.
+                # Known metrics and functions; src/server/metrics.rs compares the metrics with those that it defines.
                 for word in re.findall(r"[a-zA-Z_]\w*", re.sub(r"\[\w+\]", "", expression)):
                     self.assertTrue(word in functions or word.startswith("palpate_"), word)
 

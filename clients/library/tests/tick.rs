@@ -102,7 +102,7 @@ fn a_tick_asks_for_no_memory_and_gives_none_back() {
         let (mut most_n, mut requests) = (0.0_f64, 0);
         for tick in 0..6000_u32 {
             let time_s = 1e-3 * f64::from(tick);
-            // Connections, laws and models, faster than any server sends them.
+            // Connections, laws and models, faster than a server sends them.
             if tick % 2500 == 100 {
                 record.arrive(&opened()).unwrap();
             }

@@ -1,4 +1,4 @@
-//! `palpate-client admin`: shows what callers use of a server, and frees it.
+//! `palpate-client admin`: shows the resources that callers use of a server, and frees them.
 
 use palpate_client::{Channel, fleet};
 use palpate_proto::pb;
@@ -44,7 +44,8 @@ enum AdminAction {
         /// The stream's number, from `streams`
         number: u64,
     },
-    /// End all streams of a caller, release its tools and close its connections; it can come back while its token is valid
+    /// End all streams of a caller, release its tools and close its connections; it can come back while its token is
+    /// valid
     CutCaller {
         /// The caller's name, from `callers`: token:NAME or address:IP
         caller: String,
@@ -121,7 +122,7 @@ async fn act(act: &AdminAction, channel: Channel) -> Result<String, tonic::Statu
     })
 }
 
-/// A line for each caller, below a header.
+/// Returns a header and a line for each caller.
 fn callers(callers: &[pb::CallerUse]) -> String {
     let head = format!("{:40} {:>8} {:>8} {:>8} {:>6} {:>6}", "caller", "MiB", "sessions", "streams", "tools", "cores");
     let line = |caller: &pb::CallerUse| {
@@ -132,7 +133,7 @@ fn callers(callers: &[pb::CallerUse]) -> String {
     std::iter::once(head).chain(callers.iter().map(line)).collect::<Vec<_>>().join("\n")
 }
 
-/// A line for each stream, below a header.
+/// Returns a header and a line for each stream.
 fn streams(streams: &[pb::StreamUse]) -> String {
     let head = format!("{:>6} {:14} {:40} {:>5} {:>9}", "number", "call", "caller", "tools", "open s");
     let line = |stream: &pb::StreamUse| {

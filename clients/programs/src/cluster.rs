@@ -22,7 +22,8 @@ pub(crate) struct ClusterArguments {
     /// Any server of the fleet
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:7117", global = true)]
     server: String,
-    /// Print JSON instead of a table: an array of nodes or sessions; an object for `move`; an object on each line for `drain` and `top`
+    /// Print JSON instead of a table: an array of nodes or sessions; an object for `move`; an object on each line for
+    /// `drain` and `top`
     #[arg(long, global = true)]
     json: bool,
     #[command(flatten)]
@@ -58,7 +59,7 @@ enum ClusterAction {
     },
 }
 
-/// Time between two looks at the servers.
+/// Interval between two queries of the servers.
 const EVERY: Duration = Duration::from_secs(1);
 
 /// Time limit for an answer; a move has another.
@@ -67,7 +68,8 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(10);
 /// Performs the action and prints the result.
 ///
 /// # Errors
-/// Returns an error if an argument is refused, if the server can't be reached or refuses, or if sessions could not be moved.
+/// Returns an error if an argument is refused, if the server can't be reached or refuses, or if sessions could not be
+/// moved.
 pub(crate) async fn cluster(arguments: &ClusterArguments) -> Result<(), ClientFailure> {
     let ClusterArguments { act, json: is_json, .. } = arguments;
     let server = arguments.credentials.server(&arguments.server)?;
@@ -123,7 +125,7 @@ async fn within<T>(answer: impl Future<Output = Result<T, Status>>) -> Result<T,
     tokio::time::timeout(ANSWER_TIMEOUT, answer).await.unwrap_or_else(silent)
 }
 
-/// The servers, by name.
+/// Returns the servers, by name.
 async fn nodes(channel: &Channel) -> Result<Vec<pb::Node>, ClientFailure> {
     look(channel).await.map_err(failed)
 }
@@ -133,7 +135,7 @@ async fn look(channel: &Channel) -> Result<Vec<pb::Node>, Status> {
     within(async { Ok(admin.list_nodes(pb::ListNodesRequest {}).await?.into_inner().nodes) }).await
 }
 
-/// The sessions, by ID.
+/// Returns the sessions, by ID.
 async fn sessions(channel: Channel) -> Result<Vec<pb::FleetSession>, ClientFailure> {
     let mut admin = AdminServiceClient::new(channel);
     let listed = async {
@@ -147,7 +149,7 @@ async fn sessions(channel: Channel) -> Result<Vec<pb::FleetSession>, ClientFailu
     listed.await.map_err(failed)
 }
 
-/// Moves all sessions of a server to others, or lets it take new ones again.
+/// Moves all sessions of a server to others, or lets it accept new ones again.
 async fn drain(server: &Server, channel: &Channel, node: &str, stop: bool, is_json: bool) -> Result<(), ClientFailure> {
     let nodes = nodes(channel).await?;
     let Some(found) = nodes.iter().find(|other| other.node == node) else {
@@ -167,7 +169,7 @@ async fn drain(server: &Server, channel: &Channel, node: &str, stop: bool, is_js
             (false, false) => format!("{}  not moved: {}; {left} left", printable(session_id), printable(fault)),
         };
         *(if fault.is_empty() { &mut moved } else { &mut stayed }) += 1;
-        // Who reads no more still wants the server to be drained.
+        // If the reader of the output is gone, the drain still continues.
         crate::tell!("{line}");
     }
     if stayed > 0 {
@@ -277,7 +279,7 @@ fn sessions_table(sessions: &[pb::FleetSession]) -> String {
     aligned(std::iter::once(head).chain(sessions.iter().map(row)))
 }
 
-/// Lines of cells, one below the other. Of a long cell only the beginning is shown: each row is as wide as the widest cells are.
+/// Formats lines of cells in columns. Long cells are cut at the end, so that each column has a limited width.
 fn aligned<const N: usize>(rows: impl Iterator<Item = [String; N]>) -> String {
     const MAX_LETTERS: usize = 128;
     let short = |cell: String| match cell.char_indices().nth(MAX_LETTERS) {

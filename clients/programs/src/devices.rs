@@ -1,4 +1,4 @@
-//! `palpate-client devices`: what devices are there, and whether one keeps time.
+//! `palpate-client devices`: lists devices, or tests the timing of one.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -35,7 +35,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 /// Lists devices, or tests one.
 ///
 /// # Errors
-/// Returns an error if the device to test is not there, or fails.
+/// Returns an error if the device to test is missing or fails.
 pub(crate) async fn devices(arguments: &DevicesArguments) -> Result<(), ClientFailure> {
     let (library, is_json) = (arguments.library.clone(), arguments.json);
     let Some(name) = arguments.test.clone() else {

@@ -19,7 +19,7 @@ pub(crate) struct HealthArguments {
     credentials: CredentialOptions,
 }
 
-/// A healthy server answers sooner.
+/// Timeout of an answer: a healthy server answers sooner.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Fails unless the server reports that it is serving.

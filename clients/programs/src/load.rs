@@ -57,8 +57,9 @@ pub(crate) struct LoadArguments {
     /// Threads of this generator
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=64))]
     threads: u32,
-    /// Find the largest number of sessions that meets this objective in two of three trials: bounds on p50, p99, p999,
-    /// max (round trip), gap_p99, gap_max, frame_age_p99, dilation, lost and rejected, such as 'p99<2ms,dilation>0.999'
+    /// Find the largest number of sessions that meets this objective in two of three trials: bounds on p50, p99,
+    /// p999, max (round trip), gap_p99, gap_max, frame_age_p99, dilation, lost and rejected, such as
+    /// 'p99<2ms,dilation>0.999'
     #[arg(long, value_name = "OBJECTIVE")]
     find_limit: Option<Objective>,
     /// Load the server by this plan (TOML): phases, arrivals, mixes and objectives, in place of the numbers above
@@ -93,11 +94,11 @@ fn rate(text: &str) -> Result<f64, String> {
 /// The search ends when the bracket is narrower than this fraction of the limit (1/40).
 const RESOLUTION: u32 = 40;
 
-/// Number of trials that must agree: two of three, because one stall of the machine can spoil a trial, and one lucky trial
-/// proves nothing.
+/// Number of trials that must agree: two of three, because one stall of the machine can spoil a trial, and one lucky
+/// trial proves nothing.
 const AGREE: usize = 2;
 
-/// The largest number that is tried.
+/// Largest number of sessions that is tried.
 const MAX_SESSIONS: u32 = 1 << 16;
 
 pub(crate) async fn load(arguments: &LoadArguments) -> Result<(), ClientFailure> {
@@ -126,8 +127,8 @@ pub(crate) async fn load(arguments: &LoadArguments) -> Result<(), ClientFailure>
     Ok(())
 }
 
-/// Repeats a trial until `AGREE` of them agree on whether the objective is met. Returns that, and the outcome of the last of
-/// them, if it had one.
+/// Repeats a trial until `AGREE` of them agree on whether the objective is met. Returns that, and the outcome of the
+/// last of them, if it had one.
 async fn agreed<T, E>(mut trial: impl AsyncFnMut() -> Result<(T, bool), E>) -> Result<(T, bool), E> {
     let mut counts = [0; 2];
     loop {
@@ -139,7 +140,8 @@ async fn agreed<T, E>(mut trial: impl AsyncFnMut() -> Result<(T, bool), E>) -> R
     }
 }
 
-/// The largest number of sessions that meets the objective, and its outcome: doubled until it fails, then bisected.
+/// Finds the largest number of sessions that meets the objective, by doubling until it fails and then bisecting.
+/// Returns it with its outcome.
 async fn find_limit(
     arguments: &LoadArguments,
     server: &Server,
@@ -188,13 +190,13 @@ async fn find_limit(
     best.map(|outcome| (outcome, low)).ok_or_else(|| Error::Connection("the server gave not one session".to_owned()))
 }
 
-/// Completes at Ctrl-C, and says so.
+/// Completes at Ctrl-C, and prints a message.
 async fn called_off() {
     interrupted().await;
     crate::say!("palpate-client: interrupted: deleting the sessions");
 }
 
-/// A trial, with its progress and warnings.
+/// Performs a trial, and prints its progress and warnings.
 async fn measured(arguments: &LoadArguments, server: &Server, sessions: u32) -> Result<LoadOutcome, Error> {
     let trial = LoadTrial {
         scene: arguments.scene.clone(),
@@ -230,7 +232,7 @@ async fn measured(arguments: &LoadArguments, server: &Server, sessions: u32) -> 
     Ok(outcome)
 }
 
-/// Loads a server by a plan, and prints and writes the report.
+/// Runs a load test by a plan, and prints and writes the report.
 async fn by_plan(path: &Path, arguments: &LoadArguments) -> Result<(), ClientFailure> {
     let course = PreparedPlan::new(LoadPlan::read(path)?)?;
     let server = arguments.credentials.server(&arguments.server)?;

@@ -3,8 +3,8 @@
 // Clients live in real time; the rule is for what a server computes.
 #![allow(clippy::disallowed_methods)]
 
-/// Writes a line to the standard error, whatever names and messages of others are in it. A closed standard error does not end the
-/// program.
+/// Writes a line to the standard error, with names and messages of others made printable. A closed standard error
+/// does not end the program.
 macro_rules! say {
     ($($text:tt)*) => {{
         let text = palpate_refusal::printable::printable(format_args!($($text)*));
@@ -12,8 +12,8 @@ macro_rules! say {
     }};
 }
 
-/// Writes lines to the standard output. What others have written is made printable before it, as a part of a line or as JSON. A
-/// closed standard output does not end the program.
+/// Writes lines to the standard output. The caller makes texts of others printable first, as a part of a line or as
+/// JSON. A closed standard output does not end the program.
 macro_rules! tell {
     ($($text:tt)*) => {{
         let text = palpate_refusal::printable::printable_lines(format_args!($($text)*));
@@ -77,7 +77,8 @@ enum ClientCommand {
         Exit status: 0; 1 when a hash differs, the connection broke or the session was held; 2 when an input was \
         refused.")]
     Play(play::PlayArguments),
-    /// Simulate hand, device, network and tissue in one loop in virtual time; report how accurate and safe the touch is
+    /// Simulate hand, device, network and tissue in one loop in virtual time; report how accurate and safe the touch
+    /// is
     #[command(after_help = "Examples:\n  \
         palpate-client link --scene fibrotic --hand medium --device omega3 --rtt-ms 50\n  \
         palpate-client link --scene liver --profile wan --scheme hold --seed 7 --json\n  \
@@ -180,7 +181,7 @@ enum ClientCommand {
     Cluster(cluster::ClusterArguments),
 }
 
-/// Why a program ends early.
+/// Reason why a program ends early.
 pub(crate) enum ClientFailure {
     /// Exit status 1.
     Failed(String),
@@ -206,12 +207,12 @@ impl From<Refusal> for ClientFailure {
     }
 }
 
-/// Shows a warning.
+/// Prints a warning.
 pub(crate) fn warn(message: &str) {
     say!("palpate-client: warning: {message}");
 }
 
-/// An option's number, within a range.
+/// Parses an option's number within a range.
 pub(crate) fn within(text: &str, range: std::ops::RangeInclusive<f64>) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|_| "is not a number".to_owned())?;
     let wrong = || format!("must be from {} to {}", range.start(), range.end());

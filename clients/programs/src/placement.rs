@@ -1,4 +1,4 @@
-//! Where a device is laid over the tissue, by a file and by options.
+//! Placement of a device over the tissue, from a file and options.
 
 use std::path::PathBuf;
 
@@ -11,7 +11,7 @@ use palpate_tissue::scene::toml_document::{Document, Fields};
 /// Largest placement file, bytes.
 const MAX_BYTES: u64 = 1 << 16;
 
-/// The options; they override the file.
+/// Options of the placement, which override the file.
 #[derive(clap::Args)]
 pub(crate) struct PlacementOptions {
     /// File (TOML) with the placement of the device over the tissue, and its clutch; the options below override it
@@ -47,10 +47,10 @@ fn vector(text: &str) -> std::result::Result<DVec3, String> {
 }
 
 impl PlacementOptions {
-    /// The placement of file and options together.
+    /// Returns the placement from file and options.
     ///
     /// # Errors
-    /// Refuses a file that can't be read, and values that are out of range, by key.
+    /// Returns a refusal if the file can't be read, or with the key of a value that is out of range.
     pub(crate) fn placement(&self) -> Result<Placement> {
         let mut placement = match &self.placement {
             Some(path) => parse(&path.display().to_string(), &read_text(path, MAX_BYTES)?)?,
@@ -81,7 +81,7 @@ fn fields(fields: &mut Fields<'_>) -> Result<Placement> {
     let vector = |fields: &mut Fields<'_>, key| fields.item(key).map_or(Ok(DVec3::ZERO), |item| item.vector());
     let button = |fields: &mut Fields<'_>, key| {
         let whole = fields.item(key).map(|item| item.whole()).transpose()?;
-        // What does not fit is out of range, and refused as that.
+        // A value that does not fit the type is out of range.
         Ok(whole.map(|whole| u32::try_from(whole).unwrap_or(u32::MAX)))
     };
     let (offset_m, rotation_deg) = (vector(fields, "offset_m")?, vector(fields, "rotation_deg")?);

@@ -1,5 +1,5 @@
-//! `palpate-client play`: sends a journal to a server, and begins a session at a moment of it, played or live. What is played is
-//! compared with the hashes of the journal, and recorded if that is wanted.
+//! `palpate-client play`: sends a journal to a server, and begins a session at one of its steps, played or live.
+//! Compares a played session with the hashes of the journal, and records it if requested.
 
 mod recorded;
 
@@ -27,7 +27,7 @@ use crate::table::progress_bar;
 use crate::{ClientFailure, interrupted, table};
 use recorded::Compared;
 
-/// Bytes of a journal, at most: no server takes more.
+/// Largest size of a journal, bytes: no server accepts more.
 const MAX_BYTES: u64 = 1 << 32;
 
 /// Arguments of `play`.
@@ -74,14 +74,14 @@ pub(crate) struct PlayArguments {
     credentials: CredentialOptions,
 }
 
-/// The session is looked at so often.
+/// Interval between two queries of the session.
 const LOOK: Duration = Duration::from_millis(100);
 
 fn refused(status: Status) -> ClientFailure {
     Error::Call(status).into()
 }
 
-/// Records of a session, on their way to a file.
+/// Writer of a session's records to a file.
 struct Records {
     stream: Streaming<pb::ProbeResponse>,
     output: Box<dyn Write>,
@@ -89,7 +89,7 @@ struct Records {
 }
 
 impl Records {
-    /// Of the steps from `begin` to `end` of a session that stands.
+    /// Starts to record the steps from `begin` to `end` of a paused session.
     async fn open(
         arguments: &PlayArguments,
         channel: Channel,
@@ -122,7 +122,7 @@ impl Records {
         Ok(Some(Records { stream, output, left }))
     }
 
-    /// Writes them, to the last.
+    /// Writes the records, up to the last.
     async fn write(mut self) -> Result<(), ClientFailure> {
         let mut record = Record::default();
         while self.left > 0 {
@@ -133,7 +133,7 @@ impl Records {
                 let why = "records were lost: this client can't keep up with so many points at this rate";
                 return Err(ClientFailure::Failed(why.to_owned()));
             }
-            // Of the beginning there is one only at step 0.
+            // Only step 0 has a record of the beginning.
             if wire::sample::add_to_record(&mut record, &message) && message.step == 0 {
                 record = Record::default();
             } else if message.last {
@@ -149,10 +149,11 @@ fn unwritten(error: std::io::Error) -> ClientFailure {
     ClientFailure::Failed(format!("the records can't be written: {error}"))
 }
 
-/// Sends the journal, and plays it to its end.
+/// Sends the journal, and plays it to the end.
 ///
 /// # Errors
-/// Returns an error if the file can't be read, the server refuses it, the connection breaks, or a hash differs from the journal's.
+/// Returns an error if the file can't be read, the server refuses it, the connection breaks, or a hash differs from
+/// the journal's.
 pub(crate) async fn play(arguments: &PlayArguments) -> Result<(), ClientFailure> {
     let PlayArguments { file, from, to, speed, live, quiet, .. } = arguments;
     let bytes = files::read_regular(file, MAX_BYTES)?;
@@ -181,7 +182,7 @@ pub(crate) async fn play(arguments: &PlayArguments) -> Result<(), ClientFailure>
         ..Default::default()
     };
     let mut sessions = SessionServiceClient::new(channel.clone());
-    // Nothing of it happens before somebody can be told its name.
+    // The session is paused until its name is known.
     let request =
         pb::CreateSessionRequest { source: Some(Source::Journal(moment)), paused: true, ..Default::default() };
     let session = sessions.create_session(request).await.map_err(refused)?.into_inner().session.unwrap_or_default();
@@ -189,10 +190,10 @@ pub(crate) async fn play(arguments: &PlayArguments) -> Result<(), ClientFailure>
     if !arguments.json {
         crate::say!("palpate-client: session {id}, {}, from step {begin}", session.scene_name);
     }
-    // The hash of a moment that is left at once is told by the server that makes it.
+    // Only the server that creates the session can report the hash of its first step.
     recorded.retain(|step, _| (begin + 1..=end).contains(step) || (begin == end && *step == begin));
     let started = pb::StartSessionRequest { session_id: id.clone(), until_step: (!live).then_some(end) };
-    // Another server of the fleet may have a live session by now, here and below.
+    // From here on, another server of the fleet may have taken over a live session.
     let mut at = At { server, channel: channel.clone(), answer: () };
     let bar = progress_bar("{elapsed_precise} [{wide_bar}] step {pos} of {len}", end, *quiet);
     let run = async {
@@ -262,7 +263,7 @@ pub(crate) async fn play(arguments: &PlayArguments) -> Result<(), ClientFailure>
     }
 }
 
-/// A call to whichever server of a fleet has the session.
+/// Calls the server of a fleet that has the session.
 async fn call<T, F>(at: &mut At<()>, call: impl Fn(Channel) -> F) -> Result<T, ClientFailure>
 where
     F: Future<Output = Result<tonic::Response<T>, Status>>,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use palpate_client::bridge::Copies;
 use palpate_session::journal;
 
-/// Of which tissues a device's loop keeps a copy.
+/// Kinds of tissue of which a device's loop keeps a copy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 pub(crate) enum When {
     /// For meshes: a local model does not describe a rim, fold or lump outside its place
@@ -17,7 +17,7 @@ pub(crate) enum When {
 }
 
 impl When {
-    /// For the options of a bridge.
+    /// Returns the value for the options of a bridge.
     pub(crate) fn copies(self) -> Option<Copies> {
         (self != When::Never).then(|| Copies { make: Arc::new(journal::prediction), of_sheets: self == When::Always })
     }

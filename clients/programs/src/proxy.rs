@@ -1,4 +1,4 @@
-//! `palpate-client proxy`: a bad network on this machine, between clients and a server.
+//! `palpate-client proxy`: simulates a bad network on this machine, between clients and a server.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -48,7 +48,7 @@ pub(crate) struct ProxyArguments {
     json: bool,
 }
 
-/// Relays until it is interrupted, and tells what went through.
+/// Relays until it is interrupted, and prints counts of the relayed data.
 ///
 /// # Errors
 /// Returns an error if an argument is refused or the address is not free.

@@ -35,8 +35,8 @@ use crate::credentials::CredentialOptions;
 use crate::table::progress_bar;
 use measured::{Measured, percentiles_us};
 
-/// How far ahead of the server's step commands are sent, s: a network may stall for about as long before the session has to
-/// wait.
+/// Time by which commands are sent ahead of the server's step, s: a network may stall for about this time before the
+/// session has to wait.
 const AHEAD_S: f64 = 2.0;
 
 /// Largest number of commands of a tool that are sent ahead: fewer than a session queues.
@@ -45,7 +45,7 @@ const COMMANDS_AHEAD: u64 = 4000;
 /// Time between two heartbeats.
 const HEARTBEAT: Duration = Duration::from_millis(5);
 
-/// A server that is silent for longer than this has failed: a running session answers heartbeats at once.
+/// Silence after which a server has failed: a running session answers heartbeats at once.
 const SILENCE: Duration = Duration::from_secs(10);
 
 /// Time limit for creating the session.
@@ -65,8 +65,8 @@ pub(crate) struct ReplayArguments {
     /// Write the records here instead of to the standard output
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Plot displacement and force of the first tool with a tip, or of the first tool, in the terminal; without --output the
-    /// records are then not written to a terminal
+    /// Plot displacement and force of the first tool with a tip, or of the first tool, in the terminal; without
+    /// --output the records are then not written to a terminal
     #[arg(long)]
     plot: bool,
     /// Show no progress bar
@@ -78,7 +78,7 @@ pub(crate) struct ReplayArguments {
     credentials: CredentialOptions,
 }
 
-/// The samples that the server is to send. The records do not depend on them.
+/// Options of the samples that the server sends. The records do not depend on them.
 #[derive(clap::Args)]
 #[command(next_help_heading = "Samples, for --plot and the table")]
 struct Sampling {
@@ -129,7 +129,7 @@ impl Sampling {
     }
 }
 
-/// When the last message of the server arrived.
+/// Time when the last message of the server arrived.
 type LastHeard = Mutex<Instant>;
 
 /// The replay's session. It is deleted even when the replay fails.
@@ -180,8 +180,8 @@ pub(crate) async fn replay(arguments: &ReplayArguments) -> Result<(), ClientFail
     ended
 }
 
-/// The failure of a session with this scene. If the server does not know the name, it may be meant as a file: the message
-/// says how to give one.
+/// Returns the failure to create a session of this scene. If the server does not know the name, the message also
+/// explains how to name a file.
 fn with_hint(scene: &str, failure: ClientFailure) -> ClientFailure {
     let file = format!("{scene}.toml");
     match failure {
@@ -244,8 +244,8 @@ impl Streamer<'_> {
         self.say(Say::Renew(pb::Renew { client_time_ns: self.now_ns(), datagrams: false })).await
     }
 
-    /// Called for each answered heartbeat; they are answered in order. Returns the step before which the server has all
-    /// commands.
+    /// Called for each answered heartbeat; they are answered in order. Returns the step before which the server has
+    /// all commands.
     fn heartbeat_answered(&mut self) -> u64 {
         self.sent_before.pop_front().unwrap_or(0)
     }
@@ -258,7 +258,7 @@ fn run_until(sessions: &SessionServiceClient<Channel>, session_id: &str, step: u
     tokio::spawn(async move { sessions.start_session(request).await.map(|_| ()) })
 }
 
-/// The message that `message` waits for.
+/// Waits for `message` and returns it.
 async fn next<T>(
     message: impl Future<Output = Result<Option<T>, Status>>,
     heard: &LastHeard,
@@ -272,7 +272,7 @@ async fn next<T>(
     }
 }
 
-/// Completes when the server has been silent for too long, whatever the replay waits for.
+/// Completes when the server has been silent for too long.
 async fn silence(heard: &LastHeard) -> ClientFailure {
     loop {
         let last = *heard.lock().unwrap_or_else(PoisonError::into_inner);

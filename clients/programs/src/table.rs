@@ -1,11 +1,11 @@
-//! Tables for people: a name and a value with its unit on each line. And bars of progress.
+//! Tables for terminals, with a name and a value with its unit on each line, and progress bars.
 
 use std::io::IsTerminal;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use palpate_refusal::printable::printable;
 
-/// A bar on the terminal, in indicatif's words; hidden if there is none or it is not wanted.
+/// Returns a progress bar with a template of indicatif; it is hidden without a terminal or if it is not wanted.
 pub(crate) fn progress_bar(template: &str, length: u64, quiet: bool) -> ProgressBar {
     if quiet || !std::io::stderr().is_terminal() {
         return ProgressBar::hidden();
@@ -19,14 +19,14 @@ pub(crate) fn print(rows: &[(&str, String)]) {
     crate::tell!("{}", text(rows));
 }
 
-/// The rows as text, their values one below the other.
+/// Returns the rows as text with aligned values.
 fn text(rows: &[(&str, String)]) -> String {
     let width = rows.iter().map(|row| row.0.chars().count()).max().unwrap_or(0);
     let lines: Vec<String> = rows.iter().map(|(name, value)| format!("{name:<width$}  {}", printable(value))).collect();
     lines.join("\n")
 }
 
-/// A number with three significant digits.
+/// Formats a number with three significant digits.
 pub(crate) fn rounded(value: f64) -> String {
     if value == 0.0 || !value.is_finite() {
         return format!("{value}").replace("-0", "0");
@@ -37,7 +37,7 @@ pub(crate) fn rounded(value: f64) -> String {
     if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
 }
 
-/// A number with its unit, such as "3.5 mN". What is smaller than a billionth counts as 0.
+/// Formats a number with its unit, such as "3.5 mN". A value below a billionth counts as 0.
 pub(crate) fn with_unit(value: f64, unit: &str) -> String {
     let scales = [(1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n")];
     match scales.into_iter().find(|(scale, _)| value.abs() >= *scale) {
@@ -46,12 +46,12 @@ pub(crate) fn with_unit(value: f64, unit: &str) -> String {
     }
 }
 
-/// A fraction in per cent.
+/// Formats a fraction in per cent.
 pub(crate) fn percent(fraction: f64) -> String {
     format!("{} %", rounded(100.0 * fraction))
 }
 
-/// What acted in how many ticks; what did not act is left out.
+/// Formats the numbers of ticks in which each limit acted; limits that did not act are left out.
 pub(crate) fn acted<'n>(counts: impl IntoIterator<Item = (&'n str, u64)>) -> String {
     let acted = counts.into_iter().filter(|(_, ticks)| *ticks > 0);
     let acted: Vec<String> =

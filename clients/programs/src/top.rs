@@ -155,7 +155,7 @@ fn audit(audit: &Audit) -> Value {
     })
 }
 
-/// A line of totals, a header, and a line for each session; if there are more than `most`, the busiest.
+/// Returns a line of totals, a header, and a line for each session; if there are more than `most`, for the busiest.
 fn table(server: &str, rows: &[SessionRow], most: usize) -> String {
     let count = |wanted: &str| rows.iter().filter(|row| state(&row.session) == wanted).count();
     // Not `sum()`: the sum of nothing is −0 and would be printed with its sign.

@@ -1,17 +1,19 @@
-//! For how long a program that shows a server asks one that does not answer.
+//! Limits how long a program that shows a server waits for one that does not answer.
 
 use palpate_client::describe;
 use tonic::{Code, Status};
 
-/// Queries in a row without an answer: a server that starts again is waited for, one that is gone is not.
+/// Number of successive queries without an answer. A program waits for a server that restarts, but not for one that
+/// is gone.
 #[derive(Default)]
 pub(crate) struct Unanswered(u32);
 
 impl Unanswered {
-    /// After so many a program gives up: half a minute of a server that refuses connections, five minutes of a silent one.
+    /// Number of queries after which a program gives up: half a minute for a server that refuses connections, five
+    /// minutes for a silent one.
     const MAX_UNANSWERED: u32 = 30;
 
-    /// Counts a query that failed. Whether to ask once more, of which the user is told.
+    /// Counts a query that failed. Returns whether to ask once more, after telling the user.
     pub(crate) fn may_ask_again(&mut self, status: &Status) -> bool {
         self.0 += 1;
         let may = status.code() == Code::Unavailable && self.0 < Self::MAX_UNANSWERED;

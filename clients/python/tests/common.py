@@ -1,4 +1,4 @@
-"""What the tests share: the programs that were built, and a server."""
+"""Shared parts of the tests: the built programs, and a server."""
 
 import json
 import pathlib

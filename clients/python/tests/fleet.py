@@ -79,7 +79,7 @@ class Fleet:
         return self
 
     def told(self, what, url):
-        """What `palpate cluster` tells: nodes or sessions."""
+        """Returns the nodes or sessions that `palpate cluster` prints."""
         command = [PROGRAM, "cluster", what, "--json", "--server", url]
         ran = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
         return json.loads(ran.stdout) if ran.returncode == 0 else []

@@ -89,7 +89,7 @@ class Examples(Served, unittest.TestCase):
 
 
 class Types(unittest.TestCase):
-    """What type checkers are told is what there is."""
+    """The types for type checkers match the package."""
 
     def names(self, stub):
         tree = ast.parse((ROOT / "clients/python/palpate" / stub).read_text())

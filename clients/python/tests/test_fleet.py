@@ -64,7 +64,7 @@ class Follows(unittest.TestCase):
             samples = session.samples()
             step = next(samples)["step"]
             fleet.kill(dead)
-            # Another server tells of it, and a tool is taken once more: its lease has died with the server.
+            # Another server reports it, and a tool is acquired once more: its lease has ended with the server.
             session.push(1, (0.0, 0.0, -0.2), point=(5, 5))
             self.assertNotEqual(fleet.name_of(session), dead)
             self.assertEqual(session.status()["held_tools"], [(1, "python")])

@@ -1,4 +1,4 @@
-"""What `help` shows."""
+"""The texts that `help` shows."""
 
 import ast
 import inspect
@@ -17,7 +17,7 @@ def words(text):
 
 
 def told():
-    """What there is: name and object of every public class, function, method and property of the package."""
+    """Returns name and object of every public class, function, method and property of the package."""
     for module in (palpate, palpate.aio):
         for name in module.__all__:
             there = getattr(module, name)

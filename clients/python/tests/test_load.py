@@ -42,7 +42,7 @@ INTERRUPTED = """
 import signal
 import sys
 import palpate
-# Who runs the tests in the background may have them ignore it.
+# Tests that run in the background may ignore it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 print("begins", flush=True)
 palpate.load("[[phase]]\\nseconds = 600\\narrivals = 'spike'\\nusers = 2", sys.argv[1])

@@ -189,7 +189,7 @@ class Runs(unittest.TestCase):
                 program = (
                     "import palpate, signal, sys\n"
                     "script = sys.argv[1]\n"
-                    # Whoever starts the tests in the background has them ignore it.
+                    # Tests that run in the background may ignore it.
                     "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
                     "signal.setitimer(signal.ITIMER_REAL, 0.4)\n"
                     "signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))\n"

@@ -93,7 +93,7 @@ class Tools(Served, unittest.TestCase):
         self.assertEqual((played.header["scene"], played.summary["steps"]), ("paper", run.summary["steps"]))
         status = session.status()
         self.assertEqual((status["state"], status["step"], status["held_tools"]), ("paused", run.summary["steps"], []))
-        # It goes on from there, with one record less: that of the beginning is there already.
+        # It continues from there, with one record less: that of the beginning exists already.
         again = session.play(script)
         self.assertEqual(len(again.time_s), len(run.time_s) - 1)
         self.assertEqual(session.status()["step"], 2 * run.summary["steps"])

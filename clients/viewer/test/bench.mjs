@@ -82,7 +82,7 @@ async function frames(scene, side, forceN) {
   await page.page.selectOption("#script", "sway");
   await page.page.click("#play");
   await page.until(({ largestM }) => largestM > 0.005);
-  // Until the page knows what it can draw.
+  // Waits until the page knows its drawing speed.
   await sleep(6000);
   const state = () => page.ask(({ frames, received, ageMs }) => ({ ...frames, received, ageMs, ms: performance.now() }));
   const lags = [];
@@ -114,7 +114,7 @@ async function presses(scene, side) {
   const [point, beside] = [4 * Math.round(side / 8), 4 * Math.round(side / 8) + 1].map((at) => at / (side - 1));
   const { page, close } = await open(scene);
   await page.page.fill("#strength", "1");
-  // The first presses take the tool, and tell the page what it can draw.
+  // The first presses take the tool, and show the page its drawing speed.
   let unmeasured = 5;
   /** @type {number[]} */
   const times = [];

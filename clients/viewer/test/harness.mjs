@@ -156,7 +156,7 @@ export class Server {
       cwd: ROOT,
       stdio: ["ignore", "pipe", "inherit"],
     });
-    // Whatever becomes of the tests, the server goes with them.
+    // The server ends with the tests, however they end.
     process.on("exit", () => child.kill("SIGKILL"));
     for await (const line of createInterface(child.stdout)) {
       const url = /http:\S+/.exec(line)?.[0];
@@ -190,7 +190,7 @@ export class Server {
  *   camera: number[],
  *   datagrams: { carries: boolean, sent: number, came: number, poses: number, samples: number, fellBack: number },
  *   ageMs: number | undefined, picture: string, holds: boolean, at: (x: number, y: number) => [number, number], pixelAfterPress: (x: number, y: number) => Promise<number>, thumbnail: () => string,
- * }} Inside What the page tells of itself (src/main.ts).
+ * }} Inside State that the page exposes for tests (src/main.ts).
  */
 
 /** The processes that a browser runs pages in. @param {import("playwright-core").Browser} browser */
@@ -221,7 +221,7 @@ export class Page {
     this.complaints = [];
     page.setDefaultTimeout(TEST_TIMEOUT_MS);
     page.on("console", (message) => {
-      // Without a graphics processor the browser itself reads each picture back, and tells the page of it.
+      // Without a graphics processor the browser itself reads each picture back, and warns the page.
       if (!message.text().endsWith("GPU stall due to ReadPixels") && !message.text().includes("no longer repeat")) {
         this.complaints.push(`${message.type()}: ${message.text()}`);
       }
@@ -235,8 +235,8 @@ export class Page {
   }
 
   /**
-   * Waits until what the page tells of itself satisfies a condition. (Asked from here: the page's own policy lets no text
-   * become a program.)
+   * Waits until the exposed state of the page satisfies a condition. (It is polled from here: the page's own policy forbids
+   * to evaluate text.)
    * @template T
    * @param {(inside: Inside, argument: T) => boolean | undefined} condition
    * @param {T} [argument]

@@ -1,4 +1,4 @@
-// A server that is not honest: it serves the page, and answers each call as a test says.
+// A hostile server: it serves the page, and answers each call as a test determines.
 
 import { createServer } from "node:http";
 import { readFileSync } from "node:fs";

@@ -1,4 +1,4 @@
-// The page at a server that is not honest: it says what it can't show, runs nothing of what it is told, and stays within bounds.
+// The page at a hostile server: it reports what it can't show, runs no code from the server, and stays within bounds.
 
 import assert from "node:assert/strict";
 import { after, before, describe, test } from "node:test";
@@ -101,7 +101,7 @@ describe("the page at a hostile server", () => {
       await page.waitForFunction("document.querySelectorAll('#scene option').length >= 1000", undefined, { polling: 100 });
       assert.ok(Number(await page.evaluate("document.querySelectorAll('option').length")) < 1100);
     });
-    // What is sent before the page has had enough.
+    // Data that is sent before the page stops.
     let sent = 0;
     const zeros = Buffer.alloc(1 << 16);
     /** @type {Way} */

@@ -23,7 +23,7 @@ export class Lossy {
         await once(datagrams, "listening");
         return new Lossy(port, calls, datagrams);
       } catch {
-        // Somebody has the UDP port of that number.
+        // Another process uses the UDP port of that number.
         calls.close();
       }
     }

@@ -1,4 +1,4 @@
-// What was recorded, on the page: `make test-viewer`.
+// Recordings on the page: `make test-viewer`.
 
 import assert from "node:assert/strict";
 import { mkdtempSync } from "node:fs";
@@ -124,19 +124,19 @@ describe("what was recorded", () => {
     await page.says("player-title", /^paper, /);
     await page.says("holder", /^Recorded/);
     assert.deepEqual(await cut(page), []);
-    // What was pressed is seen, and felt, again.
+    // The recorded press is shown, with its force, again.
     await page.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
     await page.picture("recorded");
-    // Nobody can touch it.
+    // It can't be touched.
     assert.ok(await page.page.locator("#release").isDisabled());
     const { playback } = await shown(page);
-    // Another scene is a session as ever, and nothing is left of the playback.
+    // Another scene is an ordinary session, and nothing is left of the playback.
     await page.page.selectOption("#scene", "liver");
     await page.says("connection", /Connected to liver/);
     await page.page.locator("#player").waitFor({ state: "hidden" });
     assert.match(page.page.url(), /\?session=[0-9a-f]+$/);
     await gone(server, playback);
-    // The browser's way back leads to the recording.
+    // The browser's back button leads to the recording.
     await page.page.goBack();
     assert.equal((await shown(page)).sessionId, id);
     assert.deepEqual(page.complaints, []);
@@ -149,7 +149,7 @@ describe("what was recorded", () => {
     const timeline = page.page.locator("#timeline");
     const camera = await page.ask(({ camera }) => camera);
     const { end, playback } = await shown(page);
-    // A click goes there, and time stands.
+    // A click moves there, and time is paused.
     await page.page.mouse.click(...(await onTimeline(page, 0.5)));
     const half = await shown(page);
     assert.ok(Math.abs(half.step - end / 2) < end / 100, `${half.step} is not half of ${end}`);
@@ -309,7 +309,7 @@ describe("what was recorded", () => {
     const lists = async (count) => {
       for (let tries = 0; (await live.count()) !== count; tries++) {
         assert.ok(tries < 80, `there are ${await live.count()}, not ${count}`);
-        // A list that is old is asked for again when somebody turns to it.
+        // An old list is fetched again when it is shown.
         await other.page.dispatchEvent("#scene", "pointerenter");
         await other.page.waitForTimeout(250);
       }
@@ -357,7 +357,7 @@ describe("a live session that is recorded", () => {
     // The press is seen again.
     await page.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
     await page.picture("what-was-that");
-    // Meanwhile somebody else goes on: the recording grows, and is played on.
+    // Meanwhile another user continues: the recording grows, and playback continues.
     const other = await open(`${server.url}/?session=${id}`);
     await other.press();
     await other.until(({ largestM }) => largestM > 0.02);
@@ -378,7 +378,7 @@ describe("a live session that is recorded", () => {
     await page.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
     await page.page.mouse.up();
     assert.deepEqual(page.complaints, []);
-    // The browser's way back leads to what was.
+    // The browser's back button leads to the earlier state.
     await page.page.goBack();
     assert.equal((await shown(page)).sessionId, id);
     const left = await shown(page);

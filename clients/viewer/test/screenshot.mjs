@@ -1,5 +1,5 @@
-// `make screenshot`: the picture of the README, docs/viewer.png: the page as it begins, while somebody presses. It is taken while
-// the page's light is good, or not at all.
+// `make screenshot`: the picture of the README, docs/viewer.png: the page as it begins, during a press. It is taken only while
+// the page's light is good.
 
 import { existsSync, readdirSync, writeFileSync } from "node:fs";
 import { setPriority } from "node:os";

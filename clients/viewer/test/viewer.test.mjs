@@ -42,7 +42,7 @@ describe("the page", () => {
     const page = await open();
     assert.match(page.page.url(), /\?session=[0-9a-f]+/);
     const rest = await page.picture("rest");
-    // Only who feels less than the strength asks why.
+    // Only a user who feels less than the set strength needs an explanation.
     const why = page.page.locator("#why");
     await why.waitFor({ state: "hidden" });
     const [left, top] = await page.press();
@@ -122,7 +122,7 @@ describe("the page", () => {
     await (await answered).finished();
     await page.until(({ largestM }, before) => largestM > 1.3 * before, before);
     await page.page.mouse.up();
-    // What the session says, not only the slider.
+    // The session's value, not only the slider's.
     await page.page.reload();
     await page.shows();
     await page.says("k-value", /^1\.00 N\/m/);
@@ -184,7 +184,7 @@ describe("the page", () => {
   test("says that the tissue recovered, how often and why", async () => {
     const folder = mkdtempSync(join(tmpdir(), "palpate-"));
     const config = join(mkdtempSync(join(tmpdir(), "palpate-")), "config.toml");
-    // Nobody has to wait for the error of a scene whose every push fails.
+    // The error of a scene whose every push fails appears at once.
     writeFileSync(config, "[limits]\nrehearsal_work = 1\n");
     const paper = readFileSync(join(ROOT, "scenes/paper.toml"), "utf8");
     const stiff = paper.replace("stiffness_n_per_m = 10.0", "stiffness_n_per_m = 1e9");
@@ -231,7 +231,7 @@ describe("the page", () => {
     await page.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
     assert.deepEqual(page.complaints, []);
     await close(page);
-    // Whoever may only watch is told so, and how to go on.
+    // A user who may only watch is told so, and how to continue.
     const watcher = new Page(await (await browser.newContext(VIEWPORT)).newPage());
     await watcher.page.goto(`${asking.url}/#token=${watching}`);
     await watcher.says("token-form", /does not let you open a tissue/);
@@ -306,7 +306,7 @@ describe("the page", () => {
     await page.page.check("#lumps");
     await page.page.waitForTimeout(300);
     assert.ok((await bluest(page, await picture())) > without + 0.2);
-    // Depth is what a tip is led by.
+    // A tip is controlled by depth.
     assert.equal(await page.text("strength-name"), "Strength");
     await page.page.check("input[value=tip]", { force: true });
     assert.equal(await page.text("strength-name"), "Depth");
@@ -495,7 +495,7 @@ describe("touch", () => {
     assert.ok(fellBack >= 1);
     assert.equal(await page.page.locator("#notice").isVisible(), false);
     await rests(page);
-    // After some seconds the browser gives the session up. It tells its console if another can't be opened yet.
+    // After some seconds the browser gives up the session. It logs to its console if another can't be opened yet.
     assert.deepEqual(page.complaints.filter((text) => !text.includes("Failed to establish a connection")), []);
     await close(page);
     assert.equal(await behind.stop(), 0);
@@ -565,13 +565,13 @@ describe("several pages on one session", () => {
     await holder.until(({ largestM, forceN }) => largestM > 0.02 && forceN[0] > 0.3);
     for (const page of [holder, other]) assert.deepEqual(page.complaints, []);
     await close(other);
-    // Nobody's hand is on the tissue any more, and nothing goes on pressing.
+    // No user touches the tissue, and nothing continues to press.
     await holder.until(({ largestM, forceN }) => largestM < 0.004 && forceN.length === 0);
     await close(holder);
   });
 
   test("are not delayed by one that stalls, closes or reloads, and nothing of it is left", async () => {
-    // Two streams a page: were they not given back, the second reload would find none left.
+    // Each page uses two streams: if they were not released, the second reload would find none.
     const config = join(mkdtempSync(join(tmpdir(), "palpate-")), "config.toml");
     writeFileSync(config, "[limits]\nstreams_per_session = 5\n");
     const strict = await Server.start(["--config", config]);
@@ -645,11 +645,11 @@ describe("several pages on one session", () => {
     await page.page.mouse.up();
     await page.page.waitForTimeout(2000);
     assert.ok(calls <= 12, `${calls} calls in 2 s to a server that is away`);
-    // No words of the browser's, and one state at a time.
+    // No messages of the browser itself, and one state at a time.
     assert.doesNotMatch(await page.page.evaluate("document.body.innerText"), /Connected|fetch/i);
     await page.picture("lost");
     const second = await Server.start([], new URL(first.url).host);
-    // Its session went with the first server, and the page says so and offers another.
+    // Its session ended with the first server; the page says so and offers another.
     await page.page.click("#try-now").catch(() => {});
     await page.says("notice", /has ended/);
     await page.says("light", /^Ended$/);
@@ -791,7 +791,7 @@ describe("a body of any shape", () => {
     await page.picture("own");
     await page.page.mouse.up();
 
-    // A lump of one's own: shown to whoever put it in, and stiff.
+    // A lump of your own: shown to its creator, and stiff.
     assert.ok(await page.page.locator("#lumps-shown").isHidden());
     await page.page.click("#put-lump");
     const place = await page.at(0.5, 0.5);

@@ -1,17 +1,18 @@
-//! Whether datagrams get through. Each end counts its own, and says which of the other's was the newest that came. So each
-//! knows whether it is heard, and what it says goes by datagram while it is; else by the reliable stream beside it.
+//! Checks whether datagrams get through. Each end numbers its datagrams and acknowledges the newest one that it
+//! received. While an end's datagrams are acknowledged, it sends its messages as datagrams; otherwise it uses the
+//! reliable stream beside them.
 //!
-//! A network that blocks datagrams, or lets them pass one way only, is thus no error: datagrams are still tried
-//! ([`DatagramHealth::is_silent`]), and carry again once they are confirmed.
+//! A network that blocks datagrams, or passes them in one direction only, is therefore not an error. The ends keep
+//! trying ([`DatagramHealth::is_silent`]), and use datagrams again as soon as they are acknowledged.
 
-/// Datagrams carry while the other end has confirmed something new within this time, s: twice what each end waits before it
-/// holds what it does, so that a burst of losses does not change the way.
+/// Longest time since the last new acknowledgement for which datagrams are used, s. It is twice the time after which
+/// an end holds its last value, so a burst of losses does not cause a switch to the stream.
 pub const CONFIRMED_S: f64 = 0.1;
 
-/// Each end sends a datagram at least this often, s.
+/// Longest time between two datagrams of one end, s.
 pub const LIFE_S: f64 = 0.04;
 
-/// One end's account of the datagrams between two ends.
+/// One end's record of the datagrams in both directions. It decides whether this end uses datagrams or the stream.
 #[derive(Debug, Clone, Default)]
 pub struct DatagramHealth {
     sent: u64,
@@ -24,38 +25,40 @@ pub struct DatagramHealth {
     fell_back: u64,
 }
 
-/// What an end has counted.
+/// Counts of one end's datagrams.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Carried {
-    /// Datagrams that were sent.
+    /// Number of datagrams sent.
     pub sent: u64,
-    /// Datagrams that came.
+    /// Number of datagrams received.
     pub came: u64,
-    /// How often the stream took over because datagrams did not get through any more.
+    /// Number of switches from datagrams to the stream because datagrams were no longer acknowledged.
     pub fell_back: u64,
 }
 
 impl DatagramHealth {
-    /// Returns the number of a datagram that is sent at `now_s`, and the newest of the other end's, which it
-    /// acknowledges.
+    /// Counts a datagram that is sent at `now_s`. Returns its number, from 1, and the number of the other end's
+    /// newest datagram, which it acknowledges (0 before the first).
     pub fn send(&mut self, now_s: f64) -> (u64, u64) {
         self.sent += 1;
         self.sent_s = Some(now_s);
         (self.sent, self.newest)
     }
 
-    /// Takes the arrival at `now_s` of datagram `number`, which acknowledges one of this end's.
+    /// Records that datagram `number` arrived at `now_s`, which acknowledges this end's datagram `acknowledges`. A
+    /// number that this end never sent confirms nothing.
     pub fn arrive(&mut self, number: u64, acknowledges: u64, now_s: f64) {
         self.came += 1;
         self.newest = self.newest.max(number);
-        // Nobody can have seen what was not sent.
+        // A datagram that was not sent cannot have been received.
         if (self.confirmed + 1..=self.sent).contains(&acknowledges) {
             self.confirmed = acknowledges;
             self.confirmed_s = Some(now_s);
         }
     }
 
-    /// Returns whether what is to be said at `now_s` goes by datagram.
+    /// Returns whether a message at `now_s` goes as a datagram: whether an acknowledgement arrived within
+    /// [`CONFIRMED_S`]. Counts a switch to the stream.
     pub fn update(&mut self, now_s: f64) -> bool {
         let carries = self.confirmed_s.is_some_and(|confirmed_s| now_s - confirmed_s <= CONFIRMED_S);
         if self.carries && !carries {
@@ -76,16 +79,16 @@ impl DatagramHealth {
     }
 }
 
-/// Which of the newest 64 numbers have come: a pose is sent several times, and counts once.
+/// Set of the newest 64 numbers that were received. A pose is sent several times but must count once.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ReceiveWindow {
     newest: u64,
-    /// Bit k: `newest − k` has come.
+    /// Bit k: `newest − k` was received.
     bits: u64,
 }
 
 impl ReceiveWindow {
-    /// Returns whether `number` has not come before. What is older than the newest 64 counts as known.
+    /// Records `number`. Returns true if it is new, false if it was received before or is older than the newest 64.
     pub fn take(&mut self, number: u64) -> bool {
         if self.bits == 0 || number > self.newest {
             let ahead = if self.bits == 0 { 64 } else { number - self.newest };
@@ -104,8 +107,9 @@ impl ReceiveWindow {
 mod tests {
     use super::*;
 
-    /// Two ends that send each other a datagram every `every_ms`, which take 25 ms; `passes` tells whether one gets through, by
-    /// its way and the time, ms. Returns when each end's datagrams carry, one entry a millisecond.
+    /// Simulates two ends that send each other a datagram every `every_ms`, with a delay of 25 ms. `passes` decides
+    /// whether one gets through, by its sender and the time, ms. Returns whether each end uses datagrams, one entry
+    /// per millisecond.
     fn play(every_ms: u32, passes: impl Fn(usize, u32) -> bool) -> [Vec<bool>; 2] {
         let (mut ends, mut carries) =
             ([DatagramHealth::default(), DatagramHealth::default()], [Vec::new(), Vec::new()]);
@@ -140,17 +144,17 @@ mod tests {
 
     #[test]
     fn scattered_losses_change_nothing_and_a_way_that_is_cut_does_for_both_until_it_is_mended() {
-        // Every second and third.
+        // Every second one and every third one passes.
         for carries in play(10, |from, now_ms| now_ms / 10 % (2 + from as u32) == 0) {
             assert!(carries[150..].iter().all(|carries| *carries));
         }
-        // One way is cut for a second: both ends notice, each because it is not confirmed.
+        // One direction is blocked for a second. Both ends notice, each because its datagrams are not acknowledged.
         for carries in play(10, |from, now_ms| from == 1 || !(1000..2000).contains(&now_ms)) {
             assert!(carries[100..1000].iter().all(|carries| *carries));
             assert!(carries[1160..2000].iter().all(|carries| !carries));
             assert!(carries[2150..].iter().all(|carries| *carries));
         }
-        // What is blocked never carries.
+        // Blocked datagrams are never used.
         for carries in play(10, |_, _| false) {
             assert!(carries.iter().all(|carries| !carries));
         }

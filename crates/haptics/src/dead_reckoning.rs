@@ -1,13 +1,15 @@
-//! Dead reckoning: a client tells its tool's place only when the server would be wrong about it.
+//! Dead reckoning: a client sends its tool's place only when the server's estimate of it would be wrong.
 //!
-//! The server plays the movement of the newest command on ([`crate::pose_playback`]), and so can the client, which knows it. The next
-//! command goes out when the tool is farther from there than a way that the hand would feel: a part of the force, over the
-//! stiffness of the law at this depth ([`crate::Renderer::way_m`]); and in any case so often that the server does not take
-//! the client for gone.
+//! The server continues the movement of the newest command ([`crate::pose_playback`]). The client knows that command,
+//! so it computes the same estimate. It sends the next command when the tool is farther from the estimate than a
+//! distance that the hand would feel, which is a part of the force over the stiffness of the law at this depth
+//! ([`crate::Renderer::way_m`]). It also sends one after the longest interval, so that the server does not regard the
+//! client as gone.
 //!
-//! **Heartbeats.** Each end holds what it does when it hears nothing for 50 ms ([`crate::pose_playback::HOLD_S`],
-//! [`crate::envelope::FRESH_S`]). Over a steady network a message every 40 ms is enough; where messages are lost or late it is
-//! not. So each end measures what arrives ([`SendInterval`]) and tells the other how often it wants to hear from it.
+//! **Heartbeats.** Each end holds its last value when it receives nothing for 50 ms
+//! ([`crate::pose_playback::HOLD_S`], [`crate::envelope::FRESH_S`]). Over a steady network a message every 40 ms is
+//! enough, but not where messages are lost or late. So each end measures the arrivals ([`SendInterval`]) and sends
+//! the other the interval that it needs.
 
 use std::collections::VecDeque;
 
@@ -16,25 +18,26 @@ use glam::DVec3;
 use crate::deadband::HEARTBEAT_S;
 use crate::pose_playback::EXTRAPOLATE_S;
 
-/// Shortest time between two heartbeats, s: five of them in the 50 ms after which the other end holds.
+/// Shortest interval between two heartbeats, s: five fit in the 50 ms after which the other end holds its last value.
 pub const FASTEST_S: f64 = 0.01;
 
-/// A loss or a delay is remembered for this long, s.
+/// Time for which a loss or a delay is remembered, s.
 const MEMORY_S: f64 = 5.0;
 
-/// How often one end wants to hear from the other.
+/// Longest interval at which one end needs messages from the other, measured from losses and delays.
 #[derive(Debug, Clone, Default)]
 pub struct SendInterval {
     newest: u64,
     lost_s: Option<f64>,
-    /// Transit times, with whatever the clocks are apart, by arrival, s.
+    /// Times of arrival and transit times, s. Transit times include the difference of the two clocks.
     transits: VecDeque<(f64, f64)>,
 }
 
 impl SendInterval {
-    /// Takes the arrival at `now_s` of message `number` (they are counted from 1), sent at `sent_s` by the other's clock.
+    /// Records that message `number` (counted from 1) arrived at `now_s`. It was sent at `sent_s` by the other end's
+    /// clock, s. A gap in the numbers counts as a loss. At most 512 transit times of the last 5 s are kept.
     pub fn arrive(&mut self, number: u64, sent_s: f64, now_s: f64) {
-        // What comes later after all was not lost, but its place has been missed all the same.
+        // A message that arrives out of order was not lost, but it was missing when it was needed.
         if number > self.newest + 1 && self.newest > 0 {
             self.lost_s = Some(now_s);
         }
@@ -45,9 +48,9 @@ impl SendInterval {
         }
     }
 
-    /// Returns the longest time between two messages that it wants, s: [`HEARTBEAT_S`] less what the transit times of the last
-    /// 5 s differ by (the longest less the shortest: what the clocks are apart cancels), but at least [`FASTEST_S`];
-    /// and that for 5 s after a loss.
+    /// Returns the longest acceptable interval between two messages, s: [`HEARTBEAT_S`] minus the spread of the
+    /// transit times of the last 5 s (the longest minus the shortest, so the difference of the clocks cancels), but
+    /// at least [`FASTEST_S`]. For 5 s after a loss it is [`FASTEST_S`].
     pub fn heartbeat_s(&self, now_s: f64) -> f64 {
         if self.lost_s.is_some_and(|lost_s| now_s - lost_s < MEMORY_S) {
             return FASTEST_S;
@@ -60,18 +63,19 @@ impl SendInterval {
     }
 }
 
-/// Transit times that are remembered.
+/// Number of transit times that are kept; beyond it the oldest is dropped.
 const MAX_TRANSITS: usize = 512;
 
-/// The velocity of a tool is that over this time: a device counts in steps, and its noise is not a movement.
+/// Time over which a tool's velocity is measured, s: a device measures in discrete steps, whose noise is not a
+/// movement.
 const LOOK_BACK_S: f64 = 0.004;
 
-/// Places that are looked back on, at most: of a tool that is asked for more often than usual, the oldest are left out.
+/// Number of recent places that are kept for the velocity; beyond it the oldest is dropped.
 const MAX_RECENT: usize = 64;
 
-/// Decides which places of a tool are news.
+/// Decides which places of a tool must be sent to the server.
 ///
-/// The server may be wrong about the tool by 0.1 mm. A tool that drifts by 0.05 mm is no news; one that is 0.2 mm off is:
+/// The server's estimate may be wrong by 0.1 mm. A drift of 0.05 mm need not be sent; one of 0.2 mm must be:
 ///
 /// ```
 /// use glam::DVec3;
@@ -82,7 +86,7 @@ const MAX_RECENT: usize = 64;
 /// assert!(news.tell(0.000, DVec3::ZERO, most_m, heartbeat_s).is_some());
 /// assert!(news.tell(0.001, 5e-5 * DVec3::X, most_m, heartbeat_s).is_none());
 /// let told = news.tell(0.002, 2e-4 * DVec3::X, most_m, heartbeat_s).expect("it is 0.2 mm from where it was told");
-/// // It moves at 0.1 m/s, so 10 ms later the server thinks that it is 1.2 mm from its first place.
+/// // It moves at 0.1 m/s, so 10 ms later the server's estimate is 1.2 mm from its first place.
 /// assert!((told.velocity_m_per_s - 0.1 * DVec3::X).length() < 1e-12);
 /// assert!((told.at(0.012) - 1.2e-3 * DVec3::X).length() < 1e-12);
 /// ```
@@ -93,35 +97,38 @@ pub struct News {
 }
 
 impl Default for News {
-    /// Nothing is known yet. It has room for all that it will keep: a tick must not ask for memory.
+    /// Creates a state before the first place. It reserves all the memory that it will use, because a tick must not
+    /// allocate.
     fn default() -> Self {
         News { sent: None, recent: VecDeque::with_capacity(MAX_RECENT) }
     }
 }
 
-/// A place of a tool, and how it moves.
+/// Place and velocity of a tool at a time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionState {
-    /// The client's time, s.
+    /// Time by the client's clock, s.
     pub time_s: f64,
-    /// m.
+    /// Place of the tool, m.
     pub place_m: DVec3,
-    /// m/s.
+    /// Velocity of the tool, m/s.
     pub velocity_m_per_s: DVec3,
 }
 
 impl MotionState {
-    /// Returns where the server thinks the tool is at a time: x + v·(t − t0), with t − t0 from 0 to [`EXTRAPOLATE_S`], m.
+    /// Returns the server's estimate of the tool's place at a time: x + v·(t − t0), with t − t0 from 0 to
+    /// [`EXTRAPOLATE_S`], m.
     pub fn at(&self, time_s: f64) -> DVec3 {
         self.place_m + self.velocity_m_per_s * (time_s - self.time_s).clamp(0.0, EXTRAPOLATE_S)
     }
 }
 
 impl News {
-    /// Returns what to tell of a tool that is at `place_m` at `now_s`; `None` while the server is wrong by no more than
-    /// `most_m` and has heard something within `heartbeat_s`.
+    /// Records that the tool is at `place_m` at `now_s`. Returns the state to send; `None` while the server's
+    /// estimate is wrong by at most `most_m` and something was sent within `heartbeat_s`.
     ///
-    /// The velocity told is (x(t) − x(t − τ))/τ with τ = 4 ms, m/s.
+    /// The velocity is (x(t) − x(t − τ))/τ with τ = 4 ms, m/s. The caller must send the returned state: later calls
+    /// rely on it.
     pub fn tell(&mut self, now_s: f64, place_m: DVec3, most_m: f64, heartbeat_s: f64) -> Option<MotionState> {
         if self.recent.len() == MAX_RECENT {
             self.recent.pop_front();
@@ -190,7 +197,7 @@ mod tests {
         // One that is 10 ms late; then one that is missing.
         assert!((arrive(21, 0.01) - 0.03).abs() < 1e-9);
         assert_eq!(arrive(23, 0.0), FASTEST_S);
-        // That is over after some time.
+        // Its effect ends after some time.
         let calm: Vec<f64> = (24..300).map(|number| arrive(number, 0.0)).collect();
         assert_eq!(calm[0], FASTEST_S);
         assert!((calm[275] - HEARTBEAT_S).abs() < 1e-9);

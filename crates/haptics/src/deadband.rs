@@ -1,21 +1,21 @@
 //! The deadband: a sample is sent only if the client could feel the difference, or after a long time without a sample.
 //!
-//! The server knows what the client renders: the client repeats the tissue from the last sample along the tool's path,
-//! and the server has just played that path. So the server evaluates the same law, and sends a sample when the true
-//! force differs from it by more than the fraction δ. By Weber's law, a δ of about 10 % is not felt.
+//! The server knows what the client renders: the client continues from the last sample along the tool's path, and the
+//! server has just played that path. So the server evaluates the same law, and sends a sample when the true force
+//! differs from the result by more than the fraction δ. By Weber's law, a δ of about 10 % is not felt.
 
 use glam::DVec3;
 
 use crate::force_law::Law;
 use crate::local_model::{LocalModel, Touching};
 
-/// Smaller differences are not worth a message, N.
+/// Smallest difference of the force for which a sample is sent, N.
 pub const MIN_N: f64 = 0.01;
 
-/// Longest time without a sample for a rendering client, s: well below `envelope::FRESH_S`.
+/// Longest interval between two samples for a client that renders, s: below [`crate::envelope::FRESH_S`].
 pub const HEARTBEAT_S: f64 = 0.04;
 
-/// One tool's deadband.
+/// Deadband of one tool: the last sample that was sent, and what the client renders from it.
 #[derive(Debug, Clone)]
 pub struct ForceDeadband {
     fraction: f64,
@@ -23,15 +23,15 @@ pub struct ForceDeadband {
 }
 
 impl ForceDeadband {
-    /// Creates a deadband that is exceeded when the force differs by more than `fraction` of itself; 0 means at every
-    /// step.
+    /// Creates a deadband that is exceeded when the force differs by more than `fraction` of itself; with 0 it is
+    /// exceeded at every step.
     pub fn new(fraction: f64) -> Self {
         ForceDeadband { fraction, sent: None }
     }
 
-    /// Returns whether the client's force is off by too much at the tool's present place, of which `model` is:
-    /// |f − f_r| > max(δ·|f|, [`MIN_N`]), with f the tissue's force and f_r what the client renders there. Call it
-    /// at each step: it follows the client along its path.
+    /// Returns whether the client's force is wrong by too much at the tool's present place, which `model` describes:
+    /// |f − f_r| > max(δ·|f|, [`MIN_N`]), with f the tissue's force and f_r the force that the client renders there.
+    /// True before the first sample. Call it at each step: it also moves the client's simulated touch along the path.
     pub fn is_exceeded(&mut self, model: &LocalModel, law: &Law) -> bool {
         let Some((sent, touching)) = &mut self.sent else { return true };
         touching.move_to(sent, law, model.place_m);
@@ -40,7 +40,7 @@ impl ForceDeadband {
         self.fraction <= 0.0 || (model.force_n - rendered_n).length() > most_n
     }
 
-    /// Records that `model` was sent: the client renders it from now on.
+    /// Records that `model` was sent, from which the client renders from now on.
     pub fn send(&mut self, model: &LocalModel, law: &Law) {
         self.sent = Some((*model, Touching::at_sample(model, law)));
     }
@@ -89,7 +89,7 @@ mod tests {
     #[test]
     fn a_difference_is_sent_if_it_is_more_than_the_fraction_of_the_force() {
         let mut deadband = sent(0.5);
-        // The client renders 1 N here, whatever is true.
+        // The client renders 1 N here, whatever the true force.
         for (true_n, is_sent) in [(1.0, false), (2.0, false), (2.01, true), (0.7, false), (0.66, true)] {
             assert_eq!(deadband.is_exceeded(&model(1.0 / 512.0, true_n), &law()), is_sent, "{true_n} N");
         }

@@ -1,10 +1,10 @@
-//! Haptic devices: the limits that a client declares for its device, so that it gets no larger forces.
+//! Haptic devices: the limits that a client declares for its device, so that no larger force is requested from it.
 
 use crate::force_law::{Law, Row};
 
-/// A device's descriptor.
+/// Limits of a haptic device.
 ///
-/// A Touch gets 3.3 N at most. Its own loop renders 400 N/m stably, which a tissue of 1000 N/m exceeds:
+/// The force on a Touch is at most 3.3 N. Its own loop renders 400 N/m stably, which a tissue of 1000 N/m exceeds:
 ///
 /// ```
 /// use palpate_haptics::{Device, Law};
@@ -17,7 +17,7 @@ use crate::force_law::{Law, Row};
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Device {
-    /// The name, for selection.
+    /// Name by which [`Device::named`] finds it.
     pub name: &'static str,
     /// Largest force, N.
     pub force_n: f64,
@@ -31,13 +31,13 @@ pub struct Device {
     pub workspace_m: f64,
 }
 
-/// Limit of the force on a person, whatever the device can do, N.
+/// Largest force on a person with any device, N.
 pub const SAFE_FORCE_N: f64 = 3.3;
 
-/// Limit for a device without a declaration, N.
+/// Largest force of a device whose client declares no limits, N.
 pub const UNDECLARED_FORCE_N: f64 = 2.0;
 
-/// How long a device may exceed its continuous force, s.
+/// Longest time for which a device may exceed its continuous force, s.
 pub const CONTINUOUS_S: f64 = 2.0;
 
 const fn device(
@@ -51,7 +51,8 @@ const fn device(
     Device { name, force_n, continuous_n, stiffness_n_per_m, damping_n_s_per_m, workspace_m }
 }
 
-/// Devices by their makers' data. Where no continuous force is given, it is the largest. Inverse3: unverified.
+/// Known devices with the data of their makers. Where a maker gives no continuous force, it is the largest force. The
+/// data of the Inverse3 is unverified.
 pub const DEVICES: [Device; 9] = [
     device("touch", 3.3, 3.3, 400.0, 4.0, 0.075),
     device("omni", 3.3, 0.88, 700.0, 5.0, 0.10),
@@ -64,23 +65,23 @@ pub const DEVICES: [Device; 9] = [
     device("inverse3", 10.0, 10.0, 1000.0, 6.0, 0.15),
 ];
 
-/// A device without a declaration.
+/// Limits of a device whose client declares none.
 pub const UNDECLARED: Device = device("undeclared", UNDECLARED_FORCE_N, UNDECLARED_FORCE_N, 400.0, 4.0, 0.075);
 
 impl Device {
-    /// Returns the device of that name.
+    /// Returns the device of [`DEVICES`] with this name, in lower case; `None` if there is none.
     pub fn named(name: &str) -> Option<Self> {
         DEVICES.iter().find(|device| device.name == name).copied()
     }
 
-    /// Returns the largest force requested from it, N.
+    /// Returns the largest force requested from it, N: its own limit, but at most [`SAFE_FORCE_N`].
     pub fn most_n(&self) -> f64 {
         self.force_n.min(SAFE_FORCE_N)
     }
 
-    /// Describes in what the tissue exceeds the limits of stable rendering, up to the largest force requested. The
-    /// tissue is rendered all the same: a softer one would be another tissue. An unstable loop gives energy, and the
-    /// envelope removes that.
+    /// Returns a text for each limit of stable rendering that the tissue exceeds: stiffness, then damping, along the
+    /// normal, up to the largest force requested. Empty if there are none. The tissue is rendered unchanged; if the
+    /// loop becomes unstable, the envelope removes the energy that it produces.
     pub fn warnings(&self, law: &Law) -> Vec<String> {
         let reached = law.rows.iter().position(|row| row.force_n >= self.most_n()).unwrap_or(law.rows.len() - 1);
         let most = |of: fn(&Row) -> f64| law.rows[..=reached].iter().map(of).fold(0.0, f64::max);

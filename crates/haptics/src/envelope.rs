@@ -1,90 +1,92 @@
 //! The safety envelope: the limits between a wanted force and a device. Every force passes them, in this order:
 //!
-//! 1. the age of the model, counted from when the newest *arrived* (a constant delay is not staleness): up to [`FRESH_S`]
-//!    no change; up to [`STALE_S`] the force fades to a half; beyond, it decays with [`DECAY_S`]; beyond [`PAUSE_S`] the
-//!    state is PAUSED, as it is after a gap of more than [`PAUSE_S`] between two ticks. A model that arrives before brings
-//!    the force back within `RETURN_S`;
-//! 2. soft engage: after `enable` nothing is rendered until a model is known and the force by it is below
-//!    [`ENGAGE_BELOW_N`]; then the force ramps in over [`ENGAGE_S`];
-//! 3. the norm of the force (clamping its components would turn it), and the device's continuous force;
-//! 4. passivity: no more energy leaves the port than has entered it;
-//! 5. slew: at most [`SLEW_N_PER_S`], up and down, in every state.
+//! 1. The age of the newest model since its *arrival* (a constant delay is not age). The force is unchanged up to
+//!    [`FRESH_S`],
+//!    fades to a half up to [`STALE_S`], and then decays with the time constant [`DECAY_S`]. Beyond [`PAUSE_S`] the state is
+//!    PAUSED, as it is after a gap of more than [`PAUSE_S`] between two ticks. A model that arrives earlier brings the force
+//!    back within `RETURN_S`.
+//! 2. Soft engage. After `enable`, nothing is rendered until a model is known and its force is below
+//!    [`ENGAGE_BELOW_N`]. Then
+//!    the force ramps in over [`ENGAGE_S`].
+//! 3. The norm of the force (clamping its components would turn it), and the device's continuous force.
+//! 4. Passivity: no more energy leaves the port than has entered it.
+//! 5. Slew: the force changes by at most [`SLEW_N_PER_S`], up and down, in every state.
 //!
-//! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick, as in the passivity observer of Hannaford
-//! and Ryu (Time-domain passivity control of haptic interfaces, IEEE Transactions on Robotics and Automation 18(1), 2002,
-//! doi:10.1109/70.988969). A force f that moves with the
-//! hand at v, and that slew lets fall no faster than S, still gives f²·v/2S before it is zero. So it is limited to
-//! f ≤ √(2·S·E/v): a spring of K, pressed in and released at v, is not limited as long as its force falls no faster than
-//! the slew allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least `MIN_SPEED_M_PER_S`. A device
-//! that nobody holds gets faster while the force falls: with an acceleration a, which falls with the force, it gets
-//! f²/2S · a·f/4S more, so a·f/4S is added to v. A hand hardly gets faster within a few hundredths of a second, so for a hand
-//! nothing changes.
-//! To allow a first force before any energy has entered, the tank begins with `CREDIT_J`, and `FIRST_N` against a
-//! hand that presses on is always allowed.
+//! **Passivity.** The port's energy is exact for a held force: E −= f·Δx at each tick, as in the passivity observer
+//! of Hannaford and Ryu (Time-domain passivity control of haptic interfaces, IEEE Transactions on Robotics and
+//! Automation 18(1), 2002, doi:10.1109/70.988969). A force f along the hand's velocity v falls no faster than the
+//! slew S, so it still gives the energy f²·v/2S before it is zero. It is therefore limited to f ≤ √(2·S·E/v). This
+//! does not limit a spring K that is pressed in and released at v while its force falls no faster than the slew
+//! allows, K·v ≤ S. A hand at rest may start at any moment, so v counts as at least `MIN_SPEED_M_PER_S`. A device
+//! that nobody holds accelerates while the force falls: with an acceleration a, which falls with the force, it
+//! receives f²/2S · a·f/4S more, so a·f/4S is added to v. A hand hardly accelerates within a few hundredths of a
+//! second, so this term hardly affects it. To allow a first force before any energy has entered, the energy tank
+//! begins with `CREDIT_J`, and a force of `FIRST_N` against a hand that presses on is always allowed.
 
 use glam::DVec3;
 
 use crate::device::{CONTINUOUS_S, Device};
 
-/// A model up to this age counts as fresh, s.
+/// Age of the newest model up to which the force is unchanged, s.
 pub const FRESH_S: f64 = 0.05;
-/// From this age on the force decays to zero, s.
+/// Age of the newest model at which half the force is left, s. Beyond it, the force decays with [`DECAY_S`].
 pub const STALE_S: f64 = 0.15;
-/// Beyond this age, or this gap between two ticks, rendering pauses until it is enabled, s. At this age a twentieth of half
-/// the force is left.
+/// Age of the newest model, or gap between two ticks, beyond which rendering pauses until it is enabled, s. At this
+/// age a twentieth of half the force is left.
 pub const PAUSE_S: f64 = 0.3;
-/// A faded force returns within this time, s: from 50 ms after an outage of 100 ms on the error is some tenths of a per cent.
+/// Time within which a faded force returns, s: 50 ms after an outage of 100 ms, the error is some tenths of a per
+/// cent.
 const RETURN_S: f64 = 0.04;
-/// Time constant of the decay beyond [`STALE_S`], s.
+/// Time constant of the decay of the force beyond [`STALE_S`], s.
 pub const DECAY_S: f64 = 0.05;
-/// The fraction of the force that is left at [`STALE_S`].
+/// Fraction of the force that is left at [`STALE_S`].
 const STALE_SHARE: f64 = 0.5;
-/// Rendering begins only when the wanted force is smaller, N.
+/// Wanted force below which rendering begins after `enable`, N.
 pub const ENGAGE_BELOW_N: f64 = 0.2;
-/// Duration of the ramp that follows, s.
+/// Duration of the ramp from zero to the wanted force when rendering begins, s.
 pub const ENGAGE_S: f64 = 0.5;
 /// Largest rate of change of the force, N/s.
 pub const SLEW_N_PER_S: f64 = 100.0;
-/// Least speed that passivity assumes for the hand, m/s.
+/// Smallest speed that passivity assumes for the hand, m/s.
 const MIN_SPEED_M_PER_S: f64 = 0.08;
-/// Margin for a hand that speeds up while a force falls, and for a turning force, which falls slower along its old
-/// direction.
+/// Factor of the speed for a hand that speeds up while a force falls, and for a turning force, which falls more
+/// slowly along its old direction.
 const SPEED_MARGIN: f64 = 1.5;
-/// The acceleration is measured over this time, s.
+/// Time constant of the measurement of the acceleration, s.
 const ACCELERATION_S: f64 = 0.003;
-/// Largest energy in the tank, J: friction from long ago must not pay for energy given later.
+/// Largest energy in the tank, J: old friction must not pay for energy that is given later.
 const TANK_J: f64 = 0.05;
 
-/// Initial energy in the tank, J: less than any hand notices.
+/// Initial energy in the tank, J: less than a hand notices.
 const CREDIT_J: f64 = 2.5e-4;
 /// Force that is always allowed against a hand that presses on, N.
 const FIRST_N: f64 = 0.2;
 
-/// Whether forces are rendered.
+/// State of rendering: whether forces are rendered, and what starts them again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RenderingState {
     /// Nothing is rendered until `enable`.
     Disabled,
-    /// Rendering, or ramping in.
+    /// Forces are rendered, or ramp in.
     Enabled,
-    /// No model arrived for too long, or no tick came. Nothing is rendered until `enable`.
+    /// No model arrived or no tick came for longer than [`PAUSE_S`]. Nothing is rendered until `enable`.
     Paused,
-    /// An error. Nothing is rendered until `reset` and then `enable`.
+    /// An error occurred. Nothing is rendered until `reset` and then `enable`.
     Fault,
 }
 
-/// The reason why a force differs from the wanted one.
+/// Reason why the rendered force differs from the wanted one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LimitCause {
     /// The newest model is old, or the last tick was long ago.
     Stale,
-    /// Rendering is not enabled, or ramping in.
+    /// Rendering is not enabled, or the force ramps in.
     Engage,
-    /// Limit of the largest force.
+    /// The force exceeded the device's largest force.
     Force,
-    /// Limit of the continuous force.
+    /// The force exceeded the device's continuous force for too long.
     Continuous,
-    /// The force would have given energy.
+    /// The force would have given more energy than had entered.
     Passivity,
     /// The force would have changed too fast.
     Slew,
@@ -95,7 +97,7 @@ pub enum LimitCause {
 }
 
 impl LimitCause {
-    /// All reasons, in the order of their counters.
+    /// All reasons with their names, in the order of the variants.
     pub const ALL: [(LimitCause, &'static str); 8] = [
         (LimitCause::Stale, "stale"),
         (LimitCause::Engage, "engage"),
@@ -108,24 +110,25 @@ impl LimitCause {
     ];
 }
 
-/// The input of one tick.
+/// Input of one tick of the envelope: the wanted force, and the state of the device.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Wanted {
-    /// Present time, s.
+    /// Present time, s, from any origin.
     pub now_s: f64,
     /// Place of the device in its own frame, m.
     pub place_m: DVec3,
     /// Velocity of the device, m/s.
     pub velocity_m_per_s: DVec3,
-    /// Wanted force, N.
+    /// Wanted force on the device, N.
     pub force_n: DVec3,
-    /// Time since the newest model arrived, s. `None`: no model of the tissue is known.
+    /// Time since the newest model arrived, s; `None` while no model of the tissue is known.
     pub age_s: Option<f64>,
 }
 
-/// One device's envelope.
+/// Safety envelope of one device: it limits each wanted force as at the top of this module, and counts the limits.
 ///
-/// A hand presses 4 mm deep into a tissue of 1000 N/m, which asks for 4 N. A device without a declaration gets no more than 2 N:
+/// A hand presses 4 mm deep into a tissue of 1000 N/m, so the wanted force is 4 N. The force on an undeclared device
+/// is at most 2 N:
 ///
 /// ```
 /// use glam::DVec3;
@@ -165,7 +168,8 @@ pub struct Envelope {
     /// The force rendered now, N.
     force_n: DVec3,
     before: Option<(f64, DVec3)>,
-    /// The velocity, m/s, behind by [`ACCELERATION_S`], and how much it changes.
+    /// The velocity filtered with the time constant [`ACCELERATION_S`], m/s, and the acceleration that follows from
+    /// it.
     slow_m_per_s: DVec3,
     acceleration_m_per_s2: DVec3,
     /// Energy in the tank, J.
@@ -180,7 +184,8 @@ pub struct Envelope {
 }
 
 impl Envelope {
-    /// Creates an envelope in state DISABLED. The device's workspace is around `middle_m`.
+    /// Creates an envelope in state DISABLED. The device's workspace is a sphere around `middle_m` (m, in the
+    /// device's frame); a place outside is a FAULT.
     pub fn new(device: Device, middle_m: DVec3) -> Self {
         Envelope {
             device,
@@ -200,47 +205,48 @@ impl Envelope {
         }
     }
 
-    /// Returns whether forces are rendered.
+    /// Returns the state of rendering.
     pub fn state(&self) -> RenderingState {
         self.state
     }
 
-    /// Returns the energy that the hand has given to the port minus the energy it got back, J: −Σ f·Δx over all ticks, with f
-    /// the force that was held during Δx.
+    /// Returns the energy that the hand has given to the port minus the energy that it got back, J: −Σ f·Δx over all
+    /// ticks, with f the force that was held during Δx.
     pub fn energy_j(&self) -> f64 {
         self.energy_j
     }
 
-    /// Returns the number of ticks in which `reason` changed the force, and of all ticks.
+    /// Returns the number of times that `reason` changed the force, and the number of all ticks.
     pub fn count(&self, reason: LimitCause) -> (u64, u64) {
         (self.counts[reason as usize], self.ticks)
     }
 
-    /// Returns whether the ramp after `enable` has begun.
+    /// Returns whether the ramp after `enable` has begun. It stays true until rendering stops.
     pub fn is_engaged(&self) -> bool {
         self.engaged_s.is_some()
     }
 
-    /// Leaves DISABLED or PAUSED. A FAULT must be reset first.
+    /// Changes DISABLED or PAUSED to ENABLED: the force ramps in once it is small. Does nothing in another state; a
+    /// FAULT needs [`Envelope::reset`] first.
     pub fn enable(&mut self) {
         if matches!(self.state, RenderingState::Disabled | RenderingState::Paused) {
             (self.state, self.engaged_s) = (RenderingState::Enabled, None);
         }
     }
 
-    /// Stops rendering until it is enabled.
+    /// Stops rendering until [`Envelope::enable`]. Does nothing in FAULT.
     pub fn disable(&mut self) {
         if self.state != RenderingState::Fault {
             self.state = RenderingState::Disabled;
         }
     }
 
-    /// Stops rendering until it is reset and enabled.
+    /// Changes to FAULT: stops rendering until [`Envelope::reset`] and then [`Envelope::enable`].
     pub fn fail(&mut self) {
         self.state = RenderingState::Fault;
     }
 
-    /// Leaves FAULT for DISABLED.
+    /// Changes FAULT to DISABLED. Does nothing in another state.
     pub fn reset(&mut self) {
         if self.state == RenderingState::Fault {
             self.state = RenderingState::Disabled;
@@ -251,15 +257,19 @@ impl Envelope {
         self.counts[reason as usize] += 1;
     }
 
-    /// Returns the force to render until the next tick, N: the wanted one after the limits at the top of this module, in their
-    /// order. Of a model of age a, the share that is left is 1 up to [`FRESH_S`], falls linearly to a half at [`STALE_S`], and
-    /// is ½·e^{−(a − STALE_S)/DECAY_S} beyond. After `enable` it rises by t/[`ENGAGE_S`]. Passivity bounds it by √(2·S·E/v), and
-    /// slew its change in a tick of length h by S·h, S = [`SLEW_N_PER_S`].
+    /// Advances the envelope by one tick. Returns the force to render until the next tick, N: the wanted force after
+    /// the limits at the top of this module, in their order. With a model of age a, the share that is left is 1 up to
+    /// [`FRESH_S`], falls linearly to a half at [`STALE_S`], and is ½·e^{−(a − STALE_S)/DECAY_S} beyond. After
+    /// `enable` it rises as t/[`ENGAGE_S`]. Passivity bounds the force by √(2·S·E/v), and slew bounds its change in a
+    /// tick of length h by S·h, S = [`SLEW_N_PER_S`].
+    ///
+    /// A value that is not finite, or a place outside the workspace, changes the state to FAULT; a model or a gap
+    /// between two ticks older than [`PAUSE_S`] changes it to PAUSED. The force then falls to zero within the slew.
     pub fn render(&mut self, wanted: &Wanted) -> DVec3 {
         self.ticks += 1;
         let finite = wanted.place_m.is_finite() && wanted.velocity_m_per_s.is_finite() && wanted.now_s.is_finite();
         if !finite {
-            // The place of the device is unknown, so there is no work to account for; let go.
+            // The place of the device is unknown, so there is no work to account for. The force falls to zero.
             self.acted(LimitCause::NotFinite);
             self.fail();
             let step_n = SLEW_N_PER_S * NOMINAL_S;
@@ -301,7 +311,7 @@ impl Envelope {
         force_n
     }
 
-    /// Reduces the force by the model's age.
+    /// Returns the force reduced by the model's age.
     fn fade(&mut self, wanted: &Wanted, elapsed_s: f64, force_n: DVec3) -> DVec3 {
         // Without a model there is no force, and so nothing is stale.
         let age_s = wanted.age_s.unwrap_or(0.0);
@@ -331,7 +341,7 @@ impl Envelope {
                 return self.force_n.clamp_length_max(force_n.length()) * decay;
             }
         }
-        // That there is no force before the first model says nothing about the tissue: the tip may be deep in it.
+        // A zero force before the first model does not mean that the tip is outside the tissue.
         if self.engaged_s.is_none() && wanted.age_s.is_some() && force_n.length() < ENGAGE_BELOW_N {
             self.engaged_s = Some(wanted.now_s);
         }
@@ -367,8 +377,9 @@ impl Envelope {
         force_n * (most_n / length_n)
     }
 
-    /// The largest force along `force_n` whose energy the tank can cover until slew has reduced it to zero, N: √(2·S·E/v), from
-    /// ∫ (f − S·t)·v dt = f²·v/2S ≤ E. Here v is 1.5 times the speed along the force, at least 0.08 m/s, plus a·f/4S.
+    /// Returns the largest force along `force_n` whose energy the tank can cover until slew has reduced it to zero,
+    /// N: √(2·S·E/v), from ∫ (f − S·t)·v dt = f²·v/2S ≤ E. Here v is 1.5 times the speed along the force, at least
+    /// 0.08 m/s, plus a·f/4S.
     fn bearable_n(&self, velocity_m_per_s: DVec3, force_n: DVec3) -> f64 {
         let along = force_n.normalize_or_zero();
         let along_m_per_s = velocity_m_per_s.dot(along);
@@ -379,8 +390,8 @@ impl Envelope {
         if along_m_per_s < 0.0 { most_n.max(FIRST_N) } else { most_n }
     }
 
-    /// Changes the last force towards the wanted one as fast as slew allows. A turning force passes through directions
-    /// between the two: where the tank can't cover such a force, it goes straight to zero.
+    /// Returns the last force changed towards the wanted one, as fast as slew allows. A turning force passes through
+    /// directions between the two. If the tank cannot cover such a force, the force falls straight to zero.
     fn slew(&mut self, elapsed_s: f64, velocity_m_per_s: DVec3, force_n: DVec3) -> DVec3 {
         let step_n = SLEW_N_PER_S * elapsed_s;
         let change_n = force_n - self.force_n;
@@ -397,7 +408,7 @@ impl Envelope {
     }
 }
 
-/// Duration of a tick if unknown, s.
+/// Assumed duration of a tick when it is unknown, s.
 const NOMINAL_S: f64 = 1e-3;
 
 #[cfg(test)]
@@ -405,7 +416,7 @@ mod tests {
     #![allow(clippy::unwrap_used)]
     use super::*;
 
-    /// A device that a hand pushes along −z, tick by tick.
+    /// Simulates a device that a hand pushes along −z, tick by tick.
     struct Port {
         envelope: Envelope,
         tick: u32,
@@ -419,7 +430,7 @@ mod tests {
             Port { envelope, tick: 0, height_m: 0.0 }
         }
 
-        /// One tick at a velocity with a wanted force, both along z. Returns the rendered force.
+        /// Does one tick at a velocity with a wanted force, both along z. Returns the rendered force.
         fn tick(&mut self, velocity_m_per_s: f64, force_n: f64) -> f64 {
             let wanted = Wanted {
                 now_s: f64::from(self.tick) * 1e-3,
@@ -433,7 +444,7 @@ mod tests {
             self.envelope.render(&wanted).z
         }
 
-        /// The same for many ticks. Returns the last force.
+        /// Does many ticks with the same velocity and wanted force. Returns the last force.
         fn ticks(&mut self, count: u32, velocity_m_per_s: f64, force_n: f64) -> f64 {
             (0..count).map(|_| self.tick(velocity_m_per_s, force_n)).last().unwrap()
         }
@@ -444,8 +455,8 @@ mod tests {
         for (mass_kg, stiffness_n_per_m) in [(0.045, 600.0), (0.05, 1500.0), (0.1, 4000.0)] {
             let mut port = Port::new("omega3");
             port.ticks(600, 0.0, 0.0);
-            // Pressed 5 mm into a soft spring; then a stiff one takes its place, as after an outage, and a weak string is all that
-            // holds the device.
+            // The device is pressed 5 mm into a soft spring. Then a stiff spring replaces it, as after an outage, and
+            // only a weak string holds the device.
             for _ in 0..250 {
                 let force_n = -300.0 * port.height_m;
                 port.tick(-0.02, force_n);
@@ -463,7 +474,7 @@ mod tests {
     #[test]
     fn a_force_ramps_in_linearly_and_each_tick_of_the_ramp_is_counted() {
         let mut port = Port::new("omega3");
-        // It engages at once, because the force is small. A hand that presses on pays for what follows.
+        // It engages at once, because the force is small. A hand that presses on gives the energy for what follows.
         port.tick(-0.05, 0.0);
         let half_n = port.ticks(250, -0.05, 1.0);
         assert!((half_n - 0.5).abs() < 1e-9, "{half_n}");
@@ -503,7 +514,7 @@ mod tests {
         assert_eq!(port.envelope.count(LimitCause::Continuous).0, 0);
         assert!((port.ticks(60, -0.01, 2.0) - 0.88).abs() < 1e-12);
         assert!(port.envelope.count(LimitCause::Continuous).0 > 0);
-        // A second of rest is good for a second of force.
+        // A second of rest allows a second of force.
         assert_eq!(port.ticks(1000, -0.01, 0.5), 0.5);
         assert_eq!(port.ticks(950, -0.01, 2.0), 2.0);
         assert!((port.ticks(120, -0.01, 2.0) - 0.88).abs() < 1e-12);
@@ -525,10 +536,10 @@ mod tests {
         assert_eq!([LimitCause::Passivity, LimitCause::Slew].map(|reason| port.envelope.count(reason).0), [0; 2]);
     }
 
-    /// A force that is rendered as it is wanted, and so faint that no other limit acts on it, N.
+    /// A force so faint that no limit but that of the age acts on it, N.
     const FAINT_N: f64 = 0.1;
 
-    /// What is rendered of `FAINT_N`, told at a moment by a model of an age: a share of it.
+    /// Returns the share of `FAINT_N` that is rendered at a time with a model of an age.
     fn share(envelope: &mut Envelope, now_s: f64, age_s: f64) -> f64 {
         let (place_m, velocity_m_per_s, force_n) = (DVec3::ZERO, DVec3::ZERO, FAINT_N * DVec3::Z);
         envelope.render(&Wanted { now_s, place_m, velocity_m_per_s, force_n, age_s: Some(age_s) }).z / FAINT_N
@@ -550,7 +561,7 @@ mod tests {
             assert!((share - expected).abs() < 1e-9, "{share} of the force at an age of {age_s} s");
             assert_eq!(envelope.count(LimitCause::Stale).0, u64::from(expected < 1.0));
         }
-        // Half the force comes back in half the time of all of it.
+        // Half the force returns in half the time that all of it needs.
         let (mut envelope, mut now_s, mut found) = faded(STALE_S);
         for _ in 0..(250.0 * RETURN_S) as u32 {
             now_s += 1e-3;
@@ -572,7 +583,7 @@ mod tests {
         }
         let mut last_n = port.ticks(500, -0.05, 3.0);
         assert_eq!(last_n, 3.0);
-        // The law goes on wanting all of it.
+        // The wanted force stays the same.
         for tick in 0..25 {
             let force_n = port.tick(1.0, 3.0);
             assert!((0.0..last_n).contains(&force_n), "tick {tick}: {last_n}, then {force_n} N");

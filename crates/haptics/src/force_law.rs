@@ -1,42 +1,42 @@
-//! The force law of a tissue under a disc that is pressed straight in quasi-statically: what the server sends ahead, once,
-//! so that a client knows before it gets there how the force will rise.
+//! The force law of a tissue: its force, stiffness and damping over the depth of a disc that is pressed straight in
+//! quasi-statically. The server sends it once and ahead, so that a client knows how the force will rise.
 //!
-//! A stiffness at one place says nothing of the next millimetre, and tissue hardens: with 50 ms of delay and 50 mm/s a
-//! hand is 2.5 mm further than what it last felt. A polynomial through past samples extrapolates badly there; the
-//! tissue's own law, which the server computes from its model, does not.
+//! The stiffness at one place does not determine the force a millimetre deeper, because tissue hardens: with 50 ms of
+//! delay, a hand at 50 mm/s is 2.5 mm beyond the last sample. A polynomial through past samples extrapolates badly
+//! there. The tissue's own law, which the server computes from its model, is accurate.
 
-/// The law at one depth.
+/// Values of a force law at one depth: force, stiffness and damping.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Row {
-    /// Outward, N.
+    /// Outward force, N.
     pub force_n: f64,
-    /// Along the normal, N/m.
+    /// Stiffness along the normal, N/m.
     pub stiffness_n_per_m: f64,
-    /// Across it, of a disc that sticks, N/m.
+    /// Stiffness across the normal for a disc that sticks, N/m.
     pub across_n_per_m: f64,
-    /// Along the normal, N·s/m.
+    /// Damping along the normal, N·s/m.
     pub damping_n_s_per_m: f64,
-    /// Across it, of a disc that sticks, N·s/m.
+    /// Damping across the normal for a disc that sticks, N·s/m.
     pub across_n_s_per_m: f64,
-    /// Across it, of a disc that slides, N·s/m.
+    /// Damping across the normal for a disc that slides, N·s/m.
     pub drag_n_s_per_m: f64,
 }
 
-/// Rows at equal distances of depth, from 0 on.
+/// Force law of a tissue: force, stiffness and damping over depth, as a table with equal steps of depth from 0.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Law {
-    /// From a row to the next, m.
+    /// Depth between two rows, m.
     pub step_m: f64,
-    /// At least two.
+    /// Values at depths 0, `step_m`, 2·`step_m`, …; at least two rows.
     pub rows: Vec<Row>,
-    /// Put together from coarser sheets, because the tissue's own law takes too much work to be given at once: within a
-    /// tenth of it.
+    /// Whether it was composed from coarser sheets because the tissue's own law takes too long to compute. It is then
+    /// within a tenth of that law.
     pub is_coarse: bool,
 }
 
 impl Law {
-    /// Returns the law of a linear spring and damper, F = K·d and B·v, which feel the same in every direction. A disc that
-    /// slides has no drag.
+    /// Returns the law of a linear spring and damper, K·d + B·v, with the same K and B along and across the normal. A
+    /// disc that slides has no drag.
     pub fn linear(stiffness_n_per_m: f64, damping_n_s_per_m: f64) -> Self {
         let step_m = 0.1;
         let row = |force_n: f64| Row {
@@ -50,7 +50,8 @@ impl Law {
         Law { step_m, rows: vec![row(0.0), row(stiffness_n_per_m * step_m)], is_coarse: false }
     }
 
-    /// Returns whether a client can use it: finite, rising, at least two rows.
+    /// Returns whether a client can use it: it has at least two rows and a positive step, all values are finite and
+    /// not negative, and the force never falls with depth.
     pub fn is_sound(&self) -> bool {
         let finite = |row: &Row| {
             [row.force_n, row.stiffness_n_per_m, row.across_n_per_m, row.damping_n_s_per_m, row.across_n_s_per_m]
@@ -65,15 +66,16 @@ impl Law {
             && self.rows.windows(2).all(|pair| pair[1].force_n >= pair[0].force_n)
     }
 
-    /// Returns the law at a depth, m. Forces are cubic between rows, with the rows' stiffness as slopes; beyond the
-    /// last row they go on as straight lines.
+    /// Returns the values at a depth, m. The force is cubic between rows, with the rows' stiffness as slopes, and a
+    /// straight line beyond the last row. A negative depth counts as 0.
     ///
-    /// With F₀ and F₁ the forces of two rows a step h apart, k₀ and k₁ their stiffness, Δ = F₁ − F₀ and t from 0 to 1 between
-    /// them, that is the cubic of Hermite:
+    /// With F₀ and F₁ the forces of two rows a step h apart, k₀ and k₁ their stiffness, Δ = F₁ − F₀ and t from 0 to 1
+    /// between them, the force is the cubic of Hermite:
     ///
     /// F(t) = F₀ + t·Δ + t·(1 − t)·[(1 − t)·(h·k₀ − Δ) + t·(Δ − h·k₁)],  k = F′(t)/h.
     ///
-    /// All other values are linear between rows. Beyond the last row, at depth D, F = F(D) + k(D)·(d − D).
+    /// All other values are linear between rows and constant beyond the last. Beyond the last row, at depth D,
+    /// F = F(D) + k(D)·(d − D).
     pub fn at_depth(&self, depth_m: f64) -> Row {
         let last = self.rows.len() - 1;
         let place = (depth_m / self.step_m).max(0.0);
@@ -100,8 +102,8 @@ impl Law {
         }
     }
 
-    /// Returns the depth at which a force is met, m: d with F(d) = `force_n`, by bisection between the two rows around it; beyond
-    /// the last row, at depth D, d = D + (`force_n` − F(D))/k(D).
+    /// Returns the depth at which the force is `force_n`, m: by bisection between the two rows around it; beyond the
+    /// last row, at depth D, it is D + (`force_n` − F(D))/k(D). 0 if `force_n` is not positive.
     pub fn depth_of(&self, force_n: f64) -> f64 {
         if force_n <= 0.0 {
             return 0.0;
@@ -120,7 +122,7 @@ impl Law {
         0.5 * (low + high)
     }
 
-    /// Returns the depth that it reaches, m: that of the last row.
+    /// Returns the depth of the last row, m.
     pub fn reach_m(&self) -> f64 {
         (self.rows.len() - 1) as f64 * self.step_m
     }
@@ -130,7 +132,7 @@ impl Law {
 mod tests {
     use super::*;
 
-    /// One that hardens, with rows 0.5 mm apart; each value differs from the others.
+    /// Returns a law that hardens, with rows 0.5 mm apart. All its values differ.
     fn hardening() -> Law {
         let rows = (0..5).map(|row| {
             let x = f64::from(row);
@@ -171,7 +173,7 @@ mod tests {
                 assert!(near.iter().chain([&(at.across_n_s_per_m - (0.3 + 0.07 * x))]).all(|v| v.abs() < 1e-12));
             }
         }
-        // A cubic whose slopes differ from the chord has the slope that it says.
+        // Where the slopes differ from the chord, the stiffness is still the derivative of the force.
         let bent = Law {
             is_coarse: false,
             step_m: 1.0,

@@ -1,12 +1,12 @@
-//! Simulated hands: a mass that holds the device, pulled by a spring to its owner's target. The results show how a loop
-//! behaves, not how it feels to people.
+//! Simulated hands: a mass that holds the device and is pulled to a target by a spring. The results show how a
+//! control loop behaves, not how it feels to people.
 
 use glam::DVec3;
 
-/// m·ẍ = k(target − x) − b·ẋ + force of the device.
+/// Model of a hand that holds a device: m·ẍ = k(target − x) − b·ẋ + force of the device.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hand {
-    /// The name, for selection.
+    /// Name by which [`Hand::named`] finds it.
     pub name: &'static str,
     /// Mass of hand and device, kg.
     pub mass_kg: f64,
@@ -20,7 +20,7 @@ const fn hand(name: &'static str, mass_kg: f64, damping_n_s_per_m: f64, stiffnes
     Hand { name, mass_kg, damping_n_s_per_m, stiffness_n_per_m }
 }
 
-/// From a loose grip to a firm one. `none` is a device that is not held.
+/// Known hands, from a loose grip to a firm one. The last, `none`, is a device that nobody holds.
 pub const HANDS: [Hand; 4] = [
     hand("light", 0.1, 2.0, 100.0),
     hand("medium", 0.15, 5.5, 300.0),
@@ -28,11 +28,11 @@ pub const HANDS: [Hand; 4] = [
     hand("none", 0.05, 0.3, 0.0),
 ];
 
-/// The string that pulls a device that is not held: its stiffness, N/m, and its largest force, N.
+/// Stiffness, N/m, and largest force, N, of the string that pulls a device that nobody holds.
 const STRING_N_PER_M: f64 = 60.0;
 const STRING_N: f64 = 0.5;
 
-/// The state of a hand.
+/// Place and velocity of a hand.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct HandState {
     /// Place, m.
@@ -42,13 +42,13 @@ pub struct HandState {
 }
 
 impl Hand {
-    /// Returns the hand of that name.
+    /// Returns the hand of [`HANDS`] with this name; `None` if there is none.
     pub fn named(name: &str) -> Option<Self> {
         HANDS.iter().find(|hand| hand.name == name).copied()
     }
 
-    /// Returns the force of the string that pulls a device that is not held to its target, N: k·(target − x) with k = 60 N/m,
-    /// but at most 0.5 N; 0 for hands.
+    /// Returns the force of the string that pulls a device that nobody holds to its target, N: k·(target − x) with k
+    /// = 60 N/m, but at most 0.5 N. For a hand (`stiffness_n_per_m` > 0) it is 0.
     pub fn string_n(&self, target_m: DVec3, place_m: DVec3) -> DVec3 {
         if self.stiffness_n_per_m > 0.0 {
             return DVec3::ZERO;
@@ -57,9 +57,9 @@ impl Hand {
     }
 
     /// Returns the state after `time_s` under a constant force, with a target that moves straight from `from_m` to
-    /// `to_m`. Exact except for the target, which is taken at its mean in each quarter of the time.
+    /// `to_m`. It is exact except that the target counts as constant in each quarter of the time, at its mean.
     ///
-    /// With γ = b/2m, ω² = k/m − γ², x_r = target + F/k where the hand would rest, and a = x₀ − x_r:
+    /// With γ = b/2m, ω² = k/m − γ², the place of rest x_r = target + F/k, and a = x₀ − x_r:
     ///
     /// x(t) = x_r + e^{−γt}·(a·cos ωt + (v₀ + γ·a)·sin(ωt)/ω),
     /// v(t) = e^{−γt}·(v₀·cos ωt − (γ·v₀ + (k/m)·a)·sin(ωt)/ω),
@@ -103,8 +103,9 @@ impl Hand {
         HandState { place_m, velocity_m_per_s }
     }
 
-    /// Returns the delay at which the loop with a spring of `stiffness` becomes unstable, s; infinite if it never does:
-    /// the least t with m·s² + b·s + k + K·e^{−s·t} = 0 on the imaginary axis. A held sample counts as half a period.
+    /// Returns the delay at which the loop of the hand and a spring of `stiffness_n_per_m` = K becomes unstable, s;
+    /// infinite if it never does. It is the smallest t with m·s² + b·s + k + K·e^{−s·t} = 0 on the imaginary axis. A
+    /// sample that is held for a period adds a delay of half a period.
     ///
     /// With s = iω both sides of K·e^{−iωt} = mω² − k − ibω have the same size, so (mω² − k)² + b²ω² = K²:
     ///
@@ -137,7 +138,7 @@ mod tests {
     /// A hand so firm and damped that it does not oscillate.
     const CREEPING: Hand = hand("creeping", 0.1, 20.0, 300.0);
 
-    /// The equation of motion integrated to fourth order in steps too short to matter.
+    /// Integrates the equation of motion to fourth order, in steps so short that their error does not matter.
     fn integrated(hand: &Hand, held: HandState, from_m: DVec3, to_m: DVec3, force_n: DVec3, time_s: f64) -> HandState {
         const STEPS: u32 = 2000;
         let dt = time_s / f64::from(STEPS);

@@ -1,18 +1,20 @@
-//! Touch that stays accurate and safe over a network: the data a server sends with each sample, how a client renders it
-//! a thousand times a second, and the limits that protect both. Pure functions: no clock, no socket, no random number;
-//! time is an argument, in seconds from any origin. A Palpate server uses the same functions, so it knows what its clients
-//! render.
+//! Touch that stays accurate and safe over a network: the data that a server sends with each sample, how a client
+//! renders it a thousand times a second, and the limits that protect person and device. The crate uses no clock,
+//! socket or random number; time is an argument, in seconds from any origin. A Palpate server uses the same
+//! functions, so it knows what its clients render.
 //!
-//! Conventions: `force_on_tool_n` is the force of the tissue on the tool; stiffness and damping are positive; the sheet's
-//! frame is right-handed with z out of the tissue.
+//! Conventions: `force_on_tool_n` is the force of the tissue on the tool; stiffness and damping are positive; the
+//! sheet's frame is right-handed with z out of the tissue.
 //!
-//! **Delay.** Forces are not extrapolated over the delay. The client gets the force law of a slow press ahead of time (`law`). A
-//! sample tells where on that law the tissue was, and the client repeats pressure, damping, sticking and sliding along its own
-//! path since (`local`). The error is then what the law does not know (other tools, the grain of the grid, inertia) over some
-//! milliseconds, and stays at a few tenths of a per cent up to 200 ms of round trip. The safety envelope acts last.
+//! **Delay.** Forces are not extrapolated over the delay. The client receives the force law of a slow press ahead of
+//! time ([`force_law`]). A sample contains the tissue's state on that law, and the client computes pressure, damping,
+//! sticking and sliding along its own path since then ([`local_model`]). The remaining error comes from what the law
+//! omits (other tools, the grain of the grid, inertia) over some milliseconds. It stays at a few tenths of a per cent
+//! up to 200 ms of round trip. The safety envelope ([`envelope`]) acts last.
 //!
-//! **Ahead.** Where the tissue is another within the way of a round trip (a rim, a fold, the edge of a lump) no sample knows what
-//! comes next. A client that has a copy of the tissue renders from that ([`prediction`]).
+//! **Prediction.** Where the tissue changes within the distance that the hand moves in a round trip (a rim, a fold,
+//! the edge of a lump), no sample contains what comes next. A client that has a copy of the tissue renders from the
+//! copy ([`prediction`]).
 //!
 //! # Example
 //!
@@ -25,7 +27,7 @@
 //! let device = Device::named("omega3").expect("a device of the table");
 //! let mut renderer = Renderer::new(Law::linear(400.0, 0.5), Envelope::new(device, DVec3::ZERO));
 //! renderer.envelope.enable();
-//! // What the server sends of a tool at `place_m`. The surface is at z = 0.
+//! // The server's sample for a tool at `place_m`. The surface is at z = 0.
 //! let model = |sequence: u64, client_time_s: f64, place_m: DVec3| LocalModel {
 //!     sequence,
 //!     client_time_s,

@@ -1,9 +1,10 @@
-//! The local model: the content of a sample about the tissue around the tool's place at that time.
+//! The local model: the part of a sample that describes the tissue around the tool's place at that time.
 //!
-//! A client is ahead of every sample by the round trip, and knows its own path since. So it starts from the sample's
-//! state and repeats the response of the tissue along that path ([`Touching`]): the depth below the surface gives the
-//! pressure by the force law, less damping; tangentially, the disc sticks with the law's stiffness up to the friction
-//! cone, and slides beyond. The error is that of the law along some millimetres, not that of some milliseconds.
+//! A client is ahead of every sample by the round trip, and knows its own path since then. So it starts from the
+//! sample's state and computes the response of the tissue along that path ([`Touching`]). The force law gives the
+//! pressure at the depth below the surface, minus damping. Tangentially, the disc sticks with the law's stiffness up
+//! to the friction cone, and slides beyond. The error is that of the law over some millimetres, not that of a delay
+//! of some milliseconds.
 
 use std::collections::VecDeque;
 
@@ -11,57 +12,59 @@ use glam::{DMat3, DVec3};
 
 use crate::force_law::{Law, Row};
 
-/// The state of contact between a tool and the tissue.
+/// State of contact between a tool and the tissue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ContactState {
-    /// Not touching.
+    /// The tool does not touch the tissue.
     Free,
-    /// Touching, and not sliding.
+    /// The tool touches the tissue and sticks to it.
     Sticking,
-    /// Touching, at the edge of the friction cone.
+    /// The tool touches the tissue and slides, at the edge of the friction cone.
     Sliding,
-    /// Holding.
+    /// The tool holds the tissue, so it pulls as well as pushes.
     Holding,
 }
 
-/// The content of a sample. Forces are those on the tool.
+/// Model of the tissue around a tool's place, as a sample contains it. Forces are those on the tool; vectors are in
+/// the tissue's frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LocalModel {
-    /// Sequence number; each sample has a higher one.
+    /// Sequence number; it rises with each sample.
     pub sequence: u64,
-    /// Client time of the tool's place, s.
+    /// Time of the tool's place by the client's clock, s.
     pub client_time_s: f64,
-    /// Steps done.
+    /// Number of simulation steps done.
     pub step: u64,
-    /// x0: place of the tool, m.
+    /// Place x₀ of the tool, m.
     pub place_m: DVec3,
     /// Velocity of the tool, m/s.
     pub velocity_m_per_s: DVec3,
-    /// f0: the force there, N.
+    /// Force f₀ on the tool at x₀, N.
     pub force_n: DVec3,
-    /// K: symmetric, N/m.
+    /// Stiffness K of the tissue, symmetric, N/m.
     pub stiffness_n_per_m: DMat3,
-    /// B: symmetric, N·s/m.
+    /// Damping B of the tissue, symmetric, N·s/m.
     pub damping_n_s_per_m: DMat3,
-    /// p: a place on the surface under the tool as it would be without the tool, m.
+    /// Point p on the surface under the tool, as the surface would be without the tool, m.
     pub surface_m: DVec3,
-    /// n: the outward normal there.
+    /// Outward unit normal n at p.
     pub normal: DVec3,
-    /// κ: how the normal changes per metre along the surface, 1/m; symmetric, 0 of a plane, 1/R of a sphere that is touched
-    /// from outside.
+    /// Curvature κ: change of the normal per metre along the surface, 1/m. It is symmetric, 0 for a plane, and 1/R
+    /// for a sphere that is touched from outside.
     pub curvature_per_m: DMat3,
-    /// The distance from x0 within which K is valid, m.
+    /// Distance from x₀ within which K is valid, m.
     pub valid_m: f64,
-    /// μ.
+    /// Coefficient μ of Coulomb friction.
     pub friction: f64,
-    /// The state of contact between the tool and the tissue.
+    /// State of contact between the tool and the tissue.
     pub contact_state: ContactState,
-    /// The number of the force law that goes with this model: p is placed by it.
+    /// Number of the force law by which p was computed; render this model with it.
     pub law: u32,
 }
 
 impl LocalModel {
-    /// Returns whether every number is finite and the normal has unit length.
+    /// Returns whether a client can render it: every number is finite, `valid_m` and `friction` are not negative
+    /// (`valid_m` may be infinite), and the normal has unit length within 0.001.
     pub fn is_sound(&self) -> bool {
         let vectors = [self.place_m, self.velocity_m_per_s, self.force_n, self.surface_m];
         vectors.iter().all(|v| v.is_finite())
@@ -76,16 +79,16 @@ impl LocalModel {
     }
 }
 
-/// Returns the distance within which K is valid: where half its change along the path is a tenth of the force, or of
-/// `least_n` if that is larger. `change` is ‖∂K/∂x‖, N/m².
+/// Returns the distance r within which a stiffness K is valid, m: r = √(2·max(f/10, `least_n`)/‖∂K/∂x‖), with f =
+/// `force_n`, N, and ‖∂K/∂x‖ = `change_n_per_m2`, N/m².
 ///
-/// Over a way r the force of the model is off by ½·‖∂K/∂x‖·r², the next term of its Taylor series. So
-/// r = √(2·max(f/10, `least_n`)/‖∂K/∂x‖).
+/// Over a distance r, the model's force is wrong by ½·‖∂K/∂x‖·r², the next term of its Taylor series. At r this error
+/// is a tenth of the force, or `least_n` (N) if that is larger.
 pub fn valid_m(force_n: f64, least_n: f64, change_n_per_m2: f64) -> f64 {
     (2.0 * (0.1 * force_n).max(least_n) / change_n_per_m2.max(1e-9)).sqrt()
 }
 
-/// The newest places of a tool, by the client's own clock.
+/// Record of a tool's newest places with their times by the client's clock. It keeps 2048, which is 2 s at 1 kHz.
 #[derive(Debug, Clone)]
 pub struct Track {
     places: VecDeque<(f64, DVec3)>,
@@ -95,14 +98,14 @@ pub struct Track {
 const KEPT: usize = 2048;
 
 impl Default for Track {
-    /// An empty one, with room for all that it will keep: a tick must not ask for memory.
+    /// Creates an empty record. It reserves all the memory that it will use, because a tick must not allocate.
     fn default() -> Self {
         Track { places: VecDeque::with_capacity(KEPT) }
     }
 }
 
 impl Track {
-    /// Adds the newest place.
+    /// Appends a place, m, at a time by the client's clock, s. Drops the oldest beyond 2048.
     pub fn push(&mut self, time_s: f64, place_m: DVec3) {
         if self.places.len() == KEPT {
             self.places.pop_front();
@@ -110,7 +113,7 @@ impl Track {
         self.places.push_back((time_s, place_m));
     }
 
-    /// Returns all places after a time, in order.
+    /// Returns the places after a time, from the oldest to the newest, m.
     pub fn after(&self, time_s: f64) -> impl Iterator<Item = DVec3> {
         let from = self.places.partition_point(|place| !is_after(place.0, time_s));
         self.places.range(from..).map(|place| place.1)
@@ -122,8 +125,8 @@ impl Track {
     }
 }
 
-/// Whether one time of the client is after another, with half a microsecond of tolerance: times return from the wire in whole
-/// nanoseconds.
+/// Returns whether one time of the client is after another by more than half a microsecond: times are rounded to
+/// nanoseconds on the wire.
 pub(crate) fn is_after(time_s: f64, other_s: f64) -> bool {
     time_s > other_s + 5e-7
 }
@@ -131,9 +134,11 @@ pub(crate) fn is_after(time_s: f64, other_s: f64) -> bool {
 /// A client's usual tick, s.
 const TICK_S: f64 = 1e-3;
 
-/// The state of a touch along a tool's path.
+/// State of a touch along a tool's path since a sample: tangential stretch of the tissue, sticking or sliding, and
+/// place.
 ///
-/// A sample tells of a tool 2 mm deep in a tissue of 400 N/m. Since then the client's tool has gone 1 mm deeper, so it feels 1.2 N:
+/// A sample describes a tool 2 mm deep in a tissue of 400 N/m. Since then the client's tool has moved 1 mm deeper, so
+/// its force is 1.2 N:
 ///
 /// ```
 /// use glam::{DMat3, DVec3};
@@ -165,23 +170,23 @@ const TICK_S: f64 = 1e-3;
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Touching {
-    /// How far the tissue under the disc is displaced tangentially from where it would not pull, m.
+    /// Tangential displacement of the tissue under the disc from the place where it would not pull, m.
     stretch_m: DVec3,
     sliding: bool,
-    /// Stretch when the sample was taken, m.
+    /// Stretch at the time of the sample, m.
     begun_m: DVec3,
     /// The part of the sample's force that the law does not explain, N.
     rest_n: DVec3,
     place_m: DVec3,
 }
 
-/// The surface turns by no more than this along a way for which it is curved: tan of the angle.
+/// Largest angle by which a curved surface turns along a path, as its tangent.
 const MAX_TURN: f64 = 1.0;
 
 impl Touching {
-    /// Returns the state when the sample was taken: the stretch s = −(f_t + B_t·v_t)/K_t that explains what of the sample's
-    /// force is across the surface (D in place of B_t while it slides), within the friction cone, |s| ≤ μ·F(d)/K_t; and the rest r
-    /// of the force, which the law does not explain ([`Touching::force_n`]).
+    /// Creates the state at the time of the sample. The stretch s = −(f_t + B_t·v_t)/K_t explains the part f_t of the
+    /// sample's force across the normal (D in place of B_t while it slides), within the friction cone, |s| ≤
+    /// μ·F(d)/K_t. The law does not explain the rest r of the force, which is kept and added ([`Touching::force_n`]).
     pub fn at_sample(model: &LocalModel, law: &Law) -> Self {
         let mut touching = Touching {
             stretch_m: DVec3::ZERO,
@@ -202,7 +207,7 @@ impl Touching {
             let most_m = model.friction * row.force_n / row.across_n_per_m;
             touching.stretch_m = within(-drawn_n / row.across_n_per_m, most_m);
             touching.begun_m = touching.stretch_m;
-            // By the rule of `move_to`, not by the sample: otherwise the force would change with the first move.
+            // The rule of `move_to` decides, not the sample: otherwise the force would change with the first move.
             let ahead_m = touching.stretch_m + moved * TICK_S;
             touching.sliding = within(ahead_m, most_m) != ahead_m;
         }
@@ -210,12 +215,12 @@ impl Touching {
         touching
     }
 
-    /// Depth below the surface, and the normal where the disc is on it.
+    /// Returns the depth below the surface, m, and the normal at the disc's place on it.
     ///
-    /// With x the tool's place, s the stretch and d the depth, the disc is at a = x − s + d·n(a), on the surface. From
-    /// where it was when the sample was taken it has gone a way g along the surface; there the normal is that of the sample
-    /// plus κg, and the surface ½·gᵀκg below the plane of the sample. Two rounds find a: what they leave is of third order in
-    /// the angle.
+    /// With x the tool's place, s the stretch and d the depth, the disc is at a = x − s + d·n(a), on the surface.
+    /// Since the sample it has moved by g along the surface. There the normal is that of the sample plus κg, and the
+    /// surface is ½·gᵀκg below the plane of the sample. Two iterations find a, with an error of third order in the
+    /// angle.
     fn under(&self, model: &LocalModel) -> (f64, DVec3) {
         let above_m = self.place_m - model.surface_m;
         let plane = (-above_m.dot(model.normal), model.normal);
@@ -234,14 +239,15 @@ impl Touching {
         (depth_m, normal)
     }
 
-    /// Returns the depth of the disc, m, and the law there.
+    /// Returns the depth of the disc below the surface, m (negative above it), and the law's values at that depth.
     pub fn at_law(&self, model: &LocalModel, law: &Law) -> (f64, Row) {
         let (depth_m, _) = self.under(model);
         (depth_m, law.at_depth(depth_m))
     }
 
-    /// Advances to the tool's next place, Δx away: s becomes what of s + Δx is across the surface, shortened to μ·F(d)/K_t
-    /// (Coulomb's law: the disc slides where its spring would pull with more than μ times the pressure).
+    /// Moves the tool to `place_m`, m, by Δx: the stretch s becomes the part of s + Δx across the normal, shortened
+    /// to μ·F(d)/K_t (Coulomb's law: the disc slides where its spring would pull with more than μ times the
+    /// pressure). Above the surface the stretch becomes 0.
     pub fn move_to(&mut self, model: &LocalModel, law: &Law, place_m: DVec3) {
         let moved_m = place_m - self.place_m;
         self.place_m = place_m;
@@ -259,15 +265,15 @@ impl Touching {
 
     /// Returns the force on the tool at its present place, N.
     ///
-    /// With d the depth, n the normal, s the stretch, v the velocity and v_t what of it is across n; F(d), K_t, B, B_t and D the
-    /// law at that depth ([`Row`]); and r the rest of the sample's force:
+    /// With the depth d, the normal n, the stretch s, the velocity v and its part v_t across n; F(d), K_t, B, B_t and
+    /// D the law's values at that depth ([`Row`]); and r the rest of the sample's force:
     ///
-    /// f = p·n + t + r,  p = max(0, F(d) − B·v·n),
-    /// t = −K_t·s − B_t·v_t where the disc sticks,  t = −K_t·s where it slides, each shortened to μ·p; then −D·v_t as well where
-    /// it slides.
+    /// f = p·n + t + r,  p = max(0, F(d) − B·v·n), t = −K_t·s − B_t·v_t where the disc sticks,  t = −K_t·s where it
+    /// slides, each shortened to μ·p; then −D·v_t as well where it slides.
     ///
-    /// What of f points into the tissue is left out. A tool that holds the tissue feels f₀ − K·Δx − B·Δv, with Δx and Δv the
-    /// differences from the sample's place and velocity, and Δx shortened to [`LocalModel::valid_m`].
+    /// The part of f that points into the tissue is removed, and f is 0 above the surface. For a tool that holds the
+    /// tissue, f = f₀ − K·Δx − B·Δv, with Δx and Δv the differences from the sample's place and velocity, and Δx
+    /// shortened to [`LocalModel::valid_m`].
     pub fn force_n(&self, model: &LocalModel, law: &Law, velocity_m_per_s: DVec3) -> DVec3 {
         if model.contact_state == ContactState::Holding {
             let away_m = within(self.place_m - model.place_m, model.valid_m);
@@ -295,12 +301,12 @@ impl Touching {
     }
 }
 
-/// What of `vector` is across the unit vector `normal`.
+/// Returns the part of `vector` across the unit vector `normal`.
 fn across(vector: DVec3, normal: DVec3) -> DVec3 {
     vector - vector.dot(normal) * normal
 }
 
-/// `vector`, shortened to the length `most`.
+/// Returns `vector`, shortened to the length `most`.
 fn within(vector: DVec3, most: f64) -> DVec3 {
     let length = vector.length();
     if length <= most { vector } else { vector * (most / length) }

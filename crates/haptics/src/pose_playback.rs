@@ -1,22 +1,22 @@
-//! The server's side of a tool's path: how commands that arrive in bursts and gaps become a movement.
+//! Playback of a tool's path on the server: commands that arrive in bursts and gaps become a smooth movement.
 //!
-//! A client reports a thousand times a second where its tool is, and when. Played on arrival, a burst would make the
-//! tool stop and then leap, and the tissue would respond to the leaps. So commands are played by their own times: the
-//! played moment advances with the steps, stops when there is nothing newer, and catches up by a tenth while something
-//! newer has always been available. With a constant delay this adds no latency.
+//! A client reports its tool's place and time a thousand times a second. If commands were played on arrival, a burst
+//! would make the tool stop and then leap, and the tissue would respond to the leaps. So commands are played by their
+//! own times: the played moment advances with the steps, stops when there is nothing newer, and catches up by a tenth
+//! while something newer has always been available. With a constant delay this adds no latency.
 //!
-//! Old commands are never replayed: of a backlog of more than [`BACKLOG_S`] only the newest place counts, and the tool
-//! goes there no faster than [`SPEED_M_PER_S`]. After [`RELEASE_S`] without a command the tool lets go. A command
-//! without a time, or stamped with its step, takes effect at once and the path does not wait for a successor; but no
-//! tool ever leaps.
+//! Old commands are never replayed: of a backlog of more than [`BACKLOG_S`] only the newest place counts, and the
+//! tool moves there no faster than [`SPEED_M_PER_S`]. After [`RELEASE_S`] without a command the tool lets go. A
+//! command without a time, or stamped with its step, takes effect at once, and the path does not wait for a
+//! successor; but a tool never leaps.
 //!
-//! **News alone.** A command may say how fast the tool moves. Then its client sends the next one only when the tool is not
-//! where this movement leads ([`crate::dead_reckoning`]), and over a gap the tool goes on along it, for [`EXTRAPOLATE_S`] at most. So the
-//! played moment need not stop when nothing newer is there. It keeps to the arrivals instead: it falls back by a tenth while
-//! commands come too late for it, and catches up as above.
+//! **Dead reckoning.** A command may contain the tool's velocity. Then its client sends the next one only when the
+//! tool is not where this movement leads ([`crate::dead_reckoning`]), and over a gap the tool continues along it, for
+//! at most [`EXTRAPOLATE_S`]. So the played moment need not stop when there is nothing newer. Instead it follows the
+//! arrivals: it falls back by a tenth while commands arrive too late for it, and catches up as above.
 //!
-//! **Datagrams** may overtake each other and be lost. A place that comes late fills its gap if it has not been played; else
-//! nothing needs it any more ([`Path::fill`]).
+//! **Datagrams** may overtake each other and be lost. A place that arrives late fills its gap if it has not been
+//! played; otherwise it is dropped ([`Path::fill`]).
 
 use std::collections::VecDeque;
 
@@ -24,48 +24,49 @@ use glam::DVec3;
 
 /// Largest speed of a tool, m/s.
 pub const SPEED_M_PER_S: f64 = 0.5;
-/// A longer queue is a backlog, s.
+/// Length of the queue beyond which it is a backlog, s: only its newest place is then played.
 pub const BACKLOG_S: f64 = 0.1;
-/// Without a command for this long the tool is held in place, and the client is told, s.
+/// Time without a command after which the tool is held in place and the client is informed, s.
 pub const HOLD_S: f64 = 0.05;
-/// Without a command for this long the tool lets go, s.
+/// Time without a command after which the tool lets go, s.
 pub const RELEASE_S: f64 = 0.25;
-/// Longest time over which a movement is extrapolated, s: as long as a tool moves that is not held.
+/// Longest time over which a movement is extrapolated, s.
 pub const EXTRAPOLATE_S: f64 = HOLD_S;
-/// The played moment falls back while commands with a velocity come later than this for it, s.
+/// Lateness of commands with a velocity beyond which the played moment falls back, s.
 const LATE_S: f64 = 0.002;
-/// The played moment catches up by this fraction of a step.
+/// Fraction of a step by which the played moment catches up or falls back.
 const CATCH_UP: f64 = 0.1;
-/// Before it catches up, something newer must have been available for this long, s.
+/// Time for which something newer must have been available before the played moment catches up, s.
 const WATCHED_S: f64 = 0.25;
-/// No time of a path is longer, s.
+/// Largest time of a path, s.
 const LONGEST_S: f64 = 1e12;
-/// Most places in the queue.
+/// Largest number of places in the queue; beyond it the oldest is dropped.
 const MAX_POINTS: usize = 1024;
 
-/// The action of a tool in a step.
+/// Action of a tool in one simulation step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Play {
-    /// Reach this place by the step's end; the client's time there, s.
+    /// Move to this place by the end of the step: m, in the frame of the commands (the tissue's, with z out of it).
+    /// The second value is the time of this place by the client's clock, s.
     Pose(DVec3, f64),
-    /// Let go.
+    /// Let go of the tissue.
     Release,
 }
 
-/// The commands of one tool.
+/// Path of one tool on the server: the commands that are waiting, and the state of their playback.
 #[derive(Debug, Clone, Default)]
 pub struct Path {
     /// Whether the tool begins at its first place, not above it.
     at_once: bool,
-    /// Where it begins, if neither there nor above it.
+    /// The place where it begins, if it is neither the first place nor above that, m.
     begins_m: Option<DVec3>,
     waiting: VecDeque<(f64, DVec3)>,
-    /// The newest command, if it says how fast the tool moves, m/s.
+    /// Client time, s, place, m, and velocity, m/s, of the newest command, if it contains a velocity.
     heading: Option<(f64, DVec3, DVec3)>,
     played: Option<(f64, DVec3)>,
     place_m: Option<DVec3>,
     arrived_s: f64,
-    /// Least time available beyond the played moment, and since when it is measured.
+    /// Smallest time available beyond the played moment, s, and the start of its measurement, s.
     spare_s: f64,
     watched_s: f64,
     limited: u64,
@@ -73,7 +74,7 @@ pub struct Path {
     released: u64,
 }
 
-/// All that the course of a path depends on, as numbers: of a path that goes on elsewhere.
+/// Complete state of a path as numbers, from which it can be continued in another process.
 #[derive(Debug, Clone, PartialEq)]
 #[allow(missing_docs)]
 pub struct PathState {
@@ -92,7 +93,7 @@ pub struct PathState {
 }
 
 impl PathState {
-    /// Whether a path may have these.
+    /// Returns whether a path can have this state.
     fn is_sound(&self) -> bool {
         let is_time = |time_s: f64| time_s.abs() < LONGEST_S;
         let is_passed = |(time_s, place_m): &(f64, DVec3)| is_time(*time_s) && place_m.is_finite();
@@ -104,7 +105,8 @@ impl PathState {
             && self.waiting.is_sorted_by(|a, b| a.0 < b.0)
             && self.heading.iter().all(is_heading)
             && self.begins_m.iter().chain(&self.place_m).all(|place_m| place_m.is_finite())
-            // A tool that went to its place at once has arrived for good, and what was never measured is without end.
+            // A command that took effect at once arrives at infinity, and a spare time is infinite until it is
+            // measured.
             && (is_time(self.arrived_s) || self.arrived_s == f64::INFINITY)
             && (is_time(self.spare_s) || self.spare_s == f64::INFINITY)
             && is_time(self.watched_s)
@@ -113,7 +115,7 @@ impl PathState {
 }
 
 impl Path {
-    /// Returns all that its course depends on.
+    /// Returns the complete state of the path, for [`Path::restored`].
     pub fn state(&self) -> PathState {
         let Path { at_once, begins_m, waiting, heading, played, place_m, arrived_s, spare_s, watched_s, .. } = self;
         PathState {
@@ -130,7 +132,8 @@ impl Path {
         }
     }
 
-    /// Creates a path that goes on from there; none from what no path has.
+    /// Creates a path that continues from `state`; `None` if no path can have this state (more than 1024 waiting
+    /// places, times out of order, values that are not finite or too large).
     pub fn restored(state: PathState) -> Option<Self> {
         if !state.is_sound() {
             return None;
@@ -154,19 +157,21 @@ impl Path {
         })
     }
 
-    /// Creates the path of a grasp, which takes hold where its first place is. (The tool of another path comes from above: it meets the
-    /// tissue as a hand does, not from within.)
+    /// Creates the path of a grasp, which takes hold at its first place. The tool of another path begins above its
+    /// first place, so that it meets the tissue from outside, as a hand does.
     pub fn of_grasp() -> Self {
         Path { at_once: true, ..Path::default() }
     }
 
-    /// Creates the path of a tool that begins at a place of its own: where the tissue is not below it.
+    /// Creates the path of a tool that begins at `place_m`, m, because above its first place it might be inside the
+    /// tissue (the tissue is not below the tool).
     pub fn beginning_at(place_m: DVec3) -> Self {
         Path { begins_m: Some(place_m), ..Path::default() }
     }
 
-    /// Takes a command that has arrived: the tool's place at client time `time_s`. Returns false if it refuses one that
-    /// is not newer or not finite.
+    /// Queues a command that arrived at `now_s`: the tool's place, m, at client time `time_s`, s. Returns false and
+    /// counts a refusal if it is not newer than all commands before, or not finite. Beyond 1024 waiting places the
+    /// oldest is dropped.
     pub fn receive(&mut self, time_s: f64, place_m: DVec3, now_s: f64) -> bool {
         let newest_s = self.waiting.back().or(self.played.as_ref()).map_or(f64::NEG_INFINITY, |place| place.0);
         if !place_m.is_finite() || !time_s.is_finite() || time_s <= newest_s {
@@ -178,7 +183,10 @@ impl Path {
         true
     }
 
-    /// Does the same of a tool that moves at `velocity_m_per_s` then: until something newer comes, it goes on so.
+    /// Queues a command that arrived at `now_s`: the tool's place, m, and velocity, m/s, at client time `time_s`, s.
+    /// Until a newer command arrives, the tool continues at this velocity, shortened to [`SPEED_M_PER_S`]. Returns
+    /// false and counts a refusal if the command is not newer than all before, or not finite. Beyond 1024 waiting
+    /// places the oldest is dropped.
     pub fn receive_moving(&mut self, time_s: f64, place_m: DVec3, velocity_m_per_s: DVec3, now_s: f64) -> bool {
         let newest_s = self.newest_s().unwrap_or(f64::NEG_INFINITY);
         let is_finite = place_m.is_finite() && velocity_m_per_s.is_finite() && time_s.is_finite();
@@ -189,7 +197,7 @@ impl Path {
         if let Some((played_s, _)) = self.played {
             self.spare_s = self.spare_s.min(time_s - played_s);
         }
-        // It may have been played past already, along what was known.
+        // The played moment may be beyond it already, by extrapolation.
         if self.played.is_none_or(|played| time_s > played.0) {
             self.wait(self.waiting.len(), time_s, place_m);
         }
@@ -198,11 +206,12 @@ impl Path {
         true
     }
 
-    /// Fills a gap with a place that comes late. Returns false if it has been played past, is known, or is not finite.
+    /// Inserts a place that arrived late, m, at client time `time_s`, s. Returns false and counts a refusal if this
+    /// time has been played, is known, is newer than all waiting places, or if a value is not finite.
     pub fn fill(&mut self, time_s: f64, place_m: DVec3) -> bool {
         let is_due = time_s.is_finite() && self.played.is_some_and(|played| time_s > played.0);
         let at = self.waiting.partition_point(|waiting| waiting.0 < time_s);
-        // What is newer than all is no gap; and each fills it once.
+        // A time beyond all waiting places is not a gap, and a place that is known fills none.
         let fills = is_due && place_m.is_finite() && self.waiting.get(at).is_some_and(|after| after.0 > time_s);
         if fills {
             self.wait(at, time_s, place_m);
@@ -212,7 +221,7 @@ impl Path {
         fills
     }
 
-    /// Returns the client's time of the newest command, s.
+    /// Returns the client time of the newest command, s; `None` before the first.
     pub fn newest_s(&self) -> Option<f64> {
         let known = [self.heading.map(|heading| heading.0), self.waiting.back().map(|waiting| waiting.0)];
         known.into_iter().flatten().reduce(f64::max).or(self.played.map(|played| played.0))
@@ -225,13 +234,15 @@ impl Path {
         }
     }
 
-    /// Takes a command that takes effect at once, whatever its time: the tool's place at client time `time_s`.
+    /// Sets the tool's place, m, at client time `time_s`, s, with effect at once, and drops all waiting commands.
+    /// Afterwards the tool is neither held nor released for lack of commands.
     pub fn go_to(&mut self, time_s: f64, place_m: DVec3) {
         self.waiting.clear();
         (self.played, self.heading, self.arrived_s) = (Some((time_s, place_m)), None, f64::INFINITY);
     }
 
-    /// Steps in which the speed limit acted; commands that were refused or skipped; releases.
+    /// Returns three counts: steps in which the speed limit acted, commands that were refused or skipped, and
+    /// releases.
     pub fn counts(&self) -> [u64; 3] {
         [self.limited, self.dropped, self.released]
     }
@@ -241,9 +252,10 @@ impl Path {
         now_s - self.arrived_s > HOLD_S
     }
 
-    /// Returns the action of the tool in the step of `step_s` that ends at `now_s`; `None` before the first command. The tool goes
-    /// at most [`SPEED_M_PER_S`]·`step_s` towards where it is to be. Between two commands that is a point of the straight line,
-    /// x₀ + (x₁ − x₀)·(t − t₀)/(t₁ − t₀); beyond the newest of those that tell a velocity, x + v·(t − t₀) for [`EXTRAPOLATE_S`].
+    /// Advances the path by a step of `step_s` that ends at `now_s`. Returns the action of the tool; `None` before
+    /// the first command. The tool moves towards its target by at most [`SPEED_M_PER_S`]·`step_s`. Between two
+    /// commands the target is on a straight line, x₀ + (x₁ − x₀)·(t − t₀)/(t₁ − t₀); beyond the newest command with a
+    /// velocity it is x + v·(t − t₀), for at most [`EXTRAPOLATE_S`].
     pub fn step(&mut self, now_s: f64, step_s: f64) -> Option<Play> {
         let newest = self.waiting.back().copied();
         if let Some(heading) = self.heading {
@@ -300,7 +312,7 @@ impl Path {
         });
     }
 
-    /// Plays commands that say how fast the tool moves, the newest of which is `heading`.
+    /// Plays commands that contain a velocity; `heading` is the newest.
     fn go_on(&mut self, heading: (f64, DVec3, DVec3), now_s: f64, step_s: f64) {
         let (newest_s, newest_m, velocity_m_per_s) = heading;
         let Some((played_s, _)) = self.played.filter(|played| newest_s - played.0 <= BACKLOG_S) else {
@@ -323,12 +335,12 @@ impl Path {
         let before = self.pass(next_s);
         self.played = Some(match (before, self.waiting.front()) {
             (Some(before), Some(after)) => (next_s, between(before, *after, next_s)),
-            // Beyond all that is known.
+            // Beyond the newest command.
             _ => (next_s, newest_m + velocity_m_per_s * (next_s - newest_s)),
         });
     }
 
-    /// What was played last by a moment, and leaves the queue.
+    /// Removes the places up to a moment from the queue. Returns the last of them, or what was played before.
     fn pass(&mut self, until_s: f64) -> Option<(f64, DVec3)> {
         let mut before = self.played;
         while let Some(place) = self.waiting.front().copied().filter(|place| place.0 <= until_s + 1e-9) {
@@ -339,12 +351,12 @@ impl Path {
     }
 }
 
-/// The place between two at a moment between them.
+/// Returns the place on the straight line between two places, at a time between theirs.
 fn between(before: (f64, DVec3), after: (f64, DVec3), at_s: f64) -> DVec3 {
     before.1.lerp(after.1, (at_s - before.0) / (after.0 - before.0))
 }
 
-/// A new tool that touches begins at least this high above the sheet at rest, m.
+/// Smallest height above the sheet at rest at which a new tool that touches begins, m.
 const ABOVE_M: f64 = 0.002;
 
 #[cfg(test)]
@@ -353,8 +365,8 @@ mod tests {
 
     const STEP_S: f64 = 1e-3;
 
-    /// Plays commands, one a millisecond, which arrive as `arrival` says: at step k come those before `arrival(k)`. Returns
-    /// the client's time of the tool at each step.
+    /// Plays one command per millisecond. At step k, those before `arrival(k)` arrive. Returns the client time of the
+    /// tool at each step.
     fn played(steps: u32, arrival: impl Fn(u32) -> u32) -> Vec<f64> {
         let (mut path, mut sent, mut times) = (Path::default(), 0, Vec::new());
         for step in 0..steps {

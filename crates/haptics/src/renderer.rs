@@ -4,22 +4,23 @@
 //! When a newer model arrives, the force would jump by the error of the old one. That difference is kept as a bias and
 //! decays with [`BIAS_S`], so the hand feels a smooth change, not a knock.
 //!
-//! **A change of law.** A server that needs long for the exact law of a tissue sends a coarse one first, and when the tissue
-//! becomes another it sends that one's. Each model names the law by which the server has placed its surface, so the renderer changes over with the first model of the new law,
-//! and never between two models. Let F be the force by the new model and law along the tool's path, and G that by the old
-//! ones. In the tick of the change, at t0, the bias is b = G(t0) − F(t0), and from then on the force is
-//! F(t) + b·e^{−(t − t0)/τ}, τ = [`BIAS_S`]. At t0 that is G(t0): no jump. In a tick of length h after it, the bias changes
-//! by no more than |b|·h/τ, and all else is the change of F, the tissue's own. Both models pass through the force of
-//! their sample, whatever their law ([`Touching::at_sample`]). So beside the error of the old model, b is not the
-//! difference of the laws' forces, but that of their slopes over the way since the sample: for a coarse law whose slope is
-//! within a tenth of K, and a way s, that is at most 0.1·K·s.
+//! **A change of law.** A server that needs long for the exact law of a tissue sends a coarse one first. When the
+//! tissue changes, it sends a new law. Each model names the law by which the server has placed its surface, so the
+//! renderer changes the law with the first model that names the new one, and never between two models. Let F be the
+//! force by the new model and law along the tool's path, and G that by the old ones. In the tick of the change, at
+//! t₀, the bias is b = G(t₀) − F(t₀), and from then on the force is F(t) + b·e^{−(t − t₀)/τ}, τ = [`BIAS_S`]. At t₀
+//! this is G(t₀), so there is no jump. In a later tick of length h the bias changes by at most |b|·h/τ, and the rest
+//! is the change of F, the tissue's own. Both models pass through the force of their sample with any law
+//! ([`Touching::at_sample`]). So apart from the error of the old model, b is not the difference of the laws' forces,
+//! but that of their slopes over the distance since the sample: at most 0.1·K·s for a distance s and a coarse law
+//! whose slope is within a tenth of K.
 //!
-//! **A copy of the tissue** ([`crate::prediction`]) tells the force in place of the local model, if the client has one and it has
-//! been the better one. What changes over between the two is a bias as well.
+//! **A copy of the tissue** ([`crate::prediction`]) gives the force in place of the local model if the client has one
+//! and its error has been smaller. A change between the two also becomes a bias.
 //!
 //! The bias is not the force of a passive spring: it may give energy, at most |b|·v·τ when the tool moves at v. The
-//! envelope counts it like all other work at the port, and its limits act on the sum: so a change of law can't make the
-//! port active, nor the force faster than the slew.
+//! envelope counts it like all other work at the port, and its limits act on the sum. So a change of law cannot make
+//! the port active, nor the force faster than the slew.
 
 use glam::DVec3;
 
@@ -28,20 +29,22 @@ use crate::force_law::Law;
 use crate::local_model::{ContactState, LocalModel, Touching, Track};
 use crate::prediction::Prediction;
 
-/// Time constant with which the error of the last model decays, s.
+/// Time constant with which the bias after a new model decays, s.
 pub const BIAS_S: f64 = 0.02;
 
-/// Laws that a renderer keeps.
+/// Largest number of force laws that a renderer keeps. A further law replaces the oldest that neither the newest
+/// model nor one that waits for the next tick names.
 pub const MAX_LAWS: usize = 16;
 
-/// A way that nobody feels, and one that everybody does, m: [`Renderer::way_m`] is between them.
+/// Limits of [`Renderer::way_m`], m: no hand feels the smaller one, and every hand feels the larger one.
 const MIN_WAY_M: f64 = 2e-5;
 const MAX_WAY_M: f64 = 1e-3;
 
-/// One tool's renderer.
+/// Renderer of one tool: it computes the force in each tick from the newest local model, the force laws and the
+/// tool's path.
 ///
-/// Samples come every 20 ms; between them the force follows the hand a thousand times a second. A tissue of 400 N/m pushes back
-/// with 1 N where the hand is 2.5 mm deep:
+/// Samples arrive every 20 ms; between them the force follows the hand a thousand times a second. A tissue of 400 N/m
+/// pushes back with 1 N at a depth of 2.5 mm:
 ///
 /// ```
 /// use glam::{DMat3, DVec3};
@@ -83,13 +86,13 @@ const MAX_WAY_M: f64 = 1e-3;
 /// ```
 #[derive(Debug)]
 pub struct Renderer {
-    /// With their numbers, the oldest first.
+    /// The laws with their numbers, the oldest first.
     laws: Vec<(u32, Law)>,
-    /// The newest model, and the touch that follows from it.
+    /// The newest model in use, and the state of touch along the path since it.
     newest: Option<(LocalModel, Touching)>,
-    /// A newer model that has arrived since, and when.
+    /// A newer model that waits for the next tick, and its time of arrival, s.
     arrived: Option<(LocalModel, f64)>,
-    /// When the newest model arrived, of whatever connection: `None` before the first of all.
+    /// Time of arrival of the newest model of any connection, s; `None` before the first.
     newest_s: Option<f64>,
     bias_n: DVec3,
     biased_s: f64,
@@ -98,18 +101,19 @@ pub struct Renderer {
     velocity_m_per_s: DVec3,
     refused: u64,
     prediction: Option<Prediction>,
-    /// Ticks that were rendered from a copy of the tissue.
+    /// Number of ticks that were rendered from a copy of the tissue.
     predicted: u64,
-    /// Whether the last tick was, and what it wanted, N.
+    /// Whether the last tick was rendered from a copy, and its wanted force, N.
     last: (bool, DVec3),
-    /// The limits between the law and the device.
+    /// Safety envelope that limits each force before the device.
     pub envelope: Envelope,
 }
 
 impl Renderer {
-    /// Creates a renderer for a tissue with `law`, which must be sound and is number 0, behind `envelope`.
+    /// Creates a renderer for a tissue with `law`, which gets number 0. The law must be sound ([`Law::is_sound`]),
+    /// which is not checked. The force passes through `envelope`.
     pub fn new(law: Law, envelope: Envelope) -> Self {
-        // Room for all that are ever kept.
+        // Reserves all the memory that laws will use.
         let mut laws = Vec::with_capacity(MAX_LAWS);
         laws.push((0, law));
         Renderer {
@@ -130,42 +134,46 @@ impl Renderer {
         }
     }
 
-    /// Renders from a copy of the tissue from when a sample has met it. `None`: from local models alone, as at the beginning.
-    /// Returns the copy of before, which is to be dropped elsewhere than in a tick: it may be large.
+    /// Sets the copy of the tissue from which forces are rendered once a sample has been compared with it; with
+    /// `None`, forces are rendered from local models alone, as initially. Returns the previous copy. It may be large,
+    /// so drop it outside of ticks.
     pub fn predict(&mut self, prediction: Option<Prediction>) -> Option<Prediction> {
         std::mem::replace(&mut self.prediction, prediction)
     }
 
-    /// Returns how many ticks were rendered from a copy of the tissue.
+    /// Returns the number of ticks that were rendered from a copy of the tissue.
     pub fn predicted(&self) -> u64 {
         self.predicted
     }
 
-    /// Restarts with another server, whose models start from the beginning. The envelope keeps its state, a copy of the tissue is
-    /// dropped.
+    /// Restarts for a new connection: drops the models, all laws and the copy of the tissue, and keeps `law` as
+    /// number 0. It must be sound. The envelope keeps its state.
     pub fn begin(&mut self, law: Law) {
         self.prediction = None;
         self.begin_with(law, drop);
     }
 
-    /// Does what [`Renderer::begin`] does, without asking for memory or giving any back: `used` gets the laws of before, at most
-    /// [`MAX_LAWS`], which are to be dropped elsewhere. So is what [`Renderer::predict`] gives back, which is to be called with
-    /// `None`: the copy is of another tissue.
+    /// Restarts for a new connection without allocating or freeing memory: drops the models, and keeps `law` as
+    /// number 0. Passes the previous laws, at most [`MAX_LAWS`], to `used`, which should have them freed outside of
+    /// ticks. A copy of the tissue stays set: also call [`Renderer::predict`] with `None`, because the copy is of
+    /// another tissue.
     pub fn begin_with(&mut self, law: Law, mut used: impl FnMut(Law)) {
         self.laws.drain(..).for_each(|known| used(known.1));
         self.laws.push((0, law));
         (self.newest, self.arrived) = (None, None);
     }
 
-    /// Takes a further law, which models may name from now on. False: it is not sound, or its number is known already. Of
-    /// [`MAX_LAWS`] it takes the place of the oldest that no model at hand names. Models that name a law which is not known
-    /// are rendered with the oldest.
+    /// Adds a law under a number that models may name from now on. Returns false, and changes nothing, if it is not
+    /// sound or its number is known. Beyond [`MAX_LAWS`] it replaces the oldest that no current model names. A model
+    /// that names an unknown law is rendered with the oldest one.
     pub fn learn(&mut self, number: u32, law: Law) -> bool {
         law.is_sound() && self.learn_with(number, law, drop)
     }
 
-    /// Does what [`Renderer::learn`] does with a law that is sound, without asking for memory or giving any back: `used` gets the law that is
-    /// not needed any more, if there is one, which is to be dropped elsewhere.
+    /// Adds a law under a number without allocating or freeing memory. The law must be sound, which is not checked.
+    /// Returns false if the number is known. Passes the law that is no longer needed, which is `law` itself or one
+    /// that it replaces, to `used`, which should have it freed outside of ticks. Beyond [`MAX_LAWS`] it replaces the
+    /// oldest that no current model names.
     pub fn learn_with(&mut self, number: u32, law: Law, used: impl FnOnce(Law)) -> bool {
         if self.laws.iter().any(|known| known.0 == number) {
             used(law);
@@ -180,12 +188,13 @@ impl Renderer {
         true
     }
 
-    /// Returns the number of models refused: out of order, or not finite.
+    /// Returns the number of models that were refused because they were out of order or not sound
+    /// ([`LocalModel::is_sound`]).
     pub fn refused(&self) -> u64 {
         self.refused
     }
 
-    /// Returns whether forces are rendered. Before the first model there are none, also if they were asked for.
+    /// Returns the state of rendering. Before the first model it is DISABLED, even after [`Envelope::enable`].
     pub fn state(&self) -> RenderingState {
         match self.envelope.state() {
             RenderingState::Enabled if self.newest_s.is_none() => RenderingState::Disabled,
@@ -193,12 +202,13 @@ impl Renderer {
         }
     }
 
-    /// Returns the time of the newest model by the client's clock, s.
+    /// Returns the time of the newest model in use by the client's clock, s; `None` before the first.
     pub fn model_time_s(&self) -> Option<f64> {
         self.newest.as_ref().map(|newest| newest.0.client_time_s)
     }
 
-    /// Takes a model that has just arrived. It takes effect at the next tick.
+    /// Receives a model that arrived at `now_s`, s. It takes effect at the next tick. A model that is not newer than
+    /// the last, or not sound, is refused and counted ([`Renderer::refused`]).
     pub fn receive(&mut self, model: LocalModel, now_s: f64) {
         let arrived = self.arrived.as_ref().map(|arrived| &arrived.0);
         let newest = arrived.or(self.newest.as_ref().map(|newest| &newest.0));
@@ -207,14 +217,14 @@ impl Renderer {
             self.refused += 1;
             return;
         }
-        // By number, so that a law that is forgotten changes nothing.
+        // The number is resolved now, so that the removal of another law changes nothing.
         let is_known = self.laws.iter().any(|known| known.0 == model.law);
         let law = if is_known { model.law } else { self.laws[0].0 };
         self.arrived = Some((LocalModel { law, ..model }, now_s));
     }
 
-    /// Switches to a model that has arrived: repeats the tool's path since, and keeps the difference from the last
-    /// model.
+    /// Switches to a model that has arrived: repeats the tool's path since its sample, and keeps the difference from
+    /// the last model as the bias.
     fn adopt(&mut self, model: LocalModel, now_s: f64) {
         let before_n = self.newest.is_some().then(|| self.wanted_n(now_s));
         let law = law_of(&self.laws, &model);
@@ -236,7 +246,8 @@ impl Renderer {
         }
     }
 
-    /// The force to render before the envelope, N: of the copy of the tissue or of the local model, with the bias.
+    /// Returns the force to render before the envelope, N: that of the copy of the tissue or of the local model, with
+    /// the bias.
     fn wanted_n(&self, now_s: f64) -> DVec3 {
         let Some((model, _)) = &self.newest else { return DVec3::ZERO };
         let outward = (model.contact_state != ContactState::Holding).then_some(model.normal);
@@ -246,24 +257,25 @@ impl Renderer {
         outward.map_or(force_n, |outward| force_n - force_n.dot(outward).min(0.0) * outward)
     }
 
-    /// The force from the copy of the tissue, if that is to be rendered, and where out of the tissue is.
+    /// Returns the force from the copy of the tissue, N, if it is to be rendered, and the direction out of the tissue.
     fn predicted_n(&self) -> Option<(DVec3, Option<DVec3>)> {
         let (model, _) = self.newest.as_ref()?;
         self.prediction.as_ref()?.wanted_n(model.normal)
     }
 
-    /// The force of the law and the newest model, N.
+    /// Returns the force by the law and the newest model, N.
     fn modelled_n(&self) -> DVec3 {
         self.newest.as_ref().map_or(DVec3::ZERO, |(model, touching)| {
             touching.force_n(model, law_of(&self.laws, model), self.velocity_m_per_s)
         })
     }
 
-    /// Returns the way by which a server may be wrong about the tool so that the force is off by no more than `share`
-    /// of itself, m. Above the tissue the same share of the way to it counts.
+    /// Returns the distance by which a server may be wrong about the tool's place so that the force is wrong by at
+    /// most the fraction `share` of itself, m.
     ///
-    /// A way w changes the force by at most max(k, k_t)·w, so w = `share`·F(d)/max(k, k_t) at a depth d; at a height h it is
-    /// `share`·h. It is kept between 0.02 and 1 mm.
+    /// A distance w changes the force by at most max(k, k_t)·w, so w = `share`·F(d)/max(k, k_t) at a depth d. At a
+    /// height h above the tissue it is `share`·h. It is kept between 0.02 and 1 mm, and is 0.02 mm before the first
+    /// model.
     pub fn way_m(&self, share: f64) -> f64 {
         let Some((model, touching)) = &self.newest else { return MIN_WAY_M };
         let (depth_m, row) = touching.at_law(model, law_of(&self.laws, model));
@@ -275,8 +287,9 @@ impl Renderer {
         way_m.clamp(MIN_WAY_M, MAX_WAY_M)
     }
 
-    /// Returns the force to render until the next tick, for a tool at `place_m` now, N: F(t) + b·e^{−(t − t0)/τ} as at the top of
-    /// this module, within the limits of the envelope.
+    /// Advances by one tick: records the tool's place, m, at `now_s`, and switches to a model that has arrived.
+    /// Returns the force to render until the next tick, N: F(t) + b·e^{−(t − t₀)/τ} as at the top of this module,
+    /// within the limits of the envelope.
     pub fn tick(&mut self, now_s: f64, place_m: DVec3) -> DVec3 {
         let known = place_m.is_finite() && now_s.is_finite();
         if let Some((then_s, from_m)) = self.before.filter(|_| known)
@@ -308,7 +321,7 @@ impl Renderer {
             let modelled_n = self.modelled_n();
             self.prediction.iter_mut().for_each(|prediction| prediction.keep(now_s, place_m, modelled_n));
         }
-        // A hand that was feeling forces waits no longer for another server's first model than for the next of the same.
+        // While forces are rendered, the first model of a new connection counts as late like any other.
         let counts = self.newest.is_some() || self.envelope.is_engaged();
         let age_s = self.newest_s.filter(|_| counts).map(|newest_s| now_s - newest_s);
         let wanted = Wanted { now_s, place_m, velocity_m_per_s: self.velocity_m_per_s, force_n, age_s };
@@ -316,7 +329,7 @@ impl Renderer {
     }
 }
 
-/// The law that a model names.
+/// Returns the law that a model names, or the oldest if it is unknown.
 fn law_of<'l>(laws: &'l [(u32, Law)], model: &LocalModel) -> &'l Law {
     &laws.iter().find(|known| known.0 == model.law).unwrap_or(&laws[0]).1
 }
@@ -329,7 +342,7 @@ mod tests {
     use crate::device::UNDECLARED;
     use crate::envelope::ENGAGE_BELOW_N;
 
-    /// Of a tool at rest at `place_m`, on a surface at `height_m` with a spring of 400 N/m.
+    /// Returns the model of a tool at rest at `place_m`, on a surface at `height_m` with a spring of 400 N/m.
     fn model(sequence: u64, time_s: f64, place_m: DVec3, height_m: f64) -> LocalModel {
         LocalModel {
             sequence,
@@ -382,7 +395,7 @@ mod tests {
         assert_eq!(renderer.state(), RenderingState::Disabled);
         renderer.tick(0.8, place_m);
         assert_eq!(renderer.state(), RenderingState::Enabled);
-        // Another connection begins, and nothing was asked for anew.
+        // Another connection begins, without another call to `enable`.
         renderer.begin(Law::linear(400.0, 0.5));
         renderer.tick(0.801, place_m);
         assert_eq!(renderer.state(), RenderingState::Enabled);
@@ -413,10 +426,11 @@ mod tests {
         assert!(run(&mut renderer, out_m, true) < ENGAGE_BELOW_N);
         run(&mut renderer, out_m, true);
         assert!(run(&mut renderer, deep_m, true) > 1.5);
-        // Another server goes on at once, and so does what was felt.
+        // Another server continues at once, and so does the force.
         renderer.begin(Law::linear(400.0, 0.5));
         assert!(run(&mut renderer, deep_m, true) > 1.5);
-        // The first model of another takes too long: paused, and as at the beginning once it is enabled.
+        // The first model of another server takes too long: rendering is paused, and starts as at the beginning once
+        // enabled.
         renderer.begin(Law::linear(400.0, 0.5));
         run(&mut renderer, deep_m, false);
         assert_eq!(renderer.state(), RenderingState::Paused);
@@ -432,7 +446,7 @@ mod tests {
         renderer.receive(model(1, 0.0, place_m, 0.0), 0.0);
         renderer.tick(0.0, place_m);
         assert!((renderer.wanted_n(0.0).z - 1.6).abs() < 1e-12);
-        // The surface was told a millimetre too high: 1.6 N instead of 1.2.
+        // The first model's surface was a millimetre too high: 1.6 N instead of 1.2.
         renderer.receive(model(2, 0.001, place_m, -0.001), 0.001);
         renderer.tick(0.001, place_m);
         for (later_s, expected_n) in [(0.0, 1.6), (BIAS_S, 1.2 + 0.4 / std::f64::consts::E), (1.0, 1.2)] {
@@ -441,7 +455,7 @@ mod tests {
         }
     }
 
-    /// A copy of the spring that is so many times as stiff.
+    /// A copy of the spring with its stiffness multiplied by a factor.
     struct Copy(f64);
 
     impl crate::Predictor for Copy {
@@ -453,7 +467,7 @@ mod tests {
 
     #[test]
     fn a_hand_that_lifts_off_a_copy_that_is_off_is_let_go_of_without_a_knock_and_is_not_pulled() {
-        // A sample may be of the tick before, beyond which nothing was forecast.
+        // A sample may be of the previous tick, after which there is no forecast.
         for (factor, late) in [(0.8, 50), (1.25, 50), (0.8, 1), (1.25, 1)] {
             let mut renderer = renderer();
             renderer.predict(Some(Prediction::new(Box::new(Copy(factor)))));

@@ -1,12 +1,12 @@
-//! The tip of a position-controlled tool: how it meets the tissue.
+//! The tip of a tool that is controlled by its position: its size, its friction and its coupling to the tissue.
 
-/// The coupling between a tool and the surface it touches.
+/// Coupling between a tool and the surface that it touches.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Coupling {
     /// The surface follows the tool exactly: the stiffness felt is the tissue's.
     Constraint,
-    /// A spring of Kc and a damper of Bc: the stiffness felt is K·Kc/(K + Kc), that of two springs in a row, which bear the same
-    /// force and add their lengths.
+    /// A spring Kc and a damper Bc between tool and surface. The stiffness felt is that of two springs in series,
+    /// K·Kc/(K + Kc), with K the tissue's stiffness.
     Spring {
         /// Kc, N/m.
         stiffness_n_per_m: f64,
@@ -15,21 +15,21 @@ pub enum Coupling {
     },
 }
 
-/// The properties of a tool's tip.
+/// Properties of a tool's tip that determine its contact with the tissue.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tip {
-    /// Radius of the disc with which it meets the tissue, m. A stiffness in N/m means little without it.
+    /// Radius of the disc that touches the tissue, m. The tissue's stiffness in N/m depends on it.
     pub radius_m: f64,
-    /// μ of Coulomb friction; unused for a grasp.
+    /// Coefficient μ of Coulomb friction; unused for a grasp.
     pub friction: f64,
-    /// Whether it holds the tissue, and so pulls as well as pushes. Otherwise it touches and only pushes.
+    /// Whether it holds the tissue, so that it pulls as well as pushes. Otherwise it only pushes.
     pub grasps: bool,
-    /// The coupling.
+    /// Coupling between the tool and the surface.
     pub coupling: Coupling,
 }
 
 impl Default for Tip {
-    /// A fingertip on wet tissue.
+    /// Returns the tip of a finger on wet tissue: 5 mm, μ = 0.2, no grasp, a constraint.
     fn default() -> Self {
         Tip { radius_m: 0.005, friction: 0.2, grasps: false, coupling: Coupling::Constraint }
     }

@@ -1,4 +1,4 @@
-//! `palpate run`: plays a script offline, in process, as fast as possible.
+//! Run of a script: plays it offline, in this process, as fast as possible, for `palpate run` and for programs.
 
 use std::io::Write;
 use std::sync::Arc;
@@ -12,7 +12,7 @@ use palpate_tissue::scene::record::{Line, Record, Run, Summary, far_warning, wri
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::{Model, Tissue};
 
-/// Returns the first line of a run: the scene, the script and how the scene is stepped.
+/// Returns the first line of a run: the names of scene and script, and the stepping of the scene.
 pub fn header(model: &Model, script: &str) -> Run {
     Run {
         scene: model.scene.name.clone(),
@@ -29,19 +29,21 @@ pub fn header(model: &Model, script: &str) -> Run {
 pub enum RunEvent<'t> {
     /// The run begins.
     Run(&'t Run),
-    /// A record is due.
+    /// A record is due: at every `sample_every`-th step of the script.
     Record(Record),
-    /// The number of steps done, after each step.
+    /// A step was done. Contains the number of steps done.
     Steps(u64),
-    /// The run is over.
+    /// The run has ended.
     Summary(&'t Summary),
 }
 
-/// Plays `script` and writes its records, as JSON Lines, to `output`. `held` plays forces and moves as commands that keep
-/// them constant over each step. `audit` runs a twin in f64 with a quarter of the substep: the summary has the differences
-/// between the two, and with `[stepping] correct` the run corrects errors above the tolerance. `clock_s` returns the time,
-/// s, for the summary; `progress` gets the number of steps done every 1024 steps. Returns the summary, which is also the
-/// last line.
+/// Plays `script` and writes its records, as JSON Lines, to `output`. Returns the summary, which is also the last
+/// line.
+///
+/// `held` plays forces and moves as commands that keep them constant over each step. `audit` runs a second simulation
+/// in f64 with a quarter of the substep (a twin): the summary contains the differences between the two, and with
+/// `[stepping] correct` the run corrects errors above the tolerance. `clock_s` returns the time, s, for the summary.
+/// `progress` is called with the number of steps done every 1024 steps.
 ///
 /// # Errors
 /// Returns an error if the session is held, a command or change is refused, or the output can't be written.
@@ -57,12 +59,16 @@ pub fn run(
     told(model, script, [held, audit], limits, clock_s, &mut |told| write(output, progress, told))
 }
 
-/// Plays `script` for a program that takes the records as values: `tell` gets each event and may end the run with
-/// an error. The pair is whether forces and moves are commands ([`run`]), and whether a twin audits the run
-/// ([`audited`]).
+/// Plays `script` for a program that uses the records as values. Calls `tell` with each event; an error of `tell`
+/// ends the run. Returns the summary.
+///
+/// `held` plays forces and moves as commands that keep them constant over each step. `audit` runs a second simulation
+/// in f64 with a quarter of the substep (a twin) and compares the two, as [`run`] describes. `clock_s` returns the
+/// time, s, for the summary.
 ///
 /// # Errors
-/// Returns an error for the reasons of [`run`] and [`audited`]; an error of `tell` is [`RunFailure::Output`].
+/// Returns an error if the session or its twin is held or a command or change is refused. An error of `tell` is
+/// [`SimulationFailure::Output`].
 pub fn told(
     model: &Arc<Model>,
     script: &Script,
@@ -119,7 +125,7 @@ pub fn told(
             }
         });
         std::mem::replace(&mut written, Ok(()))?;
-        // A tissue that went back can't be compared with a twin that did not.
+        // A tissue that was put back to an earlier state can't be compared with a twin that was not.
         let ended = if twin.is_some() { session.fault() } else { session.hold_reason().map(str::to_owned) };
         if let Some(reason) = ended {
             return Err(SimulationFailure::Held(reason));
@@ -166,7 +172,8 @@ fn write(output: &mut dyn Write, progress: &mut dyn FnMut(u64), told: RunEvent<'
     }
 }
 
-/// Returns the last line of a run with this tissue at its end, without what only the run itself knows.
+/// Returns the summary of a run that ended with this tissue and took `wall_s`, s. Fields that only the run itself can
+/// fill (audit, corrections, warnings, peaks and curves) are empty or 0.
 #[allow(clippy::cast_precision_loss)]
 pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
     let (model, steps) = (tissue.model(), tissue.step_count());

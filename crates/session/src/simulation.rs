@@ -1,5 +1,5 @@
-//! A session without a server: its inputs come from a script, from the caller or from a journal, and the caller decides how
-//! far it advances.
+//! A session without a server. Its inputs come from a script, from the caller or from a journal, and the caller
+//! decides how far it advances.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -17,25 +17,25 @@ use palpate_tissue::scene::record::Correction;
 use palpate_tissue::scene::script::{Action, Script};
 use palpate_tissue::select::audit::AuditFinding;
 
-/// The reason why a simulation ends early.
+/// Reason why a simulation ends early.
 #[derive(Debug, thiserror::Error)]
 pub enum SimulationFailure {
-    /// The guard has ended the session, or has taken its tissue back.
+    /// The guard has ended the session, or has put its tissue back to an earlier state. Contains the reason.
     #[error("the run was stopped: {0}")]
     Held(String),
-    /// The input is refused, for the same reasons as a command.
+    /// A command or a change of the tissue was refused.
     #[error("{0}")]
     Refused(#[from] Refusal),
-    /// The output can't be written.
+    /// The output could not be written.
     #[error("can't write the output: {0}")]
     Output(#[from] std::io::Error),
 }
 
-/// A session with its waiting inputs.
+/// A session with its queue of inputs, which is stepped without a server.
 pub struct Simulation {
     /// The tissue and its tools.
     pub session: Session,
-    /// The queue of commands, as a server has one.
+    /// Queue of the commands and leases of tools.
     pub intake: Intake,
     /// The commands that act at the coming step.
     pub(crate) due: Vec<Due>,
@@ -49,22 +49,23 @@ pub struct Simulation {
 const LEASE: LeaseId = 1;
 
 impl Simulation {
-    /// Creates a simulation of a tissue at rest.
+    /// Creates a simulation of a tissue at rest, at step 0.
     pub fn new(model: &Arc<Model>, limits: &Limits) -> Self {
         Simulation::of(Session::new(model), &model.scene, limits)
     }
 
-    /// Creates a simulation that continues a session, which began with the scene `first`.
+    /// Creates a simulation that continues `session`, which began with the scene `first`.
     pub fn of(session: Session, first: &Scene, limits: &Limits) -> Self {
         let intake = Intake::new(first, limits).continued(&session, None);
         Simulation { session, intake, due: Vec::new(), changes: VecDeque::new(), script: None }
     }
 
-    /// Creates a simulation that plays `script`: forces and moves as continuous profiles, set once, or everything as the
-    /// commands that a client streams (`held`). Poses are commands in both cases.
+    /// Creates a simulation that plays `script`. Without `held`, its forces and moves are continuous profiles that
+    /// are set once; with `held`, they are commands at each step, as a client streams them. Poses are commands in
+    /// both cases.
     ///
     /// # Errors
-    /// Returns the refusals of [`Model::changed`].
+    /// Returns the errors of [`Model::apply_changes`].
     pub fn playing(model: &Arc<Model>, script: &Script, held: bool, limits: &Limits) -> Result<Self> {
         let changes = model.apply_changes(&model.scene, &script.changes, limits)?;
         let mut simulation = Simulation { changes, ..Simulation::new(model, limits) };
@@ -78,7 +79,7 @@ impl Simulation {
     /// Queues an action of a tool for the coming step. Acquires the tool first if it is free.
     ///
     /// # Errors
-    /// Refuses a command that a server would refuse.
+    /// Returns a refusal if a server would refuse the command.
     pub fn command(&mut self, tool: u32, action: Action) -> Result<()> {
         if self.intake.leases.get(tool).is_none() {
             let lease_s = self.intake.rules().limits.lease_s;
@@ -88,7 +89,8 @@ impl Simulation {
         self.intake.submit(LEASE, vec![command], 0)
     }
 
-    /// Applies an input from a journal: commands and another tissue at the coming step, everything else at once.
+    /// Applies an input from a journal. Commands and another tissue act at the coming step, the end of a session and
+    /// its revival act at once, and inputs that only start, pause or skip time do nothing.
     pub fn apply(&mut self, input: Input) {
         let step = self.session.step_count();
         match input {
@@ -107,11 +109,11 @@ impl Simulation {
         }
     }
 
-    /// Applies the correction that a finding of an audit needs, from now on and to the script's later changes. Returns the
-    /// correction; `None` if none is needed.
+    /// Corrects the tissue as a finding of an audit needs it, from now on, and also in the script's later changes.
+    /// Returns the correction; `None`, without a change, if none is needed.
     ///
     /// # Errors
-    /// Returns the refusals of [`Model::corrected`] and [`Model::changed`].
+    /// Returns the errors of [`Model::corrected`] and [`Model::apply_changes`].
     pub fn correct(&mut self, finding: &AuditFinding) -> Result<Option<Correction>> {
         let (rules, step) = (self.intake.rules(), self.session.step_count());
         let Some(correction) = self.session.model().correction(finding, step, &rules.limits) else { return Ok(None) };
@@ -124,11 +126,11 @@ impl Simulation {
         Ok(Some(correction))
     }
 
-    /// Changes the tissue to the last one that is due, if any, and takes the commands that act at the coming step. Leases
-    /// that lapse before `now_ns` end; with 0 no lease lapses.
+    /// Changes the tissue to the last one that is due, if any, and moves the commands that act at the coming step out
+    /// of the queue. Ends the leases that lapse before `now_ns`, ns; with 0 no lease lapses.
     ///
     /// # Errors
-    /// Refuses a command of the script that a server would refuse.
+    /// Returns a refusal if a server would refuse a command of the script.
     pub fn take_inputs(&mut self, now_ns: u64) -> Result<()> {
         let step = self.session.step_count();
         if let Some((script, held)) = &self.script {
@@ -152,21 +154,22 @@ impl Simulation {
         self.changes.drain(..due).next_back().map(|change| change.1)
     }
 
-    /// Advances one step, with what acts at its beginning.
+    /// Advances one step, with the inputs that act at its beginning. Leases that lapse before `now_ns`, ns, end; with
+    /// 0 none lapses.
     ///
     /// # Errors
-    /// As for [`Simulation::take_inputs`].
+    /// Returns the errors of [`Simulation::take_inputs`].
     pub fn step(&mut self, now_ns: u64) -> Result<()> {
         self.take_inputs(now_ns)?;
         self.session.advance(&mut self.due, |_| {});
         Ok(())
     }
 
-    /// Advances until `step` steps are done.
+    /// Advances until `step` steps are done. Does nothing if they are done already.
     ///
     /// # Errors
-    /// Returns a failure if the tissue is not what the inputs have made of it ([`Session::fault`]), and as for
-    /// [`Simulation::take_inputs`].
+    /// Returns [`SimulationFailure::Held`] if the guard has acted, so that the tissue is not the result of its inputs
+    /// ([`Session::fault`]), and the errors of [`Simulation::take_inputs`].
     pub fn run_to(&mut self, step: u64) -> std::result::Result<(), SimulationFailure> {
         while self.session.step_count() < step {
             self.step(0)?;

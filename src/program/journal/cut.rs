@@ -30,10 +30,10 @@ pub(super) fn cut(arguments: &CutArguments) -> Result<(), Failure> {
     let reader = source.open()?;
     let mut file = new_file(output)?;
     let survey = recover::cut(reader, [*from, *to], &limits, &mut file).inspect_err(|_| {
-        // What is half of a journal helps nobody.
+        // A half-written journal is useless.
         let _ = std::fs::remove_file(output);
     })?;
     file.sync_all().map_err(|e| unwritten(output, &e))?;
-    // It had all steps that were wanted.
+    // All requested steps were there.
     source.tell_damage(survey.damage.as_deref(), survey.until_step, Some(*to))
 }

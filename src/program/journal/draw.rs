@@ -1,4 +1,4 @@
-//! `palpate journal render`: a picture or a film of a session.
+//! `palpate journal render`: draws a picture or a film of a session.
 
 use std::path::PathBuf;
 
@@ -41,7 +41,7 @@ pub(super) struct RenderArguments {
     frames_hz: f64,
 }
 
-/// The tissue as it stands, with an arrow for what each tool feels.
+/// Returns the tissue at the present step to draw, with an arrow for the force on each tool.
 fn still(session: &Session, shown: Option<&std::sync::Arc<Skin>>) -> Still {
     let felt = session.felt().into_iter().filter(|felt| felt.force_n.length() > 0.0);
     let shape = session.model().shape();
@@ -52,7 +52,7 @@ fn still(session: &Session, shown: Option<&std::sync::Arc<Skin>>) -> Still {
     Still::of(session, shown, felt.map(arrow).collect())
 }
 
-/// The moment at which the largest force was felt, as it was recorded.
+/// Returns the step of the largest recorded force on a tool.
 fn strongest(source: &JournalSource) -> Result<u64, Failure> {
     let mut reader = source.open()?;
     let mut found = (0.0, reader.header().begin_step);

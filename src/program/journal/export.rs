@@ -1,4 +1,4 @@
-//! `palpate journal export`: what was recorded, for other programs.
+//! `palpate journal export`: writes recorded values for other programs.
 
 use std::io::Write;
 use std::path::PathBuf;

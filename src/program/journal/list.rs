@@ -20,23 +20,23 @@ pub(super) struct ListArguments {
     json: bool,
 }
 
-/// How a journal ends.
+/// Kind of end of a journal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 enum JournalEnd {
     /// The session was deleted.
     Deleted,
-    /// The server ended, and the session goes on in the next run.
+    /// The server ended, and the session continues in the next run.
     Drained,
-    /// It is a part of another.
+    /// It is a part of another journal.
     Cut,
     /// It was recovered.
     Recovered,
     /// Another server of the fleet has the session.
     Moved,
-    /// A server writes it, or was killed.
+    /// A server is writing it, or was killed.
     Unfinished,
-    /// The same, and there are bytes of no whole batch at its end.
+    /// A server is writing it or was killed, and its last batch is incomplete.
     Torn,
     /// It can't be read, or is damaged in the middle.
     Damaged,

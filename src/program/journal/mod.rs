@@ -72,12 +72,12 @@ impl JournalSource {
         limits(self.config.as_deref())
     }
 
-    /// The journal, up to where it is damaged, if it is.
+    /// Opens the journal, up to a damaged place if there is one.
     fn open(&self) -> Result<JournalReader<'static>, Failure> {
         Ok(JournalReader::open(&self.file)?.up_to_damage())
     }
 
-    /// Tells, after all that is whole was written, what is not. It is an error if more was wanted: steps after `until`.
+    /// Reports damage after all whole parts were written. Returns an error if steps after `until` were requested.
     fn tell_damage(&self, damage: Option<&str>, until: u64, wanted: Option<u64>) -> Result<(), Failure> {
         let Some(damage) = damage else { return Ok(()) };
         let message = format!("{}: {damage}; it is whole up to step {until}", self.file.display());
@@ -88,7 +88,7 @@ impl JournalSource {
         Err(Failure::Refused(format!("{message}; the output ends there")))
     }
 
-    /// A replay from the beginning, or from the newest snapshot before a step.
+    /// Begins a replay at the beginning, or at the newest snapshot before a step.
     fn replay(&self, from: Option<u64>) -> Result<Replay<'static>, Failure> {
         let mut reader = self.open()?;
         let length = reader.length();
@@ -105,7 +105,7 @@ fn limits(config: Option<&Path>) -> Result<Limits, Failure> {
     Ok(load_config(config)?.limits)
 }
 
-/// Does what the arguments say.
+/// Runs the subcommand.
 pub(crate) fn journal(arguments: &JournalArguments) -> Result<(), Failure> {
     match &arguments.command {
         JournalCommand::List(arguments) => list::list(arguments),

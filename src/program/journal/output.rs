@@ -1,4 +1,4 @@
-//! Where `palpate journal` writes.
+//! Output of `palpate journal`: the standard output or a file.
 
 use std::fs::{File, OpenOptions};
 use std::io::{BufWriter, ErrorKind, Write};
@@ -13,7 +13,7 @@ pub(super) fn output(file: Option<&Path>) -> Result<Box<dyn Write>, Failure> {
     Ok(Box::new(BufWriter::new(file)))
 }
 
-/// A new file that only its owner reads and writes; one that exists is not overwritten.
+/// Creates a file that only its owner can read and write. Does not overwrite an existing file.
 pub(super) fn new_file(path: &Path) -> Result<File, Failure> {
     let mut options = OpenOptions::new();
     options.read(true).write(true).create_new(true);
@@ -25,12 +25,12 @@ pub(super) fn new_file(path: &Path) -> Result<File, Failure> {
     })
 }
 
-/// The failure of a file that can't be written.
+/// Returns the failure for a file that can't be written.
 pub(super) fn unwritten(path: &Path, e: &std::io::Error) -> Failure {
     Failure::Failed(format!("{}: can't be written: {e}", path.display()))
 }
 
-/// Ends the program quietly where a reader closed the pipe.
+/// Ends the program quietly if a reader closed the pipe.
 pub(super) fn written(result: std::io::Result<()>) -> Result<(), Failure> {
     match result {
         Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Failure::Failed(format!("can't write the output: {e}"))),
@@ -38,7 +38,7 @@ pub(super) fn written(result: std::io::Result<()>) -> Result<(), Failure> {
     }
 }
 
-/// A time as people write it, UTC: `2026-01-31 12:34:56.789`.
+/// Returns a time in UTC as a text: `2026-01-31 12:34:56.789`.
 pub(super) fn utc(unix_ns: u64) -> String {
     let (seconds, millis) = (unix_ns / 1_000_000_000, unix_ns / 1_000_000 % 1000);
     let (days, second) = (seconds / 86_400, seconds % 86_400);

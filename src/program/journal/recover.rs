@@ -16,7 +16,7 @@ pub(super) struct RecoverArguments {
     output: Option<PathBuf>,
 }
 
-/// Recovers a journal, in a new file, which at last takes the place of the old one if no other is given.
+/// Recovers a journal into a new file, which finally replaces the old one if no other file is given.
 pub(super) fn recover(arguments: &RecoverArguments) -> Result<(), Failure> {
     let RecoverArguments { file, output } = arguments;
     let beside = file.with_extension("mcap.part");
@@ -35,7 +35,7 @@ pub(super) fn recover(arguments: &RecoverArguments) -> Result<(), Failure> {
     new.sync_all().map_err(|e| unwritten(target, &e))?;
     if output.is_none() {
         if survey.damage.is_some() {
-            // What is behind the damage may be worth something to somebody.
+            // The bytes after the damage may still be useful.
             let damaged = file.with_extension("mcap.damaged");
             std::fs::rename(file, &damaged).map_err(|e| unwritten(&damaged, &e))?;
             say!("{}: the file as it was is {}", file.display(), damaged.display());

@@ -1,4 +1,4 @@
-//! `palpate journal show`: what happened in a session, as lines.
+//! `palpate journal show`: prints the events of a session as lines.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -24,7 +24,7 @@ pub(super) struct ShowArguments {
     json: bool,
 }
 
-/// Commands of one kind to one tool, in a row.
+/// Successive commands of one kind to one tool.
 struct CommandRow {
     kind: &'static str,
     from: u64,
@@ -133,7 +133,7 @@ fn input(input: &pb::Input) -> String {
     }
 }
 
-/// What kind of input it is, for programs.
+/// Returns the kind of an input, for programs.
 fn name(input: &pb::Input) -> &'static str {
     use pb::input::What;
     match &input.what {
@@ -180,7 +180,7 @@ fn in_json(input: &pb::Input) -> Value {
     line
 }
 
-/// Shows what a journal has.
+/// Prints the events of a journal.
 pub(super) fn show(arguments: &ShowArguments) -> Result<(), Failure> {
     let mut reader = JournalReader::open(&arguments.file)?;
     let mut out = output(None)?;

@@ -24,7 +24,7 @@ pub(super) struct VerifyArguments {
     config: Option<PathBuf>,
 }
 
-/// Verifies journals, each by itself; the worst decides how the program ends.
+/// Verifies each journal. The worst result determines the exit status.
 pub(super) fn verify(arguments: &VerifyArguments) -> Result<(), Failure> {
     let limits = limits(arguments.config.as_deref())?;
     let key = arguments.signed_by.as_deref().map(public_key).transpose()?;
@@ -51,7 +51,7 @@ pub(super) fn verify(arguments: &VerifyArguments) -> Result<(), Failure> {
             Some(difference) => differs.push(format!("{name}: {difference}")),
             None => say!("{name}: {}, in {:.2} s", proved(&verdict), clock_s() - begun_s),
         }
-        unread.extend(damage.map(|damage| format!("{name}: {damage}; what follows was not looked at")));
+        unread.extend(damage.map(|damage| format!("{name}: {damage}; the rest was not checked")));
         match signed {
             Ok(None) => {}
             Ok(Some(signed)) => match of_signature(signed) {
@@ -70,7 +70,7 @@ pub(super) fn verify(arguments: &VerifyArguments) -> Result<(), Failure> {
     last.map_or(Ok(()), |problem| Err(failure(problem)))
 }
 
-/// The key in a file.
+/// Reads the key in a file.
 fn public_key(path: &Path) -> Result<PublicKey, Failure> {
     let refuse = |why: String| Failure::Refused(format!("--signed-by {}: {why}", path.display()));
     let text = files::read_text(path, files::MAX_SECRET_BYTES).map_err(|refusal| refuse(refusal.message))?;
@@ -92,7 +92,7 @@ fn signed(reader: &mut JournalReader<'_>, key: PublicKey) -> Result<Option<Signe
     checked
 }
 
-/// How much of a journal was proved to give the same bits.
+/// Returns how many steps of a journal were proved to give the same bits, as a text.
 fn proved(verdict: &Verdict) -> String {
     let Verdict { steps: [from, to], proved_until, compared: [hashes, snapshots], .. } = verdict;
     let (steps, proved) = (to - from, proved_until - from);
@@ -110,7 +110,7 @@ fn proved(verdict: &Verdict) -> String {
     }
 }
 
-/// What signatures say of a journal, or why they say too little.
+/// Returns what the signatures prove about a journal, or why they prove too little.
 fn of_signature(signed: Option<Signed>) -> Result<String, String> {
     match signed {
         None => Err("has no signature: its server has no key (`palpate serve --journal-key`)".to_owned()),

@@ -1,4 +1,4 @@
-//! The client at the device, by how it renders samples.
+//! The client at the device, for each scheme of rendering samples.
 
 use std::sync::Arc;
 
@@ -18,7 +18,7 @@ pub(super) enum LinkClient {
     Model(Box<Renderer>),
 }
 
-/// A copy of the tissue, as the hand sees it.
+/// A copy of the tissue in the hand's frame.
 struct Copied {
     tissue: TissueCopy,
     spot: Spot,
@@ -32,7 +32,7 @@ impl Predictor for Copied {
 }
 
 impl LinkClient {
-    /// Of a setup, enabled.
+    /// Creates the client of a setup, with rendering enabled.
     pub(super) fn new(setup: &Setup) -> Self {
         let envelope = || {
             let mut envelope = Envelope::new(setup.device, setup.spot.at_m);
@@ -50,7 +50,7 @@ impl LinkClient {
         }
     }
 
-    /// Takes a copy of a tissue, if it renders from one.
+    /// Sets the copy of a tissue, if the client renders from one.
     pub(super) fn copy(&mut self, setup: &Setup, model: &Arc<Model>) {
         if let (LinkClient::Model(renderer), Rendering::Prediction) = (self, setup.scheme) {
             let copied = Copied { tissue: TissueCopy::new(model, setup.tip), spot: setup.spot };
@@ -58,14 +58,14 @@ impl LinkClient {
         }
     }
 
-    /// Takes a further law, which samples may name from now on.
+    /// Adds a further law, which samples may name from now on.
     pub(super) fn learn(&mut self, number: u32, law: &Law) {
         if let LinkClient::Model(renderer) = self {
             renderer.learn(number, law.clone());
         }
     }
 
-    /// Takes a sample that has arrived.
+    /// Receives a sample that has arrived.
     pub(super) fn receive(&mut self, model: LocalModel, now_s: f64) {
         match self {
             LinkClient::Raw(newest) => *newest = Some(model),
@@ -74,7 +74,7 @@ impl LinkClient {
         }
     }
 
-    /// The force that the device holds until the next tick, N.
+    /// Does a tick. Returns the force that the device holds until the next tick, N.
     pub(super) fn tick(&mut self, now_s: f64, place_m: DVec3) -> DVec3 {
         match self {
             LinkClient::Raw(newest) => newest.map_or(DVec3::ZERO, |model| model.force_n),
@@ -92,7 +92,7 @@ impl LinkClient {
         }
     }
 
-    /// How many ticks were rendered from a copy of the tissue.
+    /// Returns the number of ticks that were rendered from a copy of the tissue.
     pub(super) fn predicted(&self) -> u64 {
         match self {
             LinkClient::Model(renderer) => renderer.predicted(),
@@ -100,7 +100,7 @@ impl LinkClient {
         }
     }
 
-    /// The envelope, if there is one.
+    /// Returns the envelope, if there is one.
     pub(super) fn envelope(&mut self) -> Option<&mut Envelope> {
         match self {
             LinkClient::Raw(_) => None,
@@ -109,7 +109,7 @@ impl LinkClient {
         }
     }
 
-    /// Time of the newest sample by the client's clock, s.
+    /// Returns the time of the newest sample by the client's clock, s.
     pub(super) fn model_time_s(&self) -> Option<f64> {
         match self {
             LinkClient::Raw(newest) | LinkClient::Hold(newest, ..) => newest.map(|model| model.client_time_s),

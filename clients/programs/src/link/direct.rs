@@ -1,5 +1,5 @@
-//! A hand that feels the tissue itself: the same hand and task, and no network, client or device between them. Where it gets is
-//! where a touch over a network should get.
+//! A hand that feels the tissue directly: the same hand and task without a network, client or device. Its depth is
+//! the reference for a touch over a network.
 
 use palpate_haptics::hand::HandState;
 
@@ -10,20 +10,20 @@ use glam::DVec3;
 use palpate_simulated::random::Random;
 use palpate_simulated::task::{self, Task};
 
-/// Least scale: a smaller task would hardly touch the tissue.
+/// Smallest scale: a smaller task would hardly touch the tissue.
 const MIN_SCALE: f64 = 0.01;
 
-/// What such a hand does.
+/// Course of a hand that feels the tissue directly.
 pub(super) struct Direct {
-    /// The scale of the task's depths: reduced until this hand meets no more than [`task::FORCE_SHARE`] of the device's force.
-    /// So it does not depend on how a client renders samples.
+    /// The scale of the task's depths: reduced until this hand meets no more than [`task::FORCE_SHARE`] of the
+    /// device's force. So it does not depend on how a client renders samples.
     pub(super) scale: f64,
     /// Its depth in each tick, m.
     depths_m: Vec<f64>,
 }
 
 impl Direct {
-    /// Of the hand and the task of a run, whose first press is after `lead_s`.
+    /// Simulates the hand and the task of a run whose first press is after `lead_s`.
     ///
     /// # Errors
     /// Returns the reason if the guard stops the tissue.
@@ -39,7 +39,7 @@ impl Direct {
         }
     }
 
-    /// The depths and the largest force of a task; only up to where that is more than `most_n`.
+    /// Returns the depths and the largest force of a task; only until the force exceeds `most_n`.
     fn performed(setup: &Setup, lead_s: f64, scale: f64, most_n: f64) -> Result<(Vec<f64>, f64), String> {
         let (middle_m, hand) = (setup.spot.at_m, &setup.hand);
         let task = Task::new(middle_m, lead_s, setup.duration_s, scale, &mut Random::new(setup.seed, 0));
@@ -61,7 +61,7 @@ impl Direct {
         Ok((depths_m, largest_n))
     }
 
-    /// Its depth in a tick, m.
+    /// Returns its depth in a tick, m.
     pub(super) fn depth_m(&self, tick: u32) -> Option<f64> {
         self.depths_m.get(tick as usize).copied()
     }

@@ -1,4 +1,4 @@
-//! The figures of a run as they are printed: a table for people, and JSON.
+//! Output of a run's figures: a table for people, and JSON.
 
 use palpate_haptics::datagram_health::Carried;
 use palpate_simulated::network::Conditions;
@@ -8,7 +8,7 @@ use super::measure::LinkOutcome;
 use super::setup::{Rendering, Setup};
 use crate::table;
 
-/// The figures of a run for people; `server` is that of a run in real time.
+/// Returns the figures of a run as rows of a table; `server` is the server of a run in real time.
 pub(super) fn rows(setup: &Setup, outcome: &LinkOutcome, server: Option<&str>) -> Vec<(&'static str, String)> {
     let (scene, hand, device) = (&setup.model.scene.name, setup.hand.name, setup.device.name);
     let scheme = format!("{:?}", setup.scheme).to_lowercase();
@@ -27,7 +27,7 @@ pub(super) fn rows(setup: &Setup, outcome: &LinkOutcome, server: Option<&str>) -
                 text += &format!(", {} in a row", table::rounded(burst));
             }
             if outage_s > 0.0 {
-                text += &format!(", {} ms once a second nothing", table::rounded(1e3 * outage_s));
+                text += &format!(", an outage of {} ms once a second", table::rounded(1e3 * outage_s));
             }
             if rate_bit_per_s > 0.0 {
                 let [rate, queue] = [1e-3 * rate_bit_per_s, 1e3 * queue_s].map(table::rounded);
@@ -144,7 +144,7 @@ pub(super) fn rows(setup: &Setup, outcome: &LinkOutcome, server: Option<&str>) -
     rows
 }
 
-/// The figures of a run that are printed: what was asked for, and what was found.
+/// Returns the figures of a run as JSON: its parameters and its results.
 pub(super) fn figures(setup: &Setup, outcome: &LinkOutcome) -> Value {
     let (Value::Object(mut all), Value::Object(found)) = (asked(setup), found(outcome)) else { return Value::Null };
     all.extend(found);

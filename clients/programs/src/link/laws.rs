@@ -7,7 +7,7 @@ use palpate_haptics::Law;
 use palpate_tissue::Model;
 use palpate_tissue::response::force_law::{self, Disc};
 
-/// Those of one tissue.
+/// The laws of one tissue.
 #[derive(Debug)]
 pub(super) struct PlaceLaws {
     pub(super) model: Arc<Model>,
@@ -15,12 +15,12 @@ pub(super) struct PlaceLaws {
 }
 
 impl PlaceLaws {
-    /// Of a tissue.
+    /// Creates an empty cache for a tissue.
     pub(super) fn new(model: &Arc<Model>) -> Self {
         PlaceLaws { model: model.clone(), known: Mutex::default() }
     }
 
-    /// The exact law under a disc; none if nothing holds the tissue.
+    /// Returns the exact law under a disc; `None` if nothing holds the tissue.
     pub(super) fn law(&self, disc: Disc) -> Option<Arc<Law>> {
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((_, law)) = known.iter().find(|known| known.0 == disc) {

@@ -1,6 +1,6 @@
-//! A run in real time, over a real connection to a real server: it validates the runs in virtual time. The simulated hand,
-//! its task and the twin are those of `run`. The twin follows the tool's course afterwards, step by step of the time that
-//! has passed, whether the client was late or not.
+//! A run in real time, over a real connection to a real server: it validates the runs in virtual time. The simulated
+//! hand, its task and the twin are those of `run`. The twin follows the tool's course afterwards, step by step of the
+//! time that has passed, whether the client was late or not.
 
 use std::time::Duration;
 
@@ -25,11 +25,11 @@ use crate::{ClientFailure, interrupted, warn};
 /// Time before the first press, s: the server computes its force law first.
 const LEAD_S: f64 = 3.0;
 
-/// A simulated device, laid on the tissue with the middle of its workspace at a spot.
+/// A simulated device, with the centre of its workspace at a place of the tissue.
 struct Laid {
     device: Simulated,
     spot: Spot,
-    /// Where a bridge lays that middle, m: the top of the tissue.
+    /// The top of the tissue, where a bridge puts the centre, m.
     top_m: DVec3,
 }
 
@@ -111,10 +111,10 @@ pub(super) async fn run(setup: &Setup, server: Server) -> Result<LinkOutcome, Cl
     Ok(outcome)
 }
 
-/// Parts of the ticks that may be late or skipped: above that, the figures are those of this machine.
+/// Fractions of the ticks that may be late or skipped. Beyond them, the figures describe this machine.
 const MAX_LATE: f64 = 0.01;
 
-/// What to say of a run in which too many ticks were late or skipped.
+/// Returns a warning about a run in which too many ticks were late or skipped.
 fn too_late([late, missed]: [f64; 2], ticks: f64) -> Option<String> {
     (late + missed > MAX_LATE * ticks).then(|| {
         let percent = |count: f64| 100.0 * count / ticks;
@@ -127,7 +127,8 @@ fn too_late([late, missed]: [f64; 2], ticks: f64) -> Option<String> {
     })
 }
 
-/// A course resampled at each whole tick: the place, interpolated linearly, and the force that the device held.
+/// Returns a course resampled at each whole tick: the place, interpolated linearly, and the force that the device
+/// held.
 fn steps(course: &[CoursePart]) -> impl Iterator<Item = CoursePart> {
     let (mut at, mut tick) = (1, 0_u32);
     std::iter::from_fn(move || {

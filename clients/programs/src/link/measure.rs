@@ -1,7 +1,8 @@
-//! What a run is measured by: the force on the hand against the true one, how deep the hand is, and the energy at the port.
+//! Measurements of a run: the force on the hand against the true one, the depth of the hand, and the energy at the
+//! port.
 //!
-//! There are two truths. The force is compared with that of a twin at the tool's own place: what should be rendered there and
-//! then. The depth is compared with that of a second hand, which feels the tissue itself: where the hand would be without a
+//! There are two references. The force is compared with that of a twin (the same tissue without a network) at the
+//! tool's own place. The depth is compared with that of a second hand, which feels the tissue directly, without a
 //! network.
 
 use glam::DVec3;
@@ -10,23 +11,24 @@ use palpate_haptics::envelope::Envelope;
 use palpate_haptics::{LimitCause, RenderingState};
 use palpate_simulated::network::Outages;
 
-/// A run is unstable if the energy that the port has received falls below this, J.
+/// Energy received by the port below which a run is unstable, J.
 const UNSTABLE_J: f64 = -0.1;
 
-/// A smaller rendered force counts as none, N.
+/// Rendered force below which it counts as 0, N.
 const MIN_FORCE_N: f64 = 1e-6;
 
-/// After the end of an outage, what it has done to the force may last for this long, s.
+/// Time after the end of an outage for which its effect on the force may last, s.
 const RECOVERS_S: f64 = 0.05;
 
-/// The outcome of a run. A tick is in contact if the twin touches or a force is rendered; figures without another word are
-/// over these ticks.
+/// The outcome of a run. A tick is in contact if the twin touches or a force is rendered; figures without another
+/// word are over these ticks.
 #[derive(Debug, Clone, Default)]
 pub(super) struct LinkOutcome {
     /// Scale of the task's depths.
     pub(super) scale: f64,
     pub(super) force_error_rms_percent: Option<f64>,
-    /// The same without outages: from 50 ms after the end of each on, while rendering is enabled and has engaged.
+    /// The error of the force without outages: from 50 ms after the end of each, while rendering is enabled and has
+    /// engaged.
     pub(super) force_error_after_outages_percent: Option<f64>,
     /// Part of the ticks in contact that this figure is over.
     pub(super) after_outages_share: Option<f64>,
@@ -35,8 +37,8 @@ pub(super) struct LinkOutcome {
     pub(super) force_bias_n: Option<f64>,
     /// Slope of the regression of the rendered force over the true one, along the normal.
     pub(super) force_gain: Option<f64>,
-    /// How far the tool's depth is from that of a hand that feels the tissue itself, m; and the root mean square as a part of
-    /// that hand's depth.
+    /// Difference of the tool's depth from that of a hand that feels the tissue directly, m; and its root mean square
+    /// as a fraction of that hand's depth.
     pub(super) depth_error_rms_m: Option<f64>,
     pub(super) depth_error_p99_m: Option<f64>,
     pub(super) depth_error_percent: Option<f64>,
@@ -63,13 +65,13 @@ pub(super) struct LinkOutcome {
     pub(super) path: [u64; 3],
     /// Only for a run in real time.
     pub(super) late_ticks: Option<u64>,
-    /// What went by datagram in a run in real time.
+    /// Counts of datagrams in a run in real time.
     pub(super) carried: Option<Carried>,
     /// For each tick: time, s, the tool's depth below the rest plane, m, rendered and true force, N.
     pub(super) course: Vec<[f64; 4]>,
 }
 
-/// What there is to measure in a tick. The normal is z.
+/// Values to measure in a tick. The normal is z.
 pub(super) struct LinkTick {
     pub(super) now_s: f64,
     /// The tool's depth, m, and that of a hand that feels the tissue itself, where it is known.
@@ -157,7 +159,7 @@ pub(super) struct Totals {
 }
 
 impl Totals {
-    /// Of a network with these outages.
+    /// Creates the measurement for a network with these outages.
     pub(super) fn with(outages: Outages) -> Self {
         Totals { outages: Some(outages), ..Totals::default() }
     }
@@ -170,7 +172,7 @@ impl Totals {
         }
     }
 
-    /// Whether the port has given so much energy that the run is unstable.
+    /// Returns whether the port has given so much energy that the run is unstable.
     pub(super) fn is_unstable(&self) -> bool {
         self.energy_j < UNSTABLE_J
     }
@@ -212,7 +214,7 @@ impl Totals {
         is_engaged && is_enabled && has_recovered
     }
 
-    /// Counts what the envelope has done in the whole run.
+    /// Counts the actions of the envelope in the whole run.
     pub(super) fn limited(&mut self, envelope: &Envelope) {
         let (acted, _) = envelope.count(LimitCause::Passivity);
         // Passivity acts on a force; there is none but in contact.
@@ -277,7 +279,7 @@ mod tests {
             let true_n = 0.01 * f64::from(number);
             totals.rendered(&tick(0.0, true_n, 1.1 * true_n + 0.3, 1e-4), None);
         }
-        // What is neither touched nor rendered does not count.
+        // Ticks without touch or rendered force do not count.
         totals.rendered(&LinkTick { touches: false, ..tick(0.0, 0.0, 0.0, 1.0) }, None);
         let outcome = totals.close();
         let near = |found: Option<f64>, expected: f64| found.is_some_and(|found| (found - expected).abs() < 1e-9);

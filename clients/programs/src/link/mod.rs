@@ -1,5 +1,5 @@
-//! `palpate-client link`: simulates hand, device, network and tissue in one loop in virtual time. The seed determines the
-//! result. Only this program drives a tissue itself.
+//! `palpate-client link`: simulates hand, device, network and tissue in one loop in virtual time. The seed determines
+//! the result. Only this program drives a tissue itself.
 
 mod boundary;
 mod client;
@@ -45,8 +45,8 @@ use spot::Spot;
 /// Arguments of `link`.
 #[derive(Args)]
 pub(crate) struct LinkArguments {
-    /// A scene file, or the name of a scene in ./scenes or built in (colon, fibrotic, gallbladder, liver, liver-organ, paper,
-    /// stomach)
+    /// A scene file, or the name of a scene in ./scenes or built in (colon, fibrotic, gallbladder, liver,
+    /// liver-organ, paper, stomach)
     #[arg(long, default_value = "liver")]
     scene: PathBuf,
     /// The hand that holds the device: light, medium or firm; or none: a weak string leads the device
@@ -64,8 +64,8 @@ pub(crate) struct LinkArguments {
     /// Fraction of the packets that are lost. A stream sends them again, which delays all later ones
     #[arg(long, value_name = "FRACTION", conflicts_with = "profile")]
     loss: Option<f64>,
-    /// How samples and poses travel: stream (TCP: a lost packet delays all later ones) or datagram (UDP: a lost packet delays no
-    /// other)
+    /// How samples and poses travel: stream (TCP: a lost packet delays all later ones) or datagram (UDP: a lost
+    /// packet delays no other)
     #[arg(long, default_value = "stream", conflicts_with_all = ["random", "boundary"])]
     transport: Transport,
     /// Mean number of packets lost in a row; 1: losses are independent
@@ -132,8 +132,8 @@ pub(crate) struct LinkArguments {
     server: Option<String>,
     #[command(flatten)]
     credentials: CredentialOptions,
-    /// Run this many random combinations of scene, hand, device, task and place, network and transport, deadbands, a second
-    /// tool and a change of the tissue, with seeds from --seed on; report the worst value of each figure
+    /// Run this many random combinations of scene, hand, device, task and place, network and transport, deadbands, a
+    /// second tool and a change of the tissue, with seeds from --seed on; report the worst value of each figure
     #[arg(long, value_name = "RUNS", conflicts_with_all = ["course", "boundary"])]
     random: Option<u64>,
     /// Find the delay at which hand and spring become unstable, and compare it with theory
@@ -200,7 +200,7 @@ pub(crate) async fn link(arguments: &LinkArguments) -> Result<(), ClientFailure>
     Ok(())
 }
 
-/// Does something with a tissue.
+/// Runs work on a tissue.
 ///
 /// # Errors
 /// Returns an error if the system has no memory for the tissue (exit status 2), or if the guard stops it (1).
@@ -259,7 +259,7 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
     };
     model.shape().check_place("--place", near_m)?;
     let spot = Spot::new(&model, near_m, tip.radius_m);
-    // With a server the first law is that of the middle, but before the first press it tells that of the place.
+    // A server first sends the law of the middle, and before the first press that of the place.
     let disc = Disc::in_middle(&model, tip.radius_m).follow(&model, spot.at_m);
     let laws = Arc::new(PlaceLaws::new(&model));
     let law = law_of(&laws, disc)?;
@@ -298,14 +298,14 @@ fn setup(arguments: &LinkArguments) -> Result<Setup, Refusal> {
     })
 }
 
-/// The exact force law of a tissue under a disc.
+/// Returns the exact force law of a tissue under a disc.
 fn law_of(laws: &PlaceLaws, disc: Disc) -> Result<Arc<Law>, Refusal> {
     laws.law(disc).ok_or_else(|| {
         Refusal::new(Reason::NotAvailable, "--scene", "has no force law: nothing holds it, or it is too large")
     })
 }
 
-/// A tissue whose springs are stiffer by `factor` from `at_s` on.
+/// Returns a change of the tissue whose springs are stiffer by `factor` from `at_s` on.
 fn changed(model: &Model, at_s: f64, factor: f64) -> Result<TissueChange, Refusal> {
     let scene = &model.scene;
     let change = Change {

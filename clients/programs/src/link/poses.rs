@@ -1,5 +1,5 @@
-//! The messages between client and server, and which places of the tool the client tells: all of them, or only what is news.
-//! A datagram repeats what the server may not have yet.
+//! Messages between client and server, and the selection of the tool's places that the client sends: all, or only
+//! those that the server's estimate misses. A datagram repeats places that the server may not have received.
 
 use std::collections::VecDeque;
 
@@ -16,7 +16,7 @@ pub(super) struct Up {
     pub(super) sent_s: f64,
     /// Places by the number of their command, the newest last.
     pub(super) told: Vec<(u64, MotionState)>,
-    /// How often the client wants a sample at least, s.
+    /// Longest interval at which the client needs samples, s.
     pub(super) heartbeat_s: f64,
 }
 
@@ -24,34 +24,34 @@ pub(super) struct Up {
 pub(super) struct Down {
     pub(super) number: u64,
     pub(super) sent_s: f64,
-    /// None of a tool that has let go.
+    /// The local model; `None` if the tool has let go.
     pub(super) model: Option<LocalModel>,
-    /// How often the server wants a place at least, s.
+    /// Longest interval at which the server needs places, s.
     pub(super) heartbeat_s: f64,
 }
 
-/// Size of a message with one place and its velocity, bytes, and of each that it repeats: what the headers below it take, and
-/// the fields of a pose.
+/// Size of a message with one place and its velocity, bytes, and of each that it repeats: what the headers below it
+/// take, and the fields of a pose.
 const FIRST_BYTES: u64 = 66 + 100;
 const FURTHER_BYTES: u64 = 24;
 
-/// Places in a datagram.
+/// Largest number of places in a datagram.
 const PLACES: usize = 8;
 
-/// A time that has come back from the server is off by no more than the rounding to nanoseconds, s.
+/// Largest error of a time that the server returns, from rounding to nanoseconds, s.
 const ROUNDING_S: f64 = 5e-7;
 
 /// The tool's places on their way to the server.
 pub(super) struct Poses {
     transport: Transport,
-    /// Part of the force; 0: each place is told.
+    /// Deadband as a fraction of the force; with 0 each place is sent.
     deadband: f64,
     news: News,
-    /// Commands so far.
+    /// Number of commands so far.
     count: u64,
-    /// What the server may not have yet, the newest last.
+    /// Places that the server may not have received, the newest last.
     unanswered: VecDeque<(u64, MotionState)>,
-    /// Of the samples.
+    /// Arrivals of samples.
     pulse: SendInterval,
     heartbeat_s: f64,
 }
@@ -69,7 +69,7 @@ impl Poses {
         }
     }
 
-    /// Tells a place, if it is news.
+    /// Sends a place to the server, if the server's estimate is wrong or a heartbeat is due.
     pub(super) fn tell(&mut self, now_s: f64, place_m: DVec3, client: &LinkClient, up: &mut Direction<Up>) {
         let told = if self.deadband > 0.0 {
             let most_m = match client {
@@ -92,7 +92,7 @@ impl Poses {
         up.send(now_s, bytes, Up { number: up.sent() + 1, sent_s: now_s, told, heartbeat_s });
     }
 
-    /// A sample tells what has arrived, and how often the server wants to hear.
+    /// Takes the acknowledgement and the server's interval from a sample.
     pub(super) fn answered(&mut self, message: &Down, now_s: f64) {
         if let Some(model) = &message.model {
             self.unanswered.retain(|(_, told)| told.time_s > model.client_time_s + ROUNDING_S);

@@ -32,7 +32,7 @@ const TISSUES: [&str; 3] = ["fibrotic", "liver", "stomach"];
 /// Constant round-trip times of the random runs, s. Half of the runs use one of the four profiles instead.
 const ROUND_TRIPS_S: [f64; 6] = [0.0, 0.002, 0.01, 0.02, 0.05, 0.1];
 
-/// What is drawn of the rest; the first of each is what most networks and sessions are like.
+/// Alternatives of the other properties; the first of each is the common case.
 const TRANSPORTS: [Transport; 2] = [Transport::Stream, Transport::Datagram];
 const MORE_LOSS: [f64; 4] = [0.0, 0.001, 0.01, 0.1];
 const BURSTS: [f64; 2] = [1.0, 5.0];
@@ -41,11 +41,11 @@ const RATES_BIT_PER_S: [f64; 6] = [0.0, 0.0, 0.0, 1e6, 3e6, 10e6];
 const QUEUE_S: f64 = 0.1;
 const DEADBANDS: [[f64; 2]; 2] = [[0.0, 0.0], [0.1, 0.05]];
 const SECOND_TOOLS_M: [f64; 4] = [0.0, 0.0, 0.015, 0.025];
-/// How much stiffer a tissue becomes that changes.
+/// Factors of the stiffness of a tissue that changes.
 const FACTORS: [f64; 2] = [0.7, 1.5];
-/// Part of the runs in which it does.
+/// Fraction of the runs in which the tissue changes.
 const CHANGES: f64 = 0.3;
-/// Places, as parts of the way from the middle to one radius from the rim.
+/// Places, as fractions of the distance from the middle to one radius from the rim.
 const PLACES: [f64; 4] = [0.0, 0.0, 0.5, 1.0];
 
 /// A tissue of the random runs.
@@ -54,7 +54,7 @@ struct Choice {
     laws: Arc<PlaceLaws>,
     law: Arc<Law>,
     disc: Disc,
-    /// By the factors above; their time is drawn.
+    /// The tissue with each of the factors above; the time of the change is drawn.
     changes: Vec<TissueChange>,
 }
 
@@ -68,7 +68,7 @@ impl Choice {
         Ok(Choice { law: law_of(&laws, disc)?, laws, disc, model, changes })
     }
 
-    /// A place so far on the way from the middle to one radius from the rim.
+    /// Returns a place at a fraction of the distance from the middle to one radius from the rim.
     fn place_m(&self, part: f64, tip: &Tip) -> DVec3 {
         let extent = self.model.shape().extent();
         let to_rim_m = 0.5 * (extent.most_m.x - extent.least_m.x) - tip.radius_m;
@@ -124,7 +124,7 @@ pub(super) fn print(arguments: &LinkArguments, runs: u64) -> Result<(), ClientFa
     report(arguments, &results)
 }
 
-/// The run of a seed.
+/// Returns the setup of the run of a seed.
 fn drawn(arguments: &LinkArguments, tissues: &BTreeMap<&str, Choice>, tip: Tip, seed: u64) -> Setup {
     let mut random = Random::new(seed, 3);
     let choice = &tissues[random.one_of(&TISSUES)];

@@ -17,20 +17,20 @@ use super::server::{LinkServer, Other};
 use super::setup::{Setup, TICK_S, ticks};
 use super::tissue::LinkTissue;
 
-/// A run is unstable, too, if the tool moves away farther than this many times the task's amplitude.
+/// Distance of the tool, in amplitudes of the task, beyond which a run is also unstable.
 const UNSTABLE_AMPLITUDES: f64 = 3.0;
 
-/// The simulated operator enables rendering this long after a pause began, s.
+/// Time after the beginning of a pause at which the simulated operator enables rendering again, s.
 const PAUSE_S: f64 = 0.3;
 
 /// Size of a message without a local model, bytes.
 const EMPTY_BYTES: u64 = 120;
 
-/// The ways between client and server. The two ways of a connection have their outages together.
+/// The two directions between client and server. Both have their outages at the same time.
 struct LinkNetwork {
     up: Direction<Up>,
     down: Direction<Down>,
-    /// A law must not be lost, so it comes by stream in any case.
+    /// A law must not be lost, so it is always sent by stream.
     laws: Direction<Other>,
 }
 
@@ -76,7 +76,7 @@ pub(super) fn run(setup: &Setup) -> Result<LinkOutcome, String> {
             poses.tell(now_s, place_m, &client, &mut network.up);
         }
         bytes += serve(&mut server, &mut network, now_s)?;
-        // While the client is stalled, the device holds the last force, and what arrives waits.
+        // While the client is stalled, the device holds the last force, and messages wait.
         if !is_stalled {
             while let Some(Other { number, law, changed }) = network.laws.receive(now_s) {
                 client.learn(number, &law);
@@ -119,7 +119,8 @@ pub(super) fn run(setup: &Setup) -> Result<LinkOutcome, String> {
     Ok(outcome)
 }
 
-/// The server's part of a tick: what has arrived, a step, and what the stream gets of it. Returns the bytes of its samples.
+/// Does the server's part of a tick: receives messages, does a step, and sends samples. Returns the bytes of the
+/// samples.
 fn serve(server: &mut LinkServer, network: &mut LinkNetwork, now_s: f64) -> Result<u64, String> {
     while let Some(message) = network.up.receive(now_s) {
         server.receive(&message, now_s);
@@ -134,7 +135,7 @@ fn serve(server: &mut LinkServer, network: &mut LinkNetwork, now_s: f64) -> Resu
     Ok(bytes)
 }
 
-/// The simulated operator notices that rendering has paused, and enables it again after [`PAUSE_S`].
+/// Enables rendering again, as the simulated operator, [`PAUSE_S`] after it has paused.
 fn operate(envelope: &mut Envelope, now_s: f64, paused_s: &mut Option<f64>, outcome: &mut LinkOutcome) {
     match (envelope.state(), *paused_s) {
         (RenderingState::Enabled, _) => *paused_s = None,

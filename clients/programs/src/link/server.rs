@@ -1,4 +1,4 @@
-//! The server's end of the network: its intake gets what arrives, and the sampler of the stream picks what is sent.
+//! The server's end of the network: its intake receives commands, and the sampler of the stream selects samples.
 
 use std::sync::Arc;
 
@@ -20,37 +20,38 @@ use super::setup::{Setup, TICK_S};
 use super::spot::Spot;
 use super::tissue::{LEASE, LinkTissue, ns};
 
-/// The law of another tissue is known so long after the tissue has changed, s.
+/// Time from a change of the tissue until the law of the new tissue is known, s.
 const LAW_S: f64 = 0.1;
 
-/// Another law, and of which tissue, if that has changed.
+/// Another law, and its tissue, if the tissue has changed.
 pub(super) struct Other {
     pub(super) number: u32,
     pub(super) law: Arc<Law>,
     pub(super) changed: Option<Arc<Model>>,
 }
 
-/// A tissue behind a network.
+/// The server's tissue behind a network.
 pub(super) struct LinkServer {
     tissue: LinkTissue,
     spot: Spot,
     sampler: Sampler,
     laws: Arc<Laws>,
-    /// How often the client wants samples.
+    /// Deadband and interval of the samples that the client requested.
     wanted: Arc<WantedHeartbeat>,
-    /// Of the tissue, and where the law of the tool's place is of; those of the tissue to come, and when they are told, s.
+    /// The laws of the tissue; the disc whose law is in use; and the laws of the next tissue with the time when they
+    /// are sent, s.
     place_laws: Arc<PlaceLaws>,
     disc: Disc,
     next_laws: Option<(f64, Arc<PlaceLaws>)>,
-    /// Whether the stream is to be told of another law, and the number of the newest.
+    /// Whether another law must be sent on the stream, and the number of the newest.
     is_other: bool,
     number: u32,
     transport: Transport,
-    /// Whether places come with velocities.
+    /// Whether places contain velocities.
     is_moving: bool,
-    /// Of the commands: a datagram repeats what is not acknowledged.
+    /// Numbers of the commands that were received: a datagram repeats what is not acknowledged.
     seen: ReceiveWindow,
-    /// Of what arrives.
+    /// Arrivals of messages.
     pulse: SendInterval,
     refused: u64,
 }
@@ -91,7 +92,7 @@ impl LinkServer {
         })
     }
 
-    /// Takes a message that has arrived.
+    /// Receives a message that has arrived.
     pub(super) fn receive(&mut self, message: &Up, now_s: f64) {
         self.pulse.arrive(message.number, message.sent_s, now_s);
         self.wanted.set(message.heartbeat_s);
@@ -101,7 +102,7 @@ impl LinkServer {
                 commands.push(self.command(*number, told));
             }
         }
-        // As a server does it: what is refused has no effect, and is counted.
+        // As on a server, a refused command has no effect and is counted.
         self.refused += u64::from(self.tissue.submit(LEASE, commands, now_s).is_err());
     }
 
@@ -116,7 +117,7 @@ impl LinkServer {
         Command { sequence: Some(number), client_time_ns, by_datagram, ..command }
     }
 
-    /// Does the step that begins at `now_s`. Returns what the stream gets of it: a sample, which has no local model if the tool
+    /// Does the step that begins at `now_s`. Returns the sample to send, if any; it has no local model if the tool
     /// has let go.
     ///
     /// # Errors
@@ -131,14 +132,14 @@ impl LinkServer {
         Ok(Some(tool.and_then(|tool| tool.local).map(|model| self.spot.of_hand(model))))
     }
 
-    /// The law is that of what the tool presses.
+    /// Changes the law to that of the tissue under the tool, if it presses at another place.
     fn follow(&mut self, rest_m: DVec3) {
         let disc = self.disc.follow(&self.place_laws.model, rest_m);
         self.is_other |= disc != self.disc;
         self.disc = disc;
     }
 
-    /// Another law, if the stream is to be told of one: local models name it from now on.
+    /// Returns another law, if one must be sent on the stream; local models name it from now on.
     pub(super) fn take_law(&mut self, now_s: f64) -> Option<Other> {
         let mut changed = None;
         if let Some((_, laws)) = self.next_laws.take_if(|next| next.0 <= now_s) {
@@ -151,12 +152,12 @@ impl LinkServer {
         Some(Other { number: self.number, law, changed })
     }
 
-    /// How often the server wants to hear from the client, s.
+    /// Returns the longest interval at which the server needs messages from the client, s.
     pub(super) fn heartbeat_s(&self, now_s: f64) -> f64 {
         self.pulse.heartbeat_s(now_s)
     }
 
-    /// What the path of the tool has counted; a message that was refused is dropped.
+    /// Returns the counts of the tool's path; a refused message counts as dropped.
     pub(super) fn path_counts(&self) -> [u64; 3] {
         let [limited, dropped, released] = self.tissue.session().path_counts();
         [limited, dropped + self.refused, released]

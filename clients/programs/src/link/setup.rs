@@ -1,4 +1,4 @@
-//! What a run is made of: tissue, tool, hand, device and network.
+//! Setup of a run: tissue, tool, hand, device and network.
 
 use std::sync::Arc;
 
@@ -30,11 +30,11 @@ pub(super) enum Rendering {
 pub(super) struct Setup {
     pub(super) model: Arc<Model>,
     pub(super) laws: Arc<PlaceLaws>,
-    /// The law to begin with, and where it is of.
+    /// The first law, and its place.
     pub(super) law: Arc<Law>,
     pub(super) disc: Disc,
     pub(super) tip: Tip,
-    /// Where the task is done.
+    /// Place of the task.
     pub(super) spot: Spot,
     pub(super) hand: Hand,
     pub(super) device: Device,
@@ -43,11 +43,12 @@ pub(super) struct Setup {
     pub(super) stall_s: f64,
     pub(super) scheme: Rendering,
     pub(super) deadband: f64,
-    /// The client sends its place only if the server would be wrong about it by more than this part of the force; 0: always.
+    /// Fraction of the force by which the server's estimate of the place must be wrong before the client sends its
+    /// place; 0: always.
     pub(super) up_deadband: f64,
-    /// A second tool presses so far from where the task is done, m; 0: there is none.
+    /// Distance of a second tool from the place of the task, m; 0: there is no second tool.
     pub(super) second_m: f64,
-    /// A change of the tissue under way.
+    /// A change of the tissue during the run.
     pub(super) change: Option<TissueChange>,
     pub(super) duration_s: f64,
     pub(super) seed: u64,
@@ -57,9 +58,9 @@ pub(super) struct Setup {
 #[derive(Debug, Clone)]
 pub(super) struct TissueChange {
     pub(super) at_s: f64,
-    /// Stiffness of all springs after it over that before.
+    /// Stiffness of all springs after the change over that before.
     pub(super) factor: f64,
-    /// What the tissue is then.
+    /// The tissue after the change.
     pub(super) model: Arc<Model>,
     pub(super) laws: Arc<PlaceLaws>,
 }
@@ -67,7 +68,7 @@ pub(super) struct TissueChange {
 /// Period of the device's loop, s.
 pub(super) const TICK_S: f64 = 1e-3;
 
-/// The ticks of a time.
+/// Returns the number of ticks of a time.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub(super) fn ticks(duration_s: f64) -> u32 {
     (duration_s / TICK_S).round() as u32

@@ -1,6 +1,6 @@
-//! A tissue in use, as a server has it: commands go through an intake, and the session takes what is due. Beside the hand's tool
-//! there is what the setup has put there: a second tool, and a change of the tissue. So the truth and the server have both at
-//! the same moments.
+//! A tissue in use, as on a server: commands go through an intake, and the session takes those that are due. It also
+//! has the second tool and the change of the tissue of the setup, so that the true tissue and the server's have both
+//! at the same times.
 
 use std::sync::Arc;
 
@@ -26,7 +26,8 @@ pub(super) const LEASE: LeaseId = 1;
 const SECOND_TOOL: u32 = 1;
 const SECOND_LEASE: LeaseId = 2;
 
-/// The second tool presses to this part of the task's depths: so deep, about, does a hand get that yields.
+/// Depth of the second tool's presses as a fraction of the task's depths: about the depth that a yielding hand
+/// reaches.
 const SECOND_DEPTHS: f64 = 0.5;
 
 /// A tissue with its tools.
@@ -38,9 +39,9 @@ pub(super) struct LinkTissue {
     change: Option<(f64, Arc<Model>)>,
 }
 
-/// A tool that presses by a task of its own, and never leaves its place: nothing holds it up.
+/// A tool that presses by a task of its own and stays at its place.
 struct Second {
-    /// From where the hand's task is done, m.
+    /// Offset from the place of the hand's task, m.
     apart_m: DVec3,
     task: Task,
 }
@@ -53,14 +54,14 @@ impl Second {
         Second { apart_m: DVec3::new(setup.second_m, 0.0, 0.0), task }
     }
 
-    /// As the hand sees it.
+    /// Returns the place of the second tool in the hand's frame, m.
     fn place_m(&self, spot: &Spot, now_s: f64) -> DVec3 {
         spot.at_m + self.apart_m + self.task.at(now_s).z * DVec3::Z
     }
 }
 
 impl LinkTissue {
-    /// At rest, before anything has touched it.
+    /// Creates the tissue at rest, before any touch.
     ///
     /// # Errors
     /// Returns why the intake refuses the tools.
@@ -85,7 +86,7 @@ impl LinkTissue {
         &self.simulation.session
     }
 
-    /// A command that leads the tool to a place of the hand's. Its client time 0 says: at once.
+    /// Returns a command that moves the tool to a place in the hand's frame. A client time of 0 means at once.
     pub(super) fn pose(&self, place_m: DVec3) -> Command {
         Command {
             tool: TOOL,
@@ -99,7 +100,7 @@ impl LinkTissue {
         }
     }
 
-    /// Takes in commands that arrive together.
+    /// Submits commands that arrive together.
     ///
     /// # Errors
     /// Returns why the intake refuses them.
@@ -112,7 +113,7 @@ impl LinkTissue {
     /// # Errors
     /// Returns the reason if the guard stops the tissue, or why a command of the second tool is refused.
     pub(super) fn step(&mut self, now_s: f64) -> Result<(), String> {
-        // Rounding must not make a step more of it.
+        // Rounding must not add a step.
         while self.session().time_s() < now_s + TICK_S - 1e-9 {
             let begin_s = self.session().time_s();
             if let Some(second) = &self.second {
@@ -130,10 +131,10 @@ impl LinkTissue {
         Ok(())
     }
 
-    /// The force on a tool that is at `place_m` now, without any network, N; and whether it touches the tissue.
+    /// Returns the force on a tool at `place_m` without a network, N, and whether it touches the tissue.
     ///
     /// # Errors
-    /// As [`LinkTissue::step`] does.
+    /// Returns the errors of [`LinkTissue::step`].
     pub(super) fn truth(&mut self, place_m: DVec3, now_s: f64) -> Result<(DVec3, bool), String> {
         self.submit(LEASE, vec![self.pose(place_m)], now_s)?;
         self.step(now_s)?;
@@ -143,7 +144,7 @@ impl LinkTissue {
     }
 }
 
-/// A time on the server's clock.
+/// Converts a time to the server's clock.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub(super) fn ns(time_s: f64) -> u64 {
     (time_s * 1e9).round() as u64

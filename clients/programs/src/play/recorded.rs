@@ -1,4 +1,4 @@
-//! The hashes that a journal has recorded, and how those of a session that plays it compare with them.
+//! The hashes in a journal, and their comparison with those of a session that plays it.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::io::Cursor;
@@ -12,13 +12,13 @@ use tonic::Code;
 
 use crate::ClientFailure;
 
-/// Hashes that are asked for before their steps are done.
+/// Number of hashes that are requested before their steps are done.
 const AHEAD: usize = 8;
 
-/// The hash of the state after each step at which one was recorded.
+/// Recorded hashes of the state, with their steps.
 pub(super) type Hashes = BTreeMap<u64, String>;
 
-/// The hashes of a journal; refusals call it `place`.
+/// Returns the hashes of a journal; refusals name it `place`.
 pub(super) fn hashes(place: &str, journal: &[u8]) -> Result<Hashes, Refusal> {
     let mut reader = JournalReader::new(place, Cursor::new(journal))?;
     let mut hashes = Hashes::new();
@@ -31,21 +31,21 @@ pub(super) fn hashes(place: &str, journal: &[u8]) -> Result<Hashes, Refusal> {
     Ok(hashes)
 }
 
-/// How the hashes compare.
+/// Result of the comparison.
 #[derive(Default)]
 pub(super) struct Compared {
-    /// So many are equal.
+    /// This many hashes are equal.
     pub(super) equal: u64,
-    /// So many the server did not tell in time.
+    /// The server did not report this many hashes in time.
     missed: u64,
-    /// The first that differs.
+    /// The first hash that differs.
     pub(super) difference: Option<String>,
 }
 
 impl Compared {
-    /// For people.
+    /// Returns the result as a text.
     pub(super) fn told(&self) -> String {
-        let missed = if self.missed == 0 { String::new() } else { format!(", {} not told in time", self.missed) };
+        let missed = if self.missed == 0 { String::new() } else { format!(", {} not reported in time", self.missed) };
         match self.equal + self.missed {
             0 => "none between these steps".to_owned(),
             _ => format!("{} equal{missed}", self.equal),
@@ -53,7 +53,8 @@ impl Compared {
     }
 }
 
-/// Compares the hashes of a session with those that were `recorded`, till the first that differs. Ends when all their steps are done.
+/// Compares the hashes of a session with those that were `recorded`, up to the first that differs. Ends when all
+/// their steps are done.
 pub(super) async fn compare(channel: &Channel, session_id: &str, recorded: Hashes) -> Result<Compared, ClientFailure> {
     let (mut compared, mut left, mut asked) = (Compared::default(), recorded.into_iter(), VecDeque::new());
     loop {
@@ -71,7 +72,7 @@ pub(super) async fn compare(channel: &Channel, session_id: &str, recorded: Hashe
                 compared.difference = Some(what);
                 return Ok(compared);
             }
-            // The step was done before the question came, or the caller has read too much of late.
+            // The step was done before the request arrived, or the caller has read too much recently.
             Err(status) if [Code::OutOfRange, Code::ResourceExhausted].contains(&status.code()) => compared.missed += 1,
             Err(status) => return Err(super::refused(status)),
         }

@@ -1,4 +1,4 @@
-//! What a replay measures: delays, samples, the largest displacement and force.
+//! Measurements of a replay: delays, samples, the largest displacement and force.
 
 use hdrhistogram::Histogram;
 use palpate_proto::geometry::from_vector;
@@ -9,7 +9,7 @@ use palpate_tissue::scene::script::Script;
 
 use crate::ClientFailure;
 
-/// What a replay has measured.
+/// Measurements of a replay.
 pub(super) struct Measured<'s> {
     script: &'s Script,
     pub(super) round_trip_ns: Histogram<u64>,
@@ -22,14 +22,14 @@ pub(super) struct Measured<'s> {
     pub(super) computed: u64,
     pub(super) late: u64,
     pub(super) rejected: u64,
-    /// How often the tissue went back to an earlier state.
+    /// Number of times that the tissue was put back to an earlier state.
     pub(super) recovery_count: u64,
     pub(super) largest_displacement_m: f64,
     pub(super) peak_reaction_n: f64,
     /// Step and server time, ns, of the first sample and of the last.
     pub(super) first: Option<(u64, u64)>,
     pub(super) last: (u64, u64),
-    /// Of the first tool with a tip, or of the first tool.
+    /// Curves of the first tool with a tip, or of the first tool.
     pub(super) curves: Curves,
 }
 
@@ -67,7 +67,7 @@ impl<'s> Measured<'s> {
         self.last = (sample.step, sample.server_time_ns);
         self.first.get_or_insert(self.last);
         let plotted = self.script.first_tip().unwrap_or(0);
-        // A tip that has been taken away leaves its tool a point that no one touches.
+        // A tool whose tip was removed has a point without contact.
         let mut poses = self.script.poses.iter();
         let is_there = poses.next().is_none_or(|profile| profile.at(sample.simulation_time_s).is_some());
         for tool in &sample.tools {
@@ -97,7 +97,7 @@ impl<'s> Measured<'s> {
     }
 }
 
-/// Quantiles in µs of a distribution in ns.
+/// Returns quantiles in µs of a distribution in ns.
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn percentiles_us(histogram: &Histogram<u64>) -> Percentiles {
     let us = |ns: u64| ns as f64 / 1e3;

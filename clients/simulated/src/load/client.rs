@@ -1,4 +1,4 @@
-//! One client of a load: it strokes the tissue with a command each tick and counts the answers.
+//! One client of a load test: it strokes the tissue with a command at each tick and counts the answers.
 
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -21,14 +21,14 @@ pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// The stage of a load, and when the measurement ended, ns.
+/// Stage of a load test, and the time when the measurement ended, ns.
 pub(crate) struct Stage(AtomicU8, AtomicU64);
 
 impl Stage {
     /// Sessions and clients start; nothing is counted yet.
     pub(crate) const RAMP: u8 = 0;
     pub(crate) const MEASURE: u8 = 1;
-    /// Nothing more is sent; outstanding answers arrive.
+    /// Clients send nothing more and wait for outstanding answers.
     pub(crate) const DRAIN: u8 = 2;
 
     pub(crate) fn new() -> Self {
@@ -49,7 +49,7 @@ impl Stage {
     }
 }
 
-/// What all clients and viewers of a user share.
+/// State that all clients and viewers of a user share.
 #[derive(Clone)]
 pub(crate) struct Common {
     pub(crate) clock: Instant,
@@ -57,7 +57,7 @@ pub(crate) struct Common {
     pub(crate) tally: Arc<Mutex<Tally>>,
     /// Commands per second.
     pub(crate) rate_hz: f64,
-    /// Clients lead tools with a tip.
+    /// Present if clients lead tools with a tip.
     pub(crate) touches: Option<Lead>,
 }
 
@@ -80,7 +80,8 @@ struct Sent {
     acknowledged: u64,
     last_tick: Option<u64>,
     is_open: bool,
-    /// The tool of a client that leads one with a tip, and the command that a sample acknowledged last, with its time, ns.
+    /// The tool of a client that leads one with a tip, and the command that a sample acknowledged last, with its
+    /// time, ns.
     led: Option<LedTip>,
     newest: (u64, u64),
 }
@@ -91,16 +92,16 @@ impl Sent {
         &mut self.at_ns[sequence as usize % OUTSTANDING]
     }
 
-    /// Number of commands that nothing has acknowledged or rejected.
+    /// Returns the number of commands that were neither acknowledged nor rejected.
     fn outstanding(&mut self) -> u64 {
         let (from, to) = (self.acknowledged + 1, self.sequence);
-        // Older commands than those kept are outstanding too, else they would count as acknowledged.
+        // Commands older than those kept count as outstanding.
         let kept = from.max(to.saturating_sub(OUTSTANDING as u64 - 1));
         (kept - from) + (kept..=to).filter(|sequence| *self.at(*sequence) > 0).count() as u64
     }
 }
 
-/// Steps of a session and when this client heard of them.
+/// Steps of a session, and the times when samples of them arrived.
 #[derive(Default)]
 struct Heartbeat {
     /// Server's time, ns, and step of the first and the last sample within the measurement.
@@ -141,25 +142,25 @@ pub(crate) struct Client {
     pub(crate) tool: u32,
     pub(crate) rate_hz: f64,
     pub(crate) stroke: Stroke,
-    /// Of its hand.
+    /// Seed of the movements of its hand.
     pub(crate) seed: u64,
-    /// The middle of the tissue, m.
+    /// Centre of the tissue, m.
     pub(crate) middle_m: DVec3,
     /// Present if the session has viewers.
     pub(crate) arrivals: Option<Arc<Mutex<Arrivals>>>,
 }
 
-/// How long a client waits for outstanding answers.
+/// Longest time for which a client waits for outstanding answers.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// A session that was silent for longer than this at the end of the measurement had stopped, ns.
+/// Silence at the end of the measurement beyond which a session counts as stopped, ns.
 const SILENCE_NS: u64 = 50_000_000;
 
 /// A second, ns.
 const SECOND_NS: u64 = 1_000_000_000;
 
 impl Client {
-    /// Opens the stream; `ticks` tells when to send. The returned future is the client's life.
+    /// Opens the stream; the client sends at each change of `ticks`. Returns a future that runs the client to its end.
     pub(crate) async fn open(
         self,
         channel: Channel,
@@ -190,7 +191,7 @@ impl Client {
             let mut sent = lock(&sent);
             sent.led = touches.and_then(|lead| LedTip::new(inbound.opened(), &lead, self.seed, self.middle_m));
             if touches.is_some() && sent.led.is_none() {
-                return Err(tonic::Status::failed_precondition("the server tells no force law for --touch"));
+                return Err(tonic::Status::failed_precondition("the server sent no force law for --touch"));
             }
             sent.is_open = true;
         }
@@ -229,7 +230,7 @@ impl Client {
         tally.dilation_min = tally.dilation_min.min(heartbeat.dilation(self.rate_hz, &self.common.stage));
     }
 
-    /// Completes when no answer is outstanding any more, or [`ANSWER_TIMEOUT`] has passed.
+    /// Completes when no answer is outstanding, or [`ANSWER_TIMEOUT`] has passed since the measurement ended.
     async fn drained(&self, sent: &Mutex<Sent>) {
         let mut begun: Option<Instant> = None;
         loop {
@@ -260,7 +261,8 @@ impl Client {
         }
         if let Some(led) = &mut sent.led {
             led.hear(sample, now_ns as f64 * 1e-9);
-            // Samples that change little are not sent: how late is one that is? The wait for its step is by design.
+            // Samples that change little are not sent, so only those that are sent are measured. The wait for a step
+            // is by design and is subtracted.
             let waited_ns = sample.tools.first().map_or(0, |tool| tool.step_wait_ns);
             if let Some(tally) = tally.as_mut().filter(|_| sent.newest.0 == acknowledged && sent.newest.1 > 0) {
                 tally.round_trip_ns.saturating_record(now_ns.saturating_sub(sent.newest.1 + waited_ns));
@@ -291,7 +293,8 @@ impl Client {
 }
 
 impl Heartbeat {
-    /// Simulated time over real time: by the server's clock, plus our own for a long silence at the end.
+    /// Returns simulated time over real time: by the server's clock, plus this client's clock for a long silence at
+    /// the end.
     #[allow(clippy::cast_precision_loss)]
     fn dilation(&self, rate_hz: f64, stage: &Stage) -> f64 {
         let Some(first) = self.first else { return 0.0 };
@@ -302,7 +305,7 @@ impl Heartbeat {
     }
 }
 
-/// The command of a tick; `None` before the stream is open and after the measurement.
+/// Returns the command of a tick; `None` before the stream is open and after the measurement.
 fn command(common: &Common, stroke: &Stroke, tool: u32, sent: &Mutex<Sent>, tick: u64) -> Option<pb::Command> {
     let mut sent = lock(sent);
     let missed = sent.last_tick.replace(tick).map_or(0, |last| tick - last - 1);

@@ -6,7 +6,7 @@ use palpate_client::{Channel, Error, Server};
 
 use super::plan::LoadPlan;
 
-/// What a connection is for. Frames have their own: on a shared one, they would delay samples.
+/// Purpose of a connection. Frames have their own connections: on a shared one, they would delay samples.
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) enum Purpose {
     Call,
@@ -14,10 +14,10 @@ pub(crate) enum Purpose {
     View,
 }
 
-/// Connections, of which each bears so many streams.
+/// Connections, each shared by a limited number of streams.
 pub(crate) struct Connections {
     most: u32,
-    /// By whether it is for frames, and by the server: the newest, and the streams on it.
+    /// The newest connection and its number of streams, by whether it is for frames and by the server.
     newest: BTreeMap<(bool, String), (Channel, u32)>,
 }
 
@@ -26,7 +26,7 @@ impl Connections {
         Connections { most: plan.clients_per_connection, newest: BTreeMap::new() }
     }
 
-    /// A connection to a server, with room for the stream of a client or viewer; a call needs none.
+    /// Returns a connection to a server with room for the stream of a client or viewer; a call needs no room.
     pub(crate) async fn to(&mut self, server: &Server, purpose: Purpose) -> Result<Channel, Error> {
         let streams = u32::from(purpose != Purpose::Call);
         let key = (purpose == Purpose::View, server.url().to_owned());

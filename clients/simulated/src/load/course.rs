@@ -1,4 +1,4 @@
-//! A plan as it runs: users arrive, stay and leave, and every second is counted by itself.
+//! Execution of a plan: users arrive, stay and leave, and each second is counted separately.
 
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::sync::{Arc, Mutex};
@@ -21,34 +21,34 @@ use super::{TURNS, tick};
 use crate::relay::RelayNetwork;
 use crate::scene_file::SceneFile;
 
-/// Flows of one network at a time.
+/// Largest number of concurrent flows of one network.
 const MAX_FLOWS: u64 = 20_000;
 
-/// Between the last user's start and the beginning of the clock, if that waits for them.
+/// Time between the start of the last user and the start of the clock, if the clock waits for the users.
 const SETTLE: Duration = Duration::from_millis(500);
 
-/// A plan with its scenes, ready to be run.
+/// A plan of a load test with its scene files read, ready to run.
 pub struct PreparedPlan {
     plan: LoadPlan,
     scenes: Vec<SceneFile>,
 }
 
 impl PreparedPlan {
-    /// Reads the scene files that a plan names.
+    /// Creates a plan that is ready to run: reads the scene files that it names.
     ///
     /// # Errors
-    /// Refuses a scene that can't be read.
+    /// Returns a refusal if a scene can't be read.
     pub fn new(plan: LoadPlan) -> Result<Self, Refusal> {
         let scenes = plan.scenes.iter().map(|scene| SceneFile::read(&scene.what)).collect::<Result<_, _>>()?;
         Ok(PreparedPlan { plan, scenes })
     }
 
-    /// Loads a server by the plan, until its end or until `stop` completes; then all users leave. `told` is told of each second,
-    /// and `warn` what goes wrong with a network.
+    /// Runs the plan against a server until its end or until `stop` completes; then all users leave. Calls `told`
+    /// after each second with its counts, and `warn` with problems of a simulated network. Returns the report.
     ///
     /// # Errors
-    /// Returns an error if the server can't be reached or refuses a scene, if a network can't stand before it, or if a session of
-    /// a trial is refused.
+    /// Returns an error if the server can't be reached or refuses a scene, if a simulated network can't be put before
+    /// it, or if a session of a trial is refused.
     pub async fn run(
         self,
         server: &Server,
@@ -81,11 +81,11 @@ impl PreparedPlan {
     }
 }
 
-/// The address of a server, for a network before it.
+/// Returns the address of a server, for a simulated network before it.
 fn address(url: &str) -> Result<SocketAddr, Error> {
     let refuse = |why: String| Error::Argument(format!("{url}: {why}"));
     let host = url.strip_prefix("http://").ok_or_else(|| {
-        let why = "must begin with http:// for a plan with networks: a certificate is not for what stands before it";
+        let why = "must begin with http:// for a plan with networks: a certificate is not valid for a relay";
         refuse(why.to_owned())
     })?;
     let host = host.split('/').next().unwrap_or(host);
@@ -127,7 +127,7 @@ async fn run(
             asking: tokio::sync::Mutex::new(()),
         };
         let (own, arrived) = (users.iter().skip(index).step_by(threads).copied().collect(), arrived.clone());
-        // A thread of its own, so that what the users do is measured by who does nothing else.
+        // The users get threads of their own, so that no other work delays their measurements.
         workers.push(std::thread::spawn(move || work(world, own, &arrived)));
     }
     drop(arrived);
@@ -141,7 +141,7 @@ async fn run(
     telling.send_replace(Stage::DRAIN);
     let joined = tokio::task::spawn_blocking(move || {
         let joined = workers.into_iter().try_for_each(std::thread::JoinHandle::join);
-        // Users are answered to the end.
+        // Users wait for outstanding answers.
         drop(beating);
         joined.and(ticker.join())
     });
@@ -151,24 +151,24 @@ async fn run(
     while let Some(arrived) = arrivals.recv().await {
         arrived?;
     }
-    // What came after the last second counts in the last phase.
+    // Counts after the last second belong to the last phase.
     let rest = course.count(course.at_s + 1.0);
     course.report.add(rest);
     Ok(course.report)
 }
 
-/// How far a load is.
+/// Progress of a load test.
 struct Course {
     report: LoadReport,
-    /// By thread.
+    /// Counts by thread.
     tallies: Vec<Arc<Mutex<Tally>>>,
-    /// Since the clock of the plan began, s.
+    /// Time since the start of the plan's clock, s.
     at_s: f64,
     users: u64,
 }
 
 impl Course {
-    /// Lets the clock of the plan run: it begins when those are there who gather.
+    /// Runs the clock of the plan. It starts when all users that gather are connected.
     async fn take(
         &mut self,
         plan: &LoadPlan,
@@ -186,7 +186,7 @@ impl Course {
         telling.send_replace(Stage::MEASURE);
         let (begun, begun_cpu_s) = (tokio::time::Instant::now(), cpu_s());
         let lasts_s = plan.lasts_s();
-        // Phases of parts of a second do not add up exactly.
+        // Fractions of a second do not add up exactly.
         while self.at_s < lasts_s - 1e-9 {
             let at_s = (self.at_s + 1.0).min(lasts_s);
             tokio::time::sleep_until(begun + Duration::from_secs_f64(at_s)).await;
@@ -204,7 +204,7 @@ impl Course {
         Ok(())
     }
 
-    /// What was counted since the last time.
+    /// Takes the counts since the last call, up to `at_s`.
     fn count(&mut self, at_s: f64) -> Second {
         let mut all = Tally::new();
         for tally in &self.tallies {
@@ -218,7 +218,7 @@ impl Course {
     }
 }
 
-/// The work of one thread; `arrived` hears when all of its users have come, or why they could not.
+/// Runs the users of one thread. Sends to `arrived` when all of them have arrived, or why they could not.
 fn work(world: World, users: Vec<User>, arrived: &mpsc::UnboundedSender<Result<(), Error>>) {
     let all = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
         Ok(runtime) => return runtime.block_on(play(Arc::new(world), users, arrived)),
@@ -237,7 +237,7 @@ async fn play(world: Arc<World>, users: Vec<User>, arrived: &mpsc::UnboundedSend
     while staying.join_next().await.is_some() {}
 }
 
-/// Lets users arrive, each at its time. Those that gather come one after the other.
+/// Starts the users, each at its time. Users that gather start one after the other.
 async fn arrive(world: &Arc<World>, users: Vec<User>, staying: &mut JoinSet<()>) -> Result<(), Error> {
     let gathers = world.plan.gathers_over_s().is_some();
     let mut connections = Connections::new(&world.plan);
@@ -252,13 +252,13 @@ async fn arrive(world: &Arc<World>, users: Vec<User>, staying: &mut JoinSet<()>)
         } else {
             staying.spawn(visit(world, user));
         }
-        // Those who have gone.
+        // Removes the tasks of users that have left.
         while staying.try_join_next().is_some() {}
     }
     Ok(())
 }
 
-/// Processor time of this process, s; `None` without a /proc.
+/// Returns the processor time of this process, s; `None` without /proc.
 fn cpu_s() -> Option<f64> {
     let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
     let ticks = stat[stat.rfind(')')? + 2..].split_whitespace().skip(11).take(2);

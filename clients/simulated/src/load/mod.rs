@@ -1,6 +1,7 @@
-//! Loads of a server: sessions, users with tools, and viewers, and how it copes.
+//! Load tests of a server: simulated users with sessions, tools and viewers, and measurements of how the server copes.
 //!
-//! By a [`LoadPlan`], users arrive, stay and leave in phases. A [`LoadTrial`] is a plan of one phase, to whose end all stay.
+//! In a [`LoadPlan`], users arrive, stay and leave in phases. A [`LoadTrial`] is a plan of one phase in which all
+//! stay to the end.
 
 mod client;
 mod connections;
@@ -27,10 +28,10 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::watch;
 
-/// Clients send at this many moments of a period: not all at once, and without a wake-up for each.
+/// Number of moments of a period at which clients send: not all at once, and without a wake-up for each.
 const TURNS: usize = 4;
 
-/// Tells the clients of each turn that they are to send: by the clock, independent of the answers.
+/// Signals the clients of each turn to send, by the clock and independent of the answers.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn tick(turns: &[watch::Sender<u64>], rate_hz: f64, over: &watch::Receiver<()>) {
     let (begun, apart_s) = (Instant::now(), 1.0 / (rate_hz * turns.len() as f64));

@@ -1,4 +1,4 @@
-//! Objectives of a load, written like `p99<2ms,dilation>0.999`.
+//! Objectives of a load test, written like `p99<2ms,dilation>0.999`.
 
 use std::str::FromStr;
 
@@ -20,22 +20,23 @@ const QUANTITIES: &[(&str, Quantity)] = &[
     ("dilation", |outcome| outcome.dilation_min),
     ("lost", |outcome| outcome.lost as f64),
     ("rejected", |outcome| outcome.rejected as f64),
-    // Of plans.
+    // Only plans measure these.
     ("start_p99", |outcome| outcome.start_us.p99 * 1e-6),
     ("turned_away", |outcome| outcome.turned_away as f64),
 ];
 
-/// One bound.
+/// One bound of an objective.
 #[derive(Debug, Clone)]
 struct ObjectiveBound {
     text: String,
     quantity: Quantity,
     is_above: bool,
-    /// In s for times, else a plain number.
+    /// Bound in s for times; otherwise a plain number.
     bound: f64,
 }
 
-/// Bounds that must all hold.
+/// Objective of a load test: bounds on measured quantities, all of which must hold. It is parsed from a text such as
+/// `p99<2ms,dilation>0.999`.
 #[derive(Debug, Clone)]
 pub struct Objective(Vec<ObjectiveBound>);
 
@@ -73,7 +74,8 @@ impl FromStr for ObjectiveBound {
 }
 
 impl Objective {
-    /// Returns the bounds that a run does not meet.
+    /// Returns the bounds that an outcome does not meet, as they were written. A quantity that was not measured meets
+    /// no bound.
     pub fn missed(&self, outcome: &LoadOutcome) -> Vec<&str> {
         let misses = |bound: &&ObjectiveBound| {
             let value = (bound.quantity)(outcome);

@@ -1,4 +1,4 @@
-//! A plan of a load: phases with arrivals of users, what the users are made of, and what is to be kept.
+//! Plan of a load test: phases with arrivals of users, the properties of the users, and the objectives.
 
 use std::path::Path;
 
@@ -17,43 +17,43 @@ use crate::random::Random;
 /// Largest plan, bytes.
 const MAX_BYTES: u64 = 1 << 20;
 
-/// Most users of a plan, in all.
+/// Largest number of users of a plan; a plan with more is refused.
 const MAX_USERS: usize = 10_000;
 
-/// How long a user stays who is not told, s: longer than any trial.
+/// Time for which a user stays without another value, s: longer than any trial.
 pub(crate) const STAYS_S: f64 = 86_400.0;
 
-/// Most entries of a list.
+/// Largest number of entries of a list; a longer list is refused.
 const MAX_ENTRIES: usize = 64;
 
-/// One of several things, and how often it is taken.
+/// One of several alternatives, with its relative frequency.
 #[derive(Debug, Clone)]
 pub(crate) struct Share<T> {
     share: f64,
     pub(crate) what: T,
 }
 
-/// A list of one thing, which everybody takes.
+/// Returns a list of one alternative, which every user gets.
 pub(crate) fn only<T>(what: T) -> Vec<Share<T>> {
     vec![Share { share: 1.0, what }]
 }
 
-/// The index of one of several parts, by their shares.
+/// Draws the index of one of several alternatives, by their shares.
 fn draw<T>(parts: &[Share<T>], random: &mut Random) -> usize {
     let mut left = random.between(0.0, parts.iter().map(|part| part.share).sum());
     let found = parts.iter().position(|part| {
         left -= part.share;
         left < 0.0
     });
-    // A part without a share is never taken, also if rounding left something.
+    // A part without a share is never taken, even after rounding.
     found.or_else(|| parts.iter().rposition(|part| part.share > 0.0)).unwrap_or(0)
 }
 
-/// A network between users and the server.
+/// A simulated network between users and the server.
 #[derive(Debug, Clone)]
 pub(crate) struct Wire {
     pub(crate) name: String,
-    /// `None`: the server as it is reached.
+    /// Conditions of the network; `None`: users reach the server directly.
     pub(crate) conditions: Option<Conditions>,
 }
 
@@ -63,41 +63,41 @@ impl Wire {
     }
 }
 
-/// Who watches a session.
+/// Viewers of a session.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Viewers {
     pub(crate) number: u32,
     pub(crate) rate_hz: f64,
 }
 
-/// How users arrive.
+/// Pattern of the arrivals of users.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Arrivals {
-    /// At even distances, users a second.
+    /// Users arrive at even intervals. Contains users per second.
     Steady(f64),
-    /// At random, as many a second on average.
+    /// Users arrive at random. Contains the mean number of users per second.
     Poisson(f64),
-    /// So many at once.
+    /// This many users arrive at once.
     Spike(u32),
-    /// So many, at even distances, before the clock of the plan begins: it waits until all are connected. A refusal of one
-    /// ends the load.
+    /// This many users arrive at even intervals before the clock of the plan starts: it waits until all are
+    /// connected. A refusal of one ends the load test.
     Gathering { users: u32, over_s: f64 },
-    /// None: those who are there stay.
+    /// No user arrives; present users stay.
     None,
 }
 
-/// A part of a plan.
+/// One phase of a plan.
 #[derive(Debug, Clone)]
 pub(crate) struct Phase {
     pub(crate) name: String,
     pub(crate) seconds: f64,
     pub(crate) arrivals: Arrivals,
-    /// How long a user stays; with random arrivals on average.
+    /// Time for which a user stays, s; with random arrivals on average.
     pub(crate) stays_s: f64,
     pub(crate) objective: Option<Objective>,
 }
 
-/// A plan.
+/// Plan of a load test: phases in which users arrive, the properties of the users, and objectives.
 ///
 /// Four users a second arrive for 10 s, and each stays for 5 s. A share below 0 is refused, with its line:
 ///
@@ -117,7 +117,7 @@ pub(crate) struct Phase {
 pub struct LoadPlan {
     pub(crate) name: String,
     pub(crate) seed: u64,
-    /// Commands a second of each client.
+    /// Commands per second of each client.
     pub(crate) rate_hz: f64,
     /// Clients of each user, with one tool each. With 0, commands sent beforehand keep the session awake.
     pub(crate) clients_per_user: u32,
@@ -126,19 +126,19 @@ pub struct LoadPlan {
     /// Threads of this generator.
     pub(crate) threads: u32,
     pub(crate) scenes: Vec<Share<String>>,
-    /// What leads the tools; `None`: forces push the tissue along a stroke.
+    /// Alternatives of what leads the tools; `None`: forces push the tissue along a stroke.
     pub(crate) leads: Vec<Share<Option<Lead>>>,
     pub(crate) wires: Vec<Share<Wire>>,
     pub(crate) viewers: Vec<Share<Viewers>>,
     pub(crate) phases: Vec<Phase>,
-    /// Of the whole.
+    /// Objective of the whole plan.
     pub(crate) objective: Option<Objective>,
 }
 
 /// One user: a session of its own, with its clients and viewers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct User {
-    /// Since the plan began, s.
+    /// Time of arrival since the plan began, s.
     pub(crate) at_s: f64,
     pub(crate) stays_s: f64,
     // Indices in the lists of the plan.
@@ -146,23 +146,23 @@ pub(crate) struct User {
     pub(crate) lead: usize,
     pub(crate) wire: usize,
     pub(crate) viewers: usize,
-    /// Of its hand.
+    /// Seed of the movements of its hand.
     pub(crate) seed: u64,
 }
 
 impl LoadPlan {
-    /// Reads a plan from a file.
+    /// Reads a plan from a file in TOML, of at most 1 MiB.
     ///
     /// # Errors
-    /// Refuses a file that can't be read, and what is wrong in it, by line and key.
+    /// Returns a refusal if the file can't be read, or with the line and key of an error in it.
     pub fn read(path: &Path) -> Result<Self> {
         LoadPlan::parse(&path.display().to_string(), &read_text(path, MAX_BYTES)?)
     }
 
-    /// Reads a plan from text (TOML); refusals call it `name`.
+    /// Parses a plan from a text in TOML. Refusals name the text `name`.
     ///
     /// # Errors
-    /// Refuses what is wrong in it, by line and key.
+    /// Returns a refusal with the line and key of an error in the text, or if more than 10 000 users would arrive.
     pub fn parse(name: &str, text: &str) -> Result<Self> {
         let document = Document::parse(name, text)?;
         let plan = document.read(plan)?;
@@ -176,12 +176,12 @@ impl LoadPlan {
         Ok(plan)
     }
 
-    /// How long the phases take together, s.
+    /// Returns the duration of all phases together, s.
     pub(crate) fn lasts_s(&self) -> f64 {
         self.phases.iter().map(|phase| phase.seconds).sum()
     }
 
-    /// The time over which users arrive before the clock begins, s; `None` if it waits for nobody.
+    /// Returns the time over which users arrive before the clock starts, s; `None` if the clock waits for no users.
     pub(crate) fn gathers_over_s(&self) -> Option<f64> {
         self.phases.iter().find_map(|phase| match phase.arrivals {
             Arrivals::Gathering { over_s, .. } => Some(over_s),
@@ -189,7 +189,7 @@ impl LoadPlan {
         })
     }
 
-    /// All users, by arrival: the same for the same plan. At most one more than [`MAX_USERS`].
+    /// Returns all users by arrival, the same for the same plan. The list has at most one more than [`MAX_USERS`].
     pub(crate) fn users(&self) -> Vec<User> {
         let (mut times, mut mix) = (Random::new(self.seed, 1), Random::new(self.seed, 2));
         let (mut users, mut from_s) = (Vec::new(), 0.0);
@@ -229,7 +229,7 @@ impl LoadPlan {
     }
 }
 
-/// A number within a range, if present.
+/// Returns a number within a range, if present.
 fn within(fields: &mut Fields<'_>, key: &'static str, range: &str, least: f64, most: f64) -> Result<Option<f64>> {
     let Some(value) = fields.number(key)? else { return Ok(None) };
     number(&fields.path(key), value, range, |value| (least..=most).contains(&value)).map(Some)
@@ -239,7 +239,7 @@ fn share(fields: &mut Fields<'_>) -> Result<f64> {
     Ok(within(fields, "share", "from 0 to 1000000", 0.0, 1e6)?.unwrap_or(1.0))
 }
 
-/// A whole number up to a limit.
+/// Returns a whole number up to a limit.
 fn count(item: &Item<'_>, most: u32) -> Result<u32> {
     let whole = item.whole()?;
     u32::try_from(whole)
@@ -254,7 +254,7 @@ fn objective(fields: &mut Fields<'_>) -> Result<Option<Objective>> {
     text.parse().map(Some).map_err(|why: String| item.refuse(Reason::WrongKind, why))
 }
 
-/// A list of tables with shares; what is said if there is none.
+/// Returns a list of tables with shares; `instead` alone if there is none.
 fn parts<T>(
     fields: &mut Fields<'_>,
     key: &'static str,
@@ -311,7 +311,7 @@ fn plan(fields: &mut Fields<'_>) -> Result<LoadPlan> {
     })
 }
 
-/// One of several names, quoted for people.
+/// Returns names in quotation marks, separated by commas.
 fn quoted<'n>(names: impl Iterator<Item = &'n str>) -> String {
     let names: Vec<String> = names.map(|name| format!("\"{name}\"")).collect();
     names.join(", ")

@@ -1,4 +1,4 @@
-//! The report of a plan: by second, by phase and as a whole; as JSON, as a table, and as a page with plots.
+//! Report of a load test by second, by phase and as a whole; as JSON, as a table, and as a page with plots.
 
 use std::collections::BTreeMap;
 use std::fmt::Write;
@@ -9,7 +9,7 @@ use super::objective::Objective;
 use super::plan::{LoadPlan, User};
 use super::tally::{LoadOutcome, Tally, listed};
 
-/// What was counted within a second.
+/// Counts of a load test within one second.
 pub struct Second {
     /// Its end, since the plan began, s.
     pub(crate) at_s: f64,
@@ -21,12 +21,13 @@ pub struct Second {
 }
 
 impl Second {
-    /// Returns a line for people who watch.
+    /// Returns a line for a terminal: time, users, samples per second, round trip, and users that were turned away.
     pub fn line(&self) -> String {
         format!("{}  turned away {}", self.figures("users"), away(&self.tally.turned_away))
     }
 
-    /// Returns a line for people who watch a trial: who is turned away ends it.
+    /// Returns a line for a terminal during a trial: time, sessions, samples per second, round trip, and rejected
+    /// commands. (A user that is turned away ends a trial.)
     pub fn trial_line(&self) -> String {
         format!("{}  rejected {}", self.figures("sessions"), self.tally.rejected.values().sum::<u64>())
     }
@@ -44,14 +45,14 @@ impl Second {
     }
 }
 
-/// One point of the courses.
+/// One point of the plots.
 struct Point {
     at_s: f64,
     users: u64,
     outcome: LoadOutcome,
 }
 
-/// A phase, or the whole.
+/// A phase, or the whole plan, with its counts.
 struct Stretch {
     name: String,
     from_s: f64,
@@ -61,25 +62,26 @@ struct Stretch {
     tally: Tally,
 }
 
-/// The report of a plan.
+/// Report of a load test: counts and quantiles of each second, each phase and the whole, and whether the objectives
+/// were met.
 pub struct LoadReport {
     name: String,
     points: Vec<Point>,
     phases: Vec<Stretch>,
     whole: Stretch,
-    /// How many users were made of what.
+    /// Numbers of users by scene, hand, network and viewers.
     mix: Value,
     pub(crate) is_interrupted: bool,
     /// Processor time of this generator per second, cores.
     pub(crate) generator_cores: f64,
 }
 
-/// Users that were turned away, by reason, for people.
+/// Returns the numbers of users that were turned away, by reason, as a text.
 fn away(reasons: &BTreeMap<String, u64>) -> String {
     if reasons.is_empty() { "none".to_owned() } else { listed(reasons) }
 }
 
-/// How many users of a plan have which scene, hand, network and number of viewers.
+/// Returns the numbers of users of a plan by scene, hand, network and number of viewers.
 fn mix(plan: &LoadPlan, users: &[User]) -> Value {
     let mut counts: [BTreeMap<String, u64>; 4] = Default::default();
     for user in users {
@@ -100,7 +102,7 @@ fn mix(plan: &LoadPlan, users: &[User]) -> Value {
     json!({ "scenes": scenes, "hands": hands, "networks": networks, "viewers": viewers })
 }
 
-/// An outcome in which the dilation is that of the worst second.
+/// Returns an outcome whose dilation is that of the worst second.
 fn outcome(tally: &Tally, users: u64) -> LoadOutcome {
     let dilation = tally.dilation_s_min;
     let dilation_min = if dilation.is_finite() { dilation } else { f64::NAN };
@@ -121,7 +123,7 @@ impl Stretch {
         outcome(&self.tally, self.most_users)
     }
 
-    /// The bounds that were not met.
+    /// Returns the bounds that were not met.
     fn missed(&self) -> Vec<String> {
         let outcome = self.outcome();
         let missed = self.objective.iter().flat_map(|objective| objective.missed(&outcome));
@@ -132,7 +134,7 @@ impl Stretch {
         let outcome = self.outcome();
         let mut told = outcome.json(None);
         if let Some(told) = told.as_object_mut() {
-            // These are of trials.
+            // Only trials have these.
             told.remove("sessions");
             told.remove("generator_cores");
             for (key, value) in [
@@ -155,7 +157,7 @@ impl Stretch {
 }
 
 impl LoadReport {
-    /// Of a plan and its users.
+    /// Creates an empty report of a plan and its users.
     pub(crate) fn new(plan: &LoadPlan, users: &[User]) -> Self {
         let mut from_s = 0.0;
         let phases = plan.phases.iter().map(|phase| {
@@ -194,13 +196,14 @@ impl LoadReport {
         self.phases.iter().chain([&self.whole])
     }
 
-    /// Returns the summary of a trial: its dilation is that of whole stays, where those of phases are of the worst second.
+    /// Returns the summary of a trial. Its dilation is the smallest of whole stays, whereas that of a phase is of the
+    /// worst second.
     pub fn outcome(&self) -> LoadOutcome {
         let tally = &self.whole.tally;
         LoadOutcome { generator_cores: self.generator_cores, ..tally.outcome(tally.arrived) }
     }
 
-    /// Returns why the load failed; `None` if it did not.
+    /// Returns why the load test failed; `None` if it succeeded.
     pub fn verdict(&self) -> Option<String> {
         let whole = self.whole.outcome();
         if self.is_interrupted {
@@ -223,7 +226,7 @@ impl LoadReport {
         (!whys.is_empty()).then(|| whys.join("; "))
     }
 
-    /// Returns JSON: the whole, its phases and seconds; what was not measured is `null`.
+    /// Returns the report as JSON: the whole, its phases and its seconds. Values that were not measured are `null`.
     pub fn json(&self) -> Value {
         let finite = |value: f64| if value.is_finite() { json!(value) } else { Value::Null };
         let points = self.points.iter().map(|Point { at_s, users, outcome }| {
@@ -241,12 +244,12 @@ impl LoadReport {
         })
     }
 
-    /// Returns a page with plots (HTML) that needs nothing else.
+    /// Returns the report as one self-contained HTML page with plots.
     pub fn page(&self) -> String {
         page(self)
     }
 
-    /// Returns it as a table for a terminal.
+    /// Returns the report as a table for a terminal.
     pub fn table(&self) -> String {
         let head = "phase               users  arrived  turned away  round trip p50 / p99      start p99    dilation   objective\n";
         let rows = self.stretches().map(|stretch| {
@@ -278,7 +281,7 @@ impl LoadReport {
     }
 }
 
-/// Whether an objective was kept, for people.
+/// Returns whether an objective was kept, as a text.
 fn kept(stretch: &Stretch) -> String {
     let missed = stretch.missed();
     match (&stretch.objective, missed.is_empty()) {
@@ -296,10 +299,10 @@ fn escaped(text: &str) -> String {
 const SIZE: [f64; 2] = [860.0, 220.0];
 const MARGINS: [f64; 4] = [64.0, 12.0, 12.0, 28.0];
 
-/// A course over time: its name, its colour, and its values; one that is not finite is left out.
+/// A curve over time: its name, its colour, and its values; values that are not finite are left out.
 type Curve<'c> = (&'c str, &'c str, Vec<f64>);
 
-/// A round number that is at least this.
+/// Returns the smallest round number (1, 2 or 5 times a power of 10) that is at least this.
 fn round_up(value: f64) -> f64 {
     if value <= 0.0 || !value.is_finite() {
         return 1.0;
@@ -308,7 +311,7 @@ fn round_up(value: f64) -> f64 {
     [1.0, 2.0, 5.0, 10.0].into_iter().map(|step| step * power).find(|step| *step >= value * 0.999_999).unwrap_or(value)
 }
 
-/// A plot of courses over the seconds, with the phases behind it.
+/// Returns a plot of curves over the seconds, with the phases behind them.
 fn plot(report: &LoadReport, title: &str, courses: &[Curve<'_>]) -> String {
     let [width, height] = SIZE;
     let [left, top, right, bottom] = MARGINS;
@@ -369,7 +372,7 @@ fn plot(report: &LoadReport, title: &str, courses: &[Curve<'_>]) -> String {
     svg + "</svg>\n"
 }
 
-/// The report as one page that needs nothing else.
+/// Returns the report as one self-contained page.
 fn page(report: &LoadReport) -> String {
     let of =
         |value: fn(&LoadOutcome) -> f64| report.points.iter().map(|point| value(&point.outcome)).collect::<Vec<f64>>();

@@ -1,5 +1,5 @@
-//! What a client of a load does with its tool: a circle about the middle of a sheet, or one vertex of a mesh after another, with a
-//! varying force, never at rest.
+//! Movement of the tool of a client in a load test: a circle around the centre of a sheet, or one vertex of a mesh
+//! after another, with a varying force, never at rest.
 
 use std::f64::consts::TAU;
 
@@ -13,10 +13,10 @@ use pb::command::Action;
 pub(crate) struct Stroke {
     over: Over,
     force_n: f64,
-    /// How deep a tip presses, at most, m.
+    /// Largest depth to which a tip presses, m.
     depth_m: f64,
     falloff_per_m: f64,
-    /// Where the stroke begins, as a fraction of a turn; it differs from client to client.
+    /// Start of the stroke as a fraction of a turn; it differs from client to client.
     begin: f64,
 }
 
@@ -26,11 +26,11 @@ enum Over {
     Mesh { vertices: u32 },
 }
 
-/// Vertices of a mesh that are pushed, one after the other, in a turn.
+/// Number of vertices of a mesh that are pushed, one after the other, in a turn.
 const VERTICES_PER_TURN: f64 = 20.0;
 
 impl Stroke {
-    /// A stroke over a session's tissue as the server tells it, with all fields.
+    /// Creates a stroke over a session's tissue, from the server's complete description of it.
     pub(crate) fn new(session: &pb::Session) -> Self {
         let scene = session.scene.clone().unwrap_or_default();
         let (over, spacing_m) = match scene.sheet {
@@ -60,12 +60,13 @@ impl Stroke {
         }
     }
 
-    /// The same, beginning elsewhere.
+    /// Returns this stroke with another start, as a fraction of a turn.
     pub(crate) fn beginning(&self, begin: f64) -> Self {
         Stroke { begin, ..self.clone() }
     }
 
-    /// Where a tip is at `time_s`, m: the same turn, pressed in as the force would; `None` on a mesh.
+    /// Returns the place of a tip at `time_s`, m: the turn of [`Stroke::at`], pressed in as its force would; `None`
+    /// on a mesh.
     pub(crate) fn place_m(&self, time_s: f64) -> Option<DVec3> {
         let Over::Sheet { middle_m, radius_m } = self.over else { return None };
         let turn = TAU * (0.5 * time_s + self.begin);
@@ -73,7 +74,7 @@ impl Stroke {
         Some(place_m.extend(-self.depth_m * (0.6 + 0.4 * (3.0 * turn).sin())))
     }
 
-    /// The tool's action at `time_s`: one turn in 2 s, with three presses.
+    /// Returns the tool's action at `time_s`, s: one turn in 2 s, with three presses.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub(crate) fn at(&self, time_s: f64) -> Action {
         let turns = 0.5 * time_s + self.begin;

@@ -1,18 +1,18 @@
-//! Counts of a load, and the report of them.
+//! Counts of a load test, and their summary.
 
 use std::collections::BTreeMap;
 
 use hdrhistogram::Histogram;
 use serde_json::{Value, json};
 
-/// The largest duration that the histograms resolve, ns.
+/// Largest duration that the histograms resolve, ns.
 const LONGEST_NS: u64 = 60_000_000_000;
 
 /// Counts of all clients of one thread.
 pub(crate) struct Tally {
-    /// From each command to the first sample that acknowledges it.
+    /// Times from each command to the first sample that acknowledges it.
     pub(crate) round_trip_ns: Histogram<u64>,
-    /// Between two samples of a client.
+    /// Times between two samples of a client.
     pub(crate) sample_gap_ns: Histogram<u64>,
     /// Age of a frame against the sample of its step, or if there is none, against the least delayed frame.
     pub(crate) frame_age_ns: Histogram<u64>,
@@ -21,7 +21,7 @@ pub(crate) struct Tally {
     pub(crate) commands: u64,
     /// Ticks at which this generator was too late to send.
     pub(crate) unsent: u64,
-    /// Commands that nothing acknowledged.
+    /// Commands that were never acknowledged.
     pub(crate) lost_commands: u64,
     /// Samples that the server dropped because a client read too slowly.
     pub(crate) lost_samples: u64,
@@ -36,13 +36,13 @@ pub(crate) struct Tally {
     /// Users that arrived, and those that left after they had started.
     pub(crate) arrived: u64,
     pub(crate) left: u64,
-    /// From the arrival of a user until the streams are open.
+    /// Times from the arrival of a user until its streams are open.
     pub(crate) start_ns: Histogram<u64>,
     /// Users that could not start, by reason.
     pub(crate) turned_away: BTreeMap<String, u64>,
     /// Number of streams that broke.
     pub(crate) broken: u64,
-    /// Why the first of them broke.
+    /// Reason why the first of them broke.
     pub(crate) first_break: Option<String>,
 }
 
@@ -109,7 +109,7 @@ impl Tally {
         self.first_break.get_or_insert(why);
     }
 
-    /// Summary of the counts.
+    /// Returns the summary of the counts.
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn outcome(&self, sessions: u64) -> LoadOutcome {
         LoadOutcome {
@@ -166,28 +166,28 @@ impl Quantiles {
     }
 }
 
-/// Counts by reason, for people.
+/// Returns counts by reason, as a text.
 pub(crate) fn listed(reasons: &BTreeMap<String, u64>) -> String {
     reasons.iter().map(|(reason, count)| format!("{reason} {count}")).collect::<Vec<_>>().join(", ")
 }
 
-/// Summary of one load.
+/// Summary of one load test: counts and quantiles.
 #[derive(Debug, Clone)]
 pub struct LoadOutcome {
     pub(crate) sessions: u64,
-    /// Samples that came.
+    /// Number of samples received.
     pub samples: u64,
     pub(crate) frames: u64,
-    /// Commands that were sent.
+    /// Number of commands sent.
     pub commands: u64,
-    /// Ticks at which this generator was too late to send.
+    /// Number of commands that were not sent because this generator was too late at their tick.
     pub unsent: u64,
     pub(crate) lost: u64,
     pub(crate) lost_commands: u64,
     pub(crate) lost_samples: u64,
     pub(crate) rejected: u64,
     pub(crate) reasons: BTreeMap<String, u64>,
-    /// Streams that broke.
+    /// Number of streams that broke.
     pub broken: u64,
     pub(crate) awake_points_mean: f64,
     pub(crate) dilation_min: f64,
@@ -196,14 +196,16 @@ pub struct LoadOutcome {
     pub(crate) frame_age_us: Quantiles,
     pub(crate) start_us: Quantiles,
     pub(crate) turned_away: u64,
-    /// Why the first of the streams broke.
+    /// Reason why the first stream broke, or, if none did, why the first user was turned away; `None` if neither
+    /// happened.
     pub first_break: Option<String>,
     /// Processor time of this generator per second, cores.
     pub(crate) generator_cores: f64,
 }
 
 impl LoadOutcome {
-    /// Returns it as one JSON object; what was not measured is `null`.
+    /// Returns the summary as one JSON object; values that were not measured are `null`. `limit_sessions` is added if
+    /// present.
     pub fn json(&self, limit_sessions: Option<u32>) -> Value {
         let mut object = json!({
             "sessions": self.sessions,
@@ -230,7 +232,7 @@ impl LoadOutcome {
         object
     }
 
-    /// Returns it as a table for a terminal.
+    /// Returns the summary as a table for a terminal, with a row for `limit_sessions` if present.
     pub fn table(&self, limit_sessions: Option<u32>) -> String {
         let mut rows = vec![
             ("sessions", self.sessions.to_string()),

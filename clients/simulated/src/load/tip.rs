@@ -1,5 +1,5 @@
-//! A client of a load that leads a tool with a tip, as a device does: it renders the force by local models, and tells of its tool
-//! what the server would not guess.
+//! A client of a load test that leads a tool with a tip, as a device does: it renders the force from local models,
+//! and sends its tool's place when the server's estimate is wrong.
 
 use glam::DVec3;
 use palpate_haptics::dead_reckoning::News;
@@ -15,16 +15,16 @@ use super::stroke::Stroke;
 use crate::random::Random;
 use crate::task::{LEAD_S, Task};
 
-/// What clients leave out because the other end can do without.
+/// Deadbands of a simulated client: fractions of the force below which the two ends do not send changes to each other.
 #[derive(Debug, Clone, Copy)]
 pub struct Deadbands {
-    /// Of samples: fraction of the force that is rendered; 0: one a step.
+    /// Deadband of samples from the server, as a fraction of the force; with 0 the server sends one at each step.
     pub down: f64,
-    /// Of poses; 0: one a tick.
+    /// Deadband of poses to the server, as a fraction of the force; with 0 the client sends one at each tick.
     pub up: f64,
 }
 
-/// What leads the tool of a client.
+/// Device and hand that lead the tool of a client.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Lead {
     pub(crate) deadbands: Deadbands,
@@ -33,22 +33,22 @@ pub(crate) struct Lead {
     pub(crate) hand: Option<Hand>,
 }
 
-/// The device of clients that are told of none.
+/// Returns the device of clients without another one.
 pub(crate) fn default_device() -> Device {
     Device::named("omega3").unwrap_or(UNDECLARED)
 }
 
-/// Scale of the depths of a hand's presses, and how long it has something to do, s.
+/// Scale of the depths of a hand's presses, and duration of its task, s.
 const SCALE: f64 = 0.2;
 const LASTS_S: f64 = 3600.0;
 
-/// A hand asks for forces with this period, s, as long as it has none.
+/// Interval at which a hand without forces enables them again, s.
 const ASKS_EVERY_S: f64 = 0.3;
 
 /// Longest time that a hand moves between two ticks, s.
 const MAX_S: f64 = 0.02;
 
-/// What a haptic stream of such a client asks for.
+/// Returns the opening of a haptic stream for such a client: `open` with device, tip, deadband and heartbeat.
 pub(crate) fn opening(open: pb::TouchOpen, lead: &Lead) -> pb::TouchOpen {
     pb::TouchOpen {
         device: Some(touch::device(&lead.device)),
@@ -80,7 +80,7 @@ impl Holding {
         Holding { hand, task, held, force_n: DVec3::ZERO, began_s: f64::NAN, last_s: never, asked_s: never }
     }
 
-    /// Where the hand has the tool now, m.
+    /// Advances the hand to `now_s`. Returns the place of its tool, m.
     fn place_m(&mut self, now_s: f64) -> DVec3 {
         if self.began_s.is_nan() {
             (self.began_s, self.last_s) = (now_s, now_s);
@@ -105,7 +105,8 @@ pub(crate) struct LedTip {
 }
 
 impl LedTip {
-    /// Of a stream that was opened, on a tissue with this middle; a hand moves by its seed. `None` if the server tells no law.
+    /// Creates the tool of a stream that was opened, on a tissue with the centre `middle_m`; the seed determines the
+    /// movements of a hand. `None` if the server sent no valid law.
     pub(crate) fn new(opened: &pb::TouchOpened, lead: &Lead, seed: u64, middle_m: DVec3) -> Option<Self> {
         let law = touch::from_law(opened.law.as_ref()?).ok()?;
         let renderer = Renderer::new(law, Envelope::new(lead.device, middle_m));
@@ -113,7 +114,7 @@ impl LedTip {
         Some(LedTip { up: lead.deadbands.up, renderer, news: News::default(), holding })
     }
 
-    /// A further law.
+    /// Adds a further law, if it is valid.
     pub(crate) fn learn(&mut self, update: &pb::ForceLawUpdate) {
         if let Some(message) = &update.law
             && let Ok(law) = touch::from_law(message)
@@ -122,14 +123,14 @@ impl LedTip {
         }
     }
 
-    /// Takes a sample that came at `now_s`.
+    /// Receives a sample that arrived at `now_s`.
     pub(crate) fn hear(&mut self, sample: &pb::Sample, now_s: f64) {
         if let Some(model) = sample.tools.first().and_then(|tool| tool.local_model.as_ref()) {
             self.renderer.receive(touch::from_local_model(model, sample.step), now_s);
         }
     }
 
-    /// One tick of the device: renders, and tells what is to be said of the tool.
+    /// Does one tick of the device: renders a force. Returns the pose to send, if one is due.
     pub(crate) fn tick(&mut self, stroke: &Stroke, time_s: f64, now_s: f64) -> Option<Action> {
         let place_m = match &mut self.holding {
             None => stroke.place_m(time_s)?,

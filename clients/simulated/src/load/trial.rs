@@ -1,16 +1,17 @@
-//! A trial of load: a plan of one phase, from numbers.
+//! A trial of load: a plan of one phase, made from a few numbers.
 
 use super::plan::{Arrivals, LoadPlan, Phase, STAYS_S, Viewers, Wire, only};
 use super::tip::{Deadbands, Lead, default_device};
 
-/// What all sessions of a trial have.
+/// Parameters of a trial: a load test in which equal sessions start, are measured together, and stay to the end.
 #[derive(Debug, Clone)]
 pub struct LoadTrial {
-    /// A scene of the server, or a scene file.
+    /// Name of a scene of the server, or a scene file.
     pub scene: String,
-    /// Clients of each session, with one tool each. With 0, commands sent beforehand keep each session awake.
+    /// Number of clients of each session, with one tool each. With 0, commands that are sent beforehand keep each
+    /// session awake.
     pub clients_per_session: u32,
-    /// Viewers of each session.
+    /// Number of viewers of each session.
     pub viewers: u32,
     /// Duration of the measurement, once all clients are connected, s.
     pub seconds: f64,
@@ -20,16 +21,18 @@ pub struct LoadTrial {
     pub rate_hz: f64,
     /// Frames per second of each viewer.
     pub frame_rate_hz: f64,
-    /// Clients lead tools with a tip and render forces, in place of pushing.
+    /// If present, clients lead tools with a tip and render forces, with these deadbands; if `None`, they push with
+    /// forces.
     pub touch: Option<Deadbands>,
-    /// Clients that share a connection.
+    /// Number of clients that share a connection.
     pub clients_per_connection: u32,
-    /// Threads of this generator.
+    /// Number of threads of this generator.
     pub threads: u32,
 }
 
 impl LoadTrial {
-    /// Returns the plan of a trial: the users of so many sessions gather, are measured together, and stay to the end.
+    /// Returns the plan of a trial with this many sessions: its users connect over `ramp_s`, are measured together
+    /// for `seconds`, and stay to the end.
     pub fn plan(&self, sessions: u32) -> LoadPlan {
         let lead = self.touch.map(|deadbands| Lead { deadbands, device: default_device(), hand: None });
         let phase = Phase {

@@ -1,4 +1,4 @@
-//! One user of a load: a session of its own, with its clients and viewers, from its arrival to its end.
+//! One user of a load test: a session with its clients and viewers, from arrival to end.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -20,21 +20,21 @@ use super::stroke::Stroke;
 use super::tally::Tally;
 use super::viewer::view;
 
-/// How long a user waits for the server before going away again.
+/// Longest time for which a user waits for the server before it leaves.
 const SERVER_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// The server deletes a session that nobody uses for so long, if this program dies, s.
+/// Idle time after which the server deletes a session, if this program dies, s.
 const IDLE_S: f64 = 10.0;
 
-/// Strokes begin at so many places.
+/// Number of different places where strokes begin.
 const MAX_PLACES: u64 = 1 << 16;
 
-/// What all users of a thread share.
+/// State that all users of a thread share.
 pub(crate) struct World {
     pub(crate) plan: Arc<LoadPlan>,
-    /// By the plan's networks.
+    /// The server through each of the plan's networks.
     pub(crate) servers: Arc<[Server]>,
-    /// By the plan's scenes.
+    /// The sources of the plan's scenes.
     pub(crate) sources: Arc<[Source]>,
     pub(crate) clock: Instant,
     pub(crate) tally: Arc<Mutex<Tally>>,
@@ -42,13 +42,13 @@ pub(crate) struct World {
     pub(crate) turns: Vec<watch::Receiver<u64>>,
     /// The stage of the whole load.
     pub(crate) stages: watch::Receiver<u8>,
-    /// Held by who asks for a step: the time of an answer that waits behind others would not be that of its step.
+    /// Held during a request for a step: an answer that waits behind others would have a wrong time.
     pub(crate) asking: tokio::sync::Mutex<()>,
 }
 
-/// A user that is there.
+/// A user with an open session.
 pub(crate) struct Guest {
-    /// The server that has made the session: of a fleet, any.
+    /// The server of the session. In a fleet, another server may own it later.
     server: Server,
     channel: Channel,
     session_id: String,
@@ -58,7 +58,7 @@ pub(crate) struct Guest {
     streams: JoinSet<()>,
 }
 
-/// Why a user could not start: the server's reason, or the code of a call, or what else it was.
+/// Returns why a user could not start: the server's reason, the code of a call, or `UNREACHABLE`.
 fn reason(error: &Error) -> String {
     match error {
         Error::Call(status) => {
@@ -74,7 +74,7 @@ fn silent() -> Error {
     Error::Connection("the server is silent".to_owned())
 }
 
-/// The life of a user that comes by itself, and goes away again if it is not let in.
+/// Runs a user from arrival to end. If the server refuses it, counts it as turned away.
 pub(crate) async fn visit(world: Arc<World>, user: User) {
     let mut connections = Connections::new(&world.plan);
     let arriving = tokio::time::timeout(SERVER_TIMEOUT, Guest::arrive(&world, &user, &mut connections)).await;
@@ -89,7 +89,7 @@ pub(crate) async fn visit(world: Arc<World>, user: User) {
 }
 
 impl Guest {
-    /// Makes a session, and opens the streams of its clients and viewers.
+    /// Creates a session, and opens the streams of its clients and viewers.
     pub(crate) async fn arrive(world: &World, user: &User, connections: &mut Connections) -> Result<Self, Error> {
         let begun = Instant::now();
         let server = &world.servers[user.wire];
@@ -97,7 +97,7 @@ impl Guest {
         let request = pb::CreateSessionRequest { source, paused: false, idle_timeout_s: Some(IDLE_S) };
         let mut sessions = SessionServiceClient::new(connections.to(server, Purpose::Call).await?);
         let created = sessions.create_session(request).await?.into_inner().session.unwrap_or_default();
-        // What stands for a network leads to one server only.
+        // A simulated network leads to one server only.
         let server = match world.plan.wires[user.wire].what.conditions {
             None => fleet::home(server, &created)?,
             Some(_) => server.clone(),
@@ -166,11 +166,11 @@ impl Guest {
         Ok(())
     }
 
-    /// Sends a session without clients all its commands in advance, in one call: a new force every [`APART_S`], so that the
-    /// tissue never comes to rest.
+    /// Sends a session without clients all its commands in advance, in one call: a new force every [`APART_S`], so
+    /// that the tissue never comes to rest.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     async fn keep_awake(&self, plan: &LoadPlan, stroke: Stroke, step: u64) -> Result<(), Error> {
-        /// Fewer than a session queues.
+        /// Fewer than the limit of a session's queue.
         const MAX_COMMANDS: u64 = 4000;
         const APART_S: f64 = 0.05;
         let rate_hz = self.rate_hz;
@@ -183,7 +183,7 @@ impl Guest {
             tool: 0,
             lease_s: Some(lasts_s),
             holder: "palpate-client load".to_owned(),
-            // Nothing is said until the commands have acted, and silent connections are closed.
+            // The connection is silent until the commands have acted, and silent connections are closed.
             outlives_connection: true,
         };
         let lease_id = haptics.acquire_tool(acquire).await?.into_inner().lease_id;
@@ -198,7 +198,7 @@ impl Guest {
         Ok(())
     }
 
-    /// Stays until all are to leave, for a time at most, and as long as a stream is left; then leaves.
+    /// Stays for `stays_s`, s, or until the load test drains or all streams have ended; then leaves.
     pub(crate) async fn stay(mut self, world: &World, stays_s: f64) {
         let mut stages = world.stages.clone();
         let _ = stages.wait_for(|stage| *stage != Stage::RAMP).await;
@@ -222,7 +222,7 @@ impl Guest {
             let mut tally = lock(&world.tally);
             tally.dilation_min = tally.dilation_min.min(simulated_s / real_s);
             if to.resting {
-                tally.broke("a session came to rest although it was to be kept awake".to_owned());
+                tally.broke("a session came to rest although commands should keep it awake".to_owned());
             }
         }
         while self.streams.join_next().await.is_some() {}
@@ -230,7 +230,8 @@ impl Guest {
         self.leave().await;
     }
 
-    /// The session as the server tells it, and when, ns: how far one without clients is, nothing else tells.
+    /// Returns the time, ns, and the session as the server describes it: the only way to find the step of one without
+    /// clients.
     async fn ask(&self, world: &World) -> Option<(u64, pb::Session)> {
         let _turn = world.asking.lock().await;
         let request = pb::GetSessionRequest { session_id: self.session_id.clone() };
@@ -248,7 +249,7 @@ impl Guest {
         }
     }
 
-    /// Deletes the session; if the server is gone, it is gone with it.
+    /// Deletes the session. An error is ignored: if the server is gone, so is the session.
     async fn leave(&mut self) {
         self.streams.abort_all();
         let request = pb::DeleteSessionRequest { session_id: self.session_id.clone() };
@@ -259,7 +260,7 @@ impl Guest {
         let _ = deleted.await;
     }
 
-    /// Calls whichever server has the session by now.
+    /// Calls the server that has the session at present.
     async fn call<T, F>(&self, call: impl Fn(SessionServiceClient<Channel>) -> F) -> Result<T, Error>
     where
         F: Future<Output = Result<Response<T>, Status>>,

@@ -1,4 +1,4 @@
-//! One viewer of a load: it counts frames, and how old they are.
+//! One viewer of a load test: it counts frames and measures their age.
 
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -10,7 +10,7 @@ use tonic::Status;
 
 use super::client::{Arrivals, Common, Stage, lock};
 
-/// Begins to watch a session. The returned future is the viewer's life.
+/// Begins to watch a session. Returns a future that runs the viewer to its end.
 pub(crate) async fn view(
     common: Common,
     channel: Channel,
@@ -23,7 +23,7 @@ pub(crate) async fn view(
     Ok(watch(common, Frames::open(channel, request).await?, arrivals))
 }
 
-/// Counts a viewer's frames until the measurement is over.
+/// Counts a viewer's frames until the measurement ends.
 async fn watch(common: Common, mut frames: Frames, arrivals: Option<Arc<Mutex<Arrivals>>>) {
     // Used when there are no samples: arrival time minus simulated time of the least delayed frame, s.
     let mut least_s = f64::INFINITY;

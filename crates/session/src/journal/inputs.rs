@@ -1,7 +1,5 @@
-//! The inputs of a journal from a step on, batch by batch; and encoded inputs that are not in a journal yet.
-//!
-//! A playback reads the former. A session that moves to another server takes the latter with it: the inputs that
-//! wait for their step.
+//! Reads the inputs of a journal from a step on, batch by batch, for a playback. Also encodes inputs that are not in
+//! a journal yet: a session that moves to another server takes the inputs with it that wait for their step.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -18,7 +16,7 @@ use palpate_refusal::Result;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 
-/// Reader of the inputs in a journal, from a step on.
+/// Reader of the inputs in a journal that act at a step or later, batch by batch.
 pub struct Inputs<'s> {
     reader: JournalReader<'s>,
     first: Arc<Model>,
@@ -27,7 +25,7 @@ pub struct Inputs<'s> {
     from_step: u64,
 }
 
-/// Inputs of one batch.
+/// Inputs of one batch of a journal (a compressed group of entries).
 pub struct Piece {
     /// Inputs in order, each with the number of steps done before it acts.
     pub inputs: VecDeque<(u64, Input)>,
@@ -36,8 +34,8 @@ pub struct Piece {
 }
 
 impl<'s> Inputs<'s> {
-    /// Creates a reader of the inputs that act at `step` and later. `survey` must be that of the journal, and
-    /// `first` the tissue with which its session began.
+    /// Creates a reader of the inputs that act at `step` or later. `survey` must be the survey of this journal,
+    /// `first` the tissue with which its session began, and `given` the limits of this process.
     pub fn new(mut reader: JournalReader<'s>, survey: &Survey, first: &Arc<Model>, given: &Limits, step: u64) -> Self {
         // A batch with a snapshot of a step has all inputs that act at that step, or later batches have them.
         match survey.snapshots.iter().rev().find(|at| at.step <= step) {
@@ -49,10 +47,10 @@ impl<'s> Inputs<'s> {
         Inputs { reader, first: first.clone(), rules, limits, from_step: step }
     }
 
-    /// Returns the inputs of the next batch; `None` after the last.
+    /// Reads the next batch and returns its inputs; `None` after the last. A batch may have no inputs.
     ///
     /// # Errors
-    /// Refuses a journal that is damaged, and inputs that no session accepts.
+    /// Returns a refusal if the journal is damaged, or if a session would not accept an input.
     pub fn next_batch(&mut self) -> Result<Option<Piece>> {
         let Some(batch) = self.reader.next_batch()? else { return Ok(None) };
         let mut inputs = VecDeque::new();
@@ -68,7 +66,8 @@ impl<'s> Inputs<'s> {
     }
 }
 
-/// Returns the input in a message, if it changes bits. Whether time advances is left to the viewer of a playback.
+/// Returns the input in a message if it changes the state of the tissue; `None` for inputs that only start, pause or
+/// skip time, which the viewer of a playback controls.
 pub(super) fn input(message: &pb::Input, rules: &Rules, first: &Model, limits: &Limits) -> Result<Option<Input>> {
     use pb::input::What;
     Ok(match message.what.as_ref() {
@@ -80,10 +79,11 @@ pub(super) fn input(message: &pb::Input, rules: &Rules, first: &Model, limits: &
     })
 }
 
-/// Limit of the inputs in one piece.
+/// Largest number of inputs in one piece.
 const PIECE: usize = 2048;
 
-/// Encodes inputs, each with its step, as pieces of bytes that [`decoded`] reads.
+/// Encodes inputs, each with its step, in order. Returns pieces of bytes for [`decoded`], with at most 2048 inputs
+/// each.
 pub fn encoded(inputs: &[(u64, Input)]) -> Vec<Vec<u8>> {
     let piece = |inputs: &[(u64, Input)]| {
         let mut tips = Tips::new();
@@ -93,11 +93,11 @@ pub fn encoded(inputs: &[(u64, Input)]) -> Vec<Vec<u8>> {
     inputs.chunks(PIECE).map(piece).collect()
 }
 
-/// Decodes one piece of encoded inputs, for a session that began with the tissue `first`. Inputs that change no
-/// bits are left out.
+/// Decodes one piece of bytes of [`encoded`], for a session that began with the tissue `first`. Returns the inputs
+/// with their steps, without those that only start, pause or skip time.
 ///
 /// # Errors
-/// Refuses bytes that are no such piece, and inputs that no session accepts.
+/// Returns a refusal if the bytes are not such a piece, or if a session would not accept an input.
 pub fn decoded(bytes: &[u8], first: &Arc<Model>, given: &Limits) -> Result<Vec<(u64, Input)>> {
     let limits = message::limits(given);
     let rules = Rules::new(&first.scene, &limits);
@@ -163,7 +163,7 @@ mod tests {
         assert_eq!(other.adopt(Handed { leases: handed.leases, waiting }, 5 * MS), 0);
         assert_eq!(other.counts(), Counts { accepted: 3, waiting: 3, ..Counts::default() });
         let first_due = due(&mut other, 7);
-        // The end of the other lease comes first: it was for step 0, which is over.
+        // The end of the other lease comes first, because it was for step 0, which has passed.
         let of = |due: &Due| (due.command.tool, due.command.sequence, due.ends_lease);
         assert_eq!(first_due.iter().map(of).collect::<Vec<_>>(), [(1, None, true), (0, Some(1), false)]);
         assert!(matches!(first_due[1].command.action, Action::Pose { place_m, .. } if place_m == glam::DVec3::Z));

@@ -1,5 +1,5 @@
-//! Replay of a journal: simulates it from its beginning or from a snapshot, up to a step, and compares every hash
-//! on the way.
+//! Replay of a journal: simulates its session again, from the beginning or a snapshot up to a step, and compares
+//! every recorded hash on the way.
 
 use std::collections::VecDeque;
 use std::io::Cursor;
@@ -127,8 +127,8 @@ impl<'s> Replay<'s> {
         Replay::near_with(reader, survey, limits, step, None)
     }
 
-    /// Begins a replay as [`Replay::near`] does. The tissue of `known` is reused if it belongs to a journal of that
-    /// session.
+    /// Begins a replay at the newest snapshot that is not after `step`. Reuses the tissue of `known` if it belongs to
+    /// a journal of the same session.
     fn near_with(
         reader: JournalReader<'s>,
         survey: Survey,
@@ -235,21 +235,23 @@ impl<'s> Replay<'s> {
         (self.running && !reached && self.session().hold_reason().is_none(), self.until)
     }
 
-    /// Returns the number of hashes and of snapshots that were compared so far.
+    /// Returns the number of hashes and the number of snapshots that were compared so far.
     pub fn compared(&self) -> [u64; 2] {
         [self.hashes, self.snapshots]
     }
 
-    /// Returns the first difference, if there is one: the replay has stopped there.
+    /// Returns the first difference between recording and replay, where the replay has stopped; `None` if there is
+    /// none so far.
     pub fn difference(&self) -> Option<&Difference> {
         self.difference.as_ref()
     }
 
-    /// Simulates until `until` steps are done, or to the end of the journal. The inputs that act at that step have
-    /// not acted then. It ends early at a difference. `see` gets each event, and may end the call with an error.
+    /// Simulates until `until` steps are done, or to the end of the journal if that is earlier. The inputs that act
+    /// at the last step have not acted then. It ends early at a difference. Calls `see` with each event; an error of
+    /// `see` ends the call.
     ///
     /// # Errors
-    /// Refuses a journal that is damaged or has inputs that no session accepts, and returns errors of `see`.
+    /// Returns a refusal if the journal is damaged or a session would not accept an input, and the errors of `see`.
     pub fn advance(&mut self, until: u64, see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()>) -> Result<()> {
         let until = until.min(self.survey.until_step);
         while self.difference.is_none() {
@@ -311,7 +313,7 @@ impl<'s> Replay<'s> {
         Ok(())
     }
 
-    /// Refuses steps that no server would do, because the journal may come from an untrusted party.
+    /// Refuses steps with more work than a server would do, because the journal may come from an untrusted party.
     fn check_work(&self) -> Result<()> {
         let (model, most) = (self.session().model(), self.limits.point_substeps_per_step);
         let (points, substeps) = (model.swept_points(), model.plan.substeps);
@@ -389,11 +391,11 @@ impl<'s> Replay<'s> {
         Ok(())
     }
 
-    /// Continues to `step`. Returns the session there, the tissue with which it began, and the reader for what
-    /// follows.
+    /// Continues to `step`. Returns the session there, the tissue with which it began, and the reader for the rest of
+    /// the journal.
     ///
     /// # Errors
-    /// Refuses whatever [`Replay::advance`] refuses, a journal whose hashes differ, and when `stop` is set.
+    /// Returns the errors of [`Replay::advance`], and a refusal if a hash differs or `stop` is set.
     pub fn reach(mut self, step: u64, stop: &AtomicBool) -> Result<(Session, Arc<Model>, JournalReader<'s>)> {
         self.advance(step, &mut |_| if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) })?;
         match self.difference {
@@ -405,11 +407,11 @@ impl<'s> Replay<'s> {
         }
     }
 
-    /// Continues to the end of the journal, and returns what was compared. `progress` gets the number of steps done
-    /// and the last step, every 1024 steps.
+    /// Continues to the end of the journal. Returns the result of the comparison. Calls `progress` with the number of
+    /// steps done and the last step, every 1024 steps.
     ///
     /// # Errors
-    /// Refuses whatever [`Replay::advance`] refuses. A difference is not an error but part of the verdict.
+    /// Returns the errors of [`Replay::advance`]. A difference is not an error but part of the verdict.
     pub fn verify(mut self, progress: &mut dyn FnMut(u64, u64)) -> Result<Verdict> {
         let (begin, end) = (self.reader.header().begin_step, self.survey.until_step);
         self.advance(u64::MAX, &mut |seen| {
@@ -424,11 +426,11 @@ impl<'s> Replay<'s> {
         Ok(Verdict { steps: [begin, end], proved_until, compared: self.compared(), difference: self.difference })
     }
 
-    /// Continues to the end of the journal, for a server that continues the session. Commands for the step after
-    /// its end have no effect, because their leases are over; other inputs for that step act.
+    /// Continues to the end of the journal, for a server that continues the session. Commands for the step after the
+    /// end have no effect, because their leases have ended; other inputs for that step act.
     ///
     /// # Errors
-    /// Refuses whatever [`Replay::advance`] refuses, and a journal whose hashes differ.
+    /// Returns the errors of [`Replay::advance`], and a refusal if a hash differs.
     pub fn resume(mut self) -> Result<Resumed> {
         let see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()> = &mut |_| Ok(());
         self.advance(u64::MAX, see)?;
@@ -554,8 +556,8 @@ pub fn resume(reader: JournalReader<'_>, limits: &Limits) -> Result<Resumed> {
     resume_as(reader, limits, None)
 }
 
-/// Returns a copy of the tissue in an encoded journal with one snapshot, at rest, for a client's tool with this
-/// tip; it can be stepped at 1 kHz. The session's steps and tools are not restored, whatever they would cost.
+/// Returns a copy of the tissue in an encoded journal with one snapshot, at rest, for a client's tool with the tip
+/// `tip`. It can be stepped at 1 kHz. The session's steps and tools are not restored.
 ///
 /// # Errors
 /// Returns a message if the bytes are no such journal, if the tissue is too large or the tip covers too much of it,
@@ -578,11 +580,11 @@ pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predict
     Ok(Box::new(copy))
 }
 
-/// Header of a journal, with the compiled tissue with which its session began.
+/// A journal's header and the compiled tissue with which its session began, for reuse.
 pub type Known = (pb::Header, Arc<Model>);
 
-/// Returns the session at the end of a journal as [`resume`] does. The tissue of `known` is reused if it belongs to
-/// a journal of that session.
+/// Returns the session at the end of a journal, simulated from the newest snapshot with all hashes compared. Reuses
+/// the tissue of `known` if it belongs to a journal of the same session, so that it need not be compiled again.
 ///
 /// # Errors
 /// Refuses a journal that is damaged in the middle, is of another generation, or gives other hashes.
@@ -600,7 +602,7 @@ fn is_same_tissue(a: &pb::Header, b: &pb::Header) -> bool {
 /// began.
 ///
 /// # Errors
-/// Refuses a step that the journal does not have, a journal that [`resume`] refuses, and when `stop` is set.
+/// Returns a refusal if the journal does not contain the step or `stop` is set, and the errors of [`resume`].
 pub fn session_at(
     mut reader: JournalReader<'_>,
     limits: &Limits,
@@ -620,14 +622,14 @@ pub struct Verdict {
     /// The last step whose recorded hash was equal; nothing is known of the steps after it. The beginning if no
     /// hash was compared.
     pub proved_until: u64,
-    /// Number of hashes and of snapshots that were compared.
+    /// Number of hashes and number of snapshots that were compared.
     pub compared: [u64; 2],
     /// The first difference; `None` if there is none.
     pub difference: Option<Difference>,
 }
 
-/// Simulates a whole journal, and compares every hash and every snapshot. `progress` gets the number of steps done
-/// and the last step, every 1024 steps.
+/// Simulates a whole journal, and compares every hash and every snapshot. Returns the result. Calls `progress` with
+/// the number of steps done and the last step, every 1024 steps.
 ///
 /// A journal is recorded while a session runs. Then it is simulated again, and both hashes are the same:
 ///
