@@ -161,10 +161,10 @@ fn most_by(line: &[(f64, f64)]) -> f64 {
     }
 }
 
-/// Largest numbers of sessions with and without clients, and the cost of each.
+/// Measures the largest numbers of sessions with and without clients, and the cost of each.
 fn crowds(report: &mut BenchReport, figures: &mut Vec<Value>, seconds: f64) -> Vec<Series> {
     let counts: &[usize] = if quick() { &[1, 25, 100] } else { &[1, 10, 25, 50, 75, 100, 150, 200, 300] };
-    // Also those that a server would not let in.
+    // Also sessions that a server would not admit.
     let folder = tempfile::tempdir().unwrap();
     let config = folder.path().join("palpate.toml");
     std::fs::write(&config, "[limits]\nthread_share = 1000.0\n").unwrap();
@@ -251,7 +251,7 @@ fn crowds(report: &mut BenchReport, figures: &mut Vec<Value>, seconds: f64) -> V
 /// Sessions, each with a client, that a profile is made of: as many as a core bears with ease.
 const PROFILED: usize = 50;
 
-/// Time spent outside of the kernel of the simulation.
+/// Measures the time spent outside of the kernel of the simulation.
 fn profile(report: &mut BenchReport) {
     report.heading("Distribution of the time");
     eprintln!("a profile of {PROFILED} sessions");
@@ -302,7 +302,7 @@ fn runs() -> usize {
     arguments.next().map_or(3, |count| count.parse().unwrap_or_else(|_| panic!("--runs {count}: not a number")))
 }
 
-/// Effects of attackers on an honest client: of the attack of that name, or of all attacks.
+/// Measures the effects of attackers on an honest client: of the attack of that name, or of all attacks.
 fn attacks(report: &mut BenchReport, name: Option<&str>) -> Panel {
     let runs = runs().max(1);
     report.say(&format!(

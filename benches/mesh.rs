@@ -148,7 +148,7 @@ impl Sphere {
     }
 }
 
-/// Initial displacement of a vertex, spacings.
+/// Returns the initial displacement of a vertex, spacings.
 fn displaced(graph: &MeshGraph, vertex: usize) -> DVec3 {
     0.01 * DVec3::from_array((graph.rest_m[vertex] / graph.spacing_m).to_array().map(f64::sin))
 }

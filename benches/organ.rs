@@ -277,7 +277,7 @@ fn spread(values: &[f64]) -> (f64, f64) {
     (mean, 100.0 * squares.sqrt() / mean)
 }
 
-/// One press at many places between the vertices, and a tip that slides.
+/// Measures one press at many places between the vertices, and a tip that slides.
 fn evenness(report: &mut BenchReport) {
     report.heading("The force does not depend on the place between vertices");
     report.say(

@@ -119,7 +119,7 @@ fn places(report: &mut BenchReport, seeds: u64) {
     table(report, "where", "places", &PLACES.iter().map(run).collect::<Vec<_>>(), seeds);
 }
 
-/// Differences of the copy from the server's tissue.
+/// Measures runs in which the copy differs from the server's tissue.
 fn disturbed(report: &mut BenchReport, seeds: u64) {
     report.heading("When the copy is incomplete: liver-organ");
     report.say(
@@ -205,7 +205,7 @@ fn live(report: &mut BenchReport) {
     report.figure("real time", Value::Array(figures));
 }
 
-/// Cost of a copy: time of a tick, memory, and time to create it.
+/// Measures the cost of a copy: time of a tick, memory, and time to create it.
 fn cost(report: &mut BenchReport) {
     report.heading("The cost of a copy");
     report.say(

@@ -327,7 +327,7 @@ impl Organ {
         Model::compile(&scene, &Limits { rehearsal_work: 0, ..Limits::default() }).unwrap()
     }
 
-    /// The limit of the scheme by the bound of the graph, and the observed limit.
+    /// Returns the limit of the scheme by the bound of the graph, and the observed limit.
     fn limit(&self, integrator: &'static str) -> OrganLimit {
         let Body::Mesh(mesh) = &self.scene.body else { panic!("{} is on a mesh", self.name) };
         let kicked = PointId::new(mesh.stiffest.vertex as usize);

@@ -1,8 +1,8 @@
-//! Random scenes whose fields are at their bounds: each is refused by the name of a field, or it is checked, touched and stepped, with
-//! finite numbers.
+//! Random scenes whose fields are at their bounds: each is refused by the name of a field, or it is checked, touched
+//! and stepped, with finite numbers.
 //!
-//! 200 in every test run; `PALPATE_STRESS_BOUNDS=10000` takes as many as that, from the seed `PALPATE_STRESS_BOUNDS_FROM` on, and
-//! tells which took longer than a second.
+//! 200 in every test run; `PALPATE_STRESS_BOUNDS=10000` takes as many as that, from the seed
+//! `PALPATE_STRESS_BOUNDS_FROM` on, and prints which took longer than a second.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "common/closed_mesh.rs"]

@@ -92,7 +92,7 @@ async fn viewers_above_the_budget_are_refused_and_what_they_were_shown_is_forgot
             Ok(stream) => unread.push(stream),
             Err(refused) => break refused,
         }
-        assert!(unread.len() < 100, "nobody is refused");
+        assert!(unread.len() < 100, "no stream was refused");
     };
     // The viewer does not fit, or already the buffer of its stream.
     let (code, reason, field) = told(&refused);
@@ -210,7 +210,7 @@ async fn a_lease_ends_with_its_connection_unless_asked_otherwise() {
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
     });
-    waited.await.expect("a tool is held by nobody");
+    waited.await.expect("a tool was never released");
     assert_eq!(server.status(&session).await.held_tools[0].tool, 1);
 }
 
@@ -233,7 +233,7 @@ async fn who_administers_frees_tools_and_cuts_streams_and_callers() {
     let number = shown.lines().nth(1).unwrap().split_whitespace().next().unwrap();
     assert!(admin(&["cut-stream", &session, number]).status.success());
     let ended = loop {
-        match tokio::time::timeout(TEST_TIMEOUT, touch.hear()).await.expect("a stream that was cut goes on") {
+        match tokio::time::timeout(TEST_TIMEOUT, touch.hear()).await.expect("a stream that was cut did not end") {
             Ok(Some(_)) => {}
             Ok(None) => panic!("it ends without a reason"),
             Err(status) => break status,

@@ -528,7 +528,7 @@ async fn a_knob_or_stick_that_fails_while_it_is_pressed_is_left_without_a_force(
                 drop(stop);
             });
             let serving = run(Noting { device, noted: noted.clone() }, target(&server), Options::default(), pending());
-            let failed = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it goes on").err().unwrap();
+            let failed = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it did not end").err().unwrap();
             assert!(failed.to_string().contains(says), "{name}: {failed}");
             ending.join().unwrap();
             playing.join().unwrap();

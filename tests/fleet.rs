@@ -390,7 +390,8 @@ async fn servers_know_each_other_by_certificates_and_clients_by_tokens() {
     assert_eq!(server::told(&refused).1, "ROLE_MISSING");
     let mut calls = pb::node_service_client::NodeServiceClient::new(there);
     assert_eq!(calls.create_here(create_here()).await.unwrap_err().code(), Code::Unauthenticated);
-    // A certificate of these authorities whose name has no role is as good as none; one of others is not let in.
+    // A certificate of these authorities whose name has no role counts as none; one of another authority is not
+    // admitted.
     let of = |(cert, key): (String, String)| Some(tonic::transport::Identity::from_pem(cert, key));
     let mut calls = pb::node_service_client::NodeServiceClient::new(to(0, of(authority.sign_node("node-9"))).await);
     assert_eq!(calls.create_here(create_here()).await.unwrap_err().code(), Code::Unauthenticated);

@@ -150,7 +150,7 @@ impl Ward {
         .await;
     }
 
-    /// Ends all; the journals are those of offline runs, and whatever a client was told was told by one server at a
+    /// Ends all. Checks that the journals are those of offline runs, and that clients were served by one server at a
     /// time.
     async fn close(mut self) -> Vec<follower::FollowerObservation> {
         let mut seen = Vec::new();
@@ -423,7 +423,7 @@ async fn etcd_is_gone() {
     let refused_s = stopped.elapsed().as_secs_f64();
     let last_step: Vec<u64> = ward.followers.iter().map(|f| f.seen().newest_step).collect();
     tokio::time::sleep(Duration::from_secs(gone_s).saturating_sub(stopped.elapsed())).await;
-    assert!(ward.followers.iter().all(|follower| !follower.acts()), "nobody may speak for a session");
+    assert!(ward.followers.iter().all(|follower| !follower.acts()), "no server may answer for a session");
     let starting = Instant::now();
     (0..3).for_each(|member| etcd.restart(member));
     until("etcd has a leader", async || etcd.leader().is_some()).await;
@@ -447,7 +447,7 @@ async fn etcd_is_gone() {
     for (id, own) in &after {
         assert_eq!(own.node, before[id].node, "it goes on in place");
         let session = ward.nodes.iter().find(|node| node.name == own.node).unwrap().session(id).await.unwrap();
-        assert_eq!(session.ownership.unwrap().revision, own.revision, "what is told is what etcd says");
+        assert_eq!(session.ownership.unwrap().revision, own.revision, "the answer equals etcd's record");
     }
     let stopped_s = ward.doors.seconds(stopped);
     let (starting_s, led_s) = (ward.doors.seconds(starting), (returned - starting).as_secs_f64());
@@ -455,7 +455,7 @@ async fn etcd_is_gone() {
     let mut latest_s = f64::NEG_INFINITY;
     for stretch in seen.iter().flat_map(|seen| &seen.stretches) {
         // The newest keepalive was sent before etcd stopped.
-        assert!(stretch.last_s < stopped_s + TTL_S || stretch.first_s > starting_s, "nobody has a lease: {stretch:?}");
+        assert!(stretch.last_s < stopped_s + TTL_S || stretch.first_s > starting_s, "no lease is held: {stretch:?}");
         if stretch.first_s < starting_s {
             latest_s = latest_s.max(stretch.last_s - stopped_s);
         }

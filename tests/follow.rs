@@ -133,7 +133,7 @@ struct Bridge {
 }
 
 impl Bridge {
-    /// It knows one server only.
+    /// Begins with one known server only.
     fn begin(node: &Node, session_id: &str) -> Self {
         let course = Arc::new(HandPath { goal_um: AtomicI64::new(OUT_UM), ..HandPath::default() });
         let hand = SlowHand { course: course.clone(), z_m: 0.004 };
@@ -155,7 +155,7 @@ impl Bridge {
 
     async fn end(self) -> BridgeReport {
         drop(self.stop);
-        tokio::time::timeout(server::TEST_TIMEOUT, self.serving).await.expect("it goes on").unwrap().unwrap().1
+        tokio::time::timeout(server::TEST_TIMEOUT, self.serving).await.expect("it did not end").unwrap().unwrap().1
     }
 }
 
@@ -297,7 +297,7 @@ async fn a_hand_whose_server_dies_rests_until_it_asks_for_forces() {
     let rested = course.len();
     assert_smooth(&course.since(begun));
     let ticks = course.since(paused);
-    assert!(ticks.iter().all(|tick| tick.state == Some(RenderingState::Paused)), "it goes on by itself");
+    assert!(ticks.iter().all(|tick| tick.state == Some(RenderingState::Paused)), "it resumed without being enabled");
     assert!(ticks.windows(2).all(|pair| pair[1].force_n.length() <= pair[0].force_n.length() + 1e-12));
     let left_n = ticks.last().unwrap().force_n.length();
     assert!(left_n < 1e-3, "{left_n} N are left after {} s", ticks.last().unwrap().time_s - ticks[0].time_s);

@@ -53,7 +53,7 @@ async fn call(channel: &Channel, path: &str, authorization: Option<&str>) -> Res
     let codec = tonic_prost::ProstCodec::<(), ()>::default();
     let answer = grpc.streaming(request, path.parse().unwrap(), codec);
     let mut answer = tokio::time::timeout(TEST_TIMEOUT, answer).await.unwrap()?.into_inner();
-    // Streams that are let in may have nothing to say.
+    // Admitted streams may have nothing to send.
     tokio::select! {
         biased;
         message = answer.message() => message.map(|_| ()),

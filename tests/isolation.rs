@@ -102,7 +102,7 @@ async fn connections_above_the_limit_are_closed_and_let_in_later() {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     });
-    waited.await.expect("nobody is let in any more");
+    waited.await.expect("no new client was admitted");
 }
 
 #[cfg(unix)]
@@ -375,7 +375,7 @@ fn frequent(points_x: u32, points_y: u32) -> Source {
     Source::Scene(scene)
 }
 
-/// One force everywhere, so that all of a tissue moves.
+/// Returns one force everywhere, so that all of a tissue moves.
 fn everywhere(sequence: u64) -> pb::Command {
     let mut command = force(0, sequence, -1.0);
     let Some(pb::command::Action::Force(force)) = &mut command.action else { unreachable!() };
@@ -391,7 +391,7 @@ async fn heavy_sessions_slow_themselves_and_let_no_further_one_in() {
     for _ in 0..12 {
         heavy.push(server.create(frequent(200, 100), false).await.unwrap().session_id);
     }
-    // At rest they take nothing: others are let in.
+    // At rest they use nothing: others are admitted.
     let light = server.paper(false).await;
     let mut quick = TestTouch::hold(&server, &light).await;
     let mut slow = Vec::new();

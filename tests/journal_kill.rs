@@ -1,9 +1,9 @@
 //! A server with journals is killed at random moments under load (`kill -9`), and started again: every session is
-//! there, not before the last step that a client was told to be durable, with the bits of an offline run of the same
-//! inputs; of the commands that were told to be durable none is lost, and none acts twice.
+//! there, not before the last step that was reported to a client as durable, with the bits of an offline run of the
+//! same inputs; of the commands that were reported as durable none is lost, and none acts twice.
 //!
 //! Twice in every run of the tests; `make soak` does it JOURNAL_KILLS=200 times with 20 sessions
-//! (PALPATE_JOURNAL_KILLS, PALPATE_JOURNAL_SESSIONS, PALPATE_SEED), and tells how soon clients touch again.
+//! (PALPATE_JOURNAL_KILLS, PALPATE_JOURNAL_SESSIONS, PALPATE_SEED), and prints how soon clients touch again.
 #![cfg(unix)]
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
@@ -90,7 +90,7 @@ fn sequences(path: &Path) -> Vec<u64> {
     sequences
 }
 
-/// The run continues the one before with the bits of an offline run of its inputs.
+/// Checks that the run continues the one before with the bits of an offline run of its inputs.
 fn goes_on(before: &JournalFile, after: &JournalFile) {
     let resumed = replay::resume(JournalReader::open(&before.path).unwrap(), &Limits::default()).unwrap();
     let mut session = resumed.session;

@@ -1,4 +1,4 @@
-//! `palpate journal` of damaged, cut and signed journals: what is whole is used, what was proved is told, and who
+//! `palpate journal` of damaged, cut and signed journals: whole parts are used, proofs are reported, and who
 //! changed a file is found.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods, missing_docs)]
 
@@ -146,7 +146,7 @@ fn a_signature_finds_who_changed_a_journal() {
     assert!(status == 0 && text.contains("signed up to step 160") && text.contains("it has no end"), "{text}");
     let (status, text) = verify(&whole[..at_batch[3]], "a.key.pub");
     assert!(status == 1 && text.contains("signed up to step 40 only") && text.contains("anybody"), "{text}");
-    // Whoever changes an input makes the checksum of its chunk anew; hashes at rest would not show it.
+    // An attacker who changes an input also renews the checksum of its chunk; hashes at rest would not show it.
     let mut changed = whole.clone();
     let owner = changed.windows(15).position(|bytes| bytes == b"ann of the test").unwrap();
     changed[owner..owner + 3].copy_from_slice(b"bob");
@@ -190,7 +190,7 @@ fn every_bit_that_decides_something_is_signed() {
         if let Ok(Some(found)) = signed(&bent)
             && found == all
         {
-            // Schemas, names of channels nobody has, numbers and times of publication: they decide nothing.
+            // Schemas, names of unknown channels, numbers and times of publication: they have no effect.
             let read = |bytes: &[u8]| {
                 let mut reader = JournalReader::new("test", std::io::Cursor::new(bytes)).unwrap();
                 let header = reader.header().clone();

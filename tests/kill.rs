@@ -39,7 +39,7 @@ fn start(config: &Path) -> TestServer {
     TestServer::start(&["--log", "error", "--config", config.to_str().unwrap()])
 }
 
-/// A program that is killed with whoever started it.
+/// A program that is killed together with the process that started it.
 struct Program(Child);
 
 impl Drop for Program {

@@ -156,7 +156,7 @@ fn a_step_longer_than_its_period_is_refused_with_the_figure() {
     let limits = Limits::default();
     let pacer = one_thread(&limits);
     let Err(refusal) = pacer.create(&large, true, 60.0, &pacer.budget.account("test"), &NEVER) else {
-        panic!("let in")
+        panic!("admitted")
     };
     assert_eq!((refusal.reason, refusal.field.as_str()), (Reason::TooLarge, "stepping.rate_hz"));
     assert!(refusal.message.contains("limits.periods_per_step"), "{refusal}");

@@ -53,7 +53,7 @@ async fn a_force_is_felt_watched_and_seen() {
         |sample: &pb::Sample| sample.tools.iter().any(|tool| from_vector(tool.displacement_m.as_ref()).z < -1e-5);
     let done = tokio::time::timeout(TEST_TIMEOUT, async {
         loop {
-            match touch.next().await.unwrap().expect("the stream goes on") {
+            match touch.next().await.unwrap().expect("the stream ended") {
                 Heard::Sample(sample) if pressed(&sample) => break,
                 Heard::Rejection(rejection) => panic!("{rejection:?}"),
                 _ => {}
@@ -193,7 +193,7 @@ async fn what_a_server_refuses_at_first_ends_the_bridge() {
     for session in [SessionChoice::New { scene: "nowhere".to_owned() }, SessionChoice::Existing("0".repeat(32))] {
         let (device, _felt) = pressing();
         let serving = run(device, target(&server, session), Options::default(), std::future::pending());
-        let error = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it goes on").err().unwrap();
+        let error = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it did not end").err().unwrap();
         assert!(error.is_refusal() && matches!(&error, Error::Call(_)), "{error}");
     }
 }
@@ -306,7 +306,7 @@ async fn a_clutch_leaves_the_tool_in_the_tissue_and_takes_the_force_off_the_hand
     orders.go(DVec3::new(0.005, 0.0, 0.004));
     orders.until("it is felt again", |tick, force_n| tick.place_m.z < 0.0 && force_n.z > 0.05).await;
     drop(stop);
-    let (placed, report) = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it goes on").unwrap().unwrap();
+    let (placed, report) = tokio::time::timeout(TEST_TIMEOUT, serving).await.expect("it did not end").unwrap().unwrap();
     assert_eq!(*placed.device().orders.force_n.lock().unwrap(), DVec3::ZERO);
     assert_eq!(report.lost.map(|error| error.to_string()), None);
 }

@@ -238,7 +238,7 @@ fn an_outage_lets_go_of_the_force_and_gives_no_energy() {
     }
 }
 
-/// The tool lets go on the server meanwhile, and rendering pauses. What comes after it is another touch, which is
+/// The tool lets go on the server meanwhile, and rendering pauses. A new touch after it is
 /// felt.
 #[test]
 fn after_a_long_outage_touch_is_enabled_again_without_a_jump() {

@@ -36,10 +36,10 @@ fn assert_no_memory(refused: &Status, field: &str) {
     assert!(refused.message().contains("the system has no memory for"), "{refused:?}");
 }
 
-/// Readers and commands of a session that is held get that state.
+/// Checks that readers and commands of a session that is held get that state.
 async fn assert_is_held(server: &TestServer, session: &str, mut touch: TestTouch) {
     let ended = loop {
-        match tokio::time::timeout(TEST_TIMEOUT, touch.hear()).await.expect("the stream goes on") {
+        match tokio::time::timeout(TEST_TIMEOUT, touch.hear()).await.expect("the stream did not end") {
             Ok(Some(_)) => {}
             Ok(None) => panic!("it ends without a reason"),
             Err(status) => break status,
@@ -115,7 +115,7 @@ async fn without_address_space_requests_are_refused_sessions_end_and_others_are_
             tokio::time::sleep(Duration::from_millis(20)).await;
         }
     });
-    let reason = waited.await.expect("it goes on without memory");
+    let reason = waited.await.expect("it was not held without memory");
     assert!(reason.contains("the system has no memory for"), "{reason}");
     assert_is_held(&server, &doomed, doomed_touch).await;
 

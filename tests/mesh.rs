@@ -147,7 +147,7 @@ fn a_flat_mesh_with_the_springs_of_a_sheet_is_that_sheet() {
     }
 }
 
-/// The shape once more.
+/// Returns a copy of the shape.
 fn shape_of(shape: &MeshShape) -> MeshShape {
     let known: std::collections::BTreeSet<[u32; 2]> = shape
         .triangles()

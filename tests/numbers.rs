@@ -139,7 +139,7 @@ fn is_finite(session: &Session) -> bool {
     })
 }
 
-/// The description of a session, without the server's times of commands.
+/// Returns the state hash and the description of a session, without the server's times of commands.
 fn told(session: &Session) -> (u128, String) {
     let tools = session.sample(None).tools;
     let tools: Vec<_> =

@@ -292,6 +292,6 @@ async fn a_tool_taken_over_grpc_web_is_not_held_for_long_by_who_says_nothing() {
             tokio::time::sleep(std::time::Duration::from_millis(10)).await;
         }
     });
-    let held: Vec<u32> = lapsed.await.expect("a tool is held by nobody").iter().map(|held| held.tool).collect();
+    let held: Vec<u32> = lapsed.await.expect("the lease did not lapse").iter().map(|held| held.tool).collect();
     assert_eq!(held, [1]);
 }

@@ -14,7 +14,7 @@ use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::scene::{Change, PAPER, Scene};
 
-/// Commands of the holder of tools 0 and 1, with their steps.
+/// Command of the holder of tools 0 and 1: its step, tool and action.
 type Order = (u64, u32, Action);
 
 /// The course of a session.

@@ -43,7 +43,7 @@ fn limits() -> Limits {
     Limits { rehearsal_work: 1 << 20, ..Limits::default() }
 }
 
-/// Number of snapshots that are tried.
+/// Returns the number of snapshots that are tried.
 fn wanted() -> usize {
     cases::count("PALPATE_SNAPSHOTS", 80, 1000)
 }
@@ -251,7 +251,7 @@ fn step(session: &mut Session, first: &Scene, inputs: &StepInputs) {
     session.advance(&mut inputs.due.clone(), |_| {});
 }
 
-/// All output of a session after a step.
+/// Returns all output of a session after a step.
 fn told(session: &Session) -> (u128, String) {
     let tissue = session.tissue();
     let counts = (session.late_commands(), session.paused_commands(), session.path_counts());

@@ -279,7 +279,7 @@ fn a_pose_beside_the_tissue_is_warned_of() {
     );
 }
 
-/// A session of liver, and what a command for the coming step tells in the sample after it.
+/// Does a step of a session with an action of tool 0. Returns the contact in the sample after it.
 fn told(session: &mut Session, sequence: u64, action: Action) -> palpate_session::Contact {
     let (sequence, at_step) = (Some(sequence), Some(session.step_count()));
     let command = Command {

@@ -84,7 +84,7 @@ enum ToolChange {
 }
 
 impl ToolChange {
-    /// Place of the action, m.
+    /// Returns the place of the action, m.
     fn place_m(&self, model: &Model) -> Option<DVec3> {
         match self {
             ToolChange::Grasp(point, ..) => Some(model.scene.shape().rest_m(*point)),

@@ -38,7 +38,7 @@ fn pose(tool: u32, sequence: u64, place_m: DVec3, client_time_ns: u64) -> pb::Co
 /// As long as either side stands still, s.
 const STALL: Duration = Duration::from_secs(5);
 
-/// A scene that an unoptimized server steps in time.
+/// Returns a scene that an unoptimized server steps in time.
 fn small() -> Source {
     let text = "name = \"small\"\n[sheet]\npoints = [9, 9]\nspacing_m = 0.01\npoint_mass_kg = 0.002\n\
                 [springs]\nstiffness_n_per_m = 30.0\n[anchor_springs]\nstiffness_n_per_m = 5.0\n\

@@ -85,7 +85,7 @@ pub async fn stall_server(ground: &Ground, seconds: f64) -> Result<(), Status> {
     std::future::pending().await
 }
 
-/// Guard that lets the honest client continue.
+/// Stops the honest client for a time, and lets it continue.
 pub async fn stall_client(ground: &Ground, seconds: f64) -> Result<(), Status> {
     if let Some(freezer) = &ground.freezer {
         freezer.freeze(Duration::from_secs_f64(seconds));

@@ -30,7 +30,7 @@ enum OpenStream {
 }
 
 impl OpenStream {
-    /// Reads one message; the viewer of a frame is told.
+    /// Reads one message. Returns the acknowledgement to send, if it is a frame.
     async fn read(&mut self) -> Result<Option<pb::AcknowledgeFramesRequest>, Status> {
         match self {
             OpenStream::Samples(stream) => stream.message().await.map(|_| None),

@@ -12,7 +12,7 @@ use crate::caller::{Door, MIDDLE, SIDE, create, haptics, push, push_all, session
 /// A step that is never done.
 const NEVER: u64 = 1 << 40;
 
-/// Number of fixed points in a scene, all of them the same one.
+/// Returns a scene with this many fixed points, all of them the same one.
 pub fn fixed(points: u32) -> pb::Scene {
     let mut scene = sheet(SIDE, SIDE);
     let points = vec![pb::GridPoint { x: 0, y: 0 }; points as usize];

@@ -276,7 +276,7 @@ impl Attack {
         let thread = std::thread::spawn({
             let over = over.clone();
             move || {
-                // Whoever attacks shares a core with the clients that are measured: it is the server's that counts.
+                // The attacker shares a core with the measured clients; only the server's core counts.
                 #[cfg(target_os = "linux")]
                 rustix::process::setpriority_process(None, 19).unwrap();
                 let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();

@@ -69,7 +69,7 @@ pub async fn strip(ground: &Ground, points: u32) -> Result<(), Status> {
     .await
 }
 
-/// Places of tools on an organ some centimetres wide.
+/// Returns the place of a tool on an organ some centimetres wide.
 fn around(tool: u32, height_m: f64) -> [f64; 3] {
     let angle = TAU * f64::from(tool) / f64::from(TOOLS);
     [0.01 * angle.cos(), 0.01 * angle.sin(), height_m]

@@ -33,7 +33,7 @@ struct WayRun {
     /// Of round trips, ms.
     p50_ms: f64,
     p99_ms: f64,
-    /// Cores that the server that stands by takes, and etcd.
+    /// Cores that the standby and etcd use.
     standby_cores: f64,
     etcd_cores: f64,
 }

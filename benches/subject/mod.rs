@@ -39,7 +39,7 @@ pub fn scene(assignments: &[String]) -> Result<Scene> {
     scene_of("paper", assignments)
 }
 
-/// The same of any scene that is built in.
+/// Returns the subject of a built-in scene.
 pub fn scene_of(name: &str, assignments: &[String]) -> Result<Scene> {
     let (_, text) = BUILT_IN.iter().find(|scene| scene.0 == name).unwrap();
     let all: Vec<String> = std::iter::once(set("sleep.tolerance", 0)).chain(assignments.iter().cloned()).collect();

@@ -86,7 +86,7 @@ fn told(output: &Output) -> serde_json::Value {
     serde_json::from_str(line).unwrap_or_else(|error| panic!("{line}: {error}"))
 }
 
-/// Output of an example for a press of 3 mm into liver for two seconds.
+/// Checks the output of an example for a press of 3 mm into liver for two seconds.
 fn assert_pressed(output: &Output, is_ticked_by_it: bool) {
     let told = told(output);
     let ticks = told["ticks"].as_u64().unwrap();
@@ -95,7 +95,7 @@ fn assert_pressed(output: &Output, is_ticked_by_it: bool) {
     assert!((0.05..3.3).contains(&most_n), "{told}");
 }
 
-/// Output of an example for a surface at rest.
+/// Checks the output of an example for a surface at rest.
 fn assert_looked(output: &Output, heights: &str) {
     let told = told(output);
     assert_eq!((told["vertices"].as_u64(), told["triangles"].as_u64()), (Some(961), Some(1800)), "{told}");

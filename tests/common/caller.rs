@@ -166,7 +166,7 @@ pub fn push(tool: u32, sequence: u64, [x, y]: [u32; 2], z_n: f64) -> pb::Command
     pb::Command { tool, sequence, action: Some(pb::command::Action::Force(force)), ..Default::default() }
 }
 
-/// One force on every point, so that all of a tissue moves.
+/// Returns one force on every point, so that all of a tissue moves.
 pub fn push_all(tool: u32, sequence: u64, z_n: f64) -> pb::Command {
     let mut command = push(tool, sequence, [0, 0], z_n);
     if let Some(pb::command::Action::Force(force)) = &mut command.action {

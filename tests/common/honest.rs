@@ -180,7 +180,7 @@ async fn work(
     counts
 }
 
-/// Results of the session's commands.
+/// Returns the server's counts of the session's commands.
 async fn counts(door: &Door, session_id: &str) -> Result<Option<pb::CommandCounts>, Status> {
     let request = pb::GetSessionRequest { session_id: session_id.to_owned() };
     Ok(sessions(door).get_session(request).await?.into_inner().session.and_then(|session| session.commands))

@@ -24,7 +24,7 @@ use tungstenite::Message;
 pub enum Wrong {
     Nothing,
     NoDevice,
-    /// The first message is none.
+    /// The first message is invalid.
     GarbageAtFirst,
     /// No grip, and so no button.
     NoGrip,
@@ -85,7 +85,7 @@ pub struct InverseService {
 }
 
 impl InverseService {
-    /// A service of that version; `None`: it tells none.
+    /// Starts a service of that version; with `None` it reports no version.
     pub fn start(version: Option<&'static str>, wrong: Wrong) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let url = format!("ws://{}", listener.local_addr().unwrap());

@@ -186,7 +186,7 @@ impl TestServer {
                 tokio::time::sleep(Duration::from_millis(10)).await;
             }
         });
-        waited.await.expect("a tool is held by nobody");
+        waited.await.expect("a tool was never released");
     }
 
     /// Ends the server. Returns its log.

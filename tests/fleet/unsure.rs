@@ -54,8 +54,7 @@ async fn patient(folder: &Path, etcd: &EtcdMembers) -> Vec<Node> {
     nodes
 }
 
-/// A new session, and which server has it. etcd is silent since it was created, and is about to be told who stands by
-/// for it.
+/// Returns a new session and its server. etcd is silent since it was created, and its standby is about to be written.
 async fn being_named(nodes: &[Node], etcd: &EtcdMembers) -> (String, usize) {
     let session = create(&nodes[0]).await;
     etcd.pause(0);

@@ -1,5 +1,5 @@
 //! Clients that follow their sessions from server to server: one that presses at 1 kHz, one that looks. They keep
-//! account of who spoke for a session, from when to when, and of what they were told.
+//! account of the server of a session over time, and of what it sent.
 #![allow(unreachable_pub, clippy::unwrap_used, clippy::panic, clippy::disallowed_methods)]
 
 use std::collections::BTreeMap;

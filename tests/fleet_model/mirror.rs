@@ -1,4 +1,4 @@
-//! Journals on their way to the nodes that stand by, as `src/server/fleet/{mirror,stand_by}.rs` do it.
+//! Journals on their way to standbys, as `src/server/fleet/{mirror,stand_by}.rs` do it.
 
 use palpate_cluster::placement;
 
@@ -8,7 +8,7 @@ use crate::world::{Ask, KeyChange, Say, Then, World};
 use crate::{MS, N, S};
 
 impl World {
-    /// The node that is to stand by for a session of `n`.
+    /// Returns the standby for a session of `n`.
     fn standby_of(&self, n: N, sid: S) -> Option<N> {
         let node = &self.nodes[n];
         placement::standby(self.id(sid), &node.name, &node.memory.view).and_then(|name| self.node_of(name))

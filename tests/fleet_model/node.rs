@@ -18,15 +18,15 @@ pub(crate) struct JournalRun {
     pub(crate) ended: bool,
 }
 
-/// A journal for which the node stands by.
+/// A journal of which the node is the standby.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ReplicaJournal {
     pub(crate) run: u32,
     pub(crate) bytes: u64,
     pub(crate) sender: N,
-    /// The stream by which it comes; `None` if there is none now.
+    /// The stream by which it comes, if there is one.
     pub(crate) stream: Option<u64>,
-    /// Since then there is none, by this node's clock.
+    /// Time since which there is no stream, by this node's clock.
     pub(crate) since: Ns,
 }
 

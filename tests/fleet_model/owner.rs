@@ -332,7 +332,7 @@ impl World {
         }
     }
 
-    /// Claims what it stands by for.
+    /// Claims the sessions of which it is the standby.
     pub(crate) fn take_over(&mut self, n: N) {
         let node = &self.nodes[n];
         if !node.is_within_fence(self.now) || !node.memory.claiming.is_empty() || !node.memory.has_settled {

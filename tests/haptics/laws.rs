@@ -161,7 +161,7 @@ async fn a_coarse_law_is_changed_for_the_exact_one_by_a_model_that_names_it() {
                 Heard::ForceLaw(update) => {
                     assert_eq!((update.coarse_number, update.reason.as_str()), (0, ""));
                     let law = update.law.unwrap();
-                    assert_eq!((law.number as usize, law.coarse), (laws.len(), false), "it is told once");
+                    assert_eq!((law.number as usize, law.coarse), (laws.len(), false), "it is sent once");
                     laws.push(touch::from_law(&law).unwrap());
                 }
                 Heard::Sample(sample) => {

@@ -35,7 +35,7 @@ class Hand:
         self.forces.append(force_n)
 
 
-# Ends while samples come, which nobody awaits any more.
+# Ends while samples come that are no longer awaited.
 ENDING = """
 import asyncio, sys
 import palpate

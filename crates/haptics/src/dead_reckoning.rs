@@ -85,7 +85,7 @@ const MAX_RECENT: usize = 64;
 /// let mut news = News::default();
 /// assert!(news.tell(0.000, DVec3::ZERO, most_m, heartbeat_s).is_some());
 /// assert!(news.tell(0.001, 5e-5 * DVec3::X, most_m, heartbeat_s).is_none());
-/// let told = news.tell(0.002, 2e-4 * DVec3::X, most_m, heartbeat_s).expect("it is 0.2 mm from where it was told");
+/// let told = news.tell(0.002, 2e-4 * DVec3::X, most_m, heartbeat_s).expect("it is 0.2 mm from the estimate");
 /// // It moves at 0.1 m/s, so 10 ms later the server's estimate is 1.2 mm from its first place.
 /// assert!((told.velocity_m_per_s - 0.1 * DVec3::X).length() < 1e-12);
 /// assert!((told.at(0.012) - 1.2e-3 * DVec3::X).length() < 1e-12);

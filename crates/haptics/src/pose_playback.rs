@@ -78,17 +78,25 @@ pub struct Path {
 #[derive(Debug, Clone, PartialEq)]
 #[allow(missing_docs)]
 pub struct PathState {
+    /// Whether the tool begins at its first place, not above it.
     pub at_once: bool,
+    /// Place where the tool begins, if it is neither the first place nor above that, m.
     pub begins_m: Option<DVec3>,
-    /// Client times, s, and places, m.
+    /// Client times, s, and places, m, of the commands that are not played yet, by ascending time; at most 1024.
     pub waiting: Vec<(f64, DVec3)>,
+    /// Client time, s, place, m, and velocity, m/s, of the newest command, if it contains a velocity.
     pub heading: Option<(f64, DVec3, DVec3)>,
+    /// Client time, s, and place, m, of the played moment; `None` before the first command.
     pub played: Option<(f64, DVec3)>,
+    /// Place of the tool, m; `None` before the first step and after a release.
     pub place_m: Option<DVec3>,
+    /// Time of arrival of the newest command, s; infinite for one that took effect at once.
     pub arrived_s: f64,
+    /// Smallest time available beyond the played moment since `watched_s`, s; infinite until it is measured.
     pub spare_s: f64,
+    /// Start of the measurement of `spare_s`, s.
     pub watched_s: f64,
-    /// [`Path::counts`].
+    /// Counts as [`Path::counts`] returns them: steps at the speed limit, commands refused or skipped, and releases.
     pub counts: [u64; 3],
 }
 

@@ -13,8 +13,8 @@ const TICK_S: f64 = 1e-3;
 /// Round trip, ticks.
 const ROUND_TRIP: u32 = 50;
 
-/// The tissue: soft, and from x = 10 mm on, with an edge of 1 mm, three times as stiff. No local model knows of that before a
-/// sample comes from there.
+/// The tissue: soft, and from x = 10 mm on, with an edge of 1 mm, three times as stiff. No local model knows of that
+/// before a sample comes from there.
 fn force_n(place_m: DVec3) -> DVec3 {
     let stiffness_n_per_m = 200.0 + 400.0 * ((place_m.x - 0.0095) / 0.001).clamp(0.0, 1.0);
     stiffness_n_per_m * (-place_m.z).max(0.0) * DVec3::Z
@@ -42,7 +42,7 @@ fn place_m(tick: u32) -> DVec3 {
     DVec3::new(along_m, 0.0, 0.001 - 0.003 * down)
 }
 
-/// What a server tells of the tool at a tick: a plane surface, and the force there.
+/// Returns a server's model of the tool at a tick: a plane surface, and the force there.
 fn sample(tick: u32) -> LocalModel {
     let place_m = place_m(tick);
     let felt_n = force_n(place_m);
@@ -137,8 +137,8 @@ fn a_copy_is_rendered_from_when_a_sample_has_met_it_and_its_end_is_no_knock() {
     assert!(late.predicted > 2500, "{}", late.predicted);
     let ends = course(Some(1.0), 0, 2300);
     assert!(ends.predicted <= 2300 && ends.predicted > 2000, "{}", ends.predicted);
-    // At the edge the force itself changes by 16 mN a tick; the local model is off by 0.8 N there, which the bias lets in by 5 %
-    // a tick.
+    // At the edge the force itself changes by 16 mN a tick; the local model is off by 0.8 N there, which the bias
+    // lets in by 5 % a tick.
     for found in [late, ends] {
         assert!(found.largest_jump_n <= 0.016 + 0.8 * TICK_S / BIAS_S, "{}", found.largest_jump_n);
     }

@@ -226,8 +226,9 @@ fn hardening(share: f64) -> Law {
     Law { step_m: 1e-3, rows: (0..=10).map(row).collect(), is_coarse: share != 1.0 }
 }
 
-/// A run of a renderer whose hand moves up and down in the tissue with the full delay of a network: forces of all ticks, N.
-/// Models name law 1, that of the tissue, from tick `changed` on; before, they name one that is `share` of it.
+/// A run of a renderer whose hand moves up and down in the tissue with the full delay of a network: forces of all
+/// ticks, N. Models name law 1, that of the tissue, from tick `changed` on; before, they name one that is `share` of
+/// it.
 fn rendered_across(share: f64, changed: u32) -> Vec<DVec3> {
     const DELAY_TICKS: u32 = 50;
     let laws = [hardening(share), hardening(1.0)];
@@ -245,7 +246,8 @@ fn rendered_across(share: f64, changed: u32) -> Vec<DVec3> {
             assert!(renderer.learn(1, laws[1].clone()));
         }
         if let Some(then) = tick.checked_sub(DELAY_TICKS) {
-            // The tissue is as the exact law says, with its surface at 0; the server tells the surface by the law it names.
+            // The tissue is as the exact law says, with its surface at 0; the server places the surface by the law
+            // that it names.
             let (law, depth_m) = (u32::from(tick >= changed), (-place(then).z).max(0.0));
             let force_n = laws[1].at_depth(depth_m).force_n;
             let surface_m = place(then) + laws[law as usize].depth_of(force_n) * DVec3::Z;

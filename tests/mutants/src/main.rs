@@ -1,9 +1,9 @@
 //! Puts many mutants into one build, so that it is compiled once: each mutated expression becomes
-//! `if crate::mutant(ID) { mutated } else { original }`, and a process is told its mutant by the environment variable
+//! `if crate::mutant(ID) { mutated } else { original }`, and a process gets its mutant from the environment variable
 //! PALPATE_MUTANT.
 //!
-//! `palpate-mutants MUTANTS.json ROOT` rewrites the files under ROOT that the mutants name. It prints the ids of those that
-//! it can't place: constants and patterns have no place for a condition.
+//! `palpate-mutants MUTANTS.json ROOT` rewrites the files under ROOT that the mutants name. It prints the ids of
+//! those that it can't place: constants and patterns have no place for a condition.
 
 use std::collections::BTreeMap;
 use std::path::Path;

@@ -217,7 +217,7 @@ impl Totals {
     /// Counts the actions of the envelope in the whole run.
     pub(super) fn limited(&mut self, envelope: &Envelope) {
         let (acted, _) = envelope.count(LimitCause::Passivity);
-        // Passivity acts on a force; there is none but in contact.
+        // Passivity acts on a force, which exists only in contact.
         self.outcome.guard_share = acted as f64 / self.errors_n.len().max(1) as f64;
         self.outcome.interventions =
             LimitCause::ALL.iter().map(|(reason, name)| (*name, envelope.count(*reason).0)).collect();
