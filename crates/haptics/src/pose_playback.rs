@@ -76,7 +76,6 @@ pub struct Path {
 
 /// Complete state of a path as numbers, from which it can be continued in another process.
 #[derive(Debug, Clone, PartialEq)]
-#[allow(missing_docs)]
 pub struct PathState {
     /// Whether the tool begins at its first place, not above it.
     pub at_once: bool,

@@ -71,7 +71,6 @@ impl Record {
 
 /// The state of one mass point: displacement, velocity, and the forces on it.
 #[derive(Debug, Clone, Serialize)]
-#[allow(missing_docs)]
 pub struct Point {
     /// The name of the point: `"point": [i, j]` on a sheet, `"vertex": n` on a mesh.
     #[serde(flatten)]
@@ -111,7 +110,6 @@ pub struct ToolRecord {
 
 /// Energies of the whole tissue, J.
 #[derive(Debug, Clone, Copy, Serialize)]
-#[allow(missing_docs)]
 pub struct EnergyJ {
     /// Σ ½m·v² of the points.
     pub kinetic: f64,
@@ -276,7 +274,6 @@ pub struct Network {
 
 /// Percentiles of a distribution, in the unit of the field that has them.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
-#[allow(missing_docs)]
 /// The median.
 pub struct Percentiles {
     /// 99 % of the values are at most this.
