@@ -35,10 +35,11 @@ fn too_many(scene: &Scene, substeps: u32, limits: &Limits) -> Refusal {
 /// The beginning of the warning of an error above the tolerance.
 const TOLERANCE: &str = "stepping.tolerance: ";
 
-/// Checks that the processor has the instructions that a step needs.
+/// Checks that the processor has the instructions that a step needs. [`Model::compile`] does this as well; a
+/// program may call it first, to fail early.
 ///
 /// # Errors
-/// Refuses a processor of x86-64 without fused multiply-add (FMA).
+/// Refuses a processor of x86-64 without fused multiply-add (FMA; [`Reason::NotAvailable`]).
 pub fn check_processor() -> Result<()> {
     if lanes::fuses() {
         return Ok(());
@@ -84,18 +85,21 @@ impl Model {
 
 impl Model {
     /// Reads the text of a scene (TOML), applies the assignments `sets` (`"sheet.spacing_m=0.01"`, as `--set`
-    /// does), and compiles it under the default limits. Refusals call the text `name`.
+    /// does) in their order, and compiles it under the default limits. Refusals call the text `name`. The text
+    /// may name no mesh file. Like [`Model::compile`], it may take some tenths of a second.
     ///
     /// # Errors
-    /// Refuses a text that is not a valid scene, and every scene that [`Model::compile`] refuses.
+    /// Refuses a text or an assignment that [`Scene::parse`] refuses, and every scene that [`Model::compile`]
+    /// refuses.
     pub fn parse(name: &str, text: &str, sets: &[&str]) -> Result<Arc<Self>> {
         let sets: Vec<_> = sets.iter().map(|set| (*set).to_owned()).collect();
         let limits = Limits::default();
         Model::compile(&Scene::parse(name, text, &sets, &limits)?, &limits)
     }
 
-    /// Checks a scene and compiles it: chooses the scheme and the substep, which may take some tenths of a
-    /// second.
+    /// Checks a scene and compiles it: chooses the scheme, the substep and the number format where the scene
+    /// leaves them open. Then rehearsals run, which may take some tenths of a second; the call blocks. The
+    /// scene itself stays unchanged.
     ///
     /// The substep follows from the stability bound: here one of a millisecond or less, within the step of 1 ms.
     ///
@@ -115,16 +119,23 @@ impl Model {
     /// ```
     ///
     /// # Errors
-    /// Refuses a scene that is not valid, that no scheme can step within the limits, or that this machine can't run.
+    /// Refuses
+    ///
+    /// - every scene that [`Scene::check`] refuses;
+    /// - a processor without FMA ([`check_processor`]) or without the `stepping.lanes` that the scene names;
+    /// - more substeps than `limits.substeps`, which stability needs ([`Reason::TooLarge`]);
+    /// - a tolerance whose rehearsals would take more than `limits.rehearsal_work` ([`Reason::TooLarge`]);
+    /// - `compensated` with an integrator that is not exponential;
+    /// - a mesh whose springs can't be laid out in memory.
     pub fn compile(scene: &Scene, limits: &Limits) -> Result<Arc<Self>> {
         Model::compile_until(scene, limits, &scheme_selection::NEVER)
     }
 
-    /// Compiles a scene as [`Model::compile`] does, but gives up when another thread sets `stop`.
+    /// Compiles a scene as [`Model::compile`] does, but gives up soon after another thread sets `stop`.
     ///
     /// # Errors
-    /// Refuses a scene that is not valid, that no scheme can step within the limits, or that this machine can't
-    /// run; and refuses when `stop` is set.
+    /// Refuses every scene that [`Model::compile`] refuses; and refuses if `stop` is set before the rehearsals
+    /// end ([`Reason::TimedOut`]). A scene that needs no rehearsal may be compiled all the same.
     pub fn compile_until(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
         scene.check(limits)?;
         // Before the rehearsals, which run sweeps.
@@ -182,22 +193,24 @@ impl Model {
         Ok(Arc::new(model))
     }
 
-    /// Returns the model with some coefficients changed, for the same state. The number format stays;
-    /// integrator and substeps are chosen again for the tolerance. `first` is the scene that the session began
-    /// with.
+    /// Returns the model of the same tissue with some coefficients changed, for
+    /// [`Tissue::change`](crate::Tissue::change). The number format stays; integrator and substeps are chosen
+    /// again for the tolerance, except that after a correction the integrator and at least the substeps of the
+    /// correction stay. `first` is the scene that the session began with ([`Scene::changed`]). Blocks as
+    /// [`Model::compile`] does.
     ///
     /// # Errors
-    /// Refuses an empty change, and every scene that [`Model::compile`] refuses.
+    /// Refuses an empty change ([`Reason::Missing`]), and every changed scene that [`Model::compile`] refuses.
     pub fn changed(&self, change: &Change, first: &Scene, limits: &Limits) -> Result<Arc<Self>> {
         self.changed_until(change, first, limits, &scheme_selection::NEVER)
     }
 
-    /// Returns the model with some coefficients changed, as [`Model::changed`] does, but gives up when another
-    /// thread sets `stop`.
+    /// Returns the model with some coefficients changed, as [`Model::changed`] does, but gives up soon after
+    /// another thread sets `stop`.
     ///
     /// # Errors
-    /// Refuses an empty change, and every scene that [`Model::compile`] refuses; and refuses when `stop` is
-    /// set.
+    /// Refuses everything that [`Model::changed`] refuses; and refuses if `stop` is set before the rehearsals
+    /// end ([`Reason::TimedOut`]).
     pub fn changed_until(
         &self,
         change: &Change,
@@ -218,7 +231,7 @@ impl Model {
     }
 
     /// Returns the coefficients and the plan of this model: everything that [`Model::resumed`] needs besides
-    /// the scene that the session began with.
+    /// the scene that the session began with. Displacements are not part of it.
     pub fn tissue_state(&self) -> TissueState {
         let Model { scene, plan, precision, expected_error, sleep_tolerance, corrected, .. } = self;
         TissueState {
@@ -238,10 +251,17 @@ impl Model {
     }
 
     /// Rebuilds the model that changes and corrections had made of `first`, the scene that the session began
-    /// with. It has the same plan and gives the same bits; nothing is chosen again.
+    /// with, from what [`Model::tissue_state`] returned. It has the same plan and gives the same bits; nothing
+    /// is rehearsed or chosen again. Lanes are those of this machine.
     ///
     /// # Errors
-    /// Refuses values that no model has, and every scene that [`Model::compile`] refuses.
+    /// Refuses
+    ///
+    /// - coefficients that [`Scene::check`] refuses;
+    /// - a sleep tolerance beyond 0 to 1, an integrator or format `auto`, 0 substeps, an expected error that is
+    ///   NaN;
+    /// - `compensated` with an integrator that is not exponential, more substeps than `limits.substeps`;
+    /// - lanes that this processor does not have, and a mesh whose springs can't be laid out in memory.
     pub fn resumed(first: &Scene, state: &TissueState, limits: &Limits) -> Result<Arc<Self>> {
         let TissueState { integrator, substeps, precision, sleep_tolerance, expected_error, .. } = *state;
         let mut scene = first.clone();
@@ -266,11 +286,13 @@ impl Model {
         Ok(Arc::new(Model { sleep_tolerance, corrected, ..Arc::unwrap_or_clone(model) }))
     }
 
-    /// Compiles the models of successive changes. Each change builds on the one before it and keeps its step.
-    /// `first` is the scene that the session began with.
+    /// Compiles the models of successive changes, each with the step at which it applies. Each change builds on
+    /// the one before it; the first builds on `self`. Returns the steps and models in the order of `changes`,
+    /// which is not checked. `first` is the scene that the session began with. Blocks for each change as
+    /// [`Model::changed`] does.
     ///
     /// # Errors
-    /// Refuses the first change that [`Model::changed`] refuses.
+    /// Refuses the first change that [`Model::changed`] refuses; the models before it are lost.
     pub fn apply_changes(
         self: &Arc<Self>,
         first: &Scene,
@@ -285,8 +307,9 @@ impl Model {
         compiled.collect()
     }
 
-    /// Returns the predicted processor time of a step with all points awake, s: t₀ + t₁·P·n, with P points, n
-    /// substeps, and t₀ and t₁ measured.
+    /// Returns the predicted processor time of a step with all points awake, s: t₀ + t₁·P·n, with P the swept
+    /// points ([`Model::swept_points`]) and n the substeps; t₀ = 2 µs and t₁ (by scheme, format, lanes and kind
+    /// of tissue) were measured on one machine.
     #[allow(clippy::cast_precision_loss)]
     pub fn predicted_step_s(&self) -> f64 {
         let point_ns =

@@ -10,42 +10,46 @@ use palpate_refusal::{Reason, Refusal, Result};
 /// How long the writer of a pipe may be silent.
 const PIPE_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// Largest size of a file with a key, a certificate, a password or tokens, bytes.
+/// Bound to pass as `most` for a file with a key, a certificate, a password or tokens: 1 MiB, in bytes. The
+/// functions here don't apply it by themselves.
 pub const MAX_SECRET_BYTES: u64 = 1 << 20;
 
-/// Reads at most `most` bytes of a path from a command line: a file, a device, or a pipe such as `<(…)`.
+/// Reads all bytes, at most `most`, of a path from a command line: a file, a device, or a pipe such as `<(…)`.
+/// It blocks until the end of the file or pipe; links are followed.
 ///
 /// # Errors
-/// Refuses a path that can't be read, more than `most` bytes, and a pipe into which nobody writes for 30 s.
+/// Refuses a path that can't be opened or read, and a folder ([`Reason::Unreadable`]); more than `most` bytes
+/// ([`Reason::TooLarge`]); and, on Unix, a pipe or device that supplies nothing for 30 s at any time
+/// (`Unreadable`; other systems wait without end). [`Refusal::place`] is the path.
 pub fn read(path: &Path, most: u64) -> Result<Vec<u8>> {
     read_within(path, most, PIPE_TIMEOUT)
 }
 
-/// Reads at most `most` bytes of text from a path of the command line: a file, a device, or a pipe.
+/// Reads text of at most `most` bytes from a path of a command line: a file, a device, or a pipe. It blocks as
+/// [`read`] does.
 ///
 /// # Errors
-/// Refuses a path that can't be read, more than `most` bytes, a pipe into which nobody writes for 30 s, and
-/// bytes that are not UTF-8.
+/// Refuses everything that [`read`] refuses, and bytes that are not UTF-8 ([`Reason::Unreadable`]).
 pub fn read_text(path: &Path, most: u64) -> Result<String> {
     text(path, read(path, most)?)
 }
 
-/// Reads at most `most` bytes of a regular file. Use it for files that a server reads by itself or that another
-/// file names: nobody is there to write into a pipe.
+/// Reads all bytes, at most `most`, of a regular file; links are followed. Use it for files that a server reads
+/// by itself or that another file names: it never waits for the writer of a pipe.
 ///
 /// # Errors
-/// Refuses a path that can't be read or is not a regular file, and a file with more bytes.
+/// Refuses a path that can't be opened or read, a folder, a pipe and a device ([`Reason::Unreadable`]), and a
+/// file of more than `most` bytes ([`Reason::TooLarge`]). [`Refusal::place`] is the path.
 pub fn read_regular(path: &Path, most: u64) -> Result<Vec<u8>> {
     let (file, is_regular) = open(path)?;
     if is_regular { bytes_of(path, file, most) } else { Err(refuse(path, "is not a regular file")) }
 }
 
-/// Reads at most `most` bytes of text from a regular file. Use it for files that a server reads by itself or
+/// Reads text of at most `most` bytes from a regular file. Use it for files that a server reads by itself or
 /// that another file names.
 ///
 /// # Errors
-/// Refuses a path that can't be read or is not a regular file, a file with more bytes, and bytes that are not
-/// UTF-8.
+/// Refuses everything that [`read_regular`] refuses, and bytes that are not UTF-8 ([`Reason::Unreadable`]).
 pub fn read_regular_text(path: &Path, most: u64) -> Result<String> {
     text(path, read_regular(path, most)?)
 }

@@ -18,8 +18,9 @@ use crate::tools::contact::{TangentInput, ToolContact};
 use crate::tools::prescribed::Grasp;
 use palpate_haptics::Tip;
 
-/// One mass point at the end of a step: displacement, velocity, and the forces on it. Where the applied force
-/// jumps, this is the value just before the jump; at step 0, just after it.
+/// One mass point at the end of a step: displacement, velocity, and the forces on it, in the tissue's frame. A
+/// force on the point is positive along the axes. Where the applied force jumps, this is the value just before
+/// the jump; at step 0, just after it. [`Tissue::point`] returns it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointState {
     /// Displacement from rest, m.
@@ -32,50 +33,59 @@ pub struct PointState {
     pub anchor_n: DVec3,
     /// Damping force, −C·v, N.
     pub damping_n: DVec3,
-    /// Force of all pushing tools, N.
+    /// Force of all pushing tools, N ([`Tissue::push`]). Forces of tools with a tip are not part of it.
     pub applied_n: DVec3,
-    /// The force that holds a prescribed point, N: m·a − spring − anchor − damping − applied. `None` for other
-    /// points.
+    /// The force that holds a prescribed (grasped) point, N: m·a − spring − anchor − damping − applied, with a
+    /// its acceleration. `None` for other points.
     pub constraint_n: Option<DVec3>,
 }
 
 impl PointState {
-    /// Returns the force of the tissue on a tool at the point, N: spring + anchor + damping.
+    /// Returns the force of the tissue on a tool at the point, N: spring + anchor + damping, as fields of this
+    /// state. At rest it is the opposite of the tool's force.
     pub fn reaction_n(&self) -> DVec3 {
         self.spring_n + self.anchor_n + self.damping_n
     }
 }
 
-/// Energies of the whole tissue, J: sums over all points and over all springs.
+/// Energies of the whole tissue, J: sums over all points and over all springs, at the end of a step. Without
+/// tools, damping only reduces their total.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Energy {
     /// Kinetic energy, Σ ½m·v².
     pub kinetic_j: f64,
-    /// Energy of the springs between points, Σ ½k(L − L0)², and of an enclosed volume.
+    /// Energy of the springs between points, Σ ½k(L − L0)², and of an enclosed volume, ½κ·ΔV²/V0.
     pub spring_j: f64,
     /// Energy of the anchor springs, Σ ½K″·u².
     pub anchor_j: f64,
 }
 
-/// An instability of the motion that the guard could not repair with shorter substeps.
+/// An instability of the motion that the guard could not repair with shorter substeps. [`Tissue::step`] returns
+/// it; then [`Tissue::recover`] is the way to go on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BlowUp {
-    /// Steps done when the guard found it.
+    /// Steps done when the guard found the first fault. The tissue itself went back to
+    /// [`Tissue::checkpoint_step`].
     pub step: u64,
     /// The check that failed.
     pub cause: CheckFailure,
 }
 
-/// How a tissue continues after a blow-up.
+/// What [`Tissue::recover`] did: how a tissue continues after a blow-up.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Released {
-    /// The tools that acted in the state that the tissue went back to, ascending. They are released.
+    /// The numbers of the tools that acted in the state that the tissue went back to, ascending, each once.
+    /// They are released. A tool that began to act later is not listed.
     pub tools: Vec<usize>,
-    /// Whether the tissue continues at rest.
+    /// Whether the tissue continues at rest, with its displacements lost; otherwise it continues in the state
+    /// of the checkpoint.
     pub at_rest: bool,
 }
 
-/// A tissue in motion, in any number format.
+/// A tissue in motion, in any number format. [`at_rest`](crate::at_rest) creates one,
+/// [`restored`](crate::restored) one from a snapshot. Tools have numbers from 0, which callers choose; memory
+/// grows with the largest. Each tool pushes, grasps, touches with a tip, or does nothing. Places and vectors
+/// are in the tissue's frame. Methods that take a [`PointId`] panic if the tissue has no such point.
 ///
 /// A force of 0.1 N on one point, which an anchor spring of 5 N/m holds, brings it 20 mm down (Hooke: u = F/K″):
 ///
@@ -109,113 +119,145 @@ pub struct Released {
 /// # Ok::<(), palpate_refusal::Refusal>(())
 /// ```
 pub trait Tissue: Send {
-    /// Returns the model of the tissue.
+    /// Returns the model of the tissue: the one it was created with, or that of the last [`Tissue::change`].
     fn model(&self) -> &Arc<Model>;
-    /// Returns the number of steps done.
+    /// Returns the number of steps done, 0 at first. Within an unfinished step ([`Tissue::is_within_step`]) it
+    /// may be smaller than before.
     fn step_count(&self) -> u64;
-    /// Sets the force of `tool` from the next step on; `None` ends it. The tool no longer grasps or touches.
+    /// Sets the force of `tool` from the next step on, in place of its last one; `None` ends it. The tool no
+    /// longer grasps or touches. The force isn't checked: see
+    /// [`check_poke`](crate::scene::action_check::check_poke).
     fn push(&mut self, tool: usize, push: Option<Push>);
-    /// Makes `tool` move `point` from the next step on. The tool no longer pushes or touches.
+    /// Makes `tool` hold `point` and move it as `grasp` says, from the next step on. The tool no longer pushes
+    /// or touches. Neither the point (it must not be fixed, nor grasped by another tool) nor the reach is
+    /// checked.
     fn grasp(&mut self, tool: usize, point: PointId, grasp: Grasp);
-    /// Makes `tool` touch the tissue with `tip` from the next step on. The tip reaches `place_m`, m, at the
-    /// step's end.
+    /// Makes `tool` touch the tissue with `tip` from the next step on. The tip reaches `place_m`, m, at that
+    /// step's end, and stays there until its next pose. The tool no longer pushes or grasps a point. Tip and
+    /// place aren't checked: see [`check_tip`](crate::scene::action_check::check_tip).
     fn pose(&mut self, tool: usize, place_m: DVec3, tip: Tip);
-    /// Returns the motion of a position-controlled tool and the force on it; `None` for other tools.
+    /// Returns the motion of a tool with a tip ([`Tissue::pose`]) and the force on it; `None` for other tools.
     fn tool_contact(&self, tool: usize) -> Option<ToolContact>;
-    /// Returns a copy of the tissue around a position-controlled tool, from which the stiffness there is
-    /// computed; `None` if the tool neither touches nor holds.
+    /// Returns a copy of the tissue around a tool with a tip, from which another thread can compute the
+    /// stiffness there. `None` for other tools, if the tip neither touches nor holds, or if there is no memory
+    /// for the copy.
     fn tangent_input(&self, tool: usize) -> Option<TangentInput>;
-    /// Releases `tool`: from the next step on it no longer pushes, grasps or touches.
+    /// Releases `tool`: from the next step on it no longer pushes, grasps or touches. Without effect on a tool
+    /// that does nothing.
     fn release(&mut self, tool: usize);
-    /// Exchanges springs, anchor springs and damping for those of `model` from the next step on. The model
-    /// comes from [`Model::changed`] of this tissue's model. Displacements and velocities stay; all tiles wake.
+    /// Exchanges springs, anchor springs, damping, scheme and substep for those of `model` from the next step
+    /// on. The model comes from [`Model::changed`] or [`Model::corrected()`] of this tissue's model, in the
+    /// same number format; for f64 after another format, first ask [`Tissue::changed`]. Displacements and
+    /// velocities stay; all tiles wake, halvings of the substep end, and a running audit is dropped.
     fn change(&mut self, model: &Arc<Model>);
     /// Requests an audit of a window of steps, which begins at the next checkpoint. `inputs` is the memory in
-    /// which the tools' inputs are recorded; it is emptied.
+    /// which the tools' inputs are recorded; it is emptied. A new request replaces one that waits or runs,
+    /// without a report.
     fn request_audit(&mut self, inputs: WindowInputs);
-    /// Takes the report on the requested window after a step: begun, ended or dropped. Returns each report
+    /// Takes the report on the requested window: begun, ended or dropped. Call it after each step: a report
+    /// that isn't taken before the next checkpoint is lost or makes the window begin anew. Returns each report
     /// once, otherwise `None`.
     fn take_mark(&mut self) -> Option<Mark>;
-    /// Returns a new tissue under `model` if that is in f64 and this one is not, as after a correction;
-    /// otherwise `None`: then [`Tissue::change`] applies.
+    /// Returns a new tissue in the same state, with the same tools and steps, under `model`, if that is in f64
+    /// and this one is not, as after a correction. This one stays as it is. Otherwise `None`: then
+    /// [`Tissue::change`] applies.
     fn changed(&self, model: &Arc<Model>) -> Option<Box<dyn Tissue>>;
-    /// Returns the present scheme and substep. The guard may have halved the model's substep.
+    /// Returns the present scheme and substep. The guard may have halved the substep of the model's plan up to
+    /// 4 times ([`MAX_HALVINGS`](crate::guard::MAX_HALVINGS)).
     fn plan(&self) -> &Plan;
-    /// Returns how many times the guard went back to a checkpoint and continued with half the substep.
+    /// Returns how many times the guard went back to a checkpoint and repeated with a shorter substep, since
+    /// the tissue was created.
     fn guard_events(&self) -> u64;
-    /// Returns the step of the state that a blow-up would go back to.
+    /// Returns the step of the state that a blow-up would go back to. Without a checkpoint (a still tissue, or
+    /// one that has not moved yet) it is the present step.
     fn checkpoint_step(&self) -> u64;
-    /// Returns the number of substeps done, including those that the guard repeated.
+    /// Returns the number of substeps done since the tissue was created, skipped ones and those that the guard
+    /// repeated included.
     fn substeps_done(&self) -> u64;
-    /// Returns the number of points that a step computes now; the others are at rest.
+    /// Returns the number of points that a step computes now; the others are at rest. 0 if the whole tissue
+    /// sleeps.
     fn awake_points(&self) -> usize;
-    /// Returns whether a step changes only the time, until a tool gets a command.
+    /// Returns whether a step would change only the time, until a tool gets a command: all tiles sleep, pushes
+    /// are constant, and no tool grasps or has a tip.
     fn is_still(&self) -> bool;
-    /// Skips `steps` steps of a still tissue ([`Tissue::is_still`]). The result is the same as that of single
-    /// steps.
+    /// Skips `steps` steps of a still tissue, at no cost. The result is then the same as that of single steps.
+    /// Whether the tissue is still ([`Tissue::is_still`]) isn't checked.
     fn skip_steps(&mut self, steps: u64);
-    /// Returns the fraction of all points in all substeps that were computed.
+    /// Returns the fraction, 0 to 1 or more, of all points in all substeps that were computed since the tissue
+    /// was created: the rest slept or was skipped. 1 before the first substep.
     fn computed_fraction(&self) -> f64;
-    /// Advances one step.
+    /// Advances one step, however often the guard must repeat it. If a step is unfinished, it only finishes
+    /// that one.
     ///
     /// # Errors
-    /// Returns a blow-up that the guard could not repair. The state is then that of the last checkpoint, which
-    /// is finite.
+    /// Returns a blow-up that the guard could not repair by halving the substep. The state is then that of the
+    /// last checkpoint, which is finite, and the tools are those of that time: call [`Tissue::recover`] next.
     fn step(&mut self) -> Result<(), BlowUp> {
         while !self.step_while(&mut || true)? {}
         Ok(())
     }
-    /// Advances one step. If the guard has to repeat substeps, it calls `may_go_on` in between and stops when
-    /// that returns false. The result is then false, and the state belongs to no step: you may only call this
-    /// function again. The result of the step does not depend on where it stops.
+    /// Advances one step, or continues an unfinished one. If the guard has to repeat substeps, it calls
+    /// `may_go_on` in between and stops when that returns false. The result is then false, and the state
+    /// belongs to no step: you may only call this function or [`Tissue::step`] again. True means that the step
+    /// is done. Its result does not depend on where it stopped.
     ///
     /// # Errors
     /// Returns a blow-up that the guard could not repair, as [`Tissue::step`] does.
     fn step_while(&mut self, may_go_on: &mut dyn FnMut() -> bool) -> Result<bool, BlowUp>;
-    /// Returns whether a step is unfinished because `step_while` stopped.
+    /// Returns whether a step is unfinished because [`Tissue::step_while`] stopped.
     fn is_within_step(&self) -> bool;
-    /// Continues after a blow-up at step `step` (that of the blow-up), from the state of the last checkpoint.
-    /// If `to_rest`, or if that state has passed no check, it continues at rest. Releases all tools and
-    /// restores the model's own substep.
+    /// Continues after a blow-up, from the state of the last checkpoint. `step` is [`BlowUp::step`], to which
+    /// the step count is set. If `to_rest`, or if that state has passed no check since a change or recovery,
+    /// the tissue continues at rest. Releases all tools, ends halvings of the substep, and drops a running
+    /// audit.
     fn recover(&mut self, step: u64, to_rest: bool) -> Released;
-    /// Returns the state of a point.
+    /// Returns the state of a point at the end of the last step.
     fn point(&self, point: PointId) -> PointState;
-    /// Returns the displacement of the surface at a place of the rest shape, m, interpolated between points as
-    /// in frames.
+    /// Returns the displacement of the surface at a place of the rest shape, m. On a sheet it is bilinear
+    /// between the four points around the place (beyond the rim, that of the rim), as in frames; on a mesh it
+    /// is that of the nearest point.
     fn surface_displacement_m(&self, place_m: DVec3) -> DVec3;
-    /// Returns the force of the tissue on a tool whose force acts around a place, N: the mean of the points'
-    /// reactions r with the force's weights w, Σ w·r/Σ w. It changes smoothly while the place moves.
+    /// Returns the force of the tissue on a tool whose force acts around a place, N: the mean Σ w·r/Σ w of the
+    /// reactions r of the points around `poke.centre_m`. The weight w is that of the force, e^{−c·distance},
+    /// tapered to 0 at some spacings, so that the mean changes smoothly while the place moves. Without a point
+    /// there, it is the reaction at the nearest.
     fn reaction_around_n(&self, poke: &Poke) -> DVec3;
-    /// Returns the energies. It computes the awake points; sleeping tiles use stored values. Earlier calls do
-    /// not affect the result.
+    /// Returns the energies at the end of the last step. It costs about a substep of the awake points; sleeping
+    /// tiles use stored values. Earlier calls do not affect the result.
     fn energy(&self) -> Energy;
-    /// Returns the length of the largest displacement, m.
+    /// Returns the length of the largest displacement of a point from rest, m. It looks at all points.
     fn largest_displacement_m(&self) -> f64;
-    /// Writes the displacements, m, in the order of the points, with x, y and z in separate vectors. Replaces
-    /// their content.
+    /// Writes the displacements from rest, m, in the order of the points, with x, y and z in separate vectors
+    /// of [`Model::len`] numbers each. Replaces their content.
     fn displacements_m(&self, into: &mut [Vec<f32>; 3]);
-    /// Writes the displacements, m, in f64, in the order of the points: x, y and z of each point together.
-    /// Replaces the content.
+    /// Writes the displacements from rest, m, in f64, in the order of the points: x, y and z of each point
+    /// together, 3 times [`Model::len`] numbers. Replaces the content.
     fn whole_displacements_m(&self, into: &mut Vec<f64>);
-    /// Writes the displacements, m, in the order of frames ([`Model::shown_order`]), with x, y and z in
-    /// separate vectors. Replaces their content. A frame of a mesh has zeros at places without a vertex.
+    /// Writes the displacements from rest, m, in the order of frames ([`Model::shown_order`]), with x, y and z
+    /// in separate vectors. Replaces their content. For a mesh they are padded at the end with zeros to whole
+    /// rows of 16.
     fn shown_displacements_m(&self, into: &mut [Vec<f32>; 3]);
-    /// Returns the number of blocks of at most 16 points, in which the state is hashed.
+    /// Returns the number of blocks of at most 16 points, in which the state is hashed. It stays the same for a
+    /// model.
     fn hash_block_count(&self) -> usize;
-    /// Adds some of these blocks to a hash: everything that the future of their points depends on.
+    /// Adds some of these blocks to a hash: everything that the future of their points depends on. Blocks are
+    /// numbered from 0 to [`Tissue::hash_block_count`] − 1; all of them in ascending order give
+    /// [`Tissue::state_hash`].
     fn hash_blocks(&self, blocks: Range<usize>, hasher: &mut Xxh3);
-    /// Returns the XXH3-128 hash of the state of every point.
+    /// Returns the XXH3-128 hash of the state of every point. It is the same on every machine and for every
+    /// lane width; time and tools are not part of it.
     fn state_hash(&self) -> u128 {
         Hashing::default().add(self, usize::MAX).unwrap_or_default()
     }
     /// Returns a copy of everything that the next steps depend on, from which another thread makes a snapshot.
-    /// It leaves out a running audit.
+    /// It leaves out a running audit. Call it between steps, not within an unfinished one.
     fn save(&self) -> SavedTissue;
-    /// Returns a copy of the present tissue that another thread can read.
+    /// Returns a copy of the present tissue that another thread can read while this one is stepped.
     fn copy(&self) -> ReadCopy;
 }
 
-/// A copy of a tissue at one moment, for reading.
+/// A copy of a tissue at one moment, for reading: [`Tissue::copy`] makes it, nothing changes it, and it keeps
+/// its memory until it is dropped.
 pub struct ReadCopy(Box<dyn Tissue>);
 
 impl ReadCopy {
@@ -229,24 +271,28 @@ impl ReadCopy {
         self.0.model()
     }
 
-    /// Returns the state of a point.
+    /// Returns the state of a point, as [`Tissue::point`] did when the copy was made. Panics if the tissue has
+    /// no such point.
     pub fn point(&self, point: PointId) -> PointState {
         self.0.point(point)
     }
 
-    /// Returns the XXH3-128 hash of the state of every point.
+    /// Returns the XXH3-128 hash of the state of every point, as [`Tissue::state_hash`] did when the copy was
+    /// made. It reads the whole state; [`ReadCopy::hash`] does so in slices.
     pub fn state_hash(&self) -> u128 {
         self.0.state_hash()
     }
 
-    /// Adds the next `points` points, rounded up to a block of 16, to an unfinished hash. Returns the hash once
-    /// all points are in.
+    /// Adds the next `points` points, rounded up to a block of 16 (at least one block), to an unfinished hash,
+    /// which must begin as `Hashing::default()` and see this copy only. Returns the hash
+    /// ([`ReadCopy::state_hash`]) once all points are in, before that `None`.
     pub fn hash(&self, hashing: &mut Hashing, points: usize) -> Option<u128> {
         hashing.add(&*self.0, points)
     }
 }
 
-/// An unfinished hash of a tissue's state, which is computed in slices.
+/// An unfinished hash of the state of one [`ReadCopy`], which is computed in slices: begin with
+/// `Hashing::default()`, and call [`ReadCopy::hash`] until it returns the hash.
 pub struct Hashing {
     hasher: Box<Xxh3>,
     /// The next block of points.

@@ -16,11 +16,12 @@ use bytemuck::allocation::try_zeroed_vec;
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Smallest allocation that is checked, bytes.
+/// Smallest allocation that is checked: 64 KiB, in bytes. The functions of this module don't check the headroom
+/// for smaller ones.
 pub const LARGE_BYTES: usize = 64 << 10;
 
-/// Bytes that a large allocation must leave for small ones. More than 32 MiB, because the GNU allocator returns
-/// such memory to the system at once and changes none of its thresholds.
+/// Bytes that must remain available after a large allocation, for small ones: 64 MiB. More than 32 MiB, because
+/// the GNU allocator returns such memory to the system at once and changes none of its thresholds.
 pub const HEADROOM_BYTES: usize = 64 << 20;
 
 fn refused(bytes: usize, what: &str) -> Refusal {
@@ -37,11 +38,12 @@ fn is_available(bytes: usize) -> bool {
     reserved
 }
 
-/// Checks that the system would give `bytes` for `what` now, and the headroom. Nothing is reserved: another
-/// thread may take them first.
+/// Checks that the system would give `bytes` now, and [`HEADROOM_BYTES`] besides. Nothing is reserved: another
+/// thread may take them first. Below [`LARGE_BYTES`] it checks nothing. `what` names the purpose in the refusal
+/// ("a texture").
 ///
 /// # Errors
-/// Refuses if the memory is not there.
+/// Refuses if the memory is not there ([`Reason::Overloaded`], with an empty field).
 pub fn check(bytes: u64, what: &str) -> Result<()> {
     let bytes = usize::try_from(bytes).unwrap_or(usize::MAX);
     if bytes < LARGE_BYTES || is_available(bytes.saturating_add(HEADROOM_BYTES)) {
@@ -51,9 +53,9 @@ pub fn check(bytes: u64, what: &str) -> Result<()> {
     }
 }
 
-/// Checks that the system would give `bytes` for `what` now, and the headroom: for many small allocations.
-///
-/// Unwinds with the refusal ([`attempt`]) if the memory is not there.
+/// Checks, as [`check`] does, that the system would give `bytes` now, and the headroom: before many small
+/// allocations. `what` names their purpose in the refusal. If the memory is not there, it unwinds with the
+/// refusal, which [`attempt`] returns.
 pub fn require(bytes: u64, what: &str) {
     if let Err(refusal) = check(bytes, what) {
         resume_unwind(Box::new(refusal));
@@ -69,44 +71,51 @@ fn kept<T, E>(values: std::result::Result<Vec<T>, E>, length: usize, what: &str)
     }
 }
 
-/// Returns `length` zeros. The system supplies their pages at the first write.
+/// Returns `length` zeros. The system supplies their pages at the first write. `what` names their purpose in
+/// the refusal.
 ///
-/// Unwinds with a refusal if there is no memory for `what`.
+/// If there is no memory for them, or (from [`LARGE_BYTES`] on) for [`HEADROOM_BYTES`] besides, it unwinds with
+/// a refusal, which [`attempt`] returns.
 pub fn zeroed<T: Zeroable>(length: usize, what: &str) -> Vec<T> {
     kept(try_zeroed_vec(length), length, what)
 }
 
-/// Returns `length` copies of `value`. Unwinds with a refusal if there is no memory for `what`.
+/// Returns `length` copies of `value`. Unwinds with a refusal that names `what` if there is no memory, as
+/// [`zeroed`] does.
 pub fn filled<T: Clone>(length: usize, value: T, what: &str) -> Vec<T> {
     let mut values = with_room(length, what);
     values.resize(length, value);
     values
 }
 
-/// Returns an empty vector with room for `capacity` values. Unwinds with a refusal if there is no memory for
-/// `what`.
+/// Returns an empty vector with room for at least `capacity` values. Unwinds with a refusal that names `what`
+/// if there is no memory, as [`zeroed`] does.
 pub fn with_room<T>(capacity: usize, what: &str) -> Vec<T> {
     let mut values = Vec::new();
     let reserved = values.try_reserve_exact(capacity).map(|()| values);
     kept(reserved, capacity, what)
 }
 
-/// Collects `values` into a vector. Unwinds with a refusal if there is no memory for `what`.
+/// Collects `values` into a vector, in their order. Unwinds with a refusal that names `what` if there is no
+/// memory for as many values as the iterator announces, as [`zeroed`] does.
 pub fn collected<T>(values: impl ExactSizeIterator<Item = T>, what: &str) -> Vec<T> {
     let mut vector = with_room(values.len(), what);
     vector.extend(values);
     vector
 }
 
-/// Returns the refusal with which a thread unwound; `None` if the panic had another cause.
+/// Returns the refusal with which a thread unwound, from the payload of `catch_unwind` or `join`; `None` if the
+/// panic had another cause.
 pub fn refusal_of(panic: &(dyn Any + Send)) -> Option<&Refusal> {
     panic.downcast_ref()
 }
 
-/// Runs `work` and catches an unwinding refusal of memory, which it returns for `field`. Other panics continue.
+/// Runs `work` and catches a refusal with which it unwinds ([`require`], [`zeroed`]), so that this is an error
+/// as well. It puts `field` before the field of such a refusal, and leaves a refusal that `work` returns as it
+/// is. Other panics continue. What `work` was changing may be half done.
 ///
 /// # Errors
-/// Returns the refusal of `work`, and refuses if there is no memory for it.
+/// Returns the refusal that `work` returns or unwinds with.
 pub fn attempt<T>(field: &str, work: impl FnOnce() -> Result<T>) -> Result<T> {
     catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| match panic.downcast::<Refusal>() {
         Ok(refusal) => Err(refusal.within(field)),

@@ -10,9 +10,12 @@ use crate::scheme::{Oscillator, QuadratureNode, Scheme};
 use crate::shape::{self, PointId, RestShape};
 
 /// The immutable half of a tissue, compiled from a scene: points, springs, and the scheme with its substep.
+/// [`Model::parse`] and [`Model::compile`] create one; [`at_rest`](crate::at_rest) creates a tissue of it. Many
+/// tissues may share it.
 #[derive(Debug, Clone)]
 pub struct Model {
-    /// The scene that the model was compiled from.
+    /// The scene that the model was compiled from, with zeros without a sign. After a change it has the new
+    /// coefficients; its `stepping` stays what the user asked for, and [`Model::plan`] what is used.
     pub scene: Scene,
     /// Rows and columns in memory: those of a sheet, or the slots of a mesh in rows of [`BLOCK`] (a slot is a
     /// vertex's place in memory).
@@ -23,45 +26,54 @@ pub struct Model {
     pub(super) unit_m: f64,
     /// The places in memory of a mesh's points, and its springs; `None` for a sheet.
     pub(super) graph: Option<Arc<MeshPlaces>>,
-    /// ω_b = √((largest spring stiffness + K″)/m), rad/s. No vibration is faster, under any deformation.
+    /// ω_b = √((λ + K″)/m), rad/s, for a point of the reference mass m; λ is the largest eigenvalue of the
+    /// springs' stiffness, K″ that of an anchor spring ([`Oscillator::omega_bound_per_s`]). No vibration is
+    /// faster, under any deformation.
     pub omega_bound_per_s: f64,
-    /// The scheme and the substep.
+    /// The scheme and the substep with which a tissue begins. The guard may halve the substep of one tissue
+    /// ([`Tissue::plan`](crate::Tissue::plan)).
     pub plan: Plan,
-    /// The number format; never `Auto`.
+    /// The number format of the state that is used; never `Auto`.
     pub precision: Precision,
-    /// Expected error of displacement and force, relative to the largest of each (see
-    /// `select::scheme_selection`). Infinite if it is unknown.
+    /// Expected error of displacement and force, each relative to the largest of its kind: the larger of the
+    /// two, from rehearsals ([`choose`](crate::select::scheme_selection::choose)). Infinite if it is unknown.
     pub expected_error: f64,
-    /// Largest error that leaving out tiles at rest may add, relative to the largest displacement.
+    /// Largest error that leaving out tiles at rest may add, relative to the largest displacement, 0 to 1. 0
+    /// turns sleep off.
     pub sleep_tolerance: f64,
-    /// How many numbers this machine works on at once; never `Auto`.
+    /// How many numbers this machine works on at once, as the scene asks or the widest that the processor has;
+    /// never `Auto`. The bits of the results don't depend on it.
     pub lanes: Lanes,
-    /// Warnings for the user, as sentences.
+    /// Warnings for the user, as sentences that often begin with the key they are about (`stepping.tolerance:
+    /// …`). Empty if there are none.
     pub warnings: Vec<String>,
-    /// The scheme and the least substeps that a correction asked for. Later changes of the tissue keep to them.
+    /// The scheme and the least substeps per step of the last correction ([`Model::corrected()`]), to which
+    /// later changes of the tissue keep; `None` before the first.
     pub corrected: Option<(Integrator, u32)>,
-    /// Points × substeps of the rehearsals that chose the plan: at most `limits.rehearsal_work`.
+    /// Points × substeps of the rehearsals that chose the plan, at most `limits.rehearsal_work`. 0 if nothing
+    /// was rehearsed, as for [`Model::resumed`].
     pub rehearsed: u64,
     /// By how much each place in memory lets a volume grow under a pressure, m³/Pa. Empty without a volume, or
     /// before it was computed.
     pub(super) volume_compliance: Arc<[f64]>,
 }
 
-/// A scheme fitted to a substep.
+/// A scheme fitted to a substep: how a tissue is advanced by one step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Plan {
-    /// The integrator; never `Auto`.
+    /// The integrator that is used; never `Auto`.
     pub integrator: Integrator,
-    /// Substeps per step.
+    /// Substeps per step, at least 1.
     pub substeps: u32,
-    /// Length of a substep, s.
+    /// Length dt of a substep, s: the step divided by `substeps`.
     pub substep_s: f64,
-    /// The scheme's coefficients, fitted to the substep.
+    /// The scheme's coefficients, fitted to the tissue and to dt.
     pub scheme: Scheme,
-    /// The moments of a substep at which the tools' force is evaluated, with their weights.
+    /// The moments of a substep at which the tools' force is evaluated, with their weights: [`Scheme::nodes`]
+    /// of `scheme`.
     pub nodes: Vec<QuadratureNode>,
-    /// Whether the substep is within the stability bound. Only a number of substeps that the scene gives can be
-    /// beyond it.
+    /// Whether the substep is within the stability bound ([`stability::is_stable`]). Only a number of substeps
+    /// that the scene gives can be beyond it; then the model has a warning.
     pub stable: bool,
 }
 
@@ -94,8 +106,8 @@ impl Plan {
 }
 
 impl Oscillator {
-    /// Returns the coefficients of a scene. Zeros are positive here, whatever their sign was, so that a
-    /// division by one gives +∞.
+    /// Returns the coefficients of a scene, for a point of the reference mass. Zeros are positive here,
+    /// whatever their sign was, so that a division by one gives +∞.
     pub fn of(scene: &Scene) -> Self {
         Oscillator {
             mass_kg: scene.point_mass_kg(),
@@ -149,7 +161,8 @@ impl Model {
         if bounded { self.sleep_tolerance } else { self.sleep_tolerance.min(f64::MIN_POSITIVE) }
     }
 
-    /// Returns the memory of the model itself, bytes.
+    /// Returns the memory of the model itself, bytes, approximately: tables of a mesh included, states of
+    /// tissues ([`Model::state_bytes`]) not.
     pub fn bytes(&self) -> u64 {
         let fixed = self.fixed.len() * (size_of::<usize>() + size_of::<[usize; 2]>());
         let vectors =
@@ -174,15 +187,15 @@ impl Model {
         }
     }
 
-    /// Returns the memory that a session of this model may take, bytes: its state, the checkpoint, and the
-    /// state at which an audit begins.
+    /// Returns the memory that a session of this model may take, bytes: three states ([`Model::state_bytes`]:
+    /// its own, the guard's checkpoint, and the one at which an audit begins) and the model.
     pub fn session_bytes(&self) -> u64 {
         const STATES: u64 = 3;
         STATES * self.state_bytes() + self.bytes()
     }
 
-    /// Returns the memory of a tissue's state, bytes: three components of u, d and the scheme's kept values for
-    /// each place in memory.
+    /// Returns the memory of one state of a tissue, bytes: three components of u, d and the scheme's kept
+    /// values for each place in memory, padding included, in the model's number format.
     pub fn state_bytes(&self) -> u64 {
         let fields = 2 + self.plan.scheme.kept(self.precision == Precision::Compensated);
         let plane_bytes = match self.precision {
@@ -194,17 +207,17 @@ impl Model {
         (fields * 3 * plane_bytes) as u64
     }
 
-    /// Returns the rest shape.
+    /// Returns the rest shape: the points, where they rest, and which are joined.
     pub fn shape(&self) -> &dyn RestShape {
         self.scene.shape()
     }
 
-    /// Returns all points.
+    /// Returns all points, by ascending index ([`PointId::index`]).
     pub fn points(&self) -> impl ExactSizeIterator<Item = PointId> + Clone + use<> {
         shape::points(self.shape())
     }
 
-    /// Returns the number of points.
+    /// Returns the number of points, fixed ones included; at least 1.
     pub fn len(&self) -> usize {
         self.shape().point_count()
     }
@@ -219,9 +232,10 @@ impl Model {
         self.graph.as_ref().map_or(point.index(), |graph| graph.slot_of(point))
     }
 
-    /// Returns the order in which frames show a mesh: its vertices in the order of memory, which keeps
-    /// neighbours together, and the place of each vertex in that order. `None` for a sheet, which frames show
-    /// in the order of its points.
+    /// Returns the order in which frames show a mesh, as two lists: the vertex at each position of a frame (in
+    /// the order of memory, which keeps neighbours together), and the position of each vertex. One is the
+    /// inverse of the other, over [`Model::len`] vertices. `None` for a sheet, which frames show in the order
+    /// of its points.
     pub fn shown_order(&self) -> Option<[&[u32]; 2]> {
         let slots = &self.graph.as_ref()?.slots;
         // Empty places are at the end.
@@ -233,17 +247,20 @@ impl Model {
         self.graph.as_ref().map_or(PointId::new(index), |graph| graph.point_in(index))
     }
 
-    /// Returns the mass of a point, kg.
+    /// Returns the mass of a point, kg: the reference mass [`Scene::point_mass_kg`] times
+    /// [`Scene::relative_mass`].
     pub fn mass_kg(&self, point: PointId) -> f64 {
         self.scene.point_mass_kg() * self.scene.relative_mass(point)
     }
 
-    /// Returns K″ of a point's anchor spring, N/m.
+    /// Returns K″ of a point's anchor spring, N/m: the reference value times
+    /// [`Scene::relative_anchor_stiffness`].
     pub fn anchor_stiffness_n_per_m(&self, point: PointId) -> f64 {
         self.scene.anchor_stiffness_n_per_m * self.scene.relative_anchor_stiffness(point)
     }
 
-    /// Returns C of a point, N·s/m. C/m is the same at every point.
+    /// Returns C of a point's damping force −C·v, N·s/m: the reference value times [`Scene::relative_mass`].
+    /// C/m is the same at every point.
     pub fn damping_n_s_per_m(&self, point: PointId) -> f64 {
         self.scene.damping_n_s_per_m * self.scene.relative_mass(point)
     }
@@ -264,13 +281,14 @@ impl Model {
         self.relative_mass_at(index) * (1.0 + self.extra_anchor_at(index))
     }
 
-    /// Returns the number of points that a substep computes, padding included: a short row costs as much as one
-    /// of a vector's width.
+    /// Returns the number of places that a substep computes with all points awake: rows times columns in
+    /// memory, a row counting as at least 16 columns, because a short row costs as much as one of a vector's
+    /// width.
     pub fn swept_points(&self) -> usize {
         self.points[0] * self.points[1].max(BLOCK)
     }
 
-    /// Returns false: a tissue has at least one point.
+    /// Returns false always: a tissue has at least one point.
     pub fn is_empty(&self) -> bool {
         false
     }

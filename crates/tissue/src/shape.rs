@@ -10,29 +10,34 @@ use serde::Serialize;
 
 use palpate_refusal::{Reason, Refusal, Result, finite, legible};
 
-/// A mass point of a tissue, as an index into arrays over all points. The rest shape gives its name and place.
+/// A mass point of a tissue, as an index into arrays over all its points: 0 to [`RestShape::point_count`] − 1.
+/// Point [i, j] of a sheet of nx × ny points has the index i·ny + j; on a mesh it is the number of the
+/// simulated vertex. It is valid for one rest shape only; other names are in [`PointName`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct PointId(usize);
 
 impl PointId {
-    /// Returns the point with this index in arrays over all points of the tissue.
+    /// Returns the point with this index in arrays over all points of the tissue. The index isn't checked: most
+    /// functions panic on a point that the tissue does not have.
     pub fn new(index: usize) -> Self {
         PointId(index)
     }
 
-    /// Returns the point's index in arrays over all points of the tissue.
+    /// Returns the point's index, from 0, in arrays over all points of the tissue.
     pub fn index(self) -> usize {
         self.0
     }
 }
 
-/// The name of a point in scripts, records and messages.
+/// The name of a point in scripts, records and messages, as people write it. [`RestShape::find`] gives its
+/// point, [`RestShape::name`] the name of a point. As text, `FromStr` reads `X,Y` (a point of a sheet) or one
+/// number (a vertex).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum PointName {
-    /// Point [i, j] of a sheet: index i along x, index j along y.
+    /// Point [i, j] of a sheet, from [0, 0]: index i along x, index j along y.
     Point([usize; 2]),
-    /// A vertex of a mesh, numbered from 0 as in its file.
+    /// A vertex of a mesh, numbered from 0 as in its file, also if the simulated mesh has fewer vertices.
     Vertex(u32),
 }
 
@@ -57,7 +62,7 @@ impl FromStr for PointName {
     }
 }
 
-/// The box around a shape at rest, parallel to the axes.
+/// The box around a shape at rest, parallel to the axes of the tissue's frame. A sheet's box is flat: z is 0.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Extent {
     /// The least of each coordinate, m.
@@ -67,13 +72,13 @@ pub struct Extent {
 }
 
 impl Extent {
-    /// Returns the box around places, m. Without places, its ends are infinite.
+    /// Returns the box around places, m. Without places, `least_m` is +∞ and `most_m` is −∞.
     pub fn around(places_m: impl Iterator<Item = DVec3> + Clone) -> Self {
         let least_m = places_m.clone().fold(DVec3::INFINITY, DVec3::min);
         Extent { least_m, most_m: places_m.fold(DVec3::NEG_INFINITY, DVec3::max) }
     }
 
-    /// Returns the middle of the box, m.
+    /// Returns the middle of the box, m, in the tissue's frame. NaN for the box around no places.
     pub fn middle_m(&self) -> DVec3 {
         (self.least_m + self.most_m) / 2.0
     }
@@ -91,47 +96,58 @@ impl fmt::Display for Extent {
     }
 }
 
-/// The rest shape of a tissue. Its points are numbered from 0 without a gap.
+/// The rest shape of a tissue: its points, in the tissue's frame (the axes of the scene or mesh file, m).
+/// Points are numbered from 0 without a gap. It never changes. A method that takes a [`PointId`] panics if the
+/// shape has no such point.
 pub trait RestShape: fmt::Debug + Send + Sync {
-    /// Returns the size in points as text, for people.
+    /// Returns the size in points as text for people, such as `31 × 31 points` or `500 vertices`.
     fn describe(&self) -> String;
     /// Returns the number of points, at least 1.
     fn point_count(&self) -> usize;
-    /// Returns the name of a point.
+    /// Returns the name of a point. If a mesh is simulated more coarsely than its file, it is the number of a
+    /// nearby vertex of the file.
     fn name(&self, point: PointId) -> PointName;
-    /// Returns the point of a name.
+    /// Returns the point of a name. If a mesh is simulated more coarsely than its file, it is the vertex
+    /// nearest to the named vertex of the file: several names may have the same point.
     ///
     /// # Errors
-    /// Refuses a name that no point has; `field` is the key that the refusal gives.
+    /// Refuses a name that is beyond the shape ([`Reason::OffTissue`]), and a vertex of a sheet or a point [i,
+    /// j] of a mesh ([`Reason::WrongKind`]); `field` is the key that the refusal gives.
     fn find(&self, field: &str, name: PointName) -> Result<PointId>;
-    /// Returns the rest position of a point, m.
+    /// Returns the rest position of a point, m, in the tissue's frame.
     fn rest_m(&self, point: PointId) -> DVec3;
-    /// Returns the unit normal of the surface at a point at rest, out of the tissue.
+    /// Returns the unit normal of the surface at a point at rest, out of the tissue: +z on a sheet; on a mesh,
+    /// the mean over the triangles around the vertex, weighted by area (+z if they have no area).
     fn normal(&self, point: PointId) -> DVec3;
-    /// Returns whether a point never moves.
+    /// Returns whether the scene fixes a point, so that it never moves.
     fn is_fixed(&self, point: PointId) -> bool;
     /// Returns the points that are joined to a point by springs within the surface (structural and shear
-    /// springs, or edges), ascending.
+    /// springs of a sheet, edges of a mesh), ascending, each once. Bending springs don't count.
     fn neighbours(&self, point: PointId) -> Vec<PointId>;
-    /// Returns the point that rests nearest to a place, m.
+    /// Returns the point that rests nearest to a place, m; on a sheet, z of the place does not count. A vertex
+    /// without an edge is never the nearest.
     fn nearest(&self, place_m: DVec3) -> PointId;
-    /// Returns the points that rest within a distance of a place, ascending. A sheet also returns some beyond
-    /// it.
+    /// Returns the points that rest within `radius_m` of a place, m, ascending, each once; empty if there are
+    /// none. A sheet ignores z of the place and returns those of the square around the circle; for a place off
+    /// the sheet, also some of its rim.
     fn around(&self, place_m: DVec3, radius_m: f64) -> Vec<PointId>;
-    /// Returns the box around all points.
+    /// Returns the box around all points at rest; vertices without an edge don't count.
     fn extent(&self) -> Extent;
-    /// Returns the usual distance between neighbours, m.
+    /// Returns the usual distance between neighbours at rest, m: the spacing of a sheet, the mean length of a
+    /// mesh's edges. It is the tissue's unit of length h.
     fn edge_m(&self) -> f64;
 
-    /// Returns the highest place of the surface in line with the middle of the box, m. Haptic devices have
-    /// their origin there, so that a tip that comes down meets the tissue.
+    /// Returns the highest place of the surface in line with the middle of the box, m, in the tissue's frame;
+    /// on a sheet, the middle. Haptic devices have their origin there, so that a tip that comes down meets the
+    /// tissue.
     fn top_m(&self) -> DVec3 {
         self.extent().middle_m()
     }
 
-    /// Returns the place, m, where a newly placed tool with a tip of `radius_m` begins on its way to a place:
-    /// outside the tissue or within it, but not in the surface, so that it meets the surface as a hand does.
-    /// `None` means above that place (on a sheet).
+    /// Returns the place, m, where a newly placed tool with a tip of `radius_m` begins on its way to `place_m`:
+    /// on the side of `place_m`, and at least 2 mm off the surface at rest, so that it meets the surface as a
+    /// hand does. A place at most `radius_m` inside a closed mesh counts as outside. `None` on a sheet, where a
+    /// tool begins straight above `place_m`.
     fn approach_m(&self, _place_m: DVec3, _radius_m: f64) -> Option<DVec3> {
         None
     }
@@ -141,24 +157,25 @@ pub trait RestShape: fmt::Debug + Send + Sync {
         3
     }
 
-    /// Returns the longest side of the box, or the distance between neighbours if that is longer, m.
+    /// Returns the longest side of the box around the shape, or [`RestShape::edge_m`] if that is longer, m.
     fn longest_side_m(&self) -> f64 {
         self.extent().size_m().max_element().max(self.edge_m())
     }
 
-    /// Returns whether a place is within the box around the shape, or beside it by at most a tenth of its
-    /// longest side: a tool that strokes over the edge is still felt.
+    /// Returns whether a place, m, is within the box around the shape, or beyond it along each axis by at most
+    /// a tenth of its longest side ([`RestShape::longest_side_m`]): a tool that strokes over the edge is still
+    /// felt.
     fn is_near(&self, place_m: DVec3) -> bool {
         let Extent { least_m, most_m } = self.extent();
         let margin_m = DVec3::splat(0.1 * self.longest_side_m());
         place_m.cmpge(least_m - margin_m).all() && place_m.cmple(most_m + margin_m).all()
     }
 
-    /// Checks the place of a force.
+    /// Checks the place of a force, m.
     ///
     /// # Errors
-    /// Refuses a place that is not finite or not near ([`RestShape::is_near`]); `field` is the key that the
-    /// refusal gives.
+    /// Refuses a place that is not finite ([`Reason::NotFinite`]), and one that is not near the shape
+    /// ([`RestShape::is_near`], [`Reason::OffTissue`]); `field` is the key that the refusal gives.
     fn check_place(&self, field: &str, place_m: DVec3) -> Result<()> {
         for component in place_m.to_array() {
             finite(field, component)?;
@@ -173,7 +190,8 @@ pub trait RestShape: fmt::Debug + Send + Sync {
     }
 }
 
-/// Returns all points of a shape, ascending.
+/// Returns all points of a shape, ascending: indices 0 to [`RestShape::point_count`] − 1, fixed points and
+/// vertices without an edge included.
 pub fn points(shape: &dyn RestShape) -> impl ExactSizeIterator<Item = PointId> + Clone + use<> {
     (0..shape.point_count()).map(PointId)
 }
