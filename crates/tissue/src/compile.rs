@@ -135,7 +135,7 @@ impl Model {
     ///
     /// # Errors
     /// Refuses every scene that [`Model::compile`] refuses; and refuses if `stop` is set before the rehearsals
-    /// end ([`Reason::TimedOut`]). A scene that needs no rehearsal may be compiled all the same.
+    /// end ([`Reason::TimedOut`]).
     pub fn compile_until(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<Arc<Self>> {
         scene.check(limits)?;
         // Before the rehearsals, which run sweeps.

@@ -18,9 +18,9 @@ use crate::tools::contact::{TangentInput, ToolContact};
 use crate::tools::prescribed::Grasp;
 use palpate_haptics::Tip;
 
-/// One mass point at the end of a step: displacement, velocity, and the forces on it, in the tissue's frame. A
-/// force on the point is positive along the axes. Where the applied force jumps, this is the value just before
-/// the jump; at step 0, just after it. [`Tissue::point`] returns it.
+/// One mass point at the end of a step: displacement, velocity, and the forces on it, as vectors in the
+/// tissue's frame. Where the applied force jumps, this is the value just before the jump; at step 0, just after
+/// it. [`Tissue::point`] returns it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointState {
     /// Displacement from rest, m.
@@ -165,8 +165,8 @@ pub trait Tissue: Send {
     /// Returns the present scheme and substep. The guard may have halved the substep of the model's plan up to
     /// 4 times ([`MAX_HALVINGS`](crate::guard::MAX_HALVINGS)).
     fn plan(&self) -> &Plan;
-    /// Returns how many times the guard went back to a checkpoint and repeated with a shorter substep, since
-    /// the tissue was created.
+    /// Returns how many times the guard went back to a checkpoint and repeated the steps since with a shorter
+    /// substep, successfully. Several halvings for one fault count once; a blow-up does not count.
     fn guard_events(&self) -> u64;
     /// Returns the step of the state that a blow-up would go back to. Without a checkpoint (a still tissue, or
     /// one that has not moved yet) it is the present step.
@@ -183,8 +183,8 @@ pub trait Tissue: Send {
     /// Skips `steps` steps of a still tissue, at no cost. The result is then the same as that of single steps.
     /// Whether the tissue is still ([`Tissue::is_still`]) isn't checked.
     fn skip_steps(&mut self, steps: u64);
-    /// Returns the fraction, 0 to 1 or more, of all points in all substeps that were computed since the tissue
-    /// was created: the rest slept or was skipped. 1 before the first substep.
+    /// Returns the fraction, 0 to 1, of all points in all substeps that were computed since the tissue was
+    /// created: the rest slept or was skipped. 1 before the first substep.
     fn computed_fraction(&self) -> f64;
     /// Advances one step, however often the guard must repeat it. If a step is unfinished, it only finishes
     /// that one.
@@ -218,9 +218,10 @@ pub trait Tissue: Send {
     /// is that of the nearest point.
     fn surface_displacement_m(&self, place_m: DVec3) -> DVec3;
     /// Returns the force of the tissue on a tool whose force acts around a place, N: the mean Σ w·r/Σ w of the
-    /// reactions r of the points around `poke.centre_m`. The weight w is that of the force, e^{−c·distance},
-    /// tapered to 0 at some spacings, so that the mean changes smoothly while the place moves. Without a point
-    /// there, it is the reaction at the nearest.
+    /// reactions r ([`PointState::reaction_n`]) of the points around `poke.centre_m`. The weight w is that of
+    /// the force, e^{−c·distance}, tapered to 0 at 1.5 to 4 times
+    /// [`RestShape::edge_m`](crate::shape::RestShape::edge_m), so that the mean changes smoothly while the
+    /// place moves. Without a point there, it is the reaction at the nearest.
     fn reaction_around_n(&self, poke: &Poke) -> DVec3;
     /// Returns the energies at the end of the last step. It costs about a substep of the awake points; sleeping
     /// tiles use stored values. Earlier calls do not affect the result.

@@ -9,14 +9,17 @@ use super::matrix::Matrix;
 use crate::kernel::lanes::Vector;
 use crate::kernel::real::Real;
 
-/// The two-step form d ← p·d + q·(N − a·u + F), u ← u + d, where d is the increment of the last substep.
+/// The two-step form d ← p·d + q·(N − a·u + F), u ← u + d of `central` and `lagged`, where d is the increment
+/// of the last substep, N the springs' force and F the tools' ([units](super)). a = K″·dt²/m and g = C·dt/m
+/// below.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TwoStep {
-    /// p: the part of the last increment that damping leaves.
+    /// p: the part of the last increment that damping leaves: (1 − g/2)/(1 + g/2) for `central`, 1 − g for
+    /// `lagged`.
     pub p: f64,
-    /// q: the increment per unit of force.
+    /// q: the increment per unit of force: 1/(1 + g/2) for `central`, 1 for `lagged`.
     pub q: f64,
-    /// a = K″·dt²/m.
+    /// a = K″·dt²/m, the pull of the anchor spring.
     pub a: f64,
 }
 

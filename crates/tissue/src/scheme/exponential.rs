@@ -35,17 +35,20 @@ use crate::kernel::real::Real;
 /// The largest p.
 const ORDER_MAX: usize = 4;
 
-/// The weights of the scheme that keeps p = `ORDER` values of the springs' force. Each weight has a part for u
-/// and one for w.
+/// The weights of the exponential multistep scheme that keeps p = `ORDER` earlier values of the springs' force
+/// N, for one tissue and substep; `ORDER` is 2, 3 or 4, and the scheme's order is p + 1. A weight pair has a
+/// part for u, then one for w. [`Scheme::fit`](super::Scheme::fit) computes them. N₋ᵢ is N at the time i
+/// substeps ago.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Multistep<const ORDER: usize> {
     /// E − 1, by rows.
     linear: [[f64; 2]; 2],
     /// Weights of N₀, N₋₁, … N₋p.
     springs: Vec<[f64; 2]>,
-    /// γ: the weights with which the error of the predicted force corrects u and w.
+    /// γ: the weights with which the error of the predicted force ([`Multistep::prediction_error`]) corrects u
+    /// and w.
     pub correction: [f64; 2],
-    /// e: weights of N₋₁, … N₋p in the prediction of N₀.
+    /// e: the p weights of N₋₁, … N₋p, in this order, in the prediction of N₀.
     pub extrapolation: Vec<f64>,
     /// ∫ e^{A(1−s)}·b·sʲ ds for j = 0, 1, …
     moments: Vec<[f64; 2]>,
@@ -117,8 +120,9 @@ pub(super) fn fit<const ORDER: usize>(a: f64, g: f64) -> Multistep<ORDER> {
 }
 
 impl<const ORDER: usize> Multistep<ORDER> {
-    /// Returns the difference between the springs' force and its prediction. `history` has p + 1 values of the
-    /// force, at 0, −1, …, −p.
+    /// Returns the difference N₀ − Σ eᵢ·N₋ᵢ between the springs' force and its prediction, in the unit of
+    /// `history`, which has the p + 1 values N₀, N₋₁, …, N₋p, newest first. Panics if `history` is empty;
+    /// missing later values count as 0.
     pub fn prediction_error(&self, history: &[f64]) -> f64 {
         history[0] - self.extrapolation.iter().zip(&history[1..]).map(|(weight, past)| weight * past).sum::<f64>()
     }

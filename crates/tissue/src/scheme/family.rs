@@ -4,12 +4,13 @@ use super::arithmetic::Arithmetic;
 use super::matrix::Matrix;
 use crate::kernel::real::Real;
 
-/// A moment of a substep at which a tool's force is evaluated.
+/// A moment of a substep at which a tool's force is evaluated, and what its value adds to the scheme.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct QuadratureNode {
     /// Fraction of the substep: 0 is its beginning, 1 its end.
     pub fraction: f64,
-    /// Weights with which the force (times dt²/(m·h)) adds to each field of the scheme.
+    /// Weights with which the force (times dt²/(m·h)) adds to each of the scheme's force fields; those beyond
+    /// its last field are 0.
     pub weights: [f64; 3],
 }
 

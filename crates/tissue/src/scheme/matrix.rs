@@ -3,7 +3,8 @@
 /// Rows of the largest matrix: u, d and the kept values; or u, d and the powers that give a scheme's weights.
 const LONGEST: usize = 7;
 
-/// A small square matrix, by rows, without heap memory: choosing a scheme creates many thousands.
+/// A square matrix of at most 7 rows, stored by rows without heap memory: choosing a scheme creates many
+/// thousands.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Matrix {
     n: usize,
@@ -11,7 +12,8 @@ pub struct Matrix {
 }
 
 impl Matrix {
-    /// Creates an n × n matrix from the value at each row and column; n is at most 7.
+    /// Creates the n × n matrix with `value(row, column)` at each row and column, from 0. n is 1 to 7; others
+    /// panic.
     pub fn of(n: usize, value: impl Fn(usize, usize) -> f64) -> Self {
         let mut values = [0.0; LONGEST * LONGEST];
         for (i, row) in values[..n * n].chunks_exact_mut(n).enumerate() {
@@ -20,7 +22,8 @@ impl Matrix {
         Matrix { n, values }
     }
 
-    /// Returns the value at a row and column.
+    /// Returns the value at a row and column, from 0 to n − 1. Others are not checked: they panic or return
+    /// another entry.
     pub fn at(&self, row: usize, column: usize) -> f64 {
         self.values[row * self.n + column]
     }
@@ -64,7 +67,8 @@ impl Matrix {
     }
 
     /// Returns the largest magnitude among the eigenvalues: the 2ᵏ-th root of the size of the 2ᵏ-th power
-    /// (Gelfand's formula, ρ(A) = lim ‖Aⁿ‖^{1/n}).
+    /// (Gelfand's formula, ρ(A) = lim ‖Aⁿ‖^{1/n}), with k up to 35. 0 for a nilpotent matrix; infinite or 0 for
+    /// one that is not finite.
     pub fn spectral_radius(&self) -> f64 {
         let (mut power, mut logarithm, mut exponent) = (*self, 0.0, 1.0);
         for _ in 0..36 {

@@ -29,10 +29,11 @@ use crate::scene::Integrator;
 use family::{Family, Release};
 use matrix::Matrix;
 
-/// A scheme with its coefficients for a tissue and a substep: one variant for each arithmetic.
+/// A scheme with its coefficients for a tissue and a substep: one variant for each arithmetic. [`Scheme::fit`]
+/// creates it. Values of its methods are in the module's [units](self).
 #[derive(Debug, Clone, PartialEq)]
 pub enum Scheme {
-    /// `central` and `lagged`.
+    /// `central` and `lagged`, which differ in their coefficients alone.
     TwoStep(TwoStep),
     /// The exponential multistep scheme that keeps 2 earlier forces of the springs.
     Exponential2(Multistep<2>),
@@ -40,7 +41,7 @@ pub enum Scheme {
     Exponential3(Multistep<3>),
     /// The exponential multistep scheme that keeps 4 earlier forces of the springs.
     Exponential4(Multistep<4>),
-    /// The classical fourth-order Runge–Kutta scheme.
+    /// The classical fourth-order Runge–Kutta scheme, `rk4`.
     Rk4(Rk4),
 }
 
@@ -113,13 +114,16 @@ fn like<'t, F: 'static>(_from: &F, to: &'t dyn Any) -> Option<&'t F> {
     to.downcast_ref()
 }
 
-/// Returns the power p of the substep with which the error of an integrator falls, as dtᵖ.
+/// Returns the power p of the substep with which the error of an integrator falls, as dtᵖ: 1 for `lagged`, 2
+/// for `central` (and for `auto`), 4 for `rk4`, 3 to 5 for `exponential2` to `exponential4`.
 pub fn order(integrator: Integrator) -> f64 {
     entry(integrator).order
 }
 
 impl Scheme {
-    /// Creates an integrator's scheme with coefficients for a = K″·dt²/m and g = C·dt/m.
+    /// Creates an integrator's scheme with coefficients for a = K″·dt²/m and g = C·dt/m
+    /// ([`Oscillator::scaled`]). `auto` gives `central`. Whether it is stable is not checked: see
+    /// [`stability::is_stable`].
     pub fn fit(integrator: Integrator, a: f64, g: f64) -> Self {
         (entry(integrator).fit)(a, g)
     }
@@ -140,40 +144,44 @@ impl Scheme {
         each!(self, |family| family.fraction_after(sweep))
     }
 
-    /// Returns how the tools' force enters a substep: the moments (0 to 1) at which it is evaluated, and the
-    /// weights with which each value adds to the scheme's force fields.
+    /// Returns how the tools' force enters a substep: the moments, by ascending fraction, at which it is
+    /// evaluated, and the weights with which each value adds to the scheme's force fields.
     pub fn nodes(&self) -> Vec<QuadratureNode> {
         each!(self, |family| family.nodes())
     }
 
-    /// Returns whether a force that jumps must be given as the mean of both sides.
+    /// Returns whether a force that jumps must be given as the mean of both sides: true for `central` and
+    /// `lagged`.
     pub fn takes_means(&self) -> bool {
         each!(self, |family| family.takes_means())
     }
 
-    /// Returns the factor that scales the springs' forces in addition to dt²/(m·h).
+    /// Returns the factor that scales the springs' forces in addition to dt²/(m·h): [`TwoStep::q`] for two-step
+    /// schemes, otherwise 1.
     pub fn spring_scale(&self) -> f64 {
         each!(self, |family| family.spring_scale())
     }
 
-    /// Returns the velocity that a constant force of 1 adds in a substep (nearly), through the last of its
-    /// fields. Units as in the scheme: d per substep.
+    /// Returns the velocity, as d per substep, that a constant force of 1 adds in a substep (nearly): the
+    /// second value of [`Scheme::constant`].
     pub fn impulse(&self) -> f64 {
         self.constant()[1]
     }
 
-    /// Returns the index of the field of the tools' force that adds to the velocity.
+    /// Returns the index, from 0, of the field of the tools' force that adds to the velocity; it is the last
+    /// one.
     pub fn last_field(&self) -> usize {
         each!(self, |family| family.last_field())
     }
 
-    /// Returns the u and d that a constant force of 1 adds in a substep. Exact for exponential schemes: ∫₀¹
-    /// e^{A(1−s)}·b ds (see `exponential.rs`).
+    /// Returns the u and d that a constant force of 1 adds in a substep to a point at rest. Exact for
+    /// exponential schemes: ∫₀¹ e^{A(1−s)}·b ds (see `exponential.rs`).
     pub fn constant(&self) -> [f64; 2] {
         each!(self, |family| family.constant())
     }
 
-    /// Returns the u and d that an impulse of 1 at a substep's beginning has added by its end.
+    /// Returns the u and d that an impulse of 1 (a sudden velocity of one spacing per substep) at a substep's
+    /// beginning has added by its end, to a point at rest.
     pub fn kick(&self) -> [f64; 2] {
         each!(self, |family| family.kick())
     }
@@ -185,19 +193,20 @@ impl Scheme {
     }
 
     /// Returns how many of the kept fields, from the first, are the springs' forces of earlier substeps, newest
-    /// first.
+    /// first: p for the exponential schemes, otherwise 0.
     pub fn history(&self) -> usize {
         each!(self, |family| family.history())
     }
 
-    /// Returns the matrix that advances u, d and the kept values of a single vibration whose springs pull with −z·u.
-    /// Its eigenvalues determine stability and accuracy.
+    /// Returns the matrix that advances (u, d, kept values) by one substep, for a single vibration without
+    /// tools whose springs pull with −z·u. z = (ω·dt)² is at least 0. Its eigenvalues determine stability and
+    /// accuracy.
     pub fn propagator(&self, z: f64) -> Matrix {
         each!(self, |family| family.propagator(z))
     }
 
     /// Returns the largest growth factor of a vibration z = (ω·dt)² in a substep: the spectral radius of its
-    /// propagator.
+    /// propagator. Above 1 the vibration grows.
     pub fn growth(&self, z: f64) -> f64 {
         self.propagator(z).spectral_radius()
     }

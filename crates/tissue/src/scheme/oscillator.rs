@@ -1,6 +1,7 @@
 //! The properties of a tissue that a scheme is fitted to.
 
-/// The properties of a tissue that a scheme depends on, for a point of the reference mass.
+/// The properties of a tissue that a scheme depends on, for a point of the reference mass. [`Oscillator::of`]
+/// takes them from a scene.
 #[derive(Debug, Clone, Copy)]
 pub struct Oscillator {
     /// Mass of the point, kg.
@@ -9,19 +10,20 @@ pub struct Oscillator {
     pub damping_n_s_per_m: f64,
     /// K″ of its anchor spring, N/m.
     pub anchor_stiffness_n_per_m: f64,
-    /// The largest eigenvalue of the springs' stiffness under any deformation, N/m.
+    /// λ: an upper bound of the largest eigenvalue of the springs' stiffness under any deformation, N/m
+    /// ([`largest_stiffness_n_per_m`](super::stability::largest_stiffness_n_per_m)).
     pub spring_stiffness_n_per_m: f64,
 }
 
 impl Oscillator {
-    /// Returns a = K″·dt²/m and g = C·dt/m for a substep of length dt.
+    /// Returns a = K″·dt²/m and g = C·dt/m, without unit, for a substep of length dt = `substep_s`, s.
     pub fn scaled(&self, substep_s: f64) -> (f64, f64) {
         let a = self.anchor_stiffness_n_per_m * substep_s * substep_s / self.mass_kg;
         (a, self.damping_n_s_per_m * substep_s / self.mass_kg)
     }
 
-    /// Returns the springs' largest stiffness in units of a substep, (ω·dt)² = λ·dt²/m, with λ their largest
-    /// eigenvalue.
+    /// Returns the springs' largest stiffness in units of a substep of length dt = `substep_s`, s: (ω·dt)² =
+    /// λ·dt²/m, without unit, with λ their largest eigenvalue.
     pub fn scaled_spring_stiffness(&self, substep_s: f64) -> f64 {
         self.spring_stiffness_n_per_m * substep_s * substep_s / self.mass_kg
     }

@@ -28,12 +28,13 @@ fn step(pull: f64, g: f64, force: f64, y: [f64; 2]) -> [f64; 2] {
     [0, 1].map(|c: usize| y[c] + (k1[c] + 2.0 * k2[c] + 2.0 * k3[c] + k4[c]) / 6.0)
 }
 
-/// The scheme for y′ = (w, N − a·u − g·w + F).
+/// The classical scheme of Runge and Kutta for y′ = (w, N − a·u − g·w + F), y = (u, w), with N the springs'
+/// force and F the tools' ([units](super)).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rk4 {
-    /// a = K″·dt²/m.
+    /// a = K″·dt²/m, the pull of the anchor spring.
     pub a: f64,
-    /// g = C·dt/m.
+    /// g = C·dt/m, the damping.
     pub g: f64,
 }
 

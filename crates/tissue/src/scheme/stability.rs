@@ -8,7 +8,8 @@ use crate::scheme::{Bound, Oscillator, Scheme, entry};
 pub const THETA: f64 = 0.25;
 
 /// Returns the factor, from 1 to 8, by which a turn must be smaller than [`THETA`] because vibrations last.
-/// `decay_s` is τ = 2m/C.
+/// `omega_per_s` is the fastest vibration ω_b, rad/s; `decay_s` is τ = 2m/C, s, which may be infinite. If
+/// nothing vibrates and nothing damps (0·∞), it is 1.
 ///
 /// Central differences make a vibration ω faster by ω(dt·ω)²/24. The phase error adds up for as long as the
 /// vibration lasts, τ, to (ω·τ)(dt·ω)²/24. The same error then requires a turn smaller by √(ω·τ). Up to ω_b·τ =
@@ -44,8 +45,8 @@ pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
     }
 }
 
-/// Returns an upper bound of the springs' stiffness without the pressure of a volume, k·β + K″·ε on a mesh, N/m
-/// ([`largest_stiffness_n_per_m`]).
+/// Returns an upper bound of the springs' stiffness without the pressure of a volume, N/m: k·β + K″·ε on a
+/// mesh, with β and ε as in [`largest_stiffness_n_per_m`], to which it is equal for a tissue without a volume.
 pub fn stiffness_of_springs_n_per_m(scene: &Scene) -> f64 {
     match &scene.body {
         Body::Mesh(mesh) if mesh.volume.is_some() => {
@@ -56,8 +57,9 @@ pub fn stiffness_of_springs_n_per_m(scene: &Scene) -> f64 {
     }
 }
 
-/// Returns the factor from rounding errors of displacements to force, N/m. The errors of many points hardly add
-/// up to a change of the volume: λ + κ·σ/√n, with λ the springs' stiffness, σ = Σ a²/(m·V0) and n points.
+/// Returns the approximate factor from rounding errors of displacements, m, to force, N; in N/m. The errors of
+/// many points hardly add up to a change of the volume: λ + κ·σ/√n, with λ the springs' stiffness
+/// ([`stiffness_of_springs_n_per_m`]), κ the volume's, σ = Σ a²/(m·V0) and n points. Without a volume it is λ.
 #[allow(clippy::cast_precision_loss)]
 pub fn approximate_stiffness_n_per_m(scene: &Scene) -> f64 {
     let of_springs = stiffness_of_springs_n_per_m(scene);
@@ -104,8 +106,10 @@ const VIBRATIONS: u32 = 48;
 /// Largest growth factor of a vibration per substep that counts as stable: 1 plus rounding error.
 const NO_GROWTH: f64 = 1.0 + 1e-7;
 
-/// Returns whether no vibration grows, for springs up to `stiffness` = (ω·dt)². It tests that each eigenvalue
-/// of the scheme's propagator has at most size 1, at 49 stiffnesses z = `stiffness`·(k/48)².
+/// Returns whether no vibration grows, for springs up to `stiffness` = (ω·dt)², without unit
+/// ([`Oscillator::scaled_spring_stiffness`]). It tests that each eigenvalue of the scheme's propagator has at
+/// most size 1 (+ 1e-7 for rounding), at 49 stiffnesses z = `stiffness`·(k/48)², k = 0 to 48; a fault between
+/// them would stay unseen.
 pub fn is_stable(scheme: &Scheme, stiffness: f64) -> bool {
     (0..=VIBRATIONS).all(|k| {
         // Dense towards the stiff end, where schemes fail first.
@@ -114,8 +118,8 @@ pub fn is_stable(scheme: &Scheme, stiffness: f64) -> bool {
     })
 }
 
-/// Returns the fewest substeps in a step of `step_s` with which any scheme is stable. Saturates for absurd
-/// scenes.
+/// Returns the fewest substeps, at least 1, in a step of `step_s`, s, with which any scheme is stable.
+/// Saturates at `u32::MAX`.
 ///
 /// This is dt·ω_b ≤ 2, the bound of central differences: u₊ − (2 − W)·u + u₋ = 0 with W = (dt·ω)² has the
 /// solutions zⁿ with z² − (2 − W)·z + 1 = 0, and both are on the unit circle if |2 − W| ≤ 2.
@@ -123,8 +127,10 @@ pub fn least_substeps(step_s: f64, sheet: &Oscillator) -> u32 {
     substeps_of_turn(step_s, sheet.omega_bound_per_s(), 2.0)
 }
 
-/// Returns the fewest substeps in a step of `step_s` with which a scheme is stable ([`is_stable`]). It tries
-/// upwards from [`least_substeps`], an eighth more each time. Saturates for absurd scenes.
+/// Returns about the fewest substeps in a step of `step_s`, s, with which an integrator is stable
+/// ([`is_stable`]). It tries upwards from [`least_substeps`], an eighth more each time. It ends, even if the
+/// test never succeeds, where the fastest vibration turns by 0.1 rad in a substep and C·dt/m is at most 1:
+/// there every scheme is stable but for rounding. Saturates at `u32::MAX`.
 pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     let mut substeps = least_substeps(step_s, sheet);
     let stable = |substeps: u32| {
@@ -142,11 +148,12 @@ pub fn stable_substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) 
     substeps
 }
 
-/// Returns the fewest substeps in a step of `step_s` with which an integrator for comparison is stable, and as
-/// accurate as it promises. Saturates for absurd scenes.
+/// Returns the number of substeps in a step of `step_s`, s, that an integrator gets without rehearsals. For
+/// exponential schemes, `rk4` and `auto` (as `central`) it is [`stable_substeps`]; for `central` and `lagged`,
+/// what makes them as accurate as they promise:
 ///
-/// For `central` this is dt·ω_b ≤ [`THETA`]/e, with e = [`endurance`] at τ = 2m/C; for `lagged` also C·dt/m ≤
-/// 1, half of its bound 2 (W + 2g < 4 with W = 0).
+/// dt·ω_b ≤ [`THETA`]/e, with e = [`endurance`] at τ = 2m/C; for `lagged` also C·dt/m ≤ 1, half of its bound 2
+/// (W + 2g < 4 with W = 0). Saturates at `u32::MAX`.
 pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 {
     let decay_s = 2.0 * sheet.mass_kg / sheet.damping_n_s_per_m;
     let omega = sheet.omega_bound_per_s();
@@ -160,8 +167,8 @@ pub fn substeps(integrator: Integrator, step_s: f64, sheet: &Oscillator) -> u32 
     }
 }
 
-/// Returns the fewest substeps with dt·`omega_per_s` ≤ `theta` (rad), dt = `step_s` / substeps. Saturates for
-/// absurd scenes.
+/// Returns the fewest substeps, at least 1, with dt·`omega_per_s` ≤ `theta`, dt = `step_s` / substeps; in s,
+/// rad/s and rad. Saturates at `u32::MAX`.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn substeps_of_turn(step_s: f64, omega_per_s: f64, theta: f64) -> u32 {
     (step_s * omega_per_s / theta).ceil().clamp(1.0, f64::from(u32::MAX)) as u32

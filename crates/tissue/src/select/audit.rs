@@ -32,7 +32,8 @@ pub use crate::select::audit_window::{Mark, SharedCheckpoint, WindowInputs};
 use crate::state::tissue_state::{TissueState, springs_of};
 use crate::tools::applied_force::Applied;
 
-/// How many substeps of the twin (the repetition in f64) replace one of the tissue.
+/// How many substeps of the twin (the repetition in f64) usually replace one of the tissue: the argument
+/// `finer` of [`Audit::work`].
 pub const FINER: u32 = 4;
 
 /// Longest window, s, before it is rounded up to the next checkpoint.
@@ -41,14 +42,14 @@ const LONGEST_S: f64 = 0.25;
 /// Points times substeps in a slice of an audit, which takes some milliseconds.
 const SLICE: u64 = 1 << 20;
 
-/// The main source of an error.
+/// The main source of an error that an audit measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Origin {
     /// The scheme with this substep.
     Substep,
     /// The rounding of the number format.
     Rounding,
-    /// Tiles at rest, which are not computed.
+    /// Tiles at rest, which were not computed.
     Sleep,
 }
 
@@ -63,23 +64,26 @@ impl Origin {
     }
 }
 
-/// The result of an audit of a window of steps.
+/// A complete window, made by [`WindowOpening::close`]: everything needed to repeat it. It does not depend on
+/// the tissue any more, so any thread can do the work.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AuditFinding {
     /// Steps done at the end of the window.
     pub step: u64,
-    /// The error that the window added.
+    /// The error that the window added, relative to `largest`.
     pub error: AuditedError,
-    /// The main source of the error; `None` if the error is within the scene's tolerance.
+    /// The main source of the error; `None` if the error is within the scene's tolerance, and no source was
+    /// looked for.
     pub origin: Option<Origin>,
-    /// Substeps per step in the window, including the guard's halvings.
+    /// Substeps per step at the beginning of the window, including the guard's halvings.
     pub substeps: u32,
-    /// The largest displacement and force of this and earlier windows, to which the next window's error is
-    /// relative.
+    /// The largest displacement and force of this and earlier windows: pass it to the next window's
+    /// [`Audit::work`].
     pub largest: ErrorExtent,
 }
 
-/// Largest components of displacement and force over the points of a tissue.
+/// Largest components of displacement and force over the points of a tissue: along any axis, without sign.
+/// `default()` is 0 for both, for the first window.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct ErrorExtent {
     /// Largest component of a displacement, m.
@@ -89,7 +93,7 @@ pub struct ErrorExtent {
 }
 
 impl ErrorExtent {
-    /// Returns the larger value of each quantity.
+    /// Returns the larger displacement and the larger force of the two.
     pub fn max(self, other: Self) -> Self {
         ErrorExtent {
             displacement_m: self.displacement_m.max(other.displacement_m),
@@ -100,7 +104,7 @@ impl ErrorExtent {
 
 impl ErrorExtent {
     /// Returns these differences relative to the largest values: max|Δu|/max|u| and max|Δf|/max|f|; 0 where
-    /// nothing differs.
+    /// nothing differs, and infinite where something differs and the largest value is 0.
     pub fn relative_to(self, largest: ErrorExtent) -> AuditedError {
         let part = |difference: f64, largest: f64| if difference == 0.0 { 0.0 } else { difference / largest };
         AuditedError {
@@ -110,7 +114,8 @@ impl ErrorExtent {
     }
 }
 
-/// A copy of the tissue at the beginning of a window.
+/// A copy of the tissue at the beginning of a window, made by [`SharedCheckpoint::open`].
+/// [`WindowOpening::close`] completes it.
 #[derive(Debug)]
 pub struct WindowOpening(Box<dyn Replay>);
 
@@ -154,8 +159,9 @@ impl Observed {
 }
 
 impl Model {
-    /// Returns the model in another number format, with `by` times the substeps and without sleep: for the
-    /// repetition of a window.
+    /// Returns the model in another number format, with `by` times the substeps (1 leaves them) and without
+    /// sleep: for the repetition of a window. Warnings and the expected error stay those of this model;
+    /// stability isn't checked against limits.
     pub fn twin(&self, by: u32, precision: Precision) -> Arc<Self> {
         let mut model = self.clone();
         model.plan = self.plan.divided(&self.scene, by);
@@ -164,7 +170,8 @@ impl Model {
         Arc::new(model)
     }
 
-    /// Returns the steps in a window: until the slowest vibration has lost half its amplitude, at most 0.25 s.
+    /// Returns the steps in a window: until the slowest vibration has lost half its amplitude, at most 0.25 s,
+    /// at least 1 step. The window then lasts until the next checkpoint of the guard.
     ///
     /// The amplitude of m·ü + C·u̇ + K·u = 0 falls as e^(−γt), with γ = C/2m, or in the overdamped case γ = (C
     /// − √(C² − 4mK))/2m for the slower part. K is that of the anchor springs alone: the slowest vibration
@@ -352,7 +359,10 @@ impl<T: Real> Replay for TissueState<T> {
 }
 
 impl SharedCheckpoint {
-    /// Copies the tissue at the beginning of a window and releases the shared checkpoint.
+    /// Copies the tissue at this checkpoint, the beginning of a window, awake and with its own substep, and
+    /// releases the checkpoint. The copy takes about one [`Model::state_bytes`], and time in proportion: call
+    /// it in any thread, soon after [`Mark::Begin`]. Without memory for it, it unwinds with a refusal, which
+    /// [`attempt`](crate::memory::attempt) returns.
     pub fn open(self) -> WindowOpening {
         WindowOpening(self.checkpoint.resume(&self.model))
     }
@@ -367,8 +377,9 @@ fn since_rest(sheet: &dyn Replay, extent: ErrorExtent) -> ErrorExtent {
 }
 
 impl WindowOpening {
-    /// Ends the window at `end`, whose shared checkpoint it releases. `inputs` are those recorded in the
-    /// window.
+    /// Ends the window at `end`, whose shared checkpoint it releases. `end` and `inputs` are those of the
+    /// [`Mark::End`] that followed the [`Mark::Begin`] of this opening, of the same tissue. It copies the state
+    /// at the end; without memory for that, it unwinds with a refusal, as [`SharedCheckpoint::open`] does.
     pub fn close(self, end: SharedCheckpoint, inputs: WindowInputs) -> Audit {
         let WindowOpening(end) = end.open();
         Audit { begin: self.0, inputs, end: Observed::of(&*end), until: end.steps() }
@@ -383,9 +394,14 @@ impl Audit {
         2 * model.twin(1, Precision::F64).state_bytes() + observed as u64
     }
 
-    /// Repeats the window in f64 with `finer` times the substeps ([`FINER`]) and returns the error. `largest`
-    /// is that of earlier windows. It calls `go_on` between slices of some milliseconds. `None` if that
-    /// returned false, if nothing moved, or if the repetition did not stay finite.
+    /// Repeats the window in f64 with `finer` times the substeps ([`FINER`]) and returns the error that the
+    /// window added; if this is above the scene's tolerance, it repeats the window twice more to find the main
+    /// source. `largest` is that of earlier windows' findings ([`AuditFinding::largest`]), or
+    /// `ErrorExtent::default()`. It blocks, and calls `go_on` between slices of some milliseconds.
+    ///
+    /// Returns `None` if `go_on` returned false, if the state at the end equals that at the beginning, or if
+    /// the repetition did not stay finite. Without memory it unwinds with a refusal, as
+    /// [`SharedCheckpoint::open`] does.
     pub fn work(self, finer: u32, largest: ErrorExtent, go_on: &mut dyn FnMut() -> bool) -> Option<AuditFinding> {
         let Audit { mut begin, inputs, end, until } = self;
         let first = Observed::of(&*begin);

@@ -11,8 +11,9 @@ use crate::model::Model;
 /// Largest number of inputs in a window. With more, the window ends without a result.
 const MAX_INPUTS: usize = 4096;
 
-/// The inputs of the tools in a window of steps: the step that each precedes, its tool, and the input. Its
-/// memory is allocated at the beginning, so that stepping allocates none.
+/// The inputs of the tools in a window of steps, for [`Tissue::request_audit`](crate::Tissue::request_audit):
+/// the step that each precedes, its tool, and the input, in the order of arrival. `default()` allocates its
+/// memory, for 4096 inputs, so that stepping allocates none.
 #[derive(Debug)]
 pub struct WindowInputs(pub(crate) Vec<(u64, usize, Input)>);
 
@@ -22,19 +23,22 @@ impl Default for WindowInputs {
     }
 }
 
-/// What a tissue reports about the requested window of steps.
+/// What a tissue reports about the requested window of steps ([`Tissue::take_mark`](crate::Tissue::take_mark)).
 #[derive(Debug)]
 pub enum Mark {
-    /// The window has begun.
+    /// The window has begun, at this checkpoint: call [`SharedCheckpoint::open`] soon.
     Begin(SharedCheckpoint),
-    /// The window has ended.
+    /// The window has ended, at this checkpoint, with these inputs: for
+    /// [`WindowOpening::close`](super::audit::WindowOpening::close). No window is requested any more.
     End(SharedCheckpoint, WindowInputs),
-    /// The window can't be audited: the guard went back, the tissue changed, everything came to rest, or there
-    /// were too many inputs.
+    /// The window can't be audited, and none is requested any more: the guard went back, the tissue changed or
+    /// was recovered, everything came to rest, there were more than 4096 inputs, or the end was not taken
+    /// before the next checkpoint.
     Dropped,
 }
 
-/// The state of a tissue at a checkpoint of the guard, shared with the tissue.
+/// The state of a tissue at a checkpoint of the guard, shared with the tissue. While it exists, the tissue
+/// can't reuse the memory of this checkpoint and allocates another one: open it soon.
 #[derive(Debug)]
 pub struct SharedCheckpoint {
     pub(crate) model: Arc<Model>,
@@ -42,7 +46,7 @@ pub struct SharedCheckpoint {
 }
 
 impl SharedCheckpoint {
-    /// Returns the model of the tissue in the window.
+    /// Returns the model of the tissue at the checkpoint.
     pub fn model(&self) -> &Arc<Model> {
         &self.model
     }

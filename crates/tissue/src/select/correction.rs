@@ -19,9 +19,11 @@ use palpate_refusal::Result;
 const AIM: f64 = 0.5;
 
 impl Model {
-    /// Returns the correction that should keep the error of `finding` below the tolerance from step `step` on:
-    /// another scheme or more substeps, a better number format, or less sleep. `None` if the error is within
-    /// the tolerance, or if nothing better exists. May run rehearsals.
+    /// Returns the correction that should bring the error of `finding`, of this model, to half of the
+    /// tolerance, from step `step` on: another scheme or more substeps (at most `limits.substeps`), a better
+    /// number format, or less sleep. `None` if the finding has no origin (the error is within the tolerance),
+    /// or if nothing better exists. It may run rehearsals, which block for some tenths of a second. Nothing is
+    /// changed: pass it to [`Model::corrected()`].
     pub fn correction(&self, finding: &AuditFinding, step: u64, limits: &Limits) -> Option<Correction> {
         let origin = finding.origin?;
         let excess = finding.error.largest() / (AIM * self.scene.stepping.tolerance);
@@ -79,10 +81,13 @@ impl Model {
         (keeps && fits && choice.integrator != self.plan.integrator).then_some(choice)
     }
 
-    /// Compiles the same tissue, stepped as `correction` says.
+    /// Compiles the same tissue, stepped as `correction` says, for [`Tissue::changed`](crate::Tissue::changed)
+    /// or [`Tissue::change`](crate::Tissue::change). Later changes keep to the correction. Blocks as
+    /// [`Model::compile`] does.
     ///
     /// # Errors
-    /// Refuses a correction that this model can't be compiled with.
+    /// Refuses a correction with which [`Model::compile`] refuses the scene, as with more substeps than
+    /// `limits.substeps`.
     pub fn corrected(&self, correction: &Correction, limits: &Limits) -> Result<Arc<Self>> {
         let mut scene = self.scene.clone();
         scene.sleep_tolerance = Some(correction.sleep_tolerance);

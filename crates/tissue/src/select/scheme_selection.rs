@@ -11,7 +11,8 @@ use crate::scheme::{CANDIDATES, Oscillator, entry};
 use crate::select::calibration::{self, Rehearsal};
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Time over which undamped, growing errors are predicted, s.
+/// Time over which undamped, growing errors are predicted, s: a longer run of such a tissue may have larger
+/// errors than expected.
 pub const LASTING_S: f64 = calibration::LASTING_S;
 
 /// The number formats and their costs relative to f32.
@@ -44,10 +45,11 @@ pub(crate) fn point_substep_ns(scene: &Scene, integrator: Integrator, precision:
 /// error.
 const RESTING_PART: f64 = 0.5;
 
-/// A stop flag that nobody sets: for callers who wait to the end.
+/// A stop flag that nobody may set: for callers of [`choose`] and
+/// [`Model::compile_until`](crate::Model::compile_until) that wait to the end.
 pub static NEVER: AtomicBool = AtomicBool::new(false);
 
-/// Returns the refusal of work whose stop flag was set.
+/// Returns the refusal of work whose stop flag was set ([`Reason::TimedOut`], with an empty field).
 pub fn given_up() -> Refusal {
     Refusal::new(Reason::TimedOut, "", "was given up, because nobody waits for it")
 }
@@ -65,14 +67,14 @@ pub const MAX_TIMES_STABLE: u32 = 64;
 /// Error from which courses have nothing in common, so that its size says nothing.
 const SATURATED: f64 = 0.1;
 
-/// A choice of integrator, substeps and number format, with its expected error.
+/// A choice of integrator, substeps and number format for a scene, with its expected error.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Choice {
-    /// The integrator.
+    /// The integrator; never `Auto`.
     pub integrator: Integrator,
-    /// Substeps per step.
+    /// Substeps per step, at least 1.
     pub substeps: u32,
-    /// The number format.
+    /// The number format; never `Auto`.
     pub precision: Precision,
     /// The larger of the expected errors of displacement and force, each relative to its largest. Infinite if
     /// it is unknown.
@@ -322,9 +324,11 @@ pub(crate) fn least_substeps(asked: Integrator, step_s: f64, sheet: &Oscillator)
     least.unwrap_or_else(|| stability::substeps(asked, step_s, sheet))
 }
 
-/// Returns the fewest substeps that a scene needs for stability, or those that it gives; and the processor time
-/// of a step of the cheapest kind with them and all points awake, s (see
-/// [`Model::predicted_step_s`](crate::Model::predicted_step_s)).
+/// Returns the fewest substeps per step that a scene needs for stability (with `auto`, those of the best
+/// integrator that it may choose), or those that the scene gives; and the processor time of a step of the
+/// cheapest kind with them and all points awake, s (see
+/// [`Model::predicted_step_s`](crate::Model::predicted_step_s)). Runs no rehearsals and checks no limits: the
+/// substeps may be above `limits.substeps`.
 #[allow(clippy::cast_precision_loss)]
 pub fn least_step(scene: &Scene) -> (u32, f64) {
     let Stepping { integrator, substeps, precision, rate_hz, lanes, .. } = scene.stepping;
@@ -336,16 +340,19 @@ pub fn least_step(scene: &Scene) -> (u32, f64) {
     (substeps, 1e-9 * (STEP_NS + point_ns * points as f64 * f64::from(substeps)))
 }
 
-/// Returns every integrator that the scene allows, each with the choice that would be made if it were the only
-/// one. Runs rehearsals.
+/// Returns, for every integrator that the scene allows, the choice that would be made if it were the only one;
+/// by falling order of the integrators. An integrator that needs more than `limits.substeps` is left out, so
+/// the list may be empty. Runs rehearsals, which block for some tenths of a second; if `limits.rehearsal_work`
+/// does not suffice, choices may be less good or have an infinite expected error.
 pub fn candidates(scene: &Scene, limits: &Limits) -> Vec<Choice> {
     let chooser = Chooser::new(scene, limits, &NEVER);
     let possible = chooser.open.iter().filter(|open| open.least <= limits.substeps);
     possible.map(|open| chooser.best(std::slice::from_ref(open))).collect()
 }
 
-/// Returns the choice for a scene if it gave no integrator, no substeps and no precision. Runs rehearsals.
-/// `None` if the scene gives none of them anyway, or if no such choice can be made within the limits.
+/// Returns the choice for a scene if it gave no integrator, no substeps and no precision. Runs rehearsals,
+/// which block for some tenths of a second. `None` if the scene gives none of them anyway, or if no such choice
+/// can be made within the limits `substeps` and `rehearsal_work`.
 pub fn by_auto(scene: &Scene, limits: &Limits) -> Option<Choice> {
     let given = &scene.stepping;
     let auto = Stepping { integrator: Integrator::Auto, substeps: None, precision: Precision::Auto, ..given.clone() };
@@ -369,9 +376,13 @@ pub fn by_auto(scene: &Scene, limits: &Limits) -> Option<Choice> {
 ///
 /// Also returns the work of the rehearsals in points × substeps.
 ///
+/// Also returns the work of the rehearsals in points × substeps. It blocks for some tenths of a second. The
+/// scene must be valid ([`Scene::check`]). The substeps may be above `limits.substeps` if the scene gives them
+/// or needs them for stability: the caller must check that.
+///
 /// # Errors
-/// Refuses a scene for which that would take more work than the limits allow; and refuses when another thread
-/// sets `stop`.
+/// Refuses a scene that gives no substeps and for which that would take more than `limits.rehearsal_work`
+/// ([`Reason::TooLarge`]); and refuses if another thread has set `stop` ([`Reason::TimedOut`]).
 pub fn choose(scene: &Scene, limits: &Limits, stop: &AtomicBool) -> Result<(Choice, u64)> {
     let chooser = Chooser::new(scene, limits, stop);
     let choice = chooser.best(&chooser.open);

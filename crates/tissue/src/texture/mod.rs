@@ -21,27 +21,30 @@ use crate::memory;
 use crate::scene::{Appearance, PaintedSurface, SMALLEST_TEXTURE};
 use palpate_refusal::{Reason, Refusal, Result, number};
 
-/// An image: rows of pixels from the top, in sRGB.
+/// An image: rows of pixels from the top, each from the left, in sRGB. [`painted`] and [`image`] create one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Image {
     /// Pixels per row.
     pub width: usize,
     /// Number of rows.
     pub height: usize,
-    /// Red, green and blue of each pixel: 3·`width`·`height` bytes.
+    /// Red, green and blue of each pixel, one byte each: 3·`width`·`height` bytes, row by row.
     pub rgb: Vec<u8>,
 }
 
-/// An image as a PNG file, in the form that the server sends.
+/// An image as a PNG file, in the form that the server sends; from [`texture()`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Texture {
     /// The bytes of the PNG file.
     pub png: Bytes,
-    /// The ETag for HTTP, a quoted string: different images have different ones.
+    /// The ETag for HTTP: 32 hexadecimal digits (XXH3-128 of `png`) in quotation marks, so that different files
+    /// have different ones.
     pub etag: String,
 }
 
-/// Paints an image of a surface, `size` × `size` pixels.
+/// Paints an image of a surface, `size` × `size` pixels. Another `seed` gives another pattern; another size
+/// shows the same pattern at another resolution. It paints with all processors and blocks meanwhile, up to some
+/// seconds for a large image.
 ///
 /// The same seed and size give the same bytes on any machine:
 ///
@@ -59,7 +62,8 @@ pub struct Texture {
 /// ```
 ///
 /// # Errors
-/// Refuses a size below 16 or above the limit `texture_side`.
+/// Refuses a size below 16 ([`SMALLEST_TEXTURE`]) or above the limit `texture_side`. Without memory for the
+/// image it unwinds with a refusal, which [`memory::attempt`] returns.
 pub fn painted(surface: PaintedSurface, seed: u64, size: u32, limits: &Limits) -> Result<Image> {
     let range = format!("from {SMALLEST_TEXTURE} to {} pixels", limits.texture_side);
     let holds = |v| v >= f64::from(SMALLEST_TEXTURE) && v <= f64::from(limits.texture_side);
@@ -74,10 +78,13 @@ pub fn painted(surface: PaintedSurface, seed: u64, size: u32, limits: &Limits) -
     Ok(Image { width: side, height: side, rgb })
 }
 
-/// Returns the image of a scene's tissue: the user's file decoded, or a painted one.
+/// Returns the image of a scene's tissue: the user's file decoded (transparency is ignored, 16-bit colours
+/// become 8-bit), or a painted one.
 ///
 /// # Errors
-/// Refuses a size beyond the limits, and a file that can't be read as a PNG image within the limits.
+/// Refuses a size of a painted image beyond the limits, as [`painted`] does; a file that is not a regular file,
+/// can't be read or is not a PNG image ([`Reason::Unreadable`]); and one with more than `file_bytes` bytes or a
+/// side above `texture_side` ([`Reason::TooLarge`]). Without memory for the image it unwinds with a refusal.
 pub fn image(appearance: &Appearance, limits: &Limits) -> Result<Image> {
     match &appearance.texture {
         Some(path) => Image::decode(path, &read(path, limits)?, limits),
@@ -85,10 +92,11 @@ pub fn image(appearance: &Appearance, limits: &Limits) -> Result<Image> {
     }
 }
 
-/// Returns the image of a scene's tissue as a PNG file. A user's own file is checked and passed on unchanged.
+/// Returns the image of a scene's tissue as a PNG file. A user's own file is decoded to check it, and passed on
+/// unchanged.
 ///
 /// # Errors
-/// Refuses a size beyond the limits, and a file that can't be read as a PNG image within the limits.
+/// Refuses and unwinds as [`image`] does.
 pub fn texture(appearance: &Appearance, limits: &Limits) -> Result<Texture> {
     let png = match &appearance.texture {
         Some(path) => {
@@ -137,10 +145,11 @@ impl Image {
         Ok(Image { width: width as usize, height: height as usize, rgb })
     }
 
-    /// Returns the image as a PNG file.
+    /// Returns the image as a PNG file, 8 bits per colour.
     ///
     /// # Errors
-    /// Refuses an image that the encoder rejects.
+    /// Refuses an image that the encoder rejects: a side of 0, or a length of `rgb` other than
+    /// 3·`width`·`height`.
     pub fn png(&self) -> Result<Vec<u8>> {
         let mut file = Vec::new();
         #[allow(clippy::cast_possible_truncation)]
