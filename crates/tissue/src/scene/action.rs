@@ -6,28 +6,30 @@ use super::profile::Poke;
 use crate::shape::PointId;
 use palpate_haptics::Tip;
 
-/// An action of a tool, which lasts until its next action.
+/// An action of a tool, which lasts until its next action. Its numbers are not checked here: see
+/// [`action_check`](super::action_check).
 #[derive(Debug, Clone, PartialEq)]
 pub enum Action {
-    /// Exerts a force.
+    /// Exerts a force, from the beginning of the step on.
     Push(Poke),
-    /// Holds a point and moves it to this displacement by the end of the step.
+    /// Holds a point and moves it to this displacement by the end of the step, at constant velocity; then the
+    /// point stays there.
     Grasp {
-        /// The point.
+        /// The point, which must not be fixed.
         point: PointId,
-        /// Displacement from the rest position, m.
+        /// Displacement from the rest position, m, in the tissue's frame.
         displacement_m: DVec3,
     },
     /// Moves the tool to this place by the end of the step and touches the tissue with its tip.
     Pose {
-        /// Place in the frame of the tissue at rest, m. On a sheet, z points out of the tissue.
+        /// Place of the tip in the frame of the tissue at rest, m. On a sheet, z points out of the tissue.
         place_m: DVec3,
         /// Velocity at that time, m/s, if the client sends it: over a gap in the commands, the tool continues
         /// with it.
         velocity_m_per_s: Option<DVec3>,
-        /// The tool's tip.
+        /// The tool's tip: its radius, friction and coupling.
         tip: Tip,
     },
-    /// Ends the tool's action.
+    /// Ends the tool's action: it no longer pushes, grasps or touches.
     Release,
 }

@@ -30,7 +30,10 @@ pub(super) fn check_force(field: &str, force_n: DVec3, factor: f64, limit_n: f64
 /// Checks a force: its values, its place and its strength.
 ///
 /// # Errors
-/// Refuses a force that is not finite, above the limit `point_force_n`, or not near the tissue.
+/// Refuses a falloff that is negative, a value that is not finite, a strength |force|·e^{c′} above the limit
+/// `point_force_n` ([`Reason::ForceTooLarge`]), and a place that is not near the tissue ([`Reason::OffTissue`],
+/// [`RestShape::is_near`]). Fields are `force.falloff_per_m`, `force.falloff_offset`, `force.centre_m` and
+/// `force.force_n`.
 pub fn check_poke(poke: &Poke, shape: &dyn RestShape, limits: &Limits) -> Result<()> {
     not_negative("force.falloff_per_m", poke.falloff_per_m)?;
     finite("force.falloff_offset", poke.falloff_offset)?;
@@ -38,11 +41,12 @@ pub fn check_poke(poke: &Poke, shape: &dyn RestShape, limits: &Limits) -> Result
     check_force("force.force_n", poke.force_n, libm::exp(poke.falloff_offset), limits.point_force_n)
 }
 
-/// Checks the length of a displacement of a grasped point, m.
+/// Checks the length of a displacement of a grasped point, or of the way from the middle of the tissue to a
+/// tip, m.
 ///
 /// # Errors
-/// Refuses a length above the limit `reach_in_sheets` times the tissue's longest side; `field` is the key that
-/// the refusal gives.
+/// Refuses a length that is not finite, or above the limit `reach_in_sheets` times the tissue's longest side
+/// ([`Reason::OutOfRange`]); `field` is the key that the refusal gives.
 pub fn check_reach(field: &str, shape: &dyn RestShape, displacement_m: f64, limits: &Limits) -> Result<()> {
     let limit_m = shape.longest_side_m() * limits.reach_in_sheets;
     let range = format!("at most {} m from the rest position", legible(limit_m));
@@ -60,10 +64,10 @@ fn in_millimetres(length_m: f64, limit_m: f64) -> impl Fn(Refusal) -> Refusal {
     }
 }
 
-/// Checks that a point can be grasped.
+/// Checks that a point of the tissue can be grasped. Panics if `shape` has no such point.
 ///
 /// # Errors
-/// Refuses a fixed point; `field` is the key that the refusal gives.
+/// Refuses a fixed point ([`Reason::OutOfRange`]); `field` is the key that the refusal gives.
 pub fn check_free(field: &str, shape: &dyn RestShape, point: PointId) -> Result<()> {
     if shape.is_fixed(point) {
         let message = format!("{} is fixed, and can't be grasped", shape.name(point));
@@ -78,8 +82,10 @@ const MAX_EDGES: f64 = 32.0;
 /// Checks that a tip suits the tissue: radius, friction and coupling.
 ///
 /// # Errors
-/// Refuses a value that is not finite or out of range; `field` is the key that the refusal gives. The radius
-/// may be at most the tissue's longest side, and on a mesh at most 32 edge lengths.
+/// Refuses a value that is not finite or out of range: a radius must be above 0 and at most the tissue's
+/// longest side, and on a mesh at most 32 mean edge lengths; friction is from 0 to 10; a coupling spring has a
+/// stiffness from 1e-12 to 1e12 N/m and a damping from 0 to 1e12 N·s/m. `field` is the tip's key: the refusal
+/// gives `{field}.radius_m` and the like.
 pub fn check_tip(field: &str, shape: &dyn RestShape, tip: &Tip) -> Result<()> {
     let longest_m = shape.longest_side_m();
     let (most_m, what) = match MAX_EDGES * shape.edge_m() {

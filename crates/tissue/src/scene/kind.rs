@@ -3,12 +3,12 @@
 use crate::scene::toml_document::Document;
 use palpate_refusal::{Reason, Result};
 
-/// The kind of a TOML text: scene or script.
+/// The kind of a TOML text in a file, folder or collection: scene or script.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TextKind {
-    /// Describes a tissue.
+    /// Describes a tissue ([`Scene`](super::Scene)).
     Scene,
-    /// Describes what is done to a tissue.
+    /// Describes what is done to a tissue ([`Script`](super::script::Script)).
     Script,
 }
 
@@ -24,7 +24,7 @@ impl TextKind {
         }
     }
 
-    /// Returns the other kind.
+    /// Returns the other kind: script for scene, scene for script.
     #[must_use]
     pub fn other(self) -> Self {
         match self {

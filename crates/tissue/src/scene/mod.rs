@@ -39,10 +39,12 @@ use source::Files;
 use toml_document::{Document, Fields, Item};
 pub use volume::{Swelling, Volume};
 
-/// The text of the built-in scene `paper`, which the paper's figures use.
+/// The TOML text of the built-in scene `paper`, a sheet, which the paper's figures use. [`Scene::parse`] reads
+/// it.
 pub const PAPER: &str = include_str!("../../../../scenes/paper.toml");
 
-/// The built-in scenes: name and TOML text, by ascending name.
+/// The built-in scenes: name and TOML text, by ascending name. Some have a mesh, which is generated: none names
+/// a file.
 pub const BUILT_IN: [(&str, &str); 7] = [
     ("colon", include_str!("../../../../scenes/colon.toml")),
     ("fibrotic", include_str!("../../../../scenes/fibrotic.toml")),
@@ -82,12 +84,13 @@ pub struct Scene {
     /// The material that the masses and coefficients were computed from; `None` if the scene gives them
     /// directly.
     pub material: Option<Material>,
-    /// Regions of a mesh that are stiffer or softer. Their factors are already applied to the springs of
-    /// `body`.
+    /// Regions of a mesh that are stiffer or softer, in the order of the file; empty on a sheet. Their factors
+    /// are already applied to the springs of `body`.
     pub inclusions: Arc<[Inclusion]>,
     /// Springs between neighbours.
     pub springs: Springs,
-    /// K″ of the springs of zero rest length that pull each point to its rest position, N/m (the paper's eq. 4).
+    /// K″ of the springs of zero rest length that pull each point to its rest position, N/m (the paper's eq.
+    /// 4); 0 for none. On a mesh, the reference K″ ([`Scene::relative_anchor_stiffness`]).
     pub anchor_stiffness_n_per_m: f64,
     /// C of the damping force −C·v, N·s/m. On a mesh, C of a point of the reference mass.
     pub damping_n_s_per_m: f64,
@@ -95,8 +98,10 @@ pub struct Scene {
     pub volume_stiffness_pa: f64,
     /// How time advances.
     pub stepping: Stepping,
-    /// Largest error that leaving out regions at rest may add, relative to the largest displacement; 0 turns
-    /// sleeping off. If `None`, it is a tenth of the wanted error (`stepping.tolerance`; see `Model`).
+    /// Largest error that leaving out regions at rest may add, relative to the largest displacement, 0 to 1; 0
+    /// turns sleeping off. If `None`, it is a tenth of the wanted error (`stepping.tolerance`), or of the
+    /// expected one if that is smaller and the scene gives the integrator or the substeps; see
+    /// [`Model::sleep_tolerance`](crate::Model::sleep_tolerance).
     pub sleep_tolerance: Option<f64>,
     /// How viewers draw the tissue.
     pub appearance: Appearance,
@@ -113,8 +118,8 @@ pub enum Body {
 
 impl Body {
     /// Returns a small part of the tissue that vibrates as fast as the whole, for test runs: at most `side`²
-    /// points, not all of them fixed. Also returns three points of the part to push or to watch; the first one
-    /// is free to move.
+    /// points, not all of them fixed. `side` is at least 1. Also returns three points of the part, in its own
+    /// numbers, to push or to watch; the first one is free to move, and they may coincide.
     pub fn part(&self, side: usize) -> (Body, [PointId; 3]) {
         match self {
             Body::Sheet(sheet) => {
@@ -129,19 +134,22 @@ impl Body {
     }
 }
 
-/// Smallest side of a generated texture, pixels.
+/// Smallest side of a generated texture: 16 pixels. The largest is the limit `texture_side`.
 pub const SMALLEST_TEXTURE: u32 = 16;
 
-/// How a tissue looks. Clients cannot set it, because it names a file on the server.
+/// How a tissue looks: an image for its surface, read or generated. Clients cannot set it, because it names a
+/// file on the server.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Appearance {
-    /// A PNG image for the surface. If `None`, the server generates one.
+    /// The path of a PNG image for the surface; it is not read here. If `None`, the server generates an image
+    /// from the other fields, which don't count otherwise.
     pub texture: Option<PathBuf>,
-    /// What a generated image shows.
+    /// What a generated image shows. Default: [`PaintedSurface::Mucosa`].
     pub surface: PaintedSurface,
-    /// Seed of the generated image: another seed gives another pattern.
+    /// Seed of the generated image: another seed gives another pattern. Default: 1.
     pub texture_seed: u64,
-    /// Pixels along each side of the generated image.
+    /// Pixels along each side of the generated image, from [`SMALLEST_TEXTURE`] to the limit `texture_side`.
+    /// Default: 1024.
     pub texture_size: u32,
 }
 
@@ -181,21 +189,24 @@ impl Named for PaintedSurface {
     ];
 }
 
-/// Coefficients of a tissue to change while it is in use. `None` leaves a coefficient as it is.
+/// Coefficients of a tissue to change while it is in use. `None` leaves a coefficient as it is; a change with
+/// `None` only is refused where it is applied ([`Change::NOTHING`]). [`Model::changed`](crate::Model::changed)
+/// applies one.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Change {
     /// k of the structural springs, N/m. The k of shear and bending springs changes in proportion.
     pub stiffness_n_per_m: Option<f64>,
-    /// C of the damping force −C·v, N·s/m.
+    /// C of the damping force −C·v of a point of the reference mass, N·s/m.
     pub damping_n_s_per_m: Option<f64>,
-    /// K″ of the springs that pull each point to its rest position, N/m.
+    /// K″ of the springs that pull each point to its rest position, N/m; on a mesh, the reference K″.
     pub anchor_stiffness_n_per_m: Option<f64>,
-    /// κ of the pressure in a mesh that encloses a volume, Pa.
+    /// κ of the pressure in a mesh that encloses a volume, Pa. Above 0 it is refused for a tissue without
+    /// `[volume]`.
     pub volume_stiffness_pa: Option<f64>,
 }
 
 impl Change {
-    /// Message of the refusal of a change that changes nothing.
+    /// Message of the refusal of a change that changes nothing ([`Reason::Missing`]).
     pub const NOTHING: &str = "names nothing to change: stiffness_n_per_m, damping_n_s_per_m, anchor_stiffness_n_per_m or \
                                volume_stiffness_pa";
 }
@@ -205,7 +216,7 @@ impl Change {
 pub struct Springs {
     /// k of the structural springs, (1,0) and (0,1) on a sheet, N/m; on a mesh, k of a reference edge.
     pub stiffness_n_per_m: f64,
-    /// k of the shear springs (1,1) and (1,−1) of a sheet, N/m.
+    /// k of the shear springs (1,1) and (1,−1) of a sheet, N/m; without effect on a mesh.
     pub shear_stiffness_n_per_m: f64,
     /// Whether a sheet has bending springs (2,0) and (0,2), with the structural k. (On a mesh, see
     /// [`Mesh::bending`].)
@@ -215,19 +226,23 @@ pub struct Springs {
 /// How time advances: rate, accuracy, scheme and number format.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stepping {
-    /// Steps per second, Hz. Commands take effect and samples are taken once per step.
+    /// Steps per second, Hz, from 1e-3 to 1e7. Commands take effect and samples are taken once per step.
+    /// Default: 1000.
     pub rate_hz: f64,
-    /// Wanted error of displacement and force, relative to their largest.
+    /// Wanted error of displacement and force, each relative to the largest of its kind; above 0 and at most 1.
+    /// Default: 1e-5.
     pub tolerance: f64,
-    /// The scheme that advances the points in time.
+    /// The scheme that advances the points in time. Default: `auto`.
     pub integrator: Integrator,
-    /// Substeps per step. If `None`, they are chosen from the stability bound.
+    /// Substeps per step, from 1 to the limit `substeps`. If `None` (the default), the tolerance and the
+    /// stability bound decide.
     pub substeps: Option<u32>,
-    /// The number format of the state.
+    /// The number format of the state. Default: `auto`.
     pub precision: Precision,
-    /// How many numbers the processor works on at once.
+    /// How many numbers the processor works on at once. Default: `auto`.
     pub lanes: Lanes,
     /// Whether the tissue is stepped more accurately after an audit finds an error above the tolerance.
+    /// Default: false.
     pub correct: bool,
 }
 
@@ -247,13 +262,13 @@ impl Default for Stepping {
 
 /// A value that a scene gives by a name from a list.
 pub trait Named: Sized + Copy + PartialEq + 'static {
-    /// Every name and its value.
+    /// Every name and its value; each name and each value once.
     const NAMES: &'static [(&'static str, Self)];
 
-    /// Returns the value of a name; `field` is the key that a refusal gives.
+    /// Returns the value of a name, which must match exactly; `field` is the key that a refusal gives.
     ///
     /// # Errors
-    /// Refuses a name that is not in the list.
+    /// Refuses a name that is not in the list ([`Reason::WrongKind`]); the message lists the names.
     fn named(field: &str, name: &str) -> Result<Self> {
         Self::NAMES.iter().find(|entry| entry.0 == name).map(|entry| entry.1).ok_or_else(|| {
             let names: Vec<_> = Self::NAMES.iter().map(|entry| entry.0).collect();
@@ -263,7 +278,7 @@ pub trait Named: Sized + Copy + PartialEq + 'static {
         })
     }
 
-    /// Returns the name of a value.
+    /// Returns the name of a value; empty for a value that is not in the list.
     fn name(self) -> &'static str {
         Self::NAMES.iter().find(|entry| entry.1 == self).map_or("", |entry| entry.0)
     }
@@ -287,7 +302,7 @@ macro_rules! named {
 named! {
     /// The schemes that advance the points in time (see the module `scheme`).
     pub enum Integrator {
-        /// Palpate chooses.
+        /// Palpate chooses, among `central` and the exponential schemes.
         Auto = "auto",
         /// Central differences, damping implicit: second order.
         Central = "central",
@@ -307,14 +322,14 @@ named! {
 named! {
     /// The number format of the state.
     pub enum Precision {
-        /// Palpate chooses.
+        /// Palpate chooses for the tolerance.
         Auto = "auto",
-        /// 4 bytes per number.
+        /// 4 bytes per number, single precision.
         F32 = "f32",
         /// 4 bytes per number, and 4 more that keep the rounding error of a displacement: for exponential
         /// schemes.
         Compensated = "compensated",
-        /// 8 bytes per number.
+        /// 8 bytes per number, double precision.
         F64 = "f64",
     }
 }
@@ -324,51 +339,65 @@ named! {
     pub enum Lanes {
         /// The widest that the machine has.
         Auto = "auto",
-        /// Vectors of 64 bytes.
+        /// Vectors of 64 bytes, on x86-64 with AVX-512.
         Avx512 = "avx512",
-        /// Vectors of 32 bytes.
+        /// Vectors of 32 bytes, on x86-64 with AVX2.
         Avx2 = "avx2",
         /// Vectors of 16 bytes, on ARM.
         Neon = "neon",
-        /// One number at a time, on any machine.
+        /// One number at a time, on any machine; much slower.
         Plain = "plain",
     }
 }
 
 impl Scene {
-    /// Reads a scene file and applies the `--set` assignments (`key.path=value`), which override its keys.
+    /// Reads a scene file and applies the `--set` assignments (`key.path=value`), in their order, which
+    /// override its keys. The path may be a pipe. Paths of other files start from the file's folder; limits
+    /// bound what is read.
     ///
     /// # Errors
-    /// Refuses a file that can't be read, and every text or assignment that [`Scene::parse`] refuses.
+    /// Refuses a file that can't be read, is not UTF-8 or has more than `limits.file_bytes` bytes
+    /// ([`files::read_text`]), and every text or assignment that [`Scene::parse_in`] refuses.
     pub fn load(path: &Path, assignments: &[String], limits: &Limits) -> Result<Self> {
         let text = files::read_text(path, limits.file_bytes)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         Self::parse_in(folder, &path.display().to_string(), &text, assignments, limits)
     }
 
-    /// Reads a scene from text. Paths of other files start from `folder`; refusals call the text `name`.
+    /// Reads a scene from text and applies the assignments (`key.path=value`), which override its keys. Paths
+    /// of other files start from `folder`; refusals call the text `name`. A mesh file is read, an image is only
+    /// named.
     ///
     /// # Errors
-    /// Refuses a text or an assignment that is not a valid scene, and a mesh file that can't be read.
+    /// Refuses
+    ///
+    /// - a text that is not TOML, a script, unknown and missing keys, and values of the wrong kind;
+    /// - an assignment that [`Document::set`] refuses;
+    /// - a value beyond its range or a limit ([`Scene::check`]);
+    /// - a mesh file that can't be read, has more than `limits.mesh_bytes` bytes or is not a surface;
+    /// - a material, inclusion or volume that does not suit the tissue.
     pub fn parse_in(folder: &Path, name: &str, text: &str, assignments: &[String], limits: &Limits) -> Result<Self> {
         let scene = Self::parse_with(name, text, assignments, Files::In(folder), limits)?;
         Ok(Scene { appearance: scene.appearance.within(folder), ..scene })
     }
 
-    /// Reads a scene from text. It may name no other files, except for an image; refusals call the text `name`.
+    /// Reads a scene from text and applies the assignments (`key.path=value`), which override its keys. It may
+    /// name no other files, except for an image, whose path stays as written; refusals call the text `name`.
     ///
     /// # Errors
-    /// Refuses a text or an assignment that is not a valid scene.
+    /// Refuses everything that [`Scene::parse_in`] refuses, and a text that names a mesh file
+    /// ([`Reason::WrongKind`]).
     pub fn parse(name: &str, text: &str, assignments: &[String], limits: &Limits) -> Result<Self> {
         Self::parse_with(name, text, assignments, Files::None, limits)
     }
 
-    /// Reads a scene from text, with the mesh file that its `[mesh]` names: the file's name and bytes. The
-    /// scene may name no other files, except for an image; refusals call the text `name`.
+    /// Reads a scene from text, with the mesh file that its `[mesh]` names: the file's name, as the text has
+    /// it, and bytes. The scene may name no other files, except for an image; refusals call the text `name`. A
+    /// file that is not named is ignored.
     ///
     /// # Errors
-    /// Refuses a text that is not a valid scene, a mesh that can't be read, and a scene that names another mesh
-    /// file.
+    /// Refuses everything that [`Scene::parse_in`] refuses, and a scene that names another mesh file. The bytes
+    /// given may be more than `limits.mesh_bytes` only for formats that don't check it.
     pub fn parse_given(name: &str, text: &str, (mesh_name, mesh): (&str, &[u8]), limits: &Limits) -> Result<Self> {
         Self::parse_with(name, text, &[], Files::Given(mesh_name, mesh), limits)
     }
@@ -405,8 +434,10 @@ impl Scene {
         Ok(scene)
     }
 
-    /// Returns the scene with some coefficients changed. `first` is the scene that the session began with. Its
-    /// ratio of shear to structural springs applies, because a k of 0 in between would lose the ratio.
+    /// Returns the scene with some coefficients changed, unchecked: see [`Scene::check`]. `first` is the scene
+    /// that the session began with. A new k of the structural springs changes that of the shear springs by the
+    /// ratio that they have in `first`, because a k of 0 in between would lose the ratio; if k is 0 in `first`,
+    /// the shear springs keep the value of `first`.
     pub fn changed(&self, change: &Change, first: &Scene) -> Self {
         let mut scene = self.clone();
         if let Some(k) = change.stiffness_n_per_m {
@@ -426,7 +457,7 @@ impl Scene {
         scene
     }
 
-    /// Returns the rest shape of the tissue: a borrowed sheet or mesh.
+    /// Returns the rest shape of the tissue, borrowed: its sheet or mesh.
     pub fn shape(&self) -> &dyn RestShape {
         match &self.body {
             Body::Sheet(sheet) => sheet,
@@ -442,7 +473,8 @@ impl Scene {
         }
     }
 
-    /// Returns the grid, mutable; `None` if the tissue is a mesh.
+    /// Returns the grid, mutable; `None` if the tissue is a mesh. Check the scene after changing it
+    /// ([`Scene::check`]).
     pub fn sheet_mut(&mut self) -> Option<&mut Sheet> {
         match &mut self.body {
             Body::Sheet(sheet) => Some(sheet),
@@ -450,7 +482,7 @@ impl Scene {
         }
     }
 
-    /// Returns the volume that a mesh encloses; `None` if the scene has no `[volume]`.
+    /// Returns the volume that a mesh encloses; `None` if the scene has no `[volume]`, as on any sheet.
     pub fn volume(&self) -> Option<&Volume> {
         match &self.body {
             Body::Sheet(_) => None,
@@ -458,8 +490,8 @@ impl Scene {
         }
     }
 
-    /// Returns whether the fastest vibration is the one in which the enclosed volume swells and shrinks. False
-    /// without a volume.
+    /// Returns whether the vibration in which the enclosed volume swells and shrinks is faster than the bound
+    /// for the springs alone, so that it decides on the substeps. False without a volume.
     pub fn volume_is_fastest(&self) -> bool {
         let Body::Mesh(mesh) = &self.body else { return false };
         let fastest = |Swelling { by_pressure_m, by_springs, .. }: Swelling| {
@@ -469,7 +501,8 @@ impl Scene {
         mesh.volume.as_ref().is_some_and(|volume| fastest(volume.swelling))
     }
 
-    /// Returns the mass of each point of a sheet, or the reference mass of a mesh, kg.
+    /// Returns the mass of each point of a sheet, or the reference mass of a mesh, kg: for a material, that of
+    /// a vertex of mean area.
     pub fn point_mass_kg(&self) -> f64 {
         match &self.body {
             Body::Sheet(sheet) => sheet.point_mass_kg,
@@ -477,8 +510,8 @@ impl Scene {
         }
     }
 
-    /// Returns the mass of a point divided by the reference mass [`Scene::point_mass_kg`]; 1 on a sheet. C of
-    /// the point is `damping_n_s_per_m` times this ratio.
+    /// Returns the mass of a point divided by the reference mass [`Scene::point_mass_kg`]; 1 on a sheet, and
+    /// for a point that a mesh does not have. C of the point is `damping_n_s_per_m` times this ratio.
     pub fn relative_mass(&self, point: PointId) -> f64 {
         match &self.body {
             Body::Sheet(_) => 1.0,
@@ -486,7 +519,8 @@ impl Scene {
         }
     }
 
-    /// Returns K″ of a point divided by the reference value `anchor_stiffness_n_per_m`; 1 on a sheet.
+    /// Returns K″ of a point divided by the reference value `anchor_stiffness_n_per_m`; 1 on a sheet, and for a
+    /// point that a mesh does not have.
     pub fn relative_anchor_stiffness(&self, point: PointId) -> f64 {
         match &self.body {
             Body::Sheet(_) => 1.0,
@@ -494,7 +528,7 @@ impl Scene {
         }
     }
 
-    /// Returns the mass of all points, kg.
+    /// Returns the mass of all points, kg, fixed ones included; on a mesh, of those with an edge.
     pub fn mass_kg(&self) -> f64 {
         #[allow(clippy::cast_precision_loss)]
         match &self.body {
@@ -503,7 +537,8 @@ impl Scene {
         }
     }
 
-    /// Returns a copy of the rest shape that can outlive the scene.
+    /// Returns the rest shape as a shared pointer that can outlive the scene: a copy of a sheet, or the mesh
+    /// itself.
     pub fn shared_shape(&self) -> Arc<dyn RestShape> {
         match &self.body {
             Body::Sheet(sheet) => Arc::new(sheet.clone()),
@@ -512,10 +547,20 @@ impl Scene {
     }
 
     /// Checks that every value is in its range and within the limits. It holds for scenes from files and from
-    /// messages.
+    /// messages; reading a scene does it as well. Material, inclusions and appearance are not checked here.
     ///
     /// # Errors
-    /// Refuses a value that is out of its range or above a limit.
+    /// Refuses
+    ///
+    /// - a name of more than 128 bytes or with control characters;
+    /// - no points, or more than `limits.points`; on a sheet, rows of fewer than [`MIN_WIDTH`] points count as
+    ///   that many;
+    /// - a spacing, mass or mean edge beyond 1e-12 to 1e12; a stiffness or damping that is neither 0 nor in
+    ///   this range;
+    /// - a fixed point that is not on the sheet; a stiffness of a volume above 0 without a volume;
+    /// - a rate beyond 1e-3 to 1e7 Hz, a tolerance that is not above 0 and at most 1, a sleep tolerance beyond
+    ///   0 to 1;
+    /// - substeps beyond 1 to `limits.substeps`.
     pub fn check(&self, limits: &Limits) -> Result<()> {
         palpate_refusal::label("name", &self.name)?;
         match &self.body {
@@ -552,31 +597,33 @@ impl Scene {
     }
 }
 
-/// The physical part of a [`Scene`]: points, springs and coefficients, without stepping and appearance.
+/// The physical part of a [`Scene`]: points, springs and coefficients, without name, stepping and appearance.
+/// Its values are not checked until the scene is ([`Scene::check`]).
 pub struct Substance {
     /// The mass points.
     pub body: Body,
     /// The material that the masses and coefficients were computed from, if any.
     pub material: Option<Material>,
-    /// Regions of a mesh that are stiffer or softer. Their factors are already applied to the springs of
-    /// `body`.
+    /// Regions of a mesh that are stiffer or softer; empty for none. Their factors are already applied to the
+    /// springs of `body`.
     pub inclusions: Arc<[Inclusion]>,
     /// Springs between neighbours.
     pub springs: Springs,
-    /// K″ of the springs that pull each point to its rest position, N/m.
+    /// K″ of the springs that pull each point to its rest position, N/m; on a mesh, the reference K″.
     pub anchor_stiffness_n_per_m: f64,
-    /// C of the damping force −C·v, N·s/m.
+    /// C of the damping force −C·v, N·s/m; on a mesh, C of a point of the reference mass.
     pub damping_n_s_per_m: f64,
     /// κ of the pressure in a mesh that encloses a volume, Pa; 0 without a volume.
     pub volume_stiffness_pa: f64,
 }
 
 impl Substance {
-    /// Creates a mesh of a material. `bending` is the k of each bending spring relative to the k of the edge
-    /// that it crosses; 0 creates none.
+    /// Creates a mesh of a material, without inclusions and volume. `bending` is the k of each bending spring
+    /// relative to the k of the edge that it crosses; 0 creates none.
     ///
     /// # Errors
-    /// Refuses a value of the material that is out of its range, and a mesh with a vertex without area.
+    /// Refuses what [`Material::applied`] refuses: a value of the material that is out of its range, and a mesh
+    /// with a vertex that has edges but no area.
     pub fn of_material(material: Material, bending: f64, shape: Arc<MeshShape>) -> Result<Self> {
         let made = material.applied(bending, shape)?;
         let stiffness_n_per_m = made.stiffness_n_per_m;
@@ -591,11 +638,13 @@ impl Substance {
         })
     }
 
-    /// Applies inclusions, if this is a mesh; a sheet stays as it is. `field` is the key of the list in
-    /// refusals.
+    /// Applies inclusions, if this is a mesh, in place of a list applied before, on top of its factors; a sheet
+    /// stays as it is and its inclusions unchecked. `field` is the key of the list in refusals. Call it before
+    /// [`Substance::enclosing`], since it drops the volume of the mesh.
     ///
     /// # Errors
-    /// Refuses too many inclusions, a value out of its range, an unknown group, and a ball without a vertex.
+    /// Refuses everything that [`Inclusion::put_into`] refuses: too many inclusions, a value out of its range,
+    /// an unknown group, and a ball that reaches no vertex.
     pub fn with(mut self, inclusions: Vec<Inclusion>, field: &str) -> Result<Self> {
         if let Body::Mesh(mesh) = &mut self.body {
             *mesh = Inclusion::put_into(&inclusions, field, mesh)?;
@@ -604,10 +653,11 @@ impl Substance {
         Ok(self)
     }
 
-    /// Adds the volume that the mesh encloses, with the stiffness κ, Pa.
+    /// Adds the volume that the mesh encloses, with the stiffness κ = `stiffness_pa`, Pa.
     ///
     /// # Errors
-    /// Refuses a stiffness that is not above 0, a sheet, and a mesh that encloses no volume, or several.
+    /// Refuses a stiffness beyond 1e-12 to 1e12, a sheet, and a mesh that [`Mesh::enclosing`] refuses: not
+    /// closed, of several parts, flat, or with triangles of inconsistent orientation.
     pub fn enclosing(mut self, stiffness_pa: f64) -> Result<Self> {
         physical("volume.stiffness_pa", positive("volume.stiffness_pa", stiffness_pa)?)?;
         self.volume_stiffness_pa = stiffness_pa;

@@ -10,8 +10,9 @@ use crate::shape::RestShape;
 /// Number of values from which every second one is left out. A terminal shows 140 dots side by side.
 const MAX_KEPT: usize = 4096;
 
-/// Displacement and force of one tool or point over time. On a sheet they are components along z, as in the
-/// paper's figures; on a mesh, which is pressed from any side, they are lengths. The memory does not grow with
+/// Displacement and force of one tool or point over time, for a chart (`Display`, 140 dots wide, on several
+/// lines). On a sheet they are components along z, as in the paper's figures; on a mesh, which is pressed from
+/// any side, they are lengths. At most 4096 values are kept, evenly spaced, so the memory does not grow with
 /// the length of a run.
 #[derive(Debug, Clone, Default)]
 pub struct Curves {
@@ -27,12 +28,15 @@ pub struct Curves {
 }
 
 impl Curves {
-    /// Creates empty curves for a tissue of this shape.
+    /// Creates empty curves for a tissue of this shape: of lengths, if places have 3 numbers
+    /// ([`RestShape::dimensions`]), otherwise of components along z.
     pub fn of(shape: &dyn RestShape) -> Self {
         Curves { of_lengths: shape.dimensions() > 2, ..Curves::default() }
     }
 
-    /// Adds the displacement, m, and the force of the tissue, N, at a time, s. Times must ascend.
+    /// Adds the displacement, m, and the force of the tissue on the tool, N, at a time, s. Times must ascend,
+    /// evenly if the chart is to show all parts alike; this isn't checked. From 4096 kept values on, every
+    /// second one is dropped.
     #[allow(clippy::cast_possible_truncation)]
     pub fn add(&mut self, time_s: f64, displacement_m: DVec3, force_n: DVec3) {
         if self.displacement.len() == MAX_KEPT {

@@ -10,7 +10,8 @@ pub use super::action::Action;
 use super::profile::{LoadProfile, Moment, MotionProfile, PoseProfile};
 use crate::shape::{PointId, RestShape};
 
-/// The built-in scripts: name and TOML text, by ascending name.
+/// The built-in scripts: name and TOML text, by ascending name. Each is made for some of the scenes
+/// ([`made_for`](super::script_reader::made_for)).
 pub const BUILT_IN: [(&str, &str); 7] = [
     ("grasp", include_str!("../../../../scripts/grasp.toml")),
     ("oblique-100", include_str!("../../../../scripts/oblique-100.toml")),
@@ -21,26 +22,31 @@ pub const BUILT_IN: [(&str, &str); 7] = [
     ("vertical-60", include_str!("../../../../scripts/vertical-60.toml")),
 ];
 
-/// A script bound to a scene: what tools do over time, and what is recorded.
+/// A script bound to a scene: what tools do over time, and what is recorded. [`Script::load`] and
+/// [`Script::parse`] create it, with times as whole steps of the scene's rate. Tools are numbered from 0:
+/// forces first, then grasped points, then tips.
 #[derive(Debug, Clone)]
 pub struct Script {
     /// Display name; any text.
     pub name: String,
-    /// Length in steps.
+    /// Length in steps, at least 1.
     pub steps: u64,
-    /// Steps between two records. The first record is at step 0.
+    /// Steps between two records, at least 1. The first record is at step 0.
     pub sample_every: u64,
-    /// The points that records contain, in this order.
+    /// The points that records contain, in this order, each once. If the script lists none: the points at its
+    /// forces, grasps and poses.
     pub sample_points: Vec<PointId>,
-    /// Surgical forces. Force k is tool k.
+    /// Surgical forces, in the order of the text. Force k is tool k.
     pub forces: Vec<LoadProfile>,
-    /// Grasped points; their tool numbers follow those of the forces.
+    /// Grasped points, each by one tool only; tool numbers follow those of the forces.
     pub moves: Vec<MotionProfile>,
     /// Tools with a tip; their numbers follow those of the grasped points.
     pub poses: Vec<PoseProfile>,
-    /// Changes of the tissue, each with the step at whose beginning it takes effect, by ascending step.
+    /// Changes of the tissue, each with the step at whose beginning it takes effect, by strictly ascending
+    /// step.
     pub changes: Vec<(u64, Change)>,
-    /// Warnings for the user: rounded values, forces that leave the tissue.
+    /// Warnings for the user, as sentences: rounded times, forces that leave the tissue, another scene than the
+    /// script is made for.
     pub warnings: Vec<String>,
     /// Steps per second, from the scene, Hz.
     pub rate_hz: f64,
@@ -49,9 +55,10 @@ pub struct Script {
 }
 
 impl Script {
-    /// Returns the actions that a client sends at step `step` to play this script, with their tool numbers.
-    /// Forces and grasps are only returned if they differ from the step before. A force acts for the whole
-    /// step, from its beginning; a grasped point reaches its target at the step's end.
+    /// Returns the actions that a client sends at step `step` to play this script, with their tool numbers,
+    /// ascending; also beyond [`Script::steps`]. Forces and grasps are only returned if they differ from the
+    /// step before, and a force that ends or leaves the tissue as [`Action::Release`]; so ask for every step. A
+    /// force acts for the whole step, from its beginning; a grasped point reaches its target at the step's end.
     pub fn actions_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
         let poke = move |profile: &LoadProfile, step: u64| {
             let poke = profile.at(Moment::start_of(step), self.rate_hz);
@@ -72,9 +79,9 @@ impl Script {
         pushes.chain(grasps).chain(self.poses_at(step))
     }
 
-    /// Returns the poses that a client sends at step `step`, with their tool numbers: one for each tool with a
-    /// tip at every step, because the server takes away a silent tool. A tip reaches its place at the step's
-    /// end.
+    /// Returns the poses that a client sends at step `step`, with their tool numbers, ascending: one for each
+    /// tool with a tip at every step from its first pose to its end, because the server takes away a silent
+    /// tool; then one release. A tip reaches its place at the step's end.
     #[allow(clippy::cast_precision_loss)]
     pub fn poses_at(&self, step: u64) -> impl Iterator<Item = (usize, Action)> {
         let first = self.first_tip().unwrap_or_default();
@@ -93,7 +100,7 @@ impl Script {
         (!self.poses.is_empty()).then_some(self.forces.len() + self.moves.len())
     }
 
-    /// Returns the number of tools that the script uses.
+    /// Returns the number of tools that the script uses: theirs are 0 to this − 1.
     pub fn tools(&self) -> usize {
         self.forces.len() + self.moves.len() + self.poses.len()
     }

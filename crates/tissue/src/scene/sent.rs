@@ -12,22 +12,25 @@ use crate::limits::Limits;
 use crate::scene::toml_document::{Document, Fields};
 use palpate_refusal::Result;
 
-/// The mesh that the section `[mesh]` of a scene file names.
+/// The mesh that the section `[mesh]` of a scene file names. Read from the text alone: the mesh file need not
+/// exist.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshFile {
-    /// The path of the file; `None` if the mesh is generated.
+    /// The path of the file; `None` if the mesh is generated or the text names none.
     pub path: Option<PathBuf>,
-    /// The unit's name, or its length in metres.
+    /// The unit's name, such as `"mm"`, or its length in metres, as text; empty if the text has none, as for a
+    /// generated mesh.
     pub unit: String,
-    /// Wanted number of simulated vertices, if fewer than the file has.
+    /// Wanted number of simulated vertices, if fewer than the file has; `None` if the text has none.
     pub vertices: Option<u64>,
 }
 
 /// Returns the mesh file that a valid scene file names, with its path resolved from the scene's folder; `None`
-/// if the tissue is not a mesh.
+/// if the tissue is not a mesh. Of a scene that is not valid, it may return `None` or what it finds.
 ///
 /// # Errors
-/// Refuses a scene file that can't be read or is not TOML.
+/// Refuses a scene file that can't be read ([`files::read_text`], at most `limits.file_bytes` bytes) or is not
+/// TOML.
 pub fn mesh_file(scene: &Path, limits: &Limits) -> Result<Option<MeshFile>> {
     let text = files::read_text(scene, limits.file_bytes)?;
     let folder = scene.parent().unwrap_or(Path::new(""));
@@ -36,7 +39,7 @@ pub fn mesh_file(scene: &Path, limits: &Limits) -> Result<Option<MeshFile>> {
 }
 
 /// Returns the mesh file that the text of a valid scene names, with the path as it is written; `None` if the
-/// tissue is not a mesh. Refusals call the text `name`.
+/// tissue is not a mesh, or if `file` or `vertices` is of the wrong kind. Refusals call the text `name`.
 ///
 /// # Errors
 /// Refuses a text that is not TOML.
@@ -57,7 +60,9 @@ pub fn said(name: &str, text: &str) -> Result<Option<MeshFile>> {
     Ok(found)
 }
 
-/// Returns the mesh of a scene before it was made coarser.
+/// Returns the mesh of a scene as its file has it, in m. If the simulated mesh has other vertices (it is
+/// coarser, or vertices were joined), it is the mesh of the file, with texture coordinates if the file has
+/// them; otherwise the simulated mesh, without texture coordinates, whose edges may have been flipped.
 pub fn written(mesh: &Mesh) -> TriangleMesh {
     if let Some(shown) = mesh.shape.shown() {
         return shown.mesh.clone();
@@ -70,8 +75,9 @@ pub fn written(mesh: &Mesh) -> TriangleMesh {
     }
 }
 
-/// Returns the mesh of a scene before it was made coarser, as a file to send: its name, its bytes (OBJ) and its
-/// unit, `"m"`.
+/// Returns the mesh of a scene as a file to send: its name `"mesh.obj"`, its bytes (OBJ, with groups), and its
+/// unit `"m"`. It is the mesh of [`written`]: that of the file, with texture coordinates, if the simulated mesh
+/// has other vertices; otherwise the simulated mesh, without them.
 pub fn file(mesh: &Mesh) -> (&'static str, Vec<u8>, &'static str) {
     ("mesh.obj", write(&written(mesh), Format::Obj), "m")
 }

@@ -19,8 +19,9 @@ fn unsigned(v: DVec3) -> DVec3 {
 }
 
 impl Scene {
-    /// Returns the scene with every −0 replaced by 0. Values that must be above 0 need no replacement. Each
-    /// field is named here, so that a new field can't be forgotten.
+    /// Returns the scene with every −0 among its coefficients and tolerances replaced by 0. Values that must be
+    /// above 0 need no replacement; those of body, material and inclusions stay. Each field is named here, so
+    /// that a new field can't be forgotten.
     #[must_use]
     pub fn with_unsigned_zeros(self) -> Self {
         let Scene {
@@ -57,7 +58,7 @@ impl Scene {
 }
 
 impl Action {
-    /// Returns the action with every −0 replaced by 0.
+    /// Returns the action with every −0 among its numbers, vectors' components included, replaced by 0.
     #[must_use]
     pub fn with_unsigned_zeros(self) -> Self {
         match self {

@@ -67,8 +67,7 @@ impl Matrix {
     }
 
     /// Returns the largest magnitude among the eigenvalues: the 2ᵏ-th root of the size of the 2ᵏ-th power
-    /// (Gelfand's formula, ρ(A) = lim ‖Aⁿ‖^{1/n}), with k up to 35. 0 for a nilpotent matrix; infinite or 0 for
-    /// one that is not finite.
+    /// (Gelfand's formula, ρ(A) = lim ‖Aⁿ‖^{1/n}), with k = 35. Meaningless for a matrix with NaN.
     pub fn spectral_radius(&self) -> f64 {
         let (mut power, mut logarithm, mut exponent) = (*self, 0.0, 1.0);
         for _ in 0..36 {

@@ -168,8 +168,7 @@ impl Scheme {
         self.constant()[1]
     }
 
-    /// Returns the index, from 0, of the field of the tools' force that adds to the velocity; it is the last
-    /// one.
+    /// Returns the index, from 0, of the field of the tools' force that adds to the velocity.
     pub fn last_field(&self) -> usize {
         each!(self, |family| family.last_field())
     }

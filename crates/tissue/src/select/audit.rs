@@ -64,8 +64,7 @@ impl Origin {
     }
 }
 
-/// A complete window, made by [`WindowOpening::close`]: everything needed to repeat it. It does not depend on
-/// the tissue any more, so any thread can do the work.
+/// The result of an audit of a window of steps, from [`Audit::work`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AuditFinding {
     /// Steps done at the end of the window.
@@ -119,7 +118,8 @@ impl ErrorExtent {
 #[derive(Debug)]
 pub struct WindowOpening(Box<dyn Replay>);
 
-/// A complete window: everything needed to repeat it.
+/// A complete window, made by [`WindowOpening::close`]: everything needed to repeat it. It does not depend on
+/// the tissue any more, so any thread can do the work.
 #[derive(Debug)]
 pub struct Audit {
     begin: Box<dyn Replay>,
@@ -159,9 +159,9 @@ impl Observed {
 }
 
 impl Model {
-    /// Returns the model in another number format, with `by` times the substeps (1 leaves them) and without
-    /// sleep: for the repetition of a window. Warnings and the expected error stay those of this model;
-    /// stability isn't checked against limits.
+    /// Returns the model in another number format, with `by` times the substeps (1 leaves them, 0 panics) and
+    /// without sleep: for the repetition of a window. Warnings and the expected error stay those of this model;
+    /// no limits are checked.
     pub fn twin(&self, by: u32, precision: Precision) -> Arc<Self> {
         let mut model = self.clone();
         model.plan = self.plan.divided(&self.scene, by);

@@ -366,17 +366,17 @@ pub fn by_auto(scene: &Scene, limits: &Limits) -> Option<Choice> {
 /// Chooses integrator, substeps and format for a scene's tolerance, as far as the scene leaves them open:
 ///
 /// 1. The cheapest choice that is expected to keep the tolerance.
+///
 /// 2. If there is none: the cheapest whose error is at most twice the smallest that can be distinguished from
-///    none; if there is none either, the choice with the smallest expected error.
+/// none; if there is none either, the choice with the smallest expected error.
+///
 /// 3. If no error can be predicted: the cheapest stable scheme, with as many substeps as let the fastest
-///    vibration turn by at most [`stability::THETA`] in each: at most 8 times those.
+/// vibration turn by at most [`stability::THETA`] in each: at most 8 times those.
 ///
 /// No choice has more than [`MAX_TIMES_STABLE`] times the substeps with which it is stable, except an
 /// integrator that the scene names and that keeps the tolerance with more.
 ///
-/// Also returns the work of the rehearsals in points × substeps.
-///
-/// Also returns the work of the rehearsals in points × substeps. It blocks for some tenths of a second. The
+/// Also returns the work of the rehearsals in points × substeps. They block for some tenths of a second. The
 /// scene must be valid ([`Scene::check`]). The substeps may be above `limits.substeps` if the scene gives them
 /// or needs them for stability: the caller must check that.
 ///

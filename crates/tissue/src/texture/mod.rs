@@ -43,8 +43,7 @@ pub struct Texture {
 }
 
 /// Paints an image of a surface, `size` × `size` pixels. Another `seed` gives another pattern; another size
-/// shows the same pattern at another resolution. It paints with all processors and blocks meanwhile, up to some
-/// seconds for a large image.
+/// shows the same pattern at another resolution. It paints with all processors, and blocks meanwhile.
 ///
 /// The same seed and size give the same bytes on any machine:
 ///
