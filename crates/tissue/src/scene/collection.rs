@@ -11,7 +11,8 @@ use crate::scene::script_reader::made_for;
 use crate::scene::toml_document::Document;
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt};
 
-/// The scenes or the scripts that can be given by name: those of a folder and the built-in ones.
+/// The scenes or the scripts that can be given by name: the files `NAME.toml` of a folder and the built-in
+/// ones. A name has letters and digits of ASCII, `-` and `_`. Each call reads the folder anew.
 #[derive(Debug, Clone)]
 pub struct Collection {
     folder: PathBuf,
@@ -22,7 +23,8 @@ pub struct Collection {
 }
 
 impl Collection {
-    /// Creates the collection of a folder, which need not exist, and the built-in texts of that kind.
+    /// Creates the collection of a folder, which need not exist, and the built-in texts of that kind. Nothing
+    /// is read yet.
     pub fn new(kind: TextKind, folder: &Path) -> Self {
         let built_in: &'static [_] = match kind {
             TextKind::Scene => &BUILT_IN,
@@ -43,13 +45,16 @@ impl Collection {
         &self.folder
     }
 
-    /// Returns every name, sorted, without those of files that belong in the folder of the other kind.
+    /// Returns every name, sorted, each once, without those of files that belong in the folder of the other
+    /// kind. It reads every file of the folder, at most `limits.file_bytes` of each; names of files that can't
+    /// be read are included.
     pub fn names(&self, limits: &Limits) -> Vec<String> {
         self.files_and_built_in().into_iter().filter(|name| self.misplaced(name, limits).is_none()).collect()
     }
 
-    /// Returns the names, sorted, whose name and text `is_wanted` accepts, and the names of files that can't be
-    /// read. Files of the other kind are left out. Each file is read once.
+    /// Returns the names, sorted, each once, whose name and text `is_wanted` accepts (called as
+    /// `is_wanted(name, text)`), and the names of files that can't be read. Files of the other kind are left
+    /// out. `others` is the collection of the other kind. Each file is read once.
     pub fn names_where(
         &self,
         others: &Collection,
@@ -64,7 +69,8 @@ impl Collection {
         self.files_and_built_in().into_iter().filter(stays).collect()
     }
 
-    /// Returns a refusal for each file that belongs in the folder of the other kind, sorted by name.
+    /// Returns a refusal for each file that belongs in the folder of the other kind, sorted by name; its place
+    /// is `NAME.toml`. Empty if there are none. Files that can't be read are left out.
     pub fn all_misplaced(&self, limits: &Limits) -> Vec<Refusal> {
         self.files_and_built_in().iter().filter_map(|name| self.misplaced(name, limits)).collect()
     }
@@ -109,12 +115,16 @@ impl Collection {
         self.file(name).is_some() || self.built_in.iter().any(|text| text.0 == name)
     }
 
-    /// Returns the text of that name, preceded by the name that refusals use for it. A file in the folder
-    /// overrides a built-in text. Refusals name the file without its folder, so that clients do not learn the
-    /// server's paths. `others` is the collection of the other kind: a name found there gets a hint.
+    /// Returns the name that refusals use for a text (`NAME.toml` for a file, `NAME` for a built-in text), and
+    /// the text. A file in the folder overrides a built-in text. Refusals name the file without its folder, so
+    /// that clients do not learn the server's paths. `others` is the collection of the other kind: a name found
+    /// there gets a hint.
     ///
     /// # Errors
-    /// Refuses an unknown name, a file that can't be read, and a file of the other kind.
+    /// Refuses an unknown name ([`Reason::UnknownScene`] or [`Reason::UnknownScript`]; the message lists the
+    /// names), a file of the other kind ([`Reason::WrongKind`]), and a file that [`files::read_regular_text`]
+    /// refuses: not a regular file, not UTF-8, or with more than `limits.file_bytes` bytes. The text itself may
+    /// be invalid.
     pub fn text(&self, name: &str, others: &Collection, limits: &Limits) -> Result<(String, String)> {
         if let Some(path) = self.file(name) {
             let file = format!("{name}.toml");
@@ -165,10 +175,12 @@ fn name_in(path: &Path) -> Option<&str> {
 const SCRIPTS: &str = "scripts";
 
 /// Reads the scene that a user gave: the path of a file, or the name of a scene in `folder` or of a built-in
-/// one. `--set` assignments override its keys.
+/// one. A plain word that is not a file of the working directory is a name. `--set` assignments override its
+/// keys.
 ///
 /// # Errors
-/// Refuses a text that is not a scene, and every text or assignment that [`Scene::parse`] refuses.
+/// Refuses an unknown name or a file of the other kind, as [`Collection::text`] does; a file that can't be
+/// read; and every text or assignment that [`Scene::parse_in`] refuses.
 pub fn find_scene(path: &Path, folder: &Path, assignments: &[String], limits: &Limits) -> Result<Scene> {
     let Some(name) = name_in(path) else { return Scene::load(path, assignments, limits) };
     let scenes = Collection::new(TextKind::Scene, folder).for_user();
@@ -192,20 +204,23 @@ fn script_text(path: &Path, limits: &Limits) -> Result<(String, String, PathBuf)
     Ok((file, text, PathBuf::from(SCRIPTS)))
 }
 
-/// Reads the script that a user gave (a file, or the name of one in ./scripts or of a built-in one) and binds
-/// it to `scene`.
+/// Reads the script that a user gave (the path of a file, or the name of one in ./scripts or of a built-in one)
+/// and binds it to `scene`. A plain word that is not a file of the working directory is a name. Traces are in
+/// the script's folder.
 ///
 /// # Errors
-/// Refuses a text that is not a script, and every text that [`Script::parse`] refuses.
+/// Refuses an unknown name, a file that can't be read, and every text that [`Script::parse`] refuses, scenes
+/// among them.
 pub fn find_script(path: &Path, scene: &Scene, limits: &Limits) -> Result<Script> {
     let (name, text, folder) = script_text(path, limits)?;
     Script::parse(&name, &text, &folder, scene, limits)
 }
 
-/// Returns the names of the scenes that a user's script is made for; empty if it names none.
+/// Returns the names of the scenes that a user's script (given as to [`find_script`]) is made for, in its
+/// order; empty if it names none or is not TOML.
 ///
 /// # Errors
-/// Refuses a script that can't be read.
+/// Refuses an unknown name, and a script that can't be read.
 pub fn scenes_of(path: &Path, limits: &Limits) -> Result<Vec<String>> {
     Ok(made_for(&script_text(path, limits)?.1))
 }

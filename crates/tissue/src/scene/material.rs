@@ -21,27 +21,30 @@ const POISSON: f64 = 1.0 / 3.0;
 /// A third of the mass beneath the surface counts: its displacement falls linearly with depth.
 const MOVES_ALONG: f64 = 1.0 / 3.0;
 
-/// The material of a tissue on a mesh: an elastic capsule on a soft foundation.
+/// The material of a tissue on a mesh: an elastic capsule on a soft foundation. [`Material::applied`] checks
+/// it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Material {
-    /// E of the capsule, Pa. Its ν is 1/3.
+    /// Young's modulus E of the capsule, Pa. Its Poisson ratio ν is 1/3.
     pub youngs_modulus_pa: f64,
     /// Thickness t of the capsule, m.
     pub thickness_m: f64,
     /// Density ρ of the tissue that moves along with the capsule, kg/m³.
     pub density_kg_per_m3: f64,
-    /// Depth of the tissue that moves along, m.
+    /// Depth H of the tissue that moves along, m.
     pub depth_m: f64,
-    /// Stiffness of the foundation, which pulls back to the rest shape, N/m for each m² of surface.
+    /// Stiffness k″ of the foundation, which pulls back to the rest shape, N/m for each m² of surface; 0 for
+    /// none.
     pub foundation_n_per_m3: f64,
-    /// Damping ratio of a point on its anchor spring alone; 1 is critical.
+    /// Damping ratio ζ of a point on its anchor spring alone, 0 to 100; 1 is critical. Without a foundation
+    /// nothing is damped.
     pub damping_ratio: f64,
 }
 
-/// A tissue made of a material: the mesh, and the reference coefficients.
+/// A tissue made of a material, by [`Material::applied`]: the mesh, and the reference coefficients.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MadeOf {
-    /// The mesh, with the factors of its points and springs.
+    /// The mesh, with the factors of its points and springs, without inclusions and volume.
     pub mesh: Mesh,
     /// Reference k, N/m: that of an edge between triangles with equal sides.
     pub stiffness_n_per_m: f64,
@@ -52,13 +55,14 @@ pub struct MadeOf {
 }
 
 impl Material {
-    /// Message of the refusal of a coefficient beside a material.
+    /// Message of the refusal of a coefficient beside a material ([`Reason::WrongKind`]).
     pub const FOLLOWS: &str = "does not go with [material], from which it follows";
 
-    /// Message of the refusal of a material or an inclusion on a sheet.
+    /// Message of the refusal of a material or an inclusion on a sheet ([`Reason::WrongKind`]).
     pub const OF_A_MESH: &str = "is for a mesh: a sheet has the same points and springs all over";
 
-    /// Creates a material of usual soft tissue: density 1060 kg/m³, depth 0.03 m, damping ratio 0.5.
+    /// Creates a material of usual soft tissue: density 1060 kg/m³, depth 0.03 m, damping ratio 0.5. The
+    /// arguments, Pa, m and N/m³, are not checked.
     pub fn new(youngs_modulus_pa: f64, thickness_m: f64, foundation_n_per_m3: f64) -> Self {
         let (density_kg_per_m3, depth_m, damping_ratio) = (1060.0, 0.03, 0.5);
         Material { youngs_modulus_pa, thickness_m, density_kg_per_m3, depth_m, foundation_n_per_m3, damping_ratio }
@@ -112,7 +116,9 @@ impl Material {
     /// on each m² for a strain of 1, with ν = 1/3 (module `membrane`).
     ///
     /// # Errors
-    /// Refuses a value out of its range, and a mesh with a vertex that has edges but no area.
+    /// Refuses a modulus, thickness, density or depth beyond 1e-12 to 1e12; a foundation that is neither 0 nor
+    /// in this range; a damping ratio beyond 0 to 100; and a mesh with a vertex that has edges but no area
+    /// ([`Reason::Unreadable`]).
     pub fn applied(&self, bending: f64, shape: Arc<MeshShape>) -> Result<MadeOf> {
         self.check()?;
         let Spread { of_vertices_m2, beside_edges_m2 } = Spread::of(&shape);
@@ -197,29 +203,29 @@ impl Spread {
     }
 }
 
-/// A region of a mesh that is stiffer or softer.
+/// A region of a mesh that is stiffer or softer. [`Inclusion::put_into`] checks it and applies it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Inclusion {
     /// Where the region is.
     pub region: Region,
-    /// k of the springs inside divided by k outside.
+    /// k of the springs inside divided by k outside, 0.01 to 100; bending springs included.
     pub stiffness_factor: f64,
-    /// K″ of the points inside divided by K″ outside.
+    /// K″ of the points inside divided by K″ outside, 0.01 to 100.
     pub anchor_stiffness_factor: f64,
-    /// Width of the transition around the region, in which the factors fall to 1, m. A factor f acts as 1 + (f
-    /// − 1)·p, with p = 1 within the region and p = 1 − x²·(3 − 2x) at x times this distance beyond it. A
-    /// spring has the mean p of its ends.
+    /// Width of the transition around the region, in which the factors fall to 1, m; at least 0. A factor f
+    /// acts as 1 + (f − 1)·p, with p = 1 within the region and p = 1 − x²·(3 − 2x) at x times this distance
+    /// beyond it. A spring has the mean p of its ends.
     pub edge_m: f64,
 }
 
-/// A part of a surface.
+/// A part of a surface: where an inclusion is.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Region {
-    /// The part within a ball.
+    /// The vertices within a ball, through the tissue: also those of another side of the surface.
     Ball {
-        /// Its centre, m.
+        /// Its centre, m, in the frame of the mesh.
         centre_m: DVec3,
-        /// Its radius, m.
+        /// Its radius, m; above 0.
         radius_m: f64,
     },
     /// The vertices of the mesh's group with this name.
@@ -227,10 +233,12 @@ pub enum Region {
 }
 
 impl Region {
-    /// Creates a region from either a ball (centre and radius, m) or the name of a group.
+    /// Creates a region from either a ball (centre and radius, m) or the name of a group. Numbers and name are
+    /// not checked.
     ///
     /// # Errors
-    /// Refuses both, neither, and a ball without centre or radius.
+    /// Refuses both ([`Reason::WrongKind`]), neither, and a ball without centre or radius
+    /// ([`Reason::Missing`]).
     pub fn of(centre_m: Option<DVec3>, radius_m: Option<f64>, group: Option<String>) -> Result<Self> {
         let refuse = |reason, key, message| Err(Refusal::new(reason, key, message));
         match (centre_m, radius_m, group) {
@@ -340,12 +348,14 @@ impl Inclusion {
         parts
     }
 
-    /// Returns the mesh with inclusions applied; where several overlap, their factors multiply. `field` is the
-    /// key of the list in refusals.
+    /// Returns the mesh with inclusions applied; where several overlap, or the mesh has factors already, the
+    /// factors multiply. The result has no volume, unless the list is empty: then the mesh is unchanged.
+    /// `field` is the key of the list in refusals (`field[n].key` for inclusion n).
     ///
     /// # Errors
-    /// Refuses too many inclusions (256, fewer on a very large mesh), a value out of its range, a group that
-    /// the mesh does not have, and a ball without a vertex.
+    /// Refuses more than 256 inclusions, or than 8,000,000 divided by the number of vertices
+    /// ([`Reason::TooLarge`]); a factor beyond 0.01 to 100, a negative edge, a radius that is not above 0; a
+    /// group that the mesh does not have; and a ball that no vertex is in or within `edge_m` of.
     pub fn put_into(inclusions: &[Inclusion], field: &str, mesh: &Mesh) -> Result<Mesh> {
         let shape = &mesh.shape;
         let count = shape.vertices_m().len();

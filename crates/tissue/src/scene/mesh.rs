@@ -20,21 +20,25 @@ use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{Extent, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, positive};
 
-/// A triangle mesh with a mass point at each vertex and a spring along each edge.
+/// A triangle mesh with a mass point at each vertex and a spring along each edge. [`Mesh::new`],
+/// [`Mesh::uneven`] and [`Mesh::of`] create it; they compute `stiffest`, which depends on the other fields, so
+/// don't change those alone.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Mesh {
-    /// The reference mass, kg: the mass of each point, unless `differences` has others.
+    /// The reference mass, kg: the mass of each point, unless `differences` has others; then, for a material,
+    /// that of a vertex of mean area.
     pub point_mass_kg: f64,
-    /// k of the bending springs relative to k of the edge that they cross; 0 without such springs. A bending
-    /// spring joins the two vertices opposite an edge.
+    /// k of the bending springs relative to k of the edge that they cross, 0 to 10 in scenes; 0 without such
+    /// springs. A bending spring joins the two vertices opposite an edge.
     pub bending: f64,
     /// Where the points rest and how they are joined.
     pub shape: Arc<MeshShape>,
-    /// How the points and springs differ from the reference values.
+    /// How the points and springs differ from the reference values; empty lists if they don't.
     pub differences: Arc<PerNodeFactors>,
-    /// An upper bound of the stiffness of the springs, which limits the substep.
+    /// An upper bound of the stiffness of the springs, which limits the substep, and the vertex where it is
+    /// largest.
     pub stiffest: StiffnessBound,
-    /// The enclosed volume, if it resists changes (section `[volume]`).
+    /// The enclosed volume, if it resists changes (section `[volume]`, [`Mesh::enclosing`]); otherwise `None`.
     pub volume: Option<Arc<Volume>>,
 }
 
@@ -42,9 +46,9 @@ pub struct Mesh {
 /// is empty if all of its points or springs have the reference value. C/m is the same at every point.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PerNodeFactors {
-    /// Mass of each point divided by the reference mass.
+    /// Mass of each point, by point number, divided by the reference mass.
     pub relative_mass: Vec<f64>,
-    /// K″/m of each point divided by the reference value, minus 1.
+    /// K″/m of each point, by point number, divided by the reference value, minus 1.
     pub extra_anchor: Vec<f64>,
     /// k of each edge divided by the reference k, in the order of [`MeshShape::edges`].
     pub edges: Vec<f64>,
@@ -61,16 +65,17 @@ pub struct StiffnessBound {
     /// Laplacian of the weighted graph, Σ k_ij/m_i·(x_i − x_j) = λ·x_i, since a spring along n contributes at
     /// most k·I to the stiffness under any deformation.
     pub bound: f64,
-    /// The vertex that moves most in the fastest vibration.
+    /// The number of the vertex that moves most in the fastest vibration (estimated); 0 without springs.
     pub vertex: u32,
-    /// The bound for the median spring: half of the springs have at most this.
+    /// The bound for the median spring, in the unit of `bound`: half of the springs have at most this.
     pub usual: f64,
     /// The largest excess of K″/m of a point over the reference value, divided by that value; at least 0.
     pub extra_anchor: f64,
 }
 
 /// The rest shape of a mesh. Point n is vertex n of the file, unless the simulated mesh is not the mesh of the
-/// file.
+/// file ([`MeshShape::shown`]); numbers here are those of the simulated mesh, places are in m in the frame of
+/// the file.
 #[derive(Debug, PartialEq)]
 pub struct MeshShape {
     vertices_m: Vec<DVec3>,
@@ -94,21 +99,23 @@ pub struct MeshShape {
     shown: Option<Shown>,
 }
 
-/// Facts about a mesh that clients receive and the simulation does not need.
+/// Facts about a mesh that clients receive and the simulation does not need; from [`MeshShape::told`].
+/// `default()` if the shape was made without a scene.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshMetadata {
     /// The vertices that never move, as the scene specifies them.
     pub fixed: FixedVertices,
-    /// Texture coordinates of each vertex, if the file has them; at a seam, those of one side.
+    /// Texture coordinates (u, v) of each simulated vertex, if the file has them; at a seam, those of one side.
     pub uv: Option<Vec<[f32; 2]>>,
-    /// Named groups of vertices.
+    /// Named groups of vertices of the simulated mesh, in the order of the file; empty if it has none.
     pub groups: Vec<Group>,
-    /// What was done with the mesh of the file, and doubts about it, as sentences for the user.
+    /// What was done with the mesh of the file, and doubts about it, as sentences for the user; empty if there
+    /// are none.
     pub findings: Vec<String>,
 }
 
 impl Mesh {
-    /// Message of the refusal of a point mass beside a material.
+    /// Message of the refusal of a point mass beside a material ([`Reason::WrongKind`]).
     pub const WEIGHED: &str = "does not go with [material], which says what a point weighs";
 
     /// Reads the section `[mesh]`. `of_material` says that a section `[material]` gives the masses; then the
@@ -145,8 +152,8 @@ impl Mesh {
         made.map_err(|refusal| source.refuse(refusal.reason, refusal.message))
     }
 
-    /// Creates a tissue on a mesh with equal springs along its edges, without bending springs. `point_mass_kg`
-    /// is the mass of each point.
+    /// Creates a tissue on a mesh, m, with equal springs along its edges, without bending springs, volume and
+    /// shown mesh. `point_mass_kg` is the mass of each point, kg, which is not checked.
     ///
     /// # Errors
     /// Refuses every mesh that [`MeshShape::new`] refuses.
@@ -155,7 +162,8 @@ impl Mesh {
     }
 
     /// Creates a tissue on a simulated mesh, for which the mesh of the file may be shown. It has equal springs
-    /// along its edges and no bending springs.
+    /// along its edges, no bending springs and no volume. `point_mass_kg` is the mass of each point, kg, which
+    /// is not checked. A ball of `fixed` without a vertex becomes a finding ([`MeshMetadata::findings`]).
     ///
     /// # Errors
     /// Refuses every mesh that [`MeshShape::new`] refuses.
@@ -194,14 +202,17 @@ impl Mesh {
         Ok(Mesh::new(point_mass_kg, 0.0, Arc::new(shape)))
     }
 
-    /// Creates a tissue in which all points and all edges are alike. `bending` is the k of the bending springs
-    /// relative to that of the edges; 0 creates none.
+    /// Creates a tissue without volume in which all points, of mass `point_mass_kg`, kg, and all edges are
+    /// alike. `bending` is the k of the bending springs relative to that of the edges; 0 creates none. It
+    /// bounds the stiffness, which takes a while on a large mesh.
     pub fn new(point_mass_kg: f64, bending: f64, shape: Arc<MeshShape>) -> Self {
         Self::uneven(point_mass_kg, bending, shape, PerNodeFactors::default())
     }
 
-    /// Creates a tissue whose points and springs differ by the factors in `differences`. `bending` is the k of
-    /// the bending springs relative to that of the edges; 0 creates none.
+    /// Creates a tissue without volume whose points and springs differ by the factors in `differences`, each
+    /// list of which must be empty or have its full length (a missing factor counts as that of the reference).
+    /// `point_mass_kg` is the reference mass, kg; `bending` is the k of the bending springs relative to that of
+    /// the edges; 0 creates none. Nothing is checked.
     pub fn uneven(point_mass_kg: f64, bending: f64, shape: Arc<MeshShape>, differences: PerNodeFactors) -> Self {
         let stiffest = StiffnessBound { bound: 0.0, vertex: 0, usual: 0.0, extra_anchor: 0.0 };
         let differences = Arc::new(differences);
@@ -210,10 +221,11 @@ impl Mesh {
         mesh
     }
 
-    /// Adds the volume that the mesh encloses. The mesh must be closed.
+    /// Adds the volume that the mesh encloses, from its rest shape and its present springs and masses.
     ///
     /// # Errors
-    /// Refuses a mesh that encloses no volume, or several.
+    /// Refuses a mesh with a hole, with triangles of inconsistent orientation, of several parts, or flat
+    /// ([`Reason::WrongKind`], field `volume`).
     pub fn enclosing(mut self) -> Result<Self> {
         let volume = Volume::of(&self.shape.vertices_m, &self.shape.triangles)?;
         let volume = volume.among(self.springs(), |vertex| self.relative_mass(PointId::new(vertex)));
@@ -221,24 +233,27 @@ impl Mesh {
         Ok(self)
     }
 
-    /// Returns the mass of a point divided by the reference mass.
+    /// Returns the mass of a point divided by the reference mass; 1 without factors, or for a point that the
+    /// mesh does not have.
     pub fn relative_mass(&self, point: PointId) -> f64 {
         self.differences.relative_mass.get(point.index()).copied().unwrap_or(1.0)
     }
 
-    /// Returns K″/m of a point divided by the reference value, minus 1.
+    /// Returns K″/m of a point divided by the reference value, minus 1; 0 without factors, or for a point that
+    /// the mesh does not have.
     pub fn extra_anchor(&self, point: PointId) -> f64 {
         self.differences.extra_anchor.get(point.index()).copied().unwrap_or(0.0)
     }
 
-    /// Returns the total mass of the points that have an edge, kg.
+    /// Returns the total mass of the points that have an edge, kg, fixed ones included.
     pub fn mass_kg(&self) -> f64 {
         let used = (0..self.shape.vertices_m.len()).filter(|vertex| self.shape.is_used(*vertex));
         self.point_mass_kg * used.map(|vertex| self.relative_mass(PointId::new(vertex))).sum::<f64>()
     }
 
-    /// Returns every spring as its two ends and its k divided by the reference k: first edges, then bending
-    /// springs.
+    /// Returns every spring as its two ends, ascending, and its k divided by the reference k: first edges, in
+    /// the order of [`MeshShape::edges`], then bending springs, in that of [`MeshShape::opposite`] (none if
+    /// `bending` is 0).
     pub fn springs(&self) -> impl Iterator<Item = ([u32; 2], f64)> + '_ {
         let (shape, part) = (&self.shape, self.bending);
         let PerNodeFactors { edges, bending: bending_factors, .. } = &*self.differences;
@@ -374,13 +389,16 @@ impl Mesh {
         stiffest
     }
 
-    /// Returns the place of the fastest vibration as the end of a message.
+    /// Returns the place of the fastest vibration as the end of a message: `, most of all at vertex n, (x, y,
+    /// z) m`.
     pub fn fastest_place(&self) -> String {
         let point = PointId::new(self.stiffest.vertex as usize);
         format!(", most of all at {}, {:.4} m", self.shape.name(point), self.shape.rest_m(point))
     }
 
-    /// Returns warnings about the mesh for the user, as sentences.
+    /// Returns warnings about the mesh for the user, as sentences: the findings ([`MeshMetadata::findings`]),
+    /// fixed vertices that fix nothing or everything, and a vertex that vibrates much faster than others. Empty
+    /// if there are none.
     pub fn warnings(&self) -> Vec<String> {
         let shape = &self.shape;
         let mut warnings = shape.told.findings.clone();
@@ -410,7 +428,7 @@ impl Mesh {
     }
 
     /// Returns whether a few vertices vibrate so fast that they alone require many substeps: more than 2.5
-    /// times as fast as half of the mesh.
+    /// times as fast as half of the springs ([`StiffnessBound::usual`]).
     pub fn has_fast_vertex(&self) -> bool {
         self.fastest_ratio() > MUCH_FASTER
     }
@@ -442,11 +460,11 @@ pub enum FixedVertices {
     /// No vertex.
     #[default]
     None,
-    /// The vertices on edges with a single triangle.
+    /// The vertices on edges with a single triangle; none if the mesh is closed.
     Rim,
-    /// The vertices of a group of the file.
+    /// The vertices of a group of the file, by numbers of the simulated mesh, ascending.
     Group(Group),
-    /// The vertices within balls, each given by centre and radius, m.
+    /// The vertices within balls, each given by centre and radius, m, the surface of the ball included.
     Balls(Vec<(DVec3, f64)>),
 }
 
@@ -475,10 +493,10 @@ impl FixedVertices {
         })
     }
 
-    /// Returns the vertices of the group `name` as fixed vertices.
+    /// Returns the vertices of the group `name` of a mesh as fixed vertices.
     ///
     /// # Errors
-    /// Refuses a name that no group has; `field` is the key that the refusal gives.
+    /// Refuses a name that no group has ([`Reason::WrongKind`]); `field` is the key that the refusal gives.
     pub fn group(field: &str, name: &str, mesh: &TriangleMesh) -> Result<Self> {
         group_named(field, name, &mesh.groups).map(|group| FixedVertices::Group(group.clone()))
     }
@@ -499,12 +517,15 @@ pub(super) fn group_named<'g>(field: &str, name: &str, groups: &'g [Group]) -> R
 }
 
 impl MeshShape {
-    /// Creates the shape from vertices, m, and triangles. `is_fixed` decides whether a vertex never moves. Its
-    /// arguments are whether the vertex is on a rim, where it rests, and its number.
+    /// Creates the shape from vertices, m, and triangles, counterclockwise seen from outside. `is_fixed`
+    /// decides whether a vertex never moves; it is called once for each, ascending. Its arguments are whether
+    /// the vertex is on a rim, where it rests, m, and its number. The shape has no metadata
+    /// ([`MeshShape::told`]) and no shown mesh.
     ///
     /// # Errors
-    /// Refuses a mesh without an edge, with an edge of length 0, with an edge of more than two triangles, and
-    /// with vertex numbers or places that are out of range or not finite.
+    /// Refuses ([`Reason::Unreadable`], field `mesh`) a mesh without a triangle, with an edge of length 0, with
+    /// an edge of more than two triangles, with vertex numbers beyond the last, and with places that are not
+    /// finite; and one so large that the mean edge is not finite.
     pub fn new(
         vertices_m: Vec<DVec3>,
         triangles: Vec<[u32; 3]>,
@@ -513,11 +534,13 @@ impl MeshShape {
         Self::braced(vertices_m, triangles, &[], is_fixed)
     }
 
-    /// Creates the shape from vertices, m, and triangles, with additional springs `braces` between other pairs
-    /// of vertices, like those of edges; for example along both diagonals of a square.
+    /// Creates the shape as [`MeshShape::new`] does, with additional springs `braces` between other pairs of
+    /// vertices, like those of edges; for example along both diagonals of a square. They count among
+    /// [`MeshShape::edges`], each once. Without triangles, they suffice as edges. Panics if a brace names a
+    /// vertex that is not there; a brace between places that coincide is not refused.
     ///
     /// # Errors
-    /// Refuses every mesh that [`MeshShape::new`] refuses.
+    /// Refuses every mesh that [`MeshShape::new`] refuses, except one with braces but no triangle.
     pub fn braced(
         vertices_m: Vec<DVec3>,
         triangles: Vec<[u32; 3]>,
@@ -619,33 +642,36 @@ impl MeshShape {
         )
     }
 
-    /// Returns the facts about the mesh that clients receive.
+    /// Returns the facts about the mesh that clients receive; empty unless the shape was made by
+    /// [`Mesh::simulating`] or from a scene.
     pub fn told(&self) -> &MeshMetadata {
         &self.told
     }
 
-    /// Returns the rest position of each vertex, m.
+    /// Returns the rest position of each vertex, m, by vertex number.
     pub fn vertices_m(&self) -> &[DVec3] {
         &self.vertices_m
     }
 
-    /// Returns the triangles as three vertices each, counterclockwise seen from outside.
+    /// Returns the triangles as three vertices each, counterclockwise seen from outside, in the order in which
+    /// they were given.
     pub fn triangles(&self) -> &[[u32; 3]] {
         &self.triangles
     }
 
-    /// Returns the triangles as a surface on which a tip can move. The first call builds it.
+    /// Returns the triangles as a surface on which a tip can move. The first call builds it, which takes a
+    /// while on a large mesh; calls of other threads wait for it.
     pub fn surface(&self) -> &Surface {
         self.surface.get_or_init(|| Surface::new(&self.vertices_m, &self.triangles))
     }
 
-    /// Returns the two vertices of each edge, ascending; edges ascending.
+    /// Returns the two vertices of each edge, braces included, ascending; edges ascending, each once.
     pub fn edges(&self) -> &[[u32; 2]] {
         &self.edges
     }
 
     /// Returns the two vertices opposite each edge that has two triangles, ascending: the ends of the bending
-    /// springs.
+    /// springs. Pairs are ascending, each once, also if several edges have the same.
     pub fn opposite(&self) -> &[[u32; 2]] {
         &self.opposite
     }
@@ -655,18 +681,19 @@ impl MeshShape {
         &self.crossed
     }
 
-    /// Returns the unit normal at each vertex, out of the tissue.
+    /// Returns the unit normal at each vertex at rest, by vertex number, out of the tissue: the mean over its
+    /// triangles, weighted by area; +z for a vertex without area.
     pub fn normals(&self) -> &[DVec3] {
         &self.normals
     }
 
     /// Returns whether a vertex has an edge. A vertex without one is not part of the tissue: size and mass do
-    /// not count it, and it is never the nearest to a place.
+    /// not count it, and it is never the nearest to a place. Panics if there is no such vertex.
     pub fn is_used(&self, vertex: usize) -> bool {
         !self.neighbours.of(vertex).is_empty()
     }
 
-    /// Returns whether a vertex is on an edge with a single triangle.
+    /// Returns whether a vertex is on an edge with a single triangle. Panics if there is no such vertex.
     pub fn is_on_rim(&self, vertex: usize) -> bool {
         self.on_rim[vertex]
     }
@@ -700,12 +727,13 @@ impl MeshShape {
         away_m
     }
 
-    /// Returns whether every edge has two triangles.
+    /// Returns whether every edge has two triangles; braces don't count.
     pub fn is_closed(&self) -> bool {
         !self.on_rim.contains(&true)
     }
 
-    /// Returns the mesh of the file, if it is shown in place of the simulated mesh.
+    /// Returns the mesh of the file, if it is shown in place of the simulated mesh, because it has other
+    /// vertices; otherwise `None`.
     pub fn shown(&self) -> Option<&Shown> {
         self.shown.as_ref()
     }

@@ -396,8 +396,8 @@ impl Scene {
     /// file that is not named is ignored.
     ///
     /// # Errors
-    /// Refuses everything that [`Scene::parse_in`] refuses, and a scene that names another mesh file. The bytes
-    /// given may be more than `limits.mesh_bytes` only for formats that don't check it.
+    /// Refuses everything that [`Scene::parse_in`] refuses, and a scene that names another mesh file
+    /// ([`Reason::WrongKind`]).
     pub fn parse_given(name: &str, text: &str, (mesh_name, mesh): (&str, &[u8]), limits: &Limits) -> Result<Self> {
         Self::parse_with(name, text, &[], Files::Given(mesh_name, mesh), limits)
     }

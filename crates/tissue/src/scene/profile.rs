@@ -9,7 +9,8 @@ use palpate_haptics::Tip;
 
 use crate::shape::{self, PointId, RestShape};
 
-/// A moment within a step.
+/// A moment within a step. A profile that jumps has its value before the jump at (n − 1, 1), and its value
+/// after it at (n, 0).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moment {
     /// The present step, counted from 0.
@@ -19,7 +20,7 @@ pub struct Moment {
 }
 
 impl Moment {
-    /// Returns the beginning of a step.
+    /// Returns the beginning of a step, at which its commands already apply.
     pub fn start_of(step: u64) -> Self {
         Moment { step, fraction: 0.0 }
     }
@@ -33,61 +34,66 @@ impl Moment {
 
 /// A surgical force at one moment (the paper's exerting force and its falloff). Point p gets the force
 /// `force_n`·exp(−`falloff_per_m`·r + `falloff_offset`), where r is the distance at rest from p to `centre_m`.
+/// Vectors and places are in the tissue's frame. [`check_poke`](super::action_check::check_poke) checks one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Poke {
     /// The mass point at the centre, if the force was given by a point. Then its reaction is reported;
     /// otherwise the mean of the reactions around the centre.
     pub point: Option<PointId>,
-    /// Place of the control point at rest, m. On a sheet z is 0.
+    /// Place of the control point at rest, m; the rest position of `point`, if that is some. On a sheet z is 0.
     pub centre_m: DVec3,
-    /// The exerting force, N.
+    /// The exerting force, N, before falloff and offset.
     pub force_n: DVec3,
-    /// Falloff c, 1/m.
+    /// Falloff c, 1/m, at least 0. With 0 every point gets the same force.
     pub falloff_per_m: f64,
-    /// Offset c′ of the exponent.
+    /// Offset c′ of the exponent, without unit: the force at the centre is `force_n`·e^{c′}.
     pub falloff_offset: f64,
 }
 
-/// A surgical force over time.
+/// A surgical force over time, whose value at a moment is a [`Poke`]. Steps are those of the step rate for
+/// which it was made.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadProfile {
     /// Place of the control point over time.
     pub centre: CentreProfile,
     /// The exerting force over time.
     pub strength: StrengthProfile,
-    /// Falloff c, 1/m.
+    /// Falloff c, 1/m, at least 0; the same all the time.
     pub falloff_per_m: f64,
-    /// Offset c′ of the exponent.
+    /// Offset c′ of the exponent, without unit; the same all the time.
     pub falloff_offset: f64,
 }
 
-/// The place of a force's control point over time.
+/// The place of a force's control point over time, m, in the frame of the tissue at rest. It stays between two
+/// entries of a list.
 #[derive(Debug, Clone, PartialEq)]
 pub enum CentreProfile {
-    /// Places, m, each with the step from which it applies. There is no force before the first.
-    Hops(Vec<(u64, DVec3)>),
-    /// Mass points and their rest positions, m, each with the step from which it applies. There is no force
+    /// Places, m, each with the step from which it applies, by strictly ascending step. There is no force
     /// before the first.
+    Hops(Vec<(u64, DVec3)>),
+    /// Mass points and their rest positions, m, each with the step from which it applies, by strictly ascending
+    /// step. There is no force before the first.
     Points(Vec<(u64, (PointId, DVec3))>),
-    /// A straight line at constant velocity.
+    /// A straight line at constant velocity, without an end: also beyond the rim of the tissue.
     Path {
-        /// Place at time 0, m.
+        /// Place at time 0 (the beginning of step 0), m.
         from_m: DVec3,
         /// Velocity, m/s.
         velocity_m_per_s: DVec3,
     },
 }
 
-/// The exerting force over time.
+/// The exerting force over time, N, before falloff and offset ([`Poke::force_n`]).
 #[derive(Debug, Clone, PartialEq)]
 pub enum StrengthProfile {
-    /// A fixed vector times a profile.
+    /// A fixed force, N, times a factor over time.
     Scaled(DVec3, Profile),
-    /// Forces, N, each with the step from which it applies. There is no force before the first.
+    /// Forces, N, each with the step from which it applies, by strictly ascending step; it stays until the
+    /// next. There is no force before the first.
     Recorded(Vec<(u64, DVec3)>),
 }
 
-/// A factor over time, which scales a force.
+/// A factor over time, without unit, which scales a force.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Profile {
     /// Always 1.
@@ -101,12 +107,12 @@ pub enum Profile {
     },
     /// 0, then linear to 1, then 1.
     Ramp {
-        /// Time at which the rise begins, s.
+        /// Time at which the rise begins, s, from the beginning of step 0.
         from_s: f64,
-        /// Time at which the factor is 1, s.
+        /// Time at which the factor is 1, s; above `from_s`, or else the factor jumps or is NaN.
         to_s: f64,
     },
-    /// sin(2πft).
+    /// sin(2πft), from −1 to 1, with t the time since the beginning of step 0.
     Sine {
         /// f, Hz.
         frequency_hz: f64,
@@ -131,14 +137,15 @@ impl Profile {
     }
 }
 
-/// Returns Σ exp(−c·r) over all points of a shape, where r is the distance at rest to `centre_m`, m, and c is
-/// `falloff_per_m`, 1/m. A force given for all points together is divided by this sum.
+/// Returns Σ exp(−c·r) over all points of a shape, fixed ones included, where r is the distance at rest to
+/// `centre_m`, m, and c is `falloff_per_m`, 1/m. A force given for all points together is divided by this sum.
+/// 0 if every point is too far away.
 pub fn weights(shape: &dyn RestShape, centre_m: DVec3, falloff_per_m: f64) -> f64 {
     shape::points(shape).map(|point| libm::exp(-falloff_per_m * shape.rest_m(point).distance(centre_m))).sum()
 }
 
 impl CentreProfile {
-    /// Returns the first place of the control point at rest, m.
+    /// Returns the first place of the control point at rest, m, whenever it applies; 0 for an empty list.
     pub fn begins_at_m(&self) -> DVec3 {
         match self {
             CentreProfile::Hops(hops) => hops.first().map_or(DVec3::ZERO, |hop| hop.1),
@@ -149,7 +156,8 @@ impl CentreProfile {
 }
 
 impl LoadProfile {
-    /// Returns the force at a moment, at `rate_hz` steps per second; zero before it begins.
+    /// Returns the force at a moment, at `rate_hz` steps per second. Before the first entry of a list, the
+    /// force is zero; before the first place, the centre is the origin as well.
     pub fn at(&self, moment: Moment, rate_hz: f64) -> Poke {
         let force_n = match &self.strength {
             StrengthProfile::Scaled(force, profile) => *force * profile.at(moment, rate_hz),
@@ -176,12 +184,13 @@ impl LoadProfile {
     }
 }
 
-/// The movement of a grasped point over time.
+/// The movement of a grasped point over time: the sum of its moves, in the tissue's frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MotionProfile {
-    /// The point.
+    /// The point, which must not be fixed.
     pub point: PointId,
-    /// Displacements from the rest position, which add up.
+    /// Displacements from the rest position, which add up; in any order, and they may overlap. Empty: the point
+    /// is held at rest.
     pub moves: Vec<Move>,
 }
 
@@ -190,23 +199,24 @@ pub struct MotionProfile {
 /// Neuroscience 5(7), 1985, doi:10.1523/JNEUROSCI.05-07-01688.1985).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Move {
-    /// Time at which it begins, s.
+    /// Time at which it begins, s, from the beginning of step 0.
     pub from_s: f64,
-    /// Time at which it ends, s.
+    /// Time at which it ends, s, above `from_s`.
     pub to_s: f64,
-    /// Displacement, m.
+    /// Displacement that the whole move adds, m.
     pub by_m: DVec3,
 }
 
 /// The movement of a tool with a tip, from pose to pose.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PoseProfile {
-    /// The tip: its radius, friction and coupling to the tissue.
+    /// The tip: its radius, friction and coupling to the tissue; the same all the time.
     pub tip: Tip,
-    /// Times, s, and places of the tip, m, by ascending time; at least one. Between two of them the tip moves
-    /// on a straight line with the smooth profile of a [`Move`].
+    /// Times, s, and places of the tip, m, in the frame of the tissue at rest, by strictly ascending time; at
+    /// least one. Between two of them the tip moves on a straight line with the smooth profile of a [`Move`];
+    /// after the last it stays.
     pub poses: Vec<(f64, DVec3)>,
-    /// Time at which the tool is taken away, s.
+    /// Time at which the tool is taken away, s, later than the first pose; infinite if it stays.
     pub until_s: f64,
 }
 
@@ -225,7 +235,7 @@ impl PoseProfile {
     }
 }
 
-/// The position and motion of a prescribed point.
+/// The position and motion of a prescribed point, as vectors in the tissue's frame. `default()` is at rest.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Motion {
     /// Displacement from rest, m.

@@ -11,36 +11,37 @@ use crate::shape::{PointName, RestShape};
 use palpate_refusal::printable::printable_json;
 use palpate_refusal::{Reason, Refusal};
 
-/// The first line of a file of records: what was run, and how.
+/// The first line of a file of records, `{"run": …}`: what was run, and how.
 #[derive(Debug, Clone, Serialize)]
 pub struct Run {
-    /// Name of the scene.
+    /// Display name of the scene.
     pub scene: String,
-    /// Name of the script.
+    /// Display name of the script.
     pub script: String,
-    /// The integrator used; with `auto`, the one that was selected.
+    /// Name of the integrator used at the beginning; with `auto`, the one that was selected.
     pub integrator: String,
-    /// Substeps per step.
+    /// Substeps per step at the beginning.
     pub substeps: u32,
-    /// The precision used; with `auto`, the one that was selected.
+    /// Name of the number format used at the beginning; with `auto`, the one that was selected.
     pub precision: String,
-    /// Steps per second.
+    /// Steps per second, Hz.
     pub rate_hz: f64,
     /// Version of Palpate.
     pub version: String,
 }
 
-/// The state at one sample time, on one line. Forces on points are those on the tissue, N.
+/// The state at one sample time, on one line. Forces on points are those on the tissue, N. Vectors are [x, y,
+/// z] in the tissue's frame.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Record {
-    /// Simulated time, s.
+    /// Simulated time, s, since the beginning of step 0.
     pub time_s: f64,
-    /// The points, in the order requested.
+    /// The points, in the order requested; empty if none were.
     pub points: Vec<Point>,
     /// The tools with a tip that are at the tissue, by ascending number.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub tools: Vec<ToolRecord>,
-    /// Energies of the whole tissue, J.
+    /// Energies of the whole tissue, J; `None` if they were not requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub energy_j: Option<EnergyJ>,
     /// Points computed in this step; sleeping points are not counted.
@@ -48,9 +49,9 @@ pub struct Record {
 }
 
 impl Record {
-    /// Returns the displacement, m, and the force of the tissue, N, of the first tool with a tip, whose number
-    /// is `tip`. Returns `None` while that tool is away. Without such tools (`tip` is `None`), returns those of
-    /// the first point.
+    /// Returns the displacement, m, and the force of the tissue, N, of the tool whose number is `tip`
+    /// ([`Script::first_tip`](super::script::Script::first_tip)); `None` while that tool is away. If `tip` is
+    /// `None`, returns displacement and reaction of the first point; `None` without points.
     pub fn first(&self, tip: Option<usize>) -> Option<([f64; 3], [f64; 3])> {
         let Some(tip) = tip else {
             return self.points.first().map(|point| (point.displacement_m, point.reaction_n));
@@ -59,8 +60,8 @@ impl Record {
         tool.map(|tool| (tool.displacement_m, tool.force_on_tool_n))
     }
 
-    /// Returns the largest force of the tissue on a tool with a tip, N; 0 while all are away. If `has_tips` is
-    /// false, the largest force at a point counts too.
+    /// Returns the largest force of the tissue on a tool with a tip, N (its length); 0 while all are away. If
+    /// `has_tips` is false, the reactions at the points count too.
     pub fn peak_n(&self, has_tips: bool) -> f64 {
         let length = |v: [f64; 3]| v.iter().map(|c| c * c).sum::<f64>().sqrt();
         let tools = self.tools.iter().map(|tool| length(tool.force_on_tool_n));
@@ -69,7 +70,8 @@ impl Record {
     }
 }
 
-/// The state of one mass point: displacement, velocity, and the forces on it.
+/// The state of one mass point at the end of a step: displacement, velocity, and the forces on it, as [x, y, z]
+/// in the tissue's frame.
 #[derive(Debug, Clone, Serialize)]
 pub struct Point {
     /// The name of the point: `"point": [i, j]` on a sheet, `"vertex": n` on a mesh.
@@ -87,14 +89,15 @@ pub struct Point {
     pub damping_n: [f64; 3],
     /// Force of all pushing tools, N.
     pub applied_n: [f64; 3],
-    /// Sum of the forces of springs, anchor spring and damping, N.
+    /// Force of the tissue on a tool at the point, N: the sum of the forces of springs, anchor spring and
+    /// damping.
     pub reaction_n: [f64; 3],
-    /// The force that holds a prescribed point, N; `None` for other points.
+    /// The force that holds a prescribed (grasped) point, N; `None`, and not written, for other points.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub constraint_n: Option<[f64; 3]>,
 }
 
-/// The state of a tool with a tip, which a client moves by poses.
+/// The state of a tool with a tip, which a client moves by poses. Vectors are [x, y, z] in the tissue's frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ToolRecord {
     /// The tool's number: a script numbers its forces first, then its grasped points, then its tools with a
@@ -108,12 +111,12 @@ pub struct ToolRecord {
     pub force_on_tool_n: [f64; 3],
 }
 
-/// Energies of the whole tissue, J.
+/// Energies of the whole tissue, J, at the end of a step.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct EnergyJ {
     /// Σ ½m·v² of the points.
     pub kinetic: f64,
-    /// Energy stored in the springs between points.
+    /// Energy stored in the springs between points, and in an enclosed volume.
     pub spring: f64,
     /// Energy stored in the anchor springs, which pull each point to its rest position. Records call it
     /// `virtual`.
@@ -121,12 +124,13 @@ pub struct EnergyJ {
     pub anchor_springs: f64,
 }
 
-/// The last line of a file of records: counts, speed and accuracy of the run. Some fields are only for display.
+/// The last line of a file of records, `{"summary": …}`: counts, speed and accuracy of the run. Some fields are
+/// only for display and not written.
 #[derive(Debug, Clone, Serialize)]
 pub struct Summary {
     /// Steps done.
     pub steps: u64,
-    /// Substeps done.
+    /// Substeps done, those that the guard repeated included.
     pub substeps: u64,
     /// Points of the tissue.
     pub points: usize,
@@ -134,13 +138,14 @@ pub struct Summary {
     pub wall_s: f64,
     /// `wall_s`/(`substeps`·`points`), ns.
     pub ns_per_point_substep: f64,
-    /// Fraction of all point-substeps that were computed; the rest slept.
+    /// Fraction, 0 to 1, of all point-substeps that were computed; the rest slept.
     pub computed_fraction: f64,
-    /// How many times the guard acted.
+    /// How many times the guard went back and repeated with a shorter substep.
     pub guard_events: u64,
     /// XXH3-128 hash of the final state, in hexadecimal.
     pub final_hash: String,
-    /// The errors that an audit measured, over all sample points and times.
+    /// The errors that an audit measured, over all sample points and times; `None`, and not written, without an
+    /// audit.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub audited_error: Option<AuditedError>,
     /// Corrections after an audit, by ascending step.
@@ -168,7 +173,8 @@ pub struct Summary {
 }
 
 impl Summary {
-    /// Returns a message if the records are not those of the script, because the guard released the tools.
+    /// Returns a message if the records are not those of the script, because the guard released the tools:
+    /// about the first of `recoveries`. `None` if there is none.
     pub fn fault(&self) -> Option<String> {
         let Recovery { step, reason, .. } = self.recoveries.first()?;
         Some(format!(
@@ -177,7 +183,8 @@ impl Summary {
     }
 }
 
-/// Returns a warning if a point moved farther than the tissue is long: then a unit is probably wrong.
+/// Returns a warning if a point moved by more than the tissue's longest side: then a unit is probably wrong.
+/// `largest_m` is the largest displacement of the run, m. Otherwise `None`.
 pub fn far_warning(largest_m: f64, shape: &dyn RestShape) -> Option<String> {
     let longest_m = shape.longest_side_m();
     (largest_m > longest_m).then(|| {
@@ -188,13 +195,14 @@ pub fn far_warning(largest_m: f64, shape: &dyn RestShape) -> Option<String> {
     })
 }
 
-/// A measured error. Each part is relative to the largest component of its quantity.
+/// A measured error, of an audit. Each part is the largest difference of its quantity, relative to the largest
+/// component of that quantity: without unit. `default()` is no error.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct AuditedError {
-    /// Largest difference of any component of a displacement.
+    /// Largest difference of any component of a displacement, relative to the largest such component.
     pub displacement: f64,
     /// Largest difference of any component of the tissue's force on a tool (springs, anchor springs and
-    /// damping).
+    /// damping), relative to the largest such component.
     pub force: f64,
 }
 
@@ -211,24 +219,26 @@ impl AuditedError {
 }
 
 /// A correction: from this step on, the tissue is stepped more accurately, because an audited error was above
-/// the tolerance.
+/// the tolerance. [`Model::correction`](crate::Model::correction) makes one,
+/// [`Model::corrected()`](crate::Model::corrected()) applies it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Correction {
     /// The step at whose beginning it takes effect.
     pub step: u64,
     /// The measured error.
     pub audited_error: AuditedError,
-    /// The main source of the error.
+    /// The main source of the error, in words ([`Origin::describe`](crate::select::audit::Origin::describe)).
     pub reason: String,
-    /// The scheme from then on.
+    /// The scheme from then on; never `Auto`.
     #[serde(serialize_with = "name")]
     pub integrator: Integrator,
-    /// The substeps from then on.
+    /// The substeps per step from then on, at least.
     pub substeps: u32,
-    /// The number format from then on.
+    /// The number format from then on; never `Auto`.
     #[serde(serialize_with = "name")]
     pub precision: Precision,
-    /// The error that sleeping regions may add, from then on.
+    /// The error that sleeping regions may add from then on, relative to the largest displacement; 0 turns
+    /// sleep off.
     pub sleep_tolerance: f64,
 }
 
@@ -238,16 +248,18 @@ pub struct Correction {
 pub struct Recovery {
     /// Steps done when the guard found the error. Time continues from there.
     pub step: u64,
-    /// The step of the state that the tissue went back to.
+    /// The step of the state that the tissue went back to, at most `step`.
     pub state_of_step: u64,
-    /// Whether no such state existed, so that the tissue continued at rest.
+    /// Whether the tissue continued at rest, because that state had passed no check, or because there were too
+    /// many recoveries.
     pub at_rest: bool,
     /// Number of commands whose effect was lost, because they took effect after that state.
     pub undone_commands: u64,
-    /// After too many recoveries: until this step, commands to the tools that acted have no effect.
+    /// After too many recoveries: until this step, commands to the tools that acted have no effect. Otherwise
+    /// `None`, and not written.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub paused_until_step: Option<u64>,
-    /// What the guard found, in words.
+    /// The check that failed, in words ([`CheckFailure`](crate::CheckFailure)).
     pub reason: String,
 }
 
@@ -255,7 +267,7 @@ fn name<S: serde::Serializer>(value: &impl Named, serializer: S) -> Result<S::Ok
     serializer.serialize_str(value.name())
 }
 
-/// The measurements of a replay through a server.
+/// The measurements of a replay through a server, written among the fields of the [`Summary`].
 #[derive(Debug, Clone, Serialize)]
 pub struct Network {
     /// Commands that arrived after their step.
@@ -264,7 +276,8 @@ pub struct Network {
     pub rejected_commands: u64,
     /// Steps that the server dropped.
     pub overruns: u64,
-    /// Simulated time divided by real time, from the first sample to the last.
+    /// Simulated time divided by real time, from the first sample to the last: below 1, the server was slower
+    /// than real time.
     pub time_dilation: f64,
     /// Time from sending a message to its answer, µs. The answer does not wait for a step.
     pub round_trip_us: Percentiles,
@@ -274,16 +287,17 @@ pub struct Network {
 
 /// Percentiles of a distribution, in the unit of the field that has them.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
-/// The median.
 pub struct Percentiles {
-    /// 99 % of the values are at most this.
+    /// The median.
     pub p50: f64,
-    /// The largest value.
+    /// 99 % of the values are at most this.
     pub p99: f64,
+    /// The largest value.
     pub max: f64,
 }
 
-/// The first or the last line of a file of records: `{"run": …}` or `{"summary": …}`.
+/// The first or the last line of a file of records, for [`write_line`]: `{"run": …}` or `{"summary": …}`. The
+/// lines between are [`Record`]s.
 #[derive(Debug, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Line<'a> {
@@ -293,11 +307,13 @@ pub enum Line<'a> {
     Summary(&'a Summary),
 }
 
-/// Opens the output of the records: `file` (created or overwritten), or else the standard output. If the
-/// standard output is a terminal and `plots` is true, the records are discarded.
+/// Opens the output of the records, buffered: `file` (created or overwritten), or else the standard output. If
+/// the standard output is a terminal and `plots` is true, the records are discarded. Flush it at the end:
+/// dropping it loses errors.
 ///
 /// # Errors
-/// Refuses a file that can't be written.
+/// Refuses a file that can't be created or opened for writing ([`Reason::Unreadable`]); [`Refusal::place`] is
+/// its path.
 pub fn output(file: Option<&Path>, plots: bool) -> Result<Box<dyn Write>, Refusal> {
     let Some(path) = file else {
         let out = std::io::stdout();
@@ -310,10 +326,11 @@ pub fn output(file: Option<&Path>, plots: bool) -> Result<Box<dyn Write>, Refusa
     Ok(Box::new(BufWriter::new(file)))
 }
 
-/// Writes one value as a JSON object on one line.
+/// Writes one value as a JSON object on one line, with a line feed. Characters that act on a terminal are
+/// escaped.
 ///
 /// # Errors
-/// Returns the error of writing to `output`.
+/// Returns the error of writing to `output`, or of a value that can't be written as JSON.
 pub fn write_line(output: &mut dyn Write, line: &impl Serialize) -> std::io::Result<()> {
     let line = printable_json(serde_json::to_string(line)?);
     writeln!(output, "{line}")

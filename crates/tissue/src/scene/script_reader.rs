@@ -20,21 +20,35 @@ use crate::shape::{self, PointId};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, legible, not_negative, number, positive, unsigned_zero};
 
 impl Script {
-    /// Reads a script file and binds it to `scene`. Its traces are in the file's folder.
+    /// Reads a script file and binds it to `scene`. The path may be a pipe. Its traces are in the file's
+    /// folder.
     ///
     /// # Errors
-    /// Refuses a script that can't be read, parsed or bound to the scene.
+    /// Refuses a file that can't be read, is not UTF-8 or has more than `limits.file_bytes` bytes
+    /// ([`files::read_text`]), and everything that [`Script::parse`] refuses.
     pub fn load(path: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
         let text = files::read_text(path, limits.file_bytes)?;
         let folder = path.parent().unwrap_or(Path::new(""));
         Self::parse(&path.display().to_string(), &text, folder, scene, limits)
     }
 
-    /// Reads a script from TOML text and binds it to `scene`. Refusals call the text `name`; its traces are in
-    /// `folder`.
+    /// Reads a script from TOML text and binds it to `scene`: converts times to whole steps (with a warning
+    /// where they aren't) and finds points and places. Refusals call the text `name`; it reads the traces that
+    /// the text names from `folder`. A script made for other scenes is only warned of.
     ///
     /// # Errors
-    /// Refuses a script that can't be parsed or bound to the scene.
+    /// Refuses
+    ///
+    /// - a text that is not TOML, a scene, unknown and missing keys, and values of the wrong kind;
+    /// - a duration or sample interval of less than half a step, times that don't ascend, a move shorter than 1
+    ///   µs;
+    /// - a point or place that is not on the tissue, a fixed or twice grasped point;
+    /// - a force above `limits.point_force_n`, a reach above `limits.reach_in_sheets`, more tools than
+    ///   `limits.tools`;
+    /// - a tip that does not suit the tissue ([`check_tip`]), and a change after which [`Scene::check`] refuses
+    ///   the scene;
+    /// - a trace that can't be read, has more than `limits.trace_bytes` bytes, or is not a table of ascending
+    ///   times and forces.
     pub fn parse(name: &str, text: &str, folder: &Path, scene: &Scene, limits: &Limits) -> Result<Self> {
         let document = Document::parse(name, text)?;
         TextKind::Script.check(&document)?;
@@ -531,15 +545,17 @@ fn is_made_for(scenes: &[String], name: &str) -> bool {
     scenes.is_empty() || scenes.iter().any(|scene| scene == name)
 }
 
-/// Returns the names of the scenes that a script's text is made for. Empty if the script is for all scenes, or
-/// if the text can't be parsed: playing the script reports the error.
+/// Returns the names of the scenes that a script's text is made for, in the order of its key `scenes`. Empty if
+/// the script is for all scenes, or if the text is not TOML or the key not a list: playing the script reports
+/// the error.
 pub fn made_for(text: &str) -> Vec<String> {
     let Ok(table) = text.parse::<toml::Table>() else { return Vec::new() };
     let scenes = table.get("scenes").and_then(|scenes| scenes.as_array());
     scenes.into_iter().flatten().filter_map(|name| name.as_str().map(str::to_owned)).collect()
 }
 
-/// Returns whether a script's text is made for the scene of that name.
+/// Returns whether a script's text is made for the scene of that name: it names it, or no scene at all
+/// ([`made_for`]). True for a text that is not TOML.
 pub fn fits(text: &str, scene: &str) -> bool {
     is_made_for(&made_for(text), scene)
 }

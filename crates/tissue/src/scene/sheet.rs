@@ -12,15 +12,17 @@ use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{Extent, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, positive};
 
-/// Smallest number of points per row in memory: the lanes of the widest vector. Shorter rows are padded.
+/// Smallest number of points per row (along y) in memory: 16, the lanes of the widest vector. Shorter rows are
+/// padded, and count as that many against `limits.points`.
 pub const MIN_WIDTH: usize = 16;
 
-/// A rectangular grid of points: point [i, j] rests at (i·spacing, j·spacing, 0).
+/// A rectangular grid of points: point [i, j] rests at (i·spacing, j·spacing, 0) and has the index i·ny + j,
+/// for nx × ny points. The scene checks it ([`Scene::check`](super::Scene::check)).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sheet {
-    /// Points along x and along y.
+    /// Points along x (nx) and along y (ny), each at least 1.
     pub points: [usize; 2],
-    /// Distance between structural neighbours at rest, m.
+    /// Distance h between structural neighbours at rest, m.
     pub spacing_m: f64,
     /// Mass of each point, kg.
     pub point_mass_kg: f64,
@@ -31,15 +33,16 @@ pub struct Sheet {
 /// The points of a grid that never move.
 #[derive(Debug, Clone, PartialEq)]
 pub enum FixedPoints {
-    /// Every point of the rim.
+    /// Every point of the rim: i is 0 or nx − 1, or j is 0 or ny − 1.
     Edges,
     /// The four corners.
     Corners,
-    /// The listed points; an empty list fixes none.
+    /// The listed points, which must be on the grid; an empty list fixes none.
     Points(PointSet),
 }
 
-/// A sorted set of grid points [i, j]. Clones share one list in memory, because a scene may name many points.
+/// A set of grid points [i, j], ascending, each once; `collect()` makes it from any order. Clones share one
+/// list in memory, because a scene may name many points.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct PointSet(Arc<[[usize; 2]]>);
 
@@ -49,7 +52,7 @@ impl PointSet {
         self.0.binary_search(&point).is_ok()
     }
 
-    /// Returns all points, ascending.
+    /// Returns all points, ascending by i, then j, each once.
     pub fn as_slice(&self) -> &[[usize; 2]] {
         &self.0
     }
@@ -117,17 +120,20 @@ impl Sheet {
         Ok(())
     }
 
-    /// Returns the point [i, j], which must be on the grid: [`RestShape::find`] checks that.
+    /// Returns the point [i, j], with the index i·ny + j. It must be on the grid, which isn't checked:
+    /// [`RestShape::find`] does.
     pub fn point(&self, [i, j]: [usize; 2]) -> PointId {
         PointId::new(i * self.points[1] + j)
     }
 
-    /// Returns the indices [i, j] of a point: i along x, j along y.
+    /// Returns the indices [i, j] of a point: i along x, j along y. For a point beyond the grid, i is too
+    /// large.
     pub fn place_of(&self, point: PointId) -> [usize; 2] {
         [point.index() / self.points[1], point.index() % self.points[1]]
     }
 
-    /// Returns the length along x and along y, m.
+    /// Returns the length along x and along y at rest, m: (nx − 1)·h and (ny − 1)·h, 0 for a single point.
+    /// Panics without points.
     pub fn extent_m(&self) -> DVec2 {
         self.spacing_m * DVec2::new((self.points[0] - 1) as f64, (self.points[1] - 1) as f64)
     }
@@ -148,7 +154,8 @@ impl Sheet {
         (part, [pushed, others[0], others[1]])
     }
 
-    /// Returns the row-major indices of the fixed points, ascending.
+    /// Returns the row-major indices i·ny + j of the fixed points, ascending, each once. Without memory for
+    /// them it unwinds with a refusal ([`memory::attempt`]).
     pub fn fixed_indices(&self) -> Vec<usize> {
         let [nx, ny] = self.points;
         let mut indices: Vec<usize> = match &self.fixed {

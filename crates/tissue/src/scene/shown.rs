@@ -12,13 +12,14 @@ use palpate_geometry::{FileMesh, TriangleMesh, prepare};
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// The mesh of the file, and how its vertices follow the simulated mesh.
+/// The mesh of the file, and how its vertices follow the simulated mesh. It exists if the simulated mesh has
+/// other vertices.
 #[derive(Debug, PartialEq)]
 pub struct Shown {
-    /// The mesh of the file, with its own vertex numbers. If one vertex stands for several simulated ones,
+    /// The mesh of the file, m, with its own vertex numbers. If one vertex stands for several simulated ones,
     /// copies of it are at the end.
     pub mesh: TriangleMesh,
-    /// For each of its vertices, the place on the simulated mesh that it follows.
+    /// For each of its vertices, in their order, the place on the simulated mesh that it follows.
     pub places: Vec<BoundPlace>,
     /// For each of its vertices, the nearest simulated vertex.
     pub(super) nearest: Vec<u32>,
@@ -28,34 +29,40 @@ pub struct Shown {
     pub(super) names: Vec<u32>,
 }
 
-/// A place at a height above a triangle. It moves and turns with the triangle.
+/// A place at a height above a triangle of the simulated mesh. It moves and turns with the triangle: with the
+/// corners a, b, c and the weights u, v, w it is at u·a + v·b + w·c + height·n, n the unit normal.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BoundPlace {
-    /// The triangle of the simulated mesh.
+    /// The number of the triangle of the simulated mesh, from 0.
     pub triangle: u32,
-    /// Barycentric weights of the triangle's three vertices; their sum is 1.
+    /// Barycentric weights of the triangle's three vertices, in its order; each is at least 0 (but for
+    /// rounding), and their sum is 1.
     pub barycentric: [f64; 3],
-    /// Height of the place above the triangle, along its normal, m.
+    /// Height of the place above the triangle at rest, along its normal, m; negative below it.
     pub height_m: f64,
 }
 
-/// The mesh of a scene as it is simulated, and the mesh that is shown.
+/// The mesh of a scene as it is simulated, and the mesh that is shown; for
+/// [`Mesh::simulating`](super::Mesh::simulating).
 #[derive(Debug, PartialEq)]
 pub struct Simulated {
-    /// The simulated mesh. Its edges are Delaunay if they were flipped.
+    /// The simulated mesh, m. Its edges are Delaunay if they were flipped.
     pub mesh: TriangleMesh,
-    /// The mesh of the file, if it has other vertices than the simulated one.
+    /// The mesh of the file, if it has other vertices than the simulated one; otherwise `None`.
     pub shown: Option<Shown>,
-    /// What was done with the mesh of the file, and doubts about it, as sentences for the user.
+    /// What was done with the mesh of the file, and doubts about it, as sentences for the user; empty for a
+    /// generated mesh.
     pub findings: Vec<String>,
 }
 
 impl Simulated {
-    /// Prepares the mesh of a file: joins vertices with the same position and turns closed parts outward. Then
-    /// it reduces the mesh to at most `vertices`, if possible, and flips edges to Delaunay if `flips`.
+    /// Prepares the mesh of a file, m: joins vertices with the same position and turns closed parts outward.
+    /// Then it reduces the mesh to at most `vertices`, if possible (`None` or more than it has: not at all),
+    /// and flips edges to Delaunay if `flips`. This may take seconds for a large mesh.
     ///
     /// # Errors
-    /// Refuses a mesh that is not a surface; the message names the element and place.
+    /// Refuses a mesh that is not a surface ([`Reason::Unreadable`], field `mesh`); the message names the
+    /// element and place.
     pub fn of(mesh: TriangleMesh, vertices: Option<usize>, flips: bool) -> Result<Self> {
         let prepared = prepare(mesh);
         let report = prepared.report();
@@ -73,8 +80,9 @@ impl Simulated {
         Ok(Self { findings, ..Self::bound(prepared.mesh, prepared.file, vertices, flips) })
     }
 
-    /// Prepares a generated mesh, which needs no repair: reduces it to at most `vertices`, if possible, and
-    /// flips edges to Delaunay if `flips`.
+    /// Prepares a generated mesh, m, which needs no repair: reduces it to at most `vertices`, if possible
+    /// (`None` or more than it has: not at all), and flips edges to Delaunay if `flips`. Then it has a shown
+    /// mesh if it was reduced.
     pub fn made(mesh: TriangleMesh, vertices: Option<usize>, flips: bool) -> Self {
         Self::bound(mesh, None, vertices, flips)
     }

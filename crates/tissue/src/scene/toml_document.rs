@@ -9,7 +9,8 @@ use toml::de::{DeTable, DeValue};
 use crate::shape::PointName;
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, nearest, unsigned_zero};
 
-/// A parsed TOML text with its name and line numbers.
+/// A parsed TOML text with its name and line numbers; [`Document::set`] may have changed values. It is read
+/// once, by [`Document::read`].
 #[derive(Debug)]
 pub struct Document {
     name: String,
@@ -49,10 +50,11 @@ impl Value {
 }
 
 impl Document {
-    /// Parses TOML text; refusals call it `name`.
+    /// Parses TOML text; refusals call it `name`, often the path of a file. A −0 becomes 0, and an integer
+    /// beyond 64 bits a number that is not whole.
     ///
     /// # Errors
-    /// Refuses text that is not TOML, with its line.
+    /// Refuses text that is not TOML ([`Reason::Unreadable`]), with `name:line` as the place.
     pub fn parse(name: &str, text: &str) -> Result<Self> {
         // Binary search for lines: a long file is read in nearly linear time.
         let starts: Vec<usize> =
@@ -66,11 +68,13 @@ impl Document {
         Ok(Document { name: name.to_owned(), root })
     }
 
-    /// Sets a value by `key.path=value`; the value is TOML or a bare string. Creates missing tables on the
-    /// path.
+    /// Sets a value by `key.path=value`, in place of an earlier one; the value is TOML or, if it can't be
+    /// parsed as that, a bare string. Creates missing tables on the path. An item of a list can't be set.
+    /// Refusals of the value later name `--set` instead of a line.
     ///
     /// # Errors
-    /// Refuses an assignment without `=`, an empty part of the path, and a path through a value that is not a table.
+    /// Refuses an assignment without `=`, an empty part of the path, and a path through a value that is not a
+    /// table ([`Reason::WrongKind`], with the assignment as the field). Tables that it created before stay.
     pub fn set(&mut self, assignment: &str) -> Result<()> {
         let refuse = |message: String| Refusal {
             place: Some("--set".into()),
@@ -100,25 +104,28 @@ impl Document {
         Ok(())
     }
 
-    /// Returns whether the document has this top-level key.
+    /// Returns whether the document has this top-level key (without dots), set ones included.
     pub fn has(&self, key: &str) -> bool {
         matches!(&self.root.value, Value::Table(entries) if entries.contains_key(key))
     }
 
-    /// Returns a refusal of the whole document, located at its name.
+    /// Returns a refusal of the whole document: its place is the document's name, without a line, and its field
+    /// is empty.
     pub fn refuse(&self, reason: Reason, message: impl Into<String>) -> Refusal {
         Refusal { place: Some(self.name.clone()), ..Refusal::new(reason, "", message) }
     }
 
-    /// Reads the whole document by `read`, which asks for its keys.
+    /// Reads the whole document by `read`, which asks for its keys, and returns the result of `read`.
     ///
     /// # Errors
-    /// Returns the refusal of `read`, with its file and line, and refuses keys that `read` did not ask for.
+    /// Returns the refusal of `read` with its file and line ([`Document::locate`]), and refuses the first key
+    /// that `read` did not ask for ([`Reason::UnknownKey`]).
     pub fn read<'a, T>(&'a self, read: impl FnOnce(&mut Fields<'a>) -> Result<T>) -> Result<T> {
         Item { path: String::new(), node: &self.root }.table(read).map_err(|refusal| self.locate(refusal))
     }
 
-    /// Adds file and line to a refusal that names a field, unless it has a place already.
+    /// Adds the place, `name:line`, to a refusal, unless it has a place already. The line is that of the value
+    /// that its field names, or of the innermost table on the way that exists; `--set` if that value was set.
     pub fn locate(&self, mut refusal: Refusal) -> Refusal {
         if refusal.place.is_none() {
             let mut node = &self.root;
@@ -188,7 +195,8 @@ fn value_of(value: &DeValue<'_>, line_of: &dyn Fn(usize) -> usize) -> Value {
     }
 }
 
-/// The keys of one table, while it is read. A key that the reader never asks for counts as unknown.
+/// The keys of one table, while [`Item::table`] or [`Document::read`] reads it. A key that the reader never
+/// asks for counts as unknown, and is refused when the reader ends.
 #[derive(Debug)]
 pub struct Fields<'a> {
     path: String,
@@ -196,7 +204,8 @@ pub struct Fields<'a> {
     known: Vec<&'static str>,
 }
 
-/// One value of a document, with its path.
+/// One value of a document, with its path (`stepping.rate_hz`, `force[0].profile`), of a kind that is not known
+/// yet.
 #[derive(Debug)]
 pub struct Item<'a> {
     path: String,
@@ -204,27 +213,28 @@ pub struct Item<'a> {
 }
 
 impl<'a> Fields<'a> {
-    /// Returns the full path of `key`, for example `stepping.rate_hz`.
+    /// Returns the full path of `key` in this table, for example `stepping.rate_hz`. The key need not exist.
     pub fn path(&self, key: &str) -> String {
         if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
     }
 
-    /// Returns a refusal of `key`; of the table itself if `key` is empty.
+    /// Returns a refusal of `key`, with its full path as the field; of the table itself if `key` is empty.
     pub fn refuse(&self, reason: Reason, key: &str, message: impl Into<String>) -> Refusal {
         let path = if key.is_empty() { self.path.clone() } else { self.path(key) };
         Refusal::new(reason, path, message)
     }
 
-    /// Returns the value of `key`, or `None` if it is absent. Marks the key as known.
+    /// Returns the value of `key`, of any kind, or `None` if it is absent. Marks the key as known.
     pub fn item(&mut self, key: &'static str) -> Option<Item<'a>> {
         self.known.push(key);
         self.entries.get(key).map(|node| Item { path: self.path(key), node })
     }
 
-    /// Returns the value of `key`. Marks the key as known.
+    /// Returns the value of `key`, of any kind. Marks the key as known.
     ///
     /// # Errors
-    /// Refuses a missing key; if a similar unknown key is there, the refusal names it.
+    /// Refuses a missing key ([`Reason::Missing`]). If a similar key is there that has not been asked for, the
+    /// refusal names that ([`Reason::UnknownKey`]): so ask for optional keys with similar names first.
     pub fn required(&mut self, key: &'static str) -> Result<Item<'a>> {
         let unknown: Vec<&String> = self.entries.keys().filter(|there| !self.known.contains(&there.as_str())).collect();
         self.item(key).ok_or_else(|| match unknown.into_iter().find(|there| meant(there, [key]).is_some()) {
@@ -245,26 +255,29 @@ impl<'a> Fields<'a> {
         self.refuse(Reason::UnknownKey, there, message)
     }
 
-    /// Returns the value of `key` as a finite number; `None` if it is absent.
+    /// Returns the value of `key` as a finite number, whole ones included; `None` if it is absent. Marks the
+    /// key as known.
     ///
     /// # Errors
-    /// Refuses a value of another kind, and one that is not finite.
+    /// Refuses a value of another kind ([`Reason::WrongKind`]), and one that is not finite
+    /// ([`Reason::NotFinite`]).
     pub fn number(&mut self, key: &'static str) -> Result<Option<f64>> {
         self.item(key).map(|item| item.number()).transpose()
     }
 
-    /// Returns the value of `key` as a finite number.
+    /// Returns the value of `key` as a finite number, whole ones included. Marks the key as known.
     ///
     /// # Errors
-    /// Refuses a missing key, a value of another kind, and one that is not finite.
+    /// Refuses a missing key, as [`Fields::required`] does, a value of another kind ([`Reason::WrongKind`]),
+    /// and one that is not finite ([`Reason::NotFinite`]).
     pub fn required_number(&mut self, key: &'static str) -> Result<f64> {
         self.required(key)?.number()
     }
 
-    /// Returns the value of `key` as a string; `None` if it is absent.
+    /// Returns the value of `key` as a string; `None` if it is absent. Marks the key as known.
     ///
     /// # Errors
-    /// Refuses a value of another kind.
+    /// Refuses a value of another kind ([`Reason::WrongKind`]).
     pub fn text(&mut self, key: &'static str) -> Result<Option<String>> {
         self.item(key).map(|item| item.text()).transpose()
     }
@@ -308,13 +321,14 @@ fn meant<'k>(there: &str, keys: impl IntoIterator<Item = &'k str>) -> Option<&'k
 }
 
 impl<'a> Item<'a> {
-    /// Returns a refusal of this value, with its path.
+    /// Returns a refusal of this value, with its path as the field and without a place, which
+    /// [`Document::read`] adds.
     pub fn refuse(&self, reason: Reason, message: impl Into<String>) -> Refusal {
         Refusal::new(reason, &self.path, message)
     }
 
-    /// Returns a refusal that says what was expected, and what was probably meant. Words in quotation marks in
-    /// `expected` are the allowed words.
+    /// Returns a refusal ([`Reason::WrongKind`]) that says what was expected ("must be {expected}, but is …"),
+    /// and what was probably meant. Words in quotation marks in `expected` are the allowed words.
     pub fn wrong(&self, expected: &str) -> Refusal {
         let words: Vec<&str> = expected.split('"').skip(1).step_by(2).collect();
         let is = match &self.node.value {
@@ -337,10 +351,11 @@ impl<'a> Item<'a> {
         self.refuse(Reason::WrongKind, format!("must be {expected}, but is {is}"))
     }
 
-    /// Returns the value as a finite number.
+    /// Returns the value as a finite number, whole ones included.
     ///
     /// # Errors
-    /// Refuses a value of another kind, and one that is not finite.
+    /// Refuses a value of another kind ([`Reason::WrongKind`]), and one that is not finite
+    /// ([`Reason::NotFinite`]).
     pub fn number(&self) -> Result<f64> {
         match self.node.value {
             Value::Number(number) => finite(&self.path, number),
@@ -350,10 +365,11 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Returns the value as an integer, 0 or more.
+    /// Returns the value as an integer, 0 to 2^63 − 1.
     ///
     /// # Errors
-    /// Refuses a value of another kind, and a negative one.
+    /// Refuses a value of another kind, `1.0` and larger integers among them ([`Reason::WrongKind`]), and a
+    /// negative one ([`Reason::OutOfRange`]).
     pub fn whole(&self) -> Result<u64> {
         match self.node.value {
             Value::Whole(whole) => u64::try_from(whole)
@@ -365,7 +381,7 @@ impl<'a> Item<'a> {
     /// Returns the value as a string.
     ///
     /// # Errors
-    /// Refuses a value of another kind.
+    /// Refuses a value of another kind ([`Reason::WrongKind`]).
     pub fn text(&self) -> Result<String> {
         match &self.node.value {
             Value::Text(text) => Ok(text.clone()),
@@ -373,7 +389,7 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Returns the string, or `None` if the value is of another kind.
+    /// Returns the value if it is a string, or `None` if it is of another kind.
     pub fn as_text(&self) -> Option<&'a str> {
         match &self.node.value {
             Value::Text(text) => Some(text),
@@ -384,7 +400,7 @@ impl<'a> Item<'a> {
     /// Returns the value as true or false.
     ///
     /// # Errors
-    /// Refuses a value of another kind.
+    /// Refuses a value of another kind, strings and 0 or 1 among them ([`Reason::WrongKind`]).
     pub fn flag(&self) -> Result<bool> {
         match self.node.value {
             Value::Flag(flag) => Ok(flag),
@@ -392,10 +408,10 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Returns the value as a list.
+    /// Returns the items of a list, in its order; they may be of any kind, and of different kinds.
     ///
     /// # Errors
-    /// Refuses a value of another kind.
+    /// Refuses a value of another kind ([`Reason::WrongKind`]).
     pub fn list(&self) -> Result<Vec<Item<'a>>> {
         match &self.node.value {
             Value::List(items) => Ok(items
@@ -407,10 +423,12 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Returns the value as a list, whose items should be tables (`[[key]]`).
+    /// Returns the items of a list that should be tables (`[[key]]`), in its order. Their kind is checked when
+    /// they are read ([`Item::table`]).
     ///
     /// # Errors
-    /// Refuses a value of another kind. For a single table the message says how to write the list.
+    /// Refuses a value of another kind ([`Reason::WrongKind`]). For a single table the message says how to
+    /// write the list.
     pub fn tables(&self) -> Result<Vec<Item<'a>>> {
         self.list().map_err(|refusal| match &self.node.value {
             Value::Table(_) => Refusal { message: format!("{}: write [[{}]]", refusal.message, self.path), ..refusal },
@@ -424,26 +442,29 @@ impl<'a> Item<'a> {
         numbers.try_into().map_err(|_| self.refuse(Reason::WrongKind, format!("must be {expected}")))
     }
 
-    /// Returns the value as `[x, y, z]`.
+    /// Returns the value as `[x, y, z]`, in the unit that its key names.
     ///
     /// # Errors
-    /// Refuses a value that is not a list of three finite numbers.
+    /// Refuses a value that is not a list of three numbers ([`Reason::WrongKind`]), and a number that is not
+    /// finite.
     pub fn vector(&self) -> Result<DVec3> {
         Ok(DVec3::from_array(self.numbers("a list of three numbers")?))
     }
 
-    /// Returns the value as `[x, y]`.
+    /// Returns the value as `[x, y]`, in the unit that its key names.
     ///
     /// # Errors
-    /// Refuses a value that is not a list of two finite numbers.
+    /// Refuses a value that is not a list of two numbers ([`Reason::WrongKind`]), and a number that is not
+    /// finite.
     pub fn place(&self) -> Result<DVec2> {
         Ok(DVec2::from_array(self.numbers("a list of two numbers")?))
     }
 
-    /// Returns the value as `[i, j]`, both 0 or more.
+    /// Returns the value as `[i, j]`, both 0 or more. Whether a tissue has this point is not checked.
     ///
     /// # Errors
-    /// Refuses a value that is not a list of two such integers.
+    /// Refuses a value that is not a list of two whole numbers ([`Reason::WrongKind`]), and a negative one
+    /// ([`Reason::OutOfRange`]).
     pub fn point(&self) -> Result<[usize; 2]> {
         let expected = "a list of two whole numbers";
         let items = self.list().map_err(|_| self.wrong(expected))?;
@@ -456,10 +477,12 @@ impl<'a> Item<'a> {
         Ok([index(i)?, index(j)?])
     }
 
-    /// Returns the value as the name of a point: `[i, j]` of a sheet or the number of a vertex.
+    /// Returns the value as the name of a point: `[i, j]` of a sheet or the number of a vertex. Whether a
+    /// tissue has this point is not checked.
     ///
     /// # Errors
-    /// Refuses a value of another kind, and a negative number.
+    /// Refuses a list that [`Item::point`] refuses, and another value that is not a whole number from 0 to 2^32
+    /// − 1 ([`Reason::WrongKind`]).
     pub fn point_name(&self) -> Result<PointName> {
         match self.node.value {
             Value::List(_) => Ok(PointName::Point(self.point()?)),
@@ -470,10 +493,11 @@ impl<'a> Item<'a> {
         }
     }
 
-    /// Reads the value as a table by `read`, which asks for its keys.
+    /// Reads the value as a table by `read`, which asks for its keys, and returns the result of `read`.
     ///
     /// # Errors
-    /// Refuses a value of another kind and unknown keys; returns the refusal of `read`.
+    /// Refuses a value of another kind ([`Reason::WrongKind`]); returns the refusal of `read`; and refuses the
+    /// first key that `read` did not ask for ([`Reason::UnknownKey`]).
     pub fn table<T>(&self, read: impl FnOnce(&mut Fields<'a>) -> Result<T>) -> Result<T> {
         let Value::Table(entries) = &self.node.value else { return Err(self.wrong("a table")) };
         let mut fields = Fields { path: self.path.clone(), entries, known: Vec::new() };

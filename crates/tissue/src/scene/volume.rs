@@ -10,33 +10,36 @@ use glam::DVec3;
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// The volume that a closed mesh encloses.
+/// The volume that a closed mesh encloses, at rest. [`Mesh::enclosing`](super::Mesh::enclosing) computes it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Volume {
-    /// V0 = Σ x_a·(x_b × x_c)/6 over the triangles, m³.
+    /// V0 = |Σ x_a·(x_b × x_c)/6| over the triangles, m³; above 0.
     pub volume_m3: f64,
-    /// a = ∂V/∂x of each vertex at rest, m²: a third of the area vectors of its triangles.
+    /// a = ∂V/∂x of each vertex at rest, m², by vertex number: a third of the area vectors of its triangles,
+    /// outward; 0 for a vertex without triangles.
     pub areas_m2: Vec<DVec3>,
-    /// What bounds the volume's part of the stiffness.
+    /// The vibration in which the volume swells, which bounds the volume's part of the stiffness.
     pub swelling: Swelling,
 }
 
 /// The vibration in which the volume swells and shrinks: all vertices move along a/√m. Contains its stiffness
-/// by pressure and by springs.
+/// by pressure and by springs. The reference k and mass are those of the mesh.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Swelling {
-    /// Σ a²/m over V0, in reference masses, m. Times κ, it is the vibration's stiffness by the pressure alone,
-    /// N/m.
+    /// σ = Σ a²/m over V0, in reference masses, m. Times κ, Pa, it is the vibration's stiffness by the pressure
+    /// alone, N/m.
     pub by_pressure_m: f64,
-    /// The vibration's stiffness by the springs, divided by the reference k.
+    /// s: the vibration's stiffness by the springs, divided by the reference k; without unit.
     pub by_springs: f64,
-    /// How strongly the springs couple this vibration to others, divided by the reference k.
+    /// j: how strongly the springs couple this vibration to others, divided by the reference k; without unit,
+    /// at least 0.
     pub passed_on: f64,
 }
 
 impl Swelling {
     /// Returns an upper bound of the largest eigenvalue of pressure and springs together, with the reference
-    /// masses, N/m. `springs` bounds that of the springs alone, divided by the reference k.
+    /// masses, N/m. `pressure_pa` is κ, Pa; `stiffness_n_per_m` is the reference k, N/m; `springs` bounds the
+    /// eigenvalue of the springs alone, divided by the reference k.
     ///
     /// The bound is ½(p + q) + √(¼(p − q)² + r²), the larger eigenvalue of [[p, r], [r, q]], with p = κ·σ + k·s
     /// the stiffness of the vibration itself ([`Swelling::by_pressure_m`], [`Swelling::by_springs`]), q the
@@ -58,10 +61,11 @@ impl Swelling {
 const FLAT: f64 = 1e-4;
 
 impl Volume {
-    /// Message of the refusal of a volume on a sheet.
+    /// Message of the refusal of a volume on a sheet ([`Reason::WrongKind`]).
     pub const OF_A_MESH: &str = "is for a closed mesh: a sheet encloses nothing";
 
-    /// Message of the refusal of a volume stiffness for a tissue without `[volume]`.
+    /// Message of the refusal of a volume stiffness above 0 for a tissue without `[volume]`
+    /// ([`Reason::WrongKind`]).
     pub const FROM_THE_BEGINNING: &str = "is for scenes that have [volume] from the beginning";
 
     /// Returns the volume that the triangles of a mesh enclose.
