@@ -25,7 +25,7 @@ use palpate_haptics::Tip;
 pub struct PointState {
     /// Displacement from rest, m.
     pub displacement_m: DVec3,
-    /// Velocity, m/s.
+    /// Velocity, m/s, at the time of the displacement.
     pub velocity_m_per_s: DVec3,
     /// Force of all springs between points, and of an enclosed volume's pressure, N.
     pub spring_n: DVec3,
@@ -52,7 +52,7 @@ impl PointState {
 /// tools, damping only reduces their total.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Energy {
-    /// Kinetic energy, Σ ½m·v².
+    /// Kinetic energy of all points, Σ ½m·v².
     pub kinetic_j: f64,
     /// Energy of the springs between points, Σ ½k(L − L0)², and of an enclosed volume, ½κ·ΔV²/V0.
     pub spring_j: f64,
@@ -267,7 +267,7 @@ impl ReadCopy {
         ReadCopy(copy)
     }
 
-    /// Returns the model of the copied tissue.
+    /// Returns the model that the tissue had when the copy was made.
     pub fn model(&self) -> &Model {
         self.0.model()
     }

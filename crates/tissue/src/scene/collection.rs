@@ -40,7 +40,7 @@ impl Collection {
         Collection { names_files: true, ..self }
     }
 
-    /// Returns the folder that is searched first.
+    /// Returns the folder whose files override the built-in texts, as it was given; it need not exist.
     pub fn folder(&self) -> &Path {
         &self.folder
     }

@@ -206,7 +206,7 @@ impl Spread {
 /// A region of a mesh that is stiffer or softer. [`Inclusion::put_into`] checks it and applies it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Inclusion {
-    /// Where the region is.
+    /// Where the region is; a ball must reach a vertex, and a group exist.
     pub region: Region,
     /// k of the springs inside divided by k outside, 0.01 to 100; bending springs included.
     pub stiffness_factor: f64,
@@ -279,7 +279,8 @@ const MAX_INCLUSIONS: usize = 256;
 const MAX_LOOKED_AT: usize = 8_000_000;
 
 impl Inclusion {
-    /// Creates an inclusion whose factors are 1, so that it changes nothing.
+    /// Creates an inclusion whose factors are 1 and whose edge is 0 wide, so that it changes nothing: a start
+    /// for others.
     pub fn even(region: Region) -> Self {
         Inclusion { region, stiffness_factor: 1.0, anchor_stiffness_factor: 1.0, edge_m: 0.0 }
     }

@@ -31,7 +31,7 @@ pub struct Mesh {
     /// k of the bending springs relative to k of the edge that they cross, 0 to 10 in scenes; 0 without such
     /// springs. A bending spring joins the two vertices opposite an edge.
     pub bending: f64,
-    /// Where the points rest and how they are joined.
+    /// Where the points rest, how they are joined, and which are fixed.
     pub shape: Arc<MeshShape>,
     /// How the points and springs differ from the reference values; empty lists if they don't.
     pub differences: Arc<PerNodeFactors>,
@@ -103,7 +103,8 @@ pub struct MeshShape {
 /// `default()` if the shape was made without a scene.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshMetadata {
-    /// The vertices that never move, as the scene specifies them.
+    /// The vertices that never move, as the scene specifies them; which these are, [`RestShape::is_fixed`]
+    /// tells.
     pub fixed: FixedVertices,
     /// Texture coordinates (u, v) of each simulated vertex, if the file has them; at a seam, those of one side.
     pub uv: Option<Vec<[f32; 2]>>,
@@ -454,7 +455,7 @@ const EMPTY_BALLS_TOLD: usize = 4;
 /// The ratio of speeds above which a warning names the fastest vertex.
 const MUCH_FASTER: f64 = 2.5;
 
-/// The vertices of a mesh that never move.
+/// The vertices of a mesh that never move, as a scene specifies them (`mesh.fixed`).
 #[derive(Debug, Clone, Default, PartialEq)]
 pub enum FixedVertices {
     /// No vertex.
@@ -523,9 +524,9 @@ impl MeshShape {
     /// ([`MeshShape::told`]) and no shown mesh.
     ///
     /// # Errors
-    /// Refuses ([`Reason::Unreadable`], field `mesh`) a mesh without a triangle, with an edge of length 0, with
-    /// an edge of more than two triangles, with vertex numbers beyond the last, and with places that are not
-    /// finite; and one so large that the mean edge is not finite.
+    /// Refuses, with the field `mesh`, a mesh without a triangle, with an edge of length 0, with an edge of
+    /// more than two triangles, with a vertex number beyond the last, and with a place that is not finite
+    /// ([`Reason::Unreadable`]); and one so large that its mean edge is not finite ([`Reason::NotFinite`]).
     pub fn new(
         vertices_m: Vec<DVec3>,
         triangles: Vec<[u32; 3]>,
@@ -676,7 +677,8 @@ impl MeshShape {
         &self.opposite
     }
 
-    /// Returns the edge that each bending spring crosses, in the order of [`MeshShape::opposite`].
+    /// Returns the edge that each bending spring crosses, as two vertices, ascending, in the order of
+    /// [`MeshShape::opposite`].
     pub fn crossed(&self) -> &[[u32; 2]] {
         &self.crossed
     }

@@ -77,7 +77,8 @@ pub const BUILT_IN: [(&str, &str); 7] = [
 /// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
-    /// Display name; any text.
+    /// Display name: at most 128 bytes, without control characters ([`Scene::check`]). `unnamed` if the text
+    /// gives none.
     pub name: String,
     /// The mass points, and how they are arranged.
     pub body: Body,
@@ -87,27 +88,29 @@ pub struct Scene {
     /// Regions of a mesh that are stiffer or softer, in the order of the file; empty on a sheet. Their factors
     /// are already applied to the springs of `body`.
     pub inclusions: Arc<[Inclusion]>,
-    /// Springs between neighbours.
+    /// Springs between neighbours; on a mesh, their reference k.
     pub springs: Springs,
     /// K″ of the springs of zero rest length that pull each point to its rest position, N/m (the paper's eq.
     /// 4); 0 for none. On a mesh, the reference K″ ([`Scene::relative_anchor_stiffness`]).
     pub anchor_stiffness_n_per_m: f64,
     /// C of the damping force −C·v, N·s/m. On a mesh, C of a point of the reference mass.
     pub damping_n_s_per_m: f64,
-    /// κ of the pressure −κ·ΔV/V0 on a mesh that encloses a volume, Pa; 0 on any other tissue.
+    /// κ of the pressure −κ·ΔV/V0 on a mesh that encloses a volume V0 (ΔV is its growth), Pa; 0 on any other
+    /// tissue.
     pub volume_stiffness_pa: f64,
-    /// How time advances.
+    /// How time advances, as the user asked for it; what is used, [`Model`](crate::Model) has.
     pub stepping: Stepping,
     /// Largest error that leaving out regions at rest may add, relative to the largest displacement, 0 to 1; 0
     /// turns sleeping off. If `None`, it is a tenth of the wanted error (`stepping.tolerance`), or of the
     /// expected one if that is smaller and the scene gives the integrator or the substeps; see
     /// [`Model::sleep_tolerance`](crate::Model::sleep_tolerance).
     pub sleep_tolerance: Option<f64>,
-    /// How viewers draw the tissue.
+    /// How viewers draw the tissue; without effect on its motion.
     pub appearance: Appearance,
 }
 
-/// The mass points of a tissue and how they are arranged.
+/// The mass points of a tissue, where they rest and how they are joined: a sheet or a mesh. [`Scene::shape`]
+/// gives both as one trait.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Body {
     /// A rectangular grid.
@@ -167,7 +170,7 @@ impl Appearance {
     }
 }
 
-/// Surfaces that the server can paint (see the module `texture`).
+/// Surfaces that the server can paint ([`painted`](crate::texture::painted)): what a generated image shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PaintedSurface {
     /// The lining of a stomach.
@@ -194,7 +197,8 @@ impl Named for PaintedSurface {
 /// applies one.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Change {
-    /// k of the structural springs, N/m. The k of shear and bending springs changes in proportion.
+    /// k of the structural springs, N/m; on a mesh, the reference k. The k of shear and bending springs changes
+    /// in proportion ([`Scene::changed`]).
     pub stiffness_n_per_m: Option<f64>,
     /// C of the damping force −C·v of a point of the reference mass, N·s/m.
     pub damping_n_s_per_m: Option<f64>,
@@ -223,7 +227,8 @@ pub struct Springs {
     pub bending: bool,
 }
 
-/// How time advances: rate, accuracy, scheme and number format.
+/// How time advances: rate, accuracy, scheme and number format, as a user asks for them. `default()` has the
+/// defaults named below.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stepping {
     /// Steps per second, Hz, from 1e-3 to 1e7. Commands take effect and samples are taken once per step.
@@ -260,7 +265,7 @@ impl Default for Stepping {
     }
 }
 
-/// A value that a scene gives by a name from a list.
+/// A value that a scene gives by a name from a list, such as an integrator.
 pub trait Named: Sized + Copy + PartialEq + 'static {
     /// Every name and its value; each name and each value once.
     const NAMES: &'static [(&'static str, Self)];
@@ -465,7 +470,7 @@ impl Scene {
         }
     }
 
-    /// Returns the grid; `None` if the tissue is a mesh.
+    /// Returns the grid, borrowed; `None` if the tissue is a mesh.
     pub fn sheet(&self) -> Option<&Sheet> {
         match &self.body {
             Body::Sheet(sheet) => Some(sheet),

@@ -25,7 +25,7 @@ impl Moment {
         Moment { step, fraction: 0.0 }
     }
 
-    /// Returns the time since the beginning of step 0, s, at `rate_hz` steps per second.
+    /// Returns the time since the beginning of step 0, s, at `rate_hz` steps per second, which must be above 0.
     #[allow(clippy::cast_precision_loss)]
     pub fn time_s(self, rate_hz: f64) -> f64 {
         (self.step as f64 + self.fraction) / rate_hz
@@ -54,9 +54,9 @@ pub struct Poke {
 /// which it was made.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadProfile {
-    /// Place of the control point over time.
+    /// Place of the control point over time, at rest.
     pub centre: CentreProfile,
-    /// The exerting force over time.
+    /// The exerting force over time, N, before falloff and offset.
     pub strength: StrengthProfile,
     /// Falloff c, 1/m, at least 0; the same all the time.
     pub falloff_per_m: f64,
@@ -207,7 +207,8 @@ pub struct Move {
     pub by_m: DVec3,
 }
 
-/// The movement of a tool with a tip, from pose to pose.
+/// The movement of a tool with a tip, from pose to pose. The tool is away before the first pose and from
+/// `until_s` on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PoseProfile {
     /// The tip: its radius, friction and coupling to the tissue; the same all the time.

@@ -26,7 +26,7 @@ pub struct Run {
     pub precision: String,
     /// Steps per second, Hz.
     pub rate_hz: f64,
-    /// Version of Palpate.
+    /// Version of Palpate that made the records.
     pub version: String,
 }
 
@@ -38,7 +38,7 @@ pub struct Record {
     pub time_s: f64,
     /// The points, in the order requested; empty if none were.
     pub points: Vec<Point>,
-    /// The tools with a tip that are at the tissue, by ascending number.
+    /// The tools with a tip that are at the tissue, by ascending number; not written if there are none.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub tools: Vec<ToolRecord>,
     /// Energies of the whole tissue, J; `None` if they were not requested.
@@ -142,16 +142,17 @@ pub struct Summary {
     pub computed_fraction: f64,
     /// How many times the guard went back and repeated with a shorter substep.
     pub guard_events: u64,
-    /// XXH3-128 hash of the final state, in hexadecimal.
+    /// XXH3-128 hash of the final state ([`Tissue::state_hash`](crate::Tissue::state_hash)), 32 hexadecimal
+    /// digits.
     pub final_hash: String,
     /// The errors that an audit measured, over all sample points and times; `None`, and not written, without an
     /// audit.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub audited_error: Option<AuditedError>,
-    /// Corrections after an audit, by ascending step.
+    /// Corrections after an audit, by ascending step; not written if there are none.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub corrections: Vec<Correction>,
-    /// The newest recoveries, by ascending step.
+    /// The newest recoveries, by ascending step; not written if there were none.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub recoveries: Vec<Recovery>,
     /// Warnings for the user. Not written.
@@ -161,10 +162,10 @@ pub struct Summary {
     /// replay: in what the server sent. Not written.
     #[serde(skip)]
     pub largest_displacement_m: f64,
-    /// The largest force of the tissue in the records, N. Not written.
+    /// The largest force of the tissue in the records, N ([`Record::peak_n`]). Not written.
     #[serde(skip)]
     pub peak_reaction_n: f64,
-    /// Displacement and force of the first tool or point over time. Not written.
+    /// Displacement and force of the first tool or point over time ([`Record::first`]). Not written.
     #[serde(skip)]
     pub curves: Curves,
     /// The additional measurements of a replay; `None` for a run.
@@ -225,7 +226,7 @@ impl AuditedError {
 pub struct Correction {
     /// The step at whose beginning it takes effect.
     pub step: u64,
-    /// The measured error.
+    /// The measured error, above the scene's tolerance.
     pub audited_error: AuditedError,
     /// The main source of the error, in words ([`Origin::describe`](crate::select::audit::Origin::describe)).
     pub reason: String,
@@ -243,7 +244,7 @@ pub struct Correction {
 }
 
 /// A recovery by the guard. The tissue's motion was wrong, and shorter substeps did not help. The tissue went
-/// back to the last state that passed the guard's checks, and continued without tools.
+/// back to the state of the last checkpoint, or to rest, and continued without tools.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Recovery {
     /// Steps done when the guard found the error. Time continues from there.
@@ -253,7 +254,8 @@ pub struct Recovery {
     /// Whether the tissue continued at rest, because that state had passed no check, or because there were too
     /// many recoveries.
     pub at_rest: bool,
-    /// Number of commands whose effect was lost, because they took effect after that state.
+    /// Number of commands whose effect was lost, because they took effect after the state that the tissue went
+    /// back to.
     pub undone_commands: u64,
     /// After too many recoveries: until this step, commands to the tools that acted have no effect. Otherwise
     /// `None`, and not written.
@@ -270,18 +272,19 @@ fn name<S: serde::Serializer>(value: &impl Named, serializer: S) -> Result<S::Ok
 /// The measurements of a replay through a server, written among the fields of the [`Summary`].
 #[derive(Debug, Clone, Serialize)]
 pub struct Network {
-    /// Commands that arrived after their step.
+    /// Commands that arrived after the step for which they were meant.
     pub late_commands: u64,
     /// Commands that the server refused.
     pub rejected_commands: u64,
-    /// Steps that the server dropped.
+    /// Steps that the server dropped because it could not keep its rate.
     pub overruns: u64,
     /// Simulated time divided by real time, from the first sample to the last: below 1, the server was slower
     /// than real time.
     pub time_dilation: f64,
-    /// Time from sending a message to its answer, µs. The answer does not wait for a step.
+    /// Time from sending a message to its answer, µs, the server's hold included. The answer does not wait for
+    /// a step.
     pub round_trip_us: Percentiles,
-    /// Time that the server held that message, µs.
+    /// Time from the arrival of that message at the server to its answer, µs.
     pub server_hold_us: Percentiles,
 }
 

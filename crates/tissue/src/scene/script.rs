@@ -27,7 +27,7 @@ pub const BUILT_IN: [(&str, &str); 7] = [
 /// forces first, then grasped points, then tips.
 #[derive(Debug, Clone)]
 pub struct Script {
-    /// Display name; any text.
+    /// Display name; any text. `unnamed` if the text gives none.
     pub name: String,
     /// Length in steps, at least 1.
     pub steps: u64,
@@ -48,7 +48,7 @@ pub struct Script {
     /// Warnings for the user, as sentences: rounded times, forces that leave the tissue, another scene than the
     /// script is made for.
     pub warnings: Vec<String>,
-    /// Steps per second, from the scene, Hz.
+    /// Steps per second, Hz, from the scene that the script is bound to.
     pub rate_hz: f64,
     /// The rest shape of the tissue that the script is bound to.
     pub shape: Arc<dyn RestShape>,

@@ -26,11 +26,11 @@ pub struct Sheet {
     pub spacing_m: f64,
     /// Mass of each point, kg.
     pub point_mass_kg: f64,
-    /// Points that never move.
+    /// Points that never move. A scene file that names none fixes none.
     pub fixed: FixedPoints,
 }
 
-/// The points of a grid that never move.
+/// The points of a grid of nx × ny points that never move.
 #[derive(Debug, Clone, PartialEq)]
 pub enum FixedPoints {
     /// Every point of the rim: i is 0 or nx − 1, or j is 0 or ny − 1.
@@ -47,7 +47,7 @@ pub enum FixedPoints {
 pub struct PointSet(Arc<[[usize; 2]]>);
 
 impl PointSet {
-    /// Returns whether a point is in the set.
+    /// Returns whether the point [i, j] is in the set.
     pub fn contains(&self, point: [usize; 2]) -> bool {
         self.0.binary_search(&point).is_ok()
     }

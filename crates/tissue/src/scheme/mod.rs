@@ -185,8 +185,8 @@ impl Scheme {
         each!(self, |family| family.kick())
     }
 
-    /// Returns the number of fields that the scheme keeps besides u and d. `compensated` adds one for the
-    /// rounding errors of u in f32.
+    /// Returns the number of fields that the scheme keeps besides u and d. `compensated` adds one, for the
+    /// rounding errors of u in f32, to the exponential schemes; others can't compensate.
     pub fn kept(&self, compensated: bool) -> usize {
         each!(self, |family| family.kept(compensated))
     }

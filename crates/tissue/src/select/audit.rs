@@ -54,7 +54,8 @@ pub enum Origin {
 }
 
 impl Origin {
-    /// Returns a description for messages.
+    /// Returns a description for messages, in the middle of a sentence: "the length of the substep" and the
+    /// like.
     pub fn describe(self) -> &'static str {
         match self {
             Origin::Substep => "the length of the substep",

@@ -366,12 +366,10 @@ pub fn by_auto(scene: &Scene, limits: &Limits) -> Option<Choice> {
 /// Chooses integrator, substeps and format for a scene's tolerance, as far as the scene leaves them open:
 ///
 /// 1. The cheapest choice that is expected to keep the tolerance.
-///
 /// 2. If there is none: the cheapest whose error is at most twice the smallest that can be distinguished from
-/// none; if there is none either, the choice with the smallest expected error.
-///
+///    none; if there is none either, the choice with the smallest expected error.
 /// 3. If no error can be predicted: the cheapest stable scheme, with as many substeps as let the fastest
-/// vibration turn by at most [`stability::THETA`] in each: at most 8 times those.
+///    vibration turn by at most [`stability::THETA`] in each: at most 8 times as many as stability needs.
 ///
 /// No choice has more than [`MAX_TIMES_STABLE`] times the substeps with which it is stable, except an
 /// integrator that the scene names and that keeps the tolerance with more.

@@ -24,9 +24,9 @@ use palpate_refusal::{Reason, Refusal, Result, number};
 /// An image: rows of pixels from the top, each from the left, in sRGB. [`painted`] and [`image`] create one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Image {
-    /// Pixels per row.
+    /// Pixels per row, from the left.
     pub width: usize,
-    /// Number of rows.
+    /// Number of rows, from the top.
     pub height: usize,
     /// Red, green and blue of each pixel, one byte each: 3·`width`·`height` bytes, row by row.
     pub rgb: Vec<u8>,
