@@ -103,8 +103,8 @@ pub struct MeshShape {
 /// `default()` if the shape was made without a scene.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshMetadata {
-    /// The vertices that never move, as the scene specifies them; which these are, [`RestShape::is_fixed`]
-    /// tells.
+    /// The vertices that never move, as the scene specifies them; [`RestShape::is_fixed`] answers for a single
+    /// vertex.
     pub fixed: FixedVertices,
     /// Texture coordinates (u, v) of each simulated vertex, if the file has them; at a seam, those of one side.
     pub uv: Option<Vec<[f32; 2]>>,
