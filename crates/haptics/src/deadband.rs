@@ -33,9 +33,9 @@ impl ForceDeadband {
     }
 
     /// Returns whether the client's force is wrong by too much at the tool's present place, which `model` describes:
-    /// |f − f_r| > max(δ·|f|, [`MIN_N`]), with f the tissue's force and f_r the force that the client renders there from
-    /// the last sample and `law`, the law by which it renders that sample. True before the first sample. Call it once
-    /// at each step: it also moves the client's simulated touch along the path.
+    /// |f − f_r| > max(δ·|f|, [`MIN_N`]), with f the tissue's force and f_r the force that the client renders there
+    /// from the last sample and `law`, the law by which it renders that sample. True before the first sample. Call it
+    /// once at each step: it also moves the client's simulated touch along the path.
     pub fn is_exceeded(&mut self, model: &LocalModel, law: &Law) -> bool {
         let Some((sent, touching)) = &mut self.sent else { return true };
         touching.move_to(sent, law, model.place_m);

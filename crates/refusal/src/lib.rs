@@ -104,8 +104,7 @@ reasons! {
     Fenced = "FENCED",
 }
 
-/// A refusal of an input: what was refused and why. A refused input has changed nothing, except with
-/// [`Reason::Recovered`], [`Reason::Cut`] and [`Reason::TimedOut`], which may come after a part was done.
+/// A refusal of an input: what was refused and why. A refused input has changed nothing.
 ///
 /// A refusal has a reason for programs, and a field and a message for people:
 ///
