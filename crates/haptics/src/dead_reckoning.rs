@@ -36,9 +36,9 @@ pub struct SendInterval {
 
 impl SendInterval {
     /// Records that message `number` (counted from 1) arrived at `now_s` by this end's clock, s. It was sent at
-    /// `sent_s` by the other end's clock, s. A gap after the newest number so far counts as a loss, even if the missing
-    /// message arrives later; messages before the first received one do not. At most 512 transit times of the last 5 s
-    /// are kept.
+    /// `sent_s` by the other end's clock, s. A gap after the newest number so far counts as a loss, even if the
+    /// missing message arrives later; messages before the first received one do not. At most 512 transit times of the
+    /// last 5 s are kept.
     pub fn arrive(&mut self, number: u64, sent_s: f64, now_s: f64) {
         // A message that arrives out of order was not lost, but it was missing when it was needed.
         if number > self.newest + 1 && self.newest > 0 {

@@ -111,8 +111,8 @@ impl LimitCause {
     ];
 }
 
-/// Input of one tick of the envelope: the wanted force, and the state of the device. All vectors are in one frame, that
-/// of the device, in which its workspace is given ([`Envelope::new`]).
+/// Input of one tick of the envelope: the wanted force, and the state of the device. All vectors are in one frame,
+/// that of the device, in which its workspace is given ([`Envelope::new`]).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Wanted {
     /// Present time, s, from any origin; it must not go back.
@@ -219,8 +219,8 @@ impl Envelope {
         self.energy_j
     }
 
-    /// Returns the number of times that `reason` limited the force, and the number of all ticks, since the envelope was
-    /// created. [`LimitCause::Stale`] and [`LimitCause::Passivity`] may count twice in one tick.
+    /// Returns the number of times that `reason` limited the force, and the number of all ticks, since the envelope
+    /// was created. [`LimitCause::Stale`] and [`LimitCause::Passivity`] may count twice in one tick.
     pub fn count(&self, reason: LimitCause) -> (u64, u64) {
         (self.counts[reason as usize], self.ticks)
     }
@@ -231,8 +231,9 @@ impl Envelope {
         self.engaged_s.is_some()
     }
 
-    /// Changes DISABLED or PAUSED to ENABLED: the force ramps in over [`ENGAGE_S`] once a model is known and the wanted
-    /// force is below [`ENGAGE_BELOW_N`]. Does nothing in another state; a FAULT needs [`Envelope::reset`] first.
+    /// Changes DISABLED or PAUSED to ENABLED: the force ramps in over [`ENGAGE_S`] once a model is known and the
+    /// wanted force is below [`ENGAGE_BELOW_N`]. Does nothing in another state; a FAULT needs [`Envelope::reset`]
+    /// first.
     pub fn enable(&mut self) {
         if matches!(self.state, RenderingState::Disabled | RenderingState::Paused) {
             (self.state, self.engaged_s) = (RenderingState::Enabled, None);
@@ -267,9 +268,9 @@ impl Envelope {
     /// Advances the envelope by one tick. Returns the force to render until the next tick, N: the wanted force after
     /// the limits at the top of this module, in their order. With a model of age a, the share that is left is 1 up to
     /// [`FRESH_S`], falls linearly to a half at [`STALE_S`], and is ½·e^{−(a − STALE_S)/DECAY_S} beyond. After
-    /// `enable` it rises as t/[`ENGAGE_S`], t from the beginning of the ramp. Passivity bounds the force by √(2·S·E/v),
-    /// with E the energy in the tank and v the hand's speed along the force (at least 0.08 m/s), and slew bounds its
-    /// change in a tick of length h (at most 10 ms count) by S·h, S = [`SLEW_N_PER_S`].
+    /// `enable` it rises as t/[`ENGAGE_S`], t from the beginning of the ramp. Passivity bounds the force by
+    /// √(2·S·E/v), with E the energy in the tank and v the hand's speed along the force (at least 0.08 m/s), and slew
+    /// bounds its change in a tick of length h (at most 10 ms count) by S·h, S = [`SLEW_N_PER_S`].
     ///
     /// A value that is not finite, or a place outside the workspace, changes the state to FAULT; a model or a gap
     /// between two ticks older than [`PAUSE_S`] changes it to PAUSED. The force then falls to zero within the slew.

@@ -37,8 +37,8 @@ pub struct Law {
 
 impl Law {
     /// Returns the law of a linear spring and damper, K·d + B·v at a depth d and a speed v inwards, with K =
-    /// `stiffness_n_per_m` and B = `damping_n_s_per_m` both along and across the normal. A disc that slides has no drag.
-    /// It has two rows, at 0 and 0.1 m, and is linear beyond as well.
+    /// `stiffness_n_per_m` and B = `damping_n_s_per_m` both along and across the normal. A disc that slides has no
+    /// drag. It has two rows, at 0 and 0.1 m, and is linear beyond as well.
     pub fn linear(stiffness_n_per_m: f64, damping_n_s_per_m: f64) -> Self {
         let step_m = 0.1;
         let row = |force_n: f64| Row {
@@ -105,8 +105,8 @@ impl Law {
     }
 
     /// Returns the depth at which the force is `force_n` (N), m: by bisection between the two rows around it; beyond
-    /// the last row, at depth D, it is D + (`force_n` − F(D))/k(D), with F and k the law's force and stiffness, which is
-    /// very large if k(D) is 0. Returns 0 if `force_n` is not positive. The law must be sound ([`Law::is_sound`]).
+    /// the last row, at depth D, it is D + (`force_n` − F(D))/k(D), with F and k the law's force and stiffness, which
+    /// is very large if k(D) is 0. Returns 0 if `force_n` is not positive. The law must be sound ([`Law::is_sound`]).
     pub fn depth_of(&self, force_n: f64) -> f64 {
         if force_n <= 0.0 {
             return 0.0;

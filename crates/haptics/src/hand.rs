@@ -50,8 +50,8 @@ impl Hand {
     }
 
     /// Returns the force of the string that pulls a device that nobody holds from `place_m` to `target_m`, N: 60 N/m
-    /// times the way, shortened to 0.5 N. For a hand (`stiffness_n_per_m` > 0) it is 0. The caller adds it to the force
-    /// that it gives to [`Hand::advance`].
+    /// times the way, shortened to 0.5 N. For a hand (`stiffness_n_per_m` > 0) it is 0. The caller adds it to the
+    /// force that it gives to [`Hand::advance`].
     pub fn string_n(&self, target_m: DVec3, place_m: DVec3) -> DVec3 {
         if self.stiffness_n_per_m > 0.0 {
             return DVec3::ZERO;
@@ -59,9 +59,9 @@ impl Hand {
         (STRING_N_PER_M * (target_m - place_m)).clamp_length_max(STRING_N)
     }
 
-    /// Returns the state `time_s` after the state `held`, under the constant force F = `force_n` on the hand, N, with a
-    /// target that moves straight from `from_m` to `to_m`, m. It is exact except that the target counts as constant in
-    /// each quarter of the time, at its mean.
+    /// Returns the state `time_s` after the state `held`, under the constant force F = `force_n` on the hand, N, with
+    /// a target that moves straight from `from_m` to `to_m`, m. It is exact except that the target counts as constant
+    /// in each quarter of the time, at its mean.
     ///
     /// With γ = b/2m, ω² = k/m − γ², the place of rest x_r = target + F/k, x₀ and v₀ the place and velocity of `held`,
     /// and a = x₀ − x_r:
@@ -109,8 +109,8 @@ impl Hand {
     }
 
     /// Returns the delay at which the loop of the hand and a rendered spring of `stiffness_n_per_m` = K (N/m) becomes
-    /// unstable, s; infinite if it never does. It is the smallest t for which m·s² + b·s + k + K·e^{−s·t} = 0 has a root
-    /// s on the imaginary axis. A sample that is held for a period adds a delay of half a period.
+    /// unstable, s; infinite if it never does. It is the smallest t for which m·s² + b·s + k + K·e^{−s·t} = 0 has a
+    /// root s on the imaginary axis. A sample that is held for a period adds a delay of half a period.
     ///
     /// With s = iω both sides of K·e^{−iωt} = mω² − k − ibω have the same size, so (mω² − k)² + b²ω² = K²:
     ///

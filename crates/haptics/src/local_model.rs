@@ -52,8 +52,8 @@ pub struct LocalModel {
     /// Curvature κ: change of the normal per metre along the surface, 1/m. It is symmetric, 0 for a plane, and 1/R
     /// for a sphere that is touched from outside.
     pub curvature_per_m: DMat3,
-    /// Distance from x₀ within which K is valid, m ([`valid_m`]); it may be infinite. Only a tool that holds the tissue
-    /// is rendered from K and B.
+    /// Distance from x₀ within which K is valid, m ([`valid_m`]); it may be infinite. Only a tool that holds the
+    /// tissue is rendered from K and B.
     pub valid_m: f64,
     /// Coefficient μ of Coulomb friction, 0 or more.
     pub friction: f64,
@@ -107,8 +107,8 @@ impl Default for Track {
 }
 
 impl Track {
-    /// Appends `place_m`, m, at `time_s` by the client's clock, s, which must not be before the last one (not checked).
-    /// Drops the oldest beyond 2048.
+    /// Appends `place_m`, m, at `time_s` by the client's clock, s, which must not be before the last one (not
+    /// checked). Drops the oldest beyond 2048.
     pub fn push(&mut self, time_s: f64, place_m: DVec3) {
         if self.places.len() == KEPT {
             self.places.pop_front();
@@ -139,8 +139,8 @@ pub(crate) fn is_after(time_s: f64, other_s: f64) -> bool {
 const TICK_S: f64 = 1e-3;
 
 /// State of a touch along a tool's path since a sample: tangential stretch of the tissue, sticking or sliding, and
-/// place. It begins with a sample ([`Touching::at_sample`]) and is replaced at the next one; each of its functions must
-/// get the same model, and the law that this model names.
+/// place. It begins with a sample ([`Touching::at_sample`]) and is replaced at the next one; each of its functions
+/// must get the same model, and the law that this model names.
 ///
 /// A sample describes a tool 2 mm deep in a tissue of 400 N/m. Since then the client's tool has moved 1 mm deeper, so
 /// its force is 1.2 N:
@@ -253,10 +253,10 @@ impl Touching {
         (depth_m, law.at_depth(depth_m))
     }
 
-    /// Moves the tool by Δx to `place_m` (m, in the tissue's frame): the stretch s becomes the part of s + Δx across the
-    /// normal, shortened to μ·F(d)/K_t, with F and K_t the law's force and stiffness across at the depth d (Coulomb's
-    /// law: the disc slides where its spring would pull with more than μ times the pressure). Above the surface, or
-    /// where K_t is 0, the stretch becomes 0. The path counts: call it for each recorded place in turn.
+    /// Moves the tool by Δx to `place_m` (m, in the tissue's frame): the stretch s becomes the part of s + Δx across
+    /// the normal, shortened to μ·F(d)/K_t, with F and K_t the law's force and stiffness across at the depth d
+    /// (Coulomb's law: the disc slides where its spring would pull with more than μ times the pressure). Above the
+    /// surface, or where K_t is 0, the stretch becomes 0. The path counts: call it for each recorded place in turn.
     pub fn move_to(&mut self, model: &LocalModel, law: &Law, place_m: DVec3) {
         let moved_m = place_m - self.place_m;
         self.place_m = place_m;

@@ -142,8 +142,8 @@ impl Path {
     }
 
     /// Creates a path that continues from `state`; `None` if no path can have this state: more than 1024 waiting
-    /// places, waiting times that do not rise, a place or time that is not finite, a time of 10¹² s or more, a velocity
-    /// above 2·[`SPEED_M_PER_S`], or a count of 2⁴⁸ or more.
+    /// places, waiting times that do not rise, a place or time that is not finite, a time of 10¹² s or more, a
+    /// velocity above 2·[`SPEED_M_PER_S`], or a count of 2⁴⁸ or more.
     pub fn restored(state: PathState) -> Option<Self> {
         if !state.is_sound() {
             return None;
@@ -179,10 +179,10 @@ impl Path {
         Path { begins_m: Some(place_m), ..Path::default() }
     }
 
-    /// Queues a command that arrived at `now_s` by the server's clock, s: the tool's place, m, at client time `time_s`,
-    /// s. Returns true; or false, and counts a refusal, if a value is not finite or `time_s` is not above that of the
-    /// newest waiting place (of the played moment if none waits). Ends a movement by [`Path::receive_moving`]. Beyond
-    /// 1024 waiting places the oldest is dropped.
+    /// Queues a command that arrived at `now_s` by the server's clock, s: the tool's place, m, at client time
+    /// `time_s`, s. Returns true; or false, and counts a refusal, if a value is not finite or `time_s` is not above
+    /// that of the newest waiting place (of the played moment if none waits). Ends a movement by
+    /// [`Path::receive_moving`]. Beyond 1024 waiting places the oldest is dropped.
     pub fn receive(&mut self, time_s: f64, place_m: DVec3, now_s: f64) -> bool {
         let newest_s = self.waiting.back().or(self.played.as_ref()).map_or(f64::NEG_INFINITY, |place| place.0);
         if !place_m.is_finite() || !time_s.is_finite() || time_s <= newest_s {
@@ -195,9 +195,9 @@ impl Path {
     }
 
     /// Queues a command that arrived at `now_s` by the server's clock, s: the tool's place, m, and velocity, m/s, at
-    /// client time `time_s`, s. Until a newer command arrives, but at most for [`EXTRAPOLATE_S`], the tool continues at
-    /// this velocity, shortened to [`SPEED_M_PER_S`]. Returns true; or false, and counts a refusal, if a value is not
-    /// finite or `time_s` is not above [`Path::newest_s`]. Beyond 1024 waiting places the oldest is dropped.
+    /// client time `time_s`, s. Until a newer command arrives, but at most for [`EXTRAPOLATE_S`], the tool continues
+    /// at this velocity, shortened to [`SPEED_M_PER_S`]. Returns true; or false, and counts a refusal, if a value is
+    /// not finite or `time_s` is not above [`Path::newest_s`]. Beyond 1024 waiting places the oldest is dropped.
     pub fn receive_moving(&mut self, time_s: f64, place_m: DVec3, velocity_m_per_s: DVec3, now_s: f64) -> bool {
         let newest_s = self.newest_s().unwrap_or(f64::NEG_INFINITY);
         let is_finite = place_m.is_finite() && velocity_m_per_s.is_finite() && time_s.is_finite();
@@ -268,8 +268,8 @@ impl Path {
         now_s - self.arrived_s > HOLD_S
     }
 
-    /// Advances the path by a step of `step_s`, s, that ends at `now_s` by the server's clock, s. Returns the action of
-    /// the tool; `None` before the first command. More than [`RELEASE_S`] after the newest command it is
+    /// Advances the path by a step of `step_s`, s, that ends at `now_s` by the server's clock, s. Returns the action
+    /// of the tool; `None` before the first command. More than [`RELEASE_S`] after the newest command it is
     /// [`Play::Release`]. The tool moves towards its target by at most [`SPEED_M_PER_S`]·`step_s`. Between two
     /// commands the target is on a straight line, x₀ + (x₁ − x₀)·(t − t₀)/(t₁ − t₀); beyond the newest command with a
     /// velocity it is x + v·(t − t₀), for at most [`EXTRAPOLATE_S`].

@@ -158,8 +158,8 @@ impl Renderer {
 
     /// Restarts for a new connection without allocating or freeing memory: drops the models, and keeps `law`, which
     /// must be sound, as number 0. Passes the previous laws, at most [`MAX_LAWS`] and the oldest first, to `used`,
-    /// which should have them freed outside of ticks. A copy of the tissue stays set: also call [`Renderer::predict`] with `None`, because the copy is of
-    /// another tissue.
+    /// which should have them freed outside of ticks. A copy of the tissue stays set: also call [`Renderer::predict`]
+    /// with `None`, because the copy is of another tissue.
     pub fn begin_with(&mut self, law: Law, mut used: impl FnMut(Law)) {
         self.laws.drain(..).for_each(|known| used(known.1));
         self.laws.push((0, law));
@@ -167,16 +167,16 @@ impl Renderer {
     }
 
     /// Adds a law under a number that models may name from now on. Returns true; or false, and changes nothing, if it
-    /// is not sound or its number is known. Beyond [`MAX_LAWS`] it replaces the oldest that no current model names. A model
-    /// that names an unknown law is rendered with the oldest one.
+    /// is not sound or its number is known. Beyond [`MAX_LAWS`] it replaces the oldest that no current model names. A
+    /// model that names an unknown law is rendered with the oldest one.
     pub fn learn(&mut self, number: u32, law: Law) -> bool {
         law.is_sound() && self.learn_with(number, law, drop)
     }
 
     /// Adds a law under a number without allocating or freeing memory. The law must be sound, which is not checked.
-    /// Returns true, or false if the number is known. Passes the law that is no longer needed, which is `law` itself or one
-    /// that it replaces, to `used`, which should have it freed outside of ticks. Beyond [`MAX_LAWS`] it replaces the
-    /// oldest that no current model names.
+    /// Returns true, or false if the number is known. Passes the law that is no longer needed, which is `law` itself
+    /// or one that it replaces, to `used`, which should have it freed outside of ticks. Beyond [`MAX_LAWS`] it
+    /// replaces the oldest that no current model names.
     pub fn learn_with(&mut self, number: u32, law: Law, used: impl FnOnce(Law)) -> bool {
         if self.laws.iter().any(|known| known.0 == number) {
             used(law);
@@ -205,16 +205,17 @@ impl Renderer {
         }
     }
 
-    /// Returns the time of the model in use by the client's clock ([`LocalModel::client_time_s`]), s; `None` before the
-    /// first tick with a model, and again after [`Renderer::begin`]. A model that waits for the next tick does not
+    /// Returns the time of the model in use by the client's clock ([`LocalModel::client_time_s`]), s; `None` before
+    /// the first tick with a model, and again after [`Renderer::begin`]. A model that waits for the next tick does not
     /// count.
     pub fn model_time_s(&self) -> Option<f64> {
         self.newest.as_ref().map(|newest| newest.0.client_time_s)
     }
 
-    /// Receives a model that arrived at `now_s` by the clock of [`Renderer::tick`], s. It takes effect at the next tick
-    /// and replaces one that waits for it. A model whose sequence number is not above the last, or that is not sound,
-    /// is refused and counted ([`Renderer::refused`]). One that names an unknown law is rendered with the oldest law.
+    /// Receives a model that arrived at `now_s` by the clock of [`Renderer::tick`], s. It takes effect at the next
+    /// tick and replaces one that waits for it. A model whose sequence number is not above the last, or that is not
+    /// sound, is refused and counted ([`Renderer::refused`]). One that names an unknown law is rendered with the
+    /// oldest law.
     pub fn receive(&mut self, model: LocalModel, now_s: f64) {
         let arrived = self.arrived.as_ref().map(|arrived| &arrived.0);
         let newest = arrived.or(self.newest.as_ref().map(|newest| &newest.0));
@@ -296,8 +297,8 @@ impl Renderer {
 
     /// Advances by one tick: records the tool's place (m, in the tissue's frame) at `now_s` by the client's clock, s,
     /// and switches to a model that has arrived. Does not allocate. A value that is not finite is not recorded and
-    /// makes the envelope's state FAULT. Returns the force to render until the next tick, N: F(t) + b·e^{−(t − t₀)/τ} as at the top of this module,
-    /// within the limits of the envelope.
+    /// makes the envelope's state FAULT. Returns the force to render until the next tick, N: F(t) + b·e^{−(t − t₀)/τ}
+    /// as at the top of this module, within the limits of the envelope.
     pub fn tick(&mut self, now_s: f64, place_m: DVec3) -> DVec3 {
         let known = place_m.is_finite() && now_s.is_finite();
         if let Some((then_s, from_m)) = self.before.filter(|_| known)
