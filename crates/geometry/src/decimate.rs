@@ -121,8 +121,8 @@ impl Eq for Candidate {}
 
 /// Collapses edges until at most `vertices` are left (at least [`MIN_VERTICES`]), or no edge can collapse without
 /// folding the surface: then more are left. Border vertices stay on the border; vertices on an edge of more than two
-/// triangles, or where surfaces touch, stay in place. All coordinates must be finite and all indices in range, or it
-/// panics; vertices without triangles are dropped.
+/// triangles, or where surfaces touch, stay in place. All coordinates must be finite and all indices in range;
+/// vertices without triangles are dropped.
 ///
 /// The cost of an edge of length l is Q(x) + 0.01·l⁴. Q(x) = xᵀAx + 2b·x + c is the sum of the squared distances of x
 /// from the planes of the triangles at both ends, weighted by their areas. The edge collapses to x = −A⁻¹b, where Q is

@@ -50,7 +50,7 @@ impl TriangleMesh {
     }
 }
 
-/// A named set of vertices of a mesh, such as a part of an organ that a scene fixes or colours.
+/// A named set of vertices of a mesh, which may overlap other sets.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Group {
     /// Name of the set in the file.

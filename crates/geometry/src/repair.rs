@@ -29,8 +29,8 @@ const HALVINGS: usize = 8;
 /// A change of the area or of the volume by more than this fraction is reported as a loss.
 const LOST: f64 = 0.01;
 
-/// Steps of a repair, in the order in which [`repair`] takes them (`degenerate` before `manifold`, …). The default is
-/// all of them, with holes of up to 64 edges.
+/// Steps of a repair, in the order in which [`repair`] takes them. The default is all of them, with holes of up to 64
+/// edges.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Repair {
     /// Weld vertices that are at most this far apart, m. `None`: a millionth of the diagonal of the bounding box; 0,

@@ -5,7 +5,7 @@ use std::fmt::Write;
 
 use crate::{Problem, TriangleMesh};
 
-/// A file format that [`write`] can write.
+/// A file format that [`write()`] can write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// Wavefront OBJ, with texture coordinates and groups.
