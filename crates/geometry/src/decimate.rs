@@ -35,13 +35,13 @@ pub const MIN_VERTICES: usize = 4;
 /// A point on the surface of a mesh, within one of its triangles.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeshPlace {
-    /// Index of the triangle.
+    /// Index of the triangle in [`TriangleMesh::triangles`].
     pub triangle: u32,
     /// Weights of its three vertices, in the order of the triangle, from 0 to 1; their sum is 1.
     pub barycentric: [f64; 3],
 }
 
-/// The result of a decimation.
+/// The result of [`decimate`]: the mesh with fewer vertices, and where the original vertices are on it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Decimated {
     /// The decimated mesh, without texture coordinates. A vertex is in a group if one that it replaces was; groups

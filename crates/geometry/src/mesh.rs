@@ -9,7 +9,7 @@ use glam::DVec3;
 pub struct TriangleMesh {
     /// Positions of the vertices, m, in the order of the file.
     pub vertices_m: Vec<DVec3>,
-    /// Three vertex indices per triangle, counterclockwise seen from outside.
+    /// Three vertex indices per triangle, from 0, counterclockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
     /// Texture coordinates (u, v) of each corner of each triangle, in the order of `triangles` and as many; `None` if
     /// the file has none.

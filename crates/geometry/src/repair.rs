@@ -51,7 +51,7 @@ pub struct Repair {
     /// Fill holes with at most this many edges (0: none): holes with three edges, and holes with a border shorter than
     /// the diagonal of the bounding box. A hole with more than three edges gets a vertex in its middle.
     pub hole_edges: usize,
-    /// Drop vertices that no triangle uses.
+    /// Drop vertices that no triangle uses, and groups without a vertex.
     pub unused: bool,
 }
 

@@ -155,7 +155,7 @@ pub struct MeshReport {
     pub vertices: usize,
     /// Number of triangles.
     pub triangles: usize,
-    /// Number of surfaces that share no vertex.
+    /// Number of connected surfaces: sets of triangles that share no vertex with others.
     pub components: usize,
     /// Number of borders of the surface: closed loops of edges that belong to only one triangle.
     pub holes: usize,
@@ -164,7 +164,7 @@ pub struct MeshReport {
     /// The volume inside, m³, negative if the surface faces inwards: Σ a·(b × c)/6 over the triangles (a, b, c), by
     /// the theorem of Gauss with the field x/3. `None` unless the surface is closed and consistently oriented.
     pub volume_m3: Option<f64>,
-    /// The area, m²: Σ |(b − a) × (c − a)|/2.
+    /// The area of all triangles (a, b, c), m²: Σ |(b − a) × (c − a)|/2. Duplicates count each time.
     pub area_m2: f64,
     /// Dimensions of the bounding box of all triangles, m: x, y, z.
     pub extent_m: [f64; 3],

@@ -355,7 +355,7 @@ struct Crossing {
 /// A vertex near a disc, whose hat may overlap it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Covered {
-    /// Index of the vertex.
+    /// Index of the vertex in [`Surface::vertices_m`].
     pub vertex: u32,
     /// Mean of its hat over the disc, from 0 to 1. The weights of all vertices add up to 1.
     pub weight: f64,

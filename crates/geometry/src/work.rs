@@ -18,7 +18,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// operations: every few milliseconds.
 const BETWEEN_LOOKS: u64 = 1 << 16;
 
-/// Reason why a computation inside [`within`] was cancelled.
+/// Reason why a computation inside [`within`] was cancelled; [`spend`] unwinds with it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GivenUp {
     /// The flag was set.

@@ -31,7 +31,7 @@ pub struct Device {
     pub workspace_m: f64,
 }
 
-/// Largest force on a person with any device, N.
+/// Largest force on a person with any device, N; a stronger device is limited to it ([`Device::most_n`]).
 pub const SAFE_FORCE_N: f64 = 3.3;
 
 /// Largest force of a device whose client declares no limits, N.

@@ -36,7 +36,7 @@ pub const PAUSE_S: f64 = 0.3;
 /// Time within which a faded force returns, s: 50 ms after an outage of 100 ms, the error is some tenths of a per
 /// cent.
 const RETURN_S: f64 = 0.04;
-/// Time constant of the decay of the force beyond [`STALE_S`], s.
+/// Time constant of the exponential decay of the force beyond [`STALE_S`], and after rendering stops, s.
 pub const DECAY_S: f64 = 0.05;
 /// Fraction of the force that is left at [`STALE_S`].
 const STALE_SHARE: f64 = 0.5;
@@ -44,7 +44,7 @@ const STALE_SHARE: f64 = 0.5;
 pub const ENGAGE_BELOW_N: f64 = 0.2;
 /// Duration of the ramp from zero to the wanted force when rendering begins, s.
 pub const ENGAGE_S: f64 = 0.5;
-/// Largest rate of change of the force, N/s.
+/// Largest rate of change of the force, as a vector, in every state, N/s.
 pub const SLEW_N_PER_S: f64 = 100.0;
 /// Smallest speed that passivity assumes for the hand, m/s.
 const MIN_SPEED_M_PER_S: f64 = 0.08;
@@ -76,7 +76,8 @@ pub enum RenderingState {
     Fault,
 }
 
-/// Reason why the rendered force differs from the wanted one.
+/// Reason why the rendered force differs from the wanted one. Several may act in one tick; [`Envelope::count`] counts
+/// each.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LimitCause {
     /// The newest model is old, or the last tick was long ago.
@@ -208,7 +209,7 @@ impl Envelope {
         }
     }
 
-    /// Returns the state of rendering.
+    /// Returns the state of rendering. It changes with the functions below and in [`Envelope::render`].
     pub fn state(&self) -> RenderingState {
         self.state
     }
@@ -254,7 +255,8 @@ impl Envelope {
         self.state = RenderingState::Fault;
     }
 
-    /// Changes FAULT to DISABLED. Does nothing in another state.
+    /// Changes FAULT to DISABLED, so that [`Envelope::enable`] acts again. Does nothing in another state. Energy,
+    /// force and counts stay.
     pub fn reset(&mut self) {
         if self.state == RenderingState::Fault {
             self.state = RenderingState::Disabled;

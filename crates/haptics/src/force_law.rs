@@ -26,7 +26,7 @@ pub struct Row {
 /// Force law of a tissue: force, stiffness and damping over depth, as a table with equal steps of depth from 0.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Law {
-    /// Depth between two rows, m.
+    /// Depth between two rows, m; above 0.
     pub step_m: f64,
     /// Values at depths 0, `step_m`, 2·`step_m`, …; at least two rows, or [`Law::at_depth`] and the others panic.
     pub rows: Vec<Row>,

@@ -7,7 +7,7 @@ use glam::DVec3;
 /// force of the device on the hand, and m, b and k the fields below.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hand {
-    /// Name by which [`Hand::named`] finds it.
+    /// Name by which [`Hand::named`] finds it, in lower case.
     pub name: &'static str,
     /// Mass m of hand and device, kg; above 0.
     pub mass_kg: f64,

@@ -12,7 +12,7 @@ use glam::{DMat3, DVec3};
 
 use crate::force_law::{Law, Row};
 
-/// State of contact between a tool and the tissue.
+/// State of contact between a tool and the tissue at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ContactState {
     /// The tool does not touch the tissue.
@@ -123,7 +123,7 @@ impl Track {
         self.places.range(from..).map(|place| place.1)
     }
 
-    /// Removes all places.
+    /// Removes all places, and keeps the memory for them.
     pub fn clear(&mut self) {
         self.places.clear();
     }

@@ -28,9 +28,9 @@ pub const SPEED_M_PER_S: f64 = 0.5;
 pub const BACKLOG_S: f64 = 0.1;
 /// Time without a command after which the tool is held in place and the client is informed, s.
 pub const HOLD_S: f64 = 0.05;
-/// Time without a command after which the tool lets go, s.
+/// Time without a command after which the tool lets go of the tissue, s. The next command begins a new touch.
 pub const RELEASE_S: f64 = 0.25;
-/// Longest time over which a movement is extrapolated, s.
+/// Longest time after a command with a velocity over which its movement is extrapolated, s; then the tool stays.
 pub const EXTRAPOLATE_S: f64 = HOLD_S;
 /// Lateness of commands with a velocity beyond which the played moment falls back, s.
 const LATE_S: f64 = 0.002;
@@ -124,7 +124,7 @@ impl PathState {
 }
 
 impl Path {
-    /// Returns the complete state of the path, for [`Path::restored`].
+    /// Returns a copy of the complete state of the path, from which [`Path::restored`] continues it.
     pub fn state(&self) -> PathState {
         let Path { at_once, begins_m, waiting, heading, played, place_m, arrived_s, spare_s, watched_s, .. } = self;
         PathState {

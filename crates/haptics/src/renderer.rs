@@ -29,7 +29,7 @@ use crate::force_law::Law;
 use crate::local_model::{ContactState, LocalModel, Touching, Track};
 use crate::prediction::Prediction;
 
-/// Time constant with which the bias after a new model decays, s.
+/// Time constant with which the bias (the difference of the force to that of the model before) decays, s.
 pub const BIAS_S: f64 = 0.02;
 
 /// Largest number of force laws that a renderer keeps. A further law replaces the oldest that neither the newest

@@ -1,6 +1,6 @@
 //! The tip of a tool that is controlled by its position: its size, its friction and its coupling to the tissue.
 
-/// Coupling between a tool and the surface that it touches.
+/// Coupling between a tool and the surface that it touches: how the place of the one follows from the other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Coupling {
     /// The surface follows the tool exactly: the stiffness felt is the tissue's.

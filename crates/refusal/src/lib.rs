@@ -117,7 +117,7 @@ reasons! {
 /// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Refusal {
-    /// The reason, for programs.
+    /// The reason, for programs; the only part that is stable.
     pub reason: Reason,
     /// The offending field, as a path such as `sheet.spacing_m` or `force[0].profile.on_s`. Empty if no field is at
     /// fault.
@@ -129,7 +129,7 @@ pub struct Refusal {
     pub place: Option<String>,
 }
 
-/// Result of a function that may refuse its input.
+/// Result of a function that may refuse its input: its value, or the [`Refusal`].
 pub type Result<T> = std::result::Result<T, Refusal>;
 
 impl Refusal {

@@ -33,7 +33,7 @@ pub const MAX_VERTICES: usize = 500_000;
 /// Area of an equilateral triangle with edges of length 1, √3/4; a vertex has twice that.
 const EQUILATERAL: f64 = 0.433_012_701_892_219_3;
 
-/// An organ, or a part of one, that [`generate`] can create.
+/// An organ, or a part of one, that [`generate`] can create. Sizes are those before the seed varies them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Organ {
     /// A gallbladder with its neck and the beginning of the cystic duct, 80 mm long. Groups: `bed` (the side at the

@@ -29,7 +29,7 @@ pub const ROOM: usize = 2 << 20;
 /// 000 vertices and 1 000 000 triangles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ReadLimits {
-    /// Maximum bytes of the file, and of everything unpacked from it.
+    /// Maximum number of bytes of the file, and of everything unpacked from it.
     pub bytes: usize,
     /// Maximum number of vertices.
     pub vertices: usize,

@@ -150,7 +150,7 @@ pub struct Tangent {
     /// D = C·Σ ∂u·∂u of sliding within the surface, with ∂u the slope of the displacements, N·s/m: the mean of both
     /// directions.
     pub drag_n_s_per_m: f64,
-    /// Mass M = m·φ̂ᵀφ̂ that moves along the normal, kg.
+    /// Mass M = m·φ̂ᵀφ̂ that moves along z, kg.
     pub mass_kg: f64,
     /// Iterations of the solver, at most 400.
     pub iterations: u32,
@@ -480,11 +480,12 @@ pub fn press(model: &Model, radius_m: f64, centre_m: DVec3, step_m: f64, count: 
 pub struct Course {
     /// Radius of the disc, m.
     pub radius_m: f64,
-    /// Middle of the disc at rest, m: the place of the surface nearest to this.
+    /// Middle of the disc at rest, m, in the tissue's frame. The disc is at the place of the rest surface nearest to
+    /// this.
     pub centre_m: DVec3,
     /// Distance between depths, m; the first depth is 0.
     pub step_m: f64,
-    /// Number of depths.
+    /// Number of depths, the first included.
     pub count: u32,
     /// Largest number of points of a mesh that are computed, unless the disc itself covers more; those beyond are
     /// held. `usize::MAX` for all that notice the disc. Without effect on a sheet.
@@ -507,7 +508,7 @@ pub struct Press {
     pressed: Vec<Pressed>,
 }
 
-/// The result of computing one depth of a press.
+/// The result of [`Press::deepen`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Deepened {
     /// A depth was computed, and further depths are left.

@@ -47,7 +47,7 @@ const MAX_COUNT: u64 = 1 << 48;
 /// [`Model::resumed`]: crate::Model::resumed
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TissueState {
-    /// k of the structural springs, N/m.
+    /// k of the structural springs, N/m; on a mesh, the reference value of which each spring has a multiple.
     pub stiffness_n_per_m: f64,
     /// k of the shear springs, N/m.
     pub shear_stiffness_n_per_m: f64,

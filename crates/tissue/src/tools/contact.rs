@@ -82,7 +82,7 @@ pub struct ToolContact {
     pub place_m: DVec3,
     /// Velocity of the tool in the last step, m/s.
     pub velocity_m_per_s: DVec3,
-    /// Whether the tool is free, sticks, slides or holds.
+    /// Whether the tool is free, sticks, slides or holds at the end of the step.
     pub contact_state: ContactState,
     /// Force of the tissue on the tool, N; 0 while it is free.
     pub force_on_tool_n: DVec3,

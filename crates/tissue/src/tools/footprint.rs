@@ -61,7 +61,7 @@ enum FootprintGeometry {
 pub struct WeightedNode {
     /// Row and column in memory; on a sheet, the indices in the grid.
     pub point: [usize; 2],
-    /// Whether the point can move.
+    /// Whether the point can move: it is not one of the tissue's fixed points.
     pub free: bool,
     /// Mass divided by the reference mass.
     pub mass: f64,

@@ -3,7 +3,7 @@
 use glam::DVec3;
 use thiserror::Error;
 
-/// A spring between two points.
+/// A spring between two points of a [`MeshGraph`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeshSpring {
     /// The numbers of the two points, from 0; they must differ.
@@ -30,7 +30,7 @@ pub struct MeshGraph {
     pub extra_anchor: Vec<f64>,
 }
 
-/// The reason why a graph can't be computed.
+/// Reason why a [`MeshGraph`] can't be computed: its first fault. Numbers are from 0, in the graph's order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 pub enum GraphFault {
     /// No point, or more than 2²⁸ points or springs. Contains the number of points, also if there are too many

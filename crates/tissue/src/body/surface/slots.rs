@@ -132,7 +132,7 @@ impl MeshSlots {
         self.vertex_of.len() / BLOCK
     }
 
-    /// Returns the number of tiles of 256 slots; the last tile may have fewer.
+    /// Returns the number of tiles of 256 successive slots, which sleep as one; the last tile may have fewer.
     pub fn tiles(&self) -> usize {
         self.vertex_of.len().div_ceil(TILE_SLOTS)
     }

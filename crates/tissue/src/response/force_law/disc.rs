@@ -11,12 +11,13 @@ const NEAR_IN_RADII: f64 = 4.0;
 /// Distance, in radii, up to which the law of a place serves a tool.
 const SERVES_IN_RADII: f64 = 0.5;
 
-/// A disc that presses on a tissue, and the place at rest where it presses.
+/// A disc that presses on a tissue, and the place at rest where it presses: that of which a force law is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Disc {
     /// Radius of the disc, m.
     pub radius_m: f64,
-    /// Middle of the disc at rest, m: the place of the surface nearest to this.
+    /// Middle of the disc at rest, m, in the tissue's frame. The disc is at the place of the rest surface nearest to
+    /// this.
     pub at_m: DVec3,
 }
 

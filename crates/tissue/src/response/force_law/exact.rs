@@ -20,7 +20,7 @@ const REACH_IN_RADII: f64 = 4.0;
 #[derive(Debug)]
 pub struct Computation(Box<Press>);
 
-/// The result of one step of a computation.
+/// The result of [`Computation::advance`].
 #[derive(Debug)]
 pub enum LawProgress {
     /// Further depths are left; continue with this.
