@@ -28,7 +28,7 @@ pub struct Row {
 pub struct Law {
     /// Depth between two rows, m; above 0.
     pub step_m: f64,
-    /// Values at depths 0, `step_m`, 2·`step_m`, …; at least two rows, or [`Law::at_depth`] and the others panic.
+    /// Values at depths 0, `step_m`, 2·`step_m`, …; at least two rows in a sound law ([`Law::is_sound`]).
     pub rows: Vec<Row>,
     /// Whether it was composed from coarser sheets because the tissue's own law takes too long to compute. It is then
     /// within a tenth of that law.

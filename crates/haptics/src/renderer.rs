@@ -149,8 +149,9 @@ impl Renderer {
 
     /// Restarts for a new connection: drops the models, all laws and the copy of the tissue, and keeps `law` as
     /// number 0. It must be sound ([`Law::is_sound`]), which is not checked. The envelope, the counts and the tool's
-    /// track stay; until the first model of the new connection, a rendered force fades as the last model's age grows.
-    /// Frees memory, so call it outside of ticks.
+    /// track stay. Until the first model of the new connection the wanted force is 0, to which a rendered force falls
+    /// within the slew; if none arrives, rendering pauses by the age of the last one. Frees memory, so call it outside
+    /// of ticks.
     pub fn begin(&mut self, law: Law) {
         self.prediction = None;
         self.begin_with(law, drop);

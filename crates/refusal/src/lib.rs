@@ -117,7 +117,7 @@ reasons! {
 /// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Refusal {
-    /// The reason, for programs; the only part that is stable.
+    /// The reason, for programs, which may rely on its name.
     pub reason: Reason,
     /// The offending field, as a path such as `sheet.spacing_m` or `force[0].profile.on_s`. Empty if no field is at
     /// fault.
