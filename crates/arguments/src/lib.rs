@@ -11,8 +11,11 @@ use clap::{Command, Parser};
 use palpate_refusal::excerpt;
 use palpate_refusal::printable::printable;
 
-/// Parses the command line of this process. Prints the text and ends the process if the arguments ask for help or
-/// the version, or if they are refused (exit code 2).
+/// Parses the command line of this process. Returns only if the arguments are accepted. If they ask for help or the
+/// version, prints it to stdout and ends the process with exit code 0; if they are refused, prints the reason to
+/// stderr and ends it with exit code 2.
+///
+/// An option or argument with a value also accepts a negative number, such as `-1` or `-1e-3`.
 pub fn parse<A: Parser>() -> A {
     match read(std::env::args_os()) {
         Ok(arguments) => arguments,

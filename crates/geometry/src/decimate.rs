@@ -1,7 +1,8 @@
 //! Decimates a mesh: edges collapse, starting with those that change the surface least.
 //!
-//! The error of a vertex is the sum of squared distances to the planes of the triangles that it stands for (Garland and
-//! Heckbert, Surface simplification using quadric error metrics, SIGGRAPH 1997, doi:10.1145/258734.258849). A small part of the edge's length is added, so that flat regions get even edges.
+//! The error of a vertex is the sum of squared distances to the planes of the triangles that it stands for (Garland
+//! and Heckbert, Surface simplification using quadric error metrics, SIGGRAPH 1997, doi:10.1145/258734.258849). A
+//! small part of the edge's length is added, so that flat regions get even edges.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
@@ -28,24 +29,26 @@ const QUALITY: f64 = 0.2;
 /// Number of triangles around a vertex above which it stays as it is: the work for a collapse grows with them.
 const MAX_AROUND: usize = 256;
 
-/// Smallest number of vertices of a closed surface.
+/// Smallest number of vertices of a closed surface; [`decimate`] does not go below it.
 pub const MIN_VERTICES: usize = 4;
 
-/// A point on a mesh.
+/// A point on the surface of a mesh, within one of its triangles.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeshPlace {
-    /// Index of the triangle.
+    /// Index of the triangle in [`TriangleMesh::triangles`].
     pub triangle: u32,
-    /// Weights of its three vertices; their sum is 1.
+    /// Weights of its three vertices, in the order of the triangle, from 0 to 1; their sum is 1.
     pub barycentric: [f64; 3],
 }
 
-/// The result of a decimation.
+/// The result of [`decimate`]: the mesh with fewer vertices, and where the original vertices are on it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Decimated {
-    /// The decimated mesh, without texture coordinates. A vertex is in a group if one that it replaces was.
+    /// The decimated mesh, without texture coordinates. A vertex is in a group if one that it replaces was; groups
+    /// without a vertex are dropped.
     pub mesh: TriangleMesh,
-    /// For each vertex of the original mesh, the nearest point on this one; empty if this one has no triangle.
+    /// For each vertex of the original mesh, in its order, the nearest point on this one; empty if this one has no
+    /// triangle.
     pub places: Vec<MeshPlace>,
 }
 
@@ -116,13 +119,14 @@ impl PartialEq for Candidate {
 
 impl Eq for Candidate {}
 
-/// Collapses edges until at most `vertices` are left (at least 4), or no edge can collapse without folding the
-/// surface. Border vertices stay on the border. All coordinates must be finite and all indices in range; vertices
-/// without triangles are dropped.
+/// Collapses edges until at most `vertices` are left (at least [`MIN_VERTICES`]), or no edge can collapse without
+/// folding the surface: then more are left. Border vertices stay on the border; vertices on an edge of more than two
+/// triangles, or where surfaces touch, stay in place. All coordinates must be finite and all indices in range;
+/// vertices without triangles are dropped.
 ///
-/// The cost of an edge of length l is Q(x) + 0.01·l⁴. Q(x) = xᵀAx + 2b·x + c is the sum of the squared distances from the planes of both
-/// ends, by their triangles' areas. x = −A⁻¹b, where Q is least, or the best of both ends and the middle.
-/// All coordinates must be finite and all indices in range; vertices without triangles are dropped.
+/// The cost of an edge of length l is Q(x) + 0.01·l⁴. Q(x) = xᵀAx + 2b·x + c is the sum of the squared distances of x
+/// from the planes of the triangles at both ends, weighted by their areas. The edge collapses to x = −A⁻¹b, where Q is
+/// least, or to the best of both ends and the middle.
 #[must_use]
 pub fn decimate(mesh: &TriangleMesh, vertices: usize) -> Decimated {
     let mut work = Decimation::new(mesh);

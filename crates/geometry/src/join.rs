@@ -11,7 +11,6 @@
 //! q to p it begins. Beginnings and ends are paired like parentheses around the edge. The remaining ones face one
 //! way, since some triangles of the file are turned: neighbours are joined. At most one triangle is left over; it has
 //! a border there.
-//! triangles of the file are turned: neighbours are joined. At most one triangle is left over; it has a border there.
 
 use std::collections::{BTreeSet, HashMap};
 

@@ -2,16 +2,19 @@
 
 use glam::DVec3;
 
-/// A triangle mesh. Only indices are guaranteed to be in range; `report` lists its faults.
+/// A triangle mesh. One that [`crate::read()`] returns has finite coordinates, indices in range and lists of matching
+/// lengths; nothing else is guaranteed, and of a mesh composed otherwise not even that. [`crate::report()`] lists its
+/// faults.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct TriangleMesh {
     /// Positions of the vertices, m, in the order of the file.
     pub vertices_m: Vec<DVec3>,
-    /// Three vertex indices per triangle, counterclockwise seen from outside.
+    /// Three vertex indices per triangle, from 0, counterclockwise seen from outside.
     pub triangles: Vec<[u32; 3]>,
-    /// Texture coordinates (u, v) of each corner of each triangle, if the file has them; as many as `triangles`.
+    /// Texture coordinates (u, v) of each corner of each triangle, in the order of `triangles` and as many; `None` if
+    /// the file has none.
     pub uv: Option<Vec<[[f32; 2]; 3]>>,
-    /// Named sets of vertices: groups, objects, materials or physical names of the file.
+    /// Named sets of vertices: groups, objects, materials or physical names of the file. A vertex may be in several.
     pub groups: Vec<Group>,
 }
 
@@ -36,8 +39,9 @@ impl TriangleMesh {
         }
     }
 
-    /// Writes the texture coordinates of each vertex to `into`, if there are any; at a seam, those of its first
-    /// corner.
+    /// Writes the texture coordinates of each vertex to `into`, by vertex; at a seam, those of its first corner.
+    /// Vertices without a triangle, and all if the mesh has no texture coordinates, keep what is there. Panics if
+    /// `into` is shorter than the vertices.
     pub fn write_vertex_uv(&self, into: &mut [[f32; 2]]) {
         // Backwards, so that the first corner is written last.
         for (triangle, corners) in self.triangles.iter().zip(self.uv.as_deref().unwrap_or_default()).rev() {
@@ -46,7 +50,7 @@ impl TriangleMesh {
     }
 }
 
-/// A named set of vertices of a mesh.
+/// A named set of vertices of a mesh, which may overlap other sets.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Group {
     /// Name of the set in the file.

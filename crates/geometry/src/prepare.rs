@@ -11,14 +11,14 @@ use crate::tree::Tree;
 use crate::walls::{doubled, match_diagonals};
 use crate::{Group, ReadLimits, TriangleMesh};
 
-/// A mesh to simulate, and that of the file.
+/// The result of [`prepare`]: a mesh to simulate, and that of the file.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prepared {
     /// The mesh to simulate. A vertex is in a group if one of the file's vertices that it represents is.
     pub mesh: TriangleMesh,
-    /// The mesh of the file, if its vertices differ.
+    /// The mesh of the file, if its vertices differ from those of `mesh`; otherwise `None`.
     pub file: Option<FileMesh>,
-    /// Sentences on what was done, with counts; empty if nothing was.
+    /// Sentences on what was done, with counts, in the order of the work; empty if nothing was.
     pub notes: Vec<String>,
     /// For each vertex of `mesh`, the smallest vertex of the file that it represents.
     vertex_names: Vec<u32>,
@@ -30,20 +30,24 @@ pub struct Prepared {
 /// texture.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FileMesh {
-    /// The mesh. A vertex of the file that several simulated ones represent has copies appended at the end.
+    /// The mesh, with the triangles of [`Prepared::mesh`] in the same order. A vertex of the file that several
+    /// simulated ones represent has copies appended at the end.
     pub mesh: TriangleMesh,
-    /// For each of its vertices, the simulated vertex that represents it; for one without a triangle, the nearest.
+    /// For each of its vertices, the simulated vertex that represents it; for one without a triangle, the nearest (or
+    /// a near one, if the search takes too long).
     pub vertex_of: Vec<u32>,
 }
 
 impl Prepared {
-    /// Reports on the mesh to simulate, with the file's numbers of vertices and triangles, within the default limits.
+    /// Reports on the mesh to simulate within the default limits ([`ReadLimits`]). Problems name vertices and
+    /// triangles by their numbers in the file, from 0.
     #[must_use]
     pub fn report(&self) -> MeshReport {
         self.report_within(&ReadLimits::default())
     }
 
-    /// Reports on the mesh to simulate, with the file's numbers of vertices and triangles, within `limits`.
+    /// Reports on the mesh to simulate. Problems name vertices and triangles by their numbers in the file, from 0; a
+    /// vertex that preparing added has a number beyond. A mesh beyond `limits` is only counted.
     #[must_use]
     pub fn report_within(&self, limits: &ReadLimits) -> MeshReport {
         let mut report = report_within(&self.mesh, limits);
@@ -66,8 +70,10 @@ pub(crate) fn note(notes: &mut Vec<String>, count: usize, what: &str) {
 /// to turn, drop or split, which may lead to more.
 const PASSES: usize = 8;
 
-/// Prepares a mesh. Returns one with indices out of range or positions that are not finite unchanged: the report
-/// refuses it. Preparing a prepared mesh again does not change it.
+/// Prepares a mesh: joins vertices at one position along the edges of their triangles, leaves out doubled triangles,
+/// walls inside of the tissue and unused vertices, splits vertices and halves triangles where surfaces touch, and
+/// turns closed parts outward. Returns a mesh with indices out of range or positions that are not finite unchanged,
+/// without notes: the report refuses it. Preparing a prepared mesh again does not change it.
 #[must_use]
 pub fn prepare(mut mesh: TriangleMesh) -> Prepared {
     let count = mesh.vertices_m.len();

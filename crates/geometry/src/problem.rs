@@ -5,7 +5,8 @@ use std::fmt;
 use crate::Unit;
 use crate::format::{length, place, rounded};
 
-/// A fault of a mesh file or a mesh. Its text says what to do.
+/// A fault of a mesh file or a mesh. Its text (`Display`) says what to do. A mesh with some faults is refused, with
+/// others the user is warned ([`Problem::is_refused`]).
 #[derive(Debug, Clone, PartialEq)]
 pub enum Problem {
     /// A text is not a unit of length.
@@ -51,7 +52,7 @@ pub enum Problem {
         /// Number of vertices.
         vertices: usize,
     },
-    /// The mesh has fewer vertices than a tissue needs.
+    /// The mesh has fewer than the 4 vertices that a tissue needs.
     TooFewVertices {
         /// Number of vertices.
         vertices: usize,
@@ -87,26 +88,26 @@ pub enum Problem {
     },
     /// A vertex is in no triangle.
     UnusedVertex,
-    /// Edge lengths differ much.
+    /// Edge lengths differ by a factor of more than 100.
     EdgeSpread {
-        /// Ratio of the longest to the shortest.
+        /// Ratio of the longest to the shortest; infinite if the shortest is 0.
         ratio: f64,
     },
-    /// Areas differ much.
+    /// Areas of triangles differ by a factor of more than 100.
     AreaSpread {
-        /// Ratio of the largest to the smallest.
+        /// Ratio of the largest to the smallest, triangles without area left out.
         ratio: f64,
     },
-    /// The size of the mesh suggests another unit.
+    /// The longest side is below 5 mm or above 5 m, which suggests another unit.
     Size {
         /// The longest side of the bounding box, m.
         longest_m: f64,
-        /// The unit that would fit, if any.
+        /// The unit that would fit, in words, such as "1000 times smaller: mm instead of m"; `None` if none would.
         instead: Option<&'static str>,
     },
     /// Triangles cut through each other.
     SelfIntersection {
-        /// The triangle that is cut.
+        /// The other triangle, which cuts the one that the finding names.
         by: u32,
     },
     /// The search for triangles that cut each other ended early.
@@ -119,7 +120,8 @@ pub enum Problem {
 }
 
 impl Problem {
-    /// Returns a stable name for programs.
+    /// Returns the name of the kind of fault, for programs: lower case with underscores, such as `not_finite`. It is
+    /// stable.
     #[must_use]
     pub fn name(&self) -> &'static str {
         match self {
@@ -153,7 +155,7 @@ impl Problem {
         }
     }
 
-    /// Returns whether a mesh with this fault is refused; otherwise the user is warned.
+    /// Returns whether a file or mesh with this fault is refused; otherwise the user is warned.
     #[must_use]
     pub fn is_refused(&self) -> bool {
         !matches!(
@@ -312,14 +314,14 @@ impl fmt::Display for Element {
     }
 }
 
-/// The reason why a mesh is refused: file, element, place in space, and fault.
+/// The reason why a mesh file is refused: file, element, place in space, and fault. Its text names all of them.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub struct MeshError {
     /// The file's name as the caller gave it.
     pub file: String,
-    /// The part of the file or mesh.
+    /// The part of the file or mesh that has the fault.
     pub element: Element,
-    /// Its position, m, if it has one.
+    /// The position of that part, m; `None` if it has none or the position is not known.
     pub place_m: Option<[f64; 3]>,
     /// The fault.
     pub problem: Problem,

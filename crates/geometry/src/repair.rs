@@ -29,11 +29,12 @@ const HALVINGS: usize = 8;
 /// A change of the area or of the volume by more than this fraction is reported as a loss.
 const LOST: f64 = 0.01;
 
-/// What is repaired. The default is everything.
+/// Steps of a repair, in the order in which [`repair`] takes them. The default is all of them, with holes of up to 64
+/// edges.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Repair {
-    /// Weld vertices that are at most this far apart, m. `None`: a millionth of the diagonal of the bounding box; 0:
-    /// only vertices at exactly the same position.
+    /// Weld vertices that are at most this far apart, m. `None`: a millionth of the diagonal of the bounding box; 0,
+    /// or a value that is negative or not finite: only vertices at exactly the same position.
     pub weld_m: Option<f64>,
     /// Drop triangles without area, triangles with the vertices of an earlier one, and internal walls that are
     /// present from both sides.
@@ -47,10 +48,10 @@ pub struct Repair {
     /// Keep the connected surface with the most triangles, along with surfaces that touch it at edges and surfaces
     /// inside it.
     pub largest: bool,
-    /// Fill holes with at most this many edges: holes with three edges, and holes with a border shorter than the
-    /// diagonal of the bounding box.
+    /// Fill holes with at most this many edges (0: none): holes with three edges, and holes with a border shorter than
+    /// the diagonal of the bounding box. A hole with more than three edges gets a vertex in its middle.
     pub hole_edges: usize,
-    /// Drop vertices that no triangle uses.
+    /// Drop vertices that no triangle uses, and groups without a vertex.
     pub unused: bool,
 }
 
@@ -68,36 +69,38 @@ impl Default for Repair {
     }
 }
 
-/// A repaired mesh.
+/// The result of [`repair`]: the mesh, what was done, and how it compares with the original.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Repaired {
-    /// The mesh.
+    /// The repaired mesh; it may still have faults.
     pub mesh: TriangleMesh,
-    /// What was done, with counts; empty if the mesh was not changed.
+    /// What was done, with counts, one sentence each in the order of the work; empty if the mesh was not changed.
     pub told: Vec<String>,
-    /// For each vertex of the original mesh, its index in the new mesh; `None` if it was dropped.
+    /// For each vertex of the original mesh, its index in the new mesh; `None` if it was dropped. Welded vertices have
+    /// the same index; added ones have no entry.
     pub vertex_of: Vec<Option<u32>>,
-    /// Size of the surface before the repair.
+    /// Size of the surface before the repair, triangles with invalid vertices left out.
     pub before: SurfaceMeasure,
     /// Size of the surface after the repair.
     pub after: SurfaceMeasure,
-    /// Ways in which the result falls short of the request; empty if it does not.
+    /// Ways in which the result falls short of the request, one clause each: more than 1 % of the area dropped or of
+    /// the volume changed, a surface no longer closed, small holes left open. Empty if it does not.
     pub faults: Vec<String>,
 }
 
-/// Size of a surface.
+/// Area and enclosed volume of a surface.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct SurfaceMeasure {
     /// The area of all triangles, m²: Σ |(b − a) × (c − a)|/2.
     pub area_m2: f64,
-    /// The volume inside, m³, |Σ a·(b × c)|/6, if the surface is closed and its triangles face the same side at each edge; with several at an
-    /// edge, if as many run one way along it as the other. Before, it is measured without copies of triangles, and with those
-    /// turned that must be.
+    /// The volume inside, m³: |Σ a·(b × c)|/6 over the triangles (a, b, c). `None` unless as many triangles run one
+    /// way along each edge as the other: the surface is then closed and oriented. Vertices at one position count as
+    /// one. In [`Repaired::before`] it is measured without copies of triangles, and with those turned that must be.
     pub volume_m3: Option<f64>,
 }
 
 impl SurfaceMeasure {
-    /// Measures a surface. Its coordinates must be finite and its indices in range.
+    /// Measures a surface. Its coordinates must be finite and its indices in range, or it panics or is NaN.
     #[must_use]
     pub fn of(mesh: &TriangleMesh) -> Self {
         let (vertices, triangles) = (&mesh.vertices_m, &mesh.triangles);
@@ -117,7 +120,8 @@ impl SurfaceMeasure {
     }
 }
 
-/// Repairs a mesh. Triangles whose vertices don't exist or are not finite are dropped.
+/// Repairs a copy of `mesh` by the steps of `how`. Before all others, triangles whose vertices don't exist or are not
+/// finite are dropped. It never fails: [`Repaired::faults`] lists what it could not do.
 #[must_use]
 pub fn repair(mesh: &TriangleMesh, how: &Repair) -> Repaired {
     let mut work = RepairedMesh {

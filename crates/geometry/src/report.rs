@@ -15,7 +15,7 @@ use crate::topology::{Topology, is_proper};
 use crate::tree::{Tree, corners, cut};
 use crate::{Element, MeshError, Problem, TriangleMesh, Unit};
 
-/// Maximum number of elements that are listed for each kind of problem. All are counted.
+/// Maximum number of elements that a report lists for each kind of problem, and of borders. All are counted.
 pub const LISTED: usize = 10;
 
 /// Ratio of the largest to the smallest edge length or area above which a warning is given.
@@ -30,7 +30,7 @@ const NOISE: f64 = 1e-9;
 /// Maximum number of boxes that the check for self-intersection visits per triangle.
 const LOOKS: u64 = 400;
 
-/// Minimum, median and maximum of some values.
+/// Minimum, median and maximum of some values, in their unit; all 0 if there are no values.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
 pub struct Spread {
     /// The minimum.
@@ -57,14 +57,14 @@ impl Spread {
     }
 }
 
-/// A problem, and where it is.
+/// A problem of a mesh, and where it is.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finding {
     /// The problem.
     pub problem: Problem,
-    /// The element that has the problem.
+    /// The element that has the problem; [`Element::Whole`] for the mesh as a whole.
     pub element: Element,
-    /// Position in space, m.
+    /// Position of the element in space, m: the middle of an edge or triangle; `None` if it has no finite one.
     pub place_m: Option<[f64; 3]>,
 }
 
@@ -93,7 +93,8 @@ impl Serialize for Finding {
 }
 
 impl Finding {
-    /// Describes the finding, with its position in the given unit.
+    /// Describes the finding in one line: the element, its position in `unit` if it has one, and what to do. Of a
+    /// finding on the whole mesh, only the last.
     #[must_use]
     pub fn text(&self, unit: Unit) -> String {
         let at = self.place_m.map(|place_m| format!(" at {}", format::place(place_m, unit))).unwrap_or_default();
@@ -113,25 +114,26 @@ impl fmt::Display for Finding {
 /// A border of a surface: a hole in it, or the outer boundary (rim) of an open surface.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Border {
-    /// Number of edges.
+    /// Number of its edges.
     pub edges: usize,
-    /// Length, m.
+    /// Length of all its edges, m.
     pub length_m: f64,
     /// Whether it is at least as long as the diagonal of the bounding box: it is then probably the rim of an open
     /// surface rather than a hole.
     pub is_rim: bool,
-    /// Middle of its vertices, m.
+    /// Mean position of its vertices, m.
     pub place_m: [f64; 3],
 }
 
 impl Border {
-    /// Returns "hole" or "rim".
+    /// Returns "rim" if [`Border::is_rim`] is true, otherwise "hole".
     #[must_use]
     pub fn name(&self) -> &'static str {
         if self.is_rim { "rim" } else { "hole" }
     }
 
-    /// Describes the border, with its position in the given unit.
+    /// Describes the border in one line, with its length and position in `unit`: "hole of 3 edges, 12 mm around, at
+    /// …".
     #[must_use]
     pub fn text(&self, unit: Unit) -> String {
         let (length, place) = (format::length(self.length_m, unit), format::place(self.place_m, unit));
@@ -145,41 +147,42 @@ impl From<MeshError> for Finding {
     }
 }
 
-/// A report on a mesh.
+/// A report on a mesh. If the mesh exceeds the limits, has a coordinate that is not finite or an index out of range,
+/// it has only the numbers of vertices and triangles, and these problems; everything else is 0 or empty.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct MeshReport {
     /// Number of vertices.
     pub vertices: usize,
     /// Number of triangles.
     pub triangles: usize,
-    /// Number of surfaces that share no vertex.
+    /// Number of connected surfaces: sets of triangles that share no vertex with others.
     pub components: usize,
     /// Number of borders of the surface: closed loops of edges that belong to only one triangle.
     pub holes: usize,
-    /// The longest borders, in descending order; at most [`LISTED`].
+    /// The longest borders, in descending order of length; at most [`LISTED`].
     pub borders: Vec<Border>,
-    /// The volume inside, m³, if the surface is closed and consistently oriented; negative if it faces inwards: Σ a·(b × c)/6 over
-    /// the triangles (a, b, c), by the theorem of Gauss with the field x/3.
+    /// The volume inside, m³, negative if the surface faces inwards: Σ a·(b × c)/6 over the triangles (a, b, c), by
+    /// the theorem of Gauss with the field x/3. `None` unless the surface is closed and consistently oriented.
     pub volume_m3: Option<f64>,
-    /// The area, m²: Σ |(b − a) × (c − a)|/2.
+    /// The area of all triangles (a, b, c), m²: Σ |(b − a) × (c − a)|/2. Duplicates count each time.
     pub area_m2: f64,
     /// Dimensions of the bounding box of all triangles, m: x, y, z.
     pub extent_m: [f64; 3],
-    /// Edge lengths, m.
+    /// Lengths of the edges, each edge once, m.
     pub edge_m: Spread,
-    /// Triangle areas, m².
+    /// Areas of the triangles that have one, m².
     pub triangle_m2: Spread,
-    /// Number of edges at a vertex.
+    /// Number of edges at a vertex, of the vertices that have one.
     pub valence: Spread,
     /// Problems: first those for which the mesh is refused, then the others, in the order in which they were found.
     /// At most [`LISTED`] of each kind.
     pub problems: Vec<Finding>,
-    /// Number of problems of each kind, by name.
+    /// Number of problems of each kind, by [`Problem::name`], also of those that are not listed.
     pub counts: BTreeMap<&'static str, usize>,
 }
 
 impl MeshReport {
-    /// Returns the first problem for which the mesh is refused.
+    /// Returns the first problem for which the mesh is refused ([`Problem::is_refused`]); `None` if it is accepted.
     #[must_use]
     pub fn refusal(&self) -> Option<&Finding> {
         self.problems.iter().find(|finding| finding.problem.is_refused())
@@ -211,13 +214,14 @@ fn without_noise(place: DVec3, noise_m: f64) -> [f64; 3] {
     place.to_array().map(|part| if part.abs() < noise_m { 0.0 } else { part })
 }
 
-/// Reports on a mesh, with the default limits.
+/// Reports on a mesh, with the default limits ([`ReadLimits`]). Any mesh is accepted, also one with faults.
 #[must_use]
 pub fn report(mesh: &TriangleMesh) -> MeshReport {
     report_within(mesh, &ReadLimits::default())
 }
 
-/// Reports on a mesh. A mesh that exceeds `limits` is only counted.
+/// Reports on a mesh, also on one with faults. A mesh that exceeds the vertices or triangles of `limits` is only
+/// counted.
 #[must_use]
 pub fn report_within(mesh: &TriangleMesh, limits: &ReadLimits) -> MeshReport {
     let mut findings = Findings::default();
@@ -261,8 +265,8 @@ pub(crate) fn has_area(vertices: &[DVec3], triangle: [u32; 3]) -> bool {
     is_proper(&triangle) && area(corners(vertices, triangle)).1
 }
 
-/// The volume that oriented triangles enclose, m³, with a sign: Σ a·(b × c)/6, the tetrahedra between each triangle and one
-/// point, which is near them, so that no digits are lost.
+/// The volume that oriented triangles enclose, m³, with a sign: Σ a·(b × c)/6, the tetrahedra between each triangle
+/// and one point, which is near them, so that no digits are lost.
 pub(crate) fn volume(vertices: &[DVec3], triangles: &[[u32; 3]]) -> f64 {
     let middle = triangles.first().map(|triangle| vertices[triangle[0] as usize]).unwrap_or_default();
     let of = |triangle: &[u32; 3]| {

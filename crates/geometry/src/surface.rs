@@ -34,19 +34,20 @@ const INSIDE: f64 = 1e-7;
 /// Maximum number of triangles that a path crosses. Paths in practice are shorter on a mesh of any size.
 const LONGEST_WAY: usize = 1 << 14;
 
-/// A point on a surface, with two directions.
+/// A point on a [`Surface`], with two directions. It belongs to the surface that returned it; with another one,
+/// functions give wrong results or panic.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Place {
-    /// The triangle.
+    /// Index of the triangle among those of the surface, which leave out triangles without area.
     pub triangle: u32,
-    /// Barycentric coordinates in the triangle.
+    /// Barycentric coordinates in the triangle, in the order of its corners: above 0, with the sum 1.
     pub barycentric: [f64; 3],
     /// Two perpendicular unit vectors in the plane of the triangle. Their cross product is the outward normal if the
     /// triangles are oriented consistently.
     pub frame: [DVec3; 2],
 }
 
-/// A mesh that is prepared for paths and discs on its surface.
+/// A mesh that is prepared for paths and discs on its surface. It does not change.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Surface {
     vertices_m: Vec<DVec3>,
@@ -71,8 +72,9 @@ fn turned(way: DVec2) -> DVec2 {
 }
 
 impl Surface {
-    /// Creates the surface of a mesh whose vertices are finite and whose edges have at most two triangles. Triangles
-    /// without area are omitted, since no path crosses them.
+    /// Creates the surface of a mesh whose vertices (m) are finite and whose edges have at most two triangles, which
+    /// is not checked: an edge of more counts as a boundary. Panics if an index is out of range. Triangles without
+    /// area are omitted, since no path crosses them.
     #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
     pub fn new(vertices_m: &[DVec3], triangles: &[[u32; 3]]) -> Self {
         let has_area = |triangle: &[u32; 3]| {
@@ -120,53 +122,59 @@ impl Surface {
         Surface { vertices_m, triangles: kept, beyond, areas_m2, curvatures_per_m, is_closed, edge_m, tree }
     }
 
-    /// Returns the positions of the vertices, m.
+    /// Returns the positions of the vertices as given to [`Surface::new`], m.
     pub fn vertices_m(&self) -> &[DVec3] {
         &self.vertices_m
     }
 
-    /// Returns the vertices of the triangle that contains a point of the surface.
+    /// Returns the vertices of the triangle of `place`, in the order of its barycentric coordinates.
     pub fn triangle(&self, place: &Place) -> [u32; 3] {
         self.triangles[place.triangle as usize]
     }
 
-    /// Returns the area of each vertex: a third of that of the triangles around it, m². That is the integral of its hat over the
-    /// surface, so a mass lumped by it is the sum of its row of the consistent mass matrix.
+    /// Returns the area of each vertex, by vertex: a third of that of the triangles around it, m²; 0 without
+    /// triangles. That is the integral of its hat over the surface, so a mass lumped by it is the sum of its row of
+    /// the consistent mass matrix.
     pub fn areas_m2(&self) -> &[f64] {
         &self.areas_m2
     }
 
     /// Returns the curvature tensor at a vertex: how the outward normal changes per metre along the surface, 1/m. It
-    /// is symmetric, and 1/R along a sphere of radius R. Its mean over a disc is the curvature of the surface there.
+    /// is symmetric, in the frame of the vertices, and 1/R along a sphere of radius R. Its mean over a disc is the
+    /// curvature of the surface there. It is 0 for a vertex without triangles; panics if `vertex` is out of range.
     ///
-    /// In a triangle of area A and normal N, whose corners have the normals n_k, the change of the interpolated normal is
-    /// Σ n_k ⊗ ∇h_k, with ∇h_k = N × e_k/2A the gradient of the hat of corner k and e_k the side opposite to it. n_k is the mean of the
-    /// normals of the triangles around, by area. A vertex has the symmetric part of Σ A·(Σ n_k ⊗ ∇h_k)/Σ A over its triangles.
+    /// In a triangle of area A and normal N, whose corners have the normals n_k, the change of the interpolated normal
+    /// is Σ n_k ⊗ ∇h_k, with ∇h_k = N × e_k/2A the gradient of the hat of corner k and e_k the side opposite to it.
+    /// n_k is the mean of the normals of the triangles around, by area. A vertex has the symmetric part of Σ A·(Σ n_k
+    /// ⊗ ∇h_k)/Σ A over its triangles.
     pub fn curvature_per_m(&self, vertex: usize) -> DMat3 {
         let [xx, yy, zz, xy, xz, yz] = self.curvatures_per_m[vertex].map(f64::from);
         DMat3::from_cols(DVec3::new(xx, xy, xz), DVec3::new(xy, yy, yz), DVec3::new(xz, yz, zz))
     }
 
-    /// Returns the usual length of an edge, m: √(4A/√3), that of triangles with equal sides whose area A is the mean of all.
+    /// Returns the usual length of an edge, m: √(4A/√3), that of triangles with equal sides whose area A is the mean
+    /// of all. 0 without triangles.
     pub fn edge_m(&self) -> f64 {
         self.edge_m
     }
 
-    /// Returns on which side of the surface a tool of `radius_m` is when it first appears `height_m` above its
-    /// nearest point: 1 for outside, -1 for inside. A tool below a closed surface by at most its radius counts as
-    /// outside.
+    /// Returns on which side of the surface a tool of radius `radius_m` (m) is when it first appears at the height
+    /// `height_m` (m) above its nearest point, negative below: 1 for outside, -1 for inside. A tool below a closed
+    /// surface by at most its radius counts as outside; below an open one, as inside.
     pub fn side(&self, height_m: f64, radius_m: f64) -> f64 {
         let below_m = if self.is_closed { radius_m } else { 0.0 };
         if height_m >= -below_m { 1.0 } else { -1.0 }
     }
 
-    /// Returns where a place is in space, m: Σ b_k·x_k over the corners of its triangle, b the barycentric coordinates.
+    /// Returns where a place is in space, m: Σ b_k·x_k over the corners of its triangle, with b_k the barycentric
+    /// coordinates and x_k the positions.
     pub fn at_m(&self, place: &Place) -> DVec3 {
         let at_m = corners(&self.vertices_m, self.triangle(place));
         (0..3).map(|corner| at_m[corner] * place.barycentric[corner]).sum()
     }
 
-    /// Returns the point of the surface that is nearest to `point_m`. `None` if the surface has no area.
+    /// Returns the point of the surface that is nearest to `point_m`, m; of equally near ones, that of the first
+    /// triangle. Its frame begins with the triangle's first side. `None` if the surface has no area.
     pub fn nearest(&self, point_m: DVec3) -> Option<Place> {
         let found = self.tree.nearest((&self.vertices_m, &self.triangles), point_m)?;
         let [a, b, c] = corners(&self.vertices_m, self.triangles[found.triangle as usize]);
@@ -176,8 +184,9 @@ impl Surface {
         Some(Place { triangle: found.triangle, barycentric, frame: [along, across] })
     }
 
-    /// Returns the end of the straight path of length and direction `by_m` from a point, in metres along the
-    /// directions of its frame. A path that meets a boundary continues along it.
+    /// Returns the end of the straight path of length and direction `by_m` from the place `from`, in metres along the
+    /// directions of its frame. The frame of the end is that of `from`, carried along the path. A path that meets a
+    /// boundary continues along it; one that crosses more than 16 384 triangles ends there.
     pub fn walk(&self, from: &Place, by_m: DVec2) -> Place {
         let mut place = *from;
         let mut left_m = by_m.x * place.frame[0] + by_m.y * place.frame[1];
@@ -343,12 +352,12 @@ struct Crossing {
     hats: [[f64; 3]; 2],
 }
 
-/// A vertex whose hat overlaps a disc.
+/// A vertex near a disc, whose hat may overlap it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Covered {
-    /// The vertex.
+    /// Index of the vertex in [`Surface::vertices_m`].
     pub vertex: u32,
-    /// Mean of its hat over the disc. The weights of all vertices add up to 1.
+    /// Mean of its hat over the disc, from 0 to 1. The weights of all vertices add up to 1.
     pub weight: f64,
     /// Derivative of the weight with respect to the position of the disc, in the directions of the frame of its
     /// centre, 1/m.
@@ -455,7 +464,8 @@ fn ways<'c>(
 }
 
 impl SurfaceDisc {
-    /// Creates a disc for a surface with edges of about `edge_m`.
+    /// Creates a disc of `radius_m` (m, above 0) for a surface with edges of about `edge_m` (m, [`Surface::edge_m`]).
+    /// It covers nothing before the first [`SurfaceDisc::lay`].
     #[allow(clippy::cast_precision_loss)]
     pub fn new(radius_m: f64, edge_m: f64) -> Self {
         let count = ways_of(radius_m, edge_m);
@@ -477,25 +487,29 @@ impl SurfaceDisc {
         }
     }
 
-    /// Estimates how many triangles the ways of a disc of `radius_m` cross, on a surface whose edges are about `edge_m` long: the work
-    /// of laying it. A way crosses about 1 + 2·`radius_m`/`edge_m`, two for each length of an edge.
+    /// Estimates how many triangles the paths of a disc of `radius_m` (m) cross, on a surface whose edges are about
+    /// `edge_m` (m) long: the work of laying it. There are 48 to 192 paths, by the radius, and a path crosses about 1
+    /// + 2·`radius_m`/`edge_m`, two for each length of an edge.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn crossings(radius_m: f64, edge_m: f64) -> u64 {
         ways_of(radius_m, edge_m) as u64 * (1.0 + 2.0 * radius_m / edge_m) as u64
     }
 
-    /// Returns the radius, m.
+    /// Returns the radius that the disc was created with, m.
     pub fn radius_m(&self) -> f64 {
         self.radius_m
     }
 
-    /// Returns the vertices that the disc covers at its present position.
+    /// Returns the vertices that the paths of the disc reach at its present position, each once, in the order in which
+    /// the paths meet them. Those beyond the part of the disc over which hats are averaged have the weight 0. Empty
+    /// before the first [`SurfaceDisc::lay`].
     pub fn covered(&self) -> &[Covered] {
         &self.covered
     }
 
-    /// Returns the weight of a vertex at the present position of the disc, 0 if the disc does not cover it. The time
-    /// does not depend on the number of covered vertices.
+    /// Returns the weight of a vertex at the present position of the disc ([`Covered::weight`]); 0 if the disc does
+    /// not cover it, and before the first [`SurfaceDisc::lay`]. The time does not depend on the number of covered
+    /// vertices.
     pub fn weight_of(&self, vertex: u32) -> f64 {
         match self.found[slot_of(vertex, &self.found)] {
             (NONE, _) => 0.0,
@@ -503,14 +517,18 @@ impl SurfaceDisc {
         }
     }
 
-    /// Returns how far it may move at once, so that its normal turns little on the way, m: half the radius of the disc
-    /// that hats are averaged over, or a quarter of an edge if that is more.
+    /// Returns how far the disc may move at once from its present position, so that its normal turns little on the
+    /// way, m: half the radius of the disc that hats are averaged over (before the first [`SurfaceDisc::lay`], its own
+    /// radius), or a quarter of an edge if that is more.
     pub fn stride_m(&self) -> f64 {
         0.5 * self.drawn_m.max(0.5 * self.edge_m)
     }
 
-    /// Lays the disc on a place: finds the radius ρ over which hats are averaged with Σ(w²/A)·πa² = 1, a the disc's radius and A the
-    /// areas of the vertices, by Newton's method between two bounds.
+    /// Lays the disc on `place` of `surface`, which replaces its position and [`SurfaceDisc::covered`]. Finds the
+    /// radius ρ over which hats are averaged with Σ(w²/A)·πa² = 1, with w the weights, a the disc's radius and A the
+    /// areas of the vertices, by Newton's method between a/20 and a; ρ = a or a/20 if there is no such radius between.
+    /// Where the tissue is thinner than the disc, ρ shrinks until the disc is simple. Gradients are in the frame of
+    /// `place`.
     pub fn lay(&mut self, surface: &Surface, place: &Place) {
         // Around a thin part, paths have no end: a large disc is tried in stages, from a small one upwards.
         let mut stages = 0;

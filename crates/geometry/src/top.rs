@@ -11,8 +11,12 @@ fn height_m(place_m: DVec3, [a, b, c]: [DVec3; 3]) -> Option<f64> {
     is_inside.then(|| (parts[0] * a.z + parts[1] * b.z + parts[2] * c.z) / whole)
 }
 
-/// Returns the highest place of a surface at the x and y of `middle_m`, m; where the surface is nowhere in line with
-/// that, at those of the nearest vertex that faces up. Within a triangle z is linear in x and y.
+/// Returns the highest place of a surface at the x and y of `middle_m`, m, with z up. Where the surface is nowhere in
+/// line with that, returns the highest place at the x and y of the nearest vertex (by x and y) whose normal has a z of
+/// at least 0.5, or of the nearest vertex if there is none; `middle_m` itself if there is no triangle.
+///
+/// `normals` has the outward unit normal of each vertex. Indices must be in range, or it panics. Within a triangle z
+/// is linear in x and y.
 pub fn top_m(vertices_m: &[DVec3], triangles: &[[u32; 3]], normals: &[DVec3], middle_m: DVec3) -> DVec3 {
     let above = |place_m: DVec3| {
         let corners = triangles.iter().map(|triangle| triangle.map(|vertex| vertices_m[vertex as usize]));

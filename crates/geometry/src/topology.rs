@@ -5,16 +5,16 @@ use crate::work::spend;
 /// Maximum number of continuations that are compared where more than two borders meet.
 const CHOICES: usize = 8;
 
-/// A triangle at an edge.
+/// A triangle at an edge, and its direction along the edge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Side {
-    /// The triangle.
+    /// Index of the triangle.
     pub triangle: u32,
     /// Whether the triangle runs along the edge from the vertex with the smaller index to the other one.
     pub is_forward: bool,
 }
 
-/// An edge of a mesh.
+/// An edge of a mesh, of at least one triangle; it belongs to the [`Topology`] that lists it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Edge {
     /// Its vertices, the smaller index first.
@@ -23,23 +23,24 @@ pub struct Edge {
     count: usize,
 }
 
-/// The connectivity of a mesh. Triangles that use a vertex twice are ignored.
+/// The connectivity of a mesh. Triangles that use a vertex twice, or whose indices are out of range, are ignored: they
+/// keep their index, but have no edges.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Topology {
-    /// In ascending order of their vertices.
+    /// The edges, each once, in ascending order of their vertices.
     pub edges: Vec<Edge>,
-    /// Number of edges at each vertex.
+    /// Number of edges at each vertex; 0 without triangles.
     pub valence: Vec<u32>,
     /// Index of the connected surface of each triangle, in the order of the first triangles of the surfaces; `None`
     /// if the triangle is ignored.
     pub component: Vec<Option<u32>>,
-    /// Number of connected surfaces.
+    /// Number of connected surfaces; surfaces are connected where they share a vertex.
     pub components: usize,
     /// For each vertex, the number of fans of triangles that share no edge: 1 on a manifold, 0 without triangles.
     pub fans: Vec<u32>,
-    /// Index of the fan of each corner of each triangle; each vertex numbers its fans from 0.
+    /// Index of the fan of each corner of each triangle; each vertex numbers its fans from 0. 0 for ignored triangles.
     pub fan_of_corner: Vec<[u32; 3]>,
-    /// Triangles with the vertices of an earlier triangle, ascending.
+    /// Triangles with the vertices of an earlier triangle in any order, ascending.
     pub duplicates: Vec<u32>,
     sides: Vec<Side>,
 }
@@ -75,8 +76,8 @@ impl Sets {
 }
 
 impl Topology {
-    /// Determines the connectivity of triangles between `vertices` vertices. Triangles whose indices are out of range
-    /// are ignored.
+    /// Determines the connectivity of `triangles` between `vertices` vertices, numbered from 0. Triangles whose
+    /// indices are out of range are ignored.
     #[must_use]
     pub fn new(vertices: usize, triangles: &[[u32; 3]]) -> Self {
         let is_in = |triangle: &[u32; 3]| is_proper(triangle) && triangle.iter().all(|v| (*v as usize) < vertices);
@@ -157,18 +158,19 @@ impl Topology {
         Self { edges, valence, component, components: components as usize, fans, fan_of_corner, duplicates, sides }
     }
 
-    /// Returns the triangles at an edge, ascending.
+    /// Returns the triangles at an edge of this topology, ascending; at least one. May panic for an edge of another.
     #[must_use]
     pub fn sides(&self, edge: &Edge) -> &[Side] {
         &self.sides[edge.first..edge.first + edge.count]
     }
 
-    /// Returns the edges that more than two triangles share.
+    /// Returns the edges that more than two triangles share, in the order of [`Topology::edges`].
     pub fn non_manifold_edges(&self) -> impl Iterator<Item = &Edge> {
         self.edges.iter().filter(|edge| edge.count > 2)
     }
 
-    /// Returns the edges at which two triangles have opposite orientations.
+    /// Returns the edges of exactly two triangles that face opposite sides there (both run along the edge the same
+    /// way), in the order of [`Topology::edges`].
     pub fn inconsistent_edges(&self) -> impl Iterator<Item = &Edge> {
         self.edges.iter().filter(|edge| match self.sides(edge) {
             [a, b] => a.is_forward == b.is_forward,
@@ -176,7 +178,7 @@ impl Topology {
         })
     }
 
-    /// Returns whether there are triangles and each edge has exactly two.
+    /// Returns whether there are triangles and each edge has exactly two. Their orientation does not count.
     #[must_use]
     pub fn is_closed(&self) -> bool {
         !self.edges.is_empty() && self.edges.iter().all(|edge| edge.count == 2)

@@ -164,7 +164,8 @@ impl Tree {
     }
 }
 
-/// Returns the barycentric coordinates of the point of a triangle that is nearest to `point` (Ericson, Real-Time
+/// Returns the barycentric coordinates, for the corners a, b and c in this order, of the point of the triangle (a, b,
+/// c) that is nearest to `point`, all in one unit. Each is from 0 to 1 and their sum is 1 (Ericson, Real-Time
 /// Collision Detection, 5.1.5).
 pub fn nearest_place(point: DVec3, [a, b, c]: [DVec3; 3]) -> [f64; 3] {
     let (ab, ac, ap) = (b - a, c - a, point - a);
@@ -208,8 +209,8 @@ pub(crate) fn cut(a: [DVec3; 3], b: [DVec3; 3]) -> bool {
     edges(a).into_iter().any(|edge| pierces(edge, b)) || edges(b).into_iter().any(|edge| pierces(edge, a))
 }
 
-/// Whether a segment goes through a triangle (Möller and Trumbore, Fast, minimum storage ray/triangle intersection, Journal of Graphics
-/// Tools 2(1), 1997, doi:10.1080/10867651.1997.10487468).
+/// Whether a segment goes through a triangle (Möller and Trumbore, Fast, minimum storage ray/triangle intersection,
+/// Journal of Graphics Tools 2(1), 1997, doi:10.1080/10867651.1997.10487468).
 fn pierces([from, to]: [DVec3; 2], [a, b, c]: [DVec3; 3]) -> bool {
     let (way, ab, ac, at) = (to - from, b - a, c - a, from - a);
     let across = way.cross(ac);

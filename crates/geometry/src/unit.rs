@@ -8,7 +8,8 @@ use crate::Problem;
 /// Named units, and their lengths in metres.
 const UNITS: [(&str, f64); 3] = [("m", 1.0), ("cm", 1e-2), ("mm", 1e-3)];
 
-/// Length of one unit of a file in metres.
+/// Unit of the lengths in a file: a number of metres above 0. It is parsed from "m", "cm", "mm" or the number of
+/// metres as text, such as "0.0254". The default is the metre.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Unit {
     metres: f64,
@@ -22,7 +23,7 @@ impl Default for Unit {
 }
 
 impl Unit {
-    /// Metres.
+    /// The metre, in which all lengths of this crate are.
     pub const METRE: Unit = Unit { metres: 1.0 };
 
     /// Returns the length of one unit in metres: above 0 and finite.

@@ -18,12 +18,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// operations: every few milliseconds.
 const BETWEEN_LOOKS: u64 = 1 << 16;
 
-/// Why a computation was cancelled.
+/// Reason why a computation inside [`within`] was cancelled; [`spend`] unwinds with it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GivenUp {
     /// The flag was set.
     Stopped,
-    /// It would have exceeded the limit, which is given here.
+    /// It would have exceeded the limit, which is given here, in operations.
     TooMuch(u64),
 }
 
@@ -51,10 +51,13 @@ impl Drop for Before {
     }
 }
 
-/// Runs `act`, which is cancelled once `stop` is set or `most` operations are exceeded.
+/// Runs `act` on this thread and returns its result. It is cancelled at a [`spend`] once `stop` is set or more than
+/// `most` operations are reported; the flag is looked at every 65 536 operations, some milliseconds. Inside another
+/// `within`, only these limits apply until it returns. What a cancelled `act` changed outside of itself stays as it
+/// is. Other panics of `act` continue.
 ///
 /// # Errors
-/// Returns why it was cancelled.
+/// Returns why `act` was cancelled: [`GivenUp::Stopped`] or [`GivenUp::TooMuch`].
 pub fn within<T>(stop: &Arc<AtomicBool>, most: u64, act: impl FnOnce() -> T) -> Result<T, GivenUp> {
     let bounds = Bounds { stop: stop.clone(), most, left: most };
     let before = Before(BOUNDS.replace(Some(bounds)), UP_TO_LOOK.replace(0));
@@ -66,7 +69,8 @@ pub fn within<T>(stop: &Arc<AtomicBool>, most: u64, act: impl FnOnce() -> T) -> 
     })
 }
 
-/// Reports that `operations` follow. Unwinds if the computation is cancelled.
+/// Reports that `operations`, of some nanoseconds each, follow on this thread. Inside [`within`], unwinds to it with a
+/// [`GivenUp`] if the computation is cancelled; outside, does nothing.
 #[inline]
 pub fn spend(operations: usize) {
     let (operations, up_to_look) = (operations as u64, UP_TO_LOOK.get());

@@ -5,22 +5,22 @@ use std::fmt::Write;
 
 use crate::{Problem, TriangleMesh};
 
-/// A file format for writing.
+/// A file format that [`write()`] can write.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
     /// Wavefront OBJ, with texture coordinates and groups.
     Obj,
-    /// STL, binary.
+    /// STL, binary: positions in single precision; no groups and texture coordinates, and vertices are not shared.
     Stl,
-    /// PLY, binary, little-endian.
+    /// PLY, binary, little-endian, with texture coordinates and without groups.
     Ply,
 }
 
 impl Format {
-    /// Returns the format for the extension of a file name.
+    /// Returns the format for the extension of a file name: `.obj`, `.stl` or `.ply`, also in capitals.
     ///
     /// # Errors
-    /// Fails for other extensions.
+    /// Returns [`Problem::Unsupported`] for other extensions, and for a name without one.
     pub fn of(name: &str) -> Result<Self, Problem> {
         let extension = name.rsplit_once('.').map_or(String::new(), |(_, extension)| extension.to_ascii_lowercase());
         match extension.as_str() {
@@ -32,8 +32,10 @@ impl Format {
     }
 }
 
-/// Returns the contents of a file with this mesh. OBJ and PLY keep positions exactly; STL rounds them to single
-/// precision.
+/// Returns the contents of a file with this mesh, lengths in metres. OBJ and PLY keep positions exactly; STL rounds
+/// them to single precision. Only OBJ keeps groups: a triangle is in the groups that contain its three vertices, and
+/// spaces in names become `_`. Nothing is checked: an index out of range is written as it is (in STL, as a corner at
+/// the origin).
 #[must_use]
 pub fn write(mesh: &TriangleMesh, format: Format) -> Vec<u8> {
     match format {

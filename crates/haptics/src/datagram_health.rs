@@ -9,10 +9,14 @@
 /// an end holds its last value, so a burst of losses does not cause a switch to the stream.
 pub const CONFIRMED_S: f64 = 0.1;
 
-/// Longest time between two datagrams of one end, s.
+/// Longest time between two datagrams of one end, s. An end that has nothing to send for this long sends one anyway
+/// ([`DatagramHealth::is_silent`]).
 pub const LIFE_S: f64 = 0.04;
 
-/// One end's record of the datagrams in both directions. It decides whether this end uses datagrams or the stream.
+/// One end's record of the datagrams of one connection, in both directions. It decides whether this end uses datagrams
+/// or the stream: the stream at first, datagrams once one of its own has been acknowledged.
+///
+/// All times of its functions are by this end's clock, s.
 #[derive(Debug, Clone, Default)]
 pub struct DatagramHealth {
     sent: u64,
@@ -25,12 +29,12 @@ pub struct DatagramHealth {
     fell_back: u64,
 }
 
-/// Counts of one end's datagrams.
+/// Counts of one end's datagrams since its [`DatagramHealth`] was created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Carried {
     /// Number of datagrams sent.
     pub sent: u64,
-    /// Number of datagrams received.
+    /// Number of datagrams received, repeated ones included.
     pub came: u64,
     /// Number of switches from datagrams to the stream because datagrams were no longer acknowledged.
     pub fell_back: u64,
@@ -45,8 +49,9 @@ impl DatagramHealth {
         (self.sent, self.newest)
     }
 
-    /// Records that datagram `number` arrived at `now_s`, which acknowledges this end's datagram `acknowledges`. A
-    /// number that this end never sent confirms nothing.
+    /// Records that the other end's datagram `number` arrived at `now_s`, which acknowledges this end's datagram
+    /// `acknowledges` (0 for none). Only a number above all acknowledged before is a new acknowledgement; one that
+    /// this end never sent confirms nothing.
     pub fn arrive(&mut self, number: u64, acknowledges: u64, now_s: f64) {
         self.came += 1;
         self.newest = self.newest.max(number);
@@ -57,8 +62,9 @@ impl DatagramHealth {
         }
     }
 
-    /// Returns whether a message at `now_s` goes as a datagram: whether an acknowledgement arrived within
-    /// [`CONFIRMED_S`]. Counts a switch to the stream.
+    /// Returns whether a message at `now_s` goes as a datagram: whether a new acknowledgement arrived in the last
+    /// [`CONFIRMED_S`]; false before the first. If it was true at the last call and is false now, this counts as a
+    /// switch to the stream ([`Carried::fell_back`]).
     pub fn update(&mut self, now_s: f64) -> bool {
         let carries = self.confirmed_s.is_some_and(|confirmed_s| now_s - confirmed_s <= CONFIRMED_S);
         if self.carries && !carries {
@@ -68,7 +74,8 @@ impl DatagramHealth {
         carries
     }
 
-    /// Returns whether a datagram is due because this end has sent none for [`LIFE_S`].
+    /// Returns whether a datagram is due at `now_s` because this end has sent none for [`LIFE_S`]; true before the
+    /// first.
     pub fn is_silent(&self, now_s: f64) -> bool {
         self.sent_s.is_none_or(|sent_s| now_s - sent_s >= LIFE_S - 1e-9)
     }
@@ -79,7 +86,8 @@ impl DatagramHealth {
     }
 }
 
-/// Set of the newest 64 numbers that were received. A pose is sent several times but must count once.
+/// Record of which of the 64 consecutive numbers up to the newest received one were received; empty at first. A pose
+/// is sent several times but must count once.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct ReceiveWindow {
     newest: u64,
@@ -88,7 +96,9 @@ pub struct ReceiveWindow {
 }
 
 impl ReceiveWindow {
-    /// Records `number`. Returns true if it is new, false if it was received before or is older than the newest 64.
+    /// Records `number`. Returns true if it is the first, above the newest, or at most 63 below the newest and not
+    /// received before. Returns false, and changes nothing, for a repeated number and for one that is 64 or more below
+    /// the newest, even if it was never received.
     pub fn take(&mut self, number: u64) -> bool {
         if self.bits == 0 || number > self.newest {
             let ahead = if self.bits == 0 { 64 } else { number - self.newest };

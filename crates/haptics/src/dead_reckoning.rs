@@ -24,7 +24,8 @@ pub const FASTEST_S: f64 = 0.01;
 /// Time for which a loss or a delay is remembered, s.
 const MEMORY_S: f64 = 5.0;
 
-/// Longest interval at which one end needs messages from the other, measured from losses and delays.
+/// Measurement of the longest interval at which this end needs messages from the other, from their losses and delays.
+/// Each end has one per connection and sends the result to the other end.
 #[derive(Debug, Clone, Default)]
 pub struct SendInterval {
     newest: u64,
@@ -34,8 +35,10 @@ pub struct SendInterval {
 }
 
 impl SendInterval {
-    /// Records that message `number` (counted from 1) arrived at `now_s`. It was sent at `sent_s` by the other end's
-    /// clock, s. A gap in the numbers counts as a loss. At most 512 transit times of the last 5 s are kept.
+    /// Records that message `number` (counted from 1) arrived at `now_s` by this end's clock, s. It was sent at
+    /// `sent_s` by the other end's clock, s. A gap after the newest number so far counts as a loss, even if the
+    /// missing message arrives later; messages before the first received one do not. At most 512 transit times of the
+    /// last 5 s are kept.
     pub fn arrive(&mut self, number: u64, sent_s: f64, now_s: f64) {
         // A message that arrives out of order was not lost, but it was missing when it was needed.
         if number > self.newest + 1 && self.newest > 0 {
@@ -48,9 +51,10 @@ impl SendInterval {
         }
     }
 
-    /// Returns the longest acceptable interval between two messages, s: [`HEARTBEAT_S`] minus the spread of the
-    /// transit times of the last 5 s (the longest minus the shortest, so the difference of the clocks cancels), but
-    /// at least [`FASTEST_S`]. For 5 s after a loss it is [`FASTEST_S`].
+    /// Returns the longest acceptable interval between two messages at `now_s`, s: [`HEARTBEAT_S`] minus the spread of
+    /// the transit times in the 5 s up to the last arrival (the longest minus the shortest, so the difference of the
+    /// clocks cancels), but at least [`FASTEST_S`]. For 5 s after a loss it is [`FASTEST_S`]; before the first message
+    /// it is [`HEARTBEAT_S`].
     pub fn heartbeat_s(&self, now_s: f64) -> f64 {
         if self.lost_s.is_some_and(|lost_s| now_s - lost_s < MEMORY_S) {
             return FASTEST_S;
@@ -73,7 +77,8 @@ const LOOK_BACK_S: f64 = 0.004;
 /// Number of recent places that are kept for the velocity; beyond it the oldest is dropped.
 const MAX_RECENT: usize = 64;
 
-/// Decides which places of a tool must be sent to the server.
+/// Decides on the client's side which places of one tool must be sent to the server. It keeps the state that was sent
+/// last, from which the server extrapolates, and the places of the last milliseconds.
 ///
 /// The server's estimate may be wrong by 0.1 mm. A drift of 0.05 mm need not be sent; one of 0.2 mm must be:
 ///
@@ -104,7 +109,8 @@ impl Default for News {
     }
 }
 
-/// Place and velocity of a tool at a time.
+/// Place and velocity of a tool at a time, as a command with a velocity contains them. Vectors are in the frame of the
+/// commands.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MotionState {
     /// Time by the client's clock, s.
@@ -116,19 +122,21 @@ pub struct MotionState {
 }
 
 impl MotionState {
-    /// Returns the server's estimate of the tool's place at a time: x + v·(t − t0), with t − t0 from 0 to
-    /// [`EXTRAPOLATE_S`], m.
+    /// Returns the server's estimate of the tool's place at `time_s` by the client's clock, m: x + v·(t − t₀), with x
+    /// and v the place and velocity at t₀ = [`MotionState::time_s`]. t − t₀ is limited to 0 to [`EXTRAPOLATE_S`].
     pub fn at(&self, time_s: f64) -> DVec3 {
         self.place_m + self.velocity_m_per_s * (time_s - self.time_s).clamp(0.0, EXTRAPOLATE_S)
     }
 }
 
 impl News {
-    /// Records that the tool is at `place_m` at `now_s`. Returns the state to send; `None` while the server's
-    /// estimate is wrong by at most `most_m` and something was sent within `heartbeat_s`.
+    /// Records that the tool is at `place_m`, m, at `now_s` by the client's clock, s, which must not go back. Returns
+    /// the state to send; `None` while the server's estimate is wrong by at most `most_m`, m, and the last state was
+    /// sent less than `heartbeat_s` ago. The first call always returns a state.
     ///
-    /// The velocity is (x(t) − x(t − τ))/τ with τ = 4 ms, m/s. The caller must send the returned state: later calls
-    /// rely on it.
+    /// The velocity is (x(t) − x(t − τ))/τ, m/s, with t − τ the newest recorded time at least 4 ms ago, or else the
+    /// oldest of the last 64 calls; 0 at the first call. The caller must send the returned state: later calls rely on
+    /// it.
     pub fn tell(&mut self, now_s: f64, place_m: DVec3, most_m: f64, heartbeat_s: f64) -> Option<MotionState> {
         if self.recent.len() == MAX_RECENT {
             self.recent.pop_front();

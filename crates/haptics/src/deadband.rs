@@ -9,10 +9,12 @@ use glam::DVec3;
 use crate::force_law::Law;
 use crate::local_model::{LocalModel, Touching};
 
-/// Smallest difference of the force for which a sample is sent, N.
+/// Difference of the force up to which no sample is sent, however small the force is, N. Without effect if the
+/// deadband's fraction is 0.
 pub const MIN_N: f64 = 0.01;
 
-/// Longest interval between two samples for a client that renders, s: below [`crate::envelope::FRESH_S`].
+/// Longest interval between two samples for a client that renders, s: below [`crate::envelope::FRESH_S`]. The caller
+/// of [`ForceDeadband::is_exceeded`] keeps it.
 pub const HEARTBEAT_S: f64 = 0.04;
 
 /// Deadband of one tool: the last sample that was sent, and what the client renders from it.
@@ -23,15 +25,17 @@ pub struct ForceDeadband {
 }
 
 impl ForceDeadband {
-    /// Creates a deadband that is exceeded when the force differs by more than `fraction` of itself; with 0 it is
-    /// exceeded at every step.
+    /// Creates the deadband of a tool of which no sample was sent yet. It is exceeded when the client's force differs
+    /// from the true one by more than `fraction` (δ, such as 0.1) of the true one; with 0 or less it is exceeded at
+    /// every step.
     pub fn new(fraction: f64) -> Self {
         ForceDeadband { fraction, sent: None }
     }
 
     /// Returns whether the client's force is wrong by too much at the tool's present place, which `model` describes:
-    /// |f − f_r| > max(δ·|f|, [`MIN_N`]), with f the tissue's force and f_r the force that the client renders there.
-    /// True before the first sample. Call it at each step: it also moves the client's simulated touch along the path.
+    /// |f − f_r| > max(δ·|f|, [`MIN_N`]), with f the tissue's force and f_r the force that the client renders there
+    /// from the last sample and `law`, the law by which it renders that sample. True before the first sample. Call it
+    /// once at each step: it also moves the client's simulated touch along the path.
     pub fn is_exceeded(&mut self, model: &LocalModel, law: &Law) -> bool {
         let Some((sent, touching)) = &mut self.sent else { return true };
         touching.move_to(sent, law, model.place_m);
@@ -40,7 +44,8 @@ impl ForceDeadband {
         self.fraction <= 0.0 || (model.force_n - rendered_n).length() > most_n
     }
 
-    /// Records that `model` was sent, from which the client renders from now on.
+    /// Records that `model` was sent, from which the client renders from now on with `law`, the law that it names.
+    /// Replaces the last sample.
     pub fn send(&mut self, model: &LocalModel, law: &Law) {
         self.sent = Some((*model, Touching::at_sample(model, law)));
     }

@@ -2,7 +2,7 @@
 
 use crate::force_law::{Law, Row};
 
-/// Limits of a haptic device.
+/// Limits of a haptic device, as its client declares them. All values are positive.
 ///
 /// The force on a Touch is at most 3.3 N. Its own loop renders 400 N/m stably, which a tissue of 1000 N/m exceeds:
 ///
@@ -17,27 +17,28 @@ use crate::force_law::{Law, Row};
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Device {
-    /// Name by which [`Device::named`] finds it.
+    /// Name by which [`Device::named`] finds it, in lower case.
     pub name: &'static str,
-    /// Largest force, N.
+    /// Largest force that it can exert for a short time, N.
     pub force_n: f64,
     /// Largest force for longer than [`CONTINUOUS_S`], N.
     pub continuous_n: f64,
     /// Largest stiffness that its own loop renders stably, N/m.
     pub stiffness_n_per_m: f64,
-    /// Largest damping, N·s/m.
+    /// Largest damping that its own loop renders stably, N·s/m.
     pub damping_n_s_per_m: f64,
-    /// Radius of its workspace, m.
+    /// Radius of its workspace, a sphere, m.
     pub workspace_m: f64,
 }
 
-/// Largest force on a person with any device, N.
+/// Largest force on a person with any device, N; a stronger device is limited to it ([`Device::most_n`]).
 pub const SAFE_FORCE_N: f64 = 3.3;
 
 /// Largest force of a device whose client declares no limits, N.
 pub const UNDECLARED_FORCE_N: f64 = 2.0;
 
-/// Longest time for which a device may exceed its continuous force, s.
+/// Longest time for which a device may exceed its continuous force ([`Device::continuous_n`]), s. Time below that
+/// force counts back at the same rate.
 pub const CONTINUOUS_S: f64 = 2.0;
 
 const fn device(
@@ -65,11 +66,12 @@ pub const DEVICES: [Device; 9] = [
     device("inverse3", 10.0, 10.0, 1000.0, 6.0, 0.15),
 ];
 
-/// Limits of a device whose client declares none.
+/// Limits of a device whose client declares none: 2 N ([`UNDECLARED_FORCE_N`]), 400 N/m, 4 N·s/m, and a workspace of
+/// 75 mm. [`Device::named`] does not find it.
 pub const UNDECLARED: Device = device("undeclared", UNDECLARED_FORCE_N, UNDECLARED_FORCE_N, 400.0, 4.0, 0.075);
 
 impl Device {
-    /// Returns the device of [`DEVICES`] with this name, in lower case; `None` if there is none.
+    /// Returns the device of [`DEVICES`] whose name is `name` exactly, in lower case; `None` if there is none.
     pub fn named(name: &str) -> Option<Self> {
         DEVICES.iter().find(|device| device.name == name).copied()
     }
@@ -79,9 +81,10 @@ impl Device {
         self.force_n.min(SAFE_FORCE_N)
     }
 
-    /// Returns a text for each limit of stable rendering that the tissue exceeds: stiffness, then damping, along the
-    /// normal, up to the largest force requested. Empty if there are none. The tissue is rendered unchanged; if the
-    /// loop becomes unstable, the envelope removes the energy that it produces.
+    /// Returns a text for each limit of stable rendering that a tissue with `law` exceeds: stiffness, then damping,
+    /// along the normal, in the rows up to the first that reaches the largest force requested ([`Device::most_n`]).
+    /// Empty if there are none. The tissue is rendered unchanged; if the loop becomes unstable, the envelope removes
+    /// the energy that it produces. Panics if the law has no row.
     pub fn warnings(&self, law: &Law) -> Vec<String> {
         let reached = law.rows.iter().position(|row| row.force_n >= self.most_n()).unwrap_or(law.rows.len() - 1);
         let most = |of: fn(&Row) -> f64| law.rows[..=reached].iter().map(of).fold(0.0, f64::max);

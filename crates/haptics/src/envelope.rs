@@ -1,10 +1,9 @@
 //! The safety envelope: the limits between a wanted force and a device. Every force passes them, in this order:
 //!
 //! 1. The age of the newest model since its *arrival* (a constant delay is not age). The force is unchanged up to
-//!    [`FRESH_S`],
-//!    fades to a half up to [`STALE_S`], and then decays with the time constant [`DECAY_S`]. Beyond [`PAUSE_S`] the state is
-//!    PAUSED, as it is after a gap of more than [`PAUSE_S`] between two ticks. A model that arrives earlier brings the force
-//!    back within `RETURN_S`.
+//!    [`FRESH_S`], fades to a half up to [`STALE_S`], and then decays with the time constant [`DECAY_S`]. Beyond
+//!    [`PAUSE_S`] the state is PAUSED, as it is after a gap of more than [`PAUSE_S`] between two ticks. A model that
+//!    arrives earlier brings the force back within `RETURN_S`.
 //! 2. Soft engage. After `enable`, nothing is rendered until a model is known and its force is below
 //!    [`ENGAGE_BELOW_N`]. Then
 //!    the force ramps in over [`ENGAGE_S`].
@@ -37,7 +36,7 @@ pub const PAUSE_S: f64 = 0.3;
 /// Time within which a faded force returns, s: 50 ms after an outage of 100 ms, the error is some tenths of a per
 /// cent.
 const RETURN_S: f64 = 0.04;
-/// Time constant of the decay of the force beyond [`STALE_S`], s.
+/// Time constant of the exponential decay of the force beyond [`STALE_S`], and after rendering stops, s.
 pub const DECAY_S: f64 = 0.05;
 /// Fraction of the force that is left at [`STALE_S`].
 const STALE_SHARE: f64 = 0.5;
@@ -45,7 +44,7 @@ const STALE_SHARE: f64 = 0.5;
 pub const ENGAGE_BELOW_N: f64 = 0.2;
 /// Duration of the ramp from zero to the wanted force when rendering begins, s.
 pub const ENGAGE_S: f64 = 0.5;
-/// Largest rate of change of the force, N/s.
+/// Largest rate of change of the force, as a vector, in every state, N/s.
 pub const SLEW_N_PER_S: f64 = 100.0;
 /// Smallest speed that passivity assumes for the hand, m/s.
 const MIN_SPEED_M_PER_S: f64 = 0.08;
@@ -62,7 +61,8 @@ const CREDIT_J: f64 = 2.5e-4;
 /// Force that is always allowed against a hand that presses on, N.
 const FIRST_N: f64 = 0.2;
 
-/// State of rendering: whether forces are rendered, and what starts them again.
+/// State of rendering: whether forces are rendered, and what starts them again. In a state without rendering, a force
+/// that is left decays to zero within the slew over the next ticks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RenderingState {
     /// Nothing is rendered until `enable`.
@@ -71,11 +71,13 @@ pub enum RenderingState {
     Enabled,
     /// No model arrived or no tick came for longer than [`PAUSE_S`]. Nothing is rendered until `enable`.
     Paused,
-    /// An error occurred. Nothing is rendered until `reset` and then `enable`.
+    /// A value was not finite, the tool left the workspace, or [`Envelope::fail`] was called. Nothing is rendered
+    /// until `reset` and then `enable`.
     Fault,
 }
 
-/// Reason why the rendered force differs from the wanted one.
+/// Reason why the rendered force differs from the wanted one. Several may act in one tick; [`Envelope::count`] counts
+/// each.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LimitCause {
     /// The newest model is old, or the last tick was long ago.
@@ -97,7 +99,7 @@ pub enum LimitCause {
 }
 
 impl LimitCause {
-    /// All reasons with their names, in the order of the variants.
+    /// All reasons with their names in lower case, such as `not_finite`, in the order of the variants.
     pub const ALL: [(LimitCause, &'static str); 8] = [
         (LimitCause::Stale, "stale"),
         (LimitCause::Engage, "engage"),
@@ -110,22 +112,24 @@ impl LimitCause {
     ];
 }
 
-/// Input of one tick of the envelope: the wanted force, and the state of the device.
+/// Input of one tick of the envelope: the wanted force, and the state of the device. All vectors are in one frame,
+/// that of the device, in which its workspace is given ([`Envelope::new`]).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Wanted {
-    /// Present time, s, from any origin.
+    /// Present time, s, from any origin; it must not go back.
     pub now_s: f64,
-    /// Place of the device in its own frame, m.
+    /// Place of the device's tool, m.
     pub place_m: DVec3,
-    /// Velocity of the device, m/s.
+    /// Velocity of the device's tool, m/s.
     pub velocity_m_per_s: DVec3,
-    /// Wanted force on the device, N.
+    /// Wanted force on the device, before any limit, N.
     pub force_n: DVec3,
     /// Time since the newest model arrived, s; `None` while no model of the tissue is known.
     pub age_s: Option<f64>,
 }
 
-/// Safety envelope of one device: it limits each wanted force as at the top of this module, and counts the limits.
+/// Safety envelope of one device: it limits each wanted force as at the top of this module, and counts the limits. One
+/// lasts as long as its device is used, over all connections: it holds the last force, the energy and the counts.
 ///
 /// A hand presses 4 mm deep into a tissue of 1000 N/m, so the wanted force is 4 N. The force on an undeclared device
 /// is at most 2 N:
@@ -184,8 +188,8 @@ pub struct Envelope {
 }
 
 impl Envelope {
-    /// Creates an envelope in state DISABLED. The device's workspace is a sphere around `middle_m` (m, in the
-    /// device's frame); a place outside is a FAULT.
+    /// Creates an envelope in state DISABLED, with force 0. The device's workspace is the sphere of radius
+    /// [`Device::workspace_m`] around `middle_m` (m, in the device's frame); a place outside is a FAULT.
     pub fn new(device: Device, middle_m: DVec3) -> Self {
         Envelope {
             device,
@@ -205,48 +209,54 @@ impl Envelope {
         }
     }
 
-    /// Returns the state of rendering.
+    /// Returns the state of rendering. It changes with the functions below and in [`Envelope::render`].
     pub fn state(&self) -> RenderingState {
         self.state
     }
 
-    /// Returns the energy that the hand has given to the port minus the energy that it got back, J: −Σ f·Δx over all
-    /// ticks, with f the force that was held during Δx.
+    /// Returns the energy that the hand has given to the port minus the energy that it got back since the envelope was
+    /// created, J: −Σ f·Δx over all ticks, with f the force that was held during Δx. Negative if the hand got more.
     pub fn energy_j(&self) -> f64 {
         self.energy_j
     }
 
-    /// Returns the number of times that `reason` changed the force, and the number of all ticks.
+    /// Returns the number of times that `reason` limited the force, and the number of all ticks, since the envelope
+    /// was created. [`LimitCause::Stale`] and [`LimitCause::Passivity`] may count twice in one tick.
     pub fn count(&self, reason: LimitCause) -> (u64, u64) {
         (self.counts[reason as usize], self.ticks)
     }
 
-    /// Returns whether the ramp after `enable` has begun. It stays true until rendering stops.
+    /// Returns whether the ramp after `enable` has begun. It stays true until the next `enable`, or until the first
+    /// tick in another state than ENABLED.
     pub fn is_engaged(&self) -> bool {
         self.engaged_s.is_some()
     }
 
-    /// Changes DISABLED or PAUSED to ENABLED: the force ramps in once it is small. Does nothing in another state; a
-    /// FAULT needs [`Envelope::reset`] first.
+    /// Changes DISABLED or PAUSED to ENABLED: the force ramps in over [`ENGAGE_S`] once a model is known and the
+    /// wanted force is below [`ENGAGE_BELOW_N`]. Does nothing in another state; a FAULT needs [`Envelope::reset`]
+    /// first.
     pub fn enable(&mut self) {
         if matches!(self.state, RenderingState::Disabled | RenderingState::Paused) {
             (self.state, self.engaged_s) = (RenderingState::Enabled, None);
         }
     }
 
-    /// Stops rendering until [`Envelope::enable`]. Does nothing in FAULT.
+    /// Changes to DISABLED: the force falls to zero over the next ticks, and nothing is rendered until
+    /// [`Envelope::enable`]. Does nothing in FAULT.
     pub fn disable(&mut self) {
         if self.state != RenderingState::Fault {
             self.state = RenderingState::Disabled;
         }
     }
 
-    /// Changes to FAULT: stops rendering until [`Envelope::reset`] and then [`Envelope::enable`].
+    /// Changes any state to FAULT: the force falls to zero over the next ticks, and nothing is rendered until
+    /// [`Envelope::reset`] and then [`Envelope::enable`].
     pub fn fail(&mut self) {
         self.state = RenderingState::Fault;
     }
 
-    /// Changes FAULT to DISABLED. Does nothing in another state.
+    /// Changes FAULT to DISABLED, so that [`Envelope::enable`] acts again. Does nothing in another state. Energy,
+    /// force and counts stay.
     pub fn reset(&mut self) {
         if self.state == RenderingState::Fault {
             self.state = RenderingState::Disabled;
@@ -260,8 +270,9 @@ impl Envelope {
     /// Advances the envelope by one tick. Returns the force to render until the next tick, N: the wanted force after
     /// the limits at the top of this module, in their order. With a model of age a, the share that is left is 1 up to
     /// [`FRESH_S`], falls linearly to a half at [`STALE_S`], and is ½·e^{−(a − STALE_S)/DECAY_S} beyond. After
-    /// `enable` it rises as t/[`ENGAGE_S`]. Passivity bounds the force by √(2·S·E/v), and slew bounds its change in a
-    /// tick of length h by S·h, S = [`SLEW_N_PER_S`].
+    /// `enable` it rises as t/[`ENGAGE_S`], t from the beginning of the ramp. Passivity bounds the force by
+    /// √(2·S·E/v), with E the energy in the tank and v the hand's speed along the force (at least 0.08 m/s), and slew
+    /// bounds its change in a tick of length h (at most 10 ms count) by S·h, S = [`SLEW_N_PER_S`].
     ///
     /// A value that is not finite, or a place outside the workspace, changes the state to FAULT; a model or a gap
     /// between two ticks older than [`PAUSE_S`] changes it to PAUSED. The force then falls to zero within the slew.

@@ -5,12 +5,13 @@
 //! delay, a hand at 50 mm/s is 2.5 mm beyond the last sample. A polynomial through past samples extrapolates badly
 //! there. The tissue's own law, which the server computes from its model, is accurate.
 
-/// Values of a force law at one depth: force, stiffness and damping.
+/// Values of a force law at one depth: force, stiffness and damping. "Along" and "across" refer to the outward normal
+/// of the surface; a disc sticks or slides as [`crate::Touching`] decides.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Row {
-    /// Outward force, N.
+    /// Outward force of the tissue on the disc, N.
     pub force_n: f64,
-    /// Stiffness along the normal, N/m.
+    /// Stiffness along the normal, the derivative of the force by the depth, N/m.
     pub stiffness_n_per_m: f64,
     /// Stiffness across the normal for a disc that sticks, N/m.
     pub across_n_per_m: f64,
@@ -25,9 +26,9 @@ pub struct Row {
 /// Force law of a tissue: force, stiffness and damping over depth, as a table with equal steps of depth from 0.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Law {
-    /// Depth between two rows, m.
+    /// Depth between two rows, m; above 0.
     pub step_m: f64,
-    /// Values at depths 0, `step_m`, 2·`step_m`, …; at least two rows.
+    /// Values at depths 0, `step_m`, 2·`step_m`, …; at least two rows in a sound law ([`Law::is_sound`]).
     pub rows: Vec<Row>,
     /// Whether it was composed from coarser sheets because the tissue's own law takes too long to compute. It is then
     /// within a tenth of that law.
@@ -35,8 +36,9 @@ pub struct Law {
 }
 
 impl Law {
-    /// Returns the law of a linear spring and damper, K·d + B·v, with the same K and B along and across the normal. A
-    /// disc that slides has no drag.
+    /// Returns the law of a linear spring and damper, K·d + B·v at a depth d and a speed v inwards, with K =
+    /// `stiffness_n_per_m` and B = `damping_n_s_per_m` both along and across the normal. A disc that slides has no
+    /// drag. It has two rows, at 0 and 0.1 m, and is linear beyond as well.
     pub fn linear(stiffness_n_per_m: f64, damping_n_s_per_m: f64) -> Self {
         let step_m = 0.1;
         let row = |force_n: f64| Row {
@@ -66,8 +68,8 @@ impl Law {
             && self.rows.windows(2).all(|pair| pair[1].force_n >= pair[0].force_n)
     }
 
-    /// Returns the values at a depth, m. The force is cubic between rows, with the rows' stiffness as slopes, and a
-    /// straight line beyond the last row. A negative depth counts as 0.
+    /// Returns the values at `depth_m`, m. The force is cubic between rows, with the rows' stiffness as slopes, and a
+    /// straight line beyond the last row. A negative depth counts as 0. Panics if the law has no row.
     ///
     /// With F₀ and F₁ the forces of two rows a step h apart, k₀ and k₁ their stiffness, Δ = F₁ − F₀ and t from 0 to 1
     /// between them, the force is the cubic of Hermite:
@@ -102,8 +104,9 @@ impl Law {
         }
     }
 
-    /// Returns the depth at which the force is `force_n`, m: by bisection between the two rows around it; beyond the
-    /// last row, at depth D, it is D + (`force_n` − F(D))/k(D). 0 if `force_n` is not positive.
+    /// Returns the depth at which the force is `force_n` (N), m: by bisection between the two rows around it; beyond
+    /// the last row, at depth D, it is D + (`force_n` − F(D))/k(D), with F and k the law's force and stiffness, which
+    /// is very large if k(D) is 0. Returns 0 if `force_n` is not positive. The law must be sound ([`Law::is_sound`]).
     pub fn depth_of(&self, force_n: f64) -> f64 {
         if force_n <= 0.0 {
             return 0.0;
@@ -122,7 +125,7 @@ impl Law {
         0.5 * (low + high)
     }
 
-    /// Returns the depth of the last row, m.
+    /// Returns the depth of the last row, m: (number of rows − 1)·`step_m`.
     pub fn reach_m(&self) -> f64 {
         (self.rows.len() - 1) as f64 * self.step_m
     }

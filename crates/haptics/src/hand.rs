@@ -3,16 +3,17 @@
 
 use glam::DVec3;
 
-/// Model of a hand that holds a device: m·ẍ = k(target − x) − b·ẋ + force of the device.
+/// Model of a hand that holds a device: m·ẍ = k·(target − x) − b·ẋ + F, with x the place of hand and device, F the
+/// force of the device on the hand, and m, b and k the fields below.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hand {
-    /// Name by which [`Hand::named`] finds it.
+    /// Name by which [`Hand::named`] finds it, in lower case.
     pub name: &'static str,
-    /// Mass of hand and device, kg.
+    /// Mass m of hand and device, kg; above 0.
     pub mass_kg: f64,
-    /// Damping, N·s/m.
+    /// Damping b, N·s/m; above 0.
     pub damping_n_s_per_m: f64,
-    /// Stiffness, N/m.
+    /// Stiffness k of the spring that pulls it to the target, N/m; 0 for a device that nobody holds.
     pub stiffness_n_per_m: f64,
 }
 
@@ -20,7 +21,8 @@ const fn hand(name: &'static str, mass_kg: f64, damping_n_s_per_m: f64, stiffnes
     Hand { name, mass_kg, damping_n_s_per_m, stiffness_n_per_m }
 }
 
-/// Known hands, from a loose grip to a firm one. The last, `none`, is a device that nobody holds.
+/// Known hands, from a loose grip to a firm one: `light`, `medium`, `firm`. The last, `none`, is a device that nobody
+/// holds.
 pub const HANDS: [Hand; 4] = [
     hand("light", 0.1, 2.0, 100.0),
     hand("medium", 0.15, 5.5, 300.0),
@@ -32,7 +34,7 @@ pub const HANDS: [Hand; 4] = [
 const STRING_N_PER_M: f64 = 60.0;
 const STRING_N: f64 = 0.5;
 
-/// Place and velocity of a hand.
+/// Place and velocity of a hand and its device at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct HandState {
     /// Place, m.
@@ -42,13 +44,14 @@ pub struct HandState {
 }
 
 impl Hand {
-    /// Returns the hand of [`HANDS`] with this name; `None` if there is none.
+    /// Returns the hand of [`HANDS`] whose name is `name` exactly, in lower case; `None` if there is none.
     pub fn named(name: &str) -> Option<Self> {
         HANDS.iter().find(|hand| hand.name == name).copied()
     }
 
-    /// Returns the force of the string that pulls a device that nobody holds to its target, N: k·(target − x) with k
-    /// = 60 N/m, but at most 0.5 N. For a hand (`stiffness_n_per_m` > 0) it is 0.
+    /// Returns the force of the string that pulls a device that nobody holds from `place_m` to `target_m`, N: 60 N/m
+    /// times the way, shortened to 0.5 N. For a hand (`stiffness_n_per_m` > 0) it is 0. The caller adds it to the
+    /// force that it gives to [`Hand::advance`].
     pub fn string_n(&self, target_m: DVec3, place_m: DVec3) -> DVec3 {
         if self.stiffness_n_per_m > 0.0 {
             return DVec3::ZERO;
@@ -56,10 +59,12 @@ impl Hand {
         (STRING_N_PER_M * (target_m - place_m)).clamp_length_max(STRING_N)
     }
 
-    /// Returns the state after `time_s` under a constant force, with a target that moves straight from `from_m` to
-    /// `to_m`. It is exact except that the target counts as constant in each quarter of the time, at its mean.
+    /// Returns the state `time_s` after the state `held`, under the constant force F = `force_n` on the hand, N, with
+    /// a target that moves straight from `from_m` to `to_m`, m. It is exact except that the target counts as constant
+    /// in each quarter of the time, at its mean.
     ///
-    /// With γ = b/2m, ω² = k/m − γ², the place of rest x_r = target + F/k, and a = x₀ − x_r:
+    /// With γ = b/2m, ω² = k/m − γ², the place of rest x_r = target + F/k, x₀ and v₀ the place and velocity of `held`,
+    /// and a = x₀ − x_r:
     ///
     /// x(t) = x_r + e^{−γt}·(a·cos ωt + (v₀ + γ·a)·sin(ωt)/ω),
     /// v(t) = e^{−γt}·(v₀·cos ωt − (γ·v₀ + (k/m)·a)·sin(ωt)/ω),
@@ -103,9 +108,9 @@ impl Hand {
         HandState { place_m, velocity_m_per_s }
     }
 
-    /// Returns the delay at which the loop of the hand and a spring of `stiffness_n_per_m` = K becomes unstable, s;
-    /// infinite if it never does. It is the smallest t with m·s² + b·s + k + K·e^{−s·t} = 0 on the imaginary axis. A
-    /// sample that is held for a period adds a delay of half a period.
+    /// Returns the delay at which the loop of the hand and a rendered spring of `stiffness_n_per_m` = K (N/m) becomes
+    /// unstable, s; infinite if it never does. It is the smallest t for which m·s² + b·s + k + K·e^{−s·t} = 0 has a
+    /// root s on the imaginary axis. A sample that is held for a period adds a delay of half a period.
     ///
     /// With s = iω both sides of K·e^{−iωt} = mω² − k − ibω have the same size, so (mω² − k)² + b²ω² = K²:
     ///

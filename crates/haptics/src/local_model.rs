@@ -12,7 +12,7 @@ use glam::{DMat3, DVec3};
 
 use crate::force_law::{Law, Row};
 
-/// State of contact between a tool and the tissue.
+/// State of contact between a tool and the tissue at one time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ContactState {
     /// The tool does not touch the tissue.
@@ -25,15 +25,15 @@ pub enum ContactState {
     Holding,
 }
 
-/// Model of the tissue around a tool's place, as a sample contains it. Forces are those on the tool; vectors are in
-/// the tissue's frame.
+/// Model of the tissue around a tool's place, as a sample contains it. Forces are those of the tissue on the tool;
+/// vectors and matrices are in the tissue's frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LocalModel {
-    /// Sequence number; it rises with each sample.
+    /// Sequence number of the sample; it rises with each sample of a connection, maybe by more than 1.
     pub sequence: u64,
     /// Time of the tool's place by the client's clock, s.
     pub client_time_s: f64,
-    /// Number of simulation steps done.
+    /// Number of simulation steps that the server had done.
     pub step: u64,
     /// Place x₀ of the tool, m.
     pub place_m: DVec3,
@@ -52,9 +52,10 @@ pub struct LocalModel {
     /// Curvature κ: change of the normal per metre along the surface, 1/m. It is symmetric, 0 for a plane, and 1/R
     /// for a sphere that is touched from outside.
     pub curvature_per_m: DMat3,
-    /// Distance from x₀ within which K is valid, m.
+    /// Distance from x₀ within which K is valid, m ([`valid_m`]); it may be infinite. Only a tool that holds the
+    /// tissue is rendered from K and B.
     pub valid_m: f64,
-    /// Coefficient μ of Coulomb friction.
+    /// Coefficient μ of Coulomb friction, 0 or more.
     pub friction: f64,
     /// State of contact between the tool and the tissue.
     pub contact_state: ContactState,
@@ -80,7 +81,8 @@ impl LocalModel {
 }
 
 /// Returns the distance r within which a stiffness K is valid, m: r = √(2·max(f/10, `least_n`)/‖∂K/∂x‖), with f =
-/// `force_n`, N, and ‖∂K/∂x‖ = `change_n_per_m2`, N/m².
+/// `force_n` the size of the force, N, and ‖∂K/∂x‖ = `change_n_per_m2` the change of K over a distance, N/m², which
+/// counts as at least 10⁻⁹.
 ///
 /// Over a distance r, the model's force is wrong by ½·‖∂K/∂x‖·r², the next term of its Taylor series. At r this error
 /// is a tenth of the force, or `least_n` (N) if that is larger.
@@ -105,7 +107,8 @@ impl Default for Track {
 }
 
 impl Track {
-    /// Appends a place, m, at a time by the client's clock, s. Drops the oldest beyond 2048.
+    /// Appends `place_m`, m, at `time_s` by the client's clock, s, which must not be before the last one (not
+    /// checked). Drops the oldest beyond 2048.
     pub fn push(&mut self, time_s: f64, place_m: DVec3) {
         if self.places.len() == KEPT {
             self.places.pop_front();
@@ -113,13 +116,14 @@ impl Track {
         self.places.push_back((time_s, place_m));
     }
 
-    /// Returns the places after a time, from the oldest to the newest, m.
+    /// Returns the places more than half a microsecond after `time_s` (client's clock, s), from the oldest to the
+    /// newest, m. Empty if there are none.
     pub fn after(&self, time_s: f64) -> impl Iterator<Item = DVec3> {
         let from = self.places.partition_point(|place| !is_after(place.0, time_s));
         self.places.range(from..).map(|place| place.1)
     }
 
-    /// Removes all places.
+    /// Removes all places, and keeps the memory for them.
     pub fn clear(&mut self) {
         self.places.clear();
     }
@@ -135,7 +139,8 @@ pub(crate) fn is_after(time_s: f64, other_s: f64) -> bool {
 const TICK_S: f64 = 1e-3;
 
 /// State of a touch along a tool's path since a sample: tangential stretch of the tissue, sticking or sliding, and
-/// place.
+/// place. It begins with a sample ([`Touching::at_sample`]) and is replaced at the next one; each of its functions
+/// must get the same model, and the law that this model names.
 ///
 /// A sample describes a tool 2 mm deep in a tissue of 400 N/m. Since then the client's tool has moved 1 mm deeper, so
 /// its force is 1.2 N:
@@ -184,9 +189,11 @@ pub struct Touching {
 const MAX_TURN: f64 = 1.0;
 
 impl Touching {
-    /// Creates the state at the time of the sample. The stretch s = −(f_t + B_t·v_t)/K_t explains the part f_t of the
-    /// sample's force across the normal (D in place of B_t while it slides), within the friction cone, |s| ≤
-    /// μ·F(d)/K_t. The law does not explain the rest r of the force, which is kept and added ([`Touching::force_n`]).
+    /// Creates the state at the time of the sample `model`. The stretch s = −(f_t + B_t·v_t)/K_t explains the part f_t
+    /// of the sample's force across the normal, with v_t the tool's velocity across it and K_t, B_t and D the law's
+    /// stiffness, damping and drag across it at the depth d (D in place of B_t while it slides). It stays within the
+    /// friction cone, |s| ≤ μ·F(d)/K_t. The law does not explain the rest r of the force, which is kept and added
+    /// ([`Touching::force_n`]). For a tool that is free or holds the tissue, s and r are 0.
     pub fn at_sample(model: &LocalModel, law: &Law) -> Self {
         let mut touching = Touching {
             stretch_m: DVec3::ZERO,
@@ -239,15 +246,17 @@ impl Touching {
         (depth_m, normal)
     }
 
-    /// Returns the depth of the disc below the surface, m (negative above it), and the law's values at that depth.
+    /// Returns the depth of the disc below the surface at the tool's present place, m (negative above it), and the
+    /// law's values at that depth (those of depth 0 above it).
     pub fn at_law(&self, model: &LocalModel, law: &Law) -> (f64, Row) {
         let (depth_m, _) = self.under(model);
         (depth_m, law.at_depth(depth_m))
     }
 
-    /// Moves the tool to `place_m`, m, by Δx: the stretch s becomes the part of s + Δx across the normal, shortened
-    /// to μ·F(d)/K_t (Coulomb's law: the disc slides where its spring would pull with more than μ times the
-    /// pressure). Above the surface the stretch becomes 0.
+    /// Moves the tool by Δx to `place_m` (m, in the tissue's frame): the stretch s becomes the part of s + Δx across
+    /// the normal, shortened to μ·F(d)/K_t, with F and K_t the law's force and stiffness across at the depth d
+    /// (Coulomb's law: the disc slides where its spring would pull with more than μ times the pressure). Above the
+    /// surface, or where K_t is 0, the stretch becomes 0. The path counts: call it for each recorded place in turn.
     pub fn move_to(&mut self, model: &LocalModel, law: &Law, place_m: DVec3) {
         let moved_m = place_m - self.place_m;
         self.place_m = place_m;
@@ -263,7 +272,7 @@ impl Touching {
         self.sliding = self.stretch_m != stretch_m;
     }
 
-    /// Returns the force on the tool at its present place, N.
+    /// Returns the force of the tissue on the tool at its present place, if it moves at `velocity_m_per_s`, N.
     ///
     /// With the depth d, the normal n, the stretch s, the velocity v and its part v_t across n; F(d), K_t, B, B_t and
     /// D the law's values at that depth ([`Row`]); and r the rest of the sample's force:

@@ -22,15 +22,15 @@ use std::collections::VecDeque;
 
 use glam::DVec3;
 
-/// Largest speed of a tool, m/s.
+/// Largest speed at which a path moves a tool, m/s; a tool farther from its target follows at this speed.
 pub const SPEED_M_PER_S: f64 = 0.5;
 /// Length of the queue beyond which it is a backlog, s: only its newest place is then played.
 pub const BACKLOG_S: f64 = 0.1;
 /// Time without a command after which the tool is held in place and the client is informed, s.
 pub const HOLD_S: f64 = 0.05;
-/// Time without a command after which the tool lets go, s.
+/// Time without a command after which the tool lets go of the tissue, s. The next command begins a new touch.
 pub const RELEASE_S: f64 = 0.25;
-/// Longest time over which a movement is extrapolated, s.
+/// Longest time after a command with a velocity over which its movement is extrapolated, s; then the tool stays.
 pub const EXTRAPOLATE_S: f64 = HOLD_S;
 /// Lateness of commands with a velocity beyond which the played moment falls back, s.
 const LATE_S: f64 = 0.002;
@@ -43,17 +43,19 @@ const LONGEST_S: f64 = 1e12;
 /// Largest number of places in the queue; beyond it the oldest is dropped.
 const MAX_POINTS: usize = 1024;
 
-/// Action of a tool in one simulation step.
+/// Action of a tool in one simulation step, as [`Path::step`] returns it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Play {
     /// Move to this place by the end of the step: m, in the frame of the commands (the tissue's, with z out of it).
     /// The second value is the time of this place by the client's clock, s.
     Pose(DVec3, f64),
-    /// Let go of the tissue.
+    /// Let go of the tissue. Returned at each step from [`RELEASE_S`] after the newest command until the next one.
     Release,
 }
 
-/// Path of one tool on the server: the commands that are waiting, and the state of their playback.
+/// Path of one tool on the server: the commands that are waiting, and the state of their playback. The default is the
+/// path of a tool that touches: it begins above its first place, at a height of at least 2 mm. Places are in the frame
+/// of the commands.
 #[derive(Debug, Clone, Default)]
 pub struct Path {
     /// Whether the tool begins at its first place, not above it.
@@ -122,7 +124,7 @@ impl PathState {
 }
 
 impl Path {
-    /// Returns the complete state of the path, for [`Path::restored`].
+    /// Returns a copy of the complete state of the path, from which [`Path::restored`] continues it.
     pub fn state(&self) -> PathState {
         let Path { at_once, begins_m, waiting, heading, played, place_m, arrived_s, spare_s, watched_s, .. } = self;
         PathState {
@@ -139,8 +141,9 @@ impl Path {
         }
     }
 
-    /// Creates a path that continues from `state`; `None` if no path can have this state (more than 1024 waiting
-    /// places, times out of order, values that are not finite or too large).
+    /// Creates a path that continues from `state`; `None` if no path can have this state: more than 1024 waiting
+    /// places, waiting times that do not rise, a place or time that is not finite, a time of 10¹² s or more, a
+    /// velocity above 2·[`SPEED_M_PER_S`], or a count of 2⁴⁸ or more.
     pub fn restored(state: PathState) -> Option<Self> {
         if !state.is_sound() {
             return None;
@@ -176,9 +179,10 @@ impl Path {
         Path { begins_m: Some(place_m), ..Path::default() }
     }
 
-    /// Queues a command that arrived at `now_s`: the tool's place, m, at client time `time_s`, s. Returns false and
-    /// counts a refusal if it is not newer than all commands before, or not finite. Beyond 1024 waiting places the
-    /// oldest is dropped.
+    /// Queues a command that arrived at `now_s` by the server's clock, s: the tool's place, m, at client time
+    /// `time_s`, s. Returns true; or false, and counts a refusal, if a value is not finite or `time_s` is not above
+    /// that of the newest waiting place (of the played moment if none waits). Ends a movement by
+    /// [`Path::receive_moving`]. Beyond 1024 waiting places the oldest is dropped.
     pub fn receive(&mut self, time_s: f64, place_m: DVec3, now_s: f64) -> bool {
         let newest_s = self.waiting.back().or(self.played.as_ref()).map_or(f64::NEG_INFINITY, |place| place.0);
         if !place_m.is_finite() || !time_s.is_finite() || time_s <= newest_s {
@@ -190,10 +194,10 @@ impl Path {
         true
     }
 
-    /// Queues a command that arrived at `now_s`: the tool's place, m, and velocity, m/s, at client time `time_s`, s.
-    /// Until a newer command arrives, the tool continues at this velocity, shortened to [`SPEED_M_PER_S`]. Returns
-    /// false and counts a refusal if the command is not newer than all before, or not finite. Beyond 1024 waiting
-    /// places the oldest is dropped.
+    /// Queues a command that arrived at `now_s` by the server's clock, s: the tool's place, m, and velocity, m/s, at
+    /// client time `time_s`, s. Until a newer command arrives, but at most for [`EXTRAPOLATE_S`], the tool continues
+    /// at this velocity, shortened to [`SPEED_M_PER_S`]. Returns true; or false, and counts a refusal, if a value is
+    /// not finite or `time_s` is not above [`Path::newest_s`]. Beyond 1024 waiting places the oldest is dropped.
     pub fn receive_moving(&mut self, time_s: f64, place_m: DVec3, velocity_m_per_s: DVec3, now_s: f64) -> bool {
         let newest_s = self.newest_s().unwrap_or(f64::NEG_INFINITY);
         let is_finite = place_m.is_finite() && velocity_m_per_s.is_finite() && time_s.is_finite();
@@ -213,8 +217,9 @@ impl Path {
         true
     }
 
-    /// Inserts a place that arrived late, m, at client time `time_s`, s. Returns false and counts a refusal if this
-    /// time has been played, is known, is newer than all waiting places, or if a value is not finite.
+    /// Inserts a place that arrived late, m, at client time `time_s`, s. Returns true; or false, and counts a refusal,
+    /// if nothing was played yet, if this time has been played, is known or is newer than all waiting places, or if a
+    /// value is not finite. It does not count as a new command ([`Path::is_held`]).
     pub fn fill(&mut self, time_s: f64, place_m: DVec3) -> bool {
         let is_due = time_s.is_finite() && self.played.is_some_and(|played| time_s > played.0);
         let at = self.waiting.partition_point(|waiting| waiting.0 < time_s);
@@ -228,7 +233,8 @@ impl Path {
         fills
     }
 
-    /// Returns the client time of the newest command, s; `None` before the first.
+    /// Returns the client time of the newest command, s, or of the played moment if no command waits or moves the
+    /// tool; `None` before the first.
     pub fn newest_s(&self) -> Option<f64> {
         let known = [self.heading.map(|heading| heading.0), self.waiting.back().map(|waiting| waiting.0)];
         known.into_iter().flatten().reduce(f64::max).or(self.played.map(|played| played.0))
@@ -241,26 +247,30 @@ impl Path {
         }
     }
 
-    /// Sets the tool's place, m, at client time `time_s`, s, with effect at once, and drops all waiting commands.
-    /// Afterwards the tool is neither held nor released for lack of commands.
+    /// Sets the tool's target, m, at client time `time_s`, s, with effect from the next step, and drops all waiting
+    /// commands, which are not counted. The tool still moves there no faster than [`SPEED_M_PER_S`]. Until the next
+    /// command arrives, it is neither held nor released for lack of commands. Nothing is checked.
     pub fn go_to(&mut self, time_s: f64, place_m: DVec3) {
         self.waiting.clear();
         (self.played, self.heading, self.arrived_s) = (Some((time_s, place_m)), None, f64::INFINITY);
     }
 
-    /// Returns three counts: steps in which the speed limit acted, commands that were refused or skipped, and
-    /// releases.
+    /// Returns three counts since the path began, in this order: steps in which the speed limit acted; commands that
+    /// were refused, or skipped in a backlog; and releases (each once, however many steps it lasts).
     pub fn counts(&self) -> [u64; 3] {
         [self.limited, self.dropped, self.released]
     }
 
-    /// Returns whether the newest command is so old at `now_s` that the tool is held.
+    /// Returns whether the newest command arrived more than [`HOLD_S`] before `now_s` (server's clock, s), so that the
+    /// tool is held in place. False after [`Path::go_to`]. Before the first command, the server's time 0 counts as the
+    /// arrival.
     pub fn is_held(&self, now_s: f64) -> bool {
         now_s - self.arrived_s > HOLD_S
     }
 
-    /// Advances the path by a step of `step_s` that ends at `now_s`. Returns the action of the tool; `None` before
-    /// the first command. The tool moves towards its target by at most [`SPEED_M_PER_S`]·`step_s`. Between two
+    /// Advances the path by a step of `step_s`, s, that ends at `now_s` by the server's clock, s. Returns the action
+    /// of the tool; `None` before the first command. More than [`RELEASE_S`] after the newest command it is
+    /// [`Play::Release`]. The tool moves towards its target by at most [`SPEED_M_PER_S`]·`step_s`. Between two
     /// commands the target is on a straight line, x₀ + (x₁ − x₀)·(t − t₀)/(t₁ − t₀); beyond the newest command with a
     /// velocity it is x + v·(t − t₀), for at most [`EXTRAPOLATE_S`].
     pub fn step(&mut self, now_s: f64, step_s: f64) -> Option<Play> {

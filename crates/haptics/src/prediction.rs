@@ -37,19 +37,21 @@ const NEAR: f64 = 0.05;
 /// Longest time from a forecast before or after a moment up to which it counts for that moment, s.
 const GAP_S: f64 = 0.02;
 
-/// Force and contact of the client's tool in a copy of the tissue.
+/// Force and contact of the client's tool in a copy of the tissue at one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Predicted {
-    /// Force of the copy on the tool, N.
+    /// Force of the copy on the tool, N, in the tissue's frame. One that is not finite counts as no answer.
     pub force_n: DVec3,
     /// State of contact between the tool and the copy.
     pub contact_state: ContactState,
 }
 
-/// A copy of the tissue on the client's side that contains the client's tool and no other.
+/// A copy of the tissue on the client's side that contains the client's tool and no other. [`crate::Renderer::tick`]
+/// calls it a thousand times a second, so it should neither block nor allocate.
 pub trait Predictor: Send {
-    /// Moves the tool to `place_m` (m, in the tissue's frame) at `now_s` by the client's clock, which never goes
-    /// back. Returns the force and contact there; `None` if the copy has no answer, now or from now on.
+    /// Moves the tool to `place_m` (m, in the tissue's frame, finite) at `now_s` by the client's clock, s, which never
+    /// goes back. Returns the force and contact there; `None` if the copy has no answer, now or from now on: the local
+    /// model is then rendered.
     fn feel(&mut self, now_s: f64, place_m: DVec3) -> Option<Predicted>;
 }
 
@@ -97,7 +99,8 @@ pub struct Prediction {
 }
 
 impl Prediction {
-    /// Creates a prediction from a copy. It reserves all the memory that ticks need.
+    /// Creates a prediction from a copy. It is not rendered until a sample has been compared with it. It reserves all
+    /// the memory that ticks need, for the newest 2048 forecasts.
     pub fn new(predictor: Box<dyn Predictor>) -> Self {
         Prediction {
             predictor,

@@ -29,7 +29,7 @@ use crate::force_law::Law;
 use crate::local_model::{ContactState, LocalModel, Touching, Track};
 use crate::prediction::Prediction;
 
-/// Time constant with which the bias after a new model decays, s.
+/// Time constant with which the bias (the difference of the force to that of the model before) decays, s.
 pub const BIAS_S: f64 = 0.02;
 
 /// Largest number of force laws that a renderer keeps. A further law replaces the oldest that neither the newest
@@ -105,7 +105,8 @@ pub struct Renderer {
     predicted: u64,
     /// Whether the last tick was rendered from a copy, and its wanted force, N.
     last: (bool, DVec3),
-    /// Safety envelope that limits each force before the device.
+    /// Safety envelope that limits each force before the device. Use it to enable, disable and reset rendering; its
+    /// `render` is called by [`Renderer::tick`] alone.
     pub envelope: Envelope,
 }
 
@@ -141,39 +142,42 @@ impl Renderer {
         std::mem::replace(&mut self.prediction, prediction)
     }
 
-    /// Returns the number of ticks that were rendered from a copy of the tissue.
+    /// Returns the number of ticks that were rendered from a copy of the tissue, since the renderer was created.
     pub fn predicted(&self) -> u64 {
         self.predicted
     }
 
     /// Restarts for a new connection: drops the models, all laws and the copy of the tissue, and keeps `law` as
-    /// number 0. It must be sound. The envelope keeps its state.
+    /// number 0. It must be sound ([`Law::is_sound`]), which is not checked. The envelope, the counts and the tool's
+    /// track stay. Until the first model of the new connection the wanted force is 0, to which a rendered force falls
+    /// within the slew; if none arrives, rendering pauses by the age of the last one. Frees memory, so call it outside
+    /// of ticks.
     pub fn begin(&mut self, law: Law) {
         self.prediction = None;
         self.begin_with(law, drop);
     }
 
-    /// Restarts for a new connection without allocating or freeing memory: drops the models, and keeps `law` as
-    /// number 0. Passes the previous laws, at most [`MAX_LAWS`], to `used`, which should have them freed outside of
-    /// ticks. A copy of the tissue stays set: also call [`Renderer::predict`] with `None`, because the copy is of
-    /// another tissue.
+    /// Restarts for a new connection without allocating or freeing memory: drops the models, and keeps `law`, which
+    /// must be sound, as number 0. Passes the previous laws, at most [`MAX_LAWS`] and the oldest first, to `used`,
+    /// which should have them freed outside of ticks. A copy of the tissue stays set: also call [`Renderer::predict`]
+    /// with `None`, because the copy is of another tissue.
     pub fn begin_with(&mut self, law: Law, mut used: impl FnMut(Law)) {
         self.laws.drain(..).for_each(|known| used(known.1));
         self.laws.push((0, law));
         (self.newest, self.arrived) = (None, None);
     }
 
-    /// Adds a law under a number that models may name from now on. Returns false, and changes nothing, if it is not
-    /// sound or its number is known. Beyond [`MAX_LAWS`] it replaces the oldest that no current model names. A model
-    /// that names an unknown law is rendered with the oldest one.
+    /// Adds a law under a number that models may name from now on. Returns true; or false, and changes nothing, if it
+    /// is not sound or its number is known. Beyond [`MAX_LAWS`] it replaces the oldest that no current model names. A
+    /// model that names an unknown law is rendered with the oldest one.
     pub fn learn(&mut self, number: u32, law: Law) -> bool {
         law.is_sound() && self.learn_with(number, law, drop)
     }
 
     /// Adds a law under a number without allocating or freeing memory. The law must be sound, which is not checked.
-    /// Returns false if the number is known. Passes the law that is no longer needed, which is `law` itself or one
-    /// that it replaces, to `used`, which should have it freed outside of ticks. Beyond [`MAX_LAWS`] it replaces the
-    /// oldest that no current model names.
+    /// Returns true, or false if the number is known. Passes the law that is no longer needed, which is `law` itself
+    /// or one that it replaces, to `used`, which should have it freed outside of ticks. Beyond [`MAX_LAWS`] it
+    /// replaces the oldest that no current model names.
     pub fn learn_with(&mut self, number: u32, law: Law, used: impl FnOnce(Law)) -> bool {
         if self.laws.iter().any(|known| known.0 == number) {
             used(law);
@@ -189,7 +193,7 @@ impl Renderer {
     }
 
     /// Returns the number of models that were refused because they were out of order or not sound
-    /// ([`LocalModel::is_sound`]).
+    /// ([`LocalModel::is_sound`]), since the renderer was created.
     pub fn refused(&self) -> u64 {
         self.refused
     }
@@ -202,13 +206,17 @@ impl Renderer {
         }
     }
 
-    /// Returns the time of the newest model in use by the client's clock, s; `None` before the first.
+    /// Returns the time of the model in use by the client's clock ([`LocalModel::client_time_s`]), s; `None` before
+    /// the first tick with a model, and again after [`Renderer::begin`]. A model that waits for the next tick does not
+    /// count.
     pub fn model_time_s(&self) -> Option<f64> {
         self.newest.as_ref().map(|newest| newest.0.client_time_s)
     }
 
-    /// Receives a model that arrived at `now_s`, s. It takes effect at the next tick. A model that is not newer than
-    /// the last, or not sound, is refused and counted ([`Renderer::refused`]).
+    /// Receives a model that arrived at `now_s` by the clock of [`Renderer::tick`], s. It takes effect at the next
+    /// tick and replaces one that waits for it. A model whose sequence number is not above the last, or that is not
+    /// sound, is refused and counted ([`Renderer::refused`]). One that names an unknown law is rendered with the
+    /// oldest law.
     pub fn receive(&mut self, model: LocalModel, now_s: f64) {
         let arrived = self.arrived.as_ref().map(|arrived| &arrived.0);
         let newest = arrived.or(self.newest.as_ref().map(|newest| &newest.0));
@@ -273,7 +281,8 @@ impl Renderer {
     /// Returns the distance by which a server may be wrong about the tool's place so that the force is wrong by at
     /// most the fraction `share` of itself, m.
     ///
-    /// A distance w changes the force by at most max(k, k_t)·w, so w = `share`·F(d)/max(k, k_t) at a depth d. At a
+    /// A distance w changes the force by at most max(k, k_t)·w, with F, k and k_t the law's force and its stiffness
+    /// along and across the normal, so w = `share`·F(d)/max(k, k_t) at a depth d. At a
     /// height h above the tissue it is `share`·h. It is kept between 0.02 and 1 mm, and is 0.02 mm before the first
     /// model.
     pub fn way_m(&self, share: f64) -> f64 {
@@ -287,9 +296,10 @@ impl Renderer {
         way_m.clamp(MIN_WAY_M, MAX_WAY_M)
     }
 
-    /// Advances by one tick: records the tool's place, m, at `now_s`, and switches to a model that has arrived.
-    /// Returns the force to render until the next tick, N: F(t) + b·e^{−(t − t₀)/τ} as at the top of this module,
-    /// within the limits of the envelope.
+    /// Advances by one tick: records the tool's place (m, in the tissue's frame) at `now_s` by the client's clock, s,
+    /// and switches to a model that has arrived. Does not allocate. A value that is not finite is not recorded and
+    /// makes the envelope's state FAULT. Returns the force to render until the next tick, N: F(t) + b·e^{−(t − t₀)/τ}
+    /// as at the top of this module, within the limits of the envelope.
     pub fn tick(&mut self, now_s: f64, place_m: DVec3) -> DVec3 {
         let known = place_m.is_finite() && now_s.is_finite();
         if let Some((then_s, from_m)) = self.before.filter(|_| known)

@@ -1,6 +1,6 @@
 //! The tip of a tool that is controlled by its position: its size, its friction and its coupling to the tissue.
 
-/// Coupling between a tool and the surface that it touches.
+/// Coupling between a tool and the surface that it touches: how the place of the one follows from the other.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Coupling {
     /// The surface follows the tool exactly: the stiffness felt is the tissue's.
@@ -15,12 +15,13 @@ pub enum Coupling {
     },
 }
 
-/// Properties of a tool's tip that determine its contact with the tissue.
+/// Properties of a tool's tip that determine its contact with the tissue: a flat disc. The default is a finger on wet
+/// tissue.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tip {
-    /// Radius of the disc that touches the tissue, m. The tissue's stiffness in N/m depends on it.
+    /// Radius of the disc that touches the tissue, m, above 0. The tissue's stiffness in N/m depends on it.
     pub radius_m: f64,
-    /// Coefficient μ of Coulomb friction; unused for a grasp.
+    /// Coefficient μ of Coulomb friction, 0 or more; unused for a grasp.
     pub friction: f64,
     /// Whether it holds the tissue, so that it pulls as well as pushes. Otherwise it only pushes.
     pub grasps: bool,

@@ -20,7 +20,8 @@ macro_rules! reasons {
             /// Every reason, in the order of declaration.
             pub const ALL: &[Reason] = &[$(Reason::$variant,)*];
 
-            /// Returns the name that clients see (`google.rpc.ErrorInfo.reason`).
+            /// Returns the name that clients see (`google.rpc.ErrorInfo.reason`): the variant's name in capitals, its
+            /// words joined by `_`.
             pub fn as_str(self) -> &'static str {
                 match self { $(Reason::$variant => $name,)* }
             }
@@ -116,23 +117,23 @@ reasons! {
 /// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Refusal {
-    /// The reason, for programs.
+    /// The reason, for programs, which may rely on its name.
     pub reason: Reason,
     /// The offending field, as a path such as `sheet.spacing_m` or `force[0].profile.on_s`. Empty if no field is at
     /// fault.
     pub field: String,
     /// The problem and what would be right, for people.
     pub message: String,
-    /// Where the input was written, such as `scenes/paper.toml:5` or `--set`. `None` for input that came over the
-    /// network.
+    /// Where the input was written, such as `scenes/paper.toml:5` or `--set`; with [`Reason::Elsewhere`], the URL of
+    /// the server that has the session. `None` for input that came over the network.
     pub place: Option<String>,
 }
 
-/// Result of a function that may refuse its input.
+/// Result of a function that may refuse its input: its value, or the [`Refusal`].
 pub type Result<T> = std::result::Result<T, Refusal>;
 
 impl Refusal {
-    /// Creates a refusal of `field` without a place.
+    /// Creates a refusal of `field`, which may be empty, with a `message` for people. Its place is `None`.
     pub fn new(reason: Reason, field: impl Into<String>, message: impl Into<String>) -> Self {
         Refusal { reason, field: field.into(), message: message.into(), place: None }
     }
@@ -151,8 +152,9 @@ impl Refusal {
 }
 
 impl Refusal {
-    /// Reduces the place to the name of its file, for callers other than the server's operator: they must not learn
-    /// the folders of this machine. An endpoint ([`Reason::Elsewhere`]) stays whole.
+    /// Reduces the place to what follows its last `/` or `\`, the name of its file, for callers other than the
+    /// server's operator: they must not learn the folders of this machine. An endpoint ([`Reason::Elsewhere`]) stays
+    /// whole; field and message do not change.
     #[must_use]
     pub fn without_folder(self) -> Self {
         let name = |place: String| match place.rsplit_once(['/', '\\']) {
@@ -180,22 +182,23 @@ impl std::error::Error for Refusal {}
 
 /// Returns `value` with 0 in place of −0. The two are equal in every meaning here but differ in their bits, which
 /// hashes compare; and protobuf omits a field that equals 0, so −0 would come back as 0. All input of a tissue or a
-/// session passes through this function.
+/// session passes through this function. Every other value, NaN included, is returned as it is.
 pub fn unsigned_zero(value: f64) -> f64 {
     value + 0.0
 }
 
 /// Rounds a value to ten significant digits, to show it to people. A computed value, or one that was a f32, has up
-/// to 17 digits, most of which are rounding errors.
+/// to 17 digits, most of which are rounding errors. Infinity and NaN are returned as they are.
 pub fn legible(value: f64) -> f64 {
     format!("{value:.9e}").parse().unwrap_or(value)
 }
 
-/// Returns `value` if it is finite and `holds` is true for it; −0 becomes 0. `range` describes the accepted values
-/// in the message ("must be {range}").
+/// Returns `value` if it is finite and `holds` is true for it; −0 becomes 0. `field` is the path that the refusal
+/// names; `range` describes the accepted values in its message ("must be {range}, but is …").
 ///
 /// # Errors
-/// Refuses a number that is not finite, or for which `holds` is false.
+/// Refuses a number that is not finite ([`Reason::NotFinite`]), or for which `holds` is false
+/// ([`Reason::OutOfRange`]).
 pub fn number(field: &str, value: f64, range: &str, holds: impl Fn(f64) -> bool) -> Result<f64> {
     if !value.is_finite() {
         return Err(Refusal::new(Reason::NotFinite, field, format!("must be a finite number, but is {value}")));
@@ -208,34 +211,35 @@ pub fn number(field: &str, value: f64, range: &str, holds: impl Fn(f64) -> bool)
     Ok(unsigned_zero(value))
 }
 
-/// Returns `value` if it is finite.
+/// Returns `value` if it is finite; −0 becomes 0. `field` is the path that the refusal names.
 ///
 /// # Errors
-/// Refuses infinity and NaN.
+/// Refuses infinity and NaN ([`Reason::NotFinite`]).
 pub fn finite(field: &str, value: f64) -> Result<f64> {
     number(field, value, "finite", |_| true)
 }
 
-/// Returns `value` if it is finite and above 0.
+/// Returns `value` if it is finite and above 0. `field` is the path that the refusal names.
 ///
 /// # Errors
-/// Refuses a number that is not finite, 0 or below.
+/// Refuses a number that is not finite ([`Reason::NotFinite`]), and 0 or below ([`Reason::OutOfRange`]).
 pub fn positive(field: &str, value: f64) -> Result<f64> {
     number(field, value, "above 0", |v| v > 0.0)
 }
 
-/// Returns `value` if it is finite and 0 or more.
+/// Returns `value` if it is finite and 0 or more; −0 becomes 0. `field` is the path that the refusal names.
 ///
 /// # Errors
-/// Refuses a number that is not finite or below 0.
+/// Refuses a number that is not finite ([`Reason::NotFinite`]) or below 0 ([`Reason::OutOfRange`]).
 pub fn not_negative(field: &str, value: f64) -> Result<f64> {
     number(field, value, "0 or more", |v| v >= 0.0)
 }
 
-/// Returns `value` if its three components are finite. −0 comes back as 0.
+/// Returns `value` if its three components are finite; −0 becomes 0 in each. `field` is the path that the refusal
+/// names; it does not name the component.
 ///
 /// # Errors
-/// Refuses a vector with a component that is not finite.
+/// Refuses a vector with a component that is infinite or NaN ([`Reason::NotFinite`]).
 pub fn finite_vector(field: &str, value: glam::DVec3) -> Result<glam::DVec3> {
     for component in value.to_array() {
         finite(field, component)?;
@@ -243,11 +247,12 @@ pub fn finite_vector(field: &str, value: glam::DVec3) -> Result<glam::DVec3> {
     Ok(value + glam::DVec3::ZERO)
 }
 
-/// Checks a text for people: at most 128 bytes, without characters that act on a terminal (control characters, line
-/// breaks, text direction).
+/// Checks a text for people: at most 128 bytes of UTF-8, without characters that act on a terminal (control
+/// characters, line breaks, text direction, most characters without width). It may be empty. `field` is the path
+/// that the refusal names.
 ///
 /// # Errors
-/// Refuses a text that is too long or has such a character.
+/// Refuses a text that is too long or has such a character ([`Reason::OutOfRange`]).
 pub fn label(field: &str, label: &str) -> Result<()> {
     const MAX_BYTES: usize = 128;
     if label.len() > MAX_BYTES || label.chars().any(acts) {
@@ -257,9 +262,11 @@ pub fn label(field: &str, label: &str) -> Result<()> {
     Ok(())
 }
 
-/// Returns the name that `given` was probably meant to be: a name that begins with it (from 3 letters), or the name
-/// with the fewest misspelt letters, at most a third of those given and 1 to 3. From 5 letters, the end of a name
-/// may be missing. `None` if no name is near.
+/// Returns the name of `names` that `given` was probably meant to be: one that begins with it (from 3 letters), or
+/// the one with the fewest misspelt letters (missing, added, replaced, or exchanged with the next). At most a third
+/// of the letters of `given` may be misspelt, but at least 1 and at most 3. From 5 letters, the end of a name may be
+/// missing, which counts as one misspelt letter. Of equally near names the first is returned; `None` if no name is
+/// near. Spaces around `given` and its capitals do not count.
 pub fn nearest<'n>(given: &str, names: impl IntoIterator<Item = &'n str>) -> Option<&'n str> {
     // A shorter text could begin too many names.
     const MIN_BEGINNING: usize = 3;
@@ -285,12 +292,14 @@ pub fn nearest<'n>(given: &str, names: impl IntoIterator<Item = &'n str>) -> Opt
     near.min_by_key(|(apart, _)| *apart).map(|(_, name)| name)
 }
 
-/// Returns "; did you mean `NAME`?", to append to a refusal of `given`; empty if no name is near.
+/// Returns "; did you mean `NAME`?" with the name that [`nearest`] finds in `names`, to append to a refusal of
+/// `given`; empty if no name is near.
 pub fn did_you_mean<'n>(given: &str, names: impl IntoIterator<Item = &'n str>) -> String {
     nearest(given, names).map_or(String::new(), |name| format!("; did you mean `{name}`?"))
 }
 
-/// Returns the first 64 characters of a client's text, to quote in a message.
+/// Returns the first 64 characters of a client's text, to quote in a message. Characters that act on a terminal
+/// stay; a [`Refusal`] replaces them when it is shown.
 pub fn excerpt(text: &str) -> String {
     text.chars().take(64).collect()
 }

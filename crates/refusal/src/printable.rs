@@ -19,19 +19,22 @@ pub(crate) fn acts(c: char) -> bool {
         )
 }
 
-/// Returns `text` for use within a line: replaces each character that acts on a terminal, line breaks included, by
-/// `?`.
+/// Returns `text` for use within a line: replaces each character that acts on a terminal by one `?`. These are control
+/// characters, line breaks included, marks of text direction, and characters without width, except the joiners
+/// U+200C and U+200D.
 pub fn printable(text: impl Display) -> String {
     text.to_string().replace(acts, "?")
 }
 
-/// Replaces each character that acts on a terminal by `?`, except `\n`: for text whose line breaks are our own.
+/// Returns `text` with each character that acts on a terminal ([`printable`]), except `\n`, replaced by `?`: for text
+/// whose line breaks are our own.
 pub fn printable_lines(text: impl Display) -> String {
     text.to_string().replace(|c| acts(c) && c != '\n', "?")
 }
 
-/// Escapes each character that acts on a terminal, except `\n`, as `\uXXXX`, so that a JSON parser still reads it.
-/// `json` must be valid JSON, where such characters occur only in strings.
+/// Returns `json` with each character that acts on a terminal ([`printable`]), except `\n`, escaped as `\uXXXX` in
+/// UTF-16 units, so that a JSON parser still reads the same value. `json` must be valid JSON, which is not checked,
+/// and have such characters only in strings: a tab or `\r` between values would be escaped as well.
 pub fn printable_json(json: impl Display) -> String {
     let json = json.to_string();
     let is_rare = |c: char| acts(c) && c != '\n';

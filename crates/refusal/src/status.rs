@@ -15,14 +15,16 @@ pub const DOMAIN: &str = "palpate";
 /// `ELSEWHERE`.
 pub const ENDPOINT: &str = "endpoint";
 
-/// Returns the URL of the server that has the session, if `status` refuses a call because another server has it.
-/// `None` for every other status.
+/// Returns the URL of the server that has the session, if `status` refuses a call because another server has it
+/// ([`Reason::Elsewhere`]). `None` for every other status, and if the refusal names no endpoint.
 pub fn elsewhere(status: &Status) -> Option<String> {
     let info = status.get_details_error_info()?;
     (info.reason == Reason::Elsewhere.as_str()).then(|| info.metadata.get(ENDPOINT).cloned())?
 }
 
-/// Returns the gRPC status code of a reason.
+/// Returns the gRPC status code of a reason: `InvalidArgument` for an input that is wrong in itself, `NotFound` for
+/// an unknown or deleted one, `ResourceExhausted` for a limit or a load, `FailedPrecondition` for a state that must
+/// change first, and the codes of the same meaning for the others.
 pub fn code(reason: Reason) -> Code {
     match reason {
         Reason::Unreadable
@@ -75,8 +77,9 @@ impl From<Refusal> for Status {
     }
 }
 
-/// Returns the text that a client shows for a status: its message, followed by the reason in brackets or, if there
-/// is none, the code. Characters that act on a terminal become `?`.
+/// Returns the text that a client shows for a status: its message, followed in brackets by the reason of its
+/// `google.rpc.ErrorInfo`, such as `(OUT_OF_RANGE)`, or by the code, such as `(Unavailable)`, if it has none.
+/// Characters that act on a terminal, line breaks included, become `?`.
 pub fn describe(status: &Status) -> String {
     match status.get_details_error_info() {
         Some(info) => printable(format_args!("{} ({})", status.message(), info.reason)),

@@ -27,38 +27,39 @@ use shape::Shape;
 
 use crate::{Group, TriangleMesh};
 
-/// Limit on the vertices of an organ.
+/// Limit on the approximate number of vertices of an organ; [`generate`] refuses shorter edges.
 pub const MAX_VERTICES: usize = 500_000;
 
 /// Area of an equilateral triangle with edges of length 1, √3/4; a vertex has twice that.
 const EQUILATERAL: f64 = 0.433_012_701_892_219_3;
 
-/// An organ, or a part of one, that [`generate`] can create.
+/// An organ, or a part of one, that [`generate`] can create. Sizes are those before the seed varies them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Organ {
-    /// A gallbladder with its neck and the beginning of the cystic duct, 80 mm long. Groups: `bed` (the side at the liver),
-    /// `neck`.
+    /// A gallbladder with its neck and the beginning of the cystic duct, 80 mm long. Groups: `bed` (the side at the
+    /// liver), `neck`.
     Gallbladder,
-    /// A liver with both lobes, 180 mm wide: domed above, hollow beneath, with a rim between. Groups: `rim`, `visceral` (the
-    /// underside), `bare-area` (where the diaphragm holds it).
+    /// A liver with both lobes, 180 mm wide: domed above, hollow beneath, with a rim between. Groups: `rim`,
+    /// `visceral` (the underside), `bare-area` (where the diaphragm holds it).
     Liver,
     /// A kidney, 110 mm long, with the beginnings of its vein and ureter. Group: `hilum`.
     Kidney,
     /// A stomach, 250 mm long, with the ends of the oesophagus and the duodenum. Groups: `cardia`, `pylorus`.
     Stomach,
-    /// A segment of colon, 200 mm long and 50 mm wide, open at both ends: one wall with folds, which faces inward, so that
-    /// it is touched from inside. Groups: `rim`, `folds`.
+    /// A segment of colon, 200 mm long and 50 mm wide, open at both ends: one wall with folds, which faces inward, so
+    /// that it is touched from inside. Groups: `rim`, `folds`.
     Colon,
-    /// A slightly curved square of tissue, 100 mm wide, open at its border, raised by lumps beneath. Groups: `rim`, `lumps`.
+    /// A slightly curved square of tissue, 100 mm wide, open at its border, raised by lumps beneath. Groups: `rim`,
+    /// `lumps`.
     Patch,
 }
 
 impl Organ {
-    /// Every organ.
+    /// Every organ, in the order of the variants.
     pub const ALL: [Organ; 6] =
         [Organ::Gallbladder, Organ::Liver, Organ::Kidney, Organ::Stomach, Organ::Colon, Organ::Patch];
 
-    /// Returns the organ's name, which [`FromStr`] parses.
+    /// Returns the organ's name in lower case, such as `liver`, which [`FromStr`] parses.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
@@ -71,7 +72,7 @@ impl Organ {
         }
     }
 
-    /// Returns a short description, without the name.
+    /// Returns a short description for people, without the name: its size and parts.
     #[must_use]
     pub fn description(self) -> &'static str {
         match self {
@@ -113,7 +114,7 @@ impl FromStr for Organ {
     }
 }
 
-/// The reasons why an organ can't be generated.
+/// Reason why an organ can't be generated: [`generate`] returns all but the first, the parser of [`Organ`] the first.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum OrganError {
     /// There is no organ with this name.
@@ -160,7 +161,7 @@ pub enum OrganError {
         /// The largest accepted edge length, m.
         fits_m: f64,
     },
-    /// The shape for this seed can't be meshed.
+    /// The shape for this seed touches itself and can't be meshed: another seed may work.
     #[error("the {organ} of seed {seed} touches itself and can't be meshed: take another seed")]
     NotAManifold {
         /// The organ.
@@ -175,12 +176,13 @@ fn in_mm(length_m: f64) -> f64 {
     (length_m * 1e6).round() / 1e3
 }
 
-/// Generates the mesh of an organ, in metres. Its edges are about `edge_m` long; `seed` varies its shape within the
-/// usual range of adults. The mesh is a manifold in one part, and closed except for the colon and the patch. Each
-/// group is the set of vertices of whole triangles, so that formats that group triangles can store it.
+/// Generates the mesh of an organ, in metres. Its edges are about `edge_m` (m) long; `seed` varies its shape within
+/// the usual range of adults. The mesh is a manifold in one part with texture coordinates, and closed except for the
+/// colon and the patch. Each group is the set of vertices of whole triangles, so that formats that group triangles can
+/// store it. Equal arguments give equal bits on every machine.
 ///
-/// A surface of area A has about A/(½√3·l²) vertices with edges of length l: a triangle with equal sides has the area ¼√3·l², and
-/// there are two of them for each vertex.
+/// A surface of area A has about A/(½√3·l²) vertices with edges of length l: a triangle with equal sides has the area
+/// ¼√3·l², and there are two of them for each vertex.
 ///
 /// ```
 /// use palpate_geometry::organ::{Organ, generate};
@@ -196,13 +198,16 @@ fn in_mm(length_m: f64) -> f64 {
 /// ```
 ///
 /// # Errors
-/// Refuses an edge length that is not a number above 0, that would give more than [`MAX_VERTICES`], or that is too
-/// long for the thinnest part of the organ; the refusal names the nearest accepted one.
+/// Refuses an edge length that is not a finite number above 0 ([`OrganError::NotALength`]), that would give more than
+/// about [`MAX_VERTICES`] ([`OrganError::TooFine`]), or that is too long for the thinnest part of the organ
+/// ([`OrganError::TooCoarse`]); the last two name the nearest accepted one. Refuses a seed whose shape touches itself
+/// ([`OrganError::NotAManifold`]).
 pub fn generate(organ: Organ, edge_m: f64, seed: u64) -> Result<TriangleMesh, OrganError> {
     generate_within(organ, edge_m, seed, MAX_VERTICES)
 }
 
-/// Like [`generate`], with at most `most` vertices, if that is less than [`MAX_VERTICES`].
+/// Generates the mesh of an organ like [`generate`], with at most about `most` vertices in place of [`MAX_VERTICES`],
+/// if `most` is less. An edge length whose estimate plus a tenth exceeds it is refused.
 ///
 /// # Errors
 /// Returns the refusals of [`generate`].

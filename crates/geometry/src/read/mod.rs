@@ -18,17 +18,18 @@ use allowance::MemoryAllowance;
 use draft::Draft;
 use source::Source;
 
-/// Memory that reading may take per byte of a file, in addition to [`ROOM`]; files that would take more are refused.
-/// Meshes written by programs take less than half of it.
+/// Memory that reading may take per byte of a file and of its neighbours, bytes, in addition to [`ROOM`]; files that
+/// would take more are refused with [`Problem::TooLarge`]. Meshes written by programs take less than half of it.
 pub const MULTIPLE: usize = 32;
 
-/// Memory that reading may take for a file of any length, bytes.
+/// Memory that reading may take for a file of any length, bytes; [`MULTIPLE`] adds to it.
 pub const ROOM: usize = 2 << 20;
 
-/// Limits for reading a mesh.
+/// Limits for reading a mesh, all inclusive; more is refused with [`Problem::TooLarge`]. The default is 64 MiB, 500
+/// 000 vertices and 1 000 000 triangles.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ReadLimits {
-    /// Maximum bytes of the file, and of everything unpacked from it.
+    /// Maximum number of bytes of the file, and of everything unpacked from it.
     pub bytes: usize,
     /// Maximum number of vertices.
     pub vertices: usize,
@@ -42,12 +43,12 @@ impl Default for ReadLimits {
     }
 }
 
-/// A mesh that was read from a file.
+/// A mesh that was read from a file, before it is prepared ([`crate::prepare()`]) or checked ([`crate::report()`]).
 #[derive(Debug, Clone, PartialEq)]
 pub struct ReadMesh {
-    /// The mesh: coordinates are finite, indices in range.
+    /// The mesh: coordinates are finite, in metres, and indices in range. It may be empty.
     pub mesh: TriangleMesh,
-    /// What was done to it, and what was left out; one sentence each.
+    /// What was done to it, and what was left out, one sentence each; empty if it is just what the file has.
     pub notes: Vec<String>,
 }
 
@@ -115,9 +116,10 @@ fn is_utf16(bytes: &[u8]) -> bool {
     bytes.starts_with(b"\xff\xfe") || bytes.starts_with(b"\xfe\xff") || is_wide(0) || is_wide(1)
 }
 
-/// Reads a mesh file. Its content determines the format, or else the extension of `name`. Vertices keep their order
-/// in the file, numbered from 0, unless a note says otherwise. `neighbours` returns the content of another file in
-/// the same folder by its bare name. Memory is not charged.
+/// Reads the mesh file with the content `bytes`. The content determines the format, or else the extension of `name`,
+/// which also appears in errors. `unit` is that of the file's lengths. Vertices keep their order in the file, numbered
+/// from 0, unless a note says otherwise. `neighbours` returns the content of another file in the same folder by its
+/// bare name, or `None` if it can't be read. Memory is limited ([`MULTIPLE`]), but not charged.
 ///
 /// A file has no unit, so you tell it: here a corner of a cube with edges of 10 mm.
 ///
@@ -136,8 +138,9 @@ fn is_utf16(bytes: &[u8]) -> bool {
 /// ```
 ///
 /// # Errors
-/// Refuses a file that violates its format, ends early, exceeds the limits, or has coordinates that are not finite or
-/// indices out of range, and names the element.
+/// Refuses a file of an unknown format or an unsupported variant (UTF-16 text included), one that violates its format,
+/// ends early, names a neighbour that can't be read, exceeds the limits or the memory for its size, or has coordinates
+/// that are not finite or indices out of range. The error names the element.
 pub fn read(
     name: &str,
     bytes: &[u8],
@@ -148,11 +151,11 @@ pub fn read(
     read_paid(name, bytes, unit, neighbours, limits, &mut |_| true)
 }
 
-/// Like [`read`], with memory paid by `pay`: before memory is allocated, it is called with the total number of bytes,
-/// and returns `false` to refuse.
+/// Reads a mesh file like [`read`], with memory paid by `pay`: before memory is allocated, it is called with the total
+/// number of bytes for this file so far, a rising number, about 256 KiB in advance. It returns `false` to refuse.
 ///
 /// # Errors
-/// Returns the refusals of [`read`], and one if `pay` refuses.
+/// Returns the refusals of [`read`], and [`Problem::TooLarge`] if `pay` refuses.
 pub fn read_paid(
     name: &str,
     bytes: &[u8],

@@ -15,19 +15,19 @@ use crate::tools::prescribed::{Grasp, Prescribed, restored_index};
 use palpate_haptics::Tip;
 use palpate_refusal::Result;
 
-/// Tolerance of the energy balance, as a fraction of energy and of work: errors of the schemes at the stability
-/// bound.
+/// Tolerance of the energy balance, as a fraction of the energy at the last survey plus the size of the tools' work:
+/// errors of the schemes at the stability bound.
 pub const MARGIN: f64 = 0.05;
 
-/// The reason why a check of the guard failed.
+/// Reason why a check of the guard failed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CheckFailure {
     /// A point is not finite, or is displaced by a billion times the tissue's size.
     NotFinite {
-        /// The point.
+        /// One such point.
         point: PointName,
     },
-    /// The energy rose more than the tools' work.
+    /// The energy rose by more than the tools' work and the tolerance ([`MARGIN`]).
     Energy {
         /// Energy of springs, anchor springs and motion, J.
         energy_j: f64,
@@ -36,9 +36,9 @@ pub enum CheckFailure {
         /// Work of all tools since, J.
         work_j: f64,
     },
-    /// The springs' force is far from its prediction.
+    /// The springs' force is far from its prediction: by more than [`super::MAX_PREDICTION_ERROR`].
     Prediction {
-        /// The resulting difference of a displacement, as a fraction of the largest.
+        /// The resulting difference of a displacement, as a fraction of the largest displacement.
         part: f64,
     },
 }

@@ -29,13 +29,15 @@ use crate::memory;
 use crate::state::tissue_state::{TissueState, springs_of};
 use crate::tools::applied_force::Applied;
 
-/// Substeps between two surveys.
+/// Number of substeps between two surveys, in which the guard checks the whole tissue and takes a checkpoint. A
+/// snapshot's checkpoint is at most as many steps old.
 pub const INTERVAL_SUBSTEPS: u64 = 256;
 
-/// Largest error of a predicted displacement, as a fraction of the largest displacement.
+/// Largest error of a predicted displacement, as a fraction of the largest displacement; beyond it the check fails
+/// with [`CheckFailure::Prediction`].
 pub const MAX_PREDICTION_ERROR: f64 = 0.5;
 
-/// Largest number of times that a substep is halved before the guard gives up.
+/// Largest number of times that a substep is halved (to a sixteenth) before the guard gives up and stops the tissue.
 pub const MAX_HALVINGS: u32 = 4;
 
 /// Largest number of inputs kept since the last checkpoint. With more, the next checkpoint is taken earlier.

@@ -18,9 +18,12 @@ use crate::shape::RestShape;
 /// of the sheet, or some of them.
 const APART_IN_RADII: f64 = 0.5;
 
-/// Returns the representative, at rest, of the place `at_m` for a disc of `radius_m`, m. On a sheet, a rim
-/// nearer than ½(a + r) counts, with a the radius and r the distance at which the disc is noticed
-/// ([`tangent::half_window_m`]).
+/// Returns the representative, at rest, of the place `at_m` (m, in the tissue's frame) for a disc of `radius_m` (m): a
+/// place with the same force law, m. On a mesh, it is the vertex nearest to `at_m`. On a sheet, it is a place of a
+/// raster of at most half the radius, at z = 0, with the same distances to the rims that count: those nearer than
+/// ½(a + r), with a the radius and r the distance at which the disc is noticed ([`tangent::half_window_m`]). A place
+/// within a radius of a rim counts as one radius away; near listed fixed points each place of the raster represents
+/// itself.
 pub fn place_alike(model: &Model, radius_m: f64, at_m: DVec3) -> DVec3 {
     let Some(sheet) = model.scene.sheet() else {
         let shape = model.shape();

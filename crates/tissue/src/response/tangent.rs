@@ -30,7 +30,7 @@ mod window;
 use window::{Spring, Triple};
 pub use window::{Window, half_window_m};
 
-/// The accuracy of a solution: when the solvers stop.
+/// The accuracy of a solution: the bounds at which the solvers stop.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Accuracy {
     /// Residual of the linear systems of a tangent, relative to the right-hand side.
@@ -42,9 +42,9 @@ pub struct Accuracy {
 }
 
 impl Accuracy {
-    /// Forces to about 1e-5.
+    /// Forces with a relative error of about 10⁻⁵.
     pub const EXACT: Self = Accuracy { residual: 1e-5, approximate_residual: 1e-3, arrived: 1e-5 };
-    /// Forces to about 1e-3, for a third of the work.
+    /// Forces with a relative error of about 10⁻³, for a third of the work.
     pub const COARSE: Self = Accuracy { residual: 1e-2, approximate_residual: 1e-2, arrived: 1e-3 };
 }
 
@@ -85,7 +85,8 @@ impl<'a> Allowance<'a> {
     }
 }
 
-/// The tissue around a disc, linearised at its present displacements.
+/// The tissue around a disc, linearised at given displacements: its springs, anchor springs and the pressure of a
+/// volume. Points at the border of its window are held.
 #[derive(Debug)]
 pub struct LinearPatch<'m> {
     model: &'m Model,
@@ -136,26 +137,29 @@ impl SharedPressure {
     }
 }
 
-/// The resistance that a disc feels against slow and small movements. Matrices are in the directions x, y, z
-/// (or turned so that z is the normal).
+/// The resistance that a disc feels against slow and small movements, with C the damping and m the mass of a point.
+/// Matrices are in the directions x, y, z of the tissue's frame; in [`Pressed`], they are turned so that z is the
+/// normal under the disc.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tangent {
-    /// S = (Eᵀ K⁻¹ E)⁻¹, with the weights E of the disc and the tangent stiffness K of the tissue, N/m.
+    /// S = (Eᵀ K⁻¹ E)⁻¹, with the weights E of the disc and the tangent stiffness K of the tissue, N/m. 0 if no point
+    /// under the disc can move.
     pub stiffness_n_per_m: DMat3,
     /// B = C·φ̂ᵀφ̂ of movements with the tissue, φ̂ = K⁻¹·E·S, N·s/m.
     pub damping_n_s_per_m: DMat3,
-    /// D = C·Σ ∂u·∂u of sliding within the surface, N·s/m.
+    /// D = C·Σ ∂u·∂u of sliding within the surface, with ∂u the slope of the displacements, N·s/m: the mean of both
+    /// directions.
     pub drag_n_s_per_m: f64,
-    /// Mass M = m·φ̂ᵀφ̂ that moves along the normal, kg.
+    /// Mass M = m·φ̂ᵀφ̂ that moves along z, kg.
     pub mass_kg: f64,
-    /// Iterations of the solver.
+    /// Iterations of the solver, at most 400.
     pub iterations: u32,
 }
 
 /// The result at one depth of a slow press by a disc, straight into a tissue that is otherwise at rest.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pressed {
-    /// Depth, m.
+    /// Depth of the disc below the surface at rest, along the normal there, m.
     pub depth_m: f64,
     /// Force of the tissue on the disc, outward, N.
     pub force_n: f64,
@@ -206,8 +210,9 @@ impl<'m> LinearPatch<'m> {
         patch
     }
 
-    /// Creates the patch of a window around a footprint. `displacement_m` has the displacement of each point in
-    /// the order of [`Window::points`].
+    /// Creates the patch of a window around a footprint on `model`, and linearises it. `displacement_m` has the
+    /// displacement from rest of each point of the window, m, in the order of [`Window::points`]. Panics if it is
+    /// shorter.
     pub fn new(model: &'m Model, footprint: &Footprint, window: Window, displacement_m: Vec<DVec3>) -> Self {
         Self::turned(model, footprint, window, displacement_m, &DMat3::IDENTITY)
     }
@@ -324,7 +329,8 @@ impl<'m> LinearPatch<'m> {
         (x, MAX_ITERATIONS)
     }
 
-    /// Computes stiffness, damping, drag and mass under the disc.
+    /// Computes stiffness, damping, drag and mass under the disc with [`Accuracy::EXACT`], by at most 400 iterations
+    /// of conjugate gradients for three systems side by side.
     pub fn tangent(&self) -> Tangent {
         let axes = [DVec3::X, DVec3::Y, DVec3::Z];
         let right: Vec<Triple> = self.weights.iter().map(|weight| axes.map(|axis| *weight * axis)).collect();
@@ -456,9 +462,11 @@ fn symmetric(of: impl Fn(usize, usize) -> f64) -> DMat3 {
     DMat3::from_cols(column(0), column(1), column(2))
 }
 
-/// Computes a slow press by a disc of `radius_m` at `centre_m` (a place at rest), at `count` depths from 0 on,
-/// `step_m` apart. At each depth d Newton's method finds the displacements at which the springs balance the
-/// disc's force along the normal, while Σ w·u = −d along it.
+/// Computes a slow press by a disc of `radius_m` (m) at `centre_m` (m, a place at rest), at `count` depths from 0 on,
+/// `step_m` (m) apart, with [`Accuracy::EXACT`] and unlimited work. Returns the results in the order of the depths. At
+/// each depth d Newton's method finds the displacements u at which the springs balance the disc's force along the
+/// normal, while Σ w·u = −d along it, with w the weights of the disc. Unwinds with a refusal if there is no memory
+/// ([`attempt`](crate::memory::attempt)).
 pub fn press(model: &Model, radius_m: f64, centre_m: DVec3, step_m: f64, count: u32) -> Vec<Pressed> {
     let course = Course { radius_m, centre_m, step_m, count, points: usize::MAX };
     let mut press = Press::new(model, course, Accuracy::EXACT);
@@ -467,22 +475,25 @@ pub fn press(model: &Model, radius_m: f64, centre_m: DVec3, step_m: f64, count: 
     press.pressed
 }
 
-/// A disc, where it presses, and the depths.
+/// What a press computes: a disc, where it presses, and the depths.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Course {
     /// Radius of the disc, m.
     pub radius_m: f64,
-    /// Middle of the disc at rest, m: the place of the surface nearest to this.
+    /// Middle of the disc at rest, m, in the tissue's frame. The disc is at the place of the rest surface nearest to
+    /// this.
     pub centre_m: DVec3,
     /// Distance between depths, m; the first depth is 0.
     pub step_m: f64,
-    /// Number of depths.
+    /// Number of depths, the first included.
     pub count: u32,
-    /// Approximate number of points of a mesh that are computed; those beyond are held.
+    /// Largest number of points of a mesh that are computed, unless the disc itself covers more; those beyond are
+    /// held. `usize::MAX` for all that notice the disc. Without effect on a sheet.
     pub points: usize,
 }
 
-/// A slow press under computation, one depth after another, so that its thread can do other work in between.
+/// A slow press under computation, one depth after another, so that its thread can do other work in between. It holds
+/// the displacements at the last depth, from which the next one starts.
 #[derive(Debug)]
 pub struct Press {
     footprint: Footprint,
@@ -497,19 +508,20 @@ pub struct Press {
     pressed: Vec<Pressed>,
 }
 
-/// The result of computing one depth of a press.
+/// The result of [`Press::deepen`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Deepened {
-    /// Further depths are left.
+    /// A depth was computed, and further depths are left.
     Further,
-    /// All depths are computed.
+    /// All depths are computed; [`Press::pressed`] has them.
     Done,
-    /// The work was used up, or the press was stopped: it can't continue.
+    /// The work was used up, or the press was stopped: it can't continue. [`Press::pressed`] has the depths before.
     GivenUp,
 }
 
 impl Press {
-    /// Creates a press by a disc with unlimited work.
+    /// Creates a press along `course` with unlimited work; no depth is computed yet. Unwinds with a refusal if there
+    /// is no memory ([`attempt`](crate::memory::attempt)).
     pub fn new(model: &Model, course: Course, accuracy: Accuracy) -> Self {
         let (footprint, window) = Self::laid(model, &course);
         Self::begun(footprint, window, course, accuracy)
@@ -531,7 +543,8 @@ impl Press {
         Press { footprint, window, turn, course, accuracy, left, displacement_m, pressed }
     }
 
-    /// Creates a press by a disc with at most `work` springs times iterations. `None` if they can't suffice.
+    /// Creates a press along `course` with at most `work` springs times iterations for all depths. `None` if they
+    /// can't suffice (an estimate from the number of points and depths). Unwinds with a refusal if there is no memory.
     pub fn within(model: &Model, course: Course, accuracy: Accuracy, work: u64) -> Option<Self> {
         // A solution takes about as many iterations as there are points from the middle to where nothing is
         // noticed, and each depth some solutions. A press that can't be completed is not begun, and takes no
@@ -541,17 +554,19 @@ impl Press {
         (least <= work).then(|| Press { left: work, ..Self::begun(footprint, window, course, accuracy) })
     }
 
-    /// Returns the springs times iterations that may still be computed.
+    /// Returns the springs times iterations that may still be computed; 0 once the press is given up.
     pub fn left(&self) -> u64 {
         self.left
     }
 
-    /// Returns the results at the depths computed so far.
+    /// Returns the results at the depths computed so far, from depth 0 downwards.
     pub fn pressed(&self) -> &[Pressed] {
         &self.pressed
     }
 
-    /// Computes the next depth, unless `stop` is set. `model` must be the one that the press was created with.
+    /// Computes the next depth on the calling thread, and appends its result to [`Press::pressed`]. Given up for good
+    /// if another thread sets `stop` or the work does not suffice; does nothing after the last depth. `model` must be
+    /// the one that the press was created with.
     pub fn deepen(&mut self, model: &Model, stop: &AtomicBool) -> Deepened {
         if self.left == 0 {
             return Deepened::GivenUp;
@@ -579,10 +594,11 @@ impl Press {
     }
 }
 
-/// Returns a sheet of the same tissue with points `spacing_m` apart, each of which replaces several. It reaches
-/// `half_m` from the middle, where it is held, or covers the whole sheet. The k of springs does not depend on
-/// their length; mass, damping and anchor springs belong to an area: m, C and K″ are multiplied by
-/// (`spacing_m`/h)², with h the distance between points. A mesh is returned as it is.
+/// Returns a sheet of the same tissue with points `spacing_m` (m) apart, each of which replaces several. It reaches
+/// `half_m` (m) from the middle, where it is held, or covers the whole sheet, with its fixed points, if that is not
+/// larger. The k of springs does not depend on their length; mass m, damping C and the stiffness K″ of anchor springs
+/// belong to an area and are multiplied by (`spacing_m`/h)², with h the distance between the points of `model`. The
+/// result serves presses alone: its plan is that of `model` and is not checked. A mesh is returned as it is.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 pub fn stand_in(model: &Model, spacing_m: f64, half_m: f64) -> Model {
     let Some(fine) = model.scene.sheet() else { return model.clone() };

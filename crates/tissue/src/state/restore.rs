@@ -29,10 +29,13 @@ use crate::tools::prescribed::Prescribed;
 use palpate_refusal::{Reason, Refusal, Result};
 
 /// Restores a tissue under its model, from its parts and the bytes of the values at its points
-/// ([`PlainTissue`]).
+/// ([`PlainTissue`]). The next steps give the same bits as those of the tissue that was saved. `model` must be the one
+/// of the parts, such as [`Model::resumed`] rebuilds it; `limits` are those of forces and tools.
 ///
 /// # Errors
-/// Refuses a tissue of another model, and values that no session produces.
+/// Refuses a tissue of another model (other points, number format, scheme, substeps, coefficients or fingerprint:
+/// [`Reason::WrongKind`]), values or parts that no session produces ([`Reason::OutOfRange`]), tools and forces above
+/// the limits, and a tissue for which there is no memory. The field is [`SNAPSHOT`], or begins with it.
 pub fn restored(model: &Arc<Model>, parts: &TissueParts, values: &[u8], limits: &Limits) -> Result<Box<dyn Tissue>> {
     fits(model, parts)?;
     memory::attempt(SNAPSHOT, || {
@@ -75,9 +78,9 @@ fn fits(model: &Model, saved: &TissueParts) -> Result<()> {
 }
 
 impl Model {
-    /// Returns the XXH3-128 hash of everything that a step depends on: the points and their order in memory,
-    /// masses, springs, coefficients, scheme, substeps and number format. Vector width and appearance do not
-    /// count.
+    /// Returns the XXH3-128 hash of everything in the model that a step depends on: the points and their order in
+    /// memory, masses, springs, coefficients, scheme, substeps, sleep tolerance and number format. Vector width and
+    /// appearance do not count. Equal on every machine; it reads the whole mesh, so it takes time in proportion.
     pub fn fingerprint(&self) -> u128 {
         let mut hasher = Xxh3::new();
         let mut add = |bytes: &[u8]| hasher.update(bytes);

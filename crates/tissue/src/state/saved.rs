@@ -38,7 +38,8 @@ pub(crate) const LARGEST: f64 = 1e150;
 /// f64.
 const MAX_COUNT: u64 = 1 << 48;
 
-/// How a tissue is stepped, and its coefficients. [`Model::resumed`] rebuilds the same model from this and the
+/// How a tissue is stepped, and its coefficients: the part of a snapshot that describes its model, not its points.
+/// [`Model::resumed`] rebuilds the same model from this and the
 /// scene that the session began with. Changes and corrections of the tissue are included; nothing is chosen or
 /// rehearsed again, so that the model gives the same bits on every machine, under any limits and with any later
 /// version that has the scheme.
@@ -46,7 +47,7 @@ const MAX_COUNT: u64 = 1 << 48;
 /// [`Model::resumed`]: crate::Model::resumed
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TissueState {
-    /// k of the structural springs, N/m.
+    /// k of the structural springs, N/m; on a mesh, the reference value of which each spring has a multiple.
     pub stiffness_n_per_m: f64,
     /// k of the shear springs, N/m.
     pub shear_stiffness_n_per_m: f64,
@@ -59,28 +60,34 @@ pub struct TissueState {
     /// The integrator; never `Auto`.
     #[serde(serialize_with = "name", deserialize_with = "named")]
     pub integrator: Integrator,
-    /// Substeps per step, without the halvings of the guard.
+    /// Substeps per step of the model's plan, 1 or more; without the halvings of the guard.
     pub substeps: u32,
     /// The number format; never `Auto`.
     #[serde(serialize_with = "name", deserialize_with = "named")]
     pub precision: Precision,
-    /// Largest error that leaving out tiles at rest may add, relative to the largest displacement.
+    /// Largest error that leaving out tiles at rest may add, relative to the largest displacement, from 0 to 1.
     pub sleep_tolerance: f64,
-    /// The scene's own sleep tolerance, from which later changes of the tissue are compiled.
+    /// The sleep tolerance that the scene or a correction sets, from which later changes of the tissue are compiled;
+    /// `None` if none does, so that it is chosen.
     pub sleep_tolerance_of_scene: Option<f64>,
     /// Expected error of displacement and force, relative to the largest of each.
     pub expected_error: f64,
-    /// The requirements of a correction, which later changes of the tissue keep.
+    /// The requirements of the last correction, which later changes of the tissue keep; `None` if the tissue was never
+    /// corrected.
     pub corrected: Option<CorrectedPlan>,
 }
 
-/// The requirements of a correction: a scheme, and at least this many substeps.
+/// What a correction requires of a tissue's later plans: a scheme, and a lower bound of the substeps. A correction
+/// follows an audit that found an error above the tolerance ([`Model::correction`]). Its requirements hold until the
+/// next correction or the end of the session, also when the tissue is changed.
+///
+/// [`Model::correction`]: crate::Model::correction
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct CorrectedPlan {
-    /// The integrator.
+    /// The integrator that the correction chose; never `Auto`.
     #[serde(serialize_with = "name", deserialize_with = "named")]
     pub integrator: Integrator,
-    /// The fewest substeps per step.
+    /// The fewest substeps per step that a later plan may have.
     pub least_substeps: u32,
 }
 
@@ -93,12 +100,14 @@ fn named<'d, N: Named, D: Deserializer<'d>>(deserializer: D) -> std::result::Res
     N::named("", &name).map_err(serde::de::Error::custom)
 }
 
-/// A copied tissue that any thread can convert to plain data.
+/// A copy of a tissue at one step ([`Tissue::save`](crate::Tissue::save)) that any thread can convert to plain data,
+/// while the tissue continues. Clones share the copy.
 #[derive(Debug, Clone)]
 pub struct SavedTissue(pub(crate) Arc<dyn SavedState>);
 
 impl SavedTissue {
-    /// Converts the tissue to plain data. That takes as long as reading all of it several times.
+    /// Converts the tissue to plain data, always to the same. That takes as long as reading all of it several times,
+    /// so call it outside of the thread that steps.
     pub fn plain(&self) -> PlainTissue {
         self.0.plain()
     }
@@ -109,17 +118,18 @@ pub(crate) trait SavedState: fmt::Debug + Send + Sync {
     fn plain(&self) -> PlainTissue;
 }
 
-/// A saved tissue as plain data: parts and values.
+/// A saved tissue as plain data, from which [`restored`](crate::restored) makes a tissue again: parts and values.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PlainTissue {
     /// Everything but the values at the points.
     pub parts: TissueParts,
-    /// The values at the points, little-endian: those of each tile that has moved, then those of the
-    /// checkpoint, then those that sleeping tiles remember.
+    /// The values at the points, little-endian in the tissue's number format (4 or 8 bytes each): those of each tile
+    /// that has moved, then those of the checkpoint, if there is one, then those that sleeping tiles remember.
     pub values: Vec<u8>,
 }
 
-/// A saved tissue without the values at its points.
+/// A saved tissue without the values at its points. Its private parts are the forces, grasps and contacts of tools,
+/// the guard's account, checkpoint and inputs, and which tiles sleep.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TissueParts {
     /// Number of points of the tissue.
@@ -128,7 +138,7 @@ pub struct TissueParts {
     pub tissue: TissueState,
     /// XXH3-128 hash of everything in the model that a step depends on (`Model::fingerprint`).
     pub fingerprint: u128,
-    /// Number of steps done.
+    /// Number of steps done; below 2⁴⁸.
     pub steps: u64,
     pub(crate) halvings: u32,
     pub(crate) forces: SavedForces,
@@ -264,7 +274,8 @@ pub(crate) enum SavedGeometry {
     Mesh { triangle: u32, barycentric: Vector, frame: [Vector; 2] },
 }
 
-/// A saved [`Poke`].
+/// A [`Poke`] as plain data, in a snapshot: a point or a centre (m), a force (N) and its falloff. Nothing of it is
+/// checked before [`SavedPoke::restored`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SavedPoke {
     point: Option<u64>,
@@ -321,7 +332,7 @@ pub(crate) enum SavedGrasp {
     Profile { point: u64, moves: Vec<(f64, f64, Vector)> },
 }
 
-/// A saved [`Tip`].
+/// A [`Tip`] as plain data, in a snapshot. Nothing of it is checked before [`SavedTip::restored`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct SavedTip {
     radius_m: f64,
@@ -331,34 +342,37 @@ pub struct SavedTip {
     spring: Option<(f64, f64)>,
 }
 
-/// Checks the parts of a snapshot when it is restored, against a tissue and the limits.
+/// Checks the parts of a snapshot when it is restored, against a tissue and the limits. All its refusals name
+/// [`SNAPSHOT`].
 #[derive(Clone, Copy)]
 pub struct Checks<'a> {
-    /// The rest shape of the tissue.
+    /// The rest shape of the tissue that is restored.
     pub shape: &'a dyn RestShape,
-    /// The limits of forces and tools.
+    /// The limits of the server that restores it: `tools` and `point_force_n` are used.
     pub limits: &'a Limits,
 }
 
-/// The field name of a snapshot in refusals.
+/// The field that refusals of a snapshot name ([`Refusal::field`]).
 pub const SNAPSHOT: &str = "snapshot";
 
-/// Returns the refusal of a snapshot that has `what`, which no session produces.
+/// Returns the refusal of a snapshot that has `what`, a fault that no session produces, such as "too few values":
+/// [`Reason::OutOfRange`] of [`SNAPSHOT`], with the message "has `what`: it is damaged, …".
 pub fn unsound(what: &str) -> Refusal {
     let message = format!("has {what}: it is damaged, or was not written by Palpate");
     Refusal::new(Reason::OutOfRange, SNAPSHOT, message)
 }
 
-/// Returns the refusal of a tool number above the limit `tools`.
+/// Returns the refusal of a snapshot whose tool number `tool` is not below `limits.tools`: [`Reason::TooLarge`] of
+/// [`SNAPSHOT`].
 pub fn tool_above(tool: u64, limits: &Limits) -> Refusal {
     let message = format!("has tool {tool}, but tools are numbered below {} (limits.tools)", limits.tools);
     Refusal::new(Reason::TooLarge, SNAPSHOT, message)
 }
 
-/// Returns an error unless `holds`.
+/// Checks a condition that every snapshot of a session meets.
 ///
 /// # Errors
-/// Refuses a snapshot that has `what`.
+/// Unless `holds`, refuses a snapshot that has `what` ([`unsound`]).
 pub fn ensure(holds: bool, what: &str) -> Result<()> {
     if holds { Ok(()) } else { Err(unsound(what)) }
 }
@@ -369,21 +383,21 @@ impl Checks<'_> {
     /// that was saved.
     ///
     /// # Errors
-    /// Refuses a number that is not finite or whose square is not.
+    /// Refuses a number that is not finite, or of 10¹⁵⁰ and more, whose square might not be.
     pub fn number(&self, value: f64) -> Result<f64> {
         ensure(value.abs() < LARGEST, "a number that is not finite or out of range").map(|()| value)
     }
 
-    /// Checks a vector of lengths, speeds or forces and returns it.
+    /// Checks a vector (x, y, z) of lengths, speeds or forces and returns it.
     ///
     /// # Errors
-    /// Refuses a vector with a number that is not finite or whose square is not.
+    /// Refuses a vector with a number that [`Checks::number`] refuses.
     pub fn vector(&self, value: Vector) -> Result<DVec3> {
         value.into_iter().try_for_each(|part| self.number(part).map(drop))?;
         Ok(DVec3::from(value))
     }
 
-    /// Checks a time of a script, which may be arbitrarily late, and returns it.
+    /// Checks a time of a script, s, which may be arbitrarily late or early, and returns it.
     ///
     /// # Errors
     /// Refuses a number that is not finite.
@@ -394,15 +408,15 @@ impl Checks<'_> {
     /// Checks a step or a count and returns it.
     ///
     /// # Errors
-    /// Refuses 2⁴⁸ and more.
+    /// Refuses 2⁴⁸ and more, which no session reaches.
     pub fn count(&self, count: u64) -> Result<u64> {
         ensure(count < MAX_COUNT, "a count beyond what any session has").map(|()| count)
     }
 
-    /// Checks the number of a tool and returns it.
+    /// Checks the number of a tool, from 0, and returns it.
     ///
     /// # Errors
-    /// Refuses a number that is not below the limit `tools`.
+    /// Refuses a number that is not below `limits.tools` ([`tool_above`]).
     #[allow(clippy::cast_possible_truncation)]
     pub fn tool(&self, tool: u64) -> Result<usize> {
         if tool < u64::from(self.limits.tools) {
@@ -411,10 +425,10 @@ impl Checks<'_> {
         Err(tool_above(tool, self.limits))
     }
 
-    /// Checks the index of a point and returns the point.
+    /// Checks the index of a point, from 0 in the numbering of [`PointId`], and returns the point.
     ///
     /// # Errors
-    /// Refuses a point that the tissue does not have.
+    /// Refuses an index that is not below the number of points of the tissue.
     #[allow(clippy::cast_possible_truncation)]
     pub fn point(&self, point: u64) -> Result<PointId> {
         ensure(point < self.shape.point_count() as u64, "a point that the tissue lacks")?;
@@ -437,7 +451,7 @@ impl Checks<'_> {
 }
 
 impl SavedPoke {
-    /// Converts a force to plain data.
+    /// Converts a force to plain data, without rounding.
     pub fn of(poke: &Poke) -> Self {
         let Poke { point, centre_m, force_n, falloff_per_m, falloff_offset } = *poke;
         SavedPoke {
@@ -449,10 +463,12 @@ impl SavedPoke {
         }
     }
 
-    /// Checks a saved force and returns it.
+    /// Checks a saved force against a tissue and the limits, and returns it.
     ///
     /// # Errors
-    /// Refuses a force that no tool may exert.
+    /// Refuses a point that the tissue lacks, a centre that is not finite or 10¹⁵⁰ m away, a falloff that is not
+    /// finite or below 0, and a force that is not finite or above the limit `point_force_n`
+    /// ([`Reason::ForceTooLarge`]).
     pub fn restored(&self, checks: &Checks<'_>) -> Result<Poke> {
         let SavedPoke { point, centre_m, force_n, falloff_per_m, falloff_offset } = *self;
         Ok(Poke {
@@ -567,7 +583,7 @@ pub(crate) fn restored_motion(checks: &Checks<'_>, motion: &[Vector; 3]) -> Resu
 }
 
 impl SavedTip {
-    /// Converts a tip to plain data.
+    /// Converts a tip to plain data, without rounding.
     pub fn of(tip: &Tip) -> Self {
         let Tip { radius_m, friction, grasps, coupling } = *tip;
         let spring = match coupling {
@@ -577,10 +593,11 @@ impl SavedTip {
         SavedTip { radius_m, friction, grasps, spring }
     }
 
-    /// Checks a saved tip and returns it.
+    /// Checks a saved tip against a tissue and returns it.
     ///
     /// # Errors
-    /// Refuses a tip that does not suit the tissue.
+    /// Refuses a tip that a command may not have either ([`check_tip`]): a radius that is not above 0 or too large for
+    /// the tissue, a friction outside 0 to 10, or a coupling out of range. The field is that of `snapshot.tip`.
     pub fn restored(&self, checks: &Checks<'_>) -> Result<Tip> {
         let SavedTip { radius_m, friction, grasps, spring } = *self;
         let coupling = spring.map_or(Coupling::Constraint, |(stiffness_n_per_m, damping_n_s_per_m)| Coupling::Spring {

@@ -30,7 +30,9 @@ use crate::tools::contact::{Contacts, TangentInput, ToolContact};
 use crate::tools::prescribed::{Grasp, Prescribed};
 use palpate_haptics::Tip;
 
-/// Creates a tissue at rest, in the number format of the model.
+/// Creates a tissue at rest, at step 0 and without tools, in the number format of the model: f64 for
+/// [`Precision::F64`], otherwise f32. Unwinds with a refusal if there is no memory for its state
+/// ([`attempt`](crate::memory::attempt)).
 pub fn at_rest(model: &Arc<Model>) -> Box<dyn Tissue> {
     match model.precision {
         Precision::F64 => Box::new(TissueState::<f64>::new(model)),

@@ -29,12 +29,13 @@ use crate::state::saved::{
 };
 use palpate_refusal::Result;
 
-/// The force of a tool.
+/// The force that a tool exerts on the points around a centre ([`Tissue::push`](crate::Tissue::push)). It lasts until
+/// the next input of the same tool.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Push {
-    /// Constant until the next command.
+    /// A constant force.
     Constant(Poke),
-    /// A function of time, evaluated exactly within the step.
+    /// A function of time, evaluated exactly at each moment within a step.
     Profile(LoadProfile),
 }
 

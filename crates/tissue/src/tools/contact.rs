@@ -74,20 +74,21 @@ const MIN_LAG: f64 = 1.0 / 64.0;
 /// along the normal at its place.
 const MIN_STRAIGHTNESS: f64 = 0.9;
 
-/// The motion of a position-controlled tool and the force on it at the end of a step.
+/// The motion of a position-controlled tool and the force on it at the end of a step
+/// ([`Tissue::tool_contact`](crate::Tissue::tool_contact)). Vectors are in the tissue's frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ToolContact {
     /// Place of the tool, m. On a sheet, z points out of the tissue.
     pub place_m: DVec3,
     /// Velocity of the tool in the last step, m/s.
     pub velocity_m_per_s: DVec3,
-    /// Whether the tool is free, sticks, slides or holds.
+    /// Whether the tool is free, sticks, slides or holds at the end of the step.
     pub contact_state: ContactState,
-    /// Force of the tissue on the tool, N.
+    /// Force of the tissue on the tool, N; 0 while it is free.
     pub force_on_tool_n: DVec3,
-    /// Place of the surface under the tool, m.
+    /// Place of the displaced surface under the tool, m: the middle of its disc.
     pub surface_m: DVec3,
-    /// Rest position of the material point under the tool, m.
+    /// Rest position of the place of the tissue under the tool, m.
     pub anchor_m: DVec3,
     /// Unit normal of the surface under the tool, on the tool's side of it.
     pub normal: DVec3,
@@ -100,7 +101,8 @@ pub struct ToolContact {
     pub is_on_fixed: bool,
 }
 
-/// A copy of the tissue around a tool, from which another thread computes the stiffness there.
+/// A copy of the tissue around a tool at one step, from which another thread computes the stiffness there while the
+/// tissue continues ([`Tissue::tangent_input`](crate::Tissue::tangent_input)).
 #[derive(Debug)]
 pub struct TangentInput {
     pub(crate) model: Arc<Model>,
@@ -110,7 +112,8 @@ pub struct TangentInput {
 }
 
 impl TangentInput {
-    /// Computes stiffness, damping and drag under the tool. Takes some milliseconds for a thousand points.
+    /// Computes stiffness, damping and drag under the tool, in the tissue's frame. Takes some milliseconds for a
+    /// thousand points, all on the calling thread.
     pub fn tangent(self) -> Tangent {
         LinearPatch::new(&self.model, &self.footprint, self.window, self.displacement_m).tangent()
     }

@@ -33,7 +33,8 @@ const MIN_FREE_PART: f64 = 0.25;
 /// If movable points carry less than this part of a disc, it lies on fixed points and moves nothing.
 const FIXED_PART: f64 = 0.02;
 
-/// The disc with which a tool touches a tissue, at a place: the points that it covers and their weights.
+/// The disc with which a tool touches a tissue, at a place of the tissue at rest: the points that it covers and their
+/// weights. It belongs to the model that it was created for; its functions must get the same.
 #[derive(Debug, Clone)]
 pub struct Footprint {
     radius_m: f64,
@@ -55,24 +56,25 @@ enum FootprintGeometry {
     Mesh(Box<MeshDisc>),
 }
 
-/// A mass point that a disc covers.
+/// A mass point that a disc covers, and its part of the disc.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WeightedNode {
     /// Row and column in memory; on a sheet, the indices in the grid.
     pub point: [usize; 2],
-    /// Whether the point can move.
+    /// Whether the point can move: it is not one of the tissue's fixed points.
     pub free: bool,
     /// Mass divided by the reference mass.
     pub mass: f64,
-    /// Weight w of the point; the weights of a disc add up to 1.
+    /// Weight w of the point: its part of the disc's force and place. The weights of a disc add up to 1.
     pub weight: f64,
-    /// ∂w/∂c, 1/m, in two perpendicular directions of the surface: x and y on a sheet.
+    /// ∂w/∂c, the derivative of w by the place c of the disc, 1/m, in two perpendicular directions of the surface: x
+    /// and y on a sheet.
     pub gradient: DVec2,
 }
 
 impl Footprint {
-    /// Creates a disc of `radius_m` around the place of the rest surface nearest to `at_m`; on a sheet, above
-    /// or below it.
+    /// Creates a disc of `radius_m` (m) around the place of the rest surface nearest to `at_m` (m, in the tissue's
+    /// frame); on a sheet, the place above or below it.
     pub fn new(model: &Model, radius_m: f64, at_m: DVec3) -> Self {
         let ground = match &model.scene.body {
             Body::Sheet(sheet) => FootprintGeometry::Grid(GridDisc::new(sheet, radius_m)),
@@ -153,7 +155,7 @@ impl Footprint {
         self.radius_m
     }
 
-    /// Returns the rest position of the material place at the centre, m.
+    /// Returns the rest position of the place of the tissue at the centre of the disc, m.
     pub fn anchor_m(&self) -> DVec3 {
         match &self.ground {
             FootprintGeometry::Grid(disc) => disc.centre_m.extend(0.0),
@@ -161,7 +163,8 @@ impl Footprint {
         }
     }
 
-    /// Moves the disc to another material place: the place of the rest surface nearest to `at_m`.
+    /// Moves the disc to another place of the tissue: the place of the rest surface nearest to `at_m`, m. Computes the
+    /// covered points and their weights anew.
     pub fn move_to(&mut self, model: &Model, at_m: DVec3) {
         match &mut self.ground {
             FootprintGeometry::Grid(_) => self.move_on_grid(model, at_m.truncate()),
@@ -292,13 +295,14 @@ impl Footprint {
         }
     }
 
-    /// Returns whether the disc lies on fixed points so much that its movable points get more weight, or that
-    /// it moves nothing.
+    /// Returns whether the disc lies mostly on fixed points: movable points carry less than a quarter of it, so that
+    /// they get a quarter, or less than 2 %, so that it moves nothing.
     pub fn is_on_fixed(&self) -> bool {
         self.free_factor != 1.0
     }
 
-    /// Returns the points that the disc covers, with their weights.
+    /// Returns the points that the disc covers, fixed ones included, each once, with their weights; sorted by row and
+    /// column on a sheet, in no fixed order on a mesh.
     pub fn reached(&self) -> &[WeightedNode] {
         &self.reached
     }
@@ -317,14 +321,15 @@ impl Footprint {
         }
     }
 
-    /// Returns Σ w²/mass over the movable points: the movement of the disc per unit of force, relative to that
-    /// of one free point.
+    /// Returns Σ w²/mass over the movable points, with masses relative to the reference mass: the acceleration of the
+    /// disc under a force, relative to that of one free point of this mass. 0 if movable points carry less than 2 %.
     pub fn relative_inverse_mass(&self) -> f64 {
         self.relative_inverse_mass
     }
 
-    /// Returns the place of the disc, s, m, and ∂s/∂c, for points displaced by `displacement_m`: s = Σ w·(X +
-    /// u) and ∂s/∂c = Σ ∂w/∂c·(X + u), with X the rest positions.
+    /// Returns the place s of the disc, m, and ∂s/∂c, its derivative by the place c on the rest surface, in the two
+    /// directions of [`WeightedNode::gradient`]: s = Σ w·(X + u) and ∂s/∂c = Σ ∂w/∂c·(X + u), with X the rest
+    /// positions and u the displacement that `displacement_m` returns for the row and column of each covered point, m.
     pub fn surface(&self, displacement_m: impl Fn([usize; 2]) -> DVec3) -> (DVec3, [DVec3; 2]) {
         let (mut place, mut along) = (self.rest_m, self.along);
         for WeightedNode { point, weight, gradient, .. } in &self.reached {
@@ -379,15 +384,15 @@ impl Footprint {
     }
 }
 
-/// The surface at rest around a tool's place, to second order.
+/// The surface of a mesh at rest around a tool's place, to second order, as seen from the tool's side.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RestSurface {
-    /// The place of the disc, m.
+    /// The place of the tool's disc on the tissue at rest, m.
     pub place_m: DVec3,
     /// The unit normal there, towards the tool.
     pub normal: DVec3,
-    /// The change of the normal per metre along the surface, 1/m: symmetric, 1/R on a sphere of radius R. Valid
-    /// for displacements perpendicular to the normal.
+    /// The change of the normal per metre along the surface, 1/m: symmetric, 1/R on a sphere of radius R seen from
+    /// outside, −1/R from inside. Valid for displacements perpendicular to the normal.
     pub curvature_per_m: DMat3,
 }
 

@@ -11,12 +11,14 @@ use crate::state::saved::{
 };
 use palpate_refusal::Result;
 
-/// How a tool moves its grasped point.
+/// How a tool moves its grasped point ([`Tissue::grasp`](crate::Tissue::grasp)). It lasts until the next input of the
+/// same tool; a point that is let go keeps its velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Grasp {
-    /// Moves the point to this displacement, m, by the end of the step, at constant velocity; then it stays.
+    /// Moves the point to this displacement from rest, m, in the tissue's frame, by the end of the next step, at
+    /// constant velocity; then it stays.
     Target(DVec3),
-    /// A function of time, evaluated exactly within the step.
+    /// A displacement as a function of time, evaluated exactly at each moment within a step.
     Profile(MotionProfile),
 }
 

@@ -3,35 +3,38 @@
 use glam::DVec3;
 use thiserror::Error;
 
-/// A spring between two points.
+/// A spring between two points of a [`MeshGraph`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeshSpring {
-    /// The numbers of the two points.
+    /// The numbers of the two points, from 0; they must differ.
     pub ends: [u32; 2],
-    /// Stiffness k, N/m.
+    /// Stiffness k, N/m; 0 or more. The spring's rest length is the distance of the points at rest.
     pub stiffness_n_per_m: f64,
 }
 
-/// Points and springs of a tissue on a mesh. Several springs may join the same points.
+/// Points and springs of a tissue on a mesh: the input of [`MeshSlots::new`](super::MeshSlots::new), which checks it.
+/// Several springs may join the same points.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct MeshGraph {
-    /// Rest position of each point, m.
+    /// Rest position of each point, m; 1 to 2²⁸ points.
     pub rest_m: Vec<DVec3>,
-    /// The springs, each once.
+    /// The springs, each once (not from both ends); at most 2²⁸.
     pub springs: Vec<MeshSpring>,
-    /// The unit of length h of the state, m: about the length of a spring.
+    /// The unit of length h of the state (a "spacing"), m, above 0: about the length of a spring. Each spring must be
+    /// 10⁻⁶ to 10⁶ of it long.
     pub spacing_m: f64,
-    /// The mass of each point divided by the reference mass. Empty if all are 1.
+    /// The mass of each point divided by the reference mass, above 0. Empty if all are 1.
     pub relative_mass: Vec<f64>,
     /// K″/m of each point divided by the reference value, minus 1: above 0 where the tissue is stiffer. Empty
     /// if all are 0.
     pub extra_anchor: Vec<f64>,
 }
 
-/// The reason why a graph can't be computed.
+/// Reason why a [`MeshGraph`] can't be computed: its first fault. Numbers are from 0, in the graph's order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 pub enum GraphFault {
-    /// No point, or too many points or springs. Contains the number of points.
+    /// No point, or more than 2²⁸ points or springs. Contains the number of points, also if there are too many
+    /// springs.
     #[error("has {0} points: must have 1 to {most}", most = MAX_POINTS)]
     Count(usize),
     /// A list has some values, but not one for each point. Contains its length.
@@ -40,16 +43,16 @@ pub enum GraphFault {
     /// The unit of length is not a positive number.
     #[error("has a unit of length that is not a positive number")]
     Spacing,
-    /// The place, mass or extra stiffness of this point is not finite, or its mass is not positive.
+    /// The place, mass or extra stiffness of the point of this number is not finite, or its mass is not positive.
     #[error("point {0} has a place, mass or extra stiffness that is not a number in its range")]
     Point(usize),
-    /// This spring joins a point to itself or to a missing point.
+    /// The spring of this index joins a point to itself or to a missing point.
     #[error("spring {0} does not join two points")]
     Ends(usize),
-    /// The stiffness of this spring is negative or not finite.
+    /// The stiffness of the spring of this index is negative or not finite.
     #[error("spring {0} has a stiffness that is negative or not finite")]
     Stiffness(usize),
-    /// This spring is too short or too long for its strain to be computed.
+    /// The spring of this index is shorter than 10⁻⁶ or longer than 10⁶ units of length: its strain can't be computed.
     #[error("spring {0} is shorter than a millionth of the unit of length, or longer than a million")]
     Rest(usize),
 }

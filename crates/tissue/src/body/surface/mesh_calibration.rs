@@ -20,36 +20,40 @@ use crate::scheme::advance::AdvanceStage;
 use crate::scheme::arithmetic::MAX_KEPT;
 use crate::scheme::family::Family;
 
-/// A mesh in free motion in f32, all of it awake: for benchmarks and tests of the kernel.
+/// A mesh in free motion in f32, without tools and damping, stepped by the central scheme, all of it awake: for
+/// benchmarks and tests of the kernel.
 #[derive(Debug)]
 pub struct MeshTrial(FreeMotion<f32>);
 
 impl MeshTrial {
     /// Creates the mesh at rest. `turn` is the phase per step of a point's anchor spring alone, rad; `scale` is
-    /// dt²/m with the reference mass, m/N.
+    /// dt²/m with the length dt of a step and the reference mass m, m/N; `lanes` is the vector width. Unwinds with a
+    /// refusal if there is no memory ([`attempt`](crate::memory::attempt)).
     ///
     /// # Errors
-    /// Returns the first fault of the graph.
+    /// Returns the first fault of the graph ([`MeshSlots::new`]).
     pub fn new(graph: &MeshGraph, turn: f64, scale: f64, lanes: Lanes) -> Result<Self, GraphFault> {
         Ok(MeshTrial(FreeMotion::new(MeshSlots::new(graph)?, turn, scale, lanes)))
     }
 
-    /// Sets the displacement of each vertex, spacings; `of_vertex` gets the vertex number.
+    /// Sets the displacement of each vertex to what `of_vertex` returns for its number, in spacings
+    /// ([`MeshGraph::spacing_m`]). Velocities do not change.
     pub fn displace(&mut self, of_vertex: impl Fn(usize) -> DVec3) {
         self.0.displace(of_vertex);
     }
 
-    /// Advances all points by `steps` steps.
+    /// Advances all points by `steps` steps, on the calling thread.
     pub fn step(&mut self, steps: usize) {
         (0..steps).for_each(|_| self.0.step());
     }
 
-    /// Returns the displacement of a vertex, spacings.
+    /// Returns the displacement of a vertex from rest, in spacings. Panics if there is no such vertex.
     pub fn displacement(&self, vertex: usize) -> DVec3 {
         self.0.displacement(vertex)
     }
 
-    /// Returns the force of the springs on a vertex, spacings per step².
+    /// Returns the force of the springs on a vertex, divided by its mass, in spacings per step². It includes the
+    /// anchor stiffness beyond the reference value ([`MeshGraph::extra_anchor`]). Panics if there is no such vertex.
     pub fn force(&self, vertex: usize) -> DVec3 {
         let FreeMotion { slots, unit, pull, state, .. } = &self.0;
         let slot = slots.slot_of()[vertex] as usize;

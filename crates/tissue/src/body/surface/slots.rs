@@ -9,7 +9,7 @@ use crate::kernel::field::{BLOCK, Layout};
 use crate::kernel::real::Real;
 use crate::memory;
 
-/// The vertex number of an empty slot.
+/// The vertex number of an empty slot in [`MeshSlots::vertex_of`]; no vertex has it.
 pub const NO_VERTEX: u32 = u32::MAX;
 
 /// Largest number of outside neighbours that a block handles at once. If it has more, its springs are in
@@ -47,9 +47,10 @@ pub struct MeshSlots {
 
 impl MeshSlots {
     /// Assigns the vertices of a graph to slots: vertices that are near along the mesh come near to each other.
+    /// Unwinds with a refusal if there is no memory ([`attempt`](crate::memory::attempt)).
     ///
     /// # Errors
-    /// Returns the first fault of the graph.
+    /// Returns the first fault of the graph, in the order of [`GraphFault`] (spring by spring for the last three).
     #[allow(clippy::cast_possible_truncation)]
     pub fn new(graph: &MeshGraph) -> Result<Self, GraphFault> {
         graph.check()?;
@@ -115,13 +116,13 @@ impl MeshSlots {
         }
     }
 
-    /// Returns the slot of each vertex, by vertex.
+    /// Returns the slot of each vertex, by vertex: a different number for each, below the number of vertices.
     pub fn slot_of(&self) -> &[u32] {
         &self.slot_of
     }
 
-    /// Returns the vertex of each slot, by slot; [`NO_VERTEX`] for an empty one. Their number is a multiple of
-    /// 16.
+    /// Returns the vertex of each slot, by slot; [`NO_VERTEX`] for an empty one, which are the last. Their number is
+    /// the next multiple of 16.
     pub fn vertex_of(&self) -> &[u32] {
         &self.vertex_of
     }
@@ -131,12 +132,13 @@ impl MeshSlots {
         self.vertex_of.len() / BLOCK
     }
 
-    /// Returns the number of tiles of 256 slots; the last tile may have fewer.
+    /// Returns the number of tiles of 256 successive slots, which sleep as one; the last tile may have fewer.
     pub fn tiles(&self) -> usize {
         self.vertex_of.len().div_ceil(TILE_SLOTS)
     }
 
-    /// Returns the other tiles that springs of a tile reach, ascending.
+    /// Returns the other tiles that springs of tile number `tile` (from 0) reach, ascending, each once. Panics if
+    /// there is no such tile.
     pub fn neighbours(&self, tile: usize) -> &[u32] {
         let [from, to] = [0, 1].map(|next| self.first_neighbours[tile + next] as usize);
         &self.neighbours[from..to]

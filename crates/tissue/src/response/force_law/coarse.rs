@@ -38,8 +38,10 @@ const POINTS: [(usize, u64); 3] = [(500, 650_000), (250, 200_000), (120, 0)];
 /// Distance of points, in radii of the disc, that is fine enough under the disc.
 const FINE_ENOUGH: f64 = 0.7;
 
-/// Computes the first force law of a disc: the exact one if it takes little work, otherwise a coarse one.
-/// `None` if that would take more than about 50 ms as well, or if another thread sets `stop`.
+/// Computes the first force law of a disc, on the calling thread: the exact one if it takes little work, otherwise a
+/// coarse one ([`Law::is_coarse`]), on a sheet that of its middle. `None` if that would take more than about 50 ms as
+/// well, if another thread sets `stop`, or if the coarse law is not sound. Work is counted, not timed, so every
+/// machine gives the same law. Unwinds with a refusal if there is no memory ([`attempt`](crate::memory::attempt)).
 pub fn first(model: &Model, disc: Disc, stop: &AtomicBool) -> Option<Law> {
     let mut work = EXACT_WORK;
     let exact = pressed(model, disc, EXACT_ROWS, Accuracy::EXACT, &mut work, stop);

@@ -11,33 +11,36 @@ const NEAR_IN_RADII: f64 = 4.0;
 /// Distance, in radii, up to which the law of a place serves a tool.
 const SERVES_IN_RADII: f64 = 0.5;
 
-/// A disc that presses on a tissue, and the place at rest where it presses.
+/// A disc that presses on a tissue, and the place at rest where it presses: that of which a force law is computed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Disc {
     /// Radius of the disc, m.
     pub radius_m: f64,
-    /// Middle of the disc at rest, m: the place of the surface nearest to this.
+    /// Middle of the disc at rest, m, in the tissue's frame. The disc is at the place of the rest surface nearest to
+    /// this.
     pub at_m: DVec3,
 }
 
 impl Disc {
-    /// Returns the disc in the middle of a sheet, or at the place of a mesh nearest to the middle of the box
-    /// around it.
+    /// Returns the disc of `radius_m` (m) in the middle of the box around the tissue at rest: of a sheet, its middle;
+    /// of a mesh, the place nearest to the middle of the box.
     pub fn in_middle(model: &Model, radius_m: f64) -> Self {
         Disc { radius_m, at_m: model.shape().extent().middle_m() }
     }
 
-    /// Returns the rest position of the tissue that a tool with this disc presses or is about to press, m;
-    /// `None` if the tool is far from the tissue. This is not the place nearest to the tool: deep in a curved
-    /// or folded tissue, another part may be nearer.
+    /// Returns the rest position of the tissue that a tool with this disc and the contact `feel` presses or is about
+    /// to press ([`ToolContact::anchor_m`]), m; `None` if the tool is more than 4 radii from the surface under it.
+    /// This is not the place nearest to the tool: deep in a curved or folded tissue, another part may be nearer.
     pub fn pressed_m(&self, feel: &ToolContact) -> Option<DVec3> {
         let is_near = feel.place_m.distance(feel.surface_m) <= NEAR_IN_RADII * self.radius_m;
         is_near.then_some(feel.anchor_m)
     }
 
-    /// Returns the disc whose law serves a tool that presses the tissue resting at `rest_m`. This is `self`
-    /// unless the law there differs. A tool that moves back and forth between two places keeps the law of the
-    /// first.
+    /// Returns the disc whose law serves a tool that presses the tissue resting at `rest_m` (m,
+    /// [`Disc::pressed_m`]): `self` while the representative of that place ([`place_alike`]) is at most half a radius
+    /// from [`Disc::at_m`], otherwise the disc of the same radius at that representative. So a tool that moves back
+    /// and forth between two near places keeps the law of the first. To be followed, [`Disc::at_m`] should be a
+    /// representative itself.
     #[must_use]
     pub fn follow(self, model: &Model, rest_m: DVec3) -> Self {
         let at_m = place_alike(model, self.radius_m, rest_m);

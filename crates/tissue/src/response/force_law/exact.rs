@@ -15,30 +15,32 @@ pub(super) const ROWS: u32 = 21;
 /// Largest depth of a law, in radii of the disc.
 const REACH_IN_RADII: f64 = 4.0;
 
-/// An exact force law under computation, one depth after another.
+/// An exact force law under computation, one depth after another, so that its thread can do other work in between.
+/// [`Computation::advance`] consumes it and returns it until the law is done or given up.
 #[derive(Debug)]
 pub struct Computation(Box<Press>);
 
-/// The result of one step of a computation.
+/// The result of [`Computation::advance`].
 #[derive(Debug)]
 pub enum LawProgress {
     /// Further depths are left; continue with this.
     UnderWay(Computation),
-    /// The complete law.
+    /// The complete law of 21 depths; the computation has ended.
     Done(Law),
-    /// The computation would exceed its work, or it was stopped.
+    /// The computation would exceed its work, or it was stopped: it has ended, and nothing of it is left.
     GivenUp,
 }
 
 impl Computation {
-    /// Begins the computation of the law under a disc, with at most `most_work` springs times iterations.
-    /// `None` if they can't suffice.
+    /// Begins the computation of the law under a disc, with at most `most_work` springs times iterations for all
+    /// depths. `None` if they can't suffice. Unwinds with a refusal if there is no memory
+    /// ([`attempt`](crate::memory::attempt)).
     pub fn new(model: &Model, disc: Disc, most_work: u64) -> Option<Self> {
         Press::within(model, course(disc, ROWS), Accuracy::EXACT, most_work).map(|press| Computation(Box::new(press)))
     }
 
-    /// Computes the next depth, unless `stop` is set. `model` must be the one that the computation was begun
-    /// with.
+    /// Computes the next depth on the calling thread; given up if another thread sets `stop`. `model` must be the one
+    /// that the computation was begun with.
     pub fn advance(mut self, model: &Model, stop: &AtomicBool) -> LawProgress {
         match self.0.deepen(model, stop) {
             Deepened::Further => LawProgress::UnderWay(self),
@@ -53,10 +55,11 @@ pub(super) fn course(Disc { radius_m, at_m }: Disc, rows: u32) -> Course {
     Course { radius_m, centre_m: at_m, step_m, count: rows, points: usize::MAX }
 }
 
-/// Computes the exact law of a disc of `radius_m` in the middle of a tissue. It takes some tenths of a second
-/// for a thousand points. The law has 21 rows, from 0 to four radii deep, each a solution at rest with its
-/// tangent ([`Tangent`](crate::response::tangent::Tangent)): k = S_zz, k_t = ½(S_xx + S_yy), B = B_zz, B_t =
-/// ½(B_xx + B_yy), and D.
+/// Computes the exact law of a disc of `radius_m` (m) in the middle of a tissue ([`Disc::in_middle`]), with unlimited
+/// work. It takes some tenths of a second for a thousand points. The law has 21 rows, from 0 to four radii deep, each
+/// a solution at rest with its tangent ([`Tangent`](crate::response::tangent::Tangent): stiffness S, damping B and
+/// drag D, turned so that z is the normal). Along the normal the row has S_zz and B_zz, across it ½(S_xx + S_yy) and
+/// ½(B_xx + B_yy), and as drag D. Unwinds with a refusal if there is no memory ([`attempt`](crate::memory::attempt)).
 ///
 /// ```
 /// use palpate_tissue::scene::PAPER;
@@ -78,8 +81,8 @@ pub fn exact(model: &Model, radius_m: f64) -> Law {
     from_pressed(&tangent::press(model, radius_m, centre_m, step_m, count))
 }
 
-/// Computes the exact law of a disc with at most `most_work` springs times iterations. `None` if they do not
-/// suffice, or if another thread sets `stop`.
+/// Computes the exact law of a disc, of 21 rows as [`exact`] does, with at most `most_work` springs times iterations.
+/// `None` if they do not suffice, or if another thread sets `stop`. Unwinds with a refusal if there is no memory.
 pub fn exact_within(model: &Model, disc: Disc, most_work: u64, stop: &AtomicBool) -> Option<Law> {
     pressed(model, disc, ROWS, Accuracy::EXACT, &mut { most_work }, stop)
 }

@@ -34,12 +34,12 @@ impl Spring {
     }
 }
 
-/// The points around a disc that notice it.
+/// The points around a disc that notice it: those that a patch computes. Those beyond are held at rest.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Window {
-    /// A rectangle of a sheet.
+    /// A rectangle of a sheet; its points are numbered row by row, i·columns + j.
     Grid {
-        /// First row and first column.
+        /// First row and first column, from 0.
         origin: [usize; 2],
         /// Number of rows and of columns.
         size: [usize; 2],
@@ -49,7 +49,8 @@ pub enum Window {
 }
 
 impl Window {
-    /// Returns the window around a footprint.
+    /// Returns the window around a footprint on `model`: all points within [`half_window_m`] of the disc's middle, on
+    /// a sheet in both directions, on a mesh in space. Without anchor springs these are all points.
     pub fn around(model: &Model, footprint: &Footprint) -> Self {
         Self::at(model, footprint.radius_m(), footprint.anchor_m(), usize::MAX)
     }
@@ -88,7 +89,7 @@ impl Window {
         Window::Grid { origin, size }
     }
 
-    /// Returns the number of points.
+    /// Returns the number of points of the window.
     pub fn len(&self) -> usize {
         match self {
             Window::Grid { size, .. } => size[0] * size[1],
@@ -114,7 +115,8 @@ impl Window {
         (self.len() * BYTES_PER_POINT) as u64
     }
 
-    /// Returns the places of the points in memory, ascending.
+    /// Returns the places of the points in the memory of `model`, ascending: on a sheet, the index i·columns + j of
+    /// the whole sheet; on a mesh, the slot.
     pub fn points(&self, model: &Model) -> impl Iterator<Item = usize> {
         let columns = model.points[1];
         (0..self.len()).map(move |at| match self {
@@ -226,9 +228,10 @@ fn half_window(model: &Model, radius_m: f64) -> f64 {
     radius_m / model.unit_m + REACHES * reach + 2.0
 }
 
-/// Returns the distance from the middle of a disc of `radius_m` at which points still notice it, m: a +
-/// 6·h·√(k/K″) + 2h, with h the distance between points and k the larger one of structural and shear springs;
-/// the root counts as at least 1. Infinite without anchor springs.
+/// Returns the distance from the middle of a disc at which points still notice it, m: a + 6·h·√(k/K″) + 2h, with a =
+/// `radius_m` (m), h the distance between points, m (on a mesh, the mean edge), k the larger stiffness of structural
+/// and shear springs and K″ that of an anchor spring, N/m. The root counts as at least 1. Infinite without anchor
+/// springs (K″ = 0).
 pub fn half_window_m(model: &Model, radius_m: f64) -> f64 {
     half_window(model, radius_m) * model.unit_m
 }
