@@ -19,7 +19,8 @@ use palpate_tissue::ReadCopy;
 use palpate_tissue::lock::lock;
 use palpate_tissue::select::audit::{Mark, WindowInputs};
 
-/// The present state of a session, from which another can continue.
+/// The present state of a session, from which another can continue
+/// ([`SessionHandle::save`](super::SessionHandle::save)). It has no leases and no waiting commands.
 pub struct Present {
     /// Everything that the next step depends on.
     pub saved: Box<Saved>,
@@ -27,7 +28,7 @@ pub struct Present {
     pub copy: ReadCopy,
     /// Whether the session's time advances.
     pub running: bool,
-    /// The step count at which the session pauses, if any.
+    /// The step count at which the session pauses; `None` if it has no such end.
     pub until_step: Option<u64>,
 }
 
