@@ -73,7 +73,7 @@ pub(super) enum Request {
     Audit(WindowInputs, SyncSender<Mark>),
     Hash {
         at: Option<u64>,
-        /// The caller who is charged for it.
+        /// The caller that is charged for it.
         account: Account,
         reply: HashReply,
     },

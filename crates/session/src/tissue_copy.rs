@@ -60,7 +60,7 @@ impl TissueCopy {
     /// ([`TICK_POINT_SUBSTEPS`]).
     ///
     /// # Errors
-    /// Refuses a tip that does not fit the tissue, and a radius above 32 lengths of an edge, in the field `tip`.
+    /// Refuses a tip that does not fit the tissue, and a radius above 32 lengths of an edge (`tip.radius_m`).
     pub fn for_client(model: &Arc<Model>, tip: Tip) -> Result<Self> {
         let shape = model.shape();
         check_tip("tip", shape, &tip)?;

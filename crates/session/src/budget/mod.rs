@@ -1,7 +1,7 @@
 //! Resources that callers share: memory, sessions, streams, leases, and processor time. One rule divides them all.
 //!
 //! A caller may take in proportion to what is left: its own amount is at most (1 − r)/r of the rest, where r is the
-//! part that a single caller must leave. So a single caller gets all but r; two callers who want as much as
+//! part that a single caller must leave. So a single caller gets all but r; two callers that want as much as
 //! possible get equal amounts; and something is always left for the next. No part has to be configured, and none
 //! lies idle.
 //!
