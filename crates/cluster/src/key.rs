@@ -76,7 +76,7 @@ pub struct NodeValue {
     pub replays: u32,
     /// Number of stepping threads.
     pub threads: u32,
-    /// Measured part of the stepping threads' time that sessions use, 0 to 1.
+    /// Measured part of the stepping threads' time, over all of them, that sessions use, 0 to 1.
     pub load: f64,
     /// Number of sessions that the node has.
     pub sessions: u32,

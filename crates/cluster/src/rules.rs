@@ -15,9 +15,9 @@ use super::key::{Keys, SessionValue, encode};
 /// two machines' clocks, and a step or a message that has begun.
 pub const MARGIN: f64 = 0.1;
 
-/// Returns the time until which a node may step its sessions and answer for them, ns of its own clock. The node
-/// sent a keepalive at `sent_ns`, and etcd granted `ttl_s` seconds from when it received that. The limit is
-/// `sent_ns` + 0.9 `ttl_s`.
+/// Returns the time until which a node may step its sessions and answer for them, ns of the clock of `sent_ns`. The
+/// node sent a keepalive at `sent_ns`, and etcd granted `ttl_s` seconds from when it received that. The limit is
+/// `sent_ns` + (1 − [`MARGIN`])·`ttl_s`, so 0.9 of the time to live.
 #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::cast_sign_loss)]
 pub fn fence_ns(sent_ns: u64, ttl_s: u64) -> u64 {
     sent_ns + ((1.0 - MARGIN) * ttl_s as f64 * 1e9) as u64

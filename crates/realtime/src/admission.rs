@@ -35,13 +35,13 @@ use palpate_tissue::select::scheme_selection;
 pub struct Begin {
     /// ID of the session, which no session of this server may have.
     pub id: String,
-    /// The first tissue of the session, in its first run.
+    /// The first tissue of the session, in its first run; later changes are made from its scene.
     pub first: Arc<Model>,
     /// Whether the session's time advances. A session that has stopped for good begins held whatever this says.
     pub running: bool,
     /// The step count at which the session pauses; `None` if it has no such end.
     pub until: Option<u64>,
-    /// Time without use after which the session is deleted, s.
+    /// Time without calls, held tools or streams after which the session is deleted, s.
     pub idle_timeout_s: f64,
     /// The recording that the session plays instead of commands of clients; its intake is then closed. `None` for a
     /// live session.
@@ -64,7 +64,7 @@ pub struct Begin {
 /// etcd.
 #[derive(Debug, Clone)]
 pub struct SessionReservation {
-    /// ID of the session.
+    /// ID of the session, which no session of this server may have.
     pub id: String,
     /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub revision: u64,

@@ -2,9 +2,9 @@
 //! reader; the thread that writes journals takes all events at once.
 //!
 //! An event log is bounded. If the writer of journals does not keep up or can't write, the log breaks: it discards
-//! its events, keeps the reason, and the session continues without a journal. If the disk was full or too slow and the
-//! writer reports that there is room again, the stepping thread restarts the log with a snapshot; that begins another run
-//! of the journal.
+//! its events, keeps the reason, and the session continues without a journal. If the disk was full or too slow and
+//! the writer reports that there is room again, the stepping thread restarts the log with a snapshot; that begins
+//! another run of the journal.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};

@@ -18,7 +18,7 @@ use palpate_tissue::memory;
 pub struct Viewer {
     /// Random ID, which can't be guessed; the client acknowledges frames with it.
     pub id: String,
-    /// Refinement of the surface.
+    /// Refinement of the surface, of the session's tissue.
     pub refinement: Refinement,
     /// Encoding of the vertices.
     pub encoding: Encoding,
@@ -60,9 +60,9 @@ pub struct Delivery {
     /// The frame has the tiles that changed after this version of the viewer's tiles ([`FrameTiles`]). `None`: it has
     /// all tiles.
     pub since: Option<u64>,
-    /// Number of frames so far that were due to the viewer and in which nothing had changed.
+    /// Number of frames so far that were due to the viewer and not sent, because nothing had changed.
     pub unchanged: u64,
-    /// Number of steps that the session has dropped so far.
+    /// Number of steps that the session has dropped from its schedule so far.
     pub overrun_count: u64,
     /// Simulated over real time, measured over about the last second.
     pub time_dilation: f64,
@@ -184,11 +184,11 @@ impl Viewer {
 /// A request to encode a snapshot of one session for the viewers that are due a frame of it.
 #[derive(Debug)]
 pub struct Job {
-    /// Displacements of the points.
+    /// Displacements of the points at the present step.
     pub snapshot: Arc<Snapshot>,
     /// The viewers, each with the number of its frame ([`Viewer::frame_id`]).
     pub viewers: Vec<(Arc<Viewer>, u64)>,
-    /// Number of steps that the session has dropped.
+    /// Number of steps that the session has dropped from its schedule so far.
     pub overrun_count: u64,
     /// Simulated over real time of the session, measured over about the last second.
     pub time_dilation: f64,

@@ -22,7 +22,7 @@ use palpate_tissue::select::audit::{Mark, WindowInputs};
 /// The present state of a session, from which another can continue
 /// ([`SessionHandle::save`](super::SessionHandle::save)). It has no leases and no waiting commands.
 pub struct Present {
-    /// Everything that the next step depends on.
+    /// Everything that the next step depends on, without a running audit.
     pub saved: Box<Saved>,
     /// A copy of the state, to be hashed.
     pub copy: ReadCopy,
@@ -32,12 +32,12 @@ pub struct Present {
     pub until_step: Option<u64>,
 }
 
-/// Why a session leaves its server.
+/// Why a session leaves its server; its journal records it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Leaving {
     /// The session is deleted.
     Deleted,
-    /// Another server has become its owner.
+    /// Another server has become its owner. A last snapshot is recorded.
     Moved,
     /// The session was being handed to this server, and the handover was cancelled.
     Withdrawn,

@@ -44,7 +44,7 @@ pub struct Pacer {
     viewers: Mutex<BTreeMap<String, Weak<Viewer>>>,
     pub(super) numbers: Mutex<u64>,
     pub(super) event_logs: OnceLock<Arc<EventLogQueue>>,
-    /// The moment until which the server may step its sessions and answer for them.
+    /// The moment until which the server may step its sessions and answer for them; none at first.
     pub fence: Arc<Fence>,
 }
 
@@ -178,7 +178,7 @@ impl Pacer {
         &self.auditor.tally
     }
 
-    /// Returns the number of viewers, over all sessions.
+    /// Returns the number of viewers that exist, over all sessions.
     pub fn viewers(&self) -> usize {
         lock(&self.viewers).values().filter(|viewer| viewer.strong_count() > 0).count()
     }

@@ -12,7 +12,8 @@ use palpate_tissue::lock::lock;
 /// Limit of inputs, and of steps, that are read ahead.
 const AHEAD: usize = 4096;
 
-/// A recording of a session that another session plays. Clones share the source of inputs.
+/// Recorded inputs that have been read and not yet played: a thread that reads the recording adds them, and the
+/// stepping thread takes them. It is empty at first.
 #[derive(Default)]
 pub struct PlaybackSource(Mutex<Fed>);
 
@@ -90,14 +91,14 @@ impl PlaybackSource {
     }
 }
 
-/// What a session plays: the recording of another session.
+/// A recording of a session that another session plays. Clones share the source of inputs.
 #[derive(Clone)]
 pub struct Playback {
     /// ID of the recorded session.
     pub session_id: String,
     /// Number of the recorded run of that session.
     pub run: u64,
-    /// Step counts at the beginning and at the end of the recording.
+    /// Step counts at the beginning and at the end of the recording, in this order.
     pub steps: [u64; 2],
     /// Speed of the playback, above 0: simulated over real time; 1 is real time.
     pub speed: f64,

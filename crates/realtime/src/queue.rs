@@ -44,7 +44,7 @@ impl Wakes {
         self.0.is_empty()
     }
 
-    /// Wakes the readers, and clears the list.
+    /// Wakes the readers, in the order in which they were added, and clears the list.
     pub fn wake(&mut self) {
         self.0.drain(..).for_each(Waker::wake);
     }

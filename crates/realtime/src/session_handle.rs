@@ -49,7 +49,7 @@ pub struct SessionHandle {
     pub model: Arc<Model>,
     /// Surface by which frames show the tissue, if it is a mesh; `None` for a sheet.
     pub skin: Option<Arc<Skin>>,
-    /// Account of the caller that created the session, which is charged for it.
+    /// Account of the caller that created the session, which is charged for it and its commands.
     pub owner: Account,
     pub(super) intake: Mutex<Intake>,
     /// Time without calls, held tools or streams after which [`Pacer::delete_idle`](super::Pacer::delete_idle)
@@ -166,7 +166,7 @@ impl SessionHandle {
         self.refused.fetch_add(commands as u64, Ordering::Relaxed);
     }
 
-    /// Returns the results of audits so far.
+    /// Returns a copy of the results of audits so far on this server.
     pub fn audited(&self) -> Audited {
         lock(&self.audited).clone()
     }
@@ -288,8 +288,9 @@ impl SessionHandle {
         self.ask(Request::Freeze).await
     }
 
-    /// Makes this server the owner of a session that was handed over frozen: `revision` is that of its key. The
-    /// session is stepped and served from now on.
+    /// Makes this server the owner of a session that was handed over frozen
+    /// ([`Begin::frozen`](super::Begin::frozen)): `revision` is that of its key in etcd. The session is stepped and
+    /// served from now on.
     pub fn arrive(&self, revision: u64) {
         self.set_owned_since(revision);
         self.is_coming.store(false, Ordering::Release);

@@ -59,7 +59,7 @@ impl Drop for StreamGuard {
     }
 }
 
-/// Returns the refusal that a cut stream ends with.
+/// Returns the refusal that a stream ends with after an administrator has cut it ([`Reason::Cut`]).
 pub fn cut() -> Refusal {
     Refusal::new(Reason::Cut, "", "an administrator of the server has ended this stream")
 }
@@ -100,7 +100,7 @@ impl SessionHandle {
         Ok(StreamGuard { handle: self.clone(), number, cut })
     }
 
-    /// Returns the number of open streams.
+    /// Returns the number of open streams of the session, of both kinds.
     pub fn streams(&self) -> usize {
         lock(&self.streams).open.len()
     }

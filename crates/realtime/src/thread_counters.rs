@@ -54,16 +54,17 @@ impl Times {
     }
 }
 
-/// Counters of one stepping thread since it began. They include sessions that have ended.
+/// Counters of one stepping thread since it began. They include sessions that have ended or moved to another thread;
+/// a session that came with counts from elsewhere adds them.
 #[derive(Debug, Default)]
 pub struct ThreadCounters {
-    /// Times of steps, including the publication of samples.
+    /// Times of steps, including the publication of samples. A step that was done in parts counts once for each part.
     pub step_time: Times,
-    /// Times by which steps began after they were due.
+    /// Times by which steps, or parts of one, began after they were due.
     pub lateness: Times,
-    /// Steps that were skipped at rest.
+    /// Steps that were skipped at rest and not computed.
     pub rested_steps: Count,
-    /// Steps that were due and were dropped.
+    /// Steps that were due and were dropped from the schedule.
     pub overruns: Count,
     /// Commands that came too late for their step.
     pub late_commands: Count,
@@ -71,7 +72,7 @@ pub struct ThreadCounters {
     pub paused_commands: Count,
     /// Tools whose lease expired.
     pub lapsed_leases: Count,
-    /// Returns of the guard to a checkpoint.
+    /// Returns of the guard to a checkpoint, from which it repeated steps with a shorter substep.
     pub guard_events: Count,
     /// Recoveries: returns of a tissue to an earlier state.
     pub recoveries: Count,
@@ -81,7 +82,7 @@ pub struct ThreadCounters {
     pub limited_steps: Count,
     /// Poses that were refused or passed over.
     pub dropped_poses: Count,
-    /// Tools that were released because no pose arrived any more.
+    /// Tools that were released because no pose had arrived for 250 ms.
     pub stale_releases: Count,
 }
 

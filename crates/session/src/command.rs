@@ -6,7 +6,7 @@ use palpate_tissue::scene::script::Action;
 /// it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Command {
-    /// The tool's number.
+    /// The tool's number, below `limits.tools`.
     pub tool: u32,
     /// Sequence number, which must rise with each command to the tool under one lease. `None`: the previous number
     /// plus 1, or 0 for the first; the intake fills it in.
@@ -49,7 +49,7 @@ impl Command {
 /// A command whose step has come, or the end of a lease: an input of [`Session::advance`](super::Session::advance).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Due {
-    /// The command itself.
+    /// The command, with its sequence number.
     pub command: Command,
     /// Whether the command was meant for a step that had passed when it came.
     pub late: bool,
@@ -61,7 +61,7 @@ pub struct Due {
 }
 
 impl Due {
-    /// Creates a client's command that came in time.
+    /// Creates a client's command that came in time: not late, and not the end of a lease.
     pub fn in_time(command: Command) -> Self {
         Due { command, late: false, late_commands: 0, ends_lease: false }
     }

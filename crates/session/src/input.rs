@@ -26,9 +26,11 @@ pub enum Input {
     /// This number of steps was due and not done in time, so all later steps are due that much later. It changes no
     /// bits.
     DroppedSteps(u64),
-    /// A held session continues, paused, with its tissue at rest: [`Session::new`], skipped to this step.
+    /// A session that has stopped continues, paused, with its tissue at rest: [`Session::new`] of the present model,
+    /// skipped to this step.
     Revive,
-    /// The session is held for a reason other than the guard's ([`Session::hold`]).
+    /// The session is stopped for good ([`Session::hold`]), for a reason other than the guard's, such as a fault of
+    /// the program. Contains the reason.
     Hold(String),
 }
 
@@ -37,7 +39,7 @@ pub enum Input {
 pub struct Felt {
     /// The tool's number.
     pub tool: u32,
-    /// Place of the tool's tip or, without a tip, of its control point, m.
+    /// Place of the tool's tip or, without a tip, present place of its control point, m.
     pub place_m: DVec3,
     /// Displacement of the tissue at the tool's control point, m; under a tip the mean over its disc.
     pub displacement_m: DVec3,

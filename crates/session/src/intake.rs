@@ -424,7 +424,8 @@ impl Intake {
         self.leases.lapsed()
     }
 
-    /// Returns the counts of the commands so far, by outcome.
+    /// Returns the counts of the commands so far, by outcome. Commands of a batch that are not in the queue yet count
+    /// as waiting.
     pub fn counts(&self) -> Counts {
         Counts { waiting: (self.queue.waiting() + self.coming) as u64, ..self.counts }
     }

@@ -69,14 +69,14 @@ const RECORD: &str = "a record";
 /// number that no command has named yet gives a sample of zeros, without `contact` and `feel`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ToolSample {
-    /// The tool's number.
+    /// The tool's number, from 0.
     pub tool: u32,
     /// Highest sequence number of the commands whose step has come; also of those without effect because the tool is
     /// paused. 0 before the first, and again after the end of a lease.
     pub acknowledged_sequence: u64,
     /// Time of that command, ns of the client's clock; 0 if it has none.
     pub client_time_ns: u64,
-    /// Arrival of that command, ns of the server's clock; 0 before the first.
+    /// Arrival of that command, ns of the server's clock; 0 before the first, and without a network.
     pub arrival_ns: u64,
     /// Motion and forces at the tool's control point. `None` before the first command that gives the tool a point; a
     /// tool that has let go keeps its last point.
@@ -84,7 +84,7 @@ pub struct ToolSample {
     /// Motion and force of the tip itself, for a tool that is led by poses; `None` for any other tool, and after a
     /// release.
     pub feel: Option<ToolContact>,
-    /// Client time of the place of such a tool, s; 0 for any other tool.
+    /// Client time of the place that a tool led by poses has now, s; 0 for any other tool.
     pub place_time_s: f64,
     /// Local model for the client's rendering. [`Session::sample`] leaves it `None`; a
     /// [`Sampler`](sample_selection::Sampler) fills it in if the stream has force laws and the tool is led by poses.
@@ -97,7 +97,8 @@ pub struct ToolSample {
     /// Whether the tool's action was ended by its time to live, with its lease, for lack of poses, or by a recovery;
     /// or the newest command had no effect because the tool is paused. The next command that acts clears it.
     pub expired: bool,
-    /// The step before which commands to the tool have no effect, if it was ever paused ([`recovery`]).
+    /// The step before which commands to the tool, except releases, have no effect; `None` if it was never paused
+    /// ([`recovery`]). It stays after that step.
     pub paused_until: Option<u64>,
 }
 
@@ -171,7 +172,8 @@ struct Posed {
 
 /// A tissue with its tools and their commands' effects: what a server, a run or a replay advances step by step.
 ///
-/// A fingertip presses 3 mm into the middle of a sheet at rest. Half a second later the surface under it is as deep, and pushes back:
+/// A fingertip presses 3 mm into the middle of a sheet at rest. Half a second later the surface under it is as deep,
+/// and pushes back:
 ///
 /// ```
 /// use glam::DVec3;
@@ -209,7 +211,8 @@ pub struct Session {
 }
 
 impl Session {
-    /// Creates a session of a tissue at rest, at step 0.
+    /// Creates a session of a tissue at rest, at step 0, without tools. It unwinds with a refusal if there is no
+    /// memory for the state ([`memory::attempt`]).
     pub fn new(model: &Arc<Model>) -> Self {
         Session {
             tissue: tissue::at_rest(model),
@@ -227,7 +230,7 @@ impl Session {
         self.tissue.model()
     }
 
-    /// Returns the tissue, read-only.
+    /// Returns the tissue, read-only: its points, forces and hash at the present step.
     pub fn tissue(&self) -> &dyn Tissue {
         &*self.tissue
     }

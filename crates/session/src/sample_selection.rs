@@ -21,7 +21,7 @@ use palpate_refusal::{Reason, Refusal, Result, number};
 /// A sample, with the timing of the session, as a stream of samples gets it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PacedSample {
-    /// State of the tools.
+    /// State of the session and of its tools, with local models if the stream has force laws.
     pub sample: Sample,
     /// Time at which the sample's step was due, ns of the server's clock.
     pub due_ns: u64,
@@ -30,11 +30,12 @@ pub struct PacedSample {
     /// Simulated over real time, measured over about the last second: 1 on time, less if the session is late; the
     /// nominal speed of a playback is 1 too.
     pub time_dilation: f64,
-    /// Everything before this step is on disk; `None` if no journal is kept, or before anything is.
+    /// Everything before this step is durable: on disk or, if that is required, on two disks; `None` if no journal is
+    /// kept, or before anything is.
     pub durable_step: Option<u64>,
     /// Revision at which this server became the session's owner; 0 without a fleet.
     pub ownership_revision: u64,
-    /// Whether steps were dropped since the stream's last sample.
+    /// Whether steps were dropped from the schedule since the stream's last sample.
     pub overrun: bool,
 }
 

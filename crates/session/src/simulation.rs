@@ -17,17 +17,17 @@ use palpate_tissue::scene::record::Correction;
 use palpate_tissue::scene::script::{Action, Script};
 use palpate_tissue::select::audit::AuditFinding;
 
-/// Reason why a simulation ends early.
+/// Reason why a simulation or a run ends early. Its `Display` is a message for people.
 #[derive(Debug, thiserror::Error)]
 pub enum SimulationFailure {
     /// The session has stopped for good, its tissue went back to an earlier state, or an audit's twin did one of
     /// these. Contains the reason, for people.
     #[error("the run was stopped: {0}")]
     Held(String),
-    /// A command or a change of the tissue was refused.
+    /// A command, a change of the tissue or a correction was refused. Contains the refusal.
     #[error("{0}")]
     Refused(#[from] Refusal),
-    /// The output could not be written.
+    /// The output could not be written, or the caller's function that receives events failed.
     #[error("can't write the output: {0}")]
     Output(#[from] std::io::Error),
 }

@@ -65,10 +65,10 @@ pub struct Txn {
     pub otherwise: Vec<Op>,
 }
 
-/// Outcome of a transaction that was executed.
+/// Outcome of a transaction that etcd has executed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TransactionOutcome {
-    /// Whether the conditions held.
+    /// Whether all conditions held, so that `then` was executed, and not `otherwise`.
     pub succeeded: bool,
     /// Revision of the store after the transaction, which is that of its writes if it wrote.
     pub revision: u64,

@@ -274,12 +274,12 @@ impl Budget {
         lock(&self.pools[resource.index()]).taken()
     }
 
-    /// Returns the bytes that are taken for one purpose.
+    /// Returns the bytes that all accounts have taken for one purpose.
     pub fn bytes_for(&self, purpose: Purpose) -> u64 {
         lock(&self.purposes)[purpose as usize]
     }
 
-    /// Returns the bytes that are taken for all purposes.
+    /// Returns the bytes that all accounts have taken, over all purposes.
     pub fn bytes_taken(&self) -> u64 {
         self.taken(Resource::Memory(Purpose::Session))
     }
@@ -304,7 +304,8 @@ struct Owner {
 pub struct Account(Arc<Owner>);
 
 impl Account {
-    /// Creates an account with a budget of its own and practically no limit of memory, for work outside a server.
+    /// Creates an account `alone` with a budget of its own and practically no limit of memory, for work outside a
+    /// server. Other resources have their default limits.
     pub fn alone() -> Self {
         Budget::new(&Limits { memory_bytes: u64::MAX / 4, ..Limits::default() }, 1, 1).account("alone")
     }
@@ -368,7 +369,7 @@ impl Account {
     }
 }
 
-/// An amount of a resource that an account has taken. Dropping it gives the amount back.
+/// An amount of a resource that an account has taken ([`Account::take`]). Dropping it gives the amount back.
 #[derive(Debug)]
 pub struct Taken {
     account: Account,
@@ -377,7 +378,7 @@ pub struct Taken {
 }
 
 impl Taken {
-    /// Returns the amount.
+    /// Returns the amount that is taken now, in the unit of the resource.
     pub fn amount(&self) -> u64 {
         self.amount
     }

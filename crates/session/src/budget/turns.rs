@@ -25,7 +25,7 @@ impl<T> Turns<T> {
         self.queues.iter().map(|queue| queue.0)
     }
 
-    /// Returns the number of waiting items of `account`.
+    /// Returns the number of waiting items of `account`; 0 for an unknown one.
     pub fn count(&self, account: u64) -> usize {
         self.queues.iter().find(|queue| queue.0 == account).map_or(0, |queue| queue.1.len())
     }
@@ -76,7 +76,7 @@ impl<T> Turns<T> {
         self.queues.retain(|queue| !queue.1.is_empty());
     }
 
-    /// Returns all items, by account in the order of turns.
+    /// Returns all items: by account in the order of turns, and each account's in their order.
     pub fn iter(&self) -> impl Iterator<Item = &T> {
         self.queues.iter().flat_map(|queue| &queue.1)
     }

@@ -44,7 +44,7 @@ pub enum Topic {
 }
 
 impl Topic {
-    /// Every topic, by number.
+    /// Every topic, in the order of declaration, which is that of the numbers.
     pub const ALL: [Topic; 8] = [
         Topic::Header,
         Topic::Inputs,

@@ -205,13 +205,13 @@ pub struct SnapshotAt {
 /// Content of a journal, as one pass over its whole batches finds it ([`JournalReader::survey`]).
 #[derive(Debug, Clone, Default)]
 pub struct Survey {
-    /// Number of batches.
+    /// Number of whole batches.
     pub batches: u64,
     /// The journal has every input that acts before this step; that of the last whole batch.
     pub until_step: u64,
-    /// Number of inputs.
+    /// Number of inputs in all batches.
     pub inputs: u64,
-    /// Number of hashes.
+    /// Number of hashes in all batches; those of snapshots do not count.
     pub hashes: u64,
     /// Positions of the snapshots, in the order of the file, which is by ascending step.
     pub snapshots: Vec<SnapshotAt>,
@@ -392,8 +392,8 @@ impl<'s> JournalReader<'s> {
         &self.header
     }
 
-    /// Returns this reader without the names of files on the machine that wrote the journal, which an untrusted
-    /// party may have sent.
+    /// Returns this reader without the names of files on the machine that wrote the journal (the texture in the
+    /// header), which an untrusted party may have sent.
     #[must_use]
     pub fn without_files(mut self) -> Self {
         if let Some(appearance) = &mut self.header.appearance {

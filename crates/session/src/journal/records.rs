@@ -28,13 +28,13 @@ pub const SUMMARY_OFFSET: u8 = 0x0E;
 /// Kind of the record that ends the data.
 pub const DATA_END: u8 = 0x0F;
 
-/// Length of a record before its content, bytes.
+/// Length of a record before its content, bytes: its kind, and 8 bytes of length.
 pub const HEAD: u64 = 9;
 
 /// Length of a chunk before its messages, bytes, if it is not compressed.
 pub const CHUNK_HEAD: u64 = 40;
 
-/// Length of a message before its data, bytes.
+/// Length of a message before its data, bytes: channel, number and two times.
 pub const MESSAGE_HEAD: usize = 22;
 
 /// Appends a record of kind `kind` to `out`: its head, and the content that `fill` appends. `fill` must only append.
@@ -59,7 +59,7 @@ pub fn bytes(out: &mut Vec<u8>, bytes: &[u8]) {
     out.extend(bytes);
 }
 
-/// Returns the first bytes of a file: the magic bytes and the header. `library` names the program that writes.
+/// Returns the first bytes of a file: the magic bytes and the header record. `library` names the program that writes.
 pub fn beginning(library: &str) -> Vec<u8> {
     let mut out = MAGIC.to_vec();
     record(&mut out, HEADER, |body| {

@@ -28,7 +28,7 @@ use palpate_tissue::select::scheme_selection::given_up;
 pub enum JournalItem {
     /// An input to the session.
     Input(pb::Input),
-    /// A hash to compare with.
+    /// A hash of the state to compare with.
     Hash(pb::Hash),
     /// A snapshot to compare with or to begin from.
     Snapshot(pb::Snapshot),
@@ -72,10 +72,11 @@ pub fn items(batch: &JournalBatch) -> Result<VecDeque<JournalItem>> {
     Ok(items)
 }
 
-/// First difference between the recorded session and the replay.
+/// First difference between the recorded session and the replay. Its `Display` is a sentence with the steps.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Difference {
-    /// The first step at which the recording and the replay are known to differ.
+    /// The step at which the recording and the replay are first known to differ; they may differ since any step after
+    /// `equal_until`.
     pub step: u64,
     /// The last step at which the two are known to be equal, by a hash or by the snapshot from which the replay
     /// began; `None` if there was neither.
@@ -230,7 +231,7 @@ impl<'s> Replay<'s> {
         &self.simulation.session
     }
 
-    /// Returns the tissue with which the session began.
+    /// Returns the tissue with which the session began, in its first run.
     pub fn first(&self) -> &Arc<Model> {
         &self.first
     }
@@ -545,7 +546,7 @@ fn restored(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Res
     Session::restore(&model, &saved)
 }
 
-/// A session at the end of its journal, ready to be continued.
+/// A session at the end of its journal, ready to be continued, as [`resume`] returns it.
 pub struct Resumed {
     /// The journal's header.
     pub header: pb::Header,
@@ -560,7 +561,7 @@ pub struct Resumed {
     pub waiting: Vec<(u64, Input)>,
     /// Whether the session's time advances at the end.
     pub running: bool,
-    /// The step count at which the session pauses, if any.
+    /// The step count at which the session pauses; `None` if it has no such end.
     pub until_step: Option<u64>,
     /// Survey of the journal.
     pub survey: Survey,

@@ -26,7 +26,8 @@ const KIND: [u8; 12] = [0x30, 0x2a, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x
 pub struct PublicKey([u8; 32]);
 
 impl PublicKey {
-    /// Returns the key in a `SubjectPublicKeyInfo` (DER); `None` if the bytes are not an Ed25519 key.
+    /// Returns the key in a `SubjectPublicKeyInfo` (DER, RFC 8410); `None` if the bytes are not exactly an Ed25519
+    /// key.
     pub fn of(der: &[u8]) -> Option<Self> {
         der.strip_prefix(&KIND).and_then(|bytes| bytes.try_into().ok()).map(PublicKey)
     }
@@ -43,8 +44,8 @@ impl std::fmt::Display for PublicKey {
 pub struct Key(Arc<Ed25519KeyPair>);
 
 impl Key {
-    /// Returns the key in PKCS#8 (DER), with or without its public part; `None` if the bytes are not an Ed25519
-    /// key.
+    /// Returns the key in PKCS#8 (DER), with or without its public part; `None` if the bytes are not an Ed25519 key
+    /// or the public part does not fit.
     pub fn of(der: &[u8]) -> Option<Self> {
         Some(Key(Arc::new(Ed25519KeyPair::from_pkcs8_maybe_unchecked(der).ok()?)))
     }
