@@ -43,7 +43,7 @@ const FELT_HZ: f64 = 100.0;
 /// An event of a session that its journal records. Copies of the state are made on the stepping thread; hashes are
 /// computed by the writer of journals.
 pub enum Event {
-    /// An input acted on the session.
+    /// An input acted on the session, before the next step.
     Input(Input),
     /// A copy of the state, to be hashed; about once a second of simulated time.
     Hash(ReadCopy),
@@ -72,7 +72,7 @@ pub struct Noted {
 pub struct TakenEvents {
     /// Events in the order in which they happened; empty if only steps were done.
     pub events: Vec<Noted>,
-    /// All events before this step are in `events`, or were taken earlier.
+    /// All events before this step are in `events`, or were taken earlier: the journal may be complete up to it.
     pub until_step: u64,
     /// Whether the session is at rest or paused, so that no event follows for now.
     pub is_still: bool,
@@ -88,7 +88,7 @@ pub struct TakenEvents {
 /// State of a session at the beginning of its journal or of a further run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Beginning {
-    /// Number of steps done.
+    /// Number of steps done when it begins.
     pub step: u64,
     /// Whether the session's time advances.
     pub running: bool,
@@ -142,7 +142,7 @@ pub struct About {
     pub idle_timeout_s: f64,
     /// The first tissue of the session, in its first run.
     pub first: Arc<Model>,
-    /// Number of steps done.
+    /// Number of steps done when the log began.
     pub begin_step: u64,
     /// Whether the session's time advances.
     pub running: bool,
@@ -157,7 +157,7 @@ pub struct About {
 /// Event log of one session: the events that its journal does not have yet, and which steps are on disk. The stepping
 /// thread adds events; the writer of journals takes them and reports progress.
 pub struct EventLog {
-    /// The session that the log belongs to.
+    /// The session that the log belongs to, as it was when the log began.
     pub about: About,
     held: Mutex<HeldEvents>,
     queue: Arc<EventLogQueue>,

@@ -36,11 +36,12 @@ impl Intake {
     }
 
     /// Adds the content of another server's intake. The leases last their full duration from `now_ns`, ns, and
-    /// sequence numbers of their commands start again; a tool that is held here gets the other lease. Steps that have
-    /// passed become the next one. Nothing is checked against limits, and a closed intake takes it too.
+    /// sequence numbers of their commands start again; a tool that is held here gets the other lease. No account is
+    /// charged for the tools ([`Intake::charge`]). Steps that have passed become the next one. Nothing is checked
+    /// against limits, and a closed intake takes it too.
     ///
     /// Inputs for which the account has no memory are dropped, but never ends of leases; so are inputs that are
-    /// neither commands nor changes. Returns how many were dropped.
+    /// neither commands nor changes. Returns the number of dropped inputs.
     pub fn adopt(&mut self, handed: Handed, now_ns: u64) -> usize {
         for lease in handed.leases {
             let tool = lease.tool;

@@ -29,7 +29,8 @@ pub(super) struct LeasedTool {
     charge: Option<Taken>,
 }
 
-/// A held tool with its lease, as a server hands it over with its session.
+/// A held tool with its lease, as a server hands it over with its session. Sequence numbers and the time until it
+/// expires are left out: they begin again.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HandedLease {
     /// The tool's number.

@@ -309,9 +309,9 @@ impl Session {
         }
     }
 
-    /// Requests an audit of a window of steps, which begins at the guard's next checkpoint ([`tissue::audit`]).
-    /// `inputs` is memory in which the tools' inputs are recorded; it is emptied first. [`Session::take_mark`]
-    /// reports the progress.
+    /// Requests an audit of a window of steps, which begins at the guard's next checkpoint
+    /// ([`tissue::select::audit`]). `inputs` is memory in which the tools' inputs are recorded; it is emptied first.
+    /// [`Session::take_mark`] reports the progress.
     pub fn request_audit(&mut self, inputs: WindowInputs) {
         self.tissue.request_audit(inputs);
     }

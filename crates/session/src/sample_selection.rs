@@ -171,8 +171,8 @@ impl Sampling {
     }
 }
 
-/// Selector of the samples of one stream, which compares each with the last one that the stream got. It gives the
-/// first sample of the session that it is asked for at a sampled step.
+/// Selector of the samples of one stream, which compares each with the last one that the stream got. Before the
+/// first, every sampled step is due.
 #[derive(Debug)]
 pub struct Sampler {
     sampling: Sampling,

@@ -17,7 +17,7 @@ impl Schedule {
         Schedule { step, at_ns: at_ns as f64, period_ns: 1e9 / rate_hz }
     }
 
-    /// Returns the time between two steps, ns.
+    /// Returns the time between two steps, ns: 10⁹ over the rate.
     pub fn period_ns(&self) -> f64 {
         self.period_ns
     }

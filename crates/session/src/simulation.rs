@@ -118,8 +118,8 @@ impl Simulation {
     }
 
     /// Corrects the tissue as a finding of an audit needs it, from the coming step on, and also in the script's later
-    /// changes. Returns the correction; `None`, without a change, if the error is within the tolerance or nothing
-    /// more accurate is allowed.
+    /// changes. It may run rehearsals, which take time. Returns the correction; `None`, without a change, if the
+    /// error is within the tolerance or nothing more accurate exists.
     ///
     /// # Errors
     /// Returns the refusals of [`Model::corrected`] and [`Model::apply_changes`]. If the latter refuses, the session

@@ -139,7 +139,7 @@ pub struct Signed {
     /// The server with the key wrote every message up to this step, and none has been changed, added or left out
     /// since.
     pub until_step: u64,
-    /// Number of messages after the last signature, which anyone may have written or changed.
+    /// Number of messages after the last signature, which may have been written or changed without the key.
     pub unsigned: u64,
     /// Whether the journal's end is signed and nothing follows it, so that nothing was cut off.
     pub ended: bool,

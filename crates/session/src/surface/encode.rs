@@ -12,7 +12,7 @@ use super::refine::{COMPONENTS, Points, Rows, Source, Written};
 use super::wide::{Available, SixteenLanes, WideWork, Width};
 use palpate_tissue::memory;
 
-/// Number format of displacements in a frame.
+/// Number format of displacements in a frame: three components for each vertex.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Encoding {
     /// 4-byte IEEE floats, little-endian, m.

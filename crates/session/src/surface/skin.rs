@@ -114,7 +114,7 @@ impl Skin {
         self.shape.edge_m()
     }
 
-    /// Returns the memory of the tables, bytes.
+    /// Returns the memory of the skin's tables, bytes, without the mesh that it shares with the model.
     pub fn bytes(&self) -> u64 {
         let uv = self.uv.as_deref().map_or(0, size_of_val);
         let tables = size_of_val(&*self.vertices) + size_of_val(&*self.places);

@@ -204,13 +204,13 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
     message.last
 }
 
-/// Converts a recovery to a message.
+/// Converts a recovery to a message, field by field.
 pub fn recovery(recovery: Recovery) -> pb::Recovery {
     let Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason } = recovery;
     pb::Recovery { step, state_of_step, undone_commands, reason, at_rest, paused_until_step }
 }
 
-/// Converts a recovery from a message.
+/// Converts a recovery from a message, field by field; nothing is checked.
 pub fn from_recovery(recovery: pb::Recovery) -> Recovery {
     let pb::Recovery { step, state_of_step, undone_commands, reason, at_rest, paused_until_step } = recovery;
     Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason }
