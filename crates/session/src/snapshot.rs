@@ -1,8 +1,8 @@
 //! Snapshots: a session at one moment, as bytes, from which it continues with the bits that it would have had
 //! without a stop.
 //!
-//! **Content**: the state of the tissue ([`tissue::state::saved`]), the state of each tool with its path, what recoveries
-//! depend on, and counts. A snapshot has no waiting commands, no leases, no unfinished audit and no scene.
+//! **Content**: the state of the tissue ([`tissue::state::saved`]), the state of each tool with its path, what
+//! recoveries depend on, and counts. A snapshot has no waiting commands, no leases, no unfinished audit and no scene.
 //!
 //! **What a caller keeps beside it**: only the scene with which the session began. The snapshot has the result of
 //! all changes and corrections of the tissue ([`Saved::tissue`]). So:

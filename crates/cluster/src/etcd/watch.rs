@@ -84,9 +84,9 @@ impl Watch {
         Watch { calls, member, next: Box::pin(following.next()) }
     }
 
-    /// Waits for the next changes and returns them by ascending revision, at least one. Keys that are not UTF-8 are left
-    /// out. The changes of one transaction come together, unless they exceed about a megabyte. You may cancel the call
-    /// at any time: nothing is lost.
+    /// Waits for the next changes and returns them by ascending revision, at least one. Keys that are not UTF-8 are
+    /// left out. The changes of one transaction come together, unless they exceed about a megabyte. You may cancel
+    /// the call at any time: nothing is lost.
     ///
     /// It waits while etcd can't be reached; a renewal of a lease reports that sooner.
     ///

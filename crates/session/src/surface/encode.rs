@@ -154,8 +154,8 @@ pub(super) fn lay_out(first: [usize; 2], [count_x, count_y]: [usize; 2], encodin
     patches
 }
 
-/// Refines and encodes `snapshot`, whose points must be those of `refinement` (of the same scene). Returns a full frame.
-/// It unwinds with a refusal if there is no memory for a row (`palpate_tissue::memory`).
+/// Refines and encodes `snapshot`, whose points must be those of `refinement` (of the same scene). Returns a full
+/// frame. It unwinds with a refusal if there is no memory for a row (`palpate_tissue::memory`).
 ///
 /// A sheet of 3 × 3 points, whose middle is 2 mm deep, with a vertex between neighbours: 5 × 5 vertices, of which the
 /// one beside the middle is 1 mm deep.
