@@ -32,10 +32,11 @@ const COUNTER: &str = "sessions";
 /// Port of the SDK if the environment names no other.
 const PORT: u16 = 9357;
 
-/// State of a server that is reported to Agones.
+/// State of a server that is reported to Agones: `Ready` without sessions, `Allocated` with some, and shut down once
+/// it is draining and has none.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ServerStatus {
-    /// Whether the server may step its sessions and answer for them.
+    /// Whether the server may step its sessions and answer for them. Nothing is reported before it first does.
     pub acts: bool,
     /// Number of sessions.
     pub sessions: usize,
@@ -179,8 +180,10 @@ pub fn port() -> u16 {
     })
 }
 
-/// Reports the state of a server to the SDK at `port` of this machine, until the future is dropped. Calls `seen`
-/// once a second; it must not block.
+/// Reports the state of a server to the SDK at `port` of this machine, until the future is dropped: its health every
+/// 2 s, and what has changed in its state and number of sessions once a second. Calls `seen` once a second; it must
+/// not block. If the SDK does not answer, it logs that and tries again; it returns only if `port` gives no valid
+/// address.
 pub async fn tell(port: u16, seen: impl Fn() -> ServerStatus) {
     let Ok(endpoint) = Endpoint::from_shared(format!("http://localhost:{port}")) else { return };
     let channel = endpoint.connect_timeout(SDK_TIMEOUT).connect_lazy();

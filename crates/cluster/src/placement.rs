@@ -6,8 +6,9 @@ use xxhash_rust::xxh3::xxh3_64;
 
 use super::key::NodeValue;
 
-/// Returns the node that takes the next session: the one with the least load in whole percent and, among equals,
-/// the fewest sessions per thread. Draining nodes are skipped; `None` if no node is left.
+/// Returns the name of the node that takes the next session: the one with the least load in whole percent, among
+/// equals the one with the fewest sessions per thread, and among those the first by name. Draining nodes are skipped;
+/// `None` if no node is left. `nodes` has the present nodes by name.
 #[allow(clippy::cast_precision_loss)]
 pub fn roomiest(nodes: &BTreeMap<String, NodeValue>) -> Option<&str> {
     // Loads are measured: smaller differences do not count.
@@ -19,9 +20,10 @@ pub fn roomiest(nodes: &BTreeMap<String, NodeValue>) -> Option<&str> {
         .map(|(name, _)| name.as_str())
 }
 
-/// Returns the node that stands by for a session of `owner`, by rendezvous hashing (Thaler and Ravishankar 1998)
-/// over the other nodes that replay with the same bits and are not draining. When a node joins or leaves, only the
-/// sessions that it stands by for change their standby. `None` if `owner` is unknown or no node qualifies.
+/// Returns the name of the node that stands by for the session `session_id` of `owner`, by rendezvous hashing (Thaler
+/// and Ravishankar 1998) over the other nodes in `nodes` that replay with the same bits and are not draining. When a
+/// node joins or leaves, only the sessions that it stands by for change their standby. `None` if `owner` is not in
+/// `nodes` or no node qualifies.
 pub fn standby<'n>(session_id: &str, owner: &str, nodes: &'n BTreeMap<String, NodeValue>) -> Option<&'n str> {
     let replays = nodes.get(owner)?.replays;
     let others = nodes.iter().filter(|(name, node)| *name != owner && node.replays == replays && !node.draining);

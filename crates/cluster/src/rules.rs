@@ -11,13 +11,13 @@
 use super::etcd::{Compare, Op, Txn};
 use super::key::{Keys, SessionValue, encode};
 
-/// Fraction of the lease's time to live by which a node stops early. It covers the difference in rate between two
-/// machines' clocks, and a step or a message that has begun.
+/// Fraction of the lease's time to live by which a node stops early, 0 to 1. It covers the difference in rate between
+/// two machines' clocks, and a step or a message that has begun.
 pub const MARGIN: f64 = 0.1;
 
-/// Returns the time until which a node may step its sessions and answer for them, ns of its own clock. The node
-/// sent a keepalive at `sent_ns`, and etcd granted `ttl_s` seconds from when it received that. The limit is
-/// `sent_ns` + 0.9 `ttl_s`.
+/// Returns the time until which a node may step its sessions and answer for them, ns of the clock of `sent_ns`. The
+/// node sent a keepalive at `sent_ns`, and etcd granted `ttl_s` seconds from when it received that. The limit is
+/// `sent_ns` + (1 − [`MARGIN`])·`ttl_s`, so 0.9 of the time to live.
 #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::cast_sign_loss)]
 pub fn fence_ns(sent_ns: u64, ttl_s: u64) -> u64 {
     sent_ns + ((1.0 - MARGIN) * ttl_s as f64 * 1e9) as u64
@@ -27,8 +27,8 @@ fn put(key: String, value: &SessionValue) -> Op {
     Op::Put { key, value: encode(value), lease: None }
 }
 
-/// Returns the transaction that makes `node` the owner of a new session. Its conditions fail if a session has this
-/// ID, or the node's lease has ended.
+/// Returns the transaction that makes `node` the owner of a new session `id`, without a standby. Its conditions fail
+/// if a session has this ID, or the node's lease has ended.
 pub fn create(keys: &Keys, id: &str, node: &str) -> Txn {
     let key = keys.session(id);
     Txn {
@@ -38,9 +38,10 @@ pub fn create(keys: &Keys, id: &str, node: &str) -> Txn {
     }
 }
 
-/// Returns the transaction by which `node` confirms that it still owns the session, with the standby `standby`
-/// (empty for none). `revision` is that of the key as `node` left it. Its conditions fail if another node has
-/// claimed the session, or the node's lease has ended.
+/// Returns the transaction by which `node` confirms that it still owns the session `id`, with the standby `standby`
+/// (empty for none). `revision` is that of the key as `node` left it. It writes the key, so the ownership has a new
+/// revision. Its conditions fail if the key has changed since, for example because another node has claimed the
+/// session, or if the node's lease has ended.
 pub fn keep(keys: &Keys, id: &str, revision: u64, node: &str, standby: &str) -> Txn {
     let key = keys.session(id);
     Txn {
@@ -50,9 +51,9 @@ pub fn keep(keys: &Keys, id: &str, revision: u64, node: &str, standby: &str) -> 
     }
 }
 
-/// Returns the transaction by which the standby `node` makes itself the owner of a session whose owner is gone.
-/// `seen` is the key's value at `revision`. Its conditions fail if the owner is present, the key has changed since,
-/// or the lease of `node` has ended.
+/// Returns the transaction by which the standby `node` makes itself the owner of a session whose owner is gone,
+/// without a standby. `seen` is the key's value at `revision`. Its conditions fail if the owner is present, the key
+/// has changed since, or the lease of `node` has ended. It does not check that `node` is the standby ([`may_claim`]).
 pub fn claim(keys: &Keys, id: &str, (seen, revision): (&SessionValue, u64), node: &str) -> Txn {
     let key = keys.session(id);
     let mut if_all = vec![Compare::ModRevision(key.clone(), revision), Compare::Present(keys.node(node))];
@@ -63,15 +64,15 @@ pub fn claim(keys: &Keys, id: &str, (seen, revision): (&SessionValue, u64), node
     Txn { if_all, then: vec![put(key, &value)], otherwise: vec![] }
 }
 
-/// Returns whether `node` may try a [`claim`]: `seen` names it as the standby, and the owner is absent by
-/// `is_there` or has given the session up.
+/// Returns whether `node` may try a [`claim`]: `seen` names it as the standby and not as the owner, and the owner has
+/// given the session up or is absent. `is_there` tells whether the node of a name is present.
 pub fn may_claim(seen: &SessionValue, node: &str, is_there: impl Fn(&str) -> bool) -> bool {
     seen.standby == node && seen.node != node && (seen.node.is_empty() || !is_there(&seen.node))
 }
 
-/// Returns the transaction by which the owner `from`, at `revision`, makes `to` the owner. `from` must already have
-/// stopped stepping the session and answering for it. Its conditions fail if the key has changed or either node is
-/// gone.
+/// Returns the transaction by which the owner `from`, at `revision` of the session's key, makes `to` the owner,
+/// without a standby. `from` must already have stopped stepping the session and answering for it. Its conditions fail
+/// if the key has changed or either node's lease has ended.
 pub fn hand_over(keys: &Keys, id: &str, revision: u64, [from, to]: [&str; 2]) -> Txn {
     let key = keys.session(id);
     Txn {
@@ -85,8 +86,9 @@ pub fn hand_over(keys: &Keys, id: &str, revision: u64, [from, to]: [&str; 2]) ->
     }
 }
 
-/// Returns the transaction by which the owner at `revision` gives the session up: the owner has kept nothing of it,
-/// and `standby` may claim it.
+/// Returns the transaction by which the owner at `revision` of the session's key gives the session up: the owner has
+/// kept nothing of it, and `standby` may claim it (empty for none). Its condition fails if the key has changed; the
+/// owner's lease need not last.
 pub fn give_up(keys: &Keys, id: &str, revision: u64, standby: &str) -> Txn {
     let key = keys.session(id);
     Txn {
@@ -96,7 +98,8 @@ pub fn give_up(keys: &Keys, id: &str, revision: u64, standby: &str) -> Txn {
     }
 }
 
-/// Returns the transaction by which the owner at `revision` deletes the session's key.
+/// Returns the transaction by which the owner at `revision` deletes the session's key. Its condition fails if the key
+/// has changed or is gone.
 pub fn delete(keys: &Keys, id: &str, revision: u64) -> Txn {
     let key = keys.session(id);
     Txn { if_all: vec![Compare::ModRevision(key.clone(), revision)], then: vec![Op::Delete(key)], otherwise: vec![] }

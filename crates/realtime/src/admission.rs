@@ -31,36 +31,40 @@ use palpate_tissue::memory;
 use palpate_tissue::scene::{Body, Change, Scene};
 use palpate_tissue::select::scheme_selection;
 
-/// The state with which a session begins on this server.
+/// The state with which a saved or recorded session begins on this server ([`Pacer::resume`]).
 pub struct Begin {
-    /// ID of the session.
+    /// ID of the session, which no session of this server may have.
     pub id: String,
-    /// The first tissue of the session, in its first run.
+    /// The first tissue of the session, in its first run; later changes are made from its scene.
     pub first: Arc<Model>,
-    /// Whether the session's time advances.
+    /// Whether the session's time advances. A session that has stopped for good begins held whatever this says.
     pub running: bool,
-    /// The step count at which the session pauses, if any.
+    /// The step count at which the session pauses; `None` if it has no such end.
     pub until: Option<u64>,
-    /// Time without use after which the session is deleted, s.
+    /// Time without calls, held tools or streams after which the session is deleted, s.
     pub idle_timeout_s: f64,
-    /// The recording that the session plays instead of commands of clients.
+    /// The recording that the session plays instead of commands of clients; its intake is then closed. `None` for a
+    /// live session.
     pub playback: Option<Playback>,
     /// Number of the journal's run that the session continues; 0 if there is none.
     pub after_run: u64,
     /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub revision: u64,
-    /// Changes of the tissue that wait for a later step, each with that step.
+    /// Changes of the tissue that wait for a later step, each with that step, by ascending step.
     pub waiting: Vec<(u64, Input)>,
-    /// Whether the session begins frozen, and is not served until [`SessionHandle::arrive`].
+    /// Whether the session begins frozen, and is neither stepped nor found by [`Pacer::get`] until
+    /// [`SessionHandle::arrive`].
     pub frozen: bool,
-    /// Whether the session's events are written to an event log, if the server keeps journals.
+    /// Whether the session's events are written to an event log, if the server keeps journals. A playback is never
+    /// recorded.
     pub recorded: bool,
 }
 
-/// A reserved ID for a new session.
+/// A reserved ID for a new session, for [`Pacer::create_as`]. In a fleet, the ID is already this server's key in
+/// etcd.
 #[derive(Debug, Clone)]
 pub struct SessionReservation {
-    /// ID of the session.
+    /// ID of the session, which no session of this server may have.
     pub id: String,
     /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub revision: u64,
@@ -69,22 +73,30 @@ pub struct SessionReservation {
 }
 
 impl SessionReservation {
-    /// Reserves a new random ID without a fleet, for a session that is recorded.
+    /// Chooses a new random ID without a fleet, for a session that is recorded. Nothing is kept for it.
     ///
     /// # Errors
-    /// Refuses if the system has no random numbers.
+    /// Refuses if the system has no random numbers ([`Reason::TooMany`]).
     pub fn new() -> Result<Self> {
         Ok(SessionReservation { id: random_id()?, revision: 0, recorded: true })
     }
 }
 
 impl Pacer {
-    /// Creates a session for `owner` with a new random ID. `idle_timeout_s` is the time without use after which it
-    /// is deleted, s. Setting `stop` cancels the call.
+    /// Creates a session for `owner` with a new random ID, at rest at step 0. `paused`: its time does not advance
+    /// before [`Pacer::start_session`]. `idle_timeout_s` is the time without use after which it is deleted, s. Blocks
+    /// while the scene is compiled, unless a session has an equal one; setting `stop` cancels the call.
     ///
     /// # Errors
-    /// Refuses a scene that is invalid or whose steps are too heavy, memory and sessions beyond the caller's part,
-    /// a thread that has no time left, and when `stop` is set.
+    /// - [`Reason::TooMany`]: `owner` has its part of the sessions, or all sessions together would have more points
+    ///   than `limits.points_in_all`.
+    /// - The scene is invalid or beyond the limits, or its rate is above `limits.session_rate_hz`.
+    /// - [`Reason::TooLarge`]: a step would be too heavy (`limits.point_substeps_per_step`,
+    ///   `limits.periods_per_step`).
+    /// - [`Reason::Overloaded`]: the memory exceeds the part of `owner` or of the system; or, if time is to advance,
+    ///   no stepping thread has the time left for the steps (`limits.thread_share`).
+    /// - `stop` is set.
+    /// - The system has no random numbers.
     pub fn create(
         &self,
         scene: &Scene,
@@ -96,12 +108,19 @@ impl Pacer {
         self.create_as(SessionReservation::new()?, scene, (paused, idle_timeout_s), owner, stop)
     }
 
-    /// Creates a session for `owner` with a reserved ID. The pair is whether time is paused, and the time without
-    /// use after which the session is deleted, s. Setting `stop` cancels the call.
+    /// Creates a session for `owner` with a reserved ID, at rest at step 0. The ID must be unused: this is not
+    /// checked. The pair is whether time is paused, and the time without use after which the session is deleted, s.
+    /// Blocks while the scene is compiled, unless a session has an equal one; setting `stop` cancels the call.
     ///
     /// # Errors
-    /// Refuses a scene that is invalid or whose steps are too heavy, memory and sessions beyond the caller's part,
-    /// a thread that has no time left, and when `stop` is set.
+    /// - [`Reason::TooMany`]: `owner` has its part of the sessions, or all sessions together would have more points
+    ///   than `limits.points_in_all`.
+    /// - The scene is invalid or beyond the limits, or its rate is above `limits.session_rate_hz`.
+    /// - [`Reason::TooLarge`]: a step would be too heavy (`limits.point_substeps_per_step`,
+    ///   `limits.periods_per_step`).
+    /// - [`Reason::Overloaded`]: the memory exceeds the part of `owner` or of the system; or, if time is to advance,
+    ///   no stepping thread has the time left for the steps (`limits.thread_share`).
+    /// - `stop` is set.
     pub fn create_as(
         &self,
         SessionReservation { id, revision, recorded }: SessionReservation,
@@ -132,11 +151,18 @@ impl Pacer {
         self.admit(begin, owner, slot, || Ok(Session::new(&model)), stop)
     }
 
-    /// Creates a session that continues a saved one. `session` returns the saved session; `begin.first` is the
-    /// tissue with which it first began.
+    /// Creates a session that continues a saved one, or plays a recording. `session` returns the saved session, and
+    /// is called once the memory is taken; `begin.first` is the tissue with which the session first began. Setting
+    /// `stop` cancels the call.
     ///
     /// # Errors
-    /// Refuses an ID that is in use, whatever `session` refuses, and whatever [`Pacer::create`] refuses.
+    /// - [`Reason::OutOfTurn`]: a session of this server has the ID.
+    /// - [`Reason::TooMany`]: `owner` has its part of the sessions, or all sessions together would have more points
+    ///   than `limits.points_in_all`.
+    /// - [`Reason::TooLarge`]: a step would be too heavy.
+    /// - [`Reason::Overloaded`]: the memory exceeds the part of `owner` or of the system; or, if time is to advance,
+    ///   no stepping thread has the time left.
+    /// - The refusal of `session`, and a set `stop`.
     pub fn resume(
         &self,
         begin: Begin,
@@ -323,10 +349,11 @@ impl Pacer {
     }
 
     /// Changes the tissue of a session as [`SessionHandle::change`] does, if its thread has the time for the new
-    /// steps. Returns the step from which it acts, and the new tissue.
+    /// steps. Returns the step from which it acts, and the new tissue. Blocks while the tissue is compiled.
     ///
     /// # Errors
-    /// Refuses whatever [`SessionHandle::change`] refuses, and a change that would make other sessions late.
+    /// Returns the refusals of [`SessionHandle::change`], and refuses a change with more substeps that would make
+    /// other sessions of the thread late ([`Reason::Overloaded`]).
     pub fn change_tissue(
         &self,
         handle: &SessionHandle,
@@ -373,11 +400,12 @@ impl Pacer {
         Err(Refusal::new(Reason::Overloaded, "", message))
     }
 
-    /// Starts a session's time as [`SessionHandle::start`] does, unless its steps would make other sessions late.
-    /// Returns the number of the next step.
+    /// Starts a session's time as [`SessionHandle::start`] does, unless it is paused and its steps would make other
+    /// sessions of its thread late. Returns the number of the next step.
     ///
     /// # Errors
-    /// Refuses whatever [`SessionHandle::start`] refuses, and steps that would make other sessions late.
+    /// Returns the refusals of [`SessionHandle::start`], and refuses steps for which the thread has no time left
+    /// ([`Reason::Overloaded`], `limits.thread_share`).
     pub async fn start_session(&self, handle: &SessionHandle, until: Option<u64>) -> Result<u64> {
         if lock(&handle.status).state == RunState::Paused {
             self.check_share(self.taken_by_others(handle), handle.cost.awake_share())?;

@@ -1,10 +1,11 @@
 //! The auditor: one thread, named `audit`, that measures errors of live sessions. It uses a small fraction of a
 //! core, at a lower priority than stepping.
 //!
-//! It asks the awake sessions in turn for a window of steps (`palpate_tissue::select::audit`), and repeats that window in
-//! f64 with a quarter of the substep. The stepping thread shares two checkpoints and records the tools' inputs. It
-//! waits for nothing and copies nothing, unless the auditor has not taken its copy of a checkpoint before the next
-//! one is made. After each slice of work the auditor rests until its processor time is within its share of a core.
+//! It asks the awake sessions in turn for a window of steps (`palpate_tissue::select::audit`), and repeats that
+//! window in f64 with a quarter of the substep. The stepping thread shares two checkpoints and records the tools'
+//! inputs. It waits for nothing and copies nothing, unless the auditor has not taken its copy of a checkpoint before
+//! the next one is made. After each slice of work the auditor rests until its processor time is within its share of
+//! a core.
 //!
 //! The results appear in the session's status, in the metrics and, if an error is above the tolerance, in the log.
 //! If the scene sets `correct`, a more accurate model replaces the tissue as any change does: through the intake,

@@ -3,7 +3,8 @@
 use std::sync::OnceLock;
 use std::time::{Duration, Instant};
 
-/// Returns the nanoseconds since the first call in this process; never 0.
+/// Returns the nanoseconds since the first call in this process, plus 1; it never decreases and is never 0. It stands
+/// still while the machine is suspended.
 #[allow(clippy::disallowed_methods, clippy::cast_possible_truncation)]
 pub fn now_ns() -> u64 {
     static ORIGIN: OnceLock<Instant> = OnceLock::new();
@@ -28,10 +29,11 @@ pub fn thread_time_ns() -> u64 {
 /// Length of the window over which time dilation is measured, ns.
 const DILATION_WINDOW_NS: u64 = 1_000_000_000;
 
-/// Time dilation of a session: simulated over real time, measured over about the last second.
+/// Time dilation of a session: simulated over real time, measured over windows of about a second. Steps that a
+/// session at rest skips count as simulated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Dilation {
-    /// The newest measurement; 1 when the session is on time.
+    /// The newest measurement: 1 when the session is on time and before the first, less when it is late.
     pub value: f64,
     /// Time at which the window of the next measurement began, ns, and the step count then.
     since: (u64, u64),

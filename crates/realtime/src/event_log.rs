@@ -2,9 +2,9 @@
 //! reader; the thread that writes journals takes all events at once.
 //!
 //! An event log is bounded. If the writer of journals does not keep up or can't write, the log breaks: it discards
-//! its events, keeps the reason, and the session continues without a journal. If the disk was full or too slow and the
-//! writer reports that there is room again, the stepping thread restarts the log with a snapshot; that begins another run
-//! of the journal.
+//! its events, keeps the reason, and the session continues without a journal. If the disk was full or too slow and
+//! the writer reports that there is room again, the stepping thread restarts the log with a snapshot; that begins
+//! another run of the journal.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -40,15 +40,17 @@ const COPIED_BYTES_PER_S: f64 = 16e6;
 /// Rate at which the poses and forces of tools are recorded, Hz.
 const FELT_HZ: f64 = 100.0;
 
-/// An event of a session that its journal records.
+/// An event of a session that its journal records. Copies of the state are made on the stepping thread; hashes are
+/// computed by the writer of journals.
 pub enum Event {
-    /// An input acted on the session.
+    /// An input acted on the session, before the next step.
     Input(Input),
-    /// A copy of the state, to be hashed.
+    /// A copy of the state, to be hashed; about once a second of simulated time.
     Hash(ReadCopy),
-    /// Everything that the next step depends on, and a copy of the state, to be hashed.
+    /// Everything that the next step depends on, and a copy of the state, to be hashed; about every 10 s, and at the
+    /// beginning.
     Snapshot(Box<Saved>, ReadCopy),
-    /// Poses of the tools, and the forces on them.
+    /// Poses of the tools, and the forces on them; at most 100 times a second.
     Felt(Vec<Felt>),
     /// All changes of the tissue that wait for their step, each with that step. The list replaces the previous one.
     Waiting(Vec<(u64, Arc<Model>)>),
@@ -56,7 +58,7 @@ pub enum Event {
     Left(Leaving),
 }
 
-/// An event with its step and time.
+/// An event with its step and time, as an event log holds it.
 pub struct Noted {
     /// Number of steps done before the event.
     pub step: u64,
@@ -66,26 +68,27 @@ pub struct Noted {
     pub event: Event,
 }
 
-/// The content of an event log, taken by the writer of journals.
+/// The content of an event log, as [`EventLog::take`] returns it to the writer of journals.
 pub struct TakenEvents {
-    /// Events in the order in which they happened.
+    /// Events in the order in which they happened; empty if only steps were done.
     pub events: Vec<Noted>,
-    /// All events before this step are in `events`, or were taken earlier.
+    /// All events before this step are in `events`, or were taken earlier: the journal may be complete up to it.
     pub until_step: u64,
     /// Whether the session is at rest or paused, so that no event follows for now.
     pub is_still: bool,
-    /// Where the events begin, if they do not follow on what was taken earlier.
+    /// Where the events begin, if the log was restarted since the last call, so that they do not follow on what was
+    /// taken earlier; otherwise `None`.
     pub anew: Option<Beginning>,
-    /// Whether the log is broken, so that no events are kept.
+    /// Whether the log is broken: it keeps no events until it is restarted.
     pub is_broken: bool,
-    /// Whether the log broke since it was last taken because it was full.
+    /// Whether the log broke since it was last taken because it held 32,768 events.
     pub has_overflowed: bool,
 }
 
 /// State of a session at the beginning of its journal or of a further run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Beginning {
-    /// Number of steps done.
+    /// Number of steps done when it begins.
     pub step: u64,
     /// Whether the session's time advances.
     pub running: bool,
@@ -106,7 +109,7 @@ struct HeldEvents {
     has_overflowed: bool,
 }
 
-/// Progress of a journal: which steps are on disk.
+/// Progress of a journal: which steps are on disk. Steps are numbers of steps done.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct JournalProgress {
     /// Everything before this step is durable: on disk, or on the disks of two servers if that is required. `None`
@@ -114,11 +117,12 @@ pub struct JournalProgress {
     pub durable_step: Option<u64>,
     /// Everything before this step is on the disk of this server; `None` before anything is.
     pub local_step: Option<u64>,
-    /// Age of the newest written event when it reached the disk, s.
+    /// Age of the newest written event when it reached the disk of this server, s; 0 before any.
     pub lag_s: f64,
     /// Number of the run that is being written; 0 before it has begun.
     pub run: u32,
-    /// Why no more events are written; `None` while the journal works.
+    /// Why no more events are written; `None` while the journal works. It stays after a restart until something is on
+    /// disk again.
     pub broken: Option<Arc<str>>,
     /// Everything before this step is on the disk of the standby server; `None` before anything is.
     pub mirrored_step: Option<u64>,
@@ -126,7 +130,8 @@ pub struct JournalProgress {
     pub is_complete: bool,
 }
 
-/// Description of the session that an event log belongs to, at the beginning of the log.
+/// Description of the session that an event log belongs to, at the beginning of the log: the journal's header is made
+/// from it.
 #[derive(Debug, Clone)]
 pub struct About {
     /// The session's ID.
@@ -137,7 +142,7 @@ pub struct About {
     pub idle_timeout_s: f64,
     /// The first tissue of the session, in its first run.
     pub first: Arc<Model>,
-    /// Number of steps done.
+    /// Number of steps done when the log began.
     pub begin_step: u64,
     /// Whether the session's time advances.
     pub running: bool,
@@ -149,9 +154,10 @@ pub struct About {
     pub revision: u64,
 }
 
-/// Event log of one session: its events, and which of them are on disk.
+/// Event log of one session: the events that its journal does not have yet, and which steps are on disk. The stepping
+/// thread adds events; the writer of journals takes them and reports progress.
 pub struct EventLog {
-    /// The session that the log belongs to.
+    /// The session that the log belongs to, as it was when the log began.
     pub about: About,
     held: Mutex<HeldEvents>,
     queue: Arc<EventLogQueue>,
@@ -177,18 +183,20 @@ impl EventLog {
         })
     }
 
-    /// Returns the step before which everything is durable; `None` before anything is.
+    /// Returns the step before which everything is durable: on the disk of this server and, if that is required, of
+    /// the standby; `None` before anything is.
     pub fn durable_step(&self) -> Option<u64> {
         self.durable.load(Ordering::Acquire).checked_sub(1)
     }
 
-    /// Returns a receiver of the journal's progress.
+    /// Returns a receiver of the journal's progress, which has the present value.
     pub fn progress(&self) -> watch::Receiver<JournalProgress> {
         self.progress.subscribe()
     }
 
     /// Sets that everything before `step` is on the disk of this server, and clears the reason of an earlier break
-    /// unless the log is broken now. `lag_s` is the age of the newest of it, s.
+    /// unless the log is broken now. `lag_s` is the age of the newest of it, s. A lower `step` than before counts
+    /// too.
     pub fn set_durable(&self, step: u64, lag_s: f64) {
         self.progress.send_modify(|progress| {
             (progress.local_step, progress.lag_s) = (Some(step), lag_s);
@@ -225,7 +233,7 @@ impl EventLog {
         self.progress.borrow().local_step
     }
 
-    /// Sets the number of the run in which the log is written.
+    /// Sets the number of the run in which the log is written from now on.
     pub fn begins(&self, run: u32) {
         self.progress.send_modify(|progress| progress.run = run);
     }
@@ -235,8 +243,8 @@ impl EventLog {
         self.progress.send_modify(|progress| progress.is_complete = true);
     }
 
-    /// Breaks the log: discards its events, ignores further ones, and logs `reason` once. A broken log stays as it
-    /// is.
+    /// Breaks the log: discards its events, ignores further ones, and logs `reason` unless an earlier break is still
+    /// reported. A log that is broken already keeps its reason. The session continues.
     pub fn break_off(&self, reason: &str) {
         let reason: Arc<str> = reason.into();
         {
@@ -254,7 +262,8 @@ impl EventLog {
         });
     }
 
-    /// Lets a broken log restart, because there may be room again. The stepping thread restarts it.
+    /// Lets a broken log restart, because there may be room again. The stepping thread restarts it after the next
+    /// step, with a snapshot. For a log that works it has no effect.
     pub fn may_begin_anew(&self) {
         self.may_begin_anew.store(true, Ordering::Release);
     }
@@ -327,7 +336,7 @@ impl EventLog {
         }
     }
 
-    /// Takes all events, and where they begin.
+    /// Takes all events, and where they begin. The log is empty afterwards, and is queued again with its next event.
     pub fn take(&self) -> TakenEvents {
         // The new buffer has room for as many events, so that the stepping thread does not allocate.
         let room = lock(&self.held).events.len();
@@ -347,7 +356,7 @@ impl EventLog {
     }
 }
 
-/// Queue of the event logs that hold events.
+/// Queue of the event logs that hold events, each at most once, from stepping threads to the writer of journals.
 #[derive(Default)]
 pub struct EventLogQueue {
     state: Mutex<Queued>,
@@ -362,7 +371,7 @@ struct Queued {
 }
 
 impl EventLogQueue {
-    /// Makes only mirrored events durable, in event logs that are created from now on.
+    /// Makes only events that are on two disks durable, in event logs that are created from now on.
     pub fn needs_mirror(&self) {
         self.needs_mirror.store(true, Ordering::Relaxed);
     }
@@ -377,8 +386,9 @@ impl EventLogQueue {
         }
     }
 
-    /// Waits until an event log holds events, at most for `longest` if given, and takes all that do; the list is
-    /// empty after a timeout. `None` if the queue is stopped and empty.
+    /// Blocks until an event log holds events, at most for `longest` (`None`: without limit), and takes all that do,
+    /// in the order in which they were queued. The list is empty after a timeout. `None` if the queue is stopped and
+    /// empty.
     pub fn wait(&self, longest: Option<Duration>) -> Option<Vec<Arc<EventLog>>> {
         let mut state = lock(&self.state);
         let mut waited = false;
@@ -401,7 +411,8 @@ impl EventLogQueue {
         }
     }
 
-    /// Takes the event logs that hold events now, without waiting.
+    /// Takes the event logs that hold events now, in the order in which they were queued, without waiting; empty if
+    /// there are none.
     pub fn take(&self) -> Vec<Arc<EventLog>> {
         std::mem::take(&mut lock(&self.state).event_logs)
     }
@@ -411,7 +422,7 @@ impl EventLogQueue {
         lock(&self.state).stop
     }
 
-    /// Stops the queue: [`EventLogQueue::wait`] returns `None` once it is empty.
+    /// Stops the queue and wakes its reader: [`EventLogQueue::wait`] returns `None` once it is empty.
     pub fn stop(&self) {
         lock(&self.state).stop = true;
         self.wake.notify_all();

@@ -6,7 +6,8 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// The moment until which a server may act. Without a fleet there is no such limit.
+/// The moment until which a server may act. It begins without such a moment, as for a server without a fleet;
+/// [`Fence::set`] gives it one.
 #[derive(Debug)]
 pub struct Fence {
     until_ns: AtomicU64,
@@ -19,7 +20,8 @@ impl Default for Fence {
 }
 
 impl Fence {
-    /// Returns whether the server may step its sessions and answer for them now.
+    /// Returns whether the server may step its sessions and answer for them now: the moment has not come, or there is
+    /// none.
     pub fn may_act(&self) -> bool {
         let until_ns = self.until_ns.load(Ordering::Acquire);
         until_ns == u64::MAX || boot_ns() < until_ns
@@ -35,7 +37,7 @@ impl Fence {
         }
     }
 
-    /// Sets the moment until which the server may act, ns of [`boot_ns`].
+    /// Sets the moment until which the server may act, ns of [`boot_ns`]; an earlier one than before counts too.
     pub fn set(&self, until_ns: u64) {
         self.until_ns.store(until_ns.min(u64::MAX - 1), Ordering::Release);
     }

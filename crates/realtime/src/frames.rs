@@ -12,16 +12,17 @@ use palpate_session::surface::{Encoding, Frame, FrameTiles, Refinement, Snapshot
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 
-/// A stream of frames of a session, with the settings of its client.
+/// A stream of frames of a session, with the settings of its client. [`Pacer::add_viewer`](super::Pacer::add_viewer)
+/// connects it to the session; it ends when its reader is dropped or it is closed.
 #[derive(Debug)]
 pub struct Viewer {
-    /// Random ID, which can't be guessed.
+    /// Random ID, which can't be guessed; the client acknowledges frames with it.
     pub id: String,
-    /// Refinement of the surface.
+    /// Refinement of the surface, of the session's tissue.
     pub refinement: Refinement,
     /// Encoding of the vertices.
     pub encoding: Encoding,
-    /// Frames per second of simulated time.
+    /// Frames per second of simulated time, at most the session's step rate.
     pub rate_hz: f64,
     /// Whether each frame has every vertex, and not only the changed tiles.
     pub always_full: bool,
@@ -48,18 +49,20 @@ struct Credit {
     in_flight: VecDeque<u64>,
 }
 
-/// A frame on its way to one viewer.
+/// A frame on its way to one viewer, with the state of its session.
 #[derive(Debug, Clone)]
 pub struct Delivery {
-    /// Number of the frame, among those that were due to the viewer.
+    /// Number of the frame, which counts all frames that were due to the viewer since step 0 of the session
+    /// ([`Viewer::frame_id`]).
     pub frame_id: u64,
     /// The frame, which other viewers may share.
     pub frame: Arc<Frame>,
-    /// The frame has the tiles that changed after this version. `None`: it has all tiles.
+    /// The frame has the tiles that changed after this version of the viewer's tiles ([`FrameTiles`]). `None`: it has
+    /// all tiles.
     pub since: Option<u64>,
-    /// Number of frames so far that were due to the viewer and in which nothing had changed.
+    /// Number of frames so far that were due to the viewer and not sent, because nothing had changed.
     pub unchanged: u64,
-    /// Number of steps that the session has dropped so far.
+    /// Number of steps that the session has dropped from its schedule so far.
     pub overrun_count: u64,
     /// Simulated over real time, measured over about the last second.
     pub time_dilation: f64,
@@ -76,12 +79,13 @@ fn moment_bytes(refinement: Refinement) -> usize {
 }
 
 impl Viewer {
-    /// Creates a viewer and the reader of its frames. Their memory is charged to `account`. At most `max_in_flight`
-    /// frames may be unacknowledged, limited to those that fit `queued_bytes`; `None` stands for a client that does
-    /// not acknowledge.
+    /// Creates a viewer and the reader of its frames. Their memory is charged to `account` while the viewer exists.
+    /// At most `max_in_flight` frames may be unacknowledged, limited to those that fit `queued_bytes` (at least one).
+    /// `None` stands for a client that does not acknowledge: then an unread frame is replaced by the next. The other
+    /// parameters are the fields of the same names.
     ///
     /// # Errors
-    /// Refuses if the memory exceeds the account's part.
+    /// Refuses if the memory exceeds the part of `account` or of the system, in the field `refinement`.
     #[allow(clippy::too_many_arguments)]
     pub fn new(
         id: String,
@@ -108,14 +112,16 @@ impl Viewer {
         Ok((Arc::new(viewer), reader))
     }
 
-    /// Returns the number of the frame that belongs to step `step` of a session with `rate_hz` steps per second.
+    /// Returns the number of the frame that belongs to step `step` of a session with `rate_hz` steps per second: the
+    /// step times the ratio of the viewer's rate to that, rounded down.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     pub fn frame_id(&self, step: u64, rate_hz: f64) -> u64 {
         // The small addition keeps 60 Hz of 1 kHz from being late by a rounding error.
         ((step as f64 + 1e-6) * self.rate_hz / rate_hz) as u64
     }
 
-    /// Acknowledges all frames up to this one, which frees their credit.
+    /// Acknowledges all frames up to this one, which frees their credit. A number that was not sent, and a viewer
+    /// that does not acknowledge, are ignored.
     pub fn acknowledge(&self, frame_id: u64) {
         if let Some(credit) = &self.credit {
             lock(credit).in_flight.retain(|id| *id > frame_id);
@@ -164,27 +170,27 @@ impl Viewer {
         lock(&self.progress).unchanged += frames;
     }
 
-    /// Returns whether the stream has ended.
+    /// Returns whether the stream has dropped its reader.
     pub fn is_gone(&self) -> bool {
         self.writer.is_abandoned()
     }
 
-    /// Ends the stream, with the reason `why`.
+    /// Ends the stream with the reason `why`, after the frames that wait. The first reason is kept.
     pub fn close(&self, why: Refusal) {
         self.writer.close(why);
     }
 }
 
-/// A request to encode the newest snapshot of one session for all viewers that wait.
+/// A request to encode a snapshot of one session for the viewers that are due a frame of it.
 #[derive(Debug)]
 pub struct Job {
-    /// Displacements of the points.
+    /// Displacements of the points at the present step.
     pub snapshot: Arc<Snapshot>,
-    /// The viewers, each with the number of its frame.
+    /// The viewers, each with the number of its frame ([`Viewer::frame_id`]).
     pub viewers: Vec<(Arc<Viewer>, u64)>,
-    /// Number of steps that the session has dropped.
+    /// Number of steps that the session has dropped from its schedule so far.
     pub overrun_count: u64,
-    /// Time dilation of the session.
+    /// Simulated over real time of the session, measured over about the last second.
     pub time_dilation: f64,
 }
 
@@ -199,7 +205,7 @@ struct JobQueue {
 /// Idle time after which buffers and the tiles of ended viewers are freed.
 const IDLE: Duration = Duration::from_millis(500);
 
-/// The thread that encodes frames, and its queue.
+/// The queue of the thread that encodes frames, with at most one job for each session.
 #[derive(Debug, Default)]
 pub struct Encoder {
     board: Mutex<JobQueue>,
@@ -207,8 +213,8 @@ pub struct Encoder {
 }
 
 impl Encoder {
-    /// Queues a job. It replaces the waiting job of session `number`, whose other viewers it takes over. It blocks
-    /// only for a queue operation.
+    /// Queues a job of the session with the number `number`. It replaces that session's waiting job, whose other
+    /// viewers it takes over, in its place in the queue. It blocks only for a queue operation.
     pub fn post(&self, number: u64, mut job: Job) {
         let mut board = lock(&self.board);
         match board.jobs.iter_mut().find(|waiting| waiting.0 == number) {
@@ -224,13 +230,14 @@ impl Encoder {
         self.posted.notify_one();
     }
 
-    /// Makes the thread end.
+    /// Makes the thread end after the job that it works on; waiting jobs are not served.
     pub fn stop(&self) {
         lock(&self.board).stop = true;
         self.posted.notify_one();
     }
 
-    /// Runs the thread until [`Encoder::stop`]. Frames that are kept for their buffers take memory from `budget`.
+    /// Runs the encoding in the calling thread until [`Encoder::stop`]. Frames that are kept for their buffers take
+    /// memory from `budget`. If there is no memory for a job, the streams of its viewers end.
     pub fn work(&self, budget: &Arc<Budget>) {
         let (mut spent, mut watched) = (RecycledFrames::of(budget), Watched::default());
         loop {
@@ -396,7 +403,7 @@ fn serve(session: u64, job: &Job, spent: &mut RecycledFrames, watched: &mut Watc
     }
 }
 
-/// Reader of a viewer's frames, used by its stream.
+/// Reader of a viewer's frames, used by its stream ([`Viewer::new`]).
 pub type FrameReader = Reader<Delivery>;
 
 #[cfg(test)]

@@ -2,18 +2,18 @@
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Returns 128 random bits as 32 hexadecimal digits.
+/// Returns 128 random bits as 32 lowercase hexadecimal digits.
 ///
 /// # Errors
-/// Refuses if the system has no random numbers.
+/// Refuses if the system has no random numbers ([`Reason::TooMany`]).
 pub fn random_id() -> Result<String> {
     Ok(format!("{:032x}", random_bits()?))
 }
 
-/// Returns 128 random bits.
+/// Returns 128 random bits from the system, fit for secrets.
 ///
 /// # Errors
-/// Refuses if the system has no random numbers.
+/// Refuses if the system has no random numbers ([`Reason::TooMany`]).
 pub fn random_bits() -> Result<u128> {
     let mut bytes = [0; 16];
     getrandom::fill(&mut bytes)

@@ -19,24 +19,25 @@ use palpate_tissue::ReadCopy;
 use palpate_tissue::lock::lock;
 use palpate_tissue::select::audit::{Mark, WindowInputs};
 
-/// The present state of a session, from which another can continue.
+/// The present state of a session, from which another can continue
+/// ([`SessionHandle::save`](super::SessionHandle::save)). It has no leases and no waiting commands.
 pub struct Present {
-    /// Everything that the next step depends on.
+    /// Everything that the next step depends on, without a running audit.
     pub saved: Box<Saved>,
     /// A copy of the state, to be hashed.
     pub copy: ReadCopy,
     /// Whether the session's time advances.
     pub running: bool,
-    /// The step count at which the session pauses, if any.
+    /// The step count at which the session pauses; `None` if it has no such end.
     pub until_step: Option<u64>,
 }
 
-/// Why a session leaves its server.
+/// Why a session leaves its server; its journal records it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Leaving {
     /// The session is deleted.
     Deleted,
-    /// Another server has become its owner.
+    /// Another server has become its owner. A last snapshot is recorded.
     Moved,
     /// The session was being handed to this server, and the handover was cancelled.
     Withdrawn,
@@ -72,7 +73,7 @@ pub(super) enum Request {
     Audit(WindowInputs, SyncSender<Mark>),
     Hash {
         at: Option<u64>,
-        /// The caller who is charged for it.
+        /// The caller that is charged for it.
         account: Account,
         reply: HashReply,
     },

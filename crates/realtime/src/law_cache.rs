@@ -20,8 +20,8 @@ const MAX_LAWS: usize = 64;
 /// Memory of a coarse and an exact law, bytes: some tens of rows of six numbers.
 const LAW_BYTES: u64 = 2 << 10;
 
-/// The force laws that a session keeps, at most 64. The least recently requested is removed when there are too
-/// many.
+/// The force laws of one tissue that a session keeps, one for each disc (radius and place of a tip), at most 64. The
+/// least recently requested is removed when there are too many; its holders keep it.
 #[derive(Default)]
 pub struct LawCache(Mutex<Option<TissueLaws>>);
 
@@ -33,7 +33,8 @@ struct TissueLaws {
     taken: Taken,
 }
 
-/// Returns whether two tissues of a session have equal force laws. Their schemes and substeps may differ.
+/// Returns whether two tissues of one session have equal force laws: equal springs, anchor springs, damping and
+/// volume. Their schemes and substeps may differ, and so may scenes on other meshes, which are not compared.
 pub fn have_same_laws(a: &Model, b: &Model) -> bool {
     let [a, b] = [a, b].map(|model| &model.scene);
     a.springs == b.springs
@@ -44,11 +45,12 @@ pub fn have_same_laws(a: &Model, b: &Model) -> bool {
 
 impl LawCache {
     /// Returns the law of `model` under a disc, and creates it if it is not kept; nothing is computed. At most
-    /// `most_work` springs times iterations may be spent on it. The laws of a different tissue are discarded first.
-    /// The memory is charged to `payer`.
+    /// `most_work` (springs times iterations) may be spent on the exact law, if this call creates it. If `model` has
+    /// other laws than the tissue whose laws are kept, those are discarded first. The memory is charged to `payer`.
     ///
     /// # Errors
-    /// Refuses if the memory exceeds the part of `payer`.
+    /// Refuses if the memory exceeds the part of `payer` or of the system. The least recently requested law may be
+    /// gone then.
     pub fn of(&self, disc: Disc, model: &Arc<Model>, most_work: u64, payer: &Account) -> Result<Arc<SoughtLaw>> {
         let mut kept = lock(&self.0);
         let kept = match &mut *kept {
@@ -78,7 +80,7 @@ impl LawCache {
 
 impl LawCache {
     /// Returns the laws of `model` that have been computed so far, exact ones where available; the most recently
-    /// requested is the last.
+    /// requested is the last. Empty if another tissue's laws are kept.
     pub fn known(&self, model: &Model) -> Vec<(Disc, Arc<Law>)> {
         let kept = lock(&self.0);
         let kept = kept.as_ref().filter(|kept| have_same_laws(&kept.model, model));
@@ -90,7 +92,8 @@ impl LawCache {
     }
 }
 
-/// Force law of a tissue under a tip, which is computed on demand: a coarse one at once, the exact one later.
+/// Force law of a tissue under a disc, which is computed on demand, once for all callers: a first law soon
+/// ([`SoughtLaw::first`]), and the exact one piece by piece ([`SoughtLaw::advance`]).
 #[derive(Debug)]
 pub struct SoughtLaw {
     disc: Disc,
@@ -103,12 +106,13 @@ pub struct SoughtLaw {
 }
 
 impl SoughtLaw {
-    /// Returns the exact law, or why it can't be computed; `None` if that is not known yet.
+    /// Returns the exact law, or the refusal that says why it can't be computed; `None` while neither is known.
     pub fn exact(&self) -> Option<Result<Arc<Law>>> {
         self.exact.get().cloned()
     }
 
-    /// Adds a law that was computed elsewhere. It is ignored if this one is already there.
+    /// Adds a law of this tissue and disc that was computed elsewhere, as the coarse or the exact one by its
+    /// `is_coarse`. It is ignored if there is one already.
     pub fn is_known(&self, law: Law) {
         // A law that is there already is equal.
         let _ = if law.is_coarse {
@@ -118,11 +122,14 @@ impl SoughtLaw {
         };
     }
 
-    /// Returns a law to begin with, after at most 50 ms of work: the exact one if it is known or takes no longer,
-    /// else a coarse one.
+    /// Returns a law to begin with: the exact or else the coarse one if it is known. Otherwise it computes one in the
+    /// calling thread, in about 50 ms: the exact one if that suffices, else a coarse one. For the few tissues that
+    /// have no coarse law in that time it computes the exact one, with up to `limits.law_work`, which takes longer.
+    /// Setting `stop` ends it.
     ///
     /// # Errors
-    /// Refuses if no law can be computed with the allowed work, or if `stop` is set.
+    /// - [`Reason::NotAvailable`]: no law can be computed with the allowed work, or `stop` is set.
+    /// - There is no memory for the computation, or the exact law was found to be impossible meanwhile.
     pub fn first(&self, stop: &AtomicBool) -> Result<Arc<Law>> {
         if let Some(Ok(law)) = self.exact.get() {
             return Ok(law.clone());
@@ -146,19 +153,20 @@ impl SoughtLaw {
     }
 
     /// Waits until no other task computes the exact law, and reserves the computation until the guard is dropped.
-    /// Then [`Self::exact`] may already have the result.
+    /// Then [`Self::exact`] may already have the result, so look before [`Self::advance`].
     pub async fn turn(&self) -> MutexGuard<'_, ()> {
         self.turn.lock().await
     }
 
-    /// Returns whether no task computes the exact law now.
+    /// Returns whether no task has the turn to compute the exact law now.
     pub fn is_free(&self) -> bool {
         self.turn.try_lock().is_ok()
     }
 
-    /// Continues the computation of the exact law by one depth, or begins it if `computation` is `None`. Returns
-    /// the computation for the next call, or `None` when it has ended: then [`Self::exact`] has the result, unless
-    /// `stop` was set.
+    /// Continues the computation of the exact law by one depth, in the calling thread, or begins it if `computation`
+    /// is `None`. Returns the computation for the next call, or `None` when it has ended: then [`Self::exact`] has
+    /// the law or a refusal (too little work allowed, or missing memory), unless `stop` was set. Have the turn
+    /// ([`Self::turn`]) while you call it.
     pub fn advance(&self, computation: Option<Computation>, stop: &AtomicBool) -> Option<Computation> {
         let progress = memory::attempt("law", || {
             let computation = computation.or_else(|| Computation::new(&self.model, self.disc, self.most_work));

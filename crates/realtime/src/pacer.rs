@@ -26,7 +26,8 @@ use palpate_tissue::lock::lock;
 /// Limit of waiting computations of stiffness, over all tools of a server.
 const WAITING_REFINEMENTS: usize = 8;
 
-/// All sessions of a server, with the threads that step, show, read and audit them.
+/// All sessions of a server, with the threads that step, show, read and audit them. [`Pacer::stop`] ends them;
+/// dropping it does not.
 pub struct Pacer {
     pub(super) limits: Limits,
     /// Memory, processor time and other resources, divided among the callers.
@@ -43,18 +44,18 @@ pub struct Pacer {
     viewers: Mutex<BTreeMap<String, Weak<Viewer>>>,
     pub(super) numbers: Mutex<u64>,
     pub(super) event_logs: OnceLock<Arc<EventLogQueue>>,
-    /// The moment until which the server may step its sessions and answer for them.
+    /// The moment until which the server may step its sessions and answer for them; none at first.
     pub fence: Arc<Fence>,
 }
 
 impl Pacer {
-    /// Starts `threads` stepping threads (at least one, named `step-0` and so on) and one thread each for: sessions
+    /// Starts `threads` stepping threads (0 counts as 1; named `step-0` and so on) and one thread each for: sessions
     /// whose steps take too long for others (`step-apart`), the stiffness under tools (`stiffness`), frames
-    /// (`frames`), reading large sheets (`records`), and audits with `audit_share` of a core (`audit`; none if that
-    /// is 0).
+    /// (`frames`), reading large sheets (`records`), and audits with `audit_share` of a core, 0 to 1 (`audit`; none
+    /// if that is 0). There are no sessions at first.
     ///
     /// # Errors
-    /// Returns an error if a thread can't be started.
+    /// Returns the error of the system if a thread can't be started; those that were started keep waiting.
     pub fn start(threads: usize, audit_share: f64, limits: &Limits, budget: Arc<Budget>) -> std::io::Result<Arc<Self>> {
         let (encoder, reading) = (Arc::new(Encoder::default()), Arc::new(Reading::default()));
         let (mut handles, fence) = (Vec::new(), Arc::new(Fence::default()));
@@ -125,8 +126,8 @@ impl Pacer {
         }))
     }
 
-    /// Makes each session that is created from now on write an event log. Returns the queue of the logs, which the
-    /// caller must empty; a further call returns the same queue.
+    /// Makes each session that is created from now on write an event log, unless it is not to be recorded. Returns
+    /// the queue of the logs, which the caller must empty; a further call returns the same queue.
     pub fn record_events(&self) -> Arc<EventLogQueue> {
         self.event_logs.get_or_init(Arc::default).clone()
     }
@@ -139,7 +140,9 @@ impl Pacer {
     /// Returns the session of that ID, and counts the call as a use of it.
     ///
     /// # Errors
-    /// Refuses an unknown ID, and every ID while the server may not answer for its sessions.
+    /// Refuses an ID that no session has or whose session is still being handed to this server
+    /// ([`Reason::UnknownSession`]), and every other ID while the server may not answer for its sessions
+    /// ([`Reason::Fenced`]).
     pub fn get(&self, id: &str) -> Result<Arc<SessionHandle>> {
         let handle = lock(&self.sessions).get(id).cloned();
         let handle = handle.filter(|handle| !handle.is_coming()).ok_or_else(|| unknown_session(id))?;
@@ -150,57 +153,59 @@ impl Pacer {
         Ok(handle)
     }
 
-    /// Returns whether the session exists and its journal is being written as run `run`.
+    /// Returns whether the session exists, has an event log, and its journal is being written as run `run`.
     pub fn is_recording(&self, id: &str, run: u32) -> bool {
         let sessions = lock(&self.sessions);
         let event_log = sessions.get(id).and_then(|handle| handle.event_log.as_ref());
         event_log.is_some_and(|event_log| event_log.progress().borrow().run == run)
     }
 
-    /// Returns all sessions, oldest first, including those that are still being handed to this server.
+    /// Returns all sessions, oldest on this server first, including those that are still being handed to it.
     pub fn list(&self) -> Vec<Arc<SessionHandle>> {
         let mut all: Vec<_> = lock(&self.sessions).values().cloned().collect();
         all.sort_by_key(|handle| handle.number);
         all
     }
 
-    /// Returns the counters of each stepping thread; the last are those of `step-apart`.
+    /// Returns the counters of each stepping thread, in the order of their numbers; the last are those of
+    /// `step-apart`.
     pub fn tallies(&self) -> impl Iterator<Item = &ThreadCounters> {
         self.steppers.iter().chain([&self.apart]).map(|stepper| &stepper.inbox.tally)
     }
 
-    /// Returns the counters of the auditor.
+    /// Returns the counters of the auditor; all 0 if there is none.
     pub fn audit_tally(&self) -> &AuditTally {
         &self.auditor.tally
     }
 
-    /// Returns the number of viewers, over all sessions.
+    /// Returns the number of viewers that exist, over all sessions.
     pub fn viewers(&self) -> usize {
         lock(&self.viewers).values().filter(|viewer| viewer.strong_count() > 0).count()
     }
 
-    /// Deletes a session: ends all its streams, and discards its waiting commands.
+    /// Deletes a session: ends all its streams, and discards its waiting commands. Its ID is unknown from now on; its
+    /// thread drops it later.
     ///
     /// # Errors
-    /// Refuses an unknown ID.
+    /// Refuses an unknown ID ([`Reason::UnknownSession`]).
     pub fn delete(&self, id: &str) -> Result<()> {
         self.part_with(id, deleted(), Leaving::Deleted)
     }
 
-    /// Removes a session that has another owner: ends all its streams on this server with `why`, and records that
-    /// it left in its journal.
+    /// Removes a session that has another owner: ends all its streams on this server with `why`, and records a last
+    /// snapshot and that it left in its journal.
     ///
     /// # Errors
-    /// Refuses an unknown ID.
+    /// Refuses an unknown ID ([`Reason::UnknownSession`]).
     pub fn leave(&self, id: &str, why: Refusal) -> Result<()> {
         self.part_with(id, why, Leaving::Moved)
     }
 
     /// Cancels a session that was being handed to this server: discards what has arrived, and ends its streams with
-    /// `why`.
+    /// `why`. It does not check that the session is still arriving.
     ///
     /// # Errors
-    /// Refuses an unknown ID.
+    /// Refuses an unknown ID ([`Reason::UnknownSession`]).
     pub fn withdraw(&self, id: &str, why: Refusal) -> Result<()> {
         self.part_with(id, why, Leaving::Withdrawn)
     }
@@ -217,8 +222,8 @@ impl Pacer {
         Ok(())
     }
 
-    /// Ends all streams and releases all tools at the next step, because the server may no longer answer for its
-    /// sessions.
+    /// Ends all streams of all sessions and releases all their tools at the next step, because the server may no
+    /// longer answer for its sessions. The sessions stay.
     pub fn fall_silent(&self) {
         for handle in self.list() {
             handle.at_intake(|intake, _| intake.free(|_, _| true));
@@ -226,7 +231,8 @@ impl Pacer {
         }
     }
 
-    /// Deletes the sessions that were not used for longer than their idle timeout. Returns their IDs.
+    /// Deletes the sessions that had no call, stream or held tool for longer than their idle timeout. Returns their
+    /// IDs, in ascending order.
     pub fn delete_idle(&self) -> Vec<String> {
         let now = now_ns();
         let all: Vec<_> = lock(&self.sessions).values().cloned().collect();
@@ -235,7 +241,8 @@ impl Pacer {
         ids.into_iter().filter(|id| self.delete(id).is_ok()).collect()
     }
 
-    /// Adds a viewer to a session: it is sent frames from now on.
+    /// Adds a viewer to a session: it is sent a full frame and then further ones. [`Pacer::viewer`] finds it while it
+    /// exists.
     pub fn add_viewer(&self, handle: &SessionHandle, viewer: &Arc<Viewer>) {
         let mut viewers = lock(&self.viewers);
         viewers.retain(|_, viewer| viewer.strong_count() > 0);
@@ -244,17 +251,19 @@ impl Pacer {
         handle.view(viewer.clone());
     }
 
-    /// Returns the viewer of that ID.
+    /// Returns the viewer of that ID, of any session.
     ///
     /// # Errors
-    /// Refuses an unknown ID.
+    /// Refuses an ID that no viewer has or whose viewer has ended ([`Reason::UnknownViewer`]).
     pub fn viewer(&self, id: &str) -> Result<Arc<Viewer>> {
         lock(&self.viewers).get(id).and_then(Weak::upgrade).ok_or_else(|| {
             Refusal::new(Reason::UnknownViewer, "viewer_id", format!("there is no viewer `{}`", excerpt(id)))
         })
     }
 
-    /// Ends all sessions and threads, and waits for the threads.
+    /// Ends all sessions with [`Reason::ShuttingDown`] and all threads, and blocks until the threads have ended. Each
+    /// event log gets a last snapshot. [`Pacer::list`] still returns the sessions. Do not call it on one of these
+    /// threads.
     pub fn stop(&self) {
         let why = Refusal::new(Reason::ShuttingDown, "", "the server is shutting down");
         for handle in lock(&self.sessions).values() {
@@ -270,7 +279,7 @@ impl Pacer {
     }
 }
 
-/// Returns the refusal of a call while the server may not answer for its sessions.
+/// Returns the refusal of a call while the server may not answer for its sessions ([`Reason::Fenced`]).
 pub fn fenced() -> Refusal {
     let message = "the server has not heard from etcd for so long that another server may have this session; it continues here, or \
                    there, when they have";

@@ -12,7 +12,8 @@ use palpate_tissue::lock::lock;
 /// Limit of inputs, and of steps, that are read ahead.
 const AHEAD: usize = 4096;
 
-/// Recorded inputs that have been read and not yet played.
+/// Recorded inputs that have been read and not yet played: a thread that reads the recording adds them, and the
+/// stepping thread takes them. It is empty at first.
 #[derive(Default)]
 pub struct PlaybackSource(Mutex<Fed>);
 
@@ -44,20 +45,21 @@ pub(super) enum Next {
 }
 
 impl PlaybackSource {
-    /// Adds inputs that were read, in order. They complete all inputs that act before `until_step`.
+    /// Adds inputs that were read, each with the number of steps done before it acts, in order, after those of
+    /// earlier calls. With them, all inputs that act before `until_step` are there.
     pub fn add(&self, inputs: VecDeque<(u64, Input)>, until_step: u64) {
         let mut fed = lock(&self.0);
         fed.inputs.extend(inputs);
         fed.until_step = fed.until_step.max(until_step);
     }
 
-    /// Marks the recording as read to its end.
+    /// Marks the recording as read to its end: the playback pauses at the last step of which all inputs were added.
     pub fn complete(&self) {
         lock(&self.0).is_complete = true;
     }
 
-    /// Returns whether more inputs should be read for a session that has done `step` steps (fewer than 4096 inputs
-    /// and steps are ahead); `None` at the end of the recording.
+    /// Returns whether more inputs should be read for a session that has done `step` steps: fewer than 4096 inputs
+    /// wait, and they reach fewer than 4096 steps ahead. `None` once [`PlaybackSource::complete`] was called.
     pub fn wants_more(&self, step: u64) -> Option<bool> {
         let fed = lock(&self.0);
         (!fed.is_complete).then(|| fed.inputs.len() < AHEAD && fed.until_step < step + AHEAD as u64)
@@ -89,18 +91,18 @@ impl PlaybackSource {
     }
 }
 
-/// What a session plays: the recording of another session.
+/// A recording of a session that another session plays. Clones share the source of inputs.
 #[derive(Clone)]
 pub struct Playback {
     /// ID of the recorded session.
     pub session_id: String,
-    /// Number of the recorded run of the server.
+    /// Number of the recorded run of that session.
     pub run: u64,
-    /// Step counts at the beginning and at the end of the recording.
+    /// Step counts at the beginning and at the end of the recording, in this order.
     pub steps: [u64; 2],
-    /// Speed of the playback; 1 is real time.
+    /// Speed of the playback, above 0: simulated over real time; 1 is real time.
     pub speed: f64,
-    /// The recorded inputs.
+    /// The recorded inputs, as far as they have been read.
     pub feed: Arc<PlaybackSource>,
 }
 

@@ -20,15 +20,16 @@ struct QueueState<T> {
     waiting: Option<Waker>,
 }
 
-/// Writing end of a queue, used by a stepping thread. Dropping it closes the queue.
+/// Writing end of a queue, used by a stepping thread; no function of it waits. Dropping it closes the queue with
+/// [`Reason::SessionDeleted`].
 #[derive(Debug)]
 pub struct Writer<T>(Arc<Mutex<QueueState<T>>>);
 
-/// Reading end of a queue, used by a stream. Dropping it makes the writer stop.
+/// Reading end of a queue, used by one stream. Dropping it discards the items: the writer finds the queue abandoned.
 #[derive(Debug)]
 pub struct Reader<T>(Arc<Mutex<QueueState<T>>>);
 
-/// Readers to be woken together: waking one may cost more than the step whose sample it gets.
+/// Readers to be woken together: waking one may cost more than the step whose sample it gets. Dropping it wakes none.
 #[derive(Debug, Default)]
 pub struct Wakes(Vec<Waker>);
 
@@ -43,13 +44,13 @@ impl Wakes {
         self.0.is_empty()
     }
 
-    /// Wakes the readers, and clears the list.
+    /// Wakes the readers, in the order in which they were added, and clears the list.
     pub fn wake(&mut self) {
         self.0.drain(..).for_each(Waker::wake);
     }
 }
 
-/// Creates a queue of `capacity` items, at least 1. Returns its two ends.
+/// Creates a queue of at most `capacity` items; 0 counts as 1. Returns its two ends.
 pub fn queue<T>(capacity: usize) -> (Writer<T>, Reader<T>) {
     let inner = QueueState {
         // It grows when needed: a reader that keeps up needs room for one item.
@@ -65,15 +66,16 @@ pub fn queue<T>(capacity: usize) -> (Writer<T>, Reader<T>) {
 }
 
 impl<T> Writer<T> {
-    /// Adds an item and wakes the reader. A full queue drops its oldest item; a closed queue ignores the new one.
+    /// Adds an item and wakes the reader. A full queue drops its oldest item and counts it; a closed or abandoned
+    /// queue ignores the new one.
     pub fn push(&self, item: T) {
         if let Some(waker) = self.place(item) {
             waker.wake();
         }
     }
 
-    /// Adds an item, and appends the waiting reader to `wakes` for the caller to wake. A full queue drops its
-    /// oldest item; a closed queue ignores the new one.
+    /// Adds an item, and appends the reader, if it waits, to `wakes` for the caller to wake. A full queue drops its
+    /// oldest item and counts it; a closed or abandoned queue ignores the new one.
     pub fn push_quietly(&self, item: T, wakes: &mut Wakes) {
         wakes.0.extend(self.place(item));
     }
@@ -91,12 +93,12 @@ impl<T> Writer<T> {
         inner.waiting.take()
     }
 
-    /// Counts one item as dropped that could not be produced.
+    /// Counts one item as dropped that could not be produced. The reader learns of it with the next item.
     pub fn skip(&self) {
         lock(&self.0).dropped += 1;
     }
 
-    /// Removes and returns the newest item; `None` if all have been read.
+    /// Removes and returns the newest unread item, without counting it as dropped; `None` if all have been read.
     pub fn withdraw(&self) -> Option<T> {
         lock(&self.0).items.pop_back()
     }
@@ -107,7 +109,8 @@ impl<T> Writer<T> {
         inner.items.len() == inner.capacity
     }
 
-    /// Closes the queue. The reader gets the remaining items and then `why`. A closed queue keeps its first reason.
+    /// Closes the queue and wakes the reader, which gets the remaining items and then `why`. A closed queue keeps its
+    /// first reason.
     pub fn close(&self, why: Refusal) {
         let mut inner = lock(&self.0);
         inner.end.get_or_insert(why);
@@ -131,16 +134,18 @@ impl<T> Drop for Writer<T> {
 }
 
 impl<T> Reader<T> {
-    /// Waits for an item. Returns the oldest one, and the number of items that were dropped so far.
+    /// Waits for an item. Returns the oldest one, and the number of items that were dropped so far. The call may be
+    /// cancelled at any time without losing an item.
     ///
     /// # Errors
-    /// Returns the reason for which the queue was closed, after the last item.
+    /// Returns the reason for which the queue was closed, after the last item; further calls return it again.
     pub async fn pop(&mut self) -> Result<(T, u64), Refusal> {
         poll_fn(|context| self.poll_pop(context)).await
     }
 
-    /// Polls for an item. Returns the oldest one with the number of dropped items, or the reason if the queue is
-    /// closed and empty. Otherwise it is pending, and the task is woken when one of these is there.
+    /// Polls for an item. Returns the oldest one with the number of items dropped so far, or the reason if the queue
+    /// is closed and empty. Otherwise it is pending, and the task of `context` is woken when one of these is there;
+    /// it replaces a task that waited before.
     pub fn poll_pop(&mut self, context: &mut Context<'_>) -> Poll<Result<(T, u64), Refusal>> {
         let mut inner = lock(&self.0);
         if let Some(item) = inner.items.pop_front() {

@@ -18,15 +18,15 @@ use palpate_tissue::scene::record::Record;
 use palpate_tissue::shape::PointId;
 use palpate_tissue::{Hashing, ReadCopy};
 
-/// A record and its step. All streams that asked for equal records share one.
+/// A record and its step. All streams that asked for equal records at a step share one.
 pub type SharedRecord = Arc<Recorded>;
 
-/// A record that was measured at one step.
+/// A record that was measured at one step. Its memory stays charged until the last stream drops it.
 #[derive(Debug)]
 pub struct Recorded {
     /// Number of steps done before the measurement.
     pub step: u64,
-    /// The measured points and tools.
+    /// The measured points, in the order of the request, with the energies and tools that were requested.
     pub record: Record,
     /// Memory of the record.
     pub(super) _taken: Taken,

@@ -61,7 +61,7 @@ impl RunQueue {
         weary.and_then(|_| due().find(is_others)).or_else(|| due().next())
     }
 
-    /// Returns the account number of the caller who created a session.
+    /// Returns the account number of the caller that created a session.
     pub(super) fn owner(&self, number: u64) -> Option<u64> {
         self.sessions.get(&number).map(|running| running.owner())
     }

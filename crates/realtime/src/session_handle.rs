@@ -42,17 +42,18 @@ use palpate_tissue::shape::PointId;
 /// Handle of a session for the server's calls, which any thread may use. Its stepping thread owns the session
 /// itself.
 pub struct SessionHandle {
-    /// Random ID, which can't be guessed.
+    /// ID of the session; random, so that it can't be guessed.
     pub id: String,
     /// The first tissue of the session. Its points and its rate stay; coefficients, scheme and substeps may have
     /// changed since ([`Status::model`]).
     pub model: Arc<Model>,
-    /// Surface by which frames show the tissue, if it is a mesh.
+    /// Surface by which frames show the tissue, if it is a mesh; `None` for a sheet.
     pub skin: Option<Arc<Skin>>,
-    /// Account of the caller that created the session, which is charged for it.
+    /// Account of the caller that created the session, which is charged for it and its commands.
     pub owner: Account,
     pub(super) intake: Mutex<Intake>,
-    /// Time without calls, held tools or streams after which the session is deleted, s.
+    /// Time without calls, held tools or streams after which [`Pacer::delete_idle`](super::Pacer::delete_idle)
+    /// deletes the session, s.
     pub idle_timeout_s: f64,
     /// Revision of the session's key in etcd at which this server became its owner; 0 without a fleet.
     pub(super) revision: AtomicU64,
@@ -72,9 +73,9 @@ pub struct SessionHandle {
     pub(super) thread: AtomicUsize,
     /// Inbox of the thread that it began on, which passes requests on if the session has moved.
     pub(super) inbox: Arc<Inbox>,
-    /// The recording that the session plays, if any.
+    /// The recording that the session plays; `None` for a live session.
     pub playback: Option<Playback>,
-    /// Event log for the session's journal, if the server keeps journals and records this session.
+    /// Event log for the session's journal; `None` if the server keeps no journals or does not record this session.
     pub event_log: Option<Arc<EventLog>>,
     /// Its place in the limit on sessions, freed when it is deleted, even if readers remain.
     pub(super) slot: Mutex<Taken>,
@@ -83,8 +84,8 @@ pub struct SessionHandle {
 }
 
 impl SessionHandle {
-    /// Returns the present status. For a session at rest it counts the steps that are due by now, without computing
-    /// them.
+    /// Returns the present status, as of the last step or request. For a session at rest it counts the steps that are
+    /// due by now, without computing them. It does not wait for the stepping thread.
     pub fn status(&self) -> Status {
         let now = now_ns();
         let resting = self.at_intake(|intake, _| intake.is_resting().then(|| intake.next_step()));
@@ -131,11 +132,13 @@ impl SessionHandle {
         answer
     }
 
-    /// Accepts all of `commands` from the holder of `lease`, or none, and puts the first slice of them in the
-    /// queue.
+    /// Accepts all of `commands` from the holder of `lease`, or none, renews the lease, and puts the first slice of
+    /// them in the queue. [`Accepted::taken_in`] puts in the rest.
     ///
     /// # Errors
-    /// Refuses commands that break the session's rules, and whatever [`Intake::accept`] refuses.
+    /// Returns the refusals of [`Rules::check`](palpate_session::rules::Rules::check) (too many commands, an action
+    /// that breaks a rule) and of [`Intake::accept`] (a session that is held, deleted or a playback; tools of other
+    /// leases; an unfinished batch; sequence numbers that do not rise; tips; a full queue; missing memory).
     pub fn submit(&self, lease: LeaseId, commands: Vec<Command>) -> Result<Accepted<'_>> {
         let rules = lock(&self.intake).rules();
         let checked = rules.check(commands)?;
@@ -146,7 +149,7 @@ impl SessionHandle {
         })
     }
 
-    /// Returns the revision at which this server became the session's owner, or last confirmed that it is; 0
+    /// Returns the revision in etcd at which this server became the session's owner, or last confirmed that it is; 0
     /// without a fleet.
     pub fn revision(&self) -> u64 {
         self.revision.load(Ordering::Acquire)
@@ -158,17 +161,17 @@ impl SessionHandle {
         self.revision.fetch_max(revision, Ordering::AcqRel);
     }
 
-    /// Adds to the count of refused commands.
+    /// Adds `commands` to the number of refused commands, which [`SessionHandle::refused`] returns.
     pub fn count_refused(&self, commands: usize) {
         self.refused.fetch_add(commands as u64, Ordering::Relaxed);
     }
 
-    /// Returns the results of audits so far.
+    /// Returns a copy of the results of audits so far on this server.
     pub fn audited(&self) -> Audited {
         lock(&self.audited).clone()
     }
 
-    /// Returns the number of refused commands.
+    /// Returns the number of refused commands so far, as [`SessionHandle::count_refused`] counted them.
     pub fn refused(&self) -> u64 {
         self.refused.load(Ordering::Relaxed)
     }
@@ -179,23 +182,30 @@ impl SessionHandle {
         answer.await.unwrap_or_else(|_| Err(deleted()))
     }
 
-    /// Starts time, without end or until `until` steps are done. Returns the number of the next step.
+    /// Starts time, without end or until `until` steps are done, when the thread serves the request. If time advances
+    /// already, only its end changes. Returns the number of the next step, which is that of steps done.
     ///
     /// # Errors
-    /// Refuses a session that is held or deleted, and an `until` that is not above the steps done.
+    /// Refuses a session that is held ([`Reason::SessionHeld`]) or deleted ([`Reason::SessionDeleted`]), and an
+    /// `until` that is not above the steps done ([`Reason::StepPassed`]).
     pub async fn start(&self, until: Option<u64>) -> Result<u64> {
         self.ask(|reply| Request::Start { until, reply }).await
     }
 
-    /// Changes the tissue from the beginning of step `at_step` on, or of the next step. Returns that step and the
-    /// new tissue. The tissue is compiled in the calling thread, which takes some milliseconds; no step waits for
-    /// that.
+    /// Changes the tissue from the beginning of step `at_step` on, or of the next step if that is later or `at_step`
+    /// is `None`. Returns that step and the new tissue. The tissue is compiled in the calling thread, which takes
+    /// some milliseconds; no step waits for that. If another change comes first, this one is applied to its result.
+    /// Setting `stop` cancels the call.
     ///
-    /// If the change needs more substeps, `admit` decides whether the stepping thread has that fraction of its time
-    /// left.
+    /// `admit` gets the fraction of its thread that the session would take, if the change needs more substeps, and
+    /// decides whether the thread has that left.
     ///
     /// # Errors
-    /// Refuses a change that is invalid or whose steps are too heavy, what `admit` refuses, and when `stop` is set.
+    /// - The change is invalid, or beyond the limits.
+    /// - [`Reason::TooLarge`]: its steps are too heavy.
+    /// - The refusals of `admit` and of [`Intake::change`] (closed intake, a waiting change with a later step, too
+    ///   many waiting changes, missing memory).
+    /// - `stop` is set.
     pub fn change(
         &self,
         change: &Change,
@@ -228,8 +238,9 @@ impl SessionHandle {
         }
     }
 
-    /// Adopts the changes of the tissue that waited for their step on the server that had the session before.
-    /// Changes for which there is no memory are dropped, with a warning.
+    /// Adopts the changes of the tissue that waited for their step on the server that had the session before, each
+    /// with that step, by ascending step. Changes for which there is no memory are dropped, with a warning in the
+    /// log.
     pub fn adopt_waiting(&self, waiting: Vec<(u64, Input)>) {
         let handed = Handed { leases: Vec::new(), waiting };
         let dropped = self.at_intake(|intake, now| {
@@ -249,34 +260,37 @@ impl SessionHandle {
         }
     }
 
-    /// Revives a held session: it continues at the step at which it was held, paused, with its tissue at rest and
-    /// all tools released. Returns that step. The cause of the failure may occur again.
+    /// Revives a held session: it continues at the step at which it was held, paused, with its tissue at rest and all
+    /// leases ended. Its counts begin again. Returns that step. The cause of the failure may occur again.
     ///
     /// # Errors
-    /// Refuses a session that is not held, or that is deleted.
+    /// Refuses a session that is not held ([`Reason::OutOfTurn`]) or that is deleted ([`Reason::SessionDeleted`]),
+    /// and if there is no memory.
     pub async fn revive(&self) -> Result<u64> {
         self.ask(|reply| Request::Revive { reply }).await
     }
 
-    /// Returns a copy of the present state, from which a session can continue.
+    /// Waits for the stepping thread and returns a copy of the present state, from which a session can continue.
     ///
     /// # Errors
-    /// Refuses a session that is deleted, and if the system has no memory for the copy.
+    /// Refuses a session that is deleted ([`Reason::SessionDeleted`]), and if the system has no memory for the copy.
     pub async fn save(&self) -> Result<Present> {
         self.ask(Request::Save).await
     }
 
-    /// Stops stepping until [`SessionHandle::thaw`], and returns a copy of the present state. Freezing changes no
-    /// bits of the session.
+    /// Stops stepping until [`SessionHandle::thaw`], and returns a copy of the present state. Requests are still
+    /// served. Freezing changes no bits of the session.
     ///
     /// # Errors
-    /// Refuses a session that is deleted, and if the system has no memory for the copy.
+    /// Refuses a session that is deleted ([`Reason::SessionDeleted`]), and if the system has no memory for the copy;
+    /// then the session is not frozen.
     pub async fn freeze(&self) -> Result<Present> {
         self.ask(Request::Freeze).await
     }
 
-    /// Makes this server the owner of a session that was handed over frozen: `revision` is that of its key. The
-    /// session is stepped and served from now on.
+    /// Makes this server the owner of a session that was handed over frozen
+    /// ([`Begin::frozen`](super::Begin::frozen)): `revision` is that of its key in etcd. The session is stepped and
+    /// served from now on.
     pub fn arrive(&self, revision: u64) {
         self.set_owned_since(revision);
         self.is_coming.store(false, Ordering::Release);
@@ -288,48 +302,56 @@ impl SessionHandle {
         self.is_coming.load(Ordering::Acquire)
     }
 
-    /// Returns the measured fraction of a core that the session's steps take; 0 at rest.
+    /// Returns the measured fraction of a core that the session's steps take while they are computed; 0 at rest or
+    /// paused. Before the first steps it is an estimate.
     pub fn share(&self) -> f64 {
         self.cost.share()
     }
 
-    /// Resumes stepping after [`SessionHandle::freeze`].
+    /// Resumes stepping after [`SessionHandle::freeze`], when the thread serves the request; otherwise it has no
+    /// effect.
     pub fn thaw(&self) {
         self.inbox.send(self.number, Request::Thaw);
     }
 
-    /// Pauses the session's time.
+    /// Pauses the session's time, when the thread serves the request. Streams of samples get the present one. A
+    /// session that is paused or held stays so.
     ///
     /// # Errors
-    /// Refuses a session that is deleted.
+    /// Refuses a session that is deleted ([`Reason::SessionDeleted`]).
     pub async fn pause(&self) -> Result<()> {
         self.ask(|reply| Request::Pause { reply }).await
     }
 
     /// Waits until `at` steps are done; `None` stands for now. Returns the step count and the hash of the state
-    /// there. `account` is charged for the time of reading.
+    /// there. `account` is charged for the time of reading and, for a large tissue, for the memory of a copy. It
+    /// waits for as long as time is paused before that step.
     ///
-    /// Refuses a step that has passed, a session that is held or deleted, and a caller that has used up its part of
-    /// the reading time.
-    /// reading time.
+    /// # Errors
+    /// - [`Reason::StepPassed`]: more than `at` steps are done.
+    /// - [`Reason::SessionHeld`] or [`Reason::SessionDeleted`], also while it waits. A hash of the step at which a
+    ///   session is held is returned.
+    /// - [`Reason::Overloaded`]: the caller has used up its part of the reading time, or there is no memory.
     pub async fn hash_at(&self, at: Option<u64>, account: &Account) -> Result<(u64, u128)> {
         let account = account.clone();
         self.ask(|reply| Request::Hash { at, account, reply }).await
     }
 
     /// Opens a stream of samples and returns its reader. A full queue (`limits.queued_samples`) drops its oldest
-    /// sample.
+    /// sample. `sampling` must have been checked. If time is paused, the present sample comes at once. For a held
+    /// session the stream ends with [`Reason::SessionHeld`] after the present sample.
     ///
     /// The stepping thread's time is charged to `watcher`, which gets no sample while its part of that time is used
-    /// up; `None` stands for the stream of a client that holds a tool.
+    /// up, except the last before a pause; `None` stands for the stream of a client that holds a tool.
     pub fn samples(&self, sampling: Sampling, watcher: Option<&Account>) -> Reader<PacedSample> {
         self.tap(sampling, watcher, false)
     }
 
-    /// Returns the next sample of the tools `only`; the present sample if time is paused.
+    /// Waits for the next sample of the tools `only`, in their order, without local models; returns the present
+    /// sample if time is paused.
     ///
     /// # Errors
-    /// Refuses a session that is held or deleted.
+    /// Refuses a session that is deleted, or that is held while it waits.
     pub async fn next_sample(&self, only: Vec<u32>) -> Result<PacedSample> {
         let (laws, touch_stiffness) = (None, false);
         let sampling = Sampling {
@@ -352,12 +374,14 @@ impl SessionHandle {
         reader
     }
 
-    /// Opens a stream of records and returns its reader: of `points`, or of all, whenever the step count is a
-    /// multiple of `every`, with the tissue's energies if `energy` and with the tools' states if `tools`. The work
-    /// is charged to `account`.
+    /// Opens a stream of records and returns its reader: of `points` in their order, or of all for `None`, whenever
+    /// the step count is a multiple of `every` (at least 1), with the tissue's energies if `energy` and with the
+    /// states of tools led by poses if `tools`. The points must be those of the tissue. Time and memory are charged
+    /// to `account`. A record for which it has neither, or for which the reader is too late (`limits.queued_bytes`,
+    /// `limits.queued_records`), is left out and counted as dropped.
     ///
     /// # Errors
-    /// Refuses if the system has no memory for a record.
+    /// Refuses if the system has no memory for a record. A held session ends the stream with [`Reason::SessionHeld`].
     pub fn probe(
         &self,
         every: u64,
@@ -378,22 +402,23 @@ impl SessionHandle {
         Ok(reader)
     }
 
-    /// Returns a receiver of the tissue and the step from whose beginning it acts. It is updated when a change
-    /// takes effect.
+    /// Returns a receiver of the step from whose beginning the present tissue acts and of that tissue. It has the
+    /// present value, and is updated when a change takes effect.
     pub fn tissue(&self) -> watch::Receiver<(u64, Arc<Model>)> {
         self.tissue.subscribe()
     }
 
-    /// Returns the force law of `model`, a tissue of this session, under a disc. It computes nothing; see
-    /// [`SoughtLaw`].
+    /// Returns the force law of `model`, a tissue of this session, under a disc, with up to `limits.law_work` for the
+    /// exact one. It computes nothing; see [`SoughtLaw`].
     ///
     /// # Errors
-    /// Refuses if the memory of a further law exceeds the part of the session's owner.
+    /// Refuses if the memory of a further law exceeds the part of the session's owner or of the system.
     pub fn law(&self, model: &Arc<Model>, disc: Disc) -> Result<Arc<SoughtLaw>> {
         self.laws.of(disc, model, self.limits.law_work, &self.owner)
     }
 
-    /// Returns the force laws of the present tissue that have been computed so far, by their disc.
+    /// Returns the force laws of the present tissue that have been computed so far, each with its disc; the most
+    /// recently requested is the last.
     pub fn known_laws(&self) -> Vec<(Disc, Arc<Law>)> {
         let model = self.tissue.borrow().1.clone();
         self.laws.known(&model)
@@ -410,13 +435,15 @@ impl SessionHandle {
         }
     }
 
-    /// Adds a viewer: it is sent a full frame and then further frames.
+    /// Adds a viewer: it is sent a full frame of the present state and then further frames.
+    /// [`Pacer::add_viewer`](super::Pacer::add_viewer) also makes it known by its ID.
     pub fn view(&self, viewer: Arc<Viewer>) {
         self.inbox.send(self.number, Request::View(viewer));
     }
 }
 
-/// Commands that were accepted. Dropping this puts those that remain in the queue.
+/// Commands that [`SessionHandle::submit`] accepted, of which the first slice is in the queue. Dropping this puts
+/// those that remain in the queue, in the calling thread.
 pub struct Accepted<'l> {
     handle: &'l SessionHandle,
     batch: AcceptedBatch,
@@ -430,7 +457,7 @@ impl Accepted<'_> {
     }
 
     /// Puts the remaining commands in the queue, slice by slice. It yields between slices to other tasks and the
-    /// stepping thread.
+    /// stepping thread. If it is cancelled, the rest is put in at once.
     pub async fn taken_in(mut self) {
         while self.goes_on {
             tokio::task::yield_now().await;

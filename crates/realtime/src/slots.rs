@@ -7,10 +7,11 @@ use tokio_util::sync::CancellationToken;
 use palpate_session::budget::{Account, Pool, Taken};
 use palpate_tissue::limits::Limits;
 
-/// Purpose of a stream.
+/// Purpose of a stream, which decides which slots of its session it may take.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StreamKind {
-    /// The stream holds tools. Some slots of a session are reserved for such streams.
+    /// The stream holds tools. Some slots of a session are reserved for such streams (`limits.streams_for_holders`,
+    /// at most an eighth of all).
     HoldsTools,
     /// The stream only reads.
     ReadsOnly,

@@ -17,10 +17,10 @@ use palpate_tissue::shape::RestShape;
 /// holds at most one more message of 64 KiB or a little more.
 const UNSENT_BYTES: u64 = (400 + 80) << 10;
 
-/// Description of a stream, for administrators.
+/// Description of an open stream, for administrators ([`SessionHandle::list_streams`]).
 #[derive(Debug, Clone)]
 pub struct StreamInfo {
-    /// Number of the stream within its session.
+    /// Number of the stream within its session, from 1; never reused.
     pub number: u64,
     /// Name of the call that opened the stream.
     pub what: &'static str,
@@ -32,7 +32,7 @@ pub struct StreamInfo {
     pub age_ns: u64,
 }
 
-/// Slot of a stream in its session. Dropping it frees the slot.
+/// Slot of an open stream in its session. Dropping it frees the slot, and counts as a use of the session.
 pub struct StreamGuard {
     handle: Arc<SessionHandle>,
     number: u64,
@@ -40,7 +40,8 @@ pub struct StreamGuard {
 }
 
 impl StreamGuard {
-    /// Returns the token that is cancelled when an administrator cuts the stream.
+    /// Returns the token that is cancelled when an administrator cuts the stream; the stream should then end with
+    /// [`cut`].
     pub fn cut(&self) -> &CancellationToken {
         &self.cut
     }
@@ -58,17 +59,20 @@ impl Drop for StreamGuard {
     }
 }
 
-/// Returns the refusal that a cut stream ends with.
+/// Returns the refusal that a stream ends with after an administrator has cut it ([`Reason::Cut`]).
 pub fn cut() -> Refusal {
     Refusal::new(Reason::Cut, "", "an administrator of the server has ended this stream")
 }
 
 impl SessionHandle {
-    /// Takes a slot for a further stream of `account`, opened by the call `what`. The stream's memory is charged
-    /// too.
+    /// Takes a slot for a further stream of `account`, opened by the call `what`. The stream is charged to `account`,
+    /// with 480 KiB of memory for unread bytes, until the guard is dropped or the stream is cut.
     ///
     /// # Errors
-    /// Refuses if all slots of the session or of the caller are taken, or if the memory exceeds the caller's part.
+    /// - [`Reason::TooMany`]: all slots of the session are taken (`limits.streams_per_session`); `kind` is
+    ///   [`StreamKind::ReadsOnly`] and the caller has its part of the slots for such streams; or the account has its
+    ///   part of the server's streams.
+    /// - [`Reason::Overloaded`]: the memory exceeds the part of the account.
     pub fn open_stream(
         self: &Arc<Self>,
         what: &'static str,
@@ -96,12 +100,12 @@ impl SessionHandle {
         Ok(StreamGuard { handle: self.clone(), number, cut })
     }
 
-    /// Returns the number of open streams.
+    /// Returns the number of open streams of the session, of both kinds.
     pub fn streams(&self) -> usize {
         lock(&self.streams).open.len()
     }
 
-    /// Describes the open streams, oldest first.
+    /// Describes the open streams, by ascending number, so oldest first.
     pub fn list_streams(&self) -> Vec<StreamInfo> {
         let now = now_ns();
         let show = |(number, open): (&u64, &OpenSlot)| StreamInfo {
@@ -114,8 +118,8 @@ impl SessionHandle {
         lock(&self.streams).open.iter().map(show).collect()
     }
 
-    /// Cuts the streams for which `chosen` holds, by number and account, and returns how many. Their slots are free
-    /// at once; their [`StreamGuard::cut`] tokens are cancelled.
+    /// Cuts the streams for which `chosen` holds, by number and account, and returns how many. `chosen` runs under a
+    /// lock. Their slots are free at once; their [`StreamGuard::cut`] tokens are cancelled.
     pub fn cut_streams(&self, chosen: impl Fn(u64, &Account) -> bool) -> usize {
         let mut streams = lock(&self.streams);
         let numbers: Vec<u64> =

@@ -3,7 +3,7 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// A counter that only one thread increments.
+/// A counter that only one thread increments and that any thread may read. It begins at 0.
 #[derive(Debug, Default)]
 pub struct Count(AtomicU64);
 
@@ -23,7 +23,7 @@ impl Count {
 /// Number of bounds of a histogram: 1 µs, 2 µs, 4 µs, … One more bucket has no bound.
 const BOUNDS: usize = 18;
 
-/// Histogram of times, with a bucket for each power of two of microseconds.
+/// Histogram of times, with 19 buckets: up to 1 µs, 2 µs, 4 µs and so on to 131 ms, and longer ones.
 #[derive(Debug, Default)]
 pub struct Times {
     buckets: [Count; BOUNDS + 1],
@@ -39,7 +39,8 @@ impl Times {
         self.sum_ns.add(ns);
     }
 
-    /// Returns the upper bound, s, and the count of each bucket, by ascending bound; that of the last is infinite.
+    /// Returns the upper bound, s, and the count of each bucket alone, by ascending bound; a time that equals a bound
+    /// counts below it. The bound of the last is infinite.
     #[allow(clippy::cast_precision_loss)]
     pub fn buckets(&self) -> Vec<(f64, u64)> {
         let bound_s = |bucket: usize| if bucket < BOUNDS { (1_u64 << bucket) as f64 * 1e-6 } else { f64::INFINITY };
@@ -53,16 +54,17 @@ impl Times {
     }
 }
 
-/// Counters of one stepping thread since it began. They include sessions that have ended.
+/// Counters of one stepping thread since it began. They include sessions that have ended or moved to another thread;
+/// a session that came with counts from elsewhere adds them.
 #[derive(Debug, Default)]
 pub struct ThreadCounters {
-    /// Times of steps, including the publication of samples.
+    /// Times of steps, including the publication of samples. A step that was done in parts counts once for each part.
     pub step_time: Times,
-    /// Times by which steps began after they were due.
+    /// Times by which steps, or parts of one, began after they were due.
     pub lateness: Times,
-    /// Steps that were skipped at rest.
+    /// Steps that were skipped at rest and not computed.
     pub rested_steps: Count,
-    /// Steps that were due and were dropped.
+    /// Steps that were due and were dropped from the schedule.
     pub overruns: Count,
     /// Commands that came too late for their step.
     pub late_commands: Count,
@@ -70,17 +72,17 @@ pub struct ThreadCounters {
     pub paused_commands: Count,
     /// Tools whose lease expired.
     pub lapsed_leases: Count,
-    /// Returns of the guard to a checkpoint.
+    /// Returns of the guard to a checkpoint, from which it repeated steps with a shorter substep.
     pub guard_events: Count,
-    /// Returns of a tissue to an earlier state.
+    /// Recoveries: returns of a tissue to an earlier state.
     pub recoveries: Count,
-    /// Sessions that the guard has stopped.
+    /// Sessions that were stopped: by the guard, a fault of the program, or missing memory.
     pub held_sessions: Count,
-    /// Steps in which a tool was held to the speed limit.
+    /// Steps in which the speed limit of 0.5 m/s acted on a tool.
     pub limited_steps: Count,
     /// Poses that were refused or passed over.
     pub dropped_poses: Count,
-    /// Tools that were released because no pose arrived any more.
+    /// Tools that were released because no pose had arrived for 250 ms.
     pub stale_releases: Count,
 }
 

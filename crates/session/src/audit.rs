@@ -19,7 +19,8 @@ fn twin_of(model: &Model) -> Arc<Model> {
     model.twin(FINER, Precision::F64)
 }
 
-/// A twin: a more accurate session that gets another session's inputs, with the differences between the two.
+/// A twin: a more accurate session (f64, a quarter of the substep, no sleep) that gets another session's inputs, with
+/// the differences between the records of the two.
 pub struct Twin {
     session: Session,
     /// The tissue of the other session.
@@ -30,7 +31,8 @@ pub struct Twin {
 }
 
 impl Twin {
-    /// Creates a twin of a session of `model` that has not begun, in which the profiles of `script` act, if there is one.
+    /// Creates a twin at step 0 of a session of `model` that has not begun. The forces and moves of `script` act in
+    /// it as continuous profiles; `None` if they come as commands.
     pub fn new(model: &Arc<Model>, script: Option<&Script>) -> Self {
         let mut session = Session::new(&twin_of(model));
         script.iter().for_each(|script| session.play_script(script));
@@ -38,8 +40,8 @@ impl Twin {
         Twin { session, of: model.clone(), records: VecDeque::new(), differences, largest }
     }
 
-    /// Changes the twin's tissue to a more accurate form of `model`, the other session's tissue. Does nothing if that has not
-    /// changed.
+    /// Changes the twin's tissue, from the coming step on, to a more accurate form of `model`, the other session's
+    /// tissue. Does nothing if that is the same as before.
     pub fn follow(&mut self, model: &Arc<Model>) {
         if !Arc::ptr_eq(&self.of, model) {
             self.session.change(&twin_of(model));
@@ -47,7 +49,8 @@ impl Twin {
         }
     }
 
-    /// Advances the twin by one step, before the other session does that step, and keeps its record if one is due.
+    /// Advances the twin by one step with the commands in `due`. Call it before the other session does that step with
+    /// the same commands. Keeps a record of the script's sample points if one is due, for [`Twin::compare`].
     pub fn advance(&mut self, due: &[Due], script: &Script) {
         let Twin { session, records, .. } = self;
         session.advance(&mut due.to_vec(), |session| {
@@ -57,12 +60,15 @@ impl Twin {
         });
     }
 
-    /// Returns why the twin can no longer be compared with the other session; `None` if it can.
+    /// Returns why the twin can no longer be compared with the other session: it has stopped, or there was a recovery
+    /// in it. `None` if it can.
     pub fn fault(&self) -> Option<String> {
         self.session.fault().map(|reason| format!("the audit's twin: {reason}"))
     }
 
-    /// Compares the twin's oldest record with `record`, the next one of the other session.
+    /// Compares the twin's oldest record with `record`, the next one of the other session: displacements and
+    /// reactions, each component. Does nothing if the twin has no record left. Call it once for each record, in
+    /// order.
     pub fn compare(&mut self, record: &Record) {
         let Some(truth) = self.records.pop_front() else { return };
         for (point, truth) in record.points.iter().zip(&truth.points) {
@@ -79,14 +85,15 @@ impl Twin {
         }
     }
 
-    /// Returns the largest difference in all records so far, relative to the largest value.
+    /// Returns the largest difference in all compared records so far, of displacements and of forces, each relative
+    /// to the largest component in the twin's records.
     pub fn error(&self) -> AuditedError {
         self.differences.relative_to(self.largest)
     }
 }
 
-/// Audits of the windows of a session, one after the other. Which steps they cover depends only on the scene and
-/// its inputs.
+/// Audits of the windows of a session, one after the other, in the thread that steps it. Which steps they cover
+/// depends only on the scene and its inputs.
 #[derive(Default)]
 pub struct Windows {
     opening: Option<WindowOpening>,
@@ -96,7 +103,8 @@ pub struct Windows {
 
 impl Windows {
     /// Audits the window that has ended, if one has, and requests the next. Call it after each step, and before the
-    /// first. Returns the finding of the audit.
+    /// first. It simulates the window again with a quarter of the substep, which takes longer than the window's own
+    /// steps. Returns the finding of the audit; `None` if no window ended or its audit gave none.
     pub fn look(&mut self, session: &mut Session) -> Option<AuditFinding> {
         if !std::mem::replace(&mut self.begun, true) {
             session.request_audit(WindowInputs::default());

@@ -9,10 +9,11 @@ use super::lease::LeaseId;
 use super::rules::{CheckedCommands, check_contact_work, check_tip, tip_radius_m};
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Number of commands that are put in the queue while the intake is locked once.
+/// Largest number of commands that one call of [`Intake::go_on`] puts in the queue.
 pub const SLICE: usize = 256;
 
-/// The commands of an accepted batch that are not in the queue yet. [`Intake::go_on`] puts them there.
+/// The commands of an accepted batch that are not in the queue yet. [`Intake::go_on`] puts them there; call it until
+/// it returns false, because the lease accepts no other batch before that.
 #[derive(Debug)]
 #[must_use]
 pub struct AcceptedBatch {
@@ -21,14 +22,20 @@ pub struct AcceptedBatch {
 }
 
 impl Intake {
-    /// Accepts all of the commands, which `Rules::check` has checked, or none, and renews the lease.
-    /// [`Intake::go_on`] puts them in the queue in slices, between which other callers may use the intake. No
-    /// command of the batch takes effect before the last is in the queue.
+    /// Accepts all of the commands, which [`Rules::check`](super::rules::Rules::check) has checked, or none, and
+    /// renews the lease `id` from `now_ns`, ns. [`Intake::go_on`] puts them in the queue in slices, between which
+    /// other callers may use the intake. No command of the batch takes effect before the last is in the queue. A
+    /// command without a sequence number gets the previous one plus 1, or 0. An empty batch only renews.
     ///
     /// # Errors
-    /// Refuses if the intake is closed, tools that this lease does not hold, sequence numbers that do not rise,
-    /// another tip on a tool in the tissue, tips with too much contact work, too many commands, and a lease with an
-    /// unfinished batch.
+    /// - The refusal with which the intake was closed.
+    /// - [`Reason::OutOfTurn`]: an earlier batch of the lease is unfinished, or a pose has another tip than the tool
+    ///   has in the tissue.
+    /// - [`Reason::NotHolder`]: a tool is not held by this lease, for example because it has expired.
+    /// - [`Reason::StaleSequence`]: a sequence number does not rise, and the command did not come by datagram.
+    /// - [`Reason::TooLarge`]: the session's tips together exceed `limits.contact_work`.
+    /// - [`Reason::QueueFull`]: more commands of a tool would wait than `limits.queued_commands_per_tool`.
+    /// - [`Reason::Overloaded`] or [`Reason::TooLarge`]: the account has no memory for the commands.
     pub fn accept(
         &mut self,
         id: LeaseId,
@@ -90,8 +97,9 @@ impl Intake {
         Ok(AcceptedBatch { id, commands: commands.into_iter() })
     }
 
-    /// Puts at most [`SLICE`] commands of a batch in the queue. Returns whether there are more. Commands to a tool
-    /// that has been released meanwhile are dropped.
+    /// Puts at most [`SLICE`] commands of a batch in the queue. Returns whether there are more. If the intake has
+    /// been closed or a tool has been released since the batch was accepted, the commands concerned are dropped and
+    /// counted.
     pub fn go_on(&mut self, batch: &mut AcceptedBatch) -> bool {
         let slice = batch.commands.len().min(SLICE);
         self.coming -= slice;

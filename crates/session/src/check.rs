@@ -17,7 +17,8 @@ use palpate_tissue::select::scheme_selection::{self, Choice};
 use palpate_tissue::shape::PointId;
 use palpate_tissue::{Model, Plan, Push};
 
-/// Report on a scene. Its `Display` is the output of `palpate check`.
+/// Report on a scene: its properties, the chosen scheme and its alternatives, the time of a step, and warnings. Its
+/// `Display` is the output of `palpate check`, several lines of text.
 #[derive(Debug)]
 pub struct CheckReport {
     model: Arc<Model>,
@@ -37,8 +38,11 @@ const LONGEST_STEP_S: f64 = 0.2;
 const WINDOWS: usize = 50;
 const WINDOW_S: f64 = 0.004;
 
-/// Reports on a scene, and on a script for it if one is given, and times a step under a poke. `clock_s` returns the
-/// time, s.
+/// Reports on a scene, and on a script for it if one is given, and times a step under a poke. `limits` bound the
+/// schemes that it tries. `clock_s` returns a monotonic time, s.
+///
+/// The timing takes about 0.2 s, or longer for steps above 4 ms; it is left out, and the report says so, if a step is
+/// predicted to take more than 0.2 s or the guard stops it.
 pub fn check(model: &Arc<Model>, script: Option<&Script>, limits: &Limits, clock_s: &dyn Fn() -> f64) -> CheckReport {
     let mut candidates = scheme_selection::candidates(&model.scene, limits);
     // The choice did not try dearer schemes, and another number format alone is no candidate.

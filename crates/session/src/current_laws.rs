@@ -8,8 +8,8 @@ use palpate_tissue::lock::lock;
 /// Number of the law with which a stream begins, as its local models name it.
 pub const FIRST: u32 = 0;
 
-/// The force law that the local models of a stream refer to, and its number in the stream. It is locked only while
-/// it is copied.
+/// The force law that the local models of a stream refer to now, and its number in the stream. It can be shared
+/// between threads; it is locked only while it is copied or replaced.
 #[derive(Debug)]
 pub struct Laws(Mutex<(u32, Arc<Law>)>);
 
@@ -19,12 +19,13 @@ impl Laws {
         Laws(Mutex::new((FIRST, first)))
     }
 
-    /// Makes all local models from the next sample on refer to `law`, whose number is `number`.
+    /// Makes all local models from the next sample on refer to `law`, whose number is `number`. A new law needs
+    /// another number: a sampler notices the change by it.
     pub fn change(&self, number: u32, law: Arc<Law>) {
         *lock(&self.0) = (number, law);
     }
 
-    /// Returns the present law, which local models refer to, and its number.
+    /// Returns the number of the present law, which local models refer to, and the law.
     pub fn newest(&self) -> (u32, Arc<Law>) {
         lock(&self.0).clone()
     }

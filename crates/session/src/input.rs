@@ -8,8 +8,8 @@ use super::command::Due;
 use super::{Session, ToolSample};
 use palpate_tissue::Model;
 
-/// One input to a session. A session that gets the inputs of another in their order, each at its step, gives equal
-/// bits.
+/// One input to a session: everything that acts on it from outside. A session that gets the inputs of another in
+/// their order, each at its step, gives equal bits.
 #[derive(Debug, Clone)]
 pub enum Input {
     /// A command that is due, or the end of a lease ([`Session::advance`]).
@@ -23,29 +23,33 @@ pub enum Input {
     },
     /// Time pauses. It changes no bits.
     Pause,
-    /// This number of steps was due and not done in time, so the schedule was moved. It changes no bits.
+    /// This number of steps was due and not done in time, so all later steps are due that much later. It changes no
+    /// bits.
     DroppedSteps(u64),
-    /// A held session continues, paused, with its tissue at rest: [`Session::new`], skipped to this step.
+    /// A session that has stopped continues, paused, with its tissue at rest: [`Session::new`] of the present model,
+    /// skipped to this step.
     Revive,
-    /// The session is held for a reason other than the guard's ([`Session::hold`]).
+    /// The session is stopped for good ([`Session::hold`]), for a reason other than the guard's, such as a fault of
+    /// the program. Contains the reason.
     Hold(String),
 }
 
-/// Pose of a tool and force on it at one moment.
+/// Pose of a tool and force on it at the end of a step. Vectors are in the tissue's frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Felt {
     /// The tool's number.
     pub tool: u32,
-    /// Place of the tool's tip or, without a tip, of its control point, m.
+    /// Place of the tool's tip or, without a tip, present place of its control point, m.
     pub place_m: DVec3,
-    /// Displacement of the tissue under the tool, m.
+    /// Displacement of the tissue at the tool's control point, m; under a tip the mean over its disc.
     pub displacement_m: DVec3,
     /// Force of the tissue on the tool, N.
     pub force_n: DVec3,
 }
 
 impl Session {
-    /// Returns the poses and forces of the tools that touch, grasp or push, by ascending number.
+    /// Returns the poses and forces of the tools at the present step, by ascending number: of all tools that ever had
+    /// a control point. A tool that has let go is still listed, with its last point; empty before the first command.
     pub fn felt(&self) -> Vec<Felt> {
         let of = |sample: &ToolSample| {
             let contact = sample.contact?;

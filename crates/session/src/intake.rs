@@ -16,24 +16,26 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Scene;
 use palpate_tissue::scene::script::Action;
 
-/// Counts of the accepted commands by outcome: `accepted` is the sum of the others.
+/// Counts of the accepted commands by outcome: `accepted` is the sum of the others. Ends of leases are not counted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counts {
-    /// Number of commands accepted.
+    /// Number of commands accepted so far.
     pub accepted: u64,
     /// Number that took effect at their step.
     pub applied: u64,
-    /// Number that a later position of the same tool replaced before their step.
+    /// Number that a later grasp or pose of the same tool for the same step replaced. Poses that are played by client
+    /// time are never replaced.
     pub superseded: u64,
-    /// Number whose lease or session ended before their step.
+    /// Number whose lease or intake ended before their step.
     pub dropped: u64,
-    /// Number that wait for their step.
+    /// Number that wait for their step now.
     pub waiting: u64,
 }
 
 /// Queue of a session's commands and changes of the tissue, with the leases of its tools.
 ///
-/// Who holds a tool commands it. A command waits for its step; one from somebody else is refused, and changes nothing:
+/// The holder of a tool commands it. A command waits for its step; one from another client is refused, and changes
+/// nothing:
 ///
 /// ```
 /// use palpate_refusal::Reason;
@@ -92,7 +94,8 @@ pub struct Intake {
 }
 
 impl Intake {
-    /// Creates an intake for a session of `scene` that has not begun.
+    /// Creates an intake for a session of `scene` that has not begun: without leases, and with step 0 as the next.
+    /// Commands must keep to `limits`; their memory is not charged, and the work of tips is not limited.
     pub fn new(scene: &Scene, limits: &Limits) -> Self {
         Intake {
             rules: Arc::new(Rules::new(scene, limits)),
@@ -115,8 +118,9 @@ impl Intake {
         }
     }
 
-    /// Returns this intake for a tissue with `substeps` substeps per step, on a thread of several sessions: the
-    /// cost of tips, which grows with the substeps, is limited from now on.
+    /// Returns this intake for a tissue with `substeps` substeps per step, on a thread of several sessions: from now
+    /// on the tips of a session together may cost at most `limits.contact_work`, which grows with the substeps. 0
+    /// removes this limit.
     #[must_use]
     pub fn of_substeps(self, substeps: u32) -> Self {
         Intake { substeps, ..self }
@@ -128,14 +132,16 @@ impl Intake {
         changed.map_or(self.substeps, |model| model.plan.substeps)
     }
 
-    /// Returns this intake with an account: the memory of what waits is charged to `account` from now on.
+    /// Returns this intake with an account: the memory of waiting commands and changes is charged to `account` from
+    /// now on, whichever client sends them.
     #[must_use]
     pub fn charged_to(self, account: &Account) -> Self {
         Intake { account: Some(account.clone()), ..self }
     }
 
-    /// Returns this intake for a continued session, whose tissue is `changed_to` unless it is still the first. A
-    /// client that acquires a tool which is in the tissue already must lead it with the tip that it has.
+    /// Returns this intake for a continued session, at that session's step. Its tissue is `changed_to`; `None` if it
+    /// is still the first. A client that acquires a tool which is in the tissue already must lead it with the tip
+    /// that it has.
     #[must_use]
     pub fn continued(self, session: &Session, changed_to: Option<Arc<Model>>) -> Self {
         let tip_radii_m = session.tips().map(|(tool, tip)| (tool, tip.radius_m)).collect();
@@ -162,11 +168,14 @@ impl Intake {
     }
 
     /// Gives all of `tools` to the lease `id`, or none. The lease expires after `lease_s` seconds without a command
-    /// or renewal.
+    /// or renewal, counted from `now_ns`, ns; then its tools let go. `holder` is a name for people. A lease that
+    /// holds tools already keeps them.
     ///
     /// # Errors
-    /// Refuses if the intake is closed, tools that are unknown, named twice or held, and a holder name or a lease
-    /// time out of range.
+    /// - The refusal with which the intake was closed.
+    /// - [`Reason::OutOfRange`]: `lease_s` is not from 0.01 to `limits.lease_s`; `holder` has more than 128 bytes or
+    ///   a control character; a tool is not below `limits.tools` or is named twice.
+    /// - [`Reason::ToolHeld`]: a lease, also this one, holds one of the tools.
     pub fn acquire(&mut self, tools: &[u32], holder: &str, lease_s: f64, id: LeaseId, now_ns: u64) -> Result<()> {
         self.check_open()?;
         self.lapse(now_ns);
@@ -184,19 +193,20 @@ impl Intake {
         }
     }
 
-    /// Extends a lease by its duration from `now_ns`.
+    /// Extends a lease by its full duration from `now_ns`, ns. Ends expired leases first.
     ///
     /// # Errors
-    /// Refuses an unknown or expired lease.
+    /// Refuses a lease that holds no tool: unknown, expired or released ([`Reason::NotHolder`]).
     pub fn renew(&mut self, id: LeaseId, now_ns: u64) -> Result<()> {
         self.lapse(now_ns);
         self.leases.renew(id, now_ns)
     }
 
-    /// Releases every tool of a lease. Their actions end at the next step, and their waiting commands are dropped.
+    /// Releases every tool of a lease. Their actions end at the next step, and their waiting commands are dropped. It
+    /// also works on a closed intake.
     ///
     /// # Errors
-    /// Refuses an unknown or expired lease.
+    /// Refuses a lease that holds no tool: unknown, expired or released ([`Reason::NotHolder`]).
     pub fn release(&mut self, id: LeaseId) -> Result<()> {
         let tools: Vec<u32> = self.tools_of(id).collect();
         if tools.is_empty() {
@@ -214,8 +224,9 @@ impl Intake {
         self.enqueue(Command::new(tool, None, Action::Release), true);
     }
 
-    /// Ends the leases that have expired at `now_ns`, and frees some discarded commands. In a resting session it
-    /// also advances the next step to that time, but never past a step for which something waits.
+    /// Ends the leases that have expired at `now_ns`, ns, as [`Intake::release`] does, and frees some discarded
+    /// commands. In a resting session it also advances the next step to that time, but never past a step for which
+    /// something waits. Most functions with a `now_ns` call it.
     pub fn lapse(&mut self, now_ns: u64) {
         if let Some((schedule, until)) = &self.resting {
             let until = self.first_waiting().map_or(*until, |step| step.min(*until));
@@ -229,16 +240,18 @@ impl Intake {
         }
     }
 
-    /// Returns the rules that commands must keep to.
+    /// Returns the rules that commands must keep to, for checks without locking the intake.
     pub fn rules(&self) -> Arc<Rules> {
         self.rules.clone()
     }
 
-    /// Accepts all of `commands`, from the holder of the lease `id`, or none, and renews the lease.
+    /// Accepts all of `commands`, from the holder of the lease `id`, or none, and renews the lease from `now_ns`, ns.
+    /// They are in the queue when it returns.
     ///
     /// # Errors
-    /// Refuses if the intake is closed, too many commands for the queue, tools that this lease does not hold,
-    /// sequence numbers that do not rise, and actions that break a rule.
+    /// Returns the refusals of [`Rules::check`] (too many commands, an action that breaks a rule) and of
+    /// [`Intake::accept`] (closed intake, tools that this lease does not hold, an unfinished batch, sequence numbers
+    /// that do not rise, another tip, tips with too much work, a full queue, missing memory).
     pub fn submit(&mut self, id: LeaseId, commands: Vec<Command>, now_ns: u64) -> Result<()> {
         self.check_open()?;
         let checked = self.rules.check(commands)?;
@@ -282,18 +295,23 @@ impl Intake {
         commands.into_iter().chain(changes).min()
     }
 
-    /// Returns the tissue after all accepted changes; `None` if there was none.
+    /// Returns the tissue after all accepted changes, waiting or not; `None` if there was none, so that the tissue is
+    /// the first.
     pub fn changed_to(&self) -> Option<Arc<Model>> {
         self.changed_to.clone()
     }
 
-    /// Accepts another tissue, made from `base`, for the beginning of step `at_step` or of the next step. Returns
-    /// the step, or `None` if [`Intake::changed_to`] is no longer `base`. Changes take effect in their order of
-    /// arrival, and each is made from the previous one. If several are for one step, the last one applies, which
-    /// includes the others.
+    /// Accepts another tissue, which was made from `base`, for the beginning of step `at_step`, or of the next step
+    /// if that is later or `at_step` is `None`. Returns the step. Returns `None`, and accepts nothing, if
+    /// [`Intake::changed_to`] is no longer `base` (the same pointer): then make the tissue again. Changes take effect
+    /// in their order of arrival; one for the step of the last waiting change replaces that one, because it includes
+    /// it.
     ///
     /// # Errors
-    /// Refuses if the intake is closed, a step before that of a waiting change, and too many waiting changes.
+    /// - The refusal with which the intake was closed.
+    /// - [`Reason::OutOfTurn`]: a waiting change has a later step.
+    /// - [`Reason::QueueFull`]: `limits.queued_changes` changes wait.
+    /// - [`Reason::Overloaded`] or [`Reason::TooLarge`]: the account has no memory for the tissue.
     pub fn change(
         &mut self,
         base: Option<&Arc<Model>>,
@@ -329,20 +347,23 @@ impl Intake {
         Ok(Some(step))
     }
 
-    /// Returns the changes that wait, each with its step, by ascending step.
+    /// Returns copies of the changes of the tissue that wait, each with its step, by ascending step; each step occurs
+    /// once.
     pub fn waiting_changes(&self) -> Vec<(u64, Arc<Model>)> {
         self.changes.iter().map(|(step, model, _)| (*step, model.clone())).collect()
     }
 
-    /// Removes the changes that are due at the beginning of step `step`, and returns the last one.
+    /// Removes the changes that are due at the beginning of step `step` or earlier, and returns the last of them,
+    /// which includes the others; `None` if none is due.
     pub fn take_change(&mut self, step: u64) -> Option<Arc<Model>> {
         let due = self.changes.partition_point(|change| change.0 <= step);
         self.changes.drain(..due).next_back().map(|change| change.1)
     }
 
-    /// Begins a rest: the session has done `step` steps and could rest until step `until`. Returns the next step
-    /// that must be computed, which is earlier than `until` if something waits here. The session then rests until
-    /// [`Intake::take_due`] takes that step, unless it is the very next one.
+    /// Begins a rest: the session has done `step` steps and could rest until step `until`; `schedule` has the times
+    /// of its steps. Returns the next step that must be computed, which is earlier than `until` if a command, a
+    /// change or the end of a lease comes before. The session then rests until [`Intake::take_due`] takes that step,
+    /// unless it is the very next one, `step`.
     pub fn rest(&mut self, step: u64, until: u64, schedule: &Schedule) -> u64 {
         let waiting = self.first_waiting();
         let lapse = self.leases.first_expiry_ns().map(|ns| schedule.next_step(ns));
@@ -353,21 +374,22 @@ impl Intake {
         next
     }
 
-    /// Returns whether the session rests.
+    /// Returns whether the session rests: from [`Intake::rest`] with a later step until [`Intake::take_due`].
     pub fn is_resting(&self) -> bool {
         self.resting.is_some()
     }
 
-    /// Returns whether the thread of a resting session must be woken to call [`Intake::rest`] again. It returns
-    /// true once for each rest.
+    /// Returns whether the thread of a resting session must be woken to call [`Intake::rest`] again, because a
+    /// command, a change or a lease has come since. It returns true at most once for each rest.
     pub fn take_wake(&mut self) -> bool {
         let wake = self.changed && !self.woken && self.is_resting();
         self.woken |= wake;
         wake
     }
 
-    /// Appends the commands that are due at the beginning of step `step` to `due`, in order of effect; step `step`
-    /// + 1 comes next.
+    /// Appends the commands and ends of leases that are due at the beginning of step `step` or earlier to `due`, by
+    /// step and then by arrival. Ends the leases that have expired at `now_ns`, ns, first, and a rest. Commands of a
+    /// batch that is not wholly in the queue stay. Step `step` + 1 is the next one afterwards.
     pub fn take_due(&mut self, step: u64, now_ns: u64, due: &mut Vec<Due>) {
         self.lapse(now_ns);
         self.resting = None;
@@ -381,32 +403,36 @@ impl Intake {
         self.next_step = step + 1;
     }
 
-    /// Returns the number of the next step.
+    /// Returns the number of the next step: commands for earlier steps act at this one, and count as late.
     pub fn next_step(&self) -> u64 {
         self.next_step
     }
 
-    /// Returns the tools of a lease, by ascending number.
+    /// Returns the tools of a lease, by ascending number; empty for an unknown or expired one. It does not end leases
+    /// that have expired since the last call with a time.
     pub fn tools_of(&self, id: LeaseId) -> impl Iterator<Item = u32> {
         self.leases.tools_of(id)
     }
 
-    /// Returns each held tool with the name of its holder.
+    /// Returns each held tool with the name of its holder, by ascending number of the tool. A name may be empty.
     pub fn holders(&self) -> impl Iterator<Item = (u32, &str)> {
         self.leases.holders()
     }
 
-    /// Returns the number of tools so far whose lease expired.
+    /// Returns the number of tools so far whose lease expired; released ones do not count.
     pub fn lapsed(&self) -> u64 {
         self.leases.lapsed()
     }
 
-    /// Returns the counts of the commands so far, by outcome.
+    /// Returns the counts of the commands so far, by outcome. Commands of a batch that are not in the queue yet count
+    /// as waiting.
     pub fn counts(&self) -> Counts {
         Counts { waiting: (self.queue.waiting() + self.coming) as u64, ..self.counts }
     }
 
-    /// Refuses everything with `refusal` from now on. Returns the discarded commands, to be freed without the lock.
+    /// Refuses commands, new leases and changes with `refusal` from now on, until [`Intake::reopen`]. Discards
+    /// everything that waits; leases stay. Returns the discarded commands: drop them without the lock, because
+    /// freeing them takes time.
     pub fn close(&mut self, refusal: Refusal) -> Discarded {
         self.closed = Some(refusal);
         self.counts.dropped += self.queue.discard_all() as u64;
@@ -415,21 +441,23 @@ impl Intake {
         self.queue.take_left_over()
     }
 
-    /// Opens a closed intake again, with its tissue and without held tools.
+    /// Opens a closed intake again, with its tissue. Removes all leases without releasing the tools in the session.
+    /// On an open intake it also removes them.
     pub fn reopen(&mut self) {
         self.closed = None;
         self.leases.clear();
     }
 
-    /// Ends the leases of the tools for which `chosen` holds, by number and by the account that is charged. Returns
-    /// how many.
+    /// Ends the leases of the tools for which `chosen` holds, as [`Intake::release`] does. `chosen` gets the tool's
+    /// number and the account that is charged for it, if any. Returns the number of tools.
     pub fn free(&mut self, chosen: impl Fn(u32, Option<&Account>) -> bool) -> usize {
         let tools = self.leases.chosen(chosen);
         tools.iter().for_each(|tool| self.end(*tool));
         tools.len()
     }
 
-    /// Charges the tools of a lease to the account that took them: one of `charges` for each tool.
+    /// Charges the tools of a lease to the account that took them: the first of `charges` for the tool with the
+    /// lowest number, and so on. Each is given back when its tool is released; surplus ones are given back at once.
     pub fn charge(&mut self, id: LeaseId, charges: Vec<Taken>) {
         self.leases.charge(id, charges);
     }

@@ -9,19 +9,20 @@ use super::rules::tip_radius_m;
 use crate::budget::{Purpose, Resource};
 use palpate_refusal::Refusal;
 
-/// Content of an intake when it was closed.
+/// Content of an intake when it was closed by [`Intake::hand_over`], for another server's [`Intake::adopt`].
 #[derive(Debug, Default)]
 pub struct Handed {
-    /// Each held tool with its lease.
+    /// Each held tool with its lease, by ascending number of the tool.
     pub leases: Vec<HandedLease>,
-    /// Changes of the tissue, then commands; each kind in order of effect, and each entry with its step.
+    /// Changes of the tissue, then commands and ends of leases; each kind in order of effect, and each entry with its
+    /// step.
     pub waiting: Vec<(u64, Input)>,
 }
 
 impl Intake {
-    /// Closes the intake, which refuses everything with `refusal` from now on, and returns its content. What waited
-    /// no longer counts as accepted here: it counts where the session continues. The rest of an unfinished batch is
-    /// dropped.
+    /// Closes the intake, which refuses everything with `refusal` from now on, and returns its content and the
+    /// discarded commands to be freed without the lock ([`Intake::close`]). What waited no longer counts as accepted
+    /// here: it counts where the session continues. The rest of an unfinished batch is dropped.
     pub fn hand_over(&mut self, refusal: Refusal) -> (Handed, Discarded) {
         let leases = self.leases.handed();
         let changes = self.waiting_changes().into_iter().map(|(step, model)| (step, Input::Tissue(model)));
@@ -34,10 +35,13 @@ impl Intake {
         (Handed { leases, waiting }, discarded)
     }
 
-    /// Adds the content of another server's intake. The leases last their full duration from `now_ns`, and sequence
-    /// numbers of their commands start again.
+    /// Adds the content of another server's intake. The leases last their full duration from `now_ns`, ns, and
+    /// sequence numbers of their commands start again; a tool that is held here gets the other lease. No account is
+    /// charged for the tools ([`Intake::charge`]). Steps that have passed become the next one. Nothing is checked
+    /// against limits, and a closed intake takes it too.
     ///
-    /// Inputs for which there is no memory are dropped. Returns how many.
+    /// Inputs for which the account has no memory are dropped, but never ends of leases; so are inputs that are
+    /// neither commands nor changes. Returns the number of dropped inputs.
     pub fn adopt(&mut self, handed: Handed, now_ns: u64) -> usize {
         for lease in handed.leases {
             let tool = lease.tool;

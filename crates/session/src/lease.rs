@@ -6,7 +6,8 @@ use crate::budget::{Account, Taken};
 use palpate_refusal::{Reason, Refusal, Result, label, number};
 use palpate_tissue::limits::Limits;
 
-/// ID of a lease. It is random, so that it can't be guessed.
+/// ID of a lease, which gives the right to command its tools. A server chooses it at random, so that it can't be
+/// guessed.
 pub type LeaseId = u128;
 
 /// One tool of a lease.
@@ -28,7 +29,8 @@ pub(super) struct LeasedTool {
     charge: Option<Taken>,
 }
 
-/// A held tool with its lease, as a server hands it over with its session.
+/// A held tool with its lease, as a server hands it over with its session. Sequence numbers and the time until it
+/// expires are left out: they begin again.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct HandedLease {
     /// The tool's number.

@@ -65,71 +65,84 @@ const GALLBLADDER: &str = "[mesh]\norgan = { name = \"gallbladder\", edge_m = 0.
 /// The name of a record in messages about missing memory.
 const RECORD: &str = "a record";
 
-/// Sample of one tool at the end of a step: its state, the forces on it, and the newest command that took effect.
+/// Sample of one tool at the end of a step: its state, the forces on it, and the newest command that took effect. A
+/// number that no command has named yet gives a sample of zeros, without `contact` and `feel`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ToolSample {
-    /// The tool's number.
+    /// The tool's number, from 0.
     pub tool: u32,
-    /// Sequence number of the newest command that took effect; 0 before the first.
+    /// Highest sequence number of the commands whose step has come; also of those without effect because the tool is
+    /// paused. 0 before the first, and again after the end of a lease.
     pub acknowledged_sequence: u64,
-    /// Time of that command, ns of the client's clock.
+    /// Time of that command, ns of the client's clock; 0 if it has none.
     pub client_time_ns: u64,
-    /// Arrival of that command, ns of the server's clock; 0 before the first.
+    /// Arrival of that command, ns of the server's clock; 0 before the first, and without a network.
     pub arrival_ns: u64,
-    /// Motion and forces at the tool's control point, if the tool has one.
+    /// Motion and forces at the tool's control point. `None` before the first command that gives the tool a point; a
+    /// tool that has let go keeps its last point.
     pub contact: Option<Contact>,
-    /// Motion and force of the tip itself, for a tool that is led by poses.
+    /// Motion and force of the tip itself, for a tool that is led by poses; `None` for any other tool, and after a
+    /// release.
     pub feel: Option<ToolContact>,
-    /// Client time of the place of such a tool, s; 0 for any other tool.
+    /// Client time of the place that a tool led by poses has now, s; 0 for any other tool.
     pub place_time_s: f64,
-    /// Local model for the client's rendering, if the stream requests it.
+    /// Local model for the client's rendering. [`Session::sample`] leaves it `None`; a
+    /// [`Sampler`](sample_selection::Sampler) fills it in if the stream has force laws and the tool is led by poses.
     pub local: Option<LocalModel>,
-    /// Whether the tool is held in place because no pose has arrived for a while.
+    /// Whether the tool stays where it is because no pose has arrived for 50 ms
+    /// ([`palpate_haptics::pose_playback::HOLD_S`]). After 250 ms it lets go, and `expired` is set.
     pub stale: bool,
-    /// Whether the newest command came too late for its step.
+    /// Whether the newest command came too late for its step, so it acted at a later one.
     pub late: bool,
-    /// Whether the tool's action was ended by its time to live, with its lease, for lack of poses, or by a
-    /// recovery; or the newest command had no effect because the tool is paused.
+    /// Whether the tool's action was ended by its time to live, with its lease, for lack of poses, or by a recovery;
+    /// or the newest command had no effect because the tool is paused. The next command that acts clears it.
     pub expired: bool,
-    /// The step before which commands to the tool have no effect, if it was ever paused ([`recovery`]).
+    /// The step before which commands to the tool, except releases, have no effect; `None` if it was never paused
+    /// ([`recovery`]). It stays after that step.
     pub paused_until: Option<u64>,
 }
 
-/// Motion and forces at a tool's control point: the mass point that it acts on.
+/// Motion and forces at a tool's control point: the mass point that it acts on. All vectors are in the tissue's frame
+/// (x and y along a sheet, z out of it).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Contact {
-    /// The mass point.
+    /// The mass point: the one that is pushed or grasped, or the one nearest to a force's centre or to the place
+    /// under a tip.
     pub point: PointId,
-    /// Displacement from rest, m; under a tip the mean over its disc.
+    /// Displacement of the point from rest, m; under a tip the displacement of the surface, as the mean over the
+    /// tip's disc.
     pub displacement_m: DVec3,
-    /// Displacement of the surface exactly under the control point, m.
+    /// Displacement of the surface exactly under the control point, m, interpolated between points; equals that of
+    /// the point if the tool was given a point.
     pub surface_displacement_m: DVec3,
-    /// Velocity, m/s.
+    /// Velocity of the point, m/s; of a tip, that of the tool.
     pub velocity_m_per_s: DVec3,
-    /// Force of the tissue on the tool, N: springs, anchor spring and damping.
+    /// Force of the tissue on the tool, N: springs, anchor spring and damping. For a push around a place it is the
+    /// mean of the points' reactions, weighted as the force is.
     pub force_on_tool_n: DVec3,
-    /// Force of all tools on the point, N.
+    /// Force of all tools on the point, N; under a tip, the force of that tool on the tissue.
     pub applied_force_n: DVec3,
 }
 
-/// Samples of the tools at the end of a step, with the state of the session.
+/// Samples of the tools at the end of a step, with the state of the session. [`Session::sample`] makes it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
     /// Number of steps done.
     pub step: u64,
     /// Simulated time, s.
     pub simulation_time_s: f64,
-    /// Number of points that the step computed.
+    /// Number of points that a step computes now; 0 if the whole tissue is asleep.
     pub awake_points: usize,
-    /// Number of commands so far that came too late.
+    /// Number of commands so far that came too late for their step.
     pub late_commands: u64,
-    /// Whether the session is held: stopped by the guard or by a fault.
+    /// Whether the session is stopped by the guard, by a fault or by [`Session::hold`]: it is not stepped any more.
     pub held: bool,
     /// Number of recoveries so far: returns of the tissue to an earlier state ([`recovery`]).
     pub recoveries: u64,
-    /// The newest recovery, with the tools that it released.
+    /// The newest recovery, with the tools that had acted; `None` before the first. It stays until the next one.
     pub recovered: Option<Arc<Recovered>>,
-    /// Samples of the tools, by ascending number, or in the order in which they were requested.
+    /// Samples of the tools: those that ever had a control point by ascending number, or the requested ones in the
+    /// order of the request.
     pub tools: Vec<ToolSample>,
 }
 
@@ -159,7 +172,8 @@ struct Posed {
 
 /// A tissue with its tools and their commands' effects: what a server, a run or a replay advances step by step.
 ///
-/// A fingertip presses 3 mm into the middle of a sheet at rest. Half a second later the surface under it is as deep, and pushes back:
+/// A fingertip presses 3 mm into the middle of a sheet at rest. Half a second later the surface under it is as deep,
+/// and pushes back:
 ///
 /// ```
 /// use glam::DVec3;
@@ -197,7 +211,8 @@ pub struct Session {
 }
 
 impl Session {
-    /// Creates a session of a tissue at rest, at step 0.
+    /// Creates a session of a tissue at rest, at step 0, without tools. It unwinds with a refusal if there is no
+    /// memory for the state ([`memory::attempt`]).
     pub fn new(model: &Arc<Model>) -> Self {
         Session {
             tissue: tissue::at_rest(model),
@@ -210,38 +225,41 @@ impl Session {
         }
     }
 
-    /// Returns the model of the tissue.
+    /// Returns the model of the present tissue: that of [`Session::new`], or of the last [`Session::change`].
     pub fn model(&self) -> &Arc<Model> {
         self.tissue.model()
     }
 
-    /// Returns the tissue, read-only.
+    /// Returns the tissue, read-only: its points, forces and hash at the present step.
     pub fn tissue(&self) -> &dyn Tissue {
         &*self.tissue
     }
 
-    /// Returns the number of steps done.
+    /// Returns the number of steps done, with skipped ones. A recovery does not lower it.
     pub fn step_count(&self) -> u64 {
         self.tissue.step_count()
     }
 
-    /// Returns the simulated time, s.
+    /// Returns the simulated time, s: the number of steps done over the step rate.
     #[allow(clippy::cast_precision_loss)]
     pub fn time_s(&self) -> f64 {
         self.step_count() as f64 / self.model().scene.stepping.rate_hz
     }
 
-    /// Returns why the session is held; `None` if it is not.
+    /// Returns why the session is stopped for good; `None` if it is not. The reason comes from a blow-up after which
+    /// a recovery would not help, or from [`Session::hold`].
     pub fn hold_reason(&self) -> Option<&str> {
         self.hold_reason.as_deref()
     }
 
-    /// Holds the session, as the guard does: it is not stepped any more. The first reason is kept.
+    /// Stops the session for good, as the guard does: [`Session::advance`] does nothing but discard commands from now
+    /// on. `reason` is for people; if there is one already, that is kept.
     pub fn hold(&mut self, reason: String) {
         self.hold_reason.get_or_insert(reason);
     }
 
-    /// Returns the number of commands so far that came too late for their step.
+    /// Returns the number of commands so far that came too late for their step, with those that a later one
+    /// superseded.
     pub fn late_commands(&self) -> u64 {
         self.late_commands
     }
@@ -251,21 +269,22 @@ impl Session {
         self.paused_commands
     }
 
-    /// Returns the tools that are led by poses, by ascending number, with their tips.
+    /// Returns the tools that are led by poses now, by ascending number, with their tips; not those that have let go.
     #[allow(clippy::cast_possible_truncation)]
     pub fn tips(&self) -> impl Iterator<Item = (u32, Tip)> {
         let of = |(tool, state): (usize, &Tool)| Some((tool as u32, state.posed.as_ref()?.tip));
         self.tools.iter().enumerate().filter_map(of)
     }
 
-    /// Returns the number of steps in which a tool was held to the speed limit, of dropped poses, and of tools that
-    /// were released for lack of poses: the sum of [`Path::counts`] over all tools.
+    /// Returns three sums of [`Path::counts`] over all tools and all their touches so far: steps in which the speed
+    /// limit of 0.5 m/s acted on a tool, poses that were refused or skipped, and releases for lack of poses.
     pub fn path_counts(&self) -> [u64; 3] {
         self.path_counts
     }
 
-    /// Returns the step at whose beginning something happens without a new command: `u64::MAX` if nothing ever
-    /// does, and `None` if the tissue moves or a tool is led by poses.
+    /// Returns the step count at which the first action's time to live ends, while nothing happens before without a
+    /// new command: `u64::MAX` if nothing ever does. `None` if the tissue moves or a tool is led by poses, so that
+    /// each step must be computed.
     pub fn rests_until(&self) -> Option<u64> {
         let expiry = self.tools.iter().filter_map(|tool| tool.expires_at).min();
         // A path may move a tool at any time.
@@ -273,14 +292,16 @@ impl Session {
         still.then(|| expiry.unwrap_or(u64::MAX))
     }
 
-    /// Skips to the moment when `step` steps are done, which must not be later than [`Session::rests_until`]. The
-    /// result equals that of single steps without commands.
+    /// Skips to the moment when `step` steps are done; does nothing if they are done already. Call it only if
+    /// [`Session::rests_until`] is `Some`, and with no later step: this is not checked. The result equals that of
+    /// single steps without commands. Nothing is observed.
     pub fn skip_to(&mut self, step: u64) {
         self.tissue.skip_steps(step.saturating_sub(self.step_count()));
     }
 
-    /// Changes the tissue, from the coming step on, to that of `model`, which comes from [`Model::changed`] or
-    /// [`Model::corrected`] of this session's model.
+    /// Changes the tissue, from the coming step on, to that of `model`, which must come from [`Model::changed`] or
+    /// [`Model::corrected`] of this session's model (not checked). Displacements, velocities and tools stay; all
+    /// tiles wake.
     pub fn change(&mut self, model: &Arc<Model>) {
         match self.tissue.changed(model) {
             Some(tissue) => self.tissue = tissue,
@@ -288,26 +309,33 @@ impl Session {
         }
     }
 
-    /// Requests an audit of a window of steps ([`tissue::audit`]).
+    /// Requests an audit of a window of steps, which begins at the guard's next checkpoint
+    /// ([`tissue::select::audit`]). `inputs` is memory in which the tools' inputs are recorded; it is emptied first.
+    /// [`Session::take_mark`] reports the progress.
     pub fn request_audit(&mut self, inputs: WindowInputs) {
         self.tissue.request_audit(inputs);
     }
 
-    /// Takes the mark that begins, ends or drops that window, if the last step made one; each is returned once.
+    /// Takes the mark that begins, ends or drops the requested window, if the last step made one; `None` otherwise.
+    /// Each mark is returned once, so call it after every step.
     pub fn take_mark(&mut self) -> Option<Mark> {
         self.tissue.take_mark()
     }
 
-    /// Advances one step. The commands in `due` take effect at its beginning, by the number of the tool, and are
-    /// removed from it. `observe` is called at the step's end unless the session is held, and before the first step
-    /// also at t = 0⁺, when the commands act and nothing has moved. A held session only discards `due`.
+    /// Advances one step. The commands in `due` take effect at its beginning, by ascending number of the tool and,
+    /// for one tool, in their order in `due`; `due` is empty afterwards.
+    ///
+    /// `observe` is called at the step's end, also after a recovery, but not if the step made the session stop
+    /// ([`Session::hold_reason`]). Before the first step it is also called at t = 0⁺, when the commands act and
+    /// nothing has moved. A session that is stopped already discards `due` and does nothing else.
     pub fn advance(&mut self, due: &mut Vec<Due>, mut observe: impl FnMut(&Session)) {
         while !self.advance_while(due, &mut || true, &mut observe) {}
     }
 
     /// Advances one step as [`Session::advance`] does, but stops within the guard's repetition of the step when
-    /// `may_go_on` returns false. Then it returns false, and only this function may be called until it returns
-    /// true. The result does not depend on where it stops.
+    /// `may_go_on` returns false. Then it returns false, the state belongs to no step, and only this function may be
+    /// called until it returns true; it does not read `due` again before that. The result does not depend on where it
+    /// stops.
     pub fn advance_while(
         &mut self,
         due: &mut Vec<Due>,
@@ -335,7 +363,7 @@ impl Session {
         true
     }
 
-    /// Returns whether a step is unfinished, because [`Session::advance_while`] has stopped within it.
+    /// Returns whether a step is unfinished, because [`Session::advance_while`] has returned false.
     pub fn is_within_step(&self) -> bool {
         self.tissue.is_within_step() && self.hold_reason.is_none()
     }
@@ -354,13 +382,13 @@ impl Session {
         }
     }
 
-    /// Returns the recoveries so far.
+    /// Returns the recoveries so far: their number, and the newest [`MAX_RECOVERIES`](recovery::MAX_RECOVERIES).
     pub fn recoveries(&self) -> &Recoveries {
         &self.recoveries
     }
 
-    /// Returns why the tissue is not what its commands have made of it: the session is held, or there was a
-    /// recovery. `None` if it is.
+    /// Returns why the tissue is not what its commands have made of it: the reason of a stop, or else a description
+    /// of the newest recovery. `None` if there was neither. A recovery counts for the rest of the session.
     pub fn fault(&self) -> Option<String> {
         let recovered = || self.recoveries.newest().map(|newest| describe(&newest.recovery));
         self.hold_reason().map(str::to_owned).or_else(recovered)
@@ -543,19 +571,25 @@ impl Session {
         }
     }
 
-    /// Makes `tool` apply a force as a function of time, exact within the step. No command can express this.
+    /// Makes `tool` apply a force as a function of time, exact within the step, from the next step on. No command can
+    /// express this. It ends what the tool did before; a later command to the tool ends it. A tool that got no
+    /// command has no entry in [`Session::sample`].
     pub fn play_force(&mut self, tool: usize, profile: LoadProfile) {
         self.recoveries.disturb();
         self.tissue.push(tool, Some(Push::Profile(profile)));
     }
 
-    /// Makes `tool` move a point as a function of time.
+    /// Makes `tool` grasp a point and move it as a function of time, from the next step on, in place of what the tool
+    /// did before. A later command to the tool ends it. A tool that got no command has no entry in
+    /// [`Session::sample`].
     pub fn play_move(&mut self, tool: usize, profile: MotionProfile) {
         self.recoveries.disturb();
         self.tissue.grasp(tool, profile.point, Grasp::Profile(profile));
     }
 
-    /// Returns the sample of the present step: of all tools in use, or of the tools whose numbers are in `only`.
+    /// Returns the sample of the present step: of all tools that ever had a control point, by ascending number, or of
+    /// the tools whose numbers are in `only`, in that order. A number without a tool gives an empty sample. Local
+    /// models are left out.
     pub fn sample(&self, only: Option<&[u32]>) -> Sample {
         let sample_of = |number: u32| {
             let tool = self.tools.get(number as usize).cloned().unwrap_or_default();
@@ -616,17 +650,20 @@ impl Session {
         }
     }
 
-    /// Returns a copy of the present tissue, which [`record_of`] reads later.
+    /// Returns a copy of the present tissue that another thread can read, for example with [`record_of`]. It copies
+    /// the memory of the whole state.
     pub fn copy(&self) -> ReadCopy {
         self.tissue.copy()
     }
 
-    /// Returns the energies of the whole tissue, J, for a record. It reads every point.
+    /// Returns the energies of the whole tissue, J, for a record: kinetic, of springs, and of anchor springs. It
+    /// computes every awake point.
     pub fn energy(&self) -> EnergyJ {
         energy_record(self.tissue.energy())
     }
 
-    /// Returns the records of the tools with a tip, by ascending number.
+    /// Returns the records of the tools that are led by poses and got a command, by ascending number; empty if there
+    /// are none.
     #[allow(clippy::cast_possible_truncation)]
     pub fn tool_records(&self) -> Vec<ToolRecord> {
         let of = |number: usize| {
@@ -641,8 +678,8 @@ impl Session {
         (0..self.tools.len()).filter_map(of).collect()
     }
 
-    /// Returns the first tool that presses where less than a quarter of its tip can move, if there is one: its
-    /// force is not that of free tissue.
+    /// Returns the lowest number of a tool that presses where less than a quarter of its tip can move, because the
+    /// points are fixed: its force is not that of free tissue. `None` if there is no such tool.
     pub fn tool_on_fixed(&self) -> Option<u32> {
         let presses = |number: &usize| {
             let feel = self.tissue.tool_contact(*number);
@@ -651,7 +688,9 @@ impl Session {
         (0..self.tools.len()).find(presses).map(|number| number as u32)
     }
 
-    /// Returns a record of `points`, or of all points, without energies and tools.
+    /// Returns a record of `points` in their order, or of all points in that of their numbers for `None`. Energies
+    /// and tools are left out ([`Session::energy`], [`Session::tool_records`]). It unwinds with a refusal if there is
+    /// no memory for all points ([`memory::attempt`]).
     pub fn record(&self, points: Option<&[PointId]>) -> Record {
         let shape = self.model().shape();
         let of = |point: PointId| point_record(shape.name(point), &self.tissue.point(point));
@@ -668,7 +707,8 @@ impl Session {
     }
 }
 
-/// Returns the record of one point of a copied tissue.
+/// Returns the record of one point of a copied tissue ([`Session::copy`]): displacement, velocity and forces. `point`
+/// must be one of its points.
 pub fn record_of(copy: &ReadCopy, point: PointId) -> Point {
     point_record(copy.model().shape().name(point), &copy.point(point))
 }

@@ -15,7 +15,8 @@ const MIN_N: f64 = 0.05;
 /// Number of samples after first contact in which the tissue may bounce off the tool.
 const BOUNCE_SAMPLES: u32 = 5;
 
-/// Maker of the local models of one tool.
+/// Maker of the local models of one tool in one stream. It remembers the surface that the tool last met, so give it
+/// every sample of the stream in order.
 #[derive(Debug, Clone)]
 pub struct Modeller {
     law: Arc<Law>,
@@ -35,7 +36,8 @@ pub struct Modeller {
     tangent: Arc<Mutex<Option<Tangent>>>,
 }
 
-/// A pending computation of the stiffness under a tool, for a thread other than the stepping threads.
+/// A pending computation of the stiffness and damping under a tool, for a thread other than the stepping threads. It
+/// owns a copy of the tissue around the tool.
 #[derive(Debug)]
 pub struct StiffnessJob {
     surroundings: TangentInput,
@@ -43,7 +45,8 @@ pub struct StiffnessJob {
 }
 
 impl StiffnessJob {
-    /// Computes the stiffness and passes it to the tool's modeller.
+    /// Computes the stiffness and damping, which takes some time, and passes them to the tool's modeller: its next
+    /// models have them. If the tool has let go meanwhile, they are discarded.
     pub fn work(self) {
         let tangent = self.surroundings.tangent();
         *self.tangent.lock().unwrap_or_else(PoisonError::into_inner) = Some(tangent);
@@ -52,26 +55,28 @@ impl StiffnessJob {
 
 impl Modeller {
     /// Creates a modeller for a tool on a tissue with `law`, whose number in the stream is `number`. A grasp is
-    /// rendered with the stiffness K and damping B of the tissue around the tool, which are recomputed continually;
-    /// a touch is rendered with the law, and K and B are computed only if `touches_too`.
+    /// rendered with the stiffness K (N/m) and damping B (N·s/m) of the tissue around the tool, which are recomputed
+    /// continually; a touch is rendered with the law, and K and B are computed at it only if `touches_too`.
     pub fn new(number: u32, law: Arc<Law>, touches_too: bool) -> Self {
         let (contact_state, tangent) = (ContactState::Free, Arc::default());
         Modeller { law, number, touches_too, contact_state, surface: None, bounced: 0, sequence: 0, tangent }
     }
 
-    /// Resets the modeller after the tool has let go: a further touch is a new one. Its models keep counting,
-    /// because a client refuses a model that is not newer than the last.
+    /// Resets the modeller after the tool has let go: a further touch is a new one, with the law's K and B. Numbers
+    /// of models keep rising, because a client refuses a model that is not newer than the last.
     pub fn let_go(&mut self) {
         let first = Modeller::new(self.number, self.law.clone(), self.touches_too);
         *self = Modeller { sequence: self.sequence, ..first };
     }
 
-    /// Makes the models from the next one on refer to another law.
+    /// Makes the models from the next one on refer to another law, `law`, whose number in the stream is `number`.
     pub fn change_law(&mut self, number: u32, law: Arc<Law>) {
         (self.number, self.law) = (number, law);
     }
 
-    /// Returns whether K and B should be computed at the tool's present place.
+    /// Returns whether K and B should be computed at the tool's present place ([`Modeller::refinement`]): under a
+    /// grasp always, under a touch if the modeller was created with `touches_too`, otherwise never. The contact state
+    /// is that of the newest model.
     pub fn wants_refinement(&self) -> bool {
         match self.contact_state {
             ContactState::Free => false,
@@ -80,12 +85,15 @@ impl Modeller {
         }
     }
 
-    /// Returns a computation of the stiffness from the tissue around the tool.
+    /// Returns a computation of stiffness and damping from `surroundings`, a copy of the tissue around the tool.
+    /// Nothing is computed before [`StiffnessJob::work`].
     pub fn refinement(&self, surroundings: TangentInput) -> StiffnessJob {
         StiffnessJob { surroundings, tangent: self.tangent.clone() }
     }
 
-    /// Returns the model after a step. K and B are the newest that were computed at the tool, or else the law's.
+    /// Returns the model after step `step`. `feel` is the tool's motion and force, `client_time_s` the client time of
+    /// its place, s. Models are numbered from 1 on. K and B are the newest that were computed at the tool, or else
+    /// the law's at this depth.
     pub fn model(&mut self, feel: &ToolContact, step: u64, client_time_s: f64) -> LocalModel {
         self.sequence += 1;
         self.contact_state = feel.contact_state;

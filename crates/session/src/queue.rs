@@ -8,12 +8,13 @@ use super::lease::QueueKey;
 /// Commands by their key: step, then order of arrival.
 type Commands = BTreeMap<QueueKey, Due>;
 
-/// Commands without further effect. Dropping this frees them, which takes time.
+/// Commands that no longer take effect, as [`Intake::close`](super::intake::Intake::close) returns them. Dropping
+/// this frees them, which takes time: do so without a lock.
 #[derive(Debug, Default)]
 pub struct Discarded(Vec<Commands>);
 
 impl Discarded {
-    /// Returns whether there are no commands.
+    /// Returns whether there is nothing to free.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }

@@ -20,29 +20,30 @@ use std::sync::Arc;
 
 use palpate_tissue::scene::record::Recovery;
 
-/// Number of recoveries within [`WINDOW_STEPS`] that pauses the tools that acted.
+/// Number of recoveries within [`WINDOW_STEPS`] at which the tissue is brought to rest and the tools that acted are
+/// paused; also the number of recoveries that are remembered.
 pub const MAX_RECOVERIES: usize = 4;
 
-/// Length of the window in which recoveries are counted, steps.
+/// Length of the window in which recoveries are counted, steps: 10 s at 1 kHz.
 pub const WINDOW_STEPS: u64 = 10_000;
 
-/// Effect of a recovery on one tool.
+/// Effect of a recovery on one tool that had acted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Ended {
     /// The tool's number.
     pub tool: u32,
     /// Sequence number of the newest command of the tool that had taken effect; 0 if there was none.
     pub sequence: u64,
-    /// Number of commands of the tool whose effect was lost.
+    /// Number of commands of the tool since the restored state, whose effect was lost.
     pub undone_commands: u64,
 }
 
-/// A recovery, with the tools that it released.
+/// A recovery, with the tools that had acted. All tools of the session are released, also those that are not listed.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recovered {
     /// The recovery.
     pub recovery: Recovery,
-    /// The tools, by ascending number.
+    /// The tools that acted on the tissue when it blew up, were led by poses, or lost a command; by ascending number.
     pub tools: Vec<Ended>,
 }
 
@@ -54,7 +55,7 @@ pub(super) struct Acts {
     pub(super) count: u64,
 }
 
-/// The recoveries of a session, and the commands that the next one would undo.
+/// The recoveries of a session, and the commands that the next one would undo. [`Session`](super::Session) keeps it.
 #[derive(Debug, Default)]
 pub struct Recoveries {
     pub(super) count: u64,
@@ -67,7 +68,7 @@ pub struct Recoveries {
 }
 
 impl Recoveries {
-    /// Returns the number of recoveries so far.
+    /// Returns the number of recoveries since the session began.
     pub fn count(&self) -> u64 {
         self.count
     }
@@ -77,7 +78,7 @@ impl Recoveries {
         self.newest.back().cloned()
     }
 
-    /// Returns the newest recoveries, at most [`MAX_RECOVERIES`], by ascending step.
+    /// Returns the newest recoveries, at most [`MAX_RECOVERIES`], by ascending step; older ones are forgotten.
     pub fn list(&self) -> Vec<Recovery> {
         self.newest.iter().map(|recovered| recovered.recovery.clone()).collect()
     }
@@ -133,7 +134,8 @@ impl Recoveries {
     }
 }
 
-/// Returns a description of a recovery for people.
+/// Returns a description of a recovery for people: step, cause, restored state, undone commands, and the end of a
+/// pause.
 pub fn describe(recovery: &Recovery) -> String {
     let Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason } = recovery;
     let rest = if *at_rest { ", brought to rest" } else { "" };

@@ -10,32 +10,36 @@ use palpate_tissue::scene::action_check::{self, check_free, check_poke, check_re
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::shape::RestShape;
 
-/// Rules for the commands of one session: its scene and its limits.
+/// Rules for the commands of one session that do not depend on their time: its scene and its limits. They never
+/// change.
 #[derive(Debug)]
 pub struct Rules {
     pub(super) scene: Scene,
     pub(super) limits: Limits,
 }
 
-/// Commands that [`Rules::check`] has accepted.
+/// Commands that [`Rules::check`] has accepted, in their order, for
+/// [`Intake::accept`](super::intake::Intake::accept).
 #[derive(Debug)]
 pub struct CheckedCommands(pub(super) Vec<Command>);
 
 impl Rules {
-    /// Creates the rules of a session of `scene`.
+    /// Creates the rules of a session that begins with `scene`, under `limits`.
     pub fn new(scene: &Scene, limits: &Limits) -> Self {
         Rules { scene: scene.clone(), limits: limits.clone() }
     }
 
-    /// Returns the number of tools: each tool has a number below it.
+    /// Returns the number of tools, `limits.tools`: each tool has a number below it.
     pub fn most_tools(&self) -> u32 {
         self.limits.tools
     }
 
-    /// Checks all of `commands`, and returns them if each keeps to the rules.
+    /// Checks all of `commands`, and returns them if each keeps to the rules. It does not check numbers of tools and
+    /// sequence numbers: those belong to leases.
     ///
     /// # Errors
-    /// Refuses more commands than one tool may have waiting, and the first command that breaks a rule.
+    /// Refuses more commands than one tool may have waiting, `limits.queued_commands_per_tool`
+    /// ([`Reason::QueueFull`]), and the first command that [`Rules::check_one`] refuses.
     pub fn check(&self, commands: Vec<Command>) -> Result<CheckedCommands> {
         if commands.len() > self.limits.queued_commands_per_tool {
             let message = format!("{} commands are more than a tool may have waiting", commands.len());
@@ -48,7 +52,15 @@ impl Rules {
     /// Checks one command: its time to live, its place on the tissue, its force or reach, and its tip.
     ///
     /// # Errors
-    /// Refuses a command that breaks a rule.
+    /// Refuses, naming the field:
+    /// - a time to live that is not above 0;
+    /// - numbers that are not finite;
+    /// - a force beyond `limits.point_force_n` on a point, or off the tissue;
+    /// - a grasp of a fixed point;
+    /// - a grasp moved farther from rest, or a pose farther from the tissue's middle, than `limits.reach_in_sheets`
+    ///   times its longest side;
+    /// - a pose with a velocity that has no client time or has a step ([`Reason::Missing`]);
+    /// - a tip that does not fit the tissue.
     pub fn check_one(&self, command: &Command) -> Result<()> {
         if let Some(seconds) = command.time_to_live_s {
             positive("time_to_live_s", seconds)?;

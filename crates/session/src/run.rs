@@ -12,7 +12,8 @@ use palpate_tissue::scene::record::{Line, Record, Run, Summary, far_warning, wri
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::{Model, Tissue};
 
-/// Returns the first line of a run: the names of scene and script, and the stepping of the scene.
+/// Returns the first line of a run: the names of scene and script, the stepping of the model (integrator, substeps
+/// per step, precision, steps per second), and the version of this program.
 pub fn header(model: &Model, script: &str) -> Run {
     Run {
         scene: model.scene.name.clone(),
@@ -25,28 +26,34 @@ pub fn header(model: &Model, script: &str) -> Run {
     }
 }
 
-/// An event of a run, in the order of the output.
+/// An event of a run. A run gives `Run` first; for each step the records that are due and then `Steps`; and `Summary`
+/// at the end, unless an error ends it.
 pub enum RunEvent<'t> {
     /// The run begins.
     Run(&'t Run),
-    /// A record is due: at every `sample_every`-th step of the script.
+    /// A record is due: at t = 0 (just after the forces begin) and at the end of each `sample_every`-th step, of the
+    /// script's sample points. It has energies and tools.
     Record(Record),
-    /// A step was done. Contains the number of steps done.
+    /// A step was done. Contains the number of steps done, from 1.
     Steps(u64),
-    /// The run has ended.
+    /// The run has ended at the script's last step.
     Summary(&'t Summary),
 }
 
-/// Plays `script` and writes its records, as JSON Lines, to `output`. Returns the summary, which is also the last
-/// line.
+/// Plays `script` on `model` from rest and writes its records, as JSON Lines, to `output`. Returns the summary, which
+/// is also the last line. Blocks until the script ends.
 ///
-/// `held` plays forces and moves as commands that keep them constant over each step. `audit` runs a second simulation
-/// in f64 with a quarter of the substep (a twin): the summary contains the differences between the two, and with
-/// `[stepping] correct` the run corrects errors above the tolerance. `clock_s` returns the time, s, for the summary.
-/// `progress` is called with the number of steps done every 1024 steps.
+/// The first flag, `held`: forces and moves are played as commands that keep them constant over each step, not as
+/// continuous functions. The second flag, `audit`: a second simulation in f64 with a quarter of the substep (a twin)
+/// runs beside; the summary contains the differences between the two, and with `[stepping] correct` the run corrects
+/// errors above the tolerance. `clock_s` returns a monotonic time, s; the summary has the time of the run's own steps
+/// by it. `progress` is called with the number of steps done: 0, 1024, 2048 and so on.
 ///
 /// # Errors
-/// Returns an error if the session is held, a command or change is refused, or the output can't be written.
+/// - [`SimulationFailure::Held`]: the session stops for good ([`Session::hold_reason`](super::Session::hold_reason)),
+///   or with `audit` there was a recovery or the twin can't be compared.
+/// - [`SimulationFailure::Refused`]: a command, a change of the tissue or a correction is refused under `limits`.
+/// - [`SimulationFailure::Output`]: `output` fails. What was written before stays.
 pub fn run(
     model: &Arc<Model>,
     script: &Script,
@@ -59,16 +66,19 @@ pub fn run(
     told(model, script, [held, audit], limits, clock_s, &mut |told| write(output, progress, told))
 }
 
-/// Plays `script` for a program that uses the records as values. Calls `tell` with each event; an error of `tell`
-/// ends the run. Returns the summary.
+/// Plays `script` on `model` from rest for a program that uses the records as values, in the calling thread. Calls
+/// `tell` with each event, in the order of [`RunEvent`]. Returns the summary, which is also the last event.
 ///
-/// `held` plays forces and moves as commands that keep them constant over each step. `audit` runs a second simulation
-/// in f64 with a quarter of the substep (a twin) and compares the two, as [`run`] describes. `clock_s` returns the
-/// time, s, for the summary.
+/// The first flag, `held`: forces and moves are played as commands that keep them constant over each step, not as
+/// continuous functions. The second flag, `audit`: a twin in f64 with a quarter of the substep runs beside, as
+/// [`run`] describes. `clock_s` returns a monotonic time, s; the summary's time excludes `tell` and the twin.
 ///
 /// # Errors
-/// Returns an error if the session or its twin is held or a command or change is refused. An error of `tell` is
-/// [`SimulationFailure::Output`].
+/// - [`SimulationFailure::Held`]: the session stops for good ([`Session::hold_reason`](super::Session::hold_reason));
+///   with `audit` also a recovery, because a tissue that was put back can't be compared, and a stop or recovery of
+///   the twin. A recovery without `audit` is no error; the summary lists it.
+/// - [`SimulationFailure::Refused`]: a command, a change of the tissue or a correction is refused under `limits`.
+/// - [`SimulationFailure::Output`]: `tell` returned an error, which ends the run at the end of its step.
 pub fn told(
     model: &Arc<Model>,
     script: &Script,
@@ -172,8 +182,9 @@ fn write(output: &mut dyn Write, progress: &mut dyn FnMut(u64), told: RunEvent<'
     }
 }
 
-/// Returns the summary of a run that ended with this tissue and took `wall_s`, s. Fields that only the run itself can
-/// fill (audit, corrections, warnings, peaks and curves) are empty or 0.
+/// Returns the summary of a run that ended with this tissue and whose steps took `wall_s`, s: counts, time per point
+/// and substep (ns; not a number before the first substep), and the final hash. Fields that only the run itself can
+/// fill (audit, corrections, recoveries, warnings, peaks, curves and network) are empty or 0.
 #[allow(clippy::cast_precision_loss)]
 pub fn summary(tissue: &dyn Tissue, wall_s: f64) -> Summary {
     let (model, steps) = (tissue.model(), tissue.step_count());

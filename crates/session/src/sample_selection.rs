@@ -18,22 +18,24 @@ use super::local_model::{Modeller, StiffnessJob};
 use super::{Sample, Session, ToolSample};
 use palpate_refusal::{Reason, Refusal, Result, number};
 
-/// A sample, with the timing of the session.
+/// A sample, with the timing of the session, as a stream of samples gets it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PacedSample {
-    /// State of the tools.
+    /// State of the session and of its tools, with local models if the stream has force laws.
     pub sample: Sample,
     /// Time at which the sample's step was due, ns of the server's clock.
     pub due_ns: u64,
-    /// Number of steps dropped so far.
+    /// Number of steps dropped from the schedule so far, because the session was late.
     pub overrun_count: u64,
-    /// Simulated over real time, measured over about the last second.
+    /// Simulated over real time, measured over about the last second: 1 on time, less if the session is late; the
+    /// nominal speed of a playback is 1 too.
     pub time_dilation: f64,
-    /// Everything before this step is on disk; `None` if no journal is kept, or before anything is.
+    /// Everything before this step is durable: on disk or, if that is required, on two disks; `None` if no journal is
+    /// kept, or before anything is.
     pub durable_step: Option<u64>,
     /// Revision at which this server became the session's owner; 0 without a fleet.
     pub ownership_revision: u64,
-    /// Whether steps were dropped since the stream's last sample.
+    /// Whether steps were dropped from the schedule since the stream's last sample.
     pub overrun: bool,
 }
 
@@ -44,25 +46,28 @@ pub const HEARTBEAT_S: f64 = 0.05;
 /// Longest heartbeat, s: clients take a longer silence for the end of the stream.
 pub const MAX_HEARTBEAT_S: f64 = 10.0;
 
-/// Bounds of changes that need no sample. A quantity without a bound is not compared.
+/// Bounds of changes that need no sample, in comparison with the last sample that the stream got. A quantity without
+/// a bound is not compared; each bound that is exceeded makes a sample due.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Deadband {
-    /// Change of the force on the tool, N.
+    /// Length of the change of the force on the tool, N.
     pub force_n: Option<f64>,
-    /// Change of the force on the tool, as a fraction of the force. If `force_n` is also given, the larger bound
-    /// applies.
+    /// Length of the change of the force on the tool, as a fraction of the present force, 0 to 1. If `force_n` is
+    /// also given, the larger bound applies.
     pub force_fraction: Option<f64>,
-    /// Change of the control point's displacement, m.
+    /// Length of the change of the control point's displacement, m.
     pub displacement_m: Option<f64>,
-    /// Error of the force that a client renders from the last local model, as a fraction of the true one.
+    /// Error of the force that a client renders from the last local model, as a fraction of the true force, 0 to 1.
+    /// It has an effect only in a stream with force laws.
     pub rendered_fraction: Option<f64>,
 }
 
 impl Deadband {
-    /// Checks the bounds. 0 stands for any change.
+    /// Checks the bounds. A bound of 0 means any change.
     ///
     /// # Errors
-    /// Refuses a deadband without a bound, and a bound out of range.
+    /// Refuses a deadband without a bound ([`Reason::Missing`]), a negative or infinite bound, a number that is not
+    /// finite, and a fraction above 1.
     pub fn check(&self) -> Result<()> {
         let Deadband { force_n, force_fraction, displacement_m, rendered_fraction } = *self;
         if !self.looks_at_samples() && rendered_fraction.is_none() {
@@ -108,33 +113,38 @@ impl Deadband {
     }
 }
 
-/// Settings of a stream of samples.
+/// Settings of a stream of samples. [`Sampling::check`] checks them.
 #[derive(Debug, Clone)]
 pub struct Sampling {
-    /// Only steps that are multiples of this are sampled.
+    /// Only steps that are multiples of this are sampled; at least 1.
     pub every: u64,
-    /// The tools to sample; `None` for all in use.
+    /// Numbers of the tools to sample, in the order in which samples have them; `None` for all that ever had a
+    /// control point.
     pub only: Option<Vec<u32>>,
-    /// Bounds within which changes are not sent. `None`: each change is sent.
+    /// Bounds within which changes are not sent. `None`: each change is sent, so every sampled step while the tissue
+    /// is awake.
     pub deadband: Option<Deadband>,
-    /// Longest interval between samples, s: a heartbeat is sent while nothing changes.
+    /// Longest simulated time between samples, s, above 0 and at most [`MAX_HEARTBEAT_S`]: a heartbeat is sent while
+    /// nothing changes.
     pub heartbeat_s: f64,
-    /// Force laws for the local models of the samples. `None`: no local models.
+    /// Force laws for the local models of tools that are led by poses. `None`: samples have no local models.
     pub laws: Option<Arc<Laws>>,
-    /// Whether stiffness and damping are computed from the tissue around the tool under a touch too, not only under
-    /// a grasp.
+    /// Whether stiffness and damping are also computed from the tissue around the tool under a touch, and not only
+    /// under a grasp. Without `laws` it has no effect.
     pub touch_stiffness: bool,
-    /// Shorter heartbeat that the reader may request at any time; `None`: only `heartbeat_s` applies.
+    /// Shorter heartbeat that the reader may request at any time; the shorter of the two applies. `None`: only
+    /// `heartbeat_s` applies.
     pub wanted: Option<Arc<WantedHeartbeat>>,
 }
 
-/// Heartbeat that a reader requests at present, by its measurements of the network.
+/// Heartbeat that the reader of a stream requests at present, by its measurements of the network. It can be set from
+/// any thread; at first there is no request.
 #[derive(Debug, Default)]
 pub struct WantedHeartbeat(AtomicU64);
 
 impl WantedHeartbeat {
-    /// Sets the requested heartbeat, s, which is limited to at least 0.01 s. A value that is not above 0 withdraws
-    /// the request.
+    /// Sets the requested heartbeat, s; below 0.01 s ([`FASTEST_S`]) it counts as 0.01 s. A value that is not above 0
+    /// withdraws the request.
     pub fn set(&self, heartbeat_s: f64) {
         let bits = if heartbeat_s > 0.0 { heartbeat_s.max(FASTEST_S).to_bits() } else { 0 };
         self.0.store(bits, Ordering::Relaxed);
@@ -147,10 +157,11 @@ impl WantedHeartbeat {
 }
 
 impl Sampling {
-    /// Checks the deadband and the heartbeat.
+    /// Checks the deadband and the heartbeat; the other settings are not checked.
     ///
     /// # Errors
-    /// Refuses a value out of range.
+    /// Returns the refusals of [`Deadband::check`], and refuses a heartbeat that is not above 0 and at most
+    /// [`MAX_HEARTBEAT_S`].
     pub fn check(&self) -> Result<()> {
         if let Some(deadband) = &self.deadband {
             deadband.check()?;
@@ -160,7 +171,8 @@ impl Sampling {
     }
 }
 
-/// Selector of the samples of one stream, which compares each with the last one sent.
+/// Selector of the samples of one stream, which compares each with the last one that the stream got. Before the
+/// first, every sampled step is due.
 #[derive(Debug)]
 pub struct Sampler {
     sampling: Sampling,
@@ -180,7 +192,7 @@ struct FollowedTool {
 }
 
 impl Sampler {
-    /// Creates a sampler for a session with `rate_hz` steps per second.
+    /// Creates a sampler for a session with `rate_hz` steps per second. `sampling` must have been checked.
     pub fn new(sampling: Sampling, rate_hz: f64) -> Self {
         Sampler { sampling, rate_hz, told: None, followed: BTreeMap::new(), law: FIRST }
     }
@@ -192,14 +204,15 @@ impl Sampler {
         (wanted_s.map_or(asked_s, |wanted_s| wanted_s.min(asked_s)) * self.rate_hz).round().max(1.0) as u64
     }
 
-    /// Returns the sample of the last step, if the stream is due one. `last`: the stream gets it in any case,
-    /// because no other follows for now. A step is returned once.
+    /// Returns the sample of the present step, if the stream is due one; otherwise `None`. With `last` the stream
+    /// gets it even if it is not due, because no other follows for now. A step is returned once, or twice if the
+    /// session was stopped in between. A returned sample counts as sent.
     pub fn pick(&mut self, session: &Session, last: bool) -> Option<Sample> {
         self.pick_from(session, &mut None, last)
     }
 
-    /// Returns the sample of the last step as [`Sampler::pick`] does, for one of many streams: `all` keeps the
-    /// sample of all tools for the others, once a stream has needed it.
+    /// Returns the sample of the present step as [`Sampler::pick`] does, for one of many streams. `all` keeps the
+    /// sample of all tools for the other streams, once a stream has needed it: begin each step with `None`.
     pub fn pick_from(&mut self, session: &Session, all: &mut Option<Sample>, last: bool) -> Option<Sample> {
         let (step, told) = (session.step_count(), self.told.as_ref());
         let is_told = told.is_some_and(|told| told.step == step && told.held == session.hold_reason().is_some());
@@ -265,7 +278,10 @@ impl Sampler {
         (models, is_exceeded)
     }
 
-    /// Returns the stiffness computations for the tools whose stiffness the stream requests.
+    /// Returns computations of stiffness and damping, by ascending number, for the tools under which the stream needs
+    /// them as of its newest sample: those that grasp and, with `touch_stiffness`, those that touch. Each has a copy
+    /// of the tissue around its tool, and computes nothing before [`StiffnessJob::work`]. Empty in a stream without
+    /// laws, and before the first sample.
     pub fn refinements(&self, session: &Session) -> impl Iterator<Item = StiffnessJob> {
         let wanted = self.followed.iter().filter(|(_, followed)| followed.modeller.wants_refinement());
         wanted.filter_map(|(tool, followed)| {
@@ -288,7 +304,8 @@ impl Sampler {
         }
     }
 
-    /// Returns the next step after `step` whose sample the stream gets even if nothing changes from now on.
+    /// Returns the next step after `step`, a multiple of N, whose sample the stream gets even if nothing changes from
+    /// now on: the next sampled one while the tissue moves, otherwise that of the heartbeat.
     pub fn next_due(&self, step: u64) -> u64 {
         let told = self.told.as_ref().filter(|told| told.awake_points == 0);
         let heartbeat = told.map_or(0, |told| told.step + self.heartbeat_steps());

@@ -1,6 +1,7 @@
 //! The times at which steps are due. Time is an argument.
 
-/// Schedule of a session: the time at which each step is due, at a constant rate.
+/// Schedule of a session: the time at which each step is due, at a constant rate. A pause or a delay needs a new or
+/// shifted one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Schedule {
     step: u64,
@@ -10,23 +11,25 @@ pub struct Schedule {
 
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 impl Schedule {
-    /// Creates a schedule: step `step` is due at `at_ns`, and each further step 1/`rate_hz` s later.
+    /// Creates a schedule: step `step` is due at `at_ns`, ns of any clock, and each further step 1/`rate_hz` s later.
+    /// `rate_hz` must be above 0.
     pub fn new(step: u64, at_ns: u64, rate_hz: f64) -> Self {
         Schedule { step, at_ns: at_ns as f64, period_ns: 1e9 / rate_hz }
     }
 
-    /// Returns the time between two steps, ns.
+    /// Returns the time between two steps, ns: 10⁹ over the rate.
     pub fn period_ns(&self) -> f64 {
         self.period_ns
     }
 
-    /// Returns the time at which a step is due, ns; an earlier step than the schedule's first counts as the first.
+    /// Returns the time at which a step is due, ns, rounded down. An earlier step than the schedule's first counts as
+    /// the first.
     pub fn due_ns(&self, step: u64) -> u64 {
         (self.at_ns + step.saturating_sub(self.step) as f64 * self.period_ns) as u64
     }
 
-    /// Returns the first step that is due after `now_ns`; that is the number of steps that a session on time has
-    /// done.
+    /// Returns the first step that is due after `now_ns`, ns, at least the schedule's first; that is the number of
+    /// steps that a session on time has done.
     pub fn next_step(&self, now_ns: u64) -> u64 {
         let periods = (now_ns as f64 - self.at_ns) / self.period_ns;
         let mut step = self.step.saturating_add(periods.max(0.0) as u64);
@@ -40,7 +43,7 @@ impl Schedule {
         step
     }
 
-    /// Delays all steps by `periods` periods.
+    /// Makes all steps due later by `periods` periods; a fraction is allowed.
     pub fn delay(&mut self, periods: f64) {
         self.at_ns += periods * self.period_ns;
     }

@@ -17,25 +17,27 @@ use palpate_tissue::scene::record::Correction;
 use palpate_tissue::scene::script::{Action, Script};
 use palpate_tissue::select::audit::AuditFinding;
 
-/// Reason why a simulation ends early.
+/// Reason why a simulation or a run ends early. Its `Display` is a message for people.
 #[derive(Debug, thiserror::Error)]
 pub enum SimulationFailure {
-    /// The guard has ended the session, or has put its tissue back to an earlier state. Contains the reason.
+    /// The session has stopped for good, its tissue went back to an earlier state, or an audit's twin did one of
+    /// these. Contains the reason, for people.
     #[error("the run was stopped: {0}")]
     Held(String),
-    /// A command or a change of the tissue was refused.
+    /// A command, a change of the tissue or a correction was refused. Contains the refusal.
     #[error("{0}")]
     Refused(#[from] Refusal),
-    /// The output could not be written.
+    /// The output could not be written, or the caller's function that receives events failed.
     #[error("can't write the output: {0}")]
     Output(#[from] std::io::Error),
 }
 
-/// A session with its queue of inputs, which is stepped without a server.
+/// A session with its queue of inputs, which the caller steps without a server. Its tools are held by one lease of
+/// its own, which never lapses while times are 0.
 pub struct Simulation {
-    /// The tissue and its tools.
+    /// The tissue and its tools. If you advance it directly, inputs that wait for that step act later.
     pub session: Session,
-    /// Queue of the commands and leases of tools.
+    /// Queue of the commands, with the leases of tools.
     pub intake: Intake,
     /// The commands that act at the coming step.
     pub(crate) due: Vec<Due>,
@@ -49,23 +51,25 @@ pub struct Simulation {
 const LEASE: LeaseId = 1;
 
 impl Simulation {
-    /// Creates a simulation of a tissue at rest, at step 0.
+    /// Creates a simulation of a tissue at rest, at step 0, without a script. Commands must keep to `limits`.
     pub fn new(model: &Arc<Model>, limits: &Limits) -> Self {
         Simulation::of(Session::new(model), &model.scene, limits)
     }
 
-    /// Creates a simulation that continues `session`, which began with the scene `first`.
+    /// Creates a simulation that continues `session` at its present step. `first` is the scene with which the session
+    /// began; commands must keep to `limits`. Tools that are led by poses stay in the tissue with their tips.
     pub fn of(session: Session, first: &Scene, limits: &Limits) -> Self {
         let intake = Intake::new(first, limits).continued(&session, None);
         Simulation { session, intake, due: Vec::new(), changes: VecDeque::new(), script: None }
     }
 
-    /// Creates a simulation that plays `script`. Without `held`, its forces and moves are continuous profiles that
-    /// are set once; with `held`, they are commands at each step, as a client streams them. Poses are commands in
-    /// both cases.
+    /// Creates a simulation at step 0 that plays `script`. Without `held`, its forces and moves are continuous
+    /// profiles that are set once; with `held`, they are commands at each step, as a client streams them. Poses are
+    /// commands in both cases. [`Simulation::take_inputs`] issues the commands.
     ///
     /// # Errors
-    /// Returns the errors of [`Model::apply_changes`].
+    /// Refuses a change of the tissue in the script that the scene or `limits` do not allow
+    /// ([`Model::apply_changes`]).
     pub fn playing(model: &Arc<Model>, script: &Script, held: bool, limits: &Limits) -> Result<Self> {
         let changes = model.apply_changes(&model.scene, &script.changes, limits)?;
         let mut simulation = Simulation { changes, ..Simulation::new(model, limits) };
@@ -76,10 +80,13 @@ impl Simulation {
         Ok(simulation)
     }
 
-    /// Queues an action of a tool for the coming step. Acquires the tool first if it is free.
+    /// Queues an action of a tool for the coming step. Acquires the tool first if it is free, under the simulation's
+    /// own lease, for `limits.lease_s`.
     ///
     /// # Errors
-    /// Returns a refusal if a server would refuse the command.
+    /// Refuses a tool number that is not below `limits.tools`, a tool that another lease holds, an action that breaks
+    /// a rule ([`Rules::check_one`](super::rules::Rules::check_one)), another tip than that of the tool in the
+    /// tissue, tips with too much work, and more commands of one tool than may wait.
     pub fn command(&mut self, tool: u32, action: Action) -> Result<()> {
         if self.intake.leases.get(tool).is_none() {
             let lease_s = self.intake.rules().limits.lease_s;
@@ -89,8 +96,9 @@ impl Simulation {
         self.intake.submit(LEASE, vec![command], 0)
     }
 
-    /// Applies an input from a journal. Commands and another tissue act at the coming step, the end of a session and
-    /// its revival act at once, and inputs that only start, pause or skip time do nothing.
+    /// Applies an input from a journal. Commands act at the coming step without being checked, and another tissue
+    /// acts there too. [`Input::Hold`] and [`Input::Revive`] act at once: the latter replaces the session by one at
+    /// rest at the same step, and drops what was due. Inputs that only start, pause or skip time do nothing.
     pub fn apply(&mut self, input: Input) {
         let step = self.session.step_count();
         match input {
@@ -109,11 +117,13 @@ impl Simulation {
         }
     }
 
-    /// Corrects the tissue as a finding of an audit needs it, from now on, and also in the script's later changes.
-    /// Returns the correction; `None`, without a change, if none is needed.
+    /// Corrects the tissue as a finding of an audit needs it, from the coming step on, and also in the script's later
+    /// changes. It may run rehearsals, which take time. Returns the correction; `None`, without a change, if the
+    /// error is within the tolerance or nothing more accurate exists.
     ///
     /// # Errors
-    /// Returns the errors of [`Model::corrected`] and [`Model::apply_changes`].
+    /// Returns the refusals of [`Model::corrected`] and [`Model::apply_changes`]. If the latter refuses, the session
+    /// already has its new tissue.
     pub fn correct(&mut self, finding: &AuditFinding) -> Result<Option<Correction>> {
         let (rules, step) = (self.intake.rules(), self.session.step_count());
         let Some(correction) = self.session.model().correction(finding, step, &rules.limits) else { return Ok(None) };
@@ -126,11 +136,12 @@ impl Simulation {
         Ok(Some(correction))
     }
 
-    /// Changes the tissue to the last one that is due, if any, and moves the commands that act at the coming step out
-    /// of the queue. Ends the leases that lapse before `now_ns`, ns; with 0 no lease lapses.
+    /// Begins a step: queues the script's commands for it, changes the tissue to the last one that is due, if any,
+    /// and moves the commands that act at the coming step out of the queue. Ends the leases that have lapsed at
+    /// `now_ns`, ns of the caller's clock; with 0 no lease lapses. [`Simulation::step`] calls it.
     ///
     /// # Errors
-    /// Returns a refusal if a server would refuse a command of the script.
+    /// Refuses a command of the script, for the reasons of [`Simulation::command`].
     pub fn take_inputs(&mut self, now_ns: u64) -> Result<()> {
         let step = self.session.step_count();
         if let Some((script, held)) = &self.script {
@@ -154,11 +165,12 @@ impl Simulation {
         self.changes.drain(..due).next_back().map(|change| change.1)
     }
 
-    /// Advances one step, with the inputs that act at its beginning. Leases that lapse before `now_ns`, ns, end; with
-    /// 0 none lapses.
+    /// Advances one step, with the inputs that act at its beginning. Leases that have lapsed at `now_ns`, ns, end;
+    /// with 0 none lapses. A session that has stopped does not advance, and this is no error
+    /// ([`Session::hold_reason`]).
     ///
     /// # Errors
-    /// Returns the errors of [`Simulation::take_inputs`].
+    /// Returns the refusals of [`Simulation::take_inputs`].
     pub fn step(&mut self, now_ns: u64) -> Result<()> {
         self.take_inputs(now_ns)?;
         self.session.advance(&mut self.due, |_| {});
@@ -168,8 +180,10 @@ impl Simulation {
     /// Advances until `step` steps are done. Does nothing if they are done already.
     ///
     /// # Errors
-    /// Returns [`SimulationFailure::Held`] if the guard has acted, so that the tissue is not the result of its inputs
-    /// ([`Session::fault`]), and the errors of [`Simulation::take_inputs`].
+    /// - [`SimulationFailure::Held`]: the session has stopped for good or there was a recovery, at any time so far,
+    ///   so that the tissue is not the result of its inputs ([`Session::fault`]). It ends at the first step after
+    ///   which this is so.
+    /// - [`SimulationFailure::Refused`]: a command of the script is refused ([`Simulation::take_inputs`]).
     pub fn run_to(&mut self, step: u64) -> std::result::Result<(), SimulationFailure> {
         while self.session.step_count() < step {
             self.step(0)?;
@@ -182,7 +196,8 @@ impl Simulation {
 }
 
 impl Session {
-    /// Sets the forces and moves of a script in a session that has not begun, as continuous profiles.
+    /// Sets the forces and moves of a script in a session that has not begun, as continuous profiles: the forces are
+    /// tools 0, 1, …, and the moves follow them. Poses are not set; they are commands.
     pub fn play_script(&mut self, script: &Script) {
         for (tool, profile) in script.forces.iter().enumerate() {
             self.play_force(tool, profile.clone());

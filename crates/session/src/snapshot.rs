@@ -1,8 +1,8 @@
 //! Snapshots: a session at one moment, as bytes, from which it continues with the bits that it would have had
 //! without a stop.
 //!
-//! **Content**: the state of the tissue ([`tissue::saved`]), the state of each tool with its path, what recoveries
-//! depend on, and counts. A snapshot has no waiting commands, no leases, no unfinished audit and no scene.
+//! **Content**: the state of the tissue ([`tissue::state::saved`]), the state of each tool with its path, what
+//! recoveries depend on, and counts. A snapshot has no waiting commands, no leases, no unfinished audit and no scene.
 //!
 //! **What a caller keeps beside it**: only the scene with which the session began. The snapshot has the result of
 //! all changes and corrections of the tissue ([`Saved::tissue`]). So:
@@ -39,7 +39,7 @@ use palpate_tissue::state::saved::{
 };
 use palpate_tissue::{self as tissue, Model, Tissue};
 
-/// The first bytes of a snapshot.
+/// The first eight bytes of a snapshot.
 pub const MAGIC: [u8; 8] = *b"PALPSNAP";
 
 /// Version of the format and of the arithmetic. A program that reads another version would continue with other
@@ -53,7 +53,8 @@ const PARTS_MULTIPLE: u64 = 32;
 /// Memory that a reader reserves for lists that it has begun, bytes.
 const ROOM: u64 = 4 << 20;
 
-/// Returns a bound of the memory for reading a snapshot, bytes, from the lengths in its header.
+/// Returns an upper bound of the memory for reading and restoring the parts of a snapshot, bytes, from the lengths in
+/// its header. It trusts no length beyond that of `bytes`, and checks nothing.
 pub fn memory_of(bytes: &[u8]) -> u64 {
     let parts = bytes.get(12..20).map_or(0, |length| u64::from_le_bytes(array(length))).min(bytes.len() as u64);
     bytes.len() as u64 + parts.saturating_mul(PARTS_MULTIPLE) + ROOM.min(parts << 10)
@@ -65,7 +66,7 @@ const HEADER: usize = 8 + 4 + 8 + 16;
 /// Position of the checksum.
 const CHECKSUM: std::ops::Range<usize> = 20..36;
 
-/// A snapshot: a session at one moment, in memory or as it was read from bytes.
+/// A snapshot: a session at one moment, copied in memory or read from bytes. Clones share the content.
 #[derive(Debug, Clone)]
 pub struct Saved {
     content: Content,
@@ -159,8 +160,9 @@ struct SavedRecovery {
 }
 
 impl Session {
-    /// Returns a copy of everything that the next steps depend on. It only copies memory; [`Saved::to_bytes`]
-    /// encodes it later, in any thread.
+    /// Returns a copy of everything that the next steps depend on. It only copies memory, as much as the state of the
+    /// tissue has; [`Saved::to_bytes`] encodes it later, in any thread. A running audit is left out. Do not call it
+    /// within an unfinished step.
     pub fn save(&self) -> Saved {
         let own = SessionParts {
             tools: self.tools.iter().map(SavedTool::of).collect(),
@@ -176,11 +178,12 @@ impl Session {
         Saved { content: Content::Taken { own: Arc::new(own), tissue, state, step }, limits }
     }
 
-    /// Creates a session that continues from a snapshot. `model` is that of the session when it was saved
-    /// ([`Model::resumed`]); only the width of its vectors may differ.
+    /// Creates a session that continues from a snapshot with equal bits. `model` is that of the session when it was
+    /// saved ([`Model::resumed`] of [`Saved::tissue`]); only the width of its vectors may differ.
     ///
     /// # Errors
-    /// Refuses a snapshot of another model, and values that no session can have.
+    /// Refuses a snapshot of another model, and values that no session can have or that are beyond the limits given
+    /// to [`Saved::from_bytes`].
     pub fn restore(model: &Arc<Model>, saved: &Saved) -> Result<Self> {
         match &saved.content {
             Content::Taken { own, tissue, .. } => {
@@ -213,8 +216,9 @@ impl Session {
         })
     }
 
-    /// Releases all tools, as if their leases ended at this step: a server does this when it continues a session
-    /// after a restart. It is an input, so a recorder of inputs must record it at this step.
+    /// Releases all tools at the present step, as if their leases ended: their paths and sequence numbers are
+    /// forgotten, and pauses stay. A server does this when it continues a session after a restart. It is an input, so
+    /// a recorder of inputs must record it at this step.
     pub fn let_go(&mut self) {
         for index in 0..self.tools.len() {
             self.end_lease(index);
@@ -223,7 +227,7 @@ impl Session {
 }
 
 impl Saved {
-    /// Returns the number of steps done.
+    /// Returns the number of steps that the saved session had done.
     pub fn step(&self) -> u64 {
         match &self.content {
             Content::Taken { step, .. } => *step,
@@ -239,7 +243,8 @@ impl Saved {
         }
     }
 
-    /// Encodes the snapshot. It takes as long as reading the state several times, and the model once.
+    /// Encodes the snapshot in the format of this module, with a checksum. It takes as long as reading the state
+    /// several times, and the model once.
     pub fn to_bytes(&self) -> Vec<u8> {
         match &self.content {
             Content::Taken { own, tissue, .. } => {
@@ -254,7 +259,9 @@ impl Saved {
     /// that it fits a model.
     ///
     /// # Errors
-    /// Refuses bytes that are no snapshot, that are damaged or of another version, and a snapshot above the limits.
+    /// - [`Reason::Unreadable`]: the bytes are no snapshot, are cut off or damaged, or can't be decoded.
+    /// - [`Reason::NotAvailable`]: they have another version than [`VERSION`].
+    /// - More tools than `limits.tools` or more points than `limits.points`.
     pub fn from_bytes(bytes: &[u8], limits: &Limits) -> Result<Self> {
         let refuse = |reason, message: &str| Err(Refusal::new(reason, SNAPSHOT, message));
         let Some((header, content)) = bytes.split_at_checked(HEADER).filter(|(header, _)| header.starts_with(&MAGIC))
@@ -318,7 +325,7 @@ fn encoded(parts: &Parts, values: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// Writes the matching checksum into a snapshot, so that a test can pass altered bytes to what checks them next.
+/// Writes the matching checksum into a snapshot, so that a test can pass altered bytes to the checks that follow it.
 /// Bytes shorter than a header stay as they are.
 pub fn seal(bytes: &mut [u8]) {
     if let Some((header, content)) = bytes.split_at_mut_checked(HEADER) {

@@ -16,8 +16,8 @@ use palpate_tissue::scene::script::Action;
 /// Number of the copy's only tool.
 const TOOL: u32 = 0;
 
-/// Limit of a copy's steps in a millisecond, in points times substeps: they take up to 1 ms with a tip on the
-/// tissue.
+/// Limit of a client copy's work in a millisecond, in awake points times substeps: this takes up to 1 ms with a tip
+/// on the tissue. Beyond it the copy predicts nothing.
 pub const TICK_POINT_SUBSTEPS: u64 = 100_000;
 
 /// Largest radius of a tip on a copy, in lengths of an edge: the cost of contact grows with the area of the tip.
@@ -29,7 +29,8 @@ const TICK_S: f64 = 1e-3;
 /// Time behind the client's above which a copy skips to the present, s: the client has paused.
 const MAX_BEHIND_S: f64 = 0.005;
 
-/// A copy of a tissue with one tool, which predicts the force on the tool between a server's samples.
+/// A copy of a tissue with one tool, which predicts the force on the tool between a server's samples. It begins at
+/// rest, and knows nothing of other tools.
 pub struct TissueCopy {
     session: Session,
     tip: Tip,
@@ -42,24 +43,24 @@ pub struct TissueCopy {
 }
 
 impl TissueCopy {
-    /// Creates a copy at rest, for a tool with this tip, without a limit of its work.
+    /// Creates a copy at rest, for a tool with this tip, without a limit of its work and without a check of the tip.
     pub fn new(model: &Arc<Model>, tip: Tip) -> Self {
         let (session, due) = (Session::new(model), Vec::with_capacity(1));
         TissueCopy { session, tip, due, ahead_s: None, place_m: DVec3::ZERO, most_point_substeps: u64::MAX }
     }
 
-    /// Returns this copy with a limit of points times substeps in a tick. Once more points are awake than that
-    /// allows, it predicts nothing, because the loop that it runs in must not be late.
+    /// Returns this copy with a limit of awake points times substeps per millisecond. While more points are awake
+    /// than that allows, it is not stepped and predicts nothing, because the loop that it runs in must not be late.
     #[must_use]
     pub fn within(self, most_point_substeps: u64) -> Self {
         TissueCopy { most_point_substeps, ..self }
     }
 
-    /// Creates a copy of a tissue that a server describes, limited to what a client can step in time
+    /// Creates a copy at rest of a tissue that a server describes, limited to what a client can step in time
     /// ([`TICK_POINT_SUBSTEPS`]).
     ///
     /// # Errors
-    /// Refuses a tip that does not fit the tissue, or that is too large for a copy.
+    /// Refuses a tip that does not fit the tissue, and a radius above 32 lengths of an edge (`tip.radius_m`).
     pub fn for_client(model: &Arc<Model>, tip: Tip) -> Result<Self> {
         let shape = model.shape();
         check_tip("tip", shape, &tip)?;

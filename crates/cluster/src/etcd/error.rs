@@ -4,11 +4,11 @@ use std::error::Error;
 
 use tonic::{Code, ConnectError, Status};
 
-/// Why a call to etcd was not executed, or may not have been.
+/// Why a call to etcd was not executed, or may not have been. Each contains a message for people, with advice.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum EtcdError {
-    /// No member can be reached, or none knows of a leader. Nothing was done, except that a lease may have been
-    /// granted that nobody knows of and that ends by itself. Try again.
+    /// No member can be reached, or none knows of a leader. Nothing was read or written by a transaction; but a lease
+    /// may have been granted, which ends by itself, renewed or ended. Try again.
     #[error("{0}")]
     Unreachable(String),
     /// etcd has refused, or the options are wrong: the same call would fail again. Nothing was done.
@@ -79,7 +79,7 @@ pub(super) fn text(status: &Status) -> String {
     }
 }
 
-/// Returns the text of an error's innermost cause.
+/// Returns the text of an error's innermost cause; its own text if it has no cause.
 pub fn root(error: &(dyn Error + 'static)) -> String {
     std::iter::successors(Some(error), |&cause| cause.source()).last().map(ToString::to_string).unwrap_or_default()
 }

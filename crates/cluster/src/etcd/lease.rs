@@ -8,10 +8,11 @@ use tonic::{Status, Streaming};
 
 use super::calls::{MemberCall, MemberCalls};
 
-/// A lease of etcd: keys that are written with it are deleted when it ends.
+/// A lease of etcd: keys that are written with it are deleted when it ends, because it was not renewed in time or was
+/// revoked. Dropping this does not end it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Lease {
-    /// Number of the lease.
+    /// Number of the lease, for [`Op::Put`](super::Op::Put) and [`Etcd::keep_alive`](super::Etcd::keep_alive).
     pub id: i64,
     /// Seconds that the lease lasts after each renewal, as etcd granted: at least the requested time.
     pub ttl_s: u64,

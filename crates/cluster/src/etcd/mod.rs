@@ -47,10 +47,11 @@ pub use store::{Compare, KeyValue, Op, TransactionOutcome, Txn};
 use store::{key_value, prefix_range, revision, signed};
 pub use watch::{Watch, WatchError, WatchEvent};
 
-/// Default time limit of an attempt at one member.
+/// Default time limit of an attempt at one member: 1 s. A call may make several attempts.
 pub const LIMIT: Duration = Duration::from_secs(1);
 
-/// A call under way. It is boxed so that it is compiled here, once, and not in every crate that makes calls.
+/// A call under way, which does nothing until it is polled. Dropping it cancels the call, which etcd may execute
+/// nevertheless. It is boxed so that it is compiled here, once, and not in every crate that makes calls.
 pub type Answer<'a, T> = Pin<Box<dyn Future<Output = EtcdResult<T>> + Send + 'a>>;
 
 /// Keys per answer to a list.
@@ -69,8 +70,8 @@ const AT_A_TIME: usize = 128;
 /// Attempts at a list, if etcd compacts the revision that it reads.
 const LIST_ATTEMPTS: usize = 3;
 
-/// Client of one etcd cluster. Clones share the connections, the keepalive stream and the limit of concurrent
-/// calls.
+/// Client of one etcd cluster. Clones share the connections, the keepalive stream and the limit of 128 concurrent
+/// reads and transactions. Its calls need a Tokio runtime.
 #[derive(Clone)]
 pub struct Etcd {
     calls: Arc<MemberCalls>,
@@ -86,10 +87,12 @@ impl std::fmt::Debug for Etcd {
 }
 
 impl Etcd {
-    /// Creates a client with the time limit [`LIMIT`] (1 s) for each attempt. It connects at the first call.
+    /// Creates a client with the time limit [`LIMIT`] (1 s) for each attempt at a member. It connects at the first
+    /// call.
     ///
     /// # Errors
-    /// Returns an error if the options are wrong or a file can't be read.
+    /// Returns [`EtcdError::Refused`] if an endpoint is invalid or there are not 1 to 16, if options contradict each
+    /// other ([`EtcdOptions`]), if a password would be sent in the clear, or if a file can't be read.
     pub fn open(options: &EtcdOptions) -> EtcdResult<Self> {
         Etcd::open_within(options, LIMIT)
     }
@@ -97,22 +100,25 @@ impl Etcd {
     /// Creates a client with the time limit `limit` for each attempt at a member. It connects at the first call.
     ///
     /// # Errors
-    /// Returns an error if the options are wrong or a file can't be read.
+    /// Returns [`EtcdError::Refused`] if an endpoint is invalid or there are not 1 to 16, if options contradict each
+    /// other ([`EtcdOptions`]), if a password would be sent in the clear, or if a file can't be read.
     pub fn open_within(options: &EtcdOptions, limit: Duration) -> EtcdResult<Self> {
         let calls = Arc::new(MemberCalls::new(options.clone(), limit)?);
         Ok(Etcd { calls, pulse: Arc::default(), turns: Arc::new(Semaphore::new(AT_A_TIME)) })
     }
 
-    /// Returns the address of the member at which the next call begins: the one that answered last.
+    /// Returns the address of the member at which the next call begins: the one that answered last, or the next one
+    /// after it failed; a random one before the first call.
     pub fn endpoint(&self) -> &str {
         self.calls.members[self.calls.preferred()].url()
     }
 
-    /// Reads a key. Returns its value, or `None` if it does not exist, and the store's revision. The read is
-    /// linearizable: it sees every write that was answered before.
+    /// Reads a key. Returns its value, or `None` if it does not exist or is not UTF-8, and the store's revision. The
+    /// read is linearizable: it sees every write that was answered before.
     ///
     /// # Errors
-    /// Returns an error if no member can answer, or if etcd refuses.
+    /// - [`EtcdError::Unreachable`]: no member can answer in time.
+    /// - [`EtcdError::Refused`]: etcd refuses, for example because the user may not do this.
     pub fn get<'a>(&'a self, key: &'a str) -> Answer<'a, (Option<KeyValue>, u64)> {
         Box::pin(async move {
             let request = RangeRequest { key: key.into(), ..Default::default() };
@@ -122,11 +128,14 @@ impl Etcd {
         })
     }
 
-    /// Reads all keys that begin with `prefix`, in order and at one revision. Returns them and that revision. The
-    /// read sees every write that was answered before. Keys that are not UTF-8 are left out.
+    /// Reads all keys that begin with `prefix`, by ascending key and at one revision. Returns them and that revision.
+    /// The read sees every write that was answered before. Keys that are not UTF-8 are left out; an empty prefix
+    /// means all keys.
     ///
     /// # Errors
-    /// Returns an error if no member can answer, if etcd refuses, or if there are more than 1,048,576 keys.
+    /// - [`EtcdError::Unreachable`]: no member can answer in time.
+    /// - [`EtcdError::Refused`]: etcd refuses, has compacted the revision at three attempts, or has more than
+    ///   1,048,576 such keys.
     pub fn list<'a>(&'a self, prefix: &'a str) -> Answer<'a, (Vec<KeyValue>, u64)> {
         Box::pin(async move {
             let what = format!("list the keys `{prefix}…`");
@@ -177,11 +186,15 @@ impl Etcd {
         Ok(response)
     }
 
-    /// Executes a transaction and returns its outcome.
+    /// Executes a transaction and returns its outcome. Conditions that do not hold are no error
+    /// ([`TransactionOutcome::succeeded`]).
     ///
     /// # Errors
-    /// Returns [`EtcdError::Unknown`] if the transaction may have been executed although there is no answer: read
-    /// its keys again. With every other error it was not executed.
+    /// - [`EtcdError::Unknown`]: the transaction may have been executed although there is no answer: read its keys
+    ///   again. It does not occur if the transaction only reads.
+    /// - [`EtcdError::Unreachable`]: no member can answer in time. Nothing was written.
+    /// - [`EtcdError::Refused`]: etcd refuses, for example more than 128 operations or a lease that has ended.
+    ///   Nothing was written.
     pub fn transact(&self, transaction: Txn) -> Answer<'_, TransactionOutcome> {
         Box::pin(async move {
             let repeat = if transaction.only_reads() { Repeat::Freely } else { Repeat::Never };
@@ -198,10 +211,12 @@ impl Etcd {
         })
     }
 
-    /// Creates a lease of at least `ttl_s` seconds. If the answer is lost, the unused lease ends by itself.
+    /// Creates a lease of at least `ttl_s` seconds, which runs from when etcd grants it. If the answer is lost, the
+    /// unused lease ends by itself.
     ///
     /// # Errors
-    /// Returns an error if no member can answer, or if etcd refuses a time to live that long.
+    /// - [`EtcdError::Unreachable`]: no member can answer in time.
+    /// - [`EtcdError::Refused`]: etcd refuses, for example a time to live that long.
     pub fn grant(&self, ttl_s: u64) -> Answer<'_, Lease> {
         Box::pin(async move {
             let message = LeaseGrantRequest { ttl: signed(ttl_s), id: 0 };
@@ -215,11 +230,13 @@ impl Etcd {
         })
     }
 
-    /// Renews a lease. Returns the seconds that it lasts from now on, or `None` if it has ended. Leases of one
-    /// client are renewed one after the other. The open stream is tried first, then each member.
+    /// Renews the lease with the number `lease` ([`Lease::id`]). Returns the seconds that it lasts from then on, or
+    /// `None` if it has ended. Leases of one client are renewed one after the other. The open stream is tried first,
+    /// then each member.
     ///
     /// # Errors
-    /// Returns an error if no member can answer. The lease may have been renewed nevertheless.
+    /// - [`EtcdError::Unreachable`]: no member can answer in time. The lease may have been renewed nevertheless.
+    /// - [`EtcdError::Refused`]: etcd refuses, for example because the user may not do this.
     pub fn keep_alive(&self, lease: i64) -> Answer<'_, Option<u64>> {
         Box::pin(async move {
             let mut kept = self.pulse.lock().await;
@@ -242,10 +259,11 @@ impl Etcd {
         })
     }
 
-    /// Ends a lease, and deletes its keys. A lease that has already ended is no error.
+    /// Ends the lease with the number `lease`, and deletes its keys. A lease that has already ended is no error.
     ///
     /// # Errors
-    /// Returns an error if no member can answer.
+    /// - [`EtcdError::Unreachable`]: no member can answer in time. The lease may have ended nevertheless.
+    /// - [`EtcdError::Refused`]: etcd refuses, for example because the user may not do this.
     pub fn revoke(&self, lease: i64) -> Answer<'_, ()> {
         Box::pin(async move {
             let attempt = |way: MemberCall| {
@@ -262,8 +280,8 @@ impl Etcd {
     }
 
     /// Returns a watch of the keys that begin with `prefix`, from revision `from_revision` on; 0 stands for the
-    /// changes after the watch is opened, which happens in the first [`Watch::next`]. After a list, pass the
-    /// revision after the list's.
+    /// changes after the watch is opened, which happens in the first [`Watch::next`]. After a list, pass the revision
+    /// after the list's. This makes no call.
     pub fn watch(&self, prefix: &str, from_revision: u64) -> Watch {
         Watch::new(self.calls.clone(), prefix, from_revision)
     }

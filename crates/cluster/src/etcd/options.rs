@@ -11,22 +11,25 @@ use palpate_tissue::files;
 /// Limit of endpoints: etcd itself advises at most seven members.
 const MAX_ENDPOINTS: usize = 16;
 
-/// Addresses and credentials for etcd. The struct holds no secret: passwords and keys are read from their files
-/// when a connection needs them, so a changed file takes effect at the next connection.
+/// Addresses and credentials for etcd. The struct holds no secret: passwords and keys are read from their files when
+/// a connection needs them, so a changed file takes effect at the next connection. [`Etcd::open`](super::Etcd::open)
+/// checks it.
 #[derive(Debug, Clone, Default)]
 pub struct EtcdOptions {
-    /// Addresses of the members for clients, `http://…` or `https://…`; 1 to 16.
+    /// Addresses of the members for clients, `http://HOST:PORT` or `https://HOST:PORT` without path and user; 1 to
+    /// 16.
     pub endpoints: Vec<String>,
     /// File of the certificates (PEM) of the authorities that signed the members' certificates; required with
-    /// `https://`.
+    /// `https://`, refused without it.
     pub ca: Option<PathBuf>,
-    /// File of our own certificate (PEM), if etcd requires one.
+    /// File of this client's certificate (PEM), if etcd requires one; together with `key`, and only with `https://`.
     pub certificate: Option<PathBuf>,
-    /// File of the private key (PEM) of our own certificate.
+    /// File of the private key (PEM) of `certificate`.
     pub key: Option<PathBuf>,
-    /// Our user name, if etcd requires passwords.
+    /// User name, if etcd requires passwords; together with `password_file`. Endpoints of other machines must then
+    /// begin with `https://`.
     pub user: Option<String>,
-    /// File of the password. Line breaks at its end are ignored.
+    /// File of the password, UTF-8 and not empty. Line breaks at its end are ignored.
     pub password_file: Option<PathBuf>,
 }
 

@@ -8,7 +8,8 @@ use palpate_proto::etcd::etcdserverpb::{
 };
 use palpate_proto::etcd::mvccpb;
 
-/// A key, its value and its history. A revision counts the changes of the whole store.
+/// A key, its value and its history, as etcd has it at one revision. A revision counts the changes of the whole
+/// store.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeyValue {
     /// The key.
@@ -23,7 +24,7 @@ pub struct KeyValue {
     pub lease: i64,
 }
 
-/// A condition of a transaction.
+/// A condition of a transaction, which holds or not when etcd executes it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Compare {
     /// The key does not exist.
@@ -56,22 +57,22 @@ pub enum Op {
 /// refuses more than 128 operations, and two writes of one key.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Txn {
-    /// Conditions.
+    /// Conditions; without any, `then` is executed.
     pub if_all: Vec<Compare>,
-    /// Operations if all conditions hold.
+    /// Operations if all conditions hold, in order; may be empty.
     pub then: Vec<Op>,
-    /// Operations otherwise.
+    /// Operations if a condition does not hold, in order; may be empty.
     pub otherwise: Vec<Op>,
 }
 
-/// Outcome of a transaction that was executed.
+/// Outcome of a transaction that etcd has executed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TransactionOutcome {
-    /// Whether the conditions held.
+    /// Whether all conditions held, so that `then` was executed, and not `otherwise`.
     pub succeeded: bool,
     /// Revision of the store after the transaction, which is that of its writes if it wrote.
     pub revision: u64,
-    /// Results of the executed [`Op::Get`]s, in their order; `None` for a key that does not exist.
+    /// Results of the executed [`Op::Get`]s, in their order; `None` for a key that does not exist or is not UTF-8.
     pub got: Vec<Option<KeyValue>>,
 }
 

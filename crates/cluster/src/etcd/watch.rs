@@ -26,7 +26,7 @@ const LARGEST_BYTES: usize = 16 << 20;
 /// Watch number in answers that belong to no watch.
 const NO_WATCH: i64 = -1;
 
-/// A change of a key.
+/// A change of a key, as [`Watch::next`] returns it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum WatchEvent {
     /// The key was written, at its `mod_revision`.
@@ -40,7 +40,7 @@ pub enum WatchEvent {
     },
 }
 
-/// Why a watch has ended.
+/// Why a watch has ended for good. Failures of connections do not end it.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum WatchError {
     /// etcd no longer has the changes since the last one seen: list the keys, and watch from the revision after
@@ -55,8 +55,9 @@ pub enum WatchError {
     Refused(String),
 }
 
-/// Changes of the keys that begin with a prefix. It works only while a [`Watch::next`] is polled, and reads no more
-/// from etcd than fits the connection's window. It has a connection of its own, so its backlog delays nothing else.
+/// Changes of the keys that begin with a prefix, each once and in order. It works only while a [`Watch::next`] is
+/// polled, and reads no more from etcd than fits the connection's window. It has a connection of its own, so its
+/// backlog delays nothing else; dropping it closes that.
 pub struct Watch {
     calls: Arc<MemberCalls>,
     /// Index of the member at which it was last open; `usize::MAX` before the first.
@@ -83,20 +84,22 @@ impl Watch {
         Watch { calls, member, next: Box::pin(following.next()) }
     }
 
-    /// Waits for the next changes and returns them in order, at least one. The changes of one transaction come
-    /// together, unless they exceed about a megabyte. You may cancel the call at any time: nothing is lost.
+    /// Waits for the next changes and returns them by ascending revision, at least one. Keys that are not UTF-8 are
+    /// left out. The changes of one transaction come together, unless they exceed about a megabyte. You may cancel
+    /// the call at any time: nothing is lost.
     ///
     /// It waits while etcd can't be reached; a renewal of a lease reports that sooner.
     ///
     /// # Errors
-    /// Returns an error if the watch has ended; then every further call returns the same error.
+    /// Returns [`WatchError::Compacted`] if etcd no longer has the changes since the last ones, or
+    /// [`WatchError::Refused`]; then every further call returns the same error.
     pub async fn next(&mut self) -> Result<Vec<WatchEvent>, WatchError> {
         let (following, batch) = self.next.as_mut().await;
         self.next = Box::pin(following.next());
         batch
     }
 
-    /// Returns the address of the member at which the watch is or was last open; `None` before the first.
+    /// Returns the address of the member at which the watch is or was last open; `None` before it was first opened.
     pub fn endpoint(&self) -> Option<&str> {
         self.calls.members.get(self.member.load(Ordering::Relaxed)).map(super::member::Member::url)
     }

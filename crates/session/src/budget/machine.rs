@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 /// Memory that is assumed if the machine's is unknown, bytes.
 const UNKNOWN: u64 = 1 << 30;
 
-/// Returns half of the machine's memory, or of the limit of this process's control groups if that is less, bytes.
+/// Returns half of the machine's memory, or of the lowest limit of this process's control groups if that is less,
+/// bytes. If neither is known, it returns half of 1 GiB.
 pub fn half_of_the_machine() -> u64 {
     let machine =
         std::fs::read_to_string("/proc/meminfo").ok().and_then(|text| total(&text)).or_else(told_by_the_system);
@@ -108,10 +109,12 @@ pub fn set_up_allocator() {
     }
 }
 
-/// Parses an amount of memory such as `512MiB`, `2GiB` or `1048576`. Returns bytes.
+/// Parses an amount of memory such as `512MiB`, `2 GiB` or `1048576` (KiB, MiB, GiB, TiB: powers of 1024). Returns
+/// bytes.
 ///
 /// # Errors
-/// Returns a message if the text is not a whole number of bytes or units, or is below 1 MiB.
+/// Returns a message if the text is not a whole number of bytes or of these units, is below 1 MiB, or is 2⁶⁴ bytes or
+/// more.
 pub fn parse_bytes(text: &str) -> Result<u64, String> {
     const UNITS: [(&str, u32); 5] = [("KiB", 10), ("MiB", 20), ("GiB", 30), ("TiB", 40), ("", 0)];
     let number = UNITS.iter().find_map(|(unit, shift)| Some((text.strip_suffix(unit)?, *shift)));

@@ -1,7 +1,7 @@
 //! Resources that callers share: memory, sessions, streams, leases, and processor time. One rule divides them all.
 //!
 //! A caller may take in proportion to what is left: its own amount is at most (1 − r)/r of the rest, where r is the
-//! part that a single caller must leave. So a single caller gets all but r; two callers who want as much as
+//! part that a single caller must leave. So a single caller gets all but r; two callers that want as much as
 //! possible get equal amounts; and something is always left for the next. No part has to be configured, and none
 //! lies idle.
 //!
@@ -24,7 +24,7 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
 
-/// Purpose for which memory is taken.
+/// Purpose for which memory is taken; the metrics show each. All purposes share one pool of bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
     /// The state of a session, its checkpoint, and the scene.
@@ -67,7 +67,7 @@ impl Purpose {
         Purpose::Requests,
     ];
 
-    /// Returns the name of the purpose in the metrics.
+    /// Returns the name of the purpose in the metrics, a plural in lower case.
     pub fn name(self) -> &'static str {
         match self {
             Purpose::Session => "sessions",
@@ -85,16 +85,16 @@ impl Purpose {
     }
 }
 
-/// A resource that can be taken.
+/// A resource that an account can take from its budget. Each has its own pool; all memory is one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Resource {
-    /// Memory, bytes.
+    /// Memory for a purpose, bytes (`limits.memory_bytes`).
     Memory(Purpose),
-    /// Sessions, charged to the account that created them.
+    /// Sessions, charged to the account that created them (`limits.sessions`).
     Sessions,
-    /// Streams, charged to the account that reads them.
+    /// Streams, charged to the account that reads them (`limits.streams`).
     Streams,
-    /// Tools that are held.
+    /// Tools that are held, charged to the account of the holder (`limits.leases`).
     Leases,
 }
 
@@ -126,7 +126,7 @@ impl Resource {
     }
 }
 
-/// A limited amount of one resource, and how much of it each account has.
+/// A limited amount of one resource, and how much of it each account has. An account is a number.
 #[derive(Debug, Default)]
 pub struct Pool {
     most: u64,
@@ -139,7 +139,7 @@ pub struct Pool {
 
 impl Pool {
     /// Creates a pool of `most`. A single account must leave the part 1/`reserve` of it, rounded down (nothing if
-    /// `most` is below `reserve`).
+    /// `most` is below `reserve`). `reserve` must not be 0.
     pub fn new(most: u64, reserve: u64) -> Self {
         Pool { most, reserve: most / reserve, ..Pool::default() }
     }
@@ -154,7 +154,9 @@ impl Pool {
         taken <= self.most && u128::from(own) * u128::from(self.reserve) <= u128::from(self.most_each()) * left
     }
 
-    /// Takes `amount` for `account`. Returns false, and takes nothing, if that is beyond the account's part.
+    /// Takes `amount` for `account`. Returns false, and takes nothing, if that is beyond the account's part: with r =
+    /// 1/`reserve`, its amount may be at most (1 − r)/r of the rest that nobody has. Taking 0 tells whether it is
+    /// within its part.
     pub fn take(&mut self, account: u64, amount: u64) -> bool {
         let own = self.of(account).saturating_add(amount);
         let fits = self.fits(own, self.taken.saturating_add(amount));
@@ -165,7 +167,7 @@ impl Pool {
         fits
     }
 
-    /// Gives back `amount` of `account`.
+    /// Gives back `amount` of `account`. More than the account has must not be given back.
     pub fn give_back(&mut self, account: u64, amount: u64) {
         self.taken = self.taken.saturating_sub(amount);
         if let Some(own) = self.by.get_mut(&account) {
@@ -176,7 +178,7 @@ impl Pool {
         }
     }
 
-    /// Returns the amount that `account` has.
+    /// Returns the amount that `account` has; 0 for an unknown one.
     pub fn of(&self, account: u64) -> u64 {
         self.by.get(&account).copied().unwrap_or(0)
     }
@@ -187,7 +189,7 @@ impl Pool {
     }
 }
 
-/// The shared resources of a server, with the accounts of its callers.
+/// The shared resources of a server, divided among the accounts of its callers by the rule of this module.
 #[derive(Debug)]
 pub struct Budget {
     /// By [`Resource::index`].
@@ -210,7 +212,9 @@ struct Accounts {
 
 impl Budget {
     /// Creates the budget of a server with `limits`, and with `stepping` stepping threads and `network` network
-    /// threads. If `limits.memory_bytes` is 0, memory is half of the machine's.
+    /// threads, whose time it divides (0 counts as 1). If `limits.memory_bytes` is 0, memory is half of the
+    /// machine's. A single caller must leave 1/4 of the memory, 1/64 of the sessions, and 1/16 of the streams and
+    /// leases.
     #[allow(clippy::cast_precision_loss)]
     pub fn new(limits: &Limits, stepping: usize, network: usize) -> Arc<Self> {
         let bytes = if limits.memory_bytes > 0 { limits.memory_bytes } else { half_of_the_machine() };
@@ -236,7 +240,9 @@ impl Budget {
         })
     }
 
-    /// Returns the account of the caller of that name. Repeated calls return the same account while it is in use.
+    /// Returns the account of the caller of that name, and creates it if it is unknown. Repeated calls return the
+    /// same account while it is in use; afterwards its number and recent time are remembered for some thousand
+    /// accounts.
     pub fn account(self: &Arc<Self>, name: &str) -> Account {
         let mut accounts = lock(&self.accounts);
         let known = accounts.known.get(name).map(|(number, owner)| (*number, owner.upgrade()));
@@ -258,27 +264,27 @@ impl Budget {
         Account(owner)
     }
 
-    /// Returns the accounts that are in use, by name.
+    /// Returns the accounts that are in use, sorted by name.
     pub fn accounts(&self) -> Vec<Account> {
         lock(&self.accounts).known.values().filter_map(|(_, owner)| owner.upgrade()).map(Account).collect()
     }
 
-    /// Returns the amount of a resource that all accounts have together; for memory, over all purposes.
+    /// Returns the amount of a resource that all accounts have together; for memory, the bytes over all purposes.
     pub fn taken(&self, resource: Resource) -> u64 {
         lock(&self.pools[resource.index()]).taken()
     }
 
-    /// Returns the bytes that are taken for one purpose.
+    /// Returns the bytes that all accounts have taken for one purpose.
     pub fn bytes_for(&self, purpose: Purpose) -> u64 {
         lock(&self.purposes)[purpose as usize]
     }
 
-    /// Returns the bytes that are taken for all purposes.
+    /// Returns the bytes that all accounts have taken, over all purposes.
     pub fn bytes_taken(&self) -> u64 {
         self.taken(Resource::Memory(Purpose::Session))
     }
 
-    /// Returns the bytes that can be taken in all.
+    /// Returns the bytes that can be taken in all: `limits.memory_bytes`, or half of the machine's memory.
     pub fn bytes(&self) -> u64 {
         lock(&self.pools[0]).most
     }
@@ -292,12 +298,14 @@ struct Owner {
     turn: tokio::sync::Mutex<()>,
 }
 
-/// Account of a caller, to which everything that it takes is charged.
+/// Account of a caller, to which everything that it takes is charged. Clones are the same account; it is in use while
+/// one exists.
 #[derive(Debug, Clone)]
 pub struct Account(Arc<Owner>);
 
 impl Account {
-    /// Creates an account with a budget of its own and practically no limit of memory, for work outside a server.
+    /// Creates an account `alone` with a budget of its own and practically no limit of memory, for work outside a
+    /// server. Other resources have their default limits.
     pub fn alone() -> Self {
         Budget::new(&Limits { memory_bytes: u64::MAX / 4, ..Limits::default() }, 1, 1).account("alone")
     }
@@ -307,7 +315,7 @@ impl Account {
         &self.0.name
     }
 
-    /// Returns the number of the account, which no other account of the budget has.
+    /// Returns the number of the account, from 1, which no other account of the budget has.
     pub fn number(&self) -> u64 {
         self.0.number
     }
@@ -317,47 +325,51 @@ impl Account {
         &self.0.budget
     }
 
-    /// Returns the amount of a resource that the account has.
+    /// Returns the amount of a resource that the account has; for memory, the bytes over all purposes.
     pub fn has(&self, resource: Resource) -> u64 {
         lock(&self.0.budget.pools[resource.index()]).of(self.0.number)
     }
 
-    /// Takes `amount` of a resource until the returned value is dropped. `field` is the field that a refusal names.
+    /// Takes `amount` of a resource until the returned value is dropped. `field` is the field of the request that a
+    /// refusal names; it may be empty.
     ///
     /// # Errors
-    /// Refuses an amount beyond the part of this account or the limit of all, and memory that the system does not
-    /// have.
+    /// - [`Reason::TooLarge`]: `amount` is more than one account can ever have.
+    /// - [`Reason::Overloaded`] for memory, [`Reason::TooMany`] for others: `amount` is beyond this account's part of
+    ///   what is left.
+    /// - The system does not have the memory. For [`Purpose::Connections`] this is not checked.
     pub fn take(&self, resource: Resource, amount: u64, field: &str) -> Result<Taken> {
         let mut taken = Taken { account: self.clone(), resource, amount: 0 };
         taken.grow_to(amount, field)?;
         Ok(taken)
     }
 
-    /// Charges the account for a request that took `took_ns` of processor time on the threads that do such work.
+    /// Charges the account for a request that took `took_ns` of processor time and ended at `now_ns`, ns of a
+    /// monotonic clock.
     pub fn spend(&self, work: Work, now_ns: u64, took_ns: u64) {
         lock(&self.0.budget.times)[work as usize].add(self.0.number, now_ns, took_ns);
     }
 
-    /// Waits for and reserves the account's turn, so that its calls begin one after another: what one takes is
-    /// known before the next begins. Dropping the guard ends the turn.
+    /// Waits for and reserves the account's turn, so that its calls begin one after another: the next call begins
+    /// when all that this one takes is known. Dropping the guard ends the turn. A task must not ask for it twice.
     pub async fn turn(&self) -> tokio::sync::MutexGuard<'_, ()> {
         self.0.turn.lock().await
     }
 
-    /// Returns how long the account must wait until its part of such work is free again, ns; 0 if it need not
-    /// wait.
+    /// Returns how long the account must wait at `now_ns`, ns, until its recent time is within its part of such work
+    /// again; 0 if it need not wait, or took no time recently. A single caller gets half of the threads' time.
     pub fn must_wait_ns(&self, work: Work, now_ns: u64) -> u64 {
         lock(&self.0.budget.times)[work as usize].wait_ns(self.0.number, now_ns)
     }
 
-    /// Returns the processor time of such work that it took recently, as a fraction of a core. Older time fades
-    /// within milliseconds.
+    /// Returns the processor time of such work that the account took recently, as a fraction of a core. Older time
+    /// fades with a time constant of 5 ms.
     pub fn share(&self, work: Work, now_ns: u64) -> f64 {
         lock(&self.0.budget.times)[work as usize].share(self.0.number, now_ns)
     }
 }
 
-/// An amount of a resource that an account has taken. Dropping it gives the amount back.
+/// An amount of a resource that an account has taken ([`Account::take`]). Dropping it gives the amount back.
 #[derive(Debug)]
 pub struct Taken {
     account: Account,
@@ -366,7 +378,7 @@ pub struct Taken {
 }
 
 impl Taken {
-    /// Returns the amount.
+    /// Returns the amount that is taken now, in the unit of the resource.
     pub fn amount(&self) -> u64 {
         self.amount
     }
@@ -376,12 +388,11 @@ impl Taken {
         &self.account
     }
 
-    /// Takes more, so that the amount is `amount`; a smaller `amount` changes nothing. Memory that is allocated at
-    /// once must be available in the system. `field` is the field that a refusal names.
+    /// Takes more, so that the amount is `amount`; an `amount` that is not larger changes nothing. Memory that is
+    /// allocated at once must be available in the system. `field` is the field that a refusal names.
     ///
     /// # Errors
-    /// Refuses an amount beyond the part of the account or the limit of all, and memory that the system does not
-    /// have. The amount then stays as it was.
+    /// Returns the refusals of [`Account::take`], for the difference. The amount then stays as it was.
     pub fn grow_to(&mut self, amount: u64, field: &str) -> Result<()> {
         let more = amount.saturating_sub(self.amount);
         if more == 0 {
@@ -403,7 +414,7 @@ impl Taken {
         Ok(())
     }
 
-    /// Gives back what exceeds `amount`.
+    /// Gives back what exceeds `amount`; a larger `amount` changes nothing.
     pub fn shrink_to(&mut self, amount: u64) {
         let less = self.amount.saturating_sub(amount);
         if less == 0 {

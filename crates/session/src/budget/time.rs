@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-/// Kind of work that threads do for a caller's requests, beside stepping.
+/// Kind of work that threads do for a caller's requests, beside stepping. Each kind has its own time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Work {
     /// Calls, and the messages of streams, on the network threads.

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-/// Items that wait, by account, which accounts take in turns.
+/// Items that wait, in a queue for each account; accounts take turns. It has no bound: the caller limits it.
 #[derive(Debug)]
 pub struct Turns<T> {
     /// By number of account, in the order of their turns; no queue is empty.
@@ -20,22 +20,23 @@ impl<T> Turns<T> {
         self.queues.iter_mut().find(|queue| queue.0 == account).map(|queue| &mut queue.1)
     }
 
-    /// Returns the accounts with waiting items, in the order of their turns.
+    /// Returns the numbers of the accounts with waiting items, each once, in the order of their turns.
     pub fn accounts(&self) -> impl Iterator<Item = u64> {
         self.queues.iter().map(|queue| queue.0)
     }
 
-    /// Returns the number of waiting items of `account`.
+    /// Returns the number of waiting items of `account`; 0 for an unknown one.
     pub fn count(&self, account: u64) -> usize {
         self.queues.iter().find(|queue| queue.0 == account).map_or(0, |queue| queue.1.len())
     }
 
-    /// Adds an item behind all others of `account`.
+    /// Adds an item behind all others of `account`. An account without items gets the last turn.
     pub fn push_back(&mut self, account: u64, item: T) {
         self.push_before(account, item, |_| false);
     }
 
-    /// Adds an item before the first item of `account` for which `may_wait` holds, or behind all.
+    /// Adds an item before the first item of `account` for which `may_wait` holds, or behind all. An account without
+    /// items gets the last turn.
     pub fn push_before(&mut self, account: u64, item: T, may_wait: impl Fn(&T) -> bool) {
         match self.queue(account) {
             Some(queue) => {
@@ -46,7 +47,8 @@ impl<T> Turns<T> {
         }
     }
 
-    /// Puts an item before all others of `account`, such as the rest of one that was taken.
+    /// Puts an item before all others of `account`, such as the rest of one that was taken. The turn of the account
+    /// stays; one without items gets the last turn.
     pub fn push_front(&mut self, account: u64, item: T) {
         match self.queue(account) {
             Some(queue) => queue.push_front(item),
@@ -54,8 +56,8 @@ impl<T> Turns<T> {
         }
     }
 
-    /// Removes and returns the first item of the first account for which `may` holds, with the account's number.
-    /// Its next turn comes after all others'. `None` if there is no such account.
+    /// Removes and returns the first item of the first account for whose number `may` holds, with that number. Its
+    /// next turn comes after all others'. `None` if no such account has items.
     pub fn next(&mut self, may: impl Fn(u64) -> bool) -> Option<(u64, T)> {
         let turn = self.queues.iter().position(|queue| may(queue.0))?;
         let (account, mut queue) = self.queues.remove(turn)?;
@@ -66,7 +68,7 @@ impl<T> Turns<T> {
         Some((account, item))
     }
 
-    /// Removes the items of `account` for which `keep` is false.
+    /// Removes the items of `account` for which `keep` is false. Its turn stays if items remain.
     pub fn retain(&mut self, account: u64, keep: impl FnMut(&T) -> bool) {
         if let Some(queue) = self.queue(account) {
             queue.retain(keep);
@@ -74,7 +76,7 @@ impl<T> Turns<T> {
         self.queues.retain(|queue| !queue.1.is_empty());
     }
 
-    /// Returns all items, by account in the order of turns.
+    /// Returns all items: by account in the order of turns, and each account's in their order.
     pub fn iter(&self) -> impl Iterator<Item = &T> {
         self.queues.iter().flat_map(|queue| &queue.1)
     }

@@ -2,12 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-/// File of the journal of one run.
+/// File of the journal of one run, found in a folder by its name. Ordered by session, then run.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct JournalFile {
     /// ID of the session.
     pub session_id: String,
-    /// Number of the run.
+    /// Number of the run, from 1.
     pub run: u64,
     /// Path of the file.
     pub path: PathBuf,
@@ -16,12 +16,13 @@ pub struct JournalFile {
 /// Length limit of a session's ID in a file name, bytes.
 const MAX_LETTERS: usize = 128;
 
-/// Returns the file name of a run: `SESSION.RUN.mcap`.
+/// Returns the file name of a run: `SESSION.RUN.mcap`, with RUN in decimal. It does not check the ID.
 pub fn name(session_id: &str, run: u64) -> String {
     format!("{session_id}.{run}.mcap")
 }
 
-/// Returns the session and the run of a file name; `None` if it is not a journal's.
+/// Returns the session and the run of a file name without folders. `None` if it is not `SESSION.RUN.mcap`, with 1 to
+/// 128 ASCII letters, digits, `-` and `_`, and a run of at least 1 without leading zeros.
 pub fn parse(name: &str) -> Option<(String, u64)> {
     let (session_id, run) = name.strip_suffix(".mcap")?.rsplit_once('.')?;
     let is_letter = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
@@ -31,11 +32,11 @@ pub fn parse(name: &str) -> Option<(String, u64)> {
     (is_id && number > 0 && run == format!("{number}")).then(|| (session_id.to_owned(), number))
 }
 
-/// Returns the journals in a folder, sorted by session and run. Only regular files count, not pipes or folders with
-/// such names.
+/// Returns the journals in a folder, sorted by session and run number. Only regular files, or links to them, with a
+/// name that [`parse`] accepts count. Folders within it are not searched.
 ///
 /// # Errors
-/// Returns an error if the folder can't be read.
+/// Returns the error of the system if the folder is absent or can't be read.
 pub fn list(folder: &Path) -> std::io::Result<Vec<JournalFile>> {
     let mut found = Vec::new();
     for entry in std::fs::read_dir(folder)? {

@@ -14,11 +14,12 @@ pub const REPLAYS: u32 = 3;
 /// Version of this program, which it writes into journals.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
-/// Limit of inputs in a batch. With more, a flush writes several batches.
+/// Largest number of inputs in a batch. A writer ends the batch there, and a reader treats a batch with more as
+/// damaged.
 pub const MAX_INPUTS: usize = 1 << 16;
 
-/// Size limit of a chunk that is read, bytes. A writer ends a batch long before; only a single snapshot may be
-/// large.
+/// Largest size of a chunk that is read, bytes: 1 GiB. A larger one is treated as damaged. A writer ends a batch at
+/// about 4 MiB; only a single snapshot may be larger.
 pub const MAX_BYTES: u64 = 1 << 30;
 
 /// Topics of a journal's messages. The number of a topic is that of its channel and its schema.
@@ -43,7 +44,7 @@ pub enum Topic {
 }
 
 impl Topic {
-    /// Every topic, by number.
+    /// Every topic, in the order of declaration, which is that of the numbers.
     pub const ALL: [Topic; 8] = [
         Topic::Header,
         Topic::Inputs,
@@ -55,7 +56,7 @@ impl Topic {
         Topic::Signatures,
     ];
 
-    /// Returns the name of the topic, as its channel has it.
+    /// Returns the name of the topic, as its MCAP channel has it, such as `/inputs`.
     pub fn name(self) -> &'static str {
         match self {
             Topic::Header => "/header",
@@ -83,7 +84,7 @@ impl Topic {
         }
     }
 
-    /// Returns the number of the topic's channel, which is also that of its schema.
+    /// Returns the number of the topic's channel, 1 to 8, which is also that of its schema.
     pub fn channel(self) -> u16 {
         self as u16
     }
@@ -114,7 +115,8 @@ fn schema(topic: Topic) -> Vec<u8> {
     })
 }
 
-/// Returns a file of the protocol and all files that it imports, as an encoded `FileDescriptorSet`.
+/// Returns a file of the protocol, such as `palpate/journal/v1/journal.proto`, and all files that it imports, each
+/// after its imports, as an encoded `FileDescriptorSet`. An unknown file gives an empty set.
 pub fn schema_of(file: &str) -> Vec<u8> {
     let all = Files::decode(pb::DESCRIPTORS).unwrap_or_default();
     let mut wanted = BTreeSet::from([file.to_owned()]);

@@ -16,7 +16,8 @@ use super::format::{VERSION, schema_of};
 use crate::Session;
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// An MCAP export for Foxglove that is being written.
+/// An MCAP export for Foxglove that is being written: channels `/tissue`, `/surface` and `/tool/N`. It is complete
+/// only after [`Export::finish`].
 pub struct Export<W: Write + Seek> {
     writer: Writer<W>,
     /// Time of step `begin`, ns since the Unix epoch.
@@ -49,10 +50,11 @@ fn channel(id: u16, topic: String, schema: &Arc<Schema<'static>>) -> Arc<Channel
 const FIRST_TOOL: u16 = 16;
 
 impl<W: Write + Seek> Export<W> {
-    /// Begins an export of a session at its present step, whose time is `begun_ns`, ns since the Unix epoch.
+    /// Begins an export of a session at its present step, whose time is `begun_ns`, ns since the Unix epoch; later
+    /// steps follow at their nominal interval. Writes the beginning of the file to `output`.
     ///
     /// # Errors
-    /// Refuses an output that can't be written.
+    /// Refuses an output that can't be written ([`Reason::Unreadable`]).
     pub fn new(output: W, begun_ns: u64, session: &Session) -> Result<Self> {
         let options = WriteOptions::new().library(format!("palpate {VERSION}"));
         let curves = "palpate/journal/v1/curves.proto";
@@ -97,11 +99,12 @@ impl<W: Write + Seek> Export<W> {
         self.writer.write(&record).map_err(|e| unwritten(&e))
     }
 
-    /// Writes the curves of the session's present step: the pose and force of each tool, and the energies, J. A
-    /// step that was written last is not written again.
+    /// Writes the curves of the session's present step: the pose and force of each tool that ever had a control
+    /// point, and the energies of the tissue, J. Does nothing if the step is the one that was written last. It
+    /// computes every awake point.
     ///
     /// # Errors
-    /// Refuses an output that can't be written.
+    /// Refuses an output that can't be written ([`Reason::Unreadable`]).
     #[allow(clippy::cast_possible_truncation)]
     pub fn curves(&mut self, session: &Session) -> Result<()> {
         let (step, time_s) = (session.step_count(), session.time_s());
@@ -139,11 +142,12 @@ impl<W: Write + Seek> Export<W> {
         self.write(&channel, step, &curve)
     }
 
-    /// Writes a point cloud of the session's present step: the place of each point and the length of its
-    /// displacement, m. A step that was written last is not written again.
+    /// Writes a point cloud of the session's present step: the place of each simulated point and the length of its
+    /// displacement, m, as 32-bit floats in the order of the points. Does nothing if the step is the one that was
+    /// written last.
     ///
     /// # Errors
-    /// Refuses an output that can't be written.
+    /// Refuses an output that can't be written ([`Reason::Unreadable`]).
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
     pub fn surface(&mut self, session: &Session) -> Result<()> {
         let step = session.step_count();
@@ -183,10 +187,10 @@ impl<W: Write + Seek> Export<W> {
         self.write(&channel, step, &cloud)
     }
 
-    /// Writes the end of the export, and returns the output.
+    /// Writes the summary and the end of the export, and returns the output.
     ///
     /// # Errors
-    /// Refuses an output that can't be written.
+    /// Refuses an output that can't be written ([`Reason::Unreadable`]).
     pub fn finish(mut self) -> Result<W> {
         self.writer.finish().map_err(|e| unwritten(&e))?;
         Ok(self.writer.into_inner())

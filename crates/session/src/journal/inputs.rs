@@ -16,7 +16,7 @@ use palpate_refusal::Result;
 use palpate_tissue::Model;
 use palpate_tissue::limits::Limits;
 
-/// Reader of the inputs in a journal that act at a step or later, batch by batch.
+/// Reader of the inputs in a journal that act at a step or later, batch by batch, for a playback.
 pub struct Inputs<'s> {
     reader: JournalReader<'s>,
     first: Arc<Model>,
@@ -25,17 +25,20 @@ pub struct Inputs<'s> {
     from_step: u64,
 }
 
-/// Inputs of one batch of a journal (a compressed group of entries).
+/// Inputs of one batch of a journal, decoded and checked.
 pub struct Piece {
-    /// Inputs in order, each with the number of steps done before it acts.
+    /// Inputs in the order in which they act, each with the number of steps done before it acts; without those that
+    /// only start, pause or skip time.
     pub inputs: VecDeque<(u64, Input)>,
-    /// All inputs that act before this step have been read.
+    /// All inputs that act before this step are in this piece or in earlier ones.
     pub until_step: u64,
 }
 
 impl<'s> Inputs<'s> {
-    /// Creates a reader of the inputs that act at `step` or later. `survey` must be the survey of this journal,
-    /// `first` the tissue with which its session began, and `given` the limits of this process.
+    /// Creates a reader of the inputs that act at `step` or later; it begins at the newest snapshot that is not after
+    /// `step`. `survey` must be the survey of this journal, and `first` the tissue with which its session began.
+    /// `given` are the limits of this process; forces, reach and tool numbers are not limited by them
+    /// ([`message::limits`]).
     pub fn new(mut reader: JournalReader<'s>, survey: &Survey, first: &Arc<Model>, given: &Limits, step: u64) -> Self {
         // A batch with a snapshot of a step has all inputs that act at that step, or later batches have them.
         match survey.snapshots.iter().rev().find(|at| at.step <= step) {
@@ -50,7 +53,10 @@ impl<'s> Inputs<'s> {
     /// Reads the next batch and returns its inputs; `None` after the last. A batch may have no inputs.
     ///
     /// # Errors
-    /// Returns a refusal if the journal is damaged, or if a session would not accept an input.
+    /// - The refusals of [`JournalReader::next_batch`]: the journal can't be read or is damaged, or memory is
+    ///   missing.
+    /// - An input can't be decoded, or a session would not accept it: a command that breaks a rule, or a tissue
+    ///   beyond the limits. The refusal names the batch.
     pub fn next_batch(&mut self) -> Result<Option<Piece>> {
         let Some(batch) = self.reader.next_batch()? else { return Ok(None) };
         let mut inputs = VecDeque::new();
@@ -82,8 +88,8 @@ pub(super) fn input(message: &pb::Input, rules: &Rules, first: &Model, limits: &
 /// Largest number of inputs in one piece.
 const PIECE: usize = 2048;
 
-/// Encodes inputs, each with its step, in order. Returns pieces of bytes for [`decoded`], with at most 2048 inputs
-/// each.
+/// Encodes inputs, each with the number of steps done before it acts, in order. Returns pieces of bytes for
+/// [`decoded`], with at most 2048 inputs each; none if there are no inputs.
 pub fn encoded(inputs: &[(u64, Input)]) -> Vec<Vec<u8>> {
     let piece = |inputs: &[(u64, Input)]| {
         let mut tips = Tips::new();
@@ -94,10 +100,12 @@ pub fn encoded(inputs: &[(u64, Input)]) -> Vec<Vec<u8>> {
 }
 
 /// Decodes one piece of bytes of [`encoded`], for a session that began with the tissue `first`. Returns the inputs
-/// with their steps, without those that only start, pause or skip time.
+/// with their steps, in order, without those that only start, pause or skip time. `given` are the limits of this
+/// process; forces, reach and tool numbers are not limited by them.
 ///
 /// # Errors
-/// Returns a refusal if the bytes are not such a piece, or if a session would not accept an input.
+/// Refuses bytes that are not such a piece or would take too much memory, a pose without a tip, a command that breaks
+/// a rule, and a tissue that `first` can't become.
 pub fn decoded(bytes: &[u8], first: &Arc<Model>, given: &Limits) -> Result<Vec<(u64, Input)>> {
     let limits = message::limits(given);
     let rules = Rules::new(&first.scene, &limits);

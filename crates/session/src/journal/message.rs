@@ -28,8 +28,9 @@ use palpate_tissue::state::saved::{CorrectedPlan, TissueState};
 /// Least number of tools with which a journal is read, whatever the limits of this program are.
 const MAX_TOOLS: u32 = 4096;
 
-/// Returns the limits under which a journal is read. An input that a server has accepted is not refused for its
-/// force, its reach or the number of its tool, for which that server's configuration may have allowed more.
+/// Returns `limits` as they apply to a journal: without bounds of force and reach, and with at least 4096 tools. An
+/// input that a server has accepted is not refused for these, because that server's configuration may have allowed
+/// more.
 pub fn limits(limits: &Limits) -> Limits {
     let tools = limits.tools.max(MAX_TOOLS);
     Limits { point_force_n: f64::MAX, reach_in_sheets: f64::MAX, tools, ..limits.clone() }
@@ -110,7 +111,7 @@ pub(super) fn scene(scene: &Scene) -> (palpate_proto::pb::Scene, Option<pb::Tria
 /// Checks that this program computes the bits that the journal's inputs gave.
 ///
 /// # Errors
-/// Refuses a journal of another generation ([`REPLAYS`]), and names both versions.
+/// Refuses a journal whose generation is not [`REPLAYS`] ([`Reason::NotAvailable`]), and names both versions.
 pub fn check_replays(header: &pb::Header) -> Result<()> {
     if header.replays == REPLAYS {
         return Ok(());
@@ -125,10 +126,11 @@ pub fn check_replays(header: &pb::Header) -> Result<()> {
     Err(Refusal::new(Reason::NotAvailable, "replays", message))
 }
 
-/// Returns the tissue with which the session of a journal began.
+/// Returns the tissue with which the session of a journal began, compiled under [`limits`] of `given`.
 ///
 /// # Errors
-/// Refuses a header that does not describe a tissue within the limits.
+/// Refuses a header without a scene or tissue, a mesh with more than `limits.mesh_vertices` or that is invalid, an
+/// unknown name, and values outside the limits or that no tissue has.
 pub fn model(header: &pb::Header, given: &Limits) -> Result<Arc<Model>> {
     let limits = limits(given);
     let message = required("scene", header.scene.as_ref())?;
@@ -149,7 +151,7 @@ fn from_appearance(message: &pb::Appearance) -> Result<Appearance> {
     Ok(Appearance { texture, surface, texture_seed: message.texture_seed, texture_size })
 }
 
-/// Returns a tissue as a message: its coefficients, and how it is stepped.
+/// Returns a tissue as a message: its coefficients, and how it is stepped. The scene is not in it.
 pub fn tissue(model: &Model) -> pb::Tissue {
     let TissueState {
         stiffness_n_per_m,
@@ -182,10 +184,11 @@ pub fn tissue(model: &Model) -> pb::Tissue {
     }
 }
 
-/// Returns the tissue in a message, of a session that began with the tissue of `first`.
+/// Returns the tissue in a message, of a session that began with the tissue of `first`, under [`limits`] of `given`.
 ///
 /// # Errors
-/// Refuses values that no tissue has.
+/// Refuses an unknown integrator or precision, and coefficients, substeps or tolerances that no tissue of that scene
+/// has.
 pub fn from_tissue(message: &pb::Tissue, first: &Model, given: &Limits) -> Result<Arc<Model>> {
     compiled(&first.scene, message, &limits(given)).map_err(|refusal| refusal.within("tissue"))
 }
@@ -365,15 +368,15 @@ pub(super) fn moment(step: u64, felt: &[Felt]) -> pb::Moment {
     pb::Moment { step, tools: felt.iter().map(tool).collect() }
 }
 
-/// Returns a hash as 32 hexadecimal digits, as messages have it.
+/// Returns a hash as 32 lowercase hexadecimal digits, as messages have it.
 pub fn hash(hash: u128) -> String {
     format!("{hash:032x}")
 }
 
-/// Returns the hash in a message.
+/// Returns the hash in a message, in lowercase or uppercase.
 ///
 /// # Errors
-/// Refuses a text that is not 32 hexadecimal digits.
+/// Refuses a text that is not 32 hexadecimal digits ([`Reason::Unreadable`]).
 pub fn from_hash(text: &str) -> Result<u128> {
     let hash = u128::from_str_radix(text, 16).ok().filter(|_| text.len() == 32);
     hash.ok_or_else(|| Refusal::new(Reason::Unreadable, "hash", "must be 32 hexadecimal digits"))

@@ -28,18 +28,19 @@ use crate::budget::Taken;
 use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::memory;
 
-/// A batch of a journal: the content of one chunk. Its messages are decoded on request.
+/// A batch of a journal: the content of one chunk, whose checksum has been checked. Each function decodes its
+/// messages anew.
 #[derive(Debug, Clone)]
 pub struct JournalBatch {
-    /// Number of the batch, from 0.
+    /// Number of the batch in its journal, from 0.
     pub number: u64,
-    /// Position of the batch's chunk in the file, bytes.
+    /// Position of the record of the batch's chunk in the file, bytes.
     pub offset: u64,
-    /// The file is complete up to this step.
+    /// The journal up to this batch has every input that acts before this step.
     pub until_step: u64,
     /// Number of batches that were certainly on the disk when this one was written.
     pub durable_batches: u64,
-    /// Number of inputs in the batches before.
+    /// Number of the first input in this batch: the number of inputs in the batches before.
     pub first_input: u64,
     /// Number of inputs in this batch.
     pub input_count: u64,
@@ -120,10 +121,12 @@ impl JournalBatch {
         Refusal { place: Some(self.place.clone()), message, field: String::new(), ..refusal }
     }
 
-    /// Returns the inputs of the batch, in order.
+    /// Returns the inputs of the batch, in the order in which they acted; empty if there are none. A pose that was
+    /// written without a tip gets the tip of the previous pose of its tool in this batch.
     ///
     /// # Errors
-    /// Refuses messages that can't be decoded.
+    /// Refuses a message that can't be decoded ([`Reason::Unreadable`]), and a pose without a tip if no earlier pose
+    /// of its tool in this batch has one ([`Reason::Missing`]). Refusals name the place of the batch.
     pub fn inputs(&self) -> Result<Vec<pb::Input>> {
         let mut inputs = Vec::new();
         for message in self.all::<pb::Inputs>(Topic::Inputs) {
@@ -133,43 +136,46 @@ impl JournalBatch {
         Ok(inputs)
     }
 
-    /// Returns the hashes of the batch, in order.
+    /// Returns the hashes of the batch, in the order of writing; empty if there are none.
     ///
     /// # Errors
-    /// Refuses messages that can't be decoded.
+    /// Refuses a message that can't be decoded ([`Reason::Unreadable`]).
     pub fn hashes(&self) -> Result<Vec<pb::Hash>> {
         self.all(Topic::Hashes).collect()
     }
 
-    /// Returns the snapshots of the batch, in order.
+    /// Returns the snapshots of the batch, in the order of writing; empty if there are none. The state in a snapshot
+    /// stays encoded.
     ///
     /// # Errors
-    /// Refuses messages that can't be decoded.
+    /// Refuses a message that can't be decoded ([`Reason::Unreadable`]).
     pub fn snapshots(&self) -> Result<Vec<pb::Snapshot>> {
         self.all(Topic::Snapshots).collect()
     }
 
-    /// Returns the recorded poses and forces of the tools, in order.
+    /// Returns the recorded poses of the tools and forces on them, one entry for each recorded step, in the order of
+    /// writing; empty if there are none.
     ///
     /// # Errors
-    /// Refuses messages that can't be decoded.
+    /// Refuses a message that can't be decoded ([`Reason::Unreadable`]).
     pub fn felt(&self) -> Result<Vec<pb::Moment>> {
         let messages: Result<Vec<pb::Felt>> = self.all(Topic::Felt).collect();
         Ok(messages?.into_iter().flat_map(|felt| felt.moments).collect())
     }
 
-    /// Returns the batch's last list of the changes of the tissue that wait for their step, if it has one.
+    /// Returns the batch's last list of the changes of the tissue that wait for their step; `None` if it has no list.
+    /// A list replaces those of earlier batches.
     ///
     /// # Errors
-    /// Refuses messages that can't be decoded.
+    /// Refuses a last list that can't be decoded ([`Reason::Unreadable`]).
     pub fn waiting(&self) -> Result<Option<pb::Waiting>> {
         self.all(Topic::Waiting).last().transpose()
     }
 
-    /// Returns the end of the journal, if it is in this batch.
+    /// Returns why the journal ends, if this is its last batch; `None` otherwise, or if the journal is unfinished.
     ///
     /// # Errors
-    /// Refuses a message that can't be decoded.
+    /// Refuses a message that can't be decoded ([`Reason::Unreadable`]).
     pub fn end(&self) -> Result<Option<pb::End>> {
         self.all(Topic::End).next().transpose()
     }
@@ -179,16 +185,16 @@ impl JournalBatch {
         self.all(Topic::Header).next().unwrap_or_else(|| Err(self.refuse("the header is missing".to_owned())))
     }
 
-    /// Returns whether the batch has messages of a topic.
+    /// Returns whether the batch has messages of a topic. Nothing is decoded.
     pub fn has(&self, topic: Topic) -> bool {
         self.messages.iter().any(|message| message.0 == topic)
     }
 }
 
-/// Position of a snapshot in a journal.
+/// Position of a snapshot in a journal, as [`JournalReader::survey`] finds it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SnapshotAt {
-    /// Number of steps done.
+    /// Number of steps done when the snapshot was made.
     pub step: u64,
     /// Position of the snapshot's chunk in the file, bytes.
     pub offset: u64,
@@ -196,33 +202,34 @@ pub struct SnapshotAt {
     pub batch: u64,
 }
 
-/// Content of a journal, as one pass over it finds.
+/// Content of a journal, as one pass over its whole batches finds it ([`JournalReader::survey`]).
 #[derive(Debug, Clone, Default)]
 pub struct Survey {
-    /// Number of batches.
+    /// Number of whole batches.
     pub batches: u64,
-    /// The file is complete up to this step, the last durable one.
+    /// The journal has every input that acts before this step; that of the last whole batch.
     pub until_step: u64,
-    /// Number of inputs.
+    /// Number of inputs in all batches.
     pub inputs: u64,
-    /// Number of hashes.
+    /// Number of hashes in all batches; those of snapshots do not count.
     pub hashes: u64,
-    /// Positions of the snapshots, by ascending step.
+    /// Positions of the snapshots, in the order of the file, which is by ascending step.
     pub snapshots: Vec<SnapshotAt>,
-    /// Changes of the tissue that had been accepted before the journal's end. Some of them may have taken effect.
+    /// Changes of the tissue in the last list that was written; at most 4096. Some of them may have taken effect
+    /// since.
     pub waiting: Vec<pb::Input>,
-    /// Times of the first and the last batch, ns since the Unix epoch.
+    /// Times of the first and the last batch, ns since the Unix epoch; 0 without a batch.
     pub unix_ns: [u64; 2],
-    /// The end of the journal, if it was written.
+    /// Why the journal ends; `None` if it is unfinished.
     pub end: Option<pb::End>,
-    /// Length of the file up to the end of the last whole batch, bytes.
+    /// Length of the file up to the end of the last whole batch with its indexes, bytes.
     pub whole_bytes: u64,
-    /// Bytes after that, which belong to no whole batch.
+    /// Bytes after that, which belong to no whole batch; 0 if the file ends with a summary or with a whole batch.
     pub torn_bytes: u64,
-    /// Whether the file has a summary, so that every MCAP tool opens it.
+    /// Whether the file has a summary ([`super::seal`]), so that every MCAP tool opens it with an index.
     pub sealed: bool,
-    /// Why reading ended before the end: the file is damaged there, and the reader stops at damage
-    /// ([`JournalReader::up_to_damage`]).
+    /// Description of the damage at which reading ended; `None` if there is none. Only a reader that stops at damage
+    /// sets it ([`JournalReader::up_to_damage`]); others refuse.
     pub damage: Option<String>,
 }
 
@@ -248,12 +255,13 @@ enum NextRecord {
     Wrong(String),
 }
 
-/// The bytes of a journal: a file, or memory.
+/// The bytes of a journal: a file or memory that can be read and sought. Every type with these traits has it.
 pub trait JournalBytes: Read + Seek + Send {}
 
 impl<T: Read + Seek + Send> JournalBytes for T {}
 
-/// Reader of a journal, whose bytes live for `'s`. It keeps one batch in memory at a time.
+/// Reader of a journal, whose bytes live for `'s`. It reads batch by batch from the first, and keeps nothing of a
+/// batch that it has returned.
 pub struct JournalReader<'s> {
     place: String,
     // One reader for every kind of source: it is large, and reads through a buffer.
@@ -286,19 +294,20 @@ pub struct JournalReader<'s> {
 }
 
 impl JournalReader<'static> {
-    /// Opens the file of a journal.
+    /// Opens the file of a journal; its path is the name in refusals.
     ///
     /// # Errors
-    /// Refuses a file that can't be read, and whatever [`JournalReader::new`] refuses.
+    /// Refuses a path that can't be read or is not a regular file ([`file`]), and what [`JournalReader::new`]
+    /// refuses.
     pub fn open(path: &Path) -> Result<Self> {
         JournalReader::new(&path.display().to_string(), file(path)?)
     }
 }
 
-/// Opens a regular file from which a journal can be read.
+/// Opens a regular file from which a journal can be read, with a buffer of 64 KiB. A symbolic link is followed.
 ///
 /// # Errors
-/// Refuses a file that can't be read, and anything that is not a regular file.
+/// Refuses a file that is absent or can't be read, and a folder, pipe or device ([`Reason::Unreadable`]).
 pub fn file(path: &Path) -> Result<BufReader<File>> {
     let place = path.display().to_string();
     let unreadable = |e: std::io::Error| Refusal {
@@ -316,20 +325,24 @@ pub fn file(path: &Path) -> Result<BufReader<File>> {
 }
 
 impl<'s> JournalReader<'s> {
-    /// Creates a reader and reads the beginning of the journal. `place` is the name of the file in refusals.
+    /// Creates a reader and reads the header of the journal. `place` is the name of the file in refusals. The first
+    /// batch comes next.
     ///
     /// # Errors
-    /// Refuses a file that is no journal, and one without a whole batch ([`Reason::Missing`]): then its session was
-    /// never reported as durable.
+    /// - [`Reason::Unreadable`]: the bytes can't be read, do not begin as an MCAP file, are damaged before the first
+    ///   whole batch, or have no valid header.
+    /// - [`Reason::Missing`]: the bytes are too short for a journal or have no whole batch, so its session was never
+    ///   reported as durable.
     pub fn new(place: &str, source: impl JournalBytes + 's) -> Result<Self> {
         JournalReader::paid(place, source, None)
     }
 
-    /// Creates a reader as [`JournalReader::new`] does, whose memory is charged: `paid` grows by what the reader
-    /// needs.
+    /// Creates a reader as [`JournalReader::new`] does, whose memory is charged: `paid` grows and shrinks with what
+    /// the reader and the batch that it read last need. `None` charges nothing.
     ///
     /// # Errors
-    /// Refuses whatever [`JournalReader::new`] refuses, and memory beyond the account's part.
+    /// Returns the refusals of [`JournalReader::new`], and refuses memory beyond the account's part
+    /// ([`Reason::TooLarge`] or [`Reason::Overloaded`]); later calls of the reader refuse that too.
     pub fn paid(place: &str, source: impl JournalBytes + 's, paid: Option<Taken>) -> Result<Self> {
         let mut source: Box<dyn JournalBytes + 's> = Box::new(source);
         let length = source.seek(SeekFrom::End(0)).map_err(|e| unreadable(place, &e.to_string()))?;
@@ -374,13 +387,13 @@ impl<'s> JournalReader<'s> {
         Ok(reader)
     }
 
-    /// Returns the header of the journal.
+    /// Returns the header of the journal: the session, its first scene and tissue, and the run.
     pub fn header(&self) -> &pb::Header {
         &self.header
     }
 
-    /// Returns this reader without the names of files on the machine that wrote the journal, which an untrusted
-    /// party may have sent.
+    /// Returns this reader without the names of files on the machine that wrote the journal (the texture in the
+    /// header), which an untrusted party may have sent.
     #[must_use]
     pub fn without_files(mut self) -> Self {
         if let Some(appearance) = &mut self.header.appearance {
@@ -390,14 +403,15 @@ impl<'s> JournalReader<'s> {
     }
 
     /// Returns this reader so that a journal that is damaged in the middle ends there, rather than being refused;
-    /// [`JournalReader::damage`] then has the reason. To continue a session, use a reader that refuses damage.
+    /// [`JournalReader::damage`] then has the reason. To continue a session, use a reader that refuses damage. A
+    /// damaged header is always refused.
     #[must_use]
     pub fn up_to_damage(self) -> Self {
         JournalReader { stops_at_damage: true, ..self }
     }
 
-    /// Returns why the last batch is not the journal's last, if the file is damaged after it; known after that
-    /// batch.
+    /// Returns a description of the damage at which the journal ended early. `None` if there is none, if the reader
+    /// refuses damage, or until [`JournalReader::next_batch`] has returned `None`.
     pub fn damage(&self) -> Option<&str> {
         self.damage.as_deref()
     }
@@ -407,17 +421,18 @@ impl<'s> JournalReader<'s> {
         &self.place
     }
 
-    /// Returns the length of the file, bytes.
+    /// Returns the length of the file when it was opened, bytes.
     pub fn length(&self) -> u64 {
         self.length
     }
 
-    /// Returns the position of the next record, bytes.
+    /// Returns the position of the next record, bytes; after the last batch, the end of the last whole batch.
     pub fn position(&self) -> u64 {
         self.at
     }
 
-    /// Returns the number of bytes at the end that belong to no whole batch; known after the last batch.
+    /// Returns the number of bytes at the end that belong to no whole batch; 0 until [`JournalReader::next_batch`]
+    /// has returned `None`.
     pub fn torn_bytes(&self) -> u64 {
         self.torn_bytes
     }
@@ -427,13 +442,15 @@ impl<'s> JournalReader<'s> {
         unreadable(&self.place, message)
     }
 
-    /// Moves to the batch that has a snapshot: that batch comes next.
+    /// Moves to the batch that has a snapshot: that batch comes next. `snapshot` must come from the survey of this
+    /// journal.
     pub fn go_to(&mut self, snapshot: &SnapshotAt) {
         (self.at, self.batch, self.ended, self.torn_bytes) = (snapshot.offset, snapshot.batch, false, 0);
         (self.input, self.damage) = (u64::MAX, None);
     }
 
-    /// Moves to the first batch.
+    /// Moves to the first batch: that one comes next. [`JournalReader::damage`] and [`JournalReader::torn_bytes`] are
+    /// unknown again.
     pub fn rewind(&mut self) {
         (self.at, self.batch, self.input, self.ended, self.torn_bytes) = (self.begin, 0, 0, false, 0);
         self.damage = None;
@@ -449,12 +466,13 @@ impl<'s> JournalReader<'s> {
         Ok(bytes)
     }
 
-    /// Reads the file once, and moves to the first batch again. `progress` gets the number of bytes read. Returns
-    /// what the journal has.
+    /// Reads the file once from the beginning, and moves to the first batch again. `progress` gets the position in
+    /// the file after each batch, bytes. Returns what the journal has. It takes as long as reading the file.
     ///
     /// # Errors
-    /// Refuses a file that is damaged in the middle, unless the reader stops there
-    /// ([`JournalReader::up_to_damage`]).
+    /// - [`Reason::Unreadable`]: the file can't be read, is damaged in the middle (unless the reader stops there,
+    ///   [`JournalReader::up_to_damage`]), or has a snapshot, an end or a list that can't be decoded.
+    /// - [`Reason::TooLarge`] or [`Reason::Overloaded`]: there is no memory for a batch.
     pub fn survey(&mut self, progress: &mut dyn FnMut(u64)) -> Result<Survey> {
         self.rewind();
         let mut survey = Survey { whole_bytes: self.begin, ..Survey::default() };
@@ -486,11 +504,13 @@ impl<'s> JournalReader<'s> {
         Ok(survey)
     }
 
-    /// Returns the next batch; `None` after the last whole one.
+    /// Returns the next batch; `None` after the last whole one, also if bytes of a torn batch follow.
     ///
     /// # Errors
-    /// Refuses a file that is damaged before its end, unless the reader stops there
-    /// ([`JournalReader::up_to_damage`]).
+    /// - [`Reason::Unreadable`]: the file can't be read, has a message that can't be measured, or is damaged, so that
+    ///   a batch is missing that was certainly on the disk. A reader that stops at damage
+    ///   ([`JournalReader::up_to_damage`]) returns `None` then.
+    /// - [`Reason::TooLarge`] or [`Reason::Overloaded`]: there is no memory for the batch.
     pub fn next_batch(&mut self) -> Result<Option<JournalBatch>> {
         while !self.ended {
             let wrong = match self.next_record()? {

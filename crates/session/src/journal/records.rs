@@ -28,16 +28,16 @@ pub const SUMMARY_OFFSET: u8 = 0x0E;
 /// Kind of the record that ends the data.
 pub const DATA_END: u8 = 0x0F;
 
-/// Length of a record before its content, bytes.
+/// Length of a record before its content, bytes: its kind, and 8 bytes of length.
 pub const HEAD: u64 = 9;
 
 /// Length of a chunk before its messages, bytes, if it is not compressed.
 pub const CHUNK_HEAD: u64 = 40;
 
-/// Length of a message before its data, bytes.
+/// Length of a message before its data, bytes: channel, number and two times.
 pub const MESSAGE_HEAD: usize = 22;
 
-/// Appends a record whose content `fill` appends.
+/// Appends a record of kind `kind` to `out`: its head, and the content that `fill` appends. `fill` must only append.
 pub fn record(out: &mut Vec<u8>, kind: u8, fill: impl FnOnce(&mut Vec<u8>)) {
     out.push(kind);
     let at = out.len();
@@ -47,19 +47,19 @@ pub fn record(out: &mut Vec<u8>, kind: u8, fill: impl FnOnce(&mut Vec<u8>)) {
     out[at..at + 8].copy_from_slice(&length.to_le_bytes());
 }
 
-/// Appends a string after its length.
+/// Appends a string after its length in bytes (4 bytes), which must be below 2³².
 pub fn string(out: &mut Vec<u8>, text: &str) {
     bytes(out, text.as_bytes());
 }
 
-/// Appends bytes after their length, which must be below 2³².
+/// Appends bytes after their length (4 bytes), which must be below 2³²; a longer length is cut off.
 #[allow(clippy::cast_possible_truncation)]
 pub fn bytes(out: &mut Vec<u8>, bytes: &[u8]) {
     out.extend((bytes.len() as u32).to_le_bytes());
     out.extend(bytes);
 }
 
-/// Returns the first bytes of a file: the magic bytes and the header. `library` names the program that writes.
+/// Returns the first bytes of a file: the magic bytes and the header record. `library` names the program that writes.
 pub fn beginning(library: &str) -> Vec<u8> {
     let mut out = MAGIC.to_vec();
     record(&mut out, HEADER, |body| {
@@ -69,7 +69,7 @@ pub fn beginning(library: &str) -> Vec<u8> {
     out
 }
 
-/// A chunk that is being filled with messages of one moment.
+/// A chunk that is being filled with messages of one moment. It is not compressed.
 #[derive(Debug)]
 pub struct Chunk {
     out: Vec<u8>,
@@ -80,15 +80,15 @@ pub struct Chunk {
 }
 
 impl Chunk {
-    /// Begins a chunk. All its messages have the time `unix_ns` (ns since the Unix epoch) and the number
-    /// `sequence`. `first` is put before them: schemas and channels.
+    /// Begins a chunk. All its messages have the time `unix_ns` (ns since the Unix epoch) and the number `sequence`.
+    /// `first` has whole records that are put before them: schemas and channels, or nothing.
     pub fn new(unix_ns: u64, sequence: u32, first: &[u8]) -> Self {
         let mut out = vec![0; (HEAD + CHUNK_HEAD) as usize];
         out.extend(first);
         Chunk { out, unix_ns, sequence, index: Vec::new() }
     }
 
-    /// Appends a message to the chunk.
+    /// Appends a message to the chunk. `channel` is the number of a channel that this or an earlier chunk defines.
     pub fn add(&mut self, channel: u16, data: &[u8]) {
         self.index.push((channel, self.out.len() as u64 - HEAD - CHUNK_HEAD));
         let Chunk { out, unix_ns, sequence, .. } = self;
@@ -101,7 +101,7 @@ impl Chunk {
         });
     }
 
-    /// Returns the chunk's record, followed by the index of its messages.
+    /// Returns the chunk's record with its CRC-32, followed by the index of its messages, by ascending channel.
     pub fn finish(self) -> Vec<u8> {
         let Chunk { mut out, unix_ns, mut index, .. } = self;
         let size = out.len() as u64 - HEAD - CHUNK_HEAD;
@@ -122,8 +122,8 @@ impl Chunk {
     }
 }
 
-/// Appends the index of a chunk from the channel, time and position of each message, which must be sorted by
-/// channel.
+/// Appends the index of a chunk, one record per channel. `messages` has the channel, the time (ns since the Unix
+/// epoch) and the position within the chunk (bytes) of each message, and must be sorted by channel.
 #[allow(clippy::cast_possible_truncation)]
 pub fn indexes(out: &mut Vec<u8>, messages: &[(u16, u64, u64)]) {
     for of_channel in messages.chunk_by(|a, b| a.0 == b.0) {
@@ -138,7 +138,8 @@ pub fn indexes(out: &mut Vec<u8>, messages: &[(u16, u64, u64)]) {
     }
 }
 
-/// Returns the little-endian number of N bytes at `at`; `None` if there are not enough bytes.
+/// Returns the little-endian number of N bytes at position `at`; `None` if there are not enough bytes. N is at most
+/// 8; it panics for more.
 pub fn number<const N: usize>(bytes: &[u8], at: usize) -> Option<u64> {
     let mut whole = [0; 8];
     whole[..N].copy_from_slice(bytes.get(at..at + N)?);

@@ -21,12 +21,13 @@ fn unwritten(e: &io::Error) -> Refusal {
 }
 
 /// Writes the whole batches of a journal to `output`, which must be empty, and completes it: with an end, if the
-/// journal has none, and with the summary. `progress` gets the bytes read. Returns the survey of the original
-/// journal.
+/// journal has none, and with the summary. Nothing is simulated. `progress` gets the position in the journal, bytes.
+/// Returns the survey of the original journal.
 ///
 /// # Errors
-/// Refuses a journal that is damaged in the middle, unless `reader` stops there ([`JournalReader::up_to_damage`]),
-/// and an output that can't be written.
+/// - The refusals of [`JournalReader::survey`]: a journal that can't be read or decoded, or that is damaged in the
+///   middle, unless `reader` stops there ([`JournalReader::up_to_damage`]); and missing memory.
+/// - [`Reason::Unreadable`]: `output` can't be written or read. It may have a part of the journal then.
 pub fn recover(
     mut reader: JournalReader<'_>,
     output: &mut (impl Read + Write + Seek),
@@ -54,12 +55,14 @@ pub fn recover(
     Ok(survey)
 }
 
-/// Writes the part of a journal from step `from` to step `to` to `output`, which must be empty, as a journal that
-/// can be verified alone. Returns the survey of the whole journal.
+/// Writes the part of a journal from step `from` to step `to` to `output`, which must be empty, as a journal that can
+/// be verified alone. It simulates from the newest snapshot to `from`. Returns the survey of the whole journal.
 ///
 /// # Errors
-/// Refuses steps that the journal does not have, a journal that can't be simulated, and an output that can't be
-/// written.
+/// - [`Reason::OutOfRange`]: `from` is before the journal, or `to` is not above `from` or beyond the journal.
+/// - The refusals of [`JournalReader::survey`] and of [`Replay::near`] and [`Replay::reach`]: a journal that is
+///   damaged, is of another generation ([`REPLAYS`](super::REPLAYS)), or gives other hashes before `from`.
+/// - [`Reason::Unreadable`]: `output` can't be written or read. It may have a part of the journal then.
 pub fn cut(
     mut reader: JournalReader<'_>,
     [from, to]: [u64; 2],

@@ -23,19 +23,19 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::memory;
 use palpate_tissue::select::scheme_selection::given_up;
 
-/// An entry of a journal that a replay uses.
+/// An entry of a journal that a replay uses, in encoded form.
 #[derive(Debug, Clone)]
 pub enum JournalItem {
     /// An input to the session.
     Input(pb::Input),
-    /// A hash to compare with.
+    /// A hash of the state to compare with.
     Hash(pb::Hash),
     /// A snapshot to compare with or to begin from.
     Snapshot(pb::Snapshot),
 }
 
 impl JournalItem {
-    /// Returns the number of steps done before the entry.
+    /// Returns the number of steps done before the entry acts or was recorded.
     pub fn step(&self) -> u64 {
         match self {
             JournalItem::Input(input) => input.step,
@@ -45,10 +45,12 @@ impl JournalItem {
     }
 }
 
-/// Returns the inputs, hashes and snapshots of a batch, in order.
+/// Returns the inputs, hashes and snapshots of a batch, in the order in which they were recorded: a hash or snapshot
+/// after the inputs that acted before it.
 ///
 /// # Errors
-/// Refuses messages that can't be decoded, and hashes or snapshots that do not lie among the inputs of the batch.
+/// Refuses messages that can't be decoded, a pose without a tip, and hashes or snapshots that do not lie among the
+/// inputs of the batch.
 pub fn items(batch: &JournalBatch) -> Result<VecDeque<JournalItem>> {
     let hashes = batch.hashes()?.into_iter().map(|hash| (hash.after_inputs, JournalItem::Hash(hash)));
     let snapshots =
@@ -70,26 +72,30 @@ pub fn items(batch: &JournalBatch) -> Result<VecDeque<JournalItem>> {
     Ok(items)
 }
 
-/// First difference between the recorded session and the replay.
+/// First difference between the recorded session and the replay. Its `Display` is a sentence with the steps.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Difference {
-    /// The first step at which the recording and the replay are known to differ.
+    /// The step at which the recording and the replay are first known to differ; they may differ since any step after
+    /// `equal_until`.
     pub step: u64,
-    /// The last step at which the two are known to be equal; `None` if no hash was compared before.
+    /// The last step at which the two are known to be equal, by a hash or by the snapshot from which the replay
+    /// began; `None` if there was neither.
     pub equal_until: Option<u64>,
     /// Description of the difference, for people.
     pub what: String,
 }
 
-/// Event of a replay.
+/// Event of a replay, as [`Replay::advance`] gives it.
 pub enum ReplayEvent<'s> {
-    /// A step was done, or steps were skipped at rest.
+    /// A step was done, or steps were skipped at rest: the session at the present step. Before step 1 of a session it
+    /// also comes at t = 0⁺.
     Step(&'s Session),
     /// An input acts now, before the next step.
     Input(&'s pb::Input),
 }
 
-/// A journal that is being replayed, with the session at the present step.
+/// A journal that is being replayed, with the session at the present step. It compares each recorded hash and
+/// snapshot on the way, and stops at the first difference.
 pub struct Replay<'s> {
     reader: JournalReader<'s>,
     survey: Survey,
@@ -108,10 +114,13 @@ pub struct Replay<'s> {
 }
 
 impl<'s> Replay<'s> {
-    /// Begins a replay at the beginning of a journal.
+    /// Begins a replay at the beginning of a journal: at rest, or from the snapshot in its first batch. `survey` must
+    /// be that of this journal; forces, reach and tool numbers are not limited by `limits` ([`message::limits`]).
     ///
     /// # Errors
-    /// Refuses a journal of another generation, and one whose tissue or first snapshot is invalid.
+    /// Refuses a journal of another generation ([`REPLAYS`](super::REPLAYS)), one whose tissue or first snapshot is
+    /// invalid, one that can't be read there, and missing memory. A snapshot whose state has another hash than
+    /// recorded is no error but a [`Difference`].
     pub fn new(reader: JournalReader<'s>, survey: Survey, limits: &Limits) -> Result<Self> {
         let header = reader.header();
         let begins = |at: &&SnapshotAt| at.step == header.begin_step && at.batch == 0;
@@ -119,10 +128,12 @@ impl<'s> Replay<'s> {
         Replay::from_snapshot(reader, survey, limits, at.as_ref(), None)
     }
 
-    /// Begins a replay at the newest snapshot that is not after `step`.
+    /// Begins a replay at the newest snapshot that is not after `step`, or at the beginning if there is none. It does
+    /// not simulate to `step`.
     ///
     /// # Errors
-    /// Refuses a journal of another generation, an invalid tissue or snapshot, and a step outside the journal.
+    /// Returns the refusals of [`Replay::new`], and refuses a step before the journal's first or after its last
+    /// ([`Reason::OutOfRange`]).
     pub fn near(reader: JournalReader<'s>, survey: Survey, limits: &Limits, step: u64) -> Result<Self> {
         Replay::near_with(reader, survey, limits, step, None)
     }
@@ -208,7 +219,8 @@ impl<'s> Replay<'s> {
         Ok(replay)
     }
 
-    /// Returns this replay with events at all steps that are multiples of `every`, even where the tissue rests.
+    /// Returns this replay with events at all steps that are multiples of `every`, even where the tissue rests and
+    /// steps are skipped. 0 counts as 1.
     #[must_use]
     pub fn stopping_every(self, every: u64) -> Self {
         Replay { stops_every: every.max(1), ..self }
@@ -219,39 +231,45 @@ impl<'s> Replay<'s> {
         &self.simulation.session
     }
 
-    /// Returns the tissue with which the session began.
+    /// Returns the tissue with which the session began, in its first run.
     pub fn first(&self) -> &Arc<Model> {
         &self.first
     }
 
-    /// Returns the survey of the journal.
+    /// Returns the survey of the journal that the replay was given.
     pub fn survey(&self) -> &Survey {
         &self.survey
     }
 
-    /// Returns whether time advances, and the step count at which it pauses, if any.
+    /// Returns whether time advances in the recorded session at the present step, and the step count at which it
+    /// pauses, if any. A stopped session does not advance.
     pub fn running(&self) -> (bool, Option<u64>) {
         let reached = self.until.is_some_and(|until| self.session().step_count() >= until);
         (self.running && !reached && self.session().hold_reason().is_none(), self.until)
     }
 
-    /// Returns the number of hashes and the number of snapshots that were compared so far.
+    /// Returns the number of hashes and the number of snapshots that were compared so far; the snapshot from which
+    /// the replay began counts.
     pub fn compared(&self) -> [u64; 2] {
         [self.hashes, self.snapshots]
     }
 
-    /// Returns the first difference between recording and replay, where the replay has stopped; `None` if there is
+    /// Returns the first difference between recording and replay, at which the replay has stopped; `None` if there is
     /// none so far.
     pub fn difference(&self) -> Option<&Difference> {
         self.difference.as_ref()
     }
 
     /// Simulates until `until` steps are done, or to the end of the journal if that is earlier. The inputs that act
-    /// at the last step have not acted then. It ends early at a difference. Calls `see` with each event; an error of
-    /// `see` ends the call.
+    /// at the last step have not acted then. It ends early, without an error, at a difference
+    /// ([`Replay::difference`]). Calls `see` with each event; an error of `see` ends the call.
     ///
     /// # Errors
-    /// Returns a refusal if the journal is damaged or a session would not accept an input, and the errors of `see`.
+    /// - The refusals of [`JournalReader::next_batch`] and [`items`]: the journal can't be read or decoded, or is
+    ///   damaged.
+    /// - An input acts before the present step, or a session would not accept it.
+    /// - [`Reason::TooLarge`]: a step would compute more than `limits.point_substeps_per_step`.
+    /// - The errors of `see`.
     pub fn advance(&mut self, until: u64, see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()>) -> Result<()> {
         let until = until.min(self.survey.until_step);
         while self.difference.is_none() {
@@ -391,11 +409,12 @@ impl<'s> Replay<'s> {
         Ok(())
     }
 
-    /// Continues to `step`. Returns the session there, the tissue with which it began, and the reader for the rest of
-    /// the journal.
+    /// Continues to `step`, before the inputs that act there. Returns the session there, the tissue with which it
+    /// began, and the reader, which is after the batches that were needed. At the end of the journal it stops at that
+    /// step. Setting `stop` ends the call before the next event.
     ///
     /// # Errors
-    /// Returns the errors of [`Replay::advance`], and a refusal if a hash differs or `stop` is set.
+    /// Returns the errors of [`Replay::advance`], and refuses if a hash differs or `stop` is set.
     pub fn reach(mut self, step: u64, stop: &AtomicBool) -> Result<(Session, Arc<Model>, JournalReader<'s>)> {
         self.advance(step, &mut |_| if stop.load(Ordering::Relaxed) { Err(given_up()) } else { Ok(()) })?;
         match self.difference {
@@ -407,8 +426,9 @@ impl<'s> Replay<'s> {
         }
     }
 
-    /// Continues to the end of the journal. Returns the result of the comparison. Calls `progress` with the number of
-    /// steps done and the last step, every 1024 steps.
+    /// Continues to the end of the journal, or to the first difference. Returns the result of the comparison. Calls
+    /// `progress` with the number of steps done and the last step, at steps that are multiples of 1024 and not
+    /// skipped.
     ///
     /// # Errors
     /// Returns the errors of [`Replay::advance`]. A difference is not an error but part of the verdict.
@@ -430,7 +450,7 @@ impl<'s> Replay<'s> {
     /// end have no effect, because their leases have ended; other inputs for that step act.
     ///
     /// # Errors
-    /// Returns the errors of [`Replay::advance`], and a refusal if a hash differs.
+    /// Returns the errors of [`Replay::advance`], and refuses if a hash differs or a waiting change is invalid.
     pub fn resume(mut self) -> Result<Resumed> {
         let see: &mut dyn FnMut(ReplayEvent<'_>) -> Result<()> = &mut |_| Ok(());
         self.advance(u64::MAX, see)?;
@@ -526,42 +546,45 @@ fn restored(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Res
     Session::restore(&model, &saved)
 }
 
-/// A session at the end of its journal, ready to be continued.
+/// A session at the end of its journal, ready to be continued, as [`resume`] returns it.
 pub struct Resumed {
     /// The journal's header.
     pub header: pb::Header,
     /// The tissue with which the session began; later changes are made from its scene.
     pub first: Arc<Model>,
-    /// The session at the last durable step. Its tools are still held: the caller releases them
-    /// ([`Session::let_go`]).
+    /// The session at the last durable step. Its tools still act: the caller releases them ([`Session::let_go`]).
     pub session: Session,
-    /// The tissue from this step on, if it changes here: to be passed to [`Session::change`].
+    /// The tissue from this step on, if it changes here, to be passed to [`Session::change`]; otherwise `None`.
     pub pending: Option<Arc<Model>>,
-    /// Changes of the tissue that wait for a later step, each with that step.
+    /// Changes of the tissue that wait for a later step, each with that step, by ascending step; at most
+    /// `limits.queued_changes`. Empty if the session has stopped.
     pub waiting: Vec<(u64, Input)>,
-    /// Whether the session's time advances.
+    /// Whether the session's time advances at the end.
     pub running: bool,
-    /// The step count at which the session pauses, if any.
+    /// The step count at which the session pauses; `None` if it has no such end.
     pub until_step: Option<u64>,
     /// Survey of the journal.
     pub survey: Survey,
 }
 
-/// Returns the session at the end of a journal. It is simulated from the newest snapshot on, and its hashes are
-/// compared.
+/// Returns the session at the end of a journal. It is simulated from the newest snapshot on, and the hashes from
+/// there on are compared.
 ///
 /// # Errors
-/// Refuses a journal that is damaged in the middle, is of another generation, or gives other hashes.
+/// Refuses a journal that can't be read or decoded, is damaged in the middle, is of another generation
+/// ([`REPLAYS`](super::REPLAYS)), has inputs or a tissue beyond the limits, or gives other hashes; and missing
+/// memory.
 pub fn resume(reader: JournalReader<'_>, limits: &Limits) -> Result<Resumed> {
     resume_as(reader, limits, None)
 }
 
-/// Returns a copy of the tissue in an encoded journal with one snapshot, at rest, for a client's tool with the tip
-/// `tip`. It can be stepped at 1 kHz. The session's steps and tools are not restored.
+/// Returns a copy of the tissue in an encoded journal with at least one snapshot (the last counts), at rest, for a
+/// client's tool with the tip `tip`. It can be stepped at 1 kHz. The session's steps and tools are not restored.
 ///
 /// # Errors
-/// Returns a message if the bytes are no such journal, if the tissue is too large or the tip covers too much of it,
-/// or if memory is missing.
+/// Returns a message if the bytes are no such journal or of another generation, if the tissue has more than 100,000
+/// points or is invalid, if the tip does not fit the tissue or is too large ([`TissueCopy::for_client`]), or if
+/// memory is missing.
 pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predictor>, String> {
     #[allow(clippy::cast_possible_truncation)]
     let limits = message::limits(&Limits { points: TICK_POINT_SUBSTEPS as usize, ..Limits::default() });
@@ -580,14 +603,14 @@ pub fn prediction(bytes: &[u8], tip: Tip) -> std::result::Result<Box<dyn Predict
     Ok(Box::new(copy))
 }
 
-/// A journal's header and the compiled tissue with which its session began, for reuse.
+/// A journal's header and the compiled tissue with which its session began, for reuse by [`resume_as`].
 pub type Known = (pb::Header, Arc<Model>);
 
-/// Returns the session at the end of a journal, simulated from the newest snapshot with all hashes compared. Reuses
-/// the tissue of `known` if it belongs to a journal of the same session, so that it need not be compiled again.
+/// Returns the session at the end of a journal, as [`resume`] does. Reuses the tissue of `known` if it belongs to the
+/// same session, scene and tissue, so that it need not be compiled again; otherwise `known` is ignored.
 ///
 /// # Errors
-/// Refuses a journal that is damaged in the middle, is of another generation, or gives other hashes.
+/// Returns the refusals of [`resume`].
 pub fn resume_as(mut reader: JournalReader<'_>, limits: &Limits, known: Option<Known>) -> Result<Resumed> {
     let survey = reader.survey(&mut |_| {})?;
     let until = survey.until_step;
@@ -598,11 +621,12 @@ fn is_same_tissue(a: &pb::Header, b: &pb::Header) -> bool {
     a.session_id == b.session_id && a.scene == b.scene && a.mesh == b.mesh && a.tissue == b.tissue
 }
 
-/// Returns the session after `step` steps, simulated from the newest snapshot before, and the tissue with which it
-/// began.
+/// Returns the session after `step` steps, before the inputs that act there, and the tissue with which it began. It
+/// is simulated from the newest snapshot before, and hashes are compared. Setting `stop` ends the call.
 ///
 /// # Errors
-/// Returns a refusal if the journal does not contain the step or `stop` is set, and the errors of [`resume`].
+/// Refuses a step that the journal does not contain ([`Reason::OutOfRange`]), a set `stop`, and what [`resume`]
+/// refuses.
 pub fn session_at(
     mut reader: JournalReader<'_>,
     limits: &Limits,
@@ -614,15 +638,15 @@ pub fn session_at(
     Ok((session, first))
 }
 
-/// Result of a verification.
+/// Result of a verification ([`verify`], [`Replay::verify`]).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Verdict {
     /// Step counts at the beginning and at the end of the journal.
     pub steps: [u64; 2],
-    /// The last step whose recorded hash was equal; nothing is known of the steps after it. The beginning if no
-    /// hash was compared.
+    /// The last step whose recorded hash was equal; nothing is known of the steps after it. The beginning if no hash
+    /// was compared.
     pub proved_until: u64,
-    /// Number of hashes and number of snapshots that were compared.
+    /// Number of hashes and number of snapshots that were compared, in this order.
     pub compared: [u64; 2],
     /// The first difference; `None` if there is none.
     pub difference: Option<Difference>,
@@ -682,7 +706,8 @@ pub struct Verdict {
 /// ```
 ///
 /// # Errors
-/// Refuses a journal that can't be read or simulated.
+/// Refuses a journal that can't be read or decoded, is damaged in the middle, is of another generation, or has a
+/// tissue, snapshot or input beyond the limits; and missing memory. A difference is not an error.
 pub fn verify(mut reader: JournalReader<'_>, limits: &Limits, progress: &mut dyn FnMut(u64, u64)) -> Result<Verdict> {
     let survey = reader.survey(&mut |_| {})?;
     Replay::new(reader, survey, limits)?.verify(progress)

@@ -20,11 +20,13 @@ struct ChunkAt {
     index_length: u64,
 }
 
-/// Appends the summary to a file of whole batches, which must have nothing after them. It keeps one index in memory
-/// at a time, and reads the file twice, without its messages.
+/// Appends the summary to a file of whole batches, which must have nothing after them, no earlier summary either. It
+/// keeps one index in memory at a time, and reads the file twice, without its messages. The position of `file` does
+/// not matter.
 ///
 /// # Errors
-/// Returns the error of `file`, or one of invalid data if the file does not consist of whole batches.
+/// Returns the error of `file`, or [`io::ErrorKind::InvalidData`] if the file does not consist of whole batches. A
+/// part of the summary may be appended then.
 pub fn seal<F: Read + Write + Seek>(file: &mut F) -> io::Result<()> {
     let length = file.seek(SeekFrom::End(0))?;
     let mut out = Vec::new();

@@ -21,12 +21,13 @@ const PURPOSE: &[u8] = b"palpate journal 1\0";
 /// First bytes of a public key in DER: its kind (RFC 8410).
 const KIND: [u8; 12] = [0x30, 0x2a, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x03, 0x21, 0x00];
 
-/// Public part of a server's key. It is displayed in hexadecimal.
+/// Public part of a server's Ed25519 key. It is displayed as 64 hexadecimal digits.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PublicKey([u8; 32]);
 
 impl PublicKey {
-    /// Returns the key in a `SubjectPublicKeyInfo` (DER); `None` if the bytes are not an Ed25519 key.
+    /// Returns the key in a `SubjectPublicKeyInfo` (DER, RFC 8410); `None` if the bytes are not exactly an Ed25519
+    /// key.
     pub fn of(der: &[u8]) -> Option<Self> {
         der.strip_prefix(&KIND).and_then(|bytes| bytes.try_into().ok()).map(PublicKey)
     }
@@ -38,13 +39,13 @@ impl std::fmt::Display for PublicKey {
     }
 }
 
-/// Private key of a server. `Debug` shows only its public part.
+/// Private Ed25519 key of a server, which signs journals. `Debug` shows only its public part.
 #[derive(Debug, Clone)]
 pub struct Key(Arc<Ed25519KeyPair>);
 
 impl Key {
-    /// Returns the key in PKCS#8 (DER), with or without its public part; `None` if the bytes are not an Ed25519
-    /// key.
+    /// Returns the key in PKCS#8 (DER), with or without its public part; `None` if the bytes are not an Ed25519 key
+    /// or the public part does not fit.
     pub fn of(der: &[u8]) -> Option<Self> {
         Some(Key(Arc::new(Ed25519KeyPair::from_pkcs8_maybe_unchecked(der).ok()?)))
     }
@@ -132,27 +133,30 @@ pub struct Signatures {
     ended: bool,
 }
 
-/// Signed extent of a journal.
+/// Signed extent of a journal, from its beginning.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Signed {
-    /// No message up to this step has been changed since the server wrote it.
+    /// The server with the key wrote every message up to this step, and none has been changed, added or left out
+    /// since.
     pub until_step: u64,
-    /// Number of messages after the last signature, which anybody may have written.
+    /// Number of messages after the last signature, which may have been written or changed without the key.
     pub unsigned: u64,
-    /// Whether the end is signed too, so that nothing was cut off.
+    /// Whether the journal's end is signed and nothing follows it, so that nothing was cut off.
     pub ended: bool,
 }
 
 impl Signatures {
-    /// Creates a verifier of signatures by the server with this key.
+    /// Creates a verifier of signatures by the server with this key, for one journal.
     pub fn of(key: PublicKey) -> Self {
         Signatures { key, sum: MessageDigest::new(), signed: None, behind: 0, ended: false }
     }
 
-    /// Checks the next batch. The batches must be given in order, from the first.
+    /// Checks the next batch. Give every batch of the journal once, in order, from the first. A batch without a
+    /// signature is accepted; [`Signatures::signed`] does not cover it until a later signature does.
     ///
     /// # Errors
-    /// Refuses a signature by another key, and one that does not match the messages before it.
+    /// Refuses a signature that can't be decoded, one by another key, and one that does not match the messages before
+    /// it, because a batch since the last signature was changed. Do not continue after that.
     pub fn check(&mut self, batch: &JournalBatch) -> Result<()> {
         let mut ends = false;
         for (topic, bytes) in batch.messages() {
@@ -181,7 +185,7 @@ impl Signatures {
         Ok(())
     }
 
-    /// Returns the signed extent so far; `None` if nothing is signed.
+    /// Returns the signed extent so far; `None` if no signature has been checked.
     pub fn signed(&self) -> Option<Signed> {
         let Signatures { behind, ended, .. } = *self;
         self.signed.map(|(until_step, _)| Signed { until_step, unsigned: behind, ended: ended && behind == 0 })

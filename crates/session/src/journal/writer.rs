@@ -11,7 +11,7 @@ use super::signature::{Key, Signer};
 use crate::input::{Felt, Input};
 use palpate_tissue::Model;
 
-/// Description of a session at the beginning of a journal.
+/// Description of a session and a run at the beginning of its journal, for [`JournalWriter::new`].
 #[derive(Debug, Clone)]
 pub struct Opening<'a> {
     /// ID of the session.
@@ -20,17 +20,17 @@ pub struct Opening<'a> {
     pub run: u64,
     /// Name of the account that created the session, for people.
     pub owner: &'a str,
-    /// Time without use after which the session is deleted, s.
+    /// Time without use after which the server deletes the session, s.
     pub idle_timeout_s: f64,
     /// The tissue with which the session began, in its first run.
     pub first: &'a Arc<Model>,
-    /// Number of steps done.
+    /// Number of steps done when the journal begins.
     pub begin_step: u64,
-    /// Whether the session's time advances.
+    /// Whether the session's time advances when the journal begins.
     pub running: bool,
-    /// The step count at which the session pauses, if any.
+    /// The step count at which the session pauses; `None` if it has no such end.
     pub until_step: Option<u64>,
-    /// Revision at which the server became the session's owner; 0 without a fleet.
+    /// Revision in etcd at which the server became the session's owner; 0 without a fleet.
     pub ownership_revision: u64,
 }
 
@@ -60,7 +60,8 @@ impl Opening<'_> {
 /// Size of a batch's messages at which the batch ends, bytes.
 const USUAL_BYTES: usize = 4 << 20;
 
-/// Writer of a journal. It holds the events until the next flush, but neither a file nor an index.
+/// Writer of a journal. It keeps the events until the next flush in memory, but neither a file nor an index: the
+/// caller appends the bytes that it returns.
 #[derive(Debug)]
 pub struct JournalWriter {
     /// Number of batches so far, and of inputs in them.
@@ -87,9 +88,9 @@ pub struct JournalWriter {
 }
 
 impl JournalWriter {
-    /// Creates the writer of a journal. The first flush returns the beginning of the file.
+    /// Creates the writer of a journal. The first flush returns the beginning of the file, with the header.
     ///
-    /// A session that does not begin at rest needs a snapshot of its beginning in the first batch
+    /// A session that does not begin at rest needs a snapshot of its beginning before the first flush
     /// ([`JournalWriter::snapshot`]). `unix_ns` is the time, ns since the Unix epoch.
     pub fn new(opening: &Opening<'_>, unix_ns: u64) -> Self {
         JournalWriter::with_header(&opening.message(), unix_ns)
@@ -116,7 +117,8 @@ impl JournalWriter {
         }
     }
 
-    /// Returns this writer with a key by which it signs what it writes; `None` for no signatures.
+    /// Returns this writer with a key by which it signs what it writes, at most once a second and at the end; `None`
+    /// for no signatures. Call it before anything else.
     #[must_use]
     pub fn signed(self, key: Option<&Key>) -> Self {
         JournalWriter { signer: key.map(|key| Signer::new(key.clone())), ..self }
@@ -129,7 +131,8 @@ impl JournalWriter {
         JournalWriter { batches, inputs_before: inputs, durable: batches, messages: Vec::new(), bytes: 0, ..writer }
     }
 
-    /// Adds an input that acts when `step` steps are done. Add inputs in the order in which they act.
+    /// Adds an input that acts when `step` steps are done. Add inputs in the order in which they act. After 65,536
+    /// inputs ([`MAX_INPUTS`]) or about 4 MiB the batch ends, and its bytes wait for the flush.
     pub fn input(&mut self, step: u64, input: &Input) {
         let message = message::input(step, input, &mut self.tips);
         self.add_input(message);
@@ -149,7 +152,8 @@ impl JournalWriter {
         }
     }
 
-    /// Adds the hash of the state after `step` steps, before the inputs that act at that step.
+    /// Adds the hash of the state after `step` steps. It belongs between the inputs that were added before and those
+    /// added later, so add it before the inputs that act at that step.
     pub fn hash(&mut self, step: u64, hash: u128) {
         self.add_hash(pb::Hash { step, hash: message::hash(hash), after_inputs: 0 });
     }
@@ -159,8 +163,8 @@ impl JournalWriter {
         self.message(Topic::Hashes, hash.encode_to_vec());
     }
 
-    /// Adds a snapshot after `step` steps, before the inputs that act at that step: the state's hash, its tissue
-    /// `model`, and `saved`, the session's state from `Saved::to_bytes`.
+    /// Adds a snapshot after `step` steps, before the inputs that act at that step are added: the state's hash, its
+    /// tissue `model`, and `saved`, the session's state from [`Saved::to_bytes`](crate::snapshot::Saved::to_bytes).
     pub fn snapshot(&mut self, step: u64, hash: u128, model: &Model, saved: Vec<u8>) {
         let (tissue, hash) = (Some(message::tissue(model)), message::hash(hash));
         self.add_snapshot(pb::Snapshot { step, hash, tissue, saved, ..Default::default() });
@@ -172,8 +176,8 @@ impl JournalWriter {
         self.message(Topic::Snapshots, snapshot.encode_to_vec());
     }
 
-    /// Adds the list of all changes of the tissue that wait for their step, each with that step. It replaces
-    /// earlier lists.
+    /// Adds the list of all changes of the tissue that wait for their step, each with that step, by ascending step.
+    /// It replaces earlier lists; an empty one says that none waits.
     pub fn waiting(&mut self, changes: &[(u64, Arc<Model>)]) {
         let input =
             |(step, model): &(u64, Arc<Model>)| message::input(*step, &Input::Tissue(model.clone()), &mut Tips::new());
@@ -181,7 +185,8 @@ impl JournalWriter {
         self.message(Topic::Waiting, waiting.encode_to_vec());
     }
 
-    /// Adds the poses of the tools and the forces on them after `step` steps; nothing if `felt` is empty.
+    /// Adds the poses of the tools and the forces on them after `step` steps, rounded to 32-bit floats; nothing if
+    /// `felt` is empty.
     pub fn felt(&mut self, step: u64, felt: &[Felt]) {
         if !felt.is_empty() {
             self.add_moment(message::moment(step, felt));
@@ -205,31 +210,34 @@ impl JournalWriter {
         self.inputs_before + self.inputs.len() as u64
     }
 
-    /// Returns the approximate number of bytes that wait for a flush.
+    /// Returns the approximate number of bytes that the next flush will return, without signatures and indexes.
     pub fn waiting_bytes(&self) -> usize {
         self.bytes + self.full.len()
     }
 
-    /// Returns the step up to which the batches so far are complete.
+    /// Returns the step up to which the batches so far are complete: the largest that a flush was given, at first the
+    /// step at which the journal begins.
     pub fn until_step(&self) -> u64 {
         self.until_step
     }
 
-    /// Returns the number of batches so far. When the bytes of a flush are certainly on the disk, pass the number
-    /// after that flush to [`JournalWriter::durable`].
+    /// Returns the number of batches so far, with those that wait for a flush because they were full. When the bytes
+    /// of a flush are certainly on the disk, pass the number after that flush to [`JournalWriter::durable`].
     pub fn batches(&self) -> u64 {
         self.batches
     }
 
     /// Sets that the first `batches` batches are certainly on the disk. Later batches record that, so that a reader
-    /// can tell damage among them from a torn end.
+    /// can tell damage among them from a torn end. A number below an earlier one changes nothing, and one above
+    /// [`JournalWriter::batches`] counts as that.
     pub fn durable(&mut self, batches: u64) {
         self.durable = self.durable.max(batches.min(self.batches));
     }
 
     /// Ends the batch and returns the bytes to append to the file in one piece: all inputs that act before
-    /// `until_step` steps are done must have been added. Returns no bytes if there were neither events nor steps.
-    /// `unix_ns` is the time, ns since the Unix epoch.
+    /// `until_step` steps are done must have been added. A lower `until_step` than before counts as the former.
+    /// Returns no bytes if there were neither events nor steps since the last flush. `unix_ns` is the time, ns since
+    /// the Unix epoch.
     pub fn flush(&mut self, until_step: u64, unix_ns: u64) -> Vec<u8> {
         let is_new = self.batches == 0 || until_step > self.until_step;
         self.until_step = self.until_step.max(until_step);
@@ -240,8 +248,9 @@ impl JournalWriter {
         std::mem::take(&mut self.full)
     }
 
-    /// Returns the bytes of the last batch, which says why the journal ends. [`super::seal`] then makes an indexed
-    /// file of the complete journal.
+    /// Ends the journal: returns the bytes to append with the last batch, which says by `why` and `message` why the
+    /// journal ends; the session has done `until_step` steps at `unix_ns`, ns since the Unix epoch. [`super::seal`]
+    /// then makes an indexed file of the complete journal.
     pub fn finish(mut self, why: pb::Why, message: &str, until_step: u64, unix_ns: u64) -> Vec<u8> {
         let end = pb::End { why: why.into(), message: message.to_owned() };
         self.message(Topic::End, end.encode_to_vec());

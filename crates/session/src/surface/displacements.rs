@@ -9,11 +9,11 @@ use super::skin::Skin;
 use super::wide::{Available, LANES, SixteenLanes, WideWork, Width};
 use palpate_tissue::scene::Scene;
 
-/// The displacements of a tissue at one moment, in the order of a frame. All viewers' frames of that moment are
-/// made from it.
+/// The displacements of a tissue at one moment, in the order of a frame. All viewers' frames of that moment are made
+/// from it; the bounding box is computed once, by the first.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Snapshot {
-    /// Number of steps done.
+    /// Number of steps done at its moment.
     pub step: u64,
     /// Simulated time, s.
     pub simulation_time_s: f64,
@@ -33,8 +33,9 @@ pub struct Snapshot {
 }
 
 impl Snapshot {
-    /// Creates a snapshot of the tissue of a scene. `displacement_m` has a value for each component and place of a
-    /// frame, m (`Tissue::shown_displacements_m`).
+    /// Creates a snapshot of the tissue of a scene after `step` steps. `displacement_m` has the x, y and z of the
+    /// displacements, m, in three vectors with a value for each place of a frame: point [i, j] of a sheet at i·ny + j
+    /// (`Tissue::shown_displacements_m`).
     pub fn new(scene: &Scene, step: u64, simulation_time_s: f64, displacement_m: [Vec<f32>; 3]) -> Self {
         let (points, spacing_m) = grid(scene);
         Snapshot {
@@ -49,8 +50,9 @@ impl Snapshot {
         }
     }
 
-    /// Returns this snapshot with the skin of a tissue on a mesh. If other vertices are shown than are simulated,
-    /// the encoder computes their displacements; otherwise the skin is ignored.
+    /// Returns this snapshot with the skin of a tissue on a mesh, which must be that of its model. If other vertices
+    /// are shown than are simulated, the encoder computes their displacements; otherwise, and with `None`, the skin
+    /// is ignored.
     #[must_use]
     pub fn with_skin(self, skin: Option<&Arc<Skin>>) -> Self {
         Snapshot { skin: skin.filter(|skin| skin.is_bound()).cloned(), ..self }

@@ -12,20 +12,21 @@ use super::refine::{COMPONENTS, Points, Rows, Source, Written};
 use super::wide::{Available, SixteenLanes, WideWork, Width};
 use palpate_tissue::memory;
 
-/// Number format of displacements in a frame.
+/// Number format of displacements in a frame: three components for each vertex.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Encoding {
     /// 4-byte IEEE floats, little-endian, m.
     F32,
-    /// 2-byte signed integers over the frame's bounding box: displacement = origin + scale·q.
+    /// 2-byte signed integers q, little-endian, within ±32767, over the bounding box of the displacements:
+    /// displacement = origin + scale·q ([`Quanta`]).
     I16,
 }
 
 impl Encoding {
-    /// Every encoding.
+    /// Every encoding, in the order of declaration.
     pub const ALL: [Encoding; 2] = [Encoding::F32, Encoding::I16];
 
-    /// Returns the bytes of the three components of a vertex.
+    /// Returns the bytes of the three components of a vertex: 12 or 6.
     pub fn bytes_per_vertex(self) -> usize {
         match self {
             Encoding::F32 => 12,
@@ -33,7 +34,7 @@ impl Encoding {
         }
     }
 
-    /// Returns the largest integer q in displacement = origin + scale·q; the least is its negative. `None` for
+    /// Returns the largest integer q in displacement = origin + scale·q, 32767; the least is its negative. `None` for
     /// floats.
     pub fn largest_integer(self) -> Option<f64> {
         match self {
@@ -46,10 +47,11 @@ impl Encoding {
 /// Size limit of a patch, bytes: a small message of another stream waits for one patch at most.
 const PATCH_BYTES: usize = 64 << 10;
 
-/// An encoded frame, shared by all viewers that request its refinement and encoding.
+/// An encoded frame: the displacements of a tissue's surface at one moment. All viewers that request its refinement
+/// and encoding share it.
 #[derive(Debug, Clone)]
 pub struct Frame {
-    /// Number of steps done.
+    /// Number of steps done at its moment.
     pub step: u64,
     /// Simulated time, s.
     pub simulation_time_s: f64,
@@ -57,20 +59,20 @@ pub struct Frame {
     pub refinement: Refinement,
     /// Number format of the displacements.
     pub encoding: Encoding,
-    /// Scale and origin of the encoding's integers.
+    /// Scale and origin of the encoding's integers, for all patches.
     pub quanta: Quanta,
-    /// Whether the patches have every vertex.
+    /// Whether the patches have every vertex, and not only those that changed.
     pub full: bool,
-    /// The patches, which share no vertex.
+    /// The patches, which share no vertex; empty if nothing has changed. A patch has at most 64 KiB.
     pub patches: Vec<Patch>,
 }
 
-/// Scale and origin of integers: a displacement is origin + scale·q for each component, m.
+/// Scale and origin of a frame's integers q: a displacement is origin + scale·q for each component, m.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Quanta {
-    /// Middle of the bounding box for integers, 0 for floats, m.
+    /// Displacement at q = 0, m: the middle of the bounding box for integers, 0 for floats.
     pub origin_m: DVec3,
-    /// Displacement of one integer step, m; 1 for floats.
+    /// Displacement of one integer step along each axis, m; 1 for floats.
     pub scale_m: DVec3,
 }
 
@@ -118,11 +120,12 @@ impl Quanta {
 /// A rectangle of vertices in a frame, with their displacements.
 #[derive(Debug, Clone)]
 pub struct Patch {
-    /// The first vertex along x and y.
+    /// Indices i and j of the first vertex, along x and y; of a mesh, its row and place.
     pub first: [usize; 2],
-    /// Number of vertices along x and y.
+    /// Number of vertices along x and y; of a mesh, rows and places.
     pub count: [usize; 2],
-    /// Displacements in the frame's encoding, three components per vertex. The y index runs fastest.
+    /// Displacements in the frame's encoding: x, y and z of each vertex together, in the tissue's frame. The index
+    /// along y runs fastest.
     pub bytes: Bytes,
 }
 
@@ -151,10 +154,11 @@ pub(super) fn lay_out(first: [usize; 2], [count_x, count_y]: [usize; 2], encodin
     patches
 }
 
-/// Refines and encodes `snapshot`, whose points must be those of `refinement`. Returns a full frame.
+/// Refines and encodes `snapshot`, whose points must be those of `refinement` (of the same scene). Returns a full
+/// frame. It unwinds with a refusal if there is no memory for a row (`palpate_tissue::memory`).
 ///
-/// A sheet of 3 × 3 points, whose middle is 2 mm deep, with a vertex between neighbours: 5 × 5 vertices, of which the one beside the
-/// middle is 1 mm deep.
+/// A sheet of 3 × 3 points, whose middle is 2 mm deep, with a vertex between neighbours: 5 × 5 vertices, of which the
+/// one beside the middle is 1 mm deep.
 ///
 /// ```
 /// use palpate_session::surface::{Encoding, Refinement, Snapshot, encode};
@@ -179,8 +183,9 @@ pub fn encode(snapshot: &Snapshot, refinement: Refinement, encoding: Encoding) -
     encode_over(snapshot, Frame::blank(refinement, encoding))
 }
 
-/// Refines and encodes `snapshot` in the refinement and encoding of `spent`, which is a full frame. Reuses the
-/// buffers of `spent` that nothing else holds: fresh memory costs more than writing the frame.
+/// Refines and encodes `snapshot` in the refinement and encoding of `spent`, which must be a full frame of the same
+/// tissue. Returns a full frame. Reuses the buffers of `spent` that nothing else holds: fresh memory costs more than
+/// writing the frame.
 pub fn encode_over(snapshot: &Snapshot, spent: Frame) -> Frame {
     encode_at(Width::widest(), snapshot, spent)
 }

@@ -15,11 +15,11 @@ use palpate_tissue::shape::{PointId, RestShape};
 /// Name of the buffers in messages.
 const ROW: &str = "a row of a frame";
 
-/// Upper limit of the refinement n.
+/// Largest refinement n: the number of vertices between two neighbouring points of a sheet.
 pub const LARGEST_REFINEMENT: u32 = 10;
 
-/// Number of a mesh's vertices in a row of a frame. 16 rows are a tile of the frame, and a tile of the sleeping
-/// logic.
+/// Number of places for a mesh's vertices in a row of a frame. 16 rows are a tile of the frame, and a tile of the
+/// sleeping logic.
 pub const MESH_ROW: usize = 16;
 
 /// Returns the number of points of a scene along x and y, as a frame has them, and their distance at rest, m. The
@@ -35,8 +35,9 @@ pub(super) fn grid(scene: &Scene) -> ([usize; 2], f64) {
     }
 }
 
-/// Grid of a frame: the points of a sheet with n vertices between neighbours, or the vertices of a mesh in rows (n
-/// = 0).
+/// Grid of a frame: nx × ny vertices, of which vertex [i, j] has the number i·ny + j. For a sheet these are its
+/// points with n vertices between neighbours; for a mesh, its vertices in rows of [`MESH_ROW`] places (n = 0), where
+/// the last row may have places without a vertex.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Refinement {
     /// Number of points along x and y; of a mesh, rows and places per row.
@@ -51,8 +52,8 @@ impl Refinement {
     /// Creates refinement `n` of the tissue of a scene.
     ///
     /// # Errors
-    /// Refuses an `n` above [`LARGEST_REFINEMENT`] (10), an `n` above 0 on a mesh, and a grid with too many
-    /// vertices.
+    /// Refuses an `n` above [`LARGEST_REFINEMENT`] (10), an `n` above 0 on a mesh ([`Reason::OutOfRange`]), and a
+    /// grid with more than `limits.frame_vertices` vertices ([`Reason::TooLarge`]).
     pub fn new(scene: &Scene, n: u32, limits: &Limits) -> Result<Self> {
         if n > LARGEST_REFINEMENT {
             let message = format!("must be from 0 to {LARGEST_REFINEMENT}, but is {n}");
@@ -72,27 +73,27 @@ impl Refinement {
         Ok(refinement)
     }
 
-    /// Returns the number of vertices along x and y; of a mesh, rows and places per row.
+    /// Returns nx and ny, the numbers of vertices along x and y; of a mesh, rows and places per row.
     pub fn vertices(&self) -> [usize; 2] {
         self.points.map(|points| (points - 1) * (self.between + 1) + 1)
     }
 
-    /// Returns the refinement without vertices between the points.
+    /// Returns the refinement of the same tissue without vertices between the points (n = 0).
     pub fn coarsest(self) -> Self {
         Refinement { between: 0, ..self }
     }
 
-    /// Returns n, the number of vertices between neighbouring points.
+    /// Returns n, the number of vertices between neighbouring points; 0 for a mesh.
     pub fn between(&self) -> usize {
         self.between
     }
 
-    /// Returns the number of points.
+    /// Returns the number of points of the sheet; of a mesh, the number of places in a frame.
     pub fn point_count(&self) -> usize {
         self.points[0] * self.points[1]
     }
 
-    /// Returns the number of vertices.
+    /// Returns the number of vertices, nx·ny; of a mesh, the number of places, with those that have no vertex.
     pub fn vertex_count(&self) -> usize {
         let [nx, ny] = self.vertices();
         nx * ny
@@ -105,20 +106,22 @@ impl Refinement {
         self.point_spacing_m / (self.between + 1) as f64
     }
 
-    /// Returns the vertex at a point.
+    /// Returns the number of the vertex at a point of a sheet. On a mesh use [`Skin::places`](super::Skin::places).
     pub fn vertex_at(&self, point: PointId) -> usize {
         let (step, [_, ny]) = (self.between + 1, self.vertices());
         (point.index() / self.points[1]) * step * ny + (point.index() % self.points[1]) * step
     }
 
-    /// Returns the rest position of a vertex of a sheet, m. On a mesh use [`Skin::rest_m`](super::Skin::rest_m).
+    /// Returns the rest position of vertex `vertex` = i·ny + j of a sheet, m, in the tissue's frame: x = i and y = j
+    /// times the spacing of vertices, and z = 0. On a mesh use [`Skin::rest_m`](super::Skin::rest_m).
     #[allow(clippy::cast_precision_loss)]
     pub fn rest_m(&self, vertex: usize) -> DVec3 {
         let [_, ny] = self.vertices();
         self.spacing_m() * DVec3::new((vertex / ny) as f64, (vertex % ny) as f64, 0.0)
     }
 
-    /// Returns the texture coordinates of a vertex of a sheet: 0 to 1 along x and along y.
+    /// Returns the texture coordinates of vertex `vertex` = i·ny + j of a sheet: i/(nx − 1) along x and j/(ny − 1)
+    /// along y, from 0 to 1. On a mesh use [`Skin::texture_at`](super::Skin::texture_at).
     #[allow(clippy::cast_precision_loss)]
     pub fn texture_at(&self, vertex: usize) -> DVec2 {
         let [nx, ny] = self.vertices();
@@ -126,14 +129,15 @@ impl Refinement {
         DVec2::new(share(vertex / ny, nx), share(vertex % ny, ny))
     }
 
-    /// Returns the number of a sheet's cells, of two triangles each.
+    /// Returns the number of a sheet's cells, (nx − 1)·(ny − 1), of two triangles each. It has no meaning for a mesh.
     pub fn cell_count(&self) -> usize {
         let [nx, ny] = self.vertices();
         (nx - 1) * (ny - 1)
     }
 
     /// Returns the vertices of the two triangles of a sheet's cell, three and three, anticlockwise seen from above
-    /// the tissue.
+    /// the tissue. Cell i·(ny − 1) + j has vertex [i, j] as its first corner. On a mesh use
+    /// [`Skin::triangles`](super::Skin::triangles).
     pub fn triangles(&self, cell: usize) -> [usize; 6] {
         let [_, ny] = self.vertices();
         let corner = cell / (ny - 1) * ny + cell % (ny - 1);

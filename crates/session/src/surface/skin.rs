@@ -14,7 +14,8 @@ use palpate_tissue::shape::RestShape;
 /// Name of the skin's tables in messages.
 const TABLES: &str = "the shown surface of a mesh";
 
-/// Skin of a tissue on a mesh: the order of its vertices in a frame, and how they move with the simulated ones.
+/// Surface by which frames show a tissue on a mesh: the vertices of the mesh file, their order in a frame, and how
+/// they move with the simulated vertices, which may be fewer. Vertices are numbered as in the file.
 #[derive(Debug, PartialEq)]
 pub struct Skin {
     shape: Arc<MeshShape>,
@@ -39,7 +40,8 @@ struct SkinVertex {
 }
 
 impl Skin {
-    /// Creates the skin of a tissue on a mesh; `None` for a sheet.
+    /// Creates the skin of a tissue on a mesh; `None` for a sheet. It unwinds with a refusal if there is no memory
+    /// for its tables (`palpate_tissue::memory`).
     pub fn of(model: &Model) -> Option<Arc<Self>> {
         let (Body::Mesh(mesh), Some([order, slot_of])) = (&model.scene.body, model.shown_order()) else { return None };
         let shape = mesh.shape.clone();
@@ -73,17 +75,19 @@ impl Skin {
         Some(Arc::new(Skin { vertices, places, uv, bound, rest_m, shape }))
     }
 
-    /// Returns the shown vertices, numbered as in the file, in their order in a frame.
+    /// Returns the number of the vertex at each place of a frame: place p is row p/[`MESH_ROW`](super::MESH_ROW) and
+    /// column p mod it. Places beyond the last vertex are left out.
     pub fn vertices(&self) -> &[u32] {
         &self.vertices
     }
 
-    /// Returns the place in a frame of each vertex of the file.
+    /// Returns the place in a frame of each vertex of the file: the inverse of [`Skin::vertices`].
     pub fn places(&self) -> &[u32] {
         &self.places
     }
 
-    /// Returns the rest position of a vertex of the file, m.
+    /// Returns the rest position of a vertex of the file, m, in the tissue's frame. Panics if the file has no such
+    /// vertex.
     pub fn rest_m(&self, vertex: u32) -> DVec3 {
         let own = self.shape.shown().map_or(self.shape.vertices_m(), |shown| &shown.mesh.vertices_m);
         own[vertex as usize]
@@ -94,22 +98,23 @@ impl Skin {
         self.shape.shown().map_or(self.shape.triangles(), |shown| &shown.mesh.triangles)
     }
 
-    /// Returns the named groups of the file's vertices.
+    /// Returns the named groups of the file's vertices; empty if it has none.
     pub fn groups(&self) -> &[Group] {
         self.shape.shown().map_or(&self.shape.told().groups, |shown| &shown.mesh.groups)
     }
 
-    /// Returns the texture coordinates of a vertex of the file; `None` if the file has none.
+    /// Returns the texture coordinates of a vertex of the file; `None` if the file has none. Panics if it has
+    /// coordinates but no such vertex.
     pub fn texture_at(&self, vertex: u32) -> Option<[f32; 2]> {
         self.uv.as_ref().map(|uv| uv[vertex as usize])
     }
 
-    /// Returns the usual length of an edge of the simulated mesh, m.
+    /// Returns the usual length of an edge of the simulated mesh, m; the file may have shorter edges.
     pub fn edge_m(&self) -> f64 {
         self.shape.edge_m()
     }
 
-    /// Returns the memory of the tables, bytes.
+    /// Returns the memory of the skin's tables, bytes, without the mesh that it shares with the model.
     pub fn bytes(&self) -> u64 {
         let uv = self.uv.as_deref().map_or(0, size_of_val);
         let tables = size_of_val(&*self.vertices) + size_of_val(&*self.places);

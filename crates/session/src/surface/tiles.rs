@@ -26,8 +26,8 @@ const KEYFRAME_S: f64 = 5.0;
 /// resting sheet is still.
 const FINEST: f64 = 1e-6;
 
-/// Surface of a tissue as viewers of one refinement and encoding see it, divided into tiles. A version counts the
-/// updates.
+/// Surface of a tissue as viewers of one refinement and encoding see it, divided into tiles of 16 × 16 points. Its
+/// version counts the updates; each tile has the version at which it was last written.
 #[derive(Debug)]
 pub struct FrameTiles {
     refinement: Refinement,
@@ -120,7 +120,8 @@ impl Tile {
 }
 
 impl FrameTiles {
-    /// Creates the tiles of `snapshot`, with a keyframe of it as the first version.
+    /// Creates the tiles of `snapshot`, with a keyframe of it, in which all tiles are new, as version 1. `refinement`
+    /// must be one of the same tissue.
     pub fn new(snapshot: &Arc<Snapshot>, refinement: Refinement, encoding: Encoding) -> Self {
         let [along_x, along_y] = refinement.points.map(tiles_along);
         let place = |number: usize| Area::of(refinement, [number / along_y, number % along_y]);
@@ -152,13 +153,14 @@ impl FrameTiles {
         self.encoding
     }
 
-    /// Returns the number of updates. A viewer with the frame of this version is up to date.
+    /// Returns the number of updates, from 1. A viewer with the frame of this version is up to date.
     pub fn version(&self) -> u64 {
         self.version
     }
 
-    /// Advances to `snapshot`: rewrites the tiles that have visibly changed since they were last written or, 5 s of
-    /// simulated time after a keyframe, all of them. A snapshot that is already the newest changes nothing.
+    /// Advances to `snapshot`, the next version: rewrites the tiles that have moved visibly since they were last
+    /// written (by more than half a quantum; any movement for floats) or, 5 s of simulated time after a keyframe
+    /// since which anything changed, all of them. The snapshot that was given last changes nothing.
     pub fn update(&mut self, snapshot: &Arc<Snapshot>) {
         if Arc::ptr_eq(snapshot, &self.now) {
             return;
@@ -209,13 +211,14 @@ impl FrameTiles {
         self.quanta = Quanta::over(self.encoding, &self.box_m, self.finest_m);
     }
 
-    /// Returns whether any tile is newer than `version`; `None` is older than every version.
+    /// Returns whether any tile was written after version `version`. `None` stands for a viewer without a frame: then
+    /// it is true.
     pub fn is_newer_than(&self, version: Option<u64>) -> bool {
         self.tiles.iter().any(|tile| Some(tile.version) > version)
     }
 
-    /// Returns a frame of the tiles newer than `version`; all of them for `None`. Each tile is encoded once for all
-    /// viewers.
+    /// Returns a frame of the newest snapshot with the tiles that were written after version `version`; all of them
+    /// for `None`. It may have no patches. Each tile is encoded once for all viewers.
     pub fn newer_than(&mut self, version: Option<u64>) -> Frame {
         let FrameTiles { refinement, encoding, version: now_at, quanta, key, now, tiles, written, .. } = self;
         let (width, most) = (Width::widest(), SIDE * (refinement.between + 1) + 1);

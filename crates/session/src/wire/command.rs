@@ -13,10 +13,14 @@ use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::shape::{PointId, RestShape};
 
-/// Returns the command in a message that arrived at `arrival_ns`, ns of the server's clock.
+/// Returns the command in a message that arrived at `arrival_ns`, ns of the server's clock. `shape` is the rest shape
+/// of the session's tissue. An absent falloff is that of a fingertip, and an absent tip is [`Tip::default`]. Numbers,
+/// forces and reach are not checked ([`Rules::check_one`](crate::rules::Rules::check_one)).
 ///
 /// # Errors
-/// Refuses an absent field, a point or place that is not on the tissue, and an orientation whose length is not 1.
+/// Refuses an absent action, centre, point, target or position ([`Reason::Missing`]); a point or place that is not on
+/// the tissue; a place in the plane on a mesh, and a point together with a vertex ([`Reason::WrongKind`]); and an
+/// orientation whose length is not 1 (within 0.001).
 pub fn from_command(message: &pb::Command, shape: &dyn RestShape, arrival_ns: u64) -> Result<Command> {
     use pb::command::Action as Message;
     let action = match required("action", message.action.as_ref())? {
@@ -107,7 +111,8 @@ fn from_pose(pose: &pb::Pose) -> Result<DVec3> {
 }
 
 /// Returns the message for a script's command to tool `tool`, which acts at step `at_step`. Its sequence number is
-/// `at_step` + 1.
+/// `at_step` + 1, and it has no time to live. `client_time_ns` is the client time, ns, or 0. `shape` is the rest
+/// shape of the tissue.
 #[allow(clippy::cast_possible_truncation)]
 pub fn scripted(shape: &dyn RestShape, tool: usize, at_step: u64, action: &Action, client_time_ns: u64) -> pb::Command {
     use pb::command::Action as Message;

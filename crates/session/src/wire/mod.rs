@@ -13,7 +13,7 @@ use palpate_tissue::shape::{Extent, PointName};
 /// Returns the value of a required field.
 ///
 /// # Errors
-/// Refuses an absent field, by the name `field`.
+/// Refuses an absent field, by the name `field` ([`Reason::Missing`]).
 pub fn required<T>(field: &str, value: Option<T>) -> Result<T> {
     value.ok_or_else(|| Refusal::new(Reason::Missing, field, "is missing"))
 }
@@ -21,7 +21,7 @@ pub fn required<T>(field: &str, value: Option<T>) -> Result<T> {
 /// Returns the N of an "every Nth step" field; 1 if it is absent.
 ///
 /// # Errors
-/// Refuses 0.
+/// Refuses 0, by the name `field` ([`Reason::OutOfRange`]).
 pub fn every(field: &str, steps: Option<u32>) -> Result<u64> {
     match steps {
         Some(0) => Err(Refusal::new(Reason::OutOfRange, field, "must be at least 1, but is 0")),
@@ -50,10 +50,11 @@ fn from_record(point: &pb::PointRecord) -> PointName {
     from_point(point.point.as_ref(), point.vertex).unwrap_or(PointName::Point([0, 0]))
 }
 
-/// Returns the mass points that a probe requests, with the name of the field that has them; `None` for all points.
+/// Returns the mass points that a probe requests, in their order, with the name of the field that has them; `None`
+/// for all points. It does not check that the tissue has them.
 ///
 /// # Errors
-/// Refuses a request that names neither points nor all of them.
+/// Refuses a request that names neither points nor vertices nor all of them ([`Reason::Missing`]).
 pub fn from_probed(r#where: Option<&pb::probe_request::Where>) -> Result<Option<(&'static str, Vec<PointName>)>> {
     use pb::probe_request::Where;
     match r#where {
@@ -71,8 +72,8 @@ pub fn from_probed(r#where: Option<&pb::probe_request::Where>) -> Result<Option<
     }
 }
 
-/// Returns the request of a probe for these mass points. If any is a vertex of a mesh, points of a sheet are left
-/// out.
+/// Returns the request of a probe for these mass points, in their order. If any is a vertex of a mesh, points of a
+/// sheet are left out.
 pub fn probed(names: impl Iterator<Item = PointName>) -> pb::probe_request::Where {
     let (mut points, mut vertices) = (Vec::new(), Vec::new());
     for name in names {
@@ -87,7 +88,8 @@ pub fn probed(names: impl Iterator<Item = PointName>) -> pb::probe_request::Wher
     }
 }
 
-/// Returns the box around a tissue or a mesh as a message, without `top_m`.
+/// Returns the box around a tissue or a mesh as a message, m: its least and greatest corner and its middle, without
+/// `top_m`.
 pub fn extent(extent: &Extent) -> pb::Extent {
     let vector = geometry::vector;
     let [least_m, most_m, middle_m] = [extent.least_m, extent.most_m, extent.middle_m()].map(vector);

@@ -10,11 +10,13 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::scene::record::{EnergyJ, Point, Record, Recovery, ToolRecord};
 use palpate_tissue::shape::RestShape;
 
-/// Returns the settings of a stream of samples, with defaults for absent fields. `renders`: the stream has declared
+/// Returns the settings of a stream of samples, without force laws: every step if `every_steps` is absent, and a
+/// heartbeat of [`HEARTBEAT_S`] if that is. `only` has the tools, `None` for all. `renders`: the stream has declared
 /// a device.
 ///
 /// # Errors
-/// Refuses a value out of range, and a deadband of rendered force without a device.
+/// Refuses an interval of 0 steps, a deadband without a bound or with one out of range, a heartbeat that is not above
+/// 0 and at most 10 s, and a bound of the rendered force without a device ([`Reason::Missing`]).
 pub fn sampling(
     every_steps: Option<u32>,
     only: Option<Vec<u32>>,
@@ -44,8 +46,8 @@ pub fn sampling(
     Ok(sampling)
 }
 
-/// Returns a sample as a message that is sent at `now_ns`. `dropped` is the number of samples that the stream has
-/// lost so far.
+/// Returns a sample as a message that is sent at `now_ns`, ns of the server's clock. `shape` names its points.
+/// `dropped` is the number of samples that the stream has lost so far.
 pub fn sample(paced: &PacedSample, shape: &dyn RestShape, dropped: u64, now_ns: u64) -> pb::Sample {
     let sample = &paced.sample;
     #[allow(clippy::cast_possible_truncation)]
@@ -95,7 +97,8 @@ fn tool_sample(tool: &ToolSample, shape: &dyn RestShape, due_ns: u64, now_ns: u6
     }
 }
 
-/// Returns the refusal of a command as a message.
+/// Returns the refusal of the command with sequence number `sequence` to tool `tool` as a message. The number of
+/// dropped answers in it is 0.
 pub fn rejection(tool: u32, sequence: u64, refusal: &Refusal) -> pb::Rejection {
     pb::Rejection {
         tool,
@@ -110,9 +113,10 @@ pub fn rejection(tool: u32, sequence: u64, refusal: &Refusal) -> pb::Rejection {
 /// Limit of points per message of a record.
 const POINTS_PER_MESSAGE: usize = 1000;
 
-/// Returns message `part` of a record of step `step`; `None` after the last. A record without points has one
-/// message. The messages are made one at a time: those of a large sheet together would take a second and a
-/// gigabyte.
+/// Returns message `part`, from 0, of a record of step `step`, with at most 1000 points each; `None` after the last.
+/// The last also has the energies, tools and number of awake points; a record without points has one message.
+/// `dropped` is the number of records that the stream has lost so far. The messages are made one at a time: those of
+/// a large sheet together would take a second and a gigabyte.
 pub fn record(step: u64, record: &Record, dropped: u64, part: usize) -> Option<pb::ProbeResponse> {
     let parts = record.points.len().div_ceil(POINTS_PER_MESSAGE).max(1);
     let points = record.points.chunks(POINTS_PER_MESSAGE).nth(part).unwrap_or_default();
@@ -163,8 +167,8 @@ fn tool_record(record: &ToolRecord) -> pb::ToolRecord {
     }
 }
 
-/// Appends a message's points to a record, and takes the other fields from the last message. Returns whether it was
-/// the last.
+/// Appends a message's points to a record, and takes the energies, tools and number of awake points from the last
+/// message. Give it the messages in order. Returns whether this was the last. An absent vector counts as 0.
 pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
     let array = |v: &Option<pb::Vector3>| from_vector(v.as_ref()).to_array();
     record.time_s = message.simulation_time_s;
@@ -200,19 +204,19 @@ pub fn add_to_record(record: &mut Record, message: &pb::ProbeResponse) -> bool {
     message.last
 }
 
-/// Converts a recovery to a message.
+/// Converts a recovery to a message, field by field.
 pub fn recovery(recovery: Recovery) -> pb::Recovery {
     let Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason } = recovery;
     pb::Recovery { step, state_of_step, undone_commands, reason, at_rest, paused_until_step }
 }
 
-/// Converts a recovery from a message.
+/// Converts a recovery from a message, field by field; nothing is checked.
 pub fn from_recovery(recovery: pb::Recovery) -> Recovery {
     let pb::Recovery { step, state_of_step, undone_commands, reason, at_rest, paused_until_step } = recovery;
     Recovery { step, state_of_step, at_rest, undone_commands, paused_until_step, reason }
 }
 
-/// Converts an encoding to its number in messages.
+/// Converts an encoding to its value in messages.
 pub fn encoding(encoding: Encoding) -> pb::Encoding {
     match encoding {
         Encoding::F32 => pb::Encoding::F32,
@@ -220,10 +224,10 @@ pub fn encoding(encoding: Encoding) -> pb::Encoding {
     }
 }
 
-/// Returns the encoding that a viewer requests; F32 if it requests none.
+/// Returns the encoding that a viewer requests by the number in its message; F32 if it requests none.
 ///
 /// # Errors
-/// Refuses a number that no encoding has.
+/// Refuses a number that no encoding has ([`Reason::WrongKind`]).
 pub fn from_encoding(encoding: i32) -> Result<Encoding> {
     match pb::Encoding::try_from(encoding) {
         Ok(pb::Encoding::Unspecified | pb::Encoding::F32) => Ok(Encoding::F32),

@@ -16,12 +16,15 @@ use palpate_tissue::scene::{
 };
 use palpate_tissue::shape::RestShape;
 
-/// Returns the scene in a message. `mesh` is the mesh that a scene on a mesh names, which its client has sent
-/// before.
+/// Returns the scene in a message, with defaults for absent optional fields. `mesh` is the mesh that a scene on a
+/// mesh names, which its client has sent before. Ranges of most numbers are checked when the scene is compiled.
 ///
 /// # Errors
-/// Refuses an absent required field, an unknown name or set, an absent mesh, and a material or inclusions that do
-/// not fit the mesh.
+/// - [`Reason::Missing`]: a required field or the mesh is absent.
+/// - [`Reason::WrongKind`]: a scene has a sheet and a mesh; a field is for the other of the two; coefficients are
+///   given beside a material from which they follow; a set of points is unknown.
+/// - An integrator, precision or group is unknown; the mesh can't be simulated with that number of vertices; a ball,
+///   an inclusion, a factor of bending or a volume is invalid or does not fit the mesh.
 pub fn from_scene(message: &pb::Scene, mesh: Option<&TriangleMesh>) -> Result<Scene> {
     let substance = match &message.mesh {
         None => from_sheet(message)?,
@@ -216,7 +219,8 @@ fn from_stepping(message: &pb::Stepping) -> Result<Stepping> {
     })
 }
 
-/// Returns the change of the tissue in a message.
+/// Returns the change of the tissue in a message; absent coefficients stay. The step is not in it, and nothing is
+/// checked.
 pub fn from_change(message: &pb::UpdateTissueRequest) -> Change {
     Change {
         stiffness_n_per_m: message.stiffness_n_per_m,
@@ -226,7 +230,7 @@ pub fn from_change(message: &pb::UpdateTissueRequest) -> Change {
     }
 }
 
-/// Returns the message that requests a change of the tissue at the beginning of step `step`.
+/// Returns the message that requests a change of the tissue of session `session_id` at the beginning of step `step`.
 pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::UpdateTissueRequest {
     pb::UpdateTissueRequest {
         session_id: session_id.to_owned(),
@@ -238,7 +242,8 @@ pub fn update_tissue(session_id: &str, change: &Change, step: u64) -> pb::Update
     }
 }
 
-/// Returns a scene as a client sends it: without the coefficients that follow from a material.
+/// Returns a scene as a client sends it: without the coefficients that follow from a material, and without the mesh's
+/// vertices and ID.
 pub fn sent(scene: &Scene) -> pb::Scene {
     let mut message = self::scene(scene);
     if message.material.is_some() {
@@ -252,7 +257,8 @@ pub fn sent(scene: &Scene) -> pb::Scene {
     message
 }
 
-/// Returns a scene as a message, with all defaults filled in and the coefficients that follow from a material.
+/// Returns a scene as a message, with all defaults filled in and the coefficients that follow from a material. The
+/// mesh's vertices and ID and the appearance are left out.
 pub fn scene(scene: &Scene) -> pb::Scene {
     let of_mesh = match &scene.body {
         Body::Mesh(mesh) => Some(mesh),
