@@ -118,7 +118,7 @@ pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
 
 /// Creates the message about the law that replaces the law numbered `before`. `update` is the number and the new law,
 /// or the reason and message why there is none. `tissue_step` is the step from whose beginning a changed tissue acts,
-/// if that is the cause; `None` if a finer law replaces a coarse one of the same tissue.
+/// if that is the cause; `None` if the tissue has not changed.
 pub fn law_update(
     before: u32,
     tissue_step: Option<u64>,

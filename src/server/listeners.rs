@@ -58,7 +58,7 @@ fn unavailable(field: &str, error: &std::io::Error) -> String {
     }
 }
 
-/// A server's open listeners and its protection (TLS and credentials), before [`serve`](super::serve) takes them.
+/// A server's open listeners and its protection (TLS and credentials), before [`serve`](super::serve()) takes them.
 /// Clients can connect, but get no answer until then. Dropping it closes the listeners.
 pub struct Listeners {
     pub(super) listener: TcpListener,
