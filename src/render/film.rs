@@ -32,7 +32,8 @@ impl<'a> Film<'a> {
     /// `model`; `limits` are those of the session.
     ///
     /// # Errors
-    /// Returns a failure if a change of the tissue at the start is refused.
+    /// Returns [`SimulationFailure::Refused`] if one of the script's changes of the tissue, at whatever step, is
+    /// refused.
     pub fn new(model: &Arc<Model>, script: &'a Script, limits: &Limits) -> Result<Self, SimulationFailure> {
         Ok(Film { simulation: Simulation::playing(model, script, false, limits)?, script, shown: Skin::of(model) })
     }
@@ -42,7 +43,8 @@ impl<'a> Film<'a> {
     /// call.
     ///
     /// # Errors
-    /// Returns a failure if the session's guard stops the run or a change of the tissue is refused.
+    /// Returns [`SimulationFailure::Held`] if the session's guard ends it or puts its tissue back to an earlier
+    /// state, and [`SimulationFailure::Refused`] if a server would refuse a pose of the script.
     pub fn at(&mut self, step: u64) -> Result<Still, SimulationFailure> {
         self.simulation.run_to(step)?;
         let session = &self.simulation.session;
@@ -153,8 +155,8 @@ impl<W: Write> Gif<W> {
 /// that is written.
 ///
 /// # Errors
-/// Returns a failure if the session's guard stops the run, a change of the tissue is refused, or the output can't be
-/// written. What was written until then stays.
+/// Returns the failures of [`Gif::new`], [`Film::new`], [`Film::at`] and [`Gif::add`]: the output can't be written, a
+/// change or a pose of the script is refused, or the guard acts. What was written until then stays.
 pub fn gif(
     model: &Arc<Model>,
     script: &Script,
