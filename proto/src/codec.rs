@@ -22,12 +22,14 @@ const MAX_FIELDS_IN_ALL: usize = 1 << 16;
 /// Memory below which a request is not charged, bytes: a caller has few calls at once, and thousands per second.
 const SMALL: usize = 16 << 10;
 
-/// Charges the memory of requests before they are decoded.
+/// An account that is charged for the memory of large requests before they are decoded, such as that of a caller
+/// ([`paid_by`]).
 pub trait Payer: Send + Sync {
-    /// Charges for a request that takes this many bytes. Called before it is decoded.
+    /// Charges for a request that takes `bytes` bytes in memory. Called before it is decoded, once per request of more
+    /// than 16 KiB. It must not wait.
     ///
     /// # Errors
-    /// Refuses if the caller has no memory for it.
+    /// Refuses if the caller has no memory for the request, which is then not decoded.
     fn pay(&self, bytes: u64) -> Result<()>;
 }
 
@@ -45,13 +47,16 @@ impl Drop for PreviousPayer {
     }
 }
 
-/// Runs `act` with `payer` charged for the requests that this thread decodes in the meantime.
+/// Runs `act` with `payer` charged for the requests that this thread decodes in the meantime, and returns its result.
+/// Then the payer from before applies again, also after a panic; without any, requests are not charged.
 pub fn paid_by<T>(payer: &Arc<dyn Payer>, act: impl FnOnce() -> T) -> T {
     let _previous = PreviousPayer(PAYER.replace(Some(payer.clone())));
     act()
 }
 
-/// The protobuf codec with a limit on the memory of received messages, and on the fields of requests.
+/// The protobuf codec of the generated clients and servers, with limits on received messages: on the memory of all,
+/// and on the fields of requests, as [`accepts`] describes. It ends the call of a message beyond them with
+/// `TOO_LARGE`, and that of a request that can't be decoded with `UNREADABLE`. `T` is sent, `U` is received.
 pub struct BoundedCodec<T, U>(ProstCodec<T, U>);
 
 impl<T, U> Default for BoundedCodec<T, U> {
@@ -79,7 +84,7 @@ where
     }
 }
 
-/// The decoder of [`BoundedCodec`].
+/// The decoder of [`BoundedCodec`]: checks a message, then has `D` decode it.
 pub struct BoundedDecoder<D> {
     inner: D,
     shape: Option<&'static Shape>,
@@ -111,10 +116,13 @@ impl<D: Decoder<Error = Status>> Decoder for BoundedDecoder<D> {
     }
 }
 
-/// Returns whether the codec would decode a message of this type: performs its checks before decoding.
+/// Performs the checks of [`BoundedCodec`] on the bytes of a message of type `M`, without decoding it: malformed bytes
+/// are left to the decoder. A type is a request if its name ends in `Request`. Charges the payer of this thread
+/// ([`paid_by`]) for a request of more than 16 KiB. A type of another crate is not checked.
 ///
 /// # Errors
-/// Refuses a message that takes more memory than any valid one, and a request with too many fields.
+/// Refuses (`TOO_LARGE`) a message that takes more memory than [`MULTIPLE`] times its length plus [`ROOM`], and a
+/// request with more than 4352 fields at its top level or 65,536 in all; and returns the refusal of the payer.
 pub fn accepts<M: Name>(message: &[u8]) -> Result<()> {
     Shape::of::<M>().map_or(Ok(()), |shape| check(message, shape, M::NAME.ends_with("Request")))
 }

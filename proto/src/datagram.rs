@@ -15,10 +15,11 @@ use wtransport::quinn::{IdleTimeout, TransportConfig, VarInt};
 use crate::geometry::{from_vector, vector};
 use crate::pb;
 
-/// Largest message, bytes: it fits into one packet on any path that QUIC can use.
+/// Largest message of a datagram, bytes: it fits into one packet on any path that QUIC can use. Longer ones go by the
+/// stream.
 pub const MAX_BYTES: usize = 1024;
 
-/// Maximum number of earlier poses beside the newest in a datagram.
+/// Maximum number of earlier poses of a tool beside its newest in a datagram.
 pub const MAX_EARLIER: usize = 8;
 
 /// Bytes that may be in flight: a second of 1 kHz at 250 bytes.
@@ -31,7 +32,8 @@ const WAITING_BYTES: usize = 4 * MAX_BYTES;
 /// QUIC, whose pauses double, would notice that the network is back.
 const IDLE: Duration = Duration::from_secs(10);
 
-/// Returns the QUIC settings of a session.
+/// Returns the QUIC settings of a session of datagrams, for both ends: a constant congestion window of 256 KiB, room
+/// for 4 datagrams of [`MAX_BYTES`] in each direction, and an end after 10 s without any data.
 pub fn transport() -> TransportConfig {
     let mut transport = TransportConfig::default();
     transport
@@ -80,20 +82,21 @@ impl Controller for Constant {
     }
 }
 
-/// One pose of a tool in a datagram.
+/// One pose of a tool for a datagram, with the numbers of its command.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Posed {
-    /// Sequence number of its command.
+    /// Sequence number of its command; it increases from pose to pose of a tool.
     pub sequence: u64,
-    /// Time of the client's clock, ns.
+    /// Time of the client's clock at the pose, ns.
     pub client_time_ns: u64,
-    /// The pose.
+    /// The pose; the velocity of an earlier one is not sent.
     pub pose: pb::Pose,
 }
 
-/// Returns the message with the newest pose of `tool` and the `earlier` ones, newest first, at most [`MAX_EARLIER`].
-/// Earlier poses with another tip, or too far away for their difference to fit, are left out, which only matters
-/// during a gap of some milliseconds.
+/// Returns the message with the newest pose of `tool` and the `earlier` ones, given newest first, at most
+/// [`MAX_EARLIER`]. Leaves out earlier poses with another tip or orientation, 10 m or more away along an axis, or
+/// with a larger sequence number or time, which only matters during a gap of some milliseconds. Rounds earlier
+/// positions to nanometres.
 pub fn tool_poses<'a>(tool: u32, newest: &Posed, earlier: impl Iterator<Item = &'a Posed>) -> pb::ToolPoses {
     let place_m = from_vector(newest.pose.position_m.as_ref());
     let difference = |before: &Posed| {
@@ -118,7 +121,8 @@ pub fn tool_poses<'a>(tool: u32, newest: &Posed, earlier: impl Iterator<Item = &
     }
 }
 
-/// Returns the commands in a message, oldest first. Invalid ones are left out.
+/// Returns the commands in a message, oldest first: the earlier poses, at most [`MAX_EARLIER`] and without velocity,
+/// then the newest. Leaves out earlier poses whose number or time would be below 0; empty without a newest pose.
 pub fn commands(message: &pb::ToolPoses) -> impl Iterator<Item = pb::Command> {
     let pb::ToolPoses { tool, sequence, client_time_ns, pose, earlier } = message;
     let command = |sequence: u64, client_time_ns: u64, pose: pb::Pose| pb::Command {

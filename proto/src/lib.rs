@@ -24,10 +24,11 @@ pub mod touch;
 pub mod pb {
     tonic::include_proto!("palpate.v1");
 
-    /// Every file of the protocol, for reflection.
+    /// Every file of the protocol, for reflection: the bytes of a `google.protobuf.FileDescriptorSet`.
     pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/palpate.bin"));
 
-    /// For the request type of every call, its name and a function that returns whether bytes can be decoded as one.
+    /// For the request type of every call, its name and a function that returns whether bytes can be decoded as one,
+    /// without any limit on their memory.
     pub const DECODERS: &[(&str, fn(&[u8]) -> bool)] = include!(concat!(env!("OUT_DIR"), "/decoders.rs"));
 }
 
@@ -54,7 +55,8 @@ pub mod journal {
         include!(concat!(env!("OUT_DIR"), "/journal/foxglove.rs"));
     }
 
-    /// The descriptors of these files and their imports, each after its own imports.
+    /// The descriptors of these files and their imports, each after its own imports: the bytes of a
+    /// `google.protobuf.FileDescriptorSet`.
     pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/journal/journal.bin"));
 }
 

@@ -8,7 +8,7 @@ use prost::{Message, Name};
 
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// Memory that a message may take per received byte, in addition to [`ROOM`].
+/// Bytes of memory that a message may take per received byte, in addition to [`ROOM`].
 pub const MULTIPLE: usize = 32;
 
 /// Memory that a message may take regardless of its length, bytes: more than a full batch of short commands.
@@ -40,7 +40,8 @@ struct Field {
     kind: FieldKind,
 }
 
-/// The fields and size of a type of message.
+/// The fields and the size in memory of a type of message, known when this crate is built, for measuring messages of
+/// that type.
 pub struct Shape {
     /// Its full name.
     name: &'static str,
@@ -53,42 +54,46 @@ pub struct Shape {
 
 include!(concat!(env!("OUT_DIR"), "/shapes.rs"));
 
-/// The size of a message.
+/// The size of a message, from [`Shape::measure`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Measure {
-    /// Number of fields at its top level.
+    /// Number of fields at its top level; each entry of a list counts, except in a packed one.
     pub own_fields: usize,
-    /// Number of fields on all levels.
+    /// Number of fields on all levels, counted in the same way.
     pub fields: usize,
-    /// Memory that it refers to when it is decoded, bytes. Growing vectors have room for up to twice their entries.
+    /// Memory that it refers to when it is decoded, bytes, without that of the type itself: an upper estimate, in
+    /// which growing vectors have room for twice their entries.
     pub memory: usize,
 }
 
 impl Shape {
-    /// Returns the shape of a type of message; `None` if it does not belong to this crate.
+    /// Returns the shape of the message type `M`; `None` if it does not belong to the protocol, to journals or, with
+    /// the feature `etcd`, to etcd.
     pub fn of<M: Name>() -> Option<&'static Shape> {
         let name = M::full_name();
         SHAPES.iter().find(|shape| shape.name == name)
     }
 
-    /// Returns the shapes of all types of messages: of the protocol, of journals and, with the feature `etcd`, of
-    /// etcd.
+    /// Returns the shapes of all types of messages, in no particular order: of the protocol, of journals and, with the
+    /// feature `etcd`, of etcd.
     pub fn all() -> &'static [Shape] {
         SHAPES
     }
 
-    /// Returns the full name of its type.
+    /// Returns the full name of its type, with the package, such as `palpate.v1.Pose`.
     pub fn name(&self) -> &'static str {
         self.name
     }
 
-    /// Returns whether bytes can be decoded as such a message, without any limit.
+    /// Returns whether bytes can be decoded as such a message. Decodes them without any limit on memory: measure them
+    /// first.
     pub fn decodes(&self, bytes: &[u8]) -> bool {
         (self.decode)(bytes)
     }
 
-    /// Measures the bytes of a message. Stops when it has more than `most_fields` fields or takes more than
-    /// `most_memory` bytes. Invalid bytes are measured up to the error: the decoder refuses them there.
+    /// Measures the bytes of a message, to 16 nested levels. Stops when it has more than `most_fields` fields or
+    /// takes more than `most_memory` bytes; the result is then beyond that limit, but not complete. Invalid bytes are
+    /// measured up to the error: the decoder refuses them there.
     pub fn measure(&self, bytes: &[u8], most_fields: usize, most_memory: usize) -> Measure {
         let mut walk = Walk { measure: Measure::default(), most_fields, most_memory };
         walk.message(self, bytes, LEVELS);
@@ -165,7 +170,8 @@ fn room(entries: usize) -> usize {
     if entries == 0 { 0 } else { entries.saturating_mul(2).max(4) }
 }
 
-/// Reads a varint from the front of `bytes`, and advances it; `None` if there is none.
+/// Reads a protobuf varint of at most 10 bytes from the front of `bytes`, and advances `bytes` beyond it. Returns
+/// `None` if there is none; what was read until then is lost.
 pub fn varint(bytes: &mut &[u8]) -> Option<u64> {
     let mut value = 0;
     for shift in (0..64).step_by(7) {
@@ -178,10 +184,12 @@ pub fn varint(bytes: &mut &[u8]) -> Option<u64> {
     None
 }
 
-/// Returns the memory that the message in `bytes` takes when it is decoded, bytes.
+/// Returns the memory that the message of type `M` in `bytes` takes when it is decoded, bytes ([`Measure::memory`]);
+/// 0 if the type does not belong to this crate. Does not decode it. `room` is the memory that it may take regardless
+/// of its length, bytes, such as [`ROOM`].
 ///
 /// # Errors
-/// Refuses a message that would take more than [`MULTIPLE`] times its bytes plus `room`.
+/// Refuses (`TOO_LARGE`) a message that would take more than [`MULTIPLE`] times its bytes plus `room`.
 pub fn memory_of<M: Name>(bytes: &[u8], room: usize) -> Result<usize> {
     let Some(shape) = Shape::of::<M>() else { return Ok(0) };
     let most = bytes.len().saturating_mul(MULTIPLE).saturating_add(room);
@@ -199,7 +207,7 @@ pub fn memory_of<M: Name>(bytes: &[u8], room: usize) -> Result<usize> {
 /// Decodes a message that takes no more memory than [`memory_of`] allows with [`ROOM`].
 ///
 /// # Errors
-/// Returns the refusals of [`memory_of`], and refuses bytes that can't be decoded.
+/// Returns the refusals of [`memory_of`], and refuses (`UNREADABLE`) bytes that can't be decoded.
 pub fn decoded<M: Message + Name + Default>(bytes: &[u8]) -> Result<M> {
     memory_of::<M>(bytes, ROOM)?;
     M::decode(bytes).map_err(|error| Refusal::new(Reason::Unreadable, "", format!("can't be decoded: {error}")))

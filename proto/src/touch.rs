@@ -8,10 +8,11 @@ use crate::geometry::{from_vector, point, vector};
 use crate::pb;
 use palpate_refusal::{self as refusal, Reason, Refusal, Result, number};
 
-/// Returns the device in a message.
+/// Returns the device in a message, with the name `declared` instead of its own.
 ///
 /// # Errors
-/// Returns an error if the name is not fit for a log, or if a limit of the device is out of range.
+/// Refuses a name of more than 128 bytes or with control characters, and a limit that is not above 0 or beyond its
+/// range: forces to 1000 N, stiffness to 10⁶ N/m, damping to 10⁴ N·s/m, the workspace's radius to 10 m.
 pub fn from_device(message: &pb::Device) -> Result<Device> {
     refusal::label("device.name", &message.name)?;
     let within = |field: &str, value: f64, most: f64| {
@@ -28,7 +29,7 @@ pub fn from_device(message: &pb::Device) -> Result<Device> {
     })
 }
 
-/// Converts a device to a message.
+/// Converts a device to a message, with its name. Does not check the values.
 pub fn device(device: &Device) -> pb::Device {
     pb::Device {
         name: device.name.to_owned(),
@@ -41,6 +42,7 @@ pub fn device(device: &Device) -> pb::Device {
 }
 
 /// Returns the tip in a message; the default tip if it is absent, with the default friction if that is absent.
+/// Couples it by a spring if the message has one, otherwise by a constraint. Does not check the values.
 pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
     tip.map_or_else(Tip::default, |tip| Tip {
         radius_m: tip.radius_m,
@@ -53,7 +55,7 @@ pub fn from_tip(tip: Option<&pb::Tip>) -> Tip {
     })
 }
 
-/// Converts a tip to a message.
+/// Converts a tip to a message; [`from_tip`] returns an equal tip.
 pub fn tip(tip: &Tip) -> pb::Tip {
     pb::Tip {
         radius_m: tip.radius_m,
@@ -68,7 +70,8 @@ pub fn tip(tip: &Tip) -> pb::Tip {
     }
 }
 
-/// Creates the pose of a tool whose tip is at `place_m`, m.
+/// Creates the pose of a tool whose tip is at `place_m` in the tissue's frame, m, without orientation, offset or
+/// velocity.
 pub fn pose(place_m: DVec3, tip: &Tip) -> pb::Pose {
     pb::Pose {
         position_m: vector(place_m),
@@ -79,7 +82,7 @@ pub fn pose(place_m: DVec3, tip: &Tip) -> pb::Pose {
     }
 }
 
-/// Converts a force law to a message, with its number in the stream.
+/// Converts a force law to a message. `number` is its number in the stream, by which local models refer to it.
 pub fn law(law: &Law, number: u32) -> pb::ForceLaw {
     let row = |row: &Row| pb::ForceLawRow {
         force_n: row.force_n,
@@ -92,10 +95,11 @@ pub fn law(law: &Law, number: u32) -> pb::ForceLaw {
     pb::ForceLaw { step_m: law.step_m, rows: law.rows.iter().map(row).collect(), coarse: law.is_coarse, number }
 }
 
-/// Returns the force law in a message.
+/// Returns the force law in a message, without its number.
 ///
 /// # Errors
-/// Returns an error if a client can't use the law ([`Law::is_sound`]).
+/// Refuses a law that a client can't use ([`Law::is_sound`]): with fewer than two rows, a number that is not finite or
+/// below 0, a distance of the rows of 0, or forces that fall from row to row.
 pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
     let row = |row: &pb::ForceLawRow| Row {
         force_n: row.force_n,
@@ -112,8 +116,9 @@ pub fn from_law(message: &pb::ForceLaw) -> Result<Law> {
     if law.is_sound() { Ok(law) } else { Err(wrong()) }
 }
 
-/// Creates the message with the law that replaces law `before`, and its number; or with the reason and message why
-/// there is none. `tissue_step` is the step from whose beginning a changed tissue acts, if that is the cause.
+/// Creates the message about the law that replaces the law numbered `before`. `update` is the number and the new law,
+/// or the reason and message why there is none. `tissue_step` is the step from whose beginning a changed tissue acts,
+/// if that is the cause; `None` if the tissue has not changed.
 pub fn law_update(
     before: u32,
     tissue_step: Option<u64>,
@@ -139,7 +144,8 @@ fn from_symmetric(m: Option<&pb::Symmetric3>) -> DMat3 {
     })
 }
 
-/// Converts a local model to a message.
+/// Converts a local model to a message, without its step, which is that of the sample. Rounds its time to
+/// nanoseconds; a negative one becomes 0. Leaves out a curvature of zero.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn local_model(model: &LocalModel) -> pb::LocalModel {
     let contact = match model.contact_state {
@@ -166,7 +172,9 @@ pub fn local_model(model: &LocalModel) -> pb::LocalModel {
     }
 }
 
-/// Returns the local model in a message. The renderer refuses invalid models.
+/// Returns the local model in a message. `step` is the step of its sample. Vectors and matrices that are absent
+/// become 0, and an unspecified contact [`ContactState::Free`]. Does not check the values: the renderer refuses
+/// invalid models.
 pub fn from_local_model(message: &pb::LocalModel, step: u64) -> LocalModel {
     let contact_state = match message.contact() {
         pb::Contact::Unspecified | pb::Contact::Free => ContactState::Free,
@@ -197,12 +205,14 @@ pub fn from_local_model(message: &pb::LocalModel, step: u64) -> LocalModel {
 /// Bytes of the headers around a message of a stream: gRPC, HTTP/2, TCP and IP.
 const HEADER_BYTES: u64 = 5 + 9 + 32 + 20;
 
-/// Returns the size of a sample on the wire, bytes.
+/// Returns the size of a sample on the wire in a stream, bytes: the encoded message, and 66 bytes for the headers of
+/// gRPC, HTTP/2, TCP and IP.
 pub fn wire_bytes(sample: &pb::Sample) -> u64 {
     prost::Message::encoded_len(sample) as u64 + HEADER_BYTES
 }
 
-/// Returns the size on the wire of a sample of one tool with this model, bytes.
+/// Returns the size on the wire ([`wire_bytes`]) of a typical sample of one tool with this model, bytes, for estimates
+/// without a server.
 pub fn sample_bytes(model: &LocalModel) -> u64 {
     let tool = pb::ToolSample {
         acknowledged_sequence: model.sequence,

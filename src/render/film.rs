@@ -13,14 +13,14 @@ use palpate_tissue::scene::profile::{Moment, Poke};
 use palpate_tissue::scene::script::Script;
 use palpate_tissue::texture::Image;
 
-/// A script that is played step by step to make pictures of it.
+/// A script that is played on a session of its own, step by step and only forwards, to make pictures of it.
 pub struct Film<'a> {
     simulation: Simulation,
     script: &'a Script,
     shown: Option<Arc<Skin>>,
 }
 
-/// The tissue at one moment, and the forces that act on it.
+/// The tissue at one moment, and the forces that act on it: all that a picture needs besides the model and the view.
 pub struct Still {
     snapshot: Snapshot,
     shown: Option<Arc<Skin>>,
@@ -28,19 +28,23 @@ pub struct Still {
 }
 
 impl<'a> Film<'a> {
-    /// Starts the script on a new session of `model`.
+    /// Starts `script` on a new session of `model`, at step 0. The script must have been bound to the scene of
+    /// `model`; `limits` are those of the session.
     ///
     /// # Errors
-    /// Returns a failure if a change of the tissue is refused.
+    /// Returns [`SimulationFailure::Refused`] if one of the script's changes of the tissue, at whatever step, is
+    /// refused.
     pub fn new(model: &Arc<Model>, script: &'a Script, limits: &Limits) -> Result<Self, SimulationFailure> {
         Ok(Film { simulation: Simulation::playing(model, script, false, limits)?, script, shown: Skin::of(model) })
     }
 
-    /// Plays the script until `step` steps are done, and returns the tissue then. It can't go back to an earlier
-    /// step.
+    /// Plays the script until `step` steps are done, and returns the tissue then, with an arrow for each force of the
+    /// script other than zero in the step just done. It can't go back: `step` must not be below that of an earlier
+    /// call.
     ///
     /// # Errors
-    /// Returns a failure if the guard stops the run or a change of the tissue is refused.
+    /// Returns [`SimulationFailure::Held`] if the session's guard ends it or puts its tissue back to an earlier
+    /// state, and [`SimulationFailure::Refused`] if a server would refuse a pose of the script.
     pub fn at(&mut self, step: u64) -> Result<Still, SimulationFailure> {
         self.simulation.run_to(step)?;
         let session = &self.simulation.session;
@@ -54,7 +58,8 @@ impl<'a> Film<'a> {
         Ok(Still::of(session, self.shown.as_ref(), arrows))
     }
 
-    /// Plays the whole script. Returns the tissue at the sample time with the largest displacement.
+    /// Plays the whole script, of which nothing may have been played yet. Returns the tissue at the first of the
+    /// script's sample times (each [`Script::sample_every`] steps, from 0) with the largest displacement of a point.
     ///
     /// # Errors
     /// Returns the failures of [`Film::at`].
@@ -75,7 +80,8 @@ impl<'a> Film<'a> {
 }
 
 impl Still {
-    /// Returns the current tissue of a session; `shown` is the surface that is drawn of a mesh.
+    /// Returns the current tissue of a session, with `arrows` for forces. `shown` is the surface that is drawn of a
+    /// mesh ([`Skin::of`] its model); `None` for a sheet.
     pub fn of(session: &Session, shown: Option<&Arc<Skin>>, arrows: Vec<Arrow>) -> Self {
         let mut displacement_m = std::array::from_fn(|_| Vec::new());
         session.tissue().shown_displacements_m(&mut displacement_m);
@@ -89,13 +95,14 @@ impl Still {
         self.snapshot.simulation_time_s
     }
 
-    /// Draws the tissue as seen by `view`.
+    /// Draws the tissue as seen by `view`, as [`picture`] does. `model` must be that of the session.
     pub fn picture(&self, model: &Model, view: &View) -> Image {
         picture(model.shape(), self.shown.as_deref(), &self.snapshot, &self.arrows, view)
     }
 }
 
-/// A GIF that is being written, played at the speed of simulated time.
+/// A GIF that is being written, frame by frame, and that plays at the speed of simulated time, repeated endlessly.
+/// Dropping it writes its end.
 pub struct Gif<W: Write> {
     encoder: gif::Encoder<W>,
     size: [u16; 2],
@@ -108,11 +115,12 @@ fn broken(e: gif::EncodingError) -> SimulationFailure {
 }
 
 impl<W: Write> Gif<W> {
-    /// Starts a GIF of `frames_hz` pictures per second of simulated time, for a session of `rate_hz` steps per
-    /// second. A GIF counts in hundredths of a second, so the rate is rounded accordingly.
+    /// Starts a GIF of `frames_hz` (above 0) pictures per second of simulated time, with the size of `view`, for a
+    /// session of `rate_hz` steps per second. Writes its head to `output`. The time between two frames is rounded to
+    /// hundredths of a second, at least one: there are at most 100 pictures per second.
     ///
     /// # Errors
-    /// Returns a failure if the output can't be written.
+    /// Returns [`SimulationFailure::Output`] if the output can't be written.
     pub fn new(output: W, view: &View, frames_hz: f64, rate_hz: f64) -> Result<Self, SimulationFailure> {
         let size = view.size.map(|pixels| pixels as u16);
         let mut encoder = gif::Encoder::new(output, size[0], size[1], &[]).map_err(broken)?;
@@ -122,15 +130,18 @@ impl<W: Write> Gif<W> {
         Ok(Gif { encoder, size, delay, steps_a_frame: 0.01 * delay * rate_hz })
     }
 
-    /// Returns the step that a frame shows, counted from the step of the first frame.
+    /// Returns the step that frame number `frame` (from 0) shows, counted from the step of the first frame.
     pub fn step(&self, frame: u64) -> u64 {
         (frame as f64 * self.steps_a_frame).round() as u64
     }
 
-    /// Writes a picture as the next frame.
+    /// Writes a picture of the size of the view as the next frame, with at most 256 colours.
     ///
     /// # Errors
-    /// Returns a failure if the output can't be written.
+    /// Returns [`SimulationFailure::Output`] if the output can't be written.
+    ///
+    /// # Panics
+    /// If the picture has another number of pixels than the view.
     pub fn add(&mut self, image: &Image) -> Result<(), SimulationFailure> {
         let mut picture = gif::Frame::from_rgb_speed(self.size[0], self.size[1], &image.rgb, 10);
         picture.delay = self.delay as u16;
@@ -138,11 +149,14 @@ impl<W: Write> Gif<W> {
     }
 }
 
-/// Plays the whole script into a GIF of `frames_hz` pictures per second, at the speed of simulated time. Calls
-/// `progress` with the step of each frame.
+/// Plays the whole script on a new session of `model` into a GIF at `output`, which plays at the speed of simulated
+/// time and repeats endlessly. It shows `frames_hz` pictures per second, above 0, with the time between two frames
+/// rounded to hundredths of a second, at least one ([`Gif::new`]). Calls `progress` with the step of each frame, once
+/// that is written.
 ///
 /// # Errors
-/// Returns a failure if the guard stops the run, a change of the tissue is refused, or the file can't be written.
+/// Returns the failures of [`Gif::new`], [`Film::new`], [`Film::at`] and [`Gif::add`]: the output can't be written, a
+/// change or a pose of the script is refused, or the guard acts. What was written until then stays.
 pub fn gif(
     model: &Arc<Model>,
     script: &Script,

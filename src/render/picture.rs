@@ -9,10 +9,13 @@ use palpate_session::surface::{Refinement, Skin as Shown, Snapshot};
 use palpate_tissue::shape::{PointId, PointName, RestShape};
 use palpate_tissue::texture::Image;
 
-/// A camera that looks at the middle of the tissue.
+/// A camera that looks at the middle of the tissue at rest. Parsed from `AZIMUTH,ELEVATION` or
+/// `AZIMUTH,ELEVATION,DISTANCE`; only that checks the ranges. The default is `25,32,2`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
-    /// Rotation about the tissue's normal, from its front side (y = 0), degrees, -360 to 360.
+    /// Rotation of the eye about the tissue's z axis, from its front side (small y) towards its left (small x),
+    /// degrees,
+    /// -360 to 360.
     pub azimuth_deg: f64,
     /// Elevation above the tissue, degrees, 1 to 90; 90 is straight from above.
     pub elevation_deg: f64,
@@ -57,25 +60,25 @@ impl std::str::FromStr for Camera {
 /// How a picture is drawn: camera, size and surface.
 #[derive(Debug, Clone)]
 pub struct View {
-    /// Position of the eye.
+    /// The camera through which the tissue is seen.
     pub camera: Camera,
-    /// Pixels along x and y.
+    /// Width and height of the picture, pixels, at least 1 each; programs allow up to [`LARGEST_SIDE`].
     pub size: [usize; 2],
-    /// Number of vertices drawn between neighbouring points.
+    /// Number of vertices drawn between neighbouring points; has no effect on a mesh.
     pub refinement: Refinement,
-    /// Texture of the surface; `None` draws the lines of its mesh instead.
+    /// Texture of the surface, on a dark background; `None` draws the lines of its mesh instead, on white.
     pub texture: Option<Image>,
 }
 
-/// Largest side of a picture, pixels.
+/// Largest side of a picture that programs allow, pixels; [`picture`] does not check it.
 pub const LARGEST_SIDE: usize = 1920;
 
-/// A force drawn as an arrow.
+/// A force drawn as an arrow in front of the tissue. Its length on the tissue is always the same.
 #[derive(Debug, Clone, Copy)]
 pub struct Arrow {
-    /// The mass point at its tip.
+    /// The mass point of the model that its tip touches.
     pub point: PointId,
-    /// Its direction; the length has no effect.
+    /// Its direction in the tissue's frame; the length has no effect, but must not be zero.
     pub towards: DVec3,
 }
 
@@ -122,7 +125,9 @@ impl Eye {
     }
 }
 
-/// Draws the tissue in the state of `snapshot`; `shown` is the surface that frames show of a mesh.
+/// Draws the tissue of rest shape `shape` in the state of `snapshot`, with `arrows`, as seen by `view`. `shown` is
+/// the surface that frames show of a mesh; `None` for a sheet. Returns an image of [`View::size`], equal on any
+/// machine. Parts nearer to the eye than a hundredth of the tissue's longest side are left out.
 pub fn picture(
     shape: &dyn RestShape,
     shown: Option<&Shown>,

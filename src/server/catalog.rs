@@ -12,7 +12,9 @@ use palpate_tissue::scene::script::Script;
 use palpate_tissue::scene::script_reader::fits;
 use palpate_tissue::scene::{BUILT_IN, Scene};
 
-/// The scenes and scripts that clients can ask for by name.
+/// The scenes and scripts that clients can ask for by name: the files `NAME.toml` of two folders, and the built-in
+/// ones. A file replaces the built-in text of its name. Each call reads the folders anew. The `limits` of the methods
+/// bound the size of a file and what a scene or script may contain. Clones share the scenes that were loaded.
 #[derive(Debug, Clone)]
 pub struct Catalog {
     scenes: Collection,
@@ -22,7 +24,8 @@ pub struct Catalog {
 }
 
 impl Catalog {
-    /// Creates the catalog of two folders and the built-in scenes and scripts. Either folder may be missing.
+    /// Creates the catalog of the built-in scenes and scripts, and of two folders: that of scenes, and that of
+    /// scripts. Either folder may be missing. Reads nothing yet.
     pub fn new(scenes: &Path, scripts: &Path) -> Self {
         Catalog {
             scenes: Collection::new(TextKind::Scene, scenes),
@@ -31,38 +34,42 @@ impl Catalog {
         }
     }
 
-    /// Returns the names of all scenes, sorted.
+    /// Returns the names of all scenes, sorted, each once, including those of invalid or unreadable files. Leaves out
+    /// files whose name has other characters than letters, digits, `-` and `_`, and scripts ([`Catalog::misplaced`]).
     pub fn names(&self, limits: &Limits) -> Vec<String> {
         self.scenes.names(limits)
     }
 
-    /// Returns a refusal for each script in the folder of scenes and each scene in the folder of scripts. The catalog
-    /// does not list such files.
+    /// Returns a refusal for each script in the folder of scenes, then for each scene in the folder of scripts, each
+    /// sorted by name. The catalog does not list or load such files.
     pub fn misplaced(&self, limits: &Limits) -> Vec<Refusal> {
         [&self.scenes, &self.scripts].into_iter().flat_map(|all| all.all_misplaced(limits)).collect()
     }
 
-    /// Returns the names of the scenes whose text differs from the built-in scene of that name. They have not been
-    /// validated.
+    /// Returns the names, sorted, of the scenes that are not exactly a built-in one: those of files with another name
+    /// or another text, and of files that can't be read. The scenes are not validated.
     pub fn foreign_names(&self, limits: &Limits) -> Vec<String> {
         self.scenes.names_where(&self.scripts, limits, |name, text| !is_built_in(name, text))
     }
 
-    /// Returns the names of all scripts, sorted.
+    /// Returns the names of all scripts, sorted, each once, including those of invalid or unreadable files, under the
+    /// conditions of [`Catalog::names`].
     pub fn script_names(&self, limits: &Limits) -> Vec<String> {
         self.scripts.names(limits)
     }
 
-    /// Returns the names of the scripts made for the scene named `scene`, sorted.
+    /// Returns the names, sorted, of the scripts made for the scene named `scene`, and of those that can't be read.
+    /// The scripts are not validated, and the scene need not exist.
     pub fn script_names_for(&self, scene: &str, limits: &Limits) -> Vec<String> {
         self.scripts.names_where(&self.scenes, limits, |_, text| fits(text, scene))
     }
 
-    /// Loads the scene named `name`; `assignments` ("key=value") override its keys. Keeps a built-in scene for later
-    /// calls.
+    /// Loads the scene named `name`; `assignments` ("key=value") override its keys. Keeps a built-in scene without
+    /// assignments for later calls.
     ///
     /// # Errors
-    /// Returns an error if there is no such scene, or if it is invalid.
+    /// Refuses an unknown name, a file that can't be read or is a script, an assignment that does not fit the scene,
+    /// and a scene that is invalid or beyond `limits`.
     pub fn load(&self, name: &str, assignments: &[String], limits: &Limits) -> Result<Scene> {
         let (file, text) = self.scenes.text(name, &self.scripts, limits)?;
         let is_built_in = assignments.is_empty() && is_built_in(name, &text);
@@ -78,10 +85,11 @@ impl Catalog {
         Ok(scene)
     }
 
-    /// Loads the script named `name` and binds it to `scene`.
+    /// Loads the script named `name` and binds it to `scene`, whose points its forces and changes refer to.
     ///
     /// # Errors
-    /// Returns an error if there is no such script, or if it is invalid for this scene.
+    /// Refuses an unknown name, a file that can't be read or is a scene, and a script that is invalid for this scene
+    /// or beyond `limits`.
     pub fn script(&self, name: &str, scene: &Scene, limits: &Limits) -> Result<Script> {
         let (file, text) = self.scripts.text(name, &self.scenes, limits)?;
         Script::parse(&file, &text, self.scripts.folder(), scene, limits)

@@ -7,35 +7,38 @@ use serde::Deserialize;
 use palpate_cluster::key::{Keys, check_name};
 use palpate_refusal::{Reason, Refusal, Result};
 
-/// The section `[cluster]`: the server's fleet and its access to etcd.
+/// The section `[cluster]`: the server's fleet and its access to etcd. Without `etcd`, the server belongs to no
+/// fleet, and `advertise`, `node` and `agones` are refused.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ClusterConfig {
-    /// URLs of the members of etcd. Empty: the server belongs to no fleet.
+    /// URLs of the members of etcd. Empty (default): the server belongs to no fleet.
     pub etcd: Vec<String>,
-    /// Name of the fleet: servers with the same name share their sessions.
+    /// Name of the fleet: servers with the same name and etcd share their sessions. Default: `default`.
     pub name: String,
-    /// URL at which clients and other servers of the fleet reach this server.
+    /// URL at which clients and other servers of the fleet reach this server, without a path; required in a fleet.
+    /// With https:// and `ca`, unless only this machine can reach it or the server is `insecure`.
     pub advertise: Option<String>,
-    /// Name of this server in the fleet; empty: host and port of `advertise`.
+    /// Name of this server in the fleet, unique there; empty (default): host and port of `advertise`.
     pub node: String,
     /// Time to live of the server's lease in etcd, 2 to 60 s: after its death other servers wait this long before
-    /// they take over.
+    /// they take over. Default: 3.
     pub ttl_s: u64,
-    /// What `durable_step` means: `one`, on the disk of this server; `two`, also on the disk of its standby server.
+    /// What `durable_step` means: `one` (default), on the disk of this server; `two`, also on the disk of its standby.
     pub durable: Durable,
-    /// Reports the server's state to Agones, through its SDK at `localhost:$AGONES_SDK_GRPC_PORT` (9357).
+    /// Whether to report the server's state to Agones, through its SDK at `localhost:$AGONES_SDK_GRPC_PORT` (9357).
+    /// Default: false. Requires a program built with the feature `agones`.
     pub agones: bool,
-    /// Certificate authorities (PEM) for connections between servers of the fleet; both ends check them. Each server
-    /// presents its certificate `tls_cert`. Other clients need none.
+    /// File of certificate authorities (PEM) for connections between servers of the fleet; both ends check them. Each
+    /// server presents its certificate `tls_cert`. Other clients need none.
     pub ca: Option<PathBuf>,
-    /// Certificate authorities (PEM) of etcd.
+    /// File of certificate authorities (PEM) of etcd.
     pub etcd_ca: Option<PathBuf>,
-    /// This server's certificate for etcd, PEM.
+    /// File of this server's certificate for etcd, PEM; requires `etcd_key`.
     pub etcd_cert: Option<PathBuf>,
-    /// Private key of `etcd_cert`, PEM.
+    /// File of the private key of `etcd_cert`, PEM.
     pub etcd_key: Option<PathBuf>,
-    /// User name for etcd, if it requires a password.
+    /// User name for etcd, if it requires a password; requires `etcd_password_file`.
     pub etcd_user: Option<String>,
     /// File with the password of `etcd_user`.
     pub etcd_password_file: Option<PathBuf>,
@@ -48,14 +51,14 @@ pub(super) struct Beside {
     pub(super) insecure: bool,
 }
 
-/// Where data must be before the server reports it as durable.
+/// Where the journal of a step must be before a server of a fleet reports that step as durable (`durable_step`).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum Durable {
     /// On the disk of the server.
     #[default]
     One,
-    /// Also on the disk of its standby.
+    /// Also on the disk of its standby, the server of the fleet that mirrors the journal.
     Two,
 }
 
@@ -80,7 +83,7 @@ impl Default for ClusterConfig {
 }
 
 impl ClusterConfig {
-    /// Returns whether the server belongs to a fleet.
+    /// Returns whether the server belongs to a fleet: `etcd` is not empty.
     pub fn is_on(&self) -> bool {
         !self.etcd.is_empty()
     }

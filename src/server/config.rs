@@ -12,65 +12,72 @@ use palpate_tissue::files;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::toml_document::nearest_name;
 
-/// The configuration of a server. Absent keys keep their defaults.
+/// The configuration of a server, with a field for each key of the file. Absent keys keep their defaults; unknown ones
+/// are refused. [`Config::check`] checks the values.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Address to listen on: address:port. An address that other machines can reach requires TLS, and tokens or
-    /// client certificates.
+    /// Address to listen on: address:port; port 0: any free one. Default: 127.0.0.1:7117. An address that other
+    /// machines can reach requires TLS, and tokens or client certificates, unless `insecure` is set.
     pub listen: String,
-    /// File of the server's certificate chain, PEM. This file and the next three are reloaded when they change.
+    /// File of the server's certificate chain, PEM; requires `tls_key`. `None`: no TLS. This file and the next three
+    /// are reloaded when they change.
     pub tls_cert: Option<PathBuf>,
-    /// File of the server's private key, PEM.
+    /// File of the server's private key, PEM; requires `tls_cert`.
     pub tls_key: Option<PathBuf>,
-    /// File of certificate authorities, PEM: clients must present a certificate that one of them has signed.
+    /// File of certificate authorities, PEM: clients must present a certificate that one of them has signed. Requires
+    /// `tls_cert`. `None`: clients need no certificate.
     pub tls_client_ca: Option<PathBuf>,
-    /// File with the roles of tokens and client certificates (docs/tokens.md).
+    /// File with the roles of tokens and client certificates (docs/tokens.md). `None`: there are no tokens.
     pub tokens: Option<PathBuf>,
-    /// Serve without TLS or authentication even if other machines can reach the server.
+    /// Whether to serve without TLS or authentication even if other machines can reach the server. Default: false.
     pub insecure: bool,
-    /// Origins of other sites whose pages may call the server, such as `https://example.org`.
+    /// Origins of other sites whose pages may call the server, such as `https://example.org`: scheme, host and perhaps
+    /// port, without a slash at the end. Default: none.
     pub origins: Vec<String>,
-    /// Accept touch by datagrams (WebTransport) as well as gRPC, on the UDP port of the same number. Requires TLS, or
-    /// an address that only this machine can reach.
+    /// Whether to accept touch by datagrams (WebTransport) as well as gRPC, on the UDP port of the same number.
+    /// Default: true. Needs TLS, or an address that only this machine can reach.
     pub datagrams: bool,
     /// HOST:PORT that the server sends to clients for datagrams, if it differs from the server's own address: behind
-    /// a proxy, in a container.
+    /// a proxy, in a container. `None`: its own.
     pub datagrams_advertise: Option<String>,
-    /// Address for `/metrics` (Prometheus), without authentication: address:port. `None` disables it.
+    /// Address for `/metrics` (Prometheus), without authentication: address:port, one that only this machine can reach
+    /// unless `insecure` is set. `None` (default): no metrics.
     pub metrics: Option<String>,
-    /// Folder of the scenes that clients can create sessions from by name.
+    /// Folder of the scenes that clients can create sessions from by name. Default: `scenes`; it may be missing.
     pub scenes: PathBuf,
-    /// Folder of the scripts that clients can request by name.
+    /// Folder of the scripts that clients can request by name. Default: `scripts`; it may be missing.
     pub scripts: PathBuf,
-    /// Folder of the page served at `/`, built by `npm run build`.
+    /// Folder of the page served at `/`, built by `npm run build`. Default: `clients/viewer/dist`.
     pub viewer: PathBuf,
-    /// Number of stepping threads; 0: one fewer than the cores of the machine.
+    /// Number of stepping threads; 0 (default): one fewer than the cores of the machine, at least 1.
     pub threads: usize,
-    /// Number of network threads; 0: the cores that the stepping threads leave, at least 1.
+    /// Number of network threads; 0 (default): the cores that the stepping threads leave, at least 1.
     pub network_threads: usize,
-    /// Fraction of a core, 0 to 1, for measuring the errors of live sessions; 0 disables the measurement.
+    /// Fraction of a core, 0 to 1, for measuring the errors of live sessions; 0 disables the measurement. Default:
+    /// 0.02.
     pub audit_share: f64,
-    /// Time that open streams have to end at shutdown before they are cut, s.
+    /// Time that open streams have to end at shutdown before they are cut, s, above 0 and at most a day. Default: 5.
     pub shutdown_deadline_s: f64,
-    /// Duration of a tool's lease if the client requests none, s.
+    /// Duration of a tool's lease if the client requests none, s, above 0 and at most `limits.lease_s`. Default: 2.
     pub lease_s: f64,
-    /// Time without a call, a held tool or a stream after which a session is deleted, s.
+    /// Time without a call, a leased tool or a stream after which a session is deleted, s, above 0. Default: 900.
     pub idle_session_s: f64,
     /// Folder of the journals, which record what happens to sessions. A restarted server continues the sessions from
-    /// them. `None` records nothing.
+    /// them. `None` (default) records nothing.
     pub journal: Option<PathBuf>,
     /// How long the journals of ended sessions are kept, and the size of all journals above which the oldest of those
-    /// are removed: `30d`, `10GiB`, `30d,10GiB`, or `0` to keep none.
+    /// are removed: `30d`, `10GiB`, `30d,10GiB` (default), or `0` to keep none.
     pub journal_keep: Keep,
     /// Whether sessions whose mesh a client has sent have journals, which then contain the mesh. Without one such a
-    /// session ends with the server.
+    /// session ends with the server. Default: true; a fleet requires it.
     pub journal_meshes: bool,
-    /// File of the private key that signs the journals, PEM. `None`: they are not signed.
+    /// File of the private key (Ed25519) that signs the journals, PEM; requires `journal`. `None`: they are not
+    /// signed.
     pub journal_key: Option<PathBuf>,
-    /// The fleet that the server belongs to.
+    /// The fleet that the server belongs to. Default: none.
     pub cluster: ClusterConfig,
-    /// The log filter: `info`, `debug`, `palpate=debug,tonic=warn`, …
+    /// The log filter: `info` (default), `debug`, `palpate=debug,tonic=warn`, …
     pub log: String,
     /// Upper limits on what clients may use.
     pub limits: Limits,
@@ -110,18 +117,20 @@ impl Default for Config {
 }
 
 impl Config {
-    /// Reads and checks a configuration file.
+    /// Reads and checks a configuration file. Files that it names are not read.
     ///
     /// # Errors
-    /// Returns an error if the file can't be read, or if the configuration is invalid.
+    /// Refuses a file that can't be read or is larger than the default `limits.file_bytes`; otherwise returns the
+    /// errors of [`Config::parse`].
     pub fn load(path: &Path) -> Result<Self> {
         Config::parse(&path.display().to_string(), &files::read_text(path, Limits::default().file_bytes)?)
     }
 
-    /// Parses and checks a configuration; refusals refer to it as `name`.
+    /// Parses and checks a configuration in TOML; refusals refer to it as `name`.
     ///
     /// # Errors
-    /// Returns an error with the line if the text is not TOML or has an unknown key, and the errors of [`Config::check`].
+    /// Refuses a text that is not TOML, has an unknown key or a value of another type, with the line; otherwise
+    /// returns the errors of [`Config::check`].
     pub fn parse(name: &str, text: &str) -> Result<Self> {
         let config: Config = toml::from_str(text).map_err(|e| {
             let line = e.span().map_or(0, |span| text[..span.start].matches('\n').count());
@@ -134,9 +143,12 @@ impl Config {
     }
 
     /// Checks that all values are within their ranges and that keys that require each other are given together.
+    /// [`Listeners::open`](super::Listeners::open) checks whether the addresses are safe.
     ///
     /// # Errors
-    /// Returns an error that names the first key that is out of range or missing.
+    /// Refuses the first key that is out of range, malformed or missing, by its name: a number or a limit out of range
+    /// (a limit of 0 too), one of two keys without the other, an origin or `datagrams_advertise` of another form, or a
+    /// section `[cluster]` that is incomplete or does not fit the rest.
     pub fn check(&self) -> Result<()> {
         for (field, value) in [
             ("limits.point_force_n", self.limits.point_force_n),
@@ -213,12 +225,13 @@ impl Config {
         Ok(())
     }
 
-    /// Returns the number of stepping threads, at least 1.
+    /// Returns the number of stepping threads, at least 1: `threads`, or if that is 0, one fewer than the cores.
     pub fn stepping_threads(&self) -> usize {
         if self.threads > 0 { self.threads } else { cores().saturating_sub(1).max(1) }
     }
 
-    /// Returns the number of network threads, at least 1.
+    /// Returns the number of network threads, at least 1: `network_threads`, or if that is 0, the cores that
+    /// [`Config::stepping_threads`] leaves.
     pub fn serving_threads(&self) -> usize {
         let left = cores().saturating_sub(self.stepping_threads()).max(1);
         if self.network_threads > 0 { self.network_threads } else { left }

@@ -10,8 +10,9 @@ use palpate_realtime::frames::Delivery;
 /// Bytes of displacements per message: messages of other streams wait for at most one of these.
 const FRAME_BYTES_PER_MESSAGE: usize = 64 << 10;
 
-/// Returns the messages of a frame for one viewer; the last one has `last` set. `skipped` is the number of frames
-/// before it that were not sent.
+/// Returns the messages of a frame for the viewer `viewer_id`, in the order of the frame's patches; only the last one
+/// has `last` set. Each has patches of at most 64 KiB together, or a single larger one. `skipped` is the number of
+/// frames before this one that the viewer did not get. Empty for a frame without patches.
 pub fn frame_messages(viewer_id: &str, delivery: &Delivery, skipped: u64) -> Vec<pb::WatchFramesResponse> {
     let frame = &delivery.frame;
     let [vertices_x, vertices_y] = frame.refinement.vertices();

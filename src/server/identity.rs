@@ -19,15 +19,16 @@ use palpate_realtime::ids::random_bits;
 use palpate_refusal::{Reason, Refusal, Result, label};
 use palpate_tissue::scene::toml_document::nearest_name;
 
-/// A role: what a caller may do. Every role includes `Watch`, and `Administer` includes every role but `Node`.
+/// A role: what a caller may do. Every role includes `Watch`, and `Administer` includes every role but `Node`;
+/// otherwise none includes another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Role {
     /// Read from sessions whose ID the caller knows.
     Watch,
-    /// Hold a tool, change the tissue.
+    /// Lease a tool and move it, change the tissue.
     Touch,
-    /// Create, start, pause and delete sessions.
+    /// Create, start, pause and delete sessions, upload meshes and journals, delete journals.
     Create,
     /// List all sessions of the server, and everything else except the calls between servers.
     Administer,
@@ -36,10 +37,10 @@ pub enum Role {
 }
 
 impl Role {
-    /// All roles.
+    /// All roles, in the order of their declaration.
     pub const ALL: [Role; 5] = [Role::Watch, Role::Touch, Role::Create, Role::Administer, Role::Node];
 
-    /// Returns the role's name in files and on the command line.
+    /// Returns the role's name in files and on the command line: that of the variant, in lower case.
     pub fn name(self) -> &'static str {
         match self {
             Role::Watch => "watch",
@@ -50,10 +51,10 @@ impl Role {
         }
     }
 
-    /// Returns the role with that name.
+    /// Returns the role with that name, in lower case.
     ///
     /// # Errors
-    /// Returns an error if there is no such role.
+    /// Refuses any other name, with the field `role` and the names of all roles.
     pub fn named(name: &str) -> Result<Role> {
         Role::ALL.into_iter().find(|role| role.name() == name).ok_or_else(|| {
             let message = format!("must be one of watch, touch, create, administer, node, but is `{name}`");
@@ -62,7 +63,7 @@ impl Role {
     }
 }
 
-/// What a call requires of its caller.
+/// What a call requires of its caller, on a server that authenticates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Access {
     /// No role: the call reveals nothing about sessions.
@@ -71,8 +72,8 @@ pub enum Access {
     Role(Role),
 }
 
-/// The role that each call requires, by path. The server refuses calls of its own protocol that are not in this
-/// table; `tests/identity.rs` checks the table against the protocol's descriptors.
+/// The path of each call (`/PACKAGE.SERVICE/METHOD`, sorted) and what it requires. The server refuses calls of its own
+/// protocol that are not in this table; `tests/identity.rs` checks the table against the protocol's descriptors.
 pub const CALLS: &[(&str, Access)] = &[
     ("/grpc.health.v1.Health/Check", Access::Open),
     ("/grpc.health.v1.Health/Watch", Access::Open),
@@ -124,15 +125,17 @@ pub const CALLS: &[(&str, Access)] = &[
     ("/palpate.v1.ViewService/WatchFrames", Access::Role(Role::Watch)),
 ];
 
-/// Returns what the call at `path` requires; `None` if it is not in the table.
+/// Returns what the call at `path`, such as `/palpate.v1.HapticService/Touch`, requires; `None` if it is not in
+/// [`CALLS`].
 pub fn access(path: &str) -> Option<Access> {
     CALLS.iter().find(|call| call.0 == path).map(|call| call.1)
 }
 
-/// An authenticated or anonymous caller with its roles.
+/// An authenticated or anonymous caller with its roles, as the server knows it during a call.
 #[derive(Debug, Clone)]
 pub struct Caller {
-    /// The caller's name in the token file, for logs and messages.
+    /// The caller's name, for logs and messages: that of its entry in the token file; without a token file, the first
+    /// name of its certificate, or `anonymous` if nothing authenticates it.
     pub name: Arc<str>,
     roles: Vec<Role>,
 }
@@ -148,10 +151,11 @@ impl Caller {
         Caller { roles: Vec::new(), ..Caller::unrestricted() }
     }
 
-    /// Checks that the caller has `role`.
+    /// Checks that the caller has `role`. Every caller has [`Role::Watch`].
     ///
     /// # Errors
-    /// Returns an error if the caller lacks the role.
+    /// Refuses (`ROLE_MISSING`) if the caller has neither the role nor, for roles other than [`Role::Node`],
+    /// [`Role::Administer`].
     pub fn needs(&self, role: Role) -> Result<()> {
         let includes_it = self.roles.contains(&Role::Administer) && role != Role::Node;
         if role == Role::Watch || self.roles.contains(&role) || includes_it {
@@ -165,7 +169,7 @@ impl Caller {
 /// Every token begins with this, so that people and programs recognize it.
 const PREFIX: &str = "palpate_";
 
-/// Creates a token of 256 random bits.
+/// Creates a token: `palpate_` and 64 hexadecimal digits, 256 random bits.
 ///
 /// # Errors
 /// Returns an error if the system gives no random bits.
@@ -185,10 +189,11 @@ fn owner(field: &str, name: &str) -> Result<()> {
     label(field, name)
 }
 
-/// Returns the entry of a token for the token file. It contains the token's hash, not the token.
+/// Returns the entry of a token for the token file, in TOML: the owner's name, its roles and the token's SHA-256, not
+/// the token. The roles are not checked: [`KnownCallers::parse`] refuses an entry without any.
 ///
 /// # Errors
-/// Returns an error if the name is empty or not fit for a log.
+/// Refuses a name that is empty, longer than 128 bytes or has control characters.
 pub fn entry(name: &str, roles: &[Role], token: &str) -> Result<String> {
     owner("name", name)?;
     let roles: Vec<_> = roles.iter().map(|role| format!("\"{}\"", role.name())).collect();
@@ -228,7 +233,8 @@ struct CertificateEntry {
     roles: Vec<Role>,
 }
 
-/// The callers that the server knows: its tokens and client certificates with their roles.
+/// The callers that the server knows: its tokens and client certificates with their roles. A reload of the token file
+/// replaces it.
 pub struct KnownCallers {
     /// Authentication is disabled.
     open: bool,
@@ -244,7 +250,8 @@ impl KnownCallers {
         KnownCallers { open: true, any_certificate: false, tokens: Vec::new(), certificates: Vec::new() }
     }
 
-    /// Returns the callers of a server on which every caller with a valid client certificate may do everything.
+    /// Returns the callers of a server without a token file, on which every caller with a valid client certificate
+    /// may do everything, and others nothing that requires a role.
     pub fn certified() -> Self {
         KnownCallers { open: false, any_certificate: true, ..KnownCallers::open() }
     }
@@ -254,10 +261,12 @@ impl KnownCallers {
         self.open
     }
 
-    /// Parses a token file.
+    /// Parses `text`, the contents of the token file at `path`, which only appears in refusals.
     ///
     /// # Errors
-    /// Returns an error with the line or entry if the text is not TOML, or if an entry is invalid or a duplicate.
+    /// Refuses, with the line, a text that is not TOML or has an unknown key or role; and, with the entry, a name
+    /// that is not valid ([`entry`]) or that another entry of the same kind has, an entry without a role, and a
+    /// `sha256` that is not 64 hexadecimal digits or occurs twice. No message quotes a token.
     pub fn parse(path: &Path, text: &str) -> Result<Self> {
         let file: TokenFileContent = toml::from_str(text).map_err(|e| {
             let line = e.span().map_or(1, |span| text[..span.start].matches('\n').count() + 1);

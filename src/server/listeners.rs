@@ -10,18 +10,20 @@ use super::datagrams::Socket;
 use super::protection::Protection;
 use palpate_refusal::{Reason, Refusal};
 
-/// The reasons why a server can't run.
+/// The reasons why a server can't start, or ends by itself.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
-    /// The configuration is invalid or not safe.
+    /// The configuration is invalid or not safe, a file that it names can't be used, or the journals or the fleet
+    /// can't.
     #[error("{0}")]
     Refused(#[from] Refusal),
-    /// The address is in use, or does not belong to this machine.
+    /// The system does not let the server listen: the address is in use, does not belong to this machine, or has a
+    /// port for which the user has no permission.
     #[error("can't listen on {address}: {}", unavailable(.field, .error))]
     Listen {
-        /// The configuration key of the address.
+        /// The configuration key of the address: `listen` or `metrics`.
         field: &'static str,
-        /// The address as it was given.
+        /// The address as it was configured.
         address: String,
         /// The system's error.
         error: std::io::Error,
@@ -29,7 +31,7 @@ pub enum ServeError {
     /// A thread can't be started.
     #[error("can't start a stepping thread: {0}")]
     Threads(#[from] std::io::Error),
-    /// The transport failed.
+    /// The transport failed while the server ran.
     #[error("the transport failed: {0}")]
     Transport(#[from] tonic::transport::Error),
     /// The reflection service can't read its own descriptors.
@@ -56,7 +58,8 @@ fn unavailable(field: &str, error: &std::io::Error) -> String {
     }
 }
 
-/// A server's open listeners and its protection (TLS and credentials).
+/// A server's open listeners and its protection (TLS and credentials), before [`serve`](super::serve()) takes them.
+/// Clients can connect, but get no answer until then. Dropping it closes the listeners.
 pub struct Listeners {
     pub(super) listener: TcpListener,
     pub(super) metrics: Option<TcpListener>,
@@ -65,10 +68,13 @@ pub struct Listeners {
 }
 
 impl Listeners {
-    /// Listens on the configured addresses, if that is safe.
+    /// Listens on the configured addresses, if that is safe, and loads certificates, keys and tokens. If the UDP port
+    /// for datagrams is not free, only logs a warning. Call it within a Tokio runtime.
     ///
     /// # Errors
-    /// Returns an error if the configuration is invalid or unsafe, a file can't be read, or an address is not available.
+    /// Returns [`ServeError::Refused`] if an address is malformed, if other machines could reach the server without
+    /// TLS and authentication or its metrics at all (without `insecure`), or if a file of the protection can't be
+    /// used; and [`ServeError::Listen`] if an address is not available.
     pub async fn open(config: &Config) -> Result<Self, ServeError> {
         let listener = listen("listen", &config.listen).await?;
         let address = local_address("listen", &listener, &config.listen)?;
@@ -93,12 +99,12 @@ impl Listeners {
         Ok(Listeners { listener, metrics, datagrams, protection })
     }
 
-    /// Returns the server's URL: scheme, address and port.
+    /// Returns the server's URL: scheme, address and port, the one that the system chose if port 0 was configured.
     pub fn url(&self) -> String {
         url(self.protection.scheme(), &self.listener)
     }
 
-    /// Returns the URL of the metrics, if they are served.
+    /// Returns the URL of the metrics, with the path `/metrics`; `None` if they are not served.
     pub fn metrics_url(&self) -> Option<String> {
         self.metrics.as_ref().map(|listener| url("http", listener) + "/metrics")
     }

@@ -61,9 +61,9 @@ const STRANGERS: Duration = Duration::from_secs(1);
 const WORTH_GIVING_BACK: u64 = 16 << 20;
 
 /// Serves at `listeners` until `shutdown` is cancelled. Then ends all streams, and returns within the configured
-/// deadline. Calls `ready` when everything that can fail at the start is done: opening the journals, continuing the
-/// sessions of the previous process, joining the fleet. The caller must end its runtime without waiting
-/// (`shutdown_background`).
+/// deadline. `config` must be the one that the listeners were opened with. Calls `ready` when everything that can
+/// fail at the start is done: opening the journals, continuing the sessions of the previous process, joining the
+/// fleet. The caller must end its runtime without waiting (`shutdown_background`).
 ///
 /// A server on any free port, and a client that asks what it serves. Both end within the example:
 ///

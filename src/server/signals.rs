@@ -2,8 +2,10 @@
 
 use tokio_util::sync::CancellationToken;
 
-/// Catches signals that would end the process by default: SIGHUP makes the server check its files; SIGUSR1 and
-/// SIGUSR2 do nothing; with SIGXFSZ caught, writing to a log at its size limit returns an error instead.
+/// Catches signals that would end the process by default, until it ends: SIGHUP makes the server check its files;
+/// SIGUSR1 and SIGUSR2 do nothing; with SIGXFSZ caught, writing to a log at its size limit returns an error instead.
+/// Does nothing on systems other than Unix. A signal that can't be caught keeps its default. Call it within a Tokio
+/// runtime.
 pub fn outlive() {
     #[cfg(unix)]
     {
@@ -16,8 +18,9 @@ pub fn outlive() {
     }
 }
 
-/// Cancels `shutdown` on Ctrl-C or SIGTERM; a second one ends the process at once. Both are caught when this returns,
-/// so a program may send one as soon as the server reports that it listens. Call it within a runtime.
+/// Cancels `shutdown` on Ctrl-C or SIGTERM; a second one ends the process at once, with code 130. Both are caught
+/// when this returns, so a program may send one as soon as the server reports that it listens; if they can't be
+/// caught, this does nothing. On systems other than Unix, only Ctrl-C counts. Call it within a Tokio runtime.
 pub fn cancel_on(shutdown: CancellationToken) {
     #[cfg(unix)]
     let (mut interrupt, mut terminate) = {

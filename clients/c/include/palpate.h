@@ -130,27 +130,31 @@ typedef enum palpate_priority {
 } palpate_priority;
 
 /**
- * A device's loop that runs on a thread of the library.
+ * A device's loop that runs on a thread of the library, from `palpate_bridge_begin` until `palpate_bridge_end`,
+ * or until the device fails. When the connection breaks, the library connects again.
  */
 typedef struct palpate_bridge palpate_bridge;
 
 /**
- * A connection to a server. Any thread, also several at once.
+ * A connection to a server, with the caller's credentials, from `palpate_connect` to `palpate_server_free`. Any
+ * thread, also several at once.
  */
 typedef struct palpate_server palpate_server;
 
 /**
- * A session on a server: one simulated tissue. Any thread, also several at once.
+ * A handle of a session on a server: of one simulated tissue, which exists on the server independently of its
+ * handles. Any thread, also several at once.
  */
 typedef struct palpate_session palpate_session;
 
 /**
- * The surface of a session, which follows its newest frame.
+ * The surface of a session, which follows its newest frame, from `palpate_surface_open` to `palpate_surface_free`.
  */
 typedef struct palpate_surface palpate_surface;
 
 /**
- * A tool that your own loop moves.
+ * A tool that your own loop moves, on a server or in a recording, from `palpate_touch_begin` or
+ * `palpate_touch_begin_offline` to `palpate_touch_end`.
  */
 typedef struct palpate_touch palpate_touch;
 
@@ -200,7 +204,7 @@ typedef struct palpate_vector {
 } palpate_vector;
 
 /**
- * The position and button of a device.
+ * The position of a device at a tick, and whether its operator requests forces.
  */
 typedef struct palpate_reading {
   /**
@@ -239,12 +243,13 @@ typedef struct palpate_device {
 } palpate_device;
 
 /**
- * A function of the caller that gets messages for people.
+ * A function of the caller that gets messages for people: `user` as given beside it, and one line of text, which
+ * is valid during the call.
  */
 typedef void (*palpate_warn)(void *user, const char *message);
 
 /**
- * Options for touching with a tool.
+ * Options of `palpate_touch_begin`, `palpate_touch_begin_offline` and `palpate_bridge_begin`. Texts are copied.
  */
 typedef struct palpate_touch_options {
   /**
@@ -320,7 +325,7 @@ typedef struct palpate_touch_options {
 } palpate_touch_options;
 
 /**
- * The current state of a loop.
+ * The state of a loop after its last tick, from `palpate_bridge_look`.
  */
 typedef struct palpate_bridge_state {
   /**
@@ -350,7 +355,7 @@ typedef struct palpate_bridge_state {
 } palpate_bridge_state;
 
 /**
- * The results of a loop.
+ * The results of a loop from its beginning to its end, from `palpate_bridge_end`.
  */
 typedef struct palpate_bridge_report {
   /**
@@ -358,11 +363,11 @@ typedef struct palpate_bridge_report {
    */
   uint64_t ticks;
   /**
-   * Number of ticks that started more than a millisecond late.
+   * Number of ticks that started more than a millisecond late; like the next four, 0 if the loop panicked.
    */
   uint64_t late_ticks;
   /**
-   * Number of ticks that were skipped.
+   * Number of ticks that were skipped, because the loop was more than 5 ms late.
    */
   uint64_t missed_ticks;
   /**
@@ -370,11 +375,11 @@ typedef struct palpate_bridge_report {
    */
   uint64_t connections;
   /**
-   * Number of samples that arrived.
+   * Number of samples that arrived and were used; overtaken ones do not count.
    */
   uint64_t samples;
   /**
-   * Number of positions that were sent.
+   * Number of positions that were sent, or dropped because the stream did not keep up.
    */
   uint64_t positions;
   /**
@@ -382,13 +387,13 @@ typedef struct palpate_bridge_report {
    */
   uint32_t priority;
   /**
-   * The reason why it ended, one of `palpate_result`: 0 if you have ended it.
+   * The result of `palpate_bridge_end`, one of `palpate_result`: 0 unless the loop has failed.
    */
   uint32_t result;
 } palpate_bridge_report;
 
 /**
- * Options of a connection.
+ * Options of `palpate_connect`. Texts are copied.
  */
 typedef struct palpate_connect_options {
   /**
@@ -423,7 +428,7 @@ typedef struct palpate_connect_options {
 } palpate_connect_options;
 
 /**
- * Options for showing a surface.
+ * Options of `palpate_surface_open`.
  */
 typedef struct palpate_surface_options {
   /**
@@ -489,7 +494,7 @@ typedef struct palpate_change {
 } palpate_change;
 
 /**
- * The size of a surface. It never changes.
+ * The size of a surface, for allocating its buffers. It never changes.
  */
 typedef struct palpate_surface_size {
   /**
@@ -563,7 +568,7 @@ typedef struct palpate_dirty {
 } palpate_dirty;
 
 /**
- * The results of a tick.
+ * What a tick felt: the force, and the state of the rendering.
  */
 typedef struct palpate_felt {
   /**
@@ -585,7 +590,7 @@ typedef struct palpate_felt {
 } palpate_felt;
 
 /**
- * Totals of what was sent and received.
+ * Totals of what was sent and received so far, over all connections.
  */
 typedef struct palpate_traffic {
   /**
@@ -593,15 +598,15 @@ typedef struct palpate_traffic {
    */
   uint64_t connections;
   /**
-   * Number of failed attempts, and of connections that broke.
+   * Number of failed attempts, and of connections that broke; moves to another server of a fleet do not count.
    */
   uint64_t failed;
   /**
-   * Number of samples that arrived.
+   * Number of samples that arrived and were used; overtaken ones do not count.
    */
   uint64_t samples;
   /**
-   * Number of positions that were sent.
+   * Number of positions that were sent, or dropped because the stream did not keep up.
    */
   uint64_t positions;
   /**
@@ -627,8 +632,11 @@ const char *palpate_version(void);
 /**
  * Connects a device of your own to a session, on a thread of the library at 1 kHz, with real-time priority if the
  * system allows it. `options` may be null; its `limits` are ignored, since `descriptor` provides them. Waits for the
- * first connection. Writes a handle for `palpate_bridge_end`. `device` is copied; its `user` must stay valid until
- * the end. Any thread; waits for the server.
+ * first connection, at most 10 s. Writes a handle for `palpate_bridge_end`, or null after an error. `device` is
+ * copied; its `user` must stay valid until the end. Returns `PALPATE_ARGUMENT` also for a device without all
+ * three functions, for invalid limits, and if `in_tissue_frame` is set; `PALPATE_DEVICE` if a function of the
+ * device fails; and `PALPATE_REFUSED` also if another caller holds the tool. The device has then been set to a
+ * force of zero if it was set to any. Any thread; waits for the server.
  */
 enum palpate_result palpate_bridge_begin(const struct palpate_session *session,
                                          const struct palpate_device *device,
@@ -636,7 +644,8 @@ enum palpate_result palpate_bridge_begin(const struct palpate_session *session,
                                          struct palpate_bridge **bridge);
 
 /**
- * Writes the current state of the loop. Any thread.
+ * Writes the state of the loop after its last tick, or, if a thread was just reading that, after the tick before.
+ * Never waits for the loop or the server. Any thread.
  */
 enum palpate_result palpate_bridge_look(const struct palpate_bridge *bridge, struct palpate_bridge_state *state);
 
@@ -647,9 +656,12 @@ enum palpate_result palpate_bridge_look(const struct palpate_bridge *bridge, str
 enum palpate_result palpate_bridge_disable(const struct palpate_bridge *bridge);
 
 /**
- * Ends the loop, waits for that, and writes its results, even if it has failed; `report` may be null. Returns
- * `PALPATE_DEVICE` if the device has failed: `palpate_last_error` describes how. Frees the handle in any case. Any
- * thread, once; not from a function of the device.
+ * Ends the loop, sets the device to a force of zero, and releases the tool; the session continues. Waits until
+ * that is done, and writes the results of the loop, even if it has failed; `report` may be null. Returns
+ * `PALPATE_DEVICE` if the device has failed: `palpate_last_error` describes how; `PALPATE_INTERNAL` if the loop
+ * panicked, without a force of zero; and `PALPATE_ARGUMENT` if `bridge` is null. A connection that is broken at
+ * the end is no error. Frees the handle in any case. Any thread, once; not from a function of the device, which
+ * would wait for itself.
  */
 enum palpate_result palpate_bridge_end(struct palpate_bridge *bridge,
                                        struct palpate_bridge_report *report);
@@ -677,13 +689,15 @@ enum palpate_result palpate_surface_options_init(struct palpate_surface_options 
 
 /**
  * Writes the limits of a device by its name: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7,
- * inverse3. Any thread.
+ * inverse3. Returns `PALPATE_ARGUMENT` for another name. Any thread.
  */
 enum palpate_result palpate_limits_of(const char *name, struct palpate_limits *limits);
 
 /**
  * Connects to the server at `url`, such as "http://127.0.0.1:7117". `options` may be null. Waits for the first
- * answer, at most 10 s. Writes a handle for `palpate_server_free`. Any thread.
+ * answer, at most 10 s; any answer counts, so an invalid token is refused only by later calls. Writes a handle
+ * for `palpate_server_free`, or null after an error. Returns `PALPATE_ARGUMENT` also for a token that would be
+ * sent without TLS to another machine, and for certificates without TLS. Any thread.
  */
 enum palpate_result palpate_connect(const char *url,
                                     const struct palpate_connect_options *options,
@@ -696,9 +710,9 @@ enum palpate_result palpate_connect(const char *url,
 void palpate_server_free(struct palpate_server *server);
 
 /**
- * Writes the names of the server's scenes into `names`, one per line, and into `needed` the number of bytes that
- * they take; either may be null. Returns `PALPATE_BUFFER` if `capacity` bytes are too few. Any thread; waits for the
- * server.
+ * Writes the names of the server's scenes, sorted, into `names`, one per line, and into `needed` the number of
+ * bytes that they take with the zero at the end; one of both may be null. Returns `PALPATE_BUFFER` if `capacity`
+ * bytes are too few. Any thread; waits for the server.
  */
 enum palpate_result palpate_scenes(const struct palpate_server *server,
                                    char *names,
@@ -746,7 +760,9 @@ enum palpate_result palpate_session_create_from_text(const struct palpate_server
                                                      struct palpate_session **session);
 
 /**
- * Joins an existing session by its ID. Writes a handle for `palpate_session_free`. Any thread; waits for the server.
+ * Joins an existing session by its ID, also one on another server of the fleet. Writes a handle for
+ * `palpate_session_free`, or null after an error. Returns `PALPATE_REFUSED` if there is no such session. Any thread;
+ * waits for the server.
  */
 enum palpate_result palpate_session_join(const struct palpate_server *server,
                                          const char *session_id,
@@ -762,7 +778,7 @@ enum palpate_result palpate_session_id(const struct palpate_session *session,
                                        size_t *needed);
 
 /**
- * Writes the bounding box of the tissue at rest. Any thread.
+ * Writes the bounding box of the tissue at rest. It never changes. Never waits. Any thread.
  */
 enum palpate_result palpate_session_extent(const struct palpate_session *session, struct palpate_extent *extent);
 
@@ -772,8 +788,8 @@ enum palpate_result palpate_session_extent(const struct palpate_session *session
 enum palpate_result palpate_change_init(struct palpate_change *change);
 
 /**
- * Changes the tissue from the next step on; all users who touch it feel the change. Any thread; waits for the
- * server.
+ * Changes the tissue from the next step on; all users who touch it feel the change. Returns `PALPATE_REFUSED` for
+ * a value out of its range: then nothing changes. Any thread; waits for the server.
  */
 enum palpate_result palpate_session_change(const struct palpate_session *session, const struct palpate_change *change);
 
@@ -790,7 +806,8 @@ void palpate_session_free(struct palpate_session *session);
 
 /**
  * Gets the surface of a session and starts to watch it. `options` may be null. Writes a handle for
- * `palpate_surface_free`. Any thread; waits for the server.
+ * `palpate_surface_free`, or null after an error. Once the connection breaks, the surface stays as it is: open
+ * another. Any thread; waits for the server.
  */
 enum palpate_result palpate_surface_open(const struct palpate_session *session,
                                          const struct palpate_surface_options *options,
@@ -802,16 +819,18 @@ enum palpate_result palpate_surface_open(const struct palpate_session *session,
 enum palpate_result palpate_surface_size_of(const struct palpate_surface *surface, struct palpate_surface_size *size);
 
 /**
- * Writes all indices, three per triangle, in the order that the engine of these axes takes for the front. They never
- * change. One thread at a time. Never waits.
+ * Writes all indices, three per triangle, in the order that the engine of these axes takes for the front. They
+ * never change. Returns `PALPATE_BUFFER` if `capacity`, in indices, is below `palpate_surface_size.indices`. One
+ * thread at a time. Never waits.
  */
 enum palpate_result palpate_surface_indices(const struct palpate_surface *surface,
                                             uint32_t *indices,
                                             size_t capacity);
 
 /**
- * Writes u and v of each vertex, `stride` bytes (8 or more) apart. They never change. Returns `PALPATE_ARGUMENT` if
- * the surface has none. One thread at a time. Never waits.
+ * Writes u and v of each vertex, `stride` bytes (8 or more) apart. They never change. Returns `PALPATE_ARGUMENT`
+ * if the surface has none, and `PALPATE_BUFFER` if `vertices`, for which there is room, is below that of the
+ * surface. One thread at a time. Never waits.
  */
 enum palpate_result palpate_surface_uv(const struct palpate_surface *surface,
                                        float *uv,
@@ -820,8 +839,9 @@ enum palpate_result palpate_surface_uv(const struct palpate_surface *surface,
 
 /**
  * Writes the newest positions and normals, and which vertices were written. Never waits, neither for the server nor
- * for another thread. Returns `PALPATE_CONNECTION` if no more will arrive: the last ones are written all the same,
- * and `palpate_last_error` describes why. One thread at a time.
+ * for another thread. Returns `PALPATE_CONNECTION` if no more will arrive: the last ones are written all the
+ * same, and `palpate_last_error` describes why; `PALPATE_BUFFER` if `buffers` has room for fewer vertices than
+ * the surface has; and `PALPATE_ARGUMENT` for a stride below 12. One thread at a time.
  */
 enum palpate_result palpate_surface_read(const struct palpate_surface *surface,
                                          const struct palpate_buffers *buffers,
@@ -834,8 +854,9 @@ void palpate_surface_free(struct palpate_surface *surface);
 
 /**
  * Acquires a tool of a session for a loop of your own, such as that of an engine's haptic thread, and waits until it
- * can be used. `options` may be null. From then on call `palpate_touch_tick` a thousand times per second. When the
- * connection breaks, the library connects again. Writes a handle for `palpate_touch_end`. Any thread; waits for the
+ * can be used, at most 10 s. `options` may be null. From then on call `palpate_touch_tick` a thousand times per
+ * second. When the connection breaks, the library connects again. Writes a handle for `palpate_touch_end`, or
+ * null after an error. Returns `PALPATE_REFUSED` also if another caller holds the tool. Any thread; waits for the
  * server.
  */
 enum palpate_result palpate_touch_begin(const struct palpate_session *session,
@@ -853,8 +874,11 @@ enum palpate_result palpate_touch_begin_offline(const struct palpate_touch_optio
                                                 struct palpate_touch **touch);
 
 /**
- * Delivers a recorded message: the bytes of a `palpate.v1.TouchResponse`. The next tick uses it. Only for a handle
- * of `palpate_touch_begin_offline`. One thread at a time; it may be another than that of the ticks.
+ * Delivers a recorded message: the `count` bytes of a `palpate.v1.TouchResponse`. The next tick uses it. The
+ * first one must be `opened`: until then forces are zero. Returns `PALPATE_ARGUMENT` for a handle other than one
+ * of `palpate_touch_begin_offline`, and for bytes that are not such a message; `PALPATE_CONNECTION` for a force
+ * law that is not valid; and `PALPATE_BUSY` if another thread delivers one. One thread at a time; it may be
+ * another than that of the ticks.
  */
 enum palpate_result palpate_touch_arrive(const struct palpate_touch *touch,
                                          const uint8_t *bytes,
@@ -863,8 +887,9 @@ enum palpate_result palpate_touch_arrive(const struct palpate_touch *touch,
 /**
  * Writes the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, of
  * a clock that advances between ticks. Takes bounded time: no lock, no call of the system, no memory allocated or
- * freed. Ticks may be late, early or missing: forces then fade, and return within the safety envelope. After an
- * error, `felt` has a force of zero. One thread at a time.
+ * freed. Ticks may be late, early or missing: forces then fade, and return within the safety envelope. Returns
+ * `PALPATE_ARGUMENT` if the position or the time is not finite: `felt` then has a force that falls to zero. After
+ * any other error, `felt` has a force of zero. One thread at a time: another gets `PALPATE_BUSY`.
  */
 enum palpate_result palpate_touch_tick(const struct palpate_touch *touch,
                                        const struct palpate_reading *reading,
@@ -878,15 +903,16 @@ enum palpate_result palpate_touch_tick(const struct palpate_touch *touch,
 enum palpate_result palpate_touch_disable(const struct palpate_touch *touch);
 
 /**
- * Writes the totals of what was sent and received. Returns `PALPATE_CONNECTION` while there is no connection:
- * `palpate_last_error` describes why. Any thread except that of the ticks, as it takes a lock.
+ * Writes the totals of what was sent and received so far; zeros without a server. Returns `PALPATE_CONNECTION`
+ * while there is no connection: the totals are written all the same, and `palpate_last_error` describes why. Any
+ * thread except that of the ticks, as it takes a lock.
  */
 enum palpate_result palpate_touch_traffic(const struct palpate_touch *touch,
                                           struct palpate_traffic *traffic);
 
 /**
- * Releases the tool and frees the handle. Null is allowed. Any thread, once, when no other thread is in a function
- * of this handle.
+ * Releases the tool and frees the handle; the session continues. Sets no force: your loop sets its device to
+ * zero. Null is allowed. Any thread, once, when no other thread is in a function of this handle.
  */
 void palpate_touch_end(struct palpate_touch *touch);
 

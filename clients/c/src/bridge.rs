@@ -35,7 +35,8 @@ pub struct palpate_device {
     pub write: Option<unsafe extern "C" fn(user: *mut c_void, force_n: *const palpate_vector) -> i32>,
 }
 
-/// A device's loop that runs on a thread of the library.
+/// A device's loop that runs on a thread of the library, from `palpate_bridge_begin` until `palpate_bridge_end`,
+/// or until the device fails. When the connection breaks, the library connects again.
 pub struct palpate_bridge {
     shared: Arc<Connected>,
     seen: Arc<Mutex<LoopObservation>>,
@@ -60,7 +61,7 @@ pub enum palpate_priority {
 
 pub use palpate_priority::*;
 
-/// The current state of a loop.
+/// The state of a loop after its last tick, from `palpate_bridge_look`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct palpate_bridge_state {
@@ -78,25 +79,25 @@ pub struct palpate_bridge_state {
     pub is_over: u32,
 }
 
-/// The results of a loop.
+/// The results of a loop from its beginning to its end, from `palpate_bridge_end`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct palpate_bridge_report {
     /// Number of ticks.
     pub ticks: u64,
-    /// Number of ticks that started more than a millisecond late.
+    /// Number of ticks that started more than a millisecond late; like the next four, 0 if the loop panicked.
     pub late_ticks: u64,
-    /// Number of ticks that were skipped.
+    /// Number of ticks that were skipped, because the loop was more than 5 ms late.
     pub missed_ticks: u64,
     /// Number of connections that were opened.
     pub connections: u64,
-    /// Number of samples that arrived.
+    /// Number of samples that arrived and were used; overtaken ones do not count.
     pub samples: u64,
-    /// Number of positions that were sent.
+    /// Number of positions that were sent, or dropped because the stream did not keep up.
     pub positions: u64,
     /// The priority of its thread: one of `palpate_priority`.
     pub priority: u32,
-    /// The reason why it ended, one of `palpate_result`: 0 if you have ended it.
+    /// The result of `palpate_bridge_end`, one of `palpate_result`: 0 unless the loop has failed.
     pub result: u32,
 }
 
@@ -158,8 +159,11 @@ impl HapticDevice for Called {
 
 /// Connects a device of your own to a session, on a thread of the library at 1 kHz, with real-time priority if the
 /// system allows it. `options` may be null; its `limits` are ignored, since `descriptor` provides them. Waits for the
-/// first connection. Writes a handle for `palpate_bridge_end`. `device` is copied; its `user` must stay valid until
-/// the end. Any thread; waits for the server.
+/// first connection, at most 10 s. Writes a handle for `palpate_bridge_end`, or null after an error. `device` is
+/// copied; its `user` must stay valid until the end. Returns `PALPATE_ARGUMENT` also for a device without all
+/// three functions, for invalid limits, and if `in_tissue_frame` is set; `PALPATE_DEVICE` if a function of the
+/// device fails; and `PALPATE_REFUSED` also if another caller holds the tool. The device has then been set to a
+/// force of zero if it was set to any. Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_bridge_begin(
     session: *const palpate_session,
@@ -259,7 +263,8 @@ impl palpate_bridge {
     }
 }
 
-/// Writes the current state of the loop. Any thread.
+/// Writes the state of the loop after its last tick, or, if a thread was just reading that, after the tick before.
+/// Never waits for the loop or the server. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_bridge_look(
     bridge: *const palpate_bridge,
@@ -293,9 +298,12 @@ pub unsafe extern "C" fn palpate_bridge_disable(bridge: *const palpate_bridge) -
     })
 }
 
-/// Ends the loop, waits for that, and writes its results, even if it has failed; `report` may be null. Returns
-/// `PALPATE_DEVICE` if the device has failed: `palpate_last_error` describes how. Frees the handle in any case. Any
-/// thread, once; not from a function of the device.
+/// Ends the loop, sets the device to a force of zero, and releases the tool; the session continues. Waits until
+/// that is done, and writes the results of the loop, even if it has failed; `report` may be null. Returns
+/// `PALPATE_DEVICE` if the device has failed: `palpate_last_error` describes how; `PALPATE_INTERNAL` if the loop
+/// panicked, without a force of zero; and `PALPATE_ARGUMENT` if `bridge` is null. A connection that is broken at
+/// the end is no error. Frees the handle in any case. Any thread, once; not from a function of the device, which
+/// would wait for itself.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_bridge_end(
     bridge: *mut palpate_bridge,

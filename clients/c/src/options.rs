@@ -11,10 +11,11 @@ use palpate_session::journal;
 use crate::axes::palpate_axes;
 use crate::error::{CodedError, guard, optional_text, palpate_result, text};
 
-/// A function of the caller that gets messages for people.
+/// A function of the caller that gets messages for people: `user` as given beside it, and one line of text, which
+/// is valid during the call.
 pub type palpate_warn = Option<unsafe extern "C" fn(user: *mut c_void, message: *const c_char)>;
 
-/// Options of a connection.
+/// Options of `palpate_connect`. Texts are copied.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct palpate_connect_options {
@@ -52,7 +53,7 @@ pub struct palpate_limits {
     pub workspace_radius_m: f64,
 }
 
-/// Options for touching with a tool.
+/// Options of `palpate_touch_begin`, `palpate_touch_begin_offline` and `palpate_bridge_begin`. Texts are copied.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct palpate_touch_options {
@@ -96,7 +97,7 @@ pub struct palpate_touch_options {
     pub prediction: u32,
 }
 
-/// Options for showing a surface.
+/// Options of `palpate_surface_open`.
 #[repr(C)]
 #[derive(Clone, Copy)]
 pub struct palpate_surface_options {
@@ -141,7 +142,7 @@ pub unsafe extern "C" fn palpate_surface_options_init(
 }
 
 /// Writes the limits of a device by its name: touch, omni, desktop, falcon, omega3, delta3, sigma7, lambda7,
-/// inverse3. Any thread.
+/// inverse3. Returns `PALPATE_ARGUMENT` for another name. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_limits_of(name: *const c_char, limits: *mut palpate_limits) -> palpate_result {
     guard(|| {

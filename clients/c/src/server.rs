@@ -24,7 +24,8 @@ use crate::error::{
 use crate::options::{TouchOptions, options_at, palpate_connect_options};
 use crate::os::Threads;
 
-/// A connection to a server. Any thread, also several at once.
+/// A connection to a server, with the caller's credentials, from `palpate_connect` to `palpate_server_free`. Any
+/// thread, also several at once.
 pub struct palpate_server {
     pub(crate) shared: Arc<Connected>,
 }
@@ -37,7 +38,8 @@ pub(crate) struct Connected {
     pub(crate) timeout: Duration,
 }
 
-/// A session on a server: one simulated tissue. Any thread, also several at once.
+/// A handle of a session on a server: of one simulated tissue, which exists on the server independently of its
+/// handles. Any thread, also several at once.
 pub struct palpate_session {
     pub(crate) shared: Arc<Connected>,
     pub(crate) session_id: String,
@@ -133,7 +135,9 @@ impl palpate_session {
 pub(crate) const CONNECTING: Duration = Duration::from_secs(10);
 
 /// Connects to the server at `url`, such as "http://127.0.0.1:7117". `options` may be null. Waits for the first
-/// answer, at most 10 s. Writes a handle for `palpate_server_free`. Any thread.
+/// answer, at most 10 s; any answer counts, so an invalid token is refused only by later calls. Writes a handle
+/// for `palpate_server_free`, or null after an error. Returns `PALPATE_ARGUMENT` also for a token that would be
+/// sent without TLS to another machine, and for certificates without TLS. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_connect(
     url: *const c_char,
@@ -195,9 +199,9 @@ pub(crate) unsafe fn free<T>(handle: *mut T) -> Result<(), CodedError> {
     Ok(())
 }
 
-/// Writes the names of the server's scenes into `names`, one per line, and into `needed` the number of bytes that
-/// they take; either may be null. Returns `PALPATE_BUFFER` if `capacity` bytes are too few. Any thread; waits for the
-/// server.
+/// Writes the names of the server's scenes, sorted, into `names`, one per line, and into `needed` the number of
+/// bytes that they take with the zero at the end; one of both may be null. Returns `PALPATE_BUFFER` if `capacity`
+/// bytes are too few. Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_scenes(
     server: *const palpate_server,
@@ -373,7 +377,9 @@ pub unsafe extern "C" fn palpate_session_create_from_text(
     })
 }
 
-/// Joins an existing session by its ID. Writes a handle for `palpate_session_free`. Any thread; waits for the server.
+/// Joins an existing session by its ID, also one on another server of the fleet. Writes a handle for
+/// `palpate_session_free`, or null after an error. Returns `PALPATE_REFUSED` if there is no such session. Any thread;
+/// waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_join(
     server: *const palpate_server,
@@ -415,7 +421,7 @@ pub unsafe extern "C" fn palpate_session_id(
     })
 }
 
-/// Writes the bounding box of the tissue at rest. Any thread.
+/// Writes the bounding box of the tissue at rest. It never changes. Never waits. Any thread.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_extent(
     session: *const palpate_session,
@@ -446,8 +452,8 @@ pub unsafe extern "C" fn palpate_change_init(change: *mut palpate_change) -> pal
     })
 }
 
-/// Changes the tissue from the next step on; all users who touch it feel the change. Any thread; waits for the
-/// server.
+/// Changes the tissue from the next step on; all users who touch it feel the change. Returns `PALPATE_REFUSED` for
+/// a value out of its range: then nothing changes. Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_session_change(
     session: *const palpate_session,

@@ -13,7 +13,7 @@ use crate::options::{options_at, palpate_surface_options};
 use crate::server::{Connected, free, palpate_session};
 use crate::touch::Exclusive;
 
-/// The surface of a session, which follows its newest frame.
+/// The surface of a session, which follows its newest frame, from `palpate_surface_open` to `palpate_surface_free`.
 pub struct palpate_surface {
     axes: palpate_axes,
     vertices: usize,
@@ -29,7 +29,7 @@ struct SurfaceObservation {
     normal: Vec<[f32; 3]>,
 }
 
-/// The size of a surface. It never changes.
+/// The size of a surface, for allocating its buffers. It never changes.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct palpate_surface_size {
@@ -76,7 +76,8 @@ pub struct palpate_dirty {
 }
 
 /// Gets the surface of a session and starts to watch it. `options` may be null. Writes a handle for
-/// `palpate_surface_free`. Any thread; waits for the server.
+/// `palpate_surface_free`, or null after an error. Once the connection breaks, the surface stays as it is: open
+/// another. Any thread; waits for the server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_surface_open(
     session: *const palpate_session,
@@ -132,8 +133,9 @@ pub unsafe extern "C" fn palpate_surface_size_of(
     })
 }
 
-/// Writes all indices, three per triangle, in the order that the engine of these axes takes for the front. They never
-/// change. One thread at a time. Never waits.
+/// Writes all indices, three per triangle, in the order that the engine of these axes takes for the front. They
+/// never change. Returns `PALPATE_BUFFER` if `capacity`, in indices, is below `palpate_surface_size.indices`. One
+/// thread at a time. Never waits.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_surface_indices(
     surface: *const palpate_surface,
@@ -160,8 +162,9 @@ pub unsafe extern "C" fn palpate_surface_indices(
     })
 }
 
-/// Writes u and v of each vertex, `stride` bytes (8 or more) apart. They never change. Returns `PALPATE_ARGUMENT` if
-/// the surface has none. One thread at a time. Never waits.
+/// Writes u and v of each vertex, `stride` bytes (8 or more) apart. They never change. Returns `PALPATE_ARGUMENT`
+/// if the surface has none, and `PALPATE_BUFFER` if `vertices`, for which there is room, is below that of the
+/// surface. One thread at a time. Never waits.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_surface_uv(
     surface: *const palpate_surface,
@@ -196,8 +199,9 @@ pub unsafe extern "C" fn palpate_surface_uv(
 }
 
 /// Writes the newest positions and normals, and which vertices were written. Never waits, neither for the server nor
-/// for another thread. Returns `PALPATE_CONNECTION` if no more will arrive: the last ones are written all the same,
-/// and `palpate_last_error` describes why. One thread at a time.
+/// for another thread. Returns `PALPATE_CONNECTION` if no more will arrive: the last ones are written all the
+/// same, and `palpate_last_error` describes why; `PALPATE_BUFFER` if `buffers` has room for fewer vertices than
+/// the surface has; and `PALPATE_ARGUMENT` for a stride below 12. One thread at a time.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_surface_read(
     surface: *const palpate_surface,

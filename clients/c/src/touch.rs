@@ -14,7 +14,8 @@ use crate::error::{CodedError, PALPATE_BUSY, at, at_mut, guard, palpate_result};
 use crate::options::{options_at, palpate_touch_options};
 use crate::server::{Connected, palpate_session};
 
-/// A tool that your own loop moves.
+/// A tool that your own loop moves, on a server or in a recording, from `palpate_touch_begin` or
+/// `palpate_touch_begin_offline` to `palpate_touch_end`.
 pub struct palpate_touch {
     ticker: Exclusive<Ticker>,
     axes: palpate_axes,
@@ -50,7 +51,7 @@ pub enum palpate_state {
 
 pub use palpate_state::*;
 
-/// The position and button of a device.
+/// The position of a device at a tick, and whether its operator requests forces.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct palpate_reading {
@@ -61,7 +62,7 @@ pub struct palpate_reading {
     pub enable: u32,
 }
 
-/// The results of a tick.
+/// What a tick felt: the force, and the state of the rendering.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct palpate_felt {
@@ -75,17 +76,17 @@ pub struct palpate_felt {
     pub age_s: f64,
 }
 
-/// Totals of what was sent and received.
+/// Totals of what was sent and received so far, over all connections.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct palpate_traffic {
     /// Number of connections that were opened.
     pub connections: u64,
-    /// Number of failed attempts, and of connections that broke.
+    /// Number of failed attempts, and of connections that broke; moves to another server of a fleet do not count.
     pub failed: u64,
-    /// Number of samples that arrived.
+    /// Number of samples that arrived and were used; overtaken ones do not count.
     pub samples: u64,
-    /// Number of positions that were sent.
+    /// Number of positions that were sent, or dropped because the stream did not keep up.
     pub positions: u64,
     /// 1 while there is a connection, else 0.
     pub is_connected: u32,
@@ -133,8 +134,9 @@ pub(crate) fn state_of(state: Option<RenderingState>) -> palpate_state {
 }
 
 /// Acquires a tool of a session for a loop of your own, such as that of an engine's haptic thread, and waits until it
-/// can be used. `options` may be null. From then on call `palpate_touch_tick` a thousand times per second. When the
-/// connection breaks, the library connects again. Writes a handle for `palpate_touch_end`. Any thread; waits for the
+/// can be used, at most 10 s. `options` may be null. From then on call `palpate_touch_tick` a thousand times per
+/// second. When the connection breaks, the library connects again. Writes a handle for `palpate_touch_end`, or
+/// null after an error. Returns `PALPATE_REFUSED` also if another caller holds the tool. Any thread; waits for the
 /// server.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_begin(
@@ -185,8 +187,11 @@ pub unsafe extern "C" fn palpate_touch_begin_offline(
     })
 }
 
-/// Delivers a recorded message: the bytes of a `palpate.v1.TouchResponse`. The next tick uses it. Only for a handle
-/// of `palpate_touch_begin_offline`. One thread at a time; it may be another than that of the ticks.
+/// Delivers a recorded message: the `count` bytes of a `palpate.v1.TouchResponse`. The next tick uses it. The
+/// first one must be `opened`: until then forces are zero. Returns `PALPATE_ARGUMENT` for a handle other than one
+/// of `palpate_touch_begin_offline`, and for bytes that are not such a message; `PALPATE_CONNECTION` for a force
+/// law that is not valid; and `PALPATE_BUSY` if another thread delivers one. One thread at a time; it may be
+/// another than that of the ticks.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_arrive(
     touch: *const palpate_touch,
@@ -209,8 +214,9 @@ pub unsafe extern "C" fn palpate_touch_arrive(
 
 /// Writes the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, of
 /// a clock that advances between ticks. Takes bounded time: no lock, no call of the system, no memory allocated or
-/// freed. Ticks may be late, early or missing: forces then fade, and return within the safety envelope. After an
-/// error, `felt` has a force of zero. One thread at a time.
+/// freed. Ticks may be late, early or missing: forces then fade, and return within the safety envelope. Returns
+/// `PALPATE_ARGUMENT` if the position or the time is not finite: `felt` then has a force that falls to zero. After
+/// any other error, `felt` has a force of zero. One thread at a time: another gets `PALPATE_BUSY`.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_tick(
     touch: *const palpate_touch,
@@ -253,8 +259,9 @@ pub unsafe extern "C" fn palpate_touch_disable(touch: *const palpate_touch) -> p
     })
 }
 
-/// Writes the totals of what was sent and received. Returns `PALPATE_CONNECTION` while there is no connection:
-/// `palpate_last_error` describes why. Any thread except that of the ticks, as it takes a lock.
+/// Writes the totals of what was sent and received so far; zeros without a server. Returns `PALPATE_CONNECTION`
+/// while there is no connection: the totals are written all the same, and `palpate_last_error` describes why. Any
+/// thread except that of the ticks, as it takes a lock.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_traffic(
     touch: *const palpate_touch,
@@ -277,8 +284,8 @@ pub unsafe extern "C" fn palpate_touch_traffic(
     })
 }
 
-/// Releases the tool and frees the handle. Null is allowed. Any thread, once, when no other thread is in a function
-/// of this handle.
+/// Releases the tool and frees the handle; the session continues. Sets no force: your loop sets its device to
+/// zero. Null is allowed. Any thread, once, when no other thread is in a function of this handle.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn palpate_touch_end(touch: *mut palpate_touch) {
     guard(|| {

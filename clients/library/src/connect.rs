@@ -19,25 +19,26 @@ use tonic_health::pb::health_client::HealthClient;
 
 use crate::Error;
 
-/// The caller's credentials, and the certificates it trusts. The default has none, and trusts the authorities of the
-/// system.
+/// The caller's credentials, and the certificates it trusts. The default has no credentials, and trusts the
+/// authorities of the system. All but `token` require a URL with https://.
 #[derive(Debug, Clone, Default)]
 pub struct Credentials {
-    /// Your token. It is sent only over TLS or to this machine.
+    /// Your token, sent with each call: only over TLS, or to `localhost` or a loopback address.
     pub token: Option<Token>,
-    /// Certificates (PEM) to trust instead of the system's.
+    /// Certificates of authorities (PEM, one or more) to trust instead of the system's.
     pub ca: Option<String>,
-    /// Name that the server's certificate must carry, if it differs from the host of the URL.
+    /// Name that the server's certificate must be for; `None`: the host of the URL.
     pub tls_name: Option<String>,
-    /// Your client certificate and its private key (PEM), if the server requires one.
+    /// Your client certificate, and its private key (both PEM), if the server requires one.
     pub cert_and_key: Option<(String, String)>,
 }
 
 impl Credentials {
-    /// Checks that certificates and key are in PEM.
+    /// Checks that each certificate and key that is present contains the first line of a PEM block of its kind. The
+    /// contents of the blocks are not read.
     ///
     /// # Errors
-    /// Returns an error that begins with the name of the wrong part: `ca`, `cert` or `key`.
+    /// Returns [`Error::Argument`] that begins with the name of the first wrong part: `ca`, `cert` or `key`.
     pub fn check(&self) -> Result<(), Error> {
         let (cert, key) = self.cert_and_key.as_ref().map(|(cert, key)| (cert, key)).unzip();
         let of = |name, what, begin, text: Option<&String>| match text {
@@ -54,15 +55,16 @@ impl Credentials {
     }
 }
 
-/// A token that authenticates the caller. `Debug` does not show it.
+/// A token that authenticates the caller; `palpate token` creates one. `Debug` does not show it.
 #[derive(Clone)]
 pub struct Token(MetadataValue<Ascii>);
 
 impl Token {
-    /// Parses a token; surrounding space is ignored.
+    /// Parses a token; surrounding space is ignored. Only a server can say whether it is valid.
     ///
     /// # Errors
-    /// Returns an error if the text can't be a token. The message does not quote it, since it might appear in a log.
+    /// Returns [`Error::Argument`] if the text is empty, has space within it, or has characters that a header of HTTP
+    /// can't contain. The message does not quote the text, since it might appear in a log.
     pub fn new(text: &str) -> Result<Self, Error> {
         let token = text.trim();
         let wrong = || Error::Argument("holds no token; `palpate token` makes one".to_owned());
@@ -81,10 +83,11 @@ impl std::fmt::Debug for Token {
     }
 }
 
-/// A connection that adds the token, if there is one, to each call. The clients of `palpate_proto::pb` take it.
+/// A connection of [`Server::connect`], which adds the token, if there is one, to each call. The clients of
+/// `palpate_proto::pb` take it. Clones share the connection, which closes when the last one is dropped.
 pub type Channel = InterceptedService<tonic::transport::Channel, Bearer>;
 
-/// Adds the token to each call.
+/// The part of a [`Channel`] that adds the token, if there is one, to each call as header `authorization`.
 #[derive(Debug, Clone)]
 pub struct Bearer(Option<Token>);
 
@@ -97,7 +100,8 @@ impl Interceptor for Bearer {
     }
 }
 
-/// A server's address and how to connect to it.
+/// A server's address, the credentials for it, and the time limit for connecting. It is not a connection:
+/// [`Server::connect`] opens one.
 ///
 /// The URL tells how to connect, and nothing is sent yet. A token is not sent in the clear to another machine:
 ///
@@ -147,11 +151,13 @@ impl std::fmt::Debug for Server {
 }
 
 impl Server {
-    /// Creates a server at `url`; http:// may be omitted. Does not connect.
+    /// Creates a server at `url`; http:// may be omitted. The default port is 80 with http:// and 443 with https://.
+    /// The time limit for connecting is 10 s ([`Server::within`]). Does not connect.
     ///
     /// # Errors
-    /// Returns an error if the URL is not valid, if a token would be sent unencrypted, or if the credentials require
-    /// TLS or can't be read.
+    /// Returns [`Error::Argument`] with the errors of [`Credentials::check`], if the URL is not valid or has another
+    /// scheme, if a token would be sent unencrypted to another machine, if the URL has no TLS although the credentials
+    /// have anything but a token, or if a certificate or key can't be read.
     pub fn new(url: &str, credentials: &Credentials) -> Result<Self, Error> {
         credentials.check()?;
         let refuse = |why: &str| Error::Argument(format!("{url}: {why}"));
@@ -192,10 +198,12 @@ impl Server {
         })
     }
 
-    /// Creates another server of the fleet, with the credentials and time limit of this one.
+    /// Creates the server at `url`, another one of the same fleet, with the credentials and time limit of this one.
+    /// Does not connect.
     ///
     /// # Errors
-    /// Returns the errors of [`Server::new`], and an error if this server is reached by TLS and the other is not.
+    /// Returns the errors of [`Server::new`], and [`Error::Argument`] if this server is reached by TLS and the other
+    /// is not.
     pub fn at(&self, url: &str) -> Result<Self, Error> {
         if url.trim_end_matches('/') == self.url {
             return Ok(self.clone());
@@ -208,7 +216,7 @@ impl Server {
         Ok(other.within(self.patience))
     }
 
-    /// Returns the server's URL.
+    /// Returns the server's URL, with its scheme and without a slash at its end.
     pub fn url(&self) -> &str {
         &self.url
     }
@@ -218,22 +226,27 @@ impl Server {
         self.patience
     }
 
-    /// Returns the host of the URL, without brackets.
+    /// Returns the host of the URL without its port, and without the brackets of an IPv6 address.
     pub fn host(&self) -> &str {
         &self.host.0
     }
 
-    /// Sets the time limit for connecting.
+    /// Returns this server with another time limit for connecting and the first answer; the default is 10 s. It also
+    /// limits how long [`crate::fleet`] searches for a session.
     #[must_use]
     pub fn within(mut self, timeout: Duration) -> Self {
         self.patience = timeout;
         self
     }
 
-    /// Connects and waits for a first answer: a listener that accepts connections and stays silent is an error.
+    /// Connects and waits for a first answer, at most for the time limit ([`Server::within`]). Any answer counts, even
+    /// a refusal: invalid credentials are noticed only by a call. The connection is pinged every 5 s without data, and
+    /// closed if the server then stays silent for another 10 s.
     ///
     /// # Errors
-    /// Returns an error that explains why the server can't be reached.
+    /// Returns [`Error::Connection`] that explains why the server can't be reached: no connection, no answer in time,
+    /// a certificate that is not trusted, or the other scheme, http:// or https://. In the last case it may take a
+    /// second longer.
     pub fn connect(&self) -> Pin<Box<dyn Future<Output = Result<Channel, Error>> + Send + '_>> {
         // Boxed so that it is compiled here, once, and not in every program that connects.
         Box::pin(async move {
@@ -285,7 +298,8 @@ async fn speaks_tls((host, port): &(String, u16)) -> bool {
     matches!(tokio::time::timeout(TLS_PROBE_TIMEOUT, asked).await, Ok(Ok(true)))
 }
 
-/// Returns the text that a program shows for a status: the server's message, or how the connection broke.
+/// Returns the text that a program shows for a status, one line without control characters: the server's message, or
+/// how the connection broke if the status did not come from a server.
 pub fn describe(status: &Status) -> String {
     if status.source().is_some() { broken(status) } else { status::describe(status) }
 }

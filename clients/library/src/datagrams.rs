@@ -49,7 +49,8 @@ const ATTEMPTS: usize = 4;
 /// costs a few packets.
 const AGAIN_S: f64 = 4.0;
 
-/// The datagram session of one haptic stream, reopened when it breaks.
+/// The datagram session of one haptic stream, if the server offers one. It may be closed at any time, while the stream
+/// continues; a new offer of the server reopens it ([`Datagrams::asks`]). It ends when this is dropped.
 #[derive(Debug)]
 pub struct Datagrams {
     /// Host of the server, if it has offered a session.
@@ -70,8 +71,12 @@ pub struct Datagrams {
 }
 
 impl Datagrams {
-    /// Opens the session that a stream was offered, in the background. Without an offer nothing is ever sent by
-    /// datagram.
+    /// Starts to open the session that a stream was offered, in the background; [`Datagrams::next`] takes it into use.
+    /// `server` is the one that has the stream: its host is used if the offer names none. Without an offer nothing is
+    /// ever sent by datagram. Makes at most 4 attempts of 2 s each.
+    ///
+    /// # Panics
+    /// Outside a Tokio runtime with a timer.
     pub fn dial(offer: Option<&pb::DatagramOffer>, server: &Server) -> Self {
         let mut life = interval(Duration::from_secs_f64(0.5 * LIFE_S));
         life.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -94,8 +99,8 @@ impl Datagrams {
         datagrams
     }
 
-    /// Opens another session that the server offered after [`Datagrams::asks`], in the background. Closes the current
-    /// one.
+    /// Starts to open another session that the server offered after [`Datagrams::asks`], in the background. Closes the
+    /// current one at once. Does nothing if [`Datagrams::dial`] got no offer.
     pub fn take_offer(&mut self, offer: &pb::DatagramOffer) {
         let Some(own) = &self.host else { return };
         let host = if offer.host.is_empty() { own.clone() } else { offer.host.clone() };
@@ -112,8 +117,9 @@ impl Datagrams {
         });
     }
 
-    /// Returns whether the session has ended and the server is to be asked for another, by `renew` with `datagrams`,
-    /// which it answers with an offer ([`Datagrams::take_offer`]). True at most once in four seconds.
+    /// Returns whether the session has ended, or could not be opened, and the server is to be asked for another: by
+    /// `renew` with `datagrams` on the stream, which it answers with an offer ([`Datagrams::take_offer`]). True at
+    /// most once in four seconds, and not in the first four; never if [`Datagrams::dial`] got no offer.
     pub fn asks(&mut self) -> bool {
         let now_s = self.now_s();
         let is_over = self.host.is_some() && self.connection.is_none() && self.opening.is_empty();
@@ -128,8 +134,10 @@ impl Datagrams {
         self.begun.elapsed().as_secs_f64()
     }
 
-    /// Sends a pose that is played by the client's time (`client_time_ns` and `sequence` set, no `at_step`). Returns
-    /// false if the stream must carry it: datagrams do not get through at present, or it is another command.
+    /// Sends a pose that is played by the client's time (`client_time_ns` and `sequence` set, no `at_step`), together
+    /// with up to 8 earlier ones of its tool, in case these were lost. Never waits. Returns false if the stream must
+    /// carry the command: there is no session, datagrams do not get through at present, the message is too long for
+    /// one datagram, or it is another command.
     pub fn send(&mut self, command: &pb::Command) -> bool {
         let (Some(pb::command::Action::Pose(pose)), Some(sequence), None) =
             (&command.action, command.sequence, command.at_step)
@@ -158,8 +166,9 @@ impl Datagrams {
         message.encoded_len() <= most && connection.send_datagram(message.encode_to_vec()).is_ok()
     }
 
-    /// Returns the next sample that arrives by datagram. Skips overtaken samples. Never completes without a session.
-    /// Call it all the time: it keeps the session alive. Dropping the future loses nothing.
+    /// Waits for the next sample that arrives by datagram. Skips samples older than one seen before
+    /// ([`Datagrams::is_newer`]). Never completes while there is no session. Call it all the time: it also takes
+    /// opened sessions into use and keeps them alive. Dropping the future loses nothing.
     pub async fn next(&mut self) -> pb::Sample {
         loop {
             let connection = self.connection.clone();
@@ -204,7 +213,7 @@ impl Datagrams {
     }
 
     /// Returns whether a sample is at least as new as all samples seen so far, by datagram or passed to this method,
-    /// and records it if so. Call it for samples of the stream.
+    /// and records it if so. The ownership revision counts first, then the step. Call it for samples of the stream.
     pub fn is_newer(&mut self, sample: &pb::Sample) -> bool {
         // A server that took the session over may continue it at an earlier step; samples of the previous owner are
         // outdated.
@@ -216,12 +225,14 @@ impl Datagrams {
         is_newer
     }
 
-    /// Returns the longest time between two poses that the server wants, s.
+    /// Returns the longest time between two poses that the server wants, s: the one of its newest datagram, at least
+    /// [`FASTEST_S`]; [`HEARTBEAT_S`] before it has sent one.
     pub fn wanted_s(&self) -> f64 {
         self.wanted_s
     }
 
-    /// Returns the number of messages that were carried by datagram so far.
+    /// Returns how many messages went and came by datagram so far, over all sessions, and how often the stream took
+    /// over.
     pub fn carried(&self) -> Carried {
         self.carrier.carried()
     }

@@ -12,19 +12,20 @@ use palpate_haptics::Device;
 
 use crate::bridge::Tick;
 
-/// The position and button of a device at a tick.
+/// The position of a device at a tick, and whether its operator requests forces.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Reading {
-    /// Position in the device's frame, m.
+    /// Position in the device's frame, m. With a value that is not finite, no force is rendered.
     pub place_m: DVec3,
     /// Whether the operator requests forces, by a button or pedal. Only a change from false to true enables them.
     pub enable: bool,
 }
 
-/// A haptic device.
+/// A haptic device, as [`crate::bridge::run`] uses it.
 ///
-/// Each tick calls `read` and then `write` once; both must return within a fraction of a tick. An error of either
-/// ends the loop. At every end, the loop writes a force of zero once.
+/// Each tick of 1 ms calls `read` and then `write` once, on the thread of the loop; both must return within a fraction
+/// of a tick. An error of either ends the loop. The loop then writes a force of zero once, as at every other end; but
+/// after a panic in one of these methods, the device is only dropped.
 ///
 /// # Example
 ///
@@ -72,27 +73,28 @@ pub struct Reading {
 /// # adapter.write(DVec3::Z).unwrap();
 /// ```
 pub trait HapticDevice: Send {
-    /// Returns the device's limits. They are sent to the server, and no force exceeds them.
+    /// Returns the device's limits. They are sent to the server, and no force exceeds them. Called once, before the
+    /// loop starts; later changes have no effect.
     fn descriptor(&self) -> Device;
-    /// Reads position and button.
+    /// Reads the current position, and whether the operator requests forces.
     ///
     /// # Errors
-    /// Returns an error if the device can't be read.
+    /// Returns an error if the device can't be read; it ends the loop.
     fn read(&mut self) -> std::io::Result<Reading>;
-    /// Sets the force to render until the next tick, N, in the device's frame.
+    /// Sets the force to render until the next call, N, in the device's frame, acting on the hand.
     ///
     /// # Errors
-    /// Returns an error if the force can't be set.
+    /// Returns an error if the force can't be set; it ends the loop.
     fn write(&mut self, force_n: DVec3) -> std::io::Result<()>;
-    /// Returns the buttons that were pressed at the newest reading, as bits. By default none is reported.
+    /// Returns the buttons that were pressed at the newest reading: bit n for button n. By default none is reported.
     fn buttons(&self) -> u32 {
         0
     }
-    /// Returns how many buttons [`HapticDevice::buttons`] can report.
+    /// Returns how many buttons [`HapticDevice::buttons`] can report, 0 to 32. By default 0.
     fn button_count(&self) -> u32 {
         0
     }
-    /// Called after `write` at each tick, for displays. It must not wait.
+    /// Receives what a tick did, after its `write`, for displays. It must not wait. By default does nothing.
     fn ticked(&mut self, _tick: &Tick) {}
 }
 

@@ -19,14 +19,14 @@ use tonic_types::StatusExt;
 use crate::Error;
 use crate::connect::{Channel, Server};
 
-/// The answer to a call, and the server that gave it.
+/// The answer to a call, and the server of the fleet that gave it, for further calls.
 #[derive(Debug, Clone)]
 pub struct At<T> {
-    /// The server.
+    /// The server that answered.
     pub server: Server,
-    /// The connection to it.
+    /// The open connection to that server.
     pub channel: Channel,
-    /// The answer.
+    /// What the call returned.
     pub answer: T,
 }
 
@@ -39,24 +39,28 @@ const MAX_SERVERS: usize = 16;
 /// Maximum number of redirections of one call.
 const MAX_HOPS: u32 = 8;
 
-/// Returns whether a server of a fleet refused temporarily: another server is about to have the session, or this one
-/// has lost contact with the fleet.
+/// Returns whether a server of a fleet refused temporarily (`FENCED`): another server is about to have the session, or
+/// this one has lost contact with the fleet. An equal call may succeed later.
 pub fn is_fenced(status: &Status) -> bool {
     status.get_details_error_info().is_some_and(|info| info.reason == Reason::Fenced.as_str())
 }
 
-/// Finds the server that has a session. Returns it with the session. `server` may be any server of the fleet. Waits
-/// while another server takes the session over, at most the time limit for connecting ([`Server::within`]).
+/// Connects to a fleet and finds the server that has the session with the ID `session_id`. Returns it with the
+/// session's status. `server` may be any server of the fleet. Waits while another server takes the session over, at
+/// most half a second longer than the time limit for connecting ([`Server::within`]).
 ///
 /// # Errors
-/// Returns the refusal of the server that has the session, or why no server can be reached.
+/// Returns [`Error::Call`] with the refusal of a server that knows what became of the session (such as `NOT_FOUND`),
+/// or with the last temporary refusal; [`Error::Connection`] if no server can be reached in time; and
+/// [`Error::Argument`] if the credentials can't be used at the server that has it.
 pub async fn locate(server: &Server, session_id: &str) -> Result<At<pb::Session>, Error> {
     Trail::new(server.clone()).seek(session_id).await
 }
 
-/// Calls a server, and repeats the call at the server that has the session if a refusal names another one. While the
-/// session is being taken over, repeats the call every quarter of a second, at most for the time limit for
-/// connecting.
+/// Connects to `server` and calls `call` with the connection. If a refusal names the server that has the session,
+/// connects to that and repeats the call there, at most 8 times. While the session is being taken over, repeats the
+/// call every quarter of a second, at most for the time limit for connecting ([`Server::within`]). A call whose
+/// connection breaks is not repeated.
 ///
 /// ```no_run
 /// use palpate_client::watch::Samples;
@@ -71,7 +75,9 @@ pub async fn locate(server: &Server, session_id: &str) -> Result<At<pb::Session>
 /// ```
 ///
 /// # Errors
-/// Returns the refusal of the server that has the session, or why it can't be reached.
+/// Returns [`Error::Call`] with any other refusal, with how the connection broke, or with the last refusal when the
+/// limits above are reached; [`Error::Connection`] if a server can't be reached; and [`Error::Argument`] if the
+/// credentials can't be used at the named server.
 pub async fn follow<T, F>(server: &Server, call: impl Fn(Channel) -> F) -> Result<At<T>, Error>
 where
     F: Future<Output = Result<T, Status>>,
@@ -79,7 +85,7 @@ where
     follow_from(server, server.connect().await?, call).await
 }
 
-/// Like [`follow`], over an open connection `channel` to `server`.
+/// Calls `call` like [`follow`], but first over `channel`, an open connection to `server`.
 ///
 /// # Errors
 /// Returns the errors of [`follow`].
@@ -106,11 +112,11 @@ where
     }
 }
 
-/// Returns the server that has a session created by a call to `server`: a fleet may have created it on another
-/// server.
+/// Returns the server that has the session `created`, which a call to `server` has just returned: a fleet may have
+/// created it on another server. Does not connect. Outside a fleet, returns `server`.
 ///
 /// # Errors
-/// Returns an error if the credentials can't be used there.
+/// Returns [`Error::Argument`] if the credentials can't be used at the other server ([`Server::at`]).
 pub fn home(server: &Server, created: &pb::Session) -> Result<Server, Error> {
     match &created.ownership {
         Some(ownership) if ownership.endpoint.trim_end_matches('/') != server.url() => server.at(&ownership.endpoint),

@@ -15,7 +15,8 @@ use crate::fleet::{At, Trail};
 /// Maximum number of times that one call is repeated at another server, or at a server that has the session again.
 const MAX_MOVES: u32 = 8;
 
-/// A session that is followed from server to server. With a server outside a fleet, calls simply go to that one.
+/// A session that is followed from server to server of its fleet: it keeps a connection to the one that last had it.
+/// With a server outside a fleet, calls simply go to that one. Any number of tasks may use it at once.
 #[derive(Debug)]
 pub struct Followed {
     session_id: String,
@@ -35,8 +36,8 @@ struct LastOwner {
     revision: u64,
 }
 
-/// Returns whether a call may find the session at another server: the session has moved, or its server is gone or
-/// about to end.
+/// Returns whether a call that ended with `status` may find the session at another server: the refusal names one or is
+/// temporary, the connection broke, or the server is not available or about to end.
 pub fn is_away(status: &Status) -> bool {
     let is_broken = std::error::Error::source(status).is_some() || status.code() == tonic::Code::Unavailable;
     elsewhere(status).is_some() || is_broken
@@ -48,17 +49,18 @@ fn is_ending(status: &Status) -> bool {
 }
 
 impl Followed {
-    /// Creates a followed session from its ID and a connection to the server that has it, or last had it.
+    /// Creates a followed session from its ID, the server that has it or last had it, and an open connection to that
+    /// server. Calls nothing: the session need not exist.
     pub fn new(server: Server, channel: Channel, session_id: String) -> Self {
         let place = LastOwner { server: server.clone(), channel, number: 0, revision: 0 };
         Followed { session_id, place: Mutex::new(place), seeking: Trail::new(server).into() }
     }
 
     /// Finds a session that `server` knows or has created: another server of its fleet may have it. Returns it with
-    /// its status.
+    /// its status. `channel` is an open connection to `server`. Waits like [`crate::fleet::locate`].
     ///
     /// # Errors
-    /// Returns the refusal of the server that has the session, or why no server can be reached.
+    /// Returns the errors of [`crate::fleet::locate`].
     pub async fn find(server: Server, channel: Channel, session_id: String) -> Result<(Self, pb::Session), Error> {
         let followed = Followed::new(server, channel, session_id);
         let session = followed.seek(None).await?;
@@ -70,7 +72,7 @@ impl Followed {
         &self.session_id
     }
 
-    /// Returns the server that last had the session.
+    /// Returns the server that last had the session, as far as this has found out.
     pub fn server(&self) -> Server {
         self.place().server.clone()
     }
@@ -79,7 +81,8 @@ impl Followed {
         self.place.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Returns whether this is the newest ownership revision seen, and remembers it if it is newer.
+    /// Returns whether no newer ownership revision than `revision` was seen so far, and remembers it if it is newer.
+    /// Ignore messages of a stream for whose revision this returns false: their server no longer has the session.
     pub fn is_current(&self, revision: u64) -> bool {
         let mut place = self.place();
         place.revision = place.revision.max(revision);
@@ -100,11 +103,13 @@ impl Followed {
         Ok(answer)
     }
 
-    /// Calls the server that has the session. If that has moved or its server is gone, repeats the call at the server
-    /// that has it then. A call whose answer was lost is repeated too, so it may take effect twice.
+    /// Calls `call` with a connection to the server that has the session. If that has moved or its server is gone
+    /// ([`is_away`]), repeats the call at the server that has it then, at most 8 times. A call whose answer was lost
+    /// is repeated too, so it may take effect twice. Sets no time limit for the call itself.
     ///
     /// # Errors
-    /// Returns the refusal of the server that has the session, or why no server can be reached.
+    /// Returns [`Error::Call`] with a refusal that no other server would change, or with that of the ninth attempt;
+    /// otherwise the errors of [`Followed::after`].
     pub async fn call<T, F>(&self, call: impl Fn(Channel) -> F) -> Result<T, Error>
     where
         F: Future<Output = Result<T, Status>>,
@@ -127,12 +132,12 @@ impl Followed {
         }
     }
 
-    /// Finds the server that has the session after a call or a stream has ended with `status`. Then open the stream
-    /// again, by [`Followed::call`].
+    /// Finds the server that has the session after a call or a stream has ended with `status`. Waits like
+    /// [`crate::fleet::locate`]. Then open the stream again, by [`Followed::call`].
     ///
     /// # Errors
-    /// Returns `status` if it is final; otherwise the refusal of the server that has the session, or why no server
-    /// can be reached.
+    /// Returns `status` if no other server would change it ([`is_away`]), and if its server is shutting down and no
+    /// other can be reached; otherwise the errors of [`crate::fleet::locate`].
     pub async fn after(&self, status: Status) -> Result<(), Error> {
         if !is_away(&status) {
             return Err(status.into());

@@ -75,13 +75,13 @@ pub enum Error {
     /// An argument is not valid. Nothing was sent.
     #[error("{}", printable(.0))]
     Argument(String),
-    /// The server can't be reached, the connection broke, or the server violates the protocol.
+    /// The server can't be reached in time, the connection broke, or the server violates the protocol.
     #[error("{}", printable(.0))]
     Connection(String),
-    /// The server refused a call, or the connection broke during it.
+    /// The server refused a call, or the connection broke during it: the status then has a source.
     #[error("{}", describe(.0))]
     Call(#[from] tonic::Status),
-    /// The device can't be read or written.
+    /// The device can't be opened, read or written, or no thread can be started for it.
     #[error("the device: {}", printable(.0))]
     Device(#[from] std::io::Error),
     /// A panic in this library or in the device's code.
@@ -96,7 +96,9 @@ impl Error {
         matches!(self, Error::Call(status) if [Unauthenticated, PermissionDenied].contains(&status.code()))
     }
 
-    /// Returns whether an input was refused, by this library or by the server: an equal call would be refused again.
+    /// Returns whether an input was refused, by this library ([`Error::Argument`]) or by the server
+    /// (`INVALID_ARGUMENT`, `NOT_FOUND`): an equal call would be refused again. Missing rights are no refusal in this
+    /// sense.
     pub fn is_refusal(&self) -> bool {
         match self {
             Error::Argument(_) => true,

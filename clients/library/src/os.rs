@@ -2,21 +2,23 @@
 
 use thread_priority::ThreadPriorityValue;
 
-/// The priority of a thread.
+/// The priority of a thread, as far as this library has changed it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Priority {
-    /// The usual priority.
+    /// The usual priority: nothing was requested.
     Usual,
     /// Real-time priority, above all usual threads.
     RealTime,
-    /// Real-time priority was requested and refused by the system: why, and what would help.
+    /// Real-time priority was requested and refused, so the thread has its usual one. Contains why, and on Unix what
+    /// would help.
     Refused(String),
 }
 
 /// Real-time priority, in the library's scale of 0 to 99: below the threads of the system itself.
 const REAL_TIME: u8 = 50;
 
-/// Requests real-time priority for the current thread. Returns its resulting priority.
+/// Requests real-time priority for the current thread: the FIFO policy at priority 50. Returns its resulting priority,
+/// never [`Priority::Usual`]. It lasts until the thread ends.
 #[cfg(unix)]
 pub fn take_real_time_priority() -> Priority {
     use thread_priority::{
@@ -34,7 +36,8 @@ pub fn take_real_time_priority() -> Priority {
     }
 }
 
-/// Requests real-time priority for the current thread. Returns its resulting priority.
+/// Requests real-time priority for the current thread: "time critical". Returns its resulting priority, never
+/// [`Priority::Usual`]. It lasts until the thread ends.
 #[cfg(windows)]
 pub fn take_real_time_priority() -> Priority {
     use thread_priority::{ThreadPriority, set_current_thread_priority};
@@ -46,7 +49,7 @@ pub fn take_real_time_priority() -> Priority {
     }
 }
 
-/// Refuses real-time priority: it is not supported on this system.
+/// Returns [`Priority::Refused`]: real-time priority is not supported on this system.
 #[cfg(not(any(unix, windows)))]
 pub fn take_real_time_priority() -> Priority {
     Priority::Refused("this system is not known".to_owned())

@@ -6,10 +6,12 @@ use tonic::{Status, Streaming};
 /// Limit on the bytes of a snapshot.
 const MAX_BYTES: usize = 1 << 31;
 
-/// Receives the bytes of a snapshot (`SaveSnapshot`): a journal of a single moment.
+/// Receives all parts of a snapshot, the answer to `SaveSnapshot`, and returns its bytes: a journal (MCAP) of a single
+/// moment.
 ///
 /// # Errors
-/// Returns the server's refusal, or how the connection broke; refuses a snapshot of more than 2 GiB.
+/// Returns the server's refusal, or how the connection broke; `RESOURCE_EXHAUSTED` if the snapshot has more than 2
+/// GiB.
 pub async fn collect(parts: Streaming<pb::SaveSnapshotResponse>) -> Result<Vec<u8>, Status> {
     collect_within(parts, MAX_BYTES).await
 }

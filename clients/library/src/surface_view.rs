@@ -14,30 +14,31 @@ use crate::view::{Frames, MAX_VERTICES, SurfaceState};
 /// The part of a surface that does not change: rest positions, texture coordinates and triangles.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ShownMesh {
-    /// Position of each vertex at rest, m.
+    /// Position of each vertex at rest, m, in the tissue's frame.
     pub rest_m: Vec<[f32; 3]>,
-    /// Texture coordinates u, v of each vertex, from the lower left; empty if the surface has none.
+    /// Texture coordinates u, v of each vertex, from the lower left of the image; empty if the surface has none.
     pub texture: Vec<[f32; 2]>,
-    /// Vertex indices of each triangle, counter-clockwise from outside.
+    /// Indices in `rest_m` of each triangle's vertices, counter-clockwise as seen from outside.
     pub triangles: Vec<[u32; 3]>,
 }
 
-/// A surface at one moment.
+/// A surface at one moment: at rest, or after a frame. Its vertices have the order of [`ShownMesh`].
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SurfaceMoment {
-    /// Number of frames so far; 0 at rest, before the first.
+    /// Number of frames received so far; 0 at rest, before the first.
     pub frames: u64,
-    /// Number of steps done.
+    /// Number of steps that the session had done; 0 before the first frame.
     pub step: u64,
-    /// Simulated time, s.
+    /// Simulated time of the session, s; 0 before the first frame.
     pub simulation_time_s: f64,
-    /// Position of each vertex, m.
+    /// Position of each vertex, m, in the tissue's frame.
     pub position_m: Vec<[f32; 3]>,
     /// Outward unit normal of each vertex; 0 for a vertex without a triangle.
     pub normal: Vec<[f32; 3]>,
 }
 
-/// A session's surface that follows its newest frame. Watching ends when this is dropped.
+/// A session's surface that follows its newest frame: tasks of the runtime receive frames, and a thread that draws
+/// takes the newest moment without waiting. Watching ends when this is dropped.
 pub struct ShownSurface {
     mesh: Arc<ShownMesh>,
     newest: NewestReader<SurfaceMoment>,
@@ -58,10 +59,10 @@ impl std::fmt::Debug for ShownSurface {
 impl ShownSurface {
     /// Gets the mesh and starts to watch its frames. `refinement` is the number of vertices between neighbouring
     /// points, 0 to 10 (0 on a mesh); `rate_hz` is the number of frames per second, at most the session's step rate.
-    /// Positions and normals are computed in tasks of the runtime. Set a time limit around this call.
+    /// Positions and normals are computed in a task of the current Tokio runtime. Set a time limit around this call.
     ///
     /// # Errors
-    /// Returns the server's refusal, how the connection broke, or that the mesh can't be used.
+    /// Returns the errors of [`mesh`], and [`Error::Call`] if the server refuses the frames.
     pub async fn open(channel: Channel, session_id: &str, refinement: u32, rate_hz: f64) -> Result<Self, Error> {
         let mesh = Arc::new(mesh(channel.clone(), session_id, refinement).await?);
         let request = pb::WatchFramesRequest {
@@ -87,23 +88,25 @@ impl ShownSurface {
         Ok(ShownSurface { mesh, newest, lost, _watching: watching })
     }
 
-    /// Returns the constant part of the surface.
+    /// Returns the constant part of the surface, which the server sent when this was opened.
     pub fn mesh(&self) -> &ShownMesh {
         &self.mesh
     }
 
-    /// Takes the newest moment, if there is a newer one, for [`ShownSurface::read`]. Returns whether there was one.
-    /// Never waits.
+    /// Takes the newest moment, if there is one newer than that of the last call, for [`ShownSurface::read`]. Returns
+    /// whether there was one. Moments in between are skipped. Never waits.
     pub fn refresh(&mut self) -> bool {
         self.newest.refresh()
     }
 
-    /// Calls `read` with the moment that the last [`ShownSurface::refresh`] took. Never waits.
+    /// Calls `read` with the moment that the last [`ShownSurface::refresh`] took, the surface at rest before the first
+    /// one, and returns its result. Never waits.
     pub fn read<R>(&self, read: impl FnOnce(&SurfaceMoment) -> R) -> R {
         read(self.newest.read())
     }
 
-    /// Returns why no newer moment will arrive; `None` while frames arrive.
+    /// Returns why no newer moment will arrive: the server has ended the frames, the connection broke, or a frame
+    /// could not be read. `None` while frames are watched. Once lost, the surface is not watched again: open another.
     pub fn lost(&self) -> Option<&str> {
         self.lost.get().map(String::as_str)
     }
@@ -163,10 +166,12 @@ fn write_normals(position_m: &[[f32; 3]], triangles: &[[u32; 3]], normals: &mut 
     }
 }
 
-/// Gets the mesh of a session, with `refinement` vertices between neighbouring points, 0 to 10 (0 on a mesh).
+/// Gets the mesh of a session's surface at rest, with `refinement` vertices between neighbouring points, 0 to 10 (0 on
+/// a mesh). Texture coordinates that are not there for each vertex are left out.
 ///
 /// # Errors
-/// Returns the server's refusal, how the connection broke, or that the mesh can't be used.
+/// Returns [`Error::Call`] with the server's refusal or how the connection broke, and [`Error::Connection`] if the
+/// mesh has more than 2²⁴ vertices or four times as many triangles, or a triangle with a vertex that is not there.
 pub async fn mesh(channel: Channel, session_id: &str, refinement: u32) -> Result<ShownMesh, Error> {
     let request = pb::GetMeshRequest { session_id: session_id.to_owned(), refinement };
     let mut parts = ViewServiceClient::new(channel).get_mesh(request).await?.into_inner();

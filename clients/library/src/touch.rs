@@ -9,7 +9,8 @@ use tonic::{Status, Streaming};
 
 use crate::connect::Channel;
 
-/// A haptic stream that a server has opened. It ends when this is dropped; the server then releases its tools.
+/// A haptic stream that a server has opened: commands go to tools that it leases, samples of these come back. It ends
+/// when this is dropped; the server then releases its tools.
 #[derive(Debug)]
 pub struct Touch {
     opened: pb::TouchOpened,
@@ -17,8 +18,9 @@ pub struct Touch {
 }
 
 impl Touch {
-    /// Opens a stream. Sends `open`, then `messages` as they are produced; when they end, so does the stream. The
-    /// server may take some time to compute a force law: set a time limit around this call.
+    /// Opens a stream and waits for the server's `opened`. Sends `open`, then `messages` as they are produced; when
+    /// they end, so does the stream. The server may take some time to compute a force law: set a time limit around
+    /// this call.
     ///
     /// ```no_run
     /// use palpate_client::{Channel, Touch};
@@ -39,7 +41,8 @@ impl Touch {
     /// ```
     ///
     /// # Errors
-    /// Returns the server's refusal, or how the connection broke.
+    /// Returns the server's refusal, or how the connection broke; `INTERNAL` if the server ends the stream or sends
+    /// something else before `opened`.
     pub async fn open<S>(channel: Channel, open: pb::TouchOpen, messages: S) -> Result<Self, Status>
     where
         S: Stream<Item = Say> + Send + 'static,
@@ -59,7 +62,8 @@ impl Touch {
         &self.opened
     }
 
-    /// Returns the next message of the server; `None` after the last. Dropping the future loses no message.
+    /// Waits for the next message of the server and returns it; `None` after the server has ended the stream without
+    /// an error. Dropping the future loses no message.
     ///
     /// # Errors
     /// Returns why the server ended the stream, or how the connection broke.

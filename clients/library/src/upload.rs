@@ -18,9 +18,10 @@ fn parts(file: &[u8]) -> impl Iterator<Item = (u64, Vec<u8>, bool)> {
     })
 }
 
-/// Uploads the file of a mesh. `unit` is the length of 1 in it: "m", "cm", "mm" or a number of metres. If `repair` is
-/// true, the server repairs faults. The answer contains the `mesh_id` for `Scene.mesh`, and a report of whether the
-/// mesh can be used.
+/// Uploads `file`, the bytes of a mesh's file called `file_name`, in parts one after another. `unit` is the length of
+/// 1 in it: "m", "cm", "mm" or a number of metres. If `repair` is true, the server repairs faults. The answer contains
+/// the `mesh_id` for `Scene.mesh`, and a report of whether the mesh can be used: faults of the mesh are no error here
+/// (`report.refused`).
 ///
 /// ```no_run
 /// # async fn example(channel: palpate_client::Channel) -> Result<(), Box<dyn std::error::Error>> {
@@ -32,7 +33,7 @@ fn parts(file: &[u8]) -> impl Iterator<Item = (u64, Vec<u8>, bool)> {
 /// ```
 ///
 /// # Errors
-/// Returns the server's refusal, or how the connection broke.
+/// Returns the server's refusal of a part, or how the connection broke. Nothing resumes the upload.
 pub async fn upload_mesh(
     channel: Channel,
     file_name: &str,
@@ -50,11 +51,12 @@ pub async fn upload_mesh(
     Ok(answer)
 }
 
-/// Uploads a journal or a snapshot (MCAP). The answer contains the `upload_id` for `JournalMoment`, and a description
-/// of the journal. Calls `sent` after each part with the number of bytes that have arrived.
+/// Uploads `file`, the bytes of a journal or a snapshot (MCAP), in parts one after another. The answer contains the
+/// `upload_id` for `JournalMoment`, and a description of the journal. Calls `sent` after each part with the number of
+/// bytes that have arrived in all.
 ///
 /// # Errors
-/// Returns the server's refusal, or how the connection broke.
+/// Returns the server's refusal of a part, or how the connection broke. Nothing resumes the upload.
 pub async fn upload_journal(
     channel: Channel,
     file: &[u8],

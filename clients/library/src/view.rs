@@ -7,14 +7,16 @@ use tonic::{Status, Streaming};
 
 use crate::connect::Channel;
 
-/// The frames of a session. The stream ends when this is dropped.
+/// An open stream of a session's frames, and the surface as the frames received so far leave it. The stream ends when
+/// this is dropped.
 #[derive(Debug)]
 pub struct Frames {
     parts: Streaming<pb::WatchFramesResponse>,
     surface: SurfaceState,
 }
 
-/// The displacement of a surface from rest. Each frame changes parts of it.
+/// The displacement of a surface from rest, for applying frames by [`SurfaceState::write`]. Without any vertex before
+/// the first frame.
 ///
 /// A part of a frame says where two vertices of a surface of 1 × 2 are; the second is 2 mm deep:
 ///
@@ -35,7 +37,8 @@ pub struct Frames {
 pub struct SurfaceState {
     /// Number of vertices along x and along y.
     pub vertices: [usize; 2],
-    /// Displacement x, y, z of each vertex, m; the index along y varies fastest.
+    /// Displacement of each vertex, m, along x, y and z of the tissue's frame. Vertex (x, y) has index
+    /// x·`vertices[1]` + y.
     pub displacement_m: Vec<[f32; 3]>,
 }
 
@@ -43,8 +46,9 @@ pub struct SurfaceState {
 pub(crate) const MAX_VERTICES: usize = 1 << 24;
 
 impl Frames {
-    /// Starts to watch frames. With `max_frames_in_flight`, acknowledge them by
-    /// `ViewServiceClient::acknowledge_frames`.
+    /// Starts to watch the frames that `request` describes, and waits until the server accepts. If `request` has
+    /// `max_frames_in_flight`, acknowledge the frames by `ViewServiceClient::acknowledge_frames`: otherwise the server
+    /// soon sends no more. Sets no time limit.
     ///
     /// # Errors
     /// Returns the server's refusal, or how the connection broke.
@@ -53,8 +57,9 @@ impl Frames {
         Ok(Frames { parts, surface: SurfaceState::default() })
     }
 
-    /// Returns the next part of a frame, without decoding its displacements; `None` after the last. Use it to count
-    /// frames.
+    /// Waits for the next part of a frame and returns it, without decoding its displacements; `None` after the server
+    /// has ended the stream. The part is not applied to the surface of [`Frames::next`]: use only one of both methods.
+    /// Dropping the future loses no part.
     ///
     /// # Errors
     /// Returns why the server ended the stream, or how the connection broke.
@@ -62,11 +67,12 @@ impl Frames {
         self.parts.message().await
     }
 
-    /// Returns the last part of the next frame, and the whole surface after it; `None` after the last frame. If you
-    /// drop the future, the parts that were read stay in the surface.
+    /// Waits for the next whole frame. Returns its last part, and the surface after it; `None` after the server has
+    /// ended the stream. If you drop the future, the parts that were read stay in the surface.
     ///
     /// # Errors
-    /// Returns why the server ended the stream, how the connection broke, or that a frame can't be read.
+    /// Returns why the server ended the stream or how the connection broke; `DATA_LOSS` with the error of
+    /// [`SurfaceState::write`] if a part can't be applied.
     pub async fn next(&mut self) -> Result<Option<(pb::WatchFramesResponse, &SurfaceState)>, Status> {
         while let Some(part) = self.parts.message().await? {
             self.surface.write(&part).map_err(Status::data_loss)?;
@@ -79,11 +85,13 @@ impl Frames {
 }
 
 impl SurfaceState {
-    /// Applies a part of a frame to the surface. Resets the surface to zero when its size changes.
+    /// Overwrites the displacements of the vertices in a part of a frame. If the part is of a surface of another size,
+    /// first takes that size and sets all displacements to zero.
     ///
     /// # Errors
-    /// Returns what is wrong with a part: patches that are not on the surface or have a wrong size, an unknown
-    /// encoding, or a surface that is too large.
+    /// Returns what is wrong with the part: a surface of more than 2²⁴ vertices, an unknown encoding, or a patch that
+    /// reaches beyond the surface or whose number of bytes is not that of its vertices. Patches before a wrong one
+    /// stay applied.
     pub fn write(&mut self, part: &pb::WatchFramesResponse) -> Result<(), String> {
         let vertices = [part.vertices_x as usize, part.vertices_y as usize];
         if vertices != self.vertices {

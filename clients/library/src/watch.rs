@@ -30,7 +30,7 @@ pub struct Samples {
 }
 
 impl Samples {
-    /// Starts to watch samples.
+    /// Starts to watch the samples that `request` describes, and waits until the server accepts. Sets no time limit.
     ///
     /// # Errors
     /// Returns the server's refusal, or how the connection broke.
@@ -39,8 +39,9 @@ impl Samples {
         Ok(Samples { samples, revision: 0 })
     }
 
-    /// Returns the next sample; `None` after the last. Skips samples of a server that no longer owns the session.
-    /// Dropping the future loses no sample.
+    /// Waits for the next sample and returns it; `None` after the server has ended the stream without an error. Skips
+    /// samples with a smaller ownership revision than one before: their server no longer owns the session. Dropping
+    /// the future loses no sample.
     ///
     /// # Errors
     /// Returns why the server ended the stream, or how the connection broke.

@@ -19,7 +19,7 @@ use std::collections::VecDeque;
 
 use crate::random::Random;
 
-/// How messages travel.
+/// How messages travel. Parsed from `stream` or `datagram`; other texts are refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Transport {
     /// A gRPC stream over TCP: a lost packet delays all later ones.
@@ -30,7 +30,7 @@ pub enum Transport {
 }
 
 impl Transport {
-    /// Returns its name in options.
+    /// Returns its name in options, `stream` or `datagram`.
     pub fn name(self) -> &'static str {
         match self {
             Transport::Stream => "stream",
@@ -48,24 +48,26 @@ impl std::str::FromStr for Transport {
     }
 }
 
-/// The conditions of a network.
+/// The conditions of a network. The default delays and loses nothing. No value is checked.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Conditions {
     /// How messages travel.
     pub transport: Transport,
     /// Round-trip time without jitter, s.
     pub round_trip_s: f64,
-    /// Standard deviation of the delay each way, s.
+    /// Standard deviation of the delay each way, s: normally distributed, but no message arrives before it has left
+    /// the link.
     pub jitter_s: f64,
-    /// Fraction of the packets that are lost, 0 to 1.
+    /// Fraction of the messages that are lost, 0 to below 1; a stream delivers them later instead.
     pub loss: f64,
-    /// Mean number of packets lost in succession; up to 1, each is lost independently.
+    /// Mean number of messages lost in succession; up to 1, each is lost independently.
     pub burst: f64,
-    /// Duration of the outage that occurs once per second, s; 0: none.
+    /// Duration of the outage that begins at a random moment of each second, s; 0: none.
     pub outage_s: f64,
     /// Rate of the link in each direction, bit/s; 0: unlimited.
     pub rate_bit_per_s: f64,
-    /// Longest time that a datagram waits for the link, s.
+    /// Longest time that a datagram waits for a link of limited rate, s; one that would wait longer is dropped. A
+    /// stream has a buffer of 1 MiB instead.
     pub queue_s: f64,
 }
 
@@ -107,7 +109,7 @@ impl Link {
 /// Least retransmission timeout of TCP, s (RFC 6298 requires 1 s, Linux uses 200 ms).
 const MIN_RTO_S: f64 = 0.2;
 
-/// Random stalls, once per second.
+/// Random stalls of equal length: one begins at a random moment of each second.
 pub struct Stalls {
     stall_s: f64,
     random: Random,
@@ -115,13 +117,14 @@ pub struct Stalls {
 }
 
 impl Stalls {
-    /// Creates stalls of `stall_s` each, the first not before `from_s`.
+    /// Creates stalls of `stall_s` each, s, the first within the second after `from_s`; with 0 there are none.
     pub fn new(stall_s: f64, from_s: f64, mut random: Random) -> Self {
         let begin_s = from_s + random.between(0.0, 1.0);
         Stalls { stall_s, random, begin_s }
     }
 
-    /// Returns the end of the stall at `now_s`, s; `None` if there is none.
+    /// Returns the end of the stall that lasts at `now_s`, s; `None` if there is none. Times must not decrease from
+    /// call to call.
     pub fn at(&mut self, now_s: f64) -> Option<f64> {
         while now_s >= self.begin_s + self.stall_s {
             self.begin_s = self.begin_s.ceil() + self.random.between(0.0, 1.0);
@@ -130,14 +133,14 @@ impl Stalls {
     }
 }
 
-/// The outages of a network, shared by both directions.
+/// The outages of a network, at equal times for both directions: each computes its own from the same seed.
 pub struct Outages {
     stalls: Stalls,
     ended_s: f64,
 }
 
 impl Outages {
-    /// Creates the outages of a seed, the first not before `from_s`.
+    /// Creates the outages of a seed, of [`Conditions::outage_s`] each, the first within the second after `from_s`.
     pub fn new(conditions: &Conditions, seed: u64, from_s: f64) -> Self {
         let stalls = Stalls::new(conditions.outage_s, from_s, Random::new(seed, 5));
         Outages { stalls, ended_s: f64::NEG_INFINITY }
@@ -153,7 +156,8 @@ impl Outages {
         self.stalls.at(now_s)
     }
 
-    /// Returns the time since the end of the last outage, s; 0 during one, infinite before the first.
+    /// Returns the time since the end of the last outage that a call fell into, s; 0 during one, infinite before the
+    /// first. Times must not decrease from call to call.
     pub fn since_s(&mut self, now_s: f64) -> f64 {
         if let Some(end_s) = self.at(now_s) {
             self.ended_s = end_s;
@@ -191,8 +195,9 @@ pub struct Direction<T> {
 }
 
 impl<T> Direction<T> {
-    /// Creates direction `direction` of the network with this seed. Both directions have their outages at equal
-    /// times, the first not before `from_s`.
+    /// Creates one direction of the network with this seed. `direction` is its number, other than 5: each has random
+    /// numbers of its own. All directions of a seed have their outages at equal times, the first within the second
+    /// after `from_s`.
     pub fn new(conditions: Conditions, seed: u64, direction: u64, from_s: f64) -> Self {
         Direction {
             conditions,
@@ -221,7 +226,8 @@ impl<T> Direction<T> {
         self.is_bursting
     }
 
-    /// Sends a message of `bytes` bytes at `now_s`.
+    /// Sends a message at `now_s`, which must not decrease from call to call; decides at once whether and when it
+    /// arrives. `bytes` is its length on the link, which only counts if the rate is limited.
     pub fn send(&mut self, now_s: f64, bytes: u64, message: T) {
         let Conditions { transport, round_trip_s, jitter_s, .. } = self.conditions;
         self.sent += 1;
@@ -251,7 +257,7 @@ impl<T> Direction<T> {
         self.under_way.insert(at, (arrives_s, message));
     }
 
-    /// Removes and returns the next message that has arrived by `now_s`; `None` if there is none.
+    /// Removes and returns the message that arrives first, if it has arrived by `now_s`; `None` otherwise.
     pub fn receive(&mut self, now_s: f64) -> Option<T> {
         // A nanosecond more allows for rounding: times are sums of milliseconds.
         if self.under_way.front()?.0 > now_s + 1e-9 {
@@ -260,22 +266,23 @@ impl<T> Direction<T> {
         self.under_way.pop_front().map(|entry| entry.1)
     }
 
-    /// Returns when the next message arrives, s; `None` if there is none.
+    /// Returns when the next message arrives, s; `None` if none is under way. It may have arrived already.
     pub fn next_s(&self) -> Option<f64> {
         self.under_way.front().map(|entry| entry.0)
     }
 
-    /// Returns the number of messages under way.
+    /// Returns the number of messages that were neither lost nor received yet.
     pub fn under_way(&self) -> usize {
         self.under_way.len()
     }
 
-    /// Returns the number of messages sent so far.
+    /// Returns the number of messages sent so far, including lost and dropped ones.
     pub fn sent(&self) -> u64 {
         self.sent
     }
 
-    /// Returns the number of messages dropped because the queue was full.
+    /// Returns the number of messages dropped so far because the queue of the link, or the buffers of a stream, were
+    /// full.
     pub fn overflowed(&self) -> u64 {
         self.overflowed
     }

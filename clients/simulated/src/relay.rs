@@ -11,7 +11,7 @@ use palpate_client::bridge::Warn;
 
 use crate::network::{Conditions, Direction, Transport};
 
-/// Maximum number of concurrent flows: connections, and senders of datagrams.
+/// Usual maximum number of concurrent flows (connections, and senders of datagrams) for [`RelayNetwork::new`].
 pub const MAX_FLOWS: u64 = 64;
 
 /// Maximum number of packets of a flow under way in each direction; beyond it, TCP waits and datagrams are lost.
@@ -31,17 +31,18 @@ struct PacketCounts {
     bytes: [AtomicU64; 2],
 }
 
-/// The totals of what was forwarded, in each direction: to the server, and back.
+/// The totals of what was forwarded so far. Pairs count what went to the server, then what came back.
 pub struct Passed {
-    /// Number of connections, and of senders of datagrams.
+    /// Number of connections and of senders of datagrams, including those that have ended.
     pub flows: u64,
-    /// Number of packets.
+    /// Number of packets that passed the network; of TCP, pieces of at most 1400 bytes.
     pub packets: [u64; 2],
-    /// Number of bytes.
+    /// Number of bytes in these packets.
     pub bytes: [u64; 2],
 }
 
-/// The simulated network that all relayed flows go through.
+/// The simulated network that all relayed flows go through. Each flow has delays and losses of its own; outages are
+/// common to all.
 pub struct RelayNetwork {
     conditions: [Conditions; 2],
     most_flows: u64,
@@ -52,8 +53,9 @@ pub struct RelayNetwork {
 }
 
 impl RelayNetwork {
-    /// Creates a network with these conditions, whose transport is ignored, for at most `most_flows` concurrent
-    /// flows. `warn` is called with messages about flows that are not relayed.
+    /// Creates a network with these conditions for at most `most_flows` concurrent flows; further ones are refused.
+    /// The conditions' transport is ignored: it follows from the flow. `seed` determines the random numbers, and time
+    /// counts from now. `warn` is called, on any thread, with messages about flows that are not relayed.
     pub fn new(conditions: Conditions, seed: u64, most_flows: u64, warn: Arc<Warn>) -> Arc<Self> {
         let of = |transport| Conditions { transport, ..conditions };
         let conditions = [of(Transport::Stream), of(Transport::Datagram)];
@@ -68,10 +70,10 @@ impl RelayNetwork {
     }
 
     /// Relays connections to `listen` to the address `to`, on threads of its own, until the program ends. Returns the
-    /// bound address.
+    /// bound address: port 0 of `listen` stands for any free one. Call it any number of times.
     ///
     /// # Errors
-    /// Returns an error if the address is not free.
+    /// Returns an error if `listen` is not free or not of this machine, or if no thread can be started.
     pub fn relay_tcp(self: &Arc<Self>, listen: SocketAddr, to: SocketAddr) -> io::Result<SocketAddr> {
         let refused = |error: io::Error| io::Error::new(error.kind(), format!("can't listen on {listen}: {error}"));
         let listener = TcpListener::bind(listen).map_err(refused)?;
@@ -81,11 +83,12 @@ impl RelayNetwork {
         Ok(bound)
     }
 
-    /// Relays datagrams to `listen` to the address `to`, on threads of its own, until the program ends. Returns the
-    /// bound address.
+    /// Relays datagrams to `listen` to the address `to`, on threads of its own, until the program ends, and the
+    /// answers back to each sender; a flow ends after 60 s without an answer. Returns the bound address: port 0 of
+    /// `listen` stands for any free one. Call it any number of times.
     ///
     /// # Errors
-    /// Returns an error if the address is not free.
+    /// Returns an error if `listen` is not free or not of this machine, or if no thread can be started.
     pub fn relay_udp(self: &Arc<Self>, listen: SocketAddr, to: SocketAddr) -> io::Result<SocketAddr> {
         let refused = |error: io::Error| io::Error::new(error.kind(), format!("can't listen on {listen}: {error}"));
         let socket = UdpSocket::bind(listen).map_err(refused)?;
@@ -95,7 +98,7 @@ impl RelayNetwork {
         Ok(bound)
     }
 
-    /// Returns the totals so far.
+    /// Returns the totals so far, over all flows.
     pub fn passed(&self) -> Passed {
         let PacketCounts { flows, packets, bytes, .. } = &self.counts;
         let read = |counts: &[AtomicU64; 2]| [0, 1].map(|way| counts[way].load(Ordering::Relaxed));

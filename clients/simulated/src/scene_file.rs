@@ -17,7 +17,7 @@ use pb::create_session_request::Source;
 use pb::view_service_client::ViewServiceClient;
 use tonic::Status;
 
-/// The scene of a session to create.
+/// The scene of sessions to create: the name of one of the server's scenes, or a scene read from a file with its mesh.
 pub struct SceneFile {
     source: Source,
     /// The scene, if it was read from a file.
@@ -33,10 +33,11 @@ struct MeshToSend {
 }
 
 impl SceneFile {
-    /// Reads a scene: one of the server's by its name, or a file whose name ends in .toml.
+    /// Reads a scene: `scene` is a path that ends in .toml, or otherwise the name of one of the server's scenes,
+    /// which is not checked. Reads the mesh that the file names too. Sends nothing.
     ///
     /// # Errors
-    /// Returns an error if the file can't be read, or if its scene is invalid.
+    /// Refuses a scene file or mesh that can't be read, is invalid, or exceeds the default limits.
     pub fn read(scene: &str) -> Result<Self, Refusal> {
         let file = Path::new(scene);
         if file.extension().is_none_or(|extension| extension != "toml") {
@@ -70,10 +71,12 @@ impl SceneFile {
         Ok(SceneFile { source: Source::Scene(message), own: Some(own), mesh })
     }
 
-    /// Returns the source of a session; uploads the mesh, if there is one.
+    /// Returns the source of a session for a call to create it. Uploads the mesh of the file, if there is one, at each
+    /// call.
     ///
     /// # Errors
-    /// Returns the server's refusal, or how the connection broke.
+    /// Returns [`Error::Call`] if the server refuses the upload or the connection breaks, and [`Error::Argument`] with
+    /// the first problem if the server can't use the mesh.
     pub async fn source(&self, channel: Channel) -> Result<Source, Error> {
         let mut source = self.source.clone();
         if let (Source::Scene(scene), Some(MeshToSend { name, bytes, unit })) = (&mut source, &self.mesh) {
@@ -89,12 +92,13 @@ impl SceneFile {
         Ok(source)
     }
 
-    /// Returns the scene of a session that the server has created from this source. For a mesh of the server, rest
-    /// positions have only seven digits, the mesh has all vertices of its file, and all points and springs have the
-    /// reference values.
+    /// Returns the scene of `session`, which the server has created from this source: that of the file if it has a
+    /// mesh, otherwise that of the server. A mesh of the server is fetched over `channel`: its rest positions have
+    /// only seven digits, it has all vertices of its file, and all points and springs have the reference values.
     ///
     /// # Errors
-    /// Returns an error if the server's scene or mesh can't be read.
+    /// Returns [`Error::Connection`] if `session` has no scene, [`Error::Call`] if the server refuses to send its
+    /// mesh or the connection breaks, and [`Error::Argument`] if the scene is invalid.
     pub async fn scene(&self, session: &pb::Session, channel: Channel) -> Result<Scene, Error> {
         let told = session.scene.as_ref().ok_or_else(|| Error::Connection("the server sent no scene".to_owned()))?;
         let wrong = |refusal: Refusal| Error::Argument(refusal.to_string());

@@ -7,7 +7,7 @@ use palpate_haptics::hand::Hand;
 
 use crate::random::Random;
 
-/// Time before the first press, s: longer than the soft engage.
+/// Usual time before the first press of a [`Task`], s: longer than forces take to fade in.
 pub const LEAD_S: f64 = 0.7;
 
 /// Range of the target's depths, m.
@@ -27,7 +27,7 @@ const PARTS: [f64; 3] = [0.3, 0.4, 0.3];
 /// Ratio of the largest to the mean speed of a minimum-jerk movement.
 const PEAK: f64 = 1.875;
 
-/// Fraction of the device's largest force that the true force must not exceed.
+/// Fraction of the device's largest force that the force of a hand's deepest press must not exceed ([`scale`]).
 pub const FORCE_SHARE: f64 = 0.8;
 
 /// One movement, relative to the end of the one before.
@@ -37,16 +37,21 @@ struct Leg {
     by_m: DVec3,
 }
 
-/// The movement of a hand's target over time.
+/// The movement of a hand's target over time: the place where the hand wants its tool to be, in the tissue's frame.
+/// Presses follow each other without a pause, 0.4 to 1 per second, each 5 to 15 mm (times a scale) below the surface
+/// and back to 2 to 5 mm above it; most have a stroke of up to 20 mm along the surface.
 pub struct Task {
     start_m: DVec3,
     legs: Vec<Leg>,
-    /// Largest distance from the start, m.
+    /// Largest distance of the target from its start at the ends of movements, m.
     pub amplitude_m: f64,
 }
 
 impl Task {
-    /// Creates presses around `middle_m` from `lead_s` until `duration_s`, with depths multiplied by `scale`.
+    /// Creates presses around `middle_m`, a place on the surface at rest, m. The first begins at `lead_s`, the last
+    /// before `duration_s`, and ends at most 2.5 s after that; both are finite times, s. `scale` (above 0, see
+    /// [`scale`]) multiplies the depths below the surface, not the heights above it. Equal random numbers give equal
+    /// movements.
     pub fn new(middle_m: DVec3, lead_s: f64, duration_s: f64, scale: f64, random: &mut Random) -> Self {
         let mut height_m = random.between(HEIGHT_M[0], HEIGHT_M[1]);
         let start_m = middle_m + height_m * DVec3::Z;
@@ -81,12 +86,12 @@ impl Task {
         Task { start_m, legs, amplitude_m }
     }
 
-    /// Returns the target's position at the start, m.
+    /// Returns the target's position until the first press, m: 2 to 5 mm above the middle.
     pub fn start_m(&self) -> DVec3 {
         self.start_m
     }
 
-    /// Returns the target's position at `time_s`, m.
+    /// Returns the target's position at `time_s`, m; it rests before the first press and after the last.
     pub fn at(&self, time_s: f64) -> DVec3 {
         self.legs.iter().take_while(|leg| leg.from_s < time_s).fold(self.start_m, |place_m, leg| {
             let x = ((time_s - leg.from_s) / (leg.to_s - leg.from_s)).min(1.0);
@@ -95,8 +100,9 @@ impl Task {
     }
 }
 
-/// Returns the scale of depths at which the deepest press of a hand at rest reaches [`FORCE_SHARE`] of the largest
-/// force, where the hand's spring and the tissue are in balance; at most 1.
+/// Returns the scale of depths for [`Task::new`] at which the deepest press of a hand at rest, whose spring and the
+/// tissue are in balance, has 93 % of [`FORCE_SHARE`] of a device's largest force `most_n`, N: the rest is a margin
+/// for damping and friction. `law` is the tissue's force law. At most 1, which a hand without stiffness gets.
 pub fn scale(hand: &Hand, law: &Law, most_n: f64) -> f64 {
     let force_n = FORCE_SHARE * MARGIN * most_n;
     let yields_m = if hand.stiffness_n_per_m > 0.0 { force_n / hand.stiffness_n_per_m } else { f64::INFINITY };

@@ -9,12 +9,14 @@ use palpate_session::budget::parse_bytes;
 
 /// The age above which journals of ended sessions are removed, and the size of all journals above which the oldest of
 /// those are. The newest journal of a running session, and those that could not be continued, are never removed.
+/// Parsed from `30d,10GiB` (the default), one of both (the other is then unlimited), or `0`, which keeps none; an age
+/// is in `d`, `h`, `m` or `s`.
 #[derive(Clone, Copy, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 pub struct Keep {
-    /// Age at which a journal is removed.
+    /// Age, since the end of its session, at which a journal is removed; [`Duration::MAX`]: never.
     pub age: Duration,
-    /// Limit on the bytes of all journals together.
+    /// Limit on the bytes of all journals together; [`u64::MAX`]: none.
     pub bytes: u64,
 }
 

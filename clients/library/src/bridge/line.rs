@@ -50,22 +50,25 @@ pub(super) struct Inbound {
     at: Option<Server>,
 }
 
-/// Totals of what was sent and received over all connections of a bridge.
+/// Totals of what was sent and received over all connections of a bridge so far.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Traffic {
     /// Number of connections that were opened.
     pub connections: u64,
-    /// Number of samples that arrived.
+    /// Number of samples that were used, by datagram or stream. Overtaken ones, and those of a server that no longer
+    /// has the session, do not count.
     pub samples: u64,
-    /// Bytes of the samples, with the headers of the network.
+    /// Bytes of these samples, each with the headers that a message of a stream has: gRPC, HTTP/2, TCP and IP.
     pub bytes: u64,
     /// Number of commands that the server refused.
     pub refused: u64,
-    /// Number of failed attempts to connect, and of connections that broke.
+    /// Number of failed attempts to connect, and of connections that broke. Moves to a server that a refusal named do
+    /// not count.
     pub failed: u64,
-    /// Number of poses that were sent, by datagram or stream.
+    /// Number of poses that the ticks passed to a connection, including those dropped because its stream did not keep
+    /// up.
     pub poses: u64,
-    /// Messages sent and received by datagram, and how often the stream took over again.
+    /// Numbers of messages sent and received by datagram, and how often the stream took over again.
     pub carried: Carried,
     /// Largest displacement of the tissue under the middle of the tip, as reported in samples, m.
     pub deepest_m: f64,

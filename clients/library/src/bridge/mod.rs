@@ -39,9 +39,9 @@ pub use ticker::{PositionOrigin, Ticker};
 pub struct Target {
     /// The server's address and credentials.
     pub server: Server,
-    /// The session to touch.
+    /// The session to touch, which exists or is created.
     pub session: SessionChoice,
-    /// Number of the tool that the device moves.
+    /// Number of the session's tool that the device moves, from 0. No other caller may hold it.
     pub tool: u32,
     /// The tool's tip.
     pub tip: Tip,
@@ -53,7 +53,7 @@ pub struct Target {
     pub up_deadband: f64,
     /// Whether poses and samples go by datagram if the server offers datagrams.
     pub datagrams: bool,
-    /// The holder's name, which other users of the server see.
+    /// The name of the tool's holder, which other users of the server see.
     pub holder: String,
 }
 
@@ -69,14 +69,15 @@ pub enum SessionChoice {
     },
 }
 
-/// A function that shows a text to people.
+/// A function that shows a text to people: one line without control characters. It may be called on any thread, and
+/// must not wait.
 pub type Warn = Box<dyn Fn(&str) + Send + Sync>;
 
 /// A function that is called with the priority of a loop before it starts.
 pub type Begun = Box<dyn FnOnce(&Priority) + Send>;
 
-/// Builds a copy of a tissue for a tool with this tip from the bytes of a snapshot (`SaveSnapshot`), or returns why
-/// it can't.
+/// A function that builds a copy of a tissue for a tool with this tip from the bytes of a snapshot (`SaveSnapshot`, at
+/// most 64 MiB), or returns why it can't. It is called on a thread of its own, for one copy at a time.
 pub type MakeCopy = Arc<dyn Fn(&[u8], Tip) -> Result<Box<dyn Predictor>, String> + Send + Sync>;
 
 /// Which tissues a loop copies, to render from the copy without the delay of the network
@@ -89,12 +90,14 @@ pub struct Copies {
     pub of_sheets: bool,
 }
 
-/// Stops the forces of a loop, from any thread, until the operator requests them again. Clones control one loop.
+/// A switch that stops the forces of a loop, from any thread, until the operator requests them again. All clones
+/// control the loop of the [`Options`] that one of them was given to.
 #[derive(Debug, Clone, Default)]
 pub struct Disable(Arc<AtomicBool>);
 
 impl Disable {
-    /// Stops rendering from the next tick on. The force falls within a few ticks.
+    /// Stops rendering from the next tick on, until [`crate::Reading::enable`] changes from false to true. The force
+    /// falls within the next ticks. Never waits.
     pub fn disable(&self) {
         self.0.store(true, Ordering::Relaxed);
     }
@@ -105,12 +108,14 @@ impl Disable {
     }
 }
 
-/// Options of [`run`] and [`begin`].
+/// Options of [`run`] and [`begin`]. By default there is no time limit, nothing is recorded or shown, the priority is
+/// the usual one, a created session is deleted at the end, and no tissue is copied. [`begin`] uses only
+/// `keeps_session`, `warn` and `copies`.
 #[derive(Default)]
 pub struct Options {
-    /// Time after which [`run`] ends; `None`: no limit.
+    /// Time after which [`run`] ends, from the first tick, which does not wait for a connection; `None`: no limit.
     pub lasts: Option<Duration>,
-    /// Whether [`run`] records the course and the ages of the models, at most an hour.
+    /// Whether [`run`] records its ticks (at most 3.6 million, an hour) and the ages of the models (without a limit).
     pub remembers: bool,
     /// Whether the loop of [`run`] requests real-time priority. [`BridgeReport::priority`] and `warn` report the
     /// result.
@@ -140,30 +145,32 @@ impl fmt::Debug for Options {
     }
 }
 
-/// The results of [`run`].
+/// The results of [`run`], over all its connections.
 #[derive(Debug)]
 pub struct BridgeReport {
-    /// The ticks; empty unless [`Options::remembers`] was set.
+    /// The ticks in order, at most 3.6 million; empty unless [`Options::remembers`] was set.
     pub course: Vec<Tick>,
-    /// Age of the local model at each tick, s; empty unless [`Options::remembers`] was set.
+    /// Age of the newest local model, s, at each tick that had one ([`Ticker::model_age_s`]), in order; empty unless
+    /// [`Options::remembers`] was set. Its indices are not those of `course`.
     pub ages_s: Vec<f64>,
-    /// The envelope at the end: the limits that act on the forces.
+    /// The envelope at the end: the limits that act on the forces. `None` if no tick had a connection.
     pub envelope: Option<Envelope>,
-    /// Number of ticks that started more than a tick late.
+    /// Number of ticks that started more than a millisecond late.
     pub late_ticks: u64,
-    /// Number of ticks that were skipped.
+    /// Number of ticks that were skipped, because the loop was more than 5 ms late.
     pub missed_ticks: u64,
     /// Number of ticks that were rendered from a copy of the tissue.
     pub predicted_ticks: u64,
-    /// The largest rendered force, N.
+    /// The largest magnitude of a rendered force, N.
     pub most_force_n: f64,
     /// The priority with which the loop ran.
     pub priority: Priority,
     /// Totals of what was sent and received.
     pub traffic: Traffic,
-    /// The ID of the session that was created for the target, if any.
+    /// The ID of the session that was created for the target, if any. It was deleted at the end unless
+    /// [`Options::keeps_session`] was set.
     pub made: Option<String>,
-    /// Why there was no connection at the end; `None` if there was one.
+    /// Why there was no connection at the end ([`Error::Connection`]); `None` if there was one.
     pub lost: Option<Error>,
     /// The error of the device that ended the loop; only set by [`run_told`].
     pub failure: Option<Error>,
@@ -177,7 +184,7 @@ const MIN_FELT_N: f64 = 1e-3;
 const MIN_MOVED_M: f64 = 1e-5;
 
 impl BridgeReport {
-    /// Returns a sentence that explains why no force was felt at all; `None` if one was.
+    /// Returns a sentence that explains why no force was felt at all; `None` if one of at least 1 mN was.
     pub fn unfelt(&self) -> Option<&'static str> {
         if self.most_force_n >= MIN_FELT_N {
             return None;
@@ -190,12 +197,16 @@ impl BridgeReport {
     }
 }
 
-/// Connects a device until its time has passed or `stop` completes. Returns the device and the results. The last
-/// force written to the device is zero, also after an error and if you drop the future.
+/// Connects `device` to `target`, until [`Options::lasts`] has passed or `stop` completes, and connects again when a
+/// connection breaks. Returns the device and the results. The loop starts at once, with forces of zero until the first
+/// connection. The last force written to the device is zero, also after an error and if you drop the future, but not
+/// after a panic of the device. Call it within a Tokio runtime.
 ///
 /// # Errors
-/// Returns an error if the device fails, if the server refuses the session or the tool at first, or if no connection
-/// succeeds.
+/// Returns [`Error::Device`] if the device fails or no thread can be started. If no connection was ever opened,
+/// returns why: the server refuses the session or the tool, the caller's rights do not suffice, somebody else holds
+/// the tool (these end the loop at once), or the server can't be reached until the end. Returns [`Error::Internal`]
+/// if the loop panicked.
 pub async fn run<D: HapticDevice + 'static>(
     device: D,
     target: Target,
@@ -206,11 +217,11 @@ pub async fn run<D: HapticDevice + 'static>(
     report.failure.take().map_or(Ok((device, report)), Err)
 }
 
-/// Runs like [`run`], but if the device fails, returns the results until then, with the error in
-/// [`BridgeReport::failure`].
+/// Runs like [`run`], but if the device fails after the first connection, returns the results until then, with the
+/// error in [`BridgeReport::failure`].
 ///
 /// # Errors
-/// Returns an error if the server refuses the session or the tool at first, or if no connection succeeds.
+/// Returns the errors of [`run`], that of the device only if no connection was opened before it.
 pub async fn run_told<D: HapticDevice + 'static>(
     mut device: D,
     target: Target,
@@ -304,14 +315,17 @@ fn line(
 /// Interval at which the courier thread of [`begin`] checks for something to send.
 const ROUND: Duration = Duration::from_micros(250);
 
-/// Connects a loop of your own. Waits for the first connection; later ones are opened automatically. `device`
-/// describes the limits of the forces; it is also sent to the server.
+/// Connects a loop of your own to `target`. Waits for the first connection, at most ten seconds; later ones are
+/// opened automatically. `device` describes the limits of the forces; it is also sent to the server. `origin` is the
+/// frame of the readings. Of `options`, only `keeps_session`, `warn` and `copies` are used. Call it within a Tokio
+/// runtime, which must run as long as the connection.
 ///
 /// A tick wakes no thread, because that would be a call of the system. A courier thread notices within a quarter of a
 /// millisecond that a tick has something to send.
 ///
 /// # Errors
-/// Returns the server's refusal, or why it can't be reached within ten seconds.
+/// Returns the server's refusal of the session or the tool, [`Error::Connection`] if it can't be reached within ten
+/// seconds, or [`Error::Device`] if no thread can be started.
 pub async fn begin(
     target: Target,
     device: Device,
@@ -348,7 +362,9 @@ pub async fn begin(
 /// Time limit for the first connection of [`begin`].
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// The network side of a [`Ticker`]. When you drop it, the forces of the ticker fade.
+/// The network side of a [`Ticker`], which connects again whenever a connection breaks. When you drop it, the server
+/// releases the tool and the forces of the ticker fade; a session that was created for the target stays until it is
+/// idle for long ([`Connection::end`] deletes it).
 pub struct Connection {
     /// Dropping it aborts the task; the loop then detects that it is over.
     network: JoinSet<()>,
@@ -360,18 +376,20 @@ pub struct Connection {
 }
 
 impl Connection {
-    /// Returns the totals of what was sent and received.
+    /// Returns the totals of what was sent and received so far.
     pub fn traffic(&self) -> Traffic {
         self.shared.inbound().traffic
     }
 
-    /// Returns why there is no connection now; `None` while there is one.
+    /// Returns why there is no connection now, one line; `None` while there is one. Unless [`Ticker::is_over`] holds,
+    /// another attempt follows.
     pub fn lost(&self) -> Option<String> {
         self.shared.inbound().failure.as_ref().map(ToString::to_string)
     }
 
     /// Releases the tool, and deletes the session that was created for the target unless [`Options::keeps_session`]
-    /// is set.
+    /// is set. Waits at most 2 s for the server; if it does not answer, the session stays until it is idle for long.
+    /// The ticker is then over ([`Ticker::is_over`]).
     pub async fn end(mut self) {
         self.close().await;
     }

@@ -19,14 +19,14 @@ const MAX_LATE: Duration = Duration::from_millis(5);
 /// Maximum number of ticks that are recorded.
 const MAX_REMEMBERED: usize = 3_600_000;
 
-/// One tick of a device's loop.
+/// One tick of a device's loop: what [`crate::HapticDevice::ticked`] and [`super::BridgeReport::course`] get.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tick {
-    /// Time since the loop started, s.
+    /// Time from the start of the loop until the device was read, s.
     pub time_s: f64,
-    /// Position in the tissue's frame, m; before the first connection, in the device's frame.
+    /// Position of the tool in the tissue's frame, m; before the first connection, in the device's frame.
     pub place_m: DVec3,
-    /// The rendered force, N.
+    /// The force written to the device, N, in its frame.
     pub force_n: DVec3,
     /// Whether forces are rendered; `None` before the first connection.
     pub state: Option<RenderingState>,

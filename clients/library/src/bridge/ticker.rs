@@ -64,18 +64,19 @@ const USED: usize = 4 * MAX_LAWS;
 /// Jump of the clock above which it counts as set rather than a tick as late, s.
 const MAX_AHEAD_S: f64 = 3600.0;
 
-/// The frame in which a device's positions are measured.
+/// The frame in which the positions of the readings are measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum PositionOrigin {
     /// The device's frame, whose origin is the middle of its workspace. It is placed on the top of the tissue, which
     /// is the middle of a sheet.
     #[default]
     Workspace,
-    /// The tissue's frame.
+    /// The tissue's frame, as for a tracker that is calibrated to it.
     Tissue,
 }
 
-/// The loop's half of a bridge: renders forces. Call [`Ticker::tick`] at 1 kHz, on any thread.
+/// The loop's half of a bridge, from [`super::begin`] or [`super::Offline`]: renders forces and queues the poses to
+/// send. Call [`Ticker::tick`] at 1 kHz, on any thread.
 pub struct Ticker {
     told: QueueReader<LoopEvent>,
     newest: NewestReader<Newest>,
@@ -179,8 +180,9 @@ impl Clock {
 }
 
 impl Ticker {
-    /// Returns the force to render from now on, N, for a device that reports `reading` at `time_s`. The times may
-    /// have any origin and must advance between ticks. Returns zero before the first connection.
+    /// Returns the force to render from now on, N, for a device that reports `reading` at `time_s`, s. The times may
+    /// have any origin and must advance between ticks. Returns zero before the first connection. Queues a pose for the
+    /// network; drops it if 64 wait. A change of [`Reading::enable`] from false to true enables forces.
     ///
     /// Takes bounded time: no lock, no call of the system, no memory allocated or freed. Another thread steps a copy
     /// of the tissue. Ticks may be late, early or missing: the envelope takes the time since the last one into
@@ -258,12 +260,13 @@ impl Ticker {
         }
     }
 
-    /// Returns the number of ticks that were rendered from a copy of the tissue ([`super::Options::copies`]).
+    /// Returns the number of ticks so far that were rendered from a copy of the tissue ([`super::Options::copies`]).
     pub fn predicted(&self) -> u64 {
         self.renderer.predicted()
     }
 
-    /// Stops rendering until the operator enables it again. The force falls to zero within a few ticks.
+    /// Stops rendering until [`Reading::enable`] changes from false to true again. The force falls to zero within the
+    /// next ticks, at the envelope's slew limit.
     pub fn disable(&mut self) {
         self.renderer.envelope.disable();
     }
@@ -274,7 +277,7 @@ impl Ticker {
     }
 
     /// Returns the position of the tool at the last tick, in the tissue's frame, m; before the first connection, in
-    /// the device's frame.
+    /// the frame of the reading; zero before the first tick.
     pub fn place_m(&self) -> DVec3 {
         self.place_m
     }
@@ -285,12 +288,14 @@ impl Ticker {
         self.renderer.model_time_s().filter(|_| self.connection > 0).map(|time_s| self.clock.now_s - time_s)
     }
 
-    /// Returns the limits that act on the forces; `None` before the first connection.
+    /// Returns the limits that act on the forces, in their current state; `None` before the first tick of the first
+    /// connection. It stays over later connections.
     pub fn envelope(&self) -> Option<&Envelope> {
         (self.connection > 0).then_some(&self.renderer.envelope)
     }
 
-    /// Returns whether the network side has ended for good. Forces then fade.
+    /// Returns whether the network side has ended for good: its half was dropped or ended, or the server refused the
+    /// first connection. Forces then fade, and no tick changes that.
     pub fn is_over(&self) -> bool {
         self.commands.is_over()
     }

@@ -7,30 +7,33 @@ use glam::DVec3;
 use crate::bridge::TICK_S;
 use crate::device::HapticDevice;
 
-/// The results of a check of a device.
+/// The results of [`check`], until the time had passed or the device failed.
 #[derive(Debug, Clone, Default)]
 pub struct DeviceReport {
-    /// Number of ticks.
+    /// Number of ticks, including one at which the device failed.
     pub ticks: u64,
-    /// Ticks per second.
+    /// Mean number of ticks per second.
     pub rate_hz: f64,
-    /// Positions per second that differ from the one before: the device's own rate, if it is moved.
+    /// Positions per second that differ from the one before: about the device's own rate, if it is moved all the time.
     pub changes_hz: f64,
-    /// Time between two ticks, s: median, 99th percentile and longest.
+    /// Time from one tick to the next, s: median, 99th percentile and longest; zeros with fewer than two ticks.
     pub period_s: [f64; 3],
-    /// Duration of reading the device and setting its force, s: median, 99th percentile and longest.
+    /// Duration of reading the device and setting its force, s: median, 99th percentile and longest; zeros without a
+    /// tick.
     pub call_s: [f64; 3],
-    /// Smallest and largest coordinates of the positions, m, in the device's frame; `None` without a position.
+    /// Smallest and largest x, y and z of the positions, m, in the device's frame; `None` without a finite position.
     pub place_m: Option<[DVec3; 2]>,
-    /// Buttons that were pressed at any time, as bits.
+    /// Buttons that were pressed at any time: bit n for button n. Bit 0 is also set if forces were requested
+    /// ([`crate::Reading::enable`]).
     pub buttons: u32,
-    /// Readings that were not finite.
+    /// Number of readings whose position was not finite. They count in none of the other values but the times.
     pub not_finite: u64,
-    /// Why the check ended early; `None` if it did not.
+    /// The error of the device that ended the check early; `None` if the time has passed.
     pub failure: Option<String>,
 }
 
-/// Reads a device a thousand times per second for the given time, and sets a force of zero each time.
+/// Reads a device a thousand times per second for the time `lasts`, and sets a force of zero each time and at the end.
+/// Blocks the thread that long; ends earlier if the device fails. Missed ticks are not made up for.
 pub fn check(device: &mut dyn HapticDevice, lasts: Duration) -> DeviceReport {
     let begun = Instant::now();
     let (mut checked, mut changes) = (DeviceReport::default(), 0_u32);

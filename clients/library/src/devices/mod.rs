@@ -46,7 +46,7 @@ pub enum DeviceKind {
 }
 
 impl DeviceKind {
-    /// All kinds, with their names.
+    /// All kinds, with their names for [`open`]; on systems other than Linux, too, where the last two can't be opened.
     pub const ALL: [(DeviceKind, &'static str); 5] = [
         (DeviceKind::ForceDimension, "force-dimension"),
         (DeviceKind::OpenHaptics, "openhaptics"),
@@ -55,18 +55,22 @@ impl DeviceKind {
         (DeviceKind::Gamepad, "gamepad"),
     ];
 
-    /// Returns the kind that a name begins with, and the text after its `:`. `None` if there is no such kind.
+    /// Returns the kind that is named before the first `:` of `name`, and the text after it, which may be empty
+    /// (`None` without a `:`). Returns `None` if there is no such kind.
     pub fn of(name: &str) -> Option<(DeviceKind, Option<&str>)> {
         let (kind, which) = name.split_once(':').map_or((name, None), |(kind, which)| (kind, Some(which)));
         DeviceKind::ALL.iter().find(|entry| entry.1 == kind).map(|entry| (entry.0, which))
     }
 }
 
-/// Opens a device by its name. `library` is the path of the maker's library, if the system does not find it.
+/// Opens a device by its name: a kind, or `KIND:WHICH`; without `:WHICH`, the first device of that kind. `library` is
+/// the path of the maker's library, if the system does not find it; only `force-dimension` and `openhaptics` use it.
+/// May wait some seconds for Haply's service. The device's force is zero until the first [`HapticDevice::write`].
 ///
 /// # Errors
-/// Returns [`Error::Argument`] if there is no such kind of device, and [`Error::Device`] with advice if the library,
-/// the service or the device is missing or has an unsupported version.
+/// Returns [`Error::Argument`] if there is no such kind of device, and [`Error::Device`] with advice if `WHICH` is not
+/// valid for the kind, if the library, the service or the device is missing, can't be opened or has an unsupported
+/// version, or if the system does not support the kind.
 pub fn open(name: &str, library: Option<&Path>) -> Result<Box<dyn HapticDevice>, Error> {
     let Some((kind, which)) = DeviceKind::of(name) else {
         let names: Vec<&str> = DeviceKind::ALL.iter().map(|entry| entry.1).collect();
@@ -91,7 +95,8 @@ pub fn open(name: &str, library: Option<&Path>) -> Result<Box<dyn HapticDevice>,
 /// A device, or a kind of device, that [`list`] looked for.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Found {
-    /// The name to pass to [`open`].
+    /// The name to pass to [`open`]: for a SpaceMouse or a gamepad with the path of its events, otherwise only the
+    /// kind.
     pub name: String,
     /// Whether it can be tried: the library or service answers, and does not report that there is no device.
     pub is_there: bool,
@@ -99,8 +104,9 @@ pub struct Found {
     pub about: String,
 }
 
-/// Lists the devices of all kinds that are there. Opens none of them. `library` is tried as the library of each kind
-/// that needs one.
+/// Looks for devices of all kinds, in the order of [`DeviceKind::ALL`], and returns at least one entry for each kind
+/// that the system supports; [`Found::is_there`] is false if there is none. Opens no device. `library` is tried as the
+/// library of each kind that needs one. May wait some seconds for Haply's service.
 pub fn list(library: Option<&Path>) -> Vec<Found> {
     let told = |name: &str, told: std::io::Result<(bool, String)>| {
         let (is_there, about) = told.unwrap_or_else(|error| (false, error.to_string()));

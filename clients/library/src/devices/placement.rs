@@ -22,28 +22,29 @@ const SHIFT_M: f64 = 1.0;
 /// Limit on the offset, m.
 const OFFSET_M: f64 = 10.0;
 
-/// Force of the envelope below which the device gets forces again after a clutch, N.
+/// Magnitude of the rendered force, N, before `force_scale`, below which the device gets forces again after a clutch.
 pub const ENGAGED_N: f64 = 0.01;
 
 /// Interval at which [`Enables::Always`] requests forces, s.
 const ASKS_EVERY_S: f64 = 0.3;
 
-/// What enables forces.
+/// What requests the forces of a [`Placed`] device ([`Reading::enable`]).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Enables {
-    /// The operator, by the device's button with this number.
+    /// The operator, by the device's button with this number, 0 to 31.
     Button(u32),
-    /// Forces return by themselves: for devices without a button.
+    /// Forces return by themselves, requested anew every 0.3 s: for devices without a button.
     Always,
-    /// The operator, as the device itself defines it.
+    /// The operator, as the device's own readings report it.
     #[default]
     Device,
 }
 
-/// Where a device's workspace is placed over the tissue, with its scales and buttons.
+/// Where a device's workspace is placed over the tissue, with its scales and buttons. The default leaves it on the top
+/// of the tissue, neither rotated nor scaled, with the clutch on button 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Placement {
-    /// The middle of the workspace, from the top of the tissue, m; at most 10 m long.
+    /// The middle of the workspace, from the top of the tissue, along the axes of the tissue, m; at most 10 m long.
     pub offset_m: DVec3,
     /// Rotation of the device about the tissue's x, then y, then z axis, degrees, -360 to 360 each.
     pub rotation_deg: DVec3,
@@ -51,9 +52,10 @@ pub struct Placement {
     pub scale: f64,
     /// Newtons at the device per newton of the tissue, 0.01 to 1.
     pub force_scale: f64,
-    /// What enables forces.
+    /// What requests forces.
     pub enable: Enables,
-    /// Number of the clutch button, 0 to 31: while it is held, the device moves without the tool. `None`: no clutch.
+    /// Number of the clutch button, 0 to 31, other than that of [`Enables::Button`]: while it is held, the device
+    /// moves without the tool. `None`: no clutch.
     pub clutch_button: Option<u32>,
 }
 
@@ -74,7 +76,8 @@ impl Placement {
     /// Checks that all values are within their ranges.
     ///
     /// # Errors
-    /// Returns the refusal of the first wrong field, by its name.
+    /// Refuses the first field, by its name, that is not finite or out of its range, and a `clutch_button` that is
+    /// also the button of [`Enables::Button`] (named `enable_button`).
     pub fn check(&self) -> Result<()> {
         let Placement { offset_m, rotation_deg, scale, force_scale, enable, clutch_button } = *self;
         finite_vector("offset_m", offset_m)?;
@@ -112,7 +115,8 @@ impl Placement {
 /// A device whose workspace is placed over the tissue, rotated and scaled, with a clutch.
 ///
 /// While the clutch is held, the tool stays where it is and the device gets no force. When it is released, the tool
-/// continues from there, and forces return once the tool is out of the tissue: none starts within it.
+/// continues from there, unless it would be shifted by more than 1 m in all; forces return once the rendered force is
+/// below [`ENGAGED_N`], as outside the tissue: none starts within it.
 #[derive(Debug)]
 pub struct Placed<D> {
     device: D,
@@ -128,10 +132,10 @@ pub struct Placed<D> {
 }
 
 impl<D: HapticDevice> Placed<D> {
-    /// Places a device over the tissue.
+    /// Places `device` over the tissue. Neither reads nor moves it.
     ///
     /// # Errors
-    /// Returns the refusals of [`Placement::check`].
+    /// Returns the refusals of [`Placement::check`]; the device is then dropped.
     pub fn new(device: D, placement: Placement) -> Result<Self> {
         placement.check()?;
         let rotation = placement.rotation();
@@ -139,7 +143,7 @@ impl<D: HapticDevice> Placed<D> {
         Ok(Placed { device, placement, rotation, shift_m, held_m, is_shut, begun })
     }
 
-    /// Returns the device itself.
+    /// Returns the device that was placed, with its own frame and limits.
     pub fn device(&self) -> &D {
         &self.device
     }

@@ -27,28 +27,31 @@ const MAX_FLOWS: u64 = 20_000;
 /// Time between the start of the last user and the start of the clock, if the clock waits for the users.
 const SETTLE: Duration = Duration::from_millis(500);
 
-/// A plan of a load test with its scene files read, ready to run.
+/// A plan of a load test with its scene files read, ready to run once, for [`PreparedPlan::run`].
 pub struct PreparedPlan {
     plan: LoadPlan,
     scenes: Vec<SceneFile>,
 }
 
 impl PreparedPlan {
-    /// Creates a plan that is ready to run: reads the scene files that it names.
+    /// Creates a plan that is ready to run: reads the scene files and meshes that it names. Sends nothing.
     ///
     /// # Errors
-    /// Returns a refusal if a scene can't be read.
+    /// Returns the refusals of [`SceneFile::read`].
     pub fn new(plan: LoadPlan) -> Result<Self, Refusal> {
         let scenes = plan.scenes.iter().map(|scene| SceneFile::read(&scene.what)).collect::<Result<_, _>>()?;
         Ok(PreparedPlan { plan, scenes })
     }
 
-    /// Runs the plan against a server until its end or until `stop` completes; then all users leave. Calls `told`
-    /// after each second with its counts, and `warn` with problems of a simulated network. Returns the report.
+    /// Runs the plan against a server until its end or until `stop` completes; then all users leave, and the report
+    /// is one of an interrupted plan. Users have threads of their own. Calls `told` after each second of the plan
+    /// with its counts, and `warn` with problems of a simulated network. Returns the report, also if objectives were
+    /// missed ([`LoadReport::verdict`]).
     ///
     /// # Errors
-    /// Returns an error if the server can't be reached or refuses a scene, if a simulated network can't be put before
-    /// it, or if a session of a trial is refused.
+    /// Returns an error if the server can't be reached, or can't use a mesh; if a simulated network can't be put
+    /// before it, such as one with https://; if a session of a trial is refused; or if a thread can't be started or
+    /// fails.
     pub async fn run(
         self,
         server: &Server,

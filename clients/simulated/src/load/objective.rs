@@ -36,7 +36,9 @@ struct ObjectiveBound {
 }
 
 /// Objective of a load test: bounds on measured quantities, all of which must hold. It is parsed from a text such as
-/// `p99<2ms,dilation>0.999`.
+/// `p99<2ms,dilation>0.999`: times (`p50`, `p99`, `p999` and `max` of round trips, `gap_p99`, `gap_max`,
+/// `frame_age_p99`, `start_p99`) with a unit, `us`, `ms` or `s`; `dilation`, `lost`, `rejected` and `turned_away`
+/// without one. Other names, or a bound with the wrong kind of unit, are refused with a text that says why.
 #[derive(Debug, Clone)]
 pub struct Objective(Vec<ObjectiveBound>);
 
@@ -74,8 +76,8 @@ impl FromStr for ObjectiveBound {
 }
 
 impl Objective {
-    /// Returns the bounds that an outcome does not meet, as they were written. A quantity that was not measured meets
-    /// no bound.
+    /// Returns the bounds that an outcome does not meet, as and in the order in which they were written. A quantity
+    /// that was not measured meets no bound.
     pub fn missed(&self, outcome: &LoadOutcome) -> Vec<&str> {
         let misses = |bound: &&ObjectiveBound| {
             let value = (bound.quantity)(outcome);

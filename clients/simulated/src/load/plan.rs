@@ -151,10 +151,11 @@ pub(crate) struct User {
 }
 
 impl LoadPlan {
-    /// Reads a plan from a file in TOML, of at most 1 MiB.
+    /// Reads a plan from a file in TOML. The scene files that it names are not read ([`super::PreparedPlan::new`]).
     ///
     /// # Errors
-    /// Returns a refusal if the file can't be read, or with the line and key of an error in it.
+    /// Refuses a file that can't be read or has more than 1 MiB; otherwise returns the refusals of
+    /// [`LoadPlan::parse`].
     pub fn read(path: &Path) -> Result<Self> {
         LoadPlan::parse(&path.display().to_string(), &read_text(path, MAX_BYTES)?)
     }
@@ -162,7 +163,9 @@ impl LoadPlan {
     /// Parses a plan from a text in TOML. Refusals name the text `name`.
     ///
     /// # Errors
-    /// Returns a refusal with the line and key of an error in the text, or if more than 10 000 users would arrive.
+    /// Refuses, with line and key, a text that is not TOML, unknown and missing keys, values of another type or out
+    /// of range, a list of more than 64 entries or without a share above 0, and a plan without a phase; and a plan in
+    /// which more than 10 000 users would arrive.
     pub fn parse(name: &str, text: &str) -> Result<Self> {
         let document = Document::parse(name, text)?;
         let plan = document.read(plan)?;

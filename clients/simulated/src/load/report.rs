@@ -9,7 +9,8 @@ use super::objective::Objective;
 use super::plan::{LoadPlan, User};
 use super::tally::{LoadOutcome, Tally, listed};
 
-/// Counts of a load test within one second.
+/// Counts of a load test within one second of its plan, for [`super::PreparedPlan::run`] to report as they come. The
+/// last one of a plan may be shorter.
 pub struct Second {
     /// Its end, since the plan began, s.
     pub(crate) at_s: f64,
@@ -21,13 +22,14 @@ pub struct Second {
 }
 
 impl Second {
-    /// Returns a line for a terminal: time, users, samples per second, round trip, and users that were turned away.
+    /// Returns a line for a terminal, without a line break: time since the start, s, users at the end of the second,
+    /// samples per second, 99th percentile of the round trips, and users that were turned away, by reason.
     pub fn line(&self) -> String {
         format!("{}  turned away {}", self.figures("users"), away(&self.tally.turned_away))
     }
 
-    /// Returns a line for a terminal during a trial: time, sessions, samples per second, round trip, and rejected
-    /// commands. (A user that is turned away ends a trial.)
+    /// Returns a line for a terminal during a trial, like [`Second::line`] but with sessions for users, and with the
+    /// number of rejected commands at its end. (A user that is turned away ends a trial.)
     pub fn trial_line(&self) -> String {
         format!("{}  rejected {}", self.figures("sessions"), self.tally.rejected.values().sum::<u64>())
     }
@@ -196,14 +198,16 @@ impl LoadReport {
         self.phases.iter().chain([&self.whole])
     }
 
-    /// Returns the summary of a trial. Its dilation is the smallest of whole stays, whereas that of a phase is of the
-    /// worst second.
+    /// Returns the summary of the whole plan, for trials: its number of sessions is that of the users that arrived.
+    /// Its dilation is the smallest of whole stays, whereas that of a phase is of the worst second.
     pub fn outcome(&self) -> LoadOutcome {
         let tally = &self.whole.tally;
         LoadOutcome { generator_cores: self.generator_cores, ..tally.outcome(tally.arrived) }
     }
 
-    /// Returns why the load test failed; `None` if it succeeded.
+    /// Returns why the load test failed; `None` if it succeeded. It fails if it was interrupted, if users arrived but
+    /// no sample did, if a phase or the plan missed bounds of its objective, or if a stream broke. Several reasons
+    /// are joined by `; `.
     pub fn verdict(&self) -> Option<String> {
         let whole = self.whole.outcome();
         if self.is_interrupted {
@@ -226,7 +230,8 @@ impl LoadReport {
         (!whys.is_empty()).then(|| whys.join("; "))
     }
 
-    /// Returns the report as JSON: the whole, its phases and its seconds. Values that were not measured are `null`.
+    /// Returns the report as JSON: `plan`, `mix`, `kept` (whether it succeeded) and `why` not, `phases`, `all` (the
+    /// whole plan) and `seconds`. Names end with the unit of their values. Values that were not measured are `null`.
     pub fn json(&self) -> Value {
         let finite = |value: f64| if value.is_finite() { json!(value) } else { Value::Null };
         let points = self.points.iter().map(|Point { at_s, users, outcome }| {
@@ -244,12 +249,12 @@ impl LoadReport {
         })
     }
 
-    /// Returns the report as one self-contained HTML page with plots.
+    /// Returns the report as one self-contained HTML page, with plots over the seconds of the plan.
     pub fn page(&self) -> String {
         page(self)
     }
 
-    /// Returns the report as a table for a terminal.
+    /// Returns the report as a table for a terminal: a row for each phase and one for the whole plan, then totals.
     pub fn table(&self) -> String {
         let head = "phase               users  arrived  turned away  round trip p50 / p99      start p99    dilation   objective\n";
         let rows = self.stretches().map(|stretch| {

@@ -171,14 +171,14 @@ pub(crate) fn listed(reasons: &BTreeMap<String, u64>) -> String {
     reasons.iter().map(|(reason, count)| format!("{reason} {count}")).collect::<Vec<_>>().join(", ")
 }
 
-/// Summary of one load test: counts and quantiles.
+/// Summary of one load test, or of a phase or second of it: counts, and quantiles of durations.
 #[derive(Debug, Clone)]
 pub struct LoadOutcome {
     pub(crate) sessions: u64,
-    /// Number of samples received.
+    /// Number of samples that clients received.
     pub samples: u64,
     pub(crate) frames: u64,
-    /// Number of commands sent.
+    /// Number of commands that clients sent.
     pub commands: u64,
     /// Number of commands that were not sent because this generator was too late at their tick.
     pub unsent: u64,
@@ -204,8 +204,8 @@ pub struct LoadOutcome {
 }
 
 impl LoadOutcome {
-    /// Returns the summary as one JSON object; values that were not measured are `null`. `limit_sessions` is added if
-    /// present.
+    /// Returns the summary as one JSON object; durations are in µs, and values that were not measured are `null`.
+    /// `limit_sessions`, the largest number of sessions that a search has found, is added if present.
     pub fn json(&self, limit_sessions: Option<u32>) -> Value {
         let mut object = json!({
             "sessions": self.sessions,
@@ -232,7 +232,8 @@ impl LoadOutcome {
         object
     }
 
-    /// Returns the summary as a table for a terminal, with a row for `limit_sessions` if present.
+    /// Returns the summary as a table for a terminal, a line for each quantity; the first is `limit_sessions`, the
+    /// largest number of sessions that a search has found, if present.
     pub fn table(&self, limit_sessions: Option<u32>) -> String {
         let mut rows = vec![
             ("sessions", self.sessions.to_string()),

@@ -15,7 +15,8 @@ use super::stroke::Stroke;
 use crate::random::Random;
 use crate::task::{LEAD_S, Task};
 
-/// Deadbands of a simulated client: fractions of the force below which the two ends do not send changes to each other.
+/// Deadbands of a simulated client: fractions of the force, 0 to 1, below which the two ends do not send changes to
+/// each other.
 #[derive(Debug, Clone, Copy)]
 pub struct Deadbands {
     /// Deadband of samples from the server, as a fraction of the force; with 0 the server sends one at each step.

@@ -3,10 +3,11 @@
 use super::plan::{Arrivals, LoadPlan, Phase, STAYS_S, Viewers, Wire, only};
 use super::tip::{Deadbands, Lead, default_device};
 
-/// Parameters of a trial: a load test in which equal sessions start, are measured together, and stay to the end.
+/// Parameters of a trial: a load test in which equal sessions start, are measured together, and stay to the end. A
+/// session that the server refuses ends the trial. No value is checked.
 #[derive(Debug, Clone)]
 pub struct LoadTrial {
-    /// Name of a scene of the server, or a scene file.
+    /// Name of a scene of the server, or the path of a scene file, which ends in .toml.
     pub scene: String,
     /// Number of clients of each session, with one tool each. With 0, commands that are sent beforehand keep each
     /// session awake.
@@ -15,24 +16,25 @@ pub struct LoadTrial {
     pub viewers: u32,
     /// Duration of the measurement, once all clients are connected, s.
     pub seconds: f64,
-    /// Time over which sessions and clients start, s.
+    /// Time over which the sessions with their clients start, at even intervals, s.
     pub ramp_s: f64,
-    /// Commands per second of each client.
+    /// Commands per second of each client; with `touch`, ticks per second.
     pub rate_hz: f64,
     /// Frames per second of each viewer.
     pub frame_rate_hz: f64,
     /// If present, clients lead tools with a tip and render forces, with these deadbands; if `None`, they push with
     /// forces.
     pub touch: Option<Deadbands>,
-    /// Number of clients that share a connection.
+    /// Number of clients that share a connection, at least 1.
     pub clients_per_connection: u32,
-    /// Number of threads of this generator.
+    /// Number of threads of this generator that clients share; at least one, and at most one per session.
     pub threads: u32,
 }
 
 impl LoadTrial {
-    /// Returns the plan of a trial with this many sessions: its users connect over `ramp_s`, are measured together
-    /// for `seconds`, and stay to the end.
+    /// Returns the plan of a trial with this many sessions, one for each of its users: they connect over `ramp_s`,
+    /// are measured together for `seconds`, and stay to the end. The clients reach the server directly; with `touch`,
+    /// their device is the `omega3`. The plan has no objective.
     pub fn plan(&self, sessions: u32) -> LoadPlan {
         let lead = self.touch.map(|deadbands| Lead { deadbands, device: default_device(), hand: None });
         let phase = Phase {
