@@ -372,18 +372,23 @@ impl SessionTask {
         let step = self.session.step_count();
         let mut session = memory::attempt("session_id", || Ok(Session::new(self.session.model())))?;
         session.skip_to(step);
-        (self.session, self.hashed, self.audit) = (session, Hashed::default(), None);
-        self.copies.forget();
+        self.restart_with(session);
         (self.running, self.until, self.still_since) = (false, None, Some(step));
         {
             let mut intake = lock(&self.handle.intake);
             intake.reopen();
             self.handle.note_waiting(&intake);
         }
-        lock(&self.handle.status).forget_hold();
         self.note_input(Input::Revive);
         tracing::info!(session = %self.handle.id, step, "session revived");
         Ok(step)
+    }
+
+    /// Replaces the session, whose counts begin at 0 again, and forgets everything that was derived from the old one.
+    fn restart_with(&mut self, session: Session) {
+        (self.session, self.hashed, self.audit) = (session, Hashed::default(), None);
+        self.copies.forget();
+        lock(&self.handle.status).forget_hold();
     }
 
     /// Drops the steps from the schedule that the policy does not let the session catch up.
@@ -511,7 +516,7 @@ impl SessionTask {
             && let Ok(mut session) = memory::attempt("", || Ok(Session::new(self.session.model())))
         {
             session.skip_to(step);
-            self.session = session;
+            self.restart_with(session);
         }
         if let Some(reason) = fetched.hold {
             self.session.hold(reason);

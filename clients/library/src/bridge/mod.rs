@@ -150,8 +150,8 @@ impl fmt::Debug for Options {
 pub struct BridgeReport {
     /// The ticks in order, at most 3.6 million; empty unless [`Options::remembers`] was set.
     pub course: Vec<Tick>,
-    /// Age of the newest local model, s, at each tick that had one ([`Ticker::model_age_s`]), in order; empty unless
-    /// [`Options::remembers`] was set. Its indices are not those of `course`.
+    /// Age of the newest local model, s, at each tick of `course` that had one ([`Ticker::model_age_s`]), in order. Its
+    /// indices are not those of `course`.
     pub ages_s: Vec<f64>,
     /// The envelope at the end: the limits that act on the forces. `None` if no tick had a connection.
     pub envelope: Option<Envelope>,
