@@ -436,8 +436,7 @@ const GRID: [&str; 5] = ["scene.sheet", "scene::Sheet", "place_of(", "GridPoint"
 #[test]
 fn above_the_sheet_a_tissue_is_its_rest_shape() {
     // Also the parts of scripts that describe a tissue.
-    let of_tissue =
-        ["force_law/", "scene/action", "scene/check", "scene/profile", "scene/reader", "scene/record", "scene/script"];
+    let of_tissue = ["response/force_law/", "scene/action", "scene/profile", "scene/record", "scene/script"];
     let of_server = ["server/", "render/"];
     // The sheet's own section as a message, the name of its points, and frames, which have rows of either.
     let form = ["wire/scene.rs", "wire/mod.rs", "journal/", "surface/"];
@@ -495,20 +494,20 @@ fn unsafe_code_is_where_vectors_are() {
         ("crates/session", "budget/machine.rs"),
         ("crates/realtime", "priority.rs"),
         ("crates/session", "surface/wide.rs"),
-        ("crates/tissue", "lanes/mod.rs"),
-        ("crates/tissue", "lanes/neon.rs"),
-        ("crates/tissue", "lanes/x86.rs"),
-        ("crates/tissue", "mesh/sweep.rs"),
-        ("crates/tissue", "mesh/mesh_calibration.rs"),
-        ("crates/tissue", "pressure.rs"),
-        ("crates/tissue", "grid.rs"),
-        ("crates/tissue", "sweep.rs"),
-        ("crates/tissue", "stage.rs"),
-        ("crates/tissue", "tables.rs"),
-        ("crates/tissue", "advance.rs"),
-        ("crates/tissue", "edge.rs"),
-        ("crates/tissue", "survey.rs"),
-        ("crates/tissue", "applied.rs"),
+        ("crates/tissue", "kernel/lanes/mod.rs"),
+        ("crates/tissue", "kernel/lanes/neon.rs"),
+        ("crates/tissue", "kernel/lanes/x86.rs"),
+        ("crates/tissue", "body/surface/sweep.rs"),
+        ("crates/tissue", "body/surface/mesh_calibration.rs"),
+        ("crates/tissue", "body/surface/pressure.rs"),
+        ("crates/tissue", "body/sheet/grid.rs"),
+        ("crates/tissue", "body/sheet/sweep.rs"),
+        ("crates/tissue", "kernel/stage.rs"),
+        ("crates/tissue", "body/tables.rs"),
+        ("crates/tissue", "scheme/advance.rs"),
+        ("crates/tissue", "body/sheet/edge.rs"),
+        ("crates/tissue", "guard/survey.rs"),
+        ("crates/tissue", "tools/applied_force.rs"),
     ];
     for (folder, ..) in CRATES.iter().filter(|of| !of.0.starts_with("clients")) {
         let source = source_of(folder);

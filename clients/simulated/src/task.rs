@@ -48,8 +48,10 @@ pub struct Task {
 }
 
 impl Task {
-    /// Creates presses around `middle_m`, a place on the surface at rest, m. The first begins at `lead_s`, the last
-    /// before `duration_s`, and ends at most 2.5 s after that; both are finite times, s. `scale` (above 0, see
+    /// Creates presses around `middle_m`, a place on the surface at rest, m, in the tissue's frame. They go down along −z
+    /// and their strokes along x and y, so the surface there should face +z. The first begins at `lead_s`, the last
+    /// before `duration_s`, and ends at most 2.5 s after that; both are finite times, s. If `duration_s` is not above
+    /// `lead_s`, there are none, and the target rests. `scale` (above 0, see
     /// [`scale`]) multiplies the depths below the surface, not the heights above it. Equal random numbers give equal
     /// movements.
     pub fn new(middle_m: DVec3, lead_s: f64, duration_s: f64, scale: f64, random: &mut Random) -> Self {

@@ -1,5 +1,5 @@
-//! Touch that stays accurate and safe over a network: the data that a server sends with each sample, how a client
-//! renders it a thousand times a second, and the limits that protect person and device. The crate uses no clock,
+//! Touch that stays accurate and safe over a network: the data of a server's samples, how a client renders them a
+//! thousand times a second, and the limits that protect person and device. The crate uses no clock,
 //! socket or random number; time is an argument, in seconds from any origin. A Palpate server uses the same
 //! functions, so it knows what its clients render.
 //!

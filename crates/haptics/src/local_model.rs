@@ -26,7 +26,8 @@ pub enum ContactState {
 }
 
 /// Model of the tissue around a tool's place, as a sample contains it. Forces are those of the tissue on the tool;
-/// vectors and matrices are in the tissue's frame.
+/// vectors and matrices are in the tissue's frame. [`Touching::force_n`] computes the force: for a tool that holds the
+/// tissue f₀ − K·(x − x₀) − B·(v − v₀), otherwise by the force law from p, n, κ and μ.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LocalModel {
     /// Sequence number of the sample; it rises with each sample of a connection, maybe by more than 1.

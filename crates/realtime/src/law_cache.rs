@@ -111,9 +111,10 @@ impl SoughtLaw {
         self.exact.get().cloned()
     }
 
-    /// Adds a law of this tissue and disc that was computed elsewhere, as the coarse or the exact one by its
-    /// `is_coarse`. It is ignored if there is one already.
-    pub fn is_known(&self, law: Law) {
+    /// Adds a law that was computed elsewhere, as the coarse or the exact one by its `is_coarse`. It must be of this
+    /// tissue and disc, which is not checked. It is ignored if there is one of its kind already or, for an exact law,
+    /// a refusal.
+    pub fn add_known(&self, law: Law) {
         // A law that is there already is equal.
         let _ = if law.is_coarse {
             self.coarse.set(Arc::new(law)).is_ok()
@@ -228,9 +229,9 @@ mod tests {
         assert!(!Arc::ptr_eq(&first, &of(1, &soft).unwrap()), "the oldest went");
         // A known law serves another session of the same tissue, and no other tissue.
         let law = |is_coarse| Law { is_coarse, ..palpate_tissue::response::force_law::exact(&soft, 0.002) };
-        of(98, &soft).unwrap().is_known(law(true));
-        of(99, &soft).unwrap().is_known(law(true));
-        of(99, &soft).unwrap().is_known(law(false));
+        of(98, &soft).unwrap().add_known(law(true));
+        of(99, &soft).unwrap().add_known(law(true));
+        of(99, &soft).unwrap().add_known(law(false));
         let known: Vec<_> = kept.known(&soft).into_iter().map(|(disc, law)| (disc, law.is_coarse)).collect();
         assert_eq!(known, [(disc(98.0), true), (disc(99.0), false)]);
         assert!(kept.known(&hard).is_empty());

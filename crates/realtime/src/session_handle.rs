@@ -430,7 +430,7 @@ impl SessionHandle {
         let model = self.tissue.borrow().1.clone();
         for (disc, law) in known {
             if let Ok(sought) = self.law(&model, disc) {
-                sought.is_known(law);
+                sought.add_known(law);
             }
         }
     }

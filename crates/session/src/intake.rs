@@ -118,9 +118,10 @@ impl Intake {
         }
     }
 
-    /// Returns this intake for a tissue with `substeps` substeps per step, on a thread of several sessions: from now
-    /// on the tips of a session together may cost at most `limits.contact_work`, which grows with the substeps. 0
-    /// removes this limit.
+    /// Returns this intake for a tissue with `substeps` substeps per step, on a thread of several sessions. From now on
+    /// it limits the work of the session's tips together: a pose whose tip would bring it above `limits.contact_work`
+    /// is refused ([`Reason::TooLarge`], field `pose.tip.radius_m`). The work is the number of triangles looked up per
+    /// step: it grows with the tips' radii and the substeps, and is 0 on a sheet. 0 substeps remove the limit.
     #[must_use]
     pub fn of_substeps(self, substeps: u32) -> Self {
         Intake { substeps, ..self }

@@ -49,13 +49,15 @@ impl Rules {
         Ok(CheckedCommands(commands))
     }
 
-    /// Checks one command: its time to live, its place on the tissue, its force or reach, and its tip.
+    /// Checks one command: its time to live, its place on the tissue, its force or reach, and its tip. A grasped point
+    /// must be one of the tissue; otherwise the check may panic.
     ///
     /// # Errors
     /// Refuses, naming the field:
-    /// - a time to live that is not above 0;
+    /// - a time to live that is not above 0, and a negative falloff;
     /// - numbers that are not finite;
-    /// - a force beyond `limits.point_force_n` on a point, or off the tissue;
+    /// - a force whose size at its control point, |force|·e^{c′}, is above `limits.point_force_n`, or whose control point
+    ///   is off the tissue by more than a tenth of its longest side;
     /// - a grasp of a fixed point;
     /// - a grasp moved farther from rest, or a pose farther from the tissue's middle, than `limits.reach_in_sheets`
     ///   times its longest side;

@@ -1,5 +1,5 @@
-//! Remeshes the surface of a shape evenly: long edges are split, short ones collapse, edges flip to Delaunay,
-//! vertices move along the surface to the middle of their neighbours (Botsch and Kobbelt, "A remeshing approach to
+//! Remeshes the surface of a shape evenly. Long edges are split, short ones collapse, edges flip to Delaunay, vertices
+//! move along the surface to the middle of their neighbours (Botsch and Kobbelt, "A remeshing approach to
 //! multiresolution modeling", 2004).
 
 use glam::{BVec3, DVec3};

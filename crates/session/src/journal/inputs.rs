@@ -99,13 +99,15 @@ pub fn encoded(inputs: &[(u64, Input)]) -> Vec<Vec<u8>> {
     inputs.chunks(PIECE).map(piece).collect()
 }
 
-/// Decodes one piece of bytes of [`encoded`], for a session that began with the tissue `first`. Returns the inputs
-/// with their steps, in order, without those that only start, pause or skip time. `given` are the limits of this
-/// process; forces, reach and tool numbers are not limited by them.
+/// Decodes one piece of bytes of [`encoded`], for a session that began with the tissue `first`. Returns the inputs in
+/// order, each with the number of steps done before it acts, without those that only start, pause or skip time.
+/// `given` are the limits of this process, relaxed: forces and reach are not limited, and tool numbers may be below
+/// 4096 or `given.tools`, whichever is larger.
 ///
 /// # Errors
-/// Refuses bytes that are not such a piece or would take too much memory, a pose without a tip, a command that breaks
-/// a rule, and a tissue that `first` can't become.
+/// Refuses bytes that are not such a piece or would take too much memory, a tool number beyond that limit, a point
+/// that the tissue does not have, a command without an action, a pose without a tip, a command that breaks a rule
+/// ([`Rules::check_one`]), and a tissue that `first` can't become.
 pub fn decoded(bytes: &[u8], first: &Arc<Model>, given: &Limits) -> Result<Vec<(u64, Input)>> {
     let limits = message::limits(given);
     let rules = Rules::new(&first.scene, &limits);
