@@ -663,8 +663,7 @@ enum palpate_result palpate_bridge_disable(const struct palpate_bridge *bridge);
  * the end is no error. Frees the handle in any case. Any thread, once; not from a function of the device, which
  * would wait for itself.
  */
-enum palpate_result palpate_bridge_end(struct palpate_bridge *bridge,
-                                       struct palpate_bridge_report *report);
+enum palpate_result palpate_bridge_end(struct palpate_bridge *bridge, struct palpate_bridge_report *report);
 
 /**
  * Returns the message of this thread's last error; empty before the first. It stays valid until another call of this
@@ -714,10 +713,7 @@ void palpate_server_free(struct palpate_server *server);
  * bytes that they take with the zero at the end; one of both may be null. Returns `PALPATE_BUFFER` if `capacity`
  * bytes are too few. Any thread; waits for the server.
  */
-enum palpate_result palpate_scenes(const struct palpate_server *server,
-                                   char *names,
-                                   size_t capacity,
-                                   size_t *needed);
+enum palpate_result palpate_scenes(const struct palpate_server *server, char *names, size_t capacity, size_t *needed);
 
 /**
  * Creates a session of one of the server's scenes. It runs at once. It exists until `palpate_session_delete`, or
@@ -823,9 +819,7 @@ enum palpate_result palpate_surface_size_of(const struct palpate_surface *surfac
  * never change. Returns `PALPATE_BUFFER` if `capacity`, in indices, is below `palpate_surface_size.indices`. One
  * thread at a time. Never waits.
  */
-enum palpate_result palpate_surface_indices(const struct palpate_surface *surface,
-                                            uint32_t *indices,
-                                            size_t capacity);
+enum palpate_result palpate_surface_indices(const struct palpate_surface *surface, uint32_t *indices, size_t capacity);
 
 /**
  * Writes u and v of each vertex, `stride` bytes (8 or more) apart. They never change. Returns `PALPATE_ARGUMENT`
@@ -880,9 +874,7 @@ enum palpate_result palpate_touch_begin_offline(const struct palpate_touch_optio
  * law that is not valid; and `PALPATE_BUSY` if another thread delivers one. One thread at a time; it may be
  * another than that of the ticks.
  */
-enum palpate_result palpate_touch_arrive(const struct palpate_touch *touch,
-                                         const uint8_t *bytes,
-                                         size_t count);
+enum palpate_result palpate_touch_arrive(const struct palpate_touch *touch, const uint8_t *bytes, size_t count);
 
 /**
  * Writes the force to render from now on, for a device that reports `reading` at `time_s`: seconds of any origin, of
@@ -907,8 +899,7 @@ enum palpate_result palpate_touch_disable(const struct palpate_touch *touch);
  * while there is no connection: the totals are written all the same, and `palpate_last_error` describes why. Any
  * thread except that of the ticks, as it takes a lock.
  */
-enum palpate_result palpate_touch_traffic(const struct palpate_touch *touch,
-                                          struct palpate_traffic *traffic);
+enum palpate_result palpate_touch_traffic(const struct palpate_touch *touch, struct palpate_traffic *traffic);
 
 /**
  * Releases the tool and frees the handle; the session continues. Sets no force: your loop sets its device to
