@@ -280,7 +280,7 @@ impl Session {
     #[pyo3(signature = (out=None))]
     fn displacements<'py>(&self, py: Python<'py>, out: Option<Bound<'py, PyAny>>) -> PyResult<Bound<'py, PyAny>> {
         let read = |inner: &mut SessionState, into: &mut Vec<f64>| {
-            inner.simulation.session.tissue().whole_displacements_m(into)
+            inner.simulation.session.tissue().whole_displacements_m(into);
         };
         self.read(py, out, &read)
     }

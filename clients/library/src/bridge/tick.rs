@@ -121,11 +121,9 @@ fn tick(
         }
         let tick = Tick { time_s, place_m: ticker.place_m(), force_n, state: ticker.state() };
         device.ticked(&tick);
-        if remember {
-            if course.len() < MAX_REMEMBERED {
-                ages_s.extend(ticker.model_age_s());
-                course.push(tick);
-            }
+        if remember && course.len() < MAX_REMEMBERED {
+            ages_s.extend(ticker.model_age_s());
+            course.push(tick);
         }
     }
     Ok(())

@@ -111,6 +111,7 @@ async fn run(
     let rate_hz = plan.rate_hz;
     let ticker = std::thread::spawn(move || tick(&senders, rate_hz, &beats));
     let (telling, stages) = watch::channel(Stage::RAMP);
+    let (counting, counted_s) = watch::channel(0.0);
     let (arrived, mut arrivals) = mpsc::unbounded_channel();
     let (servers, sources): (Arc<[_]>, Arc<[_]>) = (servers.into(), sources.into());
     let (plan, clock) = (Arc::new(plan), Instant::now());
@@ -127,6 +128,7 @@ async fn run(
             tally,
             turns: turns.clone(),
             stages: stages.clone(),
+            counted_s: counted_s.clone(),
             asking: tokio::sync::Mutex::new(()),
         };
         let (own, arrived) = (users.iter().skip(index).step_by(threads).copied().collect(), arrived.clone());
@@ -135,7 +137,7 @@ async fn run(
     }
     drop(arrived);
     let ended = tokio::select! {
-        ended = course.take(&plan, &mut arrivals, &telling, told) => ended,
+        ended = course.take(&plan, &mut arrivals, (&telling, &counting), told) => ended,
         () = stop => {
             course.report.is_interrupted = true;
             Ok(())
@@ -176,7 +178,7 @@ impl Course {
         &mut self,
         plan: &LoadPlan,
         arrivals: &mut mpsc::UnboundedReceiver<Result<(), Error>>,
-        telling: &watch::Sender<u8>,
+        (telling, counting): (&watch::Sender<u8>, &watch::Sender<f64>),
         mut told: impl FnMut(&Second),
     ) -> Result<(), Error> {
         let gathers = plan.gathers_over_s().is_some();
@@ -194,6 +196,7 @@ impl Course {
             let at_s = (self.at_s + 1.0).min(lasts_s);
             tokio::time::sleep_until(begun + Duration::from_secs_f64(at_s)).await;
             let second = self.count(at_s);
+            counting.send_replace(at_s);
             told(&second);
             self.report.add(second);
             // Nothing is left to measure.
@@ -245,8 +248,13 @@ async fn arrive(world: &Arc<World>, users: Vec<User>, staying: &mut JoinSet<()>)
     let gathers = world.plan.gathers_over_s().is_some();
     let mut connections = Connections::new(&world.plan);
     let begun = tokio::time::Instant::from_std(world.clock);
+    let mut counted_s = world.counted_s.clone();
     for user in users {
         tokio::time::sleep_until(begun + Duration::from_secs_f64(user.at_s)).await;
+        // A user that arrives when a second ends belongs to the next one.
+        if !gathers && counted_s.wait_for(|counted_s| counted_s + 1.0 > user.at_s).await.is_err() {
+            return Ok(());
+        }
         lock(&world.tally).arrived += 1;
         let world = world.clone();
         if gathers {

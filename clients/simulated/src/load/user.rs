@@ -42,6 +42,8 @@ pub(crate) struct World {
     pub(crate) turns: Vec<watch::Receiver<u64>>,
     /// The stage of the whole load.
     pub(crate) stages: watch::Receiver<u8>,
+    /// Time up to which events are counted, s since the start of the plan's clock.
+    pub(crate) counted_s: watch::Receiver<f64>,
     /// Held during a request for a step: an answer that waits behind others would have a wrong time.
     pub(crate) asking: tokio::sync::Mutex<()>,
 }
