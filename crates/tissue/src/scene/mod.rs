@@ -98,12 +98,12 @@ pub struct Scene {
     /// κ of the pressure −κ·ΔV/V0 on a mesh that encloses a volume V0 (ΔV is its growth), Pa; 0 on any other
     /// tissue.
     pub volume_stiffness_pa: f64,
-    /// How time advances, as the user asked for it; what is used, [`Model`](crate::Model) has.
+    /// How time advances, as the user asked for it; what is used, `Model` has.
     pub stepping: Stepping,
     /// Largest error that leaving out regions at rest may add, relative to the largest displacement, 0 to 1; 0
     /// turns sleeping off. If `None`, it is a tenth of the wanted error (`stepping.tolerance`), or of the
     /// expected one if that is smaller and the scene gives the integrator or the substeps; see
-    /// [`Model::sleep_tolerance`](crate::Model::sleep_tolerance).
+    /// `Model::sleep_tolerance`.
     pub sleep_tolerance: Option<f64>,
     /// How viewers draw the tissue; without effect on its motion.
     pub appearance: Appearance,
@@ -170,7 +170,7 @@ impl Appearance {
     }
 }
 
-/// Surfaces that the server can paint ([`painted`](crate::texture::painted)): what a generated image shows.
+/// Surfaces that the server can paint (`painted`: what a generated image shows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PaintedSurface {
     /// The lining of a stomach.
@@ -193,7 +193,7 @@ impl Named for PaintedSurface {
 }
 
 /// Coefficients of a tissue to change while it is in use. `None` leaves a coefficient as it is; a change with
-/// `None` only is refused where it is applied ([`Change::NOTHING`]). [`Model::changed`](crate::Model::changed)
+/// `None` only is refused where it is applied ([`Change::NOTHING`]). `Model::changed`
 /// applies one.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Change {

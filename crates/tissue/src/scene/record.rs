@@ -142,7 +142,7 @@ pub struct Summary {
     pub computed_fraction: f64,
     /// How many times the guard went back and repeated with a shorter substep.
     pub guard_events: u64,
-    /// XXH3-128 hash of the final state ([`Tissue::state_hash`](crate::Tissue::state_hash)), 32 hexadecimal
+    /// XXH3-128 hash of the final state (`Tissue::state_hash`), 32 hexadecimal
     /// digits.
     pub final_hash: String,
     /// The errors that an audit measured, over all sample points and times; `None`, and not written, without an
@@ -220,15 +220,15 @@ impl AuditedError {
 }
 
 /// A correction: from this step on, the tissue is stepped more accurately, because an audited error was above
-/// the tolerance. [`Model::correction`](crate::Model::correction) makes one,
-/// [`Model::corrected()`](crate::Model::corrected()) applies it.
+/// the tolerance. `Model::correction` makes one,
+/// `Model::corrected()` applies it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Correction {
     /// The step at whose beginning it takes effect.
     pub step: u64,
     /// The measured error, above the scene's tolerance.
     pub audited_error: AuditedError,
-    /// The main source of the error, in words ([`Origin::describe`](crate::select::audit::Origin::describe)).
+    /// The main source of the error, in words (`Origin::describe`.
     pub reason: String,
     /// The scheme from then on; never `Auto`.
     #[serde(serialize_with = "name")]
@@ -261,7 +261,7 @@ pub struct Recovery {
     /// `None`, and not written.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub paused_until_step: Option<u64>,
-    /// The check that failed, in words ([`CheckFailure`](crate::CheckFailure)).
+    /// The check that failed, in words (`CheckFailure`.
     pub reason: String,
 }
 
