@@ -478,7 +478,7 @@ fn a_zero_has_no_sign_in_any_number_of_a_journal() {
         match (negative, positive) {
             (Ok(negative), Ok(positive)) => {
                 assert_eq!(negative.fingerprint(), positive.fingerprint(), "{}", number.name);
-                let state = |model: &Model| format!("{:?}", model.tissue_state());
+                let state = |model: &Model| format!("{:?}", model.saved_plan());
                 assert_eq!(state(&negative), state(&positive), "{}", number.name);
                 tried += 1;
             }

@@ -325,7 +325,7 @@ fn what_a_session_has_reached_its_snapshot_restores_with_the_same_bits() {
         for (at, bytes) in saved {
             tried += 1;
             let read = Saved::from_bytes(&bytes, &limits()).unwrap();
-            let is_first = *read.tissue() == model.tissue_state();
+            let is_first = *read.tissue() == model.saved_plan();
             let made = if is_first { Ok(model.clone()) } else { Model::resumed(&first, read.tissue(), &limits()) };
             let restored = made.and_then(|model| Session::restore(&model, &read));
             let mut again = match restored {

@@ -18,7 +18,7 @@ use palpate_tissue::scene::profile::{CentreProfile, LoadProfile, MotionProfile, 
 use palpate_tissue::scene::record::{AuditedError, Correction};
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::scene::{Change, Integrator, Lanes, Named, PAPER, Precision, Scene};
-use palpate_tissue::state::saved::TissueState;
+use palpate_tissue::state::saved::SavedPlan;
 
 /// Little is rehearsed: most scenes give the number of substeps.
 fn limits() -> Limits {
@@ -662,8 +662,8 @@ fn changes_and_corrections_come_to_the_same_model_in_one_go() {
             None => model.corrected(&correction, &roomy).unwrap(),
         };
         // Neither work for rehearsals nor the machine makes it another.
-        let again = Model::resumed(&begun, &model.tissue_state(), &Limits { rehearsal_work: 0, ..limits() }).unwrap();
-        assert_eq!(again.tissue_state(), model.tissue_state());
+        let again = Model::resumed(&begun, &model.saved_plan(), &Limits { rehearsal_work: 0, ..limits() }).unwrap();
+        assert_eq!(again.saved_plan(), model.saved_plan());
         assert_eq!((&again.scene, &again.plan, again.precision), (&model.scene, &model.plan, model.precision));
         assert_eq!((again.corrected, &again.warnings), (model.corrected, &model.warnings));
         assert_eq!((again.fingerprint(), again.sleep_tolerance), (model.fingerprint(), model.sleep_tolerance));
@@ -671,14 +671,14 @@ fn changes_and_corrections_come_to_the_same_model_in_one_go() {
         let [one, other] = [&model, &again].map(|model| model.changed(&change(33.0), &begun, &roomy).unwrap());
         assert_eq!((&one.plan, one.fingerprint()), (&other.plan, other.fingerprint()));
     }
-    let state = model.tissue_state();
+    let state = model.saved_plan();
     for bent in [
-        TissueState { substeps: 0, ..state },
-        TissueState { integrator: Integrator::Auto, ..state },
-        TissueState { precision: Precision::Auto, ..state },
-        TissueState { stiffness_n_per_m: f64::NAN, ..state },
-        TissueState { sleep_tolerance: -1.0, ..state },
-        TissueState { substeps: u32::MAX, ..state },
+        SavedPlan { substeps: 0, ..state },
+        SavedPlan { integrator: Integrator::Auto, ..state },
+        SavedPlan { precision: Precision::Auto, ..state },
+        SavedPlan { stiffness_n_per_m: f64::NAN, ..state },
+        SavedPlan { sleep_tolerance: -1.0, ..state },
+        SavedPlan { substeps: u32::MAX, ..state },
     ] {
         assert!(Model::resumed(&begun, &bent, &roomy).is_err(), "{bent:?}");
     }

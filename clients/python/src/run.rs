@@ -7,7 +7,7 @@ use std::sync::mpsc::channel;
 use std::time::Instant;
 
 use palpate_refusal::{Reason, Refusal};
-use palpate_session::run::{RunEvent, told};
+use palpate_session::run::{RunEvent, run_with};
 use palpate_session::simulation::SimulationFailure;
 use palpate_tissue::Model;
 use palpate_tissue::scene;
@@ -105,7 +105,7 @@ fn play(
     recorded.points.reserve(records.saturating_mul(script.sample_points.len() * OF_POINT).min(1 << 24));
     let begun = Instant::now();
     let clock_s = || begun.elapsed().as_secs_f64();
-    let summary = told(model, &script, how, &limits(), &clock_s, &mut |news| {
+    let summary = run_with(model, &script, how, &limits(), &clock_s, &mut |news| {
         match news {
             RunEvent::Run(run) => recorded.header = Some(run.clone()),
             RunEvent::Record(record) => recorded.add(&record),

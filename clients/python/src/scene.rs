@@ -11,7 +11,7 @@ use palpate_tissue::scene::collection::{Collection, find_scene, find_script};
 use palpate_tissue::scene::kind::TextKind;
 use palpate_tissue::scene::{self, Body, Named};
 use palpate_tissue::shape::{PointId, PointName};
-use palpate_tissue::state::saved::TissueState;
+use palpate_tissue::state::saved::SavedPlan;
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyDict, PyFloat, PyInt, PyString};
 
@@ -128,8 +128,8 @@ impl Scene {
 }
 
 /// Combines the coefficients of a scene with the plan of a model. The error is unknown.
-fn planned(scene: &scene::Scene, plan: &Model) -> TissueState {
-    TissueState {
+fn planned(scene: &scene::Scene, plan: &Model) -> SavedPlan {
+    SavedPlan {
         stiffness_n_per_m: scene.springs.stiffness_n_per_m,
         shear_stiffness_n_per_m: scene.springs.shear_stiffness_n_per_m,
         anchor_stiffness_n_per_m: scene.anchor_stiffness_n_per_m,
@@ -139,7 +139,7 @@ fn planned(scene: &scene::Scene, plan: &Model) -> TissueState {
         sleep_tolerance_of_scene: scene.sleep_tolerance,
         expected_error: f64::INFINITY,
         corrected: None,
-        ..plan.tissue_state()
+        ..plan.saved_plan()
     }
 }
 

@@ -7,7 +7,7 @@
 //! another run of the journal.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::watch;
@@ -246,14 +246,16 @@ impl EventLog {
     /// Breaks the log: discards its events, ignores further ones, and logs `reason` unless an earlier break is still
     /// reported. A log that is broken already keeps its reason. The session continues.
     pub fn break_off(&self, reason: &str) {
-        let reason: Arc<str> = reason.into();
-        {
-            let mut held = lock(&self.held);
-            if held.broken.is_some() {
-                return;
-            }
-            *held = HeldEvents { broken: Some(reason.clone()), ..HeldEvents::default() };
+        self.break_held(lock(&self.held), reason, false);
+    }
+
+    fn break_held(&self, mut held: MutexGuard<'_, HeldEvents>, reason: &str, has_overflowed: bool) {
+        if held.broken.is_some() {
+            return;
         }
+        let reason: Arc<str> = reason.into();
+        *held = HeldEvents { broken: Some(reason.clone()), has_overflowed, ..HeldEvents::default() };
+        drop(held);
         self.progress.send_modify(|progress| {
             // Logged once, and not at every attempt to restart.
             if progress.broken.replace(reason.clone()).is_none() {
@@ -302,9 +304,7 @@ impl EventLog {
             return;
         }
         if held.events.len() >= MAX_EVENTS {
-            drop(held);
-            self.break_off(OVERFLOW);
-            lock(&self.held).has_overflowed = true;
+            self.break_held(held, OVERFLOW, true);
             // The writer of journals must learn of it, to restart the log.
             return self.queue.push(self.clone());
         }
@@ -329,7 +329,7 @@ impl EventLog {
         self.queue_up(lock(&self.held));
     }
 
-    fn queue_up(self: &Arc<Self>, mut held: std::sync::MutexGuard<'_, HeldEvents>) {
+    fn queue_up(self: &Arc<Self>, mut held: MutexGuard<'_, HeldEvents>) {
         if held.broken.is_none() && !std::mem::replace(&mut held.is_queued, true) {
             drop(held);
             self.queue.push(self.clone());

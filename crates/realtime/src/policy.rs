@@ -24,19 +24,13 @@
 /// Number of steps that a session may be late before further ones are dropped.
 const CATCH_UP_STEPS: f64 = 2.0;
 
-/// State of the overrun rule for a session since it was started. So far the rule needs none.
-#[derive(Debug, Default)]
-pub(super) struct Backlog {}
-
-impl Backlog {
-    /// Returns the number of steps to drop from the schedule of a session whose next step was due `late_ns` ago.
-    /// `forgiven_ns` of that was caused by other sessions. It is called before each step.
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    pub(super) fn dropped_steps(&mut self, late_ns: u64, forgiven_ns: u64, period_ns: f64) -> u64 {
-        let behind = (late_ns.saturating_sub(forgiven_ns) as f64 / period_ns).floor();
-        // A negative number becomes 0.
-        (behind - CATCH_UP_STEPS) as u64
-    }
+/// Returns the number of steps to drop from the schedule of a session whose next step was due `late_ns` ago.
+/// `forgiven_ns` of that was caused by other sessions. It is called before each step.
+#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub(super) fn dropped_steps(late_ns: u64, forgiven_ns: u64, period_ns: f64) -> u64 {
+    let behind = (late_ns.saturating_sub(forgiven_ns) as f64 / period_ns).floor();
+    // A negative number becomes 0.
+    (behind - CATCH_UP_STEPS) as u64
 }
 
 /// Returns the number of equal parts that a thread is divided into for one session: `callers` have awake sessions,
@@ -168,11 +162,11 @@ mod tests {
     fn a_session_catches_up_two_steps_and_what_is_not_its_fault() {
         let period_ns = MS as f64;
         for (late_ms, forgiven_ms, dropped) in [(0, 0, 0), (2, 0, 0), (3, 0, 1), (10, 0, 8), (10, 7, 1), (10, 20, 0)] {
-            let found = Backlog::default().dropped_steps(late_ms * MS, forgiven_ms * MS, period_ns);
+            let found = dropped_steps(late_ms * MS, forgiven_ms * MS, period_ns);
             assert_eq!(found, dropped, "{late_ms} {forgiven_ms}");
         }
         // Parts of a step are not dropped.
-        assert_eq!(Backlog::default().dropped_steps(4 * MS - 1, 0, period_ns), 1);
+        assert_eq!(dropped_steps(4 * MS - 1, 0, period_ns), 1);
     }
 
     #[test]

@@ -17,7 +17,7 @@ use super::fence::Fence;
 use super::frames::Encoder;
 use super::inbox::{Inbox, Leaving, Present, Request};
 use super::playback::Next;
-use super::policy::{Backlog, Longest, StepWatch, Turn};
+use super::policy::{Longest, StepWatch, Turn, dropped_steps};
 use super::queue::Wakes;
 use super::reading::{Copies, Hashed, Reading};
 use super::recorder::Recorder;
@@ -64,7 +64,6 @@ pub(super) struct SessionTask {
     pub(super) due_ns: u64,
     /// Time before which it is not stepped, ns, because it was late and takes more than its part.
     not_before_ns: u64,
-    backlog: Backlog,
     /// Step count at which all points fell asleep, if they still are.
     pub(super) still_since: Option<u64>,
     pub(super) rested_steps: u64,
@@ -120,7 +119,6 @@ impl SessionTask {
             next_step: session.step_count(),
             due_ns: 0,
             not_before_ns: 0,
-            backlog: Backlog::default(),
             still_since: session.rests_until().map(|_| session.step_count()),
             session,
             rested_steps: 0,
@@ -358,7 +356,6 @@ impl SessionTask {
             self.running = true;
             self.schedule = Schedule::new(step, now, self.handle.speed() * self.handle.model.scene.stepping.rate_hz);
             self.schedule.delay(1.0);
-            self.backlog = Backlog::default();
             self.dilation = Dilation::new(now, step);
         }
         Ok(step)
@@ -395,7 +392,7 @@ impl SessionTask {
     #[allow(clippy::cast_precision_loss)]
     fn drop_backlog(&mut self, now_ns: u64, forgiven_ns: u64) {
         let (late_ns, period_ns) = (self.late_ns(now_ns), self.schedule.period_ns());
-        let dropped = self.backlog.dropped_steps(late_ns, forgiven_ns, period_ns);
+        let dropped = dropped_steps(late_ns, forgiven_ns, period_ns);
         if dropped > 0 {
             self.schedule.delay(dropped as f64);
             self.overrun_count += dropped;

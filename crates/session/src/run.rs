@@ -63,7 +63,7 @@ pub fn run(
     clock_s: &dyn Fn() -> f64,
     progress: &mut dyn FnMut(u64),
 ) -> Result<Summary, SimulationFailure> {
-    told(model, script, [held, audit], limits, clock_s, &mut |told| write(output, progress, told))
+    run_with(model, script, [held, audit], limits, clock_s, &mut |told| write(output, progress, told))
 }
 
 /// Plays `script` on `model` from rest for a program that uses the records as values, in the calling thread. Calls
@@ -79,7 +79,7 @@ pub fn run(
 ///   the twin. A recovery without `audit` is no error; the summary lists it.
 /// - [`SimulationFailure::Refused`]: a command, a change of the tissue or a correction is refused under `limits`.
 /// - [`SimulationFailure::Output`]: `tell` returned an error, which ends the run at the end of its step.
-pub fn told(
+pub fn run_with(
     model: &Arc<Model>,
     script: &Script,
     [held, audit]: [bool; 2],

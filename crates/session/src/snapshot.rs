@@ -14,7 +14,7 @@
 //! ```
 //!
 //! Later changes also need that scene ([`Model::changed`] takes it as `first`). For each change, a recorder of
-//! inputs must record the resulting [`TissueState`] and not the change: so nothing is chosen again, under limits
+//! inputs must record the resulting [`SavedPlan`] and not the change: so nothing is chosen again, under limits
 //! that may differ.
 //!
 //! **Bytes**: [`MAGIC`], the version of the format, the length of the parts, XXH3-128 of everything else (16
@@ -34,7 +34,7 @@ use palpate_refusal::{Reason, Refusal, Result};
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::record::Recovery;
 use palpate_tissue::state::saved::{
-    Checks, PlainTissue, SNAPSHOT, SavedPoke, SavedTip, SavedTissue, TissueParts, TissueState, ensure, tool_above,
+    Checks, PlainTissue, SNAPSHOT, SavedPlan, SavedPoke, SavedTip, SavedTissue, TissueParts, ensure, tool_above,
     unsound,
 };
 use palpate_tissue::{self as tissue, Model, Tissue};
@@ -77,7 +77,7 @@ pub struct Saved {
 #[derive(Debug, Clone)]
 enum Content {
     /// A copy of a session of this process.
-    Taken { own: Arc<SessionParts>, tissue: SavedTissue, state: TissueState, step: u64 },
+    Taken { own: Arc<SessionParts>, tissue: SavedTissue, state: SavedPlan, step: u64 },
     /// Content that was read from bytes.
     Read { parts: Arc<Parts>, values: Arc<Vec<u8>> },
 }
@@ -172,7 +172,7 @@ impl Session {
             recoveries: SavedRecoveries::of(&self.recoveries),
             hold_reason: self.hold_reason.clone(),
         };
-        let (tissue, state, step) = (self.tissue.save(), self.model().tissue_state(), self.step_count());
+        let (tissue, state, step) = (self.tissue.save(), self.model().saved_plan(), self.step_count());
         // The values come from this process, which has checked them against its own limits.
         let limits = Limits { tools: u32::MAX, point_force_n: f64::INFINITY, ..Limits::default() };
         Saved { content: Content::Taken { own: Arc::new(own), tissue, state, step }, limits }
@@ -236,7 +236,7 @@ impl Saved {
     }
 
     /// Returns the scheme and the coefficients of the tissue, for [`Model::resumed`].
-    pub fn tissue(&self) -> &TissueState {
+    pub fn tissue(&self) -> &SavedPlan {
         match &self.content {
             Content::Taken { state, .. } => state,
             Content::Read { parts, .. } => &parts.tissue.tissue,

@@ -11,7 +11,7 @@ use crate::response::tangent;
 use crate::scene::{Body, Change, Integrator, Named, Precision, Scene, Stepping};
 use crate::scheme::{Oscillator, entry};
 use crate::select::scheme_selection::{self, Choice};
-use crate::state::saved::{CorrectedPlan, TissueState};
+use crate::state::saved::{CorrectedPlan, SavedPlan};
 use palpate_refusal::{Reason, Refusal, Result, number, unsigned_zero};
 
 /// What sleeping tiles may add to the error by default, as a fraction of it.
@@ -232,9 +232,9 @@ impl Model {
 
     /// Returns the coefficients and the plan of this model: everything that [`Model::resumed`] needs besides
     /// the scene that the session began with. Displacements are not part of it.
-    pub fn tissue_state(&self) -> TissueState {
+    pub fn saved_plan(&self) -> SavedPlan {
         let Model { scene, plan, precision, expected_error, sleep_tolerance, corrected, .. } = self;
-        TissueState {
+        SavedPlan {
             stiffness_n_per_m: scene.springs.stiffness_n_per_m,
             shear_stiffness_n_per_m: scene.springs.shear_stiffness_n_per_m,
             anchor_stiffness_n_per_m: scene.anchor_stiffness_n_per_m,
@@ -262,8 +262,8 @@ impl Model {
     ///   NaN;
     /// - `compensated` with an integrator that is not exponential, more substeps than `limits.substeps`;
     /// - lanes that this processor does not have, and a mesh whose springs can't be laid out in memory.
-    pub fn resumed(first: &Scene, state: &TissueState, limits: &Limits) -> Result<Arc<Self>> {
-        let TissueState { integrator, substeps, precision, sleep_tolerance, expected_error, .. } = *state;
+    pub fn resumed(first: &Scene, state: &SavedPlan, limits: &Limits) -> Result<Arc<Self>> {
+        let SavedPlan { integrator, substeps, precision, sleep_tolerance, expected_error, .. } = *state;
         let mut scene = first.clone();
         scene.springs.stiffness_n_per_m = state.stiffness_n_per_m;
         scene.springs.shear_stiffness_n_per_m = state.shear_stiffness_n_per_m;

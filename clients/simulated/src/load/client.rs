@@ -21,10 +21,10 @@ pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Stage of a load test, and the time when the measurement ended, ns.
-pub(crate) struct Stage(AtomicU8, AtomicU64);
+/// LoadStage of a load test, and the time when the measurement ended, ns.
+pub(crate) struct LoadStage(AtomicU8, AtomicU64);
 
-impl Stage {
+impl LoadStage {
     /// Sessions and clients start; nothing is counted yet.
     pub(crate) const RAMP: u8 = 0;
     pub(crate) const MEASURE: u8 = 1;
@@ -32,16 +32,16 @@ impl Stage {
     pub(crate) const DRAIN: u8 = 2;
 
     pub(crate) fn new() -> Self {
-        Stage(AtomicU8::new(Stage::RAMP), AtomicU64::new(0))
+        LoadStage(AtomicU8::new(LoadStage::RAMP), AtomicU64::new(0))
     }
 
     pub(crate) fn measure(&self) {
-        self.0.store(Stage::MEASURE, Ordering::Release);
+        self.0.store(LoadStage::MEASURE, Ordering::Release);
     }
 
     pub(crate) fn drain(&self, now_ns: u64) {
         self.1.store(now_ns, Ordering::Release);
-        self.0.store(Stage::DRAIN, Ordering::Release);
+        self.0.store(LoadStage::DRAIN, Ordering::Release);
     }
 
     pub(crate) fn is(&self, stage: u8) -> bool {
@@ -53,7 +53,7 @@ impl Stage {
 #[derive(Clone)]
 pub(crate) struct Common {
     pub(crate) clock: Instant,
-    pub(crate) stage: Arc<Stage>,
+    pub(crate) stage: Arc<LoadStage>,
     pub(crate) tally: Arc<Mutex<Tally>>,
     /// Commands per second.
     pub(crate) rate_hz: f64,
@@ -116,11 +116,11 @@ struct Heartbeat {
 }
 
 /// Arrival times of a session's samples, from which the age of its frames follows.
-pub(crate) struct Arrivals(Box<[(u64, u64); OUTSTANDING]>);
+pub(crate) struct SampleTimes(Box<[(u64, u64); OUTSTANDING]>);
 
-impl Arrivals {
+impl SampleTimes {
     pub(crate) fn new() -> Self {
-        Arrivals(Box::new([(0, 0); OUTSTANDING]))
+        SampleTimes(Box::new([(0, 0); OUTSTANDING]))
     }
 
     #[allow(clippy::cast_possible_truncation)]
@@ -147,7 +147,7 @@ pub(crate) struct Client {
     /// Centre of the tissue, m.
     pub(crate) middle_m: DVec3,
     /// Present if the session has viewers.
-    pub(crate) arrivals: Option<Arc<Mutex<Arrivals>>>,
+    pub(crate) sample_times: Option<Arc<Mutex<SampleTimes>>>,
 }
 
 /// Longest time for which a client waits for outstanding answers.
@@ -235,7 +235,7 @@ impl Client {
         let mut begun: Option<Instant> = None;
         loop {
             tokio::time::sleep(Duration::from_millis(100)).await;
-            if self.common.stage.is(Stage::DRAIN) {
+            if self.common.stage.is(LoadStage::DRAIN) {
                 let begun = *begun.get_or_insert_with(Instant::now);
                 if lock(sent).outstanding() == 0 || begun.elapsed() > ANSWER_TIMEOUT {
                     return;
@@ -246,11 +246,11 @@ impl Client {
 
     fn sample(&self, sample: &pb::Sample, heartbeat: &mut Heartbeat, sent: &mut Sent) {
         let now_ns = self.common.now_ns();
-        if let Some(arrivals) = &self.arrivals {
-            lock(arrivals).note(sample.step, now_ns);
+        if let Some(sample_times) = &self.sample_times {
+            lock(sample_times).note(sample.step, now_ns);
         }
         let acknowledged = sample.tools.first().map_or(0, |tool| tool.acknowledged_sequence);
-        let measures = self.common.stage.is(Stage::MEASURE);
+        let measures = self.common.stage.is(LoadStage::MEASURE);
         let mut tally = measures.then(|| lock(&self.common.tally));
         for sequence in sent.acknowledged + 1..=acknowledged.min(sent.sequence) {
             let at_ns = std::mem::take(sent.at(sequence));
@@ -296,7 +296,7 @@ impl Heartbeat {
     /// Returns simulated time over real time: by the server's clock, plus this client's clock for a long silence at
     /// the end.
     #[allow(clippy::cast_precision_loss)]
-    fn dilation(&self, rate_hz: f64, stage: &Stage) -> f64 {
+    fn dilation(&self, rate_hz: f64, stage: &LoadStage) -> f64 {
         let Some(first) = self.first else { return 0.0 };
         let silent_ns = stage.1.load(Ordering::Acquire).saturating_sub(self.last_arrival_ns);
         let silent_ns = if silent_ns > SILENCE_NS { silent_ns } else { 0 };
@@ -309,7 +309,7 @@ impl Heartbeat {
 fn command(common: &Common, stroke: &Stroke, tool: u32, sent: &Mutex<Sent>, tick: u64) -> Option<pb::Command> {
     let mut sent = lock(sent);
     let missed = sent.last_tick.replace(tick).map_or(0, |last| tick - last - 1);
-    if !sent.is_open || common.stage.is(Stage::DRAIN) {
+    if !sent.is_open || common.stage.is(LoadStage::DRAIN) {
         return None;
     }
     #[allow(clippy::cast_precision_loss)]
@@ -322,7 +322,7 @@ fn command(common: &Common, stroke: &Stroke, tool: u32, sent: &Mutex<Sent>, tick
     sent.sequence += 1;
     let sequence = sent.sequence;
     *sent.at(sequence) = now_ns;
-    if common.stage.is(Stage::MEASURE) {
+    if common.stage.is(LoadStage::MEASURE) {
         let mut tally = lock(&common.tally);
         tally.commands += 1;
         tally.unsent += missed;
@@ -338,7 +338,7 @@ mod tests {
 
     #[test]
     fn dilation_is_simulated_over_real_time_and_silence_counts() {
-        let stage = Stage::new();
+        let stage = LoadStage::new();
         stage.drain(4_000_000_000);
         let heartbeat = |last_arrival_ns: u64| Heartbeat {
             first: Some((1_000_000_000, 500)),

@@ -6,9 +6,9 @@ use palpate_client::{Channel, Error, Server};
 
 use super::plan::LoadPlan;
 
-/// Purpose of a connection. Frames have their own connections: on a shared one, they would delay samples.
+/// ConnectionPurpose of a connection. Frames have their own connections: on a shared one, they would delay samples.
 #[derive(Clone, Copy, PartialEq)]
-pub(crate) enum Purpose {
+pub(crate) enum ConnectionPurpose {
     Call,
     Touch,
     View,
@@ -16,24 +16,24 @@ pub(crate) enum Purpose {
 
 /// Connections, each shared by a limited number of streams.
 pub(crate) struct Connections {
-    most: u32,
+    max_streams: u32,
     /// The newest connection and its number of streams, by whether it is for frames and by the server.
     newest: BTreeMap<(bool, String), (Channel, u32)>,
 }
 
 impl Connections {
     pub(crate) fn new(plan: &LoadPlan) -> Self {
-        Connections { most: plan.clients_per_connection, newest: BTreeMap::new() }
+        Connections { max_streams: plan.clients_per_connection, newest: BTreeMap::new() }
     }
 
     /// Returns a connection to a server with room for the stream of a client or viewer; a call needs no room.
-    pub(crate) async fn to(&mut self, server: &Server, purpose: Purpose) -> Result<Channel, Error> {
-        let streams = u32::from(purpose != Purpose::Call);
-        let key = (purpose == Purpose::View, server.url().to_owned());
-        if let Some((channel, borne)) = self.newest.get_mut(&key)
-            && *borne + streams <= self.most
+    pub(crate) async fn to(&mut self, server: &Server, purpose: ConnectionPurpose) -> Result<Channel, Error> {
+        let streams = u32::from(purpose != ConnectionPurpose::Call);
+        let key = (purpose == ConnectionPurpose::View, server.url().to_owned());
+        if let Some((channel, streams_so_far)) = self.newest.get_mut(&key)
+            && *streams_so_far + streams <= self.max_streams
         {
-            *borne += streams;
+            *streams_so_far += streams;
             return Ok(channel.clone());
         }
         let channel = server.connect().await?;

@@ -5,9 +5,9 @@
 
 mod client;
 mod connections;
-mod course;
 mod objective;
 mod plan;
+mod plan_run;
 mod report;
 mod stroke;
 mod tally;
@@ -16,9 +16,9 @@ mod trial;
 mod user;
 mod viewer;
 
-pub use course::PreparedPlan;
 pub use objective::Objective;
 pub use plan::LoadPlan;
+pub use plan_run::PreparedPlan;
 pub use report::{LoadReport, Second};
 pub use tally::LoadOutcome;
 pub use tip::Deadbands;

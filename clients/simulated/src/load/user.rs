@@ -13,8 +13,8 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tonic::{Response, Status};
 
-use super::client::{Arrivals, Client, Common, Stage, lock};
-use super::connections::{Connections, Purpose};
+use super::client::{Client, Common, LoadStage, SampleTimes, lock};
+use super::connections::{ConnectionPurpose, Connections};
 use super::plan::{LoadPlan, User, Viewers};
 use super::stroke::Stroke;
 use super::tally::Tally;
@@ -30,7 +30,7 @@ const IDLE_S: f64 = 10.0;
 const MAX_PLACES: u64 = 1 << 16;
 
 /// State that all users of a thread share.
-pub(crate) struct World {
+pub(crate) struct UserContext {
     pub(crate) plan: Arc<LoadPlan>,
     /// The server through each of the plan's networks.
     pub(crate) servers: Arc<[Server]>,
@@ -49,13 +49,13 @@ pub(crate) struct World {
 }
 
 /// A user with an open session.
-pub(crate) struct Guest {
+pub(crate) struct UserSession {
     /// The server of the session. In a fleet, another server may own it later.
     server: Server,
     channel: Channel,
     session_id: String,
     rate_hz: f64,
-    stage: Arc<Stage>,
+    stage: Arc<LoadStage>,
     /// Its clients and viewers.
     streams: JoinSet<()>,
 }
@@ -77,59 +77,63 @@ fn silent() -> Error {
 }
 
 /// Runs a user from arrival to end. If the server refuses it, counts it as turned away.
-pub(crate) async fn visit(world: Arc<World>, user: User) {
-    let mut connections = Connections::new(&world.plan);
-    let arriving = tokio::time::timeout(SERVER_TIMEOUT, Guest::arrive(&world, &user, &mut connections)).await;
+pub(crate) async fn run_user(context: Arc<UserContext>, user: User) {
+    let mut connections = Connections::new(&context.plan);
+    let arriving = tokio::time::timeout(SERVER_TIMEOUT, UserSession::arrive(&context, &user, &mut connections)).await;
     match arriving.map_err(|_| silent()).and_then(|arrived| arrived) {
-        Ok(guest) => guest.stay(&world, user.stays_s).await,
+        Ok(session) => session.stay(&context, user.stays_s).await,
         Err(error) => {
-            let mut tally = lock(&world.tally);
+            let mut tally = lock(&context.tally);
             *tally.turned_away.entry(reason(&error)).or_default() += 1;
             tally.first_break.get_or_insert(error.to_string());
         }
     }
 }
 
-impl Guest {
+impl UserSession {
     /// Creates a session, and opens the streams of its clients and viewers.
-    pub(crate) async fn arrive(world: &World, user: &User, connections: &mut Connections) -> Result<Self, Error> {
+    pub(crate) async fn arrive(
+        context: &UserContext,
+        user: &User,
+        connections: &mut Connections,
+    ) -> Result<Self, Error> {
         let begun = Instant::now();
-        let server = &world.servers[user.wire];
-        let source = Some(world.sources[user.scene].clone());
+        let server = &context.servers[user.wire];
+        let source = Some(context.sources[user.scene].clone());
         let request = pb::CreateSessionRequest { source, paused: false, idle_timeout_s: Some(IDLE_S) };
-        let mut sessions = SessionServiceClient::new(connections.to(server, Purpose::Call).await?);
+        let mut sessions = SessionServiceClient::new(connections.to(server, ConnectionPurpose::Call).await?);
         let created = sessions.create_session(request).await?.into_inner().session.unwrap_or_default();
         // A simulated network leads to one server only.
-        let server = match world.plan.wires[user.wire].what.conditions {
+        let server = match context.plan.wires[user.wire].what.conditions {
             None => fleet::home(server, &created)?,
             Some(_) => server.clone(),
         };
         let stepping = created.scene.as_ref().and_then(|scene| scene.stepping.as_ref());
-        let mut guest = Guest {
-            channel: connections.to(&server, Purpose::Call).await?,
+        let mut session = UserSession {
+            channel: connections.to(&server, ConnectionPurpose::Call).await?,
             server,
             session_id: created.session_id.clone(),
             rate_hz: stepping.and_then(|stepping| stepping.rate_hz).unwrap_or(1000.0),
-            stage: Arc::new(Stage::new()),
+            stage: Arc::new(LoadStage::new()),
             streams: JoinSet::new(),
         };
-        if let Err(error) = guest.open(world, user, &created, connections).await {
-            guest.leave().await;
+        if let Err(error) = session.open(context, user, &created, connections).await {
+            session.leave().await;
             return Err(error);
         }
         #[allow(clippy::cast_possible_truncation)]
-        lock(&world.tally).start_ns.saturating_record(begun.elapsed().as_nanos() as u64);
-        Ok(guest)
+        lock(&context.tally).start_ns.saturating_record(begun.elapsed().as_nanos() as u64);
+        Ok(session)
     }
 
     async fn open(
         &mut self,
-        world: &World,
+        context: &UserContext,
         user: &User,
         created: &pb::Session,
         connections: &mut Connections,
     ) -> Result<(), Error> {
-        let World { plan, clock, tally, turns, .. } = world;
+        let UserContext { plan, clock, tally, turns, .. } = context;
         let common = Common {
             clock: *clock,
             stage: self.stage.clone(),
@@ -138,7 +142,7 @@ impl Guest {
             touches: plan.leads[user.lead].what,
         };
         let Viewers { number, rate_hz: frames_hz } = plan.viewers[user.viewers].what;
-        let arrivals = (number > 0).then(|| Arc::new(Mutex::new(Arrivals::new())));
+        let sample_times = (number > 0).then(|| Arc::new(Mutex::new(SampleTimes::new())));
         let whole = Stroke::new(created);
         for tool in 0..plan.clients_per_user {
             let place = user.seed.wrapping_add(u64::from(tool)) % MAX_PLACES;
@@ -151,19 +155,20 @@ impl Guest {
                 stroke: whole.beginning(0.618 * place as f64),
                 seed: user.seed,
                 middle_m: from_vector(created.extent.as_ref().and_then(|extent| extent.middle_m.as_ref())),
-                arrivals: arrivals.clone(),
+                sample_times: sample_times.clone(),
             };
             #[allow(clippy::cast_possible_truncation)]
             let ticks = turns[place as usize % turns.len()].clone();
-            self.streams.spawn(client.open(connections.to(&self.server, Purpose::Touch).await?, ticks).await?);
+            self.streams
+                .spawn(client.open(connections.to(&self.server, ConnectionPurpose::Touch).await?, ticks).await?);
         }
         if plan.clients_per_user == 0 {
             self.keep_awake(plan, whole, created.step).await?;
         }
         for _ in 0..number {
-            let channel = connections.to(&self.server, Purpose::View).await?;
+            let channel = connections.to(&self.server, ConnectionPurpose::View).await?;
             let (id, frames_hz) = (self.session_id.clone(), frames_hz.min(self.rate_hz));
-            self.streams.spawn(view(common.clone(), channel, id, frames_hz, arrivals.clone()).await?);
+            self.streams.spawn(view(common.clone(), channel, id, frames_hz, sample_times.clone()).await?);
         }
         Ok(())
     }
@@ -201,41 +206,41 @@ impl Guest {
     }
 
     /// Stays for `stays_s`, s, or until the load test drains or all streams have ended; then leaves.
-    pub(crate) async fn stay(mut self, world: &World, stays_s: f64) {
-        let mut stages = world.stages.clone();
-        let _ = stages.wait_for(|stage| *stage != Stage::RAMP).await;
+    pub(crate) async fn stay(mut self, context: &UserContext, stays_s: f64) {
+        let mut stages = context.stages.clone();
+        let _ = stages.wait_for(|stage| *stage != LoadStage::RAMP).await;
         self.stage.measure();
-        let has_clients = world.plan.clients_per_user > 0;
-        let begin = if has_clients { None } else { self.ask(world).await };
+        let has_clients = context.plan.clients_per_user > 0;
+        let begin = if has_clients { None } else { self.ask(context).await };
         let has_streams = !self.streams.is_empty();
         tokio::select! {
             () = tokio::time::sleep(Duration::from_secs_f64(stays_s)) => {}
-            _ = stages.wait_for(|stage| *stage == Stage::DRAIN) => {}
+            _ = stages.wait_for(|stage| *stage == LoadStage::DRAIN) => {}
             () = async { while self.streams.join_next().await.is_some() {} }, if has_streams => {}
         }
         #[allow(clippy::cast_possible_truncation)]
-        self.stage.drain(world.clock.elapsed().as_nanos() as u64);
+        self.stage.drain(context.clock.elapsed().as_nanos() as u64);
         if let Some((from_ns, from)) = begin
-            && let Some((to_ns, to)) = self.ask(world).await
+            && let Some((to_ns, to)) = self.ask(context).await
         {
             #[allow(clippy::cast_precision_loss)]
             let (simulated_s, real_s) =
                 (to.step.saturating_sub(from.step) as f64 / self.rate_hz, (to_ns - from_ns) as f64 * 1e-9);
-            let mut tally = lock(&world.tally);
+            let mut tally = lock(&context.tally);
             tally.dilation_min = tally.dilation_min.min(simulated_s / real_s);
             if to.resting {
                 tally.broke("a session came to rest although commands should keep it awake".to_owned());
             }
         }
         while self.streams.join_next().await.is_some() {}
-        lock(&world.tally).left += 1;
+        lock(&context.tally).left += 1;
         self.leave().await;
     }
 
     /// Returns the time, ns, and the session as the server describes it: the only way to find the step of one without
     /// clients.
-    async fn ask(&self, world: &World) -> Option<(u64, pb::Session)> {
-        let _turn = world.asking.lock().await;
+    async fn ask(&self, context: &UserContext) -> Option<(u64, pb::Session)> {
+        let _turn = context.asking.lock().await;
         let request = pb::GetSessionRequest { session_id: self.session_id.clone() };
         let answer = self.call(|mut sessions| {
             let request = request.clone();
@@ -243,9 +248,9 @@ impl Guest {
         });
         match answer.await {
             #[allow(clippy::cast_possible_truncation)]
-            Ok(answer) => Some((world.clock.elapsed().as_nanos() as u64, answer.session.unwrap_or_default())),
+            Ok(answer) => Some((context.clock.elapsed().as_nanos() as u64, answer.session.unwrap_or_default())),
             Err(error) => {
-                lock(&world.tally).broke(error.to_string());
+                lock(&context.tally).broke(error.to_string());
                 None
             }
         }

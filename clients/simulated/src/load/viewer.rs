@@ -8,7 +8,7 @@ use palpate_client::{Channel, describe};
 use palpate_proto::pb;
 use tonic::Status;
 
-use super::client::{Arrivals, Common, Stage, lock};
+use super::client::{Common, LoadStage, SampleTimes, lock};
 
 /// Begins to watch a session. Returns a future that runs the viewer to its end.
 pub(crate) async fn view(
@@ -16,18 +16,18 @@ pub(crate) async fn view(
     channel: Channel,
     session_id: String,
     rate_hz: f64,
-    arrivals: Option<Arc<Mutex<Arrivals>>>,
+    sample_times: Option<Arc<Mutex<SampleTimes>>>,
 ) -> Result<impl Future<Output = ()>, Status> {
     let (encoding, rate_hz) = (pb::Encoding::I16.into(), Some(rate_hz));
     let request = pb::WatchFramesRequest { session_id, encoding, rate_hz, ..Default::default() };
-    Ok(watch(common, Frames::open(channel, request).await?, arrivals))
+    Ok(watch(common, Frames::open(channel, request).await?, sample_times))
 }
 
 /// Counts a viewer's frames until the measurement ends.
-async fn watch(common: Common, mut frames: Frames, arrivals: Option<Arc<Mutex<Arrivals>>>) {
+async fn watch(common: Common, mut frames: Frames, sample_times: Option<Arc<Mutex<SampleTimes>>>) {
     // Used when there are no samples: arrival time minus simulated time of the least delayed frame, s.
     let mut least_s = f64::INFINITY;
-    while !common.stage.is(Stage::DRAIN) {
+    while !common.stage.is(LoadStage::DRAIN) {
         let part = match tokio::time::timeout(Duration::from_millis(200), frames.next_part()).await {
             Err(_) => continue,
             Ok(Ok(Some(part))) => part,
@@ -41,8 +41,8 @@ async fn watch(common: Common, mut frames: Frames, arrivals: Option<Arc<Mutex<Ar
         #[allow(clippy::cast_precision_loss)]
         let ahead_s = now_ns as f64 * 1e-9 - part.simulation_time_s;
         least_s = least_s.min(ahead_s);
-        if common.stage.is(Stage::MEASURE) {
-            let sampled_ns = arrivals.as_ref().and_then(|arrivals| lock(arrivals).of(part.step));
+        if common.stage.is(LoadStage::MEASURE) {
+            let sampled_ns = sample_times.as_ref().and_then(|sample_times| lock(sample_times).of(part.step));
             #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
             let age_ns = sampled_ns.map_or(((ahead_s - least_s) * 1e9) as u64, |at_ns| now_ns.saturating_sub(at_ns));
             let mut tally = lock(&common.tally);

@@ -178,8 +178,8 @@ mod tests {
         assert_eq!(first_due.iter().map(of).collect::<Vec<_>>(), [(1, None, true), (0, Some(1), false)]);
         assert!(matches!(first_due[1].command.action, Action::Pose { place_m, .. } if place_m == glam::DVec3::Z));
         assert!(other.take_change(7).is_none());
-        assert_eq!(other.take_change(8).unwrap().tissue_state(), changed.tissue_state());
-        assert_eq!(other.changed_to().unwrap().tissue_state(), changed.tissue_state());
+        assert_eq!(other.take_change(8).unwrap().saved_plan(), changed.saved_plan());
+        assert_eq!(other.changed_to().unwrap().saved_plan(), changed.saved_plan());
         assert_eq!(due(&mut other, 8).iter().map(of).collect::<Vec<_>>(), [(0, Some(2), false)]);
         assert_eq!(due(&mut other, 9).iter().map(of).collect::<Vec<_>>(), [(0, Some(3), false)]);
         // The lease continues, and sequence numbers of its commands start again.

@@ -23,7 +23,7 @@ use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Action;
 use palpate_tissue::scene::{Appearance, Body, Integrator, MeshShape, Named, PaintedSurface, Precision, Scene};
 use palpate_tissue::shape::PointId;
-use palpate_tissue::state::saved::{CorrectedPlan, TissueState};
+use palpate_tissue::state::saved::{CorrectedPlan, SavedPlan};
 
 /// Least number of tools with which a journal is read, whatever the limits of this program are.
 const MAX_TOOLS: u32 = 4096;
@@ -153,7 +153,7 @@ fn from_appearance(message: &pb::Appearance) -> Result<Appearance> {
 
 /// Returns a tissue as a message: its coefficients, and how it is stepped. The scene is not in it.
 pub fn tissue(model: &Model) -> pb::Tissue {
-    let TissueState {
+    let SavedPlan {
         stiffness_n_per_m,
         shear_stiffness_n_per_m,
         anchor_stiffness_n_per_m,
@@ -166,7 +166,7 @@ pub fn tissue(model: &Model) -> pb::Tissue {
         sleep_tolerance_of_scene,
         expected_error,
         corrected,
-    } = model.tissue_state();
+    } = model.saved_plan();
     pb::Tissue {
         stiffness_n_per_m,
         shear_stiffness_n_per_m,
@@ -199,7 +199,7 @@ fn compiled(first: &Scene, message: &pb::Tissue, limits: &Limits) -> Result<Arc<
         "" => None,
         name => Some(CorrectedPlan { integrator: Integrator::named("corrected_integrator", name)?, least_substeps }),
     };
-    let state = TissueState {
+    let state = SavedPlan {
         stiffness_n_per_m: message.stiffness_n_per_m,
         shear_stiffness_n_per_m: message.shear_stiffness_n_per_m,
         anchor_stiffness_n_per_m: message.anchor_stiffness_n_per_m,
@@ -395,7 +395,7 @@ mod tests {
 
     fn assert_same(model: &Arc<Model>, other: &Arc<Model>) {
         assert_eq!(model.scene, other.scene);
-        assert_eq!((model.tissue_state(), &model.plan), (other.tissue_state(), &other.plan));
+        assert_eq!((model.saved_plan(), &model.plan), (other.saved_plan(), &other.plan));
     }
 
     #[test]

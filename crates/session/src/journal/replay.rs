@@ -535,7 +535,7 @@ fn saved(snapshot: &pb::Snapshot, first: &Arc<Model>, limits: &Limits) -> Result
         return Err(Refusal::new(Reason::Unreadable, "snapshot", message));
     }
     // Most sessions have the tissue with which they began.
-    let is_first = *saved.tissue() == first.tissue_state();
+    let is_first = *saved.tissue() == first.saved_plan();
     let model = if is_first { first.clone() } else { Model::resumed(&first.scene, saved.tissue(), limits)? };
     Ok((saved, model))
 }

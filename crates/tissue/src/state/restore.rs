@@ -54,7 +54,7 @@ fn fits(model: &Model, saved: &TissueParts) -> Result<()> {
     if saved.points != model.len() as u64 {
         return refuse(format!("is of a tissue of {} points, but this one has {}", saved.points, model.len()));
     }
-    let (own, other) = (model.tissue_state(), saved.tissue);
+    let (own, other) = (model.saved_plan(), saved.tissue);
     if own.precision != other.precision {
         let (own, other) = (own.precision.name(), other.precision.name());
         return refuse(format!("is of a tissue in {other}, but this one is in {own}"));
@@ -180,7 +180,7 @@ impl<T: Real> SavedState for TypedState<T> {
         let inputs = self.inputs.iter().map(|(step, tool, input)| (*step, *tool as u64, input.saved()));
         let parts = TissueParts {
             points: self.model.len() as u64,
-            tissue: self.model.tissue_state(),
+            tissue: self.model.saved_plan(),
             fingerprint: self.model.fingerprint(),
             steps: self.steps,
             halvings: self.halvings,

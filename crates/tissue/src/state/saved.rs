@@ -46,7 +46,7 @@ const MAX_COUNT: u64 = 1 << 48;
 ///
 /// [`Model::resumed`]: crate::Model::resumed
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct TissueState {
+pub struct SavedPlan {
     /// k of the structural springs, N/m; on a mesh, the reference value of which each spring has a multiple.
     pub stiffness_n_per_m: f64,
     /// k of the shear springs, N/m.
@@ -135,7 +135,7 @@ pub struct TissueParts {
     /// Number of points of the tissue.
     pub points: u64,
     /// The model's plan and coefficients.
-    pub tissue: TissueState,
+    pub tissue: SavedPlan,
     /// XXH3-128 hash of everything in the model that a step depends on (`Model::fingerprint`).
     pub fingerprint: u128,
     /// Number of steps done; below 2⁴⁸.

@@ -11,12 +11,12 @@ use palpate_refusal::Refusal;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 
-use super::client::{Stage, lock};
+use super::client::{LoadStage, lock};
 use super::connections::Connections;
 use super::plan::{LoadPlan, User};
 use super::report::{LoadReport, Second};
 use super::tally::Tally;
-use super::user::{Guest, World, visit};
+use super::user::{UserContext, UserSession, run_user};
 use super::{TURNS, tick};
 use crate::relay::RelayNetwork;
 use crate::scene_file::SceneFile;
@@ -105,12 +105,12 @@ async fn run(
     stop: impl Future<Output = ()>,
 ) -> Result<LoadReport, Error> {
     let users = plan.users();
-    let mut course = Course { report: LoadReport::new(&plan, &users), tallies: Vec::new(), at_s: 0.0, users: 0 };
+    let mut plan_run = PlanRun { report: LoadReport::new(&plan, &users), tallies: Vec::new(), at_s: 0.0, users: 0 };
     let (senders, turns): (Vec<_>, Vec<_>) = (0..TURNS).map(|_| watch::channel(0)).unzip();
     let (beating, beats) = watch::channel(());
     let rate_hz = plan.rate_hz;
     let ticker = std::thread::spawn(move || tick(&senders, rate_hz, &beats));
-    let (telling, stages) = watch::channel(Stage::RAMP);
+    let (telling, stages) = watch::channel(LoadStage::RAMP);
     let (counting, counted_s) = watch::channel(0.0);
     let (arrived, mut arrivals) = mpsc::unbounded_channel();
     let (servers, sources): (Arc<[_]>, Arc<[_]>) = (servers.into(), sources.into());
@@ -119,8 +119,8 @@ async fn run(
     let mut workers = Vec::new();
     for index in 0..threads {
         let tally = Arc::new(Mutex::new(Tally::new()));
-        course.tallies.push(tally.clone());
-        let world = World {
+        plan_run.tallies.push(tally.clone());
+        let context = UserContext {
             plan: plan.clone(),
             servers: servers.clone(),
             sources: sources.clone(),
@@ -133,17 +133,17 @@ async fn run(
         };
         let (own, arrived) = (users.iter().skip(index).step_by(threads).copied().collect(), arrived.clone());
         // The users get threads of their own, so that no other work delays their measurements.
-        workers.push(std::thread::spawn(move || work(world, own, &arrived)));
+        workers.push(std::thread::spawn(move || work(context, own, &arrived)));
     }
     drop(arrived);
     let ended = tokio::select! {
-        ended = course.take(&plan, &mut arrivals, (&telling, &counting), told) => ended,
+        ended = plan_run.take(&plan, &mut arrivals, (&telling, &counting), told) => ended,
         () = stop => {
-            course.report.is_interrupted = true;
+            plan_run.report.is_interrupted = true;
             Ok(())
         }
     };
-    telling.send_replace(Stage::DRAIN);
+    telling.send_replace(LoadStage::DRAIN);
     let joined = tokio::task::spawn_blocking(move || {
         let joined = workers.into_iter().try_for_each(std::thread::JoinHandle::join);
         // Users wait for outstanding answers.
@@ -157,13 +157,13 @@ async fn run(
         arrived?;
     }
     // Counts after the last second belong to the last phase.
-    let rest = course.count(course.at_s + 1.0);
-    course.report.add(rest);
-    Ok(course.report)
+    let rest = plan_run.count(plan_run.at_s + 1.0);
+    plan_run.report.add(rest);
+    Ok(plan_run.report)
 }
 
 /// Progress of a load test.
-struct Course {
+struct PlanRun {
     report: LoadReport,
     /// Counts by thread.
     tallies: Vec<Arc<Mutex<Tally>>>,
@@ -172,7 +172,7 @@ struct Course {
     users: u64,
 }
 
-impl Course {
+impl PlanRun {
     /// Runs the clock of the plan. It starts when all users that gather are connected.
     async fn take(
         &mut self,
@@ -188,7 +188,7 @@ impl Course {
             }
             tokio::time::sleep(SETTLE).await;
         }
-        telling.send_replace(Stage::MEASURE);
+        telling.send_replace(LoadStage::MEASURE);
         let (begun, begun_cpu_s) = (tokio::time::Instant::now(), cpu_s());
         let lasts_s = plan.lasts_s();
         // Fractions of a second do not add up exactly.
@@ -225,43 +225,43 @@ impl Course {
 }
 
 /// Runs the users of one thread. Sends to `arrived` when all of them have arrived, or why they could not.
-fn work(world: World, users: Vec<User>, arrived: &mpsc::UnboundedSender<Result<(), Error>>) {
+fn work(context: UserContext, users: Vec<User>, arrived: &mpsc::UnboundedSender<Result<(), Error>>) {
     let all = match tokio::runtime::Builder::new_current_thread().enable_all().build() {
-        Ok(runtime) => return runtime.block_on(play(Arc::new(world), users, arrived)),
+        Ok(runtime) => return runtime.block_on(play(Arc::new(context), users, arrived)),
         Err(error) => Err(Error::Internal(format!("can't start a thread: {error}"))),
     };
     let _ = arrived.send(all);
 }
 
-async fn play(world: Arc<World>, users: Vec<User>, arrived: &mpsc::UnboundedSender<Result<(), Error>>) {
-    let (mut stages, mut staying) = (world.stages.clone(), JoinSet::new());
+async fn play(context: Arc<UserContext>, users: Vec<User>, arrived: &mpsc::UnboundedSender<Result<(), Error>>) {
+    let (mut stages, mut staying) = (context.stages.clone(), JoinSet::new());
     let all = tokio::select! {
-        all = arrive(&world, users, &mut staying) => all,
-        _ = stages.wait_for(|stage| *stage == Stage::DRAIN) => Ok(()),
+        all = arrive(&context, users, &mut staying) => all,
+        _ = stages.wait_for(|stage| *stage == LoadStage::DRAIN) => Ok(()),
     };
     let _ = arrived.send(all);
     while staying.join_next().await.is_some() {}
 }
 
 /// Starts the users, each at its time. Users that gather start one after the other.
-async fn arrive(world: &Arc<World>, users: Vec<User>, staying: &mut JoinSet<()>) -> Result<(), Error> {
-    let gathers = world.plan.gathers_over_s().is_some();
-    let mut connections = Connections::new(&world.plan);
-    let begun = tokio::time::Instant::from_std(world.clock);
-    let mut counted_s = world.counted_s.clone();
+async fn arrive(context: &Arc<UserContext>, users: Vec<User>, staying: &mut JoinSet<()>) -> Result<(), Error> {
+    let gathers = context.plan.gathers_over_s().is_some();
+    let mut connections = Connections::new(&context.plan);
+    let begun = tokio::time::Instant::from_std(context.clock);
+    let mut counted_s = context.counted_s.clone();
     for user in users {
         tokio::time::sleep_until(begun + Duration::from_secs_f64(user.at_s)).await;
         // A user that arrives when a second ends belongs to the next one.
         if !gathers && counted_s.wait_for(|counted_s| counted_s + 1.0 > user.at_s).await.is_err() {
             return Ok(());
         }
-        lock(&world.tally).arrived += 1;
-        let world = world.clone();
+        lock(&context.tally).arrived += 1;
+        let context = context.clone();
         if gathers {
-            let guest = Guest::arrive(&world, &user, &mut connections).await?;
-            staying.spawn(async move { guest.stay(&world, user.stays_s).await });
+            let session = UserSession::arrive(&context, &user, &mut connections).await?;
+            staying.spawn(async move { session.stay(&context, user.stays_s).await });
         } else {
-            staying.spawn(visit(world, user));
+            staying.spawn(run_user(context, user));
         }
         // Removes the tasks of users that have left.
         while staying.try_join_next().is_some() {}
