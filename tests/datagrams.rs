@@ -397,7 +397,7 @@ async fn a_client_that_cant_open_a_stream_has_datagrams_for_its_lease() {
         lease_id: lease_id.to_owned(),
         ..Default::default()
     };
-    assert!(haptics.open_datagrams(request(&"0".repeat(32))).await.unwrap_err().message().contains("held"));
+    assert!(haptics.open_datagrams(request(&"0".repeat(32))).await.unwrap_err().message().contains("holds no tool"));
     let offer = haptics.open_datagrams(request(&lease_id)).await.unwrap().into_inner().offer.unwrap();
     let connection =
         in_time(dial(address(&server), &offer.certificate_sha256, &hex(&offer.ticket), None)).await.unwrap();

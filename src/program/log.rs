@@ -4,7 +4,29 @@ use std::io::{Result, Write};
 
 use palpate_refusal::printable::{printable, printable_json};
 use tracing_subscriber::field::MakeExt;
+use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::fmt::format::{FormatFields, debug_fn};
+
+/// Parses a filter: a level for everything, `target=level` for one part, or several of both, separated by commas.
+/// [`Targets`] alone would take a misspelled level for the name of a target.
+///
+/// # Errors
+/// Names the part that is neither.
+pub(super) fn filter(text: &str) -> std::result::Result<Targets, String> {
+    let level = |part: &str, name: &str| match name {
+        "off" => Ok(LevelFilter::OFF),
+        "error" => Ok(LevelFilter::ERROR),
+        "warn" => Ok(LevelFilter::WARN),
+        "info" => Ok(LevelFilter::INFO),
+        "debug" => Ok(LevelFilter::DEBUG),
+        "trace" => Ok(LevelFilter::TRACE),
+        _ => Err(format!("`{part}` is neither a level (off, error, warn, info, debug, trace) nor target=level")),
+    };
+    text.split(',').map(str::trim).try_fold(Targets::new(), |filter, part| match part.split_once('=') {
+        Some((target, name)) if !target.is_empty() => Ok(filter.with_target(target, level(part, name)?)),
+        _ => Ok(filter.with_default(level(part, part)?)),
+    })
+}
 
 /// Format of a record's fields, which come from others, including the message.
 pub(super) fn fields() -> impl for<'w> FormatFields<'w> + 'static {
@@ -37,6 +59,24 @@ mod tests {
     use std::sync::mpsc::{Sender, channel};
 
     use super::*;
+
+    #[test]
+    fn a_filter_names_levels_and_targets() {
+        let chosen = filter("warn, palpate=debug,tonic=off").unwrap();
+        for (target, level, enabled) in [
+            ("hyper", tracing::Level::WARN, true),
+            ("hyper", tracing::Level::INFO, false),
+            ("palpate::server", tracing::Level::DEBUG, true),
+            ("tonic", tracing::Level::ERROR, false),
+        ] {
+            assert_eq!(chosen.would_enable(target, &level), enabled, "{target} {level}");
+        }
+        for (text, wrong) in
+            [("=,=", "`=`"), ("", "``"), ("inof", "`inof`"), ("info,", "``"), ("palpate=", "`palpate=`")]
+        {
+            assert!(filter(text).unwrap_err().starts_with(wrong), "{text}");
+        }
+    }
 
     struct SentLine(Sender<Vec<u8>>);
 

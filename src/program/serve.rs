@@ -10,7 +10,6 @@ use palpate_session::budget;
 use palpate_tissue::check_processor;
 use tokio_util::sync::CancellationToken;
 use tracing_subscriber::Registry;
-use tracing_subscriber::filter::Targets;
 use tracing_subscriber::fmt::format::FmtSpan;
 use tracing_subscriber::layer::{Filter, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
@@ -217,7 +216,7 @@ pub(crate) fn serve(arguments: &ServeArguments) -> Result<(), Failure> {
     config.check()?;
     // Clients don't choose lanes.
     check_processor()?;
-    let filter: Targets = config.log.parse().map_err(|e| Failure::Refused(format!("--log {}: {e}", config.log)))?;
+    let filter = log::filter(&config.log).map_err(|wrong| Failure::Refused(format!("log: {wrong}")))?;
     let detailed = Filter::<Registry>::max_level_hint(&filter).is_none_or(|level| level >= tracing::Level::DEBUG);
     budget::set_up_allocator();
     // Logging never blocks: lines that do not fit into the queue are dropped.

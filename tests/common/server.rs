@@ -12,6 +12,7 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Output, Stdio};
 use std::sync::OnceLock;
+use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::time::Duration;
 
 use palpate_haptics::Law;
@@ -57,13 +58,26 @@ pub fn client_program() -> PathBuf {
         .clone()
 }
 
-/// The server's program, to its end.
+/// The server's program, to its end. One that goes on, as a server would that should have been refused, is ended after
+/// [`TEST_TIMEOUT`] and has no exit code.
 pub fn palpate(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_palpate"))
+    let child = Command::new(env!("CARGO_BIN_EXE_palpate"))
         .args(arguments)
         .current_dir(env!("CARGO_MANIFEST_DIR"))
-        .output()
-        .unwrap()
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let (id, ended) = (child.id(), channel::<()>());
+    let guard = std::thread::spawn(move || {
+        if ended.1.recv_timeout(TEST_TIMEOUT) == Err(RecvTimeoutError::Timeout) {
+            drop(Command::new("kill").args(["-KILL", &id.to_string()]).status());
+        }
+    });
+    let output = child.wait_with_output().unwrap();
+    drop(ended.0);
+    guard.join().unwrap();
+    output
 }
 
 pub struct TestServer {
