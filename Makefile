@@ -343,12 +343,12 @@ SECONDS ?= 1800
 KILLS ?= 50
 JOURNAL_KILLS ?= 200
 soak: need-rust
-	PALPATE_SOAK_S=$(SECONDS) $(CARGO) test --release --test soak -- --include-ignored --nocapture
-	PALPATE_KILLS=$(KILLS) $(CARGO) test --release --test kill -- --nocapture
+	PALPATE_SOAK_S=$(SECONDS) $(CARGO) test --release --test server -- soak:: --include-ignored --nocapture
+	PALPATE_KILLS=$(KILLS) $(CARGO) test --release --test server -- kill:: --skip journal_kill:: --nocapture
 	PALPATE_JOURNAL_KILLS=$(JOURNAL_KILLS) PALPATE_JOURNAL_SESSIONS=20 \
-		$(CARGO) test --release --test journal_kill -- --nocapture
+		$(CARGO) test --release --test server -- journal_kill:: --nocapture
 	PALPATE_LONG=1 $(CARGO) test --release --test journal -- --nocapture
-	PALPATE_LONG=1 $(CARGO) test --release --test journal_server -- stalls --nocapture
+	PALPATE_LONG=1 $(CARGO) test --release --test server -- no_step_waits_for_a_disk_that_stalls --nocapture
 
 # Each seed is another siege; the first failure is said as it is found, all of them at the end.
 SEED ?= 16
@@ -368,5 +368,5 @@ chaos: need-rust
 	PALPATE_FLEET_ROUNDS=$(ROUNDS) PALPATE_FLEET_SESSIONS=12 PALPATE_FLEET_RESTING=48 PALPATE_FLEET_FROZEN_S=10 \
 		PALPATE_FLEET_LEADERS=$(LEADERS) PALPATE_FLEET_GONE_S=$(GONE_S) PALPATE_FLEET_MOVES=$(MOVES) \
 		PALPATE_FLEET_SEED=$(SEED) PALPATE_FLEET_SUMMARY=$(CHAOS) \
-		$(CARGO) test --release --test fleet_chaos -- --include-ignored --nocapture --test-threads=1; \
+		$(CARGO) test --release --test server -- fleet_chaos:: --include-ignored --nocapture --test-threads=1; \
 		ended=$$?; echo; cat $(CHAOS); exit $$ended

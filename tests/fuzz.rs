@@ -14,6 +14,7 @@ mod targets;
 
 use std::collections::BTreeSet;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::{Duration, Instant};
 
 use counting::counted;
 use fastrand::Rng;
@@ -24,6 +25,9 @@ use targets::{FuzzTarget, REQUESTS, TARGETS, Taker, requests};
 
 /// Inputs that were taken and are bent further.
 const CORPUS: usize = 512;
+
+/// Inputs between two messages of progress.
+const PROGRESS: u64 = 50_000;
 
 /// Longest input, bytes.
 const LONGEST: usize = 1 << 14;
@@ -118,17 +122,24 @@ fn fuzz(target: &FuzzTarget, inputs: u64) {
         assert!((target.run)(seed), "{} does not take its own seed {:?}", target.name, String::from_utf8_lossy(seed));
     }
     let seeds = corpus.len();
-    let (mut taken, mut most_bytes, mut most_multiple) = (0, 0, 0.0_f64);
-    for _ in 0..inputs {
+    let (mut taken, mut most_bytes, mut most_multiple, mut slowest) = (0, 0, 0.0_f64, Duration::ZERO);
+    let started = Instant::now();
+    for tried in 0..inputs {
+        // Runs of minutes show how far they are.
+        if tried > 0 && tried % PROGRESS == 0 {
+            eprintln!("{}: {tried} of {inputs} inputs after {:.0} s", target.name, started.elapsed().as_secs_f64());
+        }
         let mut bytes = corpus[random.usize(0..corpus.len())].clone();
         for _ in 0..=random.u8(0..6) {
             let other = random.usize(0..corpus.len());
             bytes = bend(&mut random, bytes, &corpus[other], &pieces);
         }
+        let begun = Instant::now();
         let (ran, took) = counted(|| catch_unwind(AssertUnwindSafe(|| (target.run)(&bytes))));
         let Ok(was_taken) = ran else {
             panic!("{} panics at {:?}\nas text: {}", target.name, bytes, String::from_utf8_lossy(&bytes));
         };
+        slowest = slowest.max(begun.elapsed());
         assert!(
             took <= MULTIPLE * bytes.len() + MAX_ROOM,
             "{}: {} bytes take {took} of memory: {:?}\nas text: {}",
@@ -150,9 +161,10 @@ fn fuzz(target: &FuzzTarget, inputs: u64) {
         }
     }
     println!(
-        "{}: {inputs} inputs, {taken} of them taken; memory at most {:.0} KiB, {most_multiple:.0} times the bytes of an input (of 64 at least)",
+        "{}: {inputs} inputs, {taken} of them taken; memory at most {:.0} KiB, {most_multiple:.0} times the bytes of an input (of 64 at least); the slowest took {:.1} ms",
         target.name,
-        most_bytes as f64 / 1024.0
+        most_bytes as f64 / 1024.0,
+        slowest.as_secs_f64() * 1e3
     );
     // Else the readers were hardly tried.
     assert!(taken > inputs / 1000 && taken < inputs, "{}: {taken} of {inputs} taken", target.name);

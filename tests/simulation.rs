@@ -1,6 +1,6 @@
 //! Clients and a session in virtual time, over a network that delays, cuts off, and brings what two clients sent in
 //! any order; clients crash and come back. The intake, the session and the queues are the server's own; threads and
-//! sockets, which run by a real clock, are not in it (those are in tests/isolation.rs). Each seed is a course of its
+//! sockets, which run by a real clock, are not in it (those are in tests/server/isolation.rs). Each seed is a course of its
 //! own, and the same course each time.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 

@@ -73,7 +73,7 @@ pub enum Access {
 }
 
 /// The path of each call (`/PACKAGE.SERVICE/METHOD`, sorted) and what it requires. The server refuses calls of its own
-/// protocol that are not in this table; `tests/identity.rs` checks the table against the protocol's descriptors.
+/// protocol that are not in this table; `tests/server/identity.rs` checks the table against the protocol's descriptors.
 pub const CALLS: &[(&str, Access)] = &[
     ("/grpc.health.v1.Health/Check", Access::Open),
     ("/grpc.health.v1.Health/Watch", Access::Open),

@@ -20,7 +20,10 @@ use pb::admin_service_client::AdminServiceClient;
 use rustix::process::{Pid, Signal, kill_process};
 use tonic::Status;
 
-use crate::server::{TEST_TIMEOUT, TestServer};
+use super::server::{TEST_TIMEOUT, TestServer};
+
+/// One fleet at a time: each has several processes, and some have clients at 1 kHz.
+pub static ALONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
 
 /// A port that is free now.
 pub fn port() -> u16 {

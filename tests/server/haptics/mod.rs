@@ -1,0 +1,6 @@
+//! Touch: contact, force laws, and the streams of devices.
+
+mod commands;
+mod contact;
+mod laws;
+mod poses;
