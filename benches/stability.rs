@@ -19,7 +19,7 @@ use glam::{DVec2, DVec3};
 use palpate_session::Session;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::{CentreProfile, LoadProfile, Poke, Profile, StrengthProfile};
-use palpate_tissue::scene::{Body, Integrator, Mesh, Named, Scene};
+use palpate_tissue::scene::{Body, BodyKind, Integrator, Mesh, Named, Scene};
 use palpate_tissue::shape::PointId;
 use palpate_tissue::{Model, Push, at_rest};
 use report::chart::Panel;

@@ -2,7 +2,13 @@
 //! same functions as under libFuzzer (`fuzz/`); here without instrumentation, and the same inputs in every run.
 //!
 //! Twenty thousand for each decoder in every run of the tests; `make fuzz` tries a million (`PALPATE_FUZZ_INPUTS`).
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::cast_precision_loss)]
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::cast_precision_loss,
+    clippy::disallowed_methods
+)]
 
 #[path = "common/cases.rs"]
 mod cases;

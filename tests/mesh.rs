@@ -10,7 +10,7 @@ use glam::DVec3;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::collection::find_scene;
 use palpate_tissue::scene::profile::Poke;
-use palpate_tissue::scene::{Body, Inclusion, Material, Mesh, MeshShape, PerNodeFactors, Region, Scene};
+use palpate_tissue::scene::{Body, BodyKind, Inclusion, Material, Mesh, MeshShape, PerNodeFactors, Region, Scene};
 use palpate_tissue::shape::{PointId, PointName, RestShape};
 use palpate_tissue::{Grasp, Model, Push, Tissue, at_rest};
 

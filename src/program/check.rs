@@ -6,7 +6,6 @@ use std::path::PathBuf;
 use palpate_refusal::printable::printable_lines;
 use palpate_session::check;
 use palpate_tissue::Model;
-use palpate_tissue::scene::Body;
 use palpate_tissue::scene::collection::find_script;
 
 use super::scene::{SceneArguments, compile, compile_with};
@@ -29,8 +28,7 @@ const WORTH_IT: f64 = 0.8;
 /// Returns a tested change that makes the steps of a mesh with a few fast vertices cheaper; `None` if there is none.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 fn advice(arguments: &SceneArguments, model: &Model) -> Option<String> {
-    let Body::Mesh(mesh) = &model.scene.body else { return None };
-    if !mesh.has_fast_vertex() {
+    if !model.scene.body.kind().has_fast_point() {
         return None;
     }
     let before_s = model.predicted_step_s();
@@ -43,8 +41,8 @@ fn advice(arguments: &SceneArguments, model: &Model) -> Option<String> {
         if after_s < WORTH_IT * before_s {
             let ([from, to], [from_ms, to_ms]) =
                 ([model.plan.substeps, coarser.plan.substeps], [before_s, after_s].map(|s| s * 1e3));
-            let is = if let Body::Mesh(mesh) = &coarser.scene.body { mesh.has_fast_vertex() } else { false };
-            let more = if is { "; other vertices are still as fast" } else { "" };
+            let more =
+                if coarser.scene.body.kind().has_fast_point() { "; other vertices are still as fast" } else { "" };
             return Some(format!(
                 "vertices = {vertices} in [mesh] takes {to} substeps in place of {from}, and about {to_ms:.2} ms a step in place of \
                  {from_ms:.2}{more}"

@@ -629,7 +629,7 @@ fn a_vibration_without_damping_keeps_its_phase() {
 
 #[test]
 fn substeps_follow_the_bound_and_a_bound_is_never_below_a_vibration() {
-    use palpate_tissue::scheme::stability::largest_stiffness_of_a_sheet_n_per_m;
+    use palpate_tissue::scene::largest_stiffness_of_a_sheet_n_per_m;
     // λ over the whole infinite grid, by brute force.
     for (k1, k2, bending) in
         [(1.0, 1.0, false), (1.0, 1.0, true), (1.0, 0.3, true), (0.2, 1.0, false), (1.0, 0.0, true)]

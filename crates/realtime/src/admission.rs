@@ -28,7 +28,7 @@ use palpate_session::surface::Skin;
 use palpate_tissue::Model;
 use palpate_tissue::lock::lock;
 use palpate_tissue::memory;
-use palpate_tissue::scene::{Body, Change, Scene};
+use palpate_tissue::scene::{Change, Scene};
 use palpate_tissue::select::scheme_selection;
 
 /// The state with which a saved or recorded session begins on this server ([`Pacer::resume`]).
@@ -201,10 +201,7 @@ impl Pacer {
         let speed = playback.as_ref().map_or(1.0, |playback| playback.speed);
         check_work(&first, &self.limits)?;
         let skin = memory::attempt("sheet.points", || Ok(Skin::of(&first)))?;
-        if let Body::Mesh(mesh) = &first.scene.body {
-            // The first use computes it, and that must not happen in a step.
-            mesh.shape.surface();
-        }
+        first.shape().prepare_contact();
         let bytes = first.session_bytes() + skin.as_ref().map_or(0, |skin| skin.bytes());
         let memory = owner.take(Resource::Memory(Purpose::Session), bytes, "sheet.points")?;
         // Allocated before the lock is taken, which every call needs.

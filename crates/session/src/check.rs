@@ -11,7 +11,7 @@ use super::scene_report::Prospect;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Script;
-use palpate_tissue::scene::{Body, Named, StiffnessBound};
+use palpate_tissue::scene::{Named, StiffnessBound};
 use palpate_tissue::scheme::Oscillator;
 use palpate_tissue::select::scheme_selection::{self, Choice};
 use palpate_tissue::shape::PointId;
@@ -131,8 +131,7 @@ impl fmt::Display for CheckReport {
             model.omega_bound_per_s / TAU,
             model.omega_bound_per_s
         )?;
-        if let Body::Mesh(mesh) = &scene.body {
-            let StiffnessBound { bound, usual, vertex, .. } = mesh.stiffest;
+        if let Some(StiffnessBound { bound, usual, vertex, .. }) = scene.body.kind().fastest() {
             let point = PointId::new(vertex as usize);
             let is_volume = scene.volume_is_fastest();
             writeln!(
@@ -143,7 +142,7 @@ impl fmt::Display for CheckReport {
                 (bound / usual).sqrt(),
                 if is_volume { "less than the volume " } else { "" }
             )?;
-            if let Some(volume) = &mesh.volume {
+            if let Some(volume) = scene.volume() {
                 let swelling = volume.swelling;
                 let stiffness_n_per_m = scene.volume_stiffness_pa * swelling.by_pressure_m
                     + scene.springs.stiffness_n_per_m * swelling.by_springs;

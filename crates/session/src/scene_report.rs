@@ -10,9 +10,9 @@ use palpate_haptics::{Coupling, Law, Tip};
 use super::{indentation, tool_depth};
 use palpate_tissue::Model;
 use palpate_tissue::response::force_law::{self, Disc};
-use palpate_tissue::scene::Body;
 use palpate_tissue::scene::profile::{LoadProfile, Poke, PoseProfile, StrengthProfile, weights};
 use palpate_tissue::scene::script::Script;
+use palpate_tissue::scene::{Body, BodyKind};
 use palpate_tissue::scheme::Oscillator;
 use palpate_tissue::shape::{Extent, RestShape};
 
@@ -140,7 +140,7 @@ impl Prospect {
             tips: script.map_or(Vec::new(), |script| tips(shape, script, &mut laws)),
             warnings: Vec::new(),
         };
-        prospect.warnings = prospect.doubts(shape, sheet.mass_kg);
+        prospect.warnings = prospect.doubts(model.scene.body.kind());
         prospect
     }
 
@@ -149,21 +149,18 @@ impl Prospect {
         self.law.as_ref().map(|law| law.at_depth(0.0).stiffness_n_per_m)
     }
 
-    fn doubts(&self, shape: &dyn RestShape, point_mass_kg: f64) -> Vec<String> {
+    fn doubts(&self, kind: &dyn BodyKind) -> Vec<String> {
+        let (shape, point_mass_kg) = (kind.shape(), kind.point_mass_kg());
         let mut doubts = Vec::new();
         let (longest_m, edge_m) = (shape.longest_side_m(), shape.edge_m());
         if longest_m > LONGEST_SIDE_M {
             let most = rounded(LONGEST_SIDE_M);
-            let (what, unit) = if shape.dimensions() == 2 {
-                ("sheet", "sheet.spacing_m is in m")
-            } else {
-                ("mesh", "mesh.unit says which unit its file is in")
-            };
+            let (what, unit) = (kind.section(), kind.unit_hint());
             doubts.push(format!("the {what} is {} long, more than {most} m: {unit}", length(longest_m)));
         }
         if point_mass_kg > HEAVIEST_POINT_KG {
             let (mass, most) = (rounded(point_mass_kg), rounded(HEAVIEST_POINT_KG));
-            let key = if shape.dimensions() == 2 { "sheet" } else { "mesh" };
+            let key = kind.section();
             doubts.push(format!("a point weighs {mass} kg, more than {most} kg: {key}.point_mass_kg is in kg"));
         }
         if edge_m > self.radius_m {

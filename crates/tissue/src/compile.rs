@@ -8,7 +8,7 @@ use super::model::{Model, Plan};
 use crate::kernel::lanes;
 use crate::limits::Limits;
 use crate::response::tangent;
-use crate::scene::{Body, Change, Integrator, Named, Precision, Scene, Stepping};
+use crate::scene::{Change, Integrator, Named, Precision, Scene, Stepping};
 use crate::scheme::{Oscillator, entry};
 use crate::select::scheme_selection::{self, Choice};
 use crate::state::saved::{CorrectedPlan, SavedPlan};
@@ -23,10 +23,10 @@ fn too_many(scene: &Scene, substeps: u32, limits: &Limits) -> Refusal {
         "would need {substeps} substeps a step for stability, above the limit of {}: the springs are too stiff \
          for points so light at this rate{}",
         limits.substeps,
-        match &scene.body {
-            Body::Mesh(_) if scene.volume_is_fastest() => " (volume.stiffness_pa most of all)".to_owned(),
-            Body::Mesh(mesh) => mesh.fastest_place(),
-            Body::Sheet(_) => String::new(),
+        if scene.volume_is_fastest() {
+            " (volume.stiffness_pa most of all)".to_owned()
+        } else {
+            scene.body.kind().fastest_place()
         }
     );
     Refusal::new(Reason::TooLarge, "stepping.substeps", message)
@@ -166,7 +166,7 @@ impl Model {
         }
         let plan = Plan::new(integrator, substeps, step_s, &sheet);
         let omega_bound_per_s = sheet.omega_bound_per_s();
-        let mut warnings = if let Body::Mesh(mesh) = &scene.body { mesh.warnings() } else { Vec::new() };
+        let mut warnings = scene.body.kind().warnings();
         if !plan.stable {
             warnings.push(format!(
                 "stepping.substeps: {} is above the stability bound of the scheme; the tissue may blow up \

@@ -26,6 +26,7 @@ pub mod state;
 pub mod texture;
 mod tools;
 
+pub use body::footprint::{Footprint, RestSurface, WeightedNode};
 pub use compile::check_processor;
 pub use guard::checkpoint::CheckFailure;
 pub use interface::{BlowUp, Energy, Hashing, PointState, ReadCopy, Released, Tissue};
@@ -35,5 +36,4 @@ pub use state::restore::restored;
 pub use state::tissue_state::at_rest;
 pub use tools::applied_force::Push;
 pub use tools::contact::{TangentInput, ToolContact};
-pub use tools::footprint::{Footprint, RestSurface, WeightedNode};
 pub use tools::prescribed::Grasp;

@@ -2,9 +2,10 @@
 
 use std::sync::Arc;
 
+use crate::body::MemoryLayout;
 use crate::body::surface::{GraphFault, MeshPlaces};
 use crate::kernel::field::{BLOCK, Layout};
-use crate::scene::{Body, Integrator, Lanes, Precision, Scene};
+use crate::scene::{Integrator, Lanes, Precision, Scene};
 use crate::scheme::stability;
 use crate::scheme::{Oscillator, QuadratureNode, Scheme};
 use crate::shape::{self, PointId, RestShape};
@@ -125,16 +126,7 @@ impl Model {
     /// # Errors
     /// Returns the fault of a mesh whose springs can't be laid out.
     pub(super) fn planned(scene: Scene, plan: Plan, precision: Precision, lanes: Lanes) -> Result<Self, GraphFault> {
-        let (points, fixed, graph) = match &scene.body {
-            Body::Sheet(sheet) => (sheet.points, sheet.fixed_indices(), None),
-            Body::Mesh(mesh) => {
-                let graph = MeshPlaces::of(mesh)?;
-                let points = shape::points(&*mesh.shape).filter(|point| mesh.shape.is_fixed(*point));
-                let mut fixed: Vec<usize> = points.map(|point| graph.slot_of(point)).collect();
-                fixed.sort_unstable();
-                ([graph.rows(), BLOCK], fixed, Some(Arc::new(graph)))
-            }
-        };
+        let MemoryLayout { points, fixed, graph } = MemoryLayout::of(&scene)?;
         Ok(Model {
             points,
             fixed,
@@ -167,24 +159,7 @@ impl Model {
         let fixed = self.fixed.len() * (size_of::<usize>() + size_of::<[usize; 2]>());
         let vectors =
             self.warnings.iter().map(String::len).sum::<usize>() + self.plan.nodes.len() * size_of::<QuadratureNode>();
-        (size_of::<Model>() + fixed + vectors) as u64 + self.mesh_bytes()
-    }
-
-    /// Returns the approximate memory of a mesh's tables, bytes: places, neighbours, and each spring from both
-    /// of its ends, as the scene has it and as the kernel reads it.
-    fn mesh_bytes(&self) -> u64 {
-        const OF_A_VERTEX: usize = 256;
-        const OF_A_SPRING: usize = 192;
-        const ENCLOSING: usize = 104;
-        match &self.scene.body {
-            Body::Sheet(_) => 0,
-            Body::Mesh(mesh) => {
-                let springs = mesh.shape.edges().len() + mesh.shape.opposite().len();
-                let shown = mesh.shape.shown().map_or(0, |shown| shown.places.len());
-                let enclosing = if mesh.volume.is_some() { ENCLOSING * self.len() } else { 0 };
-                (OF_A_VERTEX * (self.len() + shown) + OF_A_SPRING * springs + enclosing) as u64
-            }
-        }
+        (size_of::<Model>() + fixed + vectors) as u64 + self.scene.body.kind().table_bytes()
     }
 
     /// Returns the memory that a session of this model may take, bytes: three states ([`Model::state_bytes`]:

@@ -152,6 +152,15 @@ pub trait RestShape: fmt::Debug + Send + Sync {
         None
     }
 
+    /// Returns the place of the rest shape's own space that is nearest to a place, m: with z = 0 if the whole shape
+    /// rests in that plane.
+    fn in_rest_space_m(&self, place_m: DVec3) -> DVec3 {
+        place_m
+    }
+
+    /// Computes now what the contact with a tool would compute at its first use, so that no step waits for it.
+    fn prepare_contact(&self) {}
+
     /// Returns how many numbers give a place: 3, or 2 if the whole shape rests in the plane z = 0.
     fn dimensions(&self) -> usize {
         3

@@ -82,7 +82,7 @@ fn on_sheet(shape: &dyn RestShape, place_m: DVec2) -> Result<DVec3> {
 /// Returns the place of a force in space, m; on a sheet, the nearest one in its rest plane.
 fn at(shape: &dyn RestShape, place_m: DVec3) -> Result<DVec3> {
     shape.check_place("force.at_m", place_m)?;
-    Ok(if shape.dimensions() == 2 { place_m.truncate().extend(0.0) } else { place_m })
+    Ok(shape.in_rest_space_m(place_m))
 }
 
 /// Returns the point that a tool grasps.

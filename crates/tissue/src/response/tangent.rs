@@ -19,11 +19,11 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use glam::{DMat3, DQuat, DVec3};
 
+use crate::body::footprint::{Footprint, WeightedNode};
 use crate::memory;
 use crate::model::Model;
 use crate::scene::{Body, FixedPoints, Sheet};
 use crate::shape::RestShape;
-use crate::tools::footprint::{Footprint, WeightedNode};
 
 mod window;
 

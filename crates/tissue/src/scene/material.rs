@@ -408,6 +408,7 @@ mod tests {
     use palpate_geometry::delaunay::flip_to_delaunay;
 
     use super::*;
+    use crate::scene::BodyKind;
 
     const SOFT: Material = Material {
         youngs_modulus_pa: 5000.0,

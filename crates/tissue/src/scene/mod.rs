@@ -3,6 +3,7 @@
 
 pub mod action;
 pub mod action_check;
+mod body;
 pub mod collection;
 mod eigenvalue;
 pub mod kind;
@@ -29,11 +30,12 @@ use crate::files;
 use crate::limits::Limits;
 use crate::shape::{PointId, RestShape};
 use action_check::physical;
+pub use body::BodyKind;
 use kind::TextKind;
 pub use material::{Inclusion, MadeOf, Material, Region};
 pub use mesh::{FixedVertices, Mesh, MeshMetadata, MeshShape, PerNodeFactors, StiffnessBound};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
-pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet};
+pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet, largest_stiffness_of_a_sheet_n_per_m};
 pub use shown::{BoundPlace, Shown, Simulated};
 use source::Files;
 use toml_document::{Document, Fields, Item};
@@ -120,6 +122,14 @@ pub enum Body {
 }
 
 impl Body {
+    /// Returns what every kind of tissue answers.
+    pub fn kind(&self) -> &dyn BodyKind {
+        match self {
+            Body::Sheet(sheet) => sheet,
+            Body::Mesh(mesh) => mesh,
+        }
+    }
+
     /// Returns a small part of the tissue that vibrates as fast as the whole, for test runs: at most `side`²
     /// points, not all of them fixed. `side` is at least 1. Also returns three points of the part, in its own
     /// numbers, to push or to watch; the first one is free to move, and they may coincide.
@@ -464,10 +474,7 @@ impl Scene {
 
     /// Returns the rest shape of the tissue, borrowed: its sheet or mesh.
     pub fn shape(&self) -> &dyn RestShape {
-        match &self.body {
-            Body::Sheet(sheet) => sheet,
-            Body::Mesh(mesh) => &*mesh.shape,
-        }
+        self.body.kind().shape()
     }
 
     /// Returns the grid, borrowed; `None` if the tissue is a mesh.
@@ -489,66 +496,42 @@ impl Scene {
 
     /// Returns the volume that a mesh encloses; `None` if the scene has no `[volume]`, as on any sheet.
     pub fn volume(&self) -> Option<&Volume> {
-        match &self.body {
-            Body::Sheet(_) => None,
-            Body::Mesh(mesh) => mesh.volume.as_deref(),
-        }
+        self.body.kind().volume()
     }
 
     /// Returns whether the vibration in which the enclosed volume swells and shrinks is faster than the bound
     /// for the springs alone, so that it decides on the substeps. False without a volume.
     pub fn volume_is_fastest(&self) -> bool {
-        let Body::Mesh(mesh) = &self.body else { return false };
-        let fastest = |Swelling { by_pressure_m, by_springs, .. }: Swelling| {
-            let k = self.springs.stiffness_n_per_m;
-            self.volume_stiffness_pa * by_pressure_m + k * by_springs > k * mesh.stiffest.bound
-        };
-        mesh.volume.as_ref().is_some_and(|volume| fastest(volume.swelling))
+        self.body.kind().volume_is_fastest(&self.springs, self.volume_stiffness_pa)
     }
 
     /// Returns the mass of each point of a sheet, or the reference mass of a mesh, kg: for a material, that of
     /// a vertex of mean area.
     pub fn point_mass_kg(&self) -> f64 {
-        match &self.body {
-            Body::Sheet(sheet) => sheet.point_mass_kg,
-            Body::Mesh(mesh) => mesh.point_mass_kg,
-        }
+        self.body.kind().point_mass_kg()
     }
 
     /// Returns the mass of a point divided by the reference mass [`Scene::point_mass_kg`]; 1 on a sheet, and
     /// for a point that a mesh does not have. C of the point is `damping_n_s_per_m` times this ratio.
     pub fn relative_mass(&self, point: PointId) -> f64 {
-        match &self.body {
-            Body::Sheet(_) => 1.0,
-            Body::Mesh(mesh) => mesh.relative_mass(point),
-        }
+        self.body.kind().relative_mass(point)
     }
 
     /// Returns K″ of a point divided by the reference value `anchor_stiffness_n_per_m`; 1 on a sheet, and for a
     /// point that a mesh does not have.
     pub fn relative_anchor_stiffness(&self, point: PointId) -> f64 {
-        match &self.body {
-            Body::Sheet(_) => 1.0,
-            Body::Mesh(mesh) => mesh.relative_mass(point) * (1.0 + mesh.extra_anchor(point)),
-        }
+        self.body.kind().relative_anchor_stiffness(point)
     }
 
     /// Returns the mass of all points, kg, fixed ones included; on a mesh, of those with an edge.
     pub fn mass_kg(&self) -> f64 {
-        #[allow(clippy::cast_precision_loss)]
-        match &self.body {
-            Body::Sheet(sheet) => sheet.point_mass_kg * sheet.point_count() as f64,
-            Body::Mesh(mesh) => mesh.mass_kg(),
-        }
+        self.body.kind().mass_kg()
     }
 
     /// Returns the rest shape as a shared pointer that can outlive the scene: a copy of a sheet, or the mesh
     /// itself.
     pub fn shared_shape(&self) -> Arc<dyn RestShape> {
-        match &self.body {
-            Body::Sheet(sheet) => Arc::new(sheet.clone()),
-            Body::Mesh(mesh) => mesh.shape.clone(),
-        }
+        self.body.kind().shared_shape()
     }
 
     /// Checks that every value is in its range and within the limits. It holds for scenes from files and from
@@ -568,10 +551,7 @@ impl Scene {
     /// - substeps beyond 1 to `limits.substeps`.
     pub fn check(&self, limits: &Limits) -> Result<()> {
         palpate_refusal::label("name", &self.name)?;
-        match &self.body {
-            Body::Sheet(sheet) => sheet.check(limits)?,
-            Body::Mesh(mesh) => mesh.check(limits)?,
-        }
+        self.body.kind().check(limits)?;
         let coefficients = [
             ("springs.stiffness_n_per_m", self.springs.stiffness_n_per_m),
             ("springs.shear_stiffness_n_per_m", self.springs.shear_stiffness_n_per_m),

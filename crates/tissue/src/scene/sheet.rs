@@ -7,7 +7,9 @@ use glam::{DVec2, DVec3};
 
 use crate::limits::Limits;
 use crate::memory;
+use crate::scene::Springs;
 use crate::scene::action_check::physical;
+use crate::scene::body::BodyKind;
 use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{Extent, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, positive};
@@ -91,35 +93,6 @@ impl Sheet {
         })
     }
 
-    pub(super) fn check(&self, limits: &Limits) -> Result<()> {
-        let [nx, ny] = self.points;
-        if nx == 0 || ny == 0 {
-            let message = format!("must be at least 1 along each side, but are {nx} × {ny}");
-            return Err(Refusal::new(Reason::OutOfRange, "sheet.points", message));
-        }
-        if nx.checked_mul(ny).is_none_or(|points| points > limits.points) {
-            let message = format!("are {nx} × {ny}, above the limit of {} points in all", limits.points);
-            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
-        }
-        // A narrow sheet takes the memory and time of one of this width, which may be sixteen times its own.
-        if nx.checked_mul(ny.max(MIN_WIDTH)).is_none_or(|points| points > limits.points) {
-            let message = format!(
-                "are {nx} × {ny}: rows of fewer than {MIN_WIDTH} points are computed as if they had so many, and \
-                 {nx} × {MIN_WIDTH} are above the limit of {} points in all; give the longer side last",
-                limits.points
-            );
-            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
-        }
-        physical("sheet.spacing_m", positive("sheet.spacing_m", self.spacing_m)?)?;
-        physical("sheet.point_mass_kg", positive("sheet.point_mass_kg", self.point_mass_kg)?)?;
-        if let FixedPoints::Points(points) = &self.fixed
-            && let Some(index) = points.as_slice().iter().position(|[i, j]| *i >= nx || *j >= ny)
-        {
-            self.find(&format!("sheet.fixed[{index}]"), PointName::Point(points.as_slice()[index]))?;
-        }
-        Ok(())
-    }
-
     /// Returns the point [i, j], with the index i·ny + j. It must be on the grid, which isn't checked:
     /// [`RestShape::find`] does.
     pub fn point(&self, [i, j]: [usize; 2]) -> PointId {
@@ -171,6 +144,100 @@ impl Sheet {
         indices.dedup();
         indices
     }
+}
+
+impl BodyKind for Sheet {
+    fn section(&self) -> &'static str {
+        "sheet"
+    }
+
+    fn unit_hint(&self) -> &'static str {
+        "sheet.spacing_m is in m"
+    }
+
+    fn shape(&self) -> &dyn RestShape {
+        self
+    }
+
+    fn shared_shape(&self) -> Arc<dyn RestShape> {
+        Arc::new(self.clone())
+    }
+
+    fn point_mass_kg(&self) -> f64 {
+        self.point_mass_kg
+    }
+
+    fn mass_kg(&self) -> f64 {
+        self.point_mass_kg * self.point_count() as f64
+    }
+
+    fn rehearsal_margin(&self) -> f64 {
+        5.0
+    }
+
+    fn spring_bound_n_per_m(&self, springs: &Springs, _anchor_n_per_m: f64) -> f64 {
+        largest_stiffness_of_a_sheet_n_per_m(springs)
+    }
+
+    fn check(&self, limits: &Limits) -> Result<()> {
+        let [nx, ny] = self.points;
+        if nx == 0 || ny == 0 {
+            let message = format!("must be at least 1 along each side, but are {nx} × {ny}");
+            return Err(Refusal::new(Reason::OutOfRange, "sheet.points", message));
+        }
+        if nx.checked_mul(ny).is_none_or(|points| points > limits.points) {
+            let message = format!("are {nx} × {ny}, above the limit of {} points in all", limits.points);
+            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
+        }
+        // A narrow sheet takes the memory and time of one of this width, which may be sixteen times its own.
+        if nx.checked_mul(ny.max(MIN_WIDTH)).is_none_or(|points| points > limits.points) {
+            let message = format!(
+                "are {nx} × {ny}: rows of fewer than {MIN_WIDTH} points are computed as if they had so many, and \
+                 {nx} × {MIN_WIDTH} are above the limit of {} points in all; give the longer side last",
+                limits.points
+            );
+            return Err(Refusal::new(Reason::TooLarge, "sheet.points", message));
+        }
+        physical("sheet.spacing_m", positive("sheet.spacing_m", self.spacing_m)?)?;
+        physical("sheet.point_mass_kg", positive("sheet.point_mass_kg", self.point_mass_kg)?)?;
+        if let FixedPoints::Points(points) = &self.fixed
+            && let Some(index) = points.as_slice().iter().position(|[i, j]| *i >= nx || *j >= ny)
+        {
+            self.find(&format!("sheet.fixed[{index}]"), PointName::Point(points.as_slice()[index]))?;
+        }
+        Ok(())
+    }
+}
+
+/// Returns an upper bound of the largest eigenvalue of the stiffness matrix of a sheet's springs under any
+/// deformation, N/m.
+///
+/// A spring with unit direction n contributes k(nnᵀ + (1 − L0/L)(I − nnᵀ)) to the tangent stiffness, which is at
+/// most k·I: so no deformation makes the matrix larger than the graph Laplacian with weights k. On the unbounded
+/// grid the wave (a, b) has the eigenvalue
+///
+/// λ = k₁(4 − 2x − 2y) + k₂(4 − 4xy) + k₃(8 − 4x² − 4y²),  x = cos a, y = cos b in [−1, 1],
+///
+/// k₁ structural, k₂ shear, k₃ bending; a finite sheet has fewer springs, and smaller eigenvalues. With all k equal
+/// the largest is 12k without and 16⅓·k with bending.
+pub fn largest_stiffness_of_a_sheet_n_per_m(springs: &Springs) -> f64 {
+    let (k1, k2) = (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m);
+    let k3 = if springs.bending { k1 } else { 0.0 };
+    let eigenvalue =
+        |x: f64, y: f64| k1 * (4.0 - 2.0 * x - 2.0 * y) + k2 * (4.0 - 4.0 * x * y) + k3 * (8.0 - 4.0 * (x * x + y * y));
+    // λ is a quadratic form: its maximum is at a corner, where its slope along an edge is 0, or where both slopes are.
+    let mut candidates = vec![(-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)];
+    if k3 > 0.0 {
+        for edge in [-1.0, 1.0] {
+            candidates.push((edge, -(2.0 * k1 + 4.0 * k2 * edge) / (8.0 * k3)));
+        }
+    }
+    if k2 + k3 > 0.0 {
+        let inner = -2.0 * k1 / (4.0 * k2 + 8.0 * k3);
+        candidates.push((inner, inner));
+    }
+    let inside = |&(x, y): &(f64, f64)| x.abs() <= 1.0 && y.abs() <= 1.0;
+    candidates.into_iter().filter(inside).map(|(x, y)| eigenvalue(x, y)).fold(0.0, f64::max)
 }
 
 impl RestShape for Sheet {
@@ -253,6 +320,10 @@ impl RestShape for Sheet {
 
     fn edge_m(&self) -> f64 {
         self.spacing_m
+    }
+
+    fn in_rest_space_m(&self, place_m: DVec3) -> DVec3 {
+        place_m.truncate().extend(0.0)
     }
 
     fn dimensions(&self) -> usize {

@@ -1,6 +1,6 @@
 //! Computes how fast a tissue can vibrate, and how many substeps that requires.
 
-use crate::scene::{Body, Integrator, Scene, Springs, StiffnessBound};
+use crate::scene::{Integrator, Scene};
 use crate::scheme::{Bound, Oscillator, Scheme, entry};
 
 /// Largest turn of the fastest vibration per substep of central differences, rad: dt·ω_b ≤ θ. The scheme is
@@ -25,36 +25,19 @@ pub fn endurance(omega_per_s: f64, decay_s: f64) -> f64 {
 /// Returns an upper bound of the largest eigenvalue of the springs' stiffness matrix under any deformation,
 /// with the reference masses, N/m.
 ///
-/// On a sheet this is [`largest_stiffness_of_a_sheet_n_per_m`]. On a mesh it is k·β + K″·ε, with β the bound of
-/// the graph's Laplacian divided by k ([`StiffnessBound`]) and ε the largest excess of K″/m of a point over the
+/// On a sheet this is [`largest_stiffness_of_a_sheet_n_per_m`](crate::scene::largest_stiffness_of_a_sheet_n_per_m). On a mesh it is k·β + K″·ε, with β the bound of
+/// the graph's Laplacian divided by k ([`StiffnessBound`](crate::scene::StiffnessBound)) and ε the largest excess of K″/m of a point over the
 /// reference value. A volume replaces k·β by
 /// [`Swelling::bound_n_per_m`](crate::scene::Swelling::bound_n_per_m).
 pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
-    match &scene.body {
-        Body::Sheet(_) => largest_stiffness_of_a_sheet_n_per_m(&scene.springs),
-        // Anchor stiffness beyond the reference K″ counts among the springs.
-        Body::Mesh(mesh) => {
-            let StiffnessBound { bound, extra_anchor, .. } = mesh.stiffest;
-            let k = scene.springs.stiffness_n_per_m;
-            let elastic = match &mesh.volume {
-                None => k * bound,
-                Some(volume) => volume.swelling.bound_n_per_m(scene.volume_stiffness_pa, bound, k),
-            };
-            elastic + scene.anchor_stiffness_n_per_m * extra_anchor
-        }
-    }
+    let (springs, anchor_n_per_m) = (&scene.springs, scene.anchor_stiffness_n_per_m);
+    scene.body.kind().stiffness_bound_n_per_m(springs, anchor_n_per_m, scene.volume_stiffness_pa)
 }
 
 /// Returns an upper bound of the springs' stiffness without the pressure of a volume, N/m: k·β + K″·ε on a
 /// mesh, with β and ε as in [`largest_stiffness_n_per_m`], to which it is equal for a tissue without a volume.
 pub fn stiffness_of_springs_n_per_m(scene: &Scene) -> f64 {
-    match &scene.body {
-        Body::Mesh(mesh) if mesh.volume.is_some() => {
-            let StiffnessBound { bound, extra_anchor, .. } = mesh.stiffest;
-            scene.springs.stiffness_n_per_m * bound + scene.anchor_stiffness_n_per_m * extra_anchor
-        }
-        _ => largest_stiffness_n_per_m(scene),
-    }
+    scene.body.kind().spring_bound_n_per_m(&scene.springs, scene.anchor_stiffness_n_per_m)
 }
 
 /// Returns the approximate factor from rounding errors of displacements, m, to force, N; in N/m. The errors of
@@ -66,37 +49,6 @@ pub fn approximate_stiffness_n_per_m(scene: &Scene) -> f64 {
     let points = scene.shape().point_count() as f64;
     let of_pressure = |swelling_m: f64| scene.volume_stiffness_pa * swelling_m / points.sqrt();
     of_springs + scene.volume().map_or(0.0, |volume| of_pressure(volume.swelling.by_pressure_m))
-}
-
-/// Returns an upper bound of the largest eigenvalue of the stiffness matrix of a sheet's springs under any
-/// deformation, N/m.
-///
-/// A spring with unit direction n contributes k(nnᵀ + (1 − L0/L)(I − nnᵀ)) to the tangent stiffness, which is at
-/// most k·I: so no deformation makes the matrix larger than the graph Laplacian with weights k. On the unbounded
-/// grid the wave (a, b) has the eigenvalue
-///
-/// λ = k₁(4 − 2x − 2y) + k₂(4 − 4xy) + k₃(8 − 4x² − 4y²),  x = cos a, y = cos b in [−1, 1],
-///
-/// k₁ structural, k₂ shear, k₃ bending; a finite sheet has fewer springs, and smaller eigenvalues. With all k equal
-/// the largest is 12k without and 16⅓·k with bending.
-pub fn largest_stiffness_of_a_sheet_n_per_m(springs: &Springs) -> f64 {
-    let (k1, k2) = (springs.stiffness_n_per_m, springs.shear_stiffness_n_per_m);
-    let k3 = if springs.bending { k1 } else { 0.0 };
-    let eigenvalue =
-        |x: f64, y: f64| k1 * (4.0 - 2.0 * x - 2.0 * y) + k2 * (4.0 - 4.0 * x * y) + k3 * (8.0 - 4.0 * (x * x + y * y));
-    // λ is a quadratic form: its maximum is at a corner, where its slope along an edge is 0, or where both slopes are.
-    let mut candidates = vec![(-1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)];
-    if k3 > 0.0 {
-        for edge in [-1.0, 1.0] {
-            candidates.push((edge, -(2.0 * k1 + 4.0 * k2 * edge) / (8.0 * k3)));
-        }
-    }
-    if k2 + k3 > 0.0 {
-        let inner = -2.0 * k1 / (4.0 * k2 + 8.0 * k3);
-        candidates.push((inner, inner));
-    }
-    let inside = |&(x, y): &(f64, f64)| x.abs() <= 1.0 && y.abs() <= 1.0;
-    candidates.into_iter().filter(inside).map(|(x, y)| eigenvalue(x, y)).fold(0.0, f64::max)
 }
 
 /// Number of vibrations between the slowest and the fastest at which stability is tested: a scheme may fail in
@@ -178,7 +130,7 @@ pub fn substeps_of_turn(step_s: f64, omega_per_s: f64, theta: f64) -> u32 {
 mod tests {
     #![allow(clippy::cast_precision_loss)]
     use super::*;
-    use crate::scene::Named;
+    use crate::scene::{Named, Springs, largest_stiffness_of_a_sheet_n_per_m};
 
     /// Every scheme.
     fn all() -> impl Iterator<Item = Integrator> {

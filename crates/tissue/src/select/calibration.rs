@@ -5,8 +5,8 @@
 //! between 0.04 and 10,000 times the true error. So the scheme itself runs, on at most [`SIDE`]² points for
 //! half a second, under a few loads that are harder than most scripts ([`LOADS`]). The reference ("truth") is a
 //! run in f64 with a substep so short that half of it changes nothing. The true error of a script on the whole
-//! sheet is then at most [`MARGIN`] times the rehearsed one (`make bench-tolerance`), and on a whole mesh
-//! [`MARGIN_OF_MESH`] times (`tests/tolerance.rs`). Forces that change smoothly have errors 10 to 1000 times
+//! tissue is then at most a few times the rehearsed one ([`BodyKind::rehearsal_margin`](crate::scene::BodyKind); `make
+//! bench-tolerance`, `tests/tolerance.rs`). Forces that change smoothly have errors 10 to 1000 times
 //! smaller than those that jump, but a choice that is made before the script is known can't use that.
 
 use std::cell::Cell;
@@ -43,14 +43,6 @@ const SUBSTEPS_A_LOOK: u32 = 8;
 
 /// Time over which undamped, growing errors are predicted, s.
 pub(crate) const LASTING_S: f64 = 2.0;
-
-/// Largest factor by which the true error of a script may exceed the rehearsed one, on a sheet.
-const MARGIN: f64 = 5.0;
-
-/// Largest factor by which the true error of a script may exceed the rehearsed one, on a mesh. There the vertex
-/// that vibrates fastest is pushed; all others have smaller errors. (56 random meshes at 5 tolerances: at most
-/// 1.4 times, half of them 0.05 times.)
-const MARGIN_OF_MESH: f64 = 2.0;
 
 /// Time after a jump of a force in which the error may be [`ALLOWANCE`] times the tolerance, s. A jump starts
 /// the fastest vibrations, which no substep follows exactly and which are over before anybody feels them.
@@ -207,7 +199,7 @@ impl<'s> Rehearsal<'s> {
 
     /// Returns the factor by which the true error of a script may exceed the rehearsed one.
     fn margin(&self) -> f64 {
-        if self.scene.sheet().is_some() { MARGIN } else { MARGIN_OF_MESH }
+        self.scene.body.kind().rehearsal_margin()
     }
 
     /// Returns the smallest error that can be expected of any scheme, given the uncertainty of the reference. 0

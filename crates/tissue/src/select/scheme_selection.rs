@@ -23,9 +23,6 @@ const FORMATS: [(Precision, f64); 3] = [(Precision::F32, 1.0), (Precision::Compe
 const POINT_SUBSTEP_NS: f64 = 1.7;
 pub(crate) const STEP_NS: f64 = 2000.0;
 
-/// Cost of a vertex of a mesh relative to a point of a sheet: measured.
-const VERTEX: f64 = 2.8;
-
 /// Returns the predicted processor time of a point of a scene in a substep, ns.
 pub(crate) fn point_substep_ns(scene: &Scene, integrator: Integrator, precision: Precision, lanes: Lanes) -> f64 {
     let scheme = entry(integrator).cost;
@@ -37,8 +34,7 @@ pub(crate) fn point_substep_ns(scene: &Scene, integrator: Integrator, precision:
         // Fused multiply-adds are calls.
         Lanes::Plain => 200.0,
     };
-    let kind = if scene.sheet().is_some() { 1.0 } else { VERTEX };
-    POINT_SUBSTEP_NS * scheme * format * width * kind
+    POINT_SUBSTEP_NS * scheme * format * width * scene.body.kind().relative_cost()
 }
 
 /// Part of the tolerance that rounding may add to a tissue at rest. A rehearsal is too short to show that

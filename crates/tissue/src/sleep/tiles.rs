@@ -34,7 +34,7 @@ use crate::kernel::real::Real;
 use crate::kernel::region::{Marks, Region, TILE, tiles};
 use crate::memory;
 use crate::model::Model;
-use crate::scene::{Body, Scene};
+use crate::scene::Scene;
 use crate::state::saved::{SavedTile, SavedTiles, ensure, unsound};
 use crate::tools::applied_force::ForceChange;
 use palpate_refusal::Result;
@@ -48,9 +48,6 @@ const CALM_CHECKS: u8 = 2;
 /// Part of the tolerance by which a tile may be off its rest position: errors of neighbours add up. (Measured:
 /// up to three and a half times the ε of a tile, where a whole sheet creeps in one direction.)
 const PART: f64 = 0.25;
-
-/// The bound of the stiffness of an even mesh, divided by k (`StiffnessBound`).
-const EVEN: f64 = 12.0;
 
 /// Factor by which the recent largest displacement decays from one check to the next.
 const FORGET: f64 = 0.99;
@@ -341,11 +338,7 @@ impl<T: Real> SleepTiles<T> {
     /// Returns ε_w, the movement of a neighbour that wakes a tile, in spacings.
     pub(crate) fn wake_threshold(&self, scene: &Scene) -> f64 {
         let epsilon = self.epsilon();
-        let mut ratio = scene.anchor_stiffness_n_per_m / scene.springs.stiffness_n_per_m;
-        if let Body::Mesh(mesh) = &scene.body {
-            // In proportion to how much its springs are stiffer than those of an even mesh.
-            ratio /= (mesh.stiffest.bound / EVEN).max(1.0);
-        }
+        let ratio = scene.anchor_stiffness_n_per_m / scene.springs.stiffness_n_per_m / scene.body.kind().unevenness();
         // Without springs nothing passes from tile to tile.
         let unnoticed = if ratio.is_nan() { epsilon } else { epsilon * (20.0 * ratio).clamp(0.1, 1.0) };
         // A difference in the last digit is rounding noise.

@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use xxhash_rust::xxh3::Xxh3;
 
+use crate::body;
 use crate::guard::checkpoint::{Checkpoint, Input, Work};
 use crate::guard::{INTERVAL_SUBSTEPS, MAX_HALVINGS};
 use crate::interface::Tissue;
@@ -16,7 +17,7 @@ use crate::kernel::real::Real;
 use crate::limits::Limits;
 use crate::memory;
 use crate::model::{Model, Plan};
-use crate::scene::{Body, Named, Precision};
+use crate::scene::{Named, Precision};
 use crate::sleep::tiles::{TakenTiles, sides_of};
 use crate::state::saved::{
     Checks, PlainTissue, SNAPSHOT, SavedCheckpoint, SavedContact, SavedForces, SavedPrescribed, SavedState,
@@ -107,27 +108,7 @@ impl Model {
         add(self.plan.integrator.name().as_bytes());
         add(&self.plan.substeps.to_le_bytes());
         add(self.precision.name().as_bytes());
-        match (&scene.body, &self.graph) {
-            (Body::Mesh(mesh), Some(graph)) => {
-                add(b"mesh");
-                let mut numbers = |values: &[f64]| {
-                    add(&(values.len() as u64).to_le_bytes());
-                    values.iter().for_each(|value| add(&value.to_bits().to_le_bytes()));
-                };
-                numbers(&[mesh.stiffest.bound, mesh.stiffest.usual]);
-                numbers(&mesh.differences.relative_mass);
-                numbers(&mesh.differences.extra_anchor);
-                mesh.shape.vertices_m().iter().for_each(|vertex_m| numbers(&vertex_m.to_array()));
-                for corner in mesh.shape.triangles().iter().flatten().chain(graph.slots.vertex_of()) {
-                    add(&corner.to_le_bytes());
-                }
-                for (ends, stiffness_n_per_m) in mesh.springs() {
-                    ends.iter().for_each(|end| add(&end.to_le_bytes()));
-                    add(&stiffness_n_per_m.to_bits().to_le_bytes());
-                }
-            }
-            _ => add(b"sheet"),
-        }
+        body::identify(scene, self.graph.as_deref(), &mut add);
         hasher.digest128()
     }
 }

@@ -51,12 +51,12 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
+use crate::body::footprint::{Footprint, RestSurface, WeightedNode};
 use crate::kernel::field::{Layout, State};
 use crate::kernel::real::Real;
 use crate::model::{Model, Plan};
 use crate::response::tangent::{LinearPatch, Tangent, Window};
 use crate::state::saved::{Checks, SavedContact, SavedTip, ensure};
-use crate::tools::footprint::{Footprint, RestSurface, WeightedNode};
 use palpate_haptics::{ContactState, Coupling, Tip};
 use palpate_refusal::Result;
 

@@ -2,6 +2,5 @@
 
 pub(crate) mod applied_force;
 pub(crate) mod contact;
-pub(crate) mod footprint;
 pub(crate) mod position_control;
 pub(crate) mod prescribed;

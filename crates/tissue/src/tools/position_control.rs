@@ -4,6 +4,7 @@ use glam::DVec3;
 
 use palpate_haptics::ContactState;
 
+use crate::body::footprint::WeightedNode;
 use crate::body::tables::SweepTables;
 use crate::kernel::field::{Field, State};
 use crate::kernel::real::Real;
@@ -14,7 +15,6 @@ use crate::state::tissue_state::{TissueState, spring_force_n};
 use crate::tools::contact::{
     ContactForce, TangentInput, Tool, ToolContact, displacement_m, movement_m, push, within_cone,
 };
-use crate::tools::footprint::WeightedNode;
 use palpate_haptics::Coupling;
 
 impl<T: Real> TissueState<T> {

@@ -2,7 +2,7 @@
 //!
 //! The surface between points is bilinear: the material place c (in the rest plane) is at Σ N_p(c)·x_p, with
 //! N_p the bilinear hat functions. The hats are averaged over a smaller disc, chosen so that the area that
-//! shares a force (`tools::footprint`) is that of the requested disc, in the mean over its places in a cell.
+//! shares a force (`body::footprint`) is that of the requested disc, in the mean over its places in a cell.
 //! From two spacings across on this is exact; below, the hats alone are too large.
 //!
 //! The integral is a sum over rings of equal area, each with points at equal angles: sums of first powers

@@ -2,9 +2,9 @@
 
 use glam::{DMat3, DVec2, DVec3};
 
+use crate::body::footprint::Footprint;
 use crate::body::surface::MeshPlaces;
 use crate::model::Model;
-use crate::tools::footprint::Footprint;
 
 /// Size of the window around a disc, in lengths of decay: e⁻⁶ is left at its edge.
 pub(super) const REACHES: f64 = 6.0;

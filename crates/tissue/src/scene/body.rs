@@ -1,0 +1,107 @@
+//! What every kind of tissue answers about its points: where they rest, what they weigh, and how fast they vibrate.
+
+use std::fmt;
+use std::sync::Arc;
+
+use super::{Springs, StiffnessBound, Volume};
+use crate::limits::Limits;
+use crate::shape::{PointId, RestShape};
+use palpate_refusal::Result;
+
+/// A kind of tissue, as a scene describes it. [`Body::kind`](super::Body::kind) gives that of a scene; nothing else
+/// needs to know which kind it is. Stiffnesses are those of a scene: k of its springs, and K″ of its anchor springs.
+pub trait BodyKind: fmt::Debug + Send + Sync {
+    /// Returns the name of the section of a scene that describes the points.
+    fn section(&self) -> &'static str;
+
+    /// Returns which key of the section gives the unit of length, as a sentence for people who may have missed it.
+    fn unit_hint(&self) -> &'static str;
+
+    /// Returns the rest shape of the points.
+    fn shape(&self) -> &dyn RestShape;
+
+    /// Returns the rest shape as a shared pointer that can outlive the scene.
+    fn shared_shape(&self) -> Arc<dyn RestShape>;
+
+    /// Returns the reference mass of a point, kg.
+    fn point_mass_kg(&self) -> f64;
+
+    /// Returns the mass of all points, kg, fixed ones included.
+    fn mass_kg(&self) -> f64;
+
+    /// Returns the mass of a point divided by the reference mass; 1 for a point that there is not.
+    fn relative_mass(&self, _point: PointId) -> f64 {
+        1.0
+    }
+
+    /// Returns K″ of a point divided by the reference value; 1 for a point that there is not.
+    fn relative_anchor_stiffness(&self, _point: PointId) -> f64 {
+        1.0
+    }
+
+    /// Returns the volume that the tissue encloses, if its pressure counts.
+    fn volume(&self) -> Option<&Volume> {
+        None
+    }
+
+    /// Returns an upper bound of the largest eigenvalue of the springs' stiffness matrix under any deformation, with
+    /// the reference masses and without the pressure of a volume, N/m. Anchor stiffness beyond the reference K″
+    /// (`anchor_n_per_m`) counts among the springs.
+    fn spring_bound_n_per_m(&self, springs: &Springs, anchor_n_per_m: f64) -> f64;
+
+    /// Returns the bound of [`BodyKind::spring_bound_n_per_m`] with the pressure of a volume of the stiffness
+    /// `volume_pa`, N/m.
+    fn stiffness_bound_n_per_m(&self, springs: &Springs, anchor_n_per_m: f64, _volume_pa: f64) -> f64 {
+        self.spring_bound_n_per_m(springs, anchor_n_per_m)
+    }
+
+    /// Returns how many times the bound of the springs is that of a tissue whose points are all alike, at least 1.
+    fn unevenness(&self) -> f64 {
+        1.0
+    }
+
+    /// Returns the fastest vibration of the springs, and where it is; `None` where all points are alike.
+    fn fastest(&self) -> Option<StiffnessBound> {
+        None
+    }
+
+    /// Returns whether a few points vibrate so fast that they alone require many substeps.
+    fn has_fast_point(&self) -> bool {
+        false
+    }
+
+    /// Returns whether the vibration in which a volume of the stiffness `volume_pa` swells and shrinks is faster than
+    /// the bound for the springs alone, so that it decides on the substeps.
+    fn volume_is_fastest(&self, _springs: &Springs, _volume_pa: f64) -> bool {
+        false
+    }
+
+    /// Returns the place of the fastest vibration as the end of a message; empty where all points are alike.
+    fn fastest_place(&self) -> String {
+        String::new()
+    }
+
+    /// Returns warnings for the user, as sentences; empty if there are none.
+    fn warnings(&self) -> Vec<String> {
+        Vec::new()
+    }
+
+    /// Returns the measured cost of a point relative to a point of a sheet.
+    fn relative_cost(&self) -> f64 {
+        1.0
+    }
+
+    /// Returns the largest measured factor by which the true error of a script may exceed that of a rehearsal.
+    fn rehearsal_margin(&self) -> f64;
+
+    /// Returns the approximate memory of the tables of a model, bytes, besides those that every kind has.
+    fn table_bytes(&self) -> u64 {
+        0
+    }
+
+    /// Checks size, mass and spacing against their ranges and the limits.
+    ///
+    /// # Errors
+    /// Names the key of the scene that is out of range.
+    fn check(&self, limits: &Limits) -> Result<()>;
+}
