@@ -3,10 +3,27 @@
 use std::fmt;
 use std::sync::Arc;
 
-use super::{Springs, StiffnessBound, Volume};
+use super::springs::Springs;
+use super::volume::Volume;
 use crate::limits::Limits;
 use crate::shape::{PointId, RestShape};
 use palpate_refusal::Result;
+
+/// An upper bound of the largest eigenvalue of the springs' stiffness under any deformation, and the place of
+/// that vibration.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StiffnessBound {
+    /// Upper bound of the eigenvalue, with the reference masses, divided by the reference k. It bounds the
+    /// Laplacian of the weighted graph, Σ k_ij/m_i·(x_i − x_j) = λ·x_i, since a spring along n contributes at
+    /// most k·I to the stiffness under any deformation.
+    pub bound: f64,
+    /// The number of the vertex that moves most in the fastest vibration (estimated); 0 without springs.
+    pub vertex: u32,
+    /// The bound for the median spring, in the unit of `bound`: half of the springs have at most this.
+    pub usual: f64,
+    /// The largest excess of K″/m of a point over the reference value, divided by that value; at least 0.
+    pub extra_anchor: f64,
+}
 
 /// A kind of tissue, as a scene describes it. [`Body::kind`](super::Body::kind) gives that of a scene; nothing else
 /// needs to know which kind it is. Stiffnesses are those of a scene: k of its springs, and K″ of its anchor springs.

@@ -10,14 +10,14 @@ use palpate_geometry::surface::Surface;
 use palpate_geometry::work::spend;
 use palpate_geometry::{Group, TriangleMesh};
 
-use super::Springs;
 use super::eigenvalue::largest_of_laplacian;
 use super::shown::{Shown, Simulated};
 use super::source::{Files, SourceMesh};
+use super::springs::Springs;
 use super::volume::{Swelling, Volume};
 use crate::limits::Limits;
 use crate::scene::action_check::physical;
-use crate::scene::body::BodyKind;
+use crate::scene::body::{BodyKind, StiffnessBound};
 use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{Extent, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, finite, positive};
@@ -57,22 +57,6 @@ pub struct PerNodeFactors {
     /// k of each bending spring divided by `bending` times the reference k, in the order of
     /// [`MeshShape::opposite`].
     pub bending: Vec<f64>,
-}
-
-/// An upper bound of the largest eigenvalue of the springs' stiffness under any deformation, and the place of
-/// that vibration.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct StiffnessBound {
-    /// Upper bound of the eigenvalue, with the reference masses, divided by the reference k. It bounds the
-    /// Laplacian of the weighted graph, Σ k_ij/m_i·(x_i − x_j) = λ·x_i, since a spring along n contributes at
-    /// most k·I to the stiffness under any deformation.
-    pub bound: f64,
-    /// The number of the vertex that moves most in the fastest vibration (estimated); 0 without springs.
-    pub vertex: u32,
-    /// The bound for the median spring, in the unit of `bound`: half of the springs have at most this.
-    pub usual: f64,
-    /// The largest excess of K″/m of a point over the reference value, divided by that value; at least 0.
-    pub extra_anchor: f64,
 }
 
 /// The rest shape of a mesh. Point n is vertex n of the file, unless the simulated mesh is not the mesh of the

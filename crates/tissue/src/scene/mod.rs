@@ -19,6 +19,7 @@ pub mod sent;
 mod sheet;
 mod shown;
 mod source;
+mod springs;
 pub mod toml_document;
 mod volume;
 mod zero;
@@ -30,14 +31,15 @@ use crate::files;
 use crate::limits::Limits;
 use crate::shape::{PointId, RestShape};
 use action_check::physical;
-pub use body::BodyKind;
+pub use body::{BodyKind, StiffnessBound};
 use kind::TextKind;
 pub use material::{Inclusion, MadeOf, Material, Region};
-pub use mesh::{FixedVertices, Mesh, MeshMetadata, MeshShape, PerNodeFactors, StiffnessBound};
+pub use mesh::{FixedVertices, Mesh, MeshMetadata, MeshShape, PerNodeFactors};
 use palpate_refusal::{Reason, Refusal, Result, did_you_mean, excerpt, not_negative, number, positive};
 pub use sheet::{FixedPoints, MIN_WIDTH, PointSet, Sheet, largest_stiffness_of_a_sheet_n_per_m};
 pub use shown::{BoundPlace, Shown, Simulated};
 use source::Files;
+pub use springs::Springs;
 use toml_document::{Document, Fields, Item};
 pub use volume::{Swelling, Volume};
 
@@ -223,18 +225,6 @@ impl Change {
     /// Message of the refusal of a change that changes nothing ([`Reason::Missing`]).
     pub const NOTHING: &str = "names nothing to change: stiffness_n_per_m, damping_n_s_per_m, anchor_stiffness_n_per_m or \
                                volume_stiffness_pa";
-}
-
-/// Springs between neighbours: the force on a from a spring a–b is k (L − L0)(x_b − x_a)/L (Hooke's law).
-#[derive(Debug, Clone, PartialEq)]
-pub struct Springs {
-    /// k of the structural springs, (1,0) and (0,1) on a sheet, N/m; on a mesh, k of a reference edge.
-    pub stiffness_n_per_m: f64,
-    /// k of the shear springs (1,1) and (1,−1) of a sheet, N/m; without effect on a mesh.
-    pub shear_stiffness_n_per_m: f64,
-    /// Whether a sheet has bending springs (2,0) and (0,2), with the structural k. (On a mesh, see
-    /// [`Mesh::bending`].)
-    pub bending: bool,
 }
 
 /// How time advances: rate, accuracy, scheme and number format, as a user asks for them. `default()` has the

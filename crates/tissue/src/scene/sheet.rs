@@ -7,9 +7,9 @@ use glam::{DVec2, DVec3};
 
 use crate::limits::Limits;
 use crate::memory;
-use crate::scene::Springs;
 use crate::scene::action_check::physical;
 use crate::scene::body::BodyKind;
+use crate::scene::springs::Springs;
 use crate::scene::toml_document::{Fields, Item};
 use crate::shape::{Extent, PointId, PointName, RestShape};
 use palpate_refusal::{Reason, Refusal, Result, positive};

@@ -1,0 +1,13 @@
+//! The springs between neighbours that a scene gives.
+
+/// Springs between neighbours: the force on a from a spring a–b is k (L − L0)(x_b − x_a)/L (Hooke's law).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Springs {
+    /// k of the structural springs, (1,0) and (0,1) on a sheet, N/m; on a mesh, k of a reference edge.
+    pub stiffness_n_per_m: f64,
+    /// k of the shear springs (1,1) and (1,−1) of a sheet, N/m; without effect on a mesh.
+    pub shear_stiffness_n_per_m: f64,
+    /// Whether a sheet has bending springs (2,0) and (0,2), with the structural k. (On a mesh, see
+    /// [`Mesh::bending`](super::Mesh::bending).)
+    pub bending: bool,
+}
