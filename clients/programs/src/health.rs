@@ -25,13 +25,13 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 /// Fails unless the server reports that it is serving.
 pub(crate) async fn health(arguments: &HealthArguments) -> Result<(), ClientFailure> {
     let server = arguments.credentials.server(arguments.server.url())?.within(ANSWER_TIMEOUT);
-    let asked = async {
-        let mut health =
-            HealthClient::new(server.connect().await.map_err(|error| format!("{error}; --server names another"))?);
-        health.check(HealthCheckRequest::default()).await.map_err(|status| describe(&status))
-    };
-    let answer =
-        tokio::time::timeout(ANSWER_TIMEOUT, asked).await.map_err(|_| ClientFailure::Failed("no answer".into()))?;
+    // It is bounded by the same time; only what comes after it is timed here, so that one error or the other is told.
+    let connected = server.connect().await;
+    let channel = connected.map_err(|error| ClientFailure::Failed(format!("{error}; --server names another")))?;
+    let mut health = HealthClient::new(channel);
+    let asked = tokio::time::timeout(ANSWER_TIMEOUT, health.check(HealthCheckRequest::default())).await;
+    let silent = |_| format!("the server has not answered within {} s", ANSWER_TIMEOUT.as_secs());
+    let answer = asked.map_err(silent).and_then(|answer| answer.map_err(|status| describe(&status)));
     let status = answer.map_err(ClientFailure::Failed)?.into_inner().status;
     if status != ServingStatus::Serving as i32 {
         return Err(ClientFailure::Failed("the server is not serving".into()));
