@@ -170,7 +170,6 @@ test-python: build $(VENV)/ready
 lint: need-rust $(MODULES)
 	$(CARGO) fmt --all --check
 	$(PYTHON) tests/counts.py
-	$(PYTHON) scripts/count-kinds --most 71
 	$(CARGO) clippy --release --workspace --all-targets -- -D warnings
 	cd $(TYPESCRIPT) && $(NPM) run lint
 	cd $(VIEWER) && $(NPM) run lint
