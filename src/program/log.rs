@@ -13,14 +13,12 @@ use tracing_subscriber::fmt::format::{FormatFields, debug_fn};
 /// # Errors
 /// Names the part that is neither.
 pub(super) fn filter(text: &str) -> std::result::Result<Targets, String> {
-    let level = |part: &str, name: &str| match name {
-        "off" => Ok(LevelFilter::OFF),
-        "error" => Ok(LevelFilter::ERROR),
-        "warn" => Ok(LevelFilter::WARN),
-        "info" => Ok(LevelFilter::INFO),
-        "debug" => Ok(LevelFilter::DEBUG),
-        "trace" => Ok(LevelFilter::TRACE),
-        _ => Err(format!("`{part}` is neither a level (off, error, warn, info, debug, trace) nor target=level")),
+    let level = |part: &str, name: &str| {
+        // An empty text would be a level too.
+        let level = name.parse::<LevelFilter>().ok().filter(|_| !name.is_empty());
+        level.ok_or_else(|| {
+            format!("`{part}` is neither a level (off, error, warn, info, debug, trace) nor target=level")
+        })
     };
     text.split(',').map(str::trim).try_fold(Targets::new(), |filter, part| match part.split_once('=') {
         Some((target, name)) if !target.is_empty() => Ok(filter.with_target(target, level(part, name)?)),

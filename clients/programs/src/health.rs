@@ -25,7 +25,7 @@ const ANSWER_TIMEOUT: Duration = Duration::from_secs(2);
 /// Fails unless the server reports that it is serving.
 pub(crate) async fn health(arguments: &HealthArguments) -> Result<(), ClientFailure> {
     let server = arguments.credentials.server(arguments.server.url())?.within(ANSWER_TIMEOUT);
-    // It is bounded by the same time; only what comes after it is timed here, so that one error or the other is told.
+    // Connecting has the same time limit. A second limit around both would race with it, and hide its message.
     let connected = server.connect().await;
     let channel = connected.map_err(|error| ClientFailure::Failed(format!("{error}; --server names another")))?;
     let mut health = HealthClient::new(channel);

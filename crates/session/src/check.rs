@@ -9,9 +9,9 @@ use glam::DVec3;
 use super::Session;
 use super::scene_report::Prospect;
 use palpate_tissue::limits::Limits;
+use palpate_tissue::scene::Named;
 use palpate_tissue::scene::profile::Poke;
 use palpate_tissue::scene::script::Script;
-use palpate_tissue::scene::{Named, StiffnessBound};
 use palpate_tissue::scheme::Oscillator;
 use palpate_tissue::select::scheme_selection::{self, Choice};
 use palpate_tissue::shape::PointId;
@@ -131,15 +131,15 @@ impl fmt::Display for CheckReport {
             model.omega_bound_per_s / TAU,
             model.omega_bound_per_s
         )?;
-        if let Some(StiffnessBound { bound, usual, vertex, .. }) = scene.body.kind().fastest() {
-            let point = PointId::new(vertex as usize);
+        if let Some(fastest) = scene.body.kind().fastest() {
+            let point = PointId::new(fastest.vertex as usize);
             let is_volume = scene.volume_is_fastest();
             writeln!(
                 f,
                 "fastest       {} at {:.4} m: {:.2} times as fast as at half of the springs; it decides {}the substeps",
                 model.shape().name(point),
                 model.shape().rest_m(point),
-                (bound / usual).sqrt(),
+                fastest.fastest_ratio(),
                 if is_volume { "less than the volume " } else { "" }
             )?;
             if let Some(volume) = scene.volume() {

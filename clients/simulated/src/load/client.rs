@@ -21,7 +21,7 @@ pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// LoadStage of a load test, and the time when the measurement ended, ns.
+/// Stage of a load test, and the time when the measurement ended, ns.
 pub(crate) struct LoadStage(AtomicU8, AtomicU64);
 
 impl LoadStage {

@@ -6,7 +6,7 @@ use palpate_client::{Channel, Error, Server};
 
 use super::plan::LoadPlan;
 
-/// ConnectionPurpose of a connection. Frames have their own connections: on a shared one, they would delay samples.
+/// Purpose of a connection. Frames have their own connections: on a shared one, they would delay samples.
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) enum ConnectionPurpose {
     Call,

@@ -25,6 +25,19 @@ pub struct StiffnessBound {
     pub extra_anchor: f64,
 }
 
+impl StiffnessBound {
+    /// Returns how many times as fast the fastest vibration is as those of half of the springs.
+    pub fn fastest_ratio(&self) -> f64 {
+        (self.bound / self.usual).sqrt()
+    }
+}
+
+/// The ratio of speeds above which a warning names the fastest point.
+const MUCH_FASTER: f64 = 2.5;
+
+/// The bound of the stiffness of a mesh whose points are all alike, divided by k.
+const EVEN: f64 = 12.0;
+
 /// A kind of tissue, as a scene describes it. [`Body::kind`](super::Body::kind) gives that of a scene; nothing else
 /// needs to know which kind it is. Stiffnesses are those of a scene: k of its springs, and K″ of its anchor springs.
 pub trait BodyKind: fmt::Debug + Send + Sync {
@@ -72,19 +85,20 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
         self.spring_bound_n_per_m(springs, anchor_n_per_m)
     }
 
-    /// Returns how many times the bound of the springs is that of a tissue whose points are all alike, at least 1.
-    fn unevenness(&self) -> f64 {
-        1.0
-    }
-
     /// Returns the fastest vibration of the springs, and where it is; `None` where all points are alike.
     fn fastest(&self) -> Option<StiffnessBound> {
         None
     }
 
-    /// Returns whether a few points vibrate so fast that they alone require many substeps.
+    /// Returns how many times the bound of the springs is that of a tissue whose points are all alike, at least 1.
+    fn unevenness(&self) -> f64 {
+        self.fastest().map_or(1.0, |fastest| (fastest.bound / EVEN).max(1.0))
+    }
+
+    /// Returns whether a few points vibrate so fast that they alone require many substeps: more than 2.5 times as fast
+    /// as half of the springs ([`StiffnessBound::usual`]).
     fn has_fast_point(&self) -> bool {
-        false
+        self.fastest().is_some_and(|fastest| fastest.fastest_ratio() > MUCH_FASTER)
     }
 
     /// Returns whether the vibration in which a volume of the stiffness `volume_pa` swells and shrinks is faster than
@@ -93,9 +107,12 @@ pub trait BodyKind: fmt::Debug + Send + Sync {
         false
     }
 
-    /// Returns the place of the fastest vibration as the end of a message; empty where all points are alike.
+    /// Returns the place of the fastest vibration as the end of a message: `, most of all at vertex n, (x, y, z) m`;
+    /// empty where all points are alike.
     fn fastest_place(&self) -> String {
-        String::new()
+        let Some(StiffnessBound { vertex, .. }) = self.fastest() else { return String::new() };
+        let (shape, point) = (self.shape(), PointId::new(vertex as usize));
+        format!(", most of all at {}, {:.4} m", shape.name(point), shape.rest_m(point))
     }
 
     /// Returns warnings for the user, as sentences; empty if there are none.

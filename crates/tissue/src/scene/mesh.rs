@@ -363,11 +363,6 @@ impl Mesh {
         }
         stiffest
     }
-
-    /// Returns how many times as fast the fastest vibration is as those of half of the mesh.
-    fn fastest_ratio(&self) -> f64 {
-        (self.stiffest.bound / self.stiffest.usual).sqrt()
-    }
 }
 
 impl BodyKind for Mesh {
@@ -430,18 +425,8 @@ impl BodyKind for Mesh {
         elastic + anchor_n_per_m * extra_anchor
     }
 
-    fn unevenness(&self) -> f64 {
-        (self.stiffest.bound / EVEN).max(1.0)
-    }
-
     fn fastest(&self) -> Option<StiffnessBound> {
         Some(self.stiffest)
-    }
-
-    /// Returns whether a few vertices vibrate so fast that they alone require many substeps: more than 2.5
-    /// times as fast as half of the springs ([`StiffnessBound::usual`]).
-    fn has_fast_point(&self) -> bool {
-        self.fastest_ratio() > MUCH_FASTER
     }
 
     fn volume_is_fastest(&self, springs: &Springs, volume_pa: f64) -> bool {
@@ -450,13 +435,6 @@ impl BodyKind for Mesh {
             volume_pa * by_pressure_m + k * by_springs > k * self.stiffest.bound
         };
         self.volume.as_ref().is_some_and(|volume| fastest(volume.swelling))
-    }
-
-    /// Returns the place of the fastest vibration as the end of a message: `, most of all at vertex n, (x, y,
-    /// z) m`.
-    fn fastest_place(&self) -> String {
-        let point = PointId::new(self.stiffest.vertex as usize);
-        format!(", most of all at {}, {:.4} m", self.shape.name(point), self.shape.rest_m(point))
     }
 
     /// Returns warnings about the mesh for the user, as sentences: the findings ([`MeshMetadata::findings`]),
@@ -478,7 +456,7 @@ impl BodyKind for Mesh {
                  them out",
                 shape.name(point),
                 shape.rest_m(point),
-                self.fastest_ratio(),
+                self.stiffest.fastest_ratio(),
             ));
         }
         warnings
@@ -514,12 +492,6 @@ const APPROACH_M: f64 = 0.002;
 
 /// Number of empty balls of `mesh.fixed` with a message each; one message counts the others.
 const EMPTY_BALLS_TOLD: usize = 4;
-
-/// The bound of the stiffness of an even mesh, divided by k (`StiffnessBound`).
-const EVEN: f64 = 12.0;
-
-/// The ratio of speeds above which a warning names the fastest vertex.
-const MUCH_FASTER: f64 = 2.5;
 
 /// The vertices of a mesh that never move, as a scene specifies them (`mesh.fixed`).
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -25,8 +25,10 @@ pub fn endurance(omega_per_s: f64, decay_s: f64) -> f64 {
 /// Returns an upper bound of the largest eigenvalue of the springs' stiffness matrix under any deformation,
 /// with the reference masses, N/m.
 ///
-/// On a sheet this is [`largest_stiffness_of_a_sheet_n_per_m`](crate::scene::largest_stiffness_of_a_sheet_n_per_m). On a mesh it is k·β + K″·ε, with β the bound of
-/// the graph's Laplacian divided by k ([`StiffnessBound`](crate::scene::StiffnessBound)) and ε the largest excess of K″/m of a point over the
+/// On a sheet this is
+/// [`largest_stiffness_of_a_sheet_n_per_m`](crate::scene::largest_stiffness_of_a_sheet_n_per_m). On a mesh it is
+/// k·β + K″·ε, with β the bound of the graph's Laplacian divided by k
+/// ([`StiffnessBound`](crate::scene::StiffnessBound)) and ε the largest excess of K″/m of a point over the
 /// reference value. A volume replaces k·β by
 /// [`Swelling::bound_n_per_m`](crate::scene::Swelling::bound_n_per_m).
 pub fn largest_stiffness_n_per_m(scene: &Scene) -> f64 {
