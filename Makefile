@@ -19,12 +19,13 @@ MODULES := clients/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
 	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
-.PHONY: help run programs install header test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run programs install header protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos
 
 help:
 	@echo 'make run             build, serve on $(LISTEN), poke the tissue, plot the force, and keep serving for a browser'
+	@echo 'make protocol        proto/generated, the Rust code of the protocol, from its sources'
 	@echo 'make release         static server, client, container image and checksums in target/release-files; reports what it can not make'
 	@echo 'make install         libpalpate for C, C++ and C#, and the programs, below PREFIX=/usr/local'
 	@echo 'make header          clients/c/include/palpate.h from its sources'
@@ -105,6 +106,9 @@ install: build
 
 header: need-rust
 	PALPATE_WRITE_HEADER=1 $(CARGO) test --release --package palpate-c --test header
+
+protocol: need-rust
+	$(CARGO) run --package palpate-protocol-generator
 
 release: need-rust page-if-node
 	CARGO=$(CARGO) sh contrib/release.sh

@@ -25,6 +25,7 @@ CODE = (".rs", ".ts", ".mjs", ".js", ".py", ".pyi", ".cs", ".hpp", ".cpp", ".h",
 TYPE = re.compile(r"^[ \t]*(pub(?:\([^)]*\))?[ \t]+)?(?:struct|enum|union|trait|type)[ \t]+([A-Z]\w*)", re.MULTILINE)
 CONSTANT = re.compile(r"\b(?:PATIENCE(?:_\w+)?|MOST_\w+|LEAST_\w+|OFF_SHEET)\b")
 MAX_WORDS = 40
+GENERATED = "proto/generated/"
 MAX_KINDS = 71
 ASKS = re.compile(
     r"\bBody::(Sheet|Mesh)\b|\bElastic::(Sheet|Mesh)\b|\b(FootprintGeometry|SavedGeometry)::(Grid|Mesh)\b"
@@ -40,7 +41,7 @@ def files(*endings):
     here = Path(__file__).resolve()
     for name in listed:
         path = ROOT / name
-        if name.endswith(endings) and path.is_file() and path != here:
+        if name.endswith(endings) and path.is_file() and path != here and not name.startswith(GENERATED):
             yield name, path.read_text(encoding="utf-8")
 
 

@@ -22,14 +22,14 @@ pub mod touch;
 /// The generated code: messages, clients and servers of package `palpate.v1`.
 #[allow(missing_docs, clippy::all, clippy::pedantic, clippy::unwrap_used, unreachable_pub, rust_2018_idioms)]
 pub mod pb {
-    tonic::include_proto!("palpate.v1");
+    include!("../generated/palpate.v1.rs");
 
     /// Every file of the protocol, for reflection: the bytes of a `google.protobuf.FileDescriptorSet`.
-    pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/palpate.bin"));
+    pub const DESCRIPTORS: &[u8] = include_bytes!("../generated/palpate.v1.bin");
 
     /// For the request type of every call, its name and a function that returns whether bytes can be decoded as one,
     /// without any limit on their memory.
-    pub const DECODERS: &[(&str, fn(&[u8]) -> bool)] = include!(concat!(env!("OUT_DIR"), "/decoders.rs"));
+    pub const DECODERS: &[(&str, fn(&[u8]) -> bool)] = include!("../generated/decoders.rs");
 }
 
 /// The generated messages, clients and servers of the SDK of Agones, from `agones/*.proto`: the part that servers of
@@ -37,27 +37,27 @@ pub mod pb {
 #[cfg(feature = "agones")]
 #[allow(missing_docs, clippy::all, clippy::pedantic, clippy::unwrap_used, unreachable_pub, rust_2018_idioms)]
 pub mod agones {
-    tonic::include_proto!("agones.dev.sdk");
+    include!("../generated/agones.dev.sdk.rs");
 
     /// The part of the SDK that is not stable yet: counters.
     pub mod beta {
-        tonic::include_proto!("agones.dev.sdk.beta");
+        include!("../generated/agones.dev.sdk.beta.rs");
     }
 }
 
 /// The generated messages of package `palpate.journal.v1`: the contents of a session's journal.
 #[allow(missing_docs, clippy::all, clippy::pedantic, clippy::unwrap_used, unreachable_pub, rust_2018_idioms)]
 pub mod journal {
-    include!(concat!(env!("OUT_DIR"), "/journal/palpate.journal.v1.rs"));
+    include!("../generated/palpate.journal.v1.rs");
 
     /// Message formats of Foxglove, for exports.
     pub mod foxglove {
-        include!(concat!(env!("OUT_DIR"), "/journal/foxglove.rs"));
+        include!("../generated/foxglove.rs");
     }
 
     /// The descriptors of these files and their imports, each after its own imports: the bytes of a
     /// `google.protobuf.FileDescriptorSet`.
-    pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/journal/journal.bin"));
+    pub const DESCRIPTORS: &[u8] = include_bytes!("../generated/palpate.journal.v1.bin");
 }
 
 /// The generated messages and clients of etcd, by its own names of packages: `etcdserverpb` uses `mvccpb`.
@@ -65,10 +65,10 @@ pub mod journal {
 #[allow(missing_docs, clippy::all, clippy::pedantic, clippy::unwrap_used, unreachable_pub, rust_2018_idioms)]
 pub mod etcd {
     pub mod mvccpb {
-        include!(concat!(env!("OUT_DIR"), "/etcd/mvccpb.rs"));
+        include!("../generated/mvccpb.rs");
     }
 
     pub mod etcdserverpb {
-        include!(concat!(env!("OUT_DIR"), "/etcd/etcdserverpb.rs"));
+        include!("../generated/etcdserverpb.rs");
     }
 }

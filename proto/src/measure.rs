@@ -52,7 +52,7 @@ pub struct Shape {
     decode: fn(&[u8]) -> bool,
 }
 
-include!(concat!(env!("OUT_DIR"), "/shapes.rs"));
+include!("../generated/shapes.rs");
 
 /// The size of a message, from [`Shape::measure`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
