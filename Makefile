@@ -19,7 +19,7 @@ MODULES := clients/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
 	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
-.PHONY: help run programs install header protocol test-abi bench-tick build release viewer page-if-node test test-long test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run programs install header protocol test-abi bench-tick build release viewer page-if-node test test-rust test-server test-computed test-long test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos
 
@@ -32,6 +32,7 @@ help:
 	@echo 'make viewer          the page that shows the tissue, clients/viewer/dist (Node.js; make run also builds it)'
 	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
 	@echo 'make test-long       every test of Rust in its long form; docs/tests.md lists the differences'
+	@echo 'make test-rust       every test of Rust'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): tests/determinism under qemu-user; prints what it needs'
@@ -150,10 +151,19 @@ $(VENV)/ready: tests/python/requirements.txt clients/python/tests/requirements.t
 
 # The same random cases every time, so that the result is that of the change. `cargo test` alone draws others each time,
 # and `make stress` many.
-test: build $(VENV)/ready test-viewer test-python
-	PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace --no-fail-fast
+test: build $(VENV)/ready test-viewer test-python test-rust
 	sh tests/abi/check.sh $(BUILT) interface
 	$(VENV)/bin/python -m unittest discover -s tests/python -v
+
+# The tests of running servers mostly wait, so the others run beside them.
+CARGO_TEST := PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --no-fail-fast
+test-rust: build
+	$(CARGO) test --release --workspace --no-run
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync --keep-going test-server test-computed
+test-server:
+	$(CARGO_TEST) --workspace --test server --test siege
+test-computed:
+	$(CARGO_TEST) --workspace --exclude palpate-server-tests
 
 test-long: build
 	PALPATE_LONG=1 PROPTEST_RNG_SEED=20261122 $(CARGO) test --release --workspace --no-fail-fast -- --include-ignored \
@@ -347,17 +357,17 @@ SECONDS ?= 1800
 KILLS ?= 50
 JOURNAL_KILLS ?= 200
 soak: need-rust
-	PALPATE_SOAK_S=$(SECONDS) $(CARGO) test --release --test server -- soak:: --include-ignored --nocapture
-	PALPATE_KILLS=$(KILLS) $(CARGO) test --release --test server -- kill:: --skip journal_kill:: --nocapture
+	PALPATE_SOAK_S=$(SECONDS) $(CARGO) test --release --workspace --test server -- soak:: --include-ignored --nocapture
+	PALPATE_KILLS=$(KILLS) $(CARGO) test --release --workspace --test server -- kill:: --skip journal_kill:: --nocapture
 	PALPATE_JOURNAL_KILLS=$(JOURNAL_KILLS) PALPATE_JOURNAL_SESSIONS=20 \
-		$(CARGO) test --release --test server -- journal_kill:: --nocapture
+		$(CARGO) test --release --workspace --test server -- journal_kill:: --nocapture
 	PALPATE_LONG=1 $(CARGO) test --release --test journal -- --nocapture
-	PALPATE_LONG=1 $(CARGO) test --release --test server -- no_step_waits_for_a_disk_that_stalls --nocapture
+	PALPATE_LONG=1 $(CARGO) test --release --workspace --test server -- no_step_waits_for_a_disk_that_stalls --nocapture
 
 # Each seed is another siege; the first failure is said as it is found, all of them at the end.
 SEED ?= 16
 siege: need-rust
-	PALPATE_SIEGE_S=$(SECONDS) PALPATE_SIEGE_SEED=$(SEED) $(CARGO) test --release --test siege -- --nocapture
+	PALPATE_SIEGE_S=$(SECONDS) PALPATE_SIEGE_SEED=$(SEED) $(CARGO) test --release --workspace --test siege -- --nocapture
 
 # The fleet's histories, simulated s; a seed that fails is told with its last events. Then real servers on a real etcd.
 ROUNDS ?= 200
@@ -372,5 +382,5 @@ chaos: need-rust
 	PALPATE_FLEET_ROUNDS=$(ROUNDS) PALPATE_FLEET_SESSIONS=12 PALPATE_FLEET_RESTING=48 PALPATE_FLEET_FROZEN_S=10 \
 		PALPATE_FLEET_LEADERS=$(LEADERS) PALPATE_FLEET_GONE_S=$(GONE_S) PALPATE_FLEET_MOVES=$(MOVES) \
 		PALPATE_FLEET_SEED=$(SEED) PALPATE_FLEET_SUMMARY=$(CHAOS) \
-		$(CARGO) test --release --test server -- fleet_chaos:: --include-ignored --nocapture --test-threads=1; \
+		$(CARGO) test --release --workspace --test server -- fleet_chaos:: --include-ignored --nocapture --test-threads=1; \
 		ended=$$?; echo; cat $(CHAOS); exit $$ended

@@ -1,5 +1,5 @@
 //! Clients that are not friends: a table of what they do, and a thread for each that does it until it is called off.
-//! `make bench-load` shows what each does to one honest client; `tests/siege.rs` mixes them.
+//! `make bench-load` shows what each does to one honest client; `tests/server/siege.rs` mixes them.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::panic, clippy::disallowed_methods)]
 
 mod bytes;

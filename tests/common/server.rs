@@ -31,39 +31,54 @@ use tonic_types::StatusExt;
 /// Timeout of a test: long enough for any machine.
 pub const TEST_TIMEOUT: Duration = Duration::from_secs(60);
 
+/// The folder of the repository, with the scenes and scripts.
+pub fn repository() -> &'static Path {
+    let package = Path::new(env!("CARGO_MANIFEST_DIR"));
+    package.ancestors().find(|folder| folder.join("scenes").is_dir()).unwrap()
+}
+
+/// The folder of the programs, which are built if they are not there or not new.
+fn programs() -> &'static Path {
+    static BUILT: OnceLock<PathBuf> = OnceLock::new();
+    BUILT.get_or_init(|| {
+        let mut build = Command::new(env!("CARGO"));
+        // All programs, as `make build` does: a part of them might want other features of what both use, and so all of
+        // that once more.
+        build.args(["build", "--quiet", "--workspace", "--bins"]).current_dir(repository());
+        // Cargo's variables for a test would change the input of build scripts, and libraries would be built once
+        // more.
+        let of_package = |key: &str| {
+            let starts = ["CARGO_MANIFEST_", "CARGO_PKG_", "CARGO_BIN_"].iter().any(|start| key.starts_with(start));
+            starts || key == "CARGO_CRATE_NAME" || key == "CARGO_PRIMARY_PACKAGE"
+        };
+        for (key, _) in std::env::vars().filter(|(key, _)| of_package(key)) {
+            build.env_remove(key);
+        }
+        if !cfg!(debug_assertions) {
+            build.arg("--release");
+        }
+        assert!(build.status().unwrap().success());
+        // Beside the folder `deps` of this test.
+        std::env::current_exe().unwrap().ancestors().nth(2).unwrap().to_owned()
+    })
+}
+
 /// The client program, built if it is not there or not new.
 pub fn client_program() -> PathBuf {
-    static BUILT: OnceLock<PathBuf> = OnceLock::new();
-    BUILT
-        .get_or_init(|| {
-            let mut build = Command::new(env!("CARGO"));
-            // All programs, as `make build` does: a part of them might want other features of what both use, and so
-            // all of that once more.
-            build.args(["build", "--quiet", "--workspace", "--bins"]).current_dir(env!("CARGO_MANIFEST_DIR"));
-            // Cargo's variables for a test would change the input of build scripts, and libraries would be built once
-            // more.
-            let of_package = |key: &str| {
-                let starts = ["CARGO_MANIFEST_", "CARGO_PKG_", "CARGO_BIN_"].iter().any(|start| key.starts_with(start));
-                starts || key == "CARGO_CRATE_NAME" || key == "CARGO_PRIMARY_PACKAGE"
-            };
-            for (key, _) in std::env::vars().filter(|(key, _)| of_package(key)) {
-                build.env_remove(key);
-            }
-            if !cfg!(debug_assertions) {
-                build.arg("--release");
-            }
-            assert!(build.status().unwrap().success());
-            PathBuf::from(env!("CARGO_BIN_EXE_palpate")).with_file_name("palpate-client")
-        })
-        .clone()
+    programs().join("palpate-client")
+}
+
+/// The server program. Cargo builds it for tests and benches of its own package.
+pub fn server_program() -> PathBuf {
+    option_env!("CARGO_BIN_EXE_palpate").map_or_else(|| programs().join("palpate"), PathBuf::from)
 }
 
 /// The server's program, to its end. One that goes on, as a server would that should have been refused, is ended after
 /// [`TEST_TIMEOUT`] and has no exit code.
 pub fn palpate(arguments: &[&str]) -> Output {
-    let child = Command::new(env!("CARGO_BIN_EXE_palpate"))
+    let child = Command::new(server_program())
         .args(arguments)
-        .current_dir(env!("CARGO_MANIFEST_DIR"))
+        .current_dir(repository())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
@@ -94,7 +109,7 @@ impl TestServer {
 
     /// Starts a server at that address.
     pub fn start_at(listen: &str, arguments: &[&str]) -> Self {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_palpate"));
+        let mut command = Command::new(server_program());
         command.args(["serve", "--listen", listen]).args(arguments);
         if std::env::var_os("PALPATE_SHOW_LOGS").is_some() {
             return TestServer::spawn(command.stderr(Stdio::inherit()));
@@ -106,13 +121,13 @@ impl TestServer {
     /// `arguments`.
     pub fn by_script(script: &str, arguments: &[&std::ffi::OsStr]) -> Self {
         let mut command = Command::new("sh");
-        command.args(["-c", script, env!("CARGO_BIN_EXE_palpate")]).args(arguments);
+        command.args(["-c", script]).arg(server_program()).args(arguments);
         TestServer::spawn(command.stderr(Stdio::piped()))
     }
 
     /// A server that a command starts, which prints its address first.
     pub fn spawn(command: &mut Command) -> Self {
-        let mut child = command.current_dir(env!("CARGO_MANIFEST_DIR")).stdout(Stdio::piped()).spawn().unwrap();
+        let mut child = command.current_dir(repository()).stdout(Stdio::piped()).spawn().unwrap();
         let mut line = String::new();
         let mut out = BufReader::new(child.stdout.take().unwrap());
         out.read_line(&mut line).unwrap();

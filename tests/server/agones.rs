@@ -18,7 +18,7 @@ use tokio_stream::wrappers::TcpListenerStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use crate::common::etcd::EtcdMembers;
-use crate::common::server::{TEST_TIMEOUT, TestServer};
+use crate::common::server::{TEST_TIMEOUT, TestServer, server_program};
 
 /// The capacity of the counter.
 const CAPACITY: i64 = 70;
@@ -193,7 +193,7 @@ async fn an_sdk_that_hangs_is_asked_again() {
 
 /// A server of a fleet of one, under Agones.
 fn under_agones(etcd: &EtcdMembers, port: u16, folder: &std::path::Path) -> TestServer {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_palpate"));
+    let mut command = Command::new(server_program());
     command
         .args(["serve", "--listen", "127.0.0.1:0", "--agones", "--node", "a", "--advertise", "http://localhost:7117"])
         .arg(format!("--cluster={}", etcd.endpoints().join(",")))

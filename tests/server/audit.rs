@@ -3,7 +3,7 @@
 use crate::common::metrics;
 use std::time::Instant;
 
-use crate::common::server::{TEST_TIMEOUT, TestServer, TestTouch, force};
+use crate::common::server::{TEST_TIMEOUT, TestServer, TestTouch, force, repository};
 use crate::common::{SMALL, model, playing, scene_with, script};
 use glam::DVec3;
 use palpate_haptics::Tip;
@@ -99,7 +99,7 @@ fn an_audit_of_a_good_scene_is_within_its_tolerance() {
     // The script names a point of a sheet.
     for (name, text) in BUILT_IN.into_iter().filter(|scene| scene.1.contains("[sheet]")) {
         let scene = scene_with(text, &[]);
-        let file = format!("{}/scripts/vertical-60.toml", env!("CARGO_MANIFEST_DIR"));
+        let file = repository().join("scripts/vertical-60.toml");
         let error = play(&scene, &std::fs::read_to_string(file).unwrap(), false, true).0.audited_error.unwrap();
         assert!(error.largest() <= scene.stepping.tolerance && error.largest() > 0.0, "{name}: {error:?}");
     }

@@ -13,7 +13,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use crate::common::inverse_service::{InverseService, Wrong};
-use crate::common::server::{TEST_TIMEOUT, TestServer, client_program};
+use crate::common::server::{TEST_TIMEOUT, TestServer, client_program, repository};
 use glam::DVec3;
 use palpate_client::bridge::{BridgeReport, Options, SessionChoice, Target, run};
 use palpate_client::devices::{Enables, Placed, Placement, open};
@@ -36,7 +36,7 @@ impl Imitation {
     fn build(name: &str, wrong: &[&str]) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let library = folder.path().join(format!("lib{name}.so"));
-        let source = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/imitations/{name}.c"));
+        let source = repository().join(format!("tests/imitations/{name}.c"));
         let mut compile = Command::new("cc");
         compile.args(["-shared", "-fPIC", "-O1", "-o"]).arg(&library).arg(source);
         let log = Log(folder.path().join("log"));
@@ -428,7 +428,7 @@ fn what_goes_wrong_with_a_loaded_library_ends_the_bridge_without_a_force() {
         ("openhaptics", Some("Cargo.toml"), 1, &["libHD can't be loaded"]),
         ("phantom", None, 2, &["--device", "force-dimension, openhaptics, haply, spacemouse, gamepad"]),
     ] {
-        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        let root = repository();
         let library = library.map(|library| root.join(library));
         ends(&server, &DeviceFaultCase { device: device.to_owned(), library, status, says });
     }

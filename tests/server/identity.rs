@@ -7,7 +7,7 @@ use std::process::{Command, Stdio};
 use std::sync::{Arc, mpsc};
 
 use crate::common::authority::Authority;
-use crate::common::server::{self, TEST_TIMEOUT, TestServer, force, palpate, told};
+use crate::common::server::{self, TEST_TIMEOUT, TestServer, force, palpate, repository, server_program, told};
 use palpate::server::identity::{self, Access, CALLS, Role, access};
 use palpate_proto::pb;
 use prost::Message;
@@ -96,7 +96,7 @@ async fn a_client_without_a_token_is_told_how_to_give_one() {
     {
         let mut command = Command::new(server::client_program());
         command.args(arguments).args(["--server", &server.url]).env_remove("PALPATE_TOKEN");
-        let ran = command.current_dir(env!("CARGO_MANIFEST_DIR")).output().unwrap();
+        let ran = command.current_dir(repository()).output().unwrap();
         let said = String::from_utf8_lossy(&ran.stderr);
         assert!(!ran.status.success() && said.contains("UNAUTHENTICATED"), "{arguments:?}: {said}");
         assert!(said.contains("--token-file FILE") && said.contains("PALPATE_TOKEN"), "{arguments:?}: {said}");
@@ -604,7 +604,7 @@ fn a_server_that_others_can_reach_does_not_start_unprotected() {
     let ended = palpate(&["serve", "--listen", "127.0.0.1:0", "--metrics", "0.0.0.0:0"]);
     assert_eq!(ended.status.code(), Some(2));
     for more in [&["--insecure"][..], &[&tls[..], &known[..]].concat()] {
-        let mut child = Command::new(env!("CARGO_BIN_EXE_palpate"))
+        let mut child = Command::new(server_program())
             .args(anywhere)
             .args(more)
             .stdout(Stdio::piped())
@@ -776,7 +776,7 @@ fn the_clients_programs_show_their_token_and_check_the_server() {
         if !more.contains(&"--server") {
             command.args(["--server", &server.url]);
         }
-        command.current_dir(env!("CARGO_MANIFEST_DIR")).env_remove("PALPATE_TOKEN");
+        command.current_dir(repository()).env_remove("PALPATE_TOKEN");
         if let Some(token) = environment {
             command.env("PALPATE_TOKEN", token);
         }

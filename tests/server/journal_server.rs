@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use crate::common::journal_opening::opening;
-use crate::common::server::{self, TEST_TIMEOUT, TestServer, TestTouch, force, waiting};
+use crate::common::server::{self, TEST_TIMEOUT, TestServer, TestTouch, force, server_program, waiting};
 use palpate_proto::pb;
 use palpate_tissue::limits::Limits;
 use palpate_tissue::select::scheme_selection::NEVER;
@@ -193,7 +193,7 @@ async fn nothing_is_kept_where_it_is_not_wanted() {
     server.sessions().await.delete_session(pb::DeleteSessionRequest { session_id: id.clone() }).await.unwrap();
     assert!(files(folder.path(), &id).is_empty());
     // Another server has its own folder.
-    let mut second = Command::new(env!("CARGO_BIN_EXE_palpate"))
+    let mut second = Command::new(server_program())
         .args(["serve", "--listen", "127.0.0.1:0", "--journal", folder.path().to_str().unwrap()])
         .stdout(Stdio::null())
         .stderr(Stdio::piped())
@@ -454,10 +454,9 @@ async fn a_journal_is_replayed_through_a_server_that_keeps_none() {
     assert_eq!((played["begin_step"].as_u64(), played["end_step"].as_u64()), (Some(0), Some(150)));
     assert_eq!(played["state_hash"], hash.as_str());
     assert_ne!(played["session_id"], id.as_str());
-    let palpate = || PathBuf::from(env!("CARGO_BIN_EXE_palpate"));
-    let (status, out, told) = run(palpate(), &["journal", "replay", "--from", "100", "--to", "120"]);
+    let (status, out, told) = run(server_program(), &["journal", "replay", "--from", "100", "--to", "120"]);
     assert!(status == Some(0) && out.contains("100 to 120"), "{out}{told}");
-    let (status, _, told) = run(palpate(), &["journal", "replay", "--from", "151"]);
+    let (status, _, told) = run(server_program(), &["journal", "replay", "--from", "151"]);
     assert!(status == Some(2) && told.contains("--from: must be from 0 to 150"), "{told}");
     // Nothing is left, except the session that continues live.
     let (status, out, told) = run(server::client_program(), &["play", "--live", "--json"]);

@@ -3,7 +3,7 @@
 use std::process::{Command, Output, Stdio};
 use std::time::Duration;
 
-use crate::common::server::{TEST_TIMEOUT, TestServer, client_program};
+use crate::common::server::{TEST_TIMEOUT, TestServer, client_program, repository};
 use palpate_proto::pb;
 use serde_json::Value;
 
@@ -256,7 +256,7 @@ async fn a_plan_that_misses_an_objective_or_is_wrong_says_so_by_its_status() {
     assert!(said.contains("plan.toml:6") && said.contains("phase[0].stay_s"), "{said}");
     assert!(sessions(&server).await.is_empty());
     // The plan that the guide begins with can be read: its server is nowhere.
-    let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+    let root = repository();
     let plan = std::fs::read_to_string(root.join("contrib/plan.toml")).unwrap();
     let nobody = planned(&server, folder.path(), &plan, &["--server", "http://127.0.0.1:9"]);
     assert_ne!(nobody.status.code(), Some(2), "{}", String::from_utf8_lossy(&nobody.stderr));

@@ -2,11 +2,10 @@
 //! send.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
-use crate::common::server::{TestServer, TestTouch, client_program, open, palpate, told};
+use crate::common::server::{TestServer, TestTouch, client_program, open, palpate, repository, told};
 use glam::DVec3;
 use palpate_client::view::SurfaceState;
 use palpate_haptics::Tip;
@@ -671,7 +670,7 @@ fn a_replay_on_a_mesh_has_the_hash_of_the_run_offline() {
         for scene in [name, &file] {
             let output = std::process::Command::new(client_program())
                 .args(["replay", script, "--server", &server.url, "--scene", scene])
-                .current_dir(Path::new(env!("CARGO_MANIFEST_DIR")))
+                .current_dir(repository())
                 .output()
                 .unwrap();
             assert_eq!(summary(output), expected, "{scene}");

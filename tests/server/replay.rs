@@ -6,25 +6,25 @@ use std::process::{Command, Output, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use crate::common::server::{self, TEST_TIMEOUT, TestServer, TestTouch, client_program, force, open};
+use crate::common::server::{
+    self, TEST_TIMEOUT, TestServer, TestTouch, client_program, force, open, repository, server_program,
+};
 use palpate_proto::pb;
 use serde_json::Value;
-
-const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
 fn replay(server: &TestServer, script: &Path, more: &[&str]) -> Output {
     Command::new(client_program())
         .args(["replay", script.to_str().unwrap(), "--server", &server.url])
         .args(more)
-        .current_dir(ROOT)
+        .current_dir(repository())
         .output()
         .unwrap()
 }
 
 fn run_held(scene: &str, script: &Path) -> Vec<Value> {
-    let output = Command::new(env!("CARGO_BIN_EXE_palpate"))
+    let output = Command::new(server_program())
         .args(["run", scene, script.to_str().unwrap(), "--held"])
-        .current_dir(ROOT)
+        .current_dir(repository())
         .output()
         .unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -37,7 +37,7 @@ fn lines(bytes: &[u8]) -> Vec<Value> {
 
 /// Each with the first scene that it is made for.
 fn shipped_scripts() -> Vec<(String, PathBuf)> {
-    let mut scripts: Vec<_> = std::fs::read_dir(Path::new(ROOT).join("scripts"))
+    let mut scripts: Vec<_> = std::fs::read_dir(repository().join("scripts"))
         .unwrap()
         .map(|entry| entry.unwrap().path())
         .filter(|path| path.extension().is_some_and(|extension| extension == "toml"))
@@ -106,7 +106,7 @@ fn a_replay_plots_the_first_tool_with_a_tip_as_a_run_does() {
     let scene = scene.to_str().unwrap();
     assert_same(&server, scene, &script);
     let through = replay(&server, &script, &["--scene", scene, "--plot"]);
-    let offline = Command::new(env!("CARGO_BIN_EXE_palpate"))
+    let offline = Command::new(server_program())
         .args(["run", scene, script.to_str().unwrap(), "--held", "--plot"])
         .output()
         .unwrap();
@@ -360,7 +360,7 @@ fn a_server_that_stops_in_mid_replay_is_told() {
     let mut server = TestServer::start(&[]);
     let folder = tempfile::tempdir().unwrap();
     let script = folder.path().join("long.toml");
-    let text = std::fs::read_to_string(Path::new(ROOT).join("scripts/vertical-60.toml")).unwrap();
+    let text = std::fs::read_to_string(repository().join("scripts/vertical-60.toml")).unwrap();
     std::fs::write(&script, text.replace("duration_s = 1.0", "duration_s = 600.0")).unwrap();
     let records = folder.path().join("records.jsonl");
     let mut client = Command::new(client_program())
@@ -407,7 +407,7 @@ fn a_server_that_falls_silent_in_mid_replay_is_told() {
 #[test]
 fn what_a_replay_can_not_play_is_refused() {
     let server = TestServer::start(&[]);
-    let script = Path::new(ROOT).join("scripts/vertical-60.toml");
+    let script = repository().join("scripts/vertical-60.toml");
     let refused = |output: Output, status: i32, expected: &str| {
         let message = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(status), "{message}");
@@ -481,7 +481,7 @@ fn a_recovery_is_the_same_in_a_replay_and_offline_and_neither_calls_that_the_scr
     let config = ["--config", config.to_str().unwrap()];
     let server = TestServer::start(&config);
     let through = replay(&server, &script, &["--scene", scene.to_str().unwrap()]);
-    let offline = Command::new(env!("CARGO_BIN_EXE_palpate"))
+    let offline = Command::new(server_program())
         .args(["run", scene.to_str().unwrap(), script.to_str().unwrap(), "--held"])
         .args(config)
         .output()

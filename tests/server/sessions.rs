@@ -2,7 +2,7 @@
 
 use std::process::Command;
 
-use crate::common::server::{TEST_TIMEOUT, TestServer, TestTouch, force, open, palpate, told};
+use crate::common::server::{TEST_TIMEOUT, TestServer, TestTouch, force, open, palpate, repository, told};
 use palpate_proto::pb;
 use pb::create_session_request::Source;
 use tonic::Code;
@@ -518,7 +518,7 @@ async fn a_port_in_use_is_told() {
 #[test]
 fn the_example_of_a_configuration_has_every_key_with_its_default() {
     use palpate::server::config::Config;
-    let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+    let root = repository();
     let example = Config::load(&root.join("docs/palpate.toml")).unwrap();
     assert_eq!(format!("{example:#?}"), format!("{:#?}", Config::default()));
     let text = std::fs::read_to_string(root.join("docs/palpate.toml")).unwrap();

@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader};
 use std::process::{Command, Output, Stdio};
 
 use crate::common::metrics::{self, scrape};
-use crate::common::server::{TestServer, TestTouch, client_program, force};
+use crate::common::server::{TestServer, TestTouch, client_program, force, server_program};
 use palpate_proto::pb;
 use serde_json::Value;
 
@@ -91,7 +91,7 @@ fn the_dashboard_shows_what_is_there_and_asks_for_nothing_else() {
 fn top(arguments: &[&str]) -> Output {
     // The server's program hands over to the client's, which lies beside it.
     client_program();
-    Command::new(env!("CARGO_BIN_EXE_palpate")).arg("top").args(arguments).output().unwrap()
+    Command::new(server_program()).arg("top").args(arguments).output().unwrap()
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -156,7 +156,7 @@ fn a_server_says_that_it_is_well_and_one_that_is_gone_does_not() {
 
 /// Returns options in a text that `palpate serve` does not have.
 fn unknown_options(text: &str) -> Vec<String> {
-    let help = Command::new(env!("CARGO_BIN_EXE_palpate")).args(["serve", "--help"]).output().unwrap();
+    let help = Command::new(server_program()).args(["serve", "--help"]).output().unwrap();
     let client = Command::new(client_program()).args(["health", "--help"]).output().unwrap();
     let help = String::from_utf8([help.stdout, client.stdout].concat()).unwrap();
     let words = text.split(|c: char| c.is_whitespace() || "\",[]`".contains(c));
@@ -186,7 +186,7 @@ fn the_packaged_files_start_servers_as_they_are() {
     // installed.
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("palpate.service");
-    std::fs::write(&path, unit.replace("/usr/local/bin/palpate", env!("CARGO_BIN_EXE_palpate"))).unwrap();
+    std::fs::write(&path, unit.replace("/usr/local/bin/palpate", server_program().to_str().unwrap())).unwrap();
     if let Ok(verified) = Command::new("systemd-analyze").arg("verify").arg(&path).output() {
         assert!(verified.status.success() && verified.stderr.is_empty(), "{verified:?}");
     }

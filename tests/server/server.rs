@@ -1,5 +1,5 @@
-//! Everything that tests a running server without counting its memory or its time: one program, as each would link the
-//! whole server and its clients again. `cargo test --test server sessions::` runs one file of it.
+//! Everything that tests a running server but the siege, which times it: one program, as each would link the whole server
+//! and its clients again. `cargo test --release --workspace --test server sessions::` runs one file of it.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
 
 #[path = "../common"]
@@ -11,6 +11,7 @@ mod common {
 
     pub mod authority;
     pub mod cases;
+    pub mod cores;
     pub mod course;
     pub mod etcd;
     pub mod fleet;
@@ -25,6 +26,7 @@ mod common {
 #[cfg(feature = "agones")]
 mod agones;
 mod audit;
+mod budget;
 mod datagrams;
 mod devices;
 mod etcd;
@@ -40,7 +42,10 @@ mod kill;
 mod library;
 mod link;
 mod load;
+#[cfg(target_os = "linux")]
+mod memory;
 mod mesh_server;
+mod page;
 mod replay;
 mod sessions;
 mod soak;

@@ -1,20 +1,14 @@
 //! A server to which the system gives no more memory: what needs much is refused with a reason, or ends the session
 //! that needs it; the process lives and serves others. Linux only: elsewhere the limit of a process can't be set by
 //! another.
-#![cfg(target_os = "linux")]
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
-
-#[path = "common/cores.rs"]
-mod cores;
-#[path = "common/server.rs"]
-mod server;
 
 use std::time::Duration;
 
+use crate::common::cores;
+use crate::common::server::{TEST_TIMEOUT, TestServer, TestTouch, force, sheet, told};
 use palpate_proto::pb;
 use pb::session_service_client::SessionServiceClient;
 use rustix::process::{Pid, Resource, Rlimit, prlimit};
-use server::{TEST_TIMEOUT, TestServer, TestTouch, force, sheet, told};
 use tonic::transport::Channel;
 use tonic::{Code, Status};
 

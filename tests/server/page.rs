@@ -1,15 +1,11 @@
 //! The page and gRPC-web on the port of gRPC, spoken to by hand over HTTP/1.1.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
-
-#[path = "common/cores.rs"]
-mod cores;
-#[path = "common/server.rs"]
-mod server;
 
 use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::path::Path;
 
+use crate::common::cores;
+use crate::common::server::{TEST_TIMEOUT, TestServer, told};
 use palpate::server::identity::{self, Role};
 use palpate_proto::pb;
 use palpate_session::wire;
@@ -17,7 +13,6 @@ use palpate_tissue::limits::Limits;
 use palpate_tissue::scene::Scene;
 use palpate_tissue::scene::collection::find_script;
 use prost::Message;
-use server::{TEST_TIMEOUT, TestServer, told};
 
 /// Head, in small letters, and body of an answer.
 fn ask(server: &TestServer, method: &str, path: &str, headers: &str, body: &[u8]) -> (String, Vec<u8>) {

@@ -11,17 +11,17 @@
     clippy::cast_precision_loss
 )]
 
-#[path = "../benches/attack/mod.rs"]
+#[path = "../../benches/attack/mod.rs"]
 mod attack;
-#[path = "common/caller.rs"]
+#[path = "../common/caller.rs"]
 mod caller;
-#[path = "common/cores.rs"]
+#[path = "../common/cores.rs"]
 mod cores;
-#[path = "common/honest.rs"]
+#[path = "../common/honest.rs"]
 mod honest;
-#[path = "common/metrics.rs"]
+#[path = "../common/metrics.rs"]
 mod metrics;
-#[path = "common/server.rs"]
+#[path = "../common/server.rs"]
 mod server;
 
 use std::sync::Arc;

@@ -1,17 +1,10 @@
 //! Memory has a budget: what would be above it is refused with a reason before it is taken, and all is given back.
-#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::disallowed_methods)]
-
-#[path = "common/cores.rs"]
-mod cores;
-#[path = "common/metrics.rs"]
-mod metrics;
-#[path = "common/server.rs"]
-mod server;
 
 use std::time::Duration;
 
+use crate::common::server::{self, TEST_TIMEOUT, TestServer, sheet, told};
+use crate::common::{cores, metrics};
 use palpate_proto::pb;
-use server::{TEST_TIMEOUT, TestServer, sheet, told};
 use tonic::Code;
 
 /// A server with so much memory, and where its metrics are. It refuses nothing because its machine is slow.
