@@ -19,7 +19,7 @@ MODULES := clients/node_modules/.package-lock.json
 PAGE_SOURCES := $(wildcard $(VIEWER)/*.json $(VIEWER)/*.ts $(VIEWER)/index.html $(VIEWER)/src/*.ts $(VIEWER)/src/*.css \
 	$(VIEWER)/public/* $(TYPESCRIPT)/*.json $(TYPESCRIPT)/*.yaml $(TYPESCRIPT)/src/*.ts proto/palpate/v1/*.proto)
 
-.PHONY: help run programs install header protocol test-abi bench-tick build release viewer page-if-node test test-rust test-server test-computed test-long test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
+.PHONY: help run programs install header protocol test-protocol test-abi bench-tick build release viewer page-if-node test test-rust test-server test-computed test-long test-viewer test-python bench-python test-arm test-asan test-valgrind test-debug test-mutants need-arm stress libfuzzer lint picture figures screenshot page-states scene-pictures bench-roundtrip bench-duty \
 	bench-frames bench-error bench-tolerance bench-kernel bench-stability bench-skip bench-mesh bench-organ bench-rest bench-link bench-prediction bench-viewer bench-load bench-fleet soak siege fuzz need-rust \
 	need-python need-node chaos
 
@@ -33,6 +33,7 @@ help:
 	@echo 'make test            every test (Rust, Python 3, and the page in a browser)'
 	@echo 'make test-long       every test of Rust in its long form; docs/tests.md lists the differences'
 	@echo 'make test-rust       every test of Rust'
+	@echo 'make test-protocol   is proto/generated that of the protocol?'
 	@echo 'make test-viewer     the page alone; its screenshots are in target/viewer'
 	@echo 'make test-python     the Python package alone: installed with pip in target/venv, and its tests'
 	@echo 'make test-arm        the same bits on ARM (NEON): tests/determinism under qemu-user; prints what it needs'
@@ -108,8 +109,13 @@ install: build
 header: need-rust
 	PALPATE_WRITE_HEADER=1 $(CARGO) test --release --package palpate-c --test header
 
+# The generator is no part of the workspace.
+GENERATOR := --quiet --locked --target-dir $(CURDIR)/target/generator
 protocol: need-rust
-	$(CARGO) run --package palpate-protocol-generator
+	cd proto/generator && $(CARGO) run $(GENERATOR)
+
+test-protocol: need-rust
+	cd proto/generator && $(CARGO) fmt --check && $(CARGO) test $(GENERATOR)
 
 release: need-rust page-if-node
 	CARGO=$(CARGO) sh contrib/release.sh
@@ -151,7 +157,7 @@ $(VENV)/ready: tests/python/requirements.txt clients/python/tests/requirements.t
 
 # The same random cases every time, so that the result is that of the change. `cargo test` alone draws others each time,
 # and `make stress` many.
-test: build $(VENV)/ready test-viewer test-python test-rust
+test: build $(VENV)/ready test-viewer test-python test-rust test-protocol
 	sh tests/abi/check.sh $(BUILT) interface
 	$(VENV)/bin/python -m unittest discover -s tests/python -v
 

@@ -15,7 +15,7 @@ const MODULES: [(&str, &[&str]); 4] = [
 ];
 
 /// The crates: folder, name, the other crates that it may use, and what must not be in its tree of dependencies.
-const CRATES: [(&str, &str, &[&str], &[&str]); 16] = [
+const CRATES: [(&str, &str, &[&str], &[&str]); 15] = [
     ("crates/refusal", "palpate-refusal", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
     ("crates/arguments", "palpate-arguments", &["palpate-refusal"], &["prost", "tokio", "tonic"]),
     ("crates/geometry", "palpate-geometry", &[], &["axum", "clap", "prost", "tokio", "tonic"]),
@@ -32,7 +32,6 @@ const CRATES: [(&str, &str, &[&str], &[&str]); 16] = [
         &["palpate-haptics", "palpate-refusal"],
         &["axum", "clap", "hyper", "protox", "tokio-rustls"],
     ),
-    ("proto/generator", "palpate-protocol-generator", &[], &["hyper"]),
     (
         "crates/session",
         "palpate-session",

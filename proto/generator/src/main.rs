@@ -1,4 +1,4 @@
-//! Writes the Rust code of the protocol: `cargo run --package palpate-protocol-generator`, or `make protocol`.
+//! Writes the Rust code of the protocol: `make protocol`.
 //!
 //! The code is checked in, at `proto/generated`, since its generation takes longer than its compilation and most builds
 //! don't change the protocol. A test compares it with the protocol. No protoc is needed.
